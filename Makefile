@@ -1,0 +1,40 @@
+.PHONY: demo test test-slow format check bench clean
+.DEFAULT_GOAL := help
+
+PYTHON := .venv/bin/python
+OUT ?= outputs/demo
+SHELF ?= middle
+
+help:
+	@echo "make demo    demonstrate, learn, grasp, place in simulation; writes $(OUT)"
+	@echo "make test    run the tests"
+	@echo "make bench   measure the speed against floors and peers"
+	@echo "make format  format the code        make check  lint and type-check"
+
+demo: .venv/.installed
+	$(PYTHON) control/run_demo.py --out $(OUT) --shelf $(SHELF)
+
+test: .venv/.installed
+	$(PYTHON) -m pytest -n auto --dist loadfile
+
+test-slow: .venv/.installed
+	$(PYTHON) -m pytest -m slow
+
+format: .venv/.installed
+	$(PYTHON) -m ruff check --fix-only --quiet .
+	$(PYTHON) -m ruff format .
+
+check: .venv/.installed
+	$(PYTHON) -m ruff check .
+	$(PYTHON) -m ruff format --check .
+	$(PYTHON) -m pyright
+
+bench: .venv/.installed
+	for program in benchmarks/bench_*.py; do $(PYTHON) $$program || exit 1; done
+
+clean:
+	rm -rf .venv outputs
+
+.venv/.installed: pyproject.toml constraints.txt tools/make_venv.sh
+	bash tools/make_venv.sh
+	touch $@

@@ -1,0 +1,1 @@
+"""Learn robot arm motions from a few demonstrations and work safely beside people."""
