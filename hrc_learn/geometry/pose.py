@@ -1,0 +1,85 @@
+"""Position and orientation of one frame in another."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hrc_learn.geometry import quaternion
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Pose of a frame; composes, inverts, and moves points from that frame to its parent.
+
+    A pytree: goes through `torch.func`, `torch.compile` and `torch.export` as it is.
+    """
+
+    position: Float[Tensor, "*batch 3"]
+    """Origin in the parent frame [m]."""
+    orientation: Float[Tensor, "*batch 4"]
+    """Unit quaternion (w, x, y, z); either sign."""
+
+    @staticmethod
+    def from_matrix(T: Float[Tensor, "*batch 4 4"]) -> Pose:
+        """Pose of a homogeneous transform."""
+        return Pose(T[..., :3, 3], quaternion.from_matrix(T[..., :3, :3]))
+
+    def matrix(self) -> Float[Tensor, "*batch 4 4"]:
+        """Homogeneous transform."""
+        R = quaternion.to_matrix(self.orientation)
+        upper = torch.cat([R, self.position[..., None]], dim=-1)
+        corner = upper.new_tensor([[0.0, 0.0, 0.0, 1.0]])
+        return torch.cat([upper, corner.expand(*upper.shape[:-2], 1, 4)], dim=-2)
+
+    @staticmethod
+    def from_vector(r: Float[Tensor, "*batch 6"]) -> Pose:
+        """Pose of (position [m], rotation vector [rad])."""
+        return Pose(r[..., :3], quaternion.exp(r[..., 3:]))
+
+    def vector(self) -> Float[Tensor, "*batch 6"]:
+        """Position [m] and rotation vector [rad] of the shortest rotation: the paper's r."""
+        return torch.cat([self.position, quaternion.log(self.orientation)], dim=-1)
+
+    def __matmul__(self, other: Pose) -> Pose:
+        """Pose of `other`, given in this frame, in this frame's parent."""
+        return Pose(
+            self.apply(other.position), quaternion.multiply(self.orientation, other.orientation)
+        )
+
+    def inverse(self) -> Pose:
+        """Pose of the parent in this frame."""
+        inverse = quaternion.conjugate(self.orientation)
+        return Pose(-quaternion.rotate(inverse, self.position), inverse)
+
+    def apply(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*both 3"]:
+        """Move points [m] from this frame to its parent.
+
+        Args:
+            points: Their leading dimensions broadcast against the pose's.
+        """
+        return quaternion.rotate(self.orientation, points) + self.position
+
+    def twist_to(self, other: Pose) -> Float[Tensor, "*both 6"]:
+        """Motion to `other` as (linear [m], angular [rad]) in the parent frame.
+
+        The angular part is the rotation vector of R_other R_self^T. So for close poses this is
+        the geometric Jacobian times the joint motion, which a difference of `vector()` is not.
+        """
+        turn = quaternion.multiply(other.orientation, quaternion.conjugate(self.orientation))
+        move = other.position - self.position
+        return torch.cat(torch.broadcast_tensors(move, quaternion.log(turn)), dim=-1)
+
+    def __getitem__(self, index: Any) -> Pose:
+        """Index the batch dimensions."""
+        index = index if isinstance(index, tuple) else (index,)
+        return Pose(
+            self.position[(*index, slice(None))], self.orientation[(*index, slice(None))]
+        )
+
+
+torch.export.register_dataclass(Pose, serialized_type_name="hrc_learn.geometry.Pose")

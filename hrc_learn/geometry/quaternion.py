@@ -1,0 +1,169 @@
+"""Rotations as unit quaternions (w, x, y, z).
+
+Both signs of a quaternion are the same rotation and give the same answer. Every function
+takes any number of leading batch dimensions, follows the dtype and device of its input, and
+has finite first and second derivatives everywhere, also at the identity and at half turns.
+Nothing branches on data or writes in place, so all of it compiles, exports and vmaps.
+
+Inputs are taken to be unit: `normalize` what comes from outside.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hrc_learn.geometry.numerics import arctan_ratio, cos_and_sinc, safe_norm
+
+# Row i of the matrix P with p * q = P q, as components of p and their signs.
+_PRODUCT_INDEX = torch.tensor([0, 1, 2, 3, 1, 0, 3, 2, 2, 3, 0, 1, 3, 2, 1, 0])
+_PRODUCT_SIGN = torch.tensor(
+    [[1, -1, -1, -1], [1, 1, -1, 1], [1, 1, 1, -1], [1, -1, 1, 1]], dtype=torch.float64
+)
+_CONJUGATE_SIGN = torch.tensor([1, -1, -1, -1], dtype=torch.float64)
+# The sign of the sum is the sign of the first component that is not zero.
+_LEXICOGRAPHIC = torch.tensor([8, 4, 2, 1], dtype=torch.float64)
+# Below this angle [rad] an axis of rotation is rounding noise.
+_AXIS_THRESHOLD = 1e-6
+
+
+def multiply(
+    p: Float[Tensor, "*#batch 4"], q: Float[Tensor, "*#batch 4"]
+) -> Float[Tensor, "*batch 4"]:
+    """Hamilton product: rotate by q, then by p."""
+    # Sums instead of a matmul: TF32 tensor cores would round the product to three digits.
+    left = p[..., _PRODUCT_INDEX.to(p.device)].unflatten(-1, (4, 4)) * _PRODUCT_SIGN.to(p)
+    return (left * q[..., None, :]).sum(-1)
+
+
+def conjugate(q: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
+    """Inverse rotation."""
+    return q * _CONJUGATE_SIGN.to(q)
+
+
+def normalize(q: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
+    """Scale to unit length. A zero quaternion is no rotation and gives NaN."""
+    return q / torch.linalg.vector_norm(q, dim=-1, keepdim=True)
+
+
+def canonical(q: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
+    """The sign whose first non-zero component is positive (w >= 0: the shortest rotation)."""
+    order = (torch.sign(q) * _LEXICOGRAPHIC.to(q)).sum(-1, keepdim=True)
+    return torch.where(order < 0, -q, q)
+
+
+def log(q: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3"]:
+    """Rotation vector of the shortest rotation.
+
+    Returns:
+        Axis times the full angle [rad], of length 0 to pi. At exactly pi, where two axes
+        serve, the one whose first non-zero component is positive.
+    """
+    q = canonical(q)
+    w, v = q[..., 0], q[..., 1:]
+    return (2 * arctan_ratio((v * v).sum(-1), w))[..., None] * v
+
+
+def exp(v: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4"]:
+    """Unit quaternion of a rotation vector [rad] of any length."""
+    half = 0.5 * v
+    cosine, sinc = cos_and_sinc((half * half).sum(-1, keepdim=True))
+    return torch.cat([cosine, sinc * half], dim=-1)
+
+
+def rotate(
+    q: Float[Tensor, "*#batch 4"], v: Float[Tensor, "*#batch 3"]
+) -> Float[Tensor, "*batch 3"]:
+    """Rotate vectors."""
+    w = q[..., :1]
+    u, v = torch.broadcast_tensors(q[..., 1:], v)
+    t = 2 * torch.linalg.cross(u, v)
+    return v + w * t + torch.linalg.cross(u, t)
+
+
+def to_matrix(q: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
+    """Rotation matrix."""
+    basis = torch.eye(3, dtype=q.dtype, device=q.device)
+    return rotate(q[..., None, :], basis).mT
+
+
+def from_matrix(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
+    """Unit quaternion of a rotation matrix, with w >= 0.
+
+    Builds the symmetric matrix 4 q q^T, which is linear in R, and normalises its largest row
+    (Markley 2008, "Unit quaternion from rotation matrix"): accurate at every angle, and a
+    unit quaternion even where R is a rotation only to rounding.
+    """
+    rest = 1 - R.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
+    eye = torch.eye(3, dtype=R.dtype, device=R.device)
+    vv = R + R.mT + rest * eye
+    wv = (R[..., (2, 0, 1), (1, 2, 0)] - R[..., (1, 2, 0), (2, 0, 1)])[..., None]
+    rows = torch.cat(
+        [torch.cat([2 - rest, wv], dim=-2), torch.cat([wv.mT, vv], dim=-2)], dim=-1
+    )  # (*batch, 4, 4)
+    largest = rows.diagonal(dim1=-2, dim2=-1).argmax(-1)
+    row = torch.take_along_dim(rows, largest[..., None, None], dim=-2).squeeze(-2)
+    return canonical(normalize(row))
+
+
+def angle(
+    p: Float[Tensor, "*#batch 4"], q: Float[Tensor, "*#batch 4"]
+) -> Float[Tensor, "*batch"]:
+    """Angle of the shortest rotation between two orientations [rad], 0 to pi."""
+    difference = multiply(conjugate(p), q)
+    return 2 * torch.atan2(safe_norm(difference[..., 1:]), difference[..., 0].abs())
+
+
+def slerp(
+    p: Float[Tensor, "*#batch 4"],
+    q: Float[Tensor, "*#batch 4"],
+    t: Float[Tensor, "*#batch"] | float,
+) -> Float[Tensor, "*batch 4"]:
+    """Turn from p to q the short way at constant rate.
+
+    Args:
+        p: Orientation at t = 0.
+        q: Orientation at t = 1.
+        t: Fraction of the way; outside 0 to 1 it extrapolates.
+    """
+    way = log(multiply(conjugate(p), q))
+    fraction = t[..., None] if isinstance(t, Tensor) else t
+    return multiply(p, exp(fraction * way))
+
+
+def continuous(q: Float[Tensor, "*batch time 4"]) -> Float[Tensor, "*batch time 4"]:
+    """Flip signs along time so that neighbours are at most a right angle apart in R^4.
+
+    Do this before interpolating or filtering components; the first sign is kept.
+    """
+    flip = torch.where((q[..., 1:, :] * q[..., :-1, :]).sum(-1) < 0, -1.0, 1.0).to(q)
+    sign = torch.cat([torch.ones_like(q[..., :1, 0]), flip.cumprod(-1)], dim=-1)
+    return q * sign[..., None]
+
+
+def unwrap_log(v: Float[Tensor, "*batch time 3"]) -> Float[Tensor, "*batch time 3"]:
+    """Rotation vectors along time, made continuous past half turns.
+
+    `log` jumps to the opposite axis where the angle passes pi. This adds whole turns about
+    each sample's own axis, so that `exp` of the result is unchanged and neighbours are close.
+    The first sample is kept. Neighbours must be less than half a turn apart.
+
+    Args:
+        v: Rotation vectors of consecutive orientations [rad].
+
+    Returns:
+        Rotation vectors [rad] of any length.
+    """
+    length = safe_norm(v)
+    axis = v / torch.where(length > 0, length, 1.0)[..., None]
+    # At the identity there is no axis: carry on with the last one that was seen.
+    step = torch.arange(v.shape[-2], device=v.device).expand(length.shape)
+    seen = torch.where(length > _AXIS_THRESHOLD, step, 0).cummax(-1).values
+    axis = torch.take_along_dim(axis, seen[..., None], dim=-2)
+
+    # One axis that never reverses, and the signed angle about it.
+    flip = torch.where((axis[..., 1:, :] * axis[..., :-1, :]).sum(-1) < 0, -1.0, 1.0).to(v)
+    sign = torch.cat([torch.ones_like(length[..., :1]), flip.cumprod(-1)], dim=-1)
+    signed = (sign * length).detach()
+    turns = torch.round(signed.diff(dim=-1) / (2 * torch.pi)).cumsum(-1)
+    turns = torch.cat([torch.zeros_like(length[..., :1]), turns], dim=-1)
+    return v - (2 * torch.pi * turns * sign)[..., None] * axis
