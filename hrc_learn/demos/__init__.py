@@ -1,0 +1,10 @@
+"""Demonstrations: recorded as LeRobot datasets, read back as plain arrays, checked."""
+
+from .demonstration import Demonstration as Demonstration
+from .demonstration_set import DemonstrationSet as DemonstrationSet
+from .finding import DatasetError as DatasetError
+from .finding import Finding as Finding
+from .finding import UnitsWarning as UnitsWarning
+from .padding import PaddedDemonstrations as PaddedDemonstrations
+from .writer import DatasetWriter as DatasetWriter
+from .writer import recover_dataset as recover_dataset

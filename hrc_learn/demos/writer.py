@@ -1,0 +1,372 @@
+"""Recording demonstrations as a LeRobot dataset of version 3.0."""
+
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Literal, Self
+
+import numpy as np
+
+from .demonstration import Demonstration
+from .lerobot_v3 import INDEX_FEATURES, assemble
+from .schema import FRAME_WIDTHS, TIME_KEY, Column, columns_for, encode, lerobot_features
+from .sidecar import sidecar_content
+from .staging import (
+    RecordingHeader,
+    StagedEpisode,
+    episode_path,
+    staged_paths,
+    staging_folder,
+    to_table,
+    write_episode,
+)
+from .statistics import episode_statistics
+
+
+class DatasetWriter:
+    """Records episodes frame by frame and leaves a LeRobot dataset behind.
+
+        with DatasetWriter(root, fps=50, robot_type="panda", joint_names=names) as writer:
+            writer.start_episode("put the bottle on the shelf")
+            writer.add_frame(time=t, joint_position=q, position=p, orientation=quaternion)
+            ...
+            writer.save_episode()
+
+    Saved episodes wait in `ROOT.recording/`; `finalize`, which leaving the `with` block
+    calls, turns them into the dataset in one step. If the recording breaks off, by an
+    exception or a kill, the episodes saved until then stay there and `recover_dataset`
+    makes the dataset of them.
+    """
+
+    def __init__(
+        self,
+        root: str | Path,
+        fps: float,
+        robot_type: str,
+        joint_names: Sequence[str] = (),
+        features: Mapping[str, Sequence[str]] | None = None,
+        *,
+        dtype: Literal["float32", "float64"] = "float32",
+        frames: Mapping[str, str] | None = None,
+        details: Mapping[str, object] | None = None,
+    ):
+        """Claim the folder; nothing is written into `root` before `finalize`.
+
+        Args:
+            root: Folder of the dataset, which must not exist.
+            fps: Frame rate [1/s]. True stamps are kept beside it where frames give `time`.
+            robot_type: Name of the robot, as LeRobot's metadata keep it.
+            joint_names: Joints, in the order of the values of `joint_position` and the like.
+            features: Further features: key, such as "observation.shelf", and the names of
+                its components.
+            dtype: Type on disk. Policies that train on the dataset expect float32.
+            frames: Names of the frames poses are given in, such as
+                {"base": "panda_link0", "ee": "panda_hand_tcp"}.
+            details: Anything else worth keeping, as JSON values.
+
+        Raises:
+            FileExistsError: `root`, or an interrupted recording of it, is already there.
+            ValueError: An argument makes no sense.
+        """
+        self.root = Path(root)
+        if not fps > 0:
+            raise ValueError(f"fps must be positive, got {fps}")
+        if len(set(joint_names)) != len(joint_names):
+            raise ValueError(f"joint names must differ, got {', '.join(joint_names)}")
+        _check_feature_keys(features or {})
+        self.fps = float(fps)
+        self.robot_type = robot_type
+        self.joint_names = tuple(joint_names)
+        self.features = {key: tuple(names) for key, names in (features or {}).items()}
+        self._dtype = dtype
+        self._frames_of_poses = dict(frames or {})
+        self._details = dict(details or {})
+        self._columns: list[Column] = []
+        self._task: str | None = None
+        self._episode: dict[str, list[np.ndarray]] = {}
+        self._length = 0
+        self._tasks: dict[str, int] = {}
+        self._saved_frames = 0
+        self.episodes = 0
+        self._staging = _claim(self.root)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if error is None:
+            self.finalize()
+        elif not self.episodes:
+            shutil.rmtree(self._staging, ignore_errors=True)
+        else:
+            error.add_note(
+                f"The {self.episodes} episodes saved before this are kept in "
+                f"{self._staging}; hrc_learn.demos.recover_dataset({str(self.root)!r}) makes "
+                f"a dataset of them."
+            )
+
+    def start_episode(self, task: str) -> None:
+        """Begin an episode; `task` says what is shown, in words.
+
+        Raises:
+            RuntimeError: The episode before has neither been saved nor discarded.
+        """
+        if self._task is not None:
+            raise RuntimeError(
+                f"the episode before still holds {self._length} unsaved frames: call "
+                f"save_episode() or discard_episode() first"
+            )
+        self._task = task
+
+    def add_frame(self, **values) -> None:
+        """Add one frame to the open episode.
+
+        The first frame of the dataset fixes which quantities are recorded; every later one
+        gives the same.
+
+        Args:
+            values: Fields of `Demonstration` by name, one row each (`time` [s],
+                `joint_position` [rad], `orientation` as (w, x, y, z), `feature` [px], ...),
+                and the features declared at the start by their key. Without `time`, frames
+                are taken to be 1/fps apart. Arrays are copied.
+
+        Raises:
+            RuntimeError: No episode is open.
+            ValueError: A quantity is unknown, missing, new, or of the wrong length.
+        """
+        if self._task is None:
+            raise RuntimeError("no episode is open: call start_episode(task) first")
+        if not self._length:
+            self._episode = {name: [] for name in values}
+        if values.keys() != self._episode.keys():
+            raise ValueError(self._difference(values.keys(), self._episode.keys()))
+        rows = {name: self._row(name, value) for name, value in values.items()}
+        for name, row in rows.items():
+            self._episode[name].append(row)
+        self._length += 1
+
+    def save_episode(self) -> int:
+        """Keep the open episode, safe from whatever happens later.
+
+        Returns:
+            Its index in the dataset.
+
+        Raises:
+            RuntimeError: No episode is open.
+            ValueError: It is empty, holds values that are not finite, or its time does not
+                increase. The episode is discarded then.
+        """
+        if self._task is None:
+            raise RuntimeError("no episode is open: call start_episode(task) first")
+        task = self._task
+        episode = {name: np.stack(rows) for name, rows in self._episode.items()}
+        self.discard_episode()
+        return self._save(episode, task)
+
+    def add_episode(self, demonstration: Demonstration) -> int:
+        """Save a whole demonstration as one episode.
+
+        Of its `extra`, the features declared at the start are written.
+
+        Returns:
+            Its index in the dataset.
+
+        Raises:
+            RuntimeError: An episode is open.
+            ValueError: Its joints are not the dataset's, or as in `save_episode`.
+        """
+        if self._task is not None:
+            raise RuntimeError("save or discard the open episode before adding another")
+        if demonstration.joint_names != self.joint_names:
+            raise ValueError(
+                f"the demonstration's joints {demonstration.joint_names} are not the "
+                f"dataset's {self.joint_names}: select_joints(names) brings them in order"
+            )
+        episode = {name: getattr(demonstration, name) for name in demonstration.recorded}
+        episode["time"] = demonstration.time + demonstration.start_time
+        episode |= {key: demonstration.extra[key] for key in self.features}
+        return self._save(episode, demonstration.task)
+
+    def discard_episode(self) -> None:
+        """Forget the open episode, if any."""
+        self._task, self._episode, self._length = None, {}, 0
+
+    def finalize(self) -> Path:
+        """Turn the saved episodes into the dataset.
+
+        Returns:
+            The dataset's folder.
+
+        Raises:
+            RuntimeError: An episode is open.
+            DatasetError: No episode was saved.
+        """
+        if self._task is not None:
+            raise RuntimeError(
+                f"the last episode holds {self._length} unsaved frames: call save_episode() "
+                f"or discard_episode() before the recording ends"
+            )
+        if not self.episodes:
+            shutil.rmtree(self._staging, ignore_errors=True)
+        return recover_dataset(self.root)
+
+    def _row(self, name: str, value) -> np.ndarray:
+        row = np.array(value, dtype=np.float64)
+        width = self._width(name)
+        if row.size != width or row.ndim > 1:
+            raise ValueError(
+                f"{name} needs {width} numbers a frame, got an array of shape {row.shape} at "
+                f"frame {self._length} of episode {self.episodes}"
+            )
+        return row.reshape(width)
+
+    def _width(self, name: str) -> int:
+        if name in self.features:
+            return len(self.features[name])
+        if name not in FRAME_WIDTHS:
+            known = ", ".join([*FRAME_WIDTHS, *self.features])
+            raise ValueError(
+                f"{name!r} is no quantity of a frame; known are {known}. Declare others as "
+                f"features={{'observation.{name}': [names of components]}}."
+            )
+        width = FRAME_WIDTHS[name]
+        return len(self.joint_names) if width is None else width
+
+    def _difference(self, given, expected) -> str:
+        missing, new = sorted(expected - given), sorted(given - expected)
+        parts = [f"lacks {', '.join(missing)}"] * bool(missing)
+        parts += [f"gives {', '.join(new)} anew"] * bool(new)
+        return (
+            f"frame {self._length} of episode {self.episodes} {' and '.join(parts)}: every "
+            f"frame gives what the first one gave"
+        )
+
+    def _save(self, episode: dict[str, np.ndarray], task: str) -> int:
+        if not episode:
+            raise ValueError(f"episode {self.episodes} has no frames")
+        episode = self._completed(episode)
+        columns = columns_for(episode.keys(), self.joint_names, self.features)
+        self._columns = self._columns or columns
+        if columns != self._columns:
+            now, before = ({c.given for c in group} for group in (columns, self._columns))
+            raise ValueError(self._difference(now, before))
+        self._check(episode)
+        values = self._with_indices(encode(columns, episode), task)
+        header = self._header()
+        staged = StagedEpisode(
+            header=header,
+            task=task,
+            statistics=episode_statistics(values),
+            table=to_table(values, header.features),
+        )
+        write_episode(episode_path(self._staging, self.episodes), staged)
+        self._saved_frames += len(staged.table)
+        self.episodes += 1
+        return self.episodes - 1
+
+    def _completed(self, episode: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """The episode with stamps and visibility filled in where frames gave none."""
+        length = len(next(iter(episode.values())))
+        episode = {"time": np.arange(length) / self.fps, **episode}
+        if "feature" in episode:
+            visible = episode.get("feature_visible", np.ones(length)).reshape(length, 1) > 0
+            lost = ~visible & ~np.isfinite(episode["feature"])
+            episode["feature"] = np.where(lost, 0.0, episode["feature"])
+            episode["feature_visible"] = visible
+        return episode
+
+    def _check(self, episode: dict[str, np.ndarray]) -> None:
+        for name, values in episode.items():
+            bad = np.argwhere(~np.isfinite(values.reshape(len(values), -1)))
+            if len(bad):
+                raise ValueError(
+                    f"{name} is not finite at frame {bad[0, 0]} of episode {self.episodes}; "
+                    f"the episode was not saved"
+                )
+        stalled = np.flatnonzero(np.diff(episode["time"].reshape(-1)) <= 0)
+        if len(stalled):
+            raise ValueError(
+                f"time must increase, but does not after frame {stalled[0]} of episode "
+                f"{self.episodes}; the episode was not saved"
+            )
+        if "orientation" in episode:
+            wrong = np.abs(np.linalg.norm(episode["orientation"], axis=1) - 1) > 1e-3
+            if wrong.any():
+                raise ValueError(
+                    f"orientation must be a unit quaternion (w, x, y, z), but is not at frame "
+                    f"{wrong.argmax()} of episode {self.episodes}; the episode was not saved"
+                )
+
+    def _with_indices(self, values: dict[str, np.ndarray], task: str) -> dict[str, np.ndarray]:
+        frame = np.arange(len(values[TIME_KEY]))
+        return values | {
+            "timestamp": frame / self.fps,
+            "frame_index": frame,
+            "episode_index": np.full_like(frame, self.episodes),
+            "index": frame + self._saved_frames,
+            "task_index": np.full_like(frame, self._tasks.setdefault(task, len(self._tasks))),
+        }
+
+    def _header(self) -> RecordingHeader:
+        return RecordingHeader(
+            fps=self.fps,
+            robot_type=self.robot_type,
+            features=lerobot_features(self._columns, self._dtype) | INDEX_FEATURES,
+            sidecar=sidecar_content(
+                self._columns, self.joint_names, self._frames_of_poses, self._details
+            ),
+        )
+
+
+def recover_dataset(root: str | Path) -> Path:
+    """Make the dataset of a recording that was broken off, from the episodes it had saved.
+
+    Args:
+        root: Folder that the recording was to become.
+
+    Returns:
+        The same folder, now a dataset.
+
+    Raises:
+        FileNotFoundError: There is no recording of that name.
+        DatasetError: The recording holds no saved episode.
+    """
+    root = Path(root)
+    staging = staging_folder(root)
+    if not staging.is_dir():
+        raise FileNotFoundError(f"no interrupted recording at {staging}")
+    assembled = staging / "dataset"
+    shutil.rmtree(assembled, ignore_errors=True)  # of an earlier attempt
+    assemble(staged_paths(staging), assembled)
+    assembled.rename(root)
+    shutil.rmtree(staging)
+    return root
+
+
+def _claim(root: Path) -> Path:
+    if root.exists():
+        raise FileExistsError(f"{root} already exists: choose another folder or remove it")
+    staging = staging_folder(root)
+    try:
+        staging.mkdir(parents=True)
+    except FileExistsError:
+        raise FileExistsError(
+            f"{staging} holds a recording that is still going on or was interrupted: "
+            f"hrc_learn.demos.recover_dataset({str(root)!r}) makes a dataset of its saved "
+            f"episodes; remove it to start anew"
+        ) from None
+    return staging
+
+
+def _check_feature_keys(features: Mapping[str, Sequence[str]]) -> None:
+    for key in features:
+        if not key.startswith(("observation.", "action.")):
+            raise ValueError(
+                f"feature {key!r} needs a key that LeRobot understands: 'observation.{key}'"
+            )
