@@ -57,12 +57,11 @@ def pad(demonstrations: Sequence[Demonstration]) -> PaddedDemonstrations:
         name: np.stack([_hold(getattr(demo, name), longest) for demo in demonstrations])
         for name in shared
     }
+    time = np.stack([_go_on(demo.time, longest, demo.fps) for demo in demonstrations])
     return PaddedDemonstrations(
         mask=torch.from_numpy(np.arange(longest) < lengths[:, None]),
         length=torch.from_numpy(lengths),
-        time=torch.from_numpy(
-            np.stack([_go_on(d.time, longest, d.fps) for d in demonstrations])
-        ),
+        time=torch.from_numpy(time),
         **{name: torch.from_numpy(array) for name, array in stacked.items()},
     )
 

@@ -8,7 +8,7 @@ from jaxtyping import Shaped
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 
 Statistics = dict[str, dict[str, list]]
-"""Feature key -> statistic (min, max, mean, std, count, q01 ... q99) -> one number a component."""
+"""Feature -> statistic (min, max, mean, std, count, q01 ... q99) -> one number a component."""
 
 
 def episode_statistics(features: Mapping[str, Shaped[np.ndarray, "frames ..."]]) -> Statistics:

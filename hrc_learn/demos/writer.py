@@ -9,8 +9,9 @@ from typing import Literal, Self
 import numpy as np
 
 from .demonstration import Demonstration
+from .episode_buffer import Episode, EpisodeBuffer, complete, describe_difference, examine
 from .lerobot_v3 import INDEX_FEATURES, assemble
-from .schema import FRAME_WIDTHS, TIME_KEY, Column, columns_for, encode, lerobot_features
+from .schema import TIME_KEY, Column, columns_for, encode, lerobot_features
 from .sidecar import sidecar_content
 from .staging import (
     RecordingHeader,
@@ -83,9 +84,7 @@ class DatasetWriter:
         self._frames_of_poses = dict(frames or {})
         self._details = dict(details or {})
         self._columns: list[Column] = []
-        self._task: str | None = None
-        self._episode: dict[str, list[np.ndarray]] = {}
-        self._length = 0
+        self.discard_episode()
         self._tasks: dict[str, int] = {}
         self._saved_frames = 0
         self.episodes = 0
@@ -119,7 +118,7 @@ class DatasetWriter:
         """
         if self._task is not None:
             raise RuntimeError(
-                f"the episode before still holds {self._length} unsaved frames: call "
+                f"the episode before still holds {len(self._buffer)} unsaved frames: call "
                 f"save_episode() or discard_episode() first"
             )
         self._task = task
@@ -127,8 +126,8 @@ class DatasetWriter:
     def add_frame(self, **values) -> None:
         """Add one frame to the open episode.
 
-        The first frame of the dataset fixes which quantities are recorded; every later one
-        gives the same.
+        The first episode saved fixes which quantities are recorded; all later ones
+        give the same.
 
         Args:
             values: Fields of `Demonstration` by name, one row each (`time` [s],
@@ -140,16 +139,8 @@ class DatasetWriter:
             RuntimeError: No episode is open.
             ValueError: A quantity is unknown, missing, new, or of the wrong length.
         """
-        if self._task is None:
-            raise RuntimeError("no episode is open: call start_episode(task) first")
-        if not self._length:
-            self._episode = {name: [] for name in values}
-        if values.keys() != self._episode.keys():
-            raise ValueError(self._difference(values.keys(), self._episode.keys()))
-        rows = {name: self._row(name, value) for name, value in values.items()}
-        for name, row in rows.items():
-            self._episode[name].append(row)
-        self._length += 1
+        self._open_task()
+        self._buffer.append(values)
 
     def save_episode(self) -> int:
         """Keep the open episode, safe from whatever happens later.
@@ -162,10 +153,7 @@ class DatasetWriter:
             ValueError: It is empty, holds values that are not finite, or its time does not
                 increase. The episode is discarded then.
         """
-        if self._task is None:
-            raise RuntimeError("no episode is open: call start_episode(task) first")
-        task = self._task
-        episode = {name: np.stack(rows) for name, rows in self._episode.items()}
+        task, episode = self._open_task(), self._buffer.arrays()
         self.discard_episode()
         return self._save(episode, task)
 
@@ -195,7 +183,7 @@ class DatasetWriter:
 
     def discard_episode(self) -> None:
         """Forget the open episode, if any."""
-        self._task, self._episode, self._length = None, {}, 0
+        self._task, self._buffer = None, EpisodeBuffer(self.joint_names, self.features)
 
     def finalize(self) -> Path:
         """Turn the saved episodes into the dataset.
@@ -209,54 +197,31 @@ class DatasetWriter:
         """
         if self._task is not None:
             raise RuntimeError(
-                f"the last episode holds {self._length} unsaved frames: call save_episode() "
-                f"or discard_episode() before the recording ends"
+                f"the last episode holds {len(self._buffer)} unsaved frames: call "
+                f"save_episode() or discard_episode() before the recording ends"
             )
         if not self.episodes:
             shutil.rmtree(self._staging, ignore_errors=True)
         return recover_dataset(self.root)
 
-    def _row(self, name: str, value) -> np.ndarray:
-        row = np.array(value, dtype=np.float64)
-        width = self._width(name)
-        if row.size != width or row.ndim > 1:
-            raise ValueError(
-                f"{name} needs {width} numbers a frame, got an array of shape {row.shape} at "
-                f"frame {self._length} of episode {self.episodes}"
-            )
-        return row.reshape(width)
+    def _open_task(self) -> str:
+        if self._task is None:
+            raise RuntimeError("no episode is open: call start_episode(task) first")
+        return self._task
 
-    def _width(self, name: str) -> int:
-        if name in self.features:
-            return len(self.features[name])
-        if name not in FRAME_WIDTHS:
-            known = ", ".join([*FRAME_WIDTHS, *self.features])
-            raise ValueError(
-                f"{name!r} is no quantity of a frame; known are {known}. Declare others as "
-                f"features={{'observation.{name}': [names of components]}}."
-            )
-        width = FRAME_WIDTHS[name]
-        return len(self.joint_names) if width is None else width
-
-    def _difference(self, given, expected) -> str:
-        missing, new = sorted(expected - given), sorted(given - expected)
-        parts = [f"lacks {', '.join(missing)}"] * bool(missing)
-        parts += [f"gives {', '.join(new)} anew"] * bool(new)
-        return (
-            f"frame {self._length} of episode {self.episodes} {' and '.join(parts)}: every "
-            f"frame gives what the first one gave"
-        )
-
-    def _save(self, episode: dict[str, np.ndarray], task: str) -> int:
+    def _save(self, episode: Episode, task: str) -> int:
         if not episode:
             raise ValueError(f"episode {self.episodes} has no frames")
-        episode = self._completed(episode)
+        episode = complete(episode, self.fps)
         columns = columns_for(episode.keys(), self.joint_names, self.features)
-        self._columns = self._columns or columns
-        if columns != self._columns:
-            now, before = ({c.given for c in group} for group in (columns, self._columns))
-            raise ValueError(self._difference(now, before))
-        self._check(episode)
+        try:
+            if self._columns and columns != self._columns:
+                first = [column.given for column in self._columns]
+                raise ValueError(describe_difference(episode.keys(), first))
+            examine(episode)
+        except ValueError as error:
+            raise ValueError(f"episode {self.episodes} was not saved: {error}") from error
+        self._columns = columns
         values = self._with_indices(encode(columns, episode), task)
         header = self._header()
         staged = StagedEpisode(
@@ -269,39 +234,6 @@ class DatasetWriter:
         self._saved_frames += len(staged.table)
         self.episodes += 1
         return self.episodes - 1
-
-    def _completed(self, episode: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """The episode with stamps and visibility filled in where frames gave none."""
-        length = len(next(iter(episode.values())))
-        episode = {"time": np.arange(length) / self.fps, **episode}
-        if "feature" in episode:
-            visible = episode.get("feature_visible", np.ones(length)).reshape(length, 1) > 0
-            lost = ~visible & ~np.isfinite(episode["feature"])
-            episode["feature"] = np.where(lost, 0.0, episode["feature"])
-            episode["feature_visible"] = visible
-        return episode
-
-    def _check(self, episode: dict[str, np.ndarray]) -> None:
-        for name, values in episode.items():
-            bad = np.argwhere(~np.isfinite(values.reshape(len(values), -1)))
-            if len(bad):
-                raise ValueError(
-                    f"{name} is not finite at frame {bad[0, 0]} of episode {self.episodes}; "
-                    f"the episode was not saved"
-                )
-        stalled = np.flatnonzero(np.diff(episode["time"].reshape(-1)) <= 0)
-        if len(stalled):
-            raise ValueError(
-                f"time must increase, but does not after frame {stalled[0]} of episode "
-                f"{self.episodes}; the episode was not saved"
-            )
-        if "orientation" in episode:
-            wrong = np.abs(np.linalg.norm(episode["orientation"], axis=1) - 1) > 1e-3
-            if wrong.any():
-                raise ValueError(
-                    f"orientation must be a unit quaternion (w, x, y, z), but is not at frame "
-                    f"{wrong.argmax()} of episode {self.episodes}; the episode was not saved"
-                )
 
     def _with_indices(self, values: dict[str, np.ndarray], task: str) -> dict[str, np.ndarray]:
         frame = np.arange(len(values[TIME_KEY]))
