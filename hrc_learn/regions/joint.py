@@ -1,0 +1,72 @@
+"""Joint-space region: a potential that repels from the joint limits."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hrc_learn.regions.pytree import pytree, static
+from hrc_learn.regions.region import Region
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
+class JointRegion(Region):
+    """Repels each joint from the nearer of its limits, before it is reached.
+
+    With the distance to the limit delta_i, negative past it:
+
+        f_i = delta_i - margin,   f_ri = delta_i - reference_margin
+        P   = sum_i k_q/2 min(0, f_i)^2 + k_r/2 min(0, f_ri)^2           (jointxp)
+
+    `formulation="paper"` is Table I's f_i = delta_i^2 - margin^2. Its push vanishes at the
+    limit and turns outwards past it, because the square forgets the side.
+    """
+
+    centre: Float[Tensor, "*#batch n"]
+    """Middle of the joint range [rad]."""
+    half_range: Float[Tensor, "*#batch n"]
+    """Half of the joint range [rad]."""
+    margin: float = static(0.1)
+    """Distance from the limit at which the steep repulsion sets in [rad]."""
+    reference_margin: float = static(0.3)
+    """Distance at which the weak repulsion of the reference region sets in [rad]."""
+    stiffness: float = static(10.0)
+    """k_q."""
+    reference_stiffness: float = static(1.0)
+    """k_r."""
+    formulation: Literal["one_sided", "paper"] = static("one_sided")
+
+    @classmethod
+    def from_limits(
+        cls, lower: Float[Tensor, "*batch n"], upper: Float[Tensor, "*batch n"], **options
+    ) -> JointRegion:
+        """Region of the joint limits [rad]; `options` are the remaining fields."""
+        return cls(centre=(lower + upper) / 2, half_range=(upper - lower) / 2, **options)
+
+    def value(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*both n"]:
+        """f_i of every joint at the nearer limit [rad] ("paper": [rad^2])."""
+        return self._depths(self.half_range - (x - self.centre).abs())[0]
+
+    def feedback(self, x: Float[Tensor, "*batch n"]) -> tuple[Tensor, Tensor]:
+        """Potential and its gradient over the joint positions."""
+        offset = x - self.centre
+        distance = self.half_range - offset.abs()
+        f, f_reference = (depth.clamp(max=0) for depth in self._depths(distance))
+        pull, pull_reference = self.stiffness * f, self.reference_stiffness * f_reference
+        P = 0.5 * (pull * f + pull_reference * f_reference).sum(-1)
+        slope = pull + pull_reference
+        if self.formulation == "paper":
+            slope = slope * (2 * distance)
+        return P, -torch.sign(offset) * slope
+
+    def _depths(self, distance: Tensor) -> tuple[Tensor, Tensor]:
+        """F and f_r from the distance to the limit."""
+        if self.formulation == "paper":
+            square = distance * distance
+            return square - self.margin**2, square - self.reference_margin**2
+        return distance - self.margin, distance - self.reference_margin

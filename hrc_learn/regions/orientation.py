@@ -1,0 +1,74 @@
+"""Cartesian orientation region: a cone round a goal orientation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hrc_learn.geometry import quaternion
+from hrc_learn.regions.pytree import pytree, static
+from hrc_learn.regions.region import Region
+
+# Shorter axes are rounding noise. They occur at the goal, deep inside the cone, where the
+# gradient is zero whatever the axis.
+_SHORTEST_AXIS = 1e-12
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
+class OrientationRegion(Region):
+    """All orientations within an angle of the goal; its potential is zero inside.
+
+    f = alpha_o |log(p * p_g^-1)| - 1                                    (OrtRegion)
+    P = k_o/2 max(0, f)^2                                                (OrtFun1)
+
+    The norm of the quaternion logarithm is *half* the rotation angle phi, so the cone is
+    phi <= 2/alpha_o: 7.6 degrees for alpha_o = 15. The error takes the sign of the shortest
+    rotation, so p and -p are the same orientation.
+
+    The gradient belongs to the geometric Jacobian: it is dP over a small rotation of the end
+    effector about the base axes, k_o max(0, f) (alpha_o/2) n with the axis n of the error.
+    `formulation="paper"` is the printed alpha_o k_o max(0, f) phi n (orient_diff_potential),
+    which has the same direction and 2 phi times that length.
+    """
+
+    goal: Float[Tensor, "*#batch 4"]
+    """Goal orientation, a unit quaternion (w, x, y, z) of either sign."""
+    sharpness: float = static(15.0)
+    """alpha_o, two over the tolerated angle [1/rad]."""
+    stiffness: float = static(0.02)
+    """k_o."""
+    formulation: Literal["exact", "paper"] = static("exact")
+
+    @property
+    def tolerance(self) -> float:
+        """Half opening angle of the cone [rad]."""
+        return 2 / self.sharpness
+
+    def value(self, x: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*both"]:
+        """F at the orientation x (a unit quaternion)."""
+        error = self._error(x)
+        half_angle = torch.atan2(
+            torch.linalg.vector_norm(error[..., 1:], dim=-1), error[..., 0]
+        )
+        return self.sharpness * half_angle - 1
+
+    def feedback(self, x: Float[Tensor, "*batch 4"]) -> tuple[Tensor, Tensor]:
+        """Potential of shape (*both,) and its gradient (*both, 3) over a rotation [1/rad]."""
+        error = self._error(x)
+        sine = torch.linalg.vector_norm(error[..., 1:], dim=-1, keepdim=True)
+        half_angle = torch.atan2(sine, error[..., :1])
+        f = (self.sharpness * half_angle - 1).clamp(min=0)
+        P = (0.5 * self.stiffness) * (f * f).squeeze(-1)
+        slope = (0.5 * self.stiffness * self.sharpness) * f
+        if self.formulation == "paper":
+            slope = slope * (4 * half_angle)
+        return P, slope / sine.clamp(min=_SHORTEST_AXIS) * error[..., 1:]
+
+    def _error(self, x: Tensor) -> Tensor:
+        """P * p_g^-1 with the sign of the shortest rotation."""
+        return quaternion.canonical(quaternion.multiply(x, quaternion.conjugate(self.goal)))

@@ -1,0 +1,58 @@
+"""Frozen dataclasses of tensors as torch pytrees."""
+
+import dataclasses
+from typing import Any
+
+from torch.utils import _pytree
+
+
+def static(default: Any) -> Any:
+    """Field of a pytree dataclass that is no tensor: structure, not a leaf.
+
+    Gains and names belong here: `vmap` then maps the tensors alone, and `torch.compile` and
+    `torch.export` treat the value as a constant.
+    """
+    return dataclasses.field(default=default, metadata={"static": True})
+
+
+def pytree[T](cls: type[T]) -> type[T]:
+    """Register a dataclass: its fields are children, the `static` ones its structure.
+
+    A field that is None has no child, so an optional tensor may be absent. Unlike
+    `torch.export.register_dataclass` this keeps floats out of the leaves, where `vmap` would
+    refuse them.
+    """
+    fields = dataclasses.fields(cls)  # pyright: ignore[reportArgumentType]
+    children = [f.name for f in fields if not f.metadata.get("static")]
+    statics = [f.name for f in fields if f.metadata.get("static")]
+
+    def flatten(instance: T) -> tuple[list[Any], Any]:
+        present = [name for name in children if getattr(instance, name) is not None]
+        context = (tuple(present), tuple(getattr(instance, name) for name in statics))
+        return [getattr(instance, name) for name in present], context
+
+    def flatten_with_keys(instance: T) -> tuple[list[Any], Any]:
+        values, context = flatten(instance)
+        keys = [_pytree.GetAttrKey(name) for name in context[0]]
+        return list(zip(keys, values, strict=True)), context
+
+    def unflatten(values: Any, context: Any) -> T:
+        # Not through __init__: torch also unflattens things that are no tensors.
+        present, structure = context
+        instance = object.__new__(cls)
+        for name in children:
+            object.__setattr__(instance, name, None)
+        for name, value in zip(present, values, strict=True):
+            object.__setattr__(instance, name, value)
+        for name, value in zip(statics, structure, strict=True):
+            object.__setattr__(instance, name, value)
+        return instance
+
+    _pytree.register_pytree_node(
+        cls,
+        flatten,
+        unflatten,
+        serialized_type_name=f"{cls.__module__}.{cls.__qualname__}",
+        flatten_with_keys_fn=flatten_with_keys,
+    )
+    return cls

@@ -1,0 +1,90 @@
+"""Vision region: an ellipse in the image that attracts the feature to the target."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hrc_learn.regions.pytree import pytree, static
+from hrc_learn.regions.region import Region
+
+# Normalised distance at which the pull of the saturated form levels off.
+_SATURATION = 0.5
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
+class VisionRegion(Region):
+    """Ellipse round the target; its potential is least at the target.
+
+    f = ((u - u_d) / b_1)^2 + ((v - v_d) / b_2)^2 - 1                    (eq_vision_re_func)
+    P = k_v/2 (1 - min(0, f)^2)                                          (eq_vision_p)
+
+    That pull is zero at the target and again at the edge of the ellipse, and so weak near
+    both. `formulation="saturated"` has the same pull close to the target but keeps pulling
+    with constant strength further out, wherever the feature is seen:
+
+    P = 2 k_v s^2 (sqrt(1 + rho^2/s^2) - 1),   rho^2 = f + 1,   s = 1/2
+    """
+
+    target: Float[Tensor, "*#batch 2"]
+    """Desired feature position (u, v) [px]."""
+    half_size: Float[Tensor, "*#batch 2"]
+    """Half axes b_1, b_2 of the ellipse, positive [px]. It should lie inside the image."""
+    stiffness: float = static(0.3)
+    """k_v."""
+    formulation: Literal["paper", "saturated"] = static("paper")
+
+    @classmethod
+    def inside_image(
+        cls,
+        target: Float[Tensor, "*batch 2"],
+        image_size: tuple[int, int],
+        border: float = 0.0,
+        **options,
+    ) -> VisionRegion:
+        """Largest ellipse round the target that stays inside the image.
+
+        Args:
+            target: Desired feature position (u, v) [px].
+            image_size: Width and height of the image [px].
+            border: Distance the ellipse keeps from the edge of the image [px].
+            options: The remaining fields.
+
+        Raises:
+            ValueError: The target is not inside the image by more than the border.
+        """
+        far_edge = target.new_tensor(image_size) - 1
+        half_size = torch.minimum(target, far_edge - target) - border
+        if not bool((half_size > 0).all()):
+            raise ValueError(
+                f"the vision target must lie more than {border} px inside the image of "
+                f"{image_size[0]} x {image_size[1]} px, but is {target.tolist()}; "
+                "move the target or lower `border`"
+            )
+        return cls(target=target, half_size=half_size, **options)
+
+    def value(self, x: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*both"]:
+        """F at the feature position x [px]."""
+        scaled = (x - self.target) / self.half_size
+        return (scaled * scaled).sum(-1) - 1
+
+    def feedback(self, x: Float[Tensor, "*batch 2"]) -> tuple[Tensor, Tensor]:
+        """Potential and its gradient over the feature position [1/px]."""
+        scaled = (x - self.target) / self.half_size
+        square = (scaled * scaled).sum(-1, keepdim=True)
+        steer = self._saturated if self.formulation == "saturated" else self._paper
+        P, slope = steer(square)
+        return P.squeeze(-1), slope * scaled / self.half_size
+
+    def _paper(self, square: Tensor) -> tuple[Tensor, Tensor]:
+        f = (square - 1).clamp(max=0)
+        return (0.5 * self.stiffness) * (1 - f * f), (-2 * self.stiffness) * f
+
+    def _saturated(self, square: Tensor) -> tuple[Tensor, Tensor]:
+        root = torch.sqrt(1 + square / _SATURATION**2)
+        return (2 * self.stiffness * _SATURATION**2) * (root - 1), 2 * self.stiffness / root
