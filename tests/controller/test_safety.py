@@ -1,0 +1,197 @@
+import dataclasses
+
+import pytest
+import sampling
+import torch
+from torch import Tensor
+
+from hrc_learn.controller import INTERVENTIONS, SafetyConfig, SafetyFilter, SafetyState
+from hrc_learn.kinematics import panda
+
+LIMITS = panda.limits
+READY = panda.ready
+# Rounding of q + v dt over thousands of steps.
+ROUNDING = 1e-9
+
+
+def inside(*batch: int, seed: int = 0) -> Tensor:
+    rng = sampling.generator(seed)
+    return sampling.within(LIMITS.lower, LIMITS.upper, *batch, rng=rng)
+
+
+def commands(kind: str, *batch: int, rng: torch.Generator) -> Tensor:
+    noise = torch.randn(*batch, 7, generator=rng, dtype=torch.float64)
+    match kind:
+        case "noise":
+            return 3 * noise
+        case "push":  # always the same way, far beyond every limit
+            return 1e6 * torch.ones_like(noise)
+        case "bang-bang":
+            return 50 * torch.sign(noise[:1]).expand_as(noise)
+        case "broken":
+            draw = torch.rand(*batch, 7, generator=rng, dtype=torch.float64)
+            u = torch.where(draw < 0.02, torch.nan, 5 * noise)
+            return torch.where(draw > 0.98, torch.inf, u)
+        case _:
+            raise AssertionError(kind)
+
+
+@pytest.mark.parametrize("kind", ["noise", "push", "bang-bang", "broken"])
+@pytest.mark.parametrize("dt", [0.001, 0.008, 0.05])
+def test_no_command_breaks_a_limit(kind: str, dt: float):
+    """Starts anywhere inside the limits; each step checks position, velocity, acceleration."""
+    safety = SafetyFilter(LIMITS)
+    rng = sampling.generator(7)
+    q = inside(100, seed=1)
+    # Some joints start right at a limit.
+    q = torch.where(torch.rand(100, 7, generator=rng) < 0.1, LIMITS.upper, q)
+    state = safety.initial_state(q)
+    u = commands(kind, 100, rng=rng)
+    for k in range(400):
+        if k % 5 == 0:
+            u = commands(kind, 100, rng=rng)
+        before = state.velocity
+        v, state, _ = safety.step(state, q, u, dt)
+        q = q + v * dt
+        assert v.isfinite().all()
+        assert (v.abs() <= LIMITS.velocity).all()
+        assert ((v - before).abs() <= LIMITS.acceleration * dt * (1 + 1e-9)).all()
+        assert (q <= LIMITS.upper + ROUNDING).all()
+        assert (q >= LIMITS.lower - ROUNDING).all()
+
+
+def test_it_stops_short_of_the_limit_by_the_margin():
+    safety = SafetyFilter(LIMITS, SafetyConfig(margin=0.05))
+    q = READY
+    state = safety.initial_state(q)
+    for _ in range(4000):
+        v, state, _ = safety.step(state, q, 9 * torch.ones(7, dtype=torch.float64), 0.002)
+        q = q + v * 0.002
+    torch.testing.assert_close(q, LIMITS.upper - 0.05, rtol=0, atol=1e-6)
+
+
+def test_a_joint_within_the_margin_is_driven_out_of_it():
+    safety = SafetyFilter(LIMITS)
+    q = LIMITS.lower + 0.001
+    state = safety.initial_state(q)
+    for _ in range(1000):
+        v, state, _ = safety.step(state, q, torch.zeros(7, dtype=torch.float64), 0.004)
+        q = q + v * 0.004
+    torch.testing.assert_close(q, LIMITS.lower + 0.02, rtol=0, atol=1e-6)
+
+
+def test_a_harmless_command_passes_unchanged():
+    safety = SafetyFilter(LIMITS)
+    u = torch.linspace(-0.3, 0.3, 7, dtype=torch.float64)
+    v, state, report = safety.step(safety.initial_state(READY, u), READY, u, 0.001)
+    torch.testing.assert_close(v, u, rtol=0, atol=1e-15)
+    assert not report.flags.any()
+    assert not state.counts.any()
+
+
+def test_speed_and_acceleration_keep_the_direction():
+    safety = SafetyFilter(LIMITS)
+    u = torch.tensor([4.0, -1.0, 0.5, 0.2, 8.0, -2.0, 1.0], dtype=torch.float64)
+    state = safety.initial_state(READY)
+    v, state, report = safety.step(state, READY, u, 0.01)
+    torch.testing.assert_close(v / v.norm(), u / u.norm())
+    assert report.acted("velocity")
+    assert report.acted("acceleration")
+    for _ in range(100):
+        v, state, _ = safety.step(state, READY, u, 0.01)
+    torch.testing.assert_close(v, u * LIMITS.velocity[4] / 8.0)
+
+
+def test_the_tool_is_capped_where_a_jacobian_is_given():
+    safety = SafetyFilter(LIMITS, SafetyConfig(tcp_speed=0.2))
+    u = torch.tensor([1.5, 0.5, 0, 0, 0, 0, 0], dtype=torch.float64)
+    J = panda.jacobian(READY)
+    state = safety.initial_state(READY)
+    for _ in range(300):
+        v, state, report = safety.step(state, READY, u, 0.002, jacobian=J)
+    assert (J @ v)[:3].norm().item() == pytest.approx(0.2)
+    torch.testing.assert_close(v / v.norm(), u / u.norm())
+    assert report.acted("tcp_speed")
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        {"q": torch.full((7,), torch.nan, dtype=torch.float64)},
+        {"u": torch.full((7,), torch.inf, dtype=torch.float64)},
+        {"stale": torch.tensor(True)},
+        {"stop": torch.tensor(True)},
+    ],
+)
+def test_a_fault_brakes_to_rest_along_a_straight_line_and_resumes_smoothly(fault):
+    safety = SafetyFilter(LIMITS)
+    u = torch.tensor([0.5, -0.4, 0.3, 0.2, -0.1, 0.6, -0.7], dtype=torch.float64)
+    state, q, dt = safety.initial_state(READY, u), READY, 0.004
+    options = {k: w for k, w in fault.items() if k in ("stale", "stop")}
+    for _ in range(60):
+        before = state.velocity
+        v, state, report = safety.step(
+            state, fault.get("q", q), fault.get("u", u), dt, **options
+        )
+        q = q + v * dt
+        assert ((v - before).abs() <= LIMITS.acceleration * dt * (1 + 1e-9)).all()
+        assert (v.norm() == 0) or torch.allclose(v / v.norm(), u / u.norm())
+        torch.testing.assert_close(state.position, q)
+    assert v.norm() == 0
+    assert report.acted("stopped" if "stop" in fault else "invalid")
+    v, state, _ = safety.step(state, q, u, dt)
+    assert 0 < v.norm() < 0.2
+
+
+def test_one_faulty_arm_of_a_batch_leaves_the_others_alone():
+    safety = SafetyFilter(LIMITS)
+    q, u = READY.expand(3, 7).clone(), 0.01 * torch.ones(3, 7, dtype=torch.float64)
+    q[1, 3] = torch.nan
+    v, _, report = safety.step(safety.initial_state(READY.expand(3, 7)), q, u, 0.01)
+    assert report.acted("invalid").tolist() == [False, True, False]
+    assert v[1].norm() == 0
+    torch.testing.assert_close(v[[0, 2]], u[[0, 2]])
+
+
+def test_interventions_are_counted_by_kind():
+    safety = SafetyFilter(LIMITS)
+    state = safety.initial_state(READY)
+    fast = 3 * torch.ones(7, dtype=torch.float64)
+    for u in (fast, fast, torch.full_like(fast, torch.nan)):
+        _, state, _ = safety.step(state, READY, u, 0.01)
+    assert state.count("velocity") == 2
+    assert state.count("invalid") == 1
+    assert state.count("position") == 0
+    with pytest.raises(ValueError, match="velocity, position"):
+        state.count("boredom")
+    assert state.counts.shape == (len(INTERVENTIONS),)
+
+
+@pytest.mark.parametrize("dt", [0.0, -0.01, 0.3])
+def test_a_step_that_voids_the_guarantee_is_refused(dt: float):
+    safety = SafetyFilter(LIMITS)
+    with pytest.raises(ValueError, match="lower its rate"):
+        safety.step(safety.initial_state(READY), READY, READY, dt)
+
+
+def test_a_batch_is_a_loop():
+    safety = SafetyFilter(LIMITS)
+    rng = sampling.generator(3)
+    q, u = inside(4, 3, seed=3), 4 * torch.randn(4, 3, 7, generator=rng, dtype=torch.float64)
+    state = safety.initial_state(q)
+    v, _, report = safety.step(state, q, u, 0.01)
+    for i in range(4):
+        for j in range(3):
+            one = SafetyState(
+                **{f.name: getattr(state, f.name)[i, j] for f in dataclasses.fields(state)}
+            )
+            v_one, _, report_one = safety.step(one, q[i, j], u[i, j], 0.01)
+            torch.testing.assert_close(v_one, v[i, j], rtol=0, atol=0)
+            assert (report_one.flags == report.flags[i, j]).all()
+
+
+def test_follows_its_dtype():
+    safety = SafetyFilter(LIMITS).float()
+    q = READY.float()
+    v, state, _ = safety.step(safety.initial_state(q), q, torch.ones(7), 0.01)
+    assert v.dtype == state.position.dtype == torch.float32
