@@ -12,16 +12,40 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from hrc_learn.geometry.constant import Constant
 from hrc_learn.geometry.numerics import arctan_ratio, cos_and_sinc, safe_norm
 
 # Row i of the matrix P with p * q = P q, as components of p and their signs.
-_PRODUCT_INDEX = torch.tensor([0, 1, 2, 3, 1, 0, 3, 2, 2, 3, 0, 1, 3, 2, 1, 0])
-_PRODUCT_SIGN = torch.tensor(
-    [[1, -1, -1, -1], [1, 1, -1, 1], [1, 1, 1, -1], [1, -1, 1, 1]], dtype=torch.float64
+_PRODUCT_INDEX = Constant(torch.tensor([0, 1, 2, 3, 1, 0, 3, 2, 2, 3, 0, 1, 3, 2, 1, 0]))
+_PRODUCT_SIGN = Constant(
+    torch.tensor(
+        [[1, -1, -1, -1], [1, 1, -1, 1], [1, 1, 1, -1], [1, -1, 1, 1]], dtype=torch.float64
+    )
 )
-_CONJUGATE_SIGN = torch.tensor([1, -1, -1, -1], dtype=torch.float64)
+_CONJUGATE_SIGN = Constant(torch.tensor([1, -1, -1, -1], dtype=torch.float64))
 # The sign of the sum is the sign of the first component that is not zero.
-_LEXICOGRAPHIC = torch.tensor([8, 4, 2, 1], dtype=torch.float64)
+_LEXICOGRAPHIC = Constant(torch.tensor([8, 4, 2, 1], dtype=torch.float64))
+# 4 q q^T = I + sum over three entries of R (row-major) with these signs.
+_OUTER_INDEX = Constant(
+    torch.tensor(
+        [
+            [0, 7, 2, 3, 7, 0, 1, 2, 2, 1, 0, 5, 3, 2, 5, 0],
+            [4, 5, 6, 1, 5, 4, 3, 6, 6, 3, 4, 7, 1, 6, 7, 4],
+            [8, 8, 8, 8, 8, 8, 8, 8, 8, 8, 8, 8, 8, 8, 8, 8],
+        ]
+    )
+)
+_OUTER_SIGN = Constant(
+    torch.tensor(
+        [
+            [1, 1, 1, 1, 1, 1, 1, 1, 1, 1, -1, 1, 1, 1, 1, -1],
+            [1, -1, -1, -1, -1, -1, 1, 1, -1, 1, 1, 1, -1, 1, 1, -1],
+            [1, 0, 0, 0, 0, -1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1],
+        ],
+        dtype=torch.float64,
+    )
+)
+_OUTER_OFFSET = Constant(torch.eye(4, dtype=torch.float64))
 # Below this angle [rad] an axis of rotation is rounding noise.
 _AXIS_THRESHOLD = 1e-6
 
@@ -31,13 +55,13 @@ def multiply(
 ) -> Float[Tensor, "*batch 4"]:
     """Hamilton product: rotate by q, then by p."""
     # Sums instead of a matmul: TF32 tensor cores would round the product to three digits.
-    left = p[..., _PRODUCT_INDEX.to(p.device)].unflatten(-1, (4, 4)) * _PRODUCT_SIGN.to(p)
+    left = p[..., _PRODUCT_INDEX.like(p)].unflatten(-1, (4, 4)) * _PRODUCT_SIGN.like(p)
     return (left * q[..., None, :]).sum(-1)
 
 
 def conjugate(q: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
     """Inverse rotation."""
-    return q * _CONJUGATE_SIGN.to(q)
+    return q * _CONJUGATE_SIGN.like(q)
 
 
 def normalize(q: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
@@ -47,7 +71,7 @@ def normalize(q: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
 
 def canonical(q: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
     """The sign whose first non-zero component is positive (w >= 0: the shortest rotation)."""
-    order = (torch.sign(q) * _LEXICOGRAPHIC.to(q)).sum(-1, keepdim=True)
+    order = (torch.sign(q) * _LEXICOGRAPHIC.like(q)).sum(-1, keepdim=True)
     return torch.where(order < 0, -q, q)
 
 
@@ -87,22 +111,17 @@ def to_matrix(q: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
 
 
 def from_matrix(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
-    """Unit quaternion of a rotation matrix, with w >= 0.
+    """Unit quaternion of a rotation matrix, of either sign.
 
     Builds the symmetric matrix 4 q q^T, which is linear in R, and normalises its largest row
     (Markley 2008, "Unit quaternion from rotation matrix"): accurate at every angle, and a
     unit quaternion even where R is a rotation only to rounding.
     """
-    rest = 1 - R.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
-    eye = torch.eye(3, dtype=R.dtype, device=R.device)
-    vv = R + R.mT + rest * eye
-    wv = (R[..., (2, 0, 1), (1, 2, 0)] - R[..., (1, 2, 0), (2, 0, 1)])[..., None]
-    rows = torch.cat(
-        [torch.cat([2 - rest, wv], dim=-2), torch.cat([wv.mT, vv], dim=-2)], dim=-1
-    )  # (*batch, 4, 4)
-    largest = rows.diagonal(dim1=-2, dim2=-1).argmax(-1)
-    row = torch.take_along_dim(rows, largest[..., None, None], dim=-2).squeeze(-2)
-    return canonical(normalize(row))
+    entries = R.flatten(-2)[..., _OUTER_INDEX.like(R)] * _OUTER_SIGN.like(R)
+    outer = entries.sum(-2).unflatten(-1, (4, 4)) + _OUTER_OFFSET.like(R)
+    largest = outer.diagonal(dim1=-2, dim2=-1).argmax(-1)
+    row = torch.take_along_dim(outer, largest[..., None, None], dim=-2).squeeze(-2)
+    return normalize(row)
 
 
 def angle(

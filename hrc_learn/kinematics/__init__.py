@@ -1,0 +1,13 @@
+"""Serial arms: forward kinematics, Jacobians and their inverses; the Panda."""
+
+from .chain import SerialChain as SerialChain
+from .franka import FrankaArm as FrankaArm
+from .franka import panda as panda
+from .inverse import UnreachableError as UnreachableError
+from .limits import JointLimits as JointLimits
+from .pseudo_inverse import null_space_projector as null_space_projector
+from .pseudo_inverse import pseudo_inverse as pseudo_inverse
+from .pseudo_inverse import singularity_damping as singularity_damping
+from .pytorch_kinematics import from_pytorch_kinematics as from_pytorch_kinematics
+from .pytorch_kinematics import to_pytorch_kinematics as to_pytorch_kinematics
+from .urdf import to_urdf as to_urdf

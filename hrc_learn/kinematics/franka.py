@@ -1,0 +1,113 @@
+"""The Franka Emika Panda, from one table of published numbers."""
+
+from math import cos, pi, sin
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hrc_learn.geometry import Pose
+from hrc_learn.kinematics import inverse
+from hrc_learn.kinematics.chain import SerialChain
+from hrc_learn.kinematics.limits import JointLimits
+from hrc_learn.kinematics.urdf import to_urdf
+
+# Craig's modified Denavit-Hartenberg parameters and joint limits, as published in
+# frankaemika's "Robot and interface specifications" for the Panda (FER).
+# a [m], d [m], alpha [rad]; then rad, rad/s, rad/s^2, rad/s^3, N m.
+_PANDA_JOINTS = (
+    #  a,      d,     alpha,    lower,   upper,  velocity, acceleration, jerk, torque
+    (0.0, 0.333, 0.0, -2.8973, 2.8973, 2.1750, 15.0, 7500.0, 87.0),
+    (0.0, 0.0, -pi / 2, -1.7628, 1.7628, 2.1750, 7.5, 3750.0, 87.0),
+    (0.0, 0.316, pi / 2, -2.8973, 2.8973, 2.1750, 10.0, 5000.0, 87.0),
+    (0.0825, 0.0, pi / 2, -3.0718, -0.0698, 2.1750, 12.5, 6250.0, 87.0),
+    (-0.0825, 0.384, -pi / 2, -2.8973, 2.8973, 2.6100, 15.0, 7500.0, 12.0),
+    (0.0, 0.0, pi / 2, -0.0175, 3.7525, 2.6100, 20.0, 10000.0, 12.0),
+    (0.088, 0.0, pi / 2, -2.8973, 2.8973, 2.6100, 20.0, 10000.0, 12.0),
+)
+_FLANGE_OFFSET = 0.107  # along z of joint 7 [m]
+_HAND_ANGLE = -pi / 4  # the hand is bolted on turned about z of the flange [rad]
+_TCP_OFFSET = 0.1034  # fingertips of the Franka hand, along z of the flange [m]
+
+
+class FrankaArm(SerialChain):
+    """A Franka arm with the Franka hand: a serial chain with a closed-form inverse."""
+
+    def inverse(
+        self,
+        pose: Pose,
+        q7: Float[Tensor, "*#batch"] | float,
+        near: Float[Tensor, "*#batch 7"] | None = None,
+    ) -> Float[Tensor, "*batch 7"]:
+        """Joint positions that put the tool centre point at a pose, in closed form.
+
+        Seven joints leave one degree of freedom, which the position of joint 7 settles; up to
+        four branches remain, of which the nearest to `near` is returned. The elbow branch
+        with q4 > -0.467 rad is never returned. Not differentiable; batches are solved in turn.
+
+        Args:
+            pose: Of the tool centre point in the base frame.
+            q7: Position of joint 7 [rad].
+            near: Configuration to stay close to [rad]; the ready posture if None.
+
+        Raises:
+            UnreachableError: No branch within joint limits; names the first such pose.
+        """
+        return inverse.solve_nearest(self, pose, q7, self.ready if near is None else near)
+
+    def inverse_all(
+        self, pose: Pose, q7: Float[Tensor, "*#batch"] | float
+    ) -> Float[Tensor, "*batch 4 7"]:
+        """All branches of `inverse` within limits, then rows of NaN."""
+        return inverse.solve_all(self, pose, q7)
+
+    def urdf(self) -> str:
+        """URDF text with the links, joints and limits of this arm, without meshes."""
+        return to_urdf(self, name="panda")
+
+
+def _craig(a: float, d: float, alpha: float) -> Tensor:
+    """Rx(alpha) Tx(a) Tz(d): a joint frame at zero in the frame before it."""
+    c, s = _exact_cos_sin(alpha)
+    return torch.tensor(
+        [[1, 0, 0, a], [0, c, -s, -s * d], [0, s, c, c * d], [0, 0, 0, 1]], dtype=torch.float64
+    )
+
+
+def _along_z(distance: float, angle: float = 0.0) -> Tensor:
+    c, s = cos(angle), sin(angle)
+    return torch.tensor(
+        [[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, distance], [0, 0, 0, 1]], dtype=torch.float64
+    )
+
+
+def _exact_cos_sin(angle: float) -> tuple[float, float]:
+    """Cosine and sine of a multiple of a right angle without the 6e-17 of rounding."""
+    return float(round(cos(angle))), float(round(sin(angle)))
+
+
+def _panda() -> FrankaArm:
+    table = torch.tensor(_PANDA_JOINTS, dtype=torch.float64)
+    lower, upper, velocity, acceleration, jerk, torque = table[:, 3:].unbind(-1)
+    return FrankaArm(
+        joint_names=[f"panda_joint{i}" for i in range(1, 8)],
+        mounts=torch.stack([_craig(*row[:3]) for row in _PANDA_JOINTS]),
+        flange=_along_z(_FLANGE_OFFSET),
+        tcp=_along_z(_TCP_OFFSET, _HAND_ANGLE),
+        limits=JointLimits(
+            lower=lower,
+            upper=upper,
+            velocity=velocity,
+            acceleration=acceleration,
+            jerk=jerk,
+            torque=torque,
+            vintage="Franka Emika Panda (FER), FCI documentation up to libfranka 0.9",
+        ),
+        ready=torch.tensor(
+            [0, -pi / 4, 0, -3 * pi / 4, 0, pi / 2, pi / 4], dtype=torch.float64
+        ),
+    )
+
+
+panda = _panda()
+"""The Panda with its hand; a Cartesian limit of 1.7 m/s and 2.5 rad/s is the controller's."""
