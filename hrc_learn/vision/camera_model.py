@@ -1,0 +1,167 @@
+"""A fixed camera: intrinsics, lens distortion, pose; projection and its derivatives.
+
+The controller never sees a `CameraModel`: it belongs to simulation and to evaluation.
+"""
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from .distortion import NONE, Coefficients, distort, distort_jacobian, undistort
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CameraModel:
+    """Pinhole with Brown distortion, at rest in the base frame.
+
+    Camera axes are OpenCV's: x right, y down, z along the view. Pixel (0, 0) is the
+    *centre* of the top left pixel, so the middle of the image is ((W-1)/2, (H-1)/2).
+    """
+
+    width: int = 1440
+    """Image width W [px]."""
+    height: int = 1080
+    """Image height H [px]."""
+    focal: tuple[float, float] = (1200.0, 1200.0)
+    """Focal lengths (fx, fy) [px]."""
+    principal: tuple[float, float] = (719.5, 539.5)
+    """Principal point (cx, cy) [px]."""
+    distortion: Coefficients = NONE
+    """(k1, k2, p1, p2, k3), as OpenCV orders them."""
+    pose: Float[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
+    """Pose of the camera in the base frame: p_base = pose @ p_camera."""
+
+    def __post_init__(self) -> None:
+        R = self.pose[:3, :3]
+        if not np.allclose(R @ R.T, np.eye(3), atol=1e-6) or np.linalg.det(R) < 0:
+            raise ValueError(
+                "pose must hold a rotation in its upper left 3x3, but R R^T differs from the "
+                f"identity by {np.abs(R @ R.T - np.eye(3)).max():.2g} and det R is "
+                f"{np.linalg.det(R):.3g}. CameraModel.look_at() builds a pose from two points."
+            )
+        if min(self.width, self.height, *self.focal) <= 0:
+            raise ValueError(
+                "width, height and focal must be positive, but are "
+                f"{self.width}, {self.height} and {self.focal}."
+            )
+
+    def look_at(
+        self,
+        eye: Float[np.ndarray, "3"],
+        target: Float[np.ndarray, "3"],
+        *,
+        roll: float = 0.0,
+    ) -> "CameraModel":
+        """The same camera placed at `eye` with `target` on its optical axis.
+
+        Args:
+            eye: Camera centre in the base frame [m].
+            target: Point to look at in the base frame [m].
+            roll: Turn about the optical axis [rad]. At zero the base's z axis points up in
+                the image, or its x axis where the camera looks straight up or down.
+        """
+        z = target - eye
+        distance = float(np.linalg.norm(z))
+        if distance < 1e-9:
+            raise ValueError("eye and target must differ, but both are " + str(eye.tolist()))
+        z = z / distance
+        up = np.array([0.0, 0.0, 1.0]) if abs(z[2]) < 0.999 else np.array([1.0, 0.0, 0.0])
+        x = np.cross(z, up)
+        x /= np.linalg.norm(x)
+        y = np.cross(z, x)
+        c, s = np.cos(roll), np.sin(roll)
+        pose = np.eye(4)
+        pose[:3, :4] = np.column_stack([c * x + s * y, c * y - s * x, z, eye])
+        return replace(self, pose=pose)
+
+    @property
+    def matrix(self) -> Float[np.ndarray, "3 3"]:
+        """Intrinsic matrix K [px]."""
+        (fx, fy), (cx, cy) = self.focal, self.principal
+        return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+    def to_camera(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+        """Base frame to camera frame [m]."""
+        return (points - self.pose[:3, 3]) @ self.pose[:3, :3]
+
+    def project(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2"]:
+        """Pixels of points in the base frame; NaN for points behind the camera.
+
+        Args:
+            points: Positions in the base frame [m].
+
+        Returns:
+            (u right, v down) [px]. Points outside the image get the pixel they would have;
+            `in_view` tells which ones the image holds.
+        """
+        p = self.to_camera(points)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            normalised = np.where(p[..., 2:] > 0.0, p[..., :2] / p[..., 2:], np.nan)
+        return self.to_pixels(normalised)
+
+    def to_pixels(
+        self, normalised: Float[np.ndarray, "*batch 2"]
+    ) -> Float[np.ndarray, "*batch 2"]:
+        """Pixels of normalised (x/z, y/z) points, through the lens."""
+        return distort(normalised, self.distortion) * self.focal + self.principal
+
+    def to_normalised(
+        self, pixels: Float[np.ndarray, "*batch 2"]
+    ) -> Float[np.ndarray, "*batch 2"]:
+        """Normalised (x/z, y/z) points seen at the given pixels: the lens undone."""
+        return undistort((pixels - self.principal) / self.focal, self.distortion)
+
+    def in_view(self, points: Float[np.ndarray, "*batch 3"]) -> Bool[np.ndarray, "*batch"]:
+        """Whether points in the base frame lie in front of the camera and in the image."""
+        p = self.to_camera(points)
+        u, v = np.moveaxis(self.project(points), -1, 0)
+        inside = (u >= -0.5) & (u <= self.width - 0.5) & (v >= -0.5) & (v <= self.height - 0.5)
+        # Far outside the image the distortion polynomial may fold points back into it.
+        r = np.hypot(p[..., 0], p[..., 1])
+        return np.asarray(inside & (r <= self.view_radius * p[..., 2]))
+
+    @cached_property
+    def view_radius(self) -> float:
+        """Largest |(x/z, y/z)| that the image holds, with 1 % to spare."""
+        return 1.01 * float(np.linalg.norm(self.to_normalised(self.border()), axis=-1).max())
+
+    def border(self, points_per_side: int = 32) -> Float[np.ndarray, "n 2"]:
+        """Pixels along the edge of the image, clockwise from the top left."""
+        w, h = self.width - 0.5, self.height - 0.5
+        corners = np.array([[-0.5, -0.5], [w, -0.5], [w, h], [-0.5, h]])
+        t = np.arange(points_per_side)[:, None] / points_per_side
+        sides = zip(corners, np.roll(corners, -1, axis=0), strict=True)
+        return np.concatenate([a + t * (b - a) for a, b in sides])
+
+    def image_jacobian(
+        self,
+        point: Float[np.ndarray, "*batch 3"],
+        origin: Float[np.ndarray, "*batch 3"] | None = None,
+    ) -> Float[np.ndarray, "*batch 2 6"]:
+        """True image Jacobian of a point that rides on a moving body.
+
+            d(u, v)/dt = J_s (v_origin, omega),    v_point = v_origin + omega x (point - origin)
+
+        Args:
+            point: The point in the base frame [m].
+            origin: Where the body's linear velocity is measured, in the base frame [m];
+                None measures it at the point itself, which then does not feel rotation.
+
+        Returns:
+            J_s: derivative with respect to the twist (linear, angular) in the base frame
+            [px/m, px/rad].
+        """
+        p = self.to_camera(point)
+        x, y, z = p[..., 0], p[..., 1], p[..., 2]
+        zero = np.zeros_like(z)
+        perspective = np.stack(
+            [np.stack([z, zero, -x], axis=-1), np.stack([zero, z, -y], axis=-1)], axis=-2
+        )
+        perspective = perspective / (z * z)[..., None, None]
+        lens = distort_jacobian(p[..., :2] / p[..., 2:], self.distortion)
+        J_point = np.diag(self.focal) @ lens @ perspective @ self.pose[:3, :3].T
+        arm = np.zeros_like(point) if origin is None else point - origin
+        # (omega x arm) . j = omega . (arm x j) for each row j of J_point.
+        return np.concatenate([J_point, np.cross(arm[..., None, :], J_point)], axis=-1)

@@ -1,0 +1,126 @@
+"""Finding ArUco markers in images: fast search, corners to a third of a pixel."""
+
+from collections.abc import Iterable
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from .markers import MODULES, dictionary
+
+Corners = Float[np.ndarray, "4 2"]
+"""Pixels of top left, top right, bottom right, bottom left corner of the upright marker."""
+
+
+class MarkerDetector:
+    """Finds given markers in a stream of images.
+
+    A marker is looked for round its last position first, where that fails in the whole image
+    at half resolution, and only then at full resolution; corners are always refined at full
+    resolution. That takes a fraction of the time of a plain search and is no less accurate.
+    """
+
+    def __init__(self, ids: Iterable[int]):
+        """Set up the search.
+
+        Args:
+            ids: Markers to report, of the 4x4_50 dictionary; others are ignored.
+        """
+        import cv2
+
+        self.ids = frozenset(ids)
+        parameters = cv2.aruco.DetectorParameters()
+        # One threshold window of 13 px finds what the default ladder of three finds.
+        parameters.adaptiveThreshWinSizeMin = parameters.adaptiveThreshWinSizeMax = 13
+        # Lines fitted to the contour keep the rough corners within reach of the refinement.
+        parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_CONTOUR
+        # The outline of the white plate is a square too. At the default distance it hides the
+        # marker within it when both lie near the edge of the image.
+        parameters.minMarkerDistanceRate = 0.05
+        self._aruco = cv2.aruco.ArucoDetector(dictionary(), parameters)
+        self._last: dict[int, Corners] = {}
+
+    def detect(
+        self, image: UInt8[np.ndarray, "h w 3"] | UInt8[np.ndarray, "h w"]
+    ) -> dict[int, Corners]:
+        """Corners of the markers seen in an image, by id.
+
+        Args:
+            image: RGB or grey.
+        """
+        found: dict[int, Corners] = {}
+        for id, corners in self._last.items():
+            found |= self._search_near(image, id, corners)
+        if missing := self.ids.difference(found):
+            found |= self._search_everywhere(image, missing)
+        self._last = found
+        return {id: corners.copy() for id, corners in found.items()}
+
+    def _search_near(self, image: np.ndarray, id: int, last: Corners) -> dict[int, Corners]:
+        reach = 0.5 * np.ptp(last, axis=0).max() + 8  # half a marker of motion a frame
+        low = np.maximum(np.floor(last.min(axis=0) - reach).astype(int), 0)
+        high = np.ceil(last.max(axis=0) + reach).astype(int)
+        grey = _grey(image[low[1] : high[1], low[0] : high[0]])
+        rough = self._search(grey, frozenset([id]))
+        return {id: _refine(grey, corners) + low for id, corners in rough.items()}
+
+    def _search_everywhere(self, image: np.ndarray, ids: frozenset[int]) -> dict[int, Corners]:
+        import cv2
+
+        grey = _grey(image)
+        half = np.asarray(cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
+        rough = self._search(half, ids)
+        # Pixel k of the half image covers pixels 2k and 2k + 1 of the whole one.
+        rough = {id: 2.0 * corners + 0.5 for id, corners in rough.items()}
+        if missing := ids.difference(rough):  # hidden, or too small and tilted for half
+            rough |= self._search(grey, missing)
+        return {id: _refine(grey, corners) for id, corners in rough.items()}
+
+    def _search(self, grey: np.ndarray, ids: frozenset[int]) -> dict[int, Corners]:
+        corners, found, _ = self._aruco.detectMarkers(np.ascontiguousarray(grey))
+        if found is None:
+            return {}
+        return {
+            int(id): square[0].astype(np.float64)
+            for id, square in zip(found.ravel(), corners, strict=True)
+            if int(id) in ids
+        }
+
+
+def centre(corners: Float[np.ndarray, "4 2"]) -> Float[np.ndarray, "2"]:
+    """Image of a marker's middle: where the diagonals cross.
+
+    The mean of the corners is not it: perspective draws the farther half smaller.
+    """
+    a, c = corners[0], corners[2]
+    b, d = corners[1], corners[3]
+    across, between = d - b, b - a
+    ca = c - a
+    s = (between[0] * across[1] - between[1] * across[0]) / (
+        ca[0] * across[1] - ca[1] * across[0]
+    )
+    return a + s * ca
+
+
+def _grey(image: np.ndarray) -> np.ndarray:
+    import cv2
+
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)) if image.ndim == 3 else image
+
+
+def _refine(grey: np.ndarray, corners: Corners) -> Corners:
+    """Corners moved to the saddle points of the grey levels.
+
+    A wide window first, since half a pixel off at half resolution can be three at full; then
+    a narrow one, which perspective and its neighbours disturb less. Both stay clear of the
+    next corner, a module away.
+    """
+    import cv2
+
+    module = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).min() / MODULES
+    image = np.ascontiguousarray(grey)
+    refined = np.ascontiguousarray(corners, dtype=np.float32).reshape(4, 1, 2)
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 30, 0.01)
+    for share in (0.6, 0.3):
+        half_window = int(np.clip(share * module, 2, 10 * share + 2))
+        cv2.cornerSubPix(image, refined, (half_window, half_window), (-1, -1), criteria)
+    return refined[:, 0].astype(np.float64)
