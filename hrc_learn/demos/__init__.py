@@ -6,5 +6,7 @@ from .finding import DatasetError as DatasetError
 from .finding import Finding as Finding
 from .finding import UnitsWarning as UnitsWarning
 from .padding import PaddedDemonstrations as PaddedDemonstrations
+from .reader import load_demos as load_demos
+from .roles import ROLES as ROLES
 from .writer import DatasetWriter as DatasetWriter
 from .writer import recover_dataset as recover_dataset

@@ -1,0 +1,109 @@
+"""Frames of episodes as raw arrays, just as they are on disk."""
+
+from collections.abc import Iterator, Sequence
+from itertools import groupby
+
+import numpy as np
+from jaxtyping import Shaped
+
+from .finding import DatasetError
+from .layout import DatasetFolder, EpisodeEntry
+from .parquet import BadRowError, open_parquet, read_table, to_numpy
+
+RawFrames = dict[str, Shaped[np.ndarray, "frames components"]]
+"""Column -> its values during one episode, in the type and unit they have on disk."""
+
+
+def read_frames(
+    folder: DatasetFolder, entries: Sequence[EpisodeEntry], keys: Sequence[str]
+) -> Iterator[tuple[EpisodeEntry, RawFrames]]:
+    """Read columns of episodes, file by file, in the order of `entries`.
+
+    Args:
+        folder: The dataset.
+        entries: Episodes wanted, in the order they lie on disk.
+        keys: Columns wanted; LeRobot's own index columns come along where they exist.
+
+    Raises:
+        DatasetError: A file or column is missing or damaged, a column is not as wide as
+            declared, or the rows are not those the metadata promise.
+    """
+    for file, group in groupby(entries, key=lambda entry: entry.file):
+        yield from _read_file(folder, file, list(group), keys)
+
+
+def _read_file(
+    folder: DatasetFolder, file: str, entries: list[EpisodeEntry], keys: Sequence[str]
+) -> Iterator[tuple[EpisodeEntry, RawFrames]]:
+    parquet = open_parquet(folder.root, file, entries[0].index)
+    _require_rows(folder, file, parquet.metadata.num_rows)
+    existing = parquet.schema_arrow.names
+    for key in keys:
+        if key not in existing:
+            raise DatasetError(
+                "the column is declared in meta/info.json, but missing", file=file, key=key
+            )
+    indices = [k for k in ("timestamp", "episode_index", "task_index") if k in existing]
+    rows = slice(
+        min(entry.start for entry in entries),
+        max(entry.start + entry.length for entry in entries),
+    )
+    table = read_table(parquet, file, [*dict.fromkeys([*keys, *indices])], rows)
+    columns = {}
+    for key in table.column_names:
+        try:
+            columns[key] = to_numpy(table.column(key))
+        except BadRowError as error:
+            entry = _entry_at(entries, error.row + rows.start)
+            frame = error.row + rows.start - entry.start
+            raise DatasetError(
+                str(error), file=file, episode=entry.index, frame=frame, key=key
+            ) from error
+        _require_width(folder, file, key, columns[key])
+    for entry in entries:
+        start = entry.start - rows.start
+        frames = {key: values[start : start + entry.length] for key, values in columns.items()}
+        _require_episode(file, entry, frames)
+        yield entry, frames
+
+
+def _require_rows(folder: DatasetFolder, file: str, rows: int) -> None:
+    entries = [entry for entry in folder.episodes if entry.file == file]
+    expected = max(entry.start + entry.length for entry in entries)
+    if rows != expected:
+        raise DatasetError(
+            f"holds {rows} frames, but the list of episodes promises {expected}: frames were "
+            f"lost or repeated, or the metadata belong to another copy",
+            file=file,
+            episode=entries[0].index if len(entries) == 1 else None,
+        )
+
+
+def _require_width(folder: DatasetFolder, file: str, key: str, values: np.ndarray) -> None:
+    feature = folder.features.get(key)
+    if feature is not None and len(values) and values.shape[1] != feature.width:
+        raise DatasetError(
+            f"has {values.shape[1]} components, but meta/info.json declares the shape "
+            f"{list(feature.shape)}",
+            file=file,
+            key=key,
+        )
+
+
+def _require_episode(file: str, entry: EpisodeEntry, frames: RawFrames) -> None:
+    if "episode_index" not in frames:
+        return
+    wrong = np.flatnonzero(frames["episode_index"] != entry.index)
+    if len(wrong):
+        raise DatasetError(
+            f"the frame belongs to episode {int(frames['episode_index'][wrong[0], 0])} by its "
+            f"episode_index: the offsets in the list of episodes are wrong",
+            file=file,
+            episode=entry.index,
+            frame=int(wrong[0]),
+            key="episode_index",
+        )
+
+
+def _entry_at(entries: Sequence[EpisodeEntry], row: int) -> EpisodeEntry:
+    return next(entry for entry in entries if entry.start <= row < entry.start + entry.length)

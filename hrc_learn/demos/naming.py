@@ -1,0 +1,103 @@
+"""What the name of a component says about its meaning.
+
+There is no single convention; these are the ones met in published datasets. Anything not
+recognised is left to the caller's explicit mapping.
+"""
+
+import re
+from dataclasses import dataclass
+
+JOINT_SUFFIXES = {
+    "joint_position": ("pos", "position", "obs_pos", "cmd_pos", "qpos"),
+    "joint_velocity": ("vel", "velocity", "obs_vel", "cmd_vel", "qvel"),
+    "joint_effort": (
+        "torque",
+        "effort",
+        "obs_torque",
+        "obs_effort",
+        "external_torque",
+        "obs_external_torque",
+    ),
+}
+"""`JOINT.SUFFIX`, as lerobot-record and the Franka plug-ins write them."""
+
+_JOINT_PREFIXES = {"qpos": "joint_position", "qvel": "joint_velocity", "effort": "joint_effort"}
+
+_XYZ = {"x": 0, "y": 1, "z": 2}
+_POSE_COMPONENTS = {
+    **{name: ("position", slot) for name, slot in _XYZ.items()},
+    **{f"p{name}": ("position", slot) for name, slot in _XYZ.items()},
+    **{f"pos_{name}": ("position", slot) for name, slot in _XYZ.items()},
+    **{f"w{name}": ("rotation_vector", slot) for name, slot in _XYZ.items()},
+    **{f"r{name}": ("rotation_vector", slot) for name, slot in _XYZ.items()},
+    **{f"q{name}": ("quaternion_wxyz", slot) for slot, name in enumerate("wxyz")},
+    **{f"quat_{name}": ("quaternion_wxyz", slot) for slot, name in enumerate("wxyz")},
+    "roll": ("euler_xyz", 0),
+    "pitch": ("euler_xyz", 1),
+    "yaw": ("euler_xyz", 2),
+}
+_EE = re.compile(r"(?:ee|eef|tcp|end_effector)[._/](.+)")
+_MATRIX = re.compile(r"(?:ee|eef|tcp)_(?:pose|matrix)[._](\d+)")
+
+KEY_ROLES = {
+    "joint_position": "joint_position|joint_positions|joint_pos|joints|qpos",
+    "joint_velocity": "joint_velocity|joint_velocities|joint_vel|qvel|velocity",
+    "joint_effort": "joint_effort|joint_efforts|joint_torque|joint_torques|torque|effort",
+    "position": "(?:ee|eef|tcp)_(?:pos|position)",
+    "rotation_vector": "(?:ee|eef|tcp)_(?:rotvec|axis_angle|rot_axis_angle)",
+    "euler_xyz": "(?:ee|eef|tcp)_(?:euler|rpy)",
+    "quaternion_xyzw": "(?:ee|eef|tcp)_(?:quat|quaternion|orientation)",
+    "cartesian": "cartesian_position|cartesian_pose|(?:ee|eef|tcp)_pose|(?:ee|eef|tcp)",
+    "gripper": "gripper|gripper_position|gripper_width|gripper_pos",
+    "feature": "image_feature",
+    "human_effort": "human_effort",
+    "time": "time|time_stamp|timestamp|stamp",
+}
+"""What the last part of a feature's key says of the whole feature."""
+
+
+@dataclass(frozen=True)
+class Meaning:
+    """What one component stands for."""
+
+    role: str
+    slot: str | int
+    """Joint name, or index of the component within its role."""
+
+
+def meaning_of_component(name: str) -> Meaning | None:
+    """What a name says on its own; None where it says nothing (a bare joint name, say)."""
+    plain = name.strip().lower()
+    matrix = _MATRIX.fullmatch(plain)
+    if matrix:
+        return Meaning("pose_matrix", int(matrix[1]))
+    ee = _EE.fullmatch(plain)
+    component = _POSE_COMPONENTS.get(ee[1] if ee else plain)
+    if component:
+        return Meaning(*component)
+    stem, _, suffix = name.strip().rpartition(".")
+    roles = [role for role, names in JOINT_SUFFIXES.items() if suffix.lower() in names]
+    if (ee and "gripper" in ee[1]) or ("gripper" in plain and (not stem or roles)):
+        # A gripper's velocity or force is of no use here and must not pass for its opening.
+        return Meaning("gripper", name) if roles in ([], ["joint_position"]) else None
+    if stem and roles:
+        return Meaning(roles[0], stem)
+    prefix, _, number = plain.rpartition("_")
+    if number.isdigit() and prefix in _JOINT_PREFIXES:
+        return Meaning(_JOINT_PREFIXES[prefix], f"joint_{number}")
+    return None
+
+
+def says_joint_quantity(name: str) -> bool:
+    """Whether the name ends in a suffix of `JOINT_SUFFIXES`."""
+    _, dot, suffix = name.rpartition(".")
+    return bool(dot) and any(suffix.lower() in names for names in JOINT_SUFFIXES.values())
+
+
+def role_of_key(key: str) -> str | None:
+    """What the key says of the whole feature; None for a state or action of mixed content."""
+    last = re.split(r"[./]", key.lower())[-1]
+    for role, pattern in KEY_ROLES.items():
+        if re.fullmatch(pattern, last):
+            return role
+    return None

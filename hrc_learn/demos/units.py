@@ -1,0 +1,145 @@
+"""Units of a dataset's values: declared, given, or guessed from their size.
+
+LeRobot declares none, and radians, degrees, encoder ticks and -100..100 all occur.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from .finding import DatasetError
+from .roles import ROLES
+from .sidecar import SIDECAR_PATH
+
+_DIMENSIONS: dict[str, dict[str, float]] = {
+    "angle": {"rad": 1.0, "deg": math.pi / 180, "tick": 2 * math.pi / 4096},
+    "angular velocity": {
+        "rad/s": 1.0,
+        "deg/s": math.pi / 180,
+        "tick/s": 2 * math.pi / 4096,
+    },
+    "length": {"m": 1.0, "cm": 1e-2, "mm": 1e-3},
+    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
+    "torque": {"N m": 1.0, "N mm": 1e-3},
+    "pixels": {"px": 1.0},
+    "ratio": {"1": 1.0, "%": 1e-2},
+}
+"""Dimension -> unit -> its size in the unit we keep. A tick is 1/4096 of a turn, as the
+encoders of hobby servos count; where their zero lies is not known."""
+
+_JOINT_LIMITS = {"rad": 2 * math.pi, "deg": 400.0}
+_REACH = {"m": 5.0, "cm": 500.0}
+_ROTATION_LIMIT = {"euler_xyz": 2 * math.pi + 0.1, "rotation_vector": 4 * math.pi}
+
+_FOLLOWERS = {
+    "joint_velocity": "joint_position",
+    "command_position": "joint_position",
+    "command_velocity": "joint_position",
+}
+"""Quantities taken to be in the unit of another where nothing is said of them."""
+
+_GUESSABLE = ("joint_position", "command_position", "position", *_ROTATION_LIMIT)
+
+
+@dataclass(frozen=True, kw_only=True)
+class UnitDecision:
+    """The unit of one quantity on disk, and how it is known."""
+
+    role: str
+    unit: str
+    note: str | None = None
+    """What was guessed and how to overrule it; None where nothing had to be."""
+    converts: bool = False
+    """Whether a guess changes the values."""
+
+    @property
+    def factor(self) -> float:
+        """What values on disk are multiplied by."""
+        return unit_factor(self.role, self.unit)
+
+
+def unit_factor(role: str, unit: str) -> float:
+    """Size of a unit in the one we keep for a quantity.
+
+    Raises:
+        DatasetError: The quantity is unknown, or does not come in this unit.
+    """
+    if role not in ROLES:
+        raise DatasetError(
+            f"units are given for the unknown quantity {role!r}; known are {', '.join(ROLES)}"
+        )
+    own = ROLES[role].unit
+    options = next(units for units in _DIMENSIONS.values() if own in units)
+    if role == "gripper":
+        options = options | _DIMENSIONS["ratio"]
+    if unit not in options:
+        raise DatasetError(
+            f"{role} does not come in {unit!r}; known units are {', '.join(options)}"
+        )
+    return options[unit]
+
+
+def decide_units(
+    largest: Mapping[str, float],
+    declared: Mapping[str, str],
+    given: Mapping[str, str],
+) -> dict[str, UnitDecision]:
+    """Decide on a unit for every quantity.
+
+    Args:
+        largest: Largest absolute value of each quantity on disk, by role.
+        declared: Units by role from the dataset's sidecar.
+        given: Units by role from the caller; they win.
+
+    Raises:
+        DatasetError: A unit is unknown, or does not fit its quantity.
+    """
+    for role, unit in given.items():
+        unit_factor(role, unit)
+    _check_declared(declared)
+    stated = {**declared, **given}
+    decisions: dict[str, UnitDecision] = {}
+    for role in sorted(largest, key=lambda role: role in _FOLLOWERS):
+        if role in stated:
+            decisions[role] = UnitDecision(role=role, unit=stated[role])
+        elif (leader := decisions.get(_FOLLOWERS.get(role, ""))) is not None:
+            decisions[role] = UnitDecision(role=role, unit=_following_unit(role, leader.unit))
+        elif role in _GUESSABLE:
+            decisions[role] = _guess(role, largest[role])
+        else:
+            decisions[role] = UnitDecision(role=role, unit=ROLES[role].unit)
+    return decisions
+
+
+def _check_declared(declared: Mapping[str, str]) -> None:
+    for role, unit in declared.items():
+        try:
+            unit_factor(role, unit)
+        except DatasetError as error:
+            raise DatasetError(str(error), file=SIDECAR_PATH, key=f"units.{role}") from error
+
+
+def _following_unit(role: str, unit: str) -> str:
+    return f"{unit}/s" if role.endswith("velocity") else unit
+
+
+def _guess(role: str, largest: float) -> UnitDecision:
+    if role == "position":
+        unit = next((unit for unit, limit in _REACH.items() if largest <= limit), "mm")
+    elif role in _ROTATION_LIMIT:
+        unit = "rad" if largest <= _ROTATION_LIMIT[role] else "deg"
+    else:
+        unit = next((unit for unit, limit in _JOINT_LIMITS.items() if largest <= limit), "tick")
+    caution = {
+        "deg": " (LeRobot's -100..100 look alike)" if role not in _ROTATION_LIMIT else "",
+        "tick": " (1/4096 of a turn, zero unknown)",
+    }.get(unit, "")
+    return UnitDecision(
+        role=role,
+        unit=unit,
+        note=(
+            f"{role}: no unit declared, values reach {largest:.4g}: taken for {unit}{caution}; "
+            f"overrule with units={{{role!r}: ...}}"
+        ),
+        converts=unit != ROLES[role].unit,
+    )
