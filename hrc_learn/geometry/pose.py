@@ -25,8 +25,8 @@ class Pose:
     """Unit quaternion (w, x, y, z); either sign."""
 
     @staticmethod
-    def from_matrix(T: Float[Tensor, "*batch 4 4"]) -> Pose:
-        """Pose of a homogeneous transform."""
+    def from_matrix(T: Float[Tensor, "*batch rows 4"]) -> Pose:
+        """Pose of a homogeneous transform, or of its upper three rows (R | p)."""
         return Pose(T[..., :3, 3], quaternion.from_matrix(T[..., :3, :3]))
 
     def matrix(self) -> Float[Tensor, "*batch 4 4"]:

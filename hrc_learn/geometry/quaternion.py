@@ -120,8 +120,9 @@ def from_matrix(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
     entries = R.flatten(-2)[..., _OUTER_INDEX.like(R)] * _OUTER_SIGN.like(R)
     outer = entries.sum(-2).unflatten(-1, (4, 4)) + _OUTER_OFFSET.like(R)
     largest = outer.diagonal(dim1=-2, dim2=-1).argmax(-1)
-    row = torch.take_along_dim(outer, largest[..., None, None], dim=-2).squeeze(-2)
-    return normalize(row)
+    # Not take_along_dim: exporting it fixes the batch size.
+    row = outer.gather(-2, largest[..., None, None].expand(*outer.shape[:-2], 1, 4))
+    return normalize(row.squeeze(-2))
 
 
 def angle(

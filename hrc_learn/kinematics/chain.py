@@ -74,7 +74,7 @@ class SerialChain:
         Args:
             q: Joint positions [rad].
         """
-        return _pose(self._joint_frames(q)[-1] @ self._tip.like(q))
+        return Pose.from_matrix(self._joint_frames(q)[-1] @ self._tip.like(q))
 
     def link_poses(self, q: Float[Tensor, "*batch joints"]) -> Pose:
         """Poses of the joint frames, the flange and the tool centre point, in this order.
@@ -87,7 +87,7 @@ class SerialChain:
         """
         frames = self._joint_frames(q)
         tips = [frames[-1] @ self._flange.like(q), frames[-1] @ self._tip.like(q)]
-        return _pose(torch.stack([*frames, *tips], dim=-3))
+        return Pose.from_matrix(torch.stack([*frames, *tips], dim=-3))
 
     def jacobian(self, q: Float[Tensor, "*batch joints"]) -> Float[Tensor, "*batch 6 joints"]:
         """Geometric Jacobian of the tool centre point.
@@ -105,7 +105,7 @@ class SerialChain:
     ) -> tuple[Pose, Float[Tensor, "*batch 6 joints"]]:
         """`forward` and `jacobian` for little more than the price of one."""
         tip, J = self.transform_and_jacobian(q)
-        return _pose(tip), J
+        return Pose.from_matrix(tip), J
 
     def transform_and_jacobian(
         self, q: Float[Tensor, "*batch joints"]
@@ -146,10 +146,6 @@ class SerialChain:
         for step in rest:
             frames.append(frames[-1] @ step)
         return frames
-
-
-def _pose(transform: Float[Tensor, "*batch 3 4"]) -> Pose:
-    return Pose.from_matrix(transform)
 
 
 def _screw_jacobian(

@@ -66,11 +66,12 @@ def test_goes_through_vmap_as_a_value():
 
 class RoundTrip(torch.nn.Module):
     def forward(self, pose: Pose) -> Pose:
-        return Pose.from_vector((pose @ pose.inverse() @ pose).vector())
+        same = Pose.from_matrix((pose @ pose.inverse() @ pose).matrix())
+        return Pose.from_vector(same.vector())
 
 
 def test_exports_for_any_batch_size():
-    pose = poses(6, rng=generator(6))
+    pose = poses(5, rng=generator(6))
     batch = torch.export.Dim("batch")
     with shapes_unchecked():
         program = torch.export.export(

@@ -1,0 +1,101 @@
+"""URDF text, and chains of pytorch-kinematics in both directions."""
+
+from xml.etree import ElementTree
+
+import pytest
+import pytorch_kinematics
+import torch
+from arm_samples import joint_positions
+from sampling import generator
+from torch.testing import assert_close
+
+from hrc_learn.kinematics import (
+    from_pytorch_kinematics,
+    panda,
+    to_pytorch_kinematics,
+)
+
+# Axes along x, -z and a slant, a fixed joint in the middle and one at the end.
+ODD_ARM = """
+<robot name="odd">
+  <link name="base"/><link name="a"/><link name="b"/><link name="plate"/><link name="c"/>
+  <link name="tip"/>
+  <joint name="one" type="revolute"><parent link="base"/><child link="a"/>
+    <origin xyz="0.1 0 0.3" rpy="0.2 0.1 -0.4"/><axis xyz="1 0 0"/>
+    <limit lower="-1" upper="2" velocity="3" effort="4"/></joint>
+  <joint name="two" type="revolute"><parent link="a"/><child link="b"/>
+    <origin xyz="0 0.2 0.1" rpy="0 0 0.7"/><axis xyz="0 0 -1"/>
+    <limit lower="-2" upper="1" velocity="5" effort="6"/></joint>
+  <joint name="bolt" type="fixed"><parent link="b"/><child link="plate"/>
+    <origin xyz="0.3 0 0" rpy="0.5 0 0"/></joint>
+  <joint name="three" type="revolute"><parent link="plate"/><child link="c"/>
+    <origin xyz="0 0 0.2" rpy="0 -1.1 0"/><axis xyz="0 0.6 0.8"/>
+    <limit lower="-3" upper="3" velocity="7" effort="8"/></joint>
+  <joint name="end" type="fixed"><parent link="c"/><child link="tip"/>
+    <origin xyz="0 0.1 0.1" rpy="0 0 0.3"/></joint>
+</robot>
+"""
+
+
+def test_urdf_lists_joints_with_their_limits():
+    robot = ElementTree.fromstring(panda.urdf())
+    joints = {joint.get("name"): joint for joint in robot.findall("joint")}
+    assert tuple(joints)[:7] == panda.joint_names
+    for i, name in enumerate(panda.joint_names):
+        limit = joints[name].find("limit")
+        assert float(limit.get("lower")) == float(panda.limits.lower[i])
+        assert float(limit.get("upper")) == float(panda.limits.upper[i])
+        assert float(limit.get("velocity")) == float(panda.limits.velocity[i])
+        assert float(limit.get("effort")) == float(panda.limits.torque[i])
+    assert {link.get("name") for link in robot.findall("link")} >= {"link0", "flange", "tcp"}
+
+
+def test_urdf_text_read_by_another_library_moves_alike():
+    """To 1e-6: pytorch-kinematics rounds what it reads to float32."""
+    q = joint_positions(50, rng=generator(1))
+    parsed = pytorch_kinematics.build_serial_chain_from_urdf(panda.urdf().encode(), "tcp")
+    parsed = parsed.to(dtype=torch.float64)
+    assert_close(
+        parsed.forward_kinematics(q).get_matrix(),
+        panda.forward(q).matrix(),
+        rtol=0,
+        atol=1e-6,
+    )
+
+
+def test_to_pytorch_kinematics_keeps_double_precision_and_names():
+    peer = to_pytorch_kinematics(panda)
+    assert tuple(peer.get_joint_parameter_names()) == panda.joint_names
+    q = joint_positions(50, rng=generator(2))
+    assert_close(
+        peer.forward_kinematics(q).get_matrix(), panda.forward(q).matrix(), rtol=0, atol=1e-14
+    )
+
+
+def test_there_and_back_again():
+    back = from_pytorch_kinematics(to_pytorch_kinematics(panda), acceleration=10.0, jerk=5000.0)
+    assert back.joint_names == panda.joint_names
+    q = joint_positions(50, rng=generator(3))
+    assert_close(back.forward(q).matrix(), panda.forward(q).matrix(), rtol=0, atol=1e-14)
+    assert_close(back.limits.upper, panda.limits.upper)
+    assert_close(back.limits.torque, panda.limits.torque)
+
+
+def test_from_pytorch_kinematics_takes_any_axis():
+    peer = pytorch_kinematics.build_serial_chain_from_urdf(ODD_ARM.encode(), "tip")
+    peer = peer.to(dtype=torch.float64)
+    arm = from_pytorch_kinematics(peer, acceleration=10.0, jerk=100.0)
+    assert arm.joint_names == ("one", "two", "three")
+    assert arm.limits.velocity.tolist() == [3, 5, 7]
+    q = torch.randn(20, 3, generator=generator(4), dtype=torch.float64)
+    pose, J = arm.forward_and_jacobian(q)
+    # 0.6, 0.8 and the origins went through float32.
+    assert_close(pose.matrix(), peer.forward_kinematics(q).get_matrix(), rtol=0, atol=1e-6)
+    assert_close(J, peer.jacobian(q), rtol=0, atol=1e-6)
+
+
+def test_sliding_joint_is_refused_by_name():
+    text = ODD_ARM.replace('name="two" type="revolute"', 'name="two" type="prismatic"')
+    peer = pytorch_kinematics.build_serial_chain_from_urdf(text.encode(), "tip")
+    with pytest.raises(ValueError, match="joint two is prismatic"):
+        from_pytorch_kinematics(peer, acceleration=10.0, jerk=100.0)
