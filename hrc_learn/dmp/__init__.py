@@ -1,0 +1,9 @@
+"""Dynamic movement primitives: learned motions that start, goal and duration reshape."""
+
+from hrc_learn.dmp.basis import GaussianBasis as GaussianBasis
+from hrc_learn.dmp.canonical import ExponentialPhase as ExponentialPhase
+from hrc_learn.dmp.joint import JointDMP as JointDMP
+from hrc_learn.dmp.report import FitReport as FitReport
+from hrc_learn.dmp.spring import SpringDamper as SpringDamper
+from hrc_learn.dmp.state import DMPState as DMPState
+from hrc_learn.dmp.trajectory import Trajectory as Trajectory

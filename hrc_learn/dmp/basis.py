@@ -1,0 +1,72 @@
+"""Gaussian basis of the forcing term."""
+
+import math
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hrc_learn.dmp.canonical import ExponentialPhase
+
+DOMAINS = ("time", "phase")
+
+
+@dataclass(frozen=True, kw_only=True)
+class GaussianBasis:
+    """Normalised Gaussians, faded by the phase z.
+
+    psi_i(x) = exp(-(x - c_i)^2 / (2 sigma_i^2)),  phi_i = psi_i z / sum_j psi_j
+
+    Centres are equally spaced in time, s_i = (i - 1) / (N - 1), so that detail is resolved
+    alike early and late; sigma_i is `width` times the distance to the next centre.
+
+    In the domain `"time"`, x = s, and one more Gaussian without a weight follows the last: as
+    it takes over, the forcing term ends with the motion, which then settles at its goal. In
+    the domain `"phase"`, x = z, as the paper has it. There all Gaussians come back in equal
+    shares as z -> 0, and the motion wanders after its end before it settles.
+    """
+
+    count: int = 50
+    """N, the number of basis functions."""
+    width: float = 0.6
+    """sigma_i as a share of the distance between neighbouring centres."""
+    domain: str = "time"
+    """What the Gaussians are spread over: `"time"` or `"phase"`."""
+    phase: ExponentialPhase = field(default_factory=ExponentialPhase)
+    """The canonical system, whose z fades the forcing term."""
+
+    def __post_init__(self):
+        if self.count < 2:
+            raise ValueError(f"a basis needs at least 2 functions, got {self.count}")
+        if not (math.isfinite(self.width) and self.width > 0):
+            raise ValueError(f"width must be positive, got {self.width}")
+        if self.domain not in DOMAINS:
+            raise ValueError(f"unknown domain {self.domain!r}; there are {', '.join(DOMAINS)}")
+
+    def centre_times(self) -> Float[Tensor, "N"]:
+        """Normalised times s_i at which the basis functions peak (float64)."""
+        return torch.linspace(0, 1, self.count, dtype=torch.float64)
+
+    def gaussians(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch N"]:
+        """Gaussians psi_i at normalised time `s`, not normalised."""
+        return self._exponents(s).exp()[..., : self.count]
+
+    def activation(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch N"]:
+        """Normalised Gaussians psi_i / sum_j psi_j at normalised time `s`."""
+        # A softmax never divides by zero, however far s lies from every centre.
+        return torch.softmax(self._exponents(s), dim=-1)[..., : self.count]
+
+    def forcing(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch N"]:
+        """What each unit weight adds to the forcing term at normalised time `s`."""
+        return self.activation(s) * self.phase(s)[..., None]
+
+    def _exponents(self, s: Tensor) -> Tensor:
+        if self.domain == "time":
+            spacing = 1 / (self.count - 1)
+            centres = spacing * torch.arange(self.count + 1, dtype=s.dtype, device=s.device)
+            return -0.5 * ((s[..., None] - centres) / (self.width * spacing)) ** 2
+        centres = self.phase(self.centre_times().to(s))
+        spacing = -centres.diff()
+        widths = self.width * torch.cat([spacing, spacing[-1:]])
+        return -0.5 * ((self.phase(s)[..., None] - centres) / widths) ** 2

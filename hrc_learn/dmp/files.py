@@ -1,0 +1,121 @@
+"""Primitives on disk: a folder with `config.json` and `model.safetensors`.
+
+Everything is written to a temporary folder beside the target and renamed at the end, so an
+interrupted save leaves the old file or none, never half of one.
+"""
+
+import json
+import os
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+FORMAT = "hrc_learn.dmp"
+VERSION = 1
+CONFIG, MODEL = "config.json", "model.safetensors"
+
+
+def write_folder(
+    folder: str | Path, kind: str, config: dict[str, Any], tensors: dict[str, Tensor]
+) -> None:
+    """Write or replace a saved primitive.
+
+    Raises:
+        ValueError: `folder` exists and is no saved primitive; it is left alone.
+    """
+    folder = Path(folder)
+    if folder.exists() and not (folder / CONFIG).is_file():
+        raise ValueError(f"{folder} exists and is no saved primitive: choose another folder")
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    try:
+        header = {"format": FORMAT, "version": VERSION, "kind": kind}
+        (temporary / CONFIG).write_text(json.dumps(header | config, indent=2) + "\n")
+        # Clones, as buffers may share memory, which safetensors refuses to write.
+        tensors = {name: t.detach().cpu().clone() for name, t in tensors.items()}
+        save_file(tensors, temporary / MODEL)
+        temporary.chmod(0o777 & ~_umask())  # mkdtemp makes it private
+        if folder.exists():
+            old = temporary / "old"
+            os.rename(folder, old)
+            try:
+                os.rename(temporary, folder)
+            except OSError:
+                os.rename(old, folder)
+                raise
+            shutil.rmtree(folder / "old")
+        else:
+            os.rename(temporary, folder)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+class SavedPrimitive:
+    """A folder read back, whose complaints name the file and the field."""
+
+    def __init__(self, folder: str | Path, kind: str):
+        self.folder = Path(folder)
+        self.config = self._read_config()
+        for field, wanted in (("format", FORMAT), ("version", VERSION), ("kind", kind)):
+            found = self.get(field, type(wanted))
+            if found != wanted:
+                raise ValueError(
+                    f"{self.folder / CONFIG}: {field} is {found!r}, this reads {wanted!r}"
+                )
+        self.tensors = self._read_tensors()
+
+    def get(self, field: str, *types: type) -> Any:
+        """Value of a field of the config, which must be of one of `types`."""
+        if field not in self.config:
+            raise ValueError(f"{self.folder / CONFIG}: field {field!r} is missing")
+        value = self.config[field]
+        if not isinstance(value, types) or isinstance(value, bool):
+            names = " or ".join(t.__name__ for t in types)
+            raise ValueError(
+                f"{self.folder / CONFIG}: field {field!r} must be {names}, got {value!r}"
+            )
+        return value
+
+    def tensor(self, name: str) -> Tensor:
+        """Tensor of that name, which must be finite."""
+        if name not in self.tensors:
+            raise ValueError(f"{self.folder / MODEL}: tensor {name!r} is missing")
+        if not self.tensors[name].isfinite().all():
+            raise ValueError(f"{self.folder / MODEL}: tensor {name!r} is not finite")
+        return self.tensors[name]
+
+    def invalid(self, complaint: object) -> ValueError:
+        """The complaint of a constructor, with the folder that caused it."""
+        return ValueError(f"{self.folder}: {complaint}")
+
+    def _read_config(self) -> dict[str, Any]:
+        path = self.folder / CONFIG
+        if not path.is_file():
+            raise FileNotFoundError(f"{path} does not exist: no primitive was saved here")
+        try:
+            config = json.loads(path.read_text())
+        except ValueError as error:
+            raise ValueError(f"{path}: not valid JSON ({error})") from None
+        if not isinstance(config, dict):
+            raise ValueError(f"{path}: must hold one JSON object")
+        return config
+
+    def _read_tensors(self) -> dict[str, Tensor]:
+        path = self.folder / MODEL
+        if not path.is_file():
+            raise FileNotFoundError(f"{path} does not exist")
+        try:
+            return load_file(path)
+        except SafetensorError as error:
+            raise ValueError(f"{path}: not a safetensors file ({error})") from None
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

@@ -1,0 +1,151 @@
+"""Fitting the weights of a primitive to sampled motions.
+
+Demonstrations sampled at the same normalised times are fitted by one matrix product.
+"""
+
+from functools import lru_cache
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hrc_learn.dmp.response import Response
+from hrc_learn.dmp.samples import Samples
+
+METHODS = ("trajectory", "ridge", "lwr")
+type Fit = tuple[Float[Tensor, "*batch D N"], Float[Tensor, "*batch D"]]
+
+
+def fit_samples(
+    method: str, response: Response, samples: Samples, regularization: float
+) -> tuple[Float[Tensor, "B D N"], Float[Tensor, "B D"]]:
+    """Weights of the unscaled forcing term and start velocity dy/ds, in float64.
+
+    Args:
+        method: `"trajectory"`, least squares on the positions themselves; `"ridge"`, ridge
+            regression on the force; `"lwr"`, locally weighted regression on the force as in
+            the paper, which fits each weight alone.
+        response: Of the primitive to be fitted.
+        samples: Of one demonstration or many.
+        regularization: Ridge, relative to the largest singular value of the design matrix.
+    """
+    if method not in METHODS:
+        raise ValueError(f"unknown method {method!r}; there are {', '.join(METHODS)}")
+    position = samples.position.double().mT
+    rate = None
+    if samples.velocity is not None:
+        rate = samples.velocity.double().mT * samples.duration[:, None, None]
+    if samples.shared:
+        return _fit(method, response, samples.s[0], position, rate, regularization)
+    fits = []
+    for i, valid in enumerate(samples.mask):
+        one_rate = None if rate is None else rate[i, :, valid]
+        s = samples.s[i, valid]
+        fits.append(_fit(method, response, s, position[i, :, valid], one_rate, regularization))
+    weights, start_rate = zip(*fits, strict=True)
+    return torch.stack(weights), torch.stack(start_rate)
+
+
+def _fit(
+    method: str,
+    response: Response,
+    s: Float[Tensor, "T"],
+    position: Float[Tensor, "*batch D T"],
+    rate: Float[Tensor, "*batch D T"] | None,
+    regularization: float,
+) -> Fit:
+    if method == "trajectory":
+        return _trajectory(response, s, position, rate, regularization)
+    if rate is None:
+        rate = differentiate(s, position)
+    goal = position[..., -1:]
+    force = differentiate(s, rate) - response.spring.acceleration(position - goal, rate)
+    solve = _ridge_operator if method == "ridge" else _lwr_operator
+    return _apply(force, solve(response, s, regularization)), rate[..., 0]
+
+
+def _apply(
+    y: Float[Tensor, "*batch D T"], K: Float[Tensor, "n T"]
+) -> Float[Tensor, "*batch D n"]:
+    """One flat product K y for every coordinate of every demonstration."""
+    return (y.reshape(-1, y.shape[-1]) @ K.T).view(*y.shape[:-1], -1)
+
+
+def differentiate(
+    s: Float[Tensor, "T"], y: Float[Tensor, "*batch T"]
+) -> Float[Tensor, "*batch T"]:
+    """dy/ds of second order on any spacing, ends included (exact for parabolas)."""
+    slope = y.diff() / s.diff()
+    h = s.diff()
+    inner = (h[1:] * slope[..., :-1] + h[:-1] * slope[..., 1:]) / (h[1:] + h[:-1])
+    first = 2 * slope[..., :1] - inner[..., :1]
+    last = 2 * slope[..., -1:] - inner[..., -1:]
+    return torch.cat([first, inner, last], dim=-1)
+
+
+def _trajectory(
+    response: Response, s: Tensor, position: Tensor, rate: Tensor | None, regularization: float
+) -> Fit:
+    """Minimise the squared distance between motion and samples; no differentiation.
+
+    Start and goal are the first and the last sample. The start velocity is the recorded one
+    or, without, fitted along.
+    """
+    K, to_weights = _trajectory_operator(
+        response, tuple(s.tolist()), s.device, rate is None, regularization
+    )
+    unknown = _apply(position, K)
+    if rate is None:
+        return unknown[..., :-1], unknown[..., -1]
+    start_rate = rate[..., 0]
+    return unknown - start_rate[..., None] * to_weights, start_rate
+
+
+@lru_cache(maxsize=16)
+def _trajectory_operator(
+    response: Response,
+    stamps: tuple[float, ...],
+    device: torch.device,
+    fit_rate: bool,
+    regularization: float,
+) -> tuple[Float[Tensor, "unknown T"], Float[Tensor, "unknown"]]:
+    """Maps samples to unknowns, and a known start velocity to what it takes off them.
+
+    With y_0 = y(0) and g = y(1) read off the samples, the residual is linear in the samples
+    too, so that one matrix does it all.
+    """
+    N = response.basis.count
+    s = torch.tensor(stamps, dtype=torch.float64, device=device)
+    H = response.evaluate(s)[:, 0]
+    velocity, start, goal = H[:, N], H[:, N + 1], H[:, N + 2]
+    # Units in which the ridge weighs all alike: late weights act through a small phase, a
+    # velocity through no double integration.
+    unit = 1 / response.basis.phase(response.basis.centre_times().to(device))
+    if fit_rate:
+        size = (H[:, :N] * unit).norm(dim=0).amax() / velocity.norm()
+        unit = torch.cat([unit, size[None]])
+    K = unit[:, None] * _ridge_inverse(H[:, : N + fit_rate] * unit, regularization)
+    from_samples = K.clone()
+    from_samples[:, 0] -= K @ start
+    from_samples[:, -1] -= K @ goal
+    return from_samples, K @ velocity
+
+
+def _ridge_operator(response: Response, s: Tensor, regularization: float) -> Tensor:
+    return _ridge_inverse(response.basis.forcing(s), regularization)
+
+
+def _lwr_operator(response: Response, s: Tensor, regularization: float) -> Tensor:
+    """w_i = (z' Gamma_i f) / (z' Gamma_i z), the paper's solution of its (Cost_i)."""
+    del regularization  # each weight is a mean of its own samples: nothing is ill-posed
+    z = response.basis.phase(s)
+    weighted = (response.basis.gaussians(s) * z[:, None]).T
+    # A Gaussian narrower than the sampling may see no sample: its weight is zero then.
+    return weighted / (weighted @ z).clamp_min(torch.finfo(s.dtype).tiny)[:, None]
+
+
+def _ridge_inverse(A: Float[Tensor, "T n"], regularization: float) -> Float[Tensor, "n T"]:
+    """(A'A + (r sigma_max)^2 I)^-1 A', by singular values: A'A is never formed."""
+    U, sigma, Vh = torch.linalg.svd(A, full_matrices=False)
+    damping = regularization * sigma[0]
+    return (Vh.T * (sigma / (sigma**2 + damping**2))) @ U.T

@@ -1,0 +1,410 @@
+"""Movement primitive of joints, or of any coordinates that add up like them."""
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from types import NoneType
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from hrc_learn.dmp.basis import GaussianBasis
+from hrc_learn.dmp.canonical import ExponentialPhase
+from hrc_learn.dmp.files import SavedPrimitive, write_folder
+from hrc_learn.dmp.fitting import fit_samples
+from hrc_learn.dmp.report import FitReport
+from hrc_learn.dmp.response import response_of
+from hrc_learn.dmp.samples import ArrayLike, check_samples
+from hrc_learn.dmp.scaling import check_paper_scale, check_scaling, forcing_scale
+from hrc_learn.dmp.spring import SpringDamper
+from hrc_learn.dmp.state import DMPState
+from hrc_learn.dmp.trajectory import Trajectory
+
+BUFFERS = ("start", "goal", "start_velocity", "duration", "amplitude", "stamps")
+
+
+class JointDMP(nn.Module):
+    """Discrete movement primitive of D coordinates under one phase.
+
+    y'' = alpha (beta (g - y) - y') + scale * sum_i phi_i(s) w_i,   s = t / duration
+
+    (paper eqs. (eq_tf), (eq_cs)), primes by s. Left alone, the motion is a linear map of
+    weights, start, start velocity and goal, computed exactly; see `Response`. Any number of
+    leading batch dimensions: one primitive each.
+    """
+
+    start: Tensor
+    goal: Tensor
+    start_velocity: Tensor
+    duration: Tensor
+    amplitude: Tensor
+    stamps: Tensor
+    joint_names: tuple[str, ...] | None
+    """Names of the D coordinates."""
+    fit_report: FitReport | None
+    """How well the fit reproduces its demonstrations."""
+
+    def __init__(
+        self,
+        *,
+        weights: Float[Tensor, "*batch D N"],
+        start: Float[Tensor, "*batch D"],
+        goal: Float[Tensor, "*batch D"],
+        start_velocity: Float[Tensor, "*batch D"],
+        duration: Float[Tensor, "*batch"],
+        amplitude: Float[Tensor, "*batch D"],
+        stamps: Float[Tensor, "*#batch T"],
+        basis: GaussianBasis,
+        spring: SpringDamper,
+        scaling: str = "none",
+        joint_names: Sequence[str] | None = None,
+        units: str = "rad",
+        fit_report: FitReport | None = None,
+    ):
+        """Put a primitive together; `fit` is the usual way to one.
+
+        Args:
+            weights: Of the scaled forcing term.
+            start: y_0, where the demonstration starts.
+            goal: g, where it ends.
+            start_velocity: Per second, at `duration`.
+            duration: tau [s].
+            amplitude: Range covered by each coordinate, for `scaling="amplitude"`.
+            stamps: Normalised times at which a rollout repeats the demonstration.
+            basis: Shape of the forcing term.
+            spring: The unforced dynamics.
+            scaling: `"none"`, `"paper"` or `"amplitude"`; see `scaling.py`.
+            joint_names: D names.
+            units: Of the coordinates.
+            fit_report: Kept for the reader.
+        """
+        super().__init__()
+        check_scaling(scaling)
+        D = weights.shape[-2]
+        if joint_names is not None and len(joint_names) != D:
+            raise ValueError(f"{len(joint_names)} joint names for {D} coordinates")
+        if weights.shape[-1] != basis.count:
+            raise ValueError(f"{weights.shape[-1]} weights for {basis.count} basis functions")
+        if start.shape != weights.shape[:-1]:
+            raise ValueError(
+                f"start has shape {tuple(start.shape)}, weights {tuple(weights.shape)}"
+            )
+        self.weights = nn.Parameter(weights)
+        buffers = (start, goal, start_velocity, duration, amplitude, stamps)
+        for name, value in zip(BUFFERS, buffers, strict=True):
+            self.register_buffer(name, value)
+        self.basis = basis
+        self.spring = spring
+        self.scaling = scaling
+        self.joint_names = None if joint_names is None else tuple(joint_names)
+        self.units = units
+        self.fit_report = fit_report
+        self.response = response_of(spring, basis)
+
+    @classmethod
+    def fit(
+        cls,
+        time: ArrayLike,
+        position: ArrayLike,
+        n_basis: int = 50,
+        velocity: ArrayLike | None = None,
+        mask: ArrayLike | None = None,
+        *,
+        method: str = "trajectory",
+        scaling: str = "none",
+        joint_names: Sequence[str] | None = None,
+        units: str = "rad",
+        basis: GaussianBasis | None = None,
+        spring: SpringDamper | None = None,
+        regularization: float = 1e-7,
+    ) -> "JointDMP":
+        """Learn one primitive from each demonstration.
+
+        Args:
+            time: Stamps [s], (T,) or (*B, T); any origin, any spacing.
+            position: (T, D) or (*B, T, D); of the shape of `time`, it is taken as D = 1. Its
+                floating dtype is the primitive's; the fit itself runs in float64.
+            n_basis: N, unless `basis` is given.
+            velocity: Recorded velocity per second, like `position`. Without it, the default
+                method fits the start velocity along and the others differentiate positions.
+            mask: (*B, T), false where a sample does not count (padding, dropouts).
+            method: `"trajectory"`, least squares on the positions, the closest
+                reproduction; `"ridge"`, regression on the force; `"lwr"`, the paper's.
+            scaling: Of the forcing term: `"none"`, `"paper"` or `"amplitude"`.
+            joint_names: D names, kept with the primitive.
+            units: Of the coordinates.
+            basis: Shape of the forcing term.
+            spring: Gains; alpha = 25, critically damped, unless given.
+            regularization: Ridge, relative to the largest singular value.
+
+        Raises:
+            ValueError: Bad samples (says which), or a scaling that the motion forbids.
+        """
+        check_scaling(scaling)
+        samples = check_samples(time, position, velocity, mask)
+        basis, spring = basis or GaussianBasis(count=n_basis), spring or SpringDamper()
+        response = response_of(spring, basis)
+        weights, rate = fit_samples(method, response, samples, regularization)
+        # One where a coordinate never moves: nothing to scale, and nothing to divide by.
+        amplitude = torch.where(samples.span > 0, samples.span, 1.0)
+        scale = forcing_scale(scaling, samples.first, samples.last, amplitude)
+        if scale is not None:
+            if scaling == "paper":
+                check_paper_scale(scale, amplitude, samples.batch, joint_names)
+            weights = weights / scale[..., None]
+
+        def batched(tensor: Tensor) -> Tensor:
+            return tensor.to(samples.position.dtype).reshape(samples.batch + tensor.shape[1:])
+
+        dmp = cls(
+            weights=batched(weights),
+            start=batched(samples.first),
+            goal=batched(samples.last),
+            start_velocity=batched(rate / samples.duration[:, None]),
+            duration=batched(samples.duration),
+            amplitude=batched(amplitude),
+            stamps=samples.s[0] if samples.shared else samples.s.reshape(*samples.batch, -1),
+            basis=basis,
+            spring=spring,
+            scaling=scaling,
+            joint_names=joint_names,
+            units=units,
+        )
+        with torch.no_grad():
+            reproduction = dmp.rollout().position.reshape(samples.position.shape)
+        dmp.fit_report = samples.compare(reproduction)
+        return dmp
+
+    def rollout(
+        self,
+        time: ArrayLike | None = None,
+        start: ArrayLike | None = None,
+        goal: ArrayLike | None = None,
+        duration: ArrayLike | None = None,
+        start_velocity: ArrayLike | None = None,
+        *,
+        speed: ArrayLike | None = None,
+    ) -> Trajectory:
+        """Motion from start to goal; without arguments, the demonstrated one.
+
+        All arguments broadcast over the batch, and gradients flow to each of them.
+
+        Args:
+            time: Since the start of the motion [s], (T,) or (*batch, T), not negative; by
+                default the stamps of the demonstration, stretched to the duration. After the
+                duration the motion settles at its goal.
+            start: (*batch, D).
+            goal: (*batch, D).
+            duration: [s], (*batch).
+            start_velocity: Per second, (*batch, D). By default the demonstrated one, changed
+                with the duration so that the path stays the same.
+            speed: Instead of a duration, how many times faster than the demonstration.
+        """
+        start, goal, rate, duration = self._boundary(
+            start, goal, duration, start_velocity, speed
+        )
+        ends = (x[..., None] for x in (rate, start, goal))
+        parts = [self._scaled_weights(start, goal), *ends]
+        batch = torch.broadcast_shapes(*(part.shape[:-1] for part in parts))
+        coordinates = torch.cat([part.expand(*batch, -1) for part in parts], dim=-1)
+        if time is None:
+            s, time = self.stamps, self.stamps * duration[..., None]
+        else:
+            time = self._as_tensor(time).double()
+            s = _normalised_time(time, duration)
+        return Trajectory(
+            time=time.to(self.weights.dtype),
+            coordinates=coordinates,
+            response=self.response,
+            s=s,
+            duration=duration,
+        )
+
+    def initial_state(
+        self,
+        start: ArrayLike | None = None,
+        goal: ArrayLike | None = None,
+        duration: ArrayLike | None = None,
+        start_velocity: ArrayLike | None = None,
+        *,
+        speed: ArrayLike | None = None,
+    ) -> DMPState:
+        """State at the start of a motion, for `step`; arguments as in `rollout`."""
+        start, goal, rate, duration = self._boundary(
+            start, goal, duration, start_velocity, speed
+        )
+        batch = torch.broadcast_shapes(
+            self.weights.shape[:-2],
+            *(x.shape[:-1] for x in (start, goal, rate)),
+            duration.shape,
+        )
+        start, goal, rate = (x.expand(*batch, -1) for x in (start, goal, rate))
+        duration = duration.expand(batch)
+        return DMPState(
+            position=start,
+            rate=rate,
+            start=start,
+            goal=goal,
+            duration=duration,
+            pace=torch.ones_like(duration),
+            s=torch.zeros_like(duration, dtype=torch.float64),
+            forced=torch.zeros_like(torch.stack([start, start], dim=-2)),
+        )
+
+    def step(
+        self,
+        state: DMPState,
+        dt: ArrayLike,
+        *,
+        goal: ArrayLike | None = None,
+        coupling: ArrayLike | None = None,
+        slowdown: ArrayLike | None = None,
+    ) -> DMPState:
+        """Advance by `dt`, exactly for whatever is constant over the step.
+
+        The motion that the forcing term causes alone is known at both ends of the step; what
+        the state differs from it dies out as the spring has it. So no step is too long, and
+        uncoupled steps end where the rollout does.
+
+        Args:
+            state: From `initial_state` or the last step.
+            dt: [s], (*batch).
+            goal: New goal from here on, (*batch, D).
+            coupling: Acceleration added to the motion, per s^2, (*batch, D).
+            slowdown: The clock of the whole system, phase and spring, runs 1 + slowdown
+                times slower, (*batch), >= 0. Slows along the path without leaving it.
+        """
+        goal = state.goal if goal is None else self._as_tensor(goal).expand_as(state.goal)
+        pace = torch.ones_like(state.pace)
+        if slowdown is not None:
+            pace = pace / (1 + self._as_tensor(slowdown))
+        ds = (self._as_tensor(dt) * pace / state.duration).double()
+        s = state.s + ds
+        # A constant push moves the point where the spring comes to rest.
+        rest = goal
+        if coupling is not None:
+            push = self._as_tensor(coupling) * state.duration[..., None] ** 2
+            rest = goal + push / self.spring.stiffness
+        forced = self.response.forced_state(s).to(goal) @ self.weights.mT
+        before, after = state.forced, forced
+        scale = forcing_scale(self.scaling, state.start, goal, self.amplitude)
+        if scale is not None:
+            before, after = before * scale[..., None, :], after * scale[..., None, :]
+        deviation = torch.stack([state.position - rest, state.rate], dim=-2) - before
+        moved = self.spring.propagator(ds).to(goal) @ deviation + after
+        return DMPState(
+            position=moved[..., 0, :] + rest,
+            rate=moved[..., 1, :],
+            start=state.start,
+            goal=goal,
+            duration=state.duration,
+            pace=pace,
+            s=s,
+            forced=forced,
+        )
+
+    def save(self, folder: str | Path) -> None:
+        """Write config.json and model.safetensors into `folder`, replacing an older save."""
+        write_folder(folder, type(self).__name__, self._config(), self._tensors())
+
+    @classmethod
+    def load(cls, folder: str | Path) -> "JointDMP":
+        """Read what `save` wrote.
+
+        Raises:
+            FileNotFoundError: No saved primitive there.
+            ValueError: Names the file and the field that is wrong.
+        """
+        return cls._restore(SavedPrimitive(folder, cls.__name__))
+
+    def _config(self) -> dict[str, Any]:
+        return {
+            "joint_names": self.joint_names,
+            "units": {"coordinates": self.units, "time": "s"},
+            "scaling": self.scaling,
+            "spring": asdict(self.spring),
+            "basis": asdict(self.basis),
+        }
+
+    def _tensors(self) -> dict[str, Tensor]:
+        report = {} if self.fit_report is None else vars(self.fit_report)
+        return dict(self.state_dict()) | {f"fit_report.{k}": v for k, v in report.items()}
+
+    @classmethod
+    def _restore(cls, saved: SavedPrimitive) -> "JointDMP":
+        spring = saved.get("spring", dict)
+        basis = dict(saved.get("basis", dict))
+        try:
+            basis["phase"] = ExponentialPhase(**basis["phase"])
+            parts = {"spring": SpringDamper(**spring), "basis": GaussianBasis(**basis)}
+        except (KeyError, TypeError, ValueError) as error:
+            raise saved.invalid(f"field 'spring' or 'basis': {error}") from None
+        arguments = {
+            **{name: saved.tensor(name) for name in ("weights", *BUFFERS)},
+            "scaling": saved.get("scaling", str),
+            "joint_names": saved.get("joint_names", list, NoneType),
+            "units": saved.get("units", dict).get("coordinates", ""),
+        }
+        if "fit_report.rmse" in saved.tensors:
+            report = {k: saved.tensor(f"fit_report.{k}") for k in ("rmse", "peak", "span")}
+            arguments["fit_report"] = FitReport(**report)
+        try:
+            return cls(**parts, **arguments)
+        except ValueError as error:
+            raise saved.invalid(error) from None
+
+    def _boundary(
+        self,
+        start: ArrayLike | None,
+        goal: ArrayLike | None,
+        duration: ArrayLike | None,
+        start_velocity: ArrayLike | None,
+        speed: ArrayLike | None,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Start, goal, dy/ds at the start, and duration."""
+        start = self.start if start is None else self._coordinates("start", start)
+        goal = self.goal if goal is None else self._coordinates("goal", goal)
+        if duration is not None and speed is not None:
+            raise ValueError("give a duration or a speed, not both")
+        if speed is not None:
+            duration = self.duration / self._positive("speed", speed)
+        elif duration is not None:
+            duration = self._positive("duration", duration)
+        if start_velocity is None:
+            rate = self.start_velocity * self.duration[..., None]
+        else:
+            velocity = self._coordinates("start_velocity", start_velocity)
+            rate = velocity * (self.duration if duration is None else duration)[..., None]
+        return start, goal, rate, self.duration if duration is None else duration
+
+    def _scaled_weights(self, start: Tensor, goal: Tensor) -> Tensor:
+        scale = forcing_scale(self.scaling, start, goal, self.amplitude)
+        return self.weights if scale is None else self.weights * scale[..., None]
+
+    def _coordinates(self, name: str, value: ArrayLike) -> Tensor:
+        tensor = self._as_tensor(value)
+        D = self.weights.shape[-2]
+        if tensor.ndim == 0 or tensor.shape[-1] != D:
+            raise ValueError(f"{name} must have shape (..., {D}), got {tuple(tensor.shape)}")
+        return tensor
+
+    def _positive(self, name: str, value: ArrayLike) -> Tensor:
+        tensor = self._as_tensor(value)
+        if not (tensor > 0).all():
+            raise ValueError(f"{name} must be positive, got {tensor.min().item()}")
+        return tensor
+
+    def _as_tensor(self, value: ArrayLike) -> Tensor:
+        return torch.as_tensor(value, dtype=self.weights.dtype, device=self.weights.device)
+
+
+def _normalised_time(time: Tensor, duration: Tensor) -> Tensor:
+    if time.ndim == 0 or not (time >= 0).all():
+        raise ValueError("time must be an array of seconds since the start, none negative")
+    s = time / duration.double()[..., None]
+    # Rows that are all alike need one response matrix, not one each.
+    if s.ndim > 1 and not s.requires_grad and (s == s.reshape(-1, s.shape[-1])[0]).all():
+        return s.reshape(-1, s.shape[-1])[0]
+    return s

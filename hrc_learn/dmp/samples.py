@@ -1,0 +1,184 @@
+"""Demonstrations as a primitive takes them: checked, batched, in normalised time."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from hrc_learn.dmp.report import FitReport
+
+type ArrayLike = Tensor | np.ndarray | list | tuple | float
+MINIMUM_SAMPLES = 3
+
+
+@dataclass(frozen=True, kw_only=True)
+class Samples:
+    """Sampled demonstrations on a flat batch, padded where `mask` is false."""
+
+    batch: tuple[int, ...]
+    """The batch shape that was flattened to B."""
+    s: Float[Tensor, "B T"]
+    """Time since the first sample over the duration, 0 to 1, never falling (float64)."""
+    duration: Float[Tensor, "B"]
+    """First to last sample [s] (float64)."""
+    position: Float[Tensor, "B T D"]
+    velocity: Float[Tensor, "B T D"] | None
+    mask: Bool[Tensor, "B T"]
+
+    @property
+    def first(self) -> Float[Tensor, "B D"]:
+        """Position at the first sample that counts."""
+        index = self.mask.long().argmax(-1)
+        return self.position[torch.arange(len(index), device=index.device), index]
+
+    @property
+    def last(self) -> Float[Tensor, "B D"]:
+        """Position at the last sample that counts."""
+        index = self.mask.shape[-1] - 1 - self.mask.flip(-1).long().argmax(-1)
+        return self.position[torch.arange(len(index), device=index.device), index]
+
+    @property
+    def span(self) -> Float[Tensor, "B D"]:
+        """Range that each coordinate covers."""
+        valid = self.mask[..., None]
+        high = self.position.masked_fill(~valid, -torch.inf).amax(-2)
+        return high - self.position.masked_fill(~valid, torch.inf).amin(-2)
+
+    @property
+    def shared(self) -> bool:
+        """Whether all demonstrations are sampled alike, so that one solve serves all."""
+        # 1e-12 of the motion: stamps that differ by the rounding of a start time are alike.
+        return bool(self.mask.all()) and bool(((self.s - self.s[:1]).abs() < 1e-12).all())
+
+    def compare(self, reproduction: Float[Tensor, "B T D"]) -> FitReport:
+        """Residuals of a reproduction, on the samples that count."""
+        valid = self.mask[..., None]
+        error = (reproduction - self.position).masked_fill(~valid, 0)
+        residuals = {
+            "rmse": (error.square().sum(-2) / valid.sum(-2)).sqrt(),
+            "peak": error.abs().amax(-2),
+            "span": self.span,
+        }
+        return FitReport(**{k: v.reshape(*self.batch, -1) for k, v in residuals.items()})
+
+
+def check_samples(
+    time: ArrayLike,
+    position: ArrayLike,
+    velocity: ArrayLike | None = None,
+    mask: ArrayLike | None = None,
+) -> Samples:
+    """Check and batch what the caller recorded.
+
+    Args:
+        time: Stamps [s], (T,) or (*B, T); any origin, any spacing.
+        position: (T,), (T, D) or (*B, T, D). Of the same shape as `time`: D = 1.
+        velocity: Like `position`, or None.
+        mask: Like `time`, true where a sample counts; None: all do. The others may hold
+            anything, NaN included.
+
+    Raises:
+        ValueError: Shapes that do not fit, values that are not finite, time that does not
+            increase, fewer than 3 samples; says where.
+    """
+    position = _floating(position)
+    time = torch.as_tensor(time, device=position.device).double()
+    if position.ndim == 0 or time.ndim == 0:
+        raise ValueError("time and position need a sample axis, got a single number")
+    if position.shape == time.shape:
+        position = position[..., None]
+        velocity = None if velocity is None else torch.as_tensor(velocity)[..., None]
+    if position.ndim < 2:
+        raise ValueError(f"{_shapes(time, position)}: expected (T,) and (T, D)")
+    *batch, T, D = position.shape
+    time = _fit_shape("time", time, (*batch, T), position)
+    mask = torch.ones_like(time) if mask is None else torch.as_tensor(mask, device=time.device)
+    mask = _fit_shape("mask", mask.bool(), (*batch, T), position)
+    if position.numel() == 0:
+        raise ValueError(f"position has shape {(*batch, T, D)}: there is nothing to fit")
+    time, mask = time.reshape(-1, T), mask.reshape(-1, T)
+    position = position.reshape(-1, T, D)
+
+    enough = mask.sum(-1) >= MINIMUM_SAMPLES
+    if not enough.all():
+        i = int((~enough).nonzero()[0])
+        raise ValueError(
+            f"{demo_label(i, batch)}a motion needs at least {MINIMUM_SAMPLES} samples, "
+            f"got {int(mask[i].sum())}"
+        )
+    _check_finite("time", time[..., None], mask, batch)
+    _check_finite("position", position, mask, batch)
+    if velocity is not None:
+        velocity = torch.as_tensor(velocity).to(position)
+        velocity = _fit_shape("velocity", velocity, (*batch, T, D), position).reshape(-1, T, D)
+        _check_finite("velocity", velocity, mask, batch)
+        velocity = velocity.masked_fill(~mask[..., None], 0)
+    position = position.masked_fill(~mask[..., None], 0)
+    s, duration = _normalised(time, mask, batch)
+    return Samples(
+        batch=tuple(batch),
+        s=s,
+        duration=duration,
+        position=position,
+        velocity=velocity,
+        mask=mask,
+    )
+
+
+def _floating(values: ArrayLike) -> Tensor:
+    tensor = torch.as_tensor(values)
+    return tensor if tensor.is_floating_point() else tensor.to(torch.get_default_dtype())
+
+
+def _fit_shape(name: str, values: Tensor, shape: tuple[int, ...], position: Tensor) -> Tensor:
+    try:
+        return values.expand(shape)
+    except RuntimeError:
+        raise ValueError(
+            f"{name} has shape {tuple(values.shape)}, position {tuple(position.shape)}: "
+            f"{name} must be {shape}, without any leading axes it shares with all"
+        ) from None
+
+
+def _shapes(time: Tensor, position: Tensor) -> str:
+    return f"time has shape {tuple(time.shape)}, position {tuple(position.shape)}"
+
+
+def _check_finite(name: str, values: Tensor, mask: Tensor, batch: list[int]) -> None:
+    bad = ~values.isfinite() & mask[..., None]
+    if bad.any():
+        i, k, column = bad.nonzero()[0].tolist()
+        where = f"sample {k}" if name == "time" else f"sample {k}, column {column}"
+        raise ValueError(
+            f"{demo_label(i, batch)}{name} is {values[i, k, column].item()} at {where}"
+        )
+
+
+def _normalised(time: Tensor, mask: Tensor, batch: list[int]) -> tuple[Tensor, Tensor]:
+    first = time.masked_fill(~mask, torch.inf).amin(-1, keepdim=True)
+    last = time.masked_fill(~mask, -torch.inf).amax(-1, keepdim=True)
+    elapsed = (time - first).masked_fill(~mask, 0)
+    # Samples that do not count repeat the stamp before them, so that stamps never fall.
+    latest = torch.cat([torch.full_like(first, -1.0), elapsed.cummax(-1).values], dim=-1)
+    stalled = mask & (elapsed <= latest[..., :-1])
+    # The first sample that counts has zero elapsed time, as have the filled ones before it.
+    stalled &= mask.long().cumsum(-1) > 1
+    if stalled.any():
+        i, k = stalled.nonzero()[0].tolist()
+        raise ValueError(
+            f"{demo_label(i, batch)}time must increase, but is {time[i, k].item():.6f} s "
+            f"at sample {k} after {(latest[i, k] + first[i, 0]).item():.6f} s"
+        )
+    duration = last - first
+    return elapsed.cummax(-1).values / duration, duration[..., 0]
+
+
+def demo_label(index: int, batch: Sequence[int]) -> str:
+    """Prefix of a message that says which of a flat batch of demonstrations it is about."""
+    if not batch:
+        return ""
+    place = tuple(int(k) for k in np.unravel_index(index, batch))
+    return f"demonstration {place[0] if len(place) == 1 else place}: "

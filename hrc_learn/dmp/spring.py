@@ -1,0 +1,61 @@
+"""The transformation system without its forcing term: a spring and a damper."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpringDamper:
+    """y'' = alpha (beta (g - y) - y'), solved exactly for any gains.
+
+    (paper eq. (eq_tf)); primes are derivatives by s = t / tau. With x = (y - g, y') this
+    is x' = A x, A = [[0, 1], [-alpha beta, -alpha]].
+    """
+
+    alpha: float = 25.0
+    """Damping gain alpha_q."""
+    beta: float = math.nan
+    """Spring gain beta_q; alpha / 4, critical damping, unless given."""
+
+    def __post_init__(self):
+        if math.isnan(self.beta):
+            object.__setattr__(self, "beta", self.alpha / 4)
+        for name in ("alpha", "beta"):
+            gain = getattr(self, name)
+            if not (math.isfinite(gain) and gain > 0):
+                raise ValueError(f"{name} must be positive for stability, got {gain}")
+
+    @property
+    def stiffness(self) -> float:
+        """Alpha beta."""
+        return self.alpha * self.beta
+
+    def acceleration(self, offset: Tensor, velocity: Tensor) -> Tensor:
+        """Y'' of the unforced system, `offset` being y - g."""
+        return -self.stiffness * offset - self.alpha * velocity
+
+    def propagator(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 2 2"]:
+        """Transition matrix exp(A s): maps (y - g, y') at 0 to the same at `s`.
+
+        exp(A s) = exp(-alpha s / 2) (C I + S (A + alpha / 2 I)) by Cayley-Hamilton, where
+        C, S are cosh, sinh, their trigonometric twins, or 1, s at critical damping.
+        """
+        half = self.alpha / 2
+        discriminant = half**2 - self.stiffness
+        rate = math.sqrt(abs(discriminant))
+        if rate < 1e-6 * half:
+            C = torch.exp(-half * s)
+            S = s * C
+        elif discriminant > 0:
+            # Both exponents are negative: unlike cosh, nothing overflows at large s.
+            slow, fast = torch.exp((rate - half) * s), torch.exp((-rate - half) * s)
+            C, S = (slow + fast) / 2, (slow - fast) / (2 * rate)
+        else:
+            envelope = torch.exp(-half * s)
+            C, S = envelope * torch.cos(rate * s), envelope * torch.sin(rate * s) / rate
+        rows = [C + half * S, S, -self.stiffness * S, C - half * S]
+        return torch.stack(rows, dim=-1).unflatten(-1, (2, 2))

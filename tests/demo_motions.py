@@ -1,0 +1,24 @@
+"""Synthetic demonstrations with known properties, for tests of movement primitives."""
+
+import torch
+
+
+def minimum_jerk(s):
+    """Quintic from 0 to 1 that starts and ends at rest."""
+    return s**3 * (10 - 15 * s + 6 * s**2)
+
+
+def arm_motion(n_samples=400, n_joints=7, duration=3.0, seed=0, moving_start=False):
+    """Time (T,) [s] and smooth joint positions (T, D) [rad]; nothing here is a DMP."""
+    rng = torch.Generator().manual_seed(seed)
+
+    def rand(*shape):
+        return 2 * torch.rand(*shape, generator=rng, dtype=torch.float64) - 1
+
+    s = torch.linspace(0, 1, n_samples, dtype=torch.float64)
+    start, goal = rand(n_joints), rand(n_joints)
+    position = start + minimum_jerk(s)[:, None] * (goal - start)
+    for k in (1, 2, 3):
+        bump = (k * torch.pi * s).sin() ** (1 if moving_start else 3)
+        position = position + 0.2 * bump[:, None] * rand(n_joints)
+    return s * duration, position

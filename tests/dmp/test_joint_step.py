@@ -1,0 +1,79 @@
+import dataclasses
+
+import pytest
+import torch
+from demo_motions import arm_motion
+
+from hrc_learn.dmp import JointDMP, SpringDamper
+
+
+@pytest.mark.parametrize("n_steps", [1, 20, 1000])
+@pytest.mark.parametrize("scaling", ["none", "paper"])
+def test_steps_end_where_the_rollout_does(n_steps, scaling):
+    time, position = arm_motion(moving_start=True)
+    dmp = JointDMP.fit(time, position, scaling=scaling)
+    goal = position[-1] + 0.2
+    state = dmp.initial_state(goal=goal, duration=2.0)
+    with torch.no_grad():
+        for _ in range(n_steps):
+            state = dmp.step(state, 2.2 / n_steps)
+    end = dmp.rollout(time=[2.2], goal=goal, duration=2.0)
+    torch.testing.assert_close(state.position, end.position[0], rtol=0, atol=1e-9)
+    torch.testing.assert_close(state.velocity, end.velocity[0], rtol=0, atol=1e-9)
+
+
+def test_steps_of_any_length_in_any_order():
+    time, position = arm_motion()
+    dmp = JointDMP.fit(time, position)
+    state = dmp.initial_state(speed=1.5)
+    elapsed = 0.0
+    for dt in (0.001, 0.3, 0.05, 0.0, 0.7, 1e-6):
+        state = dmp.step(state, dt)
+        elapsed += dt
+        there = dmp.rollout(time=torch.tensor([elapsed], dtype=torch.float64), speed=1.5)
+        torch.testing.assert_close(state.position, there.position[0], rtol=0, atol=1e-9)
+
+
+def test_a_pushed_robot_comes_back_to_the_goal():
+    time, position = arm_motion()
+    dmp = JointDMP.fit(time, position)
+    state = dmp.step(dmp.initial_state(), 1.0)
+    state = dataclasses.replace(state, position=state.position + 0.5)
+    for _ in range(50):
+        state = dmp.step(state, 0.1)
+    torch.testing.assert_close(state.position, dmp.goal, rtol=0, atol=1e-6)
+
+
+def test_a_goal_that_moves_on_the_way_is_reached():
+    time, position = arm_motion()
+    dmp = JointDMP.fit(time, position)
+    goal = torch.zeros(7, dtype=torch.float64)
+    state = dmp.step(dmp.initial_state(), 1.0)
+    before = state.position
+    state = dmp.step(state, 0.0, goal=goal)
+    torch.testing.assert_close(state.position, before)
+    for _ in range(50):
+        state = dmp.step(state, 0.1)
+    torch.testing.assert_close(state.position, goal, rtol=0, atol=1e-6)
+
+
+def test_slowing_down_stays_on_the_path():
+    time, position = arm_motion(moving_start=True)
+    dmp = JointDMP.fit(time, position)
+    state = dmp.initial_state()
+    for k in range(20):
+        state = dmp.step(state, 0.1, slowdown=3.0 if k % 2 else None)
+    on_path = dmp.rollout(time=3.0 * state.s[None])
+    torch.testing.assert_close(state.position, on_path.position[0], rtol=0, atol=1e-9)
+    torch.testing.assert_close(4 * state.velocity, on_path.velocity[0], rtol=0, atol=1e-9)
+
+
+def test_a_constant_push_shifts_the_resting_point():
+    """At rest, spring force balances the push: alpha beta (y - g) = tau^2 c."""
+    time, position = arm_motion()
+    dmp = JointDMP.fit(time, position, spring=SpringDamper(alpha=20.0))
+    state = dmp.initial_state()
+    for _ in range(100):
+        state = dmp.step(state, 0.1, coupling=torch.full((7,), 0.4))
+    shift = torch.full((7,), 0.4 * 3.0**2 / 100, dtype=torch.float64)
+    torch.testing.assert_close(state.position - dmp.goal, shift, rtol=0, atol=1e-6)
