@@ -1,5 +1,7 @@
 """Demonstrations: recorded as LeRobot datasets, read back as plain arrays, checked."""
 
+from .check import check_dataset as check_dataset
+from .checks.report import Report as Report
 from .demonstration import Demonstration as Demonstration
 from .demonstration_set import DemonstrationSet as DemonstrationSet
 from .finding import DatasetError as DatasetError

@@ -32,6 +32,11 @@ def read_frames(
         yield from _read_file(folder, file, list(group), keys)
 
 
+def slice_frames(columns: RawFrames, start: int, length: int) -> RawFrames:
+    """The columns of one episode as views into those of its file."""
+    return {key: values[start : start + length] for key, values in columns.items()}
+
+
 def _read_file(
     folder: DatasetFolder, file: str, entries: list[EpisodeEntry], keys: Sequence[str]
 ) -> Iterator[tuple[EpisodeEntry, RawFrames]]:
@@ -61,8 +66,7 @@ def _read_file(
             ) from error
         _require_width(folder, file, key, columns[key])
     for entry in entries:
-        start = entry.start - rows.start
-        frames = {key: values[start : start + entry.length] for key, values in columns.items()}
+        frames = slice_frames(columns, entry.start - rows.start, entry.length)
         _require_episode(file, entry, frames)
         yield entry, frames
 

@@ -247,7 +247,7 @@ def _episodes_v3(root: Path, info: dict) -> Iterable[EpisodeEntry]:
     first_row: dict[tuple, int] = {}
     for row in rows:
         place = row["data/chunk_index"], row["data/file_index"]
-        start = row["dataset_from_index"]
+        start = int(row["dataset_from_index"])
         first_row[place] = min(first_row.get(place, start), start)
     for row in rows:
         chunk, file = row["data/chunk_index"], row["data/file_index"]

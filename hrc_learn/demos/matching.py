@@ -30,6 +30,8 @@ class Matching:
     """Numeric features with components that no role took."""
     notes: tuple[str, ...]
     """What had to be guessed or left out."""
+    unmatched: dict[str, tuple[str, ...]]
+    """Quantities of other joints than `joint_names`: role -> their joints."""
 
 
 def match_columns(
@@ -60,14 +62,25 @@ def match_columns(
     else:
         found = _by_convention(usable, notes)
     found = _override(found, mapping or {}, usable)
-    names, found = _align_joints(found, notes)
+    names, found, unmatched = _align_joints(found)
+    notes.extend(
+        f"{role} is of other joints ({', '.join(others)}) than the rest ({', '.join(names)}); "
+        f"left among the extra columns"
+        for role, others in unmatched.items()
+    )
     taken = {column for selection in found.values() for column in selection.columns}
     extra = [
         key
         for key, feature in usable.items()
         if any((key, index) not in taken for index in range(feature.width))
     ]
-    return Matching(selections=found, joint_names=names, extra=tuple(extra), notes=tuple(notes))
+    return Matching(
+        selections=found,
+        joint_names=names,
+        extra=tuple(extra),
+        notes=tuple(notes),
+        unmatched=unmatched,
+    )
 
 
 def _override(
@@ -202,13 +215,17 @@ def _is_command(feature: Feature) -> bool:
 
 
 def _align_joints(
-    found: dict[str, Selection], notes: list[str]
-) -> tuple[tuple[str, ...], dict[str, Selection]]:
-    """Bring every quantity that goes by joints into the order of the first such one."""
+    found: dict[str, Selection],
+) -> tuple[tuple[str, ...], dict[str, Selection], dict[str, tuple[str, ...]]]:
+    """Bring every quantity that goes by joints into the order of the first such one.
+
+    Returns:
+        The joints, the quantities in their order, and the joints of those that have others.
+    """
     first = next((found[role] for role in JOINT_FIELDS if role in found), None)
     if first is None:
-        return (), found
-    aligned = {}
+        return (), found, {}
+    aligned, unmatched = {}, {}
     for role, selection in found.items():
         if role not in JOINT_FIELDS or selection.labels == first.labels:
             aligned[role] = selection
@@ -219,11 +236,8 @@ def _align_joints(
         ):
             aligned[role] = replace(selection, labels=first.labels)
         else:
-            notes.append(
-                f"{role} is of other joints ({', '.join(selection.labels)}) than "
-                f"{first.role} ({', '.join(first.labels)}); left among the extra columns"
-            )
-    return _joint_names(first, aligned), aligned
+            unmatched[role] = selection.labels
+    return _joint_names(first, aligned), aligned, unmatched
 
 
 def _joint_names(first: Selection, aligned: Mapping[str, Selection]) -> tuple[str, ...]:

@@ -5,7 +5,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64
 
 from .demonstration import JOINT_FIELDS, Demonstration, joint_columns
 from .demonstration_set import DemonstrationSet
@@ -15,13 +14,11 @@ from .frames import RawFrames, read_frames
 from .layout import DatasetFolder, EpisodeEntry, open_folder
 from .matching import Matching, match_columns
 from .poses import matrix_position, to_quaternion
+from .quantities import Quantities, select_quantities
 from .roles import ORIENTATION_ROLES
 from .sidecar import read_sidecar
 from .stamps import stamps
 from .units import UnitDecision, decide_units
-
-Quantities = dict[str, Float64[np.ndarray, "frames components"]]
-"""Role -> values of one episode."""
 
 
 def load_demos(
@@ -98,10 +95,7 @@ def _read_quantities(
     for entry, frames in read_frames(folder, ordered, sorted(keys | {*matching.extra})):
         if not entry.length:
             raise DatasetError("has no frames", file=entry.file, episode=entry.index)
-        quantities = {
-            role: _columns(frames, selection.columns)
-            for role, selection in matching.selections.items()
-        }
+        quantities = select_quantities(frames, matching.selections)
         _refuse_non_finite(entry, quantities, matching)
         read[entry.index] = frames, quantities
     return read
@@ -109,19 +103,6 @@ def _read_quantities(
 
 def _place(entry: EpisodeEntry) -> tuple[str, int]:
     return entry.file, entry.start
-
-
-def _columns(
-    frames: RawFrames, columns: Sequence[tuple[str, int]]
-) -> Float64[np.ndarray, "frames components"]:
-    keys = {key for key, _ in columns}
-    if len(keys) > 1:
-        return np.stack([frames[key][:, index] for key, index in columns], axis=1).astype(float)
-    indices = [index for _, index in columns]
-    values = frames[keys.pop()]
-    if indices == list(range(indices[0], indices[-1] + 1)):  # a view, copied once only
-        return values[:, indices[0] : indices[-1] + 1].astype(float)
-    return values[:, indices].astype(float)
 
 
 def _refuse_non_finite(entry: EpisodeEntry, quantities: Quantities, matching: Matching) -> None:

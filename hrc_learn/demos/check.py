@@ -1,0 +1,98 @@
+"""Examining a dataset before anything is learned from it."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from .checks import motion, structure, timing, values
+from .checks.meaning import Understood, check_joint_sets, understand
+from .checks.report import Report
+from .explicit_mapping import MappingSpec
+from .finding import DatasetError
+from .frames import RawFrames
+from .layout import DatasetFolder, EpisodeEntry
+from .matching import Matching
+
+
+def check_dataset(
+    path: str | Path,
+    mapping: MappingSpec | None = None,
+    units: Mapping[str, str] | None = None,
+    speed_limits: Mapping[str, float] | None = None,
+) -> Report:
+    """Examine a LeRobot dataset of version 2.0, 2.1 or 3.0.
+
+    Whatever can be read is looked at, whatever else is broken.
+
+    Args:
+        path: The dataset's folder.
+        mapping: Where quantities are that are not found by name, as in `load_demos`.
+        units: Units on disk by role, as in `load_demos`.
+        speed_limits: Fastest each joint can turn [rad/s], by name; 12 rad/s where not given.
+    """
+    report = Report(path=Path(path))
+    folder = structure.check_metadata(report.path, report)
+    if folder is None:
+        return report
+    episodes = _check_frames(folder, report)
+    report.episodes = len(episodes)
+    report.frames = sum(entry.length for entry, _ in episodes)
+    values.check_columns(folder, episodes, report)
+    try:
+        matching, understood = understand(folder, episodes, mapping or {}, units or {}, report)
+    except DatasetError as error:
+        report.add(error)
+        return report
+    check_joint_sets(matching, report)
+    for episode in understood:
+        _check_episode(folder, episode, matching, speed_limits or {}, report)
+    moving = [(episode.entry, _motion(episode)) for episode in understood]
+    motion.check_duplicates([(e, m) for e, m in moving if m is not None], report)
+    return report
+
+
+def _check_frames(
+    folder: DatasetFolder, report: Report
+) -> list[tuple[EpisodeEntry, RawFrames]]:
+    """Everything that needs no understanding of the columns."""
+    sound = []
+    for file in dict.fromkeys(entry.file for entry in folder.episodes):
+        for entry, frames in structure.check_file(folder, file, report):
+            structure.check_indices(folder, entry, frames, report)
+            values.check_finite(folder.features, entry, frames, report)
+            values.check_repeats(entry, frames, report)
+            timing.check_length(entry, folder.fps, report)
+            if "timestamp" in frames:
+                stamps = frames["timestamp"][:, 0].astype(float)
+                timing.check_stamps(entry, "timestamp", stamps, folder.fps, report)
+            sound.append((entry, frames))
+    return sound
+
+
+def _check_episode(
+    folder: DatasetFolder,
+    episode: Understood,
+    matching: Matching,
+    speed_limits: Mapping[str, float],
+    report: Report,
+) -> None:
+    entry, time, quantities = episode.entry, episode.time, episode.quantities
+    if "time" in quantities:
+        timing.check_stamps(entry, "time", time, folder.fps, report)
+    if (np.diff(time) <= 0).any():
+        return  # reported as an error; speeds make no sense
+    moving = _motion(episode)
+    if moving is not None:
+        motion.check_stillness(entry, time, moving, report)
+    joints = quantities.get("joint_position")
+    if joints is None:
+        return
+    motion.check_jumps(entry, time, joints, matching.joint_names, speed_limits, report)
+    if "command_position" in quantities:
+        motion.check_commands(entry, joints, quantities["command_position"], report)
+
+
+def _motion(episode: Understood) -> np.ndarray | None:
+    """What moves: the joints, or the position where no joints are known."""
+    return episode.quantities.get("joint_position", episode.quantities.get("position"))

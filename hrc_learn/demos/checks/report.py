@@ -1,0 +1,52 @@
+"""The findings about one dataset."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from ..finding import DatasetError, Finding
+
+
+@dataclass(kw_only=True)
+class Report:
+    """What is wrong with a dataset (errors), and what is odd (warnings)."""
+
+    path: Path
+    errors: list[Finding] = field(default_factory=list)
+    """Faults that lose data or mislead a reader."""
+    warnings: list[Finding] = field(default_factory=list)
+    """Oddities worth a look before training."""
+    episodes: int = 0
+    """Episodes whose frames could be read."""
+    frames: int = 0
+    """Frames of those episodes."""
+
+    @property
+    def ok(self) -> bool:
+        """Whether there are no errors; warnings are allowed."""
+        return not self.errors
+
+    def error(self, message: str, **place) -> None:
+        """Add an error; `place` as in `Finding`."""
+        self.errors.append(Finding(message=message, **place))
+
+    def warning(self, message: str, **place) -> None:
+        """Add a warning; `place` as in `Finding`."""
+        self.warnings.append(Finding(message=message, **place))
+
+    def add(self, error: DatasetError) -> None:
+        """Add what a reading function raised."""
+        if error.finding not in self.errors:
+            self.errors.append(error.finding)
+
+    def lines(self) -> Iterator[str]:
+        """The report in words, a line a finding."""
+        for kind, findings in (("error", self.errors), ("warning", self.warnings)):
+            yield from (f"{kind}: {finding}" for finding in findings)
+        yield (
+            f"{self.path}: {self.episodes} episodes, {self.frames} frames, "
+            f"{len(self.errors)} errors, {len(self.warnings)} warnings"
+        )
+
+    def __str__(self) -> str:
+        return "\n".join(self.lines())
