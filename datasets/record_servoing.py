@@ -1,0 +1,73 @@
+"""Record demonstrations of aiming at an object in the image of an uncalibrated camera.
+
+The scripted expert moves the marked hand about over the table and ends right above an object.
+The camera's pose and lens are in none of the columns. Writes a LeRobot dataset of version 3.0.
+"""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from rich.progress import track
+
+from hrc_learn import cli
+from hrc_learn.demos import DatasetWriter
+from hrc_learn.kinematics import panda
+from hrc_learn.sim import CameraKind, World, open_camera
+from hrc_learn.tasks import (
+    OBJECT_FEATURE,
+    OBJECT_FEATURE_NAMES,
+    AimingLesson,
+    Eye,
+    Workplace,
+    teach_aiming,
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args:
+    """What to record."""
+
+    out: Path
+    """Folder of the new dataset; it must not exist."""
+    episodes: int = 8
+    """Demonstrations to record."""
+    camera: CameraKind = "synthetic"
+    """Camera: rendered by "egl", or "synthetic", which draws the markers only but is fast."""
+    lesson: AimingLesson = field(default_factory=AimingLesson)
+    """How the expert teaches."""
+    seed: int = 1
+    """Seed of objects, paths and image noise."""
+    json: Path | None = None
+    """File for the measured values."""
+
+
+def main(args: Args) -> None:
+    workplace = Workplace()
+    world = World(workplace.scene)
+    rng = np.random.default_rng(args.seed)
+    eye = Eye.on(open_camera(world, args.camera, rng=rng), workplace.scene)
+    seen = []
+    with DatasetWriter(
+        args.out,
+        fps=args.lesson.fps,
+        robot_type="panda",
+        joint_names=panda.joint_names,
+        features={OBJECT_FEATURE: OBJECT_FEATURE_NAMES},
+        frames={"base": "panda_link0", "ee": "panda_hand_tcp"},
+        details={"scene": "hrc_learn workplace"},
+    ) as writer:
+        for _ in track(range(args.episodes), description="Aiming demonstrations"):
+            frames = teach_aiming(world, workplace, eye, args.lesson, rng)
+            writer.start_episode("aim at the box")
+            for frame in frames:
+                writer.add_frame(**frame)
+            writer.save_episode()
+            seen.append(float(np.mean([frame["feature_visible"] for frame in frames])))
+    print(f"{args.episodes} demonstrations in {args.out}, marker seen {100 * min(seen):.0f} %")
+    if args.json is not None:
+        cli.write_json(args.json, {"episodes": args.episodes, "marker_seen_min": min(seen)})
+
+
+if __name__ == "__main__":
+    cli.run(main, Args)

@@ -1,0 +1,242 @@
+"""The workplace: arm, table with objects, a cabinet with three shelves, a fixed camera.
+
+The robot stands at the origin. To its left (+y) is the table, which people share; to its
+right (-y) the cabinet, whose open door stands in the way of a careless elbow.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
+import mujoco
+import numpy as np
+
+from ..vision import CameraModel, Marker
+from .markers import Plate, add_plate
+from .panda_model import PandaModelConfig, add_panda
+
+_BOX = mujoco.mjtGeom.mjGEOM_BOX
+
+HAND_MARKER = 7
+"""ArUco number of the plate on the hand."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Box:
+    """A fixed box, axes along the base frame's."""
+
+    name: str
+    centre: tuple[float, float, float]
+    """[m]"""
+    half_size: tuple[float, float, float]
+    """[m]"""
+    rgba: tuple[float, float, float, float] = (0.75, 0.62, 0.45, 1.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CabinetConfig:
+    """A cabinet that opens towards +y, with a door that stands open at right angles."""
+
+    left: float = 0.12
+    """x of the inner face of the left wall, where the door hangs [m]."""
+    right: float = 0.72
+    """x of the inner face of the right wall [m]."""
+    front: float = -0.50
+    """y of the boards' front edges [m]."""
+    depth: float = 0.36
+    """[m]"""
+    bottom: float = -0.72
+    """Foot of the walls, below the robot's base [m]."""
+    top: float = 0.86
+    """Top of the walls [m]."""
+    shelves: Mapping[str, float] = field(
+        default_factory=lambda: MappingProxyType({"lower": 0.12, "middle": 0.36, "upper": 0.60})
+    )
+    """Height of each board's upper face, by name [m]."""
+    thickness: float = 0.02
+    """Of boards and walls [m]."""
+    door_reach: float = 0.34
+    """How far the open door stands out of the cabinet [m]."""
+
+    def boxes(self) -> list[Box]:
+        """Boards, walls, back and door."""
+        x, w = (self.left + self.right) / 2, (self.right - self.left) / 2
+        y, d = self.front - self.depth / 2, self.depth / 2
+        t, z, h = self.thickness / 2, (self.top + self.bottom) / 2, (self.top - self.bottom) / 2
+        wood, glass = (0.75, 0.62, 0.45, 1.0), (0.55, 0.70, 0.75, 0.45)
+        boards = [
+            Box(name=f"board_{name}", centre=(x, y, top - t), half_size=(w, d, t), rgba=wood)
+            for name, top in self.shelves.items()
+        ]
+        door_y = self.front + self.door_reach / 2
+        return [
+            *boards,
+            Box(
+                name="cabinet_top", centre=(x, y, self.top - t), half_size=(w, d, t), rgba=wood
+            ),
+            Box(
+                name="cabinet_left",
+                centre=(self.left - t, y, z),
+                half_size=(t, d, h),
+                rgba=wood,
+            ),
+            Box(
+                name="cabinet_right",
+                centre=(self.right + t, y, z),
+                half_size=(t, d, h),
+                rgba=wood,
+            ),
+            Box(
+                name="cabinet_back",
+                centre=(x, self.front - self.depth - t, z),
+                half_size=(w + 2 * t, t, h),
+                rgba=wood,
+            ),
+            Box(
+                name="cabinet_door",
+                centre=(self.left - t, door_y, z),
+                half_size=(t, self.door_reach / 2, h),
+                rgba=glass,
+            ),
+        ]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObjectConfig:
+    """A box to grasp, with a marker on top."""
+
+    name: str = "box"
+    half_size: tuple[float, float, float] = (0.022, 0.040, 0.030)
+    """[m]; the gripper closes along its x."""
+    mass: float = 0.12
+    """[kg]"""
+    marker: Marker = Marker(11, 0.030)
+    rgba: tuple[float, float, float, float] = (0.16, 0.44, 0.70, 1.0)
+
+
+_TABLE = Box(
+    name="table",
+    centre=(0.26, 0.54, -0.02),
+    half_size=(0.42, 0.34, 0.02),
+    rgba=(0.83, 0.80, 0.74, 1.0),
+)
+
+
+def overhead_camera() -> CameraModel:
+    """The camera above the table: image right is -x, image down +y, with a little distortion."""
+    pose = np.eye(4)
+    pose[:3, :3] = np.diag([-1.0, 1.0, -1.0])
+    pose[:3, 3] = (0.22, 0.50, 1.55)
+    return CameraModel(
+        focal=(2050.0, 2050.0), distortion=(-0.06, 0.02, 0.0, 0.0, 0.0), pose=pose
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneConfig:
+    """Everything that stands in the workplace."""
+
+    arm: PandaModelConfig = PandaModelConfig(
+        # Sticks out sideways, clear of the forearm as seen from above.
+        marker=Plate(
+            marker=Marker(HAND_MARKER, 0.048),
+            position=(0.0, 0.135, 0.02),
+            orientation=(0.0, 1.0, 0.0, 0.0),
+        )
+    )
+    table: Box = _TABLE
+    cabinet: CabinetConfig = field(default_factory=CabinetConfig)
+    objects: tuple[ObjectConfig, ...] = (ObjectConfig(),)
+    camera: CameraModel = field(default_factory=overhead_camera)
+    timestep: float = 0.002
+    """Physics step [s]."""
+
+    def boxes(self) -> list[Box]:
+        """The fixed furniture, for drawing and for collision checks."""
+        return [self.table, *self.cabinet.boxes()]
+
+
+def build_scene(config: SceneConfig) -> mujoco.MjSpec:
+    """Describe the workplace as an `MjSpec`; `.compile()` makes the model, `.to_xml()` the MJCF."""
+    spec = mujoco.MjSpec()
+    spec.modelname = "hrc_learn workplace"
+    _set_options(spec, config)
+    _add_surroundings(spec)
+    add_panda(spec, config.arm)
+    for box in config.boxes():
+        _add_box(spec, box)
+    for item in config.objects:
+        _add_object(spec, item)
+    return spec
+
+
+def _set_options(spec: mujoco.MjSpec, config: SceneConfig) -> None:
+    spec.compiler.degree = False
+    spec.option.timestep = config.timestep
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    # Elliptic cones, a stiff friction constraint and the no-slip pass hold a grasp still.
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.impratio = 10
+    spec.option.noslip_iterations = 3
+    spec.visual.global_.offwidth = config.camera.width
+    spec.visual.global_.offheight = config.camera.height
+    spec.visual.quality.offsamples = 0  # four times cheaper without a GPU
+    spec.visual.quality.shadowsize = 0
+    spec.visual.headlight.ambient = (0.45, 0.45, 0.45)
+    spec.visual.headlight.diffuse = (0.35, 0.35, 0.35)
+    spec.visual.headlight.specular = (0.0, 0.0, 0.0)
+    spec.visual.map.znear = 0.02
+
+
+def _add_surroundings(spec: mujoco.MjSpec) -> None:
+    spec.add_texture(
+        name="sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        rgb1=(0.93, 0.95, 0.97),
+        rgb2=(0.75, 0.80, 0.86),
+        width=64,
+        height=384,
+    )
+    spec.worldbody.add_light(
+        pos=(0.5, 0.5, 2.5), dir=(-0.1, -0.1, -1), diffuse=(0.3, 0.3, 0.3), castshadow=False
+    )
+    spec.worldbody.add_geom(
+        name="floor",
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=(2.5, 2.5, 0.1),
+        pos=(0, 0, -0.72),
+        rgba=(0.62, 0.64, 0.66, 1.0),
+    )
+    spec.worldbody.add_geom(
+        name="pedestal",
+        type=_BOX,
+        size=(0.12, 0.12, 0.36),
+        pos=(-0.03, 0, -0.36),
+        rgba=(0.3, 0.3, 0.32, 1),
+    )
+
+
+def _add_box(spec: mujoco.MjSpec, box: Box) -> None:
+    body = spec.worldbody.add_body(name=box.name, pos=box.centre)
+    body.add_geom(name=box.name, type=_BOX, size=box.half_size, rgba=box.rgba)
+
+
+def _add_object(spec: mujoco.MjSpec, item: ObjectConfig) -> None:
+    body = spec.worldbody.add_body(name=item.name, pos=(0.22, 0.5, item.half_size[2]))
+    body.add_freejoint(name=item.name)
+    body.add_geom(
+        name=item.name,
+        type=_BOX,
+        size=item.half_size,
+        mass=item.mass,
+        friction=(1.0, 0.02, 0.001),
+        condim=4,
+        solref=(0.004, 1.0),
+        solimp=(0.97, 0.99, 0.0005, 0.5, 2),
+        rgba=item.rgba,
+    )
+    top = Plate(
+        marker=item.marker, position=(0.0, 0.0, item.half_size[2] + 0.0005), solid=False
+    )
+    add_plate(spec, body, f"{item.name}_marker", top)

@@ -1,0 +1,237 @@
+"""The workplace in motion: MuJoCo behind the `Arm` and `Gripper` protocols."""
+
+from collections.abc import Mapping
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from ..kinematics import panda
+from ..protocols import ArmState
+from .contacts import ContactMonitor, Touch
+from .panda_model import FINGER_STROKE
+from .scene import HAND_MARKER, SceneConfig, build_scene
+
+_ARM_BODIES = ("link1",)  # the tree from link 1 on, hand and fingers included
+
+
+class World:
+    """A workplace that can be reset, advanced in time, looked at and asked about contacts.
+
+    Attributes:
+        config: What stands in it.
+        arm: The arm and its gripper.
+        cabinet_contacts: Touches of the arm, its hand or an object with the cabinet.
+        table_contacts: Touches of the arm or its hand with the table.
+        self_contacts: Touches of the arm with itself.
+    """
+
+    def __init__(self, config: SceneConfig | None = None):
+        self.config = config or SceneConfig()
+        self.model = build_scene(self.config).compile()
+        self.data = mujoco.MjData(self.model)
+        self.arm = MujocoArm(self.model, self.data)
+        cabinet = [box.name for box in self.config.cabinet.boxes()]
+        self.cabinet_contacts = ContactMonitor(self.model, _ARM_BODIES, cabinet)
+        self.table_contacts = ContactMonitor(self.model, _ARM_BODIES, [self.config.table.name])
+        self.self_contacts = ContactMonitor(self.model, _ARM_BODIES, _ARM_BODIES)
+        self._monitors = (self.cabinet_contacts, self.table_contacts, self.self_contacts)
+
+    @property
+    def time(self) -> float:
+        """Simulated time [s]."""
+        return self.data.time
+
+    def reset(
+        self,
+        joint_position: Float[np.ndarray, "7"],
+        objects: Mapping[str, Float[np.ndarray, "4 4"]] | None = None,
+        gripper_width: float = 2 * FINGER_STROKE,
+    ) -> None:
+        """Put everything at rest at time zero.
+
+        Args:
+            joint_position: Joints of the arm [rad].
+            objects: Poses of objects in the base frame; those not named keep their initial one.
+            gripper_width: Opening of the gripper [m].
+
+        Raises:
+            KeyError: If there is no object of a given name.
+        """
+        mujoco.mj_resetData(self.model, self.data)
+        self.arm.place(joint_position, gripper_width)
+        for name, pose in (objects or {}).items():
+            joint = self.data.joint(name)
+            joint.qpos[:3] = pose[:3, 3]
+            mujoco.mju_mat2Quat(joint.qpos[3:7], np.ascontiguousarray(pose[:3, :3]).ravel())
+        mujoco.mj_forward(self.model, self.data)
+        for monitor in self._monitors:
+            monitor.clear()
+
+    def advance(self, duration: float) -> None:
+        """Run the physics for a while, the arm following its last command [s]."""
+        for _ in range(max(1, round(duration / self.model.opt.timestep))):
+            self.arm.drive()
+            mujoco.mj_step(self.model, self.data)
+            for monitor in self._monitors:
+                monitor.update(self.data)
+
+    def hold(self, name: str, joint_position: Float[np.ndarray, "7"]) -> None:
+        """Reset with an object between the fingers, the grip settled.
+
+        Args:
+            name: The object.
+            joint_position: Joints of the arm [rad].
+        """
+        width = 2 * self._object(name).half_size[0]
+        self.reset(joint_position, gripper_width=width + 0.002)
+        tcp = self.arm.tcp_pose()
+        # The object's x lies along the fingers' line of closing, its top towards the hand.
+        in_hand = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
+        self.reset(joint_position, {name: tcp @ in_hand}, gripper_width=width + 0.002)
+        self.arm.move(0.0)
+        self.advance(0.5)
+        self.data.time = 0.0
+
+    def _object(self, name: str):
+        for item in self.config.objects:
+            if item.name == name:
+                return item
+        known = ", ".join(item.name for item in self.config.objects)
+        raise KeyError(f"no object named {name!r}; there are: {known}")
+
+    def object_pose(self, name: str) -> Float[np.ndarray, "4 4"]:
+        """Pose of an object's centre in the base frame."""
+        self._object(name)
+        return _pose(self.data.body(name))
+
+    def holds(self, name: str) -> bool:
+        """Whether both finger pads touch an object."""
+        touching = set()
+        target = self.model.geom(name).id
+        for geoms in self.data.contact.geom[self.data.contact.dist < 1e-4]:
+            if target in geoms:
+                touching.update(self.model.geom(int(g)).name for g in geoms)
+        return {"finger_left_pad", "finger_right_pad"} <= touching
+
+    def rests_on(self, name: str, board: str) -> bool:
+        """Whether an object touches a piece of furniture and nothing of the arm."""
+        target, support = self.model.geom(name).id, self.model.geom(board).id
+        partners = set()
+        for geoms in self.data.contact.geom[self.data.contact.dist < 1e-4]:
+            if target in geoms:
+                partners.update(int(g) for g in geoms)
+        furniture = {self.model.geom(box.name).id for box in self.config.boxes()}
+        return support in partners and partners <= furniture | {target}
+
+    def marker_poses(self) -> dict[int, Float[np.ndarray, "4 4"]]:
+        """Pose of every marker's face in the base frame, by ArUco number."""
+        poses = {
+            item.marker.id: _pose(self.data.site(f"{item.name}_marker"))
+            for item in self.config.objects
+        }
+        if self.config.arm.marker is not None:
+            poses[HAND_MARKER] = _pose(self.data.site("hand_marker"))
+        return poses
+
+    def collisions_along(
+        self, path: Float[np.ndarray, "steps 7"], carried: str | None = None
+    ) -> list[Touch]:
+        """Touches of arm and cabinet, table or itself along a path of joint positions.
+
+        Purely geometric: nothing is simulated and the world stays as it is. Times in the
+        touches are sample numbers.
+
+        Args:
+            path: Joint positions [rad].
+            carried: An object to carry along, at its present pose in the hand.
+        """
+        data = mujoco.MjData(self.model)
+        data.qpos[:] = self.data.qpos
+        in_hand = None
+        if carried is not None:
+            in_hand = np.linalg.inv(self.arm.tcp_pose()) @ self.object_pose(carried)
+        boxes = [box.name for box in self.config.boxes()]
+        movers = _ARM_BODIES if carried is None else (*_ARM_BODIES, carried)
+        monitors = [
+            ContactMonitor(self.model, movers, boxes),
+            ContactMonitor(self.model, _ARM_BODIES, _ARM_BODIES),
+        ]
+        for k, q in enumerate(path):
+            data.qpos[self.arm.joints] = q
+            mujoco.mj_kinematics(self.model, data)
+            if in_hand is not None:
+                pose = self.arm.tcp_pose(data) @ in_hand
+                joint = data.joint(carried)
+                joint.qpos[:3] = pose[:3, 3]
+                mujoco.mju_mat2Quat(joint.qpos[3:7], np.ascontiguousarray(pose[:3, :3]).ravel())
+                mujoco.mj_kinematics(self.model, data)
+            mujoco.mj_collision(self.model, data)
+            data.time = float(k)
+            for monitor in monitors:
+                monitor.update(data)
+        return [touch for monitor in monitors for touch in monitor.touches]
+
+
+class MujocoArm:
+    """The simulated Panda as an `Arm` and a `Gripper`."""
+
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData):
+        self._model = model
+        self._data = data
+        names = panda.joint_names
+        self.joints = np.array([model.joint(n).qposadr[0] for n in names])
+        self._velocities = np.array([model.joint(n).dofadr[0] for n in names])
+        self._position_servos = np.array([model.actuator(f"{n}_position").id for n in names])
+        self._velocity_servos = np.array([model.actuator(f"{n}_velocity").id for n in names])
+        fingers = ("finger_left", "finger_right")
+        self._fingers = np.array([model.joint(n).qposadr[0] for n in fingers])
+        self._finger_servos = np.array([model.actuator(n).id for n in fingers])
+        self._reference = np.zeros(len(names))
+        self._velocity = np.zeros(len(names))
+
+    def read(self) -> ArmState:
+        """Return the present state, encoders without noise."""
+        return ArmState(
+            time=self._data.time,
+            joint_position=self._data.qpos[self.joints].copy(),
+            joint_velocity=self._data.qvel[self._velocities].copy(),
+            gripper_width=float(self._data.qpos[self._fingers].sum()),
+        )
+
+    def command(self, joint_velocity: Float[np.ndarray, "7"]) -> None:
+        """Set the joint velocities to hold from now on [rad/s]."""
+        if not np.isfinite(joint_velocity).all():
+            raise ValueError(f"joint_velocity must be finite, but is {joint_velocity}.")
+        self._velocity = np.array(joint_velocity, dtype=float)
+
+    def move(self, width: float) -> None:
+        """Open or close the gripper to a width [m]; 0 squeezes what is between the fingers."""
+        self._data.ctrl[self._finger_servos] = np.clip(width / 2, 0.0, FINGER_STROKE)
+
+    def place(self, joint_position: Float[np.ndarray, "7"], gripper_width: float) -> None:
+        """Set the joints at once, at rest. For resets, not for control."""
+        self._reference = np.array(joint_position, dtype=float)
+        self._velocity = np.zeros_like(self._reference)
+        self._data.qpos[self.joints] = self._reference
+        self._data.qvel[self._velocities] = 0.0
+        self._data.qpos[self._fingers] = gripper_width / 2
+        self.move(gripper_width)
+        self.drive()
+
+    def drive(self) -> None:
+        """Advance the servos' reference by one physics step."""
+        self._reference += self._velocity * self._model.opt.timestep
+        self._data.ctrl[self._position_servos] = self._reference
+        self._data.ctrl[self._velocity_servos] = self._velocity
+
+    def tcp_pose(self, data: mujoco.MjData | None = None) -> Float[np.ndarray, "4 4"]:
+        """True pose of the tool centre point in the base frame."""
+        return _pose((data or self._data).site("tcp"))
+
+
+def _pose(thing) -> Float[np.ndarray, "4 4"]:
+    pose = np.eye(4)
+    pose[:3, :3] = thing.xmat.reshape(3, 3)
+    pose[:3, 3] = thing.xpos
+    return pose

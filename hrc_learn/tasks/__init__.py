@@ -1,0 +1,12 @@
+"""The pieces put to work: demonstrating, grasping, placing, and the whole collaboration."""
+
+from .eye import Eye as Eye
+from .teach_aiming import OBJECT_FEATURE as OBJECT_FEATURE
+from .teach_aiming import OBJECT_FEATURE_NAMES as OBJECT_FEATURE_NAMES
+from .teach_aiming import AimingLesson as AimingLesson
+from .teach_aiming import teach_aiming as teach_aiming
+from .teach_placing import PlacingLesson as PlacingLesson
+from .teach_placing import teach_placing as teach_placing
+from .visual_target import VisualTarget as VisualTarget
+from .workplace import Workplace as Workplace
+from .workplace import nearest_configuration as nearest_configuration

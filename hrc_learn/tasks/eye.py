@@ -1,0 +1,34 @@
+"""A camera and a marker detector together: images in, pixels of markers out."""
+
+from collections.abc import Iterable
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from ..protocols import Camera
+from ..sim import HAND_MARKER, SceneConfig
+from ..vision import MarkerDetector, centre
+
+
+class Eye:
+    """Finds the centres of markers in a camera's images.
+
+    Attributes:
+        image: The newest image.
+    """
+
+    def __init__(self, camera: Camera, marker_ids: Iterable[int]):
+        self._camera = camera
+        self._detector = MarkerDetector(list(marker_ids))
+        self.image: UInt8[np.ndarray, "height width 3"] | None = None
+
+    @classmethod
+    def on(cls, camera: Camera, scene: SceneConfig) -> "Eye":
+        """An eye that looks for the markers of a scene."""
+        return cls(camera, [HAND_MARKER, *(item.marker.id for item in scene.objects)])
+
+    def look(self) -> dict[int, Float[np.ndarray, "2"]]:
+        """Take an image; return the pixel (u, v) of each marker in it, by number."""
+        self.image = self._camera.read()
+        found = self._detector.detect(self.image)
+        return {id: centre(corners) for id, corners in found.items()}

@@ -1,0 +1,83 @@
+"""Letting a person lead the arm while it is recorded."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from ..controller import SafetyFilter
+from ..kinematics import panda
+from ..protocols import Human
+from ..sim import World
+from .motion import resolved_rate
+
+Frame = dict[str, np.ndarray | float | bool]
+"""Columns of one recorded instant, as `DatasetWriter.add_frame` takes them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TeachingConfig:
+    """How an arm is led."""
+
+    tremor: float = 4e-4
+    """Amplitude of the hand's tremor [m]."""
+    settle: float = 1.0
+    """Rest at the end of a demonstration [s]."""
+    dt: float = 0.01
+    """Control step [s]."""
+    record_every: int = 2
+    """Control steps from one recorded frame to the next."""
+    damping: float = 3.0
+    """c_d [N m s/rad]."""
+
+    @property
+    def fps(self) -> float:
+        """Recorded frames a second."""
+        return 1.0 / (self.dt * self.record_every)
+
+
+def teach(
+    world: World,
+    human: Human,
+    duration: float,
+    config: TeachingConfig,
+    observe: Callable[[], Frame] = dict,
+) -> Iterator[Frame]:
+    """Let a person lead the arm, and yield what is to be recorded.
+
+    Args:
+        world: The workplace, reset to where the demonstration starts.
+        human: Gives hand motion and pulls.
+        duration: Of the demonstration [s].
+        config: How the arm is led.
+        observe: Further columns of a frame, asked for when it is taken.
+
+    Yields:
+        A frame every `record_every` control steps.
+    """
+    guard = SafetyFilter(panda.limits)
+    state = guard.initial_state(torch.from_numpy(world.arm.read().joint_position))
+    for k in range(round(duration / config.dt)):
+        reading = world.arm.read()
+        asked = human.read(reading)
+        q = torch.from_numpy(reading.joint_position)
+        pose, J = panda.forward_and_jacobian(q)
+        wanted = resolved_rate(
+            J, torch.from_numpy(asked.twist), torch.from_numpy(asked.effort) / config.damping
+        )
+        velocity, state, _ = guard.step(state, q, wanted, config.dt)
+        if k % config.record_every == 0:
+            yield {
+                "time": reading.time,
+                "joint_position": reading.joint_position,
+                "joint_velocity": reading.joint_velocity,
+                "position": pose.position.numpy(),
+                "orientation": pose.orientation.numpy(),
+                "gripper": reading.gripper_width,
+                "human_effort": asked.effort,
+                "command_velocity": velocity.numpy(),
+                **observe(),
+            }
+        world.arm.command(velocity.numpy())
+        world.advance(config.dt)

@@ -1,0 +1,124 @@
+"""Where things happen in the simulated workplace: home, table, shelves."""
+
+import math
+from dataclasses import dataclass, field
+
+import torch
+
+from ..geometry import Pose, quaternion
+from ..human import coarse_orientation, gripper_down
+from ..kinematics import UnreachableError, panda
+from ..sim import ObjectConfig, SceneConfig
+
+
+def _vector(*values: float) -> torch.Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Workplace:
+    """Poses of the task in a scene. All in the base frame, gripper closing along x."""
+
+    scene: SceneConfig = field(default_factory=SceneConfig)
+    home_position: tuple[float, float, float] = (0.60, 0.0, 0.35)
+    """Hand between table and cabinet, where a placing motion starts [m]."""
+    home_q7: float = -1.0
+    """Joint 7 at home [rad]: the elbow leans to the left, away from the cabinet."""
+    table_centre: tuple[float, float] = (0.22, 0.50)
+    """Middle of the part of the table that the camera sees well [m]."""
+    hover_height: float = 0.17
+    """Of the tool centre point while it aims at an object [m]."""
+    shelf_x: float = 0.40
+    """Where along the boards things are put [m]."""
+    shelf_depth: float = 0.10
+    """From the boards' front edge to the tool centre point [m]."""
+    clearance: float = 0.004
+    """Gap left under a thing when it is let go on a board [m]."""
+    approach: float = 0.16
+    """Distance in front of the boards from which the hand moves straight in [m]."""
+
+    def home(self) -> Pose:
+        """Hand at home, pointing down."""
+        return Pose(_vector(*self.home_position), gripper_down())
+
+    def home_joints(self, offset: torch.Tensor | None = None) -> torch.Tensor:
+        """Joint positions with the hand at home, or at an offset from it [m]."""
+        home = self.home()
+        if offset is not None:
+            home = Pose(home.position + offset, home.orientation)
+        return panda.inverse(home, self.home_q7, near=_LEANING_FORWARD)
+
+    def hover(self) -> Pose:
+        """Hand above the middle of the table, pointing down."""
+        return Pose(_vector(*self.table_centre, self.hover_height), gripper_down())
+
+    def shelf_names(self) -> tuple[str, ...]:
+        """From bottom to top."""
+        shelves = self.scene.cabinet.shelves
+        return tuple(sorted(shelves, key=shelves.__getitem__))
+
+    def shelf(self, name: str, item: ObjectConfig | None = None) -> Pose:
+        """Hand where it lets go of a thing on a shelf, pointing level into the cabinet.
+
+        Args:
+            name: Of the shelf.
+            item: What is put down; the scene's first object when None.
+
+        Raises:
+            ValueError: If there is no such shelf.
+        """
+        cabinet = self.scene.cabinet
+        if name not in cabinet.shelves:
+            raise ValueError(
+                f"no shelf named {name!r}: this cabinet has {', '.join(self.shelf_names())}."
+            )
+        item = item or self.scene.objects[0]
+        # Held from above, a thing lies on its side once the hand points level.
+        height = cabinet.shelves[name] + item.half_size[1] + self.clearance
+        position = _vector(self.shelf_x, cabinet.front - self.shelf_depth, height)
+        return Pose(position, coarse_orientation(position))
+
+    def mouth(self, name: str, item: ObjectConfig | None = None) -> Pose:
+        """Hand in front of a shelf, level with where it will let go."""
+        goal = self.shelf(name, item)
+        position = goal.position.clone()
+        position[1] = self.scene.cabinet.front + self.approach
+        return Pose(position, coarse_orientation(position))
+
+
+# Upper arm forward: the branch in which joint 1 keeps clear of its limits on both sides.
+_LEANING_FORWARD = _vector(1.0, 0.3, -1.2, -1.8, 0.3, 1.9, -1.0)
+
+
+def nearest_configuration(goal: Pose, near: torch.Tensor, samples: int = 57) -> torch.Tensor:
+    """Joint positions that reach a pose, as near as can be to given ones.
+
+    Scans joint 7, the redundant one, and keeps the best of the analytic solutions.
+
+    Args:
+        goal: Pose of the tool centre point.
+        near: Joint positions [rad], shape (7,).
+        samples: Values of joint 7 tried between its limits.
+
+    Raises:
+        UnreachableError: If no value of joint 7 reaches the pose within the limits.
+    """
+    lower, upper = float(panda.limits.lower[6]), float(panda.limits.upper[6])
+    candidates = torch.linspace(lower + 0.02, upper - 0.02, samples, dtype=torch.float64)
+    candidates = torch.cat([near[6:7], candidates])
+    best, distance = None, math.inf
+    for q7 in candidates:
+        try:
+            q = panda.inverse(goal, q7, near=near)
+        except UnreachableError:
+            continue
+        if (d := float((q - near).norm())) < distance:
+            best, distance = q, d
+    if best is None:
+        x, y, z = goal.position.tolist()
+        w = [round(v, 3) for v in quaternion.normalize(goal.orientation).tolist()]
+        raise UnreachableError(
+            f"no joint positions within the limits reach position ({x:.3f}, {y:.3f}, {z:.3f}) m "
+            f"with orientation {w} (wxyz): move the goal towards the robot or turn it."
+        )
+    return best

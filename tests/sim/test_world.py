@@ -1,0 +1,96 @@
+import numpy as np
+import pytest
+import torch
+
+from hrc_learn.kinematics import panda
+from hrc_learn.sim import World
+from hrc_learn.tasks import Workplace
+
+
+@pytest.fixture(scope="module")
+def workplace():
+    return Workplace()
+
+
+@pytest.fixture
+def world(workplace):
+    world = World(workplace.scene)
+    world.reset(workplace.home_joints().numpy())
+    return world
+
+
+def test_simulator_and_kinematics_agree(world):
+    rng = np.random.default_rng(0)
+    lower, upper = panda.limits.lower.numpy(), panda.limits.upper.numpy()
+    for _ in range(20):
+        q = rng.uniform(lower, upper)
+        world.reset(q)
+        expected = panda.forward(torch.from_numpy(q)).matrix().numpy()
+        np.testing.assert_allclose(world.arm.tcp_pose(), expected, atol=1e-9)
+
+
+def test_arm_follows_a_velocity_without_lag(world):
+    start = world.arm.read().joint_position
+    velocity = np.array([0.2, -0.1, 0.15, 0.1, -0.2, 0.1, 0.3])
+    world.arm.command(velocity)
+    world.advance(2.0)
+    state = world.arm.read()
+    # The servos must make up the start's jerk; what is left is the load of gravity and inertia.
+    np.testing.assert_allclose(state.joint_position, start + 2.0 * velocity, atol=1e-3)
+    np.testing.assert_allclose(state.joint_velocity, velocity, atol=1e-3)
+
+
+def test_a_held_object_stays_in_the_hand_while_the_arm_swings(world, workplace):
+    world.hold("box", workplace.home_joints().numpy())
+    assert world.holds("box")
+    before = np.linalg.inv(world.arm.tcp_pose()) @ world.object_pose("box")
+    for turn in (0.5, -0.5) * 2:
+        world.arm.command(np.array([turn, 0.0, 0.0, 0.2 * np.sign(turn), 0.0, 0.0, turn]))
+        world.advance(1.5)
+    after = np.linalg.inv(world.arm.tcp_pose()) @ world.object_pose("box")
+    assert world.holds("box")
+    assert np.linalg.norm(after[:3, 3] - before[:3, 3]) < 2e-3
+
+
+def test_an_object_let_go_above_a_board_comes_to_rest_on_it(world, workplace):
+    pose = np.eye(4)
+    pose[:3, 3] = (0.4, -0.65, workplace.scene.cabinet.shelves["middle"] + 0.05)
+    world.reset(workplace.home_joints().numpy(), {"box": pose})
+    assert not world.rests_on("box", "board_middle")
+    world.advance(1.0)
+    assert world.rests_on("box", "board_middle")
+    assert not world.rests_on("box", "board_upper")
+
+
+def test_contacts_tell_who_met_whom(world, workplace):
+    assert world.collisions_along(workplace.home_joints().numpy()[None]) == []
+    # Swing the stretched arm into the open door.
+    path = np.linspace([0.0, 1.2, 0, -1.0, 0, 2.0, 0.8], [-1.6, 1.2, 0, -1.0, 0, 2.0, 0.8], 60)
+    touches = world.collisions_along(path)
+    assert any(touch.second == "cabinet_door" for touch in touches)
+    assert all(touch.first.startswith(("link", "hand", "finger")) for touch in touches)
+    assert world.time == 0.0
+
+
+def test_collisions_include_what_is_carried(world, workplace):
+    goal = workplace.shelf("middle")
+    q = panda.inverse(goal, torch.tensor(0.0, dtype=torch.float64))
+    world.hold("box", workplace.home_joints().numpy())
+    low = goal.position.clone()
+    low[2] -= 0.02
+    sunk = panda.inverse(
+        type(goal)(low, goal.orientation), torch.tensor(0.0, dtype=torch.float64)
+    )
+    met = {t.second for t in world.collisions_along(q.numpy()[None], "box") if t.first == "box"}
+    assert met == set()
+    met = {
+        t.second for t in world.collisions_along(sunk.numpy()[None], "box") if t.first == "box"
+    }
+    assert met == {"board_middle"}
+
+
+def test_unknown_objects_and_bad_commands_are_refused(world):
+    with pytest.raises(KeyError, match="there are: box"):
+        world.object_pose("bottle")
+    with pytest.raises(ValueError, match="finite"):
+        world.arm.command(np.full(7, np.nan))
