@@ -64,6 +64,6 @@ def _number(value: Any) -> float | int | bool | None:
 
 
 def _summary(main: Callable) -> str | None:
-    """The first paragraph of the program's own docstring."""
+    """The program's own docstring."""
     text = sys.modules[main.__module__].__doc__ or main.__doc__
-    return text.strip().split("\n\n")[0] if text else None
+    return text and text.strip()
