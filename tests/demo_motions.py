@@ -22,3 +22,11 @@ def arm_motion(n_samples=400, n_joints=7, duration=3.0, seed=0, moving_start=Fal
         bump = (k * torch.pi * s).sin() ** (1 if moving_start else 3)
         position = position + 0.2 * bump[:, None] * rand(n_joints)
     return s * duration, position
+
+
+def turning_motion(n_samples=400, duration=3.0, seed=0):
+    """Time (T,) [s] and smooth orientations (T, 4) that turn about a wandering axis."""
+    from hrc_learn.geometry import quaternion
+
+    time, vector = arm_motion(n_samples, 3, duration, seed, moving_start=True)
+    return time, quaternion.exp(vector)

@@ -3,6 +3,12 @@
 from hrc_learn.dmp.basis import GaussianBasis as GaussianBasis
 from hrc_learn.dmp.canonical import ExponentialPhase as ExponentialPhase
 from hrc_learn.dmp.joint import JointDMP as JointDMP
+from hrc_learn.dmp.orientation import OrientationDMP as OrientationDMP
+from hrc_learn.dmp.orientation import OrientationState as OrientationState
+from hrc_learn.dmp.orientation import OrientationTrajectory as OrientationTrajectory
+from hrc_learn.dmp.pose import PoseDMP as PoseDMP
+from hrc_learn.dmp.pose import PoseState as PoseState
+from hrc_learn.dmp.pose import PoseTrajectory as PoseTrajectory
 from hrc_learn.dmp.report import FitReport as FitReport
 from hrc_learn.dmp.spring import SpringDamper as SpringDamper
 from hrc_learn.dmp.state import DMPState as DMPState

@@ -26,11 +26,11 @@ def write_folder(
     """Write or replace a saved primitive.
 
     Raises:
-        ValueError: `folder` exists and is no saved primitive; it is left alone.
+        ValueError: `folder` exists and holds anything else; it is left alone.
     """
     folder = Path(folder)
-    if folder.exists() and not (folder / CONFIG).is_file():
-        raise ValueError(f"{folder} exists and is no saved primitive: choose another folder")
+    if folder.exists() and not {p.name for p in folder.iterdir()} <= {CONFIG, MODEL}:
+        raise ValueError(f"{folder} holds more than a saved primitive: choose another folder")
     folder.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:

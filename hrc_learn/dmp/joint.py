@@ -305,9 +305,19 @@ class JointDMP(nn.Module):
             forced=forced,
         )
 
+    def resolve_duration(self, duration: ArrayLike | None, speed: ArrayLike | None) -> Tensor:
+        """Duration [s] that either argument of a rollout asks for."""
+        if duration is not None and speed is not None:
+            raise ValueError("give a duration or a speed, not both")
+        if duration is not None:
+            return self._positive("duration", duration)
+        return (
+            self.duration if speed is None else self.duration / self._positive("speed", speed)
+        )
+
     def save(self, folder: str | Path) -> None:
         """Write config.json and model.safetensors into `folder`, replacing an older save."""
-        write_folder(folder, type(self).__name__, self._config(), self._tensors())
+        write_folder(folder, type(self).__name__, self.config(), self.tensors())
 
     @classmethod
     def load(cls, folder: str | Path) -> "JointDMP":
@@ -317,9 +327,10 @@ class JointDMP(nn.Module):
             FileNotFoundError: No saved primitive there.
             ValueError: Names the file and the field that is wrong.
         """
-        return cls._restore(SavedPrimitive(folder, cls.__name__))
+        return cls.restore(SavedPrimitive(folder, cls.__name__))
 
-    def _config(self) -> dict[str, Any]:
+    def config(self) -> dict[str, Any]:
+        """What a saved primitive needs besides its tensors."""
         return {
             "joint_names": self.joint_names,
             "units": {"coordinates": self.units, "time": "s"},
@@ -328,12 +339,14 @@ class JointDMP(nn.Module):
             "basis": asdict(self.basis),
         }
 
-    def _tensors(self) -> dict[str, Tensor]:
+    def tensors(self) -> dict[str, Tensor]:
+        """Learned numbers and residuals, by the names they are saved under."""
         report = {} if self.fit_report is None else vars(self.fit_report)
         return dict(self.state_dict()) | {f"fit_report.{k}": v for k, v in report.items()}
 
     @classmethod
-    def _restore(cls, saved: SavedPrimitive) -> "JointDMP":
+    def restore(cls, saved: SavedPrimitive) -> "JointDMP":
+        """The primitive inside a saved one."""
         spring = saved.get("spring", dict)
         basis = dict(saved.get("basis", dict))
         try:
@@ -366,18 +379,11 @@ class JointDMP(nn.Module):
         """Start, goal, dy/ds at the start, and duration."""
         start = self.start if start is None else self._coordinates("start", start)
         goal = self.goal if goal is None else self._coordinates("goal", goal)
-        if duration is not None and speed is not None:
-            raise ValueError("give a duration or a speed, not both")
-        if speed is not None:
-            duration = self.duration / self._positive("speed", speed)
-        elif duration is not None:
-            duration = self._positive("duration", duration)
+        duration = self.resolve_duration(duration, speed)
         if start_velocity is None:
-            rate = self.start_velocity * self.duration[..., None]
-        else:
-            velocity = self._coordinates("start_velocity", start_velocity)
-            rate = velocity * (self.duration if duration is None else duration)[..., None]
-        return start, goal, rate, self.duration if duration is None else duration
+            return start, goal, self.start_velocity * self.duration[..., None], duration
+        velocity = self._coordinates("start_velocity", start_velocity)
+        return start, goal, velocity * duration[..., None], duration
 
     def _scaled_weights(self, start: Tensor, goal: Tensor) -> Tensor:
         scale = forcing_scale(self.scaling, start, goal, self.amplitude)

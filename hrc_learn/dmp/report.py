@@ -21,3 +21,7 @@ class FitReport:
     def nrmse(self) -> Float[Tensor, "*batch"]:
         """RMSE over all samples and coordinates, relative to the largest range."""
         return self.rmse.square().mean(-1).sqrt() / self.span.amax(-1)
+
+    def select(self, columns: slice) -> "FitReport":
+        """Report of some of the coordinates."""
+        return FitReport(**{name: values[..., columns] for name, values in vars(self).items()})

@@ -70,6 +70,8 @@ def check_samples(
     position: ArrayLike,
     velocity: ArrayLike | None = None,
     mask: ArrayLike | None = None,
+    *,
+    name: str = "position",
 ) -> Samples:
     """Check and batch what the caller recorded.
 
@@ -79,6 +81,7 @@ def check_samples(
         velocity: Like `position`, or None.
         mask: Like `time`, true where a sample counts; None: all do. The others may hold
             anything, NaN included.
+        name: What complaints call `position`.
 
     Raises:
         ValueError: Shapes that do not fit, values that are not finite, time that does not
@@ -110,7 +113,7 @@ def check_samples(
             f"got {int(mask[i].sum())}"
         )
     _check_finite("time", time[..., None], mask, batch)
-    _check_finite("position", position, mask, batch)
+    _check_finite(name, position, mask, batch)
     if velocity is not None:
         velocity = torch.as_tensor(velocity).to(position)
         velocity = _fit_shape("velocity", velocity, (*batch, T, D), position).reshape(-1, T, D)

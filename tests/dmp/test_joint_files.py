@@ -42,7 +42,7 @@ def test_saving_replaces_whole_folders_and_leaves_nothing_else(saved):
 def test_saving_does_not_overwrite_what_is_no_primitive(tmp_path):
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "chapter.tex").write_text("years of work")
-    with pytest.raises(ValueError, match="no saved primitive"):
+    with pytest.raises(ValueError, match="more than a saved primitive"):
         JointDMP.fit(TIME, POSITION).save(tmp_path / "thesis")
     assert (tmp_path / "thesis" / "chapter.tex").read_text() == "years of work"
 

@@ -1,0 +1,319 @@
+"""Movement primitive of an orientation."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from hrc_learn.dmp import orientation_error as error_space
+from hrc_learn.dmp.basis import GaussianBasis
+from hrc_learn.dmp.files import SavedPrimitive, write_folder
+from hrc_learn.dmp.joint import JointDMP
+from hrc_learn.dmp.report import FitReport
+from hrc_learn.dmp.samples import ArrayLike, check_samples, demo_label
+from hrc_learn.dmp.spring import SpringDamper
+from hrc_learn.dmp.state import DMPState
+from hrc_learn.dmp.trajectory import Trajectory
+from hrc_learn.geometry import quaternion
+
+NORM_TOLERANCE = 1e-2
+"""How far from one the norm of a recorded quaternion may be before it is called broken."""
+
+
+class OrientationTrajectory:
+    """An orientation over time, each output computed when first asked for."""
+
+    def __init__(self, errors: Trajectory, goal: Float[Tensor, "*batch 4"], first: int = 0):
+        """Read the motion of an error, found in columns `first` to `first` + 3 of `errors`."""
+        self._errors = errors
+        self._goal = goal
+        self._columns = slice(first, first + 3)
+        self.time = errors.time
+        """Since the start of the motion [s]."""
+
+    @cached_property
+    def orientation(self) -> Float[Tensor, "*batch T 4"]:
+        """Unit quaternions (w, x, y, z), continuous in sign."""
+        return error_space.to_orientations(self._error, self._goal)
+
+    @cached_property
+    def angular_velocity(self) -> Float[Tensor, "*batch T 3"]:
+        """In the base frame [rad/s]."""
+        return error_space.angular_velocity(self._error, self._rate)
+
+    @cached_property
+    def angular_acceleration(self) -> Float[Tensor, "*batch T 3"]:
+        """In the base frame [rad/s^2]."""
+        curvature = self._errors.acceleration[..., self._columns]
+        return error_space.angular_acceleration(self._error, self._rate, curvature)
+
+    @property
+    def _error(self) -> Tensor:
+        return self._errors.position[..., self._columns]
+
+    @property
+    def _rate(self) -> Tensor:
+        return self._errors.velocity[..., self._columns]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class OrientationState:
+    """Where an orientation primitive is while it is stepped."""
+
+    motion: DMPState
+    """Of the error to the goal."""
+    goal: Float[Tensor, "*batch 4"]
+
+    @property
+    def orientation(self) -> Float[Tensor, "*batch 4"]:
+        """Unit quaternion (w, x, y, z)."""
+        return error_space.to_orientation(self.motion.position, self.goal)
+
+    @property
+    def angular_velocity(self) -> Float[Tensor, "*batch 3"]:
+        """In the base frame [rad/s]."""
+        return error_space.angular_velocity(self.motion.position, self.motion.velocity)
+
+
+class OrientationDMP(nn.Module):
+    """Discrete movement primitive of an orientation, exact at all angles.
+
+    The error e to the goal is the state of a linear primitive that ends at e = 0; see
+    `orientation_error`. Both signs of any quaternion give the same motion.
+    """
+
+    goal: Tensor
+
+    def __init__(self, motion: JointDMP, goal: Float[Tensor, "*batch 4"]):
+        """Put a primitive together; `fit` is the usual way to one.
+
+        Args:
+            motion: Of the error [rad], D = 3, with its goal at zero.
+            goal: Unit quaternion (w, x, y, z) that the error is taken to.
+        """
+        super().__init__()
+        self.motion = motion
+        self.register_buffer("goal", goal)
+
+    @classmethod
+    def fit(
+        cls,
+        time: ArrayLike,
+        orientation: ArrayLike,
+        n_basis: int = 50,
+        mask: ArrayLike | None = None,
+        *,
+        method: str = "trajectory",
+        basis: GaussianBasis | None = None,
+        spring: SpringDamper | None = None,
+        regularization: float = 1e-7,
+    ) -> "OrientationDMP":
+        """Learn one primitive from each demonstration.
+
+        Args:
+            time: Stamps [s], (T,) or (*B, T).
+            orientation: Unit quaternions (w, x, y, z), (*B, T, 4). Signs may flip; neighbours
+                must be less than half a turn apart.
+            n_basis: N, unless `basis` is given.
+            mask: (*B, T), false where a sample does not count.
+            method: As for `JointDMP.fit`, like all that follow.
+            basis: Shape of the forcing term.
+            spring: Gains.
+            regularization: Ridge.
+
+        Raises:
+            ValueError: Bad samples; says which.
+        """
+        error, goal = fitted_error(time, orientation, mask)
+        motion = JointDMP.fit(
+            time,
+            error,
+            n_basis,
+            mask=mask,
+            method=method,
+            basis=basis,
+            spring=spring,
+            regularization=regularization,
+        )
+        return cls(motion, goal)
+
+    @property
+    def start(self) -> Float[Tensor, "*batch 4"]:
+        """Where the demonstration starts."""
+        return error_space.to_orientation(self.motion.start, self.goal)
+
+    @property
+    def duration(self) -> Float[Tensor, "*batch"]:
+        """Of the demonstration [s]."""
+        return self.motion.duration
+
+    @property
+    def fit_report(self) -> FitReport | None:
+        """Residuals of the error's components [rad]; they bound those of the angle."""
+        return self.motion.fit_report
+
+    def rollout(
+        self,
+        time: ArrayLike | None = None,
+        start: ArrayLike | None = None,
+        goal: ArrayLike | None = None,
+        duration: ArrayLike | None = None,
+        start_velocity: ArrayLike | None = None,
+        *,
+        speed: ArrayLike | None = None,
+    ) -> OrientationTrajectory:
+        """Motion from start to goal; without arguments, the demonstrated one.
+
+        All arguments broadcast over the batch, and gradients flow to each of them. A new
+        start or goal is reached the way round that the demonstration took.
+
+        Args:
+            time: Since the start of the motion [s], (T,) or (*batch, T).
+            start: Unit quaternion, (*batch, 4).
+            goal: Unit quaternion, (*batch, 4).
+            duration: [s], (*batch).
+            start_velocity: Angular, in the base frame [rad/s], (*batch, 3).
+            speed: Instead of a duration, how many times faster than the demonstration.
+        """
+        error, rate, goal, duration = self._ends(start, goal, duration, start_velocity, speed)
+        return OrientationTrajectory(
+            self.motion.rollout(time, error, None, duration, rate), goal
+        )
+
+    def initial_state(
+        self,
+        start: ArrayLike | None = None,
+        goal: ArrayLike | None = None,
+        duration: ArrayLike | None = None,
+        start_velocity: ArrayLike | None = None,
+        *,
+        speed: ArrayLike | None = None,
+    ) -> OrientationState:
+        """State at the start of a motion, for `step`; arguments as in `rollout`."""
+        error, rate, goal, duration = self._ends(start, goal, duration, start_velocity, speed)
+        motion = self.motion.initial_state(error, None, duration, rate)
+        return OrientationState(motion=motion, goal=goal.expand(*motion.position.shape[:-1], 4))
+
+    def step(
+        self,
+        state: OrientationState,
+        dt: ArrayLike,
+        *,
+        goal: ArrayLike | None = None,
+        slowdown: ArrayLike | None = None,
+    ) -> OrientationState:
+        """Advance by `dt`; as `JointDMP.step`. A new goal changes neither pose nor velocity."""
+        motion, target = state.motion, state.goal
+        if goal is not None:
+            target = unit_quaternion(goal, state.goal).expand_as(state.goal)
+            error, rate = retarget(motion.position, motion.rate, state.goal, target)
+            motion = replace(motion, position=error, rate=rate)
+        motion = self.motion.step(motion, dt, slowdown=slowdown)
+        return OrientationState(motion=motion, goal=target)
+
+    def save(self, folder: str | Path) -> None:
+        """Write config.json and model.safetensors into `folder`, replacing an older save."""
+        tensors = {"goal_orientation": self.goal, **self.motion.tensors()}
+        write_folder(folder, "OrientationDMP", self.motion.config(), tensors)
+
+    @classmethod
+    def load(cls, folder: str | Path) -> "OrientationDMP":
+        """Read what `save` wrote; complains as `JointDMP.load`."""
+        saved = SavedPrimitive(folder, "OrientationDMP")
+        return cls(JointDMP.restore(saved), saved.tensor("goal_orientation"))
+
+    def _ends(
+        self,
+        start: ArrayLike | None,
+        goal: ArrayLike | None,
+        duration: ArrayLike | None,
+        velocity: ArrayLike | None,
+        speed: ArrayLike | None,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Error at the start, its rate [rad/s], goal, and duration."""
+        duration = self.motion.resolve_duration(duration, speed)
+        rate = self.motion.start_velocity * (self.motion.duration / duration)[..., None]
+        error, rate, goal = error_ends(
+            self.motion.start, rate, self.goal, start, goal, velocity
+        )
+        return error, rate, goal, duration
+
+
+def fitted_error(
+    time: ArrayLike, orientation: ArrayLike, mask: ArrayLike | None
+) -> tuple[Tensor, Tensor]:
+    """Errors (*B, T, 3) and goals (*B, 4) of checked demonstrations (*B, T, 4)."""
+    samples = check_samples(time, orientation, mask=mask, name="orientation")
+    if samples.position.shape[-1] != 4:
+        raise ValueError(
+            f"orientation must be quaternions (w, x, y, z), shape (..., T, 4), "
+            f"got {tuple(torch.as_tensor(orientation).shape)}"
+        )
+    norm = samples.position.norm(dim=-1)
+    broken = samples.mask & ((norm - 1).abs() > NORM_TOLERANCE)
+    if broken.any():
+        i, k = broken.nonzero()[0].tolist()
+        raise ValueError(
+            f"{demo_label(i, samples.batch)}orientation has norm {norm[i, k].item():.4f} at "
+            f"sample {k}: not a unit quaternion. Interpolating across a sign flip does this."
+        )
+    unit = samples.position / norm.masked_fill(~samples.mask, 1)[..., None]
+    error, goal = error_space.demonstrated_error(unit, samples.mask)
+    return error.reshape(*samples.batch, -1, 3), goal.reshape(*samples.batch, 4)
+
+
+def unit_quaternion(value: ArrayLike, like: Tensor) -> Float[Tensor, "*batch 4"]:
+    """A quaternion given by the caller, normalised; dtype and device of `like`."""
+    q = torch.as_tensor(value, dtype=like.dtype, device=like.device)
+    if q.ndim == 0 or q.shape[-1] != 4 or not (q.norm(dim=-1) > 0.5).all():
+        raise ValueError(f"an orientation must be unit quaternions (w, x, y, z), got {value}")
+    return quaternion.normalize(q)
+
+
+def error_ends(
+    error: Float[Tensor, "*batch 3"],
+    rate: Float[Tensor, "*#batch 3"],
+    demonstrated_goal: Float[Tensor, "*batch 4"],
+    start: ArrayLike | None,
+    goal: ArrayLike | None,
+    velocity: ArrayLike | None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Error at the start of a motion, its rate [rad/s], and the goal.
+
+    Args:
+        error: At the start of the demonstration.
+        rate: Of that, when the motion takes as long as it shall.
+        demonstrated_goal: Where the demonstration ends.
+        start: New start; the demonstrated one is kept if None, as with all that follow.
+        goal: New goal.
+        velocity: New angular velocity [rad/s].
+    """
+    if start is None and goal is None and velocity is None:
+        return error, rate, demonstrated_goal
+    if velocity is None:
+        error_all, rate = torch.broadcast_tensors(error, rate)
+        omega = error_space.angular_velocity(error_all, rate)
+    else:
+        omega = torch.as_tensor(velocity, dtype=error.dtype, device=error.device)
+    if start is None:
+        q = error_space.to_orientation(error, demonstrated_goal)
+    else:
+        q = unit_quaternion(start, error)
+    goal = demonstrated_goal if goal is None else unit_quaternion(goal, error)
+    error = error_space.nearest_turn(error_space.to_error(q, goal), error)
+    return error, error_space.error_rate(error, omega), goal
+
+
+def retarget(
+    error: Float[Tensor, "*batch 3"],
+    rate: Float[Tensor, "*batch 3"],
+    old_goal: Float[Tensor, "*batch 4"],
+    goal: Float[Tensor, "*#batch 4"],
+) -> tuple[Tensor, Tensor]:
+    """Error to a new goal and its rate, for the same orientation and angular velocity."""
+    q = error_space.to_orientation(error, old_goal)
+    new = error_space.nearest_turn(error_space.to_error(q, goal), error)
+    return new, error_space.error_rate(new, error_space.angular_velocity(error, rate))

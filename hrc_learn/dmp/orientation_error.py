@@ -1,0 +1,119 @@
+"""Orientations as errors to a goal, the coordinates in which an orientation moves linearly.
+
+e = log(g * conj(q)), a rotation vector [rad] in the base frame, so that q = exp(-e) * g
+(Koutras and Doulgeri 2019, "A correct formulation for the orientation dynamic movement
+primitives for robot control in the Cartesian space"; their logarithm is half of ours). The
+goal is e = 0. Moving start and goal alike by a rotation of the tool frame leaves e as it is.
+"""
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from hrc_learn.geometry import quaternion
+
+_NO_AXIS = 1e-9
+"""Rotation vectors shorter than this [rad] have no direction of their own."""
+
+_SINGULAR = 1e-3
+"""Share of an angular velocity that still counts as rate of the error."""
+
+
+def demonstrated_error(
+    orientation: Float[Tensor, "*batch T 4"], mask: Bool[Tensor, "*batch T"]
+) -> tuple[Float[Tensor, "*batch T 3"], Float[Tensor, "*batch 4"]]:
+    """Errors to the last sample that counts, continuous past any number of turns.
+
+    Where `mask` is false an orientation may be anything. The error of a demonstration is
+    followed backwards from its end, so that 720 degrees are learned as two turns.
+
+    Returns:
+        Errors [rad], and the goal.
+    """
+    T = mask.shape[-1]
+    index = torch.arange(T, device=mask.device).expand(mask.shape)
+    first = mask.long().argmax(-1, keepdim=True)
+    seen = torch.where(mask, index, first).cummax(-1).values
+    q = torch.take_along_dim(orientation, seen[..., None], dim=-2)
+    goal = q[..., -1, :]
+    backwards = to_error(q, goal[..., None, :]).flip(-2)
+    return quaternion.unwrap_log(backwards).flip(-2), goal
+
+
+def to_error(
+    q: Float[Tensor, "*#batch 4"], goal: Float[Tensor, "*#batch 4"]
+) -> Float[Tensor, "*batch 3"]:
+    """Shortest error of an orientation to the goal."""
+    return quaternion.log(quaternion.multiply(goal, quaternion.conjugate(q)))
+
+
+def to_orientation(
+    error: Float[Tensor, "*#batch 3"], goal: Float[Tensor, "*#batch 4"]
+) -> Float[Tensor, "*batch 4"]:
+    """Orientation that differs from the goal by this error."""
+    return quaternion.multiply(quaternion.exp(-error), goal)
+
+
+def to_orientations(
+    error: Float[Tensor, "*#batch T 3"], goal: Float[Tensor, "*#batch 4"]
+) -> Float[Tensor, "*batch T 4"]:
+    """Orientations along time that differ from one goal by these errors."""
+    # One 4x4 product each: row i of the matrix is the unit quaternion i times the goal.
+    unit = torch.eye(4, dtype=goal.dtype, device=goal.device)
+    return quaternion.exp(-error) @ quaternion.multiply(unit, goal[..., None, :])
+
+
+def angular_velocity(
+    error: Float[Tensor, "*batch 3"], rate: Float[Tensor, "*batch 3"]
+) -> Float[Tensor, "*batch 3"]:
+    """Angular velocity of q = exp(-e) * g in the base frame [rad/s], from de/dt."""
+    turn, turn_rate = _derivative(quaternion.exp, (-error,), (-rate,))
+    return 2 * quaternion.multiply(turn_rate, quaternion.conjugate(turn))[..., 1:]
+
+
+def angular_acceleration(
+    error: Float[Tensor, "*batch 3"],
+    rate: Float[Tensor, "*batch 3"],
+    curvature: Float[Tensor, "*batch 3"],
+) -> Float[Tensor, "*batch 3"]:
+    """Angular acceleration [rad/s^2], from e and its first two derivatives by time."""
+    return _derivative(angular_velocity, (error, rate), (rate, curvature))[1]
+
+
+def error_rate(
+    error: Float[Tensor, "*#batch 3"], velocity: Float[Tensor, "*#batch 3"]
+) -> Float[Tensor, "*batch 3"]:
+    """de/dt of an angular velocity [rad/s]; the inverse of `angular_velocity`.
+
+    Whole turns away from the goal the error has a rate about its own axis only: what the
+    velocity holds across it is lost there.
+    """
+    unit = torch.eye(3, dtype=error.dtype, device=error.device)
+    rows = error[..., None, :].expand(*error.shape, 3)
+    columns = angular_velocity(rows, unit.expand(rows.shape)).mT
+    return (torch.linalg.pinv(columns, rtol=_SINGULAR) @ velocity[..., None])[..., 0]
+
+
+def nearest_turn(
+    error: Float[Tensor, "*#batch 3"], reference: Float[Tensor, "*#batch 3"]
+) -> Float[Tensor, "*batch 3"]:
+    """The same rotation as `error`, with the whole turns that bring it closest to `reference`.
+
+    A start or goal that is new takes its way round from the demonstration.
+    """
+    error, reference = torch.broadcast_tensors(error, reference)
+    own = error.norm(dim=-1, keepdim=True) > _NO_AXIS
+    axis = torch.where(own, error, reference).detach()
+    axis = axis / axis.norm(dim=-1, keepdim=True).clamp_min(_NO_AXIS)
+    along = ((reference - error) * axis).sum(-1, keepdim=True).detach()
+    return error + 2 * torch.pi * torch.round(along / (2 * torch.pi)) * axis
+
+
+def _derivative(
+    function: Callable[..., Tensor], at: tuple[Tensor, ...], along: tuple[Tensor, ...]
+) -> tuple[Tensor, Tensor]:
+    """Value and directional derivative."""
+    result = torch.func.jvp(function, at, along)
+    return result[0], result[1]

@@ -1,0 +1,396 @@
+"""Movement primitive of a pose, and of the arm's body shape along with it."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from hrc_learn.dmp.basis import GaussianBasis
+from hrc_learn.dmp.files import SavedPrimitive, write_folder
+from hrc_learn.dmp.joint import JointDMP
+from hrc_learn.dmp.orientation import (
+    OrientationState,
+    OrientationTrajectory,
+    error_ends,
+    fitted_error,
+    retarget,
+    unit_quaternion,
+)
+from hrc_learn.dmp.orientation_error import to_orientation
+from hrc_learn.dmp.report import FitReport
+from hrc_learn.dmp.samples import ArrayLike, check_samples
+from hrc_learn.dmp.spring import SpringDamper
+from hrc_learn.dmp.state import DMPState
+from hrc_learn.dmp.trajectory import Trajectory
+from hrc_learn.geometry import Pose
+
+POSITION, ERROR, BODY = slice(0, 3), slice(3, 6), slice(6, None)
+"""Columns of the coordinates that move under one phase."""
+
+
+class PoseTrajectory:
+    """A pose over time, each output computed when first asked for."""
+
+    def __init__(self, motion: Trajectory, goal: Float[Tensor, "*batch 4"]):
+        self._motion = motion
+        self._rotation = OrientationTrajectory(motion, goal, first=ERROR.start)
+        self.time = motion.time
+        """Since the start of the motion [s]."""
+
+    @property
+    def position(self) -> Float[Tensor, "*batch T 3"]:
+        """[m]."""
+        return self._motion.position[..., POSITION]
+
+    @property
+    def orientation(self) -> Float[Tensor, "*batch T 4"]:
+        """Unit quaternions (w, x, y, z), continuous in sign."""
+        return self._rotation.orientation
+
+    @property
+    def pose(self) -> Pose:
+        """Position and orientation, (*batch, T)."""
+        return Pose(self.position, self.orientation)
+
+    @property
+    def velocity(self) -> Float[Tensor, "*batch T 3"]:
+        """Linear [m/s]."""
+        return self._motion.velocity[..., POSITION]
+
+    @property
+    def angular_velocity(self) -> Float[Tensor, "*batch T 3"]:
+        """In the base frame [rad/s]."""
+        return self._rotation.angular_velocity
+
+    @cached_property
+    def twist(self) -> Float[Tensor, "*batch T 6"]:
+        """(linear [m/s], angular [rad/s]) in the base frame."""
+        return torch.cat([self.velocity, self.angular_velocity], dim=-1)
+
+    @property
+    def acceleration(self) -> Float[Tensor, "*batch T 3"]:
+        """Linear [m/s^2]."""
+        return self._motion.acceleration[..., POSITION]
+
+    @property
+    def angular_acceleration(self) -> Float[Tensor, "*batch T 3"]:
+        """In the base frame [rad/s^2]."""
+        return self._rotation.angular_acceleration
+
+    @property
+    def body(self) -> Float[Tensor, "*batch T K"]:
+        """Coordinates learned along; K = 0 without any."""
+        return self._motion.position[..., BODY]
+
+    @property
+    def body_velocity(self) -> Float[Tensor, "*batch T K"]:
+        """The same per second."""
+        return self._motion.velocity[..., BODY]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PoseState:
+    """Where a pose primitive is while it is stepped."""
+
+    motion: DMPState
+    """Of position, error to the goal, and body."""
+    goal_orientation: Float[Tensor, "*batch 4"]
+
+    @property
+    def pose(self) -> Pose:
+        """Position [m] and orientation."""
+        return Pose(self.motion.position[..., POSITION], self._rotation.orientation)
+
+    @property
+    def twist(self) -> Float[Tensor, "*batch 6"]:
+        """(linear [m/s], angular [rad/s]) in the base frame."""
+        linear = self.motion.velocity[..., POSITION]
+        return torch.cat([linear, self._rotation.angular_velocity], dim=-1)
+
+    @property
+    def body(self) -> Float[Tensor, "*batch K"]:
+        """Coordinates learned along."""
+        return self.motion.position[..., BODY]
+
+    @property
+    def _rotation(self) -> OrientationState:
+        columns = {
+            name: getattr(self.motion, name)[..., ERROR]
+            for name in ("position", "rate", "start", "goal", "forced")
+        }
+        return OrientationState(
+            motion=replace(self.motion, **columns), goal=self.goal_orientation
+        )
+
+
+class PoseDMP(nn.Module):
+    """Discrete movement primitive of a pose under one phase.
+
+    Position, orientation error (see `orientation_error`) and, if given, K coordinates of the
+    arm's body shape are columns of one linear primitive. The body, such as a redundant joint
+    or an arm angle, keeps its demonstrated shape when the pose is sent to another goal.
+    """
+
+    goal_orientation: Tensor
+
+    def __init__(self, motion: JointDMP, goal_orientation: Float[Tensor, "*batch 4"]):
+        """Put a primitive together; `fit` is the usual way to one.
+
+        Args:
+            motion: Of position (3), orientation error (3) and body (K).
+            goal_orientation: Unit quaternion (w, x, y, z) that the error is taken to.
+        """
+        super().__init__()
+        self.motion = motion
+        self.register_buffer("goal_orientation", goal_orientation)
+
+    @classmethod
+    def fit(
+        cls,
+        time: ArrayLike,
+        position: ArrayLike,
+        orientation: ArrayLike,
+        n_basis: int = 50,
+        body: ArrayLike | None = None,
+        mask: ArrayLike | None = None,
+        *,
+        method: str = "trajectory",
+        basis: GaussianBasis | None = None,
+        spring: SpringDamper | None = None,
+        regularization: float = 1e-7,
+    ) -> "PoseDMP":
+        """Learn one primitive from each demonstration.
+
+        Args:
+            time: Stamps [s], (T,) or (*B, T).
+            position: (*B, T, 3) [m]. Its floating dtype is the primitive's.
+            orientation: Unit quaternions (w, x, y, z), (*B, T, 4); signs may flip.
+            n_basis: N, unless `basis` is given.
+            body: Coordinates learned along, (*B, T, K), or (T,) for one.
+            mask: (*B, T), false where a sample does not count.
+            method: As for `JointDMP.fit`, like all that follow.
+            basis: Shape of the forcing term.
+            spring: Gains.
+            regularization: Ridge.
+
+        Raises:
+            ValueError: Bad samples; says which.
+        """
+        checked = check_samples(time, position, mask=mask)
+        if checked.position.shape[-1] != 3:
+            raise ValueError(f"position must have 3 columns, got {checked.position.shape[-1]}")
+        error, goal = fitted_error(time, orientation, mask)
+        columns = [checked.position.reshape(*checked.batch, -1, 3), error.to(checked.position)]
+        if body is not None:
+            shape = check_samples(time, body, mask=mask, name="body")
+            columns.append(shape.position.reshape(*shape.batch, *shape.position.shape[1:]))
+        try:
+            coordinates = torch.cat(columns, dim=-1)
+        except RuntimeError:
+            shapes = ", ".join(str(tuple(column.shape)) for column in columns)
+            raise ValueError(f"position, orientation error and body differ: {shapes}") from None
+        motion = JointDMP.fit(
+            time,
+            coordinates,
+            n_basis,
+            mask=mask,
+            units="m, rad, body",
+            method=method,
+            basis=basis,
+            spring=spring,
+            regularization=regularization,
+        )
+        return cls(motion, goal.to(coordinates))
+
+    @property
+    def start(self) -> Pose:
+        """Where the demonstration starts."""
+        error = self.motion.start[..., ERROR]
+        rotation = to_orientation(error, self.goal_orientation)
+        return Pose(self.motion.start[..., POSITION], rotation)
+
+    @property
+    def goal(self) -> Pose:
+        """Where the demonstration ends."""
+        return Pose(self.motion.goal[..., POSITION], self.goal_orientation)
+
+    @property
+    def duration(self) -> Float[Tensor, "*batch"]:
+        """Of the demonstration [s]."""
+        return self.motion.duration
+
+    @property
+    def fit_report(self) -> FitReport | None:
+        """Residuals by column: position [m], orientation error [rad], body.
+
+        Those of the error's components bound those of the angle. The largest range, which
+        `nrmse` divides by, mixes units: prefer `select` and read one kind at a time.
+        """
+        return self.motion.fit_report
+
+    def rollout(
+        self,
+        time: ArrayLike | None = None,
+        start: Pose | None = None,
+        goal: Pose | None = None,
+        duration: ArrayLike | None = None,
+        start_velocity: ArrayLike | None = None,
+        *,
+        speed: ArrayLike | None = None,
+        start_body: ArrayLike | None = None,
+        goal_body: ArrayLike | None = None,
+    ) -> PoseTrajectory:
+        """Motion from start to goal; without arguments, the demonstrated one.
+
+        All arguments broadcast over the batch, and gradients flow to each of them.
+
+        Args:
+            time: Since the start of the motion [s], (T,) or (*batch, T).
+            start: New start, (*batch).
+            goal: New goal, (*batch).
+            duration: [s], (*batch).
+            start_velocity: Twist (linear [m/s], angular [rad/s]), (*batch, 6).
+            speed: Instead of a duration, how many times faster than the demonstration.
+            start_body: (*batch, K).
+            goal_body: (*batch, K).
+        """
+        ends, goal_orientation = self._ends(
+            start, goal, duration, start_velocity, speed, start_body, goal_body
+        )
+        return PoseTrajectory(self.motion.rollout(time, **ends), goal_orientation)
+
+    def initial_state(
+        self,
+        start: Pose | None = None,
+        goal: Pose | None = None,
+        duration: ArrayLike | None = None,
+        start_velocity: ArrayLike | None = None,
+        *,
+        speed: ArrayLike | None = None,
+        start_body: ArrayLike | None = None,
+        goal_body: ArrayLike | None = None,
+    ) -> PoseState:
+        """State at the start of a motion, for `step`; arguments as in `rollout`."""
+        ends, goal_orientation = self._ends(
+            start, goal, duration, start_velocity, speed, start_body, goal_body
+        )
+        motion = self.motion.initial_state(**ends)
+        goal_orientation = goal_orientation.expand(*motion.position.shape[:-1], 4)
+        return PoseState(motion=motion, goal_orientation=goal_orientation)
+
+    def step(
+        self,
+        state: PoseState,
+        dt: ArrayLike,
+        *,
+        goal: Pose | None = None,
+        goal_body: ArrayLike | None = None,
+        coupling: ArrayLike | None = None,
+        slowdown: ArrayLike | None = None,
+    ) -> PoseState:
+        """Advance by `dt`, as `JointDMP.step`.
+
+        Args:
+            state: From `initial_state` or the last step.
+            dt: [s], (*batch).
+            goal: New goal from here on; changes neither pose nor twist of the moment.
+            goal_body: New goal of the body from here on, (*batch, K).
+            coupling: Acceleration added to the position [m/s^2], (*batch, 3).
+            slowdown: The clock runs 1 + slowdown times slower, (*batch), >= 0.
+        """
+        motion, rotation = state.motion, state.goal_orientation
+        ends = motion.goal
+        if goal is not None:
+            rotation = unit_quaternion(goal.orientation, rotation).expand_as(rotation)
+            error, rate = retarget(
+                motion.position[..., ERROR],
+                motion.rate[..., ERROR],
+                state.goal_orientation,
+                rotation,
+            )
+            motion = replace(
+                motion,
+                position=_replaced(motion.position, ERROR, error),
+                rate=_replaced(motion.rate, ERROR, rate),
+            )
+            ends = _replaced(ends, POSITION, goal.position)
+        if goal_body is not None:
+            ends = _replaced(ends, BODY, goal_body)
+        if coupling is not None:
+            coupling = _replaced(torch.zeros_like(motion.position), POSITION, coupling)
+        motion = self.motion.step(motion, dt, goal=ends, coupling=coupling, slowdown=slowdown)
+        return PoseState(motion=motion, goal_orientation=rotation)
+
+    def save(self, folder: str | Path) -> None:
+        """Write config.json and model.safetensors into `folder`, replacing an older save."""
+        tensors = {"goal_orientation": self.goal_orientation, **self.motion.tensors()}
+        write_folder(folder, "PoseDMP", self.motion.config(), tensors)
+
+    @classmethod
+    def load(cls, folder: str | Path) -> "PoseDMP":
+        """Read what `save` wrote; complains as `JointDMP.load`."""
+        saved = SavedPrimitive(folder, "PoseDMP")
+        return cls(JointDMP.restore(saved), saved.tensor("goal_orientation"))
+
+    def _ends(
+        self,
+        start: Pose | None,
+        goal: Pose | None,
+        duration: ArrayLike | None,
+        velocity: ArrayLike | None,
+        speed: ArrayLike | None,
+        start_body: ArrayLike | None,
+        goal_body: ArrayLike | None,
+    ) -> tuple[dict[str, Tensor], Tensor]:
+        """Arguments for the linear primitive, and the goal's orientation."""
+        like = self.motion.start
+        duration = self.motion.resolve_duration(duration, speed)
+        demonstrated = self.motion.start_velocity * (self.motion.duration / duration)[..., None]
+        twist = None if velocity is None else torch.as_tensor(velocity).to(like)
+        error, error_rate, goal_orientation = error_ends(
+            like[..., ERROR],
+            demonstrated[..., ERROR],
+            self.goal_orientation,
+            None if start is None else start.orientation,
+            None if goal is None else goal.orientation,
+            None if twist is None else twist[..., 3:],
+        )
+        return {
+            "start": _joined(
+                like[..., POSITION] if start is None else start.position,
+                error,
+                like[..., BODY] if start_body is None else start_body,
+                like,
+            ),
+            "goal": _joined(
+                self.motion.goal[..., POSITION] if goal is None else goal.position,
+                torch.zeros_like(error),
+                self.motion.goal[..., BODY] if goal_body is None else goal_body,
+                like,
+            ),
+            "start_velocity": _joined(
+                demonstrated[..., POSITION] if twist is None else twist[..., :3],
+                error_rate,
+                demonstrated[..., BODY],
+                like,
+            ),
+            "duration": duration,
+        }, goal_orientation
+
+
+def _joined(position: Tensor, error: Tensor, body: ArrayLike, like: Tensor) -> Tensor:
+    """The columns of a linear primitive, broadcast and side by side."""
+    columns = [torch.as_tensor(part).to(like) for part in (position, error, body)]
+    batch = torch.broadcast_shapes(*(column.shape[:-1] for column in columns))
+    return torch.cat([column.expand(*batch, -1) for column in columns], dim=-1)
+
+
+def _replaced(values: Tensor, columns: slice, new: ArrayLike) -> Tensor:
+    """`values` with some columns exchanged; differentiable in both."""
+    new = torch.as_tensor(new).to(values)
+    stop = values.shape[-1] if columns.stop is None else columns.stop
+    new = new.expand(*values.shape[:-1], stop - columns.start)
+    return torch.cat([values[..., : columns.start], new, values[..., stop:]], dim=-1)

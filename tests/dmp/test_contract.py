@@ -1,0 +1,125 @@
+"""Every kind of primitive, held to the same contract."""
+
+import torch
+from demo_motions import arm_motion, turning_motion
+from dmp_contract import DMPContract
+
+from hrc_learn.dmp import JointDMP, OrientationDMP, PoseDMP
+from hrc_learn.geometry import Pose, quaternion
+
+
+def random_tensor(seed, *shape):
+    rng = torch.Generator().manual_seed(seed)
+    return 2 * torch.rand(*shape, generator=rng, dtype=torch.float64) - 1
+
+
+def random_orientations(seed):
+    return quaternion.exp(random_tensor(seed, 2, 3)).unbind()
+
+
+def quaternion_rate(orientation, angular_velocity):
+    """q' = (0, omega) * q / 2."""
+    pure = torch.nn.functional.pad(angular_velocity, (1, 0))
+    return quaternion.multiply(pure, orientation) / 2
+
+
+class TestJoint(DMPContract):
+    def demonstrate(self, seed, n_samples=300):
+        return arm_motion(n_samples, n_joints=3, seed=seed, moving_start=True)
+
+    def fit(self, *demonstration, **kwargs):
+        return JointDMP.fit(*demonstration, **kwargs)
+
+    def outputs(self, trajectory):
+        return {
+            "position": trajectory.position,
+            "rate of position": trajectory.velocity,
+        }
+
+    state_outputs = outputs
+
+    def ends(self, seed):
+        return random_tensor(seed, 2, 3).unbind()
+
+    def distance(self, outputs, demonstration):
+        return (outputs["position"] - demonstration[1]).abs().max()
+
+
+class TestOrientation(DMPContract):
+    def demonstrate(self, seed, n_samples=300):
+        return turning_motion(n_samples, seed=seed)
+
+    def fit(self, *demonstration, **kwargs):
+        return OrientationDMP.fit(*demonstration, **kwargs)
+
+    def outputs(self, trajectory):
+        return {
+            "orientation": trajectory.orientation,
+            "rate of orientation": trajectory.angular_velocity,
+        }
+
+    state_outputs = outputs
+
+    def ends(self, seed):
+        return random_orientations(seed)
+
+    def rate(self, name, outputs):
+        return quaternion_rate(outputs[name], outputs[f"rate of {name}"])
+
+    def distance(self, outputs, demonstration):
+        return quaternion.angle(outputs["orientation"], demonstration[1]).max()
+
+
+class TestPose(DMPContract):
+    """Pose with two body coordinates; start and goal as (position, rotation vector, body)."""
+
+    reproduction = 3e-5
+
+    def demonstrate(self, seed, n_samples=300):
+        time, position = arm_motion(n_samples, n_joints=5, seed=seed, moving_start=True)
+        return time, position[:, :3], turning_motion(n_samples, seed=seed)[1], position[:, 3:]
+
+    def fit(self, time, position, orientation, body, **kwargs):
+        return PoseDMP.fit(time, position, orientation, body=body, **kwargs)
+
+    def outputs(self, trajectory):
+        return {
+            "position": trajectory.position,
+            "rate of position": trajectory.velocity,
+            "orientation": trajectory.orientation,
+            "rate of orientation": trajectory.angular_velocity,
+            "body": trajectory.body,
+            "rate of body": trajectory.body_velocity,
+        }
+
+    def state_outputs(self, state):
+        return {
+            "position": state.pose.position,
+            "orientation": state.pose.orientation,
+            "rate of position": state.twist[..., :3],
+            "rate of orientation": state.twist[..., 3:],
+            "body": state.body,
+        }
+
+    def ends(self, seed):
+        return random_tensor(seed, 2, 8).unbind()
+
+    def arguments(self, start, goal):
+        return {
+            "start": Pose(start[:3], quaternion.exp(start[3:6])),
+            "goal": Pose(goal[:3], quaternion.exp(goal[3:6])),
+            "start_body": start[6:],
+            "goal_body": goal[6:],
+        }
+
+    def rate(self, name, outputs):
+        rate = outputs[f"rate of {name}"]
+        return quaternion_rate(outputs[name], rate) if name == "orientation" else rate
+
+    def distance(self, outputs, demonstration):
+        _, position, orientation, body = demonstration
+        return max(
+            (outputs["position"] - position).abs().max(),
+            quaternion.angle(outputs["orientation"], orientation).max(),
+            (outputs["body"] - body).abs().max(),
+        )
