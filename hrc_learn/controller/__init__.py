@@ -1,5 +1,13 @@
 """The adaptive controller and the safety filter behind it."""
 
+from .activation import Activation as Activation
+from .activation import ActivationConfig as ActivationConfig
+from .config import ControllerConfig as ControllerConfig
+from .controller import AdaptiveController as AdaptiveController
+from .goals import Goals as Goals
+from .interface import Command as Command
+from .interface import ControllerState as ControllerState
+from .interface import Observation as Observation
 from .safety import INTERVENTIONS as INTERVENTIONS
 from .safety import SafetyConfig as SafetyConfig
 from .safety import SafetyFilter as SafetyFilter

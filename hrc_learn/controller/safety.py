@@ -90,9 +90,15 @@ class SafetyFilter(nn.Module):
     keeps its direction; only a position limit cuts single joints.
     """
 
-    def __init__(self, limits: JointLimits, config: SafetyConfig = SafetyConfig()):
+    velocity: Tensor
+    acceleration: Tensor
+    knee: Tensor
+    walls: Tensor
+    sides: Tensor
+
+    def __init__(self, limits: JointLimits, config: SafetyConfig | None = None):
         super().__init__()
-        self.config = config
+        self.config = config = config or SafetyConfig()
         self.register_buffer("velocity", limits.velocity.clone())
         self.register_buffer("acceleration", limits.acceleration.clone())
         walls = torch.stack([-limits.lower - config.margin, limits.upper - config.margin])

@@ -1,0 +1,45 @@
+"""Settings of the controller that stay the same through a task."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+from hrc_learn.controller.activation import ActivationConfig
+from hrc_learn.controller.safety import SafetyConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class ControllerConfig:
+    """The defaults are those that were measured to work best."""
+
+    linear_speed: float = 0.25
+    """Cap on the linear part of the twist [m/s]; the direction of the twist is kept."""
+    angular_speed: float = 1.0
+    """Cap on its angular part [rad/s]."""
+    null_damping: float = 3.0
+    """c_d: effort divided by it is velocity."""
+    null_space_yields: bool = True
+    """Scale null-space motion as a whole where a limit would cut single joints."""
+    hold_rate: float = 2.0
+    """Rate at which the tool returns to its place while a person acts [1/s]; 0: it does not."""
+    activation: ActivationConfig = field(default_factory=ActivationConfig)
+    safety: SafetyConfig = field(default_factory=SafetyConfig)
+
+    def __post_init__(self):
+        for name in ("linear_speed", "angular_speed", "null_damping"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive, but is {getattr(self, name)}")
+        if self.hold_rate < 0:
+            raise ValueError(f"hold_rate must not be negative, but is {self.hold_rate}")
+
+    @classmethod
+    def paper(cls) -> ControllerConfig:
+        """The law as printed: nothing between it and the safety filter."""
+        return cls(
+            linear_speed=math.inf,
+            angular_speed=math.inf,
+            null_space_yields=False,
+            hold_rate=0.0,
+            activation=ActivationConfig(hysteresis=0.0, blend_time=0.0),
+        )

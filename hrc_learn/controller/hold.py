@@ -1,0 +1,66 @@
+"""Pose hold: undoes what null-space motion leaks into the tool pose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from hrc_learn.regions.pytree import pytree
+
+_FARTHEST = 0.005
+"""Bound on each component of the remembered drift [m, rad]: a person who blocks the arm
+must not wind it up."""
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
+class Hold:
+    """How far the tool has drifted from where the task sent it, and what that needs."""
+
+    drift: Float[Tensor, "*batch 6"]
+    """Motion still owed to the task (linear [m], angular [rad])."""
+    joint_position: Float[Tensor, "*batch n"]
+    """Of the last step [rad]."""
+    jacobian: Float[Tensor, "*batch 6 n"]
+    """Of the last step."""
+    planned: Float[Tensor, "*batch 6"]
+    """Motion the task had planned for the last step (linear [m], angular [rad])."""
+
+
+def measure_drift(
+    hold: Hold,
+    joint_position: Float[Tensor, "*batch n"],
+    jacobian: Float[Tensor, "*batch 6 n"],
+    acting: Bool[Tensor, "*batch"],
+) -> Float[Tensor, "*batch 6"]:
+    """Drift after the last step: what was planned, less what the tool did.
+
+    The motion of the tool is (J_0 + J_1)/2 dq, right to the third order of the step, where
+    the J_0 dq by which it was planned is right to the second: the difference is the drift.
+    Zero while no effort acts, so that every effort starts afresh.
+    """
+    step = (joint_position - hold.joint_position).unsqueeze(-1)
+    moved = ((hold.jacobian + jacobian) @ step).squeeze(-1)
+    drift = torch.add(hold.drift + hold.planned, moved, alpha=-0.5)
+    return torch.where(acting.unsqueeze(-1), drift.clamp(-_FARTHEST, _FARTHEST), 0.0)
+
+
+def planned_motion(
+    twist: Float[Tensor, "*batch 6"],
+    jacobian: Float[Tensor, "*batch 6 n"],
+    joint_velocity: Float[Tensor, "*batch n"],
+    dt: float | Tensor,
+) -> Float[Tensor, "*batch 6"]:
+    """The part of the step to come that the task has planned.
+
+    Limits may slow the task down. That is no drift, so only the share of the twist that the
+    filtered joint velocity carries out counts as planned.
+    """
+    done = (jacobian @ joint_velocity.unsqueeze(-1)).squeeze(-1)
+    along = torch.linalg.vecdot(done, twist)
+    square = torch.linalg.vecdot(twist, twist).clamp(min=torch.finfo(twist.dtype).tiny)
+    share = (along / square).clamp(0, 1)
+    return (share * dt).unsqueeze(-1) * twist

@@ -1,0 +1,89 @@
+"""What goes into a control step and what comes out of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from hrc_learn.controller.activation import Activation
+from hrc_learn.controller.goals import Goals
+from hrc_learn.controller.hold import Hold
+from hrc_learn.controller.safety import SafetyReport, SafetyState
+from hrc_learn.regions.pytree import pytree
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
+class Observation:
+    """What the controller is told at one step."""
+
+    joint_position: Float[Tensor, "*batch n"]
+    """Measured [rad]."""
+    feature: Float[Tensor, "*batch 2"]
+    """Measured feature (u, v) [px]; anything, also NaN, where it is not visible."""
+    feature_visible: Bool[Tensor, "*batch"]
+    """Whether the feature was found in the image."""
+    dt: float | Float[Tensor, ""]
+    """Time until the next step [s]."""
+    target: Float[Tensor, "*#batch 2"] | None = None
+    """Target in the image [px]; None: that of the goals."""
+    human_effort: Float[Tensor, "*batch n"] | None = None
+    """Effort d of the person on each joint; None: nobody acts."""
+    goals: Goals | None = None
+    """Regions to go to; None: those the controller was built with."""
+    feature_new: Bool[Tensor, "*batch"] | None = None
+    """Whether `feature` stems from an image that no earlier step has used; None: it does."""
+    feature_age: Float[Tensor, "*batch"] | None = None
+    """Time since the image was taken [s]; None: none."""
+    joint_state_stale: Bool[Tensor, "*batch"] | None = None
+    """Whether the joint position is too old to be used; None: it is not."""
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
+class ControllerState:
+    """All that the controller remembers from one step to the next."""
+
+    activation: Activation
+    """Hand-over between Cartesian and vision feedback."""
+    hold: Hold
+    """Drift of the tool while a person acts."""
+    safety: SafetyState
+    """Of the safety filter, with its counts of interventions."""
+    estimator: Any
+    """Of the image Jacobian: whatever the estimator keeps."""
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
+class Command:
+    """The joint velocity to send, and how it came about."""
+
+    joint_velocity: Float[Tensor, "*batch n"]
+    """To send [rad/s]; it has passed the safety filter."""
+    twist: Float[Tensor, "*batch 6"]
+    """Wanted motion of the tool (linear [m/s], angular [rad/s])."""
+    null_velocity: Float[Tensor, "*batch n"]
+    """Joint velocity in the null space [rad/s]."""
+    xi_x: Float[Tensor, "*batch 2"]
+    """Vision feedback, faded by the activation."""
+    xi_r: Float[Tensor, "*batch 6"]
+    """Cartesian feedback, position then orientation."""
+    xi_q: Float[Tensor, "*batch n"]
+    """Joint-space feedback."""
+    s: Float[Tensor, "*batch 6"]
+    """J_s_hat^T xi_x + xi_r, which goes to zero where the law is stable."""
+    image_jacobian: Float[Tensor, "*batch 2 6"]
+    """Estimate J_s_hat [px/m, px/rad]."""
+    weight_norm: Float[Tensor, "*batch"]
+    """Frobenius norm of the estimator's weights."""
+    vision_activation: Float[Tensor, "*batch"]
+    """Share of vision feedback, 0 to 1."""
+    potential: Float[Tensor, "*batch"]
+    """Sum of the task-space potentials P_v + P_t + P_o: the part of the Lyapunov function
+    that needs no true weights."""
+    safety: SafetyReport
+    """What the safety filter did."""

@@ -1,0 +1,85 @@
+"""From a tool twist and a joint-space wish to one joint velocity."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+SINGULAR_BELOW = 0.05
+"""Smallest singular value of the Jacobian below which its inverse is damped, and the damping
+at the singularity itself, as in `hrc_learn.kinematics.singularity_damping`."""
+
+# Lets the Cholesky factorisation go through at a singularity; used there only to see how
+# near it is, never in a solution.
+_FLOOR = 1e-9
+
+
+def cap_twist(
+    twist: Float[Tensor, "*batch 6"], caps: Float[Tensor, "2"]
+) -> Float[Tensor, "*batch 6"]:
+    """Scale a twist to a linear and an angular speed [m/s, rad/s], keeping its direction."""
+    speeds = torch.linalg.vector_norm(twist.unflatten(-1, (2, 3)), dim=-1)
+    return twist / (speeds / caps).amax(-1, keepdim=True).clamp(min=1)
+
+
+def resolve(
+    J: Float[Tensor, "*batch 6 n"],
+    twist: Float[Tensor, "*batch 6"],
+    wish: Float[Tensor, "*batch n"],
+) -> tuple[Float[Tensor, "*batch n"], Float[Tensor, "*batch n"]]:
+    """J^+ twist and N wish from one symmetric 6 x 6 solve.
+
+        J^+ v = J^T A^-1 v,   N w = w - J^T A^-1 J w,   A = J J^T + lambda^2 I
+
+    The damping lambda is exactly zero unless J is near a singularity. It is judged by
+    |A^-1|_F^(-1/2), which is at most sigma_min and close to it where sigma_min is small.
+
+    Args:
+        J: Geometric Jacobian.
+        twist: Wanted motion of the tool (linear [m/s], angular [rad/s]).
+        wish: Wanted joint velocity in the null space [rad/s].
+
+    Returns:
+        Joint velocity of the task, and that of the null space [rad/s].
+    """
+    gram = J @ J.mT
+    eye = torch.eye(6, dtype=J.dtype, device=J.device)
+    factor, _ = torch.linalg.cholesky_ex(gram + _FLOOR * eye)
+    inverse_norm = torch.linalg.matrix_norm(torch.cholesky_inverse(factor), keepdim=True)
+    # 1 - (sigma/sigma_0)^2 with sigma^2 = 1/|A^-1|
+    depth = (1 - 1 / (SINGULAR_BELOW**2 * inverse_norm)).clamp(min=0)
+    factor, _ = torch.linalg.cholesky_ex(gram + (SINGULAR_BELOW**2 * depth) * eye)
+    wish = wish.unsqueeze(-1)
+    wrench = torch.cholesky_solve(torch.cat([twist.unsqueeze(-1), J @ wish], dim=-1), factor)
+    task, leak = (J.mT @ wrench).unbind(-1)
+    return task, wish.squeeze(-1) - leak
+
+
+def fit_null_space(
+    task: Float[Tensor, "*batch n"],
+    null: Float[Tensor, "*batch n"],
+    lower: Float[Tensor, "*#batch n"],
+    upper: Float[Tensor, "*#batch n"],
+) -> Float[Tensor, "*batch n"]:
+    """Scale the null-space velocity as a whole so that limits need not cut single joints.
+
+    A limit that cuts one joint of a null-space motion makes it move the tool. Scaled as a
+    whole it does not; scaled below zero it even turns the redundant joints away to let the
+    task through. Where no factor fits task and limits, the least motion is taken.
+
+    Args:
+        task: Joint velocity of the task [rad/s].
+        null: Joint velocity of the null space [rad/s].
+        lower: Lowest allowed velocity [rad/s].
+        upper: Highest allowed velocity [rad/s].
+
+    Returns:
+        The scaled null-space velocity [rad/s].
+    """
+    null_or_tiny = torch.where(null == 0, torch.finfo(null.dtype).tiny, null)
+    at_lower, at_upper = (lower - task) / null_or_tiny, (upper - task) / null_or_tiny
+    least = torch.minimum(at_lower, at_upper).amax(-1, keepdim=True)
+    most = torch.maximum(at_lower, at_upper).amin(-1, keepdim=True)
+    wanted = (least <= most).to(null.dtype)
+    low, high = torch.minimum(least, most), torch.maximum(least, most)
+    factor = torch.minimum(torch.maximum(wanted, low), high)
+    return factor * null
