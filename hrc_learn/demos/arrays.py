@@ -14,7 +14,7 @@ from .naming import meaning_of_component
 from .poses import to_quaternion
 from .units import unit_factor
 
-Table = dict[str, Float64[np.ndarray, "demos frames components"]]
+Table = dict[str, Float64[np.ndarray, "_demos _frames _components"]]
 """Array or column name -> its values; one frame axis, and a leading one for demonstrations."""
 
 _TIME_NAMES = ("t", "time", "timestamp", "stamp")

@@ -63,7 +63,7 @@ class Demonstration:
     """Stamp of the first frame on the recorder's own clock [s]."""
     episode: int = 0
     """Index of the episode in its dataset."""
-    extra: dict[str, Float64[np.ndarray, "frames _"]] = field(default_factory=dict)
+    extra: dict[str, Float64[np.ndarray, "_frames _components"]] = field(default_factory=dict)
     """Every other numeric column, by the key it has in the dataset, unconverted."""
 
     def __post_init__(self) -> None:

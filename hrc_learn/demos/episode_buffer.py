@@ -7,7 +7,7 @@ from jaxtyping import Float64, Shaped
 
 from .schema import FRAME_WIDTHS
 
-Episode = dict[str, Shaped[np.ndarray, "frames ..."]]
+Episode = dict[str, Shaped[np.ndarray, "_frames ..."]]
 
 
 class EpisodeBuffer:

@@ -10,7 +10,7 @@ from .finding import DatasetError
 from .layout import DatasetFolder, EpisodeEntry
 from .parquet import BadRowError, open_parquet, read_table, to_numpy
 
-RawFrames = dict[str, Shaped[np.ndarray, "frames components"]]
+RawFrames = dict[str, Shaped[np.ndarray, "_frames _components"]]
 """Column -> its values during one episode, in the type and unit they have on disk."""
 
 

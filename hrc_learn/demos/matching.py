@@ -193,7 +193,9 @@ def _grouped(
         order = sorted(slots) if role in _POSES else list(slots)
         labels = tuple(map(str, order))
         columns = tuple((feature.key, slots[slot]) for slot in order)
-        selections.append(Selection(role=role, columns=columns, labels=labels))
+        selections.append(
+            Selection(role=role, columns=columns, labels=labels, numbered=feature.names is None)
+        )
     return selections
 
 

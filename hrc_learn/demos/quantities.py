@@ -8,7 +8,7 @@ from jaxtyping import Float64
 from .explicit_mapping import Selection
 from .frames import RawFrames
 
-Quantities = dict[str, Float64[np.ndarray, "frames components"]]
+Quantities = dict[str, Float64[np.ndarray, "_frames _components"]]
 """Role -> values during one episode."""
 
 

@@ -108,8 +108,8 @@ def lerobot_features(columns: Sequence[Column], dtype: str) -> dict[str, dict]:
 
 
 def encode(
-    columns: Sequence[Column], episode: Mapping[str, Shaped[np.ndarray, "frames ..."]]
-) -> dict[str, Float64[np.ndarray, "frames width"]]:
+    columns: Sequence[Column], episode: Mapping[str, Shaped[np.ndarray, "_frames ..."]]
+) -> dict[str, Float64[np.ndarray, "_frames _width"]]:
     """Features of one episode from what its frames gave."""
     parts: dict[str, list[np.ndarray]] = {}
     for column in columns:

@@ -11,7 +11,7 @@ Statistics = dict[str, dict[str, list]]
 """Feature -> statistic (min, max, mean, std, count, q01 ... q99) -> one number a component."""
 
 
-def episode_statistics(features: Mapping[str, Shaped[np.ndarray, "frames ..."]]) -> Statistics:
+def episode_statistics(features: Mapping[str, Shaped[np.ndarray, "_frames ..."]]) -> Statistics:
     """Statistics of each feature over the frames of one episode."""
     return {key: _of_columns(np.asarray(values, float)) for key, values in features.items()}
 

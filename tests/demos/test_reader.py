@@ -1,0 +1,348 @@
+"""Every version and naming convention reads into the same demonstrations."""
+
+import json
+
+import numpy as np
+import pytest
+from lerobot_folders import FPS, joint_path, rewrite, write_folder
+from scipy.spatial.transform import Rotation
+
+from hrc_learn.demos import DatasetError, UnitsWarning, load_demos
+
+PANDA = [f"panda_joint{i}" for i in range(1, 4)]
+STATE = "observation.state"
+
+
+def two_episodes(**columns):
+    """Two episodes of these columns; each column is a function of the joint motion."""
+    motions = [joint_path(60, seed=0), joint_path(45, seed=1)]
+    return motions, [{key: make(q) for key, make in columns.items()} for q in motions]
+
+
+@pytest.mark.parametrize("version", ["v3.0", "v2.1", "v2.0"])
+@pytest.mark.parametrize("ragged_lists", [False, True])
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_versions_and_column_types_read_alike(tmp_path, version, ragged_lists, dtype):
+    motions, episodes = two_episodes(**{STATE: lambda q: q})
+    root = write_folder(
+        tmp_path / "set",
+        episodes,
+        {STATE: [f"{j}.pos" for j in PANDA]},
+        version=version,
+        ragged_lists=ragged_lists,
+        dtype=dtype,
+        tasks=("reach", "place"),
+    )
+    demos = load_demos(root)
+    assert [demo.task for demo in demos] == ["reach", "place"]
+    assert demos.joint_names == tuple(PANDA)
+    for demo, q in zip(demos, motions, strict=True):
+        np.testing.assert_allclose(demo.joint_position, q, atol=1e-6)
+        np.testing.assert_array_equal(demo.time, np.arange(len(q)) / FPS)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        PANDA,
+        {"axes": PANDA},
+        {"motors": PANDA},
+        {"joints": PANDA},
+        [PANDA],
+        [f"{j}.pos" for j in PANDA],
+        [f"{j}.obs_pos" for j in PANDA],
+    ],
+)
+def test_names_in_every_nesting(tmp_path, names):
+    motions, episodes = two_episodes(**{STATE: lambda q: q})
+    demos = load_demos(write_folder(tmp_path / "set", episodes, {STATE: names}))
+    assert demos.joint_names == tuple(PANDA)
+    np.testing.assert_allclose(demos[1].joint_position, motions[1], atol=1e-6)
+
+
+def test_columns_without_names_are_numbered_joints_and_said_so(tmp_path):
+    _, episodes = two_episodes(state=lambda q: q, actions=lambda q: q + 0.1)
+    demos = load_demos(write_folder(tmp_path / "set", episodes, {}))
+    assert demos.joint_names == ("joint_1", "joint_2", "joint_3")
+    assert demos[0].command_position is not None
+    assert any("names no components" in note for note in demos.notes)
+
+
+def test_lerobot_record_convention(tmp_path):
+    names = [
+        *(f"joint_{i}.pos" for i in range(3)),
+        *(f"joint_{i}.vel" for i in range(3)),
+        *(f"joint_{i}.torque" for i in range(3)),
+        "gripper.pos",
+        *("ee.x", "ee.y", "ee.z", "ee.wx", "ee.wy", "ee.wz"),
+    ]
+    motions, episodes = two_episodes(
+        **{
+            STATE: lambda q: np.hstack([q, 2 * q, 3 * q, q[:, :1], q / 2, q / 3]),
+            "action": lambda q: np.hstack([q + 1, q[:, :1]]),
+        }
+    )
+    command = [*(f"joint_{i}.pos" for i in range(3)), "gripper.pos"]
+    demo = load_demos(
+        write_folder(tmp_path / "set", episodes, {STATE: names, "action": command})
+    )[0]
+    q = motions[0]
+    np.testing.assert_allclose(demo.joint_velocity, 2 * q, atol=1e-6)
+    np.testing.assert_allclose(demo.joint_effort, 3 * q, atol=1e-6)
+    np.testing.assert_allclose(demo.gripper, q[:, 0], atol=1e-6)
+    np.testing.assert_allclose(demo.position, q / 2, atol=1e-6)
+    np.testing.assert_allclose(demo.command_position, q + 1, atol=1e-6)
+    assert_same_rotation(demo.orientation, Rotation.from_rotvec(q / 3))
+
+
+def test_franka_plug_in_convention_with_libfranka_columns(tmp_path):
+    names = [f"joint_{i}.pos" for i in range(3)] + [f"ee_pose.{i:02d}" for i in range(16)]
+    motions, episodes = two_episodes(**{STATE: lambda q: np.hstack([q, transforms(q, "F")])})
+    demo = load_demos(write_folder(tmp_path / "set", episodes, {STATE: names}))[0]
+    np.testing.assert_allclose(demo.position, motions[0] / 2, atol=1e-6)
+    assert_same_rotation(demo.orientation, Rotation.from_rotvec(motions[0]))
+
+
+def test_aloha_convention(tmp_path):
+    motions, episodes = two_episodes(
+        **{
+            STATE: lambda q: q,
+            "observation.velocity": lambda q: 2 * q,
+            "observation.effort": lambda q: 3 * q,
+            "action": lambda q: q + 0.1,
+        }
+    )
+    names = {STATE: ["waist", "shoulder", "elbow"], "action": ["waist", "shoulder", "elbow"]}
+    demo = load_demos(write_folder(tmp_path / "set", episodes, names))[0]
+    assert demo.joint_names == ("waist", "shoulder", "elbow")
+    np.testing.assert_allclose(demo.joint_velocity, 2 * motions[0], atol=1e-6)
+    np.testing.assert_allclose(demo.joint_effort, 3 * motions[0], atol=1e-6)
+    np.testing.assert_allclose(demo.command_position, motions[0] + 0.1, atol=1e-6)
+
+
+def test_droid_convention(tmp_path):
+    motions, episodes = two_episodes(
+        **{
+            STATE: lambda q: np.hstack([q, q[:, :1]]),
+            f"{STATE}.joint_position": lambda q: q,
+            f"{STATE}.cartesian_position": lambda q: np.hstack([q / 2, q]),
+            f"{STATE}.gripper_position": lambda q: q[:, :1],
+            "action.joint_velocity": lambda q: 3 * q,
+            "action.cartesian_position": lambda q: np.hstack([q, q]),
+            "camera_extrinsics.wrist": lambda q: np.hstack([q, q]),
+        }
+    )
+    joints = ["joint_0", "joint_1", "joint_2"]
+    names = {
+        STATE: {"axes": [*joints, "gripper"]},
+        f"{STATE}.joint_position": {"axes": joints},
+        f"{STATE}.cartesian_position": {"axes": ["x", "y", "z", "roll", "pitch", "yaw"]},
+        f"{STATE}.gripper_position": {"axes": ["gripper"]},
+        "action.joint_velocity": {"axes": joints},
+    }
+    demo = load_demos(write_folder(tmp_path / "set", episodes, names))[0]
+    q = motions[0]
+    np.testing.assert_allclose(demo.joint_position, q, atol=1e-6)
+    np.testing.assert_allclose(demo.gripper, q[:, 0], atol=1e-6)
+    np.testing.assert_allclose(demo.position, q / 2, atol=1e-6)
+    np.testing.assert_allclose(demo.command_velocity, 3 * q, atol=1e-6)
+    assert_same_rotation(demo.orientation, Rotation.from_euler("xyz", q))
+    assert "camera_extrinsics.wrist" in demo.extra
+
+
+@pytest.mark.parametrize(
+    ("names", "encode"),
+    [
+        (["ee.qx", "ee.qy", "ee.qz", "ee.qw"], lambda r: r.as_quat()),
+        (["qw", "qx", "qy", "qz"], lambda r: r.as_quat(scalar_first=True)),
+        (["ee.wx", "ee.wy", "ee.wz"], lambda r: r.as_rotvec()),
+        (["roll", "pitch", "yaw"], lambda r: r.as_euler("xyz")),
+    ],
+)
+def test_orientations_turn_continuous_in_every_encoding(tmp_path, names, encode):
+    # A turn by 400 degrees: every encoding wraps or changes sign on the way.
+    turn = Rotation.from_rotvec(np.linspace(0.1, 7, 80)[:, None] * np.array([0.6, 0.0, 0.8]))
+    columns = np.hstack([np.zeros((80, 3)), encode(turn)])
+    root = write_folder(
+        tmp_path / "set", [{STATE: columns}], {STATE: ["x", "y", "z", *names]}, dtype="float64"
+    )
+    orientation = load_demos(root)[0].orientation
+    assert_same_rotation(orientation, turn)
+    assert np.abs(np.diff(orientation, axis=0)).max() < 0.1
+
+
+def test_true_stamps_are_preferred_and_begin_at_zero(tmp_path):
+    stamps = 1.7e9 + np.cumsum(np.random.default_rng(0).uniform(0.018, 0.022, 60))
+    episode = {STATE: joint_path(60), "observation.time": stamps[:, None]}
+    root = write_folder(tmp_path / "set", [episode], {STATE: PANDA}, dtype="float64")
+    demo = load_demos(root)[0]
+    np.testing.assert_allclose(demo.time, stamps - stamps[0], atol=1e-6)
+    assert demo.start_time == pytest.approx(stamps[0])
+
+
+@pytest.mark.parametrize("without", ["timestamp", "frame_index", "index", "task_index"])
+def test_index_columns_may_be_missing(tmp_path, without):
+    root = write_folder(
+        tmp_path / "set", [{STATE: joint_path()}], {STATE: PANDA}, without=[without]
+    )
+    demo = load_demos(root)[0]
+    assert demo.task == "reach"
+    np.testing.assert_allclose(np.diff(demo.time), 1 / FPS)
+
+
+def test_missing_videos_are_no_matter(tmp_path):
+    root = write_folder(
+        tmp_path / "set",
+        [{STATE: joint_path()}],
+        {STATE: PANDA},
+        videos=["observation.images.a"],
+    )
+    assert len(load_demos(root)) == 1
+
+
+def test_episodes_are_chosen_in_order_and_from_their_row_groups(tmp_path):
+    motions = [joint_path(20 + i, seed=i) for i in range(5)]
+    root = write_folder(tmp_path / "set", [{STATE: q} for q in motions], {STATE: PANDA})
+    demos = load_demos(root, episodes=[3, 1])
+    assert [demo.episode for demo in demos] == [3, 1]
+    np.testing.assert_allclose(demos[0].joint_position, motions[3], atol=1e-6)
+    np.testing.assert_allclose(demos[1].joint_position, motions[1], atol=1e-6)
+    with pytest.raises(DatasetError, match=r"episode 7.*0 to 4"):
+        load_demos(root, episodes=[7])
+
+
+@pytest.mark.parametrize(
+    ("scale", "unit"), [(180 / np.pi, "deg"), (4096 / (2 * np.pi), "tick"), (1, "rad")]
+)
+def test_units_of_joints_are_guessed_shown_and_overruled(tmp_path, recwarn, scale, unit):
+    q = joint_path() + 2
+    root = write_folder(
+        tmp_path / "set", [{STATE: scale * q, "action": scale * q}], {STATE: PANDA}
+    )
+    demos = load_demos(root)
+    np.testing.assert_allclose(demos[0].joint_position, q, atol=1e-5)
+    np.testing.assert_allclose(demos[0].command_position, q, atol=1e-5)
+    assert any(f"taken for {unit}" in note for note in demos.notes)
+    assert bool(recwarn.list) == (unit != "rad")
+    assert all(issubclass(warning.category, UnitsWarning) for warning in recwarn.list)
+    given = load_demos(root, units={"joint_position": "rad"})
+    np.testing.assert_allclose(given[0].joint_position, scale * q, rtol=1e-6)
+    assert not given.notes or "joint_position" not in " ".join(given.notes)
+
+
+def test_positions_in_centimetres_are_noticed(tmp_path):
+    position = 100 * joint_path()
+    root = write_folder(tmp_path / "set", [{STATE: position}], {STATE: ["x", "y", "z"]})
+    with pytest.warns(UnitsWarning, match="taken for cm"):
+        demo = load_demos(root)[0]
+    np.testing.assert_allclose(demo.position, position / 100, rtol=1e-6)
+
+
+def test_units_stand_in_the_sidecar(tmp_path):
+    q = joint_path()
+    root = write_folder(
+        tmp_path / "set", [{STATE: np.rad2deg(q)}], {STATE: [f"{j}.pos" for j in PANDA]}
+    )
+    sidecar = {
+        "format": 1,
+        "units": {"joint_position": "deg"},
+        "columns": {},
+        "joint_names": PANDA,
+        "frames": {},
+        "details": {},
+    }
+    (root / "meta/hrc_learn.json").write_text(json.dumps(sidecar))
+    demos = load_demos(root)
+    np.testing.assert_allclose(demos[0].joint_position, q, atol=1e-6)
+    assert demos.notes == ()
+
+
+def test_mapping_overrules_what_names_say(tmp_path):
+    q = joint_path()
+    episode = {STATE: np.hstack([q, q / 2]), "observation.qpos_raw": 2 * q}
+    root = write_folder(tmp_path / "set", [episode], {STATE: [*PANDA, "px", "py", "pz"]})
+    by_slice = load_demos(root, mapping={"joint_position": "observation.state[0:2]"})
+    assert by_slice.joint_names == tuple(PANDA[:2])
+    by_feature = load_demos(root, mapping={"joint_position": "observation.qpos_raw"})
+    np.testing.assert_allclose(by_feature[0].joint_position, 2 * q, atol=1e-6)
+    by_names = load_demos(root, mapping={"joint_position": [PANDA[2], f"{STATE}/{PANDA[0]}"]})
+    np.testing.assert_allclose(by_names[0].joint_position, q[:, [2, 0]], atol=1e-6)
+    assert load_demos(root, mapping={"position": None})[0].position is None
+
+
+@pytest.mark.parametrize(
+    ("mapping", "message"),
+    [
+        ({"joints": STATE}, "unknown quantity 'joints'"),
+        ({"joint_position": "observation.qpos"}, "observation.qpos: .*does not exist"),
+        ({"joint_position": ["elbow"]}, "elbow: .*does not exist.*panda_joint1"),
+        ({"position": f"{STATE}[0:2]"}, "position 2 columns, it takes 3"),
+    ],
+)
+def test_a_wrong_mapping_says_what_exists(tmp_path, mapping, message):
+    root = write_folder(tmp_path / "set", [{STATE: joint_path()}], {STATE: PANDA})
+    with pytest.raises(DatasetError, match=message):
+        load_demos(root, mapping=mapping)
+
+
+def test_joints_are_selected_by_name(tmp_path):
+    q = joint_path()
+    root = write_folder(
+        tmp_path / "set",
+        [{STATE: q, "action": q[:, ::-1]}],
+        {STATE: PANDA, "action": PANDA[::-1]},
+    )
+    demo = load_demos(root, joint_names=[PANDA[2], PANDA[0]])[0]
+    assert demo.joint_names == (PANDA[2], PANDA[0])
+    np.testing.assert_allclose(demo.joint_position, q[:, [2, 0]], atol=1e-6)
+    np.testing.assert_allclose(demo.command_position, q[:, [2, 0]], atol=1e-6)
+    with pytest.raises(DatasetError, match="no joint named elbow.*panda_joint1"):
+        load_demos(root, joint_names=["elbow"])
+
+
+def test_actions_of_other_joints_are_kept_apart(tmp_path):
+    q = joint_path()
+    names = {STATE: ["f1.pos", "f2.pos", "f3.pos"], "action": ["l1.pos", "l2.pos", "l3.pos"]}
+    demos = load_demos(write_folder(tmp_path / "set", [{STATE: q, "action": q}], names))
+    assert demos[0].command_position is None
+    assert demos[0].extra["action"].shape == q.shape
+    assert any("other joints" in note for note in demos.notes)
+
+
+def test_an_object_is_not_taken_for_the_end_effector(tmp_path):
+    episode = {STATE: joint_path(), "observation.object_position": joint_path(seed=5)}
+    names = {STATE: PANDA, "observation.object_position": ["x", "y", "z"]}
+    demo = load_demos(write_folder(tmp_path / "set", [episode], names))[0]
+    assert demo.position is None
+    assert "observation.object_position" in demo.extra
+
+
+def test_shards_are_read_from_their_own_first_row(tmp_path):
+    motions = [joint_path(30, seed=i) for i in range(3)]
+    root = write_folder(tmp_path / "set", [{STATE: q} for q in motions], {STATE: PANDA})
+    first = root / "data/chunk-000/file-000.parquet"
+    second = root / "data/chunk-000/file-001.parquet"
+    second.write_bytes(first.read_bytes())
+    rewrite(first, lambda table: table.slice(0, 30))
+    rewrite(second, lambda table: table.slice(30))
+    rewrite(
+        root / "meta/episodes/chunk-000/file-000.parquet",
+        lambda table: table.set_column(
+            table.schema.get_field_index("data/file_index"), "data/file_index", [[0, 1, 1]]
+        ),
+    )
+    for demo, q in zip(load_demos(root), motions, strict=True):
+        np.testing.assert_allclose(demo.joint_position, q, atol=1e-6)
+
+
+def transforms(q: np.ndarray, order) -> np.ndarray:
+    """Flattened 4x4 transforms that turn by q and move by q / 2."""
+    T = np.tile(np.eye(4), (len(q), 1, 1))
+    T[:, :3, :3] = Rotation.from_rotvec(q).as_matrix()
+    T[:, :3, 3] = q / 2
+    return np.array([matrix.flatten(order) for matrix in T])
+
+
+def assert_same_rotation(orientation: np.ndarray, expected: Rotation) -> None:
+    difference = Rotation.from_quat(orientation, scalar_first=True) * expected.inv()
+    assert difference.magnitude().max() < 1e-5
