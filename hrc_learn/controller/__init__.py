@@ -2,6 +2,7 @@
 
 from .activation import Activation as Activation
 from .activation import ActivationConfig as ActivationConfig
+from .activation import HandOver as HandOver
 from .config import ControllerConfig as ControllerConfig
 from .controller import AdaptiveController as AdaptiveController
 from .goals import Goals as Goals

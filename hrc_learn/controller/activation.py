@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import final
 
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from hrc_learn.regions.pytree import pytree
 
@@ -36,49 +37,71 @@ class Activation:
     feature: Float[Tensor, "*batch 2"]
     """Where the feature was last seen [px]: what fades out when it is lost."""
 
-    @classmethod
-    def initial(
-        cls, like: Float[Tensor, "*batch n"], image_size: tuple[int, int]
-    ) -> Activation:
-        """Nothing seen yet."""
+
+@final
+class HandOver(nn.Module):
+    """Decides from the measured feature how much vision feedback takes part."""
+
+    edge: Tensor
+    """Half of the image, which is where its middle is [px]."""
+
+    def __init__(self, config: ActivationConfig | None = None):
+        super().__init__()
+        self.config = config = config or ActivationConfig()
+        size = torch.tensor(config.image_size, dtype=torch.float64)
+        self.register_buffer("edge", (size - 1) / 2)
+
+    def initial_state(self, like: Float[Tensor, "*batch n"]) -> Activation:
+        """Nothing seen yet, for the batch of `like`."""
         level = torch.zeros_like(like[..., 0])
-        centre = (like.new_tensor(image_size) - 1) / 2
-        return cls(
+        return Activation(
             active=torch.zeros_like(level, dtype=torch.bool),
             level=level,
-            feature=centre.expand(*level.shape, 2).clone(),
+            feature=self.edge.expand(*level.shape, 2).clone(),
         )
 
+    def step(
+        self,
+        state: Activation,
+        feature: Float[Tensor, "*batch 2"],
+        usable: Bool[Tensor, "*batch"],
+        dt: float | Float[Tensor, ""],
+        *,
+        age: Float[Tensor, "*batch"] | None = None,
+    ) -> tuple[Activation, Bool[Tensor, "*batch"], Bool[Tensor, "*batch"] | None]:
+        """One step of the hand-over.
 
-def advance(
-    activation: Activation,
-    feature: Float[Tensor, "*batch 2"],
-    usable: Bool[Tensor, "*batch"],
-    dt: float | Tensor,
-    config: ActivationConfig,
-) -> tuple[Activation, Bool[Tensor, "*batch"]]:
-    """One step of the hand-over.
+        Args:
+            state: Of the step before.
+            feature: Measured position [px]; anything, also NaN, where it is not usable.
+            usable: Whether the camera takes part and found the feature.
+            dt: Step [s].
+            age: Of the measurement [s]; None: none.
 
-    Args:
-        activation: Of the step before.
-        feature: Measured position [px]; anything, also NaN, where it is not usable.
-        usable: Whether the camera takes part and found the feature.
-        dt: Step [s].
-        config: Hysteresis, blend time and image size.
+        Returns:
+            The next state; whether the feature was seen within the image; and whether the arm
+            must stop because the camera it follows has fallen silent (None without an age).
+        """
+        stop = None
+        if age is not None:
+            late = age > self.config.max_feature_age
+            stop = usable & late & state.active
+            usable = usable & ~late
+        # Distance to the nearest edge of the image; NaN compares as not seen.
+        depth = (self.edge - (feature - self.edge).abs()).amin(-1)
+        seen = usable & (depth >= 0)
+        active = seen & (state.active | (depth >= self.config.hysteresis))
+        level = self._faded(state.level, active, dt)
+        if stop is not None:
+            # Wait for the camera: neither fade out nor forget that it was in charge.
+            active = active | stop
+            level = torch.where(stop, state.level, level)
+        feature = torch.where(seen.unsqueeze(-1), feature, state.feature)
+        return Activation(active=active, level=level, feature=feature), seen, stop
 
-    Returns:
-        The next state, and whether the feature was seen within the image.
-    """
-    width, height = config.image_size
-    edge = feature.new_tensor((width - 1, height - 1))
-    # Distance to the nearest edge; NaN compares as not seen.
-    depth = torch.minimum(feature, edge - feature).amin(-1)
-    seen = usable & (depth >= 0)
-    active = seen & (activation.active | (depth >= config.hysteresis))
-    if config.blend_time > 0:
-        change = torch.where(active, 1.0, -1.0) * (dt / config.blend_time)
-        level = (activation.level + change).clamp(0, 1)
-    else:
-        level = active.to(activation.level.dtype)
-    feature = torch.where(seen.unsqueeze(-1), feature, activation.feature)
-    return Activation(active=active, level=level, feature=feature), seen
+    def _faded(self, level: Tensor, active: Tensor, dt: float | Tensor) -> Tensor:
+        wanted = active.to(level.dtype)
+        if self.config.blend_time == 0:
+            return wanted
+        change = dt / self.config.blend_time
+        return (level + (2 * change) * wanted - change).clamp(0, 1)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import NamedTuple, final
 
 import torch
@@ -11,8 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.utils import _pytree
 
-from hrc_learn.controller import activation
-from hrc_learn.controller.activation import Activation
+from hrc_learn.controller.activation import Activation, HandOver
 from hrc_learn.controller.config import ControllerConfig
 from hrc_learn.controller.goals import Goals
 from hrc_learn.controller.hold import Hold, measure_drift, planned_motion
@@ -77,6 +75,7 @@ class AdaptiveController(nn.Module):
         self.config = config = config or ControllerConfig()
         limits = chain.limits
         self.joint_region = joint_region or JointRegion.from_limits(limits.lower, limits.upper)
+        self.hand_over = HandOver(config.activation)
         self.safety = SafetyFilter(limits, config.safety)
         caps = torch.tensor([config.linear_speed, config.angular_speed], dtype=torch.float64)
         self.register_buffer("caps", caps)
@@ -99,7 +98,7 @@ class AdaptiveController(nn.Module):
         pose, J = self.chain.forward_and_jacobian(joint_position)
         still = torch.zeros_like(J[..., 0])
         return ControllerState(
-            activation=Activation.initial(joint_position, self.config.activation.image_size),
+            activation=self.hand_over.initial_state(joint_position),
             hold=Hold(drift=still, joint_position=joint_position, jacobian=J, planned=still),
             safety=self.safety.initial_state(joint_position, joint_velocity),
             estimator=self.estimator.initial_state(pose),
@@ -123,18 +122,32 @@ class AdaptiveController(nn.Module):
         goals = _effective_goals(observation, self.goals)
         q, stale = _trusted_position(state, observation)
         pose, J = self.chain.forward_and_jacobian(q)
-        hand_over, seen, stop = self._hand_over(state, observation, goals)
-        feedback = self._feedback(state, goals, pose, hand_over)
+        activation, seen, stop = self.hand_over.step(
+            state.activation,
+            observation.feature,
+            observation.feature_visible & goals.vision_enabled,
+            observation.dt,
+            age=observation.feature_age,
+        )
+        feedback = self._feedback(state, goals, pose, activation)
 
         task_twist = cap_twist(-feedback.s, self.caps)
         d = observation.human_effort
         drift = self._drift(state, q, J, d)
         twist = task_twist if drift is None else task_twist + self.config.hold_rate * drift
 
-        _, xi_q = self.joint_region.feedback(q)
-        u, null_velocity = self._joint_velocity(q, J, twist, d, xi_q)
+        xi_q = self.joint_region.gradient(q)
+        bounds = self.safety.velocity_bounds(q)
+        u, null_velocity = self._joint_velocity(q, J, twist, d, xi_q, bounds)
         v, safety, report = self.safety.step(
-            state.safety, q, u, observation.dt, jacobian=J, stop=stop, stale=stale
+            state.safety,
+            q,
+            u,
+            observation.dt,
+            jacobian=J,
+            stop=stop,
+            stale=stale,
+            bounds=bounds,
         )
         command = Command(
             joint_velocity=v,
@@ -146,7 +159,7 @@ class AdaptiveController(nn.Module):
             s=feedback.s,
             image_jacobian=feedback.image_jacobian,
             weight_norm=self.estimator.weight_norm(state.estimator),
-            vision_activation=hand_over.level,
+            vision_activation=activation.level,
             potential=feedback.potential,
             safety=report,
         )
@@ -157,51 +170,28 @@ class AdaptiveController(nn.Module):
         estimator = self.estimator.update(
             state.estimator,
             pose=pose,
-            feature=hand_over.feature,
+            feature=activation.feature,
             seen=seen,
             xi_x=feedback.xi_x,
             s=feedback.s,
             dt=observation.dt,
         )
         return command, ControllerState(
-            activation=hand_over, hold=hold, safety=safety, estimator=estimator
+            activation=activation, hold=hold, safety=safety, estimator=estimator
         )
-
-    def _hand_over(
-        self, state: ControllerState, observation: Observation, goals: Goals
-    ) -> tuple[Activation, Bool[Tensor, "*batch"], Bool[Tensor, "*batch"] | None]:
-        """Next activation, whether the feature is seen, whether a dead camera stops the arm."""
-        config = self.config.activation
-        usable = observation.feature_visible & goals.vision_enabled
-        stop = None
-        if observation.feature_age is not None:
-            fresh = observation.feature_age <= config.max_feature_age
-            stop = usable & ~fresh & state.activation.active
-            usable = usable & fresh
-        hand_over, seen = activation.advance(
-            state.activation, observation.feature, usable, observation.dt, config
-        )
-        if stop is not None:
-            # Wait for the camera: neither fade out nor forget that it was in charge.
-            hand_over = replace(
-                hand_over,
-                active=hand_over.active | stop,
-                level=torch.where(stop, state.activation.level, hand_over.level),
-            )
-        return hand_over, seen, stop
 
     def _feedback(
-        self, state: ControllerState, goals: Goals, pose: Pose, hand_over: Activation
+        self, state: ControllerState, goals: Goals, pose: Pose, activation: Activation
     ) -> _Feedback:
         """Regional feedback in image and Cartesian space."""
         P_t, xi_position = goals.position.feedback(pose.position)
         P_o, xi_orientation = goals.orientation.feedback(pose.orientation)
-        P_v, xi_x = goals.vision.feedback(hand_over.feature)
-        xi_x = hand_over.level.unsqueeze(-1) * xi_x
+        P_v, xi_x = goals.vision.feedback(activation.feature)
+        xi_x = activation.level.unsqueeze(-1) * xi_x
         xi_r = torch.cat([xi_position, xi_orientation], dim=-1)
         J_s = self.estimator.jacobian(state.estimator, pose)
-        s = (J_s.mT @ xi_x.unsqueeze(-1)).squeeze(-1) + xi_r
-        return _Feedback(xi_x, xi_r, s, J_s, P_t + P_o + hand_over.level * P_v)
+        s = torch.linalg.vecdot(J_s, xi_x.unsqueeze(-1), dim=-2) + xi_r
+        return _Feedback(xi_x, xi_r, s, J_s, P_t + P_o + activation.level * P_v)
 
     def _drift(
         self, state: ControllerState, q: Tensor, J: Tensor, d: Tensor | None
@@ -212,14 +202,20 @@ class AdaptiveController(nn.Module):
         return measure_drift(state.hold, q, J, acting=(d != 0).any(-1))
 
     def _joint_velocity(
-        self, q: Tensor, J: Tensor, twist: Tensor, d: Tensor | None, xi_q: Tensor
+        self,
+        q: Tensor,
+        J: Tensor,
+        twist: Tensor,
+        d: Tensor | None,
+        xi_q: Tensor,
+        bounds: tuple[Tensor, Tensor],
     ) -> tuple[Tensor, Tensor]:
         """The law's joint velocity, and its part in the null space."""
         wish = (-xi_q if d is None else d - xi_q) / self.config.null_damping
         wish = torch.add(wish, q - self.joint_region.centre, alpha=-_CENTRING)
         task, null = resolve(J, twist, wish)
         if self.config.null_space_yields:
-            null = fit_null_space(task, null, *self.safety.velocity_bounds(q))
+            null = fit_null_space(task, null, *bounds)
         return task + null, null
 
 

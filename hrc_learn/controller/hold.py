@@ -42,8 +42,8 @@ def measure_drift(
     the J_0 dq by which it was planned is right to the second: the difference is the drift.
     Zero while no effort acts, so that every effort starts afresh.
     """
-    step = (joint_position - hold.joint_position).unsqueeze(-1)
-    moved = ((hold.jacobian + jacobian) @ step).squeeze(-1)
+    step = (joint_position - hold.joint_position).unsqueeze(-2)
+    moved = torch.linalg.vecdot(hold.jacobian + jacobian, step)
     drift = torch.add(hold.drift + hold.planned, moved, alpha=-0.5)
     return torch.where(acting.unsqueeze(-1), drift.clamp(-_FARTHEST, _FARTHEST), 0.0)
 
@@ -59,7 +59,7 @@ def planned_motion(
     Limits may slow the task down. That is no drift, so only the share of the twist that the
     filtered joint velocity carries out counts as planned.
     """
-    done = (jacobian @ joint_velocity.unsqueeze(-1)).squeeze(-1)
+    done = torch.linalg.vecdot(jacobian, joint_velocity.unsqueeze(-2))
     along = torch.linalg.vecdot(done, twist)
     square = torch.linalg.vecdot(twist, twist).clamp(min=torch.finfo(twist.dtype).tiny)
     share = (along / square).clamp(0, 1)

@@ -4,6 +4,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from hrc_learn.geometry.constant import Constant
+
 SINGULAR_BELOW = 0.05
 """Smallest singular value of the Jacobian below which its inverse is damped, and the damping
 at the singularity itself, as in `hrc_learn.kinematics.singularity_damping`."""
@@ -11,13 +13,14 @@ at the singularity itself, as in `hrc_learn.kinematics.singularity_damping`."""
 # Lets the Cholesky factorisation go through at a singularity; used there only to see how
 # near it is, never in a solution.
 _FLOOR = 1e-9
+_EYE = Constant(torch.eye(6, dtype=torch.float64))
 
 
 def cap_twist(
     twist: Float[Tensor, "*batch 6"], caps: Float[Tensor, "2"]
 ) -> Float[Tensor, "*batch 6"]:
     """Scale a twist to a linear and an angular speed [m/s, rad/s], keeping its direction."""
-    speeds = torch.linalg.vector_norm(twist.unflatten(-1, (2, 3)), dim=-1)
+    speeds = torch.linalg.vector_norm(twist.view(*twist.shape[:-1], 2, 3), dim=-1)
     return twist / (speeds / caps).amax(-1, keepdim=True).clamp(min=1)
 
 
@@ -42,12 +45,12 @@ def resolve(
         Joint velocity of the task, and that of the null space [rad/s].
     """
     gram = J @ J.mT
-    eye = torch.eye(6, dtype=J.dtype, device=J.device)
-    factor, _ = torch.linalg.cholesky_ex(gram + _FLOOR * eye)
-    inverse_norm = torch.linalg.matrix_norm(torch.cholesky_inverse(factor), keepdim=True)
-    # 1 - (sigma/sigma_0)^2 with sigma^2 = 1/|A^-1|
-    depth = (1 - 1 / (SINGULAR_BELOW**2 * inverse_norm)).clamp(min=0)
-    factor, _ = torch.linalg.cholesky_ex(gram + (SINGULAR_BELOW**2 * depth) * eye)
+    eye = _EYE.like(J)
+    factor, _ = torch.linalg.cholesky_ex(torch.add(gram, eye, alpha=_FLOOR))
+    inverse = torch.cholesky_inverse(factor)
+    sigma_square = 1 / torch.linalg.vector_norm(inverse, dim=(-2, -1), keepdim=True)
+    damping = (SINGULAR_BELOW**2 - sigma_square).clamp(min=0)
+    factor, _ = torch.linalg.cholesky_ex(torch.addcmul(gram, eye, damping))
     wish = wish.unsqueeze(-1)
     wrench = torch.cholesky_solve(torch.cat([twist.unsqueeze(-1), J @ wish], dim=-1), factor)
     task, leak = (J.mT @ wrench).unbind(-1)

@@ -91,10 +91,16 @@ class SafetyFilter(nn.Module):
     """
 
     velocity: Tensor
+    """v_max [rad/s]."""
     acceleration: Tensor
+    """a [rad/s^2]."""
     knee: Tensor
+    """c = a / rate [rad/s]."""
     walls: Tensor
+    """Lower and upper limits, less the margin, with the signs of `sides` [rad]."""
     sides: Tensor
+    knee_square: Tensor
+    twice_acceleration: Tensor
 
     def __init__(self, limits: JointLimits, config: SafetyConfig | None = None):
         super().__init__()
@@ -104,7 +110,10 @@ class SafetyFilter(nn.Module):
         walls = torch.stack([-limits.lower - config.margin, limits.upper - config.margin])
         self.register_buffer("walls", walls)
         self.register_buffer("sides", torch.tensor([[1.0], [-1.0]]).to(walls))
-        self.register_buffer("knee", limits.acceleration / config.rate)
+        knee = limits.acceleration / config.rate
+        self.register_buffer("knee", knee)
+        self.register_buffer("knee_square", knee * knee)
+        self.register_buffer("twice_acceleration", 2 * limits.acceleration)
 
     def initial_state(
         self,
@@ -125,10 +134,11 @@ class SafetyFilter(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Lowest and highest velocity [rad/s] that position and velocity limits allow."""
         room = torch.addcmul(self.walls, self.sides, joint_position.unsqueeze(-2))
-        root = torch.sqrt(self.knee**2 + 2 * self.acceleration * room.abs())
-        h = torch.copysign(root - self.knee, room).clamp(-self.velocity, self.velocity)
-        below, above = h.unbind(-2)
-        return -below, above
+        square = torch.addcmul(self.knee_square, self.twice_acceleration, room.abs())
+        h = torch.minimum(square.sqrt() - self.knee, self.velocity)
+        bounds = torch.copysign(h, room) * -self.sides
+        lower, upper = bounds.unbind(-2)
+        return lower, upper
 
     def step(
         self,
@@ -140,6 +150,7 @@ class SafetyFilter(nn.Module):
         jacobian: Float[Tensor, "*batch rows n"] | None = None,
         stop: Bool[Tensor, "*batch"] | None = None,
         stale: Bool[Tensor, "*batch"] | None = None,
+        bounds: tuple[Tensor, Tensor] | None = None,
     ) -> tuple[Tensor, SafetyState, SafetyReport]:
         """Velocity to send for the next `dt` seconds.
 
@@ -151,6 +162,7 @@ class SafetyFilter(nn.Module):
             jacobian: Of the tool centre point, linear rows first: enables its speed cap.
             stop: Brake to rest for another reason.
             stale: The joint position is too old to be used: brake to rest.
+            bounds: `velocity_bounds` of a trusted joint position, where they are known.
 
         Returns:
             The velocity (*batch, n) [rad/s], the next state, and what was done.
@@ -162,7 +174,7 @@ class SafetyFilter(nn.Module):
         q, u, invalid, stopped = self._trusted(
             state, joint_position, joint_velocity_command, stop, stale
         )
-        lower, upper = self.velocity_bounds(q)
+        lower, upper = bounds or self.velocity_bounds(q)
 
         excess = _excess(u, self.velocity)
         u = u / excess.clamp(min=1)
@@ -173,12 +185,13 @@ class SafetyFilter(nn.Module):
         change = target - state.velocity
         jerky = _excess(change, reach)
         v = torch.addcdiv(state.velocity, change, jerky.clamp(min=1))
-        slowest, fastest = state.velocity - reach, state.velocity + reach
-        v = v.clamp(lower.clamp(slowest, fastest), upper.clamp(slowest, fastest))
+        # Last the bounds that no scaling may loosen. Should both exclude each other, the arm
+        # could not brake harder anyway.
+        v = v.clamp(lower, upper).clamp(state.velocity - reach, state.velocity + reach)
 
         cut = (inside != u).any(-1, keepdim=True)
         flags = torch.cat([excess > 1, cut, jerky > 1, speeding, invalid, stopped], dim=-1)
-        position = torch.add(q, v * dt)
+        position = q + v * dt
         next_state = SafetyState(velocity=v, position=position, counts=state.counts + flags)
         return v, next_state, SafetyReport(flags=flags)
 
@@ -204,13 +217,13 @@ class SafetyFilter(nn.Module):
             invalid = invalid | stale.unsqueeze(-1)
         stopped = torch.zeros_like(invalid) if stop is None else stop.unsqueeze(-1)
         q = torch.where(invalid, state.position, q)
-        u = torch.where(invalid | stopped, 0.0, u)
+        u = u.masked_fill(invalid | stopped, 0)
         return q, u, invalid, stopped
 
     def _cap_tcp_speed(self, u: Tensor, jacobian: Tensor | None) -> tuple[Tensor, Tensor]:
         if jacobian is None:
             return u, torch.zeros_like(u[..., :1], dtype=torch.bool)
-        linear = (jacobian[..., :3, :] @ u.unsqueeze(-1)).squeeze(-1)
+        linear = torch.linalg.vecdot(jacobian[..., :3, :], u.unsqueeze(-2))
         ratio = torch.linalg.vector_norm(linear, dim=-1, keepdim=True) / self.config.tcp_speed
         return u / ratio.clamp(min=1), ratio > 1
 
