@@ -9,6 +9,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 FPS = 50
+INDEX_TYPES = {
+    "timestamp": "float32",
+    "frame_index": "int64",
+    "episode_index": "int64",
+    "index": "int64",
+    "task_index": "int64",
+}
 
 
 def joint_path(frames: int = 60, joints: int = 3, seed: int = 0) -> np.ndarray:

@@ -71,8 +71,8 @@ def demonstrations_from_table(
     units: Mapping[str, str] | None = None,
     quaternion_order: str = "wxyz",
     joint_names: Sequence[str] = (),
-    duration: float | None = None,
-    fps: float | None = None,
+    duration: float | int | None = None,
+    fps: float | int | None = None,
     task: str = "",
 ) -> list[Demonstration]:
     """Make demonstrations of arrays.
@@ -166,8 +166,8 @@ def _demonstration(
     episode: Mapping[str, np.ndarray],
     quaternion_order: str,
     joint_names: Sequence[str],
-    duration: float | None,
-    fps: float | None,
+    duration: float | int | None,
+    fps: float | int | None,
     task: str,
 ) -> Demonstration:
     for name, values in episode.items():
@@ -203,7 +203,7 @@ def _orientation(values: np.ndarray | None, quaternion_order: str) -> np.ndarray
 
 
 def _stamps(
-    given: np.ndarray | None, frames: int, duration: float | None, fps: float | None
+    given: np.ndarray | None, frames: int, duration: float | int | None, fps: float | int | None
 ) -> np.ndarray:
     if given is not None:
         return given[:, 0]

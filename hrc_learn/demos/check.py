@@ -19,7 +19,7 @@ def check_dataset(
     path: str | Path,
     mapping: MappingSpec | None = None,
     units: Mapping[str, str] | None = None,
-    speed_limits: Mapping[str, float] | None = None,
+    speed_limits: Mapping[str, float | int] | None = None,
 ) -> Report:
     """Examine a LeRobot dataset of version 2.0, 2.1 or 3.0.
 
@@ -74,7 +74,7 @@ def _check_episode(
     folder: DatasetFolder,
     episode: Understood,
     matching: Matching,
-    speed_limits: Mapping[str, float],
+    speed_limits: Mapping[str, float | int],
     report: Report,
 ) -> None:
     entry, time, quantities = episode.entry, episode.time, episode.quantities

@@ -57,7 +57,7 @@ class Demonstration:
     """What the person was asked to show."""
     joint_names: tuple[str, ...] = ()
     """Names of the joints, in the order of the columns; empty where poses alone are known."""
-    fps: float
+    fps: float | int
     """Nominal frame rate [1/s]."""
     start_time: float = 0.0
     """Stamp of the first frame on the recorder's own clock [s]."""

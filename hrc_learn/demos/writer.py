@@ -10,6 +10,7 @@ import numpy as np
 
 from .demonstration import Demonstration
 from .episode_buffer import Episode, EpisodeBuffer, complete, describe_difference, examine
+from .finding import DatasetError
 from .lerobot_v3 import INDEX_FEATURES, assemble
 from .schema import TIME_KEY, Column, columns_for, encode, lerobot_features
 from .sidecar import sidecar_content
@@ -43,7 +44,7 @@ class DatasetWriter:
     def __init__(
         self,
         root: str | Path,
-        fps: float,
+        fps: float | int,
         robot_type: str,
         joint_names: Sequence[str] = (),
         features: Mapping[str, Sequence[str]] | None = None,
@@ -201,7 +202,8 @@ class DatasetWriter:
                 f"save_episode() or discard_episode() before the recording ends"
             )
         if not self.episodes:
-            shutil.rmtree(self._staging, ignore_errors=True)
+            shutil.rmtree(self._staging)
+            raise DatasetError("no episode was saved, so there is no dataset", file=self.root)
         return recover_dataset(self.root)
 
     def _open_task(self) -> str:

@@ -296,7 +296,7 @@ def test_joints_are_selected_by_name(tmp_path):
     assert demo.joint_names == (PANDA[2], PANDA[0])
     np.testing.assert_allclose(demo.joint_position, q[:, [2, 0]], atol=1e-6)
     np.testing.assert_allclose(demo.command_position, q[:, [2, 0]], atol=1e-6)
-    with pytest.raises(DatasetError, match="no joint named elbow.*panda_joint1"):
+    with pytest.raises(DatasetError, match=r"no joint named elbow.*panda_joint1"):
         load_demos(root, joint_names=["elbow"])
 
 

@@ -22,7 +22,7 @@ def check_jumps(
     time: Times,
     joint_position: Joints,
     joint_names: Sequence[str],
-    speed_limits: Mapping[str, float],
+    speed_limits: Mapping[str, float | int],
     report: Report,
 ) -> None:
     """Steps no joint can make: lost frames, glitches, encoders that wrapped."""
@@ -86,7 +86,7 @@ def check_commands(
 
 
 def check_duplicates(
-    episodes: Sequence[tuple[EpisodeEntry, Float64[np.ndarray, "frames _"]]], report: Report
+    episodes: Sequence[tuple[EpisodeEntry, Float64[np.ndarray, "_frames _"]]], report: Report
 ) -> None:
     """Episodes that show the same motion to within a thousandth of its span."""
     seen: list[tuple[EpisodeEntry, np.ndarray]] = []

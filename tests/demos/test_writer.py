@@ -1,0 +1,324 @@
+"""What is recorded comes back, and a recording that breaks off is neither lost nor whole."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from lerobot_folders import joint_path
+
+from hrc_learn.demos import (
+    DatasetError,
+    DatasetWriter,
+    Demonstration,
+    check_dataset,
+    load_demos,
+    recover_dataset,
+)
+
+JOINTS = ("panda_joint1", "panda_joint2", "panda_joint3")
+
+
+def frame(k: int, q: np.ndarray, seed: int = 0) -> dict:
+    """Everything a frame can hold, made from the joint positions."""
+    half = 0.02 * k + seed  # past a half turn within 160 frames
+    return {
+        "time": 100.0 + 0.0201 * k,
+        "joint_position": q,
+        "joint_velocity": 2 * q,
+        "joint_effort": 3 * q,
+        "position": q / 2,
+        "orientation": [np.cos(half), 0.6 * np.sin(half), 0.0, 0.8 * np.sin(half)],
+        "gripper": 0.04,
+        "feature": [700.5 + k, 500.25],
+        "feature_visible": k % 3 != 0,
+        "human_effort": -q,
+        "command_velocity": q + 1,
+        "observation.shelf": [1.0, 2.0],
+    }
+
+
+def record(root, lengths=(160, 40), dtype="float64", tasks=("reach", "place")):
+    motions = [joint_path(n, seed=i) for i, n in enumerate(lengths)]
+    with DatasetWriter(
+        root, 50, "panda", JOINTS, {"observation.shelf": ["row", "column"]}, dtype=dtype
+    ) as writer:
+        for index, motion in enumerate(motions):
+            writer.start_episode(tasks[index % len(tasks)])
+            for k, q in enumerate(motion):
+                writer.add_frame(**frame(k, q, index))
+            assert writer.save_episode() == index
+    return motions
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [("float64", 1e-12), ("float32", 1e-6)])
+def test_everything_recorded_comes_back(tmp_path, dtype, tolerance):
+    motions = record(tmp_path / "set", dtype=dtype)
+    demos = load_demos(tmp_path / "set")
+    assert demos.joint_names == JOINTS
+    assert demos.notes == ()  # the sidecar spares every guess
+    for index, (demo, q) in enumerate(zip(demos, motions, strict=True)):
+        assert (demo.task, demo.fps) == (("reach", "place")[index], 50.0)
+        np.testing.assert_allclose(demo.time, 0.0201 * np.arange(len(q)), atol=1e-9)
+        assert demo.start_time == 100.0
+        np.testing.assert_allclose(demo.joint_position, q, atol=tolerance)
+        np.testing.assert_allclose(demo.joint_velocity, 2 * q, atol=2 * tolerance)
+        np.testing.assert_allclose(demo.joint_effort, 3 * q, atol=3 * tolerance)
+        np.testing.assert_allclose(demo.position, q / 2, atol=tolerance)
+        np.testing.assert_allclose(demo.human_effort, -q, atol=tolerance)
+        np.testing.assert_allclose(demo.command_velocity, q + 1, atol=2 * tolerance)
+        np.testing.assert_allclose(demo.feature[:, 0], 700.5 + np.arange(len(q)), rtol=1e-7)
+        np.testing.assert_array_equal(demo.feature_visible, np.arange(len(q)) % 3 != 0)
+        np.testing.assert_allclose(demo.gripper, 0.04, atol=tolerance)
+        np.testing.assert_array_equal(demo.extra["observation.shelf"][0], [1, 2])
+        assert demo.command_position is None
+        given = np.array([frame(k, row, index)["orientation"] for k, row in enumerate(q)])
+        assert np.abs((demo.orientation * given).sum(1)).min() > 1 - 1e-6
+        assert np.abs(np.diff(demo.orientation, axis=0)).max() < 0.03
+    assert check_dataset(tmp_path / "set").ok
+
+
+def test_rotation_vectors_on_disk_do_not_jump_past_a_half_turn(tmp_path):
+    record(tmp_path / "set")
+    table = pq.read_table(tmp_path / "set/data/chunk-000/file-000.parquet")
+    names = json.loads((tmp_path / "set/meta/info.json").read_text())["features"]
+    columns = [names["observation.state"]["names"].index(f"ee.w{axis}") for axis in "xyz"]
+    state = np.stack(table.column("observation.state").to_numpy())[:160]
+    assert np.linalg.norm(state[:, columns], axis=1).max() > np.pi
+    assert np.abs(np.diff(state[:, columns], axis=0)).max() < 0.1
+
+
+def test_one_row_group_an_episode(tmp_path):
+    record(tmp_path / "set", lengths=(30, 20, 25))
+    metadata = pq.read_metadata(tmp_path / "set/data/chunk-000/file-000.parquet")
+    assert [metadata.row_group(i).num_rows for i in range(3)] == [30, 20, 25]
+
+
+def test_large_recordings_are_cut_into_files_between_episodes(tmp_path, monkeypatch):
+    monkeypatch.setattr("hrc_learn.demos.lerobot_v3.FILE_SIZE_MB", 0.02)
+    motions = record(tmp_path / "set", lengths=(60, 60, 60))
+    assert len(list((tmp_path / "set/data/chunk-000").iterdir())) > 1
+    for demo, q in zip(load_demos(tmp_path / "set"), motions, strict=True):
+        np.testing.assert_allclose(demo.joint_position, q)
+    assert check_dataset(tmp_path / "set").ok
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    lengths=st.lists(st.integers(2, 30), min_size=1, max_size=4),
+    width=st.integers(1, 9),
+    has_pose=st.booleans(),
+)
+def test_whole_demonstrations_come_back(tmp_path_factory, lengths, width, has_pose):
+    root = tmp_path_factory.mktemp("any") / "set"
+    names = tuple(f"j{i}" for i in range(width))
+    rng = np.random.default_rng(len(lengths))
+    given_demos = [
+        Demonstration(
+            time=np.concatenate([[0.0], np.cumsum(rng.uniform(0.01, 0.03, n - 1))]),
+            joint_position=rng.normal(size=(n, width)),
+            position=rng.normal(size=(n, 3)) if has_pose else None,
+            joint_names=names,
+            fps=50,
+            start_time=12.5,
+            task=f"task {i % 2}",
+        )
+        for i, n in enumerate(lengths)
+    ]
+    with DatasetWriter(root, 50, "any", names, dtype="float64") as writer:
+        for demo in given_demos:
+            writer.add_episode(demo)
+    read = load_demos(root)
+    assert len(read) == len(lengths)
+    for before, after in zip(given_demos, read, strict=True):
+        np.testing.assert_array_equal(before.joint_position, after.joint_position)
+        np.testing.assert_allclose(before.time, after.time, atol=1e-12)
+        assert (before.task, before.start_time) == (after.task, after.start_time)
+        assert (after.position is None) != has_pose
+
+
+def test_without_stamps_frames_are_one_period_apart(tmp_path):
+    with DatasetWriter(tmp_path / "set", 30, "any", JOINTS) as writer:
+        writer.start_episode("")
+        for q in joint_path(12):
+            writer.add_frame(joint_position=q)
+        writer.save_episode()
+    np.testing.assert_allclose(load_demos(tmp_path / "set")[0].time, np.arange(12) / 30)
+
+
+def test_a_feature_that_is_not_seen_need_not_be_a_number(tmp_path):
+    with DatasetWriter(tmp_path / "set", 30, "any") as writer:
+        writer.start_episode("")
+        writer.add_frame(feature=[np.nan, np.nan], feature_visible=False)
+        writer.add_frame(feature=[3.0, 4.0], feature_visible=True)
+        writer.save_episode()
+    demo = load_demos(tmp_path / "set")[0]
+    np.testing.assert_array_equal(demo.feature, [[0, 0], [3, 4]])
+    np.testing.assert_array_equal(demo.feature_visible, [False, True])
+
+
+def test_arrays_are_copied_when_a_frame_is_added(tmp_path):
+    buffer = np.zeros(3)
+    with DatasetWriter(tmp_path / "set", 30, "any", JOINTS) as writer:
+        writer.start_episode("")
+        for k in range(3):
+            buffer[:] = k
+            writer.add_frame(joint_position=buffer)
+        writer.save_episode()
+    assert load_demos(tmp_path / "set")[0].joint_position[:, 0].tolist() == [0, 1, 2]
+
+
+def test_an_existing_folder_is_refused(tmp_path):
+    (tmp_path / "set").mkdir()
+    with pytest.raises(FileExistsError, match="already exists"):
+        DatasetWriter(tmp_path / "set", 50, "any")
+    assert list(tmp_path.iterdir()) == [tmp_path / "set"]
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "message"),
+    [
+        ({"joint_position": [1, 2]}, None, r"joint_position needs 3 numbers"),
+        ({"speed": 1.0}, None, r"'speed' is no quantity of a frame; known are joint_position"),
+        (
+            {"gripper": 1.0},
+            {"position": [1, 2, 3]},
+            r"frame 1 lacks gripper and gives position",
+        ),
+    ],
+)
+def test_frames_that_do_not_fit_are_refused(tmp_path, first, second, message):
+    with pytest.raises(ValueError, match=message):
+        record_one(tmp_path / "set", [first, second])
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("frames", "message"),
+    [
+        ([{"joint_position": [0, np.nan, 0]}], "episode 0 .*joint_position .*frame 0"),
+        ([{"time": 1.0}, {"time": 1.0}], "time must increase.*frame 0"),
+        ([{"orientation": [1, 1, 0, 0]}], "unit quaternion.*frame 0"),
+        ([], "episode 0 has no frames"),
+    ],
+)
+def test_episodes_no_reader_could_use_are_refused(tmp_path, frames, message):
+    with pytest.raises(ValueError, match=message):
+        record_one(tmp_path / "set", frames)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_episode_unlike_the_first_is_refused_and_the_first_kept(tmp_path):
+    with writing(tmp_path / "set") as writer:
+        writer.start_episode("")
+        writer.add_frame(gripper=0.1)
+        writer.save_episode()
+        writer.start_episode("")
+        writer.add_frame(position=[0, 0, 0])
+        with pytest.raises(ValueError, match=r"episode 1 was not saved: lacks gripper"):
+            writer.save_episode()
+    assert len(load_demos(tmp_path / "set")) == 1
+
+
+def test_episodes_are_started_and_ended_in_order(tmp_path):
+    with writing(tmp_path / "set") as writer:
+        with pytest.raises(RuntimeError, match="start_episode"):
+            writer.add_frame(gripper=0.1)
+        writer.start_episode("")
+        writer.add_frame(gripper=0.1)
+        with pytest.raises(RuntimeError, match="1 unsaved frames"):
+            writer.start_episode("")
+        with pytest.raises(RuntimeError, match="1 unsaved frames"):
+            writer.finalize()
+        writer.discard_episode()
+        writer.start_episode("")
+        writer.add_frame(gripper=0.2)
+        writer.save_episode()
+    assert load_demos(tmp_path / "set")[0].gripper == pytest.approx([0.2])
+
+
+def test_a_recording_without_episodes_leaves_nothing(tmp_path):
+    with pytest.raises(DatasetError, match="no episode was saved"), writing(tmp_path / "set"):
+        pass
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_exception_keeps_the_saved_episodes_for_recovery(tmp_path):
+    root = tmp_path / "set"
+    with pytest.raises(OSError, match="robot lost") as raised:
+        record_one(root, [{"gripper": 0.1}], then=OSError("robot lost"))
+    assert "recover_dataset" in raised.value.__notes__[0]
+    assert not root.exists()
+    with pytest.raises(DatasetError, match="recover_dataset"):
+        load_demos(root)
+    with pytest.raises(FileExistsError, match="recover_dataset"):
+        DatasetWriter(root, 50, "any")
+    assert recover_dataset(root) == root
+    assert len(load_demos(root)) == 1
+    assert list(tmp_path.iterdir()) == [root]
+    with pytest.raises(FileNotFoundError, match="no interrupted recording"):
+        recover_dataset(root)
+
+
+KILLED = textwrap.dedent(
+    """
+    import sys
+    import numpy as np
+    from hrc_learn.demos import DatasetWriter
+
+    writer = DatasetWriter(sys.argv[1], 50, "any", ["a", "b"])
+    for episode in range(10_000):
+        writer.start_episode("reach")
+        for k in range(20):
+            writer.add_frame(joint_position=[episode, k])
+        writer.save_episode()
+        print(writer.episodes, flush=True)
+    """
+)
+
+
+def test_a_killed_recording_loses_the_open_episode_at_most(tmp_path):
+    root = tmp_path / "set"
+    process = subprocess.Popen(
+        [sys.executable, "-c", KILLED, str(root)], stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    saved = [process.stdout.readline() for _ in range(17)]
+    os.kill(process.pid, signal.SIGKILL)
+    announced = int((saved + process.stdout.readlines())[-1])
+    process.wait()
+    assert not root.exists()  # nothing that looks whole
+    demos = load_demos(recover_dataset(root))
+    assert announced <= len(demos) <= announced + 1
+    assert [demo.joint_position[0, 0] for demo in demos] == list(range(len(demos)))
+    assert check_dataset(root).ok
+
+
+def test_a_recovery_that_was_killed_starts_anew(tmp_path):
+    root = tmp_path / "set"
+    with pytest.raises(KeyboardInterrupt):
+        record_one(root, [{"gripper": 0.1}], then=KeyboardInterrupt())
+    (tmp_path / "set.recording/dataset/meta").mkdir(parents=True)
+    (tmp_path / "set.recording/episode_000001.unfinished").write_bytes(b"PAR1")
+    assert len(load_demos(recover_dataset(root))) == 1
+
+
+def record_one(root, frames, then=None):
+    with writing(root) as writer:
+        writer.start_episode("reach")
+        for values in frames:
+            writer.add_frame(**values)
+        writer.save_episode()
+        if then is not None:
+            raise then
+
+
+def writing(root):
+    return DatasetWriter(root, 50, "any", JOINTS)
