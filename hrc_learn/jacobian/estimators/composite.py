@@ -1,0 +1,93 @@
+"""The paper's law with what it lacks: the error of the predicted image motion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hrc_learn.jacobian.estimators.interface import (
+    ImageJacobianEstimator,
+    Measurement,
+    evaluate,
+)
+from hrc_learn.jacobian.estimators.key_frames import KeyFrame, Pair, advance
+from hrc_learn.jacobian.estimators.paper import paper_rate
+from hrc_learn.jacobian.network import RBFImageJacobian
+from hrc_learn.jacobian.pairs import PairConfig
+from hrc_learn.jacobian.prior import component_scale
+from hrc_learn.regions.pytree import pytree
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompositeConfig(PairConfig):
+    """Gains of the composite law."""
+
+    task_gain: float = 0.25
+    """Of the paper's term: diagonal of L."""
+    prediction_gain: float = 0.5
+    """Share of the prediction error that one pair removes, 0 to below 2."""
+    noise_floor: float = 5e-4
+    """Motion [m] at which half of that share is believed: below it noise is."""
+    weight_bound: float = 2e4
+    """Largest entry of the weights [px/m], rotation counted with `rotation_scale`."""
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
+class CompositeState:
+    """Weights and the frame that the next one is compared with."""
+
+    weight: Float[Tensor, "*batch 12 K"]
+    """W [px/m, px/rad]."""
+    key: KeyFrame
+    """Last key frame."""
+
+
+class CompositeEstimator(ImageJacobianEstimator):
+    """Composite adaptation: task error and prediction error (Slotine and Li 1989).
+
+    Between key frames the prediction error is e = dx - J_s_hat dr. Each pair moves the
+    weights along the gradient of |e|^2, normalised by the size of the regressor:
+
+        W <- W + gamma e (x) dr theta^T / (|theta|^2 (|dr|^2 + floor^2))
+
+    so that |e| shrinks by the factor 1 - gamma |dr|^2 / (|dr|^2 + floor^2), never grows for
+    0 < gamma < 2, and pairs of little motion, mostly noise, count for little. Entries of the
+    weights are bounded.
+    """
+
+    def __init__(self, network: RBFImageJacobian, config: CompositeConfig | None = None):
+        super().__init__(network)
+        self.config = config or CompositeConfig()
+
+    def initial_state(self, *batch: int) -> CompositeState:
+        """The network's weights and no key frame."""
+        weight, key = self.initial_weight(*batch), KeyFrame.absent(self.network, *batch)
+        return CompositeState(weight=weight, key=key)
+
+    def update(self, state: CompositeState, measurement: Measurement) -> CompositeState:
+        """One step of dt of the paper's term, and one pair if there is a new one."""
+        config = self.config
+        key, pair = advance(state.key, measurement, self.network, config)
+        theta = self.network.basis(measurement.pose)
+        rate = paper_rate(state.weight, theta, measurement, config.task_gain)
+        change = self._correction(state.weight, pair)
+        weight = state.weight + measurement.dt * rate + change
+        scale = component_scale(weight, config.rotation_scale).repeat(2).unsqueeze(-1)
+        bound = config.weight_bound * scale
+        return CompositeState(weight=torch.clamp(weight, -bound, bound), key=key)
+
+    def _correction(self, weight: Tensor, pair: Pair) -> Tensor:
+        """Normalised gradient step on the prediction error; zero without a pair."""
+        config = self.config
+        scale = component_scale(weight, config.rotation_scale)
+        J = evaluate(weight, pair.theta) / scale
+        error = pair.dx - (J @ pair.dr.unsqueeze(-1)).squeeze(-1)
+        size = pair.dr.square().sum(-1) + config.noise_floor**2
+        size = size * pair.theta.square().sum(-1)
+        step = config.prediction_gain * error / size.unsqueeze(-1)
+        entries = step.unsqueeze(-1) * (pair.dr * scale).unsqueeze(-2)
+        return entries.flatten(-2).unsqueeze(-1) * pair.theta.unsqueeze(-2)

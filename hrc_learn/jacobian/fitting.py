@@ -1,0 +1,129 @@
+"""Bayesian ridge regression of the weights on pairs of key frames.
+
+Each image row is dx = w . phi + noise with phi = dr (x) theta, a Gaussian prior on w and
+Gaussian noise: mean and covariance of w are in closed form, from summed statistics alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from functools import reduce
+from operator import add
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hrc_learn.jacobian.pairs import PairConfig, PairStatistics
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageJacobianFitConfig(PairConfig):
+    """Which frames are compared, and what is believed before they are."""
+
+    pixel_noise: float = 0.5
+    """Standard deviation of the measured feature [px]; enters twice into each difference.
+    Where the held-out error shows more, because the network is too coarse, that is used."""
+    bias_std: float = 1500.0
+    """Prior standard deviation of the Jacobian's mean over the workspace [px/m]."""
+    weight_std: float = 500.0
+    """Prior standard deviation of each neuron's departure from that mean [px/m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageJacobianFitReport:
+    """How well a fitted image Jacobian predicts the motion of the feature between key frames.
+
+    Errors are root mean squares of the error's length [px].
+    """
+
+    pairs: int
+    """Pairs of key frames used."""
+    motion: float
+    """Motion of the feature itself: the error of predicting none [px]."""
+    error: float
+    """Over the pairs that were fitted [px]."""
+    held_out_error: float
+    """Over pairs that were not: cross-validation by demonstration, or by fifths of a single
+    one [px]."""
+    noise: float
+    """Standard deviation of dx in each coordinate that the posterior assumes [px]."""
+
+    def summary(self) -> dict[str, Any]:
+        """As plain numbers."""
+        return asdict(self)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Posterior:
+    """Distribution of the weights after the fit."""
+
+    mean: Float[Tensor, "P 2"]
+    """[px/m], one column an image row."""
+    covariance: Float[Tensor, "P P"]
+    """Of either image row [(px/m)^2]."""
+
+
+def fit_weights(
+    parts: Sequence[PairStatistics],
+    prior: Float[Tensor, "K K"],
+    config: ImageJacobianFitConfig,
+) -> tuple[Posterior, ImageJacobianFitReport]:
+    """Fit to all parts; each part in turn is held out to measure the error on unseen data.
+
+    Args:
+        parts: Statistics of parts of the data that were recorded apart.
+        prior: Covariance between neurons, the same for each of the six components.
+        config: Noise of the feature.
+
+    Raises:
+        ValueError: There is no pair at all.
+    """
+    parts = [part for part in parts if part.count]
+    if not parts:
+        raise ValueError(
+            "no two visible key frames are within reach of each other: the feature was not "
+            "seen, or the tool moved less than min_step or more than max_step at a time."
+        )
+    total = reduce(add, parts)
+    precision = torch.block_diag(*[torch.linalg.inv(prior)] * 6)
+    noise = 2 * config.pixel_noise**2
+    held_out = _held_out_square(parts, precision, noise)
+    noise = max(noise, held_out / 2)  # two coordinates
+    posterior = solve(total, precision, noise)
+    report = ImageJacobianFitReport(
+        pairs=total.count,
+        motion=float(total.energy / total.count) ** 0.5,
+        error=(total.squared_error(posterior.mean) / total.count) ** 0.5,
+        held_out_error=held_out**0.5,
+        noise=noise**0.5,
+    )
+    return posterior, report
+
+
+def solve(
+    statistics: PairStatistics, precision: Float[Tensor, "P P"], noise: float
+) -> Posterior:
+    """Posterior of the weights for a zero-mean prior.
+
+    Args:
+        statistics: Of the data.
+        precision: Inverse covariance of the prior.
+        noise: Variance of each coordinate of dx [px^2].
+    """
+    factor = torch.linalg.cholesky(statistics.gram / noise + precision)
+    mean = torch.cholesky_solve(statistics.cross / noise, factor)
+    return Posterior(mean=mean, covariance=torch.cholesky_inverse(factor))
+
+
+def _held_out_square(parts: Sequence[PairStatistics], precision: Tensor, noise: float) -> float:
+    """Mean squared error over all pairs, each predicted without its own part."""
+    if len(parts) == 1:
+        return float("nan")
+    error = 0.0
+    for i, held_out in enumerate(parts):
+        rest = reduce(add, [*parts[:i], *parts[i + 1 :]])
+        error += held_out.squared_error(solve(rest, precision, noise).mean)
+    return error / sum(part.count for part in parts)

@@ -1,0 +1,255 @@
+"""The image Jacobian as a network of radial basis functions of the tool's pose."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from hrc_learn.geometry import Pose
+from hrc_learn.jacobian.basis import radial_basis
+from hrc_learn.jacobian.files import read_folder, write_folder
+from hrc_learn.jacobian.fitting import (
+    ImageJacobianFitConfig,
+    ImageJacobianFitReport,
+    fit_weights,
+)
+from hrc_learn.jacobian.gathering import statistics_by_part
+from hrc_learn.jacobian.prior import component_scale, weight_covariance
+
+
+class RBFImageJacobian(nn.Module):
+    """Estimate J_s_hat of the Jacobian from the tool's twist to the motion of its image.
+
+        x_dot = J_s(r) r_dot,   vec(J_s_hat(r)^T) = W theta(r)      (approxNN_vec)
+
+    r is position [m] and rotation vector [rad]; r_dot is the geometric twist (linear,
+    angular) in the base frame, *not* the derivative of the rotation vector, so that
+    J_s J is the Jacobian from joint velocities to pixels per second. vec stacks columns,
+    which for J_s^T are the rows of J_s.
+    """
+
+    weight: nn.Parameter
+    """W, (12, K) [px/m and px/rad]."""
+    centers: Tensor
+    """Of the neurons, (K, n), in the units of the chosen components of r."""
+    width: Tensor
+    """Standard deviation of the neurons, one number in the same unit."""
+    covariance: Tensor | None
+    """Posterior covariance of one image row of W, (6 K, 6 K) in (component, neuron) order,
+    with rotation counted in metres (`rotation_scale`); None if not fitted."""
+
+    def __init__(
+        self,
+        centers: Float[Tensor, "K n"],
+        width: float,
+        *,
+        weight: Float[Tensor, "12 K"] | None = None,
+        input_indices: Sequence[int] = (0, 1),
+        normalized: bool = True,
+    ):
+        """Build a network; its dtype is that of `centers`.
+
+        Args:
+            centers: One row a neuron, one column an input.
+            width: Standard deviation of the neurons.
+            weight: W; zero if None.
+            input_indices: Components of r = (x, y, z, three of the rotation vector) that the
+                neurons see. A rotation vector jumps at half turns; prefer positions.
+            normalized: Whether neurons are divided by their sum (see `radial_basis`).
+
+        Raises:
+            ValueError: Centres and indices do not match, or the width is not positive.
+        """
+        super().__init__()
+        self.input_indices = _checked_indices(input_indices, centers)
+        if not width > 0:
+            raise ValueError(f"width must be positive, got {width}.")
+        self.normalized = normalized
+        self.register_buffer("centers", centers.detach().clone())
+        self.register_buffer("width", torch.as_tensor(width, dtype=centers.dtype))
+        self.register_buffer("covariance", None)
+        if weight is None:
+            weight = centers.new_zeros(12, len(centers))
+        self.weight = nn.Parameter(weight.detach().clone().to(centers))
+        self.report: ImageJacobianFitReport | None = None
+
+    @classmethod
+    def from_jacobian(
+        cls,
+        jacobian: Float[Tensor, "2 6"],
+        centers: Float[Tensor, "K n"],
+        width: float,
+        *,
+        input_indices: Sequence[int] = (0, 1),
+        formulation: Literal["exact", "paper"] = "exact",
+        start: Float[Tensor, "6"] | None = None,
+    ) -> RBFImageJacobian:
+        """Start from one guess of the image Jacobian for the whole workspace.
+
+        Args:
+            jacobian: J_s0 [px/m, px/rad].
+            centers: Of the neurons.
+            width: Of the neurons.
+            input_indices: Components of r that the neurons see.
+            formulation: "exact" reproduces J_s0 everywhere. "paper" is (eq_w0) as printed:
+                neurons are not normalised, so the estimate grows or fades away from `start`,
+                and the entries of vec(J_s) stand where those of vec(J_s^T) belong, which
+                mixes the two image rows.
+            start: r at which the paper's formulation starts; it alone needs it.
+
+        Raises:
+            ValueError: `start` is missing or superfluous, or the formulation is unknown.
+        """
+        jacobian = jacobian.to(centers)
+        if formulation == "exact":
+            if start is not None:
+                raise ValueError("start is only used by formulation='paper': leave it out.")
+            network = cls(centers, width, input_indices=input_indices)
+            column = jacobian.flatten()
+        elif formulation == "paper":
+            if start is None:
+                raise ValueError("formulation='paper' needs start, the pose vector at t0.")
+            network = cls(centers, width, input_indices=input_indices, normalized=False)
+            column = jacobian.mT.flatten() / network.basis(start).sum()
+        else:
+            raise ValueError(f"formulation must be 'exact' or 'paper', got {formulation!r}.")
+        network.weight.data = column[:, None].repeat(1, len(centers))
+        return network
+
+    @classmethod
+    def fit(
+        cls,
+        poses: Sequence[Pose],
+        features: Sequence[Float[Tensor, "_ 2"]],
+        visible: Sequence[Bool[Tensor, "_"]] | None = None,
+        *,
+        centers: Float[Tensor, "K n"],
+        width: float,
+        input_indices: Sequence[int] = (0, 1),
+        config: ImageJacobianFitConfig | None = None,
+    ) -> RBFImageJacobian:
+        """Fit to demonstrations in which the camera watched the tool.
+
+        Args:
+            poses: Of the tool along each demonstration, (time,).
+            features: Image feature along each [px]; anything where it is not visible.
+            visible: Where the feature was found; None: wherever it is not NaN.
+            centers: Of the neurons.
+            width: Of the neurons.
+            input_indices: Components of r that the neurons see.
+            config: Noise, prior and the choice of key frames.
+
+        Returns:
+            The network, with `report` and `covariance` set.
+
+        Raises:
+            ValueError: Lengths differ, or no pair of key frames is left.
+        """
+        network = cls(centers.double(), width, input_indices=input_indices)
+        config = config or ImageJacobianFitConfig()
+        if visible is None:
+            visible = [~feature.isnan().any(-1) for feature in features]
+        parts = statistics_by_part(network.basis, poses, features, visible, config)
+        prior = weight_covariance(network.centers, config.bias_std, config.weight_std)
+        posterior, report = fit_weights(parts, prior, config)
+        rows = posterior.mean.mT.unflatten(-1, (6, -1))  # (2, 6, K)
+        scale = component_scale(rows, config.rotation_scale)
+        network.weight.data = (rows * scale[:, None]).flatten(0, 1)
+        network.covariance = posterior.covariance
+        network.report = report
+        return network.to(centers.dtype)
+
+    def forward(self, r: Pose | Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 2 6"]:
+        """J_s_hat at a pose.
+
+        Args:
+            r: Position [m] and rotation vector [rad], or a pose.
+
+        Returns:
+            Rows u and v; columns linear [px/m] then angular [px/rad].
+        """
+        return (self.basis(r) @ self.weight.mT).unflatten(-1, (2, 6))
+
+    def basis(self, r: Pose | Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch K"]:
+        """Activation theta(r) of the neurons."""
+        return radial_basis(
+            self._inputs(r), self.centers, self.width, normalized=self.normalized
+        )
+
+    def uncertainty(
+        self, r: Pose | Float[Tensor, "*batch 6"], rotation_scale: float = 0.15
+    ) -> Float[Tensor, "*batch 6"]:
+        """Posterior standard deviation of the columns of J_s_hat, alike for both rows.
+
+        Args:
+            r: Where, as for `forward`.
+            rotation_scale: As in the configuration of the fit [m/rad].
+
+        Raises:
+            ValueError: The network was not fitted.
+        """
+        if self.covariance is None:
+            raise ValueError("only a network fitted to demonstrations knows its uncertainty.")
+        theta = self.basis(r)
+        blocks = self.covariance.unflatten(0, (6, -1)).unflatten(-1, (6, -1))
+        blocks = blocks.diagonal(dim1=0, dim2=2)  # (K, K, 6)
+        variance = torch.einsum("...k,klj,...l->...j", theta, blocks, theta)
+        return variance.clamp_min(0).sqrt() * component_scale(variance, rotation_scale)
+
+    def save(self, folder: str | Path) -> None:
+        """Write `config.json` and `model.safetensors` into a folder, replacing an older save.
+
+        Raises:
+            ValueError: The folder holds something else.
+        """
+        config = {
+            "input_indices": list(self.input_indices),
+            "normalized": self.normalized,
+            "report": None if self.report is None else self.report.summary(),
+        }
+        write_folder(folder, config, self.state_dict())
+
+    @classmethod
+    def load(cls, folder: str | Path) -> RBFImageJacobian:
+        """Read what `save` wrote; the summary of the fit stays in `config.json`.
+
+        Raises:
+            FileNotFoundError: There is no such folder or file.
+            ValueError: A file is damaged or not ours; the message names file and field.
+        """
+        config, tensors = read_folder(folder)
+        try:
+            network = cls(
+                tensors["centers"],
+                float(tensors["width"]),
+                weight=tensors["weight"],
+                input_indices=config["input_indices"],
+                normalized=config["normalized"],
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"{folder} is no usable image Jacobian: {error!r}.") from error
+        network.covariance = tensors.get("covariance")
+        return network
+
+    def _inputs(self, r: Pose | Tensor) -> Tensor:
+        if isinstance(r, Tensor):
+            vector = r
+        elif max(self.input_indices) < 3:
+            vector = r.position  # saves the logarithm of the orientation
+        else:
+            vector = r.vector()
+        return vector[..., self.input_indices]
+
+
+def _checked_indices(indices: Sequence[int], centers: Tensor) -> tuple[int, ...]:
+    if centers.shape[-1] != len(indices) or not all(0 <= i <= 5 for i in indices):
+        raise ValueError(
+            f"input_indices choose components 0 to 5 of r, one for each column of centers, "
+            f"but got {tuple(indices)} for centers with {centers.shape[-1]} columns."
+        )
+    return tuple(indices)
