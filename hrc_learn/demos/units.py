@@ -27,7 +27,8 @@ _DIMENSIONS: dict[str, dict[str, float]] = {
 """Dimension -> unit -> its size in the unit we keep. A tick is 1/4096 of a turn, as the
 encoders of hobby servos count; where their zero lies is not known."""
 
-_JOINT_LIMITS = {"rad": 2 * math.pi, "deg": 400.0}
+# Two turns: wrists go past one, and no demonstration stays within 13 degrees.
+_JOINT_LIMITS = {"rad": 4 * math.pi, "deg": 400.0}
 _REACH = {"m": 5.0, "cm": 500.0}
 _ROTATION_LIMIT = {"euler_xyz": 2 * math.pi + 0.1, "rotation_vector": 4 * math.pi}
 

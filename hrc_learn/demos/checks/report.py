@@ -40,9 +40,14 @@ class Report:
             self.errors.append(error.finding)
 
     def lines(self) -> Iterator[str]:
-        """The report in words, a line a finding."""
+        """The report in words; findings alike but for the episode share a line."""
         for kind, findings in (("error", self.errors), ("warning", self.warnings)):
-            yield from (f"{kind}: {finding}" for finding in findings)
+            alike: dict[tuple, list[Finding]] = {}
+            for finding in findings:
+                alike.setdefault((finding.key, finding.message), []).append(finding)
+            for first, *others in alike.values():
+                also = f" (and {len(others)} times more)" if others else ""
+                yield f"{kind}: {first}{also}"
         yield (
             f"{self.path}: {self.episodes} episodes, {self.frames} frames, "
             f"{len(self.errors)} errors, {len(self.warnings)} warnings"
