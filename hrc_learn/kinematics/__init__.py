@@ -1,5 +1,7 @@
 """Serial arms: forward kinematics, Jacobians and their inverses; the Panda."""
 
+from .arm_angle import arm_angle as arm_angle
+from .arm_angle import arm_angle_motion as arm_angle_motion
 from .chain import SerialChain as SerialChain
 from .franka import FrankaArm as FrankaArm
 from .franka import panda as panda

@@ -21,7 +21,8 @@ class World:
     Attributes:
         config: What stands in it.
         arm: The arm and its gripper.
-        cabinet_contacts: Touches of the arm, its hand or an object with the cabinet.
+        cabinet_contacts: Touches of the arm or its hand with the cabinet.
+        object_contacts: Touches of objects with the cabinet.
         table_contacts: Touches of the arm or its hand with the table.
         self_contacts: Touches of the arm with itself.
     """
@@ -33,9 +34,16 @@ class World:
         self.arm = MujocoArm(self.model, self.data)
         cabinet = [box.name for box in self.config.cabinet.boxes()]
         self.cabinet_contacts = ContactMonitor(self.model, _ARM_BODIES, cabinet)
+        objects = [item.name for item in self.config.objects]
+        self.object_contacts = ContactMonitor(self.model, objects, cabinet)
         self.table_contacts = ContactMonitor(self.model, _ARM_BODIES, [self.config.table.name])
         self.self_contacts = ContactMonitor(self.model, _ARM_BODIES, _ARM_BODIES)
-        self._monitors = (self.cabinet_contacts, self.table_contacts, self.self_contacts)
+        self._monitors = (
+            self.cabinet_contacts,
+            self.object_contacts,
+            self.table_contacts,
+            self.self_contacts,
+        )
 
     @property
     def time(self) -> float:

@@ -28,6 +28,8 @@ class PlacingLesson(TeachingConfig):
     """Standard deviation of where demonstrations start, around home [m]."""
     shape_body: bool = True
     """Whether the expert pulls the elbow past the cabinet's open door."""
+    lift: float = 0.03
+    """How far above its last height the hand crosses the board's front edge [m]."""
 
 
 def placing_expert(
@@ -41,9 +43,12 @@ def placing_expert(
         lesson: How.
         rng: Source of the hand's unsteadiness and of where it starts.
     """
-    goal, mouth = workplace.shelf(shelf), workplace.mouth(shelf)
+    goal, mouth = workplace.shelf(shelf).position, workplace.mouth(shelf).position
+    # The hand is not quite level yet at the edge: what it carries hangs a little lower.
+    lifted = torch.tensor([0.0, 0.0, lesson.lift], dtype=torch.float64)
+    inside = goal + 0.3 * (mouth - goal)
     start = workplace.home().position + lesson.spread * torch.from_numpy(rng.standard_normal(3))
-    waypoints = torch.stack([start, mouth.position, goal.position]).numpy()
+    waypoints = torch.stack([start, mouth + lifted, inside + lifted, goal]).numpy()
     return ScriptedExpert(
         panda,
         GuidedPath(waypoints, lesson.duration),
@@ -62,10 +67,10 @@ def teach_placing(
     """Demonstrate one placing motion, from home to a shelf with the thing in hand.
 
     Returns:
-        The recorded frames, and all touches of the cabinet on the way.
+        The recorded frames, and all touches of the cabinet by arm or thing on the way.
     """
     expert = placing_expert(workplace, shelf, lesson, rng)
     offset = torch.from_numpy(expert.path.position(0.0)) - workplace.home().position
     world.hold(workplace.scene.objects[0].name, workplace.home_joints(offset).numpy())
     frames = list(teach(world, expert, lesson.duration + lesson.settle, lesson))
-    return frames, list(world.cabinet_contacts.touches)
+    return frames, world.cabinet_contacts.touches + world.object_contacts.touches
