@@ -44,6 +44,24 @@ class GaussianBasis:
         if self.domain not in DOMAINS:
             raise ValueError(f"unknown domain {self.domain!r}; there are {', '.join(DOMAINS)}")
 
+    @property
+    def horizon(self) -> float:
+        """Normalised time after which the forcing is lost in float64 rounding."""
+        if self.domain == "phase":
+            return self.phase.horizon
+        # Past the end, the last Gaussian falls behind its follower by
+        # exp((1/2 - x) / width^2) at x spacings; exp(-39) = 1e-17.
+        return 1 + (0.5 + 39 * self.width**2) / (self.count - 1)
+
+    @property
+    def smooth_interval(self) -> float:
+        """Length over which the forcing is a polynomial of low degree.
+
+        Neighbours hand over along a logistic function of scale width^2 times the spacing,
+        which is analytic within pi times that.
+        """
+        return min(0.5, 1.4 * self.width**2) / (self.count - 1)
+
     def centre_times(self) -> Float[Tensor, "N"]:
         """Normalised times s_i at which the basis functions peak (float64)."""
         return torch.linspace(0, 1, self.count, dtype=torch.float64)

@@ -31,10 +31,10 @@ def fit_samples(
     """
     if method not in METHODS:
         raise ValueError(f"unknown method {method!r}; there are {', '.join(METHODS)}")
-    position = samples.position.double().mT
+    position = samples.position.double()
     rate = None
     if samples.velocity is not None:
-        rate = samples.velocity.double().mT * samples.duration[:, None, None]
+        rate = samples.velocity.double() * samples.duration[:, None, None]
     if samples.shared:
         return _fit(method, response, samples.s[0], position, rate, regularization)
     fits = []

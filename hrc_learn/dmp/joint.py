@@ -20,7 +20,7 @@ from hrc_learn.dmp.samples import ArrayLike, check_samples
 from hrc_learn.dmp.scaling import check_paper_scale, check_scaling, forcing_scale
 from hrc_learn.dmp.spring import SpringDamper
 from hrc_learn.dmp.state import DMPState
-from hrc_learn.dmp.trajectory import Trajectory
+from hrc_learn.dmp.trajectory import Trajectory, broadcast_shapes
 
 BUFFERS = ("start", "goal", "start_velocity", "duration", "amplitude", "stamps")
 
@@ -173,7 +173,7 @@ class JointDMP(nn.Module):
             units=units,
         )
         with torch.no_grad():
-            reproduction = dmp.rollout().position.reshape(samples.position.shape)
+            reproduction = dmp.rollout().position.mT.reshape(samples.position.shape)
         dmp.fit_report = samples.compare(reproduction)
         return dmp
 
@@ -205,21 +205,15 @@ class JointDMP(nn.Module):
         start, goal, rate, duration = self._boundary(
             start, goal, duration, start_velocity, speed
         )
-        ends = (x[..., None] for x in (rate, start, goal))
-        parts = [self._scaled_weights(start, goal), *ends]
-        batch = torch.broadcast_shapes(*(part.shape[:-1] for part in parts))
-        coordinates = torch.cat([part.expand(*batch, -1) for part in parts], dim=-1)
-        if time is None:
-            s, time = self.stamps, self.stamps * duration[..., None]
-        else:
-            time = self._as_tensor(time).double()
-            s = _normalised_time(time, duration)
+        weights, ends = self._scaled_weights(start, goal), (rate, start, goal)
+        batch = broadcast_shapes(weights.shape[:-1], *(x.shape for x in ends))
+        if weights.shape[:-1] != batch or any(x.shape != batch for x in ends):
+            weights, ends = weights.expand(*batch, -1), [x.expand(batch) for x in ends]
         return Trajectory(
-            time=time.to(self.weights.dtype),
-            coordinates=coordinates,
-            response=self.response,
-            s=s,
+            coordinates=torch.cat([weights, torch.stack(ends, dim=-1)], dim=-1),
+            s=self.stamps if time is None else self._normalised_time(time, duration),
             duration=duration,
+            response=self.response,
         )
 
     def initial_state(
@@ -235,7 +229,7 @@ class JointDMP(nn.Module):
         start, goal, rate, duration = self._boundary(
             start, goal, duration, start_velocity, speed
         )
-        batch = torch.broadcast_shapes(
+        batch = broadcast_shapes(
             self.weights.shape[:-2],
             *(x.shape[:-1] for x in (start, goal, rate)),
             duration.shape,
@@ -287,13 +281,15 @@ class JointDMP(nn.Module):
         if coupling is not None:
             push = self._as_tensor(coupling) * state.duration[..., None] ** 2
             rest = goal + push / self.spring.stiffness
-        forced = self.response.forced_state(s).to(goal) @ self.weights.mT
+        # Both transitions at once: over this step, and since the forcing has ended.
+        E, coast = self.spring.propagator(torch.stack([ds, self.response.coasting(s)])).to(goal)
+        forced = coast @ (self.response.forced.to(s.device)(s).to(goal) @ self.weights.mT)
         before, after = state.forced, forced
         scale = forcing_scale(self.scaling, state.start, goal, self.amplitude)
         if scale is not None:
             before, after = before * scale[..., None, :], after * scale[..., None, :]
         deviation = torch.stack([state.position - rest, state.rate], dim=-2) - before
-        moved = self.spring.propagator(ds).to(goal) @ deviation + after
+        moved = E @ deviation + after
         return DMPState(
             position=moved[..., 0, :] + rest,
             rate=moved[..., 1, :],
@@ -405,12 +401,12 @@ class JointDMP(nn.Module):
     def _as_tensor(self, value: ArrayLike) -> Tensor:
         return torch.as_tensor(value, dtype=self.weights.dtype, device=self.weights.device)
 
-
-def _normalised_time(time: Tensor, duration: Tensor) -> Tensor:
-    if time.ndim == 0 or not (time >= 0).all():
-        raise ValueError("time must be an array of seconds since the start, none negative")
-    s = time / duration.double()[..., None]
-    # Rows that are all alike need one response matrix, not one each.
-    if s.ndim > 1 and not s.requires_grad and (s == s.reshape(-1, s.shape[-1])[0]).all():
-        return s.reshape(-1, s.shape[-1])[0]
-    return s
+    def _normalised_time(self, time: ArrayLike, duration: Tensor) -> Tensor:
+        time = torch.as_tensor(time, dtype=torch.float64, device=duration.device)
+        if time.ndim == 0 or not (time >= 0).all():
+            raise ValueError("time must be an array of seconds since the start, none negative")
+        s = time / duration.double()[..., None]
+        # Rows that are all alike need one response matrix, not one each.
+        if s.ndim > 1 and not s.requires_grad and (s == s.reshape(-1, s.shape[-1])[0]).all():
+            return s.reshape(-1, s.shape[-1])[0]
+        return s

@@ -31,8 +31,11 @@ class OrientationTrajectory:
         self._errors = errors
         self._goal = goal
         self._columns = slice(first, first + 3)
-        self.time = errors.time
+
+    @property
+    def time(self) -> Float[Tensor, "*batch T"]:
         """Since the start of the motion [s]."""
+        return self._errors.time
 
     @cached_property
     def orientation(self) -> Float[Tensor, "*batch T 4"]:
@@ -247,12 +250,12 @@ def fitted_error(
 ) -> tuple[Tensor, Tensor]:
     """Errors (*B, T, 3) and goals (*B, 4) of checked demonstrations (*B, T, 4)."""
     samples = check_samples(time, orientation, mask=mask, name="orientation")
-    if samples.position.shape[-1] != 4:
+    if samples.position.shape[-2] != 4:
         raise ValueError(
             f"orientation must be quaternions (w, x, y, z), shape (..., T, 4), "
             f"got {tuple(torch.as_tensor(orientation).shape)}"
         )
-    norm = samples.position.norm(dim=-1)
+    norm = samples.position.norm(dim=-2)
     broken = samples.mask & ((norm - 1).abs() > NORM_TOLERANCE)
     if broken.any():
         i, k = broken.nonzero()[0].tolist()
@@ -260,9 +263,8 @@ def fitted_error(
             f"{demo_label(i, samples.batch)}orientation has norm {norm[i, k].item():.4f} at "
             f"sample {k}: not a unit quaternion. Interpolating across a sign flip does this."
         )
-    unit = samples.position / norm.masked_fill(~samples.mask, 1)[..., None]
-    error, goal = error_space.demonstrated_error(unit, samples.mask)
-    return error.reshape(*samples.batch, -1, 3), goal.reshape(*samples.batch, 4)
+    unit = samples.columns / norm.masked_fill(~samples.mask, 1).reshape(*samples.batch, -1, 1)
+    return error_space.demonstrated_error(unit, samples.mask.reshape(unit.shape[:-1]))
 
 
 def unit_quaternion(value: ArrayLike, like: Tensor) -> Float[Tensor, "*batch 4"]:

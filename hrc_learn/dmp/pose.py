@@ -37,8 +37,11 @@ class PoseTrajectory:
     def __init__(self, motion: Trajectory, goal: Float[Tensor, "*batch 4"]):
         self._motion = motion
         self._rotation = OrientationTrajectory(motion, goal, first=ERROR.start)
-        self.time = motion.time
+
+    @property
+    def time(self) -> Float[Tensor, "*batch T"]:
         """Since the start of the motion [s]."""
+        return self._motion.time
 
     @property
     def position(self) -> Float[Tensor, "*batch T 3"]:
@@ -180,13 +183,13 @@ class PoseDMP(nn.Module):
             ValueError: Bad samples; says which.
         """
         checked = check_samples(time, position, mask=mask)
-        if checked.position.shape[-1] != 3:
-            raise ValueError(f"position must have 3 columns, got {checked.position.shape[-1]}")
+        if checked.position.shape[-2] != 3:
+            raise ValueError(f"position must have 3 columns, got {checked.position.shape[-2]}")
         error, goal = fitted_error(time, orientation, mask)
-        columns = [checked.position.reshape(*checked.batch, -1, 3), error.to(checked.position)]
+        columns = [checked.columns, error.to(checked.position)]
         if body is not None:
             shape = check_samples(time, body, mask=mask, name="body")
-            columns.append(shape.position.reshape(*shape.batch, *shape.position.shape[1:]))
+            columns.append(shape.columns)
         try:
             coordinates = torch.cat(columns, dim=-1)
         except RuntimeError:

@@ -1,5 +1,6 @@
 """The motion of a primitive as a linear map of its coordinates."""
 
+import math
 from collections import OrderedDict
 from functools import lru_cache
 
@@ -9,12 +10,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.dmp.basis import GaussianBasis
+from hrc_learn.dmp.piecewise import PiecewisePolynomial, chebyshev_points
 from hrc_learn.dmp.spring import SpringDamper
 
-KNOTS_PER_BASIS = 8
-"""Table knots per basis function. With 4 Gauss points a knot interval the quadrature
-error is below 1e-13 of the response (the tests compare it with an ODE solver)."""
-GAUSS_POINTS = 4
+GAUSS_POINTS = 12
+"""For the forcing over one piece of the table, which no basis function changes much in."""
 GRIDS_KEPT = 16
 
 
@@ -22,10 +22,10 @@ class Response:
     """Response of y'' = alpha (beta (g - y) - y') + sum_i phi_i(s) w_i, solved exactly.
 
     y(s) = H(s) [w_1 ... w_N, y_0', y_0, g]: the columns of H are the motions that a unit of
-    each coordinate causes alone. Their state (y, y') is tabulated at knots and carried from
-    a knot to any s between by the transition matrix of the spring, with the forcing
-    integrated by Gauss-Legendre quadrature; nothing depends on the step length of a grid.
-    Everything is float64 until it is handed out.
+    each coordinate causes alone. What the weights cause is integrated once by Gauss-Legendre
+    quadrature and the transition matrix of the spring, and kept as polynomials in s; the
+    rest is closed form. Nothing depends on the step length of a grid. Everything is float64
+    until it is handed out.
     """
 
     def __init__(self, spring: SpringDamper, basis: GaussianBasis):
@@ -33,8 +33,8 @@ class Response:
         self.basis = basis
         self.size = basis.count + 3
         """Number of coordinates: N weights, start velocity, start, goal."""
-        self._interval = 1.0 / (KNOTS_PER_BASIS * basis.count)
-        self._tables: dict[torch.device, Tensor] = {}
+        self.forced = self._integrate()
+        """(y, y') that unit weights alone have caused, from rest at the goal: (2, N)."""
         self._matrices: OrderedDict[tuple, tuple[Tensor, Tensor, Tensor]] = OrderedDict()
 
     def matrices(
@@ -63,17 +63,17 @@ class Response:
         state = _StateAt.apply(s, self)
         return torch.cat([state, self._acceleration(s, state)], dim=-2)
 
-    def forced_state(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 2 N"]:
-        """(y, y') that unit weights alone have caused by `s`, from rest at the goal."""
-        knot = (s / self._interval).floor().clamp(0, self._last_knot)
-        table = self._table(s.device)
-        return self._carry(table[knot.long()], knot * self._interval, s)
+    def coasting(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """How long the spring alone has moved on what the forcing caused until it ended."""
+        return (s - self.forced.end).clamp(min=0)
 
-    def _state(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 2 M"]:
+    def state(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 2 M"]:
+        """Rows H(s), H'(s)."""
         E = self.spring.propagator(s)
         start, velocity = E[..., :, :1], E[..., :, 1:]
         at_rest = torch.tensor([[1.0], [0.0]], dtype=s.dtype, device=s.device)
-        return torch.cat([self.forced_state(s), velocity, start, at_rest - start], dim=-1)
+        forced = self.spring.propagator(self.coasting(s)) @ self.forced.to(s.device)(s)
+        return torch.cat([forced, velocity, start, at_rest - start], dim=-1)
 
     def _acceleration(self, s: Tensor, state: Tensor) -> Tensor:
         goal = torch.zeros(self.size, dtype=s.dtype, device=s.device)
@@ -82,39 +82,33 @@ class Response:
         free = self.spring.acceleration(state[..., 0, :] - goal, state[..., 1, :])
         return (free + forcing)[..., None, :]
 
-    def _carry(self, state: Tensor, s_from: Tensor, s_to: Tensor) -> Tensor:
-        """Forced state at `s_to` from the one at `s_from`, no further than a knot away."""
-        nodes, node_weights = (
-            torch.as_tensor(a).to(s_to) for a in np.polynomial.legendre.leggauss(GAUSS_POINTS)
-        )
-        half = (s_to - s_from) / 2
-        u = s_from[..., None] + half[..., None] * (1 + nodes)
-        # Late enough the forcing is zero, and only then may s_to be far from the last knot.
-        impulse = self.spring.propagator(s_to[..., None] - u)[..., 1]
-        kernel = (half[..., None] * node_weights)[..., None] * impulse
-        added = kernel.mT @ self.basis.forcing(u)
-        return self.spring.propagator(s_to - s_from) @ state + added
-
-    @property
-    def _last_knot(self) -> int:
-        return int(self.basis.phase.horizon / self._interval)
-
-    def _table(self, device: torch.device) -> Float[Tensor, "knots 2 N"]:
-        if device not in self._tables:
-            self._tables[device] = self._build_table().to(device)
-        return self._tables[device]
-
-    def _build_table(self) -> Tensor:
-        """Forced state at every knot, by a parallel prefix sum over the knot intervals."""
-        knots = self._interval * torch.arange(self._last_knot + 1, dtype=torch.float64)
-        rest = torch.zeros(len(knots) - 1, 2, self.basis.count, dtype=torch.float64)
-        state = torch.cat([rest[:1], self._carry(rest, knots[:-1], knots[1:])])
+    def _integrate(self) -> PiecewisePolynomial:
+        """Solve for all basis functions at once, from rest to where the forcing has ended."""
+        interval = min(self.basis.smooth_interval, self.spring.smooth_interval)
+        n_pieces = math.ceil(self.basis.horizon / interval)
+        knots = interval * torch.arange(n_pieces, dtype=torch.float64)
+        points = interval * chebyshev_points()
+        # The forcing's share at each point of each piece, then the states at the knots by a
+        # parallel prefix sum, then both together.
+        share = torch.stack([self._impulse(knots, point) for point in points], dim=1)
+        rest = torch.zeros_like(share[:1, -1])
+        state = torch.cat([rest, share[:-1, -1]])
         stride = 1
-        while stride < len(knots):
+        while stride < n_pieces:
             E = self.spring.propagator(knots[stride])
             state = torch.cat([state[:stride], state[stride:] + E @ state[:-stride]])
             stride *= 2
-        return state
+        values = self.spring.propagator(points) @ state[:, None] + share
+        return PiecewisePolynomial.interpolate(values, interval)
+
+    def _impulse(
+        self, start: Float[Tensor, "pieces"], length: Float[Tensor, ""]
+    ) -> Float[Tensor, "pieces 2 N"]:
+        """State at start + length that the forcing since `start` has caused."""
+        nodes, weights = map(torch.from_numpy, np.polynomial.legendre.leggauss(GAUSS_POINTS))
+        u = length * (1 + nodes) / 2
+        kernel = self.spring.propagator(length - u)[..., 1] * (length / 2 * weights)[:, None]
+        return kernel.mT @ self.basis.forcing(start[:, None] + u)
 
 
 class _StateAt(torch.autograd.Function):
@@ -124,7 +118,7 @@ class _StateAt(torch.autograd.Function):
 
     @staticmethod
     def forward(s, response):
-        return response._state(s)
+        return response.state(s)
 
     @staticmethod
     def setup_context(ctx, inputs, output):

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -14,9 +15,9 @@ type ArrayLike = Tensor | np.ndarray | list | tuple | float
 MINIMUM_SAMPLES = 3
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Samples:
-    """Sampled demonstrations on a flat batch, padded where `mask` is false."""
+    """Sampled demonstrations on a flat batch, time last, padded where `mask` is false."""
 
     batch: tuple[int, ...]
     """The batch shape that was flattened to B."""
@@ -24,45 +25,60 @@ class Samples:
     """Time since the first sample over the duration, 0 to 1, never falling (float64)."""
     duration: Float[Tensor, "B"]
     """First to last sample [s] (float64)."""
-    position: Float[Tensor, "B T D"]
-    velocity: Float[Tensor, "B T D"] | None
+    position: Float[Tensor, "B D T"]
+    velocity: Float[Tensor, "B D T"] | None
     mask: Bool[Tensor, "B T"]
+
+    @property
+    def columns(self) -> Float[Tensor, "*batch T D"]:
+        """Position as it was given, time before coordinates."""
+        return self.position.mT.reshape(*self.batch, -1, self.position.shape[-2])
+
+    @cached_property
+    def complete(self) -> bool:
+        """Whether all samples count."""
+        return bool(self.mask.all())
+
+    @cached_property
+    def shared(self) -> bool:
+        """Whether all demonstrations are sampled alike, so that one solve serves all."""
+        # 1e-12 of the motion: stamps that differ by the rounding of a start time are alike.
+        return self.complete and bool(((self.s - self.s[:1]).abs() < 1e-12).all())
 
     @property
     def first(self) -> Float[Tensor, "B D"]:
         """Position at the first sample that counts."""
-        index = self.mask.long().argmax(-1)
-        return self.position[torch.arange(len(index), device=index.device), index]
+        return self._at(self.mask.long().argmax(-1))
 
     @property
     def last(self) -> Float[Tensor, "B D"]:
         """Position at the last sample that counts."""
-        index = self.mask.shape[-1] - 1 - self.mask.flip(-1).long().argmax(-1)
-        return self.position[torch.arange(len(index), device=index.device), index]
+        return self._at(self.mask.shape[-1] - 1 - self.mask.flip(-1).long().argmax(-1))
 
-    @property
+    @cached_property
     def span(self) -> Float[Tensor, "B D"]:
         """Range that each coordinate covers."""
-        valid = self.mask[..., None]
-        high = self.position.masked_fill(~valid, -torch.inf).amax(-2)
-        return high - self.position.masked_fill(~valid, torch.inf).amin(-2)
+        # Samples that do not count repeat the first: they widen nothing.
+        low, high = self._filled(self.position, self.first[..., None]).aminmax(dim=-1)
+        return high - low
 
-    @property
-    def shared(self) -> bool:
-        """Whether all demonstrations are sampled alike, so that one solve serves all."""
-        # 1e-12 of the motion: stamps that differ by the rounding of a start time are alike.
-        return bool(self.mask.all()) and bool(((self.s - self.s[:1]).abs() < 1e-12).all())
-
-    def compare(self, reproduction: Float[Tensor, "B T D"]) -> FitReport:
+    def compare(self, reproduction: Float[Tensor, "B D T"]) -> FitReport:
         """Residuals of a reproduction, on the samples that count."""
-        valid = self.mask[..., None]
-        error = (reproduction - self.position).masked_fill(~valid, 0)
+        zero = torch.zeros((), dtype=reproduction.dtype, device=reproduction.device)
+        error = self._filled(reproduction - self.position, zero)
+        low, high = error.aminmax(dim=-1)
         residuals = {
-            "rmse": (error.square().sum(-2) / valid.sum(-2)).sqrt(),
-            "peak": error.abs().amax(-2),
+            "rmse": error.norm(dim=-1) / self.mask.sum(-1, keepdim=True).sqrt(),
+            "peak": torch.maximum(-low, high),
             "span": self.span,
         }
         return FitReport(**{k: v.reshape(*self.batch, -1) for k, v in residuals.items()})
+
+    def _at(self, index: Tensor) -> Tensor:
+        return torch.take_along_dim(self.position, index[:, None, None], dim=-1)[..., 0]
+
+    def _filled(self, values: Tensor, filling: Tensor) -> Tensor:
+        return values if self.complete else torch.where(self.mask[:, None], values, filling)
 
 
 def check_samples(
@@ -103,7 +119,8 @@ def check_samples(
     if position.numel() == 0:
         raise ValueError(f"position has shape {(*batch, T, D)}: there is nothing to fit")
     time, mask = time.reshape(-1, T), mask.reshape(-1, T)
-    position = position.reshape(-1, T, D)
+    # Time last from here on: everything that reads the samples runs along it.
+    position = position.reshape(-1, T, D).mT.contiguous()
 
     enough = mask.sum(-1) >= MINIMUM_SAMPLES
     if not enough.all():
@@ -112,14 +129,13 @@ def check_samples(
             f"{demo_label(i, batch)}a motion needs at least {MINIMUM_SAMPLES} samples, "
             f"got {int(mask[i].sum())}"
         )
-    _check_finite("time", time[..., None], mask, batch)
-    _check_finite(name, position, mask, batch)
+    _check_finite("time", time[:, None], mask, batch)
+    position = _check_finite(name, position, mask, batch)
     if velocity is not None:
         velocity = torch.as_tensor(velocity).to(position)
-        velocity = _fit_shape("velocity", velocity, (*batch, T, D), position).reshape(-1, T, D)
-        _check_finite("velocity", velocity, mask, batch)
-        velocity = velocity.masked_fill(~mask[..., None], 0)
-    position = position.masked_fill(~mask[..., None], 0)
+        velocity = _fit_shape("velocity", velocity, (*batch, T, D), position)
+        velocity = velocity.reshape(-1, T, D).mT.contiguous()
+        velocity = _check_finite("velocity", velocity, mask, batch)
     s, duration = _normalised(time, mask, batch)
     return Samples(
         batch=tuple(batch),
@@ -150,17 +166,26 @@ def _shapes(time: Tensor, position: Tensor) -> str:
     return f"time has shape {tuple(time.shape)}, position {tuple(position.shape)}"
 
 
-def _check_finite(name: str, values: Tensor, mask: Tensor, batch: list[int]) -> None:
-    bad = ~values.isfinite() & mask[..., None]
+def _check_finite(
+    name: str,
+    values: Float[Tensor, "B D T"],
+    mask: Bool[Tensor, "B T"],
+    batch: Sequence[int],
+) -> Tensor:
+    """The values, none of them NaN or infinite; where the mask is true none may be."""
+    # A sum is finite unless a summand is not or it overflows: the second look sorts that out.
+    if values.sum().isfinite():
+        return values
+    bad = ~values.isfinite() & mask[:, None]
     if bad.any():
-        i, k, column = bad.nonzero()[0].tolist()
+        i, column, k = bad.nonzero()[0].tolist()
         where = f"sample {k}" if name == "time" else f"sample {k}, column {column}"
-        raise ValueError(
-            f"{demo_label(i, batch)}{name} is {values[i, k, column].item()} at {where}"
-        )
+        value = values[i, column, k].item()
+        raise ValueError(f"{demo_label(i, batch)}{name} is {value} at {where}")
+    return values.masked_fill(~mask[:, None], 0)
 
 
-def _normalised(time: Tensor, mask: Tensor, batch: list[int]) -> tuple[Tensor, Tensor]:
+def _normalised(time: Tensor, mask: Tensor, batch: Sequence[int]) -> tuple[Tensor, Tensor]:
     first = time.masked_fill(~mask, torch.inf).amin(-1, keepdim=True)
     last = time.masked_fill(~mask, -torch.inf).amax(-1, keepdim=True)
     elapsed = (time - first).masked_fill(~mask, 0)

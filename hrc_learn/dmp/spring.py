@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 from jaxtyping import Float
@@ -34,6 +35,13 @@ class SpringDamper:
         """Alpha beta."""
         return self.alpha * self.beta
 
+    @property
+    def smooth_interval(self) -> float:
+        """Length over which the unforced motion is a polynomial of low degree."""
+        half = self.alpha / 2
+        fastest = half + math.sqrt(max(half**2 - self.stiffness, 0.0))
+        return 1 / max(fastest, math.sqrt(self.stiffness))
+
     def acceleration(self, offset: Tensor, velocity: Tensor) -> Tensor:
         """Y'' of the unforced system, `offset` being y - g."""
         return -self.stiffness * offset - self.alpha * velocity
@@ -57,5 +65,15 @@ class SpringDamper:
         else:
             envelope = torch.exp(-half * s)
             C, S = envelope * torch.cos(rate * s), envelope * torch.sin(rate * s) / rate
-        rows = [C + half * S, S, -self.stiffness * S, C - half * S]
-        return torch.stack(rows, dim=-1).unflatten(-1, (2, 2))
+        eye, shifted = _constants(self, s.dtype, s.device)
+        return C[..., None, None] * eye + S[..., None, None] * shifted
+
+
+@lru_cache(maxsize=64)
+def _constants(
+    spring: SpringDamper, dtype: torch.dtype, device: torch.device
+) -> tuple[Float[Tensor, "2 2"], Float[Tensor, "2 2"]]:
+    """I and A + alpha / 2 I."""
+    eye = torch.eye(2, dtype=dtype, device=device)
+    A = eye.new_tensor([[0.0, 1.0], [-spring.stiffness, -spring.alpha]])
+    return eye, A + spring.alpha / 2 * eye

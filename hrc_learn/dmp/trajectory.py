@@ -19,21 +19,29 @@ class Trajectory:
     def __init__(
         self,
         *,
-        time: Float[Tensor, "*#batch T"],
         coordinates: Float[Tensor, "*#batch D M"],
-        response: Response,
         s: Float[Tensor, "*#batch T"],
         duration: Float[Tensor, "*#batch"],
+        response: Response,
     ):
-        self._batch = torch.broadcast_shapes(
-            time.shape[:-1], coordinates.shape[:-2], s.shape[:-1], duration.shape
-        )
+        """Describe the motion.
+
+        Args:
+            coordinates: What `response` maps to motions.
+            s: Normalised times.
+            duration: [s].
+            response: Of the primitive.
+        """
         self._coordinates = coordinates
-        self._response = response
         self._s = s
-        self._duration = duration[..., None, None]
-        self.time = time.expand(*self._batch, -1)
+        self._duration = duration[..., None]
+        self._response = response
+        self._batch = broadcast_shapes(coordinates.shape[:-2], s.shape[:-1], duration.shape)
+
+    @cached_property
+    def time(self) -> Float[Tensor, "*batch T"]:
         """Since the start of the motion [s]."""
+        return (self._s * self._duration).to(self._coordinates.dtype).expand(*self._batch, -1)
 
     @cached_property
     def position(self) -> Float[Tensor, "*batch T D"]:
@@ -43,12 +51,12 @@ class Trajectory:
     @cached_property
     def velocity(self) -> Float[Tensor, "*batch T D"]:
         """The same per second."""
-        return (self._output(1) / self._duration).expand(*self._batch, -1, -1)
+        return (self._output(1) / self._duration[..., None]).expand(*self._batch, -1, -1)
 
     @cached_property
     def acceleration(self) -> Float[Tensor, "*batch T D"]:
         """The same per second squared."""
-        return (self._output(2) / self._duration**2).expand(*self._batch, -1, -1)
+        return (self._output(2) / self._duration[..., None] ** 2).expand(*self._batch, -1, -1)
 
     def _output(self, order: int) -> Tensor:
         X = self._coordinates
@@ -61,3 +69,9 @@ class Trajectory:
     @cached_property
     def _rows(self) -> Float[Tensor, "*#batch T 3 M"]:
         return self._response.evaluate(self._s.double())
+
+
+def broadcast_shapes(*shapes: tuple[int, ...]) -> tuple[int, ...]:
+    """As `torch.broadcast_shapes`, which takes longer than a rollout of shapes all alike."""
+    first = shapes[0]
+    return first if all(shape == first for shape in shapes) else torch.broadcast_shapes(*shapes)

@@ -1,0 +1,63 @@
+"""Smooth functions of time kept as polynomials on equal pieces."""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+DEGREE = 12
+
+
+def chebyshev_points() -> Float[Tensor, "P"]:
+    """Chebyshev points of a piece of unit length, both ends included."""
+    k = torch.arange(DEGREE + 1, dtype=torch.float64)
+    return (1 - torch.cos(torch.pi * k / DEGREE)) / 2
+
+
+@dataclass(frozen=True, eq=False)
+class PiecewisePolynomial:
+    """A matrix f(s) = sum_p c_p u^p, u from -1 to 1 along the piece that s lies on."""
+
+    coefficients: Float[Tensor, "pieces P rows columns"]
+    interval: float
+    """Length of a piece."""
+    _moved: dict[torch.device, "PiecewisePolynomial"] = field(default_factory=dict)
+
+    @classmethod
+    def interpolate(
+        cls, values: Float[Tensor, "pieces P rows columns"], interval: float
+    ) -> "PiecewisePolynomial":
+        """The function that has these values at the Chebyshev points of its pieces."""
+        u = 2 * chebyshev_points() - 1
+        powers = u[:, None] ** torch.arange(DEGREE + 1)
+        solved = torch.linalg.solve(powers, values.flatten(2))
+        return cls(solved.view(values.shape), interval)
+
+    @property
+    def end(self) -> float:
+        """Where the last piece ends."""
+        return self.interval * len(self.coefficients)
+
+    def __call__(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch rows columns"]:
+        """Value at `s`; past the end, the value at the end."""
+        pieces, P, *shape = self.coefficients.shape
+        x = (s / self.interval).clamp(0, pieces)
+        piece = x.detach().long().clamp(max=pieces - 1)
+        powers = (2 * (x - piece) - 1)[..., None, None] ** self._exponents
+        c = self.coefficients.view(pieces, P, -1)[piece]
+        return (powers @ c).view(*s.shape, *shape)
+
+    def to(self, device: torch.device) -> "PiecewisePolynomial":
+        """The same function on another device; made once."""
+        if device == self.coefficients.device:
+            return self
+        if device not in self._moved:
+            moved = self.coefficients.to(device)
+            self._moved[device] = PiecewisePolynomial(moved, self.interval)
+        return self._moved[device]
+
+    @cached_property
+    def _exponents(self) -> Tensor:
+        return torch.arange(DEGREE + 1, device=self.coefficients.device)
