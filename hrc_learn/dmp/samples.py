@@ -45,12 +45,12 @@ class Samples:
         # 1e-12 of the motion: stamps that differ by the rounding of a start time are alike.
         return self.complete and bool(((self.s - self.s[:1]).abs() < 1e-12).all())
 
-    @property
+    @cached_property
     def first(self) -> Float[Tensor, "B D"]:
         """Position at the first sample that counts."""
         return self._at(self.mask.long().argmax(-1))
 
-    @property
+    @cached_property
     def last(self) -> Float[Tensor, "B D"]:
         """Position at the last sample that counts."""
         return self._at(self.mask.shape[-1] - 1 - self.mask.flip(-1).long().argmax(-1))

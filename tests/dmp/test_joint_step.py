@@ -1,8 +1,10 @@
 import dataclasses
 
+import numpy as np
 import pytest
 import torch
 from demo_motions import arm_motion
+from dmp_oracle import solve
 
 from hrc_learn.dmp import JointDMP, SpringDamper
 
@@ -77,3 +79,58 @@ def test_a_constant_push_shifts_the_resting_point():
         state = dmp.step(state, 0.1, coupling=torch.full((7,), 0.4))
     shift = torch.full((7,), 0.4 * 3.0**2 / 100, dtype=torch.float64)
     torch.testing.assert_close(state.position - dmp.goal, shift, rtol=0, atol=1e-6)
+
+
+# Order of accuracy, against an adaptive solver
+
+
+def primitive():
+    """One joint that moves for 2 s, with rough weights and a moving start."""
+    time, position = arm_motion(n_joints=1, duration=2.0, moving_start=True)
+    dmp = JointDMP.fit(time, position, n_basis=15)
+    rng = torch.Generator().manual_seed(0)
+    noise = 200 * torch.randn(dmp.weights.shape, generator=rng, dtype=torch.float64)
+    dmp.weights.data += noise
+    return dmp
+
+
+def exact(dmp, y, rate, goal, span, push=None):
+    weights = dmp.weights[0].detach().numpy()
+    return solve(dmp.spring, dmp.basis, weights, y, rate, goal, np.array(span), push)[:, -1]
+
+
+@pytest.mark.parametrize("n_steps", [20, 1000])
+def test_steps_solve_the_equation_also_when_the_goal_jumps(n_steps):
+    dmp = primitive()
+    state = dmp.initial_state()
+    y, rate = state.position.item(), state.rate.item()
+    middle = exact(dmp, y, rate, dmp.goal.item(), (0.0, 0.5))
+    expected = exact(dmp, *middle, 1.5, (0.5, 1.2))
+    for _ in range(n_steps // 2):
+        state = dmp.step(state, 2.0 * 0.5 / (n_steps // 2))
+    for _ in range(n_steps // 2):
+        state = dmp.step(state, 2.0 * 0.7 / (n_steps // 2), goal=[1.5])
+    got = [state.position.item(), state.rate.item()]
+    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-8)
+
+
+def test_coupling_sampled_at_the_start_of_a_step_is_of_first_order():
+    """An elastic band to y = 1 of 30 / s^2, which depends on the state."""
+    dmp = primitive()
+    start = dmp.initial_state()
+    expected = exact(
+        dmp,
+        start.position.item(),
+        start.rate.item(),
+        dmp.goal.item(),
+        (0.0, 1.0),
+        lambda s, y, rate: 2.0**2 * 30 * (1 - y),
+    )[0]
+    errors = []
+    for n_steps in (100, 200, 400):
+        state = start
+        for _ in range(n_steps):
+            state = dmp.step(state, 2.0 / n_steps, coupling=30 * (1 - state.position))
+        errors.append(abs(state.position.item() - expected))
+    orders = np.log2(np.array(errors[:-1]) / errors[1:])
+    assert ((orders > 0.9) & (orders < 1.2)).all(), orders

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from scipy.integrate import solve_ivp
+from dmp_oracle import forcing, gaussians, solve
 
 from hrc_learn.dmp import ExponentialPhase, GaussianBasis, SpringDamper
 from hrc_learn.dmp.response import Response
@@ -16,41 +16,13 @@ SPRINGS = {
 }
 
 
-def gaussians(basis, s):
-    """The basis as its docstring states it, by another route than the code's."""
-    spacing = 1 / (basis.count - 1)
-    if basis.domain == "time":
-        c = spacing * np.arange(basis.count + 1)
-        psi = np.exp(-((s - c) ** 2) / (2 * (basis.width * spacing) ** 2))
-    else:
-        c = np.exp(-basis.phase.decay * spacing * np.arange(basis.count))
-        sigma = basis.width * np.append(c[:-1] - c[1:], c[-2] - c[-1])
-        psi = np.exp(-((np.exp(-basis.phase.decay * s) - c) ** 2) / (2 * sigma**2))
-    return psi
-
-
-def forcing(basis, s):
-    psi = gaussians(basis, s)
-    return psi[: basis.count] / psi.sum() * np.exp(-basis.phase.decay * s)
-
-
-def solve(spring, basis, weights, y0, rate, goal, times):
-    def rhs(s, x):
-        force = forcing(basis, s) @ weights
-        return [x[1], spring.alpha * (spring.beta * (goal - x[0]) - x[1]) + force]
-
-    return solve_ivp(
-        rhs, (0, times[-1]), [y0, rate], "DOP853", times, rtol=1e-12, atol=1e-12, max_step=0.01
-    ).y
-
-
 @pytest.mark.parametrize("domain", ["time", "phase"])
 @pytest.mark.parametrize("spring", SPRINGS.values(), ids=SPRINGS)
 def test_response_solves_the_differential_equation(spring, domain):
     basis = GaussianBasis(count=12, domain=domain, phase=ExponentialPhase(decay=3.0))
     rng = np.random.default_rng(0)
     weights = 300 * rng.standard_normal(12)
-    times = np.sort(rng.uniform(0, 1.4, 40))
+    times = np.append(0.0, np.sort(rng.uniform(0, 1.4, 40)))
     expected = solve(spring, basis, weights, 0.3, -2.0, 1.1, times)
 
     H = Response(spring, basis).evaluate(torch.tensor(times))
