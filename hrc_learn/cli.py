@@ -9,7 +9,7 @@ import os
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, SupportsFloat
 
 
 def run[Args](main: Callable[[Args], int | None], args: type[Args]) -> NoReturn:
@@ -42,7 +42,7 @@ def one_line(error: BaseException) -> str:
     return " ".join(" ".join([text, *getattr(error, "__notes__", ())]).split())
 
 
-def write_json(path: str | Path, values: Mapping[str, float]) -> None:
+def write_json(path: str | Path, values: Mapping[str, SupportsFloat]) -> None:
     """Write measured values as one flat object; the file is whole or not there at all.
 
     Args:

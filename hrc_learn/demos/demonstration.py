@@ -29,29 +29,29 @@ class Demonstration:
     radians; poses are of the tool centre point in the robot's base frame.
     """
 
-    time: Float64[np.ndarray, " frames"]
+    time: Float64[np.ndarray, " _frames"]
     """Time since the first frame [s], increasing."""
-    joint_position: Float64[np.ndarray, "frames joints"] | None = None
+    joint_position: Float64[np.ndarray, "_frames _joints"] | None = None
     """[rad]"""
-    joint_velocity: Float64[np.ndarray, "frames joints"] | None = None
+    joint_velocity: Float64[np.ndarray, "_frames _joints"] | None = None
     """[rad/s]"""
-    joint_effort: Float64[np.ndarray, "frames joints"] | None = None
+    joint_effort: Float64[np.ndarray, "_frames _joints"] | None = None
     """Measured joint torque [N m]."""
-    position: Float64[np.ndarray, "frames 3"] | None = None
+    position: Float64[np.ndarray, "_frames _xyz"] | None = None
     """[m]"""
-    orientation: Float64[np.ndarray, "frames 4"] | None = None
+    orientation: Float64[np.ndarray, "_frames _wxyz"] | None = None
     """Unit quaternion (w, x, y, z), its sign continuous along the demonstration."""
-    gripper: Float64[np.ndarray, " frames"] | None = None
+    gripper: Float64[np.ndarray, " _frames"] | None = None
     """Opening [m], or 0 to 1 where the robot knows no width."""
-    feature: Float64[np.ndarray, "frames 2"] | None = None
+    feature: Float64[np.ndarray, "_frames _uv"] | None = None
     """Image feature (u right, v down) [px]; meaningless where `feature_visible` is false."""
-    feature_visible: Bool[np.ndarray, " frames"] | None = None
+    feature_visible: Bool[np.ndarray, " _frames"] | None = None
     """Whether the camera saw the feature."""
-    human_effort: Float64[np.ndarray, "frames joints"] | None = None
+    human_effort: Float64[np.ndarray, "_frames _joints"] | None = None
     """The person's effort d in joint space [N m]."""
-    command_position: Float64[np.ndarray, "frames joints"] | None = None
+    command_position: Float64[np.ndarray, "_frames _joints"] | None = None
     """Commanded joint position [rad]."""
-    command_velocity: Float64[np.ndarray, "frames joints"] | None = None
+    command_velocity: Float64[np.ndarray, "_frames _joints"] | None = None
     """Commanded joint velocity [rad/s]."""
     task: str = ""
     """What the person was asked to show."""

@@ -70,6 +70,6 @@ def _hold(array: np.ndarray, length: int) -> np.ndarray:
     return np.concatenate([array, np.repeat(array[-1:], length - len(array), axis=0)])
 
 
-def _go_on(time: np.ndarray, length: int, fps: float) -> np.ndarray:
+def _go_on(time: np.ndarray, length: int, fps: float | int) -> np.ndarray:
     step = time[-1] - time[-2] if len(time) > 1 else 1 / fps
     return np.concatenate([time, time[-1] + step * np.arange(1, length - len(time) + 1)])

@@ -1,0 +1,93 @@
+"""Demonstrations keep their arrays consistent, alone and stacked."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hrc_learn.demos import DatasetError, Demonstration, DemonstrationSet
+
+NAMES = ("a", "b", "c")
+
+
+def demonstration(frames=5, **changed) -> Demonstration:
+    values = np.arange(3.0 * frames).reshape(frames, 3)
+    recorded = {
+        "time": 0.1 * np.arange(frames),
+        "joint_position": values,
+        "human_effort": -values,
+        "position": 2 * values,
+        "joint_names": NAMES,
+        "fps": 10,
+    }
+    return Demonstration(**recorded | changed)
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"time": np.zeros(0)}, "at least one frame"),
+        ({"joint_position": np.zeros((4, 3))}, "joint_position has 4 frames, but time has 5"),
+        ({"joint_position": np.zeros((5, 2))}, r"expected \(5, 3\) for the joints a, b, c"),
+        ({"orientation": np.zeros((5, 3))}, r"orientation has shape \(5, 3\)"),
+        ({"time": np.array([0, 0.1, 0.1, 0.2, 0.3])}, "from 0.1 s to 0.1 s at frame 1"),
+    ],
+)
+def test_arrays_that_contradict_each_other_are_refused(changed, message):
+    with pytest.raises(ValueError, match=message):
+        demonstration(**changed)
+
+
+def test_joints_are_selected_in_every_field_that_goes_by_joints():
+    demo = demonstration().select_joints(["c", "a"])
+    assert demo.joint_names == ("c", "a")
+    np.testing.assert_array_equal(demo.joint_position[0], [2, 0])
+    np.testing.assert_array_equal(demo.human_effort[1], [-5, -3])
+    np.testing.assert_array_equal(demo.position, demonstration().position)
+    with pytest.raises(DatasetError, match=r"no joint named d; .* are a, b, c"):
+        demonstration().select_joints(["d"])
+
+
+def test_a_demonstration_cannot_be_changed():
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        demonstration().task = "other"
+
+
+@given(st.lists(st.integers(2, 20), min_size=1, max_size=5))
+def test_padding_holds_the_end_and_lets_time_go_on(lengths):
+    demos = DemonstrationSet([demonstration(n) for n in lengths])
+    padded = demos.padded()
+    assert padded.mask.sum(1).tolist() == padded.length.tolist() == lengths
+    assert (padded.time.diff(dim=1) > 0).all()
+    for index, demo in enumerate(demos):
+        row = padded.joint_position[index]
+        torch.testing.assert_close(row[: len(demo)], torch.from_numpy(demo.joint_position))
+        assert (row[len(demo) :] == row[len(demo) - 1]).all()
+    assert padded.orientation is None
+    assert padded.to(dtype=torch.float32).time.dtype == torch.float32
+    assert padded.to(dtype=torch.float32).mask.dtype == torch.bool
+
+
+def test_what_one_demonstration_lacks_is_not_stacked():
+    padded = DemonstrationSet([demonstration(), demonstration(position=None)]).padded()
+    assert padded.position is None
+    assert padded.joint_position is not None
+
+
+def test_a_set_slices_and_iterates_like_a_tuple():
+    demos = DemonstrationSet([demonstration(n) for n in (2, 3, 4)], notes=["guessed"])
+    assert [len(demo) for demo in demos] == [2, 3, 4]
+    assert demos.frames == 9
+    assert isinstance(demos[1:], DemonstrationSet)
+    assert demos[1:].notes == ("guessed",)
+    assert demos.select_joints(["b"]).joint_names == ("b",)
+
+
+def test_sets_hold_one_robot():
+    with pytest.raises(ValueError, match="share their joints"):
+        DemonstrationSet([demonstration(), demonstration(joint_names=("x", "y", "z"))])
+    with pytest.raises(ValueError, match="no padded form"):
+        DemonstrationSet([]).padded()

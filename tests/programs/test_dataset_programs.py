@@ -1,0 +1,201 @@
+"""The dataset programs as a user runs them: results, messages, exit status."""
+
+import importlib.util
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from lerobot_folders import joint_path, write_folder
+
+from hrc_learn import cli
+from hrc_learn.demos import load_demos
+
+PROGRAMS = Path(__file__).parents[2] / "datasets"
+
+
+def run(monkeypatch, capsys, program, *arguments):
+    """Run a program in this process; its exit status, stdout and stderr."""
+    spec = importlib.util.spec_from_file_location(program, PROGRAMS / f"{program}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, program, module)
+    spec.loader.exec_module(module)
+    monkeypatch.setattr(sys, "argv", [f"{program}.py", *map(str, arguments)])
+    with pytest.raises(SystemExit) as ended:
+        cli.run(module.main, module.Args)
+    captured = capsys.readouterr()
+    return ended.value.code, captured.out, captured.err
+
+
+@pytest.fixture
+def program(monkeypatch, capsys):
+    return lambda *arguments: run(monkeypatch, capsys, *arguments)
+
+
+@pytest.fixture
+def recording(tmp_path):
+    path = tmp_path / "pour.npz"
+    np.savez(path, t=3.0 + 0.003 * np.arange(200), q=joint_path(200, 7))
+    return path
+
+
+def test_arrays_are_imported_checked_and_read(program, recording, tmp_path):
+    out = tmp_path / "set"
+    status, text, _ = program(
+        *("import_arrays", recording, recording, "--out", out, "--joints", "q", "--time", "t"),
+        *("--json", tmp_path / "values.json", "--robot-type", "iiwa14"),
+    )
+    assert status == 0
+    assert "2 demonstrations, 400 frames" in text
+    values = json.loads((tmp_path / "values.json").read_text())
+    assert values == {"episodes": 2, "frames": 400, "seconds": pytest.approx(1.194), "fps": 333}
+    demos = load_demos(out)
+    assert demos[1].task == "pour"
+    assert demos[1].start_time == 3.0
+    np.testing.assert_allclose(demos[1].time, 0.003 * np.arange(200), atol=1e-9)
+    np.testing.assert_allclose(demos[1].joint_position, joint_path(200, 7), atol=1e-6)
+    status, text, _ = program("check_dataset", out, "--json", tmp_path / "check.json")
+    assert status == 0
+    checked = json.loads((tmp_path / "check.json").read_text())
+    assert (checked["errors"], checked["episodes"], checked["frames"]) == (0, 2, 400)
+    assert checked["warnings"] >= 1  # the same episode twice
+    assert "same motion as episode 0" in text
+    assert program("check_dataset", out, "--strict")[0] == 1
+
+
+def test_poses_are_imported_in_centimetres(program, tmp_path):
+    angle = np.linspace(0, 1, 50)
+    pose = np.column_stack(
+        [100 * joint_path(50), np.cos(angle), np.sin(angle), 0 * angle, 0 * angle]
+    )
+    np.save(tmp_path / "poses.npy", np.stack([pose, pose + 1e-9]))
+    status, *_ = program(
+        *("import_arrays", tmp_path / "poses.npy", "--out", tmp_path / "set"),
+        *("--columns", "px,py,pz,qw,qx,qy,qz", "--position-unit", "cm", "--duration", "5"),
+    )
+    assert status == 0
+    demos = load_demos(tmp_path / "set")
+    assert len(demos) == 2
+    np.testing.assert_allclose(demos[0].position, joint_path(50), atol=1e-6)
+    assert demos[0].duration == pytest.approx(5)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--joints", "p", "--time", "t"], "pour.npz, joints: there is no array 'p'"),
+        (["--joints", "q"], None),
+        (["--joints", "q", "--time", "t", "--joint-names", "a"], "1 joint names for 7 columns"),
+        (["--position", "q", "--time", "t"], "position has shape (200, 7)"),
+    ],
+)
+def test_bad_input_is_one_line_and_leaves_nothing(
+    program, recording, tmp_path, arguments, message
+):
+    status, _, error = program(
+        "import_arrays", recording, "--out", tmp_path / "set", *arguments
+    )
+    if message is None:  # the array of stamps is found by its name
+        assert status == 0
+        return
+    assert status == 2
+    assert message in error
+    assert error.startswith("error: ")
+    assert error.count("\n") == 1
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["pour.npz"]
+
+
+def test_an_existing_dataset_is_not_touched(program, recording, tmp_path):
+    (tmp_path / "set").mkdir()
+    arguments = ("import_arrays", recording, "--out", tmp_path / "set", "--joints", "q")
+    status, _, error = program(*arguments)
+    assert status == 2
+    assert "already exists" in error
+
+
+def test_recordings_of_different_robots_do_not_mix(program, recording, tmp_path):
+    np.savez(tmp_path / "other.npz", t=0.003 * np.arange(200), q=joint_path(200, 6))
+    status, _, error = program(
+        *("import_arrays", recording, tmp_path / "other.npz"),
+        *("--out", tmp_path / "set", "--joints", "q", "--time", "t"),
+    )
+    assert status == 2
+    assert "do not fit into one dataset" in error
+
+
+def test_check_names_the_place_of_an_error(program, tmp_path):
+    q = joint_path()
+    q[7, 1] = np.nan
+    root = write_folder(
+        tmp_path / "set", [{"observation.state": q}], {"observation.state": ["a", "b", "c"]}
+    )
+    status, text, _ = program("check_dataset", root)
+    assert status == 1
+    place = "data/chunk-000/file-000.parquet, episode 0, frame 7, observation.state: b is nan"
+    assert place in text
+
+
+def test_check_of_nothing(program, tmp_path):
+    status, _, error = program("check_dataset", tmp_path / "none")
+    assert (status, error.count("\n")) == (2, 1)
+    assert "there is no dataset" in error
+
+
+@pytest.mark.parametrize("name", ["import_arrays", "check_dataset"])
+def test_help_tells_what_the_program_is_for(name):
+    done = subprocess.run(
+        [sys.executable, PROGRAMS / f"{name}.py", "--help"], capture_output=True, text=True
+    )
+    assert done.returncode == 0
+    assert "LeRobot dataset" in done.stdout
+    assert "--json" in done.stdout
+
+
+def test_no_package_shadows_hugging_faces_datasets():
+    assert not list(PROGRAMS.glob("__init__.py"))
+
+
+def test_measured_values_are_written_whole_or_not_at_all(tmp_path):
+    path = tmp_path / "new" / "values.json"
+    cli.write_json(path, {"a": 1, "b": np.float32(0.5), "c": float("nan"), "d": np.int64(3)})
+    assert json.loads(path.read_text()) == {"a": 1, "b": 0.5, "c": None, "d": 3}
+    with pytest.raises(TypeError):
+        cli.write_json(path, {"a": object()})  # pyright: ignore[reportArgumentType]
+    assert json.loads(path.read_text())["a"] == 1
+    assert [p.name for p in path.parent.iterdir()] == ["values.json"]
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "line"),
+    [
+        (ValueError("two\nlines"), 2, "error: two lines\n"),
+        (FileNotFoundError(2, "No such file or directory", "/x"), 2, "error: /x: No such file"),
+        (KeyboardInterrupt(), 1, "interrupted\n"),
+    ],
+)
+def test_the_users_mistakes_end_in_one_line(monkeypatch, capsys, error, status, line):
+    from dataclasses import make_dataclass
+
+    def main(_):
+        raise error
+
+    monkeypatch.setattr(sys, "argv", ["program"])
+    with pytest.raises(SystemExit) as ended:
+        cli.run(main, make_dataclass("Args", []))
+    assert ended.value.code == status
+    assert capsys.readouterr().err.startswith(line)
+
+
+def test_our_own_mistakes_are_not_taken_for_the_users(monkeypatch):
+    from dataclasses import make_dataclass
+
+    def main(_):
+        raise KeyError("ours")
+
+    monkeypatch.setattr(sys, "argv", ["program"])
+    with pytest.raises(KeyError):
+        cli.run(main, make_dataclass("Args", []))
