@@ -12,4 +12,6 @@ from hrc_learn.dmp.pose import PoseTrajectory as PoseTrajectory
 from hrc_learn.dmp.report import FitReport as FitReport
 from hrc_learn.dmp.spring import SpringDamper as SpringDamper
 from hrc_learn.dmp.state import DMPState as DMPState
+from hrc_learn.dmp.stepper import Stepper as Stepper
+from hrc_learn.dmp.stepper import StepperState as StepperState
 from hrc_learn.dmp.trajectory import Trajectory as Trajectory

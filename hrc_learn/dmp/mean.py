@@ -1,5 +1,7 @@
 """One primitive from several: the mean of what a person showed more than once."""
 
+from typing import Any
+
 import torch
 
 from hrc_learn.dmp.joint import BUFFERS, JointDMP
@@ -34,7 +36,9 @@ def _mean_of_joints(primitives: JointDMP) -> JointDMP:
     def mean(tensor: torch.Tensor) -> torch.Tensor:
         return tensor.flatten(0, batch - 1).mean(dim=0) if batch else tensor
 
-    buffers = {name: mean(getattr(primitives, name)) for name in BUFFERS if name != "stamps"}
+    buffers: dict[str, Any] = {
+        name: mean(getattr(primitives, name)) for name in BUFFERS if name != "stamps"
+    }
     samples = primitives.stamps.shape[-1]
     return JointDMP(
         weights=mean(weights),

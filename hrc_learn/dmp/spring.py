@@ -3,6 +3,8 @@
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from types import ModuleType
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -49,24 +51,33 @@ class SpringDamper:
     def propagator(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 2 2"]:
         """Transition matrix exp(A s): maps (y - g, y') at 0 to the same at `s`.
 
-        exp(A s) = exp(-alpha s / 2) (C I + S (A + alpha / 2 I)) by Cayley-Hamilton, where
-        C, S are cosh, sinh, their trigonometric twins, or 1, s at critical damping.
+        exp(A s) = C I + S (A + alpha / 2 I) by Cayley-Hamilton; see `modes` for C and S.
         """
-        half = self.alpha / 2
-        discriminant = half**2 - self.stiffness
-        rate = math.sqrt(abs(discriminant))
-        if rate < 1e-6 * half:
-            C = torch.exp(-half * s)
-            S = s * C
-        elif discriminant > 0:
-            # Both exponents are negative: unlike cosh, nothing overflows at large s.
-            slow, fast = torch.exp((rate - half) * s), torch.exp((-rate - half) * s)
-            C, S = (slow + fast) / 2, (slow - fast) / (2 * rate)
-        else:
-            envelope = torch.exp(-half * s)
-            C, S = envelope * torch.cos(rate * s), envelope * torch.sin(rate * s) / rate
+        C, S = self.modes(s, torch)
         eye, shifted = _constants(self, s.dtype, s.device)
         return C[..., None, None] * eye + S[..., None, None] * shifted
+
+    def modes(self, s: Any, xp: ModuleType) -> tuple[Any, Any]:
+        """exp(-alpha s / 2) times cosh(r s) and sinh(r s) / r, r^2 = alpha^2 / 4 - alpha beta.
+
+        Trigonometric where r is imaginary, 1 and s where it is zero.
+
+        Args:
+            s: Normalised time, of a type that `xp` takes.
+            xp: `torch` for tensors, `math` for numbers.
+        """
+        half = self.alpha / 2
+        square = half**2 - self.stiffness
+        rate = math.sqrt(abs(square))
+        if rate < 1e-6 * half:
+            C = xp.exp(-half * s)
+            return C, s * C
+        if square > 0:
+            # Both exponents are negative: unlike cosh, nothing overflows at large s.
+            slow, fast = xp.exp((rate - half) * s), xp.exp((-rate - half) * s)
+            return (slow + fast) / 2, (slow - fast) / (2 * rate)
+        envelope = xp.exp(-half * s)
+        return envelope * xp.cos(rate * s), envelope * xp.sin(rate * s) / rate
 
 
 @lru_cache(maxsize=64)
