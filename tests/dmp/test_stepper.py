@@ -10,10 +10,6 @@ SPRINGS = [
     SpringDamper(alpha=30.0, beta=2.0),
     SpringDamper(alpha=12.0, beta=20.0),
 ]
-    SpringDamper(),
-    SpringDamper(alpha=30.0, beta=2.0),
-    SpringDamper(alpha=12.0, beta=20.0),
-]
 
 
 @pytest.mark.parametrize("spring", SPRINGS)
