@@ -1,0 +1,17 @@
+"""Logging, dashboards, figures and reports of runs.
+
+`StepLog` and the recording dataclasses need numpy only. What draws imports its library when
+it is asked for: `hrc_learn.viz.run_dashboard` and `fit_dashboard` import rerun,
+`hrc_learn.viz.figures` imports matplotlib.
+"""
+
+from .recording import Body as Body
+from .recording import Box as Box
+from .recording import CameraRecording as CameraRecording
+from .recording import Capsule as Capsule
+from .recording import FitRecording as FitRecording
+from .recording import JointLimits as JointLimits
+from .recording import RunRecording as RunRecording
+from .recording import arm_bodies as arm_bodies
+from .step_log import Event as Event
+from .step_log import StepLog as StepLog

@@ -1,0 +1,198 @@
+"""A log that a control loop can afford: about a microsecond a step, no files, no threads."""
+
+import os
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+Value = np.ndarray | np.generic | float | int | bool
+"""A measurement of one step: an array of any shape, or a number."""
+
+
+class Event(NamedTuple):
+    """Something worth a line of text, such as a task entering its next phase."""
+
+    time: float
+    """[s]"""
+    text: str
+
+
+class StepLog:
+    """Columns of whatever a loop measures, one row a step.
+
+    The first row decides the columns and their shapes; every later row must bring the same
+    ones. Numbers become float64, whatever their first value looks like (`time=0`); truth values
+    stay so. Memory is taken in blocks and never moved, so no step pays for growth.
+
+        log = StepLog()
+        log.append(time=t, joint_position=q, feature=x, pushed=True)
+        log["joint_position"]      # (T, 7)
+
+    The fastest way is a prepared row, whose fields are written in place where they arise:
+
+        row = log.prepare(joint_position=q, feature=x)
+        row["joint_position"][:] = q
+        log.append_row(row)
+    """
+
+    def __init__(self, block: int = 8192):
+        """Make an empty log.
+
+        Args:
+            block: Rows to take memory for at a time.
+        """
+        if block < 1:
+            raise ValueError(f"block must be at least one row, but is {block}.")
+        self._block = block
+        self._dtype: np.dtype | None = None
+        self._full: list[np.ndarray] = []
+        self._rows = np.empty(0)
+        self._columns: list[tuple[str, np.ndarray]] = []
+        self._count = 0  # rows used in the last block
+        self.events: list[Event] = []
+        """What happened when, in the order of the calls."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the columns, in the order of the first row."""
+        return () if self._dtype is None else self._dtype.names or ()
+
+    def __len__(self) -> int:
+        return len(self._full) * self._block + self._count
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.names
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """One column, (T, ...): a copy, whatever is logged afterwards."""
+        if name not in self:
+            raise KeyError(f"{name!r} is not logged; the columns are {list(self.names)}.")
+        return np.concatenate([block[name] for block in self.blocks()])
+
+    def blocks(self, start: int = 0) -> Iterator[np.ndarray]:
+        """The rows from `start` on, as structured arrays that share memory with the log."""
+        # The count is read once: rows appended meanwhile by the loop's thread come next time.
+        full, count = list(self._full), self._count
+        first, offset = divmod(start, self._block)
+        for i, rows in enumerate([*full, self._rows[:count]]):
+            if i >= first:
+                yield rows[offset if i == first else 0 :]
+
+    def append(self, **values: Value) -> None:
+        """Add a row.
+
+        Raises:
+            ValueError: If the row lacks a column, brings a new one, or one of another shape.
+        """
+        if self._dtype is None:
+            self._open(values)
+        if self._count == self._block:
+            self._extend()
+        i = self._count
+        try:
+            for name, column in self._columns:
+                column[i] = values[name]
+        except (KeyError, ValueError, TypeError) as error:
+            raise self._mismatch(values) from error
+        if len(values) != len(self._columns):
+            raise self._mismatch(values)
+        self._count = i + 1
+
+    def prepare(self, **examples: Value) -> np.ndarray:
+        """A row to be filled in place and given to `append_row`, holding the examples."""
+        if self._dtype is None:
+            self._open(examples)
+        elif set(examples) != set(self.names):
+            raise self._mismatch(examples)
+        row = np.zeros((), dtype=self._dtype)
+        for name, value in examples.items():
+            row[name] = value
+        return row
+
+    def append_row(self, row: np.ndarray) -> None:
+        """Add a copy of a row made by `prepare`."""
+        if self._count == self._block:
+            self._extend()
+        self._rows[self._count] = row
+        self._count += 1
+
+    def event(self, time: float, text: str) -> None:
+        """Note that something happened at a time [s]."""
+        self.events.append(Event(float(time), text))
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write columns and events as one .npz file, which appears only when complete."""
+        path = Path(path)
+        part = path.with_name(path.name + ".part")
+        arrays: dict[str, Any] = {f"column/{name}": self[name] for name in self.names}
+        arrays["event/time"] = np.array([event.time for event in self.events], dtype=float)
+        arrays["event/text"] = np.array([event.text for event in self.events], dtype=str)
+        try:
+            with part.open("wb") as file:
+                np.savez(file, **arrays)
+            part.replace(path)
+        finally:
+            part.unlink(missing_ok=True)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> "StepLog":
+        """Read what `save` wrote. The log can be appended to."""
+        with np.load(path, allow_pickle=False) as file:
+            columns = {
+                key.removeprefix("column/"): file[key]
+                for key in file.files
+                if key.startswith("column/")
+            }
+            times, texts = file["event/time"].tolist(), file["event/text"].tolist()
+        log = cls()
+        log.events = [Event(time, text) for time, text in zip(times, texts, strict=True)]
+        if columns:
+            log._fill(columns)
+        return log
+
+    def _fill(self, columns: dict[str, np.ndarray]) -> None:
+        self._open({name: np.zeros(c.shape[1:], c.dtype) for name, c in columns.items()})
+        total = len(next(iter(columns.values())))
+        for start in range(0, total, self._block):
+            if start:
+                self._extend()
+            self._count = min(self._block, total - start)
+            for name, column in self._columns:
+                column[: self._count] = columns[name][start : start + self._count]
+
+    def _open(self, values: Mapping[str, Value]) -> None:
+        self._dtype = np.dtype(
+            [(name, _kind(value), np.shape(value)) for name, value in values.items()]
+        )
+        self._new_block()
+
+    def _mismatch(self, values: Mapping[str, Value]) -> ValueError:
+        assert self._dtype is not None
+        expected = {name: self._dtype[name].shape for name in self.names}
+        given = {name: np.shape(value) for name, value in values.items()}
+        differing = [
+            f"{name} is {given.get(name, 'missing')}, not {expected.get(name, 'a column')}"
+            for name in sorted(expected.keys() | given.keys())
+            if given.get(name) != expected.get(name)
+        ]
+        return ValueError(
+            f"row {len(self)} does not fit the columns that the first row decided: "
+            + "; ".join(differing)
+            + ". Log every quantity at every step, with NaN where there is none."
+        )
+
+    def _extend(self) -> None:
+        self._full.append(self._rows)
+        self._new_block()
+
+    def _new_block(self) -> None:
+        assert self._dtype is not None
+        self._rows = np.zeros(self._block, dtype=self._dtype)
+        self._columns = [(name, self._rows[name]) for name in self.names]
+        self._count = 0
+
+
+def _kind(value: Value) -> type:
+    return bool if np.asarray(value).dtype == bool else float

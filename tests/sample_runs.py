@@ -1,0 +1,115 @@
+"""A small made-up run and fit with every field filled, for the tests of `hrc_learn.viz`."""
+
+import numpy as np
+
+from hrc_learn.vision import CameraModel
+from hrc_learn.viz import (
+    Body,
+    Box,
+    CameraRecording,
+    Capsule,
+    Event,
+    FitRecording,
+    JointLimits,
+    RunRecording,
+)
+
+STEPS = 200
+OPTIONAL = (
+    "camera",
+    "demo_joint_position",
+    "demo_path",
+    "elbow_motion",
+    "human_effort",
+    "image_jacobian",
+    "joint_limits",
+    "plan_path",
+    "position_deviation",
+    "region",
+    "rotation_deviation",
+    "true_image_jacobian",
+    "weight_norm",
+)
+"""Fields of a run that may be None."""
+NAMES = tuple(f"joint{i}" for i in range(1, 8))
+LIMITS = JointLimits(lower=np.full(7, -2.9), upper=np.full(7, 2.9))
+
+
+def camera_recording(time: np.ndarray, images: int = 3) -> CameraRecording:
+    """A feature that comes near its target, unseen for a while, with a few small images."""
+    model = CameraModel(width=160, height=120, focal=(150.0, 150.0), principal=(79.5, 59.5))
+    feature = 80.0 + 40.0 * np.exp(-time)[:, None] * [1.0, -0.5]
+    feature[50:60] = np.nan
+    target = np.full_like(feature, 80.0)
+    target[:20] = np.nan
+    grey = tuple(np.full((120, 160, 3), 60 * (i + 1), dtype=np.uint8) for i in range(images))
+    return CameraRecording(
+        model=model.look_at(np.array([0.4, 0.0, 1.2]), np.array([0.4, 0.0, 0.0])),
+        feature=feature,
+        target=target,
+        image_time=np.linspace(0.0, time[-1], images),
+        images=grey,
+    )
+
+
+def sample_run(**changes) -> RunRecording:
+    """Four seconds at 50 Hz. `changes` replace fields; None or empty leaves one out."""
+    time = np.arange(STEPS) / 50
+    rng = np.random.default_rng(0)
+    position = np.stack([0.4 + 0.1 * np.sin(time), 0.1 * time, 0.3 + 0 * time], axis=-1)
+    effort = np.zeros((STEPS, 7))
+    effort[80:120, 3] = 1.0
+    upright = np.tile([np.cos(0.3), 0.0, 0.0, np.sin(0.3)], (STEPS, 1))
+    body = Body(
+        name="hand",
+        position=position,
+        orientation=upright,
+        capsules=(Capsule(start=(0.0, 0.0, -0.1), end=(0.0, 0.0, 0.0), radius=0.03),),
+        boxes=(Box(centre=(0.0, 0.0, 0.05), half_size=(0.02, 0.05, 0.05)),),
+    )
+    fields = {
+        "title": "Grasp",
+        "time": time,
+        "joint_names": NAMES,
+        "joint_position": np.sin(time[:, None] + np.arange(7)),
+        "joint_limits": LIMITS,
+        "demo_joint_position": np.sin(time[:, None] + np.arange(7)) + 0.01,
+        "position": position,
+        "demo_path": position + 0.01,
+        "plan_path": position + 0.02,
+        "bodies": (body,),
+        "boxes": (Box(centre=(0.4, 0.1, -0.1), half_size=(0.5, 0.5, 0.1), name="table"),),
+        "region": Box(centre=(0.4, 0.1, 0.3), half_size=(0.1, 0.1, 0.1), name="region"),
+        "camera": camera_recording(time),
+        "image_jacobian": 1000.0 + rng.normal(size=(STEPS, 2, 6)),
+        "true_image_jacobian": np.full((STEPS, 2, 6), 1000.0),
+        "weight_norm": 5.0 + time,
+        "potentials": {"vision": np.exp(-time), "Cartesian box": 2 * np.exp(-time)},
+        "human_effort": effort,
+        "elbow_motion": 0.1 * effort[:, 3],
+        "position_deviation": 1e-4 * effort[:, 3],
+        "rotation_deviation": np.radians(0.01) * effort[:, 3],
+        "safety": {"velocity limit": time > 3.0},
+        "phases": (Event(0.0, "Approach"), Event(1.0, "Servo")),
+    }
+    return RunRecording(**(fields | changes))
+
+
+def sample_fit(**changes) -> FitRecording:
+    """Three demonstrations of different lengths."""
+    times = tuple(np.linspace(0.0, 2.0 + i, 80 + 10 * i) for i in range(3))
+    demos = tuple(np.sin(t[:, None] + np.arange(7)) for t in times)
+    paths = tuple(demo[:, :3] for demo in demos)
+    fields = {
+        "title": "Placing",
+        "joint_names": NAMES,
+        "time": times,
+        "demos": demos,
+        "reproductions": tuple(demo + 1e-3 for demo in demos),
+        "demo_paths": paths,
+        "reproduction_paths": tuple(path + 1e-3 for path in paths),
+        "joint_limits": LIMITS,
+        "residual": {10: 1e-2, 30: 1e-3, 50: 1e-4},
+        "n_basis": 50,
+    }
+    return FitRecording(**(fields | changes))
