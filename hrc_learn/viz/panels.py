@@ -1,0 +1,212 @@
+"""Which curves of a run are drawn where: one list that data and layout are both made from."""
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Shaped
+
+from . import palette
+from .recording import JointLimits, RunRecording
+
+Colour = tuple[int, int, int, int]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Curves:
+    """Curves over time that share an entity and a unit."""
+
+    path: str
+    names: tuple[str, ...]
+    values: Shaped[np.ndarray, "time curves"]
+    colours: tuple[Colour, ...]
+    width: float = 1.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plot:
+    """One coordinate system."""
+
+    title: str
+    """What is shown, with its unit: plots have no axis labels."""
+    curves: tuple[Curves, ...]
+    legend: bool = False
+    """Where the title cannot name the colours."""
+    share: float = 1.0
+    """Height, in proportion to the other plots of the tab."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tab:
+    """Plots shown together."""
+
+    title: str
+    plots: tuple[Plot, ...]
+    columns: int = 1
+
+
+def run_tabs(run: RunRecording) -> list[Tab]:
+    """Every tab that the run has data for."""
+    tabs = [
+        _servoing(run),
+        _regions(run),
+        _image_jacobian(run),
+        _person(run),
+        _joints(run),
+        _safety(run),
+    ]
+    return [tab for tab in tabs if tab.plots]
+
+
+def _servoing(run: RunRecording) -> Tab:
+    if run.camera is None:
+        return Tab(title="Pixel error", plots=())
+    error = single("camera/error", "distance", run.camera.error, palette.RUN_ON_DARK)
+    delta = run.camera.feature - run.camera.target
+    parts = several("camera/error_uv", ("u (right)", "v (down)"), delta)
+    plots = (
+        Plot(title="Distance from feature to target [px]", curves=(error,)),
+        Plot(title="Feature minus target: u blue, v orange [px]", curves=(parts,)),
+    )
+    return Tab(title="Pixel error", plots=plots)
+
+
+def _regions(run: RunRecording) -> Tab:
+    plots = tuple(
+        Plot(
+            title=f"Potential of the region: {name} [-]",
+            curves=(single(f"regions/{_slug(name)}", name, values, palette.RUN_ON_DARK),),
+        )
+        for name, values in run.potentials.items()
+    )
+    return Tab(title="Regions", plots=plots)
+
+
+def _image_jacobian(run: RunRecording) -> Tab:
+    plots = []
+    if run.image_jacobian is not None:
+        for row, pixel in enumerate(("u", "v")):
+            for half in ("linear", "angular"):
+                plots.append(_jacobian_plot(run, row, pixel, half))
+    if run.weight_norm is not None:
+        norm = single("image_jacobian/weight_norm", "‖W‖", run.weight_norm, palette.PURPLE)
+        plots.append(Plot(title="Norm of the learned weights [-]", curves=(norm,)))
+    return Tab(title="Image Jacobian", plots=tuple(plots))
+
+
+def _jacobian_plot(run: RunRecording, row: int, pixel: str, half: str) -> Plot:
+    assert run.image_jacobian is not None
+    columns, symbol, unit = (
+        (slice(0, 3), "v", "px/m") if half == "linear" else (slice(3, 6), "ω", "px/rad")
+    )
+    path = f"image_jacobian/{pixel}_{half}"
+    names = tuple(f"∂{pixel}/∂{symbol}{axis}" for axis in "xyz")
+    curves = [several(f"{path}/estimate", names, run.image_jacobian[:, row, columns])]
+    title = f"∂{pixel} / {half} velocity [{unit}]: x blue, y orange, z green"
+    if run.true_image_jacobian is not None:
+        true = run.true_image_jacobian[:, row, columns]
+        names = tuple(f"{name} true" for name in names)
+        curves.insert(0, several(f"{path}/true", names, true, width=5.0, light=True))
+        title += "; pale: true"
+    return Plot(title=title, curves=tuple(curves))
+
+
+def _person(run: RunRecording) -> Tab:
+    plots = []
+    if run.human_effort is not None:
+        effort = several("person/effort", run.joint_names, run.human_effort)
+        title = "Null-space effort d of the person, by joint [-]"
+        plots.append(Plot(title=title, curves=(effort,), legend=True, share=2.0))
+    if run.elbow_motion is not None:
+        elbow = single("person/elbow", "elbow", 1e3 * run.elbow_motion, palette.PERSON)
+        plots.append(Plot(title="Elbow moved by the person [mm]", curves=(elbow,)))
+    if run.position_deviation is not None:
+        moved = 1e3 * run.position_deviation
+        curves = single("person/position_deviation", "position", moved, palette.RUN_ON_DARK)
+        plots.append(Plot(title="End effector led astray, position [mm]", curves=(curves,)))
+    if run.rotation_deviation is not None:
+        turned = np.degrees(run.rotation_deviation)
+        curves = single("person/rotation_deviation", "rotation", turned, palette.PURPLE)
+        plots.append(Plot(title="End effector led astray, rotation [deg]", curves=(curves,)))
+    return Tab(title="Person", plots=tuple(plots))
+
+
+def _joints(run: RunRecording) -> Tab:
+    demo, limits = run.demo_joint_position, run.joint_limits
+    plots = tuple(
+        joint_plot("joints", name, i, run.joint_position, demo, limits)
+        for i, name in enumerate(run.joint_names)
+    )
+    return Tab(title=joints_title(demo is not None, limits is not None), plots=plots, columns=2)
+
+
+def joints_title(demo: bool, limits: bool) -> str:
+    """Title that says what the colours of `joint_plot` mean; its plots are too small for it."""
+    return "Joints: position blue" + ", demonstration grey" * demo + ", limits red" * limits
+
+
+def joint_plot(
+    root: str,
+    name: str,
+    i: int,
+    position: np.ndarray,
+    demo: np.ndarray | None,
+    limits: JointLimits | None,
+) -> Plot:
+    """Position of joint i over its demonstration and between its limits."""
+    curves = []
+    if limits is not None:
+        bounds = np.broadcast_to([limits.lower[i], limits.upper[i]], (len(position), 2))
+        names, red = ("lower limit", "upper limit"), palette.rgba(palette.LIMIT)
+        curves.append(
+            Curves(path=f"{root}/{name}/limits", names=names, values=bounds, colours=(red, red))
+        )
+    if demo is not None:
+        path = f"{root}/{name}/demonstration"
+        curves.append(single(path, "demonstration", demo[:, i], palette.DEMO, width=5.0))
+    path = f"{root}/{name}/position"
+    curves.append(single(path, "position", position[:, i], palette.RUN_ON_DARK))
+    return Plot(title=f"{name} [rad]", curves=tuple(curves))
+
+
+def _safety(run: RunRecording) -> Tab:
+    plots = tuple(
+        Plot(
+            title=f"Safety filter: {name}",
+            curves=(
+                single(f"safety/{_slug(name)}", name, values.astype(float), palette.LIMIT),
+            ),
+        )
+        for name, values in run.safety.items()
+    )
+    return Tab(title="Safety", plots=plots)
+
+
+def _slug(name: str) -> str:
+    """A name as a part of an entity path, which slashes and blanks would break up."""
+    return re.sub(r"\W+", "_", name).strip("_")
+
+
+def single(path: str, name: str, values: np.ndarray, colour: str, width: float = 1.5) -> Curves:
+    """One curve, from values of shape (T,)."""
+    colours = (palette.rgba(colour),)
+    return Curves(
+        path=path, names=(name,), values=values[:, None], colours=colours, width=width
+    )
+
+
+def several(
+    path: str,
+    names: Iterable[str],
+    values: np.ndarray,
+    *,
+    width: float = 1.5,
+    light: bool = False,
+) -> Curves:
+    """A curve for each column, each in a colour of its own, pale where `light`."""
+    names = tuple(names)
+    colours = palette.SERIES_ON_DARK
+    chosen = [colours[i % len(colours)] for i in range(len(names))]
+    mixed = tuple(palette.lighter(c) if light else palette.rgba(c) for c in chosen)
+    return Curves(path=path, names=names, values=values, colours=mixed, width=width)

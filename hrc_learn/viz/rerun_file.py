@@ -1,0 +1,164 @@
+"""Writing one .rrd file: all or nothing, columns instead of single values."""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from jaxtyping import Float, Int
+
+from .panels import Curves, Plot, Tab
+from .recording import Body, Box, Capsule
+
+TIMELINE = "time"
+"""All that is recorded lies on this timeline [s]: the viewer shows one at a time."""
+
+_PATH_POINTS = 400
+
+
+@contextmanager
+def rrd_file(
+    path: str | os.PathLike[str], title: str, blueprint: rrb.Blueprint
+) -> Iterator[rr.RecordingStream]:
+    """A recording stream into a file that appears only when it is complete."""
+    path = Path(path)
+    part = path.with_name(path.name + ".part")
+    stream = rr.RecordingStream("hrc_learn")
+    try:
+        stream.save(part, default_blueprint=blueprint)
+        stream.send_recording_name(title)
+        stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        yield stream
+        stream.flush()
+        stream.disconnect()
+        part.replace(path)
+    finally:
+        stream.disconnect()
+        part.unlink(missing_ok=True)
+
+
+def seconds(time: Float[np.ndarray, " time"]) -> list[rr.TimeColumn]:
+    """The index of columns sampled at these times."""
+    return [rr.TimeColumn(TIMELINE, duration=np.rint(1e9 * time).astype("timedelta64[ns]"))]
+
+
+def send_curves(
+    stream: rr.RecordingStream, time: Float[np.ndarray, " time"], curves: Curves
+) -> None:
+    """Send curves with their names and colours; they break off where they are NaN."""
+    style = rr.SeriesLines(
+        names=curves.names,
+        colors=curves.colours,
+        widths=[curves.width] * len(curves.names),
+    )
+    stream.log(curves.path, style, static=True)
+    values = np.asarray(curves.values, dtype=np.float64)
+    columns = rr.Scalars.columns(scalars=values.ravel())
+    stream.send_columns(
+        curves.path, seconds(time), columns.partition([values.shape[1]] * len(values))
+    )
+
+
+def send_body(
+    stream: rr.RecordingStream,
+    time: Float[np.ndarray, " time"],
+    body: Body,
+    at: Int[np.ndarray, " chosen"],
+) -> None:
+    """Send the shape of a body once and its pose at the chosen samples."""
+    path = f"world/bodies/{body.name}"
+    stream.send_columns(
+        path,
+        seconds(time[at]),
+        rr.Transform3D.columns(
+            translation=body.position[at],
+            quaternion=np.roll(body.orientation[at], -1, axis=-1),  # rerun: x, y, z, w
+        ),
+    )
+    if body.capsules:
+        stream.log(f"{path}/capsules", capsules(body.capsules), static=True)
+    if body.boxes:
+        stream.log(f"{path}/boxes", boxes(body.boxes), static=True)
+
+
+def boxes(shapes: tuple[Box, ...]) -> rr.Boxes3D:
+    """Solid boxes."""
+    return rr.Boxes3D(
+        centers=[s.centre for s in shapes],
+        half_sizes=[s.half_size for s in shapes],
+        colors=[s.colour for s in shapes],
+        labels=[s.name for s in shapes],
+        show_labels=False,
+        fill_mode=rr.components.FillMode.Solid,
+    )
+
+
+def capsules(shapes: tuple[Capsule, ...]) -> rr.Capsules3D:
+    """Solid capsules; rerun's start at the origin and point along z."""
+    start, end = (np.array([getattr(s, at) for s in shapes]) for at in ("start", "end"))
+    axis = end - start
+    length = np.linalg.norm(axis, axis=1)
+    direction = np.where(
+        length[:, None] > 0, axis / np.maximum(length, 1e-12)[:, None], [0, 0, 1]
+    )
+    # Half way between z and the axis lies the normal of the turn by pi that swaps them; its
+    # quaternion is (0, normal). Where both are opposite, any normal across z will do.
+    half = direction + np.array([0.0, 0.0, 1.0])
+    norm = np.linalg.norm(half, axis=1, keepdims=True)
+    normal = np.where(norm > 1e-9, half / np.maximum(norm, 1e-12), [1.0, 0.0, 0.0])
+    return rr.Capsules3D(
+        lengths=length,
+        radii=[s.radius for s in shapes],
+        translations=start,
+        quaternions=np.concatenate([normal, np.zeros((len(shapes), 1))], axis=1),
+        colors=[s.colour for s in shapes],
+        fill_mode=rr.components.FillMode.Solid,
+    )
+
+
+def tab_view(tab: Tab) -> rrb.Grid:
+    """Layout of one tab."""
+    return rrb.Grid(
+        contents=[plot_view(plot) for plot in tab.plots],
+        grid_columns=tab.columns,
+        row_shares=[plot.share for plot in tab.plots[:: tab.columns]],
+        name=tab.title,
+    )
+
+
+def plot_view(plot: Plot) -> rrb.TimeSeriesView:
+    """Layout of one plot."""
+    return rrb.TimeSeriesView(
+        origin="/",
+        contents=[f"/{curves.path}" for curves in plot.curves],
+        name=plot.title,
+        plot_legend=rrb.PlotLegend("RightTop", visible=plot.legend),
+    )
+
+
+def look_at_all(path: Float[np.ndarray, "n 3"]) -> rrb.EyeControls3D:
+    """An eye in front of the robot, to its left, that sees the base and the whole path."""
+    points = np.concatenate([path, np.zeros((1, 3))])
+    low, high = points.min(axis=0), points.max(axis=0)
+    middle, reach = (low + high) / 2, max(float(np.linalg.norm(high - low)), 0.5)
+    return rrb.EyeControls3D(
+        position=middle + reach * np.array([1.5, 0.9, 1.0]),
+        look_target=middle,
+        eye_up=(0.0, 0.0, 1.0),
+    )
+
+
+def samples(time: Float[np.ndarray, " time"], rate: float) -> Int[np.ndarray, " chosen"]:
+    """Indices of about `rate` samples a second, the first and the last among them."""
+    wanted = np.arange(time[0], time[-1], 1.0 / rate)
+    return np.unique(np.append(np.searchsorted(time, wanted), len(time) - 1))
+
+
+def thin(path: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "m d"]:
+    """A path of at most a few hundred of its points, ends kept."""
+    if len(path) <= _PATH_POINTS:
+        return path
+    return path[np.linspace(0, len(path) - 1, _PATH_POINTS).astype(int)]

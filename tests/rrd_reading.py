@@ -1,0 +1,47 @@
+"""Reading a Rerun recording back, for tests."""
+
+from pathlib import Path
+
+import numpy as np
+from rerun.experimental import RrdReader
+
+
+class Rrd:
+    """Contents of an .rrd file: its entities, and their components as Python lists."""
+
+    def __init__(self, path: Path):
+        reader = RrdReader(path)
+        (self.store,) = reader.recordings()
+        self.blueprints = len(reader.blueprints())
+        self._batches = [
+            (chunk.entity_path.lstrip("/"), chunk.is_static, chunk.to_record_batch())
+            for chunk in reader.store().stream()
+        ]
+
+    @property
+    def entities(self) -> set[str]:
+        """Paths that hold anything."""
+        return {path for path, _, _ in self._batches}
+
+    def column(self, path: str, component: str, *, static: bool = False) -> list:
+        """All rows of a component of an entity, in the order they were sent."""
+        return [
+            row
+            for entity, is_static, batch in self._batches
+            if entity == path and is_static == static and component in batch.schema.names
+            for row in batch.column(component).to_pylist()
+        ]
+
+    def time(self, path: str) -> np.ndarray:
+        """Times of an entity's rows [s]."""
+        return np.concatenate(
+            [
+                batch.column("time").to_numpy().astype(np.int64) / 1e9
+                for entity, is_static, batch in self._batches
+                if entity == path and not is_static
+            ]
+        )
+
+    def scalars(self, path: str) -> np.ndarray:
+        """Curves of an entity, (T, D)."""
+        return np.array(self.column(path, "Scalars:scalars"))

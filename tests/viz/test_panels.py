@@ -1,0 +1,74 @@
+import numpy as np
+import pytest
+from sample_runs import OPTIONAL, STEPS, sample_run
+
+from hrc_learn.viz.panels import Curves, Tab, run_tabs
+
+FIELDS = {
+    "camera": "Pixel error",
+    "potentials": "Regions",
+    "safety": "Safety",
+}
+
+
+def curves(tabs: list[Tab]) -> dict[str, Curves]:
+    return {c.path: c for tab in tabs for plot in tab.plots for c in plot.curves}
+
+
+@pytest.mark.parametrize("field", FIELDS)
+def test_absent_fields_drop_their_tab(field):
+    titles = [tab.title for tab in run_tabs(sample_run())]
+    empty = None if field == "camera" else {}
+    fewer = [tab.title for tab in run_tabs(sample_run(**{field: empty}))]
+    assert FIELDS[field] in titles
+    assert fewer == [title for title in titles if title != FIELDS[field]]
+
+
+def test_a_bare_run_shows_its_joints():
+    bare = dict.fromkeys(OPTIONAL)
+    (tab,) = run_tabs(sample_run(**bare, potentials={}, safety={}))
+    assert tab.title == "Joints: position blue"
+    assert [plot.title for plot in tab.plots] == [f"joint{i} [rad]" for i in range(1, 8)]
+
+
+def test_titles_tell_what_the_colours_mean():
+    titles = [tab.title for tab in run_tabs(sample_run())]
+    assert "Joints: position blue, demonstration grey, limits red" in titles
+    shown = [plot.title for tab in run_tabs(sample_run()) for plot in tab.plots]
+    assert "∂u / linear velocity [px/m]: x blue, y orange, z green; pale: true" in shown
+
+
+def test_curves_have_a_name_and_a_colour_each_and_a_path_of_their_own():
+    tabs = run_tabs(sample_run())
+    every = [c for tab in tabs for plot in tab.plots for c in plot.curves]
+    assert len({c.path for c in every}) == len(every)
+    for c in every:
+        assert c.values.shape == (STEPS, len(c.names))
+        assert len(c.colours) == len(c.names)
+
+
+def test_all_twelve_entries_of_the_jacobian_are_shown_beside_the_truth():
+    run = sample_run()
+    shown = curves(run_tabs(run))
+    for kind, expected in (
+        ("estimate", run.image_jacobian),
+        ("true", run.true_image_jacobian),
+    ):
+        for row, pixel in enumerate("uv"):
+            for half, columns in (("linear", slice(0, 3)), ("angular", slice(3, 6))):
+                c = shown[f"image_jacobian/{pixel}_{half}/{kind}"]
+                np.testing.assert_array_equal(c.values, expected[:, row, columns])
+    assert shown["image_jacobian/u_linear/true"].width > 2
+
+
+def test_lengths_are_shown_in_millimetres_and_angles_in_degrees():
+    shown = curves(run_tabs(sample_run()))
+    assert shown["person/elbow"].values.max() == pytest.approx(100.0)
+    assert shown["person/position_deviation"].values.max() == pytest.approx(0.1)
+    assert shown["person/rotation_deviation"].values.max() == pytest.approx(0.01)
+
+
+def test_names_with_blanks_and_slashes_make_plain_paths():
+    values = np.zeros(STEPS)
+    shown = curves(run_tabs(sample_run(safety={"limit [rad/s]": values})))
+    assert "safety/limit_rad_s" in shown
