@@ -1,0 +1,146 @@
+"""Style and parts that the figures share."""
+
+from itertools import pairwise, product
+from typing import Any
+
+import numpy as np
+from cycler import cycler
+from jaxtyping import Bool, Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from mpl_toolkits.mplot3d import Axes3D
+from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
+
+from . import palette
+from .recording import Box
+
+STYLE: dict[Any, Any] = {
+    "font.size": 9.0,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.titlesize": 10.0,
+    "axes.titlelocation": "left",
+    "axes.prop_cycle": cycler(color=palette.SERIES),
+    "grid.color": "#E3E5E8",
+    "grid.linewidth": 0.6,
+    "lines.linewidth": 1.4,
+    "legend.frameon": False,
+    "legend.fontsize": 8.0,
+    "figure.constrained_layout.use": True,
+}
+"""Settings of matplotlib for every figure."""
+
+WIDTH = 7.2
+"""Of a figure [inch]: the text width of a page."""
+
+_SURROUNDINGS = 0.22  # how far around the paths boxes are drawn [m]
+
+
+def needed[T](value: T | None, name: str) -> T:
+    """The value, or an error that names the field that a figure cannot do without."""
+    if value is None:
+        raise ValueError(f"this figure needs {name}, which the recording leaves out.")
+    return value
+
+
+def scaled(
+    values: Float[np.ndarray, " time"] | None, factor: float
+) -> Float[np.ndarray, " time"] | None:
+    """Values in another unit, where there are any."""
+    return None if values is None else factor * values
+
+
+def finite_span(
+    axes: Axes, time: Float[np.ndarray, " time"], known: Bool[np.ndarray, " time"]
+) -> None:
+    """Limit the time axis to where there is something to see."""
+    if known.any():
+        axes.set_xlim(time[known][0], time[known][-1])
+
+
+def spells(active: Bool[np.ndarray, " time"]) -> list[tuple[int, int]]:
+    """First and last index of every run of true samples."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], active, [False]]).astype(int)))
+    return [(int(a), int(b) - 1) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def shade(
+    axes: Axes, time: Float[np.ndarray, " time"], active: Bool[np.ndarray, " time"]
+) -> None:
+    """Shade the spells in which something was active."""
+    for first, last in spells(active):
+        axes.axvspan(time[first], time[last], color=palette.PERSON, alpha=0.13, lw=0)
+
+
+def draw_limits(axes: Axes, lower: float, upper: float) -> None:
+    """Lines at both limits of a joint, with what lies beyond them tinted."""
+    margin = 0.06 * (upper - lower)
+    for limit, beyond in ((lower, lower - margin), (upper, upper + margin)):
+        axes.axhspan(
+            min(limit, beyond), max(limit, beyond), color=palette.LIMIT, alpha=0.15, lw=0
+        )
+        axes.axhline(limit, color=palette.LIMIT, lw=0.9, label="limit")
+    axes.set_ylim(lower - margin, upper + margin)
+
+
+def legend_in_free_cell(figure: Figure, grid: np.ndarray, used: int) -> None:
+    """One legend for all cells, in the first unused one, or above where all are used."""
+    handles, labels = grid[0].get_legend_handles_labels()
+    unique = dict(zip(labels, handles, strict=True))
+    for axes in grid[used:]:
+        axes.set_axis_off()
+    if used < len(grid):
+        grid[used].legend(unique.values(), unique.keys(), loc="center left", fontsize=9)
+    else:
+        figure.legend(unique.values(), unique.keys(), loc="outside upper right", ncols=3)
+    for axes in grid[max(used - 2, 0) : used]:
+        axes.tick_params(labelbottom=True)
+    figure.supxlabel("time [s]", fontsize=9)
+
+
+def space(figure: Figure) -> Axes3D:
+    """Axes in three dimensions."""
+    axes = figure.add_subplot(projection="3d", computed_zorder=False)
+    assert isinstance(axes, Axes3D)
+    axes.view_init(elev=24, azim=35)
+    for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
+        axis.set_pane_color((1, 1, 1, 0))  # pyright: ignore[reportAttributeAccessIssue]
+    axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
+    return axes
+
+
+def frame_space(axes: Axes3D, points: Float[np.ndarray, "n 3"]) -> None:
+    """Show the surroundings of some points, one metre as long on every axis."""
+    low, high = points.min(axis=0) - _SURROUNDINGS, points.max(axis=0) + _SURROUNDINGS
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+    axes.set_box_aspect(tuple(high - low), zoom=1.12)  # pyright: ignore[reportArgumentType]
+
+
+def near(boxes: tuple[Box, ...], points: Float[np.ndarray, "n 3"]) -> list[Box]:
+    """The parts of the boxes that lie in the surroundings of some points."""
+    low, high = points.min(axis=0) - _SURROUNDINGS, points.max(axis=0) + _SURROUNDINGS
+    parts = []
+    for box in boxes:
+        centre, half = np.array(box.centre), np.array(box.half_size)
+        a, b = np.maximum(centre - half, low), np.minimum(centre + half, high)
+        if (a < b).all():
+            x, y, z = ((a + b) / 2).tolist()
+            dx, dy, dz = ((b - a) / 2).tolist()
+            parts.append(Box(centre=(x, y, z), half_size=(dx, dy, dz), colour=box.colour))
+    return parts
+
+
+def draw_box(axes: Axes3D, box: Box, colour: str, *, alpha: float) -> None:
+    """A translucent box with its edges."""
+    corners = np.array(list(product((-1, 1), repeat=3))) * box.half_size + box.centre
+    faces, edges = [], []
+    for axis, side in product(range(3), (-1, 1)):
+        rim = [k for k, signs in enumerate(product((-1, 1), repeat=3)) if signs[axis] == side]
+        ring = [rim[0], rim[1], rim[3], rim[2], rim[0]]  # round the face
+        faces.append(corners[ring[:4]])
+        edges += [corners[[a, b]] for a, b in pairwise(ring)]
+    axes.add_collection3d(
+        Poly3DCollection(faces, facecolor=colour, alpha=alpha, edgecolor="none")
+    )
+    axes.add_collection3d(Line3DCollection(edges, colors=colour, linewidths=0.6, alpha=0.6))

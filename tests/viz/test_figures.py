@@ -1,0 +1,128 @@
+import sys
+from io import BytesIO
+
+import numpy as np
+import pytest
+from PIL import Image
+from sample_runs import NAMES, STEPS, sample_fit, sample_run
+
+from hrc_learn.viz import figures
+from hrc_learn.viz.figure_parts import near, spells
+from hrc_learn.viz.recording import Box
+
+RUN_FIGURES = [
+    figures.image_figure,
+    figures.paths_figure,
+    figures.joints_figure,
+    figures.person_figure,
+    figures.image_jacobian_figure,
+]
+FIT_FIGURES = [figures.fit_joints_figure, figures.residual_figure]
+
+
+def lines(axes) -> dict[str, np.ndarray]:
+    return {line.get_label(): np.asarray(line.get_ydata(), float) for line in axes.get_lines()}
+
+
+@pytest.mark.parametrize("draw", [*RUN_FIGURES, *FIT_FIGURES])
+def test_figures_are_drawn_with_units_and_without_pyplot(draw):
+    figure = draw(sample_run() if draw in RUN_FIGURES else sample_fit())
+    buffer = BytesIO()
+    figure.savefig(buffer, format="png", dpi=60)
+    assert np.asarray(Image.open(buffer).convert("L")).std() > 10
+    drawn = [axes for axes in figure.axes if axes.axison]
+    assert all(axes.get_ylabel() for axes in drawn)
+    assert any("[s]" in text for text in _words(figure)) or draw in (
+        figures.paths_figure,
+        figures.residual_figure,
+    )
+    assert "matplotlib.pyplot" not in sys.modules
+
+
+def _words(figure) -> list[str]:
+    return [figure.get_supxlabel(), *(axes.get_xlabel() for axes in figure.axes)]
+
+
+def test_image_figure_shows_path_target_and_error():
+    run = sample_run()
+    image, error = figures.image_figure(run).axes
+    (curve,) = (line.get_ydata() for line in error.get_lines())
+    np.testing.assert_array_equal(curve, run.camera.error)
+    assert image.get_xlim() == (0, 160)
+    assert image.get_ylim() == (120, 0)  # v points down
+    assert lines(image)["target"].tolist() == [80.0]
+
+
+def test_joints_figure_shows_every_joint_with_its_limits():
+    run = sample_run()
+    axes = [a for a in figures.joints_figure(run).axes if a.axison]
+    assert [a.get_title(loc="left") for a in axes] == list(NAMES)
+    for i, a in enumerate(axes):
+        shown = lines(a)
+        np.testing.assert_array_equal(shown["run"], run.joint_position[:, i])
+        np.testing.assert_array_equal(shown["demonstration"], run.demo_joint_position[:, i])
+        low, high = a.get_ylim()
+        assert low < -2.9
+        assert high > 2.9
+
+
+def test_person_figure_shades_the_push_and_shows_millimetres():
+    run = sample_run()
+    effort, elbow, position, rotation = figures.person_figure(run).axes
+    assert elbow.get_lines()[0].get_ydata().max() == pytest.approx(100.0)
+    assert position.get_lines()[0].get_ydata().max() == pytest.approx(0.1)
+    assert rotation.get_lines()[0].get_ydata().max() == pytest.approx(0.01)
+    assert len(effort.get_lines()) == 7
+    (span,) = effort.patches
+    assert span.get_x() == pytest.approx(run.time[80])
+    assert span.get_x() + span.get_width() == pytest.approx(run.time[119])
+
+
+def test_jacobian_figure_shows_twelve_estimates_and_twelve_truths():
+    run = sample_run()
+    axes = figures.image_jacobian_figure(run).axes
+    assert [len(a.get_lines()) for a in axes] == [6, 6, 6, 6]
+    np.testing.assert_array_equal(lines(axes[3])["z"], run.image_jacobian[:, 1, 5])
+    alone = figures.image_jacobian_figure(sample_run(true_image_jacobian=None)).axes
+    assert [len(a.get_lines()) for a in alone] == [3, 3, 3, 3]
+
+
+def test_residual_figure_marks_the_number_used():
+    (axes,) = figures.residual_figure(sample_fit()).axes
+    curve, mark = axes.get_lines()
+    assert curve.get_xdata().tolist() == [10, 30, 50]
+    assert curve.get_ydata().tolist() == [1e-2, 1e-3, 1e-4]
+    assert (mark.get_xdata()[0], mark.get_ydata()[0]) == (50, 1e-4)
+
+
+@pytest.mark.parametrize(
+    ("draw", "field"),
+    [
+        (figures.image_figure, "camera"),
+        (figures.person_figure, "human_effort"),
+        (figures.image_jacobian_figure, "image_jacobian"),
+    ],
+)
+def test_a_figure_names_the_field_it_lacks(draw, field):
+    with pytest.raises(ValueError, match=f"needs {field}"):
+        draw(sample_run(**{field: None}))
+
+
+def test_a_fit_without_residuals_has_no_residual_figure():
+    with pytest.raises(ValueError, match="residual is empty"):
+        figures.residual_figure(sample_fit(residual={}))
+
+
+def test_spells_are_the_runs_of_true_samples():
+    active = np.zeros(STEPS, dtype=bool)
+    active[[0, 1, 5, 198, 199]] = True
+    assert spells(active) == [(0, 1), (5, 5), (198, 199)]
+    assert spells(np.zeros(4, dtype=bool)) == []
+
+
+def test_boxes_are_cut_to_the_surroundings_of_the_paths():
+    tall = Box(centre=(0.0, 0.0, 0.0), half_size=(0.1, 0.1, 5.0))
+    far = Box(centre=(9.0, 0.0, 0.0), half_size=(0.1, 0.1, 0.1))
+    (part,) = near((tall, far), np.zeros((1, 3)))
+    assert part.centre == (0.0, 0.0, 0.0)
+    assert part.half_size == pytest.approx((0.1, 0.1, 0.22))
