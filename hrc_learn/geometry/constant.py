@@ -30,6 +30,5 @@ class Constant:
 
 def _outlives_the_call(tensor: Tensor) -> bool:
     """False for stand-ins that a tracer or a functional transform will take down again."""
-    return type(tensor) is Tensor and not torch._C._functorch.is_functorch_wrapped_tensor(
-        tensor
-    )
+    functorch = torch._C._functorch  # pyright: ignore[reportAttributeAccessIssue]
+    return type(tensor) is Tensor and not functorch.is_functorch_wrapped_tensor(tensor)

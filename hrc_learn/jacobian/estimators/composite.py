@@ -29,7 +29,7 @@ class CompositeConfig(PairConfig):
     """Of the paper's term: diagonal of L."""
     prediction_gain: float = 0.5
     """Share of the prediction error that one pair removes, 0 to below 2."""
-    noise_floor: float = 5e-4
+    noise_floor: float = 2e-3
     """Motion [m] at which half of that share is believed: below it noise is."""
     weight_bound: float = 2e4
     """Largest entry of the weights [px/m], rotation counted with `rotation_scale`."""
@@ -86,8 +86,12 @@ class CompositeEstimator(ImageJacobianEstimator):
         scale = component_scale(weight, config.rotation_scale)
         J = evaluate(weight, pair.theta) / scale
         error = pair.dx - (J @ pair.dr.unsqueeze(-1)).squeeze(-1)
-        size = pair.dr.square().sum(-1) + config.noise_floor**2
-        size = size * pair.theta.square().sum(-1)
+        motion = pair.dr.square().sum(-1) + config.noise_floor**2
+        # Normalised neurons never fade. Others do between and beyond the centres: dividing by
+        # their activity there would write far too much into weights that act elsewhere.
+        least = 0.0 if self.network.normalized else 1.0
+        activity = pair.theta.square().sum(-1).clamp_min(least)
+        size = (motion * activity).clamp_min(torch.finfo(motion.dtype).tiny)
         step = config.prediction_gain * error / size.unsqueeze(-1)
         entries = step.unsqueeze(-1) * (pair.dr * scale).unsqueeze(-2)
         return entries.flatten(-2).unsqueeze(-1) * pair.theta.unsqueeze(-2)

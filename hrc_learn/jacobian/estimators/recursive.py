@@ -75,8 +75,8 @@ def condition(
     scale = component_scale(weight, config.rotation_scale)
     rows = weight.unflatten(-2, (2, 6)) / scale.unsqueeze(-1)  # (*batch, 2, 6, K)
     error = pair.dx.unsqueeze(-1) - rows.flatten(-2) @ phi  # (*batch, 2, 1)
-    rows = rows + (error @ gain.mT).unflatten(-1, rows.shape[-2:])
-    weight = (rows * scale.unsqueeze(-1)).flatten(-3, -2)
+    change = (error @ gain.mT).unflatten(-1, rows.shape[-2:]) * scale.unsqueeze(-1)
+    weight = weight + change.flatten(-3, -2)
     shrunk = covariance - gain @ P_phi.mT
     if discount == 1.0:
         return weight, shrunk  # gain is zero where there is no pair
