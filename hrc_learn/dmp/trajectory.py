@@ -51,15 +51,17 @@ class Trajectory:
     @cached_property
     def velocity(self) -> Float[Tensor, "*batch T D"]:
         """The same per second."""
-        return (self._output(1) / self._duration[..., None]).expand(*self._batch, -1, -1)
+        return self._output(1).expand(*self._batch, -1, -1)
 
     @cached_property
     def acceleration(self) -> Float[Tensor, "*batch T D"]:
         """The same per second squared."""
-        return (self._output(2) / self._duration[..., None] ** 2).expand(*self._batch, -1, -1)
+        return self._output(2).expand(*self._batch, -1, -1)
 
     def _output(self, order: int) -> Tensor:
         X = self._coordinates
+        if order:
+            X = X / self._duration[..., None] ** order
         if self._s.ndim == 1 and not self._s.requires_grad:
             # One flat product: batched ones against a shared matrix are ten times slower.
             H = self._response.matrices(self._s, X.dtype)[order]

@@ -1,0 +1,223 @@
+"""How fast movement primitives fit, roll out and step, against bare matrix products.
+
+7 joints, 1000 samples, 50 basis functions, one thread, float32 (steps: float64). Each figure
+is the median CPU time of calls made in turn with its floor, the same product on ready
+matrices. Libraries that do the same are measured along where they are installed.
+"""
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import importlib.util
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from rich.console import Console
+from rich.table import Table
+from timing import Timing, time_calls
+
+from hrc_learn import cli
+from hrc_learn.dmp import JointDMP, PoseDMP, Stepper
+from hrc_learn.geometry import quaternion
+
+JOINTS, SAMPLES, BASIS = 7, 1000, 50
+TARGETS: dict[str, tuple[float, int]] = {
+    "rollout_1_of_gemm": (0.6, +1),
+    "rollout_256_of_gemm": (0.6, +1),
+    "rollout_4096_of_gemm": (0.6, +1),
+    "rollout_1_per_s": (50_000, +1),
+    "rollout_256_per_s": (50_000, +1),
+    "rollout_4096_per_s": (50_000, +1),
+    "pose_rollout_256_per_s": (15_000, +1),
+    "fit_1_ms": (0.5, -1),
+    "fit_256_ms": (30, -1),
+    "step_us": (30, -1),
+    "stepper_us": (8, -1),
+    "backward_over_forward": (3, -1),
+}
+"""What DMPs are to reach; +1: at least, -1: at most."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args:
+    repeats: int = 50
+    """Repeats of a call that takes milliseconds; short ones are repeated more often."""
+    json: Path | None = None
+    """Receives the figures as one flat object."""
+    save: Path | None = None
+    """Keeps the figures for a later --compare."""
+    compare: Path | None = None
+    """Figures of an earlier --save to show beside these."""
+
+
+def main(args: Args) -> None:
+    """Measure, print a table, write the figures."""
+    torch.set_num_threads(1)
+    earlier = read_figures(args.compare) if args.compare else {}
+    figures: dict[str, float] = {}
+    for batch in (1, 256, 4096):
+        figures |= measure_rollouts(batch, args.repeats)
+    for batch in (1, 256):
+        figures |= measure_fits(batch, args.repeats)
+    figures |= measure_poses(args.repeats) | measure_steps(args.repeats)
+    figures |= measure_gradients(args.repeats)
+    if importlib.util.find_spec("movement_primitives"):
+        figures |= measure_movement_primitives()
+    show(figures, earlier)
+    for path in (args.json, args.save):
+        if path:
+            cli.write_json(path, figures)
+
+
+def demonstrations(batch: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Time (T,) and smooth joint positions (batch, T, 7), without the batch axis for one."""
+    s = torch.linspace(0, 1, SAMPLES)
+    rng = torch.Generator().manual_seed(0)
+    ends = torch.randn(batch, 2, 1, JOINTS, generator=rng)
+    jerk = (s**3 * (10 - 15 * s + 6 * s**2))[:, None]
+    position = ends[:, 0] * jerk + 0.2 * ends[:, 1] * torch.sin(9 * s)[:, None]
+    return 3 * s, position if batch > 1 else position[0]
+
+
+@torch.no_grad()
+def measure_rollouts(batch: int, repeats: int) -> dict[str, float]:
+    """Position alone and with its derivatives, to new goals, against the bare product."""
+    dmp = JointDMP.fit(*demonstrations(batch))
+    goal = dmp.goal + 0.1
+    X, H = torch.randn(batch * JOINTS, BASIS + 3), torch.randn(BASIS + 3, SAMPLES)
+
+    def everything() -> tuple[torch.Tensor, ...]:
+        motion = dmp.rollout(goal=goal)
+        return motion.position, motion.velocity, motion.acceleration
+
+    calls: dict[str, Callable[[], object]] = {
+        "gemm": lambda: X @ H,
+        "rollout": lambda: dmp.rollout(goal=goal).position,
+        "everything": everything,
+    }
+    t = time_calls(calls, repeats_for(batch, repeats))
+    return {
+        f"gemm_{batch}_us": 1e6 * t["gemm"].median,
+        f"rollout_{batch}_us": 1e6 * t["rollout"].median,
+        f"rollout_{batch}_of_gemm": t["gemm"].median / t["rollout"].median,
+        f"rollout_{batch}_per_s": batch / t["rollout"].median,
+        f"rollout_with_derivatives_{batch}_per_s": batch / t["everything"].median,
+    }
+
+
+def measure_fits(batch: int, repeats: int) -> dict[str, float]:
+    """Demonstrations to primitives, residuals included."""
+    time, position = demonstrations(batch)
+    calls: dict[str, Callable[[], object]] = {
+        name: lambda method=name: JointDMP.fit(time, position, method=method)
+        for name in ("trajectory", "ridge")
+    }
+    t = time_calls(calls, repeats_for(batch, repeats))
+    return {
+        f"fit_{batch}_ms": 1e3 * t["trajectory"].median,
+        f"fit_ridge_{batch}_ms": 1e3 * t["ridge"].median,
+    }
+
+
+@torch.no_grad()
+def measure_poses(repeats: int) -> dict[str, float]:
+    """Position and quaternion of 256 poses."""
+    time, columns = demonstrations(256)
+    dmp = PoseDMP.fit(time, columns[..., :3], quaternion.exp(columns[..., 3:6]))
+
+    def rollout() -> tuple[torch.Tensor, ...]:
+        motion = dmp.rollout()
+        return motion.position, motion.orientation
+
+    t = time_calls({"pose": rollout}, repeats)
+    return {"pose_rollout_256_per_s": 256 / t["pose"].median}
+
+
+@torch.no_grad()
+def measure_steps(repeats: int) -> dict[str, float]:
+    """One closed-loop step of 1 ms."""
+    time, position = demonstrations(1)
+    dmp = JointDMP.fit(time.double(), position.double())
+    stepper = Stepper(dmp)
+    state, plain = dmp.step(dmp.initial_state(), 0.5), stepper.initial_state()
+    calls: dict[str, Callable[[], object]] = {
+        "step": lambda: dmp.step(state, 1e-3),
+        "stepper": lambda: stepper.step(plain, 1e-3),
+    }
+    t: dict[str, Timing] = time_calls(calls, 40 * repeats)
+    return {
+        "step_us": 1e6 * t["step"].median,
+        "step_p99_us": 1e6 * t["step"].p99,
+        "stepper_us": 1e6 * t["stepper"].median,
+        "stepper_p99_us": 1e6 * t["stepper"].p99,
+    }
+
+
+def measure_gradients(repeats: int) -> dict[str, float]:
+    """Backward through a rollout of 256, to weights and goal."""
+    dmp = JointDMP.fit(*demonstrations(256))
+    goal = dmp.goal.clone().requires_grad_()
+    seed = torch.randn(256, SAMPLES, JOINTS)
+
+    def forward() -> torch.Tensor:
+        return dmp.rollout(goal=goal).position
+
+    def both() -> None:
+        torch.autograd.grad(forward(), (dmp.weights, goal), seed)
+
+    t = time_calls({"forward": forward, "both": both}, repeats)
+    return {"backward_over_forward": t["both"].median / t["forward"].median - 1}
+
+
+def measure_movement_primitives() -> dict[str, float]:
+    """The same demonstration through movement-primitives."""
+    from movement_primitives.dmp import DMP
+
+    time, position = (column.double().numpy() for column in demonstrations(1))
+    dmp = DMP(n_dims=JOINTS, execution_time=3.0, dt=3.0 / SAMPLES, n_weights_per_dim=BASIS)
+    t = time_calls(
+        {"fit": lambda: dmp.imitate(time, position), "rollout": lambda: dmp.open_loop()}, 15
+    )
+    return {
+        "movement_primitives_fit_1_ms": 1e3 * t["fit"].median,
+        "movement_primitives_rollout_per_s": 1 / t["rollout"].median,
+    }
+
+
+def repeats_for(batch: int, repeats: int) -> int:
+    """More for what takes microseconds, fewer for what takes a tenth of a second."""
+    return {1: 20 * repeats, 256: repeats}.get(batch, max(repeats // 5, 3))
+
+
+def read_figures(path: Path) -> dict[str, float]:
+    """Figures of an earlier run."""
+    try:
+        figures = json.loads(path.read_text())
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{path} holds no saved figures: {error}") from None
+    return figures
+
+
+def show(figures: dict[str, float], earlier: dict[str, float]) -> None:
+    """Print all figures, with what they should reach and what they were."""
+    table = Table("figure", *(3 * [""]), title="Movement primitives, one thread")
+    for column, name in zip(table.columns[1:], ("measured", "reach", "earlier"), strict=True):
+        column.header, column.justify = name, "right"
+    for name, value in figures.items():
+        reach = ""
+        if name in TARGETS:
+            target, sign = TARGETS[name]
+            met = sign * value >= sign * target
+            color = "green" if met else "red"
+            reach = f"[{color}]{'>=' if sign > 0 else '<='} {target:,g}"
+        before = f"{earlier[name]:,.4g}" if name in earlier else ""
+        table.add_row(name, f"{value:,.4g}", reach, before)
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    cli.run(main, Args)

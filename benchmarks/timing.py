@@ -1,0 +1,37 @@
+"""Timing that a shared machine disturbs as little as possible."""
+
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, kw_only=True)
+class Timing:
+    """CPU seconds of one thread per call."""
+
+    median: float
+    p99: float
+
+
+def time_calls(calls: dict[str, Callable[[], object]], repeats: int) -> dict[str, Timing]:
+    """Time calls in turn, so that whatever slows the machine slows them alike.
+
+    CPU time of this thread is taken: other processes do not count, other threads must not
+    work (`torch.set_num_threads(1)`).
+    """
+    for call in calls.values():
+        call()
+    seconds: dict[str, list[float]] = {name: [] for name in calls}
+    for _ in range(repeats):
+        for name, call in calls.items():
+            start = time.thread_time()
+            call()
+            seconds[name].append(time.thread_time() - start)
+    return {
+        name: Timing(
+            median=statistics.median(values),
+            p99=sorted(values)[min(int(0.99 * len(values)), len(values) - 1)],
+        )
+        for name, values in seconds.items()
+    }
