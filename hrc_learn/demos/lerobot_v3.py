@@ -9,6 +9,7 @@ meta/hrc_learn.json                        units, frames, meaning of columns (ou
 """
 
 import json
+import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +20,7 @@ import pyarrow.parquet as pq
 from .sidecar import SIDECAR_PATH
 from .staging import RecordingHeader, StagedEpisode, read_episode
 from .statistics import Statistics, combined_statistics
+from .video import video_path
 
 VERSION = "v3.0"
 INDEX_FEATURES = {
@@ -79,9 +81,11 @@ def assemble(paths: Sequence[Path], target: Path) -> None:
     for folder in ("meta", "meta/episodes/chunk-000", "data"):
         (target / folder).mkdir(parents=True)
     saved = _write_frames(target, header, paths)
+    cameras = [key for key, f in header.features.items() if f["dtype"] == "video"]
+    _place_videos(paths[0].parent, target, cameras, len(saved))
     tasks = list(dict.fromkeys(episode.task for episode in saved))
     _write_tasks(target / "meta/tasks.parquet", tasks)
-    _write_episodes(target / EPISODES_PATH, saved)
+    _write_episodes(target / EPISODES_PATH, saved, cameras, header.fps)
     _write_json(target / "meta/info.json", _info(header, saved, tasks))
     _write_json(
         target / "meta/stats.json",
@@ -140,7 +144,28 @@ def _write_tasks(path: Path, tasks: Sequence[str]) -> None:
     pq.write_table(table.replace_schema_metadata({"pandas": json.dumps(_PANDAS_INDEX)}), path)
 
 
-def _write_episodes(path: Path, saved: Sequence[_SavedEpisode]) -> None:
+def _place_videos(staging: Path, target: Path, cameras: Sequence[str], episodes: int) -> None:
+    for camera in cameras:
+        for episode in range(episodes):
+            chunk, file = divmod(episode, CHUNK_SIZE)
+            path = target / VIDEO_PATH.format(
+                video_key=camera, chunk_index=chunk, file_index=file
+            )
+            path.parent.mkdir(parents=True, exist_ok=True)
+            _link(video_path(staging, camera, episode), path)
+
+
+def _link(source: Path, target: Path) -> None:
+    """A second name for a file, not another: until the dataset stands, both must."""
+    try:
+        target.hardlink_to(source)
+    except OSError:  # a file system without links
+        shutil.copyfile(source, target)
+
+
+def _write_episodes(
+    path: Path, saved: Sequence[_SavedEpisode], cameras: Sequence[str], fps: float
+) -> None:
     stops = [0]
     for episode in saved:
         stops.append(stops[-1] + episode.length)
@@ -153,6 +178,16 @@ def _write_episodes(path: Path, saved: Sequence[_SavedEpisode]) -> None:
         "data/file_index": files,
         "dataset_from_index": stops[:-1],
         "dataset_to_index": stops[1:],
+        **{
+            f"videos/{camera}/{name}": values
+            for camera in cameras
+            for name, values in {
+                "chunk_index": [episode // CHUNK_SIZE for episode in range(len(saved))],
+                "file_index": [episode % CHUNK_SIZE for episode in range(len(saved))],
+                "from_timestamp": [0.0] * len(saved),
+                "to_timestamp": [episode.length / fps for episode in saved],
+            }.items()
+        },
         **{
             f"stats/{key}/{name}": [episode.statistics[key][name] for episode in saved]
             for key, statistics in saved[0].statistics.items()

@@ -78,7 +78,7 @@ def read_table(
     """
     wanted = None if columns is None else list(columns)
     try:
-        if rows is None:
+        if rows is None or (rows.start, rows.stop) == (0, parquet.metadata.num_rows):
             return parquet.read(columns=wanted)
         groups, offset = _row_groups(parquet.metadata, rows)
         table = parquet.read_row_groups(groups, columns=wanted)

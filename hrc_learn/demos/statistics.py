@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from jaxtyping import Shaped
+from jaxtyping import Shaped, UInt8
 
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 
@@ -14,6 +14,13 @@ Statistics = dict[str, dict[str, list]]
 def episode_statistics(features: Mapping[str, Shaped[np.ndarray, "_frames ..."]]) -> Statistics:
     """Statistics of each feature over the frames of one episode."""
     return {key: _of_columns(np.asarray(values, float)) for key, values in features.items()}
+
+
+def image_statistics(images: UInt8[np.ndarray, "_count _height _width 3"]) -> dict[str, list]:
+    """Statistics of each colour channel, scaled to 0..1, in the nesting LeRobot expects."""
+    flat = _of_columns(images.reshape(-1, 3) / 255)
+    nested = {name: [[[value]] for value in values] for name, values in flat.items()}
+    return nested | {"count": [len(images)]}
 
 
 def combined_statistics(episodes: Sequence[Statistics]) -> Statistics:

@@ -24,6 +24,7 @@ from .staging import (
     write_episode,
 )
 from .statistics import episode_statistics
+from .video import CameraRecorder, Image, video_features
 
 
 class DatasetWriter:
@@ -49,6 +50,7 @@ class DatasetWriter:
         joint_names: Sequence[str] = (),
         features: Mapping[str, Sequence[str]] | None = None,
         *,
+        cameras: Mapping[str, tuple[int, int]] | None = None,
         dtype: Literal["float32", "float64"] = "float32",
         frames: Mapping[str, str] | None = None,
         details: Mapping[str, object] | None = None,
@@ -62,6 +64,7 @@ class DatasetWriter:
             joint_names: Joints, in the order of the values of `joint_position` and the like.
             features: Further features: key, such as "observation.shelf", and the names of
                 its components.
+            cameras: Cameras whose images are kept as videos: name -> height, width [px].
             dtype: Type on disk. Policies that train on the dataset expect float32.
             frames: Names of the frames poses are given in, such as
                 {"base": "panda_link0", "ee": "panda_hand_tcp"}.
@@ -85,10 +88,14 @@ class DatasetWriter:
         self._frames_of_poses = dict(frames or {})
         self._details = dict(details or {})
         self._columns: list[Column] = []
-        self.discard_episode()
+        self._task: str | None = None
+        self._buffer = EpisodeBuffer(self.joint_names, self.features)
         self._tasks: dict[str, int] = {}
         self._saved_frames = 0
         self.episodes = 0
+        self._video_features = video_features(cameras or {}, self.fps)
+        staging = staging_folder(self.root)
+        self._images = CameraRecorder(cameras or {}, self.fps, staging)
         self._staging = _claim(self.root)
 
     def __enter__(self) -> "DatasetWriter":
@@ -102,8 +109,10 @@ class DatasetWriter:
     ) -> None:
         if error is None:
             self.finalize()
-        elif not self.episodes:
-            shutil.rmtree(self._staging, ignore_errors=True)
+            return
+        self.discard_episode()
+        if not self.episodes:
+            shutil.rmtree(self._staging)
         else:
             error.add_note(
                 f"The {self.episodes} episodes saved before this are kept in "
@@ -124,13 +133,14 @@ class DatasetWriter:
             )
         self._task = task
 
-    def add_frame(self, **values) -> None:
+    def add_frame(self, *, images: Mapping[str, Image] | None = None, **values) -> None:
         """Add one frame to the open episode.
 
         The first episode saved fixes which quantities are recorded; all later ones
         give the same.
 
         Args:
+            images: RGB image (height, width, 3) uint8 of every camera, by its name.
             values: Fields of `Demonstration` by name, one row each (`time` [s],
                 `joint_position` [rad], `orientation` as (w, x, y, z), `feature` [px], ...),
                 and the features declared at the start by their key. Without `time`, frames
@@ -141,7 +151,9 @@ class DatasetWriter:
             ValueError: A quantity is unknown, missing, new, or of the wrong length.
         """
         self._open_task()
+        self._images.examine(images or {})
         self._buffer.append(values)
+        self._images.append(images or {})
 
     def save_episode(self) -> int:
         """Keep the open episode, safe from whatever happens later.
@@ -155,8 +167,10 @@ class DatasetWriter:
                 increase. The episode is discarded then.
         """
         task, episode = self._open_task(), self._buffer.arrays()
-        self.discard_episode()
-        return self._save(episode, task)
+        try:
+            return self._save(episode, task)
+        finally:
+            self.discard_episode()
 
     def add_episode(self, demonstration: Demonstration) -> int:
         """Save a whole demonstration as one episode.
@@ -172,6 +186,8 @@ class DatasetWriter:
         """
         if self._task is not None:
             raise RuntimeError("save or discard the open episode before adding another")
+        if self._video_features:
+            raise ValueError("a demonstration holds no images: add its frames one by one")
         if demonstration.joint_names != self.joint_names:
             raise ValueError(
                 f"the demonstration's joints {demonstration.joint_names} are not the "
@@ -185,6 +201,7 @@ class DatasetWriter:
     def discard_episode(self) -> None:
         """Forget the open episode, if any."""
         self._task, self._buffer = None, EpisodeBuffer(self.joint_names, self.features)
+        self._images.discard()
 
     def finalize(self) -> Path:
         """Turn the saved episodes into the dataset.
@@ -229,7 +246,7 @@ class DatasetWriter:
         staged = StagedEpisode(
             header=header,
             task=task,
-            statistics=episode_statistics(values),
+            statistics=episode_statistics(values) | self._images.finish(self.episodes),
             table=to_table(values, header.features),
         )
         write_episode(episode_path(self._staging, self.episodes), staged)
@@ -251,7 +268,11 @@ class DatasetWriter:
         return RecordingHeader(
             fps=self.fps,
             robot_type=self.robot_type,
-            features=lerobot_features(self._columns, self._dtype) | INDEX_FEATURES,
+            features={
+                **lerobot_features(self._columns, self._dtype),
+                **self._video_features,
+                **INDEX_FEATURES,
+            },
             sidecar=sidecar_content(
                 self._columns, self.joint_names, self._frames_of_poses, self._details
             ),

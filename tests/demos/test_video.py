@@ -1,0 +1,89 @@
+"""Camera images recorded as video: LeRobot decodes them, frame for frame."""
+
+import numpy as np
+import pytest
+
+from hrc_learn.demos import DatasetWriter, check_dataset, load_demos, recover_dataset
+from hrc_learn.demos.video import video_path
+
+SIZE = (96, 128)
+
+
+def image(k: int) -> np.ndarray:
+    """A grey that brightens with the frame, and a bright bar that wanders."""
+    picture = np.full((*SIZE, 3), 20 + 4 * k, np.uint8)
+    picture[:, 3 * k : 3 * k + 8] = (250, 40, 40)
+    return picture
+
+
+def record(root, lengths=(30, 20), then=None):
+    with DatasetWriter(root, 50, "panda", ["a"], cameras={"front": SIZE}) as writer:
+        for length in lengths:
+            writer.start_episode("look")
+            for k in range(length):
+                writer.add_frame(joint_position=[0.01 * k], images={"front": image(k)})
+            writer.save_episode()
+        if then is not None:
+            raise then
+
+
+def test_lerobot_decodes_our_videos(tmp_path, monkeypatch):
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    datasets = pytest.importorskip("lerobot.datasets")
+    record(tmp_path / "set")
+    dataset = datasets.LeRobotDataset("local/set", root=tmp_path / "set", video_backend="pyav")
+    key = "observation.images.front"
+    for index, k in ((0, 0), (17, 17), (29, 29), (30, 0), (49, 19)):
+        decoded = 255 * dataset[index][key].numpy().transpose(1, 2, 0)
+        assert np.abs(decoded - image(k)).mean() < 4
+    statistics = dataset.meta.stats[key]
+    assert statistics["mean"].shape == (3, 1, 1)
+    assert 0 <= statistics["min"].min() <= statistics["mean"].max() <= 1
+    assert check_dataset(tmp_path / "set").ok
+    assert len(load_demos(tmp_path / "set")[1]) == 20
+
+
+def test_videos_survive_a_broken_recording(tmp_path):
+    root = tmp_path / "set"
+    with pytest.raises(OSError, match="lost"):
+        record(root, then=OSError("lost"))
+    recover_dataset(root)
+    videos = sorted(root.glob("videos/observation.images.front/chunk-000/*.mp4"))
+    assert [path.name for path in videos] == ["file-000.mp4", "file-001.mp4"]
+
+
+def test_discarded_images_leave_no_file(tmp_path):
+    with DatasetWriter(tmp_path / "set", 50, "any", ["a"], cameras={"front": SIZE}) as writer:
+        for keep in (False, True):
+            writer.start_episode("look")
+            for k in range(12):
+                writer.add_frame(joint_position=[k], images={"front": image(k + 10 * keep)})
+            if not keep:
+                writer.discard_episode()
+                assert list((tmp_path / "set.recording").iterdir()) == []
+        writer.save_episode()
+        assert video_path(tmp_path / "set.recording", "observation.images.front", 0).exists()
+
+
+@pytest.mark.parametrize(
+    ("images", "message"),
+    [
+        (None, "images of no camera, expected front"),
+        ({"side": image(0)}, "images of side, expected front"),
+        ({"front": image(0)[1:]}, r"images of front are \(96, 128, 3\), got \(95, 128, 3\)"),
+    ],
+)
+def test_images_that_do_not_fit_are_refused(tmp_path, images, message):
+    with DatasetWriter(tmp_path / "set", 50, "any", ["a"], cameras={"front": SIZE}) as writer:
+        writer.start_episode("look")
+        with pytest.raises(ValueError, match=message):
+            writer.add_frame(joint_position=[0.0], images=images)
+        writer.add_frame(joint_position=[0.0], images={"front": image(0)})
+        writer.save_episode()
+    assert len(load_demos(tmp_path / "set")[0]) == 1
+
+
+def test_odd_sizes_are_refused_before_anything_is_written(tmp_path):
+    with pytest.raises(ValueError, match="even sizes"):
+        DatasetWriter(tmp_path / "set", 50, "any", cameras={"front": (95, 128)})
+    assert list(tmp_path.iterdir()) == []
