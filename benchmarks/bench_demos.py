@@ -1,0 +1,179 @@
+"""How fast demonstrations are recorded and read, against the floor of a bare pyarrow read.
+
+The dataset is what an arm with an image feature leaves: 20 episodes of 30 s at 50 Hz, 41
+numbers a frame. Medians over repeats; all figures come from one run on one thread.
+"""
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("HF_HUB_OFFLINE", "1")
+
+import statistics
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from hrc_learn import cli
+from hrc_learn.demos import DatasetWriter, check_dataset, load_demos
+
+JOINTS = tuple(f"panda_joint{i}" for i in range(1, 8))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args:
+    episodes: int = 20
+    """Episodes of the dataset."""
+    frames: int = 1500
+    """Frames of each."""
+    repeats: int = 9
+    """Times each reading is repeated; the median counts."""
+    peer: bool = False
+    """Also record and read one episode with LeRobot's own classes."""
+    json: Path | None = None
+    """Receives the figures as one flat object."""
+
+
+def main(args: Args) -> None:
+    """Measure, print a table, write the figures."""
+    pa.set_cpu_count(1)
+    with tempfile.TemporaryDirectory() as folder:
+        root = Path(folder) / "set"
+        figures = measure_writing(root, args)
+        figures |= measure_reading(root, args)
+        if args.peer:
+            figures |= measure_lerobot(Path(folder) / "peer", args)
+    for name, value in figures.items():
+        print(f"{name:36s} {value:12,.4g}")
+    if args.json:
+        cli.write_json(args.json, figures)
+
+
+def measure_writing(root: Path, args: Args) -> dict[str, float]:
+    """Record the dataset frame by frame."""
+    recorded = [make_episode(args.frames, seed) for seed in range(args.episodes)]
+    adding, saving = [], []
+    with DatasetWriter(root, 50, "panda", JOINTS) as writer:
+        for frames in recorded:
+            writer.start_episode("place the bottle")
+            start = time.perf_counter()
+            for frame in frames:
+                writer.add_frame(**frame)
+            middle = time.perf_counter()
+            writer.save_episode()
+            adding.append(middle - start)
+            saving.append(time.perf_counter() - middle)
+        start = time.perf_counter()
+    finalizing = time.perf_counter() - start
+    return {
+        "add_frame_us": 1e6 * statistics.median(adding) / args.frames,
+        "save_episode_ms_per_frame": 1e3 * statistics.median(saving) / args.frames,
+        "finalize_ms_per_frame": 1e3 * finalizing / (args.frames * args.episodes),
+    }
+
+
+def measure_reading(root: Path, args: Args) -> dict[str, float]:
+    """Read it back: the bare columns, the demonstrations, one of them, tensors."""
+    frames = args.frames * args.episodes
+    floor = median_seconds(lambda: read_bare(root), args.repeats)
+    loading = median_seconds(lambda: load_demos(root), args.repeats)
+    one = median_seconds(lambda: load_demos(root, episodes=[args.episodes // 2]), args.repeats)
+    demos = load_demos(root)
+    padding = median_seconds(demos.padded, args.repeats)
+    checking = median_seconds(lambda: check_dataset(root), 3)
+    return {
+        "bare_read_samples_per_s": frames / floor,
+        "load_demos_samples_per_s": frames / loading,
+        "load_demos_over_bare_read": loading / floor,
+        "load_one_episode_ms": 1e3 * one,
+        "padded_samples_per_s": frames / padding,
+        "check_samples_per_s": frames / checking,
+    }
+
+
+def measure_lerobot(root: Path, args: Args) -> dict[str, float]:
+    """What LeRobot's own classes take for one episode of the same columns."""
+    start = time.perf_counter()
+    from lerobot.datasets import LeRobotDataset
+
+    importing = time.perf_counter() - start
+    features = {
+        "observation.state": {"dtype": "float32", "shape": (28,), "names": None},
+        "action": {"dtype": "float32", "shape": (7,), "names": None},
+    }
+    dataset = LeRobotDataset.create("local/peer", 50, features, root=root, use_videos=False)
+    for _ in range(args.frames):
+        state, action = np.zeros(28, np.float32), np.zeros(7, np.float32)
+        dataset.add_frame({"observation.state": state, "action": action, "task": "place"})
+    start = time.perf_counter()
+    dataset.save_episode()
+    saving = time.perf_counter() - start
+    dataset.finalize()
+    opened = LeRobotDataset("local/peer", root=root, video_backend="pyav")
+    start = time.perf_counter()
+    for index in range(args.frames):
+        opened[index]
+    reading = time.perf_counter() - start
+    return {
+        "lerobot_import_s": importing,
+        "lerobot_save_episode_ms_per_frame": 1e3 * saving / args.frames,
+        "lerobot_samples_per_s": args.frames / reading,
+    }
+
+
+def make_episode(frames: int, seed: int) -> list[dict]:
+    """Frames of one episode, made beforehand so that only recording is measured."""
+    rng = np.random.default_rng(seed)
+    joints = np.cumsum(rng.normal(scale=0.01, size=(frames, 7)), axis=0)
+    angle = np.linspace(0, 2, frames)
+    return [
+        {
+            "time": 0.02 * k,
+            "joint_position": joints[k],
+            "joint_velocity": joints[k] - joints[k - 1],
+            "position": joints[k, :3],
+            "orientation": np.array([np.cos(angle[k]), np.sin(angle[k]), 0.0, 0.0]),
+            "gripper": 0.04,
+            "feature": joints[k, 3:5],
+            "feature_visible": True,
+            "human_effort": joints[k],
+            "command_velocity": joints[k],
+        }
+        for k in range(frames)
+    ]
+
+
+def read_bare(root: Path) -> list[np.ndarray]:
+    """The same columns as flat arrays, and nothing made of them: no reader can be faster."""
+    table = pq.read_table(root / "data/chunk-000/file-000.parquet")
+    return [
+        np.concatenate(
+            [
+                chunk.flatten().to_numpy()
+                if pa.types.is_nested(chunk.type)
+                else chunk.to_numpy()
+                for chunk in table.column(name).chunks
+            ]
+        )
+        for name in table.column_names
+    ]
+
+
+def median_seconds(call: Callable[[], object], repeats: int) -> float:
+    """Median duration of a call."""
+    seconds = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        call()
+        seconds.append(time.perf_counter() - start)
+    return statistics.median(seconds)
+
+
+if __name__ == "__main__":
+    cli.run(main, Args)
