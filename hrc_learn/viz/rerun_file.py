@@ -49,12 +49,24 @@ def send_curves(
     stream: rr.RecordingStream, time: Float[np.ndarray, " time"], curves: Curves
 ) -> None:
     """Send curves with their names and colours; they break off where they are NaN."""
+    send_style(stream, curves)
+    send_values(stream, time, curves)
+
+
+def send_style(stream: rr.RecordingStream, curves: Curves) -> None:
+    """Send names, colours and widths of curves."""
     style = rr.SeriesLines(
         names=curves.names,
         colors=curves.colours,
         widths=[curves.width] * len(curves.names),
     )
     stream.log(curves.path, style, static=True)
+
+
+def send_values(
+    stream: rr.RecordingStream, time: Float[np.ndarray, " time"], curves: Curves
+) -> None:
+    """Send the samples of curves."""
     values = np.asarray(curves.values, dtype=np.float64)
     columns = rr.Scalars.columns(scalars=values.ravel())
     stream.send_columns(

@@ -47,10 +47,10 @@ class StepLog:
             raise ValueError(f"block must be at least one row, but is {block}.")
         self._block = block
         self._dtype: np.dtype | None = None
-        self._full: list[np.ndarray] = []
-        self._rows = np.empty(0)
-        self._columns: list[tuple[str, np.ndarray]] = []
-        self._count = 0  # rows used in the last block
+        self._blocks: list[np.ndarray] = []
+        self._columns: list[tuple[str, np.ndarray]] = []  # of the last block
+        self._first = 0  # rows before the last block
+        self._length = 0  # counted last, so that another thread sees whole rows only
         self.events: list[Event] = []
         """What happened when, in the order of the calls."""
 
@@ -60,7 +60,7 @@ class StepLog:
         return () if self._dtype is None else self._dtype.names or ()
 
     def __len__(self) -> int:
-        return len(self._full) * self._block + self._count
+        return self._length
 
     def __contains__(self, name: str) -> bool:
         return name in self.names
@@ -72,13 +72,14 @@ class StepLog:
         return np.concatenate([block[name] for block in self.blocks()])
 
     def blocks(self, start: int = 0) -> Iterator[np.ndarray]:
-        """The rows from `start` on, as structured arrays that share memory with the log."""
-        # The count is read once: rows appended meanwhile by the loop's thread come next time.
-        full, count = list(self._full), self._count
-        first, offset = divmod(start, self._block)
-        for i, rows in enumerate([*full, self._rows[:count]]):
-            if i >= first:
-                yield rows[offset if i == first else 0 :]
+        """The rows from `start` on, as structured arrays that share memory with the log.
+
+        Another thread may read while the loop appends.
+        """
+        length = self._length
+        for i in range(start // self._block, len(self._blocks)):
+            before = i * self._block
+            yield self._blocks[i][max(start - before, 0) : max(length - before, 0)]
 
     def append(self, **values: Value) -> None:
         """Add a row.
@@ -88,9 +89,10 @@ class StepLog:
         """
         if self._dtype is None:
             self._open(values)
-        if self._count == self._block:
+        i = self._length - self._first
+        if i == self._block:
             self._extend()
-        i = self._count
+            i = 0
         try:
             for name, column in self._columns:
                 column[i] = values[name]
@@ -98,7 +100,7 @@ class StepLog:
             raise self._mismatch(values) from error
         if len(values) != len(self._columns):
             raise self._mismatch(values)
-        self._count = i + 1
+        self._length += 1
 
     def prepare(self, **examples: Value) -> np.ndarray:
         """A row to be filled in place and given to `append_row`, holding the examples."""
@@ -113,10 +115,12 @@ class StepLog:
 
     def append_row(self, row: np.ndarray) -> None:
         """Add a copy of a row made by `prepare`."""
-        if self._count == self._block:
+        i = self._length - self._first
+        if i == self._block:
             self._extend()
-        self._rows[self._count] = row
-        self._count += 1
+            i = 0
+        self._blocks[-1][i] = row
+        self._length += 1
 
     def event(self, time: float, text: str) -> None:
         """Note that something happened at a time [s]."""
@@ -154,19 +158,19 @@ class StepLog:
 
     def _fill(self, columns: dict[str, np.ndarray]) -> None:
         self._open({name: np.zeros(c.shape[1:], c.dtype) for name, c in columns.items()})
-        total = len(next(iter(columns.values())))
-        for start in range(0, total, self._block):
-            if start:
-                self._extend()
-            self._count = min(self._block, total - start)
-            for name, column in self._columns:
-                column[: self._count] = columns[name][start : start + self._count]
+        self._length = len(next(iter(columns.values())))
+        while self._first + self._block < self._length:
+            self._extend()
+        for i, block in enumerate(self._blocks):
+            for name, column in columns.items():
+                part = column[i * self._block : (i + 1) * self._block]
+                block[name][: len(part)] = part
 
     def _open(self, values: Mapping[str, Value]) -> None:
         self._dtype = np.dtype(
             [(name, _kind(value), np.shape(value)) for name, value in values.items()]
         )
-        self._new_block()
+        self._extend()
 
     def _mismatch(self, values: Mapping[str, Value]) -> ValueError:
         assert self._dtype is not None
@@ -184,14 +188,11 @@ class StepLog:
         )
 
     def _extend(self) -> None:
-        self._full.append(self._rows)
-        self._new_block()
-
-    def _new_block(self) -> None:
         assert self._dtype is not None
-        self._rows = np.zeros(self._block, dtype=self._dtype)
-        self._columns = [(name, self._rows[name]) for name in self.names]
-        self._count = 0
+        rows = np.zeros(self._block, dtype=self._dtype)
+        self._columns = [(name, rows[name]) for name in self.names]
+        self._blocks.append(rows)
+        self._first = (len(self._blocks) - 1) * self._block
 
 
 def _kind(value: Value) -> type:

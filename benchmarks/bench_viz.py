@@ -1,0 +1,168 @@
+"""What logging costs the control loop, writing a recording costs a run, and a camera a frame.
+
+The row logged is that of the collaboration task: 62 numbers and a flag in 13 columns. The
+floor is one bare NumPy row of the same width. Medians of CPU time on one thread, of calls
+made in turn.
+"""
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from timing import time_calls
+
+from hrc_learn import cli
+from hrc_learn.vision import CameraModel, Marker, MarkerDetector, SyntheticCamera
+from hrc_learn.viz import CameraRecording, RunRecording, StepLog
+from hrc_learn.viz.run_dashboard import record_run
+
+STEPS = 200  # timed together, since one takes less than the clock resolves
+TARGETS = {"log_step_us": 2.0, "camera_ms": 4.0, "detect_ms": 4.0}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args:
+    repeats: int = 200
+    """Repeats of every call."""
+    seconds: float = 60.0
+    """Length of the run that is written as a recording, at 125 steps a second."""
+    json: Path | None = None
+    """Receives the figures as one flat object."""
+
+
+def main(args: Args) -> None:
+    """Measure, print a table with the targets, write the figures."""
+    cv2.setNumThreads(1)
+    figures = measure_log(args.repeats)
+    figures |= measure_vision(args.repeats)
+    figures |= measure_recording(args.seconds)
+    for name, value in figures.items():
+        target = f"   target <= {TARGETS[name]:g}" if name in TARGETS else ""
+        print(f"{name:24s} {value:10.3g}{target}")
+    if args.json:
+        cli.write_json(args.json, figures)
+
+
+def measure_log(repeats: int) -> dict[str, float]:
+    """Microseconds a step."""
+    values = step_values()
+    width = sum(np.size(value) for value in values.values())
+    rows, row = np.zeros((STEPS, width)), np.zeros(width)
+    log = StepLog()
+    prepared = log.prepare(**values)
+    places = [(prepared[name], value) for name, value in values.items() if np.ndim(value)]
+    numbers = [(name, value) for name, value in values.items() if not np.ndim(value)]
+
+    def bare() -> None:
+        for k in range(STEPS):
+            rows[k] = row
+
+    def append_row() -> None:
+        for _ in range(STEPS):
+            log.append_row(prepared)
+
+    def fill_and_append_row() -> None:
+        for _ in range(STEPS):
+            for place, value in places:
+                place[...] = value
+            for name, value in numbers:
+                prepared[name] = value
+            log.append_row(prepared)
+
+    def append() -> None:
+        for _ in range(STEPS):
+            log.append(**values)
+
+    calls: dict[str, Callable[[], object]] = {
+        "log_floor_us": bare,
+        "log_row_us": append_row,
+        "log_step_us": fill_and_append_row,
+        "log_append_us": append,
+    }
+    timings = time_calls(calls, repeats)
+    return {name: 1e6 * timing.median / STEPS for name, timing in timings.items()}
+
+
+def step_values() -> dict[str, np.ndarray | float | bool]:
+    """What a step of the collaboration task logs."""
+    joints = {f"joint_{name}": np.zeros(7) for name in ("position", "command", "effort")}
+    pixels = {name: np.zeros(2) for name in ("feature", "target")}
+    return {
+        "time": 0.0,
+        **joints,
+        **pixels,
+        "feature_visible": True,
+        "image_jacobian": np.zeros((2, 6)),
+        "weight_norm": 0.0,
+        "position": np.zeros(3),
+        "orientation": np.zeros(4),
+        "region_gradient": np.zeros(6),
+        "safety": np.zeros(10),
+    }
+
+
+def measure_vision(repeats: int) -> dict[str, float]:
+    """Milliseconds a frame of 1440x1080, one marker 80 px wide."""
+    model = CameraModel().look_at(np.array([0.5, 0.0, 1.3]), np.array([0.5, 0.0, 0.0]))
+    pose = np.eye(4)
+    pose[:3, 3] = [0.55, 0.1, 0.3]
+    marker = Marker(7, 0.06)
+    camera = SyntheticCamera(model, [marker], lambda: {7: pose}, rng=np.random.default_rng(0))
+    image = camera.read()
+    tracking, blind = MarkerDetector([7]), MarkerDetector([7, 8])  # 8 is not there
+    timings = time_calls(
+        {
+            "camera_ms": camera.read,
+            "detect_ms": lambda: tracking.detect(image),
+            "detect_missing_ms": lambda: blind.detect(image),
+        },
+        repeats,
+    )
+    return {name: 1e3 * timing.median for name, timing in timings.items()}
+
+
+def measure_recording(seconds: float) -> dict[str, float]:
+    """Seconds of CPU and megabytes of one recording, with three images a second."""
+    run = long_run(seconds)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "run.rrd"
+        timing = time_calls({"record": lambda: record_run(path, run)}, 3)["record"]
+        return {"record_s": timing.median, "record_mb": path.stat().st_size / 1e6}
+
+
+def long_run(seconds: float) -> RunRecording:
+    """A run with the most voluminous fields filled."""
+    time = np.arange(0.0, seconds, 1 / 125)
+    steps = len(time)
+    model = CameraModel()
+    feature = np.stack([700 + 50 * np.sin(time), 500 + 50 * np.cos(time)], axis=-1)
+    frames = int(3 * seconds)
+    image = SyntheticCamera(model, [], dict, rng=np.random.default_rng(0)).read()
+    camera = CameraRecording(
+        model=model,
+        feature=feature,
+        target=np.full_like(feature, 700.0),
+        image_time=np.linspace(0.0, seconds, frames),
+        images=(image,) * frames,
+    )
+    return RunRecording(
+        title="benchmark",
+        time=time,
+        joint_names=tuple(f"joint{i}" for i in range(1, 8)),
+        joint_position=np.sin(time[:, None] + np.arange(7)),
+        position=np.sin(time[:, None] + np.arange(3)),
+        camera=camera,
+        image_jacobian=np.random.default_rng(0).normal(size=(steps, 2, 6)),
+        human_effort=np.zeros((steps, 7)),
+    )
+
+
+if __name__ == "__main__":
+    cli.run(main, Args)
