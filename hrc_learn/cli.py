@@ -7,6 +7,7 @@ import json
 import math
 import os
 import sys
+import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NoReturn, SupportsFloat
@@ -21,6 +22,7 @@ def run[Args](main: Callable[[Args], int | None], args: type[Args]) -> NoReturn:
     """
     import tyro
 
+    warnings.formatwarning = _warning_line
     parsed = tyro.cli(args, description=_summary(main))
     try:
         status = main(parsed) or 0
@@ -55,6 +57,11 @@ def write_json(path: str | Path, values: Mapping[str, SupportsFloat]) -> None:
     unfinished = path.with_name(f".{path.name}.{os.getpid()}")
     unfinished.write_text(json.dumps(content, indent=2) + "\n")
     unfinished.replace(path)
+
+
+def _warning_line(message: Warning | str, *_place: object, **_line: object) -> str:
+    """A warning as a user reads it: without the place in our code that gave it."""
+    return f"warning: {message}\n"
 
 
 def _number(value: Any) -> float | int | bool | None:
