@@ -352,19 +352,21 @@ def test_recursive_least_squares_is_least_squares():
 def test_forgetting_weighs_old_pairs_less():
     """Against the weighted ridge problem: a pair k ago counts forgetting^k, so the prior."""
     network, forgetting = guess(), 0.9
-    config = LeastSquaresConfig(forgetting=forgetting)
     path = wander(12, rng=generator(22))
     pairs = naive_pairs(path, CAMERA.project(path), network, 2e-4, 0.05)
     prior = np.kron(np.eye(6), 1500.0**2 * np.ones((9, 9)) + 500.0**2 * np.eye(9))
     weight, covariance = network.weight.detach(), torch.from_numpy(prior)
     for _, dx, dr, theta in pairs:
         pair = Pair(
+            twist=torch.from_numpy(dr / SCALE),
             dr=torch.from_numpy(dr),
             dx=torch.from_numpy(dx),
             theta=torch.from_numpy(theta),
             valid=torch.ones((), dtype=torch.bool),
         )
-        weight, covariance = condition(weight, covariance, pair, config, forgetting)
+        weight, covariance = condition(
+            weight, covariance / forgetting, pair, torch.from_numpy(SCALE), 0.5
+        )
 
     count = forgetting ** np.arange(len(pairs))[::-1]
     Phi, dX = np.stack([p[0] for p in pairs]), np.stack([p[1] for p in pairs])

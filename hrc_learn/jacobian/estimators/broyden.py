@@ -5,15 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from hrc_learn.jacobian.estimators.composite import CompositeState
-from hrc_learn.jacobian.estimators.interface import (
-    ImageJacobianEstimator,
-    Measurement,
-    evaluate,
-)
-from hrc_learn.jacobian.estimators.key_frames import KeyFrame, advance
+from hrc_learn.jacobian.estimators.interface import Measurement
+from hrc_learn.jacobian.estimators.key_frames import KeyFrame, PairEstimator
 from hrc_learn.jacobian.network import RBFImageJacobian
 from hrc_learn.jacobian.pairs import PairConfig
-from hrc_learn.jacobian.prior import component_scale
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,7 +21,7 @@ class BroydenConfig(PairConfig):
     """Share of the prediction error that one pair removes, above 0 to 1."""
 
 
-class BroydenEstimator(ImageJacobianEstimator):
+class BroydenEstimator(PairEstimator):
     """J_s <- J_s + gain (dx - J_s dr) dr^T / |dr|^2 (Jägersand 1997), everywhere at once.
 
     The same change of every neuron changes a network of normalised neurons by a constant.
@@ -38,13 +33,13 @@ class BroydenEstimator(ImageJacobianEstimator):
         Raises:
             ValueError: The network's neurons are not normalised.
         """
-        super().__init__(network)
+        self.config = config or BroydenConfig()
+        super().__init__(network, self.config)
         if not network.normalized:
             raise ValueError(
                 "Broyden's update adds a constant Jacobian, which only normalised neurons can "
                 "represent: build the network with normalized=True."
             )
-        self.config = config or BroydenConfig()
 
     def initial_state(self, *batch: int) -> CompositeState:
         """The network's weights and no key frame."""
@@ -53,13 +48,11 @@ class BroydenEstimator(ImageJacobianEstimator):
 
     def update(self, state: CompositeState, measurement: Measurement) -> CompositeState:
         """One pair if there is a new one."""
-        key, pair = advance(state.key, measurement, self.network, self.config)
-        scale = component_scale(state.weight, self.config.rotation_scale)
-        J = evaluate(state.weight, pair.theta) / scale
-        error = pair.dx - (J @ pair.dr.unsqueeze(-1)).squeeze(-1)
+        theta = self.network.basis(measurement.pose)
+        key, pair = self.advance(state.key, measurement, theta, self.config)
         # dr is zero without a pair: then the floor keeps 0 / 0 away.
         size = pair.dr.square().sum(-1).clamp_min((self.config.min_step / 2) ** 2)
-        step = self.config.gain * error / size.unsqueeze(-1)
-        change = step.unsqueeze(-1) * (pair.dr * scale).unsqueeze(-2)
+        step = self.config.gain * pair.error(state.weight) / size.unsqueeze(-1)
+        change = step.unsqueeze(-1) * (pair.dr * self.scale).unsqueeze(-2)
         weight = state.weight + change.flatten(-2).unsqueeze(-1)
         return CompositeState(weight=weight, key=key)

@@ -8,16 +8,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.jacobian.estimators.interface import (
-    ImageJacobianEstimator,
-    Measurement,
-    evaluate,
-)
-from hrc_learn.jacobian.estimators.key_frames import KeyFrame, Pair, advance
+from hrc_learn.jacobian.estimators.interface import Measurement
+from hrc_learn.jacobian.estimators.key_frames import KeyFrame, Pair, PairEstimator
 from hrc_learn.jacobian.estimators.paper import paper_rate
 from hrc_learn.jacobian.network import RBFImageJacobian
 from hrc_learn.jacobian.pairs import PairConfig
-from hrc_learn.jacobian.prior import component_scale
 from hrc_learn.regions.pytree import pytree
 
 
@@ -46,7 +41,7 @@ class CompositeState:
     """Last key frame."""
 
 
-class CompositeEstimator(ImageJacobianEstimator):
+class CompositeEstimator(PairEstimator):
     """Composite adaptation: task error and prediction error (Slotine and Li 1989).
 
     Between key frames the prediction error is e = dx - J_s_hat dr. Each pair moves the
@@ -59,9 +54,13 @@ class CompositeEstimator(ImageJacobianEstimator):
     weights are bounded.
     """
 
+    bound: Tensor
+
     def __init__(self, network: RBFImageJacobian, config: CompositeConfig | None = None):
-        super().__init__(network)
         self.config = config or CompositeConfig()
+        super().__init__(network, self.config)
+        bound = self.config.weight_bound * self.scale.repeat(2).unsqueeze(-1)
+        self.register_buffer("bound", bound, persistent=False)
 
     def initial_state(self, *batch: int) -> CompositeState:
         """The network's weights and no key frame."""
@@ -70,28 +69,22 @@ class CompositeEstimator(ImageJacobianEstimator):
 
     def update(self, state: CompositeState, measurement: Measurement) -> CompositeState:
         """One step of dt of the paper's term, and one pair if there is a new one."""
-        config = self.config
-        key, pair = advance(state.key, measurement, self.network, config)
         theta = self.network.basis(measurement.pose)
-        rate = paper_rate(state.weight, theta, measurement, config.task_gain)
-        change = self._correction(state.weight, pair)
-        weight = state.weight + measurement.dt * rate + change
-        scale = component_scale(weight, config.rotation_scale).repeat(2).unsqueeze(-1)
-        bound = config.weight_bound * scale
-        return CompositeState(weight=torch.clamp(weight, -bound, bound), key=key)
+        key, pair = self.advance(state.key, measurement, theta, self.config)
+        rate = paper_rate(state.weight, theta, measurement, self.config.task_gain)
+        change = measurement.dt * rate + self._correction(state.weight, pair)
+        weight = state.weight + change
+        return CompositeState(weight=weight.clamp(-self.bound, self.bound), key=key)
 
     def _correction(self, weight: Tensor, pair: Pair) -> Tensor:
         """Normalised gradient step on the prediction error; zero without a pair."""
         config = self.config
-        scale = component_scale(weight, config.rotation_scale)
-        J = evaluate(weight, pair.theta) / scale
-        error = pair.dx - (J @ pair.dr.unsqueeze(-1)).squeeze(-1)
         motion = pair.dr.square().sum(-1) + config.noise_floor**2
         # Normalised neurons never fade. Others do between and beyond the centres: dividing by
         # their activity there would write far too much into weights that act elsewhere.
         least = 0.0 if self.network.normalized else 1.0
         activity = pair.theta.square().sum(-1).clamp_min(least)
         size = (motion * activity).clamp_min(torch.finfo(motion.dtype).tiny)
-        step = config.prediction_gain * error / size.unsqueeze(-1)
-        entries = step.unsqueeze(-1) * (pair.dr * scale).unsqueeze(-2)
+        step = config.prediction_gain * pair.error(weight) / size.unsqueeze(-1)
+        entries = step.unsqueeze(-1) * (pair.dr * self.scale).unsqueeze(-2)
         return entries.flatten(-2).unsqueeze(-1) * pair.theta.unsqueeze(-2)

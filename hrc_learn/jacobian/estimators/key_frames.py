@@ -9,7 +9,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hrc_learn.geometry import Pose
-from hrc_learn.jacobian.estimators.interface import Measurement
+from hrc_learn.jacobian.estimators.interface import (
+    ImageJacobianEstimator,
+    Measurement,
+    evaluate,
+)
 from hrc_learn.jacobian.network import RBFImageJacobian
 from hrc_learn.jacobian.pairs import PairConfig
 from hrc_learn.jacobian.prior import component_scale
@@ -48,45 +52,73 @@ class KeyFrame:
 class Pair:
     """Motion from the key frame to now; zero where there is none to learn from."""
 
+    twist: Float[Tensor, "*batch 6"]
+    """Motion of the tool, linear [m] and angular [rad]."""
     dr: Float[Tensor, "*batch 6"]
-    """Of the tool, rotation counted in metres [m]."""
+    """The same with rotation counted in metres [m]."""
     dx: Float[Tensor, "*batch 2"]
-    """Of the feature [px]."""
+    """Motion of the feature [px]."""
     theta: Float[Tensor, "*batch K"]
     """Neurons half-way: the mean of both ends."""
     valid: Bool[Tensor, "*batch"]
     """Whether there is a pair."""
 
+    def error(self, weight: Float[Tensor, "*batch 12 K"]) -> Float[Tensor, "*batch 2"]:
+        """Prediction error dx - J_s_hat dr [px]."""
+        J = evaluate(weight, self.theta)
+        return self.dx - (J @ self.twist.unsqueeze(-1)).squeeze(-1)
 
-def advance(
-    key: KeyFrame, measurement: Measurement, network: RBFImageJacobian, config: PairConfig
-) -> tuple[KeyFrame, Pair]:
-    """Compare with the key frame; move it here once the tool is `min_step` away.
 
-    Where the tool has meanwhile moved further than `max_step`, as after a loss of the
-    feature, the key frame moves without a pair.
-    """
-    theta = network.basis(measurement.pose)
-    scale = component_scale(theta, config.rotation_scale)
-    dr = key.pose.twist_to(measurement.pose) * scale
-    distance = torch.linalg.vector_norm(dr, dim=-1)
-    moved = measurement.valid & key.present & (distance >= config.min_step)
-    valid = moved & (distance <= config.max_step)
-    take = (moved | (measurement.valid & ~key.present)).unsqueeze(-1)
-    use = valid.unsqueeze(-1)
-    pair = Pair(
-        dr=torch.where(use, dr, 0.0),
-        dx=torch.where(use, measurement.feature - key.feature, 0.0),
-        theta=(key.theta + theta) / 2,
-        valid=valid,
-    )
-    moved_key = KeyFrame(
-        pose=Pose(
-            torch.where(take, measurement.pose.position, key.pose.position),
-            torch.where(take, measurement.pose.orientation, key.pose.orientation),
-        ),
-        feature=torch.where(take, measurement.feature, key.feature),
-        theta=torch.where(take, theta, key.theta),
-        present=key.present | measurement.valid,
-    )
-    return moved_key, pair
+class PairEstimator(ImageJacobianEstimator):
+    """An estimator that learns from pairs of key frames."""
+
+    scale: Tensor
+    """Metres that each component of a twist counts for, (6,)."""
+
+    def __init__(self, network: RBFImageJacobian, config: PairConfig):
+        super().__init__(network)
+        scale = component_scale(network.centers, config.rotation_scale)
+        self.register_buffer("scale", scale, persistent=False)
+
+    def advance(
+        self,
+        key: KeyFrame,
+        measurement: Measurement,
+        theta: Float[Tensor, "*batch K"],
+        config: PairConfig,
+    ) -> tuple[KeyFrame, Pair]:
+        """Compare with the key frame; move it here once the tool is `min_step` away.
+
+        Where the tool has meanwhile moved further than `max_step`, as after a loss of the
+        feature, the key frame moves without a pair.
+
+        Args:
+            key: Key frame before.
+            measurement: Now.
+            theta: Neurons at the pose of the measurement.
+            config: Distances.
+        """
+        twist = key.pose.twist_to(measurement.pose)
+        distance = torch.linalg.vector_norm(twist * self.scale, dim=-1)
+        moved = measurement.valid & key.present & (distance >= config.min_step)
+        valid = moved & (distance <= config.max_step)
+        use = valid.unsqueeze(-1)
+        twist = torch.where(use, twist, 0.0)
+        pair = Pair(
+            twist=twist,
+            dr=twist * self.scale,
+            dx=torch.where(use, measurement.feature - key.feature, 0.0),
+            theta=(key.theta + theta) / 2,
+            valid=valid,
+        )
+        take = (moved | (measurement.valid & ~key.present)).unsqueeze(-1)
+        here = KeyFrame(
+            pose=Pose(
+                torch.where(take, measurement.pose.position, key.pose.position),
+                torch.where(take, measurement.pose.orientation, key.pose.orientation),
+            ),
+            feature=torch.where(take, measurement.feature, key.feature),
+            theta=torch.where(take, theta, key.theta),
+            present=key.present | measurement.valid,
+        )
+        return here, pair

@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.jacobian.estimators.key_frames import KeyFrame, Pair
+from hrc_learn.jacobian.estimators.key_frames import KeyFrame, Pair, PairEstimator
 from hrc_learn.jacobian.network import RBFImageJacobian
 from hrc_learn.jacobian.pairs import PairConfig
-from hrc_learn.jacobian.prior import component_scale, weight_covariance
+from hrc_learn.jacobian.prior import weight_covariance
 from hrc_learn.regions.pytree import pytree
 
 
@@ -25,6 +25,11 @@ class RecursiveConfig(PairConfig):
     """Prior standard deviation of the Jacobian as a whole [px/m]."""
     weight_std: float = 500.0
     """Prior standard deviation of each neuron's departure from it [px/m]."""
+
+    @property
+    def pair_noise(self) -> float:
+        """Variance of each coordinate of dx [px^2]."""
+        return 2 * self.pixel_noise**2
 
 
 @pytree
@@ -40,24 +45,39 @@ class RecursiveState:
     """Last key frame."""
 
 
-def prior_covariance(
-    network: RBFImageJacobian, config: RecursiveConfig
-) -> Float[Tensor, "P P"]:
-    """What is believed at the start: the posterior of an offline fit, or else the prior."""
-    if network.covariance is not None:
-        return network.covariance
-    neurons = weight_covariance(network.centers, config.bias_std, config.weight_std)
-    return torch.block_diag(*[neurons] * 6)
+class RecursiveEstimator(PairEstimator):
+    """An estimator that keeps a covariance of the weights."""
+
+    first_covariance: Tensor
+    """Covariance to start with, (P, P)."""
+
+    def __init__(self, network: RBFImageJacobian, config: RecursiveConfig):
+        super().__init__(network, config)
+        # The posterior of an offline fit, or else the prior.
+        covariance = network.covariance
+        if covariance is None:
+            neurons = weight_covariance(network.centers, config.bias_std, config.weight_std)
+            covariance = torch.block_diag(*[neurons] * 6)
+        self.register_buffer("first_covariance", covariance.clone(), persistent=False)
+
+    def initial_state(self, *batch: int) -> RecursiveState:
+        """The network's weights, the prior (or the fit's posterior), no key frame."""
+        shape = self.first_covariance.shape
+        return RecursiveState(
+            weight=self.initial_weight(*batch),
+            covariance=self.first_covariance.expand(*batch, *shape).clone(),
+            key=KeyFrame.absent(self.network, *batch),
+        )
 
 
 def condition(
     weight: Float[Tensor, "*batch 12 K"],
     covariance: Float[Tensor, "*batch P P"],
     pair: Pair,
-    config: RecursiveConfig,
-    discount: float = 1.0,
+    scale: Float[Tensor, "6"],
+    noise: float,
 ) -> tuple[Float[Tensor, "*batch 12 K"], Float[Tensor, "*batch P P"]]:
-    """Mean and covariance after one more pair; unchanged where there is none.
+    """Mean and covariance given one more pair; unchanged where there is none.
 
     With phi = dr (x) theta and P the covariance, the gain is P phi / (phi' P phi + noise).
 
@@ -65,20 +85,12 @@ def condition(
         weight: Mean before.
         covariance: Covariance before.
         pair: Motion seen.
-        config: Noise.
-        discount: Weight of all earlier pairs against this one, 0 to 1.
+        scale: Metres that each component of a twist counts for.
+        noise: Variance of each coordinate of dx [px^2].
     """
     phi = (pair.dr.unsqueeze(-1) * pair.theta.unsqueeze(-2)).flatten(-2).unsqueeze(-1)
     P_phi = covariance @ phi  # (*batch, P, 1)
-    noise = 2 * config.pixel_noise**2 * discount
     gain = P_phi / (phi.mT @ P_phi + noise)
-    scale = component_scale(weight, config.rotation_scale)
-    rows = weight.unflatten(-2, (2, 6)) / scale.unsqueeze(-1)  # (*batch, 2, 6, K)
-    error = pair.dx.unsqueeze(-1) - rows.flatten(-2) @ phi  # (*batch, 2, 1)
-    change = (error @ gain.mT).unflatten(-1, rows.shape[-2:]) * scale.unsqueeze(-1)
-    weight = weight + change.flatten(-3, -2)
-    shrunk = covariance - gain @ P_phi.mT
-    if discount == 1.0:
-        return weight, shrunk  # gain is zero where there is no pair
-    there = pair.valid.unsqueeze(-1).unsqueeze(-1)
-    return weight, torch.where(there, shrunk / discount, covariance)
+    change = pair.error(weight).unsqueeze(-1) * gain.squeeze(-1).unsqueeze(-2)
+    change = change.unflatten(-1, (6, -1)) * scale.unsqueeze(-1)  # (*batch, 2, 6, K)
+    return weight + change.flatten(-3, -2), covariance - gain @ P_phi.mT

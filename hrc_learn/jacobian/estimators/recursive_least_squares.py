@@ -7,13 +7,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from hrc_learn.jacobian.estimators.interface import ImageJacobianEstimator, Measurement
-from hrc_learn.jacobian.estimators.key_frames import KeyFrame, advance
+from hrc_learn.jacobian.estimators.interface import Measurement
 from hrc_learn.jacobian.estimators.recursive import (
     RecursiveConfig,
+    RecursiveEstimator,
     RecursiveState,
     condition,
-    prior_covariance,
 )
 from hrc_learn.jacobian.network import RBFImageJacobian
 
@@ -26,7 +25,7 @@ class LeastSquaresConfig(RecursiveConfig):
     """Weight of all that was learned against each new pair, 0 to 1."""
 
 
-class RecursiveLeastSquaresEstimator(ImageJacobianEstimator):
+class RecursiveLeastSquaresEstimator(RecursiveEstimator):
     """Weighted least squares over all pairs so far, a pair k ago counting forgetting^k.
 
     Forgetting inflates the covariance where nothing new is seen; it is kept from growing
@@ -36,27 +35,24 @@ class RecursiveLeastSquaresEstimator(ImageJacobianEstimator):
     largest_trace: Tensor
 
     def __init__(self, network: RBFImageJacobian, config: LeastSquaresConfig | None = None):
-        super().__init__(network)
         self.config = config or LeastSquaresConfig()
-        trace = prior_covariance(network, self.config).diagonal().sum()
+        super().__init__(network, self.config)
+        trace = self.first_covariance.diagonal().sum()
         self.register_buffer("largest_trace", trace, persistent=False)
-
-    def initial_state(self, *batch: int) -> RecursiveState:
-        """The network's weights, the prior (or the fit's posterior), no key frame."""
-        covariance = prior_covariance(self.network, self.config)
-        return RecursiveState(
-            weight=self.initial_weight(*batch),
-            covariance=covariance.expand(*batch, *covariance.shape).clone(),
-            key=KeyFrame.absent(self.network, *batch),
-        )
 
     def update(self, state: RecursiveState, measurement: Measurement) -> RecursiveState:
         """One pair if there is a new one."""
-        key, pair = advance(state.key, measurement, self.network, self.config)
+        theta = self.network.basis(measurement.pose)
+        key, pair = self.advance(state.key, measurement, theta, self.config)
+        # Forgetting is one more pair against a covariance divided by the factor.
+        kept = 1 - (1 - self.config.forgetting) * pair.valid.to(state.covariance.dtype)
         weight, covariance = condition(
-            state.weight, state.covariance, pair, self.config, self.config.forgetting
+            state.weight,
+            state.covariance / kept[..., None, None],
+            pair,
+            self.scale,
+            self.config.pair_noise,
         )
         trace = covariance.diagonal(dim1=-2, dim2=-1).sum(-1)
-        shrink = torch.clamp_max(self.largest_trace / trace, 1.0)
-        covariance = covariance * shrink.unsqueeze(-1).unsqueeze(-1)
-        return RecursiveState(weight=weight, covariance=covariance, key=key)
+        shrink = torch.clamp_max(self.largest_trace / trace, 1.0)[..., None, None]
+        return RecursiveState(weight=weight, covariance=covariance * shrink, key=key)
