@@ -20,6 +20,7 @@ from hrc_learn.dmp.samples import ArrayLike, check_samples
 from hrc_learn.dmp.scaling import check_paper_scale, check_scaling, forcing_scale
 from hrc_learn.dmp.spring import SpringDamper
 from hrc_learn.dmp.state import DMPState
+from hrc_learn.dmp.stepping import advance, second_derivative
 from hrc_learn.dmp.trajectory import Trajectory, broadcast_shapes
 
 BUFFERS = ("start", "goal", "start_velocity", "duration", "amplitude", "stamps")
@@ -241,6 +242,7 @@ class JointDMP(nn.Module):
             rate=rate,
             start=start,
             goal=goal,
+            target=goal,
             duration=duration,
             pace=torch.ones_like(duration),
             s=torch.zeros_like(duration, dtype=torch.float64),
@@ -253,53 +255,56 @@ class JointDMP(nn.Module):
         dt: ArrayLike,
         *,
         goal: ArrayLike | None = None,
+        goal_filter: float | None = None,
         coupling: ArrayLike | None = None,
         slowdown: ArrayLike | None = None,
     ) -> DMPState:
         """Advance by `dt`, exactly for whatever is constant over the step.
 
-        The motion that the forcing term causes alone is known at both ends of the step; what
-        the state differs from it dies out as the spring has it. So no step is too long, and
-        uncoupled steps end where the rollout does.
+        Uncoupled steps of any length end where the rollout does. A coupling that depends on
+        the state is taken as it is at the start of the step: of first order in `dt`, and so
+        is a filtered goal with the scaling `"paper"`, whose forcing it scales.
 
         Args:
             state: From `initial_state` or the last step.
             dt: [s], (*batch).
             goal: New goal from here on, (*batch, D).
+            goal_filter: Rate, per duration, at which the goal moves to where it was last
+                told to be: the acceleration has no jump then. None: it is there at once.
             coupling: Acceleration added to the motion, per s^2, (*batch, D).
             slowdown: The clock of the whole system, phase and spring, runs 1 + slowdown
                 times slower, (*batch), >= 0. Slows along the path without leaving it.
         """
-        goal = state.goal if goal is None else self._as_tensor(goal).expand_as(state.goal)
+        target = state.target if goal is None else self._as_tensor(goal).expand_as(state.goal)
         pace = torch.ones_like(state.pace)
         if slowdown is not None:
             pace = pace / (1 + self._as_tensor(slowdown))
-        ds = (self._as_tensor(dt) * pace / state.duration).double()
-        s = state.s + ds
-        # A constant push moves the point where the spring comes to rest.
-        rest = goal
+        push = None
         if coupling is not None:
             push = self._as_tensor(coupling) * state.duration[..., None] ** 2
-            rest = goal + push / self.spring.stiffness
-        # Both transitions at once: over this step, and since the forcing has ended.
-        E, coast = self.spring.propagator(torch.stack([ds, self.response.coasting(s)])).to(goal)
-        forced = coast @ (self.response.forced.to(s.device)(s).to(goal) @ self.weights.mT)
-        before, after = state.forced, forced
-        scale = forcing_scale(self.scaling, state.start, goal, self.amplitude)
-        if scale is not None:
-            before, after = before * scale[..., None, :], after * scale[..., None, :]
-        deviation = torch.stack([state.position - rest, state.rate], dim=-2) - before
-        moved = E @ deviation + after
-        return DMPState(
-            position=moved[..., 0, :] + rest,
-            rate=moved[..., 1, :],
-            start=state.start,
-            goal=goal,
-            duration=state.duration,
+        aim = target if goal_filter is None else state.goal
+        return advance(
+            state,
+            (self._as_tensor(dt) * pace / state.duration).double(),
+            response=self.response,
+            weights=self.weights,
+            scale=forcing_scale(self.scaling, state.start, aim, self.amplitude),
+            target=target,
+            goal_filter=goal_filter,
+            push=push,
             pace=pace,
-            s=s,
-            forced=forced,
         )
+
+    def curvature(self, state: DMPState) -> Float[Tensor, "*batch D"]:
+        """d^2 y / ds^2 at a state that nothing couples to."""
+        scale = forcing_scale(self.scaling, state.start, state.goal, self.amplitude)
+        return second_derivative(state, self.response, self.weights, scale)
+
+    def resting_point(
+        self, state: DMPState, curvature: Float[Tensor, "*batch D"]
+    ) -> Float[Tensor, "*batch D"]:
+        """The goal with which the state would have this d^2 y / ds^2 (unscaled forcing)."""
+        return state.goal + (curvature - self.curvature(state)) / self.spring.stiffness
 
     def resolve_duration(self, duration: ArrayLike | None, speed: ArrayLike | None) -> Tensor:
         """Duration [s] that either argument of a rollout asks for."""

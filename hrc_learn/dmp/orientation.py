@@ -206,15 +206,24 @@ class OrientationDMP(nn.Module):
         dt: ArrayLike,
         *,
         goal: ArrayLike | None = None,
+        goal_filter: float | None = None,
         slowdown: ArrayLike | None = None,
     ) -> OrientationState:
-        """Advance by `dt`; as `JointDMP.step`. A new goal changes neither pose nor velocity."""
+        """Advance by `dt`; arguments as in `JointDMP.step`.
+
+        A new goal changes neither orientation nor angular velocity at that moment, nor, with
+        a `goal_filter`, the angular acceleration.
+        """
         motion, target = state.motion, state.goal
         if goal is not None:
             target = unit_quaternion(goal, state.goal).expand_as(state.goal)
-            error, rate = retarget(motion.position, motion.rate, state.goal, target)
+            curvature = self.motion.curvature(motion)
+            error, rate, curvature = retarget(
+                motion.position, motion.rate, curvature, state.goal, target
+            )
             motion = replace(motion, position=error, rate=rate)
-        motion = self.motion.step(motion, dt, slowdown=slowdown)
+            motion = replace(motion, goal=self.motion.resting_point(motion, curvature))
+        motion = self.motion.step(motion, dt, goal_filter=goal_filter, slowdown=slowdown)
         return OrientationState(motion=motion, goal=target)
 
     def save(self, folder: str | Path) -> None:
@@ -312,10 +321,16 @@ def error_ends(
 def retarget(
     error: Float[Tensor, "*batch 3"],
     rate: Float[Tensor, "*batch 3"],
+    curvature: Float[Tensor, "*batch 3"],
     old_goal: Float[Tensor, "*batch 4"],
     goal: Float[Tensor, "*#batch 4"],
-) -> tuple[Tensor, Tensor]:
-    """Error to a new goal and its rate, for the same orientation and angular velocity."""
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Error to a new goal and its derivatives, for the same motion of the orientation."""
     q = error_space.to_orientation(error, old_goal)
     new = error_space.nearest_turn(error_space.to_error(q, goal), error)
-    return new, error_space.error_rate(new, error_space.angular_velocity(error, rate))
+    omega = error_space.angular_velocity(error, rate)
+    omega_rate = error_space.angular_acceleration(error, rate, curvature)
+    new_rate = error_space.error_rate(new, omega)
+    # The angular acceleration is linear in the curvature; the rest stems from turning itself.
+    bias = error_space.angular_acceleration(new, new_rate, torch.zeros_like(new))
+    return new, new_rate, error_space.error_rate(new, omega_rate - bias)

@@ -122,7 +122,7 @@ class PoseState:
     def _rotation(self) -> OrientationState:
         columns = {
             name: getattr(self.motion, name)[..., ERROR]
-            for name in ("position", "rate", "start", "goal", "forced")
+            for name in ("position", "rate", "start", "goal", "target", "forced")
         }
         return OrientationState(
             motion=replace(self.motion, **columns), goal=self.goal_orientation
@@ -291,6 +291,7 @@ class PoseDMP(nn.Module):
         *,
         goal: Pose | None = None,
         goal_body: ArrayLike | None = None,
+        goal_filter: float | None = None,
         coupling: ArrayLike | None = None,
         slowdown: ArrayLike | None = None,
     ) -> PoseState:
@@ -301,16 +302,20 @@ class PoseDMP(nn.Module):
             dt: [s], (*batch).
             goal: New goal from here on; changes neither pose nor twist of the moment.
             goal_body: New goal of the body from here on, (*batch, K).
+            goal_filter: Rate, per duration, at which goals move to where they were last told
+                to be, so that no acceleration jumps; None: they are there at once.
             coupling: Acceleration added to the position [m/s^2], (*batch, 3).
             slowdown: The clock runs 1 + slowdown times slower, (*batch), >= 0.
         """
         motion, rotation = state.motion, state.goal_orientation
-        ends = motion.goal
+        ends = motion.target
         if goal is not None:
             rotation = unit_quaternion(goal.orientation, rotation).expand_as(rotation)
-            error, rate = retarget(
+            curvature = self.motion.curvature(motion)
+            error, rate, error_curvature = retarget(
                 motion.position[..., ERROR],
                 motion.rate[..., ERROR],
+                curvature[..., ERROR],
                 state.goal_orientation,
                 rotation,
             )
@@ -319,12 +324,21 @@ class PoseDMP(nn.Module):
                 position=_replaced(motion.position, ERROR, error),
                 rate=_replaced(motion.rate, ERROR, rate),
             )
+            curvature = _replaced(curvature, ERROR, error_curvature)
+            motion = replace(motion, goal=self.motion.resting_point(motion, curvature))
             ends = _replaced(ends, POSITION, goal.position)
         if goal_body is not None:
             ends = _replaced(ends, BODY, goal_body)
         if coupling is not None:
             coupling = _replaced(torch.zeros_like(motion.position), POSITION, coupling)
-        motion = self.motion.step(motion, dt, goal=ends, coupling=coupling, slowdown=slowdown)
+        motion = self.motion.step(
+            motion,
+            dt,
+            goal=ends,
+            goal_filter=goal_filter,
+            coupling=coupling,
+            slowdown=slowdown,
+        )
         return PoseState(motion=motion, goal_orientation=rotation)
 
     def save(self, folder: str | Path) -> None:

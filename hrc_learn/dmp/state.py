@@ -18,6 +18,9 @@ class DMPState:
     """dy/ds, the velocity times the duration."""
     start: Float[Tensor, "*batch D"]
     goal: Float[Tensor, "*batch D"]
+    """What attracts the motion now."""
+    target: Float[Tensor, "*batch D"]
+    """Where the goal was last told to be; a filtered goal takes a while to get there."""
     duration: Float[Tensor, "*batch"]
     """[s] that the motion takes when nothing slows it."""
     pace: Float[Tensor, "*batch"]

@@ -134,3 +134,44 @@ def test_coupling_sampled_at_the_start_of_a_step_is_of_first_order():
         errors.append(abs(state.position.item() - expected))
     orders = np.log2(np.array(errors[:-1]) / errors[1:])
     assert ((orders > 0.9) & (orders < 1.2)).all(), orders
+
+
+# Filtered goals
+
+
+@pytest.mark.parametrize("spring", [SpringDamper(), SpringDamper(alpha=12.0, beta=20.0)])
+@pytest.mark.parametrize("n_steps", [3, 200])
+def test_a_filtered_goal_solves_the_equation(n_steps, spring):
+    """As a push of alpha beta (g - target), with g in closed form."""
+    time, position = arm_motion(n_joints=1, duration=2.0)
+    dmp = JointDMP.fit(time, position, n_basis=15, spring=spring)
+    start, goal = dmp.start.item(), dmp.goal.item()
+    expected = exact(
+        dmp,
+        start,
+        dmp.initial_state().rate.item(),
+        1.5,
+        (0.0, 0.9),
+        lambda s, y, rate: spring.stiffness * (goal - 1.5) * np.exp(-7.0 * s),
+    )
+    state = dmp.initial_state()
+    for k in range(n_steps):
+        change = {"goal": [1.5]} if k == 0 else {}
+        state = dmp.step(state, 2.0 * 0.9 / n_steps, goal_filter=7.0, **change)
+    np.testing.assert_allclose([state.position.item(), state.rate.item()], expected, atol=1e-8)
+    assert state.goal.item() == pytest.approx(1.5 + (goal - 1.5) * np.exp(-7.0 * 0.9))
+
+
+def test_curvature_is_the_derivative_of_the_rate():
+    dmp = primitive()
+    state = dmp.step(dmp.initial_state(), 0.7)
+    ahead, behind = (dmp.step(state, dt) for dt in (1e-5, -1e-5))
+    numeric = (ahead.rate - behind.rate) / 1e-5
+    torch.testing.assert_close(numeric, dmp.curvature(state), rtol=1e-5, atol=1e-4)
+
+
+@pytest.mark.parametrize("rate", [0.0, -1.0, 12.5])
+def test_impossible_goal_filters_are_refused(rate):
+    dmp = primitive()
+    with pytest.raises(ValueError, match="goal filter"):
+        dmp.step(dmp.initial_state(), 0.1, goal=[0.0], goal_filter=rate)

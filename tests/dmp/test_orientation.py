@@ -4,7 +4,12 @@ import torch
 from demo_motions import minimum_jerk, turning_motion
 
 from hrc_learn.dmp import OrientationDMP, PoseDMP
-from hrc_learn.dmp.orientation_error import angular_velocity, error_rate, nearest_turn
+from hrc_learn.dmp.orientation_error import (
+    angular_acceleration,
+    angular_velocity,
+    error_rate,
+    nearest_turn,
+)
 from hrc_learn.geometry import Pose, quaternion
 
 AXIS = torch.nn.functional.normalize(torch.tensor([1.0, 2.0, -0.5]).double(), dim=0)
@@ -114,6 +119,43 @@ def test_a_goal_that_jumps_moves_neither_pose_nor_velocity():
     for _ in range(60):
         jumped = dmp.step(jumped, 0.1)
     assert quaternion.angle(jumped.orientation, goal) < 1e-6
+
+
+def turned_away(dmp, angle):
+    """The goal, turned about another axis."""
+    axis = torch.nn.functional.normalize(torch.tensor([0.3, -1.0, 0.5]).double(), dim=0)
+    return quaternion.multiply(quaternion.exp(np.deg2rad(angle) * axis), dmp.goal)
+
+
+def acceleration_of(dmp, state):
+    """Angular acceleration at a state, times the duration squared."""
+    motion = state.motion
+    return angular_acceleration(motion.position, motion.rate, dmp.motion.curvature(motion))
+
+
+@pytest.mark.parametrize("angle", [90, 150])
+def test_a_filtered_goal_leaves_the_angular_acceleration_without_a_jump(angle):
+    dmp = OrientationDMP.fit(2 * S, turn(120))
+    before = dmp.step(dmp.initial_state(), 1.0)
+    goal = turned_away(dmp, angle)
+    filtered = dmp.step(before, 0.0, goal=goal, goal_filter=8.0)
+    plain = dmp.step(before, 0.0, goal=goal)
+    torch.testing.assert_close(acceleration_of(dmp, filtered), acceleration_of(dmp, before))
+    jump = (acceleration_of(dmp, plain) - acceleration_of(dmp, before)).norm()
+    assert jump > 0.5 * 4 * dmp.rollout().angular_acceleration.norm(dim=-1).max()
+
+
+@pytest.mark.parametrize("angle", [90, 150])
+def test_a_goal_that_jumps_far_is_reached_without_a_detour(angle):
+    dmp = OrientationDMP.fit(2 * S, turn(120))
+    goal = turned_away(dmp, angle)
+    state, speed = dmp.step(dmp.initial_state(), 1.0), []
+    for k in range(200):
+        state = dmp.step(state, 0.02, goal_filter=8.0, **({} if k else {"goal": goal}))
+        speed.append(state.angular_velocity.norm().item())
+    assert quaternion.angle(state.orientation, goal) < 1e-3
+    # At half time 60 degrees are left. The way is no longer than those and the new ones.
+    assert np.rad2deg(sum(speed) * 0.02) < 60 + angle
 
 
 def test_error_rate_inverts_angular_velocity():

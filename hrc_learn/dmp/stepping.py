@@ -1,0 +1,109 @@
+"""One exact step of a primitive in closed loop.
+
+What moves a primitive is linear: each influence has a motion of its own that solves the
+equation alone, known at both ends of the step. What the state differs from the sum of those
+dies out as the unforced spring has it. So no step is too long, whatever its length.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hrc_learn.dmp.response import Response
+from hrc_learn.dmp.spring import SpringDamper
+from hrc_learn.dmp.state import DMPState
+
+RESONANCE = 1e-3
+"""How close to a mode of the spring a goal filter may come, relative to the stiffness."""
+
+
+def advance(
+    state: DMPState,
+    ds: Float[Tensor, "*#batch"],
+    *,
+    response: Response,
+    weights: Float[Tensor, "*#batch D N"],
+    scale: Float[Tensor, "*#batch D"] | None,
+    target: Float[Tensor, "*batch D"],
+    goal_filter: float | None,
+    push: Float[Tensor, "*#batch D"] | None,
+    pace: Float[Tensor, "*batch"],
+) -> DMPState:
+    """Advance by `ds`, all influences as given for the whole step.
+
+    Args:
+        state: Where the primitive is.
+        ds: Step in normalised time (float64).
+        response: Of the primitive.
+        weights: Of the unscaled forcing term.
+        scale: Of the forcing term; None stands for one.
+        target: Where the goal shall be.
+        goal_filter: Rate dg/ds = -rate (g - target); None: the goal is there at once.
+        push: Constant second derivative added to the motion, by s.
+        pace: Kept in the state for its velocity.
+    """
+    spring, s = response.spring, state.s + ds
+    # Both transitions at once: over this step, and since the forcing has ended.
+    E, coast = spring.propagator(torch.stack([ds, response.coasting(s)])).to(target)
+    forced = coast @ (response.forced.to(s.device)(s).to(target) @ weights.mT)
+    before, after = state.forced, forced
+    if scale is not None:
+        before, after = before * scale[..., None, :], after * scale[..., None, :]
+    goal, *attracted = _attracted(state.goal, target, ds, goal_filter, spring)
+    before, after = before + attracted[0], after + attracted[1]
+    if push is not None:
+        # At rest the spring balances a push.
+        resting = torch.stack([push / spring.stiffness, torch.zeros_like(push)], dim=-2)
+        before, after = before + resting, after + resting
+    y = torch.stack([state.position, state.rate], dim=-2)
+    moved = E @ (y - before) + after
+    return DMPState(
+        position=moved[..., 0, :],
+        rate=moved[..., 1, :],
+        start=state.start,
+        goal=goal,
+        target=target,
+        duration=state.duration,
+        pace=pace,
+        s=s,
+        forced=forced,
+    )
+
+
+def second_derivative(
+    state: DMPState,
+    response: Response,
+    weights: Float[Tensor, "*#batch D N"],
+    scale: Float[Tensor, "*#batch D"] | None,
+) -> Float[Tensor, "*batch D"]:
+    """Y'' by s at a state, without coupling."""
+    force = (response.basis.forcing(state.s)[..., None, :].to(weights) @ weights.mT)[..., 0, :]
+    if scale is not None:
+        force = force * scale
+    return response.spring.acceleration(state.position - state.goal, state.rate) + force
+
+
+def _attracted(
+    goal: Tensor, target: Tensor, ds: Tensor, rate: float | None, spring: SpringDamper
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The goal after the step, and the (y, y') that goals alone lead to, before and after.
+
+    y_p = target + k (g - target), k = alpha beta / (rate^2 - alpha rate + alpha beta), solves
+    the equation for a goal that decays to its target.
+    """
+    if rate is None:
+        at_rest = torch.stack([target, torch.zeros_like(target)], dim=-2)
+        return target, at_rest, at_rest
+    denominator = rate**2 - spring.alpha * rate + spring.stiffness
+    if not rate > 0 or abs(denominator) < RESONANCE * spring.stiffness:
+        raise ValueError(
+            f"a goal filter needs a positive rate off the modes of the spring, got {rate}"
+        )
+    gain = spring.stiffness / denominator
+    lag_before = goal - target
+    lag_after = lag_before * torch.exp(-rate * ds).to(goal)[..., None]
+    before, after = (
+        torch.stack([target + gain * lag, -rate * gain * lag], dim=-2)
+        for lag in (lag_before, lag_after)
+    )
+    return target + lag_after, before, after
