@@ -86,18 +86,35 @@ class PullSpell:
 class ScriptedPuller:
     """A person who pulls at the arm's body at given times, and does nothing else."""
 
-    def __init__(self, chain: SerialChain, spells: Sequence[PullSpell]):
+    def __init__(
+        self, chain: SerialChain, spells: Sequence[PullSpell], begin: float | None = 0.0
+    ):
+        """Prepare the script.
+
+        Args:
+            chain: The arm.
+            spells: When and where it is pulled.
+            begin: Time from which the spells' times count [s]; None: not before `begin`.
+        """
         self._chain = chain
         self.spells = tuple(spells)
+        self._begin = begin
+
+    def begin(self, time: float) -> None:
+        """Start the script now [s]."""
+        self._begin = time
 
     def read(self, state: ArmState) -> HumanInput:
         """The effort of all spells that are on."""
         effort = np.zeros(len(self._chain.joint_names))
-        active = [spell for spell in self.spells if spell.strength(state.time) > 0.0]
+        if self._begin is None:
+            return HumanInput(effort=effort, twist=np.zeros(6))
+        time = state.time - self._begin
+        active = [spell for spell in self.spells if spell.strength(time) > 0.0]
         if active:
             q = torch.from_numpy(state.joint_position)
             origins = self._chain.link_poses(q).position.numpy()
             for spell in active:
-                force = spell.force(state.time, origins[spell.joint - 1])
+                force = spell.force(time, origins[spell.joint - 1])
                 effort += pull_effort(self._chain, state.joint_position, spell.joint, force)
         return HumanInput(effort=effort, twist=np.zeros(6))

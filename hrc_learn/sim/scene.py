@@ -126,7 +126,7 @@ def overhead_camera() -> CameraModel:
     """The camera above the table: image right is -x, image down +y, with a little distortion."""
     pose = np.eye(4)
     pose[:3, :3] = np.diag([-1.0, 1.0, -1.0])
-    pose[:3, 3] = (0.22, 0.50, 1.55)
+    pose[:3, 3] = (0.24, 0.52, 1.55)
     return CameraModel(
         focal=(2050.0, 2050.0), distortion=(-0.06, 0.02, 0.0, 0.0, 0.0), pose=pose
     )

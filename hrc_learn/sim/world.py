@@ -142,6 +142,18 @@ class World:
             poses[HAND_MARKER] = _pose(self.data.site("hand_marker"))
         return poses
 
+    def hand_marker_offset(self) -> Float[np.ndarray, "3"]:
+        """Centre of the hand's marker in the frame of the tool centre point [m].
+
+        Raises:
+            ValueError: If the hand carries no marker.
+        """
+        if self.config.arm.marker is None:
+            raise ValueError("this scene's hand carries no marker: give its arm a Plate.")
+        to_tool = np.linalg.inv(self.arm.tcp_pose())
+        marker = self.marker_poses()[HAND_MARKER]
+        return (to_tool @ marker)[:3, 3]
+
     def collisions_along(
         self, path: Float[np.ndarray, "steps 7"], carried: str | None = None
     ) -> list[Touch]:

@@ -1,5 +1,11 @@
 """The pieces put to work: demonstrating, grasping, placing, and the whole collaboration."""
 
+from .aiming import Aimer as Aimer
+from .aiming import AimingConfig as AimingConfig
+from .aiming import TaskFailedError as TaskFailedError
+from .collaboration import Collaboration as Collaboration
+from .collaboration import CollaborationConfig as CollaborationConfig
+from .collaboration import CollaborationResult as CollaborationResult
 from .eye import Eye as Eye
 from .fit_aiming import AimingSkill as AimingSkill
 from .fit_aiming import fit_aiming as fit_aiming
@@ -9,9 +15,12 @@ from .placing import BlockedPathError as BlockedPathError
 from .placing import PlacingSkill as PlacingSkill
 from .placing import Plan as Plan
 from .placing import check_plan as check_plan
+from .station import Station as Station
+from .station import StationConfig as StationConfig
 from .teach_aiming import OBJECT_FEATURE as OBJECT_FEATURE
 from .teach_aiming import OBJECT_FEATURE_NAMES as OBJECT_FEATURE_NAMES
 from .teach_aiming import AimingLesson as AimingLesson
+from .teach_aiming import random_object_pose as random_object_pose
 from .teach_aiming import teach_aiming as teach_aiming
 from .teach_placing import PlacingLesson as PlacingLesson
 from .teach_placing import teach_placing as teach_placing

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 
 import numpy as np
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -58,6 +59,26 @@ def straight_line(
         s, slope = minimum_jerk(k * dt / duration)
         turned = quaternion.multiply(quaternion.exp(s * twist[3:]), start.orientation)
         yield Pose(start.position + s * twist[:3], turned), twist * (slope / duration)
+
+
+def joint_line(
+    start: Float[Tensor, " joints"], goal: Float[Tensor, " joints"], speed: float, dt: float
+) -> Float[Tensor, "steps joints"]:
+    """Joint positions on a straight line in joint space, from rest to rest.
+
+    Args:
+        start: First [rad].
+        goal: Last [rad].
+        speed: Largest speed of any joint [rad/s].
+        dt: Time between samples [s].
+    """
+    # A minimum jerk motion peaks at 1.875 times its mean speed.
+    duration = max(1.875 * float((goal - start).abs().max()) / speed, dt)
+    steps = round(duration / dt) + 1
+    progress = torch.tensor(
+        [minimum_jerk(k * dt / duration)[0] for k in range(steps + 1)], dtype=start.dtype
+    )
+    return torch.lerp(start, goal, progress[:, None])
 
 
 def path_velocity(

@@ -12,12 +12,12 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from ..controller import SafetyFilter
+from ..controller import INTERVENTIONS, Command, SafetyFilter
 from ..geometry import Pose
 from ..kinematics import SerialChain
-from ..protocols import Arm, ArmState, Camera, Gripper, Human, HumanInput
-from ..vision import MarkerDetector, centre
+from ..protocols import Arm, ArmState, Gripper, Human, HumanInput
 from ..viz import StepLog
+from .eye import Eye
 from .motion import path_velocity, resolved_rate, straight_line
 
 
@@ -27,16 +27,14 @@ class StationConfig:
 
     dt: float = 0.01
     """Control step [s]."""
-    camera_every: int = 4
-    """Control steps from one image to the next."""
-    keep_image_every: int = 25
-    """Control steps from one image kept in the recording to the next."""
+    look_every: int = 4
+    """Control steps from one image to the next, while the task watches the camera."""
+    keep_every: int = 40
+    """Control steps from one image kept for the recording to the next."""
     damping: float = 3.0
-    """c_d: effort that moves the body at one unit of joint speed (paper, Table I) [N m s/rad]."""
+    """c_d: effort that moves the body by one unit of joint speed (paper, Table I)."""
     pose_gain: float = 4.0
     """How fast an error of pose is corrected on given motions [1/s]."""
-    marker_ids: tuple[int, ...] = ()
-    """ArUco numbers to look for."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,15 +43,18 @@ class Sight:
 
     time: float = -np.inf
     """When the image was taken [s]."""
+    joints: Float[Tensor, " joints"] | None = None
+    """Joint positions at that time [rad]."""
     pixels: Mapping[int, Float[np.ndarray, "2"]] = field(default_factory=dict)
     """Centre of each marker in it, by number (u, v) [px]."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class KeptImage:
     """An image kept for the recording."""
 
     time: float
+    """[s]"""
     image: UInt8[np.ndarray, "height width 3"]
 
 
@@ -61,12 +62,14 @@ class Station:
     """Runs the loop: look, listen to the person, command, wait, log.
 
     Attributes:
+        chain: Kinematics of the arm.
+        gripper: Its gripper's driver.
         state: Newest reading of the arm.
         sight: Newest detection of markers.
         asked: What the person asks for now.
-        log: Columns of every step so far.
+        watching: Whether images are taken and markers looked for at every `look_every` steps.
+        log: Columns of every step so far, and the phases of the task.
         images: Images kept for the recording.
-        phase: Name of what the task is doing, for the log.
     """
 
     def __init__(
@@ -75,10 +78,11 @@ class Station:
         chain: SerialChain,
         arm: Arm,
         gripper: Gripper,
-        camera: Camera | None,
+        eye: Eye,
         human: Human,
         advance: Callable[[float], None],
         config: StationConfig | None = None,
+        on_phase: Callable[[str, float], None] = lambda phase, time: None,
     ):
         """Take hold of the parts and look once.
 
@@ -86,24 +90,26 @@ class Station:
             chain: Kinematics of the arm.
             arm: Its driver.
             gripper: Its gripper's driver.
-            camera: The fixed camera; None where the task needs none.
-            human: The person beside it.
+            eye: The fixed camera and what finds markers in its images.
+            human: The person beside the arm.
             advance: Lets a given time pass [s].
             config: How the loop runs.
+            on_phase: Told the name of each phase of the task, and when it begins [s].
         """
         self.config = config or StationConfig()
         self.chain = chain
         self.gripper = gripper
-        self.human = human
+        self.watching = False
         self.log = StepLog()
         self.images: list[KeptImage] = []
-        self.phase = ""
-        self.sight = Sight()
-        self._arm, self._camera, self._advance = arm, camera, advance
-        self._detector = MarkerDetector(list(self.config.marker_ids))
+        self._arm, self._eye, self._human = arm, eye, human
+        self._advance, self._on_phase = advance, on_phase
         self._safety = SafetyFilter(chain.limits)
         self._ticks = 0
-        self._observe()
+        self.state: ArmState = arm.read()
+        self.asked: HumanInput = human.read(self.state)
+        self.sight = Sight()
+        self.look()
         self._guard = self._safety.initial_state(self.joints)
 
     @property
@@ -113,7 +119,7 @@ class Station:
 
     @property
     def pose(self) -> Pose:
-        """Pose of the hand from the measured joints."""
+        """Pose of the hand, from the measured joints."""
         return self.chain.forward(self.joints)
 
     @property
@@ -122,79 +128,116 @@ class Station:
         return self.state.time
 
     def enter(self, phase: str) -> None:
-        """Note in the log that another phase of the task begins."""
-        self.phase = phase
+        """Begin another phase of the task."""
         self.log.event(self.time, phase)
+        self._on_phase(phase, self.time)
 
-    def step(self, joint_velocity: Float[Tensor, " joints"], **columns) -> None:
-        """Send one command through the safety filter, and let one step pass.
+    def look(self) -> Sight:
+        """Take an image and find the markers in it."""
+        pixels = self._eye.look()
+        self.sight = Sight(time=self.time, joints=self.joints, pixels=pixels)
+        return self.sight
 
-        Args:
-            joint_velocity: Wanted [rad/s].
-            columns: Further values to log with this step.
-        """
+    def step(self, joint_velocity: Float[Tensor, " joints"]) -> None:
+        """Send a command through the safety filter, and let one step pass [rad/s]."""
         safe, self._guard, report = self._safety.step(
             self._guard, self.joints, joint_velocity, self.config.dt
         )
-        columns["safety"] = report.flags
-        self.command(safe, **columns)
+        self._send(safe, safety=report.flags.numpy(), **_NOTHING_SEEN)
 
-    def command(self, joint_velocity: Float[Tensor, " joints"], **columns) -> None:
-        """Send a command that has passed a safety filter, and let one step pass."""
-        velocity = joint_velocity.numpy()
-        pose = self.pose
-        self.log.append(
-            time=self.time,
-            joint_position=self.state.joint_position,
-            joint_velocity=velocity,
-            position=pose.position.numpy(),
-            orientation=pose.orientation.numpy(),
-            human_effort=self.asked.effort,
-            gripper=self.state.gripper_width,
-            **columns,
+    def obey(
+        self, command: Command, target: Float[np.ndarray, "2"], feature: np.ndarray
+    ) -> None:
+        """Carry out one step of the adaptive controller, which has its own safety filter.
+
+        Args:
+            command: Of the controller.
+            target: Where the feature should be [px].
+            feature: Where it is; NaN if it is not seen [px].
+        """
+        self._guard = self._safety.initial_state(self.joints, command.joint_velocity)
+        self._send(
+            command.joint_velocity,
+            safety=command.safety.flags.numpy(),
+            feature=feature,
+            target=target,
+            image_jacobian=command.image_jacobian.numpy(),
+            weight_norm=float(command.weight_norm),
+            potential=float(command.potential),
+            vision_activation=float(command.vision_activation),
         )
-        self._arm.command(velocity)
-        self._advance(self.config.dt)
-        self._ticks += 1
-        self._observe()
-
-    def wait(self, duration: float) -> None:
-        """Stand still, yielding to the person."""
-        for _ in range(round(duration / self.config.dt)):
-            self.follow(self.pose, torch.zeros(6, dtype=torch.float64))
 
     def follow(self, goal: Pose, twist: Float[Tensor, "6"]) -> None:
         """One step of keeping the hand on a moving goal while the person may push the body."""
-        correction = self.config.pose_gain * self.pose.twist_to(goal)
+        pose, J = self.chain.forward_and_jacobian(self.joints)
+        correction = self.config.pose_gain * pose.twist_to(goal)
         effort = torch.from_numpy(self.asked.effort) / self.config.damping
-        self.step(resolved_rate(self.chain.jacobian(self.joints), twist + correction, effort))
+        self.step(resolved_rate(J, twist + correction, effort))
 
-    def move_straight(self, goal: Pose, speed: float = 0.15) -> None:
-        """Move the hand to a pose on a straight line [m/s]."""
+    def stay(self, duration: float) -> None:
+        """Keep the hand where it is for a while [s], yielding to the person."""
+        goal, still = self.pose, torch.zeros(6, dtype=torch.float64)
+        for _ in range(round(duration / self.config.dt)):
+            self.follow(goal, still)
+
+    def move_straight(self, goal: Pose, speed: float = 0.15, settle: float = 0.4) -> None:
+        """Move the hand to a pose on a straight line, and let it come to rest.
+
+        Args:
+            goal: Where to.
+            speed: Mean speed [m/s].
+            settle: Time at the end [s].
+        """
         for pose, twist in straight_line(self.pose, goal, speed, self.config.dt):
             self.follow(pose, twist)
-        for _ in range(round(0.5 / self.config.dt)):
-            self.follow(goal, torch.zeros(6, dtype=torch.float64))
+        still = torch.zeros(6, dtype=torch.float64)
+        for _ in range(round(settle / self.config.dt)):
+            self.follow(goal, still)
 
     def play(self, path: Float[np.ndarray, "steps joints"]) -> None:
-        """Move the joints along a path sampled at the station's step.
+        """Move the joints along a path sampled at the control step.
 
-        The person's effort is not followed meanwhile: a planned path is free of obstacles
-        only as planned.
+        The person's effort is not followed meanwhile: a planned path avoids obstacles only as
+        it was planned.
         """
         for k, q in enumerate(path):
             error = torch.from_numpy(q) - self.joints
             velocity = torch.from_numpy(path_velocity(path, k, self.config.dt))
             self.step(velocity + self.config.pose_gain * error)
 
-    def _observe(self) -> None:
-        self.state: ArmState = self._arm.read()
-        self.asked: HumanInput = self.human.read(self.state)
-        if self._camera is None or self._ticks % self.config.camera_every:
-            return
-        image = self._camera.read()
-        found = self._detector.detect(image)
-        pixels = {id: centre(corners) for id, corners in found.items()}
-        self.sight = Sight(time=self.time, pixels=pixels)
-        if self._ticks % self.config.keep_image_every < self.config.camera_every:
-            self.images.append(KeptImage(time=self.time, image=image))
+    def _send(self, velocity: Float[Tensor, " joints"], **columns) -> None:
+        links = self.chain.link_poses(self.joints)
+        self.log.append(
+            time=self.time,
+            joint_position=self.state.joint_position,
+            joint_velocity=velocity.numpy(),
+            link_position=links.position.numpy(),
+            link_orientation=links.orientation.numpy(),
+            human_effort=self.asked.effort,
+            gripper=self.state.gripper_width,
+            **columns,
+        )
+        self._arm.command(velocity.numpy())
+        self._advance(self.config.dt)
+        self._ticks += 1
+        self.state = self._arm.read()
+        self.asked = self._human.read(self.state)
+        keep = self._ticks % self.config.keep_every == 0
+        if keep or (self.watching and self._ticks % self.config.look_every == 0):
+            self.look()
+        if keep and self._eye.image is not None:
+            self.images.append(KeptImage(time=self.time, image=self._eye.image))
+
+
+_NAN = float("nan")
+_NOTHING_SEEN = {
+    "feature": np.full(2, _NAN),
+    "target": np.full(2, _NAN),
+    "image_jacobian": np.full((2, 6), _NAN),
+    "weight_norm": _NAN,
+    "potential": _NAN,
+    "vision_activation": _NAN,
+}
+
+SAFETY_COLUMNS = INTERVENTIONS
+"""Names of the components of the log's column "safety"."""

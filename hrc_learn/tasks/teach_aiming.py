@@ -30,7 +30,7 @@ class AimingLesson(TeachingConfig):
     """From the first point to above the object [s]."""
     points: int = 4
     """Random points passed before the object."""
-    reach: tuple[float, float, float] = (0.10, 0.09, 0.06)
+    reach: tuple[float, float, float] = (0.10, 0.08, 0.06)
     """How far from the middle of the table the points lie, and how far above hovering [m]."""
     wobble: float = 0.12
     """Amplitude of small turns of the hand on the way, which show how turning acts [rad]."""
@@ -100,7 +100,9 @@ def teach_aiming(
     expert = aiming_expert(workplace, above, lesson, rng)
     start = torch.from_numpy(expert.path.position(0.0))
     goal = type(workplace.hover())(start, expert.orientation(start, 0.0))
-    world.reset(panda.inverse(goal, 0.2, near=panda.ready).numpy(), {item.name: pose})
+    world.reset(
+        panda.inverse(goal, workplace.hover_q7, near=panda.ready).numpy(), {item.name: pose}
+    )
     last = np.zeros(2)
 
     def observe() -> Frame:

@@ -24,10 +24,12 @@ class Workplace:
     """Hand between table and cabinet, where a placing motion starts [m]."""
     home_q7: float = -1.0
     """Joint 7 at home [rad]: the elbow leans to the left, away from the cabinet."""
-    table_centre: tuple[float, float] = (0.22, 0.50)
+    table_centre: tuple[float, float] = (0.24, 0.54)
     """Middle of the part of the table that the camera sees well [m]."""
     hover_height: float = 0.17
     """Of the tool centre point while it aims at an object [m]."""
+    hover_q7: float = -0.1
+    """Joint 7 above the table [rad]."""
     shelf_x: float = 0.40
     """Where along the boards things are put [m]."""
     shelf_depth: float = 0.10
@@ -51,6 +53,13 @@ class Workplace:
     def hover(self) -> Pose:
         """Hand above the middle of the table, pointing down."""
         return Pose(_vector(*self.table_centre, self.hover_height), gripper_down())
+
+    def hover_joints(self) -> torch.Tensor:
+        """Joint positions with the hand above the table, the upper arm well off the vertical.
+
+        Where it stands upright, joints 1 and 3 are in line, and nobody can pull the elbow.
+        """
+        return panda.inverse(self.hover(), self.hover_q7, near=_LEANING_FORWARD)
 
     def shelf_names(self) -> tuple[str, ...]:
         """From bottom to top."""

@@ -1,0 +1,82 @@
+"""What a run of the collaboration has to reach, measured."""
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+
+from ..kinematics import panda
+from ..sim import ObjectConfig, World
+from ..viz.report import Measurement
+from .collaboration import CollaborationResult
+from .recording import Deviation
+from .station import Station
+
+
+def evaluate(
+    result: CollaborationResult,
+    station: Station,
+    world: World,
+    item: ObjectConfig,
+    shelf: str,
+    fit: Mapping[str, float],
+) -> list[Measurement]:
+    """Compare a run with its targets.
+
+    Success is read from the simulator's contacts and poses, not from what the task believes.
+
+    Args:
+        result: Of the task.
+        station: That ran it.
+        world: In its state at the end of the run.
+        item: What was to be placed.
+        shelf: Where.
+        fit: Metrics of the fitted primitives.
+    """
+    distance, angle = result.goal_error
+    deviation = Deviation.of(station, result.grasp.interaction)
+    touches = world.cabinet_contacts.touches + _carried_touches(station, world)
+    placed = world.rests_on(item.name, f"board_{shelf}")
+    values = (
+        ("reproduction of the demonstrations, NRMSE", fit["joint_nrmse_median"], "", 1e-3),
+        ("time to aim", result.grasp.aim_time, "s", None),
+        ("pixel error when the hand goes down", result.grasp.pixel_error, "px", 5.0),
+        ("end effector moved by the person", 1e3 * deviation.most("position"), "mm", 1.0),
+        ("end effector turned by the person", _degrees(deviation.most("rotation")), "deg", 0.2),
+        ("goal error at the shelf", 1e3 * distance, "mm", 2.0),
+        ("goal error at the shelf, angle", _degrees(angle), "deg", 0.5),
+        ("joint limit violations", limit_violations(station), "steps", 0),
+        ("collisions with the cabinet", len(touches), "", 0),
+        ("collisions with the table", len(world.table_contacts.touches), "", 0),
+    )
+    table = [
+        Measurement(name=name, value=value, unit=unit, target=target)
+        for name, value, unit, target in values
+    ]
+    at_least = (
+        ("elbow moved by the person", deviation.most("elbow"), "m", 0.1),
+        ("object stands on the shelf", int(placed), "", 1),
+    )
+    return table + [
+        Measurement(name=name, value=value, unit=unit, target=target, at_least=True)
+        for name, value, unit, target in at_least
+    ]
+
+
+def _degrees(angle: float) -> float:
+    return float(np.rad2deg(angle))
+
+
+def limit_violations(station: Station) -> int:
+    """Steps in which a joint was outside its range of position or velocity."""
+    q = torch.from_numpy(station.log["joint_position"])
+    v = torch.from_numpy(station.log["joint_velocity"])
+    limits = panda.limits
+    outside = (q < limits.lower) | (q > limits.upper) | (v.abs() > limits.velocity * (1 + 1e-9))
+    return int(outside.any(dim=-1).sum())
+
+
+def _carried_touches(station: Station, world: World) -> list:
+    """Touches of the cabinet by the object before it was let go."""
+    release = next((e.time for e in station.log.events if e.text == "release"), np.inf)
+    return [touch for touch in world.object_contacts.touches if touch.start < release]
