@@ -1,5 +1,6 @@
 """Dynamic movement primitives: learned motions that start, goal and duration reshape."""
 
+from hrc_learn.dmp import coupling as coupling
 from hrc_learn.dmp.basis import GaussianBasis as GaussianBasis
 from hrc_learn.dmp.canonical import ExponentialPhase as ExponentialPhase
 from hrc_learn.dmp.joint import JointDMP as JointDMP

@@ -1,0 +1,125 @@
+import pytest
+import torch
+from demo_motions import minimum_jerk
+
+from hrc_learn.dmp import JointDMP
+from hrc_learn.dmp.coupling import (
+    nearest_on_box,
+    nearest_on_sphere,
+    phase_stopping,
+    repulsion,
+    steering,
+)
+
+S = torch.linspace(0, 1, 400, dtype=torch.float64)
+OBSTACLE = torch.tensor([0.3, 0.01, 0.0], dtype=torch.float64)
+
+
+def reach_past_the_obstacle():
+    """A straight line of 0.6 m in 3 s that passes 10 mm beside the obstacle."""
+    way = torch.tensor([0.6, 0.0, 0.0], dtype=torch.float64)
+    return JointDMP.fit(3 * S, minimum_jerk(S)[:, None] * way, units="m")
+
+
+def run(dmp, couple, steps=600):
+    state, path = dmp.initial_state(), []
+    with torch.no_grad():
+        for _ in range(steps):
+            state = dmp.step(state, 0.01, coupling=couple(state))
+            path.append(state.position)
+    return torch.stack(path)
+
+
+def clearance(path):
+    return (path - OBSTACLE).norm(dim=-1).min().item()
+
+
+@pytest.mark.parametrize(
+    "couple",
+    [
+        lambda state: steering(state.position, state.velocity, OBSTACLE[None], gain=200.0),
+        lambda state: repulsion(state.position, OBSTACLE[None], reach=0.15, gain=2e-3),
+    ],
+    ids=["steering", "repulsion"],
+)
+def test_obstacles_are_passed_and_the_goal_is_reached(couple):
+    dmp = reach_past_the_obstacle()
+    plain, avoiding = run(dmp, lambda state: None), run(dmp, couple)
+    assert clearance(plain) < 0.011
+    assert clearance(avoiding) > 0.04
+    torch.testing.assert_close(avoiding[-1], dmp.goal, rtol=0, atol=1e-3)
+
+
+def test_steering_neither_drives_nor_brakes():
+    rng = torch.Generator().manual_seed(0)
+    position, velocity = torch.randn(2, 50, 3, generator=rng, dtype=torch.float64)
+    obstacles = torch.randn(50, 4, 3, generator=rng, dtype=torch.float64)
+    term = steering(position, velocity, obstacles)
+    power = (term * velocity).sum(-1)
+    torch.testing.assert_close(power, torch.zeros_like(power), rtol=0, atol=1e-9)
+
+
+def test_steering_turns_away_from_the_obstacle():
+    velocity = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
+    for side in (-1.0, 1.0):
+        obstacle = torch.tensor([[1.0, 0.2 * side, 0.0]], dtype=torch.float64)
+        term = steering(torch.zeros(3).double(), velocity, obstacle)
+        assert term[1] * side < 0
+        near, far = (
+            steering(torch.zeros(3).double(), velocity, k * obstacle, reach=0.5).norm()
+            for k in (1, 2)
+        )
+        assert far < near < term.norm()
+
+
+def test_steering_is_finite_at_rest_and_straight_ahead():
+    obstacle = torch.tensor([[1.0, 0.0, 0.0]])
+    for velocity in (torch.zeros(3), torch.tensor([1.0, 0.0, 0.0])):
+        assert (steering(torch.zeros(3), velocity, obstacle) == 0).all()
+
+
+def test_repulsion_is_the_gradient_of_its_potential():
+    rng = torch.Generator().manual_seed(0)
+    position = torch.rand(100, 3, generator=rng, dtype=torch.float64).requires_grad_()
+    obstacles = torch.rand(3, 3, generator=rng, dtype=torch.float64)
+    distance = (position[:, None] - obstacles).norm(dim=-1)
+    potential = 0.5e-3 * (1 / distance - 1 / 0.4).clamp_min(0) ** 2
+    (gradient,) = torch.autograd.grad(potential.sum(), position)
+    torch.testing.assert_close(repulsion(position, obstacles, reach=0.4), -gradient)
+    assert (gradient == 0).any(dim=-1).any()
+
+
+def test_nearest_points_lie_on_the_obstacle():
+    rng = torch.Generator().manual_seed(0)
+    position = 2 * torch.randn(200, 3, generator=rng, dtype=torch.float64)
+    centre, half = torch.tensor([[0.1, -0.2, 0.3], [0.5, 1.0, 0.2]], dtype=torch.float64)
+    on_box = nearest_on_box(position, centre, half)
+    inside = ((position - centre).abs() <= half).all(-1)
+    assert inside.any()
+    torch.testing.assert_close(on_box[inside], position[inside])
+    # No point of the box is nearer.
+    cloud = centre + half * (2 * torch.rand(5000, 3, generator=rng, dtype=torch.float64) - 1)
+    nearest = torch.cdist(position, cloud).amin(-1)
+    assert ((on_box - position).norm(dim=-1) <= nearest + 1e-12).all()
+    on_sphere = nearest_on_sphere(position, centre, 0.7)
+    outside = (position - centre).norm(dim=-1) > 0.7
+    radii = (on_sphere - centre).norm(dim=-1)
+    torch.testing.assert_close(radii[outside], torch.full_like(radii[outside], 0.7))
+    torch.testing.assert_close(on_sphere[~outside], position[~outside])
+
+
+def test_a_held_robot_is_waited_for():
+    """Held at its start, the motion all but stops; let go, it ends on its path."""
+    dmp = reach_past_the_obstacle()
+    state, robot = dmp.initial_state(), dmp.start
+    with torch.no_grad():
+        for k in range(1500):
+            slowdown = phase_stopping(state.position, robot, gain=1e4)
+            state = dmp.step(state, 0.01, slowdown=slowdown)
+            if k >= 500:
+                robot = state.position
+            if k == 499:
+                assert state.s < 0.5
+                on_path = dmp.rollout(time=3 * state.s[None]).position[0]
+                torch.testing.assert_close(state.position, on_path, rtol=0, atol=1e-9)
+    torch.testing.assert_close(state.position, dmp.goal, rtol=0, atol=1e-3)
