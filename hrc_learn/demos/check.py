@@ -57,8 +57,8 @@ def _check_frames(
 ) -> list[tuple[EpisodeEntry, RawFrames]]:
     """Everything that needs no understanding of the columns."""
     sound = []
-    for file in dict.fromkeys(entry.file for entry in folder.episodes):
-        for entry, frames in structure.check_file(folder, file, report):
+    for file, entries in folder.files().items():
+        for entry, frames in structure.check_file(folder, file, entries, report):
             structure.check_indices(folder, entry, frames, report)
             values.check_finite(folder.features, entry, frames, report)
             values.check_repeats(entry, frames, report)

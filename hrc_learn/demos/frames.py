@@ -28,8 +28,12 @@ def read_frames(
         DatasetError: A file or column is missing or damaged, a column is not as wide as
             declared, or the rows are not those the metadata promise.
     """
+    promised = {
+        file: max(entry.start + entry.length for entry in group)
+        for file, group in folder.files().items()
+    }
     for file, group in groupby(entries, key=lambda entry: entry.file):
-        yield from _read_file(folder, file, list(group), keys)
+        yield from _read_file(folder, file, list(group), keys, promised[file])
 
 
 def slice_frames(columns: RawFrames, start: int, length: int) -> RawFrames:
@@ -38,10 +42,14 @@ def slice_frames(columns: RawFrames, start: int, length: int) -> RawFrames:
 
 
 def _read_file(
-    folder: DatasetFolder, file: str, entries: list[EpisodeEntry], keys: Sequence[str]
+    folder: DatasetFolder,
+    file: str,
+    entries: list[EpisodeEntry],
+    keys: Sequence[str],
+    promised: int,
 ) -> Iterator[tuple[EpisodeEntry, RawFrames]]:
     parquet = open_parquet(folder.root, file, entries[0].index)
-    _require_rows(folder, file, parquet.metadata.num_rows)
+    require_rows(file, entries, parquet.metadata.num_rows, promised)
     existing = parquet.schema_arrow.names
     for key in keys:
         if key not in existing:
@@ -71,12 +79,15 @@ def _read_file(
         yield entry, frames
 
 
-def _require_rows(folder: DatasetFolder, file: str, rows: int) -> None:
-    entries = [entry for entry in folder.episodes if entry.file == file]
-    expected = max(entry.start + entry.length for entry in entries)
-    if rows != expected:
+def require_rows(file: str, entries: Sequence[EpisodeEntry], rows: int, promised: int) -> None:
+    """Refuse a file that holds more or fewer frames than the list of episodes promises.
+
+    Raises:
+        DatasetError: It does.
+    """
+    if rows != promised:
         raise DatasetError(
-            f"holds {rows} frames, but the list of episodes promises {expected}: frames were "
+            f"holds {rows} frames, but the list of episodes promises {promised}: frames were "
             f"lost or repeated, or the metadata belong to another copy",
             file=file,
             episode=entries[0].index if len(entries) == 1 else None,

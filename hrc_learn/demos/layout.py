@@ -70,6 +70,13 @@ class DatasetFolder:
     info: dict
     """`meta/info.json` as it is."""
 
+    def files(self) -> dict[str, list[EpisodeEntry]]:
+        """Data file -> the episodes in it."""
+        files: dict[str, list[EpisodeEntry]] = {}
+        for entry in self.episodes:
+            files.setdefault(entry.file, []).append(entry)
+        return files
+
 
 def open_folder(path: str | Path) -> DatasetFolder:
     """Read the metadata of a dataset.

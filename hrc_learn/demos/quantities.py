@@ -17,6 +17,13 @@ def select_quantities(frames: RawFrames, selections: Mapping[str, Selection]) ->
     return {role: _columns(frames, selection.columns) for role, selection in selections.items()}
 
 
+def frame_step(time: Float64[np.ndarray, "frames 1"] | None, fps: float) -> float:
+    """Usual step of true stamps as a multiple of the nominal period; 1 without stamps."""
+    if time is None or len(time) < 2:
+        return 1.0
+    return float(np.median(np.diff(time[:, 0]))) * fps
+
+
 def _columns(
     frames: RawFrames, columns: Sequence[tuple[str, int]]
 ) -> Float64[np.ndarray, "frames components"]:

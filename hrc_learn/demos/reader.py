@@ -14,7 +14,7 @@ from .frames import RawFrames, read_frames
 from .layout import DatasetFolder, EpisodeEntry, open_folder
 from .matching import Matching, match_columns
 from .poses import matrix_position, to_quaternion
-from .quantities import Quantities, select_quantities
+from .quantities import Quantities, frame_step, select_quantities
 from .roles import ORIENTATION_ROLES
 from .sidecar import read_sidecar
 from .stamps import stamps
@@ -56,7 +56,9 @@ def load_demos(
         role: max(float(np.abs(quantities[role]).max()) for _, quantities in raw.values())
         for role in matching.selections
     }
-    decisions = decide_units(largest, sidecar.units, units or {})
+    _, first = raw[entries[0].index]
+    step = frame_step(first.get("time"), folder.fps)
+    decisions = decide_units(largest, sidecar.units, units or {}, step)
     demos = [
         _demonstration(folder, entry, *raw[entry.index], matching, decisions)
         for entry in entries

@@ -84,6 +84,7 @@ def decide_units(
     largest: Mapping[str, float],
     declared: Mapping[str, str],
     given: Mapping[str, str],
+    frame_step: float = 1.0,
 ) -> dict[str, UnitDecision]:
     """Decide on a unit for every quantity.
 
@@ -91,6 +92,7 @@ def decide_units(
         largest: Largest absolute value of each quantity on disk, by role.
         declared: Units by role from the dataset's sidecar.
         given: Units by role from the caller; they win.
+        frame_step: Step of the true stamps on disk, as a multiple of the nominal period [s].
 
     Raises:
         DatasetError: A unit is unknown, or does not fit its quantity.
@@ -105,6 +107,8 @@ def decide_units(
             decisions[role] = UnitDecision(role=role, unit=stated[role])
         elif (leader := decisions.get(_FOLLOWERS.get(role, ""))) is not None:
             decisions[role] = UnitDecision(role=role, unit=_following_unit(role, leader.unit))
+        elif role == "time":
+            decisions[role] = _guess_time(frame_step)
         elif role in _GUESSABLE:
             decisions[role] = _guess(role, largest[role])
         else:
@@ -144,3 +148,17 @@ def _guess(role: str, largest: float) -> UnitDecision:
         ),
         converts=unit != ROLES[role].unit,
     )
+
+
+def _guess_time(frame_step: float) -> UnitDecision:
+    """The unit of stamps, from how far their step is off the frame rate."""
+    sizes = _DIMENSIONS["time"]
+    off = {unit: abs(math.log10(max(frame_step, 1e-3) * size)) for unit, size in sizes.items()}
+    unit = min(off, key=off.__getitem__)
+    if unit == "s":
+        return UnitDecision(role="time", unit=unit)
+    note = (
+        f"time: no unit declared, steps are {frame_step:.3g} times 1/fps: taken for {unit}; "
+        f"overrule with units={{'time': ...}}"
+    )
+    return UnitDecision(role="time", unit=unit, note=note, converts=True)

@@ -180,6 +180,17 @@ def test_true_stamps_are_preferred_and_begin_at_zero(tmp_path):
     assert demo.start_time == pytest.approx(stamps[0])
 
 
+@pytest.mark.parametrize(("unit", "size"), [("s", 1), ("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9)])
+def test_units_of_stamps_are_guessed_from_the_frame_rate(tmp_path, recwarn, unit, size):
+    stamps = 5 + np.arange(60) / FPS * 1.2  # a recorder that fell behind
+    episode = {STATE: joint_path(60), "time_stamp": stamps[:, None] / size}
+    root = write_folder(tmp_path / "set", [episode], {STATE: PANDA}, dtype="float64")
+    demos = load_demos(root)
+    np.testing.assert_allclose(demos[0].time, stamps - 5, atol=1e-9)
+    assert any(note.startswith("time: ") for note in demos.notes) == (unit != "s")
+    assert bool(recwarn.list) == (unit != "s")
+
+
 @pytest.mark.parametrize("without", ["timestamp", "frame_index", "index", "task_index"])
 def test_index_columns_may_be_missing(tmp_path, without):
     root = write_folder(

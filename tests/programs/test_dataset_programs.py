@@ -4,6 +4,7 @@ import importlib.util
 import json
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +30,12 @@ def run(monkeypatch, capsys, program, *arguments):
         cli.run(module.main, module.Args)
     captured = capsys.readouterr()
     return ended.value.code, captured.out, captured.err
+
+
+@pytest.fixture(autouse=True)
+def _warnings_as_before(monkeypatch):
+    """Programs change how warnings look; that must not outlive the test."""
+    monkeypatch.setattr(warnings, "formatwarning", warnings.formatwarning)
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from ..frames import RawFrames
 from ..layout import DatasetFolder, EpisodeEntry
 from ..matching import Matching, match_columns
 from ..poses import to_quaternion
-from ..quantities import Quantities, select_quantities
+from ..quantities import Quantities, frame_step, select_quantities
 from ..roles import ORIENTATION_ROLES
 from ..sidecar import read_sidecar
 from ..units import UnitDecision, decide_units
@@ -53,7 +53,8 @@ def understand(
         role: max((float(np.abs(q[role]).max()) for _, _, q in raw), default=0.0)
         for role in matching.selections
     }
-    decisions = decide_units(largest, sidecar.units, units) if raw else {}
+    step = frame_step(raw[0][2].get("time"), folder.fps) if raw else 1.0
+    decisions = decide_units(largest, sidecar.units, units, step) if raw else {}
     _report_guesses(matching, decisions, report)
     understood = []
     for entry, frames, quantities in raw:

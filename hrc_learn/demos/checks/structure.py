@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ..finding import DatasetError
-from ..frames import RawFrames
+from ..frames import RawFrames, require_rows, slice_frames
 from ..layout import (
     INFO_PATH,
     DatasetFolder,
@@ -53,10 +53,9 @@ def check_metadata(root: Path, report: Report) -> DatasetFolder | None:
 
 
 def check_file(
-    folder: DatasetFolder, file: str, report: Report
+    folder: DatasetFolder, file: str, entries: list[EpisodeEntry], report: Report
 ) -> list[tuple[EpisodeEntry, RawFrames]]:
     """Read one data file as far as it goes; its episodes with the columns that are sound."""
-    entries = [entry for entry in folder.episodes if entry.file == file]
     try:
         parquet = open_parquet(folder.root, file, entries[0].index)
         table = read_table(parquet, file)
@@ -65,19 +64,10 @@ def check_file(
         return []
     columns = _sound_columns(folder, file, table, entries, report)
     rows = table.num_rows
-    expected = max(entry.start + entry.length for entry in entries)
-    if rows != expected:
-        report.error(
-            f"holds {rows} frames, but the list of episodes promises {expected}: frames were "
-            f"lost or repeated, or the metadata belong to another copy",
-            file=file,
-            episode=entries[0].index if len(entries) == 1 else None,
-        )
+    promised = max(entry.start + entry.length for entry in entries)
+    _attempt(report, lambda: require_rows(file, entries, rows, promised))
     return [
-        (
-            entry,
-            {key: v[entry.start : entry.start + entry.length] for key, v in columns.items()},
-        )
+        (entry, slice_frames(columns, entry.start, entry.length))
         for entry in entries
         if entry.start + entry.length <= rows
     ]
