@@ -3,6 +3,7 @@
 from hrc_learn.dmp import coupling as coupling
 from hrc_learn.dmp.basis import GaussianBasis as GaussianBasis
 from hrc_learn.dmp.canonical import ExponentialPhase as ExponentialPhase
+from hrc_learn.dmp.distribution import DMPDistribution as DMPDistribution
 from hrc_learn.dmp.joint import JointDMP as JointDMP
 from hrc_learn.dmp.orientation import OrientationDMP as OrientationDMP
 from hrc_learn.dmp.orientation import OrientationState as OrientationState
