@@ -58,9 +58,7 @@ class DMPDistribution:
         """
         certain = cls._coordinates(primitive)
         if certain.ndim != 2:
-            raise ValueError(
-                f"one primitive is needed, got a batch {tuple(certain.shape[:-2])}"
-            )
+            raise ValueError(f"needs one primitive, got a batch {tuple(certain.shape[:-2])}")
         centres = primitive.basis.centre_times().to(certain.device)
         (D, M), N = certain.shape, primitive.basis.count
         spread = torch.zeros(D, M, D, N, dtype=torch.float64, device=certain.device)
