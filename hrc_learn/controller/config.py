@@ -17,6 +17,14 @@ class ControllerConfig:
     """Cap on the linear part of the twist [m/s]; the direction of the twist is kept."""
     angular_speed: float = 1.0
     """Cap on its angular part [rad/s]."""
+    vision_rate: float = 4.0
+    """Fastest decay of the pixel error that the estimate may ask for [1/s]. The gain of the
+    law grows with the square of the Jacobian over that of the region: uncapped it can exceed
+    what images at 15 to 30 Hz, late by a frame or more, allow."""
+    approach_linear_speed: float = 0.5
+    """Cap on the linear speed of the tool during a joint-space approach [m/s]."""
+    approach_angular_speed: float = 2.0
+    """Cap on its angular speed then [rad/s]."""
     null_damping: float = 3.0
     """c_d: effort divided by it is velocity."""
     null_space_yields: bool = True
@@ -27,7 +35,14 @@ class ControllerConfig:
     safety: SafetyConfig = field(default_factory=SafetyConfig)
 
     def __post_init__(self):
-        for name in ("linear_speed", "angular_speed", "null_damping"):
+        for name in (
+            "linear_speed",
+            "angular_speed",
+            "vision_rate",
+            "approach_linear_speed",
+            "approach_angular_speed",
+            "null_damping",
+        ):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, but is {getattr(self, name)}")
         if self.hold_rate < 0:
@@ -39,6 +54,7 @@ class ControllerConfig:
         return cls(
             linear_speed=math.inf,
             angular_speed=math.inf,
+            vision_rate=math.inf,
             null_space_yields=False,
             hold_rate=0.0,
             activation=ActivationConfig(hysteresis=0.0, blend_time=0.0),

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from typing import NamedTuple, final
+from dataclasses import replace
+from typing import Any, NamedTuple, final
 
 import torch
 from jaxtyping import Bool, Float
@@ -15,15 +17,15 @@ from hrc_learn.controller.config import ControllerConfig
 from hrc_learn.controller.goals import Goals
 from hrc_learn.controller.hold import Hold, measure_drift, planned_motion
 from hrc_learn.controller.interface import Command, ControllerState, Observation
-from hrc_learn.controller.resolution import cap_twist, fit_null_space, resolve
+from hrc_learn.controller.resolution import excess_speed, fit_null_space, resolve
 from hrc_learn.controller.safety import SafetyFilter
 from hrc_learn.geometry import Pose
+from hrc_learn.jacobian import ImageJacobianEstimator, Measurement
 from hrc_learn.kinematics import SerialChain
-from hrc_learn.regions import JointRegion
+from hrc_learn.regions import JointRegion, PostureRegion
 
-# A wish for the middle of the joint ranges too weak to be seen [1/s]. It gives the null space
-# a direction where nothing else does, so that it can turn away to let the task through.
-_CENTRING = 1e-6
+# Keeps the cap on the pixel rate finite at the target.
+_ONE_PIXEL_PER_SECOND = 1.0
 
 
 class _Feedback(NamedTuple):
@@ -34,6 +36,17 @@ class _Feedback(NamedTuple):
     s: Tensor
     image_jacobian: Tensor
     potential: Tensor
+
+
+class _Motion(NamedTuple):
+    """Joint velocity of the law before the safety filter, and how it came about."""
+
+    joint_velocity: Tensor
+    null_velocity: Tensor
+    twist: Tensor
+    task_twist: Tensor
+    xi_q: Tensor
+    bounds: tuple[Tensor, Tensor]
 
 
 @final
@@ -53,7 +66,7 @@ class AdaptiveController(nn.Module):
     def __init__(
         self,
         chain: SerialChain,
-        estimator: nn.Module,
+        estimator: ImageJacobianEstimator,
         goals: Goals,
         *,
         config: ControllerConfig | None = None,
@@ -77,10 +90,14 @@ class AdaptiveController(nn.Module):
         self.joint_region = joint_region or JointRegion.from_limits(limits.lower, limits.upper)
         self.hand_over = HandOver(config.activation)
         self.safety = SafetyFilter(limits, config.safety)
-        caps = torch.tensor([config.linear_speed, config.angular_speed], dtype=torch.float64)
-        self.register_buffer("caps", caps)
+        caps = [
+            [config.linear_speed, config.angular_speed],
+            [config.approach_linear_speed, config.approach_angular_speed],
+        ]
+        self.register_buffer("caps", torch.tensor(caps, dtype=torch.float64))
 
     caps: Tensor
+    """Linear and angular speed: of the task, of a joint-space approach [m/s, rad/s]."""
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True):
         # Regions are no modules, but move with the module like its buffers.
@@ -95,13 +112,13 @@ class AdaptiveController(nn.Module):
         joint_velocity: Float[Tensor, "*batch n"] | None = None,
     ) -> ControllerState:
         """State of an arm that starts at a joint position [rad], at rest unless told."""
-        pose, J = self.chain.forward_and_jacobian(joint_position)
+        J = self.chain.jacobian(joint_position)
         still = torch.zeros_like(J[..., 0])
         return ControllerState(
             activation=self.hand_over.initial_state(joint_position),
             hold=Hold(drift=still, joint_position=joint_position, jacobian=J, planned=still),
             safety=self.safety.initial_state(joint_position, joint_velocity),
-            estimator=self.estimator.initial_state(pose),
+            estimator=self.estimator.initial_state(*joint_position.shape[:-1]),
         )
 
     def step(
@@ -125,60 +142,59 @@ class AdaptiveController(nn.Module):
         activation, seen, stop = self.hand_over.step(
             state.activation,
             observation.feature,
-            observation.feature_visible & goals.vision_enabled,
+            self._camera_usable(state, observation, goals, q),
             observation.dt,
             age=observation.feature_age,
         )
         feedback = self._feedback(state, goals, pose, activation)
-
-        task_twist = cap_twist(-feedback.s, self.caps)
-        d = observation.human_effort
-        drift = self._drift(state, q, J, d)
-        twist = task_twist if drift is None else task_twist + self.config.hold_rate * drift
-
-        xi_q = self.joint_region.gradient(q)
-        bounds = self.safety.velocity_bounds(q)
-        u, null_velocity = self._joint_velocity(q, J, twist, d, xi_q, bounds)
+        motion, hold = self._motion(state, observation, goals, q, J, activation, feedback.s)
         v, safety, report = self.safety.step(
             state.safety,
             q,
-            u,
+            motion.joint_velocity,
             observation.dt,
             jacobian=J,
             stop=stop,
             stale=stale,
-            bounds=bounds,
+            bounds=motion.bounds,
         )
+        if hold is not None:
+            planned = planned_motion(motion.task_twist, J, v, observation.dt)
+            hold = replace(hold, planned=planned)
         command = Command(
             joint_velocity=v,
-            twist=twist,
-            null_velocity=null_velocity,
+            twist=motion.twist,
+            null_velocity=motion.null_velocity,
             xi_x=feedback.xi_x,
             xi_r=feedback.xi_r,
-            xi_q=xi_q,
+            xi_q=motion.xi_q,
             s=feedback.s,
             image_jacobian=feedback.image_jacobian,
-            weight_norm=self.estimator.weight_norm(state.estimator),
+            weight_norm=torch.linalg.vector_norm(state.estimator.weight, dim=(-2, -1)),
             vision_activation=activation.level,
             potential=feedback.potential,
             safety=report,
         )
-        hold = state.hold
-        if drift is not None:
-            planned = planned_motion(task_twist, J, v, observation.dt)
-            hold = Hold(drift=drift, joint_position=q, jacobian=J, planned=planned)
-        estimator = self.estimator.update(
-            state.estimator,
-            pose=pose,
-            feature=activation.feature,
-            seen=seen,
-            xi_x=feedback.xi_x,
-            s=feedback.s,
-            dt=observation.dt,
-        )
+        estimator = self._adapted(state, observation, pose, seen, activation, feedback)
         return command, ControllerState(
-            activation=activation, hold=hold, safety=safety, estimator=estimator
+            activation=activation,
+            hold=state.hold if hold is None else hold,
+            safety=safety,
+            estimator=estimator,
         )
+
+    def _camera_usable(
+        self, state: ControllerState, observation: Observation, goals: Goals, q: Tensor
+    ) -> Bool[Tensor, "*batch"]:
+        """Whether the camera takes part and found the feature.
+
+        It first takes over inside the posture region: earlier it would lead an arm from
+        whatever posture it is in, and many of those end at a joint limit.
+        """
+        usable = observation.feature_visible & goals.vision_enabled
+        if goals.posture is not None:
+            usable = usable & (state.activation.active | (goals.posture.value(q) <= 0))
+        return usable
 
     def _feedback(
         self, state: ControllerState, goals: Goals, pose: Pose, activation: Activation
@@ -187,36 +203,90 @@ class AdaptiveController(nn.Module):
         P_t, xi_position = goals.position.feedback(pose.position)
         P_o, xi_orientation = goals.orientation.feedback(pose.orientation)
         P_v, xi_x = goals.vision.feedback(activation.feature)
-        xi_x = activation.level.unsqueeze(-1) * xi_x
         xi_r = torch.cat([xi_position, xi_orientation], dim=-1)
         J_s = self.estimator.jacobian(state.estimator, pose)
+        error = activation.feature - goals.vision.target
+        share = activation.level.unsqueeze(-1)
+        if self.config.vision_rate < math.inf:
+            share = share / self._excess_rate(J_s, xi_x, error)
+        xi_x = share * xi_x
         s = torch.linalg.vecdot(J_s, xi_x.unsqueeze(-1), dim=-2) + xi_r
         return _Feedback(xi_x, xi_r, s, J_s, P_t + P_o + activation.level * P_v)
 
-    def _drift(
-        self, state: ControllerState, q: Tensor, J: Tensor, d: Tensor | None
-    ) -> Tensor | None:
-        """Drift of the tool under human effort; None where no pose hold is asked for."""
-        if d is None or self.config.hold_rate == 0:
-            return None
-        return measure_drift(state.hold, q, J, acting=(d != 0).any(-1))
+    def _excess_rate(
+        self, J_s: Tensor, xi_x: Tensor, error: Tensor
+    ) -> Float[Tensor, "*batch 1"]:
+        """What to divide vision feedback by to keep the rate of the pixel error; at least 1."""
+        push = torch.linalg.vecdot(J_s, xi_x.unsqueeze(-1), dim=-2)
+        speed = torch.linalg.vecdot(J_s, push.unsqueeze(-2))
+        speed = torch.linalg.vector_norm(speed, dim=-1, keepdim=True)
+        distance = torch.linalg.vector_norm(error, dim=-1, keepdim=True)
+        allowed = self.config.vision_rate * distance + _ONE_PIXEL_PER_SECOND
+        return (speed / allowed).clamp(min=1)
 
-    def _joint_velocity(
+    def _motion(
         self,
+        state: ControllerState,
+        observation: Observation,
+        goals: Goals,
         q: Tensor,
         J: Tensor,
-        twist: Tensor,
-        d: Tensor | None,
-        xi_q: Tensor,
-        bounds: tuple[Tensor, Tensor],
-    ) -> tuple[Tensor, Tensor]:
-        """The law's joint velocity, and its part in the null space."""
+        activation: Activation,
+        s: Tensor,
+    ) -> tuple[_Motion, Hold | None]:
+        """Joint velocity of the law, and the pose hold where one is asked for."""
+        d = observation.human_effort
+        xi_q = self.joint_region.gradient(q)
         wish = (-xi_q if d is None else d - xi_q) / self.config.null_damping
-        wish = torch.add(wish, q - self.joint_region.centre, alpha=-_CENTRING)
+
+        twist = task_twist = -s / excess_speed(s, self.caps[0])
+        hold = None
+        if d is not None and self.config.hold_rate > 0:
+            # A joint-space approach has planned no path of the tool that could be held.
+            holds = (d != 0).any(-1) & ((activation.level == 1) | (goals.posture is None))
+            hold = measure_drift(state.hold, q, J, holds)
+            twist = torch.add(task_twist, hold.drift, alpha=self.config.hold_rate)
+
         task, null = resolve(J, twist, wish)
+        if goals.posture is not None:
+            approach = self._approach(goals.posture, q, J)
+            task = torch.lerp(approach, task, activation.level.unsqueeze(-1))
+        bounds = self.safety.velocity_bounds(q)
         if self.config.null_space_yields:
             null = fit_null_space(task, null, *bounds)
-        return task + null, null
+        return _Motion(task + null, null, twist, task_twist, xi_q, bounds), hold
+
+    def _approach(
+        self, posture: PostureRegion, q: Tensor, J: Tensor
+    ) -> Float[Tensor, "*batch n"]:
+        """Joint velocity towards a posture, as slow as the caps of the tool ask [rad/s]."""
+        velocity = -posture.gradient(q)
+        twist = torch.linalg.vecdot(J, velocity.unsqueeze(-2))
+        return velocity / excess_speed(twist, self.caps[1])
+
+    def _adapted(
+        self,
+        state: ControllerState,
+        observation: Observation,
+        pose: Pose,
+        seen: Tensor,
+        activation: Activation,
+        feedback: _Feedback,
+    ) -> Any:
+        """State of the estimator after what the camera saw."""
+        if observation.image_joint_position is not None:
+            pose = self.chain.forward(observation.image_joint_position)
+        if observation.feature_new is not None:
+            seen = seen & observation.feature_new
+        measurement = Measurement(
+            pose=pose,
+            feature=activation.feature,
+            valid=seen,
+            dt=observation.dt,
+            xi_x=feedback.xi_x,
+            xi_r=feedback.xi_r,
+        )
+        return self.estimator.update(state.estimator, measurement)
 
 
 def _effective_goals(observation: Observation, default: Goals) -> Goals:

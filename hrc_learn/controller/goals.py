@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from hrc_learn.regions import OrientationRegion, PositionRegion, VisionRegion
+from hrc_learn.regions import OrientationRegion, PositionRegion, PostureRegion, VisionRegion
 from hrc_learn.regions.pytree import pytree
 
 HALF_SIZE = (0.12, 0.12, 0.08)
@@ -32,13 +32,16 @@ class Goals:
     vision: VisionRegion
     vision_enabled: Bool[Tensor, "*#batch"]
     """False: steer by the Cartesian regions alone, whatever the camera sees."""
+    posture: PostureRegion | None = None
+    """Where to go in joint space as long as vision feedback has not taken over; None: the
+    Cartesian regions lead from the start."""
 
     @classmethod
     def at(
         cls,
-        centre: Float[Tensor, "*batch 3"],
-        orientation: Float[Tensor, "*batch 4"],
-        target: Float[Tensor, "*batch 2"] | None = None,
+        centre: Float[Tensor, "*#batch 3"],
+        orientation: Float[Tensor, "*#batch 4"],
+        target: Float[Tensor, "*#batch 2"] | None = None,
         *,
         half_size: Sequence[float] = HALF_SIZE,
         image_size: tuple[int, int] = IMAGE_SIZE,
@@ -67,7 +70,7 @@ class Goals:
 
     def moved_to(
         self,
-        centre: Float[Tensor, "*batch 3"],
+        centre: Float[Tensor, "*#batch 3"],
         half_size: Float[Tensor, "*#batch 3"] | None = None,
     ) -> Goals:
         """The same goals with the box elsewhere and, if told, of another size [m]."""
@@ -77,13 +80,21 @@ class Goals:
             self, position=replace(self.position, centre=centre, half_size=half_size)
         )
 
-    def turned_to(self, orientation: Float[Tensor, "*batch 4"]) -> Goals:
+    def turned_to(self, orientation: Float[Tensor, "*#batch 4"]) -> Goals:
         """The same goals with another tool orientation."""
         return replace(self, orientation=replace(self.orientation, goal=orientation))
 
-    def aimed_at(self, target: Float[Tensor, "*batch 2"]) -> Goals:
+    def aimed_at(self, target: Float[Tensor, "*#batch 2"]) -> Goals:
         """The same goals with another target in the image [px]."""
         return replace(self, vision=replace(self.vision, target=target))
+
+    def approached_by(self, posture: Float[Tensor, "*#batch n"] | None) -> Goals:
+        """The same goals, first approached in joint space towards a posture [rad].
+
+        Take an inverse-kinematics solution of the box centre that is near the arm.
+        """
+        region = None if posture is None else PostureRegion(goal=posture)
+        return replace(self, posture=region)
 
     def with_vision(self, enabled: bool) -> Goals:
         """The same goals with the camera taking part or not."""

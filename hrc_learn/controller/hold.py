@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -34,18 +34,24 @@ def measure_drift(
     hold: Hold,
     joint_position: Float[Tensor, "*batch n"],
     jacobian: Float[Tensor, "*batch 6 n"],
-    acting: Bool[Tensor, "*batch"],
-) -> Float[Tensor, "*batch 6"]:
-    """Drift after the last step: what was planned, less what the tool did.
+    holds: Bool[Tensor, "*batch"],
+) -> Hold:
+    """Add the drift of the last step: what was planned, less what the tool did.
 
     The motion of the tool is (J_0 + J_1)/2 dq, right to the third order of the step, where
     the J_0 dq by which it was planned is right to the second: the difference is the drift.
-    Zero while no effort acts, so that every effort starts afresh.
+
+    Args:
+        hold: Of the step before.
+        joint_position: Now [rad].
+        jacobian: Now.
+        holds: Where to hold. Elsewhere the drift is zero, so that every effort starts afresh.
     """
     step = (joint_position - hold.joint_position).unsqueeze(-2)
     moved = torch.linalg.vecdot(hold.jacobian + jacobian, step)
     drift = torch.add(hold.drift + hold.planned, moved, alpha=-0.5)
-    return torch.where(acting.unsqueeze(-1), drift.clamp(-_FARTHEST, _FARTHEST), 0.0)
+    drift = torch.where(holds.unsqueeze(-1), drift.clamp(-_FARTHEST, _FARTHEST), 0.0)
+    return replace(hold, drift=drift, joint_position=joint_position, jacobian=jacobian)
 
 
 def planned_motion(

@@ -38,6 +38,9 @@ class Observation:
     """Whether `feature` stems from an image that no earlier step has used; None: it does."""
     feature_age: Float[Tensor, "*batch"] | None = None
     """Time since the image was taken [s]; None: none."""
+    image_joint_position: Float[Tensor, "*batch n"] | None = None
+    """Joint position when the image was taken [rad]; None: the present one. Pairing an image
+    with a later pose teaches the estimator a wrong Jacobian."""
     joint_state_stale: Bool[Tensor, "*batch"] | None = None
     """Whether the joint position is too old to be used; None: it is not."""
 

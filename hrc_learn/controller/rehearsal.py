@@ -91,7 +91,8 @@ class PinholeCamera:
         )
         # Turning by w moves the marker by w x arm: a row g of d(pixel)/d(point) gives arm x g.
         arm = quaternion.rotate(tool.orientation, self.marker)
-        over_turn = torch.linalg.cross(arm.unsqueeze(-2), over_point)
+        arm, over_point = torch.broadcast_tensors(arm.unsqueeze(-2), over_point)
+        over_turn = torch.linalg.cross(arm, over_point)
         return torch.cat([over_point, over_turn], dim=-1)
 
     def _ray(self, tool: Pose) -> Tensor:
@@ -129,25 +130,31 @@ class VirtualCamera:
     imperfections: Imperfections
     generator: torch.Generator
     _steps: int = 0
-    _images: list[tuple[Tensor, Tensor]] = field(default_factory=list)
+    _images: list[tuple[Tensor, Tensor, Tensor]] = field(default_factory=list)
     _covered: Tensor | None = None
 
-    def observe(self, tool: Pose, dt: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Feature [px], whether visible, and whether from a new image."""
+    def observe(self, tool: Pose, joint_position: Tensor, dt: float) -> dict[str, Tensor]:
+        """Fields of an observation that come from the camera."""
         new = self._steps % self.imperfections.frame_steps == 0
         if new:
-            self._take_image(tool, dt * self.imperfections.frame_steps)
+            self._take_image(tool, joint_position, dt * self.imperfections.frame_steps)
         self._steps += 1
-        feature, visible = self._images[0]
-        return feature, visible, torch.full_like(visible, new)
+        feature, visible, q = self._images[0]
+        return {
+            "feature": feature,
+            "feature_visible": visible,
+            "feature_new": torch.full_like(visible, new),
+            "image_joint_position": q,
+        }
 
-    def _take_image(self, tool: Pose, frame_time: float) -> None:
+    def _take_image(self, tool: Pose, joint_position: Tensor, frame_time: float) -> None:
         imperfections = self.imperfections
         feature, visible = self.camera.project(tool)
         feature = feature + imperfections.noise * self._normal(feature)
         broken = self._uniform(visible) < imperfections.nan_share
         feature = torch.where(broken.unsqueeze(-1), torch.nan, feature)
-        self._images.append((feature, visible & ~self._cover(visible, frame_time)))
+        visible = visible & ~self._cover(visible, frame_time)
+        self._images.append((feature, visible, joint_position))
         del self._images[: -1 - imperfections.latency_frames]
 
     def _cover(self, visible: Tensor, frame_time: float) -> Tensor:
@@ -196,12 +203,9 @@ def rehearse(
     """
     q, state = joint_position, controller.initial_state(joint_position)
     for k in range(steps):
-        feature, visible, new = camera.observe(controller.chain.forward(q), dt)
         observation = Observation(
+            **camera.observe(controller.chain.forward(q), q, dt),
             joint_position=q,
-            feature=feature,
-            feature_visible=visible,
-            feature_new=new,
             dt=dt,
             human_effort=None if effort is None else effort(k, q),
             goals=None if goals is None else goals(k),

@@ -16,12 +16,17 @@ _FLOOR = 1e-9
 _EYE = Constant(torch.eye(6, dtype=torch.float64))
 
 
-def cap_twist(
+def excess_speed(
     twist: Float[Tensor, "*batch 6"], caps: Float[Tensor, "2"]
-) -> Float[Tensor, "*batch 6"]:
-    """Scale a twist to a linear and an angular speed [m/s, rad/s], keeping its direction."""
+) -> Float[Tensor, "*batch 1"]:
+    """What to divide a motion by to keep its twist within the caps; at least 1.
+
+    Args:
+        twist: Of the tool (linear [m/s], angular [rad/s]).
+        caps: Highest linear and angular speed [m/s, rad/s].
+    """
     speeds = torch.linalg.vector_norm(twist.view(*twist.shape[:-1], 2, 3), dim=-1)
-    return twist / (speeds / caps).amax(-1, keepdim=True).clamp(min=1)
+    return (speeds / caps).amax(-1, keepdim=True).clamp(min=1)
 
 
 def resolve(
@@ -65,9 +70,11 @@ def fit_null_space(
 ) -> Float[Tensor, "*batch n"]:
     """Scale the null-space velocity as a whole so that limits need not cut single joints.
 
-    A limit that cuts one joint of a null-space motion makes it move the tool. Scaled as a
-    whole it does not; scaled below zero it even turns the redundant joints away to let the
-    task through. Where no factor fits task and limits, the least motion is taken.
+    A limit that cuts one joint of a null-space motion makes it move the tool; scaled as a
+    whole it does not. The factor is 0 to 1, the largest that fits; where none fits because
+    the task alone is too fast, the one that comes closest. (Factors beyond would let the
+    redundant joints give way to the task. They were measured to whip the elbow into the
+    limits near singularities.)
 
     Args:
         task: Joint velocity of the task [rad/s].
@@ -84,5 +91,5 @@ def fit_null_space(
     most = torch.maximum(at_lower, at_upper).amin(-1, keepdim=True)
     wanted = (least <= most).to(null.dtype)
     low, high = torch.minimum(least, most), torch.maximum(least, most)
-    factor = torch.minimum(torch.maximum(wanted, low), high)
+    factor = torch.minimum(torch.maximum(wanted, low), high).clamp(0, 1)
     return factor * null

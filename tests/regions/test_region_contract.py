@@ -15,6 +15,7 @@ from hrc_learn.regions import (
     JointRegion,
     OrientationRegion,
     PositionRegion,
+    PostureRegion,
     Region,
     VisionRegion,
 )
@@ -109,6 +110,17 @@ def vision(formulation: str) -> Case:
     return Case(make, lambda *b, rng: 1000 * rand(*b, 2, rng=rng), delicate, 2)
 
 
+def posture() -> Case:
+    def make(*batch: int, rng: torch.Generator) -> PostureRegion:
+        return PostureRegion(goal=rand(*batch, 7, rng=rng))
+
+    def delicate() -> Tensor:
+        goal = make(rng=sampling.generator()).goal
+        return torch.stack([goal, goal + 0.05 * torch.eye(7)[0], goal + 100])
+
+    return Case(make, lambda *b, rng: -3 + 6 * rand(*b, 7, rng=rng), delicate, 7)
+
+
 CASES = {
     "joint": joint("one_sided"),
     "joint-paper": joint("paper"),
@@ -117,6 +129,7 @@ CASES = {
     "position-per-axis": position(rotated=True, stiffness=(4e-4, 4e-4, 4e-5)),
     "orientation": orientation("exact"),
     "orientation-paper": orientation("paper"),
+    "posture": posture(),
     "vision": vision("paper"),
     "vision-saturated": vision("saturated"),
 }
