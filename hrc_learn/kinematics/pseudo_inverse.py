@@ -48,8 +48,9 @@ def singularity_damping(
 
     Args:
         J: Jacobian.
-        strength: Damping at the singularity itself. The default bounds the gain of the
-            pseudo-inverse by 10.
+        strength: Damping at the singularity itself. With the default the gain of the
+            pseudo-inverse grows to 1 / 0.05 = 20 and from there falls in proportion to
+            sigma_min, to zero at the singularity.
     """
     smallest = torch.linalg.svdvals(J)[..., -1]
     depth = torch.clamp_min(1 - torch.square(smallest / SINGULAR_BELOW), 0.0)

@@ -74,11 +74,22 @@ def test_damping_grows_smoothly_towards_a_singularity():
     assert_close(damping, expected, rtol=0, atol=1e-12)
 
 
-def test_damped_inverse_is_bounded_at_a_singularity():
+def test_gain_of_the_damped_inverse_falls_to_zero_at_a_singularity():
+    for sigma in (0.0, 1e-6, 0.01, 0.03, 0.049, 0.06):
+        J = scaled_to(sigma)
+        gains = torch.linalg.svdvals(pseudo_inverse(J, singularity_damping(J)))
+        largest = torch.linalg.svdvals(J)[:-1].reciprocal()
+        expected = sigma / 0.05**2 if sigma < 0.05 else 1 / sigma
+        expected = torch.cat([largest, torch.tensor([expected], dtype=J.dtype)])
+        # Damping takes a little from the other gains as well: at most 0.05^2 / sigma_5^2.
+        assert float(gains[0]) <= 1.001 * float(expected.max())
+        assert float((gains - expected[-1]).abs().min()) < 1e-6 * (1 + float(expected[-1]))
+
+
+def test_damped_inverse_survives_a_real_singularity():
     J = singular_jacobian()
-    damping = singularity_damping(J)
-    gain = torch.linalg.svdvals(pseudo_inverse(J, damping))[0]
-    assert float(gain) <= 1 / (2 * 0.05)
+    gain = torch.linalg.svdvals(pseudo_inverse(J, singularity_damping(J)))[0]
+    assert float(gain) < 20
 
 
 @pytest.mark.parametrize("sigma_min", [0.0, 0.03, 0.05, 0.4])
