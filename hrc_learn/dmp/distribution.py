@@ -27,11 +27,13 @@ class DMPDistribution:
     """Square root of the covariance, which has the rank of the demonstrations."""
 
     @classmethod
-    def fit(cls, primitives: JointDMP) -> "DMPDistribution":
+    def fit(cls, primitives: JointDMP, slack: float = 0.0) -> "DMPDistribution":
         """Mean and covariance of a batch of primitives.
 
         Args:
             primitives: Of one motion, fitted with `scaling="none"`.
+            slack: Freedom beyond what the demonstrations vary, as in `around`. Without, a via
+                point that none of their mixtures passes is approached, not reached.
 
         Raises:
             ValueError: Fewer than two, or scaled primitives, whose motion is not linear.
@@ -39,33 +41,28 @@ class DMPDistribution:
         batch = primitives.weights.shape[:-2]
         if batch.numel() < 2 or not batch:
             raise ValueError("a distribution needs a batch of at least 2 primitives")
-        x = cls._coordinates(primitives)
-        x = x.reshape(-1, *x.shape[-2:])
-        mean = x.mean(0)
+        x = _coordinates(primitives).flatten(0, -3)
+        mean, primitive = x.mean(0), mean_primitive(primitives)
         spread = (x - mean).flatten(1).mT / (len(x) - 1) ** 0.5
-        return cls(primitive=mean_primitive(primitives), mean=mean, spread=spread)
+        if slack:
+            spread = torch.cat([spread, _free_forcing(primitive, slack)], dim=1)
+        return cls(primitive=primitive, mean=mean, spread=spread)
 
     @classmethod
-    def around(cls, primitive: JointDMP, deviation: float = 1.0) -> "DMPDistribution":
+    def around(cls, primitive: JointDMP, slack: float = 1.0) -> "DMPDistribution":
         """One primitive whose forcing may change, for via points without other examples.
 
-        Start, start velocity and goal are certain. Each weight is free to change by as much
-        as makes the forcing term change alike at all times.
+        Start, start velocity and goal are certain.
 
         Args:
             primitive: Without batch dimensions, fitted with `scaling="none"`.
-            deviation: Standard deviation of the forcing term, by s^2.
+            slack: Standard deviation of the forcing term, alike at all times, in units of the
+                force that holds a coordinate away from its goal by the range it covers.
         """
-        certain = cls._coordinates(primitive)
+        certain = _coordinates(primitive)
         if certain.ndim != 2:
             raise ValueError(f"needs one primitive, got a batch {tuple(certain.shape[:-2])}")
-        centres = primitive.basis.centre_times().to(certain.device)
-        (D, M), N = certain.shape, primitive.basis.count
-        spread = torch.zeros(D, M, D, N, dtype=torch.float64, device=certain.device)
-        free = torch.diag(deviation / primitive.basis.phase(centres))
-        for joint in range(D):
-            spread[joint, :N, joint] = free
-        return cls(primitive=primitive, mean=certain, spread=spread.view(D * M, D * N))
+        return cls(primitive=primitive, mean=certain, spread=_free_forcing(primitive, slack))
 
     def mean_primitive(self) -> JointDMP:
         """The most likely primitive."""
@@ -87,9 +84,6 @@ class DMPDistribution:
         self, time: ArrayLike, value: ArrayLike, *, noise: float = 1e-6, order: int = 0
     ) -> "DMPDistribution":
         """The distribution, given where the motion passes at some times.
-
-        Only what the demonstrations vary can give: a via point that none of their mixtures
-        passes is approached, not reached.
 
         Args:
             time: Of the via points [s], (n,).
@@ -128,14 +122,6 @@ class DMPDistribution:
         observed = torch.distributions.LowRankMultivariateNormal(mean, root, diagonal)
         return observed.log_prob(value.reshape(-1))
 
-    @staticmethod
-    def _coordinates(primitives: JointDMP) -> Float[Tensor, "*batch D M"]:
-        if primitives.scaling != "none":
-            raise ValueError(f"scaling {primitives.scaling!r} is not linear: fit with 'none'")
-        rate = primitives.start_velocity * primitives.duration[..., None]
-        ends = torch.stack([rate, primitives.start, primitives.goal], dim=-1)
-        return torch.cat([primitives.weights, ends], dim=-1).detach().double()
-
     def _rows(self, time: ArrayLike, order: int) -> tuple[Tensor, torch.Size]:
         """H at the times, per second if its derivative, and the shape of what it gives."""
         duration = self.primitive.duration.double()
@@ -168,3 +154,22 @@ class DMPDistribution:
             joint_names=like.joint_names,
             units=like.units,
         )
+
+
+def _coordinates(primitives: JointDMP) -> Float[Tensor, "*batch D M"]:
+    if primitives.scaling != "none":
+        raise ValueError(f"scaling {primitives.scaling!r} is not linear: fit with 'none'")
+    rate = primitives.start_velocity * primitives.duration[..., None]
+    ends = torch.stack([rate, primitives.start, primitives.goal], dim=-1)
+    return torch.cat([primitives.weights, ends], dim=-1).detach().double()
+
+
+def _free_forcing(primitive: JointDMP, slack: float) -> Float[Tensor, "DM DN"]:
+    """Spread of weights that are independent and make the forcing vary alike at all times."""
+    basis, amplitude = primitive.basis, primitive.amplitude.detach().double()
+    D, N = len(amplitude), basis.count
+    share = 1 / basis.phase(basis.centre_times().to(amplitude))
+    deviation = slack * primitive.spring.stiffness * amplitude[:, None] * share
+    spread = torch.zeros(D, N + 3, D, N).to(amplitude)
+    spread[:, :N] = torch.diag_embed(deviation.flatten()).view(D, N, D, N)
+    return spread.flatten(0, 1).flatten(1)

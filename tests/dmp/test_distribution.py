@@ -94,6 +94,20 @@ def test_one_primitive_bends_through_via_points_and_keeps_its_ends():
     assert kink < 1e-3
 
 
+def test_slack_reaches_what_no_mixture_passes():
+    time, motions = family(n=3)
+    primitives = JointDMP.fit(time, motions, n_basis=15)
+    via = torch.tensor([[2.0, -1.0], [-0.5, 1.5], [2.0, 0.0]], dtype=torch.float64)
+    times = [0.5, 1.0, 1.6]
+
+    def miss(slack):
+        given = DMPDistribution.fit(primitives, slack=slack).condition(times, via)
+        return (given.mean_primitive().rollout(time=times).position - via).abs().max()
+
+    assert miss(0.0) > 0.1
+    assert miss(0.3) < 1e-5
+
+
 def test_log_prob_is_that_of_the_gaussian(distribution):
     time, motions = family(seed=1)
     some = slice(None, None, 40)
