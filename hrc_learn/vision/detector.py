@@ -68,12 +68,15 @@ class MarkerDetector:
 
         grey = _grey(image)
         half = np.asarray(cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
-        rough = self._search(half, ids)
-        # Pixel k of the half image covers pixels 2k and 2k + 1 of the whole one.
-        rough = {id: 2.0 * corners + 0.5 for id, corners in rough.items()}
-        if missing := ids.difference(rough):  # hidden, or too small and tilted for half
-            rough |= self._search(grey, missing)
-        return {id: _refine(grey, corners) for id, corners in rough.items()}
+        found: dict[int, Corners] = {}
+        for id, corners in self._search(half, ids).items():
+            # Pixel k of the half image covers pixels 2k and 2k + 1 of the whole one. It only
+            # says where to look: its corners may be pixels off.
+            found |= self._search_near(grey, id, 2.0 * corners + 0.5)
+        if missing := ids.difference(found):  # hidden, or too small and tilted for half
+            rough = self._search(grey, missing)
+            found |= {id: _refine(grey, corners) for id, corners in rough.items()}
+        return found
 
     def _search(self, grey: np.ndarray, ids: frozenset[int]) -> dict[int, Corners]:
         corners, found, _ = self._aruco.detectMarkers(np.ascontiguousarray(grey))
@@ -110,17 +113,18 @@ def _grey(image: np.ndarray) -> np.ndarray:
 def _refine(grey: np.ndarray, corners: Corners) -> Corners:
     """Corners moved to the saddle points of the grey levels.
 
-    A wide window first, since half a pixel off at half resolution can be three at full; then
-    a narrow one, which perspective and its neighbours disturb less. Both stay clear of the
-    next corner, a module away.
+    The window reaches as far as the rough corners may be off, but stays clear of the next
+    corner, a module away, and of what may cover the rim of the plate.
     """
     import cv2
 
     module = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).min() / MODULES
-    image = np.ascontiguousarray(grey)
-    refined = np.ascontiguousarray(corners, dtype=np.float32).reshape(4, 1, 2)
-    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 30, 0.01)
-    for share in (0.6, 0.3):
-        half_window = int(np.clip(share * module, 2, 10 * share + 2))
-        cv2.cornerSubPix(image, refined, (half_window, half_window), (-1, -1), criteria)
+    half_window = int(np.clip(0.4 * module, 2, 6))
+    refined = cv2.cornerSubPix(
+        np.ascontiguousarray(grey),
+        np.ascontiguousarray(corners, dtype=np.float32).reshape(4, 1, 2),
+        (half_window, half_window),
+        (-1, -1),
+        (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 30, 0.01),
+    )
     return refined[:, 0].astype(np.float64)

@@ -3,6 +3,7 @@ import pytest
 from marker_scenes import MARKER, corners_of, overhead, poses_in_view
 
 from hrc_learn.vision import CameraModel, ImageNoise, Lens, MarkerDetector, SyntheticCamera
+from hrc_learn.vision.imaging import pixel_rays
 
 GREY = np.full((90, 120, 3), 128, dtype=np.uint8)
 
@@ -67,6 +68,14 @@ def test_lens_fills_the_image_from_the_pinhole(k1):
     white = np.full((lens.pinhole.height, lens.pinhole.width, 3), 255, dtype=np.uint8)
     assert lens.apply(white).min() == 255  # nowhere does the black outside show
     assert lens.apply(white).shape == (240, 320, 3)
+
+
+def test_every_pixel_knows_its_ray():
+    model = overhead()
+    u, v = np.meshgrid(np.arange(1440), np.arange(1080))
+    pixels = model.to_pixels(pixel_rays(model).astype(np.float64))
+    # Rays are in single precision.
+    np.testing.assert_allclose(pixels, np.stack([u, v], axis=-1), atol=1e-3)
 
 
 def test_lens_refuses_an_image_of_another_size():
