@@ -85,7 +85,8 @@ def _send_paths(stream: rr.RecordingStream, fit: FitRecording) -> None:
 
 def _summary(fit: FitRecording) -> str:
     """What was fitted, as Markdown."""
-    lines = [f"# {fit.title}", "", joints_title(demo=True, limits=fit.joint_limits is not None)]
+    limits = fit.joint_limits is not None
+    lines = [f"# {fit.title}", "", joints_title(True, limits, position="reproduction")]
     worst = [
         1e3 * np.abs(r - d).max() for r, d in zip(fit.reproductions, fit.demos, strict=True)
     ]

@@ -141,9 +141,9 @@ def _joints(run: RunRecording) -> Tab:
     return Tab(title=joints_title(demo is not None, limits is not None), plots=plots, columns=2)
 
 
-def joints_title(demo: bool, limits: bool) -> str:
+def joints_title(demo: bool, limits: bool, position: str = "position") -> str:
     """Title that says what the colours of `joint_plot` mean; its plots are too small for it."""
-    return "Joints: position blue" + ", demonstration grey" * demo + ", limits red" * limits
+    return f"Joints: {position} blue" + ", demonstration grey" * demo + ", limits red" * limits
 
 
 def joint_plot(

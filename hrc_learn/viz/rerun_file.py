@@ -157,7 +157,7 @@ def look_at_all(path: Float[np.ndarray, "n 3"]) -> rrb.EyeControls3D:
     low, high = points.min(axis=0), points.max(axis=0)
     middle, reach = (low + high) / 2, max(float(np.linalg.norm(high - low)), 0.5)
     return rrb.EyeControls3D(
-        position=middle + reach * np.array([1.5, 0.9, 1.0]),
+        position=middle + reach * np.array([1.05, 0.65, 0.6]),
         look_target=middle,
         eye_up=(0.0, 0.0, 1.0),
     )

@@ -181,7 +181,7 @@ def _blueprint(run: RunRecording) -> rrb.Blueprint:
         origin="/world",
         contents=["+ /world/**", "- /world/camera/image/**"],
         name="Robot: path of the run (blue), demonstration (grey), plan (orange)",
-        eye_controls=look_at_all(run.position),
+        eye_controls=look_at_all(_sights(run)),
     )
     left: list[rrb.View] = [scene]
     if run.camera is not None:
@@ -205,6 +205,12 @@ def _blueprint(run: RunRecording) -> rrb.Blueprint:
         rrb.TimePanel(state="collapsed", timeline="time"),
         collapse_panels=True,
     )
+
+
+def _sights(run: RunRecording) -> Float[np.ndarray, "n 3"]:
+    """What the first look at the scene should not miss: the path and the camera."""
+    eyes = [] if run.camera is None else [run.camera.model.pose[None, :3, 3]]
+    return np.concatenate([run.position, *eyes])
 
 
 def _jpeg(image: UInt8[np.ndarray, "h w 3"], quality: int) -> bytes:
