@@ -5,8 +5,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from .demonstration import JOINT_FIELDS
+from .features import INFO_PATH, Feature
 from .finding import DatasetError
-from .layout import INFO_PATH, Feature
 from .naming import says_joint_quantity
 from .roles import ROLES
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 from .demonstration import JOINT_FIELDS
 from .explicit_mapping import MappingSpec, Selection, parse_mapping
-from .layout import Feature
+from .features import Feature
 from .naming import Meaning, meaning_of_component, role_of_key, says_joint_quantity
 from .roles import INDEX_KEYS, ORIENTATION_ROLES, ROLES
 from .sidecar import Sidecar

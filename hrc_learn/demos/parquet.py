@@ -107,7 +107,7 @@ def to_numpy(column: pa.ChunkedArray) -> Shaped[np.ndarray, "rows components"]:
             array = _flatten_ragged(array, rows)
         else:
             break
-    values = array.to_numpy(zero_copy_only=False)
+    values = _without_pandas(array)
     return values.reshape(rows, len(values) // rows if rows else 0)
 
 
@@ -124,7 +124,7 @@ def _row_groups(metadata: pq.FileMetaData, rows: slice) -> tuple[list[int], int]
 
 
 def _flatten_ragged(array: pa.Array, rows: int) -> pa.Array:
-    widths = array.value_lengths().to_numpy(zero_copy_only=False)
+    widths = _without_pandas(array.value_lengths())
     differing = np.flatnonzero(widths != widths[0]) if len(widths) else []
     if len(differing):
         row = int(differing[0]) * rows // len(array)
@@ -135,5 +135,12 @@ def _flatten_ragged(array: pa.Array, rows: int) -> pa.Array:
 
 def _refuse_nulls(array: pa.Array, rows: int) -> None:
     if array.null_count:
-        at = int(np.flatnonzero(array.is_null().to_numpy(zero_copy_only=False))[0])
+        at = int(np.flatnonzero(_without_pandas(array.is_null()))[0])
         raise BadRowError(at * rows // len(array), "holds no value (null)")
+
+
+def _without_pandas(array: pa.Array) -> Shaped[np.ndarray, " values"]:
+    """Values of an array of numbers; its own `to_numpy` imports pandas, for a second."""
+    if pa.types.is_boolean(array.type):  # packed to bits, which numpy cannot view
+        return np.from_dlpack(array.cast(pa.uint8())).astype(bool)
+    return np.from_dlpack(array)

@@ -110,5 +110,10 @@ def to_table(values: dict[str, np.ndarray], features: dict[str, dict]) -> pa.Tab
 
 
 def _to_arrow(values: np.ndarray, dtype: str, width: int) -> pa.Array:
-    flat = pa.array(np.ascontiguousarray(values, dtype=dtype).reshape(-1))
+    contiguous = np.ascontiguousarray(values, dtype=dtype)
+    # Not pa.array(): it imports pandas, which would hold up the first episode for a second.
+    buffers = [None, pa.py_buffer(contiguous)]
+    flat = pa.Array.from_buffers(
+        pa.from_numpy_dtype(contiguous.dtype), contiguous.size, buffers
+    )
     return flat if width == 1 else pa.FixedSizeListArray.from_arrays(flat, width)

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+import time
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -284,21 +285,34 @@ KILLED = textwrap.dedent(
 )
 
 
-def test_a_killed_recording_loses_the_open_episode_at_most(tmp_path):
-    root = tmp_path / "set"
+def kill_and_recover(root, seconds):
+    """Kill a recording so long after its first episode was saved; what was and is there."""
     process = subprocess.Popen(
         [sys.executable, "-c", KILLED, str(root)], stdout=subprocess.PIPE, text=True
     )
     assert process.stdout is not None
-    saved = [process.stdout.readline() for _ in range(17)]
+    first = process.stdout.readline()
+    time.sleep(seconds)
     os.kill(process.pid, signal.SIGKILL)
-    announced = int((saved + process.stdout.readlines())[-1])
+    announced = int([first, *process.stdout.readlines()][-1])
     process.wait()
     assert not root.exists()  # nothing that looks whole
-    demos = load_demos(recover_dataset(root))
+    return announced, load_demos(recover_dataset(root))
+
+
+def test_a_killed_recording_loses_the_open_episode_at_most(tmp_path):
+    announced, demos = kill_and_recover(tmp_path / "set", 0.1)
     assert announced <= len(demos) <= announced + 1
     assert [demo.joint_position[0, 0] for demo in demos] == list(range(len(demos)))
-    assert check_dataset(root).ok
+    assert check_dataset(tmp_path / "set").ok
+
+
+@pytest.mark.slow
+def test_whenever_a_recording_is_killed(tmp_path):
+    moments = np.random.default_rng(0).uniform(0, 0.5, 20)
+    for index, seconds in enumerate(moments):
+        announced, demos = kill_and_recover(tmp_path / f"set{index}", seconds)
+        assert announced <= len(demos) <= announced + 1
 
 
 def test_a_recovery_that_was_killed_starts_anew(tmp_path):

@@ -6,18 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
+from ..features import INFO_PATH, Feature, read_features
 from ..finding import DatasetError
 from ..frames import RawFrames, require_rows, slice_frames
-from ..layout import (
-    INFO_PATH,
-    DatasetFolder,
-    EpisodeEntry,
-    Feature,
-    read_episodes,
-    read_features,
-    read_info,
-    read_tasks,
-)
+from ..layout import DatasetFolder, EpisodeEntry, read_episodes, read_info, read_tasks
 from ..parquet import BadRowError, open_parquet, read_table, to_numpy
 from ..roles import INDEX_KEYS
 from .report import Report

@@ -4,8 +4,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from ..features import Feature
 from ..frames import RawFrames
-from ..layout import DatasetFolder, EpisodeEntry, Feature
+from ..layout import DatasetFolder, EpisodeEntry
 from ..roles import INDEX_KEYS
 from .report import Report
 
