@@ -58,7 +58,8 @@ class RecursiveEstimator(PairEstimator):
         if covariance is None:
             neurons = weight_covariance(network.centers, config.bias_std, config.weight_std)
             covariance = torch.block_diag(*[neurons] * 6)
-        self.register_buffer("first_covariance", covariance.clone(), persistent=False)
+        covariance = (covariance + covariance.mT) / 2  # symmetric to the last bit
+        self.register_buffer("first_covariance", covariance, persistent=False)
 
     def initial_state(self, *batch: int) -> RecursiveState:
         """The network's weights, the prior (or the fit's posterior), no key frame."""
@@ -90,7 +91,11 @@ def condition(
     """
     phi = (pair.dr.unsqueeze(-1) * pair.theta.unsqueeze(-2)).flatten(-2).unsqueeze(-1)
     P_phi = covariance @ phi  # (*batch, P, 1)
-    gain = P_phi / (phi.mT @ P_phi + noise)
+    spread = phi.mT @ P_phi + noise
+    gain = P_phi / spread
     change = pair.error(weight).unsqueeze(-1) * gain.squeeze(-1).unsqueeze(-2)
     change = change.unflatten(-1, (6, -1)) * scale.unsqueeze(-1)  # (*batch, 2, 6, K)
-    return weight + change.flatten(-3, -2), covariance - gain @ P_phi.mT
+    # An outer product of a vector with itself is symmetric to the last bit. gain P_phi^T is
+    # not, and forgetting amplifies the difference until the covariance is none any more.
+    root = P_phi / spread.sqrt()
+    return weight + change.flatten(-3, -2), covariance - root @ root.mT
