@@ -14,3 +14,8 @@ from .safety import SafetyConfig as SafetyConfig
 from .safety import SafetyFilter as SafetyFilter
 from .safety import SafetyReport as SafetyReport
 from .safety import SafetyState as SafetyState
+from .table1 import GRIPPER_DOWN as GRIPPER_DOWN
+from .table1 import INITIAL_IMAGE_JACOBIAN as INITIAL_IMAGE_JACOBIAN
+from .table1 import table1_config as table1_config
+from .table1 import table1_goals as table1_goals
+from .table1 import table1_joint_region as table1_joint_region

@@ -9,11 +9,15 @@ from torch import Tensor
 from torch.utils import _pytree
 
 from hrc_learn.controller import (
+    INITIAL_IMAGE_JACOBIAN,
     AdaptiveController,
     ControllerConfig,
     ControllerState,
     Goals,
     Observation,
+    table1_config,
+    table1_goals,
+    table1_joint_region,
 )
 from hrc_learn.controller.rehearsal import (
     Imperfections,
@@ -302,14 +306,14 @@ def test_a_person_moves_the_elbow_and_not_the_tool(dt: float):
     goals = Goals.at(tool.position, tool.orientation, camera.project(tool)[0])
     J = camera.image_jacobian(tool)[0]
     controller = AdaptiveController(panda, FixedEstimator(network(J)), goals)
-    half = int(1.2 / dt)
+    half = int(1.1 / dt)
     self_motion = torch.linalg.svd(panda.jacobian(q)).Vh[:, -1:].mT
     way = panda.joint_jacobian(q, 4)[:, :3] @ self_motion
     way = way / way.norm(dim=-2, keepdim=True)
     moved, deviation, turned = [], [], []
 
     def pull(k: int, q: Tensor) -> Tensor:
-        force = (8.0 if k < half else -8.0) * way
+        force = (10.0 if k < half else -10.0) * way
         return (panda.joint_jacobian(q, 4)[:, :3].mT @ force)[..., 0]
 
     def watch(k: int, q: Tensor, *_) -> None:
@@ -423,7 +427,9 @@ def test_goes_through_vmap():
     controller, _ = grasping(rng=rng)
     q = near_starts(6, rng=rng)
     state = controller.initial_state(q)
-    mapped, _ = torch.vmap(lambda state, q: controller.step(state, observe(q, dt=0.01)))(state, q)
+    mapped, _ = torch.vmap(lambda state, q: controller.step(state, observe(q, dt=0.01)))(
+        state, q
+    )
     whole, _ = controller.step(state, observe(q, dt=0.01))
     torch.testing.assert_close(mapped.joint_velocity, whole.joint_velocity)
 
@@ -444,3 +450,31 @@ def test_bad_settings_are_refused():
         ControllerConfig(null_damping=0.0)
     with pytest.raises(ValueError, match="hold_rate must not be negative"):
         ControllerConfig(hold_rate=-1.0)
+
+
+def test_table_one_runs_only_because_of_the_safety_filter():
+    """k_o = 1 asks for many times the joint velocity limits, as its peak was measured."""
+    rng = sampling.generator(14)
+    q = near_starts(50, rng=rng)
+    target = torch.tensor([700.0, 500.0], dtype=DOUBLE)
+    half_size = torch.tensor([0.12, 0.12, 0.08], dtype=DOUBLE)
+    J = torch.tensor(INITIAL_IMAGE_JACOBIAN, dtype=DOUBLE)
+    controller = AdaptiveController(
+        panda,
+        PaperEstimator(network(J)),
+        table1_goals(CENTRE, half_size, target),
+        config=table1_config(),
+        joint_region=table1_joint_region(LIMITS),
+    )
+    state = controller.initial_state(q)
+    hidden = torch.zeros(50, dtype=torch.bool)
+    wanted = torch.zeros(50, dtype=DOUBLE)
+    for _ in range(50):
+        before = state.safety.velocity
+        command, state = controller.step(state, observe(q, feature_visible=hidden, dt=0.008))
+        speed = pseudo_inverse(panda.jacobian(q)) @ command.twist[..., None]
+        wanted = torch.maximum(wanted, (speed[..., 0].abs() / LIMITS.velocity).amax(-1))
+        q = q + 0.008 * command.joint_velocity
+        assert not violations(q, command.joint_velocity, before, 0.008).any()
+    assert wanted.median() > 5
+    assert (state.safety.count("velocity") > 0).all()

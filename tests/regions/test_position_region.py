@@ -22,7 +22,7 @@ def test_printed_gradient():
     """(trans_diff_potential): 2 k max(0, f) (r - c) / h^2."""
     region = PositionRegion(**BOX)
     x = BOX["centre"] + torch.tensor([0.24, 0.05, -0.16], dtype=torch.float64)
-    expected = [2 * 4e-4 * 3 * 0.24 / 0.12**2, 0, -2 * 4e-4 * 3 * 0.16 / 0.08**2]
+    expected = [2 * 4e-3 * 3 * 0.24 / 0.12**2, 0, -2 * 4e-3 * 3 * 0.16 / 0.08**2]
     assert region.gradient(x).tolist() == pytest.approx(expected)
 
 
@@ -40,4 +40,4 @@ def test_the_rate_near_a_wall_is_the_documented_one():
     region = PositionRegion(**BOX)
     excess = 1e-6
     x = BOX["centre"] + torch.tensor([0.12 + excess, 0, 0], dtype=torch.float64)
-    assert region.gradient(x)[0].item() / excess == pytest.approx(4 * 4e-4 / 0.12**2, rel=1e-4)
+    assert region.gradient(x)[0].item() / excess == pytest.approx(4 * 4e-3 / 0.12**2, rel=1e-4)
