@@ -8,11 +8,12 @@ import numpy as np
 from .checks import motion, structure, timing, values
 from .checks.meaning import Understood, check_joint_sets, understand
 from .checks.report import Report
-from .explicit_mapping import MappingSpec
+from .explicit_mapping import MappingSpec, parse_mapping
 from .finding import DatasetError
 from .frames import RawFrames
 from .layout import DatasetFolder, EpisodeEntry
 from .matching import Matching
+from .units import unit_factor
 
 
 def check_dataset(
@@ -30,11 +31,17 @@ def check_dataset(
         mapping: Where quantities are that are not found by name, as in `load_demos`.
         units: Units on disk by role, as in `load_demos`.
         speed_limits: Fastest each joint can turn [rad/s], by name; 12 rad/s where not given.
+
+    Raises:
+        DatasetError: `mapping` or `units` name what does not exist.
     """
+    for role, unit in (units or {}).items():
+        unit_factor(role, unit)
     report = Report(path=Path(path))
     folder = structure.check_metadata(report.path, report)
     if folder is None:
         return report
+    parse_mapping(mapping or {}, folder.features)
     episodes = _check_frames(folder, report)
     report.episodes = len(episodes)
     report.frames = sum(entry.length for entry, _ in episodes)

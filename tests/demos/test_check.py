@@ -405,6 +405,13 @@ def test_guessed_units_are_shown(tmp_path):
     assert not any("taken for" in finding.message for finding in declared.warnings)
 
 
+def test_the_callers_own_mistakes_are_no_findings(root):
+    with pytest.raises(DatasetError, match="does not come in 'furlong'; known units are rad"):
+        check_dataset(root, units={"joint_position": "furlong"})
+    with pytest.raises(DatasetError, match="unknown quantity 'joints'"):
+        check_dataset(root, mapping={"joints": STATE})
+
+
 def test_missing_videos(tmp_path):
     root = write_folder(
         tmp_path / "set", [{STATE: joint_path()}], {STATE: NAMES}, videos=["observation.front"]
