@@ -118,10 +118,13 @@ def person_figure(run: RunRecording) -> Figure:
     rows = [
         ("effort d [-]", "Null-space effort of the person, by joint", effort),
         ("elbow [mm]", "Elbow moved", scaled(run.elbow_motion, 1e3)),
-        ("position [mm]", "End effector led astray", scaled(run.position_deviation, 1e3)),
+        ("position [mm]", "Deviation of the end effector", scaled(run.position_deviation, 1e3)),
         ("rotation [deg]", "", scaled(run.rotation_deviation, 180 / np.pi)),
     ]
     shown = [row for row in rows if row[2] is not None]
+    # Deviations are known while the person is about; without them the whole run is shown.
+    known = [np.isfinite(values) for _, _, values in shown[1:] if values is not None]
+    about = np.logical_or.reduce([acting, *known])
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, 1.0 + 1.35 * len(shown)))
         column = figure.subplots(len(shown), 1, sharex=True, squeeze=False)[:, 0]
@@ -140,6 +143,7 @@ def person_figure(run: RunRecording) -> Figure:
             loc="center left",
             bbox_to_anchor=(1.0, 0.5),
         )
+        finite_span(column[-1], run.time, about)
         column[-1].set_xlabel("time [s] (shaded: the person acts)")
         figure.align_ylabels()
     return figure

@@ -31,6 +31,8 @@ class Plot:
     title: str
     """What is shown, with its unit: plots have no axis labels."""
     curves: tuple[Curves, ...]
+    range: tuple[float, float] | None = None
+    """Of the vertical axis; fits the data when None."""
     legend: bool = False
     """Where the title cannot name the colours."""
     share: float = 1.0
@@ -124,11 +126,15 @@ def _person(run: RunRecording) -> Tab:
     if run.position_deviation is not None:
         moved = 1e3 * run.position_deviation
         curves = single("person/position_deviation", "position", moved, palette.RUN_ON_DARK)
-        plots.append(Plot(title="End effector led astray, position [mm]", curves=(curves,)))
+        plots.append(
+            Plot(title="Deviation of the end effector, position [mm]", curves=(curves,))
+        )
     if run.rotation_deviation is not None:
         turned = np.degrees(run.rotation_deviation)
         curves = single("person/rotation_deviation", "rotation", turned, palette.PURPLE)
-        plots.append(Plot(title="End effector led astray, rotation [deg]", curves=(curves,)))
+        plots.append(
+            Plot(title="Deviation of the end effector, rotation [deg]", curves=(curves,))
+        )
     return Tab(title="Person", plots=tuple(plots))
 
 
@@ -171,16 +177,15 @@ def joint_plot(
 
 
 def _safety(run: RunRecording) -> Tab:
-    plots = tuple(
-        Plot(
-            title=f"Safety filter: {name}",
-            curves=(
-                single(f"safety/{_slug(name)}", name, values.astype(float), palette.LIMIT),
-            ),
-        )
-        for name, values in run.safety.items()
-    )
-    return Tab(title="Safety", plots=plots)
+    plots = []
+    for name, values in run.safety.items():
+        values = values.astype(float)
+        curves = single(f"safety/{_slug(name)}", name, values, palette.LIMIT)
+        # A guard that never acted is a line at the bottom, not in the middle.
+        top = max(1.0, float(np.nanmax(values, initial=0.0)))
+        room = (-0.05 * top, 1.05 * top)
+        plots.append(Plot(title=f"Safety filter: {name}", curves=(curves,), range=room))
+    return Tab(title="Safety", plots=tuple(plots))
 
 
 def _slug(name: str) -> str:

@@ -147,6 +147,7 @@ def plot_view(plot: Plot) -> rrb.TimeSeriesView:
         origin="/",
         contents=[f"/{curves.path}" for curves in plot.curves],
         name=plot.title,
+        axis_y=None if plot.range is None else rrb.ScalarAxis(range=plot.range),
         plot_legend=rrb.PlotLegend("RightTop", visible=plot.legend),
     )
 

@@ -171,7 +171,8 @@ def _cross(pixel: Float[np.ndarray, "2"]) -> list[Float[np.ndarray, "2 2"]]:
 
 def _send_phases(stream: rr.RecordingStream, run: RunRecording) -> None:
     when = seconds(np.array([phase.time for phase in run.phases], dtype=float))
-    texts = [phase.text for phase in run.phases]
+    # The viewer's own column of times is too narrow for decimals.
+    texts = [f"{phase.time:.1f} s: {phase.text}" for phase in run.phases]
     levels = ["INFO"] * len(texts)
     stream.send_columns("phases", when, rr.TextLog.columns(text=texts, level=levels))
 

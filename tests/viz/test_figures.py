@@ -78,6 +78,18 @@ def test_person_figure_shades_the_push_and_shows_millimetres():
     assert span.get_x() + span.get_width() == pytest.approx(run.time[119])
 
 
+def test_person_figure_shows_the_time_in_which_the_person_is_about():
+    run = sample_run()
+    whole = figures.person_figure(run).axes[-1].get_xlim()
+    assert whole == (run.time[0], run.time[-1])
+    unknown = np.where(run.human_effort[:, 3] > 0, run.position_deviation, np.nan)
+    known_at = dict.fromkeys(
+        ("elbow_motion", "position_deviation", "rotation_deviation"), unknown
+    )
+    spell = figures.person_figure(sample_run(**known_at)).axes[-1].get_xlim()
+    assert spell == (run.time[80], run.time[119])
+
+
 def test_jacobian_figure_shows_twelve_estimates_and_twelve_truths():
     run = sample_run()
     axes = figures.image_jacobian_figure(run).axes

@@ -72,3 +72,11 @@ def test_names_with_blanks_and_slashes_make_plain_paths():
     values = np.zeros(STEPS)
     shown = curves(run_tabs(sample_run(safety={"limit [rad/s]": values})))
     assert "safety/limit_rad_s" in shown
+
+
+def test_guards_that_never_acted_lie_at_the_bottom_of_their_plot():
+    never, often = np.zeros(STEPS), np.arange(STEPS)
+    tabs = run_tabs(sample_run(safety={"never": never, "often": often.astype(float)}))
+    ranges = {plot.title: plot.range for plot in tabs[-1].plots}
+    assert ranges["Safety filter: never"] == (-0.05, 1.05)
+    assert ranges["Safety filter: often"] == pytest.approx((-9.95, 208.95))

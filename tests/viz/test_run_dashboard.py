@@ -102,7 +102,7 @@ def test_the_still_things_are_there(run, rrd):
 
 
 def test_phases_are_logged_at_their_times(rrd):
-    assert rrd.column("phases", "TextLog:text") == [["Approach"], ["Servo"]]
+    assert rrd.column("phases", "TextLog:text") == [["0.0 s: Approach"], ["1.0 s: Servo"]]
     assert rrd.time("phases").tolist() == [0.0, 1.0]
 
 
