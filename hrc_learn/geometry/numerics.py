@@ -27,7 +27,7 @@ def cos_and_sinc(square: Float[Tensor, "*batch"]) -> tuple[Tensor, Tensor]:
     """
     small = square < _SINC_THRESHOLD
     x = torch.sqrt(torch.where(small, 1.0, square))
-    near = torch.where(small, square, 0.0)
+    near = square.clamp_max(_SINC_THRESHOLD)
     cos_series = _horner(near, (1.0, -1 / 2, 1 / 24, -1 / 720, 1 / 40320))
     sinc_series = _horner(near, (1.0, -1 / 6, 1 / 120, -1 / 5040, 1 / 362880))
     return torch.where(small, cos_series, torch.cos(x)), torch.where(
@@ -52,7 +52,7 @@ def arctan_ratio(
     small = sine_square < _ARCTAN_THRESHOLD * cosine * cosine
     s = torch.sqrt(torch.where(small, 1.0, sine_square))
     c = torch.where(small, cosine, 1.0)
-    tangent_square = torch.where(small, sine_square, 0.0) / (c * c)
+    tangent_square = sine_square / (c * c)  # where not small it only has to be finite
     series = _horner(tangent_square, (1.0, -1 / 3, 1 / 5, -1 / 7, 1 / 9)) / c
     return torch.where(small, series, torch.atan2(s, cosine) / s)
 
@@ -66,7 +66,8 @@ def safe_norm(vector: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
 
 def _horner(x: Tensor, coefficients: tuple[float, ...]) -> Tensor:
     """Polynomial with the constant term first."""
-    value = torch.full_like(x, coefficients[-1])
-    for coefficient in reversed(coefficients[:-1]):
+    *rest, last_but_one, last = coefficients
+    value = x * last + last_but_one
+    for coefficient in reversed(rest):
         value = value * x + coefficient
     return value

@@ -72,7 +72,7 @@ def normalize(q: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
 def canonical(q: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
     """The sign whose first non-zero component is positive (w >= 0: the shortest rotation)."""
     order = (torch.sign(q) * _LEXICOGRAPHIC.like(q)).sum(-1, keepdim=True)
-    return torch.where(order < 0, -q, q)
+    return q * torch.sign(order)
 
 
 def log(q: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3"]:
