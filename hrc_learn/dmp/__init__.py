@@ -2,6 +2,7 @@
 
 from hrc_learn.dmp import coupling as coupling
 from hrc_learn.dmp.basis import GaussianBasis as GaussianBasis
+from hrc_learn.dmp.basis import PeriodicBasis as PeriodicBasis
 from hrc_learn.dmp.canonical import ExponentialPhase as ExponentialPhase
 from hrc_learn.dmp.distribution import DMPDistribution as DMPDistribution
 from hrc_learn.dmp.joint import JointDMP as JointDMP
@@ -12,6 +13,7 @@ from hrc_learn.dmp.pose import PoseDMP as PoseDMP
 from hrc_learn.dmp.pose import PoseState as PoseState
 from hrc_learn.dmp.pose import PoseTrajectory as PoseTrajectory
 from hrc_learn.dmp.report import FitReport as FitReport
+from hrc_learn.dmp.rhythmic import fit_rhythmic as fit_rhythmic
 from hrc_learn.dmp.spring import SpringDamper as SpringDamper
 from hrc_learn.dmp.state import DMPState as DMPState
 from hrc_learn.dmp.stepper import Stepper as Stepper

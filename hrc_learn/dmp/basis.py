@@ -1,7 +1,8 @@
-"""Gaussian basis of the forcing term."""
+"""Bases of the forcing term: Gaussians for motions that end, periodic ones for rhythms."""
 
 import math
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
@@ -35,12 +36,10 @@ class GaussianBasis:
     """What the Gaussians are spread over: `"time"` or `"phase"`."""
     phase: ExponentialPhase = field(default_factory=ExponentialPhase)
     """The canonical system, whose z fades the forcing term."""
+    periodic: ClassVar[bool] = False
 
     def __post_init__(self):
-        if self.count < 2:
-            raise ValueError(f"a basis needs at least 2 functions, got {self.count}")
-        if not (math.isfinite(self.width) and self.width > 0):
-            raise ValueError(f"width must be positive, got {self.width}")
+        _check_shape(self.count, self.width)
         if self.domain not in DOMAINS:
             raise ValueError(f"unknown domain {self.domain!r}; there are {', '.join(DOMAINS)}")
 
@@ -88,3 +87,53 @@ class GaussianBasis:
         spacing = -centres.diff()
         widths = self.width * torch.cat([spacing, spacing[-1:]])
         return -0.5 * ((self.phase(s)[..., None] - centres) / widths) ** 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class PeriodicBasis:
+    """Normalised periodic bells, that do not fade.
+
+    psi_i(s) = exp(h (cos(2 pi (s - c_i)) - 1)),  phi_i = psi_i / sum_j psi_j
+
+    (Ijspeert et al. 2013, section 2.2.2). Centres c_i = (i - 1) / N; h such that a bell has
+    the standard deviation `width` times their distance.
+    """
+
+    count: int = 25
+    """N, the number of basis functions."""
+    width: float = 0.6
+    """Standard deviation of a bell as a share of the distance between centres."""
+    periodic: ClassVar[bool] = True
+    horizon: ClassVar[float] = 1.0
+
+    def __post_init__(self):
+        _check_shape(self.count, self.width)
+
+    @property
+    def smooth_interval(self) -> float:
+        """Length over which the forcing is a polynomial of low degree."""
+        return min(0.5, 1.4 * self.width**2) / self.count
+
+    def phase(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """What fades the forcing term: nothing."""
+        return torch.ones_like(s)
+
+    def centre_times(self) -> Float[Tensor, "N"]:
+        """Normalised times c_i at which the basis functions peak (float64)."""
+        return torch.arange(self.count, dtype=torch.float64) / self.count
+
+    def forcing(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch N"]:
+        """What each unit weight adds to the forcing term at normalised time `s`."""
+        sharpness = (self.count / (2 * math.pi * self.width)) ** 2
+        angle = 2 * math.pi * (s[..., None] - self.centre_times().to(s))
+        return torch.softmax(sharpness * torch.cos(angle), dim=-1)
+
+
+type Basis = GaussianBasis | PeriodicBasis
+
+
+def _check_shape(count: int, width: float) -> None:
+    if count < 2:
+        raise ValueError(f"a basis needs at least 2 functions, got {count}")
+    if not (math.isfinite(width) and width > 0):
+        raise ValueError(f"width must be positive, got {width}")

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from hrc_learn.dmp.basis import GaussianBasis
 from hrc_learn.dmp.response import Response
 from hrc_learn.dmp.samples import Samples
 
@@ -138,6 +139,7 @@ def _ridge_operator(response: Response, s: Tensor, regularization: float) -> Ten
 def _lwr_operator(response: Response, s: Tensor, regularization: float) -> Tensor:
     """w_i = (z' Gamma_i f) / (z' Gamma_i z), the paper's solution of its (Cost_i)."""
     del regularization  # each weight is a mean of its own samples: nothing is ill-posed
+    assert isinstance(response.basis, GaussianBasis)
     z = response.basis.phase(s)
     weighted = (response.basis.gaussians(s) * z[:, None]).T
     # A Gaussian narrower than the sampling may see no sample: its weight is zero then.

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from hrc_learn.dmp.basis import GaussianBasis
+from hrc_learn.dmp.basis import Basis, GaussianBasis, PeriodicBasis
 from hrc_learn.dmp.canonical import ExponentialPhase
 from hrc_learn.dmp.files import SavedPrimitive, write_folder
 from hrc_learn.dmp.fitting import fit_samples
@@ -23,6 +23,7 @@ from hrc_learn.dmp.state import DMPState
 from hrc_learn.dmp.stepping import advance, second_derivative
 from hrc_learn.dmp.trajectory import Trajectory, broadcast_shapes
 
+BASES = {basis.__name__: basis for basis in (GaussianBasis, PeriodicBasis)}
 BUFFERS = ("start", "goal", "start_velocity", "duration", "amplitude", "stamps")
 
 
@@ -57,7 +58,7 @@ class JointDMP(nn.Module):
         duration: Float[Tensor, "*batch"],
         amplitude: Float[Tensor, "*batch D"],
         stamps: Float[Tensor, "*#batch T"],
-        basis: GaussianBasis,
+        basis: Basis,
         spring: SpringDamper,
         scaling: str = "none",
         joint_names: Sequence[str] | None = None,
@@ -187,6 +188,7 @@ class JointDMP(nn.Module):
         start_velocity: ArrayLike | None = None,
         *,
         speed: ArrayLike | None = None,
+        amplitude: ArrayLike | None = None,
     ) -> Trajectory:
         """Motion from start to goal; without arguments, the demonstrated one.
 
@@ -202,11 +204,14 @@ class JointDMP(nn.Module):
             start_velocity: Per second, (*batch, D). By default the demonstrated one, changed
                 with the duration so that the path stays the same.
             speed: Instead of a duration, how many times faster than the demonstration.
+            amplitude: Factor on the forcing term, (*batch): how wide a rhythm swings.
         """
         start, goal, rate, duration = self._boundary(
             start, goal, duration, start_velocity, speed
         )
         weights, ends = self._scaled_weights(start, goal), (rate, start, goal)
+        if amplitude is not None:
+            weights = weights * self._as_tensor(amplitude)[..., None, None]
         batch = broadcast_shapes(weights.shape[:-1], *(x.shape for x in ends))
         if weights.shape[:-1] != batch or any(x.shape != batch for x in ends):
             weights, ends = weights.expand(*batch, -1), [x.expand(batch) for x in ends]
@@ -237,6 +242,7 @@ class JointDMP(nn.Module):
         )
         start, goal, rate = (x.expand(*batch, -1) for x in (start, goal, rate))
         duration = duration.expand(batch)
+        s = torch.zeros_like(duration, dtype=torch.float64)
         return DMPState(
             position=start,
             rate=rate,
@@ -245,8 +251,8 @@ class JointDMP(nn.Module):
             target=goal,
             duration=duration,
             pace=torch.ones_like(duration),
-            s=torch.zeros_like(duration, dtype=torch.float64),
-            forced=torch.zeros_like(torch.stack([start, start], dim=-2)),
+            s=s,
+            forced=self.response.forced.to(s.device)(s).to(start) @ self.weights.mT,
         )
 
     def step(
@@ -258,6 +264,7 @@ class JointDMP(nn.Module):
         goal_filter: float | None = None,
         coupling: ArrayLike | None = None,
         slowdown: ArrayLike | None = None,
+        amplitude: ArrayLike | None = None,
     ) -> DMPState:
         """Advance by `dt`, exactly for whatever is constant over the step.
 
@@ -274,6 +281,7 @@ class JointDMP(nn.Module):
             coupling: Acceleration added to the motion, per s^2, (*batch, D).
             slowdown: The clock of the whole system, phase and spring, runs 1 + slowdown
                 times slower, (*batch), >= 0. Slows along the path without leaving it.
+            amplitude: Factor on the forcing term, (*batch).
         """
         target = state.target if goal is None else self._as_tensor(goal).expand_as(state.goal)
         pace = torch.ones_like(state.pace)
@@ -283,12 +291,16 @@ class JointDMP(nn.Module):
         if coupling is not None:
             push = self._as_tensor(coupling) * state.duration[..., None] ** 2
         aim = target if goal_filter is None else state.goal
+        scale = forcing_scale(self.scaling, state.start, aim, self.amplitude)
+        if amplitude is not None:
+            factor = self._as_tensor(amplitude)[..., None]
+            scale = factor.expand_as(target) if scale is None else scale * factor
         return advance(
             state,
             (self._as_tensor(dt) * pace / state.duration).double(),
             response=self.response,
             weights=self.weights,
-            scale=forcing_scale(self.scaling, state.start, aim, self.amplitude),
+            scale=scale,
             target=target,
             goal_filter=goal_filter,
             push=push,
@@ -337,7 +349,7 @@ class JointDMP(nn.Module):
             "units": {"coordinates": self.units, "time": "s"},
             "scaling": self.scaling,
             "spring": asdict(self.spring),
-            "basis": asdict(self.basis),
+            "basis": {"type": type(self.basis).__name__, **asdict(self.basis)},
         }
 
     def tensors(self) -> dict[str, Tensor]:
@@ -351,8 +363,10 @@ class JointDMP(nn.Module):
         spring = saved.get("spring", dict)
         basis = dict(saved.get("basis", dict))
         try:
-            basis["phase"] = ExponentialPhase(**basis["phase"])
-            parts = {"spring": SpringDamper(**spring), "basis": GaussianBasis(**basis)}
+            make = BASES[basis.pop("type")]
+            if make is GaussianBasis:
+                basis["phase"] = ExponentialPhase(**basis["phase"])
+            parts = {"spring": SpringDamper(**spring), "basis": make(**basis)}
         except (KeyError, TypeError, ValueError) as error:
             raise saved.invalid(f"field 'spring' or 'basis': {error}") from None
         arguments = {

@@ -23,17 +23,22 @@ class PiecewisePolynomial:
     coefficients: Float[Tensor, "pieces P rows columns"]
     interval: float
     """Length of a piece."""
+    periodic: bool = False
+    """Whether the last piece is followed by the first."""
     _moved: dict[torch.device, "PiecewisePolynomial"] = field(default_factory=dict)
 
     @classmethod
     def interpolate(
-        cls, values: Float[Tensor, "pieces P rows columns"], interval: float
+        cls,
+        values: Float[Tensor, "pieces P rows columns"],
+        interval: float,
+        periodic: bool = False,
     ) -> "PiecewisePolynomial":
         """The function that has these values at the Chebyshev points of its pieces."""
         u = 2 * chebyshev_points() - 1
         powers = u[:, None] ** torch.arange(DEGREE + 1)
         solved = torch.linalg.solve(powers, values.flatten(2))
-        return cls(solved.view(values.shape), interval)
+        return cls(solved.view(values.shape), interval, periodic)
 
     @property
     def end(self) -> float:
@@ -41,9 +46,10 @@ class PiecewisePolynomial:
         return self.interval * len(self.coefficients)
 
     def __call__(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch rows columns"]:
-        """Value at `s`; past the end, the value at the end."""
+        """Value at `s`; past the end of what is not periodic, the value at the end."""
         pieces, P, *shape = self.coefficients.shape
-        x = (s / self.interval).clamp(0, pieces)
+        x = s / self.interval
+        x = x % pieces if self.periodic else x.clamp(0, pieces)
         piece = x.detach().long().clamp(max=pieces - 1)
         powers = (2 * (x - piece) - 1)[..., None, None] ** self._exponents
         c = self.coefficients.view(pieces, P, -1)[piece]
@@ -55,7 +61,7 @@ class PiecewisePolynomial:
             return self
         if device not in self._moved:
             moved = self.coefficients.to(device)
-            self._moved[device] = PiecewisePolynomial(moved, self.interval)
+            self._moved[device] = PiecewisePolynomial(moved, self.interval, self.periodic)
         return self._moved[device]
 
     @cached_property

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.dmp.basis import GaussianBasis
+from hrc_learn.dmp.basis import Basis
 from hrc_learn.dmp.piecewise import PiecewisePolynomial, chebyshev_points
 from hrc_learn.dmp.spring import SpringDamper
 
@@ -28,13 +28,14 @@ class Response:
     until it is handed out.
     """
 
-    def __init__(self, spring: SpringDamper, basis: GaussianBasis):
+    def __init__(self, spring: SpringDamper, basis: Basis):
         self.spring = spring
         self.basis = basis
         self.size = basis.count + 3
         """Number of coordinates: N weights, start velocity, start, goal."""
         self.forced = self._integrate()
-        """(y, y') that unit weights alone have caused, from rest at the goal: (2, N)."""
+        """(y, y') that unit weights alone cause, (2, N): from rest at the goal at s = 0, or,
+        of a periodic basis, the limit cycle."""
         self._matrices: OrderedDict[tuple, tuple[Tensor, Tensor, Tensor]] = OrderedDict()
 
     def matrices(
@@ -65,6 +66,8 @@ class Response:
 
     def coasting(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
         """How long the spring alone has moved on what the forcing caused until it ended."""
+        if self.basis.periodic:
+            return torch.zeros_like(s)
         return (s - self.forced.end).clamp(min=0)
 
     def state(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 2 M"]:
@@ -72,7 +75,11 @@ class Response:
         E = self.spring.propagator(s)
         start, velocity = E[..., :, :1], E[..., :, 1:]
         at_rest = torch.tensor([[1.0], [0.0]], dtype=s.dtype, device=s.device)
-        forced = self.spring.propagator(self.coasting(s)) @ self.forced.to(s.device)(s)
+        table = self.forced.to(s.device)
+        forced = self.spring.propagator(self.coasting(s)) @ table(s)
+        if self.basis.periodic:
+            # From rest: what it takes to be off the limit cycle at first dies out.
+            forced = forced - E @ table(torch.zeros_like(s))
         return torch.cat([forced, velocity, start, at_rest - start], dim=-1)
 
     def _acceleration(self, s: Tensor, state: Tensor) -> Tensor:
@@ -83,9 +90,11 @@ class Response:
         return (free + forcing)[..., None, :]
 
     def _integrate(self) -> PiecewisePolynomial:
-        """Solve for all basis functions at once, from rest to where the forcing has ended."""
+        """Solve for all basis functions at once, to where the forcing ends or starts over."""
         interval = min(self.basis.smooth_interval, self.spring.smooth_interval)
         n_pieces = math.ceil(self.basis.horizon / interval)
+        if self.basis.periodic:
+            interval = self.basis.horizon / n_pieces
         knots = interval * torch.arange(n_pieces, dtype=torch.float64)
         points = interval * chebyshev_points()
         # The forcing's share at each point of each piece, then the states at the knots by a
@@ -98,8 +107,14 @@ class Response:
             E = self.spring.propagator(knots[stride])
             state = torch.cat([state[:stride], state[stride:] + E @ state[:-stride]])
             stride *= 2
+        if self.basis.periodic:
+            # The start that a period leads back to: x = E x + (what is there from rest).
+            E = self.spring.propagator(interval * torch.tensor(n_pieces, dtype=torch.float64))
+            after = self.spring.propagator(points[-1]) @ state[-1] + share[-1, -1]
+            cycle = torch.linalg.solve(torch.eye(2, dtype=torch.float64) - E, after)
+            state = state + self.spring.propagator(knots) @ cycle
         values = self.spring.propagator(points) @ state[:, None] + share
-        return PiecewisePolynomial.interpolate(values, interval)
+        return PiecewisePolynomial.interpolate(values, interval, self.basis.periodic)
 
     def _impulse(
         self, start: Float[Tensor, "pieces"], length: Float[Tensor, ""]
@@ -133,6 +148,6 @@ class _StateAt(torch.autograd.Function):
 
 
 @lru_cache(maxsize=64)
-def response_of(spring: SpringDamper, basis: GaussianBasis) -> Response:
+def response_of(spring: SpringDamper, basis: Basis) -> Response:
     """The one `Response` of these parts: primitives alike share tables and matrices."""
     return Response(spring, basis)

@@ -62,7 +62,8 @@ class Stepper:
         table = (forced.coefficients @ weights.T).numpy()
         self._table = np.ascontiguousarray(table.reshape(*table.shape[:2], -1))
         self._exponents = np.arange(table.shape[1])
-        self._interval, self._end = forced.interval, forced.end
+        self._interval = forced.interval
+        self._end = math.inf if forced.periodic else forced.end
         self._spring = dmp.spring
         self._by_distance = dmp.scaling == "paper"
         self._start, self._goal, self._velocity = (
@@ -88,7 +89,7 @@ class Stepper:
             rate = start_velocity * duration
         y = np.stack([start, rate])
         goal = self._goal if goal is None else goal
-        return StepperState(0.0, y, np.zeros_like(y), start, goal, duration, 1.0)
+        return StepperState(0.0, y, self._forced(0.0), start, goal, duration, 1.0)
 
     def step(
         self,
@@ -123,7 +124,7 @@ class Stepper:
 
     def _forced(self, s: float) -> Pair:
         """(y, dy/ds) that the forcing term has caused, by a table that ends where it does."""
-        x = min(s, self._end) / self._interval
+        x = (s % 1.0 if self._end == math.inf else min(s, self._end)) / self._interval
         piece = min(int(x), len(self._table) - 1)
         powers = (2.0 * (x - piece) - 1.0) ** self._exponents
         forced = (powers @ self._table[piece]).reshape(2, -1)
