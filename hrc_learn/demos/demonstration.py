@@ -21,7 +21,7 @@ JOINT_FIELDS = (
 _WIDTHS = {"position": 3, "orientation": 4, "feature": 2}
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Demonstration:
     """What was recorded while a person showed the task once.
 
@@ -90,6 +90,12 @@ class Demonstration:
 
     def __len__(self) -> int:
         return len(self.time)
+
+    def __repr__(self) -> str:
+        return (
+            f"Demonstration(episode {self.episode}, {self.task!r}: {len(self)} frames, "
+            f"{self.duration:.3g} s; {', '.join(self.recorded)})"
+        )
 
     @property
     def duration(self) -> float:

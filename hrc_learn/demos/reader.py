@@ -77,6 +77,8 @@ def _select_episodes(folder: DatasetFolder, wanted: Sequence[int] | None) -> lis
     by_index = {entry.index: entry for entry in folder.episodes}
     if not by_index:
         raise DatasetError("the dataset holds no episodes", file=folder.root)
+    if wanted is not None and not len(wanted):
+        raise DatasetError("no episode was asked for; None reads all", file=folder.root)
     missing = [index for index in wanted or () if index not in by_index]
     if missing:
         raise DatasetError(

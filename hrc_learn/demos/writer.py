@@ -290,12 +290,18 @@ def recover_dataset(root: str | Path) -> Path:
 
     Raises:
         FileNotFoundError: There is no recording of that name.
+        FileExistsError: There is a dataset of that name.
         DatasetError: The recording holds no saved episode.
     """
     root = Path(root)
     staging = staging_folder(root)
     if not staging.is_dir():
         raise FileNotFoundError(f"no interrupted recording at {staging}")
+    if root.exists():
+        raise FileExistsError(
+            f"{root} already exists: remove {staging} if it is the same recording, or move "
+            f"{root} away to make a dataset of it"
+        )
     assembled = staging / "dataset"
     shutil.rmtree(assembled, ignore_errors=True)  # of an earlier attempt
     assemble(staged_paths(staging), assembled)

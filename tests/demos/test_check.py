@@ -383,6 +383,15 @@ def test_dimensions_that_never_change_or_saturate(tmp_path):
     assert find(report.warnings, "end of its range").message.endswith("c.pos")
 
 
+def test_actions_of_some_joints_only(tmp_path):
+    q = joint_path()
+    names = {STATE: NAMES, "action": NAMES[:2]}
+    root = write_folder(tmp_path / "set", [{STATE: q, "action": q[:, :2]}], names)
+    report = check_dataset(root)
+    assert report.ok
+    assert find(report.warnings, "left among the extra columns").key == "command_position"
+
+
 def test_leader_and_follower(tmp_path):
     q = joint_path()
     names = {STATE: NAMES, "action": ["l1.pos", "l2.pos", "l3.pos"]}

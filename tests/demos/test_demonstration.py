@@ -51,6 +51,11 @@ def test_joints_are_selected_in_every_field_that_goes_by_joints():
         demonstration().select_joints(["d"])
 
 
+def test_a_demonstration_tells_what_it_holds():
+    text = repr(demonstration(task="pour", episode=3))
+    assert "episode 3, 'pour': 5 frames, 0.4 s; time, joint_position, position" in text
+
+
 def test_a_demonstration_cannot_be_changed():
     with pytest.raises(dataclasses.FrozenInstanceError):
         demonstration().task = "other"

@@ -220,6 +220,8 @@ def test_episodes_are_chosen_in_order_and_from_their_row_groups(tmp_path):
     np.testing.assert_allclose(demos[1].joint_position, motions[1], atol=1e-6)
     with pytest.raises(DatasetError, match=r"episode 7.*0 to 4"):
         load_demos(root, episodes=[7])
+    with pytest.raises(DatasetError, match="no episode was asked for"):
+        load_demos(root, episodes=[])
 
 
 @pytest.mark.parametrize(

@@ -334,5 +334,16 @@ def record_one(root, frames, then=None):
             raise then
 
 
+def test_a_recovery_does_not_replace_a_dataset(tmp_path):
+    root = tmp_path / "set"
+    with pytest.raises(KeyboardInterrupt):
+        record_one(root, [{"gripper": 0.1}], then=KeyboardInterrupt())
+    root.mkdir()
+    with pytest.raises(FileExistsError, match="move"):
+        recover_dataset(root)
+    root.rmdir()
+    assert len(load_demos(recover_dataset(root))) == 1
+
+
 def writing(root):
     return DatasetWriter(root, 50, "any", JOINTS)

@@ -72,7 +72,9 @@ def check_joint_sets(matching: Matching, report: Report) -> None:
             f"{role} is of the joints {', '.join(others)}, the rest of "
             f"{', '.join(matching.joint_names)}"
         )
-        if len(others) == len(matching.joint_names):
+        if set(others) < set(matching.joint_names):
+            report.warning(f"{message}: it is left among the extra columns", key=role)
+        elif len(others) == len(matching.joint_names):
             report.warning(f"{message}: leader and follower? They are not compared", key=role)
         else:
             report.error(
