@@ -9,6 +9,7 @@ from .goals import Goals as Goals
 from .interface import Command as Command
 from .interface import ControllerState as ControllerState
 from .interface import Observation as Observation
+from .posture import comfortable_posture as comfortable_posture
 from .safety import INTERVENTIONS as INTERVENTIONS
 from .safety import SafetyConfig as SafetyConfig
 from .safety import SafetyFilter as SafetyFilter
