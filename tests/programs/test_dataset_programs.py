@@ -162,6 +162,17 @@ def test_help_tells_what_the_program_is_for(name):
     assert "--json" in done.stdout
 
 
+def test_the_benchmark_writes_its_figures(tmp_path):
+    program = PROGRAMS.parent / "benchmarks/bench_demos.py"
+    sizes = ["--episodes", "2", "--frames", "50", "--repeats", "1"]
+    subprocess.run(
+        [sys.executable, program, *sizes, "--json", tmp_path / "figures.json"], check=True
+    )
+    figures = json.loads((tmp_path / "figures.json").read_text())
+    assert figures["load_demos_samples_per_s"] > 0
+    assert all(isinstance(value, float) for value in figures.values())
+
+
 def test_no_package_shadows_hugging_faces_datasets():
     assert not list(PROGRAMS.glob("__init__.py"))
 
