@@ -7,12 +7,17 @@ SHELF ?= middle
 
 help:
 	@echo "make demo    demonstrate, learn, grasp, place in simulation; writes $(OUT)"
+	@echo "             make demo SHELF=upper places on another shelf (lower, middle, upper)"
 	@echo "make test    run the tests"
 	@echo "make bench   measure the speed against floors and peers"
 	@echo "make format  format the code        make check  lint and type-check"
 
 demo: .venv/.installed
-	$(PYTHON) control/run_demo.py --out $(OUT) --shelf $(SHELF)
+	$(PYTHON) datasets/record_placing.py --out $(OUT)/placing_demos --overwrite
+	$(PYTHON) datasets/record_servoing.py --out $(OUT)/aiming_demos --overwrite
+	$(PYTHON) training/fit_dmp.py --dataset $(OUT)/placing_demos --out $(OUT)/placing --overwrite
+	$(PYTHON) training/fit_image_jacobian.py --dataset $(OUT)/aiming_demos --out $(OUT)/aiming --overwrite
+	$(PYTHON) control/run_collaboration.py --placing $(OUT)/placing --aiming $(OUT)/aiming --shelf $(SHELF) --out $(OUT)/run --overwrite
 
 test: .venv/.installed
 	$(PYTHON) -m pytest -n auto --dist loadfile

@@ -14,6 +14,7 @@ from rich.progress import track
 from hrc_learn import cli
 from hrc_learn.demos import DatasetWriter
 from hrc_learn.kinematics import panda
+from hrc_learn.output import replacing
 from hrc_learn.sim import World
 from hrc_learn.tasks import PlacingLesson, Workplace, teach_placing
 
@@ -23,7 +24,7 @@ class Args:
     """What to record."""
 
     out: Path
-    """Folder of the new dataset; it must not exist."""
+    """Folder of the new dataset."""
     episodes: int = 3
     """Demonstrations to record."""
     shelf: str = "middle"
@@ -32,24 +33,29 @@ class Args:
     """How the expert teaches."""
     seed: int = 0
     """Seed of the hand's unsteadiness and of where demonstrations start."""
+    overwrite: bool = False
+    """Replace an older dataset in that folder."""
     json: Path | None = None
     """File for the measured values."""
 
 
-def main(args: Args) -> int:
+def main(args: Args) -> None:
     workplace = Workplace()
     goal = workplace.shelf(args.shelf)
     world = World(workplace.scene)
     rng = np.random.default_rng(args.seed)
     thrown_away, errors = 0, []
-    with DatasetWriter(
-        args.out,
-        fps=args.lesson.fps,
-        robot_type="panda",
-        joint_names=panda.joint_names,
-        frames={"base": "panda_link0", "ee": "panda_hand_tcp"},
-        details={"shelf": args.shelf, "scene": "hrc_learn workplace"},
-    ) as writer:
+    with (
+        replacing(args.out, "meta/info.json", args.overwrite) as folder,
+        DatasetWriter(
+            folder,
+            fps=args.lesson.fps,
+            robot_type="panda",
+            joint_names=panda.joint_names,
+            frames={"base": "panda_link0", "ee": "panda_hand_tcp"},
+            details={"shelf": args.shelf, "scene": "hrc_learn workplace"},
+        ) as writer,
+    ):
         for _ in track(range(args.episodes), description="Placing demonstrations"):
             for _attempt in range(3):
                 frames, touches = teach_placing(world, workplace, args.shelf, args.lesson, rng)
@@ -57,11 +63,12 @@ def main(args: Args) -> int:
                     break
                 thrown_away += 1
             else:
-                print(f"three demonstrations in a row touched the cabinet: {touches[0]}")
-                return 1
+                raise RuntimeError(
+                    f"three demonstrations in a row hit the cabinet: {touches[0]}"
+                )
             writer.start_episode(f"place the box on the {args.shelf} shelf")
             for frame in frames:
-                writer.add_frame(**frame)
+                writer.add_frame(images=None, **frame)
             writer.save_episode()
             errors.append(float(np.linalg.norm(frames[-1]["position"] - goal.position.numpy())))
     print(f"{args.episodes} demonstrations in {args.out} ({thrown_away} thrown away)")
@@ -72,7 +79,6 @@ def main(args: Args) -> int:
             "final_error_mm_max": 1e3 * max(errors),
         }
         cli.write_json(args.json, values)
-    return 0
 
 
 if __name__ == "__main__":

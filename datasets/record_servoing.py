@@ -13,6 +13,7 @@ from rich.progress import track
 from hrc_learn import cli
 from hrc_learn.demos import DatasetWriter
 from hrc_learn.kinematics import panda
+from hrc_learn.output import replacing
 from hrc_learn.sim import CameraKind, World, open_camera
 from hrc_learn.tasks import (
     OBJECT_FEATURE,
@@ -29,7 +30,7 @@ class Args:
     """What to record."""
 
     out: Path
-    """Folder of the new dataset; it must not exist."""
+    """Folder of the new dataset."""
     episodes: int = 8
     """Demonstrations to record."""
     camera: CameraKind = "synthetic"
@@ -38,6 +39,8 @@ class Args:
     """How the expert teaches."""
     seed: int = 1
     """Seed of objects, paths and image noise."""
+    overwrite: bool = False
+    """Replace an older dataset in that folder."""
     json: Path | None = None
     """File for the measured values."""
 
@@ -48,25 +51,30 @@ def main(args: Args) -> None:
     rng = np.random.default_rng(args.seed)
     eye = Eye.on(open_camera(world, args.camera, rng=rng), workplace.scene)
     seen = []
-    with DatasetWriter(
-        args.out,
-        fps=args.lesson.fps,
-        robot_type="panda",
-        joint_names=panda.joint_names,
-        features={OBJECT_FEATURE: OBJECT_FEATURE_NAMES},
-        frames={"base": "panda_link0", "ee": "panda_hand_tcp"},
-        details={"scene": "hrc_learn workplace"},
-    ) as writer:
+    with (
+        replacing(args.out, "meta/info.json", args.overwrite) as folder,
+        DatasetWriter(
+            folder,
+            fps=args.lesson.fps,
+            robot_type="panda",
+            joint_names=panda.joint_names,
+            features={OBJECT_FEATURE: OBJECT_FEATURE_NAMES},
+            frames={"base": "panda_link0", "ee": "panda_hand_tcp"},
+            details={"scene": "hrc_learn workplace"},
+        ) as writer,
+    ):
         for _ in track(range(args.episodes), description="Aiming demonstrations"):
             frames = teach_aiming(world, workplace, eye, args.lesson, rng)
             writer.start_episode("aim at the box")
             for frame in frames:
-                writer.add_frame(**frame)
+                writer.add_frame(images=None, **frame)
             writer.save_episode()
-            seen.append(float(np.mean([frame["feature_visible"] for frame in frames])))
+            seen.append(np.mean([bool(frame["feature_visible"]) for frame in frames]))
     print(f"{args.episodes} demonstrations in {args.out}, marker seen {100 * min(seen):.0f} %")
     if args.json is not None:
-        cli.write_json(args.json, {"episodes": args.episodes, "marker_seen_min": min(seen)})
+        cli.write_json(
+            args.json, {"episodes": args.episodes, "marker_seen_min": float(min(seen))}
+        )
 
 
 if __name__ == "__main__":

@@ -8,41 +8,61 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-MARK = "made_by.json"
-"""File in each folder of ours: which program made it, from what."""
+MADE_BY = "made_by.json"
+"""File in each folder of results: what it was made from."""
 
 
 @contextmanager
-def new_folder(
-    path: Path, made_by: Mapping[str, Any], overwrite: bool = False
-) -> Iterator[Path]:
-    """A folder to fill, which takes its name only when it is complete.
+def replacing(path: Path, mark: str, overwrite: bool = False) -> Iterator[Path]:
+    """A place to build a folder, which takes its name only when it is complete.
 
     Args:
-        path: Where it will be.
-        made_by: What it is made from, kept inside as JSON; paths and the like as text.
-        overwrite: Replace an older folder of ours. One that we did not make is never touched.
+        path: Where the folder will be.
+        mark: File inside that tells folders of this kind from others.
+        overwrite: Replace an older folder of the kind; any other is never touched.
 
     Yields:
-        An empty folder beside `path`.
+        A path beside `path` at which nothing is yet.
 
     Raises:
         FileExistsError: If there is something at `path` that may not be replaced.
     """
     if path.exists() and not overwrite:
         raise FileExistsError(f"{path} exists: choose another folder, or allow to overwrite it")
-    if path.exists() and not (path / MARK).is_file():
+    if path.exists() and not (path / mark).is_file():
         raise FileExistsError(
-            f"{path} exists and is not ours to overwrite: choose another folder"
+            f"{path} has no {mark}, so it is not ours to overwrite: choose another folder"
         )
+    path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.partial.{os.getpid()}")
     shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True)
     try:
         yield partial
-        (partial / MARK).write_text(json.dumps(made_by, indent=2, default=str) + "\n")
         if path.exists():
             shutil.rmtree(path)
         partial.rename(path)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+
+
+@contextmanager
+def new_folder(
+    path: Path, made_by: Mapping[str, Any], overwrite: bool = False
+) -> Iterator[Path]:
+    """A folder of results to fill, which takes its name only when it is complete.
+
+    Args:
+        path: Where it will be.
+        made_by: What it is made from, kept inside as JSON; paths and the like as text.
+        overwrite: Replace an older folder of results.
+
+    Yields:
+        The empty folder.
+
+    Raises:
+        FileExistsError: If there is something at `path` that may not be replaced.
+    """
+    with replacing(path, MADE_BY, overwrite) as folder:
+        folder.mkdir()
+        yield folder
+        (folder / MADE_BY).write_text(json.dumps(made_by, indent=2, default=str) + "\n")

@@ -56,17 +56,13 @@ class Camera(Protocol):
         ...
 
 
-def _zeros(n: int):
-    return field(default_factory=lambda: np.zeros(n))
-
-
 @dataclass(frozen=True, kw_only=True)
 class HumanInput:
     """What a person asks for at one instant."""
 
-    effort: Float[np.ndarray, " joints"] = _zeros(7)
+    effort: Float[np.ndarray, " joints"] = field(default_factory=lambda: np.zeros(7))
     """Null-space effort d on the joints (paper, eq. globalControl)."""
-    twist: Float[np.ndarray, " 6"] = _zeros(6)
+    twist: Float[np.ndarray, " 6"] = field(default_factory=lambda: np.zeros(6))
     """End-effector motion, linear [m/s] and angular [rad/s], in the base frame."""
 
 

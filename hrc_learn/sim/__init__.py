@@ -3,14 +3,14 @@
 from .contacts import ContactMonitor as ContactMonitor
 from .contacts import Touch as Touch
 from .markers import Plate as Plate
+from .motion_log import MotionLog as MotionLog
 from .panda_model import PandaModelConfig as PandaModelConfig
 from .rendering import CameraKind as CameraKind
 from .rendering import EGLCamera as EGLCamera
 from .rendering import OffscreenRenderer as OffscreenRenderer
-from .rendering import RenderingUnavailable as RenderingUnavailable
+from .rendering import RenderingUnavailableError as RenderingUnavailableError
 from .rendering import open_camera as open_camera
 from .scene import HAND_MARKER as HAND_MARKER
-from .scene import Box as Box
 from .scene import CabinetConfig as CabinetConfig
 from .scene import ObjectConfig as ObjectConfig
 from .scene import SceneConfig as SceneConfig

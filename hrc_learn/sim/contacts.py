@@ -1,5 +1,8 @@
 """Who touches whom, from MuJoCo's contact list."""
 
+# pyright: reportAttributeAccessIssue=false
+# MuJoCo ships no type stubs; its names come from a compiled module.
+
 from collections.abc import Iterable
 from dataclasses import dataclass
 

@@ -4,6 +4,9 @@ The picture lies on a flat mesh with its own texture coordinates, so that the co
 exact to the texel; a texture stretched over a box's six faces would not be.
 """
 
+# pyright: reportAttributeAccessIssue=false
+# MuJoCo ships no type stubs; its names come from a compiled module.
+
 from dataclasses import dataclass
 
 import mujoco

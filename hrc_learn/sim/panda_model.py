@@ -5,6 +5,9 @@ one table of numbers. Capsules and boxes follow the published link shapes to abo
 centimetre: they render ten times faster than meshes without a GPU and give clean contacts.
 """
 
+# pyright: reportAttributeAccessIssue=false
+# MuJoCo ships no type stubs; its names come from a compiled module.
+
 from dataclasses import dataclass
 
 import mujoco
@@ -178,7 +181,7 @@ def _add_hand(spec: mujoco.MjSpec, hand, config: PandaModelConfig) -> None:
             pos=(0, side * 0.004, 0.045),
             size=(0.010, 0.004, 0.012),
             mass=0.005,
-            # Rubber pads; torsional friction keeps a held box from turning about the pads' axis.
+            # Torsional friction keeps a held box from turning about the pads' axis.
             friction=(1.5, 0.02, 0.001),
             condim=4,
             solref=(0.004, 1.0),

@@ -1,5 +1,8 @@
 """The workplace as a camera sees it: rendered by OpenGL without a screen, or without OpenGL."""
 
+# pyright: reportAttributeAccessIssue=false
+# MuJoCo ships no type stubs; its names come from a compiled module.
+
 import sys
 from collections.abc import Set
 from typing import Literal
@@ -15,7 +18,7 @@ from .world import World
 CameraKind = Literal["auto", "egl", "synthetic"]
 
 
-class RenderingUnavailable(RuntimeError):
+class RenderingUnavailableError(RuntimeError):
     """This machine cannot render without a screen."""
 
 
@@ -26,7 +29,7 @@ class OffscreenRenderer:
         """Open an OpenGL context.
 
         Raises:
-            RenderingUnavailable: If there is no EGL (on Linux) or no OpenGL to be had.
+            RenderingUnavailableError: If there is no EGL (on Linux) or no OpenGL to be had.
         """
         self._world = world
         self._size = (width, height)
@@ -75,7 +78,7 @@ def _open_context(width: int, height: int):
         context = GLContext(width, height)
         context.make_current()
     except Exception as error:  # PyOpenGL fails in many ways where a library is missing
-        raise RenderingUnavailable(
+        raise RenderingUnavailableError(
             f"this machine cannot render without a screen ({error}). Install EGL (Debian: "
             "libegl1 and libgl1-mesa-dri), or use the camera that needs no OpenGL: 'synthetic'."
         ) from error
@@ -112,7 +115,7 @@ class EGLCamera:
         """Open a renderer for the world's camera, or for another one.
 
         Raises:
-            RenderingUnavailable: If this machine cannot render without a screen.
+            RenderingUnavailableError: If this machine cannot render without a screen.
         """
         self.model = model or world.config.camera
         self._lens = Lens(self.model)
@@ -190,12 +193,12 @@ def open_camera(
         noise: Blur and noise of the sensor.
 
     Raises:
-        RenderingUnavailable: If `kind` is "egl" and this machine cannot render.
+        RenderingUnavailableError: If `kind` is "egl" and this machine cannot render.
     """
     if kind != "synthetic":
         try:
             return EGLCamera(world, model, rng=rng, noise=noise)
-        except RenderingUnavailable:
+        except RenderingUnavailableError:
             if kind == "egl":
                 raise
     model = model or world.config.camera

@@ -4,6 +4,9 @@ The robot stands at the origin. To its left (+y) is the table, which people shar
 right (-y) the cabinet, whose open door stands in the way of a careless elbow.
 """
 
+# pyright: reportAttributeAccessIssue=false
+# MuJoCo ships no type stubs; its names come from a compiled module.
+
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
@@ -12,6 +15,7 @@ import mujoco
 import numpy as np
 
 from ..vision import CameraModel, Marker
+from ..viz import Box
 from .markers import Plate, add_plate
 from .panda_model import PandaModelConfig, add_panda
 
@@ -19,18 +23,6 @@ _BOX = mujoco.mjtGeom.mjGEOM_BOX
 
 HAND_MARKER = 7
 """ArUco number of the plate on the hand."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Box:
-    """A fixed box, axes along the base frame's."""
-
-    name: str
-    centre: tuple[float, float, float]
-    """[m]"""
-    half_size: tuple[float, float, float]
-    """[m]"""
-    rgba: tuple[float, float, float, float] = (0.75, 0.62, 0.45, 1.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,38 +57,41 @@ class CabinetConfig:
         t, z, h = self.thickness / 2, (self.top + self.bottom) / 2, (self.top - self.bottom) / 2
         wood, glass = (0.75, 0.62, 0.45, 1.0), (0.55, 0.70, 0.75, 0.45)
         boards = [
-            Box(name=f"board_{name}", centre=(x, y, top - t), half_size=(w, d, t), rgba=wood)
+            Box(name=f"board_{name}", centre=(x, y, top - t), half_size=(w, d, t), colour=wood)
             for name, top in self.shelves.items()
         ]
         door_y = self.front + self.door_reach / 2
         return [
             *boards,
             Box(
-                name="cabinet_top", centre=(x, y, self.top - t), half_size=(w, d, t), rgba=wood
+                name="cabinet_top",
+                centre=(x, y, self.top - t),
+                half_size=(w, d, t),
+                colour=wood,
             ),
             Box(
                 name="cabinet_left",
                 centre=(self.left - t, y, z),
                 half_size=(t, d, h),
-                rgba=wood,
+                colour=wood,
             ),
             Box(
                 name="cabinet_right",
                 centre=(self.right + t, y, z),
                 half_size=(t, d, h),
-                rgba=wood,
+                colour=wood,
             ),
             Box(
                 name="cabinet_back",
                 centre=(x, self.front - self.depth - t, z),
                 half_size=(w + 2 * t, t, h),
-                rgba=wood,
+                colour=wood,
             ),
             Box(
                 name="cabinet_door",
                 centre=(self.left - t, door_y, z),
                 half_size=(t, self.door_reach / 2, h),
-                rgba=glass,
+                colour=glass,
             ),
         ]
 
@@ -110,20 +105,20 @@ class ObjectConfig:
     """[m]; the gripper closes along its x."""
     mass: float = 0.12
     """[kg]"""
-    marker: Marker = Marker(11, 0.030)
-    rgba: tuple[float, float, float, float] = (0.16, 0.44, 0.70, 1.0)
+    marker: Marker = field(default_factory=lambda: Marker(11, 0.030))
+    colour: tuple[float, float, float, float] = (0.16, 0.44, 0.70, 1.0)
 
 
 _TABLE = Box(
     name="table",
     centre=(0.26, 0.54, -0.02),
     half_size=(0.42, 0.34, 0.02),
-    rgba=(0.83, 0.80, 0.74, 1.0),
+    colour=(0.83, 0.80, 0.74, 1.0),
 )
 
 
 def overhead_camera() -> CameraModel:
-    """The camera above the table: image right is -x, image down +y, with a little distortion."""
+    """The camera above the table: image right is -x, down is +y, with a little distortion."""
     pose = np.eye(4)
     pose[:3, :3] = np.diag([-1.0, 1.0, -1.0])
     pose[:3, 3] = (0.24, 0.52, 1.55)
@@ -132,18 +127,21 @@ def overhead_camera() -> CameraModel:
     )
 
 
+def _marked_arm() -> PandaModelConfig:
+    # The plate sticks out sideways, clear of the forearm as seen from above.
+    plate = Plate(
+        marker=Marker(HAND_MARKER, 0.048),
+        position=(0.0, 0.135, 0.02),
+        orientation=(0.0, 1.0, 0.0, 0.0),
+    )
+    return PandaModelConfig(marker=plate)
+
+
 @dataclass(frozen=True, kw_only=True)
 class SceneConfig:
     """Everything that stands in the workplace."""
 
-    arm: PandaModelConfig = PandaModelConfig(
-        # Sticks out sideways, clear of the forearm as seen from above.
-        marker=Plate(
-            marker=Marker(HAND_MARKER, 0.048),
-            position=(0.0, 0.135, 0.02),
-            orientation=(0.0, 1.0, 0.0, 0.0),
-        )
-    )
+    arm: PandaModelConfig = field(default_factory=_marked_arm)
     table: Box = _TABLE
     cabinet: CabinetConfig = field(default_factory=CabinetConfig)
     objects: tuple[ObjectConfig, ...] = (ObjectConfig(),)
@@ -157,7 +155,7 @@ class SceneConfig:
 
 
 def build_scene(config: SceneConfig) -> mujoco.MjSpec:
-    """Describe the workplace as an `MjSpec`; `.compile()` makes the model, `.to_xml()` the MJCF."""
+    """Describe the workplace as an `MjSpec`, whose `compile()` makes the model."""
     spec = mujoco.MjSpec()
     spec.modelname = "hrc_learn workplace"
     _set_options(spec, config)
@@ -219,7 +217,7 @@ def _add_surroundings(spec: mujoco.MjSpec) -> None:
 
 def _add_box(spec: mujoco.MjSpec, box: Box) -> None:
     body = spec.worldbody.add_body(name=box.name, pos=box.centre)
-    body.add_geom(name=box.name, type=_BOX, size=box.half_size, rgba=box.rgba)
+    body.add_geom(name=box.name, type=_BOX, size=box.half_size, rgba=box.colour)
 
 
 def _add_object(spec: mujoco.MjSpec, item: ObjectConfig) -> None:
@@ -234,7 +232,7 @@ def _add_object(spec: mujoco.MjSpec, item: ObjectConfig) -> None:
         condim=4,
         solref=(0.004, 1.0),
         solimp=(0.97, 0.99, 0.0005, 0.5, 2),
-        rgba=item.rgba,
+        rgba=item.colour,
     )
     top = Plate(
         marker=item.marker, position=(0.0, 0.0, item.half_size[2] + 0.0005), solid=False

@@ -1,5 +1,8 @@
 """The workplace in motion: MuJoCo behind the `Arm` and `Gripper` protocols."""
 
+# pyright: reportAttributeAccessIssue=false
+# MuJoCo ships no type stubs; its names come from a compiled module.
+
 from collections.abc import Mapping
 
 import mujoco

@@ -15,6 +15,8 @@ from .placing import BlockedPathError as BlockedPathError
 from .placing import PlacingSkill as PlacingSkill
 from .placing import Plan as Plan
 from .placing import check_plan as check_plan
+from .simulated_job import SimulatedJob as SimulatedJob
+from .simulated_job import simulate_collaboration as simulate_collaboration
 from .station import Station as Station
 from .station import StationConfig as StationConfig
 from .teach_aiming import OBJECT_FEATURE as OBJECT_FEATURE

@@ -8,9 +8,11 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+import numpy as np
 import torch
+from jaxtyping import Float
 
-from ..controller import AdaptiveController, ControllerConfig
+from ..controller import AdaptiveController, ControllerConfig, Goals
 from ..geometry import Pose
 from ..jacobian import KalmanEstimator
 from ..sim import HAND_MARKER, ObjectConfig
@@ -24,6 +26,9 @@ from .workplace import Workplace, nearest_configuration
 OPEN, CLOSED = 0.08, 0.0
 """Widths the gripper is told to take [m]."""
 
+INTERACT, TRANSFER, RELEASE = "interact", "transfer", "release"
+"""Phases that others look for in the log."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class CollaborationConfig:
@@ -33,7 +38,7 @@ class CollaborationConfig:
     controller: ControllerConfig = field(
         default_factory=lambda: ControllerConfig(hold_rate=10.0)
     )
-    """Settings of the adaptive controller; the hand is held firmly against the drift that
+    """Settings of the adaptive controller; it holds the hand firmly against the drift that
     steps of 10 ms leave."""
     interaction: float = 11.0
     """How long the robot goes on aiming while the person reaches under its arm [s]."""
@@ -56,8 +61,6 @@ class GraspResult:
     """From the start of aiming until the target was reached [s]."""
     pixel_error: float
     """When the hand went down [px]."""
-    interaction: tuple[float, float]
-    """Start and end of the time left to the person [s]."""
     attempts: int
     """Grasps tried."""
 
@@ -136,49 +139,45 @@ class Collaboration:
 
     def _grasp(self, item: ObjectConfig) -> GraspResult:
         self._station.gripper.move(OPEN)
-        interaction = (0.0, 0.0)
         for attempt in range(1, self._config.attempts + 1):
             goals = self._config.aiming.goals(self._workplace.hover(), self._look_for(item))
             goals = goals.approached_by(self._workplace.hover_joints())
             aim_time = self._aim(goals)
             if attempt == 1:
-                interaction = self._interact(goals)
+                self._interact(goals)
             pixel_error = self._aimer.error(goals)
             if self._close_on(item):
                 return GraspResult(
                     aim_time=aim_time,
                     pixel_error=pixel_error,
-                    interaction=interaction,
                     attempts=attempt,
                 )
             self._rise()
             self._go_home()
         raise TaskFailedError(
-            f"grasp: {self._config.attempts} times the fingers closed on nothing. Is the object "
-            "where its marker says?"
+            f"grasp: {self._config.attempts} times the fingers closed on nothing. Is the "
+            "object where its marker says?"
         )
 
-    def _look_for(self, item: ObjectConfig):
+    def _look_for(self, item: ObjectConfig) -> Float[np.ndarray, "2"]:
         """Pixel to aim at, from a look at the table before the arm is over it."""
         self._station.enter("look")
         pixel = self._station.look().pixels.get(item.marker.id)
         if pixel is None:
             raise TaskFailedError(
-                f"look: the camera does not see marker {item.marker.id} of {item.name!r}. Put it "
-                "into the camera's view, and the arm out of it."
+                f"look: the camera does not see marker {item.marker.id} of {item.name!r}. Put "
+                "it into the camera's view, and the arm out of it."
             )
         return self._aiming.target(pixel)
 
-    def _aim(self, goals) -> float:
+    def _aim(self, goals: Goals) -> float:
         self._station.enter("aim")
         self._station.watching = True
         return self._aimer.aim(goals)
 
-    def _interact(self, goals) -> tuple[float, float]:
-        self._station.enter("interact")
-        start = self._station.time
+    def _interact(self, goals: Goals) -> None:
+        self._station.enter(INTERACT)
         self._aimer.hold(goals, self._config.interaction)
-        return start, self._station.time
 
     def _close_on(self, item: ObjectConfig) -> bool:
         """Go down, close the fingers; whether there is something between them."""
@@ -214,7 +213,7 @@ class Collaboration:
 
     def _transfer(self, goal: Pose) -> tuple[Plan, Pose]:
         """Carry to the shelf along the learned motion; the plan, and where the hand let go."""
-        self._station.enter("transfer")
+        self._station.enter(TRANSFER)
         plan = self._placing.plan(
             self._station.joints,
             goal,
@@ -225,7 +224,7 @@ class Collaboration:
         self._check(plan)
         self._station.play(plan.path)
         self._station.move_straight(goal)
-        self._station.enter("release")
+        self._station.enter(RELEASE)
         release = self._station.pose
         self._station.gripper.move(OPEN)
         self._station.stay(0.8)

@@ -33,18 +33,18 @@ def write_collaboration_report(
         path,
         title=run.title,
         summary=(
-            "An arm grasps an object with a camera that nobody calibrated, while a person pulls "
-            "its elbow aside to reach under it. It then carries the object to a cabinet along a "
-            "motion learned from demonstrations of hand and body shape at once, and puts it on a "
-            "shelf. Simulated in MuJoCo; success is read from contacts and poses there."
+            "An arm grasps an object with a camera that nobody calibrated, while a person "
+            "pulls its elbow aside to reach under it. It then carries the object to a cabinet "
+            "along a motion learned from demonstrations of hand and body shape at once, and "
+            "puts it on a shelf. Simulated in MuJoCo; success is read from contacts there."
         ),
         table=table,
         sections=(
             Section(
                 heading="Grasping with an uncalibrated camera",
                 text=(
-                    "The hand's marker is brought to where demonstrations had it right above the "
-                    "object. The image Jacobian was learned from demonstrations and adapts online."
+                    "The hand's marker is brought to where demonstrations had it above the "
+                    "object. The image Jacobian was learned from them, and adapts online."
                 ),
                 figures=(
                     (
@@ -53,7 +53,7 @@ def write_collaboration_report(
                     ),
                     (
                         figures.image_jacobian_figure(run),
-                        "Image Jacobian: estimate of the controller and truth of the simulator.",
+                        "Image Jacobian: the controller's estimate, and the simulator's truth.",
                     ),
                 ),
             ),
@@ -68,8 +68,8 @@ def write_collaboration_report(
             Section(
                 heading="Carrying and placing",
                 text=(
-                    "Demonstrations, the plan made from the learned primitive, and what the arm "
-                    "did."
+                    "Demonstrations, the plan made from the learned primitive, and what the "
+                    "arm did."
                 ),
                 figures=(
                     (figures.paths_figure(run), "Paths of the hand."),

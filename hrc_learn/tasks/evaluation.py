@@ -6,37 +6,33 @@ import numpy as np
 import torch
 
 from ..kinematics import panda
-from ..sim import ObjectConfig, World
+from ..sim import Touch, World
 from ..viz.report import Measurement
-from .collaboration import CollaborationResult
-from .recording import Deviation
+from .collaboration import RELEASE
+from .recording import Deviation, span
+from .simulated_job import SimulatedJob
 from .station import Station
 
 
-def evaluate(
-    result: CollaborationResult,
-    station: Station,
-    world: World,
-    item: ObjectConfig,
-    shelf: str,
-    fit: Mapping[str, float],
-) -> list[Measurement]:
+def evaluate(job: SimulatedJob, fit: Mapping[str, float]) -> list[Measurement]:
     """Compare a run with its targets.
 
     Success is read from the simulator's contacts and poses, not from what the task believes.
 
     Args:
-        result: Of the task.
-        station: That ran it.
-        world: In its state at the end of the run.
-        item: What was to be placed.
-        shelf: Where.
+        job: The run.
         fit: Metrics of the fitted primitives.
+
+    Raises:
+        ValueError: If the run failed; there is nothing to measure then.
     """
+    if job.result is None:
+        raise ValueError(f"the job failed, so there is nothing to measure: {job.failure}")
+    station, world, result = job.station, job.world, job.result
     distance, angle = result.goal_error
-    deviation = Deviation.of(station, result.grasp.interaction)
+    deviation = Deviation.of(station)
     touches = world.cabinet_contacts.touches + _carried_touches(station, world)
-    placed = world.rests_on(item.name, f"board_{shelf}")
+    placed = world.rests_on(job.item.name, f"board_{job.shelf}")
     values = (
         ("reproduction of the demonstrations, NRMSE", fit["joint_nrmse_median"], "", 1e-3),
         ("time to aim", result.grasp.aim_time, "s", None),
@@ -76,7 +72,7 @@ def limit_violations(station: Station) -> int:
     return int(outside.any(dim=-1).sum())
 
 
-def _carried_touches(station: Station, world: World) -> list:
+def _carried_touches(station: Station, world: World) -> list[Touch]:
     """Touches of the cabinet by the object before it was let go."""
-    release = next((e.time for e in station.log.events if e.text == "release"), np.inf)
+    release, _ = span(station, RELEASE)
     return [touch for touch in world.object_contacts.touches if touch.start < release]

@@ -93,8 +93,8 @@ def _require(demo: Demonstration, source: str) -> None:
     missing += [] if OBJECT_FEATURE in demo.extra else [OBJECT_FEATURE]
     if missing:
         raise ValueError(
-            f"{source}, episode {demo.episode}: no {', '.join(missing)}. An image Jacobian needs "
-            "the hand's pose and its marker's pixel in every frame, and the object's pixel."
+            f"{source}, episode {demo.episode}: no {', '.join(missing)}. An image Jacobian "
+            "needs the hand's pose and its marker's pixel in every frame, and the object's."
         )
 
 

@@ -116,7 +116,7 @@ def fit_primitives(
     if joint is None and pose is None:
         raise ValueError(
             f"{demos.source}: the demonstrations hold neither joint positions nor end-effector "
-            "poses, so there is no motion to learn. datasets/check_dataset.py lists what is there."
+            "poses, so there is no motion to learn. Look with datasets/check_dataset.py."
         )
     return FittedPrimitives(demonstrations=padded, joint=joint, pose=pose)
 
@@ -129,8 +129,10 @@ def _with_pose(
     )
 
 
-def _body_shape(joint_position: Tensor) -> Tensor:
+def _body_shape(joint_position: Tensor | None) -> Tensor | None:
     """Arm angle along each demonstration, continuous, and alike in turns at the start [rad]."""
+    if joint_position is None:
+        return None
     angle = np.unwrap(arm_angle(panda, joint_position).numpy(), axis=1)
     start = np.unwrap(angle[:, :1], axis=0) - angle[:, :1]
     return torch.from_numpy(angle + start)[..., None]

@@ -76,8 +76,8 @@ class PlacingSkill:
             )
         if not (folder / "pose").is_dir():
             raise ValueError(
-                f"{folder} holds no pose primitive: its demonstrations had no end-effector pose. "
-                "Record it (columns ee.x ... ee.wz), then fit again."
+                f"{folder} holds no pose primitive: its demonstrations had no end-effector "
+                "pose. Record it (columns ee.x ... ee.wz), then fit again."
             )
         return cls(joint=joint, pose=PoseDMP.load(folder / "pose").double())
 
@@ -188,8 +188,8 @@ def check_plan(plan: Plan, world: World, carried: str | None = None) -> None:
     if bool(outside.any()):
         k, joint = (int(i) for i in outside.nonzero()[0])
         raise BlockedPathError(
-            f"the plan leaves the range of {panda.joint_names[joint]} after {k * plan.dt:.1f} s, "
-            f"at {float(path[k, joint]):.3f} rad."
+            f"the plan leaves the range of {panda.joint_names[joint]} after {k * plan.dt:.1f} "
+            f"s, at {float(path[k, joint]):.3f} rad."
         )
     speed = path.diff(dim=0).abs() / plan.dt
     too_fast = speed > limits.velocity
@@ -197,14 +197,14 @@ def check_plan(plan: Plan, world: World, carried: str | None = None) -> None:
         k, joint = (int(i) for i in too_fast.nonzero()[0])
         raise BlockedPathError(
             f"the plan asks {panda.joint_names[joint]} for {float(speed[k, joint]):.2f} rad/s "
-            f"after {k * plan.dt:.1f} s, more than its {float(limits.velocity[joint]):.2f} rad/s: "
-            "play it slower."
+            f"after {k * plan.dt:.1f} s, more than its {float(limits.velocity[joint]):.2f} "
+            "rad/s: play it slower."
         )
     every = max(1, round(0.04 / plan.dt))
     touches = world.collisions_along(plan.path[::every], carried)
     if touches:
         first = touches[0]
         raise BlockedPathError(
-            f"after {first.start * every * plan.dt:.1f} s {first.first} would hit {first.second}, "
-            f"{1e3 * first.depth:.0f} mm deep."
+            f"after {first.start * every * plan.dt:.1f} s {first.first} would hit "
+            f"{first.second}, {1e3 * first.depth:.0f} mm deep."
         )

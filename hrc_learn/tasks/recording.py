@@ -2,16 +2,16 @@
 
 from dataclasses import dataclass
 
-import mujoco
 import numpy as np
 import torch
 from jaxtyping import Float
 
 from .. import viz
+from ..demos import Demonstration
 from ..geometry import quaternion
 from ..kinematics import panda
-from ..sim import World
-from ..sim.contacts import body_geoms
+from ..sim import MotionLog, World
+from .collaboration import INTERACT, TRANSFER
 from .placing import Plan
 from .station import SAFETY_COLUMNS, Station
 
@@ -19,79 +19,15 @@ ELBOW, TOOL = 3, 8
 """Frames of the elbow and of the tool among the logged links."""
 
 
-class WorldLog:
-    """Remembers where everything that moves was after each step of the station."""
-
-    def __init__(self, world: World):
-        self._world = world
-        model = world.model
-        movers = ["link0", *(item.name for item in world.config.objects)]
-        geoms = body_geoms(model, movers)
-        self._bodies = sorted({int(b) for b in model.geom_bodyid[geoms]})
-        self._positions: list[np.ndarray] = []
-        self._orientations: list[np.ndarray] = []
-
-    def advance(self, duration: float) -> None:
-        """Note where everything is, then let the world go on [s]."""
-        data = self._world.data
-        self._positions.append(data.xpos[self._bodies].copy())
-        self._orientations.append(data.xquat[self._bodies].copy())
-        self._world.advance(duration)
-
-    def bodies(self) -> tuple[viz.Body, ...]:
-        """Everything that moved, as it is to be drawn."""
-        positions, orientations = np.stack(self._positions), np.stack(self._orientations)
-        return tuple(
-            viz.Body(
-                name=self._world.model.body(body).name,
-                position=positions[:, i],
-                orientation=orientations[:, i],
-                **_shapes(self._world.model, body),
-            )
-            for i, body in enumerate(self._bodies)
-        )
-
-
-def _shapes(model: mujoco.MjModel, body: int) -> dict[str, tuple]:
-    """Capsules and boxes of a body in its own frame."""
-    capsules, boxes = [], []
-    for g in np.flatnonzero(model.geom_bodyid == body):
-        kind, size, centre = model.geom_type[g], model.geom_size[g], model.geom_pos[g]
-        colour = tuple(float(c) for c in model.geom_rgba[g])
-        R = np.empty(9)
-        mujoco.mju_quat2Mat(R, model.geom_quat[g])
-        R = R.reshape(3, 3)
-        if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
-            half = size[1] * R[:, 2]
-            capsules.append(
-                viz.Capsule(
-                    start=tuple((centre - half).tolist()),
-                    end=tuple((centre + half).tolist()),
-                    radius=float(size[0]),
-                    colour=colour,
-                )
-            )
-        elif kind == mujoco.mjtGeom.mjGEOM_BOX:
-            # All boxes of ours are turned by multiples of a quarter turn.
-            half_size = np.abs(R @ size)
-            boxes.append(
-                viz.Box(
-                    centre=tuple(centre.tolist()),
-                    half_size=tuple(half_size.tolist()),
-                    colour=colour,
-                )
-            )
-    return {"capsules": tuple(capsules), "boxes": tuple(boxes)}
-
-
 def record(
     title: str,
     station: Station,
     world: World,
-    moved: WorldLog,
-    interaction: tuple[float, float],
-    plan: Plan,
-    demo_path: Float[np.ndarray, "samples 3"] | None = None,
+    motion: MotionLog,
+    *,
+    plan: Plan | None = None,
+    region: viz.Box | None = None,
+    demonstration: Demonstration | None = None,
 ) -> viz.RunRecording:
     """Everything worth looking at in a run of the collaboration.
 
@@ -99,15 +35,14 @@ def record(
         title: What it was.
         station: That ran it.
         world: That it ran in; tells what only a simulator knows.
-        moved: Where everything was.
-        interaction: Start and end of the time left to the person [s].
-        plan: The way to the shelf.
-        demo_path: Hand along a demonstration [m].
+        motion: Where everything was.
+        plan: The way to the shelf, if it came to that.
+        region: Box above the table in which the camera takes over.
+        demonstration: One that the way was learned from.
     """
     log = station.log
-    time = log["time"]
-    deviation = Deviation.of(station, interaction)
-    feature, safety = log["feature"], log["safety"]
+    time, safety = log["time"], log["safety"]
+    deviation = Deviation.of(station)
     limits = panda.limits
     return viz.RunRecording(
         title=title,
@@ -115,17 +50,16 @@ def record(
         joint_names=panda.joint_names,
         joint_position=log["joint_position"],
         joint_limits=viz.JointLimits(lower=limits.lower.numpy(), upper=limits.upper.numpy()),
+        demo_joint_position=_matching_demonstration(station, plan, demonstration),
         position=log["link_position"][:, TOOL],
-        demo_path=demo_path,
-        plan_path=plan.hand.position.numpy(),
-        bodies=moved.bodies(),
-        boxes=tuple(
-            viz.Box(name=box.name, centre=box.centre, half_size=box.half_size, colour=box.rgba)
-            for box in world.config.boxes()
-        ),
+        demo_path=None if demonstration is None else demonstration.position,
+        plan_path=None if plan is None else plan.hand.position.numpy(),
+        bodies=motion.bodies(),
+        boxes=tuple(world.config.boxes()),
+        region=region,
         camera=viz.CameraRecording(
             model=world.config.camera,
-            feature=feature,
+            feature=log["feature"],
             target=log["target"],
             image_time=np.array([kept.time for kept in station.images]),
             images=tuple(kept.image for kept in station.images),
@@ -141,6 +75,30 @@ def record(
         safety={name: safety[:, i] for i, name in enumerate(SAFETY_COLUMNS)},
         phases=tuple(log.events),
     )
+
+
+def span(station: Station, phase: str) -> tuple[float, float]:
+    """Start and end of the first time a phase was entered [s]; empty if it never was."""
+    events = station.log.events
+    for event, following in zip(events, [*events[1:], None], strict=True):
+        if event.text == phase:
+            return event.time, station.time if following is None else following.time
+    return 0.0, 0.0
+
+
+def _matching_demonstration(
+    station: Station, plan: Plan | None, demonstration: Demonstration | None
+) -> Float[np.ndarray, "time joints"] | None:
+    """Demonstrated joints at the same share of the way to the shelf, NaN elsewhere [rad]."""
+    if plan is None or demonstration is None or demonstration.joint_position is None:
+        return None
+    time = station.log["time"]
+    start, end = span(station, TRANSFER)
+    share = (time - start) / plan.duration * demonstration.duration
+    joints = np.column_stack(
+        [np.interp(share, demonstration.time, q) for q in demonstration.joint_position.T]
+    )
+    return np.where(((time >= start) & (time < end))[:, None], joints, np.nan)
 
 
 def true_image_jacobian(station: Station, world: World) -> Float[np.ndarray, "time 2 6"]:
@@ -168,16 +126,12 @@ class Deviation:
     """Of the elbow [m]."""
 
     @classmethod
-    def of(cls, station: Station, interaction: tuple[float, float]) -> "Deviation":
-        """From the first pull at the body on, until the time left to the person is over.
-
-        Args:
-            station: That ran the task.
-            interaction: Start and end of the time left to the person [s].
-        """
+    def of(cls, station: Station) -> "Deviation":
+        """From the first pull at the body on, until the time left to the person is over."""
         log = station.log
         time = log["time"]
-        within = (time >= interaction[0]) & (time < interaction[1])
+        start, end = span(station, INTERACT)
+        within = (time >= start) & (time < end)
         pulled = within & (np.abs(log["human_effort"]).max(axis=1) > 0)
         first = int(pulled.argmax()) if pulled.any() else 0
         rows = within & (np.arange(len(time)) >= first) & bool(pulled.any())

@@ -34,7 +34,7 @@ class Workplace:
     """Where along the boards things are put [m]."""
     shelf_depth: float = 0.10
     """From the boards' front edge to the tool centre point [m]."""
-    clearance: float = 0.004
+    clearance: float = 0.007
     """Gap left under a thing when it is let go on a board [m]."""
     approach: float = 0.16
     """Distance in front of the boards from which the hand moves straight in [m]."""
@@ -127,7 +127,7 @@ def nearest_configuration(goal: Pose, near: torch.Tensor, samples: int = 57) -> 
         x, y, z = goal.position.tolist()
         w = [round(v, 3) for v in quaternion.normalize(goal.orientation).tolist()]
         raise UnreachableError(
-            f"no joint positions within the limits reach position ({x:.3f}, {y:.3f}, {z:.3f}) m "
-            f"with orientation {w} (wxyz): move the goal towards the robot or turn it."
+            f"no joint positions within the limits reach position ({x:.3f}, {y:.3f}, {z:.3f}) "
+            f"m with orientation {w} (wxyz): move the goal towards the robot or turn it."
         )
     return best

@@ -61,7 +61,8 @@ def test_tremor_is_a_small_motion_about_the_path():
 def test_the_experts_hand_reaches_the_end_of_the_path():
     start = torch.tensor([0.2402, -0.5026, -0.1803, -2.1236, -0.0934, 1.6267, -0.7]).double()
     position = panda.forward(start).position.numpy()
-    path = GuidedPath(np.stack([position, position + [0.05, -0.2, -0.1]]), duration=4.0)
+    goal = position + np.array([0.05, -0.2, -0.1])
+    path = GuidedPath(np.stack([position, goal]), duration=4.0)
     expert = ScriptedExpert(panda, path)
     q, dt = start, 0.01
     for k in range(600):

@@ -7,7 +7,7 @@ from hrc_learn.kinematics import panda
 from hrc_learn.sim import (
     HAND_MARKER,
     EGLCamera,
-    RenderingUnavailable,
+    RenderingUnavailableError,
     World,
     open_camera,
     rendering,
@@ -34,7 +34,7 @@ def world():
 def egl_or_skip(world):
     try:
         return EGLCamera(world, rng=np.random.default_rng(0))
-    except RenderingUnavailable as reason:
+    except RenderingUnavailableError as reason:
         pytest.skip(str(reason))
 
 
@@ -77,10 +77,10 @@ def test_the_arm_hides_what_is_behind_it(world):
 
 def test_without_opengl_auto_falls_back_and_egl_says_what_to_install(world, monkeypatch):
     def unavailable(width, height):
-        raise RenderingUnavailable("no EGL here. Install EGL")
+        raise RenderingUnavailableError("no EGL here. Install EGL")
 
     monkeypatch.setattr(rendering, "_open_context", unavailable)
     rng = np.random.default_rng(0)
     assert isinstance(open_camera(world, "auto", rng=rng), SyntheticCamera)
-    with pytest.raises(RenderingUnavailable, match="Install"):
+    with pytest.raises(RenderingUnavailableError, match="Install"):
         open_camera(world, "egl", rng=rng)
