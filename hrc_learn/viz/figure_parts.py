@@ -8,6 +8,7 @@ from cycler import cycler
 from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
@@ -105,6 +106,7 @@ def space(figure: Figure) -> Axes3D:
     assert isinstance(axes, Axes3D)
     axes.view_init(elev=24, azim=35)
     for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
+        axis.set_major_locator(MaxNLocator(5))
         axis.set_pane_color((1, 1, 1, 0))  # pyright: ignore[reportAttributeAccessIssue]
     axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
     return axes

@@ -7,7 +7,7 @@ the recording that the dashboards take, and raises ValueError where it lacks the
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
 from . import palette
 from .figure_parts import (
@@ -53,10 +53,12 @@ def image_figure(run: RunRecording) -> Figure:
             ylabel="v [px]",
             title="Path of the feature in the image",
         )
-        image.legend(loc="best")
+        image.legend(loc="best", frameon=True, framealpha=0.75, edgecolor="none")
         error.plot(run.time, camera.error, color=palette.RUN)
         error.set(xlabel="time [s]", ylabel="distance to target [px]", title="Pixel error")
-        error.set_ylim(bottom=0)
+        # From hundreds of pixels to a fraction of one: a linear scale would hide the end.
+        error.set_yscale("log")
+        error.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
         finite_span(error, run.time, servoing)
     return figure
 
@@ -64,8 +66,8 @@ def image_figure(run: RunRecording) -> Figure:
 def paths_figure(run: RunRecording) -> Figure:
     """Path of the tool centre point in space, with the demonstration, boxes and region."""
     lines = [
-        ("demonstration", run.demo_path, palette.DEMO, 3.5),
-        ("plan", run.plan_path, palette.ORANGE, 1.4),
+        ("demonstration", run.demo_path, palette.DEMO, 4.0),
+        ("plan", run.plan_path, palette.ORANGE, 3.0),
         ("run", run.position, palette.RUN, 1.4),
     ]
     shown = [line for line in lines if line[1] is not None]

@@ -66,12 +66,12 @@ def _send_scene(stream: rr.RecordingStream, run: RunRecording) -> None:
             show_labels=False,
         )
         stream.log("world/region", region, static=True)
-    for name, line, colour in (
-        ("demonstration", run.demo_path, palette.DEMO),
-        ("plan", run.plan_path, palette.ORANGE),
+    for name, line, colour, radius in (
+        ("demonstration", run.demo_path, palette.DEMO, 0.006),
+        ("plan", run.plan_path, palette.ORANGE, 0.005),
     ):
         if line is not None:
-            strip = rr.LineStrips3D([thin(line)], radii=[0.003], colors=[palette.rgba(colour)])
+            strip = rr.LineStrips3D([thin(line)], radii=[radius], colors=[palette.rgba(colour)])
             stream.log(f"world/paths/{name}", strip, static=True)
 
 
