@@ -80,7 +80,7 @@ def _send_motion(stream: rr.RecordingStream, run: RunRecording) -> None:
     for body in run.bodies:
         send_body(stream, run.time, body, at)
     style = rr.LineStrips3D.from_fields(
-        radii=[0.004], colors=[palette.rgba(palette.RUN_ON_DARK)]
+        radii=[0.003], colors=[palette.rgba(palette.RUN_ON_DARK)]
     )
     stream.log("world/paths/run", style, static=True)
     ends = samples(run.time, _PATH_RATE)
