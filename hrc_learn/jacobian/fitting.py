@@ -47,7 +47,7 @@ class ImageJacobianFitReport:
     """Over the pairs that were fitted [px]."""
     held_out_error: float
     """Over pairs that were not: cross-validation by demonstration, or by fifths of a single
-    one [px]."""
+    one [px]. NaN where all pairs fall into one part."""
     noise: float
     """Standard deviation of dx in each coordinate that the posterior assumes [px]."""
 
