@@ -6,7 +6,7 @@ beside its target. Exit status 1 if a target was missed.
 """
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,6 +16,7 @@ from rich.table import Table
 from torch import Tensor
 
 from hrc_learn import cli
+from hrc_learn.controller.effort_trials import EffortConfig, run_effort_trials
 from hrc_learn.controller.trials import ROLL_CLASSES, TrialConfig, run_trials
 from hrc_learn.jacobian import (
     CompositeEstimator,
@@ -128,6 +129,17 @@ EXPERIMENTS: dict[str, Experiment] = {
 }
 """What is run, by name, with the acceptance figures."""
 
+EFFORTS: dict[str, tuple[EffortConfig, dict[str, float]]] = {
+    "effort": (
+        EffortConfig(),
+        {"deviation_mm": 0.2, "turn_deg": 0.05, "deviation_p95_mm": 1.5, "turn_p95_deg": 0.5},
+    ),
+    "effort_noise": (EffortConfig(noise=0.5), {"deviation_p95_mm": 2.5}),
+}
+"""A person pulls the elbow away for 7 s and back for 4 s: what may at most happen."""
+LEAST_ELBOW_MM = 100.0
+"""In the median, or the trial shows nothing."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
@@ -145,14 +157,35 @@ class Args:
 
 def main(args: Args) -> int:
     """Run the experiments, print a line for each, write the figures."""
-    chosen = _chosen(args.only)
+    names = _checked(args.only) or (*EXPERIMENTS, *EFFORTS)
     torch.set_num_threads(1)
     console = Console()
     console = Console(width=max(console.width, _WIDTH))
     figures: dict[str, float] = {}
-    missed: list[str] = []
-    table = _table()
-    for name in chosen:
+    grasps = _grasp([name for name in names if name in EXPERIMENTS], args, figures, console)
+    efforts = _pull([name for name in names if name in EFFORTS], args, figures, console)
+    missed = grasps + efforts
+    for miss in missed:
+        console.print(f"missed  {miss}", style="red")
+    if args.json is not None:
+        cli.write_json(args.json, figures)
+    return 1 if missed else 0
+
+
+def _checked(names: tuple[str, ...]) -> tuple[str, ...]:
+    known = (*EXPERIMENTS, *EFFORTS)
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        raise ValueError(f"no experiment {unknown[0]!r}; there are {', '.join(known)}")
+    return names
+
+
+def _grasp(
+    names: list[str], args: Args, figures: dict[str, float], console: Console
+) -> list[str]:
+    """Run grasping experiments; returns what was missed."""
+    table, missed = _grasp_table(), []
+    for name in names:
         experiment = EXPERIMENTS[name]
         config = replace(experiment.config, count=args.trials, seed=args.seed)
         began = time.monotonic()
@@ -163,19 +196,33 @@ def main(args: Args) -> int:
         misses = _misses(experiment, summary)
         missed += [f"{name}: {miss}" for miss in misses]
         table.add_row(*_row(name, summary), "missed" if misses else "")
-    console.print(table)
-    for miss in missed:
-        console.print(f"missed  {miss}", style="red")
-    if args.json is not None:
-        cli.write_json(args.json, figures)
-    return 1 if missed else 0
+    if names:
+        console.print(table)
+    return missed
 
 
-def _chosen(names: tuple[str, ...]) -> Iterable[str]:
-    unknown = [name for name in names if name not in EXPERIMENTS]
-    if unknown:
-        raise ValueError(f"no experiment {unknown[0]!r}; there are {', '.join(EXPERIMENTS)}")
-    return names or EXPERIMENTS
+def _pull(
+    names: list[str], args: Args, figures: dict[str, float], console: Console
+) -> list[str]:
+    """Run trials with a person; returns what was missed."""
+    table, missed = Table(title="A person pulls the elbow"), []
+    for column in ("experiment", "elbow [mm]", "tool [mm]", "p95", "tool [deg]", "p95"):
+        table.add_column(column, no_wrap=True, justify="right")
+    for name in names:
+        config, bounds = EFFORTS[name]
+        summary = run_effort_trials(replace(config, seed=args.seed)).summary()
+        figures |= {f"{name}_{key}": value for key, value in summary.items()}
+        table.add_row(name, *(f"{value:.3g}" for value in summary.values()))
+        if summary["elbow_mm"] < LEAST_ELBOW_MM:
+            missed.append(f"{name}: elbow moved {summary['elbow_mm']:.0f} mm only")
+        missed += [
+            f"{name}: {key} {summary[key]:.3g} > {bound:g}"
+            for key, bound in bounds.items()
+            if summary[key] > bound
+        ]
+    if names:
+        console.print(table)
+    return missed
 
 
 def _misses(experiment: Experiment, summary: dict[str, float]) -> list[str]:
@@ -192,7 +239,7 @@ def _misses(experiment: Experiment, summary: dict[str, float]) -> list[str]:
     return misses
 
 
-def _table() -> Table:
+def _grasp_table() -> Table:
     rolls = ", ".join(f"{low}-{high}" for low, high in ROLL_CLASSES)
     table = Table(title=f"Grasping; success [%] by camera roll of {rolls} degrees")
     table.add_column("experiment", no_wrap=True)

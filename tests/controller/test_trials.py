@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from hrc_learn.controller import comfortable_posture
+from hrc_learn.controller.effort_trials import EffortConfig, run_effort_trials
 from hrc_learn.controller.rehearsal import Imperfections
 from hrc_learn.controller.trials import TrialConfig, TrialResult, run_trials
 from hrc_learn.geometry import Pose, quaternion
@@ -76,3 +77,11 @@ def test_a_pose_out_of_reach_is_refused():
     )
     with pytest.raises(UnreachableError, match="move the goal"):
         comfortable_posture(panda, far)
+
+
+def test_a_pull_moves_the_elbow_far_and_the_tool_hardly():
+    config = EffortConfig(count=6, force=12.0, dt=0.01, away=1.5, back=0.5)
+    summary = run_effort_trials(config).summary()
+    assert summary["elbow_mm"] > 100
+    assert summary["deviation_p95_mm"] < 0.2
+    assert summary["turn_p95_deg"] < 0.05
