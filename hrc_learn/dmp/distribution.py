@@ -151,6 +151,7 @@ class DMPDistribution:
             stamps=like.stamps,
             basis=like.basis,
             spring=like.spring,
+            approach=like.response.approach,
             joint_names=like.joint_names,
             units=like.units,
         )

@@ -61,6 +61,8 @@ def _fit(
         rate = differentiate(s, position)
     goal = position[..., -1:]
     force = differentiate(s, rate) - response.spring.acceleration(position - goal, rate)
+    if response.approach:
+        force = force - (goal - position[..., :1]) * response.approach_force(s)
     solve = _ridge_operator if method == "ridge" else _lwr_operator
     return _apply(force, solve(response, s, regularization)), rate[..., 0]
 

@@ -61,6 +61,7 @@ class JointDMP(nn.Module):
         basis: Basis,
         spring: SpringDamper,
         scaling: str = "none",
+        approach: float = 0.0,
         joint_names: Sequence[str] | None = None,
         units: str = "rad",
         fit_report: FitReport | None = None,
@@ -78,6 +79,7 @@ class JointDMP(nn.Module):
             basis: Shape of the forcing term.
             spring: The unforced dynamics.
             scaling: `"none"`, `"paper"` or `"amplitude"`; see `scaling.py`.
+            approach: Share of the motion along which a new goal is taken up; 0: at once.
             joint_names: D names.
             units: Of the coordinates.
             fit_report: Kept for the reader.
@@ -103,7 +105,7 @@ class JointDMP(nn.Module):
         self.joint_names = None if joint_names is None else tuple(joint_names)
         self.units = units
         self.fit_report = fit_report
-        self.response = response_of(spring, basis)
+        self.response = response_of(spring, basis, approach)
 
     @classmethod
     def fit(
@@ -116,6 +118,7 @@ class JointDMP(nn.Module):
         *,
         method: str = "trajectory",
         scaling: str = "none",
+        approach: float = 0.0,
         joint_names: Sequence[str] | None = None,
         units: str = "rad",
         basis: GaussianBasis | None = None,
@@ -135,6 +138,8 @@ class JointDMP(nn.Module):
             method: `"trajectory"`, least squares on the positions, the closest
                 reproduction; `"ridge"`, regression on the force; `"lwr"`, the paper's.
             scaling: Of the forcing term: `"none"`, `"paper"` or `"amplitude"`.
+            approach: Share of the motion, 0 to 1, along which a new start and goal are taken
+                up, smoothly; 0: at once, as the paper has it.
             joint_names: D names, kept with the primitive.
             units: Of the coordinates.
             basis: Shape of the forcing term.
@@ -147,7 +152,7 @@ class JointDMP(nn.Module):
         check_scaling(scaling)
         samples = check_samples(time, position, velocity, mask)
         basis, spring = basis or GaussianBasis(count=n_basis), spring or SpringDamper()
-        response = response_of(spring, basis)
+        response = response_of(spring, basis, approach)
         weights, rate = fit_samples(method, response, samples, regularization)
         # One where a coordinate never moves: nothing to scale, and nothing to divide by.
         amplitude = torch.where(samples.span > 0, samples.span, 1.0)
@@ -171,6 +176,7 @@ class JointDMP(nn.Module):
             basis=basis,
             spring=spring,
             scaling=scaling,
+            approach=approach,
             joint_names=joint_names,
             units=units,
         )
@@ -248,6 +254,7 @@ class JointDMP(nn.Module):
             rate=rate,
             start=start,
             goal=goal,
+            way=goal - start,
             target=goal,
             duration=duration,
             pace=torch.ones_like(duration),
@@ -348,6 +355,7 @@ class JointDMP(nn.Module):
             "joint_names": self.joint_names,
             "units": {"coordinates": self.units, "time": "s"},
             "scaling": self.scaling,
+            "approach": self.response.approach,
             "spring": asdict(self.spring),
             "basis": {"type": type(self.basis).__name__, **asdict(self.basis)},
         }
@@ -372,6 +380,7 @@ class JointDMP(nn.Module):
         arguments = {
             **{name: saved.tensor(name) for name in ("weights", *BUFFERS)},
             "scaling": saved.get("scaling", str),
+            "approach": saved.get("approach", float, int),
             "joint_names": saved.get("joint_names", list, NoneType),
             "units": saved.get("units", dict).get("coordinates", ""),
         }

@@ -46,6 +46,7 @@ def _mean_of_joints(primitives: JointDMP) -> JointDMP:
         basis=primitives.basis,
         spring=primitives.spring,
         scaling=primitives.scaling,
+        approach=primitives.response.approach,
         joint_names=primitives.joint_names,
         units=primitives.units,
         **buffers,

@@ -110,6 +110,7 @@ class OrientationDMP(nn.Module):
         mask: ArrayLike | None = None,
         *,
         method: str = "trajectory",
+        approach: float = 0.0,
         basis: GaussianBasis | None = None,
         spring: SpringDamper | None = None,
         regularization: float = 1e-7,
@@ -123,6 +124,7 @@ class OrientationDMP(nn.Module):
             n_basis: N, unless `basis` is given.
             mask: (*B, T), false where a sample does not count.
             method: As for `JointDMP.fit`, like all that follow.
+            approach: Share of the motion along which new ends are taken up.
             basis: Shape of the forcing term.
             spring: Gains.
             regularization: Ridge.
@@ -137,6 +139,7 @@ class OrientationDMP(nn.Module):
             n_basis,
             mask=mask,
             method=method,
+            approach=approach,
             basis=basis,
             spring=spring,
             regularization=regularization,

@@ -122,7 +122,7 @@ class PoseState:
     def _rotation(self) -> OrientationState:
         columns = {
             name: getattr(self.motion, name)[..., ERROR]
-            for name in ("position", "rate", "start", "goal", "target", "forced")
+            for name in ("position", "rate", "start", "goal", "way", "target", "forced")
         }
         return OrientationState(
             motion=replace(self.motion, **columns), goal=self.goal_orientation
@@ -161,6 +161,7 @@ class PoseDMP(nn.Module):
         mask: ArrayLike | None = None,
         *,
         method: str = "trajectory",
+        approach: float = 0.0,
         basis: GaussianBasis | None = None,
         spring: SpringDamper | None = None,
         regularization: float = 1e-7,
@@ -175,6 +176,7 @@ class PoseDMP(nn.Module):
             body: Coordinates learned along, (*B, T, K), or (T,) for one.
             mask: (*B, T), false where a sample does not count.
             method: As for `JointDMP.fit`, like all that follow.
+            approach: Share of the motion along which new ends are taken up.
             basis: Shape of the forcing term.
             spring: Gains.
             regularization: Ridge.
@@ -202,6 +204,7 @@ class PoseDMP(nn.Module):
             mask=mask,
             units="m, rad, body",
             method=method,
+            approach=approach,
             basis=basis,
             spring=spring,
             regularization=regularization,

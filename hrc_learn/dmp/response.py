@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from hrc_learn.dmp.approach import approach_state, minimum_jerk
 from hrc_learn.dmp.basis import Basis
 from hrc_learn.dmp.piecewise import PiecewisePolynomial, chebyshev_points
 from hrc_learn.dmp.spring import SpringDamper
@@ -28,9 +29,22 @@ class Response:
     until it is handed out.
     """
 
-    def __init__(self, spring: SpringDamper, basis: Basis):
+    def __init__(self, spring: SpringDamper, basis: Basis, approach: float = 0.0):
+        """Solve the equation for all coordinates.
+
+        Args:
+            spring: Gains.
+            basis: Of the forcing term.
+            approach: Share of the motion over which start and goal act along a minimum-jerk
+                curve, see `approach.py`; 0: they act through the spring alone, as printed.
+        """
+        if not 0 <= approach <= 1 or (approach and basis.periodic):
+            raise ValueError(
+                f"approach must be a share, 0 to 1, and 0 for rhythms, got {approach}"
+            )
         self.spring = spring
         self.basis = basis
+        self.approach = approach
         self.size = basis.count + 3
         """Number of coordinates: N weights, start velocity, start, goal."""
         self.forced = self._integrate()
@@ -80,12 +94,22 @@ class Response:
         if self.basis.periodic:
             # From rest: what it takes to be off the limit cycle at first dies out.
             forced = forced - E @ table(torch.zeros_like(s))
+        if self.approach:
+            start = -approach_state(s, self.approach)[..., None]
         return torch.cat([forced, velocity, start, at_rest - start], dim=-1)
+
+    def approach_force(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """Forcing per unit of goal - start that makes the motion between them m(s)."""
+        m, slope, curvature = minimum_jerk(s, self.approach)
+        return curvature - self.spring.acceleration(m - 1, slope)
 
     def _acceleration(self, s: Tensor, state: Tensor) -> Tensor:
         goal = torch.zeros(self.size, dtype=s.dtype, device=s.device)
         goal[-1] = 1.0
         forcing = torch.nn.functional.pad(self.basis.forcing(s), (0, 3))
+        if self.approach:
+            force = self.approach_force(s)[..., None]
+            forcing = torch.cat([forcing[..., :-2], -force, force], dim=-1)
         free = self.spring.acceleration(state[..., 0, :] - goal, state[..., 1, :])
         return (free + forcing)[..., None, :]
 
@@ -148,6 +172,6 @@ class _StateAt(torch.autograd.Function):
 
 
 @lru_cache(maxsize=64)
-def response_of(spring: SpringDamper, basis: Basis) -> Response:
+def response_of(spring: SpringDamper, basis: Basis, approach: float = 0.0) -> Response:
     """The one `Response` of these parts: primitives alike share tables and matrices."""
-    return Response(spring, basis)
+    return Response(spring, basis, approach)

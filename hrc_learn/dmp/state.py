@@ -19,6 +19,8 @@ class DMPState:
     start: Float[Tensor, "*batch D"]
     goal: Float[Tensor, "*batch D"]
     """What attracts the motion now."""
+    way: Float[Tensor, "*batch D"]
+    """Goal minus start, as the motion began."""
     target: Float[Tensor, "*batch D"]
     """Where the goal was last told to be; a filtered goal takes a while to get there."""
     duration: Float[Tensor, "*batch"]

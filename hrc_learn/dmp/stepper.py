@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
+from hrc_learn.dmp.approach import quintic
 from hrc_learn.dmp.joint import JointDMP
 
 Vector = Float64[np.ndarray, "D"]
@@ -23,6 +24,8 @@ class StepperState(NamedTuple):
     """(y, dy/ds) that the unscaled forcing term alone has caused by `s`."""
     start: Vector
     goal: Vector
+    way: Vector
+    """Goal minus start, as the motion began."""
     duration: float
     """[s] that the motion takes when nothing slows it."""
     pace: float
@@ -64,7 +67,7 @@ class Stepper:
         self._exponents = np.arange(table.shape[1])
         self._interval = forced.interval
         self._end = math.inf if forced.periodic else forced.end
-        self._spring = dmp.spring
+        self._spring, self._approach = dmp.spring, dmp.response.approach
         self._by_distance = dmp.scaling == "paper"
         self._start, self._goal, self._velocity = (
             x.double().cpu().numpy() for x in (dmp.start, dmp.goal, dmp.start_velocity)
@@ -89,7 +92,8 @@ class Stepper:
             rate = start_velocity * duration
         y = np.stack([start, rate])
         goal = self._goal if goal is None else goal
-        return StepperState(0.0, y, self._forced(0.0), start, goal, duration, 1.0)
+        forced = self._forced(0.0)
+        return StepperState(0.0, y, forced, start, goal, goal - start, duration, 1.0)
 
     def step(
         self,
@@ -100,7 +104,7 @@ class Stepper:
         slowdown: float = 0.0,
     ) -> StepperState:
         """Advance by `dt` [s]; arguments as in `JointDMP.step`."""
-        s, y, before, start, _, duration, _ = state
+        s, y, before, start, _, way, duration, _ = state
         goal = state.goal if goal is None else goal
         pace = 1.0 / (1.0 + slowdown)
         ds = dt * pace / duration
@@ -117,10 +121,17 @@ class Stepper:
         if self._by_distance:
             scale = goal - start
             before, after = before * scale, after * scale
+        if self._approach:
+            before = before + self._approaching(state.s, way)
+            after = after + self._approaching(s, way)
         y = E @ (y - rest - before)
         y += after
         y += rest
-        return StepperState(s, y, forced, start, goal, duration, pace)
+        return StepperState(s, y, forced, start, goal, way, duration, pace)
+
+    def _approaching(self, s: float, way: Vector) -> Pair:
+        m, slope = quintic(min(s / self._approach, 1.0))
+        return np.stack([(m - 1.0) * way, slope / self._approach * way])
 
     def _forced(self, s: float) -> Pair:
         """(y, dy/ds) that the forcing term has caused, by a table that ends where it does."""

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from hrc_learn.dmp.approach import approach_state
 from hrc_learn.dmp.response import Response
 from hrc_learn.dmp.spring import SpringDamper
 from hrc_learn.dmp.state import DMPState
@@ -49,6 +50,10 @@ def advance(
     before, after = state.forced, forced
     if scale is not None:
         before, after = before * scale[..., None, :], after * scale[..., None, :]
+    if response.approach:
+        share, way = response.approach, state.way[..., None, :]
+        before = before + approach_state(state.s, share).to(way)[..., None] * way
+        after = after + approach_state(s, share).to(way)[..., None] * way
     goal, *attracted = _attracted(state.goal, target, ds, goal_filter, spring)
     before, after = before + attracted[0], after + attracted[1]
     if push is not None:
@@ -62,6 +67,7 @@ def advance(
         rate=moved[..., 1, :],
         start=state.start,
         goal=goal,
+        way=state.way,
         target=target,
         duration=state.duration,
         pace=pace,
@@ -80,6 +86,8 @@ def second_derivative(
     force = (response.basis.forcing(state.s)[..., None, :].to(weights) @ weights.mT)[..., 0, :]
     if scale is not None:
         force = force * scale
+    if response.approach:
+        force = force + state.way * response.approach_force(state.s).to(force)[..., None]
     return response.spring.acceleration(state.position - state.goal, state.rate) + force
 
 

@@ -123,3 +123,13 @@ class TestPose(DMPContract):
             quaternion.angle(outputs["orientation"], orientation).max(),
             (outputs["body"] - body).abs().max(),
         )
+
+
+class TestJointOnItsApproach(TestJoint):
+    def fit(self, *demonstration, **kwargs):
+        return JointDMP.fit(*demonstration, approach=0.8, **kwargs)
+
+
+class TestPoseOnItsApproach(TestPose):
+    def fit(self, time, position, orientation, body, **kwargs):
+        return PoseDMP.fit(time, position, orientation, body=body, approach=1.0, **kwargs)

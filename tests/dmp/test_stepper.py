@@ -13,11 +13,12 @@ SPRINGS = [
 
 
 @pytest.mark.parametrize("spring", SPRINGS)
+@pytest.mark.parametrize("approach", [0.0, 0.7])
 @pytest.mark.parametrize("scaling", ["none", "paper", "amplitude"])
-def test_it_does_what_the_primitive_does(scaling, spring):
+def test_it_does_what_the_primitive_does(scaling, spring, approach):
     """Over new goals, pushes, slow-downs, steps of all lengths and far past the end."""
     time, position = arm_motion(moving_start=True)
-    dmp = JointDMP.fit(time, position, scaling=scaling, spring=spring)
+    dmp = JointDMP.fit(time, position, scaling=scaling, spring=spring, approach=approach)
     stepper = Stepper(dmp)
     ends = {"start": position[0].numpy() + 0.1, "duration": 2.0}
     state, numpy_state = dmp.initial_state(**ends), stepper.initial_state(**ends)
