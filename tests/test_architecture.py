@@ -1,0 +1,300 @@
+"""The house as it is meant to stand: who imports whom, and what stays out of the repository."""
+
+import ast
+import os
+import re
+import subprocess
+import sys
+import tomllib
+import zipfile
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+SOURCES = sorted((ROOT / "hrc_learn").rglob("*.py"))
+FOLDERS_OF_PROGRAMS = ("datasets", "training", "control", "tests", "benchmarks")
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+
+CORE: dict[str, set[str]] = {
+    "geometry": set(),
+    "kinematics": {"geometry"},
+    "dmp": {"geometry"},
+    "regions": {"geometry"},
+    "jacobian": {"geometry", "regions"},
+    "controller": {"geometry", "kinematics", "regions", "jacobian"},
+    "protocols": set(),
+}
+"""Core packages in the order they build on each other, with what each may import."""
+
+EDGES: dict[str, set[str]] = {
+    "cli": set(),
+    "output": set(),
+    "demos": {*CORE},
+    "vision": {*CORE},
+    "human": {*CORE},
+    "viz": {*CORE, "vision"},
+    "sim": {*CORE, "vision", "viz"},
+}
+"""Edges likewise: where the package meets files, screens, simulators and people."""
+
+LAYERS = CORE | EDGES | {"tasks": {*CORE, *EDGES}}
+
+LIBRARIES: dict[str, set[str]] = {
+    **{package: {"torch", "jaxtyping", "numpy", "safetensors"} for package in CORE},
+    "cli": set(),
+    "output": set(),
+    "demos": {"torch", "jaxtyping", "numpy", "pyarrow"},
+    "vision": {"jaxtyping", "numpy"},
+    "human": {"torch", "jaxtyping", "numpy", "scipy"},
+    "viz": {"jaxtyping", "numpy", "rerun", "matplotlib", "mpl_toolkits", "cycler", "PIL"},
+    "sim": {"torch", "jaxtyping", "numpy", "mujoco"},
+    "tasks": {"torch", "jaxtyping", "numpy"},
+}
+"""Libraries that modules of a package may import as soon as they are imported."""
+
+LAZY_LIBRARIES: dict[str, set[str]] = {
+    "kinematics": {"pytorch_kinematics", "frankik"},
+    "cli": {"tyro"},
+    "demos": {"av"},
+    "vision": {"cv2"},
+}
+"""Libraries that they may import in the functions that need them, and nowhere else."""
+
+DISTRIBUTIONS = {
+    "pytorch_kinematics": "pytorch-kinematics",
+    "cv2": "opencv-python-headless",
+    "rerun": "rerun-sdk",
+    # Parts and requirements of matplotlib's own.
+    "mpl_toolkits": "matplotlib",
+    "cycler": "matplotlib",
+    "PIL": "matplotlib",
+}
+"""What a library is called in pyproject.toml where that is not its name in code."""
+
+
+class Import(NamedTuple):
+    """One imported module; lazy: only in a function that is called, or for type checkers."""
+
+    source: Path
+    line: int
+    module: str
+    lazy: bool
+
+    @property
+    def package(self) -> str:
+        """Package of ours that imports."""
+        return self.source.relative_to(ROOT / "hrc_learn").parts[0].removesuffix(".py")
+
+    @property
+    def top(self) -> str:
+        """First part of the module's name."""
+        return self.module.split(".")[0]
+
+    def __str__(self) -> str:
+        return f"{self.source.relative_to(ROOT)}:{self.line} imports {self.module}"
+
+
+@cache
+def parse(source: Path) -> ast.Module:
+    return ast.parse(source.read_text(), filename=str(source))
+
+
+def imports_of(source: Path) -> Iterator[Import]:
+    """Every import of a file, relative ones made absolute."""
+
+    def visit(node: ast.AST, lazy: bool) -> Iterator[Import]:
+        for child in ast.iter_child_nodes(node):
+            for module in modules_named(child, source):
+                yield Import(source, getattr(child, "lineno", 0), module, lazy)
+            yield from visit(child, lazy or waits(child))
+
+    yield from visit(parse(source), lazy=False)
+
+
+def waits(node: ast.AST) -> bool:
+    """Whether what stands inside does not run when the module is imported."""
+    if isinstance(node, ast.If):
+        return isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"
+    return isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef))
+
+
+def modules_named(node: ast.AST, source: Path) -> list[str]:
+    if isinstance(node, ast.Import):
+        return [alias.name for alias in node.names]
+    if not isinstance(node, ast.ImportFrom):
+        return []
+    parents = (
+        source.relative_to(ROOT).with_suffix("").parts[: -node.level] if node.level else ()
+    )
+    base = ".".join([*parents, *([node.module] if node.module else [])])
+    # `from hrc_learn import demos` names a module, not a value.
+    if base == "hrc_learn":
+        return [f"hrc_learn.{alias.name}" for alias in node.names]
+    return [base]
+
+
+ALL_IMPORTS = [i for source in SOURCES for i in imports_of(source)]
+OURS = [i for i in ALL_IMPORTS if i.top == "hrc_learn"]
+OTHERS = [i for i in ALL_IMPORTS if i.top not in {"hrc_learn", *sys.stdlib_module_names}]
+
+
+def tracked_files() -> list[Path]:
+    """Files in git's index; skips the test where the sources came without their history."""
+    listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True)
+    if listed.returncode or not listed.stdout:
+        pytest.skip("not a git checkout")
+    paths = [ROOT / name for name in listed.stdout.rstrip("\0").split("\0")]
+    return [path for path in paths if path.is_file()]
+
+
+def test_every_package_has_its_place():
+    found = {
+        path.relative_to(ROOT / "hrc_learn").parts[0].removesuffix(".py") for path in SOURCES
+    }
+    assert found - {"__init__"} == LAYERS.keys()
+
+
+@pytest.mark.parametrize("package", LAYERS)
+def test_imports_run_one_way(package):
+    wrong = [
+        str(i)
+        for i in OURS
+        if i.package == package and i.module.split(".")[1] not in {package, *LAYERS[package]}
+    ]
+    assert not wrong
+
+
+def test_no_package_builds_on_itself():
+    """The table has an order in which each package comes after all that it may import."""
+    placed: set[str] = set()
+    for package, below in LAYERS.items():
+        assert below <= placed, package
+        placed.add(package)
+
+
+def test_the_package_itself_imports_its_parts_only():
+    assert not [str(i) for i in OTHERS if i.package == "__init__"]
+
+
+@pytest.mark.parametrize("package", LAYERS)
+def test_libraries_stay_where_they_belong(package):
+    eager, lazy = LIBRARIES[package], LAZY_LIBRARIES.get(package, set())
+    wrong = [
+        str(i)
+        for i in OTHERS
+        if i.package == package and i.top not in (eager | lazy if i.lazy else eager)
+    ]
+    assert not wrong
+
+
+def required(requirements: list[str]) -> set[str]:
+    """Names of the distributions in a list of requirements, extras of ours left out."""
+    names = {re.split(r"[\[<>=!~; ]", requirement)[0] for requirement in requirements}
+    return names - {PROJECT["name"]}
+
+
+@pytest.mark.parametrize(
+    "package",
+    [
+        pytest.param(
+            name,
+            marks=[pytest.mark.xfail(reason="scipy is declared for development only")]
+            if name == "human"
+            else [],
+        )
+        for name in LAYERS
+    ],
+)
+def test_every_library_is_declared(package):
+    """What a user's machine lacks is an error that no developer's machine shows."""
+    declared = required(PROJECT["dependencies"])
+    for extra, requirements in PROJECT["optional-dependencies"].items():
+        declared |= required(requirements) if extra != "dev" else set()
+    missing = [
+        str(i)
+        for i in OTHERS
+        if i.package == package and DISTRIBUTIONS.get(i.top, i.top) not in declared
+    ]
+    assert not missing
+
+
+@pytest.mark.parametrize("folder", FOLDERS_OF_PROGRAMS)
+def test_folders_of_programs_are_no_packages(folder):
+    """A package named `datasets` would shadow Hugging Face's, which lerobot imports."""
+    assert (ROOT / folder).is_dir()
+    assert not list((ROOT / folder).rglob("__init__.py"))
+
+
+UNSAFE_MODULES = {"pickle", "cPickle", "cloudpickle", "dill", "joblib", "shelve", "marshal"}
+UNSAFE_CALLS = {("torch", "load"), ("torch", "save")}
+
+
+def test_nothing_reads_or_writes_pickles():
+    """A pickle runs code when it is read; models and logs travel between people."""
+    found = []
+    for path in (path for path in tracked_files() if path.suffix == ".py"):
+        found += [str(i) for i in imports_of(path) if i.top in UNSAFE_MODULES]
+        found += [
+            f"{path.relative_to(ROOT)}:{call.lineno} pickles"
+            for call in ast.walk(parse(path))
+            if isinstance(call, ast.Call) and pickles(call)
+        ]
+    assert not found
+
+
+def pickles(call: ast.Call) -> bool:
+    if any(k.arg == "allow_pickle" and not is_false(k.value) for k in call.keywords):
+        return True
+    f = call.func
+    if not isinstance(f, ast.Attribute) or not isinstance(f.value, ast.Name):
+        return False
+    return (f.value.id, f.attr) in UNSAFE_CALLS
+
+
+def is_false(node: ast.expr) -> bool:
+    return isinstance(node, ast.Constant) and node.value is False
+
+
+@pytest.mark.parametrize(
+    ("code", "unsafe"),
+    [
+        ("np.load(path)", False),
+        ("np.load(path, allow_pickle=False)", False),
+        ("np.load(path, allow_pickle=True)", True),
+        ("np.load(path, allow_pickle=trusted)", True),
+        ("torch.load(path)", True),
+        ("torch.tensor(path)", False),
+    ],
+)
+def test_pickles_are_recognised(code, unsafe):
+    call = ast.parse(code, mode="eval").body
+    assert isinstance(call, ast.Call)
+    assert pickles(call) == unsafe
+
+
+def test_no_large_file_is_tracked():
+    large = [path for path in tracked_files() if path.stat().st_size > 2**20]
+    assert not large, "recordings stay out of the repository: programs take their path"
+
+
+def test_the_wheel_holds_the_package_alone(tmp_path):
+    pytest.importorskip("hatchling", reason="the build backend is not installed")
+    subprocess.run(
+        [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", tmp_path],
+        cwd=ROOT,
+        check=True,
+        capture_output=True,
+        env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1"},
+    )
+    (wheel,) = tmp_path.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        names = archive.namelist()
+    roots = {name.split("/")[0] for name in names}
+    information = f"hrc_learn-{PROJECT['version']}.dist-info"
+    assert roots == {"hrc_learn", information}
+    packed = {name for name in names if name.startswith("hrc_learn/") and name.endswith(".py")}
+    assert packed == {str(path.relative_to(ROOT)) for path in SOURCES}
