@@ -10,8 +10,8 @@ from hrc_learn.dmp.orientation import OrientationDMP as OrientationDMP
 from hrc_learn.dmp.orientation import OrientationState as OrientationState
 from hrc_learn.dmp.orientation import OrientationTrajectory as OrientationTrajectory
 from hrc_learn.dmp.pose import PoseDMP as PoseDMP
-from hrc_learn.dmp.pose import PoseState as PoseState
-from hrc_learn.dmp.pose import PoseTrajectory as PoseTrajectory
+from hrc_learn.dmp.pose_motion import PoseState as PoseState
+from hrc_learn.dmp.pose_motion import PoseTrajectory as PoseTrajectory
 from hrc_learn.dmp.report import FitReport as FitReport
 from hrc_learn.dmp.rhythmic import fit_rhythmic as fit_rhythmic
 from hrc_learn.dmp.spring import SpringDamper as SpringDamper

@@ -89,6 +89,10 @@ class SavedPrimitive:
             raise ValueError(f"{self.folder / MODEL}: tensor {name!r} is not finite")
         return self.tensors[name]
 
+    def invalid_field(self, field: str, complaint: object) -> ValueError:
+        """A complaint about what a field of the config holds."""
+        return ValueError(f"{self.folder / CONFIG}: field {field!r}: {complaint}")
+
     def invalid(self, complaint: object) -> ValueError:
         """The complaint of a constructor, with the folder that caused it."""
         return ValueError(f"{self.folder}: {complaint}")

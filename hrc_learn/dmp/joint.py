@@ -3,28 +3,24 @@
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from types import NoneType
 from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from hrc_learn.dmp.basis import Basis, GaussianBasis, PeriodicBasis
-from hrc_learn.dmp.canonical import ExponentialPhase
+from hrc_learn.dmp.basis import Basis, GaussianBasis
 from hrc_learn.dmp.files import SavedPrimitive, write_folder
 from hrc_learn.dmp.fitting import fit_samples
 from hrc_learn.dmp.report import FitReport
 from hrc_learn.dmp.response import response_of
 from hrc_learn.dmp.samples import ArrayLike, check_samples
+from hrc_learn.dmp.saved_joint import TENSORS, saved_arguments
 from hrc_learn.dmp.scaling import check_paper_scale, check_scaling, forcing_scale
 from hrc_learn.dmp.spring import SpringDamper
 from hrc_learn.dmp.state import DMPState
 from hrc_learn.dmp.stepping import advance, second_derivative
 from hrc_learn.dmp.trajectory import Trajectory, broadcast_shapes
-
-BASES = {basis.__name__: basis for basis in (GaussianBasis, PeriodicBasis)}
-BUFFERS = ("start", "goal", "start_velocity", "duration", "amplitude", "stamps")
 
 
 class JointDMP(nn.Module):
@@ -86,18 +82,15 @@ class JointDMP(nn.Module):
         """
         super().__init__()
         check_scaling(scaling)
+        buffers = (start, goal, start_velocity, duration, amplitude, stamps)
+        self._check_shapes(weights, *buffers)
         D = weights.shape[-2]
         if joint_names is not None and len(joint_names) != D:
             raise ValueError(f"{len(joint_names)} joint names for {D} coordinates")
         if weights.shape[-1] != basis.count:
             raise ValueError(f"{weights.shape[-1]} weights for {basis.count} basis functions")
-        if start.shape != weights.shape[:-1]:
-            raise ValueError(
-                f"start has shape {tuple(start.shape)}, weights {tuple(weights.shape)}"
-            )
         self.weights = nn.Parameter(weights)
-        buffers = (start, goal, start_velocity, duration, amplitude, stamps)
-        for name, value in zip(BUFFERS, buffers, strict=True):
+        for name, value in zip(TENSORS[1:], buffers, strict=True):
             self.register_buffer(name, value)
         self.basis = basis
         self.spring = spring
@@ -368,29 +361,23 @@ class JointDMP(nn.Module):
     @classmethod
     def restore(cls, saved: SavedPrimitive) -> "JointDMP":
         """The primitive inside a saved one."""
-        spring = saved.get("spring", dict)
-        basis = dict(saved.get("basis", dict))
+        arguments = saved_arguments(saved)
         try:
-            make = BASES[basis.pop("type")]
-            if make is GaussianBasis:
-                basis["phase"] = ExponentialPhase(**basis["phase"])
-            parts = {"spring": SpringDamper(**spring), "basis": make(**basis)}
-        except (KeyError, TypeError, ValueError) as error:
-            raise saved.invalid(f"field 'spring' or 'basis': {error}") from None
-        arguments = {
-            **{name: saved.tensor(name) for name in ("weights", *BUFFERS)},
-            "scaling": saved.get("scaling", str),
-            "approach": saved.get("approach", float, int),
-            "joint_names": saved.get("joint_names", list, NoneType),
-            "units": saved.get("units", dict).get("coordinates", ""),
-        }
-        if "fit_report.rmse" in saved.tensors:
-            report = {k: saved.tensor(f"fit_report.{k}") for k in ("rmse", "peak", "span")}
-            arguments["fit_report"] = FitReport(**report)
-        try:
-            return cls(**parts, **arguments)
+            return cls(**arguments)
         except ValueError as error:
             raise saved.invalid(error) from None
+
+    @staticmethod
+    def _check_shapes(weights: Tensor, *buffers: Tensor) -> None:
+        """Every buffer but `stamps`, the last, follows from the shape of the weights."""
+        batch = weights.shape[:-1]
+        for name, tensor in zip(TENSORS[1:-1], buffers, strict=False):
+            shape = batch[:-1] if name == "duration" else batch
+            if weights.ndim < 2 or tensor.shape != shape:
+                raise ValueError(
+                    f"{name} has shape {tuple(tensor.shape)}, which does not fit weights "
+                    f"{tuple(weights.shape)}"
+                )
 
     def _boundary(
         self,

@@ -4,8 +4,9 @@ from typing import Any
 
 import torch
 
-from hrc_learn.dmp.joint import BUFFERS, JointDMP
+from hrc_learn.dmp.joint import JointDMP
 from hrc_learn.dmp.pose import PoseDMP
+from hrc_learn.dmp.saved_joint import TENSORS
 
 
 def mean_primitive[Primitive: (JointDMP, PoseDMP)](primitives: Primitive) -> Primitive:
@@ -36,9 +37,7 @@ def _mean_of_joints(primitives: JointDMP) -> JointDMP:
     def mean(tensor: torch.Tensor) -> torch.Tensor:
         return tensor.flatten(0, batch - 1).mean(dim=0) if batch else tensor
 
-    buffers: dict[str, Any] = {
-        name: mean(getattr(primitives, name)) for name in BUFFERS if name != "stamps"
-    }
+    buffers: dict[str, Any] = {name: mean(getattr(primitives, name)) for name in TENSORS[1:-1]}
     samples = primitives.stamps.shape[-1]
     return JointDMP(
         weights=mean(weights),

@@ -3,6 +3,7 @@ import json
 import pytest
 import torch
 from demo_motions import arm_motion
+from safetensors.torch import load_file, save_file
 
 from hrc_learn.dmp import JointDMP
 
@@ -55,7 +56,10 @@ def test_saving_does_not_overwrite_what_is_no_primitive(tmp_path):
         ("scaling", None, "config.json: field 'scaling' must be str, got None"),
         ("scaling", "cubic", "unknown scaling 'cubic'"),
         ("spring", {"alpha": -1.0}, "alpha must be positive"),
-        ("basis", {"count": 8}, "basis"),
+        ("basis", {"count": 8}, r"config\.json: field 'basis': 'type' is missing"),
+        ("basis", {"type": "Wavelets"}, "field 'basis': unknown type 'Wavelets'"),
+        ("spring", {"gamma": 1.0}, "field 'spring': .*gamma"),
+        ("approach", 2.0, "approach must be a share"),
         ("joint_names", ["only"], "1 joint names for 2"),
     ],
 )
@@ -88,3 +92,21 @@ def test_a_missing_field_or_file_is_named(saved):
         JointDMP.load(folder)
     with pytest.raises(FileNotFoundError, match="no primitive was saved"):
         JointDMP.load(folder.parent)
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        (lambda tensors: tensors.pop("goal"), "tensor 'goal' is missing"),
+        (lambda tensors: tensors.update(goal=torch.zeros(5)), r"goal has shape \(5,\)"),
+        (lambda tensors: tensors["weights"].fill_(torch.nan), "tensor 'weights' is not finite"),
+    ],
+)
+def test_wrong_tensors_are_named(saved, change, complaint):
+    _, folder = saved
+    tensors = load_file(folder / "model.safetensors")
+    change(tensors)
+    save_file(tensors, folder / "model.safetensors")
+    with pytest.raises(ValueError, match=complaint) as error:
+        JointDMP.load(folder)
+    assert str(folder) in str(error.value)

@@ -1,0 +1,53 @@
+"""What a saved joint primitive holds, read back as the arguments that make it again."""
+
+from types import NoneType
+from typing import Any
+
+from hrc_learn.dmp.basis import Basis, GaussianBasis, PeriodicBasis
+from hrc_learn.dmp.canonical import ExponentialPhase
+from hrc_learn.dmp.files import SavedPrimitive
+from hrc_learn.dmp.report import FitReport
+from hrc_learn.dmp.spring import SpringDamper
+
+TENSORS = ("weights", "start", "goal", "start_velocity", "duration", "amplitude", "stamps")
+
+
+def saved_arguments(saved: SavedPrimitive) -> dict[str, Any]:
+    """Arguments of `JointDMP`.
+
+    Raises:
+        ValueError: Names the file and the field that is wrong.
+    """
+    arguments = {
+        **{name: saved.tensor(name) for name in TENSORS},
+        "spring": _part(saved, "spring", lambda fields: SpringDamper(**fields)),
+        "basis": _part(saved, "basis", _basis),
+        "scaling": saved.get("scaling", str),
+        "approach": float(saved.get("approach", float, int)),
+        "joint_names": saved.get("joint_names", list, NoneType),
+        "units": saved.get("units", dict).get("coordinates", ""),
+    }
+    if "fit_report.rmse" in saved.tensors:
+        report = {name: saved.tensor(f"fit_report.{name}") for name in ("rmse", "peak", "span")}
+        arguments["fit_report"] = FitReport(**report)
+    return arguments
+
+
+def _part(saved: SavedPrimitive, field: str, make: Any) -> Any:
+    fields = saved.get(field, dict)
+    try:
+        return make(fields)
+    except KeyError as error:
+        raise saved.invalid_field(field, f"{error} is missing") from None
+    except (TypeError, ValueError) as error:
+        raise saved.invalid_field(field, error) from None
+
+
+def _basis(fields: dict[str, Any]) -> Basis:
+    kind, fields = fields["type"], {k: v for k, v in fields.items() if k != "type"}
+    if kind == "PeriodicBasis":
+        return PeriodicBasis(**fields)
+    if kind != "GaussianBasis":
+        raise ValueError(f"unknown type {kind!r}")
+    phase = ExponentialPhase(**fields.pop("phase"))
+    return GaussianBasis(**fields, phase=phase)
