@@ -82,14 +82,13 @@ class JointDMP(nn.Module):
         """
         super().__init__()
         check_scaling(scaling)
-        buffers = (start, goal, start_velocity, duration, amplitude, stamps)
-        self._check_shapes(weights, *buffers)
         D = weights.shape[-2]
         if joint_names is not None and len(joint_names) != D:
             raise ValueError(f"{len(joint_names)} joint names for {D} coordinates")
         if weights.shape[-1] != basis.count:
             raise ValueError(f"{weights.shape[-1]} weights for {basis.count} basis functions")
         self.weights = nn.Parameter(weights)
+        buffers = (start, goal, start_velocity, duration, amplitude, stamps)
         for name, value in zip(TENSORS[1:], buffers, strict=True):
             self.register_buffer(name, value)
         self.basis = basis
@@ -366,18 +365,6 @@ class JointDMP(nn.Module):
             return cls(**arguments)
         except ValueError as error:
             raise saved.invalid(error) from None
-
-    @staticmethod
-    def _check_shapes(weights: Tensor, *buffers: Tensor) -> None:
-        """Every buffer but `stamps`, the last, follows from the shape of the weights."""
-        batch = weights.shape[:-1]
-        for name, tensor in zip(TENSORS[1:-1], buffers, strict=False):
-            shape = batch[:-1] if name == "duration" else batch
-            if weights.ndim < 2 or tensor.shape != shape:
-                raise ValueError(
-                    f"{name} has shape {tuple(tensor.shape)}, which does not fit weights "
-                    f"{tuple(weights.shape)}"
-                )
 
     def _boundary(
         self,

@@ -3,6 +3,8 @@
 from types import NoneType
 from typing import Any
 
+from torch import Tensor
+
 from hrc_learn.dmp.basis import Basis, GaussianBasis, PeriodicBasis
 from hrc_learn.dmp.canonical import ExponentialPhase
 from hrc_learn.dmp.files import SavedPrimitive
@@ -18,8 +20,10 @@ def saved_arguments(saved: SavedPrimitive) -> dict[str, Any]:
     Raises:
         ValueError: Names the file and the field that is wrong.
     """
+    tensors = {name: saved.tensor(name) for name in TENSORS}
+    _check_shapes(saved, tensors)
     arguments = {
-        **{name: saved.tensor(name) for name in TENSORS},
+        **tensors,
         "spring": _part(saved, "spring", lambda fields: SpringDamper(**fields)),
         "basis": _part(saved, "basis", _basis),
         "scaling": saved.get("scaling", str),
@@ -31,6 +35,18 @@ def saved_arguments(saved: SavedPrimitive) -> dict[str, Any]:
         report = {name: saved.tensor(f"fit_report.{name}") for name in ("rmse", "peak", "span")}
         arguments["fit_report"] = FitReport(**report)
     return arguments
+
+
+def _check_shapes(saved: SavedPrimitive, tensors: dict[str, Tensor]) -> None:
+    """All but the stamps follow from the shape of the weights."""
+    weights = tensors["weights"]
+    for name in TENSORS[1:-1]:
+        shape = weights.shape[:-2] if name == "duration" else weights.shape[:-1]
+        if weights.ndim < 2 or tensors[name].shape != shape:
+            raise saved.invalid(
+                f"{name} has shape {tuple(tensors[name].shape)}, which does not fit weights "
+                f"{tuple(weights.shape)}"
+            )
 
 
 def _part(saved: SavedPrimitive, field: str, make: Any) -> Any:
