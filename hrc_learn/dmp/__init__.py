@@ -14,6 +14,8 @@ from hrc_learn.dmp.pose_motion import PoseState as PoseState
 from hrc_learn.dmp.pose_motion import PoseTrajectory as PoseTrajectory
 from hrc_learn.dmp.report import FitReport as FitReport
 from hrc_learn.dmp.rhythmic import fit_rhythmic as fit_rhythmic
+from hrc_learn.dmp.selection import BasisSelection as BasisSelection
+from hrc_learn.dmp.selection import select_basis_count as select_basis_count
 from hrc_learn.dmp.spring import SpringDamper as SpringDamper
 from hrc_learn.dmp.state import DMPState as DMPState
 from hrc_learn.dmp.stepper import Stepper as Stepper

@@ -1,0 +1,52 @@
+import pytest
+import torch
+from demo_motions import arm_motion
+
+from hrc_learn.dmp import select_basis_count
+
+CANDIDATES = (5, 10, 20, 40, 80, 120)
+
+
+def test_noise_free_detail_asks_for_many_basis_functions():
+    time, position = arm_motion(n_samples=300)
+    position = position + 0.05 * torch.sin(20 * time)[:, None]
+    chosen = select_basis_count(time, position, CANDIDATES)
+    assert chosen.count >= 40
+    assert chosen.error[0] > 100 * chosen.error.min()
+
+
+def test_noise_asks_for_few():
+    """More than the motion needs only follow the noise, and miss what was held out."""
+    time, position = arm_motion(n_samples=300)
+    rng = torch.Generator().manual_seed(0)
+    noisy = position + 0.02 * torch.randn(position.shape, generator=rng, dtype=torch.float64)
+    chosen = select_basis_count(time, noisy, CANDIDATES)
+    assert 10 <= chosen.count <= 40
+    assert chosen.error[-1] > 1.1 * chosen.error.min()
+
+
+def test_held_out_samples_are_not_fitted():
+    """A spike in one sample is missed by about its height, however many basis functions."""
+    time, position = arm_motion(n_samples=60, n_joints=1)
+    position[30] += 1.0
+    chosen = select_basis_count(time, position, (50,))
+    rmse = chosen.error[0] * (position.max() - position.min())
+    assert rmse > 0.5 / 60**0.5
+
+
+def test_masks_are_kept():
+    time, position = arm_motion(n_samples=100)
+    mask = torch.arange(120) < 100
+    padded = torch.cat([position, torch.full((20, 7), torch.nan, dtype=torch.float64)])
+    stamps = torch.cat([time, time[:20]])
+    plain = select_basis_count(time, position, (10, 20))
+    masked = select_basis_count(stamps, padded, (10, 20), mask=mask)
+    torch.testing.assert_close(masked.error, plain.error)
+
+
+def test_no_candidates_or_folds_are_refused():
+    time, position = arm_motion(n_samples=30)
+    with pytest.raises(ValueError, match="needs candidates"):
+        select_basis_count(time, position, ())
+    with pytest.raises(ValueError, match="2 folds"):
+        select_basis_count(time, position, n_folds=1)
