@@ -91,7 +91,7 @@ class HandOver(nn.Module):
         depth = (self.edge - (feature - self.edge).abs()).amin(-1)
         seen = usable & (depth >= 0)
         active = seen & (state.active | (depth >= self.config.hysteresis))
-        level = self._faded(state.level, active, dt)
+        level = fade(state.level, active, dt, self.config.blend_time)
         if stop is not None:
             # Wait for the camera: neither fade out nor forget that it was in charge.
             active = active | stop
@@ -99,9 +99,16 @@ class HandOver(nn.Module):
         feature = torch.where(seen.unsqueeze(-1), feature, state.feature)
         return Activation(active=active, level=level, feature=feature), seen, stop
 
-    def _faded(self, level: Tensor, active: Tensor, dt: float | Tensor) -> Tensor:
-        wanted = active.to(level.dtype)
-        if self.config.blend_time == 0:
-            return wanted
-        change = dt / self.config.blend_time
-        return (level + (2 * change) * wanted - change).clamp(0, 1)
+
+def fade(
+    level: Float[Tensor, "*batch"],
+    rising: Bool[Tensor, "*batch"],
+    dt: float | Float[Tensor, ""],
+    time: float,
+) -> Float[Tensor, "*batch"]:
+    """Move a level towards 1 or 0, all the way in `time` seconds."""
+    wanted = rising.to(level.dtype)
+    if time == 0:
+        return wanted
+    change = dt / time
+    return (level + (2 * change) * wanted - change).clamp(0, 1)

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.utils import _pytree
 
-from hrc_learn.controller.activation import Activation, HandOver
+from hrc_learn.controller.activation import Activation, HandOver, fade
 from hrc_learn.controller.config import ControllerConfig
 from hrc_learn.controller.goals import Goals
 from hrc_learn.controller.hold import Hold, measure_drift, planned_motion
@@ -26,6 +26,11 @@ from hrc_learn.regions import JointRegion, PostureRegion
 
 # Keeps the cap on the pixel rate finite at the target.
 _ONE_PIXEL_PER_SECOND = 1.0
+
+
+# Region function of the posture beyond which a joint-space approach begins anew: at the
+# default tolerance of 0.5 rad, a distance of 1.5 rad.
+_FAR_AWAY = 2.0
 
 
 class _Feedback(NamedTuple):
@@ -116,6 +121,7 @@ class AdaptiveController(nn.Module):
         still = torch.zeros_like(J[..., 0])
         return ControllerState(
             activation=self.hand_over.initial_state(joint_position),
+            arrival=torch.zeros_like(joint_position[..., 0]),
             hold=Hold(drift=still, joint_position=joint_position, jacobian=J, planned=still),
             safety=self.safety.initial_state(joint_position, joint_velocity),
             estimator=self.estimator.initial_state(*joint_position.shape[:-1]),
@@ -139,15 +145,17 @@ class AdaptiveController(nn.Module):
         goals = _effective_goals(observation, self.goals)
         q, stale = _trusted_position(state, observation)
         pose, J = self.chain.forward_and_jacobian(q)
+        arrival = self._arrival(state, goals, q, observation.dt)
+        usable = observation.feature_visible & goals.vision_enabled
         activation, seen, stop = self.hand_over.step(
             state.activation,
             observation.feature,
-            self._camera_usable(state, observation, goals, q),
+            usable if goals.posture is None else usable & (arrival > 0),
             observation.dt,
             age=observation.feature_age,
         )
         feedback = self._feedback(state, goals, pose, activation)
-        motion, hold = self._motion(state, observation, goals, q, J, activation, feedback.s)
+        motion, hold = self._motion(state, observation, goals, q, J, arrival, feedback.s)
         v, safety, report = self.safety.step(
             state.safety,
             q,
@@ -178,23 +186,27 @@ class AdaptiveController(nn.Module):
         estimator = self._adapted(state, observation, pose, seen, activation, feedback)
         return command, ControllerState(
             activation=activation,
+            arrival=arrival,
             hold=state.hold if hold is None else hold,
             safety=safety,
             estimator=estimator,
         )
 
-    def _camera_usable(
-        self, state: ControllerState, observation: Observation, goals: Goals, q: Tensor
-    ) -> Bool[Tensor, "*batch"]:
-        """Whether the camera takes part and found the feature.
+    def _arrival(
+        self, state: ControllerState, goals: Goals, q: Tensor, dt: float | Tensor
+    ) -> Float[Tensor, "*batch"]:
+        """Share in which task-space feedback has taken over from a joint-space approach.
 
-        It first takes over inside the posture region: earlier it would lead an arm from
-        whatever posture it is in, and many of those end at a joint limit.
+        It does so inside the posture region: earlier it would lead an arm from whatever
+        posture it is in, and many of those end at a joint limit. Once it has, it keeps the
+        lead, also where a person or the task moves the joints out of the region, unless the
+        posture lies far away, as when a new phase begins.
         """
-        usable = observation.feature_visible & goals.vision_enabled
-        if goals.posture is not None:
-            usable = usable & (state.activation.active | (goals.posture.value(q) <= 0))
-        return usable
+        if goals.posture is None:
+            return torch.zeros_like(state.arrival)
+        f = goals.posture.value(q)
+        leads = (state.arrival > 0) & ((f <= _FAR_AWAY) | state.activation.active)
+        return fade(state.arrival, leads | (f <= 0), dt, self.config.activation.blend_time)
 
     def _feedback(
         self, state: ControllerState, goals: Goals, pose: Pose, activation: Activation
@@ -231,7 +243,7 @@ class AdaptiveController(nn.Module):
         goals: Goals,
         q: Tensor,
         J: Tensor,
-        activation: Activation,
+        arrival: Tensor,
         s: Tensor,
     ) -> tuple[_Motion, Hold | None]:
         """Joint velocity of the law, and the pose hold where one is asked for."""
@@ -243,14 +255,14 @@ class AdaptiveController(nn.Module):
         hold = None
         if d is not None and self.config.hold_rate > 0:
             # A joint-space approach has planned no path of the tool that could be held.
-            holds = (d != 0).any(-1) & ((activation.level == 1) | (goals.posture is None))
+            holds = (d != 0).any(-1) & ((arrival == 1) | (goals.posture is None))
             hold = measure_drift(state.hold, q, J, holds)
             twist = torch.add(task_twist, hold.drift, alpha=self.config.hold_rate)
 
         task, null = resolve(J, twist, wish)
         if goals.posture is not None:
             approach = self._approach(goals.posture, q, J)
-            task = torch.lerp(approach, task, activation.level.unsqueeze(-1))
+            task = torch.lerp(approach, task, arrival.unsqueeze(-1))
         bounds = self.safety.velocity_bounds(q)
         if self.config.null_space_yields:
             null = fit_null_space(task, null, *bounds)

@@ -33,8 +33,8 @@ class Goals:
     vision_enabled: Bool[Tensor, "*#batch"]
     """False: steer by the Cartesian regions alone, whatever the camera sees."""
     posture: PostureRegion | None = None
-    """Where to go in joint space as long as vision feedback has not taken over; None: the
-    Cartesian regions lead from the start."""
+    """Where to go in joint space before task-space feedback takes over; None: it leads from
+    the start."""
 
     @classmethod
     def at(

@@ -52,6 +52,8 @@ class ControllerState:
 
     activation: Activation
     """Hand-over between Cartesian and vision feedback."""
+    arrival: Float[Tensor, "*batch"]
+    """Hand-over from a joint-space approach to them, 0 to 1."""
     hold: Hold
     """Drift of the tool while a person acts."""
     safety: SafetyState

@@ -283,12 +283,12 @@ def test_adaptation_finds_a_camera_turned_upside_down():
             controller,
             VirtualCamera(
                 camera=camera,
-                imperfections=Imperfections(frame_steps=3, latency_frames=1, noise=0.5),
+                imperfections=Imperfections(frame_steps=2, latency_frames=1, noise=0.5),
                 generator=sampling.generator(7),
             ),
             near_starts(30, rng=sampling.generator(8)),
-            steps=700,
-            dt=0.01,
+            steps=350,
+            dt=0.02,
         )
         error = (camera.project(panda.forward(q))[0] - target).norm(dim=-1)
         success[kind] = (error < 5).double().mean().item()
@@ -420,6 +420,46 @@ def test_phases_share_one_module_and_one_state():
     assert command.vision_activation == 0
     offset = (panda.forward(q).position - lower.position.centre).abs()
     assert (offset <= 1.2 * lower.position.half_size).all()
+
+
+def test_a_lost_marker_does_not_send_the_arm_back_to_its_approach():
+    rng = sampling.generator(15)
+    controller, camera = grasping(rng=rng)
+    goals = controller.goals.approached_by(POSTURE)
+    q, state = POSTURE + 0.2, controller.initial_state(POSTURE + 0.2)
+    path = []
+    for k in range(500):
+        feature, visible = camera.project(panda.forward(q))
+        observation = observe(
+            q, feature=feature, feature_visible=visible & (k < 300), goals=goals, dt=0.01
+        )
+        command, state = controller.step(state, observation)
+        q = q + 0.01 * command.joint_velocity
+        path.append(panda.forward(q).position)
+    assert command.vision_activation == 0
+    assert (path[-1] - path[300]).norm() < 2e-3
+
+
+def test_a_posture_far_away_begins_a_new_approach():
+    rng = sampling.generator(16)
+    controller, _ = grasping(rng=rng)
+    q, state = POSTURE, controller.initial_state(POSTURE)
+    hidden = torch.tensor(False)
+    there = controller.goals.approached_by(POSTURE)
+    for _ in range(60):
+        command, state = controller.step(
+            state, observe(q, goals=there, feature_visible=hidden, dt=0.01)
+        )
+    assert state.arrival == 1
+    elsewhere = controller.goals.approached_by(panda.ready)
+    for _ in range(500):
+        command, state = controller.step(
+            state, observe(q, goals=elsewhere, feature_visible=hidden, dt=0.01)
+        )
+        q = q + 0.01 * command.joint_velocity
+        if state.arrival > 0:
+            break
+    assert 0.3 < (q - panda.ready).norm() <= 0.5
 
 
 def test_goes_through_vmap():
