@@ -54,6 +54,7 @@ def select_basis_count(
     if not candidates or n_folds < 2:
         raise ValueError(f"needs candidates and 2 folds or more, got {candidates}, {n_folds}")
     folds = [_held_out(samples.mask, fold, n_folds) for fold in range(n_folds)]
+    elapsed = (samples.s * samples.duration[:, None]).reshape(*samples.batch, -1)
     errors = []
     for count in candidates:
         square, weight = torch.zeros((), dtype=torch.float64), 0
@@ -61,7 +62,7 @@ def select_basis_count(
             kept = (samples.mask & ~held).reshape(*samples.batch, -1)
             dmp = JointDMP.fit(time, position, count, mask=kept, **fit_arguments)
             with torch.no_grad():
-                reproduction = dmp.rollout().position.mT.reshape(samples.position.shape)
+                reproduction = dmp.rollout(elapsed).position.mT.reshape(samples.position.shape)
                 miss = (reproduction - samples.position).double() / samples.span.amax()
             square = square + miss.mT[held].square().sum()
             weight += int(held.sum()) * miss.shape[1]
