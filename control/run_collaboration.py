@@ -116,7 +116,7 @@ def _region(workplace: Workplace, half_size: tuple[float, float, float]) -> Box:
 
 
 def _demonstration(placing: Path) -> Demonstration | None:
-    """The first demonstration that the placing motion was learned from, if it is still there."""
+    """The first demonstration the placing motion was learned from, if it is still there."""
     dataset = Path(json.loads((placing / MADE_BY).read_text())["dataset"])
     return load_demos(dataset, episodes=[0])[0] if dataset.is_dir() else None
 

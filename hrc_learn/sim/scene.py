@@ -131,7 +131,7 @@ def _marked_arm() -> PandaModelConfig:
     # The plate sticks out sideways, clear of the forearm as seen from above.
     plate = Plate(
         marker=Marker(HAND_MARKER, 0.048),
-        position=(0.0, 0.135, 0.02),
+        position=(0.0, 0.145, 0.02),
         orientation=(0.0, 1.0, 0.0, 0.0),
     )
     return PandaModelConfig(marker=plate)

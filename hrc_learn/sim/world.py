@@ -86,6 +86,8 @@ class World:
             mujoco.mj_step(self.model, self.data)
             for monitor in self._monitors:
                 monitor.update(self.data)
+        # A step leaves the poses of bodies as they were before it: bring them up to date.
+        mujoco.mj_kinematics(self.model, self.data)
 
     def hold(self, name: str, joint_position: Float[np.ndarray, "7"]) -> None:
         """Reset with an object between the fingers, the grip settled.

@@ -140,8 +140,7 @@ class Collaboration:
     def _grasp(self, item: ObjectConfig) -> GraspResult:
         self._station.gripper.move(OPEN)
         for attempt in range(1, self._config.attempts + 1):
-            goals = self._config.aiming.goals(self._workplace.hover(), self._look_for(item))
-            goals = goals.approached_by(self._workplace.hover_joints())
+            goals = self._goals_above(item)
             aim_time = self._aim(goals)
             if attempt == 1:
                 self._interact(goals)
@@ -158,6 +157,17 @@ class Collaboration:
             f"grasp: {self._config.attempts} times the fingers closed on nothing. Is the "
             "object where its marker says?"
         )
+
+    def _goals_above(self, item: ObjectConfig) -> Goals:
+        target = self._look_for(item)
+        try:
+            goals = self._config.aiming.goals(self._workplace.hover(), target)
+        except ValueError as error:
+            raise TaskFailedError(
+                f"look: {item.name!r} lies where the camera would not see the hand above it: "
+                "put it nearer to the middle of the image."
+            ) from error
+        return goals.approached_by(self._workplace.hover_joints())
 
     def _look_for(self, item: ObjectConfig) -> Float[np.ndarray, "2"]:
         """Pixel to aim at, from a look at the table before the arm is over it."""

@@ -102,15 +102,17 @@ class PlacingSkill:
         Raises:
             UnreachableError: If no joint positions reach the goal.
         """
-        plan = self._plan_joints if space == "joint" else self._plan_pose
+        end = nearest_configuration(goal, near=self.joint.goal)
         duration = float(self.joint.duration) / speed
         time = torch.arange(0.0, duration + dt / 2, dt, dtype=torch.float64)
         with torch.no_grad():
-            path = plan(start, goal, time, duration)
+            if space == "joint":
+                path = self._plan_joints(start, end, time, duration)
+            else:
+                path = self._plan_pose(start, goal, time, duration)
         return Plan(goal=goal, dt=dt, path=path.numpy())
 
-    def _plan_joints(self, start: Tensor, goal: Pose, time: Tensor, duration: float) -> Tensor:
-        end = nearest_configuration(goal, near=self.joint.goal)
+    def _plan_joints(self, start: Tensor, end: Tensor, time: Tensor, duration: float) -> Tensor:
         still = torch.zeros_like(start)
         motion = self.joint.rollout(
             time, start=start, goal=end, duration=duration, start_velocity=still

@@ -15,7 +15,7 @@ from ..kinematics import panda
 from ..sim import HAND_MARKER, World
 from .eye import Eye
 from .teaching import Frame, TeachingConfig, teach
-from .workplace import Workplace
+from .workplace import Workplace, nearest_configuration
 
 OBJECT_FEATURE = "observation.object_feature"
 """Column of the object's marker in the image."""
@@ -100,9 +100,8 @@ def teach_aiming(
     expert = aiming_expert(workplace, above, lesson, rng)
     start = torch.from_numpy(expert.path.position(0.0))
     goal = type(workplace.hover())(start, expert.orientation(start, 0.0))
-    world.reset(
-        panda.inverse(goal, workplace.hover_q7, near=panda.ready).numpy(), {item.name: pose}
-    )
+    q = nearest_configuration(goal, near=workplace.hover_joints())
+    world.reset(q.numpy(), {item.name: pose})
     last = np.zeros(2)
 
     def observe() -> Frame:
