@@ -2,7 +2,8 @@
 
 Learns the motion of the joints, of any robot, and that of the hand where its pose is recorded.
 Several demonstrations give one primitive each and their mean, which is what is saved. Writes a
-folder with the primitives, the measured errors, a figure and what it was made from.
+folder with the primitives, the measured errors, demonstrations beside reproductions as a
+figure and a Rerun recording, and what it was made from.
 """
 
 from dataclasses import asdict, dataclass
@@ -15,7 +16,9 @@ from rich.table import Table
 from hrc_learn import cli
 from hrc_learn.demos import load_demos
 from hrc_learn.output import new_folder
-from hrc_learn.tasks import fit_primitives
+from hrc_learn.tasks import fit_primitives, fit_recording
+from hrc_learn.viz.figures import fit_joints_figure
+from hrc_learn.viz.fit_dashboard import record_fit
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,6 +61,10 @@ def main(args: Args) -> None:
             metrics = fitted.metrics()
         fitted.save(folder)
         cli.write_json(folder / "metrics.json", metrics)
+        if fitted.joint is not None:
+            shown = fit_recording(fitted, f"Fit of {args.dataset.name}")
+            record_fit(folder / "fit.rrd", shown)
+            fit_joints_figure(shown).savefig(folder / "joints.png", dpi=120)
     table = Table("measure", "value", title=f"Fit of {args.dataset}")
     for name, value in metrics.items():
         table.add_row(name.replace("_", " "), f"{value:.3g}")

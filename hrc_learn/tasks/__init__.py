@@ -11,6 +11,7 @@ from .fit_aiming import AimingSkill as AimingSkill
 from .fit_aiming import fit_aiming as fit_aiming
 from .fit_primitives import FittedPrimitives as FittedPrimitives
 from .fit_primitives import fit_primitives as fit_primitives
+from .fit_primitives import fit_recording as fit_recording
 from .placing import BlockedPathError as BlockedPathError
 from .placing import PlacingSkill as PlacingSkill
 from .placing import Plan as Plan

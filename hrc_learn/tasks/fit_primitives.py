@@ -12,6 +12,7 @@ from ..dmp import JointDMP, PoseDMP
 from ..dmp.mean import mean_primitive
 from ..geometry import quaternion
 from ..kinematics import arm_angle, panda
+from ..viz import FitRecording, JointLimits
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,10 +56,6 @@ class FittedPrimitives:
             turn = quaternion.angle(own.orientation.detach(), demos.orientation)[demos.mask]
             values["orientation_rmse_deg"] = float(turn.square().mean().sqrt().rad2deg())
         return values
-
-    def reproductions(self) -> Tensor | None:
-        """Joint positions of every demonstration as its own primitive repeats them."""
-        return None if self.joint is None else self.joint.rollout().position.detach()
 
     def _mean_joints(self) -> Tensor:
         assert self.joint is not None
@@ -150,3 +147,40 @@ def _compare(name: str, got: Tensor, wanted: Tensor, mask: Tensor) -> dict[str, 
         f"{name}_nrmse_max": float(nrmse.max()),
         f"{name}_error_max": float(error.abs().max()),
     }
+
+
+def fit_recording(fitted: FittedPrimitives, title: str) -> FitRecording:
+    """Joint demonstrations beside their reproductions, to be looked at.
+
+    Raises:
+        ValueError: If the demonstrations hold no joint positions.
+    """
+    demos, joint = fitted.demonstrations, fitted.joint
+    if joint is None or demos.joint_position is None:
+        raise ValueError(
+            "there are no joint positions to show; pose primitives have no figure."
+        )
+    reproduced = joint.rollout().position.detach()
+    lengths = demos.length.tolist()
+
+    def cut(padded: Tensor) -> tuple[np.ndarray, ...]:
+        return tuple(
+            values[:n].double().numpy() for values, n in zip(padded, lengths, strict=True)
+        )
+
+    paths: dict[str, tuple[np.ndarray, ...]] = {}
+    limits = None
+    if joint.joint_names == panda.joint_names:
+        limits = JointLimits(lower=panda.limits.lower.numpy(), upper=panda.limits.upper.numpy())
+        paths["demo_paths"] = cut(panda.forward(demos.joint_position.double()).position)
+        paths["reproduction_paths"] = cut(panda.forward(reproduced.double()).position)
+    return FitRecording(
+        title=title,
+        joint_names=joint.joint_names or (),
+        time=cut(demos.time),
+        demos=cut(demos.joint_position),
+        reproductions=cut(reproduced),
+        joint_limits=limits,
+        n_basis=joint.basis.count,
+        **paths,
+    )
