@@ -1,0 +1,108 @@
+"""What the documentation says can be done as it says."""
+
+import ast
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+README = ROOT / "README.md"
+PAGES = [
+    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")),
+    *sorted((ROOT / "docs").glob("*.md")),
+]
+FOLDERS = (
+    "hrc_learn",
+    "datasets",
+    "training",
+    "control",
+    "tests",
+    "benchmarks",
+    "docs",
+    "tools",
+)
+
+BLOCK = re.compile(r"^```(\w*)[^\n]*\n(.*?)^```", re.MULTILINE | re.DOTALL)
+LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s#]+)[^)]*\)|<img[^>]*src=\"([^\"]+)\"")
+PROGRAM_PATH = re.compile(rf"(?<![\w/.])(?:{'|'.join(FOLDERS)})/[\w./-]*\w")
+MAKE_TARGET = re.compile(r"\bmake ([a-z][\w-]*)")
+COMMAND = re.compile(r"\b((?:datasets|training|control|benchmarks)/\w+\.py)([^\n|;&]*)")
+OPTION = re.compile(r"(?<!\S)--([a-z][\w-]*)")
+
+by_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+
+
+def blocks(page: Path, *languages: str) -> list[str]:
+    """Fenced blocks in one of some languages."""
+    return [body for language, body in BLOCK.findall(page.read_text()) if language in languages]
+
+
+def code(page: Path) -> str:
+    """Everything set as code: fenced blocks, and spans within lines."""
+    text = page.read_text()
+    fenced = [body.replace("\\\n", " ") for _, body in BLOCK.findall(text)]
+    return "\n".join([*fenced, *re.findall(r"`([^`\n]+)`", BLOCK.sub("", text))])
+
+
+def test_the_example_runs(tmp_path):
+    """One block that needs nothing before it; it may write into the folder it runs in."""
+    (example,) = blocks(README, "python")
+    done = subprocess.run(
+        [sys.executable, "-c", example],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        env={**os.environ, "MPLBACKEND": "agg"},
+    )
+    assert done.returncode == 0, done.stderr
+
+
+@by_page
+def test_what_is_linked_exists(page):
+    names = {a or b for a, b in LINK.findall(page.read_text())}
+    local = {name for name in names if not re.match(r"\w+:", name)}
+    assert not [name for name in local if not (page.parent / name).exists()]
+
+
+@by_page
+def test_what_is_named_exists(page):
+    named = set(PROGRAM_PATH.findall(code(page)))
+    assert not [name for name in named if not (ROOT / name).exists()]
+
+
+@by_page
+def test_make_knows_its_targets(page):
+    makefile = (ROOT / "Makefile").read_text()
+    targets = set(re.findall(r"^([a-z][\w-]*):", makefile, re.MULTILINE))
+    assert set(MAKE_TARGET.findall(code(page))) <= targets
+
+
+@by_page
+def test_programs_know_their_options(page):
+    unknown = [
+        f"{program} --{option}"
+        for program, arguments in COMMAND.findall(code(page))
+        for option in OPTION.findall(arguments)
+        if option.split(".")[0] not in options(ROOT / program)
+    ]
+    assert not unknown
+
+
+def options(program: Path) -> set[str]:
+    """Names a program takes, as its dataclass `Args` declares them."""
+    (args,) = (
+        node
+        for node in ast.parse(program.read_text()).body
+        if isinstance(node, ast.ClassDef) and node.name == "Args"
+    )
+    fields = [
+        node.target.id.replace("_", "-")
+        for node in args.body
+        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name)
+    ]
+    return {"help", *fields, *(f"no-{name}" for name in fields)}
