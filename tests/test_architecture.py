@@ -197,18 +197,7 @@ def required(requirements: list[str]) -> set[str]:
     return names - {PROJECT["name"]}
 
 
-@pytest.mark.parametrize(
-    "package",
-    [
-        pytest.param(
-            name,
-            marks=[pytest.mark.xfail(reason="scipy is declared for development only")]
-            if name == "human"
-            else [],
-        )
-        for name in LAYERS
-    ],
-)
+@pytest.mark.parametrize("package", LAYERS)
 def test_every_library_is_declared(package):
     """What a user's machine lacks is an error that no developer's machine shows."""
     declared = required(PROJECT["dependencies"])
