@@ -84,22 +84,30 @@ class TrialResult:
 
     def summary(self) -> dict[str, float]:
         """Shares, medians and totals, by name."""
-        reached = self.time.isfinite()
-        phase = self.vision_time[reached]
         figures = {
-            "success": self.success.double().mean().item(),
+            "success": _share(self.success),
             "t50": self.time.quantile(0.5, interpolation="higher").item(),
             "t95": self.time.quantile(0.95, interpolation="higher").item(),
-            "vision_phase": phase.median().item() if len(phase) else math.inf,
+            "vision_phase": _median(self.vision_time),
             "violations": float(self.violations.sum()),
             "peak_speed": self.peak_speed.max().item(),
             "hand_overs": self.hand_overs.double().mean().item(),
         }
         for k, (low, high) in enumerate(ROLL_CLASSES):
             members = self.roll_class == k
-            share = self.success[members].double().mean().item()
-            figures[f"success_roll_{low}_{high}"] = share
+            figures[f"success_roll_{low}_{high}"] = _share(self.success[members])
+            figures[f"vision_phase_roll_{low}_{high}"] = _median(self.vision_time[members])
         return figures
+
+
+def _share(flags: Tensor) -> float:
+    return flags.double().mean().item()
+
+
+def _median(times: Tensor) -> float:
+    """Median where infinity, for never, is a value like any other."""
+    times = torch.where(times.isnan(), math.inf, times)  # never taken over: inf - inf
+    return times.quantile(0.5, interpolation="higher").item()
 
 
 @dataclass(frozen=True, kw_only=True)

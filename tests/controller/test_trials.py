@@ -42,7 +42,7 @@ def test_a_run_that_left_the_target_again_is_no_success():
         roll_class=torch.tensor([0, 1, 2, 3, 4]),
         success=torch.tensor([True, True, False, True, True]),
         time=torch.tensor([1.0, 2.0, math.inf, 3.0, 4.0], dtype=torch.float64),
-        vision_time=torch.tensor([0.5, 0.5, math.inf, 1.0, 1.0], dtype=torch.float64),
+        vision_time=torch.tensor([0.5, 0.5, math.nan, 1.0, 1.0], dtype=torch.float64),
         violations=torch.tensor([0, 0, 2, 0, 0]),
         peak_speed=torch.full((5,), 0.7, dtype=torch.float64),
         hand_overs=torch.ones(5, dtype=torch.int64),
@@ -52,6 +52,8 @@ def test_a_run_that_left_the_target_again_is_no_success():
     assert summary["t50"] == 3.0
     assert summary["t95"] == math.inf
     assert summary["violations"] == 2
+    assert summary["vision_phase"] == 1.0
+    assert summary["vision_phase_roll_60_90"] == math.inf
     assert summary["success_roll_60_90"] == 0
     assert summary["success_roll_0_30"] == 1
 
