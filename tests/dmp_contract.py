@@ -124,6 +124,24 @@ class DMPContract:
         for name, value in self.state_outputs(state).items():
             torch.testing.assert_close(value, there[name][0], rtol=0, atol=1e-9, msg=name)
 
+    def test_steps_can_be_exported(self, dmp):
+        class Step(torch.nn.Module):
+            def __init__(self):
+                super().__init__()
+                self.dmp = dmp
+
+            def forward(self, state, dt):
+                return self.dmp.step(state, dt)
+
+        dmp.requires_grad_(False)
+        state = dmp.initial_state()
+        dt = torch.tensor(0.02, dtype=torch.float64)
+        program = torch.export.export(Step(), (state, dt)).module()
+        exported = state
+        for _ in range(5):
+            state, exported = dmp.step(state, dt), program(exported, dt)
+        self.assert_same(self.state_outputs(exported), self.state_outputs(state))
+
     def test_slowing_down_stays_on_the_path(self, dmp):
         state = dmp.initial_state()
         for k in range(20):

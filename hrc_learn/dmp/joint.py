@@ -241,13 +241,14 @@ class JointDMP(nn.Module):
         start, goal, rate = (x.expand(*batch, -1) for x in (start, goal, rate))
         duration = duration.expand(batch)
         s = torch.zeros_like(duration, dtype=torch.float64)
+        # Copies: an export takes one tensor in two places for one input.
         return DMPState(
-            position=start,
+            position=start.clone(),
             rate=rate,
             start=start,
             goal=goal,
             way=goal - start,
-            target=goal,
+            target=goal.clone(),
             duration=duration,
             pace=torch.ones_like(duration),
             s=s,

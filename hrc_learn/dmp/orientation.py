@@ -81,6 +81,11 @@ class OrientationState:
         return error_space.angular_velocity(self.motion.position, self.motion.velocity)
 
 
+torch.export.register_dataclass(
+    OrientationState, serialized_type_name="hrc_learn.dmp.OrientationState"
+)
+
+
 class OrientationDMP(nn.Module):
     """Discrete movement primitive of an orientation, exact at all angles.
 

@@ -1,10 +1,9 @@
 """Smooth functions of time kept as polynomials on equal pieces."""
 
 from dataclasses import dataclass, field
-from functools import cached_property
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 DEGREE = 12
@@ -25,7 +24,14 @@ class PiecewisePolynomial:
     """Length of a piece."""
     periodic: bool = False
     """Whether the last piece is followed by the first."""
+    _exponents: Int[Tensor, "P"] = field(init=False)
     _moved: dict[torch.device, "PiecewisePolynomial"] = field(default_factory=dict)
+
+    def __post_init__(self):
+        # Now and not when first needed: that may be while a program is traced, and what is
+        # made there is no tensor to keep.
+        exponents = torch.arange(DEGREE + 1, device=self.coefficients.device)
+        object.__setattr__(self, "_exponents", exponents)
 
     @classmethod
     def interpolate(
@@ -38,7 +44,7 @@ class PiecewisePolynomial:
         u = 2 * chebyshev_points() - 1
         powers = u[:, None] ** torch.arange(DEGREE + 1)
         solved = torch.linalg.solve(powers, values.flatten(2))
-        return cls(solved.view(values.shape), interval, periodic)
+        return cls(solved.reshape(values.shape).contiguous(), interval, periodic)
 
     @property
     def end(self) -> float:
@@ -52,8 +58,9 @@ class PiecewisePolynomial:
         x = x % pieces if self.periodic else x.clamp(0, pieces)
         piece = x.detach().long().clamp(max=pieces - 1)
         powers = (2 * (x - piece) - 1)[..., None, None] ** self._exponents
-        c = self.coefficients.view(pieces, P, -1)[piece]
-        return (powers @ c).view(*s.shape, *shape)
+        # Not by brackets: those read a single index as a number, which no export can trace.
+        c = self.coefficients.view(pieces, -1).index_select(0, piece.reshape(-1))
+        return (powers @ c.view(*s.shape, P, -1)).view(*s.shape, *shape)
 
     def to(self, device: torch.device) -> "PiecewisePolynomial":
         """The same function on another device; made once."""
@@ -63,7 +70,3 @@ class PiecewisePolynomial:
             moved = self.coefficients.to(device)
             self._moved[device] = PiecewisePolynomial(moved, self.interval, self.periodic)
         return self._moved[device]
-
-    @cached_property
-    def _exponents(self) -> Tensor:
-        return torch.arange(DEGREE + 1, device=self.coefficients.device)

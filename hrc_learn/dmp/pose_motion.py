@@ -112,3 +112,6 @@ class PoseState:
         return OrientationState(
             motion=replace(self.motion, **columns), goal=self.goal_orientation
         )
+
+
+torch.export.register_dataclass(PoseState, serialized_type_name="hrc_learn.dmp.PoseState")

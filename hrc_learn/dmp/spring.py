@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
 from types import ModuleType
 from typing import Any
 
@@ -54,8 +53,9 @@ class SpringDamper:
         exp(A s) = C I + S (A + alpha / 2 I) by Cayley-Hamilton; see `modes` for C and S.
         """
         C, S = self.modes(s, torch)
-        eye, shifted = _constants(self, s.dtype, s.device)
-        return C[..., None, None] * eye + S[..., None, None] * shifted
+        lean = S * (self.alpha / 2)
+        entries = torch.stack([C + lean, S, S * -self.stiffness, C - lean], dim=-1)
+        return entries.view(*s.shape, 2, 2)
 
     def modes(self, s: Any, xp: ModuleType) -> tuple[Any, Any]:
         """exp(-alpha s / 2) times cosh(r s) and sinh(r s) / r, r^2 = alpha^2 / 4 - alpha beta.
@@ -78,13 +78,3 @@ class SpringDamper:
             return (slow + fast) / 2, (slow - fast) / (2 * rate)
         envelope = xp.exp(-half * s)
         return envelope * xp.cos(rate * s), envelope * xp.sin(rate * s) / rate
-
-
-@lru_cache(maxsize=64)
-def _constants(
-    spring: SpringDamper, dtype: torch.dtype, device: torch.device
-) -> tuple[Float[Tensor, "2 2"], Float[Tensor, "2 2"]]:
-    """I and A + alpha / 2 I."""
-    eye = torch.eye(2, dtype=dtype, device=device)
-    A = eye.new_tensor([[0.0, 1.0], [-spring.stiffness, -spring.alpha]])
-    return eye, A + spring.alpha / 2 * eye

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -9,6 +10,8 @@ from torch import Tensor
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DMPState:
     """Where a primitive is while it is stepped; every step makes a new one.
+
+    A pytree: goes through `torch.func` and `torch.export` as it is.
 
     To follow a robot that was pushed, replace the position by the measured one.
     """
@@ -36,3 +39,6 @@ class DMPState:
     def velocity(self) -> Float[Tensor, "*batch D"]:
         """Per second."""
         return self.rate * (self.pace / self.duration)[..., None]
+
+
+torch.export.register_dataclass(DMPState, serialized_type_name="hrc_learn.dmp.DMPState")

@@ -130,6 +130,6 @@ class TestJointOnItsApproach(TestJoint):
         return JointDMP.fit(*demonstration, approach=0.8, **kwargs)
 
 
-class TestPoseOnItsApproach(TestPose):
-    def fit(self, time, position, orientation, body, **kwargs):
-        return PoseDMP.fit(time, position, orientation, body=body, approach=1.0, **kwargs)
+class TestOrientationOnItsApproach(TestOrientation):
+    def fit(self, *demonstration, **kwargs):
+        return OrientationDMP.fit(*demonstration, approach=1.0, **kwargs)
