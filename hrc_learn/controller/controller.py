@@ -122,7 +122,13 @@ class AdaptiveController(nn.Module):
         return ControllerState(
             activation=self.hand_over.initial_state(joint_position),
             arrival=torch.zeros_like(joint_position[..., 0]),
-            hold=Hold(drift=still, joint_position=joint_position, jacobian=J, planned=still),
+            hold=Hold(
+                drift=still,
+                joint_position=joint_position,
+                jacobian=J,
+                planned=still,
+                active=torch.zeros_like(still[..., 0], dtype=torch.bool),
+            ),
             safety=self.safety.initial_state(joint_position, joint_velocity),
             estimator=self.estimator.initial_state(*joint_position.shape[:-1]),
         )
@@ -142,11 +148,11 @@ class AdaptiveController(nn.Module):
         Raises:
             ValueError: dt is not in (0, 1/rate] of the safety filter.
         """
-        goals = _effective_goals(observation, self.goals)
+        goals, known = _effective_goals(observation, self.goals)
         q, stale = _trusted_position(state, observation)
         pose, J = self.chain.forward_and_jacobian(q)
         arrival = self._arrival(state, goals, q, observation.dt)
-        usable = observation.feature_visible & goals.vision_enabled
+        usable = observation.feature_visible & goals.vision_enabled & known
         activation, seen, stop = self.hand_over.step(
             state.activation,
             observation.feature,
@@ -166,7 +172,9 @@ class AdaptiveController(nn.Module):
             stale=stale,
             bounds=motion.bounds,
         )
-        if hold is not None:
+        if hold is None:
+            hold = replace(state.hold, active=torch.zeros_like(state.hold.active))
+        else:
             planned = planned_motion(motion.task_twist, J, v, observation.dt)
             hold = replace(hold, planned=planned)
         command = Command(
@@ -183,11 +191,11 @@ class AdaptiveController(nn.Module):
             potential=feedback.potential,
             safety=report,
         )
-        estimator = self._adapted(state, observation, pose, seen, activation, feedback)
+        estimator = self._adapted(state, observation, pose, seen & ~stale, activation, feedback)
         return command, ControllerState(
             activation=activation,
             arrival=arrival,
-            hold=state.hold if hold is None else hold,
+            hold=hold,
             safety=safety,
             estimator=estimator,
         )
@@ -286,8 +294,14 @@ class AdaptiveController(nn.Module):
         feedback: _Feedback,
     ) -> Any:
         """State of the estimator after what the camera saw."""
-        if observation.image_joint_position is not None:
-            pose = self.chain.forward(observation.image_joint_position)
+        q = observation.image_joint_position
+        if q is not None:
+            # Estimators compute with the pose even where they must not learn from it.
+            known = (q * 0).sum(-1) == 0
+            pose = self.chain.forward(
+                torch.where(known.unsqueeze(-1), q, state.safety.position)
+            )
+            seen = seen & known
         if observation.feature_new is not None:
             seen = seen & observation.feature_new
         measurement = Measurement(
@@ -301,9 +315,17 @@ class AdaptiveController(nn.Module):
         return self.estimator.update(state.estimator, measurement)
 
 
-def _effective_goals(observation: Observation, default: Goals) -> Goals:
+def _effective_goals(
+    observation: Observation, default: Goals
+) -> tuple[Goals, Bool[Tensor, "*batch"] | bool]:
+    """Goals of this step, and whether the target is known: one that is NaN is not."""
     goals = default if observation.goals is None else observation.goals
-    return goals if observation.target is None else goals.aimed_at(observation.target)
+    target = observation.target
+    if target is None:
+        return goals, True
+    known = (target * 0).sum(-1) == 0
+    target = torch.where(known.unsqueeze(-1), target, goals.vision.target)
+    return goals.aimed_at(target), known
 
 
 def _trusted_position(

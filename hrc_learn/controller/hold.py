@@ -28,6 +28,8 @@ class Hold:
     """Of the last step."""
     planned: Float[Tensor, "*batch 6"]
     """Motion the task had planned for the last step (linear [m], angular [rad])."""
+    active: Bool[Tensor, "*batch"]
+    """Whether the last step held; where not, the rest may be old."""
 
 
 def measure_drift(
@@ -45,13 +47,17 @@ def measure_drift(
         hold: Of the step before.
         joint_position: Now [rad].
         jacobian: Now.
-        holds: Where to hold. Elsewhere the drift is zero, so that every effort starts afresh.
+        holds: Where to hold. Elsewhere, and in the first step of it, the drift is zero, so that
+            every effort starts afresh.
     """
     step = (joint_position - hold.joint_position).unsqueeze(-2)
     moved = torch.linalg.vecdot(hold.jacobian + jacobian, step)
     drift = torch.add(hold.drift + hold.planned, moved, alpha=-0.5)
-    drift = torch.where(holds.unsqueeze(-1), drift.clamp(-_FARTHEST, _FARTHEST), 0.0)
-    return replace(hold, drift=drift, joint_position=joint_position, jacobian=jacobian)
+    drift = drift.clamp(-_FARTHEST, _FARTHEST)
+    drift = torch.where((holds & hold.active).unsqueeze(-1), drift, 0.0)
+    return replace(
+        hold, drift=drift, joint_position=joint_position, jacobian=jacobian, active=holds
+    )
 
 
 def planned_motion(

@@ -29,7 +29,8 @@ class Observation:
     dt: float | Float[Tensor, ""]
     """Time until the next step [s]."""
     target: Float[Tensor, "*#batch 2"] | None = None
-    """Target in the image [px]; None: that of the goals."""
+    """Target in the image [px]; None: that of the goals. NaN: not known, so the camera does
+    not take part."""
     human_effort: Float[Tensor, "*batch n"] | None = None
     """Effort d of the person on each joint; None: nobody acts."""
     goals: Goals | None = None

@@ -397,6 +397,28 @@ def test_no_limit_is_broken_in_random_runs(faults: str):
     assert state.safety.count("position").sum() > 0
 
 
+@pytest.mark.parametrize("field", ["target", "image_joint_position", "joint_position"])
+def test_what_is_nan_for_a_while_spoils_no_state(field: str):
+    """Estimators keep what they learned, the arm comes back to its target."""
+    rng = sampling.generator(17)
+    camera = overhead_camera()
+    target, _ = target_in(camera, rng=rng)
+    estimator = CompositeEstimator(network(camera.image_jacobian(Pose(CENTRE, DOWN))))
+    controller = AdaptiveController(panda, estimator, Goals.at(CENTRE, DOWN, target))
+    q, state = POSTURE, controller.initial_state(POSTURE)
+    for k in range(300):
+        feature, visible = camera.project(panda.forward(q))
+        fields = {"target": target, "image_joint_position": q, "joint_position": q}
+        if 100 <= k < 140:
+            fields[field] = torch.full_like(fields[field], torch.nan)
+        observation = observe(**fields, q=q, feature=feature, feature_visible=visible, dt=0.01)
+        command, state = controller.step(state, observation)
+        q = q + 0.01 * command.joint_velocity
+        leaves = [*_pytree.tree_leaves(command), *_pytree.tree_leaves(state)]
+        assert all(leaf.isfinite().all() for leaf in leaves)
+    assert (camera.project(panda.forward(q))[0] - target).norm() < 5
+
+
 def test_phases_share_one_module_and_one_state():
     """Approach, servo, then move the box down with the camera off: three goals, one state."""
     rng = sampling.generator(11)

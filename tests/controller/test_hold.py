@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import sampling
 import torch
 
@@ -7,7 +9,13 @@ from hrc_learn.kinematics import panda
 
 def start(q: torch.Tensor) -> Hold:
     zero = torch.zeros(*q.shape[:-1], 6, dtype=q.dtype)
-    return Hold(drift=zero, joint_position=q, jacobian=panda.jacobian(q), planned=zero)
+    return Hold(
+        drift=zero,
+        joint_position=q,
+        jacobian=panda.jacobian(q),
+        planned=zero,
+        active=torch.ones(q.shape[:-1], dtype=torch.bool),
+    )
 
 
 def test_the_drift_is_what_the_tool_did_beyond_the_plan():
@@ -27,8 +35,7 @@ def test_a_motion_that_was_planned_is_no_drift():
     v = torch.tensor([0.1, -0.2, 0.1, 0.3, 0.0, 0.1, -0.1], dtype=torch.float64)
     J = panda.jacobian(q)
     hold = start(q)
-    planned = planned_motion(J @ v, J, v, 1e-4)
-    hold = Hold(drift=hold.drift, joint_position=q, jacobian=hold.jacobian, planned=planned)
+    hold = replace(hold, planned=planned_motion(J @ v, J, v, 1e-4))
     moved = q + 1e-4 * v
     hold = measure_drift(hold, moved, panda.jacobian(moved), torch.tensor(True))
     assert hold.drift.norm() < 1e-8
@@ -50,3 +57,13 @@ def test_it_forgets_where_it_does_not_hold_and_cannot_wind_up():
     hold = measure_drift(start(q), moved, panda.jacobian(moved), torch.tensor([True, False]))
     assert hold.drift[0].abs().max() == 0.005
     assert (hold.drift[1] == 0).all()
+
+
+def test_the_first_step_of_an_effort_forgets_what_is_old():
+    q = panda.ready
+    old = replace(start(q - 0.5), active=torch.tensor(False))
+    hold = measure_drift(old, q, panda.jacobian(q), torch.tensor(True))
+    assert (hold.drift == 0).all()
+    assert hold.active
+    hold = measure_drift(hold, q + 1e-3, panda.jacobian(q + 1e-3), torch.tensor(True))
+    assert hold.drift.norm() > 1e-4
