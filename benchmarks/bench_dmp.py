@@ -175,7 +175,7 @@ def measure_gradients(repeats: int) -> dict[str, float]:
 
 def measure_movement_primitives() -> dict[str, float]:
     """The same demonstration through movement-primitives."""
-    from movement_primitives.dmp import DMP
+    from movement_primitives.dmp import DMP  # pyright: ignore[reportMissingImports]
 
     time, position = (column.double().numpy() for column in demonstrations(1))
     dmp = DMP(n_dims=JOINTS, execution_time=3.0, dt=3.0 / SAMPLES, n_weights_per_dim=BASIS)

@@ -6,9 +6,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from hrc_learn.dmp.arrays import ArrayLike, to_tensor
 from hrc_learn.dmp.joint import JointDMP
 from hrc_learn.dmp.mean import mean_primitive
-from hrc_learn.dmp.samples import ArrayLike
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -94,7 +94,7 @@ class DMPDistribution:
         """
         rows, shape = self._rows(time, order)
         mean, root = self._observe(rows)
-        value = torch.as_tensor(value, dtype=mean.dtype, device=mean.device)
+        value = to_tensor(value, dtype=mean.dtype, device=mean.device)
         if value.shape != shape:
             raise ValueError(f"value must have shape {tuple(shape)}, got {tuple(value.shape)}")
         given = ~value.isnan().reshape(-1)
@@ -115,7 +115,7 @@ class DMPDistribution:
         """Log density of observed positions (n, D) at times (n,), with that sensor noise."""
         rows, shape = self._rows(time, order=0)
         mean, root = self._observe(rows)
-        value = torch.as_tensor(position, dtype=mean.dtype, device=mean.device)
+        value = to_tensor(position, dtype=mean.dtype, device=mean.device)
         if value.shape != shape:
             raise ValueError(f"position must be {tuple(shape)}, got {tuple(value.shape)}")
         diagonal = torch.full_like(mean, noise**2)
@@ -125,7 +125,7 @@ class DMPDistribution:
     def _rows(self, time: ArrayLike, order: int) -> tuple[Tensor, torch.Size]:
         """H at the times, per second if its derivative, and the shape of what it gives."""
         duration = self.primitive.duration.double()
-        s = torch.as_tensor(time, dtype=torch.float64, device=duration.device) / duration
+        s = to_tensor(time, dtype=torch.float64, device=duration.device) / duration
         if s.ndim != 1 or not (s >= 0).all() or order not in (0, 1):
             raise ValueError("time must be (n,), none negative, and order 0 or 1")
         H = self.primitive.response.evaluate(s)[:, order] / duration**order

@@ -9,12 +9,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from hrc_learn.dmp.arrays import ArrayLike, to_tensor
 from hrc_learn.dmp.basis import Basis, GaussianBasis
 from hrc_learn.dmp.files import SavedPrimitive, write_folder
 from hrc_learn.dmp.fitting import fit_samples
 from hrc_learn.dmp.report import FitReport
 from hrc_learn.dmp.response import response_of
-from hrc_learn.dmp.samples import ArrayLike, check_samples
+from hrc_learn.dmp.samples import check_samples
 from hrc_learn.dmp.saved_joint import TENSORS, saved_arguments
 from hrc_learn.dmp.scaling import check_paper_scale, check_scaling, forcing_scale
 from hrc_learn.dmp.spring import SpringDamper
@@ -402,10 +403,10 @@ class JointDMP(nn.Module):
         return tensor
 
     def _as_tensor(self, value: ArrayLike) -> Tensor:
-        return torch.as_tensor(value, dtype=self.weights.dtype, device=self.weights.device)
+        return to_tensor(value, dtype=self.weights.dtype, device=self.weights.device)
 
     def _normalised_time(self, time: ArrayLike, duration: Tensor) -> Tensor:
-        time = torch.as_tensor(time, dtype=torch.float64, device=duration.device)
+        time = to_tensor(time, dtype=torch.float64, device=duration.device)
         if time.ndim == 0 or not (time >= 0).all():
             raise ValueError("time must be an array of seconds since the start, none negative")
         s = time / duration.double()[..., None]

@@ -9,11 +9,12 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from hrc_learn.dmp import orientation_error as error_space
+from hrc_learn.dmp.arrays import ArrayLike, to_tensor
 from hrc_learn.dmp.basis import GaussianBasis
 from hrc_learn.dmp.files import SavedPrimitive, write_folder
 from hrc_learn.dmp.joint import JointDMP
 from hrc_learn.dmp.report import FitReport
-from hrc_learn.dmp.samples import ArrayLike, check_samples, demo_label
+from hrc_learn.dmp.samples import check_samples, demo_label
 from hrc_learn.dmp.spring import SpringDamper
 from hrc_learn.dmp.state import DMPState
 from hrc_learn.dmp.trajectory import Trajectory
@@ -270,7 +271,7 @@ def fitted_error(
     if samples.position.shape[-2] != 4:
         raise ValueError(
             f"orientation must be quaternions (w, x, y, z), shape (..., T, 4), "
-            f"got {tuple(torch.as_tensor(orientation).shape)}"
+            f"got {tuple(to_tensor(orientation).shape)}"
         )
     norm = samples.position.norm(dim=-2)
     broken = samples.mask & ((norm - 1).abs() > NORM_TOLERANCE)
@@ -286,7 +287,7 @@ def fitted_error(
 
 def unit_quaternion(value: ArrayLike, like: Tensor) -> Float[Tensor, "*batch 4"]:
     """A quaternion given by the caller, normalised; dtype and device of `like`."""
-    q = torch.as_tensor(value, dtype=like.dtype, device=like.device)
+    q = to_tensor(value, dtype=like.dtype, device=like.device)
     if q.ndim == 0 or q.shape[-1] != 4 or not (q.norm(dim=-1) > 0.5).all():
         raise ValueError(f"an orientation must be unit quaternions (w, x, y, z), got {value}")
     return quaternion.normalize(q)
@@ -316,7 +317,7 @@ def error_ends(
         error_all, rate = torch.broadcast_tensors(error, rate)
         omega = error_space.angular_velocity(error_all, rate)
     else:
-        omega = torch.as_tensor(velocity, dtype=error.dtype, device=error.device)
+        omega = to_tensor(velocity, dtype=error.dtype, device=error.device)
     if start is None:
         q = error_space.to_orientation(error, demonstrated_goal)
     else:

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from hrc_learn.dmp.arrays import ArrayLike, to_tensor
 from hrc_learn.dmp.basis import GaussianBasis
 from hrc_learn.dmp.files import SavedPrimitive, write_folder
 from hrc_learn.dmp.joint import JointDMP
@@ -19,7 +20,7 @@ from hrc_learn.dmp.orientation import (
 from hrc_learn.dmp.orientation_error import to_orientation
 from hrc_learn.dmp.pose_motion import BODY, ERROR, POSITION, PoseState, PoseTrajectory
 from hrc_learn.dmp.report import FitReport
-from hrc_learn.dmp.samples import ArrayLike, check_samples
+from hrc_learn.dmp.samples import check_samples
 from hrc_learn.dmp.spring import SpringDamper
 from hrc_learn.geometry import Pose
 
@@ -264,7 +265,7 @@ class PoseDMP(nn.Module):
         like = self.motion.start
         duration = self.motion.resolve_duration(duration, speed)
         demonstrated = self.motion.start_velocity * (self.motion.duration / duration)[..., None]
-        twist = None if velocity is None else torch.as_tensor(velocity).to(like)
+        twist = None if velocity is None else to_tensor(velocity, like.dtype, like.device)
         error, error_rate, goal_orientation = error_ends(
             like[..., ERROR],
             demonstrated[..., ERROR],
@@ -298,14 +299,14 @@ class PoseDMP(nn.Module):
 
 def _joined(position: Tensor, error: Tensor, body: ArrayLike, like: Tensor) -> Tensor:
     """The columns of a linear primitive, broadcast and side by side."""
-    columns = [torch.as_tensor(part).to(like) for part in (position, error, body)]
+    columns = [to_tensor(part, like.dtype, like.device) for part in (position, error, body)]
     batch = torch.broadcast_shapes(*(column.shape[:-1] for column in columns))
     return torch.cat([column.expand(*batch, -1) for column in columns], dim=-1)
 
 
 def _replaced(values: Tensor, columns: slice, new: ArrayLike) -> Tensor:
     """`values` with some columns exchanged; differentiable in both."""
-    new = torch.as_tensor(new).to(values)
+    new = to_tensor(new, values.dtype, values.device)
     stop = values.shape[-1] if columns.stop is None else columns.stop
     new = new.expand(*values.shape[:-1], stop - columns.start)
     return torch.cat([values[..., : columns.start], new, values[..., stop:]], dim=-1)

@@ -6,10 +6,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from hrc_learn.dmp.arrays import ArrayLike
 from hrc_learn.dmp.basis import PeriodicBasis
 from hrc_learn.dmp.joint import JointDMP
 from hrc_learn.dmp.response import Response, response_of
-from hrc_learn.dmp.samples import ArrayLike, check_samples
+from hrc_learn.dmp.samples import check_samples
 from hrc_learn.dmp.spring import SpringDamper
 
 SEARCH = 0.1

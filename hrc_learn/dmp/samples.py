@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from hrc_learn.dmp.arrays import ArrayLike, to_tensor
 from hrc_learn.dmp.report import FitReport
 
-type ArrayLike = Tensor | np.ndarray | list | tuple | float
 MINIMUM_SAMPLES = 3
 
 
@@ -104,17 +104,17 @@ def check_samples(
             increase, fewer than 3 samples; says where.
     """
     position = _floating(position)
-    time = torch.as_tensor(time, device=position.device).double()
+    time = to_tensor(time, torch.float64, position.device)
     if position.ndim == 0 or time.ndim == 0:
         raise ValueError("time and position need a sample axis, got a single number")
     if position.shape == time.shape:
         position = position[..., None]
-        velocity = None if velocity is None else torch.as_tensor(velocity)[..., None]
+        velocity = None if velocity is None else to_tensor(velocity)[..., None]
     if position.ndim < 2:
         raise ValueError(f"{_shapes(time, position)}: expected (T,) and (T, D)")
     *batch, T, D = position.shape
     time = _fit_shape("time", time, (*batch, T), position)
-    mask = torch.ones_like(time) if mask is None else torch.as_tensor(mask, device=time.device)
+    mask = torch.ones_like(time) if mask is None else to_tensor(mask, device=time.device)
     mask = _fit_shape("mask", mask.bool(), (*batch, T), position)
     if position.numel() == 0:
         raise ValueError(f"position has shape {(*batch, T, D)}: there is nothing to fit")
@@ -132,7 +132,7 @@ def check_samples(
     _check_finite("time", time[:, None], mask, batch)
     position = _check_finite(name, position, mask, batch)
     if velocity is not None:
-        velocity = torch.as_tensor(velocity).to(position)
+        velocity = to_tensor(velocity, position.dtype, position.device)
         velocity = _fit_shape("velocity", velocity, (*batch, T, D), position)
         velocity = velocity.reshape(-1, T, D).mT.contiguous()
         velocity = _check_finite("velocity", velocity, mask, batch)
@@ -148,7 +148,7 @@ def check_samples(
 
 
 def _floating(values: ArrayLike) -> Tensor:
-    tensor = torch.as_tensor(values)
+    tensor = to_tensor(values)
     return tensor if tensor.is_floating_point() else tensor.to(torch.get_default_dtype())
 
 

@@ -115,6 +115,24 @@ def test_numpy_and_float32_are_taken_as_they_are():
     assert nrmse(dmp.rollout().position.double(), position) < 1e-5
 
 
+@pytest.mark.filterwarnings("error")
+def test_read_only_and_reversed_arrays_are_taken():
+    time, position = (column.numpy() for column in arm_motion())
+    expected = JointDMP.fit(time, position).rollout(goal=np.zeros(7)).position
+    backwards = position[::-1].copy()[::-1]
+    frozen = time.copy()
+    frozen.flags.writeable = False
+    got = JointDMP.fit(frozen, backwards).rollout(goal=np.zeros(14)[::-2]).position
+    torch.testing.assert_close(got, expected, rtol=0, atol=0)
+
+
+def test_lists_keep_their_precision():
+    time = [0.1 * k for k in range(30)]
+    plain = JointDMP.fit(torch.tensor(time, dtype=torch.float64), torch.tensor(time).double())
+    listed = JointDMP.fit(time, torch.tensor(time).double())
+    torch.testing.assert_close(listed.stamps, plain.stamps, rtol=0, atol=0)
+
+
 @pytest.mark.parametrize("batch", [(2,), (3, 1, 2)])
 def test_a_batch_is_a_loop(batch):
     demos = [arm_motion(seed=i) for i in range(int(np.prod(batch)))]
