@@ -18,17 +18,14 @@ from hrc_learn import cli
 from hrc_learn.demos import Demonstration, load_demos
 from hrc_learn.output import MADE_BY, new_folder
 from hrc_learn.sim import CameraKind
-from hrc_learn.tasks import (
-    AimingSkill,
-    CollaborationConfig,
-    PlacingSkill,
-    Workplace,
-    simulate_collaboration,
-)
+from hrc_learn.tasks.collaboration import CollaborationConfig
 from hrc_learn.tasks.collaboration_report import write_collaboration_report
 from hrc_learn.tasks.evaluation import evaluate
+from hrc_learn.tasks.fit_aiming import AimingSkill
+from hrc_learn.tasks.placing import PlacingSkill
 from hrc_learn.tasks.recording import record
-from hrc_learn.tasks.simulated_job import PULLS
+from hrc_learn.tasks.simulated_job import PULLS, simulate_collaboration
+from hrc_learn.tasks.workplace import Workplace
 from hrc_learn.viz import Box
 from hrc_learn.viz.report import Measurement
 from hrc_learn.viz.run_dashboard import record_run

@@ -16,7 +16,8 @@ from hrc_learn.demos import DatasetWriter
 from hrc_learn.kinematics import panda
 from hrc_learn.output import replacing
 from hrc_learn.sim import World
-from hrc_learn.tasks import PlacingLesson, Workplace, teach_placing
+from hrc_learn.tasks.teach_placing import PlacingLesson, teach_placing
+from hrc_learn.tasks.workplace import Workplace
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,6 +43,8 @@ class Args:
 def main(args: Args) -> None:
     workplace = Workplace()
     goal = workplace.shelf(args.shelf)
+    if args.episodes < 1:
+        raise ValueError(f"--episodes must be at least 1, but is {args.episodes}.")
     world = World(workplace.scene)
     rng = np.random.default_rng(args.seed)
     thrown_away, errors = 0, []

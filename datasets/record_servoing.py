@@ -15,14 +15,10 @@ from hrc_learn.demos import DatasetWriter
 from hrc_learn.kinematics import panda
 from hrc_learn.output import replacing
 from hrc_learn.sim import CameraKind, World, open_camera
-from hrc_learn.tasks import (
-    OBJECT_FEATURE,
-    OBJECT_FEATURE_NAMES,
-    AimingLesson,
-    Eye,
-    Workplace,
-    teach_aiming,
-)
+from hrc_learn.tasks.eye import Eye
+from hrc_learn.tasks.teach_aiming import AimingLesson, teach_aiming
+from hrc_learn.tasks.visual_target import OBJECT_FEATURE, OBJECT_FEATURE_NAMES
+from hrc_learn.tasks.workplace import Workplace
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,6 +43,8 @@ class Args:
 
 def main(args: Args) -> None:
     workplace = Workplace()
+    if args.episodes < 1:
+        raise ValueError(f"--episodes must be at least 1, but is {args.episodes}.")
     world = World(workplace.scene)
     rng = np.random.default_rng(args.seed)
     eye = Eye.on(open_camera(world, args.camera, rng=rng), workplace.scene)

@@ -52,3 +52,14 @@ def test_datasets_is_hugging_faces_even_in_our_checkout():
     assert origin.name == "__init__.py"
     assert ROOT / "datasets" not in origin.parents
     assert origin.parent.parent.name in {"site-packages", "dist-packages"}
+
+
+def test_learning_from_a_dataset_needs_no_simulator():
+    """A user with demonstrations of their own installs neither MuJoCo nor OpenCV."""
+    program = """
+import sys
+for name in ("mujoco", "cv2", "lerobot"):
+    sys.modules[name] = None
+import hrc_learn.tasks.fit_primitives, hrc_learn.tasks.fit_aiming, hrc_learn.demos
+"""
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=120)

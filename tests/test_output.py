@@ -61,7 +61,6 @@ def test_a_failure_leaves_what_was_there(tmp_path, error, before):
     assert [path.name for path in tmp_path.iterdir()] == ([] if before is None else ["out"])
 
 
-@pytest.mark.xfail(reason="the old folder goes before the new one is known to be there")
 def test_work_that_made_nothing_leaves_the_old_folder(tmp_path):
     fill(tmp_path / "out", "old")
     with pytest.raises(FileNotFoundError), replacing(tmp_path / "out", MARK, overwrite=True):

@@ -16,7 +16,7 @@ from rich.table import Table
 from hrc_learn import cli
 from hrc_learn.demos import load_demos
 from hrc_learn.output import new_folder
-from hrc_learn.tasks import fit_primitives, fit_recording
+from hrc_learn.tasks.fit_primitives import fit_primitives, fit_recording
 from hrc_learn.viz.figures import fit_joints_figure
 from hrc_learn.viz.fit_dashboard import record_fit
 
@@ -53,7 +53,8 @@ def main(args: Args) -> None:
     )
     for note in demos.notes:
         console.print(f"note: {note}")
-    with new_folder(args.out, asdict(args), args.overwrite) as folder:
+    made_by = asdict(args) | {"dataset": args.dataset.resolve()}
+    with new_folder(args.out, made_by, args.overwrite) as folder:
         with console.status(
             f"Fitting {len(demos)} demonstrations, {args.n_basis} basis functions"
         ):

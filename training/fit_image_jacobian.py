@@ -14,7 +14,7 @@ from hrc_learn import cli
 from hrc_learn.demos import load_demos
 from hrc_learn.jacobian import grid
 from hrc_learn.output import new_folder
-from hrc_learn.tasks import fit_aiming
+from hrc_learn.tasks.fit_aiming import fit_aiming
 
 
 @dataclass(frozen=True, kw_only=True)

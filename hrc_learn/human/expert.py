@@ -14,6 +14,12 @@ from .coarse_orientation import coarse_orientation
 from .pull import PullSpell, ScriptedPuller
 
 
+def minimum_jerk(x: float) -> tuple[float, float]:
+    """Progress and its slope at share `x` of the duration (Flash and Hogan 1985)."""
+    x = min(max(x, 0.0), 1.0)
+    return x**3 * (10 - 15 * x + 6 * x**2), 30 * x**2 * (1 - x) ** 2
+
+
 class GuidedPath:
     """A smooth path through way points, run through once from rest to rest."""
 
@@ -58,9 +64,9 @@ class GuidedPath:
         return self._slope(s) * rate
 
     def _progress(self, time: float) -> tuple[float, float]:
-        """Share of the path covered and its rate [1/s]: minimum jerk (Flash and Hogan 1985)."""
-        x = min(max((time - self._start) / self.duration, 0.0), 1.0)
-        return x**3 * (10 - 15 * x + 6 * x**2), 30 * x**2 * (1 - x) ** 2 / self.duration
+        """Share of the path covered, and its rate [1/s]."""
+        s, slope = minimum_jerk((time - self._start) / self.duration)
+        return s, slope / self.duration
 
 
 class Tremor:

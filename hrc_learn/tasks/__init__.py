@@ -1,32 +1,4 @@
-"""The pieces put to work: demonstrating, grasping, placing, and the whole collaboration."""
+"""The pieces put to work: demonstrating, learning, grasping, placing, the whole collaboration.
 
-from .aiming import Aimer as Aimer
-from .aiming import AimingConfig as AimingConfig
-from .aiming import TaskFailedError as TaskFailedError
-from .collaboration import Collaboration as Collaboration
-from .collaboration import CollaborationConfig as CollaborationConfig
-from .collaboration import CollaborationResult as CollaborationResult
-from .eye import Eye as Eye
-from .fit_aiming import AimingSkill as AimingSkill
-from .fit_aiming import fit_aiming as fit_aiming
-from .fit_primitives import FittedPrimitives as FittedPrimitives
-from .fit_primitives import fit_primitives as fit_primitives
-from .fit_primitives import fit_recording as fit_recording
-from .placing import BlockedPathError as BlockedPathError
-from .placing import PlacingSkill as PlacingSkill
-from .placing import Plan as Plan
-from .placing import check_plan as check_plan
-from .simulated_job import SimulatedJob as SimulatedJob
-from .simulated_job import simulate_collaboration as simulate_collaboration
-from .station import Station as Station
-from .station import StationConfig as StationConfig
-from .teach_aiming import OBJECT_FEATURE as OBJECT_FEATURE
-from .teach_aiming import OBJECT_FEATURE_NAMES as OBJECT_FEATURE_NAMES
-from .teach_aiming import AimingLesson as AimingLesson
-from .teach_aiming import random_object_pose as random_object_pose
-from .teach_aiming import teach_aiming as teach_aiming
-from .teach_placing import PlacingLesson as PlacingLesson
-from .teach_placing import teach_placing as teach_placing
-from .visual_target import VisualTarget as VisualTarget
-from .workplace import Workplace as Workplace
-from .workplace import nearest_configuration as nearest_configuration
+Each module is imported by itself, so that learning from a dataset needs no simulator.
+"""

@@ -10,9 +10,11 @@ from torch import Tensor
 
 from ..demos import Demonstration, DemonstrationSet
 from ..geometry import Pose
-from ..jacobian import ImageJacobianFitReport, RBFImageJacobian
-from .teach_aiming import OBJECT_FEATURE
-from .visual_target import VisualTarget
+from ..jacobian import RBFImageJacobian
+from .visual_target import OBJECT_FEATURE, VisualTarget
+
+_REST = 0.3
+"""Time at the end of a demonstration in which the hand stands above the object [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,9 +43,14 @@ class AimingSkill:
         )
 
     def metrics(self) -> dict[str, float]:
-        """How well image motion is predicted, and how well aiming."""
+        """How well image motion is predicted, and how well aiming.
+
+        Raises:
+            ValueError: If the skill was loaded; its metrics are in metrics.json.
+        """
         report = self.jacobian.report
-        assert isinstance(report, ImageJacobianFitReport)
+        if report is None:
+            raise ValueError("only a skill just fitted has metrics; see its metrics.json.")
         return {
             "pairs": float(report.pairs),
             "motion_px": report.motion,
@@ -80,7 +87,7 @@ def fit_aiming(
         centers=centers,
         width=width,
     )
-    ends = [_end(demo) for demo in demos]
+    ends = [_end(demo, demos.source) for demo in demos]
     target = VisualTarget.fit(
         np.array([objects for objects, _ in ends]), np.array([hands for _, hands in ends])
     )
@@ -98,9 +105,15 @@ def _require(demo: Demonstration, source: str) -> None:
         )
 
 
-def _end(demo: Demonstration) -> tuple[np.ndarray, np.ndarray]:
+def _end(demo: Demonstration, source: str) -> tuple[np.ndarray, np.ndarray]:
     """Pixels of the object and of the hand above it, at rest at the end of a demonstration."""
     assert demo.feature is not None
     assert demo.feature_visible is not None
-    last = np.flatnonzero(demo.feature_visible)[-5:]
+    at_rest = demo.time > demo.time[-1] - _REST
+    last = np.flatnonzero(demo.feature_visible & at_rest)
+    if not len(last):
+        raise ValueError(
+            f"{source}, episode {demo.episode}: the hand's marker is not seen in the last "
+            f"{_REST} s, where the hand stands above the object. Leave this episode out."
+        )
     return demo.extra[OBJECT_FEATURE][last, :2].mean(axis=0), demo.feature[last].mean(axis=0)

@@ -141,7 +141,7 @@ def _compare(name: str, got: Tensor, wanted: Tensor, mask: Tensor) -> dict[str, 
     rmse = (error.square().sum(dim=(-2, -1)) / samples.squeeze(-1)).sqrt()
     low = torch.where(mask[..., None], wanted, torch.inf).amin(dim=-2)
     high = torch.where(mask[..., None], wanted, -torch.inf).amax(dim=-2)
-    nrmse = rmse / (high - low).amax(dim=-1)
+    nrmse = rmse / (high - low).amax(dim=-1).clamp(min=1e-12)
     return {
         f"{name}_nrmse_median": float(nrmse.median()),
         f"{name}_nrmse_max": float(nrmse.max()),
@@ -168,12 +168,11 @@ def fit_recording(fitted: FittedPrimitives, title: str) -> FitRecording:
             values[:n].double().numpy() for values, n in zip(padded, lengths, strict=True)
         )
 
-    paths: dict[str, tuple[np.ndarray, ...]] = {}
-    limits = None
+    limits, demo_paths, reproduction_paths = None, (), ()
     if joint.joint_names == panda.joint_names:
         limits = JointLimits(lower=panda.limits.lower.numpy(), upper=panda.limits.upper.numpy())
-        paths["demo_paths"] = cut(panda.forward(demos.joint_position.double()).position)
-        paths["reproduction_paths"] = cut(panda.forward(reproduced.double()).position)
+        demo_paths = cut(panda.forward(demos.joint_position.double()).position)
+        reproduction_paths = cut(panda.forward(reproduced.double()).position)
     return FitRecording(
         title=title,
         joint_names=joint.joint_names or (),
@@ -182,5 +181,6 @@ def fit_recording(fitted: FittedPrimitives, title: str) -> FitRecording:
         reproductions=cut(reproduced),
         joint_limits=limits,
         n_basis=joint.basis.count,
-        **paths,
+        demo_paths=demo_paths,
+        reproduction_paths=reproduction_paths,
     )

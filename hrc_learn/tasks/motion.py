@@ -1,5 +1,6 @@
 """Moving the hand along given motions: resolved rates, straight lines, planned joint paths."""
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -8,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..geometry import Pose, quaternion
+from ..human import minimum_jerk
 from ..kinematics import pseudo_inverse, singularity_damping
 
 
@@ -30,12 +32,6 @@ def resolved_rate(
     return null_velocity + (J_pinv @ remaining.unsqueeze(-1)).squeeze(-1)
 
 
-def minimum_jerk(x: float) -> tuple[float, float]:
-    """Progress and its slope at share `x` of the duration (Flash and Hogan 1985)."""
-    x = min(max(x, 0.0), 1.0)
-    return x**3 * (10 - 15 * x + 6 * x**2), 30 * x**2 * (1 - x) ** 2
-
-
 def straight_line(
     start: Pose, goal: Pose, speed: float, dt: float, angular_speed: float = 0.6
 ) -> Iterator[tuple[Pose, Float[Tensor, "6"]]]:
@@ -55,7 +51,7 @@ def straight_line(
     distance, turn = float(twist[:3].norm()), float(twist[3:].norm())
     # A minimum jerk motion peaks at 1.875 times its mean speed.
     duration = max(distance / speed, turn / angular_speed, 0.3)
-    for k in range(1, round(duration / dt) + 1):
+    for k in range(1, math.ceil(duration / dt) + 1):
         s, slope = minimum_jerk(k * dt / duration)
         turned = quaternion.multiply(quaternion.exp(s * twist[3:]), start.orientation)
         yield Pose(start.position + s * twist[:3], turned), twist * (slope / duration)

@@ -48,7 +48,7 @@ class Plan:
     @property
     def duration(self) -> float:
         """[s]"""
-        return self.dt * len(self.path)
+        return self.dt * (len(self.path) - 1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -203,7 +203,8 @@ def check_plan(plan: Plan, world: World, carried: str | None = None) -> None:
             "rad/s: play it slower."
         )
     every = max(1, round(0.04 / plan.dt))
-    touches = world.collisions_along(plan.path[::every], carried)
+    samples = np.concatenate([plan.path[:-1:every], plan.path[-1:]])
+    touches = world.collisions_along(samples, carried)
     if touches:
         first = touches[0]
         raise BlockedPathError(

@@ -148,7 +148,21 @@ class Deviation:
             elbow=distance(ELBOW),
         )
 
-    def most(self, name: str) -> float:
-        """Largest value of one of the fields; 0 if nobody pulled."""
-        values = getattr(self, name)
-        return float(np.nanmax(values)) if np.isfinite(values).any() else 0.0
+    @property
+    def most_moved(self) -> float:
+        """Largest distance of the hand [m]; 0 if nobody pulled."""
+        return _largest(self.position)
+
+    @property
+    def most_turned(self) -> float:
+        """Largest turn of the hand [rad]; 0 if nobody pulled."""
+        return _largest(self.rotation)
+
+    @property
+    def elbow_most_moved(self) -> float:
+        """Largest distance of the elbow [m]; 0 if nobody pulled."""
+        return _largest(self.elbow)
+
+
+def _largest(values: Float[np.ndarray, " time"]) -> float:
+    return float(np.nanmax(values)) if np.isfinite(values).any() else 0.0

@@ -15,7 +15,6 @@ from .eye import Eye
 from .fit_aiming import AimingSkill
 from .placing import BlockedPathError, PlacingSkill, Plan, check_plan
 from .station import Station
-from .teach_aiming import random_object_pose
 from .workplace import Workplace
 
 PULLS = (
@@ -77,7 +76,7 @@ def simulate_collaboration(
     workplace.shelf(shelf)
     item = workplace.scene.objects[0]
     world = World(workplace.scene)
-    pose = random_object_pose(workplace, OBJECT_REACH, rng)
+    pose = workplace.random_object_pose(OBJECT_REACH, rng)
     world.reset(workplace.home_joints().numpy(), {item.name: pose})
     person = ScriptedPuller(panda, pulls, begin=None)
     motion = MotionLog(world)

@@ -140,8 +140,13 @@ class Station:
 
     def step(self, joint_velocity: Float[Tensor, " joints"]) -> None:
         """Send a command through the safety filter, and let one step pass [rad/s]."""
+        joints = self.joints
         safe, self._guard, report = self._safety.step(
-            self._guard, self.joints, joint_velocity, self.config.dt
+            self._guard,
+            joints,
+            joint_velocity,
+            self.config.dt,
+            jacobian=self.chain.jacobian(joints),
         )
         self._send(safe, safety=report.flags.numpy(), **_NOTHING_SEEN)
 
@@ -210,7 +215,8 @@ class Station:
         self.log.append(
             time=self.time,
             joint_position=self.state.joint_position,
-            joint_velocity=velocity.numpy(),
+            joint_velocity=self.state.joint_velocity,
+            command_velocity=velocity.numpy(),
             link_position=links.position.numpy(),
             link_orientation=links.orientation.numpy(),
             human_effort=self.asked.effort,

@@ -9,17 +9,14 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from ..geometry import quaternion
+from ..geometry import Pose, quaternion
 from ..human import GuidedPath, ScriptedExpert, Tremor, gripper_down
 from ..kinematics import panda
 from ..sim import HAND_MARKER, World
 from .eye import Eye
 from .teaching import Frame, TeachingConfig, teach
+from .visual_target import OBJECT_FEATURE
 from .workplace import Workplace, nearest_configuration
-
-OBJECT_FEATURE = "observation.object_feature"
-"""Column of the object's marker in the image."""
-OBJECT_FEATURE_NAMES = ("u", "v", "visible")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,20 +33,6 @@ class AimingLesson(TeachingConfig):
     """Amplitude of small turns of the hand on the way, which show how turning acts [rad]."""
     record_every: int = 4
     """Control steps from one recorded frame, and image, to the next."""
-
-
-def random_object_pose(
-    workplace: Workplace, reach: tuple[float, float, float], rng: np.random.Generator
-) -> Float[np.ndarray, "4 4"]:
-    """Pose of an object lying at random in the middle of the table."""
-    item = workplace.scene.objects[0]
-    turn = rng.uniform(-0.06, 0.06)
-    c, s = np.cos(turn), np.sin(turn)
-    pose = np.eye(4)
-    pose[:2, :2] = [[c, -s], [s, c]]
-    pose[:2, 3] = np.array(workplace.table_centre) + rng.uniform(-1, 1, 2) * reach[:2]
-    pose[2, 3] = item.half_size[2]
-    return pose
 
 
 def aiming_expert(
@@ -88,7 +71,7 @@ def teach_aiming(
         ValueError: If the camera does not see the object.
     """
     item = workplace.scene.objects[0]
-    pose = random_object_pose(workplace, lesson.reach, rng)
+    pose = workplace.random_object_pose(lesson.reach, rng)
     world.reset(workplace.home_joints().numpy(), {item.name: pose})
     target = eye.look().get(item.marker.id)
     if target is None:
@@ -99,7 +82,7 @@ def teach_aiming(
     above = np.append(pose[:2, 3], workplace.hover_height)
     expert = aiming_expert(workplace, above, lesson, rng)
     start = torch.from_numpy(expert.path.position(0.0))
-    goal = type(workplace.hover())(start, expert.orientation(start, 0.0))
+    goal = Pose(start, expert.orientation(start, 0.0))
     q = nearest_configuration(goal, near=workplace.hover_joints())
     world.reset(q.numpy(), {item.name: pose})
     last = np.zeros(2)

@@ -31,6 +31,13 @@ class TeachingConfig:
     damping: float = 3.0
     """c_d [N m s/rad]."""
 
+    def __post_init__(self) -> None:
+        if not (self.dt > 0 and self.record_every >= 1 and self.damping > 0):
+            raise ValueError(
+                "dt and damping must be positive and record_every at least 1, but are "
+                f"{self.dt}, {self.damping} and {self.record_every}."
+            )
+
     @property
     def fps(self) -> float:
         """Recorded frames a second."""

@@ -12,6 +12,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+OBJECT_FEATURE = "observation.object_feature"
+"""Column of a dataset with the object's marker in the image."""
+OBJECT_FEATURE_NAMES = ("u", "v", "visible")
+
 
 @dataclass(frozen=True, kw_only=True)
 class VisualTarget:
@@ -61,7 +65,8 @@ class VisualTarget:
     def save(self, path: Path) -> None:
         """Write to a JSON file, whole or not at all."""
         partial = path.with_suffix(".partial")
-        content = {"version": 1, "matrix": self.matrix.tolist(), "error_px": self.error}
+        error = None if np.isnan(self.error) else self.error
+        content = {"version": 1, "matrix": self.matrix.tolist(), "error_px": error}
         partial.write_text(json.dumps(content, indent=2))
         partial.replace(path)
 
@@ -76,4 +81,8 @@ class VisualTarget:
         content = json.loads(path.read_text())
         if content.get("version") != 1 or "matrix" not in content:
             raise ValueError(f"{path} is not a visual target of a known version: fit it again.")
-        return cls(matrix=np.array(content["matrix"]), error=float(content["error_px"]))
+        error = content["error_px"]
+        return cls(
+            matrix=np.array(content["matrix"]),
+            error=float("nan") if error is None else float(error),
+        )

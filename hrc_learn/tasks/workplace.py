@@ -3,7 +3,9 @@
 import math
 from dataclasses import dataclass, field
 
+import numpy as np
 import torch
+from jaxtyping import Float
 
 from ..geometry import Pose, quaternion
 from ..human import coarse_orientation, gripper_down
@@ -60,6 +62,23 @@ class Workplace:
         Where it stands upright, joints 1 and 3 are in line, and nobody can pull the elbow.
         """
         return panda.inverse(self.hover(), self.hover_q7, near=_LEANING_FORWARD)
+
+    def random_object_pose(
+        self, reach: tuple[float, float, float], rng: np.random.Generator
+    ) -> Float[np.ndarray, "4 4"]:
+        """Pose of the scene's first object, lying at random about the middle of the table.
+
+        Args:
+            reach: How far from the middle, along x and y [m]; its height is the table's.
+            rng: Source of place and turn.
+        """
+        turn = rng.uniform(-0.06, 0.06)
+        c, s = np.cos(turn), np.sin(turn)
+        pose = np.eye(4)
+        pose[:2, :2] = [[c, -s], [s, c]]
+        pose[:2, 3] = np.array(self.table_centre) + rng.uniform(-1, 1, 2) * reach[:2]
+        pose[2, 3] = self.scene.objects[0].half_size[2]
+        return pose
 
     def shelf_names(self) -> tuple[str, ...]:
         """From bottom to top."""

@@ -4,7 +4,7 @@ import torch
 
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import World
-from hrc_learn.tasks import Workplace
+from hrc_learn.tasks.workplace import Workplace
 
 
 @pytest.fixture(scope="module")

@@ -11,24 +11,18 @@ from hrc_learn.human import PullSpell
 from hrc_learn.jacobian import paper_grid
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import World, open_camera
-from hrc_learn.tasks import (
-    OBJECT_FEATURE,
-    OBJECT_FEATURE_NAMES,
-    AimingLesson,
-    AimingSkill,
-    CollaborationConfig,
-    Eye,
-    PlacingLesson,
-    PlacingSkill,
-    Workplace,
-    fit_aiming,
-    fit_primitives,
-    simulate_collaboration,
-    teach_aiming,
-    teach_placing,
-)
+from hrc_learn.tasks.collaboration import CollaborationConfig
 from hrc_learn.tasks.evaluation import evaluate
+from hrc_learn.tasks.eye import Eye
+from hrc_learn.tasks.fit_aiming import AimingSkill, fit_aiming
+from hrc_learn.tasks.fit_primitives import fit_primitives
+from hrc_learn.tasks.placing import PlacingSkill
 from hrc_learn.tasks.recording import Deviation, record, span, true_image_jacobian
+from hrc_learn.tasks.simulated_job import simulate_collaboration
+from hrc_learn.tasks.teach_aiming import AimingLesson, teach_aiming
+from hrc_learn.tasks.teach_placing import PlacingLesson, teach_placing
+from hrc_learn.tasks.visual_target import OBJECT_FEATURE, OBJECT_FEATURE_NAMES
+from hrc_learn.tasks.workplace import Workplace
 
 WORKPLACE = Workplace()
 PULL = (PullSpell(start=0.3, duration=3.5, towards=(0.4, 0.0, 0.5), strongest=60.0),)
@@ -125,8 +119,8 @@ def test_deviations_count_from_the_first_pull(job):
     first = int(np.flatnonzero(np.isfinite(deviation.position))[0])
     assert deviation.position[first] == 0.0
     assert time[first] == pytest.approx(start + PULL[0].start, abs=0.05)
-    assert deviation.most("elbow") > 0.1
-    assert deviation.most("position") < 1e-3
+    assert deviation.elbow_most_moved > 0.1
+    assert deviation.most_moved < 1e-3
 
 
 def test_the_recording_holds_what_the_run_did(job):
@@ -152,7 +146,7 @@ def test_a_person_who_keeps_away_changes_nothing(aiming, placing):
         aiming, placing[0], "middle", camera="synthetic", pulls=(), config=config, seed=5
     )
     assert job.failure == ""
-    assert Deviation.of(job.station).most("elbow") == 0.0
+    assert Deviation.of(job.station).elbow_most_moved == 0.0
     assert job.world.rests_on("box", "board_middle")
 
 

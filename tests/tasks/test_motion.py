@@ -3,10 +3,10 @@ import pytest
 import torch
 
 from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.human import minimum_jerk
 from hrc_learn.kinematics import panda
 from hrc_learn.tasks.motion import (
     joint_line,
-    minimum_jerk,
     path_velocity,
     resolved_rate,
     straight_line,

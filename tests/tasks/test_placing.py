@@ -10,15 +10,10 @@ from hrc_learn.demos import DatasetWriter, load_demos
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import UnreachableError, panda
 from hrc_learn.sim import World
-from hrc_learn.tasks import (
-    BlockedPathError,
-    PlacingLesson,
-    PlacingSkill,
-    Workplace,
-    check_plan,
-    fit_primitives,
-    teach_placing,
-)
+from hrc_learn.tasks.fit_primitives import fit_primitives
+from hrc_learn.tasks.placing import BlockedPathError, PlacingSkill, check_plan
+from hrc_learn.tasks.teach_placing import PlacingLesson, teach_placing
+from hrc_learn.tasks.workplace import Workplace
 
 WORKPLACE = Workplace()
 HOME = WORKPLACE.home_joints()

@@ -3,7 +3,7 @@ import json
 import numpy as np
 import pytest
 
-from hrc_learn.tasks import VisualTarget
+from hrc_learn.tasks.visual_target import VisualTarget
 
 
 def demonstrations(n, noise=0.0, seed=0):

@@ -3,7 +3,7 @@ import torch
 
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import UnreachableError, panda
-from hrc_learn.tasks import Workplace, nearest_configuration
+from hrc_learn.tasks.workplace import Workplace, nearest_configuration
 
 WORKPLACE = Workplace()
 

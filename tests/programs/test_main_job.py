@@ -1,0 +1,99 @@
+"""Each program of the main job once, small, as a user runs them."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+
+def run(program, *arguments, status=0):
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [sys.executable, program, *map(str, arguments)],
+        cwd=ROOT,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert done.returncode == status, done.stdout + done.stderr
+    return done
+
+
+@pytest.fixture(scope="module")
+def work(tmp_path_factory):
+    """Demonstrations and models of a small main job."""
+    work = tmp_path_factory.mktemp("job")
+    run("datasets/record_placing.py", "--out", work / "placing_demos", "--episodes", 1)
+    run(
+        *("datasets/record_servoing.py", "--out", work / "aiming_demos", "--episodes", 4),
+        *("--lesson.duration", 5, "--json", work / "aiming.json"),
+    )
+    run("training/fit_dmp.py", "--dataset", work / "placing_demos", "--out", work / "placing")
+    run(
+        *("training/fit_image_jacobian.py", "--dataset", work / "aiming_demos"),
+        *("--out", work / "aiming"),
+    )
+    return work
+
+
+def test_the_job_is_done_and_every_target_met(work):
+    out = work / "run"
+    done = run(
+        *("control/run_collaboration.py", "--placing", work / "placing"),
+        *("--aiming", work / "aiming", "--out", out, "--shelf", "lower"),
+        *("--camera", "synthetic", "--seed", 3, "--json", work / "measured.json"),
+    )
+    assert "missed" not in done.stdout
+    measured = json.loads((work / "measured.json").read_text())
+    assert measured["object_stands_on_the_shelf"] == 1
+    assert measured["collisions_with_the_cabinet"] == 0
+    assert {path.name for path in out.iterdir()} == {
+        "log.npz",
+        "made_by.json",
+        "measured.json",
+        "report.html",
+        "run.rrd",
+    }
+
+
+def test_an_unknown_shelf_and_a_missing_model_are_bad_input(work):
+    models = ("--placing", work / "placing", "--aiming", work / "aiming")
+    for arguments, reason in (
+        ((*models, "--shelf", "attic"), "lower, middle, upper"),
+        (("--placing", work / "nowhere", "--aiming", work / "aiming"), "nowhere"),
+    ):
+        out = work / "refused"
+        done = run("control/run_collaboration.py", *arguments, "--out", out, status=2)
+        assert reason in done.stderr
+        assert len(done.stderr.strip().splitlines()) == 1
+        assert not out.exists()
+
+
+def test_nothing_is_overwritten_unasked(work):
+    arguments = ("--dataset", work / "placing_demos", "--out", work / "placing")
+    before = (work / "placing" / "made_by.json").read_text()
+    done = run("training/fit_dmp.py", *arguments, status=2)
+    assert "exists" in done.stderr
+    assert (work / "placing" / "made_by.json").read_text() == before
+    run("training/fit_dmp.py", *arguments, "--overwrite")
+
+
+def test_a_missing_dataset_and_unknown_joints_are_bad_input(work):
+    out = work / "none"
+    done = run("training/fit_dmp.py", "--dataset", work / "absent", "--out", out, status=2)
+    assert "absent" in done.stderr
+    done = run(
+        *("training/fit_dmp.py", "--dataset", work / "placing_demos", "--out", out),
+        *("--joint-names", "elbow"),
+        status=2,
+    )
+    assert "elbow" in done.stderr
+    assert "panda_joint1" in done.stderr
+    assert not out.exists()
