@@ -83,9 +83,7 @@ class JointDMP(nn.Module):
         """
         super().__init__()
         check_scaling(scaling)
-        D = weights.shape[-2]
-        if joint_names is not None and len(joint_names) != D:
-            raise ValueError(f"{len(joint_names)} joint names for {D} coordinates")
+        _check_names(joint_names, weights.shape[-2])
         if weights.shape[-1] != basis.count:
             raise ValueError(f"{weights.shape[-1]} weights for {basis.count} basis functions")
         self.weights = nn.Parameter(weights)
@@ -144,6 +142,7 @@ class JointDMP(nn.Module):
         """
         check_scaling(scaling)
         samples = check_samples(time, position, velocity, mask)
+        _check_names(joint_names, samples.position.shape[1])
         basis, spring = basis or GaussianBasis(count=n_basis), spring or SpringDamper()
         response = response_of(spring, basis, approach)
         weights, rate = fit_samples(method, response, samples, regularization)
@@ -414,3 +413,8 @@ class JointDMP(nn.Module):
         if s.ndim > 1 and not s.requires_grad and (s == s.reshape(-1, s.shape[-1])[0]).all():
             return s.reshape(-1, s.shape[-1])[0]
         return s
+
+
+def _check_names(joint_names: Sequence[str] | None, D: int) -> None:
+    if joint_names is not None and len(joint_names) != D:
+        raise ValueError(f"{len(joint_names)} joint names for {D} coordinates")

@@ -280,6 +280,12 @@ def broken(values, index, value):
         (TIME, POSITION, {"velocity": broken(POSITION, (1, 0), torch.inf)}, "velocity is inf"),
         (TIME, POSITION, {"mask": torch.zeros(20)}, "at least 3 samples, got 0"),
         (TIME, POSITION, {"joint_names": ["a"]}, "1 joint names for 2 coordinates"),
+        (
+            TIME,
+            POSITION[:, [0, 0]] * 0,
+            {"scaling": "paper", "joint_names": ["a"]},
+            "1 joint names for 2 coordinates",
+        ),
         (TIME, POSITION, {"scaling": "cubic"}, "unknown scaling 'cubic'"),
         (TIME, POSITION, {"method": "magic"}, "unknown method 'magic'"),
         (TIME, torch.zeros(20, 0), {}, "nothing to fit"),
