@@ -20,12 +20,14 @@ FOLDERS_OF_PROGRAMS = ("datasets", "training", "control", "tests", "benchmarks")
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 CORE: dict[str, set[str]] = {
+    "pytree": set(),
+    "storage": set(),
     "geometry": set(),
     "kinematics": {"geometry"},
-    "dmp": {"geometry"},
-    "regions": {"geometry"},
-    "jacobian": {"geometry", "regions"},
-    "controller": {"geometry", "kinematics", "regions", "jacobian"},
+    "dmp": {"storage", "geometry"},
+    "regions": {"pytree", "geometry"},
+    "jacobian": {"pytree", "storage", "geometry"},
+    "controller": {"pytree", "geometry", "kinematics", "regions", "jacobian"},
     "protocols": set(),
 }
 """Core packages in the order they build on each other, with what each may import."""

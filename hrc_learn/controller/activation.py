@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from hrc_learn.regions.pytree import pytree
+from hrc_learn.pytree import pytree
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from hrc_learn.pytree import pytree
 from hrc_learn.regions import OrientationRegion, PositionRegion, PostureRegion, VisionRegion
-from hrc_learn.regions.pytree import pytree
 
 HALF_SIZE = (0.12, 0.12, 0.08)
 """Half edges of the box that proved large enough to find the marker in view [m]."""

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from hrc_learn.regions.pytree import pytree
+from hrc_learn.pytree import pytree
 
 _FARTHEST = 0.005
 """Bound on each component of the remembered drift [m, rad]: a person who blocks the arm

@@ -12,7 +12,7 @@ from hrc_learn.controller.activation import Activation
 from hrc_learn.controller.goals import Goals
 from hrc_learn.controller.hold import Hold
 from hrc_learn.controller.safety import SafetyReport, SafetyState
-from hrc_learn.regions.pytree import pytree
+from hrc_learn.pytree import pytree
 
 
 @pytree

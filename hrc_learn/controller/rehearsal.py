@@ -17,7 +17,7 @@ from hrc_learn.controller.controller import AdaptiveController
 from hrc_learn.controller.goals import Goals
 from hrc_learn.controller.interface import Command, ControllerState, Observation
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.regions.pytree import pytree, static
+from hrc_learn.pytree import pytree, static
 
 OVERHEAD = (0.0, 0.0, 1.0, 0.0)
 """Orientation of the paper's camera: it looks down, image right is -x and image down is +y."""

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from hrc_learn.kinematics import JointLimits
-from hrc_learn.regions.pytree import pytree
+from hrc_learn.pytree import pytree
 
 INTERVENTIONS = ("velocity", "position", "acceleration", "tcp_speed", "invalid", "stopped")
 """Kinds of interventions, in the order of the last axis of their flags and counts."""

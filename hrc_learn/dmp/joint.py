@@ -11,7 +11,6 @@ from torch import Tensor, nn
 
 from hrc_learn.dmp.arrays import ArrayLike, to_tensor
 from hrc_learn.dmp.basis import Basis, GaussianBasis
-from hrc_learn.dmp.files import SavedPrimitive, write_folder
 from hrc_learn.dmp.fitting import fit_samples
 from hrc_learn.dmp.report import FitReport
 from hrc_learn.dmp.response import response_of
@@ -22,6 +21,7 @@ from hrc_learn.dmp.spring import SpringDamper
 from hrc_learn.dmp.state import DMPState
 from hrc_learn.dmp.stepping import advance, second_derivative
 from hrc_learn.dmp.trajectory import Trajectory, broadcast_shapes
+from hrc_learn.storage import SavedModel, write_model
 
 
 class JointDMP(nn.Module):
@@ -330,7 +330,7 @@ class JointDMP(nn.Module):
 
     def save(self, folder: str | Path) -> None:
         """Write config.json and model.safetensors into `folder`, replacing an older save."""
-        write_folder(folder, type(self).__name__, self.config(), self.tensors())
+        write_model(folder, type(self).__name__, self.config(), self.tensors())
 
     @classmethod
     def load(cls, folder: str | Path) -> "JointDMP":
@@ -340,7 +340,7 @@ class JointDMP(nn.Module):
             FileNotFoundError: No saved primitive there.
             ValueError: Names the file and the field that is wrong.
         """
-        return cls.restore(SavedPrimitive(folder, cls.__name__))
+        return cls.restore(SavedModel(folder, cls.__name__))
 
     def config(self) -> dict[str, Any]:
         """What a saved primitive needs besides its tensors."""
@@ -359,7 +359,7 @@ class JointDMP(nn.Module):
         return dict(self.state_dict()) | {f"fit_report.{k}": v for k, v in report.items()}
 
     @classmethod
-    def restore(cls, saved: SavedPrimitive) -> "JointDMP":
+    def restore(cls, saved: SavedModel) -> "JointDMP":
         """The primitive inside a saved one."""
         arguments = saved_arguments(saved)
         try:

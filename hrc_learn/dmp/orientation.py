@@ -11,7 +11,6 @@ from torch import Tensor, nn
 from hrc_learn.dmp import orientation_error as error_space
 from hrc_learn.dmp.arrays import ArrayLike, to_tensor
 from hrc_learn.dmp.basis import GaussianBasis
-from hrc_learn.dmp.files import SavedPrimitive, write_folder
 from hrc_learn.dmp.joint import JointDMP
 from hrc_learn.dmp.report import FitReport
 from hrc_learn.dmp.samples import check_samples, demo_label
@@ -19,6 +18,7 @@ from hrc_learn.dmp.spring import SpringDamper
 from hrc_learn.dmp.state import DMPState
 from hrc_learn.dmp.trajectory import Trajectory
 from hrc_learn.geometry import quaternion
+from hrc_learn.storage import SavedModel, write_model
 
 NORM_TOLERANCE = 1e-2
 """How far from one the norm of a recorded quaternion may be before it is called broken."""
@@ -238,12 +238,12 @@ class OrientationDMP(nn.Module):
     def save(self, folder: str | Path) -> None:
         """Write config.json and model.safetensors into `folder`, replacing an older save."""
         tensors = {"goal_orientation": self.goal, **self.motion.tensors()}
-        write_folder(folder, "OrientationDMP", self.motion.config(), tensors)
+        write_model(folder, "OrientationDMP", self.motion.config(), tensors)
 
     @classmethod
     def load(cls, folder: str | Path) -> "OrientationDMP":
         """Read what `save` wrote; complains as `JointDMP.load`."""
-        saved = SavedPrimitive(folder, "OrientationDMP")
+        saved = SavedModel(folder, "OrientationDMP")
         return cls(JointDMP.restore(saved), saved.tensor("goal_orientation"))
 
     def _ends(

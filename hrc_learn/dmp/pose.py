@@ -9,7 +9,6 @@ from torch import Tensor, nn
 
 from hrc_learn.dmp.arrays import ArrayLike, to_tensor
 from hrc_learn.dmp.basis import GaussianBasis
-from hrc_learn.dmp.files import SavedPrimitive, write_folder
 from hrc_learn.dmp.joint import JointDMP
 from hrc_learn.dmp.orientation import (
     error_ends,
@@ -23,6 +22,7 @@ from hrc_learn.dmp.report import FitReport
 from hrc_learn.dmp.samples import check_samples
 from hrc_learn.dmp.spring import SpringDamper
 from hrc_learn.geometry import Pose
+from hrc_learn.storage import SavedModel, write_model
 
 
 class PoseDMP(nn.Module):
@@ -243,12 +243,12 @@ class PoseDMP(nn.Module):
     def save(self, folder: str | Path) -> None:
         """Write config.json and model.safetensors into `folder`, replacing an older save."""
         tensors = {"goal_orientation": self.goal_orientation, **self.motion.tensors()}
-        write_folder(folder, "PoseDMP", self.motion.config(), tensors)
+        write_model(folder, "PoseDMP", self.motion.config(), tensors)
 
     @classmethod
     def load(cls, folder: str | Path) -> "PoseDMP":
         """Read what `save` wrote; complains as `JointDMP.load`."""
-        saved = SavedPrimitive(folder, "PoseDMP")
+        saved = SavedModel(folder, "PoseDMP")
         return cls(JointDMP.restore(saved), saved.tensor("goal_orientation"))
 
     def _ends(

@@ -7,14 +7,14 @@ from torch import Tensor
 
 from hrc_learn.dmp.basis import Basis, GaussianBasis, PeriodicBasis
 from hrc_learn.dmp.canonical import ExponentialPhase
-from hrc_learn.dmp.files import SavedPrimitive
 from hrc_learn.dmp.report import FitReport
 from hrc_learn.dmp.spring import SpringDamper
+from hrc_learn.storage import SavedModel
 
 TENSORS = ("weights", "start", "goal", "start_velocity", "duration", "amplitude", "stamps")
 
 
-def saved_arguments(saved: SavedPrimitive) -> dict[str, Any]:
+def saved_arguments(saved: SavedModel) -> dict[str, Any]:
     """Arguments of `JointDMP`.
 
     Raises:
@@ -37,7 +37,7 @@ def saved_arguments(saved: SavedPrimitive) -> dict[str, Any]:
     return arguments
 
 
-def _check_shapes(saved: SavedPrimitive, tensors: dict[str, Tensor]) -> None:
+def _check_shapes(saved: SavedModel, tensors: dict[str, Tensor]) -> None:
     """All but the stamps follow from the shape of the weights."""
     weights = tensors["weights"]
     for name in TENSORS[1:-1]:
@@ -49,7 +49,7 @@ def _check_shapes(saved: SavedPrimitive, tensors: dict[str, Tensor]) -> None:
             )
 
 
-def _part(saved: SavedPrimitive, field: str, make: Any) -> Any:
+def _part(saved: SavedModel, field: str, make: Any) -> Any:
     fields = saved.get(field, dict)
     try:
         return make(fields)

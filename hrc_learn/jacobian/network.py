@@ -12,7 +12,6 @@ from torch import Tensor, nn
 
 from hrc_learn.geometry import Pose
 from hrc_learn.jacobian.basis import radial_basis
-from hrc_learn.jacobian.files import read_folder, write_folder
 from hrc_learn.jacobian.fitting import (
     ImageJacobianFitConfig,
     ImageJacobianFitReport,
@@ -20,6 +19,10 @@ from hrc_learn.jacobian.fitting import (
 )
 from hrc_learn.jacobian.gathering import statistics_by_part
 from hrc_learn.jacobian.prior import component_scale, weight_covariance
+from hrc_learn.storage import SavedModel, write_model
+
+_KIND = "RBFImageJacobian"
+_UNITS = {"position": "m", "rotation": "rad", "jacobian": "px/m, px/rad", "pixels": "u, v"}
 
 
 class RBFImageJacobian(nn.Module):
@@ -208,11 +211,12 @@ class RBFImageJacobian(nn.Module):
             ValueError: The folder holds something else.
         """
         config = {
+            "units": _UNITS,
             "input_indices": list(self.input_indices),
             "normalized": self.normalized,
             "report": None if self.report is None else self.report.summary(),
         }
-        write_folder(folder, config, self.state_dict())
+        write_model(folder, _KIND, config, self.state_dict())
 
     @classmethod
     def load(cls, folder: str | Path) -> RBFImageJacobian:
@@ -222,18 +226,19 @@ class RBFImageJacobian(nn.Module):
             FileNotFoundError: There is no such folder or file.
             ValueError: A file is damaged or not ours; the message names file and field.
         """
-        config, tensors = read_folder(folder)
+        saved = SavedModel(folder, _KIND)
         try:
             network = cls(
-                tensors["centers"],
-                float(tensors["width"]),
-                weight=tensors["weight"],
-                input_indices=config["input_indices"],
-                normalized=config["normalized"],
+                saved.tensor("centers"),
+                float(saved.tensor("width")),
+                weight=saved.tensor("weight"),
+                input_indices=saved.get("input_indices", list),
+                normalized=saved.flag("normalized"),
             )
-        except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"{folder} is no usable image Jacobian: {error!r}.") from error
-        network.covariance = tensors.get("covariance")
+        except (TypeError, ValueError) as error:
+            raise saved.invalid(error) from error
+        if "covariance" in saved.tensors:
+            network.covariance = saved.tensor("covariance")
         return network
 
     def _inputs(self, r: Pose | Tensor) -> Tensor:

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.geometry import quaternion
-from hrc_learn.regions.pytree import pytree, static
+from hrc_learn.pytree import pytree, static
 from hrc_learn.regions.region import Region
 
 # Shorter axes are rounding noise. They occur at the goal, deep inside the cone, where the

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.regions.pytree import pytree, static
+from hrc_learn.pytree import pytree, static
 from hrc_learn.regions.region import Region
 
 

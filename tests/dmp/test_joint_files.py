@@ -43,7 +43,7 @@ def test_saving_replaces_whole_folders_and_leaves_nothing_else(saved):
 def test_saving_does_not_overwrite_what_is_no_primitive(tmp_path):
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "chapter.tex").write_text("years of work")
-    with pytest.raises(ValueError, match="more than a saved primitive"):
+    with pytest.raises(ValueError, match="more than a saved model"):
         JointDMP.fit(TIME, POSITION).save(tmp_path / "thesis")
     assert (tmp_path / "thesis" / "chapter.tex").read_text() == "years of work"
 
@@ -90,7 +90,7 @@ def test_a_missing_field_or_file_is_named(saved):
     (folder / "model.safetensors").unlink()
     with pytest.raises(FileNotFoundError, match=r"model\.safetensors"):
         JointDMP.load(folder)
-    with pytest.raises(FileNotFoundError, match="no primitive was saved"):
+    with pytest.raises(FileNotFoundError, match="no model was saved"):
         JointDMP.load(folder.parent)
 
 

@@ -169,7 +169,7 @@ def test_load_names_what_is_wrong(tmp_path):
     with pytest.raises(ValueError, match="version is 99"):
         RBFImageJacobian.load(folder)
     (folder / "config.json").write_text(json.dumps(config | {"input_indices": [0, 1, 2]}))
-    with pytest.raises(ValueError, match=r"no usable image Jacobian.*2 columns"):
+    with pytest.raises(ValueError, match=r"model: .*2 columns"):
         RBFImageJacobian.load(folder)
     (folder / "config.json").write_text("{")
     with pytest.raises(ValueError, match="not valid JSON"):

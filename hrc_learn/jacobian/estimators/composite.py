@@ -13,7 +13,7 @@ from hrc_learn.jacobian.estimators.key_frames import KeyFrame, Pair, PairEstimat
 from hrc_learn.jacobian.estimators.paper import paper_rate
 from hrc_learn.jacobian.network import RBFImageJacobian
 from hrc_learn.jacobian.pairs import PairConfig
-from hrc_learn.regions.pytree import pytree
+from hrc_learn.pytree import pytree
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from hrc_learn.geometry import Pose
 from hrc_learn.jacobian.network import RBFImageJacobian
-from hrc_learn.regions.pytree import pytree
+from hrc_learn.pytree import pytree
 
 
 @pytree

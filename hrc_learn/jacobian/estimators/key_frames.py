@@ -17,7 +17,7 @@ from hrc_learn.jacobian.estimators.interface import (
 from hrc_learn.jacobian.network import RBFImageJacobian
 from hrc_learn.jacobian.pairs import PairConfig
 from hrc_learn.jacobian.prior import component_scale
-from hrc_learn.regions.pytree import pytree
+from hrc_learn.pytree import pytree
 
 
 @pytree

@@ -1,4 +1,4 @@
-"""Primitives on disk: a folder with `config.json` and `model.safetensors`.
+"""Learned models on disk: a folder with `config.json` and `model.safetensors`.
 
 Everything is written to a temporary folder beside the target and renamed at the end, so an
 interrupted save leaves the old file or none, never half of one.
@@ -15,29 +15,35 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-FORMAT = "hrc_learn.dmp"
+FORMAT = "hrc_learn"
 VERSION = 1
 CONFIG, MODEL = "config.json", "model.safetensors"
 
 
-def write_folder(
+def write_model(
     folder: str | Path, kind: str, config: dict[str, Any], tensors: dict[str, Tensor]
 ) -> None:
-    """Write or replace a saved primitive.
+    """Write or replace a saved model.
+
+    Args:
+        folder: Where.
+        kind: Class of the model, checked when it is read.
+        config: What the model needs besides its tensors, as JSON values.
+        tensors: By name.
 
     Raises:
         ValueError: `folder` exists and holds anything else; it is left alone.
     """
     folder = Path(folder)
     if folder.exists() and not {p.name for p in folder.iterdir()} <= {CONFIG, MODEL}:
-        raise ValueError(f"{folder} holds more than a saved primitive: choose another folder")
+        raise ValueError(f"{folder} holds more than a saved model: choose another folder")
     folder.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:
         header = {"format": FORMAT, "version": VERSION, "kind": kind}
         (temporary / CONFIG).write_text(json.dumps(header | config, indent=2) + "\n")
         # Clones, as buffers may share memory, which safetensors refuses to write.
-        tensors = {name: t.detach().cpu().clone() for name, t in tensors.items()}
+        tensors = {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}
         save_file(tensors, temporary / MODEL)
         temporary.chmod(0o777 & ~_umask())  # mkdtemp makes it private
         if folder.exists():
@@ -55,7 +61,7 @@ def write_folder(
         shutil.rmtree(temporary, ignore_errors=True)
 
 
-class SavedPrimitive:
+class SavedModel:
     """A folder read back, whose complaints name the file and the field."""
 
     def __init__(self, folder: str | Path, kind: str):
@@ -81,6 +87,15 @@ class SavedPrimitive:
             )
         return value
 
+    def flag(self, field: str) -> bool:
+        """Value of a field of the config, which must be true or false."""
+        value = self.config.get(field)
+        if not isinstance(value, bool):
+            raise ValueError(
+                f"{self.folder / CONFIG}: field {field!r} must be true or false, got {value!r}"
+            )
+        return value
+
     def tensor(self, name: str) -> Tensor:
         """Tensor of that name, which must be finite."""
         if name not in self.tensors:
@@ -100,7 +115,7 @@ class SavedPrimitive:
     def _read_config(self) -> dict[str, Any]:
         path = self.folder / CONFIG
         if not path.is_file():
-            raise FileNotFoundError(f"{path} does not exist: no primitive was saved here")
+            raise FileNotFoundError(f"{path} does not exist: no model was saved here")
         try:
             config = json.loads(path.read_text())
         except ValueError as error:
