@@ -43,6 +43,10 @@ class Args:
     """Folder for recording, report and measured values."""
     shelf: str = "middle"
     """Where to put the object: lower, middle or upper."""
+    shelf_x: float = 0.40
+    """Where along the board [m], in the robot's base frame."""
+    shelf_depth: float = 0.10
+    """How far behind the board's front edge [m]."""
     camera: CameraKind = "auto"
     """Camera: rendered by "egl", or "synthetic", which needs no OpenGL; "auto" renders where
     it can."""
@@ -69,6 +73,7 @@ def main(args: Args) -> int:
             aiming,
             placing,
             args.shelf,
+            workplace=Workplace(shelf_x=args.shelf_x, shelf_depth=args.shelf_depth),
             camera=args.camera,
             pulls=PULLS if args.person else (),
             config=args.config,

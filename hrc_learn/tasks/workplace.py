@@ -93,7 +93,7 @@ class Workplace:
             item: What is put down; the scene's first object when None.
 
         Raises:
-            ValueError: If there is no such shelf.
+            ValueError: If there is no such shelf, or the place is not on its board.
         """
         cabinet = self.scene.cabinet
         if name not in cabinet.shelves:
@@ -101,10 +101,22 @@ class Workplace:
                 f"no shelf named {name!r}: this cabinet has {', '.join(self.shelf_names())}."
             )
         item = item or self.scene.objects[0]
+        self._check_place_on_board(item)
         # Held from above, a thing lies on its side once the hand points level.
         height = cabinet.shelves[name] + item.half_size[1] + self.clearance
         position = _vector(self.shelf_x, cabinet.front - self.shelf_depth, height)
         return Pose(position, coarse_orientation(position))
+
+    def _check_place_on_board(self, item: ObjectConfig) -> None:
+        cabinet, half_size = self.scene.cabinet, item.half_size
+        left, right = cabinet.left + half_size[0], cabinet.right - half_size[0]
+        front, back = half_size[2], cabinet.depth - half_size[2]
+        if not (left <= self.shelf_x <= right and front <= self.shelf_depth <= back):
+            raise ValueError(
+                f"shelf_x {self.shelf_x:g} m and shelf_depth {self.shelf_depth:g} m are not on "
+                f"the boards: {item.name!r} stands on them for x from {left:g} to {right:g} m "
+                f"and depths from {front:g} to {back:g} m."
+            )
 
     def mouth(self, name: str, item: ObjectConfig | None = None) -> Pose:
         """Hand in front of a shelf, level with where it will let go."""

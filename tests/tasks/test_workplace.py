@@ -42,6 +42,12 @@ def test_an_unknown_shelf_is_named_together_with_those_that_exist():
         WORKPLACE.shelf("attic")
 
 
+@pytest.mark.parametrize("place", [{"shelf_x": 1.2}, {"shelf_depth": 0.5}, {"shelf_x": 0.0}])
+def test_a_place_beside_the_board_is_refused(place):
+    with pytest.raises(ValueError, match="not on the boards"):
+        Workplace(**place).shelf("middle")
+
+
 def test_an_unreachable_pose_is_told_with_its_numbers():
     far = Pose(torch.tensor([0.4, -1.6, 0.4]).double(), WORKPLACE.shelf("middle").orientation)
     with pytest.raises(UnreachableError, match=r"-1\.600"):
