@@ -5,6 +5,8 @@ past the open door. Demonstrations that touch the cabinet are thrown away and sh
 Writes a LeRobot dataset of version 3.0.
 """
 
+import sys
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -12,11 +14,11 @@ import numpy as np
 from rich.progress import track
 
 from hrc_learn import cli
-from hrc_learn.demos import DatasetWriter
-from hrc_learn.kinematics import panda
-from hrc_learn.output import replacing
 from hrc_learn.sim import World
-from hrc_learn.tasks.teach_placing import PlacingLesson, teach_placing
+from hrc_learn.tasks.failure import TaskFailedError
+from hrc_learn.tasks.lessons import write_lessons
+from hrc_learn.tasks.teach_placing import PlacingLesson, teach_placing_cleanly
+from hrc_learn.tasks.teaching import Frame
 from hrc_learn.tasks.workplace import Workplace
 
 
@@ -40,48 +42,45 @@ class Args:
     """File for the measured values."""
 
 
-def main(args: Args) -> None:
-    workplace = Workplace()
-    goal = workplace.shelf(args.shelf)
+def main(args: Args) -> int:
     if args.episodes < 1:
         raise ValueError(f"--episodes must be at least 1, but is {args.episodes}.")
+    workplace = Workplace()
+    goal = workplace.shelf(args.shelf).position.numpy()
     world = World(workplace.scene)
     rng = np.random.default_rng(args.seed)
-    thrown_away, errors = 0, []
-    with (
-        replacing(args.out, "meta/info.json", args.overwrite) as folder,
-        DatasetWriter(
-            folder,
-            fps=args.lesson.fps,
-            robot_type="panda",
-            joint_names=panda.joint_names,
-            frames={"base": "panda_link0", "ee": "panda_hand_tcp"},
-            details={"shelf": args.shelf, "scene": "hrc_learn workplace"},
-        ) as writer,
-    ):
+    thrown_away, errors = [], []
+
+    def lessons() -> Iterator[list[Frame]]:
         for _ in track(range(args.episodes), description="Placing demonstrations"):
-            for _attempt in range(3):
-                frames, touches = teach_placing(world, workplace, args.shelf, args.lesson, rng)
-                if not touches:
-                    break
-                thrown_away += 1
-            else:
-                raise RuntimeError(
-                    f"three demonstrations in a row hit the cabinet: {touches[0]}"
-                )
-            writer.start_episode(f"place the box on the {args.shelf} shelf")
-            for frame in frames:
-                writer.add_frame(images=None, **frame)
-            writer.save_episode()
-            errors.append(float(np.linalg.norm(frames[-1]["position"] - goal.position.numpy())))
-    print(f"{args.episodes} demonstrations in {args.out} ({thrown_away} thrown away)")
+            frames, thrown = teach_placing_cleanly(
+                world, workplace, args.shelf, args.lesson, rng
+            )
+            thrown_away.append(thrown)
+            errors.append(float(np.linalg.norm(frames[-1]["position"] - goal)))
+            yield frames
+
+    try:
+        write_lessons(
+            args.out,
+            lessons(),
+            f"place the box on the {args.shelf} shelf",
+            args.lesson.fps,
+            details={"shelf": args.shelf, "scene": "hrc_learn workplace"},
+            overwrite=args.overwrite,
+        )
+    except TaskFailedError as error:
+        print(f"failed: {error}", file=sys.stderr)
+        return 1
+    print(f"{args.episodes} demonstrations in {args.out} ({sum(thrown_away)} thrown away)")
     if args.json is not None:
         values = {
             "episodes": args.episodes,
-            "thrown_away": thrown_away,
+            "thrown_away": sum(thrown_away),
             "final_error_mm_max": 1e3 * max(errors),
         }
         cli.write_json(args.json, values)
+    return 0
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ The scripted expert moves the marked hand about over the table and ends right ab
 The camera's pose and lens are in none of the columns. Writes a LeRobot dataset of version 3.0.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -11,12 +12,11 @@ import numpy as np
 from rich.progress import track
 
 from hrc_learn import cli
-from hrc_learn.demos import DatasetWriter
-from hrc_learn.kinematics import panda
-from hrc_learn.output import replacing
 from hrc_learn.sim import CameraKind, World, open_camera
 from hrc_learn.tasks.eye import Eye
+from hrc_learn.tasks.lessons import write_lessons
 from hrc_learn.tasks.teach_aiming import AimingLesson, teach_aiming
+from hrc_learn.tasks.teaching import Frame
 from hrc_learn.tasks.visual_target import OBJECT_FEATURE, OBJECT_FEATURE_NAMES
 from hrc_learn.tasks.workplace import Workplace
 
@@ -42,37 +42,32 @@ class Args:
 
 
 def main(args: Args) -> None:
-    workplace = Workplace()
     if args.episodes < 1:
         raise ValueError(f"--episodes must be at least 1, but is {args.episodes}.")
+    workplace = Workplace()
     world = World(workplace.scene)
     rng = np.random.default_rng(args.seed)
     eye = Eye.on(open_camera(world, args.camera, rng=rng), workplace.scene)
     seen = []
-    with (
-        replacing(args.out, "meta/info.json", args.overwrite) as folder,
-        DatasetWriter(
-            folder,
-            fps=args.lesson.fps,
-            robot_type="panda",
-            joint_names=panda.joint_names,
-            features={OBJECT_FEATURE: OBJECT_FEATURE_NAMES},
-            frames={"base": "panda_link0", "ee": "panda_hand_tcp"},
-            details={"scene": "hrc_learn workplace"},
-        ) as writer,
-    ):
+
+    def lessons() -> Iterator[list[Frame]]:
         for _ in track(range(args.episodes), description="Aiming demonstrations"):
             frames = teach_aiming(world, workplace, eye, args.lesson, rng)
-            writer.start_episode("aim at the box")
-            for frame in frames:
-                writer.add_frame(images=None, **frame)
-            writer.save_episode()
-            seen.append(np.mean([bool(frame["feature_visible"]) for frame in frames]))
+            seen.append(float(np.mean([bool(frame["feature_visible"]) for frame in frames])))
+            yield frames
+
+    write_lessons(
+        args.out,
+        lessons(),
+        "aim at the box",
+        args.lesson.fps,
+        features={OBJECT_FEATURE: OBJECT_FEATURE_NAMES},
+        details={"scene": "hrc_learn workplace"},
+        overwrite=args.overwrite,
+    )
     print(f"{args.episodes} demonstrations in {args.out}, marker seen {100 * min(seen):.0f} %")
     if args.json is not None:
-        cli.write_json(
-            args.json, {"episodes": args.episodes, "marker_seen_min": float(min(seen))}
-        )
+        cli.write_json(args.json, {"episodes": args.episodes, "marker_seen_min": min(seen)})
 
 
 if __name__ == "__main__":

@@ -64,6 +64,17 @@ def _warning_line(message: Warning | str, *_place: object, **_line: object) -> s
     return f"warning: {message}\n"
 
 
+def show_values(title: str, values: Mapping[str, float]) -> None:
+    """Print measured values as a table."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table("measure", "value", title=title)
+    for name, value in values.items():
+        table.add_row(name.replace("_", " "), f"{value:.3g}")
+    Console().print(table)
+
+
 def _number(value: Any) -> float | int | bool | None:
     # numpy's and torch's scalars come as their plain counterparts.
     plain = value.item() if hasattr(value, "item") else value

@@ -60,7 +60,7 @@ LIBRARIES: dict[str, set[str]] = {
 
 LAZY_LIBRARIES: dict[str, set[str]] = {
     "kinematics": {"pytorch_kinematics", "frankik"},
-    "cli": {"tyro"},
+    "cli": {"tyro", "rich"},
     "demos": {"av"},
     "vision": {"cv2"},
 }

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Literal
 
 from rich.console import Console
-from rich.table import Table
 
 from hrc_learn import cli
 from hrc_learn.demos import load_demos
@@ -66,10 +65,7 @@ def main(args: Args) -> None:
             shown = fit_recording(fitted, f"Fit of {args.dataset.name}")
             record_fit(folder / "fit.rrd", shown)
             fit_joints_figure(shown).savefig(folder / "joints.png", dpi=120)
-    table = Table("measure", "value", title=f"Fit of {args.dataset}")
-    for name, value in metrics.items():
-        table.add_row(name.replace("_", " "), f"{value:.3g}")
-    console.print(table)
+    cli.show_values(f"Fit of {args.dataset}", metrics)
     console.print(f"Model in {args.out}")
     if args.json is not None:
         cli.write_json(args.json, metrics)

@@ -8,7 +8,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from rich.console import Console
-from rich.table import Table
 
 from hrc_learn import cli
 from hrc_learn.demos import load_demos
@@ -48,10 +47,7 @@ def main(args: Args) -> None:
         skill.save(folder)
         metrics = skill.metrics()
         cli.write_json(folder / "metrics.json", metrics)
-    table = Table("measure", "value", title=f"Image Jacobian from {args.dataset}")
-    for name, value in metrics.items():
-        table.add_row(name.replace("_", " "), f"{value:.3g}")
-    console.print(table)
+    cli.show_values(f"Image Jacobian from {args.dataset}", metrics)
     console.print(f"Model in {args.out}")
     if args.json is not None:
         cli.write_json(args.json, metrics)

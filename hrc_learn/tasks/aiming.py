@@ -9,11 +9,8 @@ from torch import Tensor
 
 from ..controller import AdaptiveController, ControllerState, Goals, Observation
 from ..geometry import Pose
+from .failure import TaskFailedError
 from .station import Station
-
-
-class TaskFailedError(RuntimeError):
-    """A task could not be carried out; says at which phase and why."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,7 +16,8 @@ from ..controller import AdaptiveController, ControllerConfig, Goals
 from ..geometry import Pose
 from ..jacobian import KalmanEstimator
 from ..sim import HAND_MARKER, ObjectConfig
-from .aiming import Aimer, AimingConfig, TaskFailedError
+from .aiming import Aimer, AimingConfig
+from .failure import TaskFailedError
 from .fit_aiming import AimingSkill
 from .motion import joint_line
 from .placing import PlacingSkill, Plan, PlanningSpace

@@ -19,14 +19,11 @@ from ..geometry import Pose
 from ..kinematics import SerialChain, arm_angle, arm_angle_motion, panda
 from ..regions import JointRegion
 from ..sim import World
+from .failure import BlockedPathError
 from .motion import resolved_rate
 from .workplace import nearest_configuration
 
 PlanningSpace = Literal["joint", "pose"]
-
-
-class BlockedPathError(RuntimeError):
-    """A planned motion would hit something or leave the limits of the arm."""
 
 
 @dataclass(frozen=True, kw_only=True)

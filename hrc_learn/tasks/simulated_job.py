@@ -9,11 +9,11 @@ import torch
 from ..human import PullSpell, ScriptedPuller
 from ..kinematics import panda
 from ..sim import CameraKind, MotionLog, ObjectConfig, World, open_camera
-from .aiming import TaskFailedError
 from .collaboration import INTERACT, Collaboration, CollaborationConfig, CollaborationResult
 from .eye import Eye
+from .failure import TaskFailedError
 from .fit_aiming import AimingSkill
-from .placing import BlockedPathError, PlacingSkill, Plan, check_plan
+from .placing import PlacingSkill, Plan, check_plan
 from .station import Station
 from .workplace import Workplace
 
@@ -103,7 +103,7 @@ def simulate_collaboration(
         task = Collaboration(station, workplace, aiming, placing, check, config)
         try:
             result = task.run(item, shelf)
-        except (TaskFailedError, BlockedPathError) as error:
+        except TaskFailedError as error:
             failure = str(error)
     return SimulatedJob(
         workplace=workplace,

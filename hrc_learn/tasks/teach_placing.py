@@ -8,6 +8,7 @@ import torch
 from ..human import GuidedPath, PullSpell, ScriptedExpert, Tremor
 from ..kinematics import panda
 from ..sim import Touch, World
+from .failure import TaskFailedError
 from .teaching import Frame, TeachingConfig, teach
 from .workplace import Workplace
 
@@ -55,6 +56,29 @@ def placing_expert(
         spells=BODY_SHAPE if lesson.shape_body else (),
         tremor=Tremor(lesson.tremor, rng),
     )
+
+
+def teach_placing_cleanly(
+    world: World,
+    workplace: Workplace,
+    shelf: str,
+    lesson: PlacingLesson,
+    rng: np.random.Generator,
+    attempts: int = 3,
+) -> tuple[list[Frame], int]:
+    """Demonstrate until nothing is touched on the way, as a person would.
+
+    Returns:
+        The recorded frames, and how many demonstrations were thrown away.
+
+    Raises:
+        TaskFailedError: If something was touched each time.
+    """
+    for attempt in range(attempts):
+        frames, touches = teach_placing(world, workplace, shelf, lesson, rng)
+        if not touches:
+            return frames, attempt
+    raise TaskFailedError(f"{attempts} demonstrations in a row hit the cabinet: {touches[0]}")
 
 
 def teach_placing(

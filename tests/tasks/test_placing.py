@@ -10,8 +10,9 @@ from hrc_learn.demos import DatasetWriter, load_demos
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import UnreachableError, panda
 from hrc_learn.sim import World
+from hrc_learn.tasks.failure import BlockedPathError
 from hrc_learn.tasks.fit_primitives import fit_primitives
-from hrc_learn.tasks.placing import BlockedPathError, PlacingSkill, check_plan
+from hrc_learn.tasks.placing import PlacingSkill, check_plan
 from hrc_learn.tasks.teach_placing import PlacingLesson, teach_placing
 from hrc_learn.tasks.workplace import Workplace
 
