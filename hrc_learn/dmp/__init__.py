@@ -4,6 +4,8 @@ from hrc_learn.dmp import coupling as coupling
 from hrc_learn.dmp.basis import GaussianBasis as GaussianBasis
 from hrc_learn.dmp.basis import PeriodicBasis as PeriodicBasis
 from hrc_learn.dmp.canonical import ExponentialPhase as ExponentialPhase
+from hrc_learn.dmp.context import PolynomialFeatures as PolynomialFeatures
+from hrc_learn.dmp.contextual import ContextualDMP as ContextualDMP
 from hrc_learn.dmp.distribution import DMPDistribution as DMPDistribution
 from hrc_learn.dmp.joint import JointDMP as JointDMP
 from hrc_learn.dmp.orientation import OrientationDMP as OrientationDMP

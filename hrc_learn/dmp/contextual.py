@@ -1,0 +1,258 @@
+"""A primitive for every task: what was shown for some, carried over to those between."""
+
+from pathlib import Path
+from types import NoneType
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from hrc_learn.dmp.arrays import ArrayLike, to_tensor
+from hrc_learn.dmp.context import FeatureMap, PolynomialFeatures
+from hrc_learn.dmp.joint import JointDMP
+from hrc_learn.dmp.mean import mean_primitive
+from hrc_learn.dmp.report import FitReport
+from hrc_learn.dmp.ridge import fit_ridge
+from hrc_learn.dmp.samples import check_samples
+from hrc_learn.storage import SavedModel, write_model
+
+OWN_TENSORS = ("coefficients", "feature_mean", "feature_scale", "held_out_duration")
+
+
+class ContextualDMP(nn.Module):
+    """Joint primitives as a function of a task parameter, the context c.
+
+    x(c) = a + B (phi(c) - mean) / scale,   x = (weights, y_0', y_0, g, log tau)
+
+    a and B by ridge regression from one demonstration per context (after Forte et al. 2012,
+    "On-line motion synthesis and adaptation using a trajectory database", and Ude et al.
+    2010, "Task-specific generalization of discrete and periodic dynamic movement
+    primitives", here global instead of local). A motion is linear in all but the duration,
+    so affine features mix demonstrations, and never leave what they span.
+    """
+
+    feature_mean: Tensor
+    feature_scale: Tensor
+    held_out_duration: Tensor
+    """Duration of each demonstration over its prediction by the others (n)."""
+    held_out: FitReport
+    """Each demonstration, (n), against its prediction by the others, at the same s."""
+
+    def __init__(
+        self,
+        *,
+        mean: JointDMP,
+        coefficients: Float[Tensor, "F_and_1 K"],
+        feature_mean: Float[Tensor, "F"],
+        feature_scale: Float[Tensor, "F"],
+        held_out: FitReport,
+        held_out_duration: Float[Tensor, "n"],
+        features: FeatureMap,
+    ):
+        """Put one together; `fit` is the usual way.
+
+        Args:
+            mean: Primitive without batch dimensions, whose basis, gains and names all have.
+            coefficients: a and B transposed; K = D (N + 3) + 1.
+            feature_mean: Of the demonstrations.
+            feature_scale: Of the demonstrations.
+            held_out: Kept for the reader.
+            held_out_duration: Kept for the reader.
+            features: phi.
+
+        Raises:
+            ValueError: Coefficients that do not fit the primitive or the features.
+        """
+        super().__init__()
+        D, N = mean.weights.shape
+        shape = (len(feature_mean) + 1, D * (N + 3) + 1)
+        if coefficients.shape != shape:
+            raise ValueError(
+                f"coefficients have shape {tuple(coefficients.shape)}, must be {shape}"
+            )
+        self.mean = mean.requires_grad_(False)
+        self.coefficients = nn.Parameter(coefficients)
+        self.register_buffer("feature_mean", feature_mean)
+        self.register_buffer("feature_scale", feature_scale)
+        self.register_buffer("held_out_duration", held_out_duration)
+        self.held_out = held_out
+        self.features = features
+
+    @classmethod
+    def fit(
+        cls,
+        time: ArrayLike,
+        position: ArrayLike,
+        context: ArrayLike,
+        n_basis: int = 50,
+        mask: ArrayLike | None = None,
+        *,
+        features: FeatureMap | None = None,
+        regularization: float = 1e-6,
+        **fit_arguments: Any,
+    ) -> "ContextualDMP":
+        """Learn from one demonstration for each of several contexts.
+
+        Args:
+            time: Stamps [s], (T,) or (n, T).
+            position: (n, T, D), n >= 2.
+            context: (n, C), or (n,) for C = 1.
+            n_basis: N.
+            mask: (n, T), false where a sample does not count.
+            features: phi; affine in the context unless given.
+            regularization: Ridge over standardised features, positive. The default hardly
+                smoothes; `held_out` tells what suits noisy demonstrations.
+            fit_arguments: Others of `JointDMP.fit`, such as `approach` or `joint_names`.
+
+        Raises:
+            ValueError: Bad samples (says which), contexts that do not fit them, or a
+                scaling other than `"none"`, in which motions are not linear.
+        """
+        each = JointDMP.fit(time, position, n_basis, mask=mask, **fit_arguments)
+        if each.scaling != "none":
+            raise ValueError(f"scaling {each.scaling!r} is not linear: fit with 'none'")
+        if each.weights.ndim != 3:
+            raise ValueError(f"position must be (n, T, D), got {_shape(position)}")
+        samples = check_samples(time, position, mask=mask)
+        features = features or PolynomialFeatures()
+        phi = features(_contexts(context, each)).double()
+        x = _coordinates(each)
+        ridge = fit_ridge(phi, x, regularization)
+        predicted = _primitive(each, x - ridge.held_out)
+        with torch.no_grad():
+            motion = predicted.rollout().position.mT.reshape(samples.position.shape)
+        dtype = each.weights.dtype
+        return cls(
+            mean=mean_primitive(each),
+            coefficients=ridge.coefficients.to(dtype),
+            feature_mean=ridge.mean.to(dtype),
+            feature_scale=ridge.scale.to(dtype),
+            held_out=samples.compare(motion),
+            held_out_duration=ridge.held_out[:, -1].exp().to(dtype),
+            features=features,
+        )
+
+    def at(self, context: ArrayLike) -> JointDMP:
+        """Primitives for contexts (*batch, C); gradients flow to them and to the coefficients.
+
+        What is learned here are the coefficients: the weights of the result are a buffer.
+        """
+        like = self.coefficients
+        phi = self.features(to_tensor(context, dtype=like.dtype, device=like.device))
+        F = len(self.feature_mean)
+        if phi.ndim == 0 or phi.shape[-1] != F:
+            raise ValueError(
+                f"context of shape {_shape(context)} gives features {tuple(phi.shape)}, "
+                f"fitted were (..., {F})"
+            )
+        standard = (phi - self.feature_mean) / self.feature_scale
+        return _primitive(self.mean, like[0] + standard @ like[1:])
+
+    def save(self, folder: str | Path) -> None:
+        """Write config.json and model.safetensors into `folder`, replacing an older save.
+
+        A feature map other than `PolynomialFeatures` is code, which is not written: `load`
+        has to be given the same one.
+        """
+        phi = self.features
+        features = {"degree": phi.degree} if isinstance(phi, PolynomialFeatures) else None
+        config = self.mean.config() | {"features": features}
+        own = {name: getattr(self, name) for name in OWN_TENSORS}
+        report = {f"held_out.{k}": v for k, v in vars(self.held_out).items()}
+        write_model(folder, type(self).__name__, config, self.mean.tensors() | own | report)
+
+    @classmethod
+    def load(cls, folder: str | Path, features: FeatureMap | None = None) -> "ContextualDMP":
+        """Read what `save` wrote.
+
+        Args:
+            folder: Where.
+            features: The feature map it was fitted with, unless that was a polynomial.
+
+        Raises:
+            FileNotFoundError: No saved primitive there.
+            ValueError: Names the file and the field that is wrong.
+        """
+        saved = SavedModel(folder, cls.__name__)
+        own = {name: saved.tensor(name) for name in OWN_TENSORS}
+        report = {k: saved.tensor(f"held_out.{k}") for k in ("rmse", "peak", "span")}
+        features = _saved_features(saved, features)
+        try:
+            return cls(
+                mean=JointDMP.restore(saved),
+                features=features,
+                held_out=FitReport(**report),
+                **own,
+            )
+        except ValueError as error:
+            raise saved.invalid(error) from None
+
+
+def _coordinates(primitives: JointDMP) -> Float[Tensor, "n K"]:
+    """X of each, the ends after the weights of a coordinate (float64)."""
+    p = primitives
+    rate = p.start_velocity * p.duration[:, None]
+    ends = torch.stack([rate, p.start, p.goal], dim=-1)
+    x = torch.cat([p.weights.detach(), ends], dim=-1).flatten(1)
+    return torch.cat([x, p.duration.log()[:, None]], dim=-1).double()
+
+
+def _primitive(like: JointDMP, x: Float[Tensor, "*batch K"]) -> JointDMP:
+    """The primitives with these coordinates, else like `like`."""
+    x = x.to(like.weights)
+    duration = x[..., -1].exp()
+    X = x[..., :-1].unflatten(-1, (like.weights.shape[-2], -1))
+    weights = X[..., :-3].contiguous()
+    dmp = JointDMP(
+        weights=weights,
+        start_velocity=X[..., -3] / duration[..., None],
+        start=X[..., -2],
+        goal=X[..., -1],
+        duration=duration,
+        amplitude=like.amplitude.expand(X.shape[:-1]),
+        stamps=like.stamps,
+        basis=like.basis,
+        spring=like.spring,
+        approach=like.response.approach,
+        joint_names=like.joint_names,
+        units=like.units,
+    )
+    # A parameter is a leaf, which no gradient passes.
+    del dmp.weights
+    dmp.register_buffer("weights", weights)
+    return dmp
+
+
+def _contexts(context: ArrayLike, primitives: JointDMP) -> Float[Tensor, "n C"]:
+    weights = primitives.weights
+    tensor = to_tensor(context, dtype=torch.float64, device=weights.device)
+    tensor = tensor[:, None] if tensor.ndim == 1 else tensor
+    if tensor.ndim != 2 or len(tensor) != len(weights):
+        raise ValueError(
+            f"context has shape {_shape(context)}: expected one row for each of "
+            f"{len(weights)} demonstrations"
+        )
+    if not tensor.isfinite().all():
+        raise ValueError(f"context of demonstration {_first_bad(tensor)} is not finite")
+    return tensor
+
+
+def _first_bad(rows: Tensor) -> int:
+    return int((~rows.isfinite()).nonzero()[0, 0])
+
+
+def _saved_features(saved: SavedModel, given: FeatureMap | None) -> FeatureMap:
+    fields = saved.get("features", dict, NoneType)
+    if given is not None:
+        return given
+    if fields is None:
+        raise saved.invalid_field("features", "fitted with a map of its own, give it to load")
+    try:
+        return PolynomialFeatures(**fields)
+    except (TypeError, ValueError) as error:
+        raise saved.invalid_field("features", error) from None
+
+
+def _shape(values: ArrayLike) -> tuple[int, ...]:
+    return tuple(to_tensor(values).shape)
