@@ -25,9 +25,6 @@ _HIDDEN = 4  # sites of this group are not drawn
 _WHITE = (0.92, 0.93, 0.95, 1.0)
 _GREY = (0.35, 0.37, 0.40, 1.0)
 
-HAND_TO_TCP = 0.1034
-"""Distance from the hand's frame to the tool centre point along z [m] (franka_description)."""
-
 FINGER_STROKE = 0.04
 """Travel of one finger [m]; the gripper opens to twice this."""
 
@@ -106,10 +103,15 @@ def add_panda(spec: mujoco.MjSpec, config: PandaModelConfig) -> None:
                 mass=mass / len(capsules),
                 rgba=_WHITE,
             )
-    tcp = np.linalg.inv(parent_frame) @ frames[8]
-    hand_frame = tcp.copy()
-    hand_frame[:3, 3] -= HAND_TO_TCP * tcp[:3, 2]
-    _add_hand(spec, _add_body(body, "hand", hand_frame), config)
+    # The hand's frame: at the flange, turned as the tool.
+    flange, tool = frames[7], frames[8]
+    hand_frame = np.linalg.inv(parent_frame) @ tool
+    hand_frame[:3, 3] = (np.linalg.inv(parent_frame) @ flange)[:3, 3]
+    hand = _add_body(body, "hand", hand_frame)
+    hand.add_site(
+        name="tcp", pos=(0, 0, np.linalg.norm(tool[:3, 3] - flange[:3, 3])), group=_HIDDEN
+    )
+    _add_hand(spec, hand, config)
     for a, b in _OVERLAPPING:
         spec.add_exclude(bodyname1=a, bodyname2=b)
 
@@ -145,7 +147,6 @@ def _add_joint(spec: mujoco.MjSpec, body, name: str, i: int, config: PandaModelC
 
 
 def _add_hand(spec: mujoco.MjSpec, hand, config: PandaModelConfig) -> None:
-    hand.add_site(name="tcp", pos=(0, 0, HAND_TO_TCP), group=_HIDDEN)
     hand.add_geom(
         name="hand",
         type=_BOX,
