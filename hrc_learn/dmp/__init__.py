@@ -1,6 +1,7 @@
 """Dynamic movement primitives: learned motions that start, goal and duration reshape."""
 
 from hrc_learn.dmp import coupling as coupling
+from hrc_learn.dmp import force as force
 from hrc_learn.dmp.basis import GaussianBasis as GaussianBasis
 from hrc_learn.dmp.basis import PeriodicBasis as PeriodicBasis
 from hrc_learn.dmp.canonical import ExponentialPhase as ExponentialPhase
