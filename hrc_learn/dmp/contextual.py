@@ -28,8 +28,9 @@ class ContextualDMP(nn.Module):
     a and B by ridge regression from one demonstration per context (after Forte et al. 2012,
     "On-line motion synthesis and adaptation using a trajectory database", and Ude et al.
     2010, "Task-specific generalization of discrete and periodic dynamic movement
-    primitives", here global instead of local). A motion is linear in all but the duration,
-    so affine features mix demonstrations, and never leave what they span.
+    primitives", here global instead of local). As the constant is free, x(c) mixes those of
+    the demonstrations in shares that sum to one, and so does the motion, which is linear in
+    all but the duration.
     """
 
     feature_mean: Tensor

@@ -103,6 +103,16 @@ def test_a_strong_penalty_leads_to_the_mean():
     torch.testing.assert_close(dmp.at(CONTEXTS[1]).goal, dmp.mean.goal, rtol=0, atol=1e-8)
 
 
+def test_single_precision_is_kept_and_follows():
+    time, position = motion(CONTEXTS)
+    single = ContextualDMP.fit(time, position.float(), CONTEXTS, n_basis=25)
+    got = single.at(CONTEXTS[1]).rollout().position
+    assert got.dtype == torch.float32
+    expected = fitted().at(CONTEXTS[1]).rollout().position
+    # Six digits of motions of size 2.
+    torch.testing.assert_close(got.double(), expected, rtol=0, atol=1e-5)
+
+
 def test_a_context_that_never_changes_tells_nothing():
     context = torch.cat([CONTEXTS, torch.full((5, 1), 0.1).double()], dim=1)
     dmp = ContextualDMP.fit(*motion(CONTEXTS), context, n_basis=25)
