@@ -63,7 +63,7 @@ def _fit(
     force = differentiate(s, rate) - response.spring.acceleration(position - goal, rate)
     if response.approach:
         force = force - (goal - position[..., :1]) * response.approach_force(s)
-    solve = _ridge_operator if method == "ridge" else _lwr_operator
+    solve = ridge_operator if method == "ridge" else _lwr_operator
     return _apply(force, solve(response, s, regularization)), rate[..., 0]
 
 
@@ -134,7 +134,10 @@ def _trajectory_operator(
     return from_samples, K @ velocity
 
 
-def _ridge_operator(response: Response, s: Tensor, regularization: float) -> Tensor:
+def ridge_operator(
+    response: Response, s: Float[Tensor, "T"], regularization: float
+) -> Float[Tensor, "N T"]:
+    """Maps a force at times `s` to the weights closest to it."""
     return _ridge_inverse(response.basis.forcing(s), regularization)
 
 

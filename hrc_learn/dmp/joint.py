@@ -215,7 +215,7 @@ class JointDMP(nn.Module):
             weights, ends = weights.expand(*batch, -1), [x.expand(batch) for x in ends]
         return Trajectory(
             coordinates=torch.cat([weights, torch.stack(ends, dim=-1)], dim=-1),
-            s=self.stamps if time is None else self._normalised_time(time, duration),
+            s=self.normalised_time(time, duration),
             duration=duration,
             response=self.response,
         )
@@ -328,6 +328,21 @@ class JointDMP(nn.Module):
             self.duration if speed is None else self.duration / self._positive("speed", speed)
         )
 
+    def normalised_time(
+        self, time: ArrayLike | None, duration: Float[Tensor, "*#batch"]
+    ) -> Float[Tensor, "*#batch T"]:
+        """Times [s] of a rollout over its duration; of None, the demonstration's stamps."""
+        if time is None:
+            return self.stamps
+        time = to_tensor(time, dtype=torch.float64, device=duration.device)
+        if time.ndim == 0 or not (time >= 0).all():
+            raise ValueError("time must be an array of seconds since the start, none negative")
+        s = time / duration.double()[..., None]
+        # Rows that are all alike need one response matrix, not one each.
+        if s.ndim > 1 and not s.requires_grad and (s == s.reshape(-1, s.shape[-1])[0]).all():
+            return s.reshape(-1, s.shape[-1])[0]
+        return s
+
     def save(self, folder: str | Path) -> None:
         """Write config.json and model.safetensors into `folder`, replacing an older save."""
         write_model(folder, type(self).__name__, self.config(), self.tensors())
@@ -403,16 +418,6 @@ class JointDMP(nn.Module):
 
     def _as_tensor(self, value: ArrayLike) -> Tensor:
         return to_tensor(value, dtype=self.weights.dtype, device=self.weights.device)
-
-    def _normalised_time(self, time: ArrayLike, duration: Tensor) -> Tensor:
-        time = to_tensor(time, dtype=torch.float64, device=duration.device)
-        if time.ndim == 0 or not (time >= 0).all():
-            raise ValueError("time must be an array of seconds since the start, none negative")
-        s = time / duration.double()[..., None]
-        # Rows that are all alike need one response matrix, not one each.
-        if s.ndim > 1 and not s.requires_grad and (s == s.reshape(-1, s.shape[-1])[0]).all():
-            return s.reshape(-1, s.shape[-1])[0]
-        return s
 
 
 def _check_names(joint_names: Sequence[str] | None, D: int) -> None:

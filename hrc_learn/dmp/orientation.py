@@ -1,6 +1,6 @@
 """Movement primitive of an orientation."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
@@ -11,12 +11,16 @@ from torch import Tensor, nn
 from hrc_learn.dmp import orientation_error as error_space
 from hrc_learn.dmp.arrays import ArrayLike, to_tensor
 from hrc_learn.dmp.basis import GaussianBasis
+from hrc_learn.dmp.formulation import (
+    ErrorMotion,
+    UnknownFormulationError,
+    find_formulation,
+)
 from hrc_learn.dmp.joint import JointDMP
 from hrc_learn.dmp.report import FitReport
 from hrc_learn.dmp.samples import check_samples, demo_label
 from hrc_learn.dmp.spring import SpringDamper
 from hrc_learn.dmp.state import DMPState
-from hrc_learn.dmp.trajectory import Trajectory
 from hrc_learn.geometry import quaternion
 from hrc_learn.storage import SavedModel, write_model
 
@@ -27,7 +31,7 @@ NORM_TOLERANCE = 1e-2
 class OrientationTrajectory:
     """An orientation over time, each output computed when first asked for."""
 
-    def __init__(self, errors: Trajectory, goal: Float[Tensor, "*batch 4"], first: int = 0):
+    def __init__(self, errors: ErrorMotion, goal: Float[Tensor, "*batch 4"], first: int = 0):
         """Read the motion of an error, found in columns `first` to `first` + 3 of `errors`."""
         self._errors = errors
         self._goal = goal
@@ -88,22 +92,33 @@ torch.export.register_dataclass(
 
 
 class OrientationDMP(nn.Module):
-    """Discrete movement primitive of an orientation, exact at all angles.
+    """Discrete movement primitive of an orientation.
 
-    The error e to the goal is the state of a linear primitive that ends at e = 0; see
-    `orientation_error`. Both signs of any quaternion give the same motion.
+    The error e to the goal is the state of a linear primitive that ends at e = 0, exact at
+    all angles, or of that of Ude et al. 2014; see `formulation`. Both signs of any quaternion
+    give the same motion.
     """
 
     goal: Tensor
+    formulation: str
+    """`"log"` or `"ude"`."""
 
-    def __init__(self, motion: JointDMP, goal: Float[Tensor, "*batch 4"]):
+    def __init__(
+        self, motion: JointDMP, goal: Float[Tensor, "*batch 4"], formulation: str = "log"
+    ):
         """Put a primitive together; `fit` is the usual way to one.
 
         Args:
             motion: Of the error [rad], D = 3, with its goal at zero.
             goal: Unit quaternion (w, x, y, z) that the error is taken to.
+            formulation: `"log"` or `"ude"`, what `motion` acts on; see `formulation.py`.
+
+        Raises:
+            ValueError: No such formulation.
         """
         super().__init__()
+        self._dynamics = find_formulation(formulation)
+        self.formulation = formulation
         self.motion = motion
         self.register_buffer("goal", goal)
 
@@ -115,6 +130,7 @@ class OrientationDMP(nn.Module):
         n_basis: int = 50,
         mask: ArrayLike | None = None,
         *,
+        formulation: str = "log",
         method: str = "trajectory",
         approach: float = 0.0,
         basis: GaussianBasis | None = None,
@@ -129,6 +145,8 @@ class OrientationDMP(nn.Module):
                 must be less than half a turn apart.
             n_basis: N, unless `basis` is given.
             mask: (*B, T), false where a sample does not count.
+            formulation: `"log"`, exact, or `"ude"`, integrated and for turns of less than 360
+                degrees.
             method: As for `JointDMP.fit`, like all that follow.
             approach: Share of the motion along which new ends are taken up.
             basis: Shape of the forcing term.
@@ -136,8 +154,9 @@ class OrientationDMP(nn.Module):
             regularization: Ridge.
 
         Raises:
-            ValueError: Bad samples; says which.
+            ValueError: Bad samples (says which), or no such formulation.
         """
+        dynamics = find_formulation(formulation)
         error, goal = fitted_error(time, orientation, mask)
         motion = JointDMP.fit(
             time,
@@ -150,7 +169,8 @@ class OrientationDMP(nn.Module):
             spring=spring,
             regularization=regularization,
         )
-        return cls(motion, goal)
+        dynamics.adapt(motion, check_samples(time, error, mask=mask))
+        return cls(motion, goal, formulation)
 
     @property
     def start(self) -> Float[Tensor, "*batch 4"]:
@@ -191,9 +211,8 @@ class OrientationDMP(nn.Module):
             speed: Instead of a duration, how many times faster than the demonstration.
         """
         error, rate, goal, duration = self._ends(start, goal, duration, start_velocity, speed)
-        return OrientationTrajectory(
-            self.motion.rollout(time, error, None, duration, rate), goal
-        )
+        errors = self._dynamics.rollout(self.motion, time, error, duration, rate)
+        return OrientationTrajectory(errors, goal)
 
     def initial_state(
         self,
@@ -226,25 +245,26 @@ class OrientationDMP(nn.Module):
         motion, target = state.motion, state.goal
         if goal is not None:
             target = unit_quaternion(goal, state.goal).expand_as(state.goal)
-            curvature = self.motion.curvature(motion)
-            error, rate, curvature = retarget(
-                motion.position, motion.rate, curvature, state.goal, target
-            )
-            motion = replace(motion, position=error, rate=rate)
-            motion = replace(motion, goal=self.motion.resting_point(motion, curvature))
-        motion = self.motion.step(motion, dt, goal_filter=goal_filter, slowdown=slowdown)
+            motion = self._dynamics.retarget(self.motion, motion, state.goal, target)
+        motion = self._dynamics.step(self.motion, motion, dt, goal_filter, slowdown)
         return OrientationState(motion=motion, goal=target)
 
     def save(self, folder: str | Path) -> None:
         """Write config.json and model.safetensors into `folder`, replacing an older save."""
         tensors = {"goal_orientation": self.goal, **self.motion.tensors()}
-        write_model(folder, "OrientationDMP", self.motion.config(), tensors)
+        config = self.motion.config() | {"formulation": self.formulation}
+        write_model(folder, "OrientationDMP", config, tensors)
 
     @classmethod
     def load(cls, folder: str | Path) -> "OrientationDMP":
         """Read what `save` wrote; complains as `JointDMP.load`."""
         saved = SavedModel(folder, "OrientationDMP")
-        return cls(JointDMP.restore(saved), saved.tensor("goal_orientation"))
+        # Older files have no formulation: there was one only.
+        name = saved.get("formulation", str) if "formulation" in saved.config else "log"
+        try:
+            return cls(JointDMP.restore(saved), saved.tensor("goal_orientation"), name)
+        except UnknownFormulationError as error:
+            raise saved.invalid_field("formulation", error) from None
 
     def _ends(
         self,
@@ -325,21 +345,3 @@ def error_ends(
     goal = demonstrated_goal if goal is None else unit_quaternion(goal, error)
     error = error_space.nearest_turn(error_space.to_error(q, goal), error)
     return error, error_space.error_rate(error, omega), goal
-
-
-def retarget(
-    error: Float[Tensor, "*batch 3"],
-    rate: Float[Tensor, "*batch 3"],
-    curvature: Float[Tensor, "*batch 3"],
-    old_goal: Float[Tensor, "*batch 4"],
-    goal: Float[Tensor, "*#batch 4"],
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Error to a new goal and its derivatives, for the same motion of the orientation."""
-    q = error_space.to_orientation(error, old_goal)
-    new = error_space.nearest_turn(error_space.to_error(q, goal), error)
-    omega = error_space.angular_velocity(error, rate)
-    omega_rate = error_space.angular_acceleration(error, rate, curvature)
-    new_rate = error_space.error_rate(new, omega)
-    # The angular acceleration is linear in the curvature; the rest stems from turning itself.
-    bias = error_space.angular_acceleration(new, new_rate, torch.zeros_like(new))
-    return new, new_rate, error_space.error_rate(new, omega_rate - bias)

@@ -111,6 +111,24 @@ def nearest_turn(
     return error + 2 * torch.pi * torch.round(along / (2 * torch.pi)) * axis
 
 
+def retarget(
+    error: Float[Tensor, "*batch 3"],
+    rate: Float[Tensor, "*batch 3"],
+    curvature: Float[Tensor, "*batch 3"],
+    old_goal: Float[Tensor, "*batch 4"],
+    goal: Float[Tensor, "*#batch 4"],
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Error to a new goal and its derivatives, for the same motion of the orientation."""
+    q = to_orientation(error, old_goal)
+    new = nearest_turn(to_error(q, goal), error)
+    omega = angular_velocity(error, rate)
+    omega_rate = angular_acceleration(error, rate, curvature)
+    new_rate = error_rate(new, omega)
+    # The angular acceleration is linear in the curvature; the rest stems from turning itself.
+    bias = angular_acceleration(new, new_rate, torch.zeros_like(new))
+    return new, new_rate, error_rate(new, omega_rate - bias)
+
+
 def _derivative(
     function: Callable[..., Tensor], at: tuple[Tensor, ...], along: tuple[Tensor, ...]
 ) -> tuple[Tensor, Tensor]:

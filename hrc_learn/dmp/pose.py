@@ -13,10 +13,9 @@ from hrc_learn.dmp.joint import JointDMP
 from hrc_learn.dmp.orientation import (
     error_ends,
     fitted_error,
-    retarget,
     unit_quaternion,
 )
-from hrc_learn.dmp.orientation_error import to_orientation
+from hrc_learn.dmp.orientation_error import retarget, to_orientation
 from hrc_learn.dmp.pose_motion import BODY, ERROR, POSITION, PoseState, PoseTrajectory
 from hrc_learn.dmp.report import FitReport
 from hrc_learn.dmp.samples import check_samples

@@ -1,10 +1,11 @@
 """Every kind of primitive, held to the same contract."""
 
+import pytest
 import torch
 from demo_motions import arm_motion, turning_motion
 from dmp_contract import DMPContract
 
-from hrc_learn.dmp import JointDMP, OrientationDMP, PoseDMP
+from hrc_learn.dmp import JointDMP, OrientationDMP, PoseDMP, ude
 from hrc_learn.geometry import Pose, quaternion
 
 
@@ -133,3 +134,39 @@ class TestJointOnItsApproach(TestJoint):
 class TestOrientationOnItsApproach(TestOrientation):
     def fit(self, *demonstration, **kwargs):
         return OrientationDMP.fit(*demonstration, approach=1.0, **kwargs)
+
+
+class TestOrientationOfUde(TestOrientation):
+    """Integrated: what is exact elsewhere holds to the error of the method here."""
+
+    reproduction = 1e-4
+
+    def fit(self, *demonstration, **kwargs):
+        return OrientationDMP.fit(*demonstration, formulation="ude", **kwargs)
+
+    def test_gradients_are_exact(self, monkeypatch):
+        # Coarse: the derivative of what is computed is exact at any step length.
+        monkeypatch.setattr(ude, "LONGEST", 0.1)
+        super().test_gradients_are_exact()
+
+    @pytest.mark.parametrize("n_steps", [150])
+    def test_steps_end_where_the_rollout_does(self, dmp, n_steps):
+        arguments = self.arguments(*self.ends(4))
+        state = dmp.initial_state(**arguments, duration=2.0)
+        with torch.no_grad():
+            for _ in range(n_steps):
+                state = dmp.step(state, 1.7 / n_steps)
+            there = self.outputs(dmp.rollout(time=[1.7], **arguments, duration=2.0))
+        for name, value in self.state_outputs(state).items():
+            torch.testing.assert_close(value, there[name][0], rtol=0, atol=1e-5, msg=name)
+
+    def test_slowing_down_stays_on_the_path(self, dmp):
+        state = dmp.initial_state()
+        for k in range(200):
+            slowdown = 3.0 if k % 2 else None
+            state = dmp.step(state, 0.003 * dmp.duration, slowdown=slowdown)
+        s = torch.tensor([100 * 0.003 * (1 + 1 / 4)], dtype=torch.float64)
+        there = self.outputs(dmp.rollout(time=s * dmp.duration))
+        for name, value in self.state_outputs(state).items():
+            factor = 4 if name.startswith("rate of") else 1
+            torch.testing.assert_close(factor * value, there[name][0], rtol=0, atol=1e-6)
