@@ -9,6 +9,9 @@ from hrc_learn.dmp.context import PolynomialFeatures as PolynomialFeatures
 from hrc_learn.dmp.contextual import ContextualDMP as ContextualDMP
 from hrc_learn.dmp.distribution import DMPDistribution as DMPDistribution
 from hrc_learn.dmp.joint import JointDMP as JointDMP
+from hrc_learn.dmp.moving_goal import MovingGoal as MovingGoal
+from hrc_learn.dmp.moving_goal import MovingGoalState as MovingGoalState
+from hrc_learn.dmp.moving_goal import MovingTrajectory as MovingTrajectory
 from hrc_learn.dmp.orientation import OrientationDMP as OrientationDMP
 from hrc_learn.dmp.orientation import OrientationState as OrientationState
 from hrc_learn.dmp.orientation import OrientationTrajectory as OrientationTrajectory
