@@ -168,7 +168,9 @@ class MovingGoal:
         dmp = self.dmp
 
         def given(value: ArrayLike | None, otherwise: Tensor) -> Tensor:
-            return otherwise if value is None else to_tensor(value).to(otherwise)
+            if value is None:
+                return otherwise
+            return to_tensor(value, otherwise.dtype, otherwise.device)
 
         duration = dmp.resolve_duration(duration, None)
         demonstrated = dmp.start_velocity * (dmp.duration / duration)[..., None]

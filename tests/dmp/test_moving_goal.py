@@ -100,6 +100,13 @@ def test_acceleration_is_the_derivative_of_the_velocity():
     torch.testing.assert_close(numeric, motion.acceleration[1:-1], rtol=0, atol=2e-2)
 
 
+def test_lists_are_taken_at_full_precision():
+    moving = MovingGoal(primitive())
+    from_list = moving.rollout(END.tolist(), [1.0], START.tolist(), GOAL.tolist())
+    from_tensor = moving.rollout(END, [1.0], START, GOAL)
+    assert torch.equal(from_list.position, from_tensor.position)
+
+
 def test_forcing_that_scales_with_the_start_is_refused():
     with pytest.raises(ValueError, match="a moving goal needs"):
         MovingGoal(primitive(scaling="paper"))
