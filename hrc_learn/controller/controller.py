@@ -297,7 +297,7 @@ class AdaptiveController(nn.Module):
         q = observation.image_joint_position
         if q is not None:
             # Estimators compute with the pose even where they must not learn from it.
-            known = (q * 0).sum(-1) == 0
+            known = q.isfinite().all(-1)
             pose = self.chain.forward(
                 torch.where(known.unsqueeze(-1), q, state.safety.position)
             )
@@ -323,7 +323,7 @@ def _effective_goals(
     target = observation.target
     if target is None:
         return goals, True
-    known = (target * 0).sum(-1) == 0
+    known = target.isfinite().all(-1)
     target = torch.where(known.unsqueeze(-1), target, goals.vision.target)
     return goals.aimed_at(target), known
 
@@ -333,7 +333,7 @@ def _trusted_position(
 ) -> tuple[Tensor, Bool[Tensor, "*batch"]]:
     """Measured joint position, or the expected one where that is NaN or stale."""
     q = observation.joint_position
-    stale = (q * 0).sum(-1) != 0
+    stale = ~q.isfinite().all(-1)
     if observation.joint_state_stale is not None:
         stale = stale | observation.joint_state_stale
     return torch.where(stale.unsqueeze(-1), state.safety.position, q), stale

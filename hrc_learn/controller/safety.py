@@ -211,8 +211,7 @@ class SafetyFilter(nn.Module):
         stale: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Position and command to work with, and the flags `invalid` and `stopped`."""
-        # Zero times a number is zero unless it is infinite or NaN.
-        invalid = (torch.cat([q, u], dim=-1) * 0).sum(-1, keepdim=True) != 0
+        invalid = ~torch.cat([q, u], dim=-1).isfinite().all(-1, keepdim=True)
         if stale is not None:
             invalid = invalid | stale.unsqueeze(-1)
         stopped = torch.zeros_like(invalid) if stop is None else stop.unsqueeze(-1)

@@ -89,12 +89,9 @@ def trace(step: FlatStep) -> torch.export.ExportedProgram:
         program = torch.export.export(step, tuple(step.example.inputs), strict=False)
     aten = torch.ops.aten
     for node in program.graph.nodes:
-        # Two faults of inductor in torch 2.11. It cannot raise a constant number to a power,
+        # Inductor of torch 2.11 cannot raise a constant number to a power.
         if node.target is aten.square.default:
             node.target, node.args = aten.mul.Tensor, (node.args[0], node.args[0])
-        # and it makes x * 0 zero where x is NaN, by which the step finds out what is.
-        elif node.target is aten.mul.Tensor and node.args[1] == 0:
-            node.target, node.args = aten.sub.Tensor, (node.args[0], node.args[0])
     return program
 
 
