@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.dmp.spring import SpringDamper
+from hrc_learn.dmp.system.spring import SpringDamper
 
 
 def velocity_coupling(

@@ -10,16 +10,16 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from hrc_learn.dmp.arrays import ArrayLike, to_tensor
-from hrc_learn.dmp.basis import Basis, GaussianBasis
-from hrc_learn.dmp.fitting import fit_samples
-from hrc_learn.dmp.report import FitReport
-from hrc_learn.dmp.response import response_of
-from hrc_learn.dmp.samples import check_samples
+from hrc_learn.dmp.fitting.methods import fit_samples
+from hrc_learn.dmp.fitting.report import FitReport
+from hrc_learn.dmp.fitting.samples import check_samples
 from hrc_learn.dmp.saved_joint import TENSORS, saved_arguments
 from hrc_learn.dmp.scaling import check_paper_scale, check_scaling, forcing_scale
-from hrc_learn.dmp.spring import SpringDamper
 from hrc_learn.dmp.state import DMPState
 from hrc_learn.dmp.stepping import advance, second_derivative
+from hrc_learn.dmp.system.basis import Basis, GaussianBasis
+from hrc_learn.dmp.system.response import response_of
+from hrc_learn.dmp.system.spring import SpringDamper
 from hrc_learn.dmp.trajectory import Trajectory, broadcast_shapes
 from hrc_learn.storage import SavedModel, write_model
 

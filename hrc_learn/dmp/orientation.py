@@ -8,19 +8,19 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from hrc_learn.dmp import orientation_error as error_space
 from hrc_learn.dmp.arrays import ArrayLike, to_tensor
-from hrc_learn.dmp.basis import GaussianBasis
-from hrc_learn.dmp.formulation import (
+from hrc_learn.dmp.fitting.report import FitReport
+from hrc_learn.dmp.fitting.samples import check_samples, demo_label
+from hrc_learn.dmp.joint import JointDMP
+from hrc_learn.dmp.rotation import error as error_space
+from hrc_learn.dmp.rotation.formulation import (
     ErrorMotion,
     UnknownFormulationError,
     find_formulation,
 )
-from hrc_learn.dmp.joint import JointDMP
-from hrc_learn.dmp.report import FitReport
-from hrc_learn.dmp.samples import check_samples, demo_label
-from hrc_learn.dmp.spring import SpringDamper
 from hrc_learn.dmp.state import DMPState
+from hrc_learn.dmp.system.basis import GaussianBasis
+from hrc_learn.dmp.system.spring import SpringDamper
 from hrc_learn.geometry import quaternion
 from hrc_learn.storage import SavedModel, write_model
 
@@ -111,7 +111,7 @@ class OrientationDMP(nn.Module):
         Args:
             motion: Of the error [rad], D = 3, with its goal at zero.
             goal: Unit quaternion (w, x, y, z) that the error is taken to.
-            formulation: `"log"` or `"ude"`, what `motion` acts on; see `formulation.py`.
+            formulation: `"log"` or `"ude"`, what `motion` acts on.
 
         Raises:
             ValueError: No such formulation.

@@ -8,18 +8,18 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from hrc_learn.dmp.arrays import ArrayLike, to_tensor
-from hrc_learn.dmp.basis import GaussianBasis
+from hrc_learn.dmp.fitting.report import FitReport
+from hrc_learn.dmp.fitting.samples import check_samples
 from hrc_learn.dmp.joint import JointDMP
 from hrc_learn.dmp.orientation import (
     error_ends,
     fitted_error,
     unit_quaternion,
 )
-from hrc_learn.dmp.orientation_error import retarget, to_orientation
 from hrc_learn.dmp.pose_motion import BODY, ERROR, POSITION, PoseState, PoseTrajectory
-from hrc_learn.dmp.report import FitReport
-from hrc_learn.dmp.samples import check_samples
-from hrc_learn.dmp.spring import SpringDamper
+from hrc_learn.dmp.rotation.error import retarget, to_orientation
+from hrc_learn.dmp.system.basis import GaussianBasis
+from hrc_learn.dmp.system.spring import SpringDamper
 from hrc_learn.geometry import Pose
 from hrc_learn.storage import SavedModel, write_model
 

@@ -7,11 +7,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.dmp.arrays import ArrayLike
-from hrc_learn.dmp.basis import PeriodicBasis
+from hrc_learn.dmp.fitting.samples import check_samples
 from hrc_learn.dmp.joint import JointDMP
-from hrc_learn.dmp.response import Response, response_of
-from hrc_learn.dmp.samples import check_samples
-from hrc_learn.dmp.spring import SpringDamper
+from hrc_learn.dmp.system.basis import PeriodicBasis
+from hrc_learn.dmp.system.response import Response, response_of
+from hrc_learn.dmp.system.spring import SpringDamper
 
 SEARCH = 0.1
 """How far from the autocorrelation's estimate a period is looked for, as a share of it."""

@@ -5,10 +5,10 @@ from typing import Any
 
 from torch import Tensor
 
-from hrc_learn.dmp.basis import Basis, GaussianBasis, PeriodicBasis
-from hrc_learn.dmp.canonical import ExponentialPhase
-from hrc_learn.dmp.report import FitReport
-from hrc_learn.dmp.spring import SpringDamper
+from hrc_learn.dmp.fitting.report import FitReport
+from hrc_learn.dmp.system.basis import Basis, GaussianBasis, PeriodicBasis
+from hrc_learn.dmp.system.canonical import ExponentialPhase
+from hrc_learn.dmp.system.spring import SpringDamper
 from hrc_learn.storage import SavedModel
 
 TENSORS = ("weights", "start", "goal", "start_velocity", "duration", "amplitude", "stamps")

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.dmp.samples import demo_label
+from hrc_learn.dmp.fitting.samples import demo_label
 
 SCALINGS = ("none", "paper", "amplitude")
 PAPER_MINIMUM = 1e-3

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
-from hrc_learn.dmp.approach import quintic
 from hrc_learn.dmp.joint import JointDMP
+from hrc_learn.dmp.system.approach import quintic
 
 Vector = Float64[np.ndarray, "D"]
 Pair = Float64[np.ndarray, "2 D"]

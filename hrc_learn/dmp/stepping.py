@@ -9,10 +9,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.dmp.approach import approach_state
-from hrc_learn.dmp.response import Response
-from hrc_learn.dmp.spring import SpringDamper
 from hrc_learn.dmp.state import DMPState
+from hrc_learn.dmp.system.approach import approach_state
+from hrc_learn.dmp.system.response import Response
+from hrc_learn.dmp.system.spring import SpringDamper
 
 RESONANCE = 1e-3
 """How close to a mode of the spring a goal filter may come, relative to the stiffness."""

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.dmp.response import Response
+from hrc_learn.dmp.system.response import Response
 
 
 class Trajectory:

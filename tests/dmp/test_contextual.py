@@ -7,7 +7,7 @@ from demo_motions import minimum_jerk
 from torch.autograd import gradcheck
 
 from hrc_learn.dmp import ContextualDMP, JointDMP, PolynomialFeatures
-from hrc_learn.dmp.ridge import fit_ridge
+from hrc_learn.dmp.fitting.ridge import fit_ridge
 
 S = torch.linspace(0, 1, 200, dtype=torch.float64)
 CONTEXTS = torch.tensor([[0.0, 0.2], [0.5, 1.0], [1.0, 0.1], [0.3, 0.7], [0.8, 0.6]]).double()
@@ -193,8 +193,9 @@ def test_a_saved_one_is_the_same(features, tmp_path):
     dmp.save(tmp_path / "placing")
     loaded = ContextualDMP.load(tmp_path / "placing", features)
     new = [0.2, 0.9]
+    # Not to the last bit: where tensors lie in memory decides how a product is summed.
     torch.testing.assert_close(
-        loaded.at(new).rollout().position, dmp.at(new).rollout().position, rtol=0, atol=0
+        loaded.at(new).rollout().position, dmp.at(new).rollout().position, rtol=0, atol=1e-14
     )
     torch.testing.assert_close(loaded.held_out.rmse, dmp.held_out.rmse, rtol=0, atol=0)
     # What it gives can be kept alone.

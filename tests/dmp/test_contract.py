@@ -5,7 +5,8 @@ import torch
 from demo_motions import arm_motion, turning_motion
 from dmp_contract import DMPContract
 
-from hrc_learn.dmp import JointDMP, OrientationDMP, PoseDMP, ude
+from hrc_learn.dmp import JointDMP, OrientationDMP, PoseDMP
+from hrc_learn.dmp.rotation import ude
 from hrc_learn.geometry import Pose, quaternion
 
 

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from hrc_learn.dmp import JointDMP, PoseDMP
-from hrc_learn.dmp.mean import mean_primitive
+from hrc_learn.dmp.fitting.mean import mean_primitive
 from hrc_learn.geometry import quaternion
 
 

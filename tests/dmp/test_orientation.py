@@ -4,7 +4,7 @@ import torch
 from demo_motions import minimum_jerk, turning_motion
 
 from hrc_learn.dmp import OrientationDMP, PoseDMP
-from hrc_learn.dmp.orientation_error import (
+from hrc_learn.dmp.rotation.error import (
     angular_acceleration,
     angular_velocity,
     error_rate,

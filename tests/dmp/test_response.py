@@ -6,7 +6,7 @@ import torch
 from dmp_oracle import forcing, gaussians, solve
 
 from hrc_learn.dmp import ExponentialPhase, GaussianBasis, SpringDamper
-from hrc_learn.dmp.response import Response
+from hrc_learn.dmp.system.response import Response
 
 SPRINGS = {
     "critical": SpringDamper(),

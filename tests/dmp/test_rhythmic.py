@@ -5,7 +5,7 @@ from dmp_contract import DMPContract
 from scipy.integrate import solve_ivp
 
 from hrc_learn.dmp import PeriodicBasis, SpringDamper, Stepper, fit_rhythmic
-from hrc_learn.dmp.response import Response
+from hrc_learn.dmp.system.response import Response
 
 PERIOD = 0.83
 

@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.dmp.basis import GaussianBasis
-from hrc_learn.dmp.response import Response
-from hrc_learn.dmp.samples import Samples
+from hrc_learn.dmp.fitting.samples import Samples
+from hrc_learn.dmp.system.basis import GaussianBasis
+from hrc_learn.dmp.system.response import Response
 
 METHODS = ("trajectory", "ridge", "lwr")
 type Fit = tuple[Float[Tensor, "*batch D N"], Float[Tensor, "*batch D"]]

@@ -9,10 +9,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.dmp.approach import approach_state, minimum_jerk
-from hrc_learn.dmp.basis import Basis
-from hrc_learn.dmp.piecewise import PiecewisePolynomial, chebyshev_points
-from hrc_learn.dmp.spring import SpringDamper
+from hrc_learn.dmp.system.approach import approach_state, minimum_jerk
+from hrc_learn.dmp.system.basis import Basis
+from hrc_learn.dmp.system.piecewise import PiecewisePolynomial, chebyshev_points
+from hrc_learn.dmp.system.spring import SpringDamper
 
 GAUSS_POINTS = 12
 """For the forcing over one piece of the table, which no basis function changes much in."""

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hrc_learn.dmp.arrays import ArrayLike, to_tensor
-from hrc_learn.dmp.report import FitReport
+from hrc_learn.dmp.fitting.report import FitReport
 
 MINIMUM_SAMPLES = 3
 

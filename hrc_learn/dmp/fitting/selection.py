@@ -9,8 +9,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.dmp.arrays import ArrayLike
+from hrc_learn.dmp.fitting.samples import check_samples
 from hrc_learn.dmp.joint import JointDMP
-from hrc_learn.dmp.samples import check_samples
 
 TOLERANCE = 1.05
 """A held-out error this close to the smallest, by ratio, is as good."""

@@ -7,8 +7,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.dmp.arrays import ArrayLike, to_tensor
+from hrc_learn.dmp.fitting.mean import mean_primitive
 from hrc_learn.dmp.joint import JointDMP
-from hrc_learn.dmp.mean import mean_primitive
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -12,13 +12,13 @@ from typing import Protocol, runtime_checkable
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.dmp import orientation_error as error_space
 from hrc_learn.dmp.arrays import ArrayLike
+from hrc_learn.dmp.fitting.samples import Samples
 from hrc_learn.dmp.joint import JointDMP
-from hrc_learn.dmp.samples import Samples
+from hrc_learn.dmp.rotation import error as error_space
+from hrc_learn.dmp.rotation.ude import UdeFormulation, UdeMotion
 from hrc_learn.dmp.state import DMPState
 from hrc_learn.dmp.trajectory import Trajectory
-from hrc_learn.dmp.ude import UdeFormulation, UdeMotion
 
 type ErrorMotion = Trajectory | UdeMotion
 

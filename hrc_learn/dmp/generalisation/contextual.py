@@ -9,12 +9,12 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from hrc_learn.dmp.arrays import ArrayLike, to_tensor
-from hrc_learn.dmp.context import FeatureMap, PolynomialFeatures
+from hrc_learn.dmp.fitting.mean import mean_primitive
+from hrc_learn.dmp.fitting.report import FitReport
+from hrc_learn.dmp.fitting.ridge import fit_ridge
+from hrc_learn.dmp.fitting.samples import check_samples
+from hrc_learn.dmp.generalisation.context import FeatureMap, PolynomialFeatures
 from hrc_learn.dmp.joint import JointDMP
-from hrc_learn.dmp.mean import mean_primitive
-from hrc_learn.dmp.report import FitReport
-from hrc_learn.dmp.ridge import fit_ridge
-from hrc_learn.dmp.samples import check_samples
 from hrc_learn.storage import SavedModel, write_model
 
 OWN_TENSORS = ("coefficients", "feature_mean", "feature_scale", "held_out_duration")

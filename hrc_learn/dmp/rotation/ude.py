@@ -20,12 +20,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.dmp import orientation_error as error_space
 from hrc_learn.dmp.arrays import ArrayLike, to_tensor
-from hrc_learn.dmp.fitting import ridge_operator
+from hrc_learn.dmp.fitting.methods import ridge_operator
+from hrc_learn.dmp.fitting.samples import Samples
 from hrc_learn.dmp.joint import JointDMP
-from hrc_learn.dmp.left_jacobian import axis_drift, drift_free_rate
-from hrc_learn.dmp.samples import Samples
+from hrc_learn.dmp.rotation import error as error_space
+from hrc_learn.dmp.rotation.left_jacobian import axis_drift, drift_free_rate
 from hrc_learn.dmp.state import DMPState
 from hrc_learn.dmp.trajectory import Trajectory
 

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.dmp.canonical import ExponentialPhase
+from hrc_learn.dmp.system.canonical import ExponentialPhase
 
 DOMAINS = ("time", "phase")
 

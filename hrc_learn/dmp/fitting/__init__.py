@@ -1,0 +1,1 @@
+"""From sampled motions to the weights of a primitive."""

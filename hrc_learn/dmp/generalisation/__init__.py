@@ -1,0 +1,1 @@
+"""Primitives from several demonstrations: distributions and contexts."""

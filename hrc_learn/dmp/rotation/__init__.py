@@ -1,0 +1,1 @@
+"""Orientations as a linear system: errors to the goal and their formulations."""
