@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..demos import DemonstrationSet, PaddedDemonstrations
 from ..dmp import JointDMP, PoseDMP
-from ..dmp.mean import mean_primitive
+from ..dmp.fitting.mean import mean_primitive
 from ..geometry import quaternion
 from ..kinematics import arm_angle, panda
 from ..viz import FitRecording, JointLimits
