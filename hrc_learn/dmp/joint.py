@@ -34,6 +34,8 @@ class JointDMP(nn.Module):
     leading batch dimensions: one primitive each.
     """
 
+    weights: Tensor
+    """A parameter, or a buffer where they were computed from what gradients flow to."""
     start: Tensor
     goal: Tensor
     start_velocity: Tensor
@@ -86,7 +88,11 @@ class JointDMP(nn.Module):
         _check_names(joint_names, weights.shape[-2])
         if weights.shape[-1] != basis.count:
             raise ValueError(f"{weights.shape[-1]} weights for {basis.count} basis functions")
-        self.weights = nn.Parameter(weights)
+        if weights.grad_fn is None:
+            self.weights = nn.Parameter(weights)
+        else:
+            # A parameter is a leaf, which no gradient passes.
+            self.register_buffer("weights", weights)
         buffers = (start, goal, start_velocity, duration, amplitude, stamps)
         for name, value in zip(TENSORS[1:], buffers, strict=True):
             self.register_buffer(name, value)
@@ -176,6 +182,55 @@ class JointDMP(nn.Module):
             reproduction = dmp.rollout().position.mT.reshape(samples.position.shape)
         dmp.fit_report = samples.compare(reproduction)
         return dmp
+
+    def coordinates(self) -> Float[Tensor, "*batch D M"]:
+        """What the response maps to the demonstrated motion: weights, dy/ds, start, goal.
+
+        Weights are those of the scaled forcing term.
+        """
+        rate = self.start_velocity * self.duration[..., None]
+        ends = torch.stack([rate, self.start, self.goal], dim=-1)
+        return torch.cat([self.weights, ends], dim=-1)
+
+    def with_coordinates(
+        self,
+        coordinates: Float[Tensor, "*batch D M"],
+        duration: Float[Tensor, "*#batch"] | None = None,
+        *,
+        amplitude: Float[Tensor, "*#batch D"] | None = None,
+        stamps: Float[Tensor, "*#batch T"] | None = None,
+    ) -> "JointDMP":
+        """Primitives like this one that move otherwise; gradients flow to the arguments.
+
+        Args:
+            coordinates: As `coordinates` gives them; their batch is that of the result.
+            duration: [s]; this one's, like all that follow, if None.
+            amplitude: Range covered by each coordinate.
+            stamps: Normalised times of a rollout without arguments.
+
+        Returns:
+            A primitive of its own memory, with the same parts and names and no fit report.
+        """
+        x = coordinates.to(self.weights)
+        batch = x.shape[:-2]
+        duration = self.duration if duration is None else duration
+        amplitude = self.amplitude if amplitude is None else amplitude
+        duration = duration.to(x).expand(batch).clone()
+        return JointDMP(
+            weights=x[..., :-3].clone(),
+            start_velocity=x[..., -3] / duration[..., None],
+            start=x[..., -2].clone(),
+            goal=x[..., -1].clone(),
+            duration=duration,
+            amplitude=amplitude.to(x).expand(*batch, -1).clone(),
+            stamps=(self.stamps if stamps is None else stamps).clone(),
+            basis=self.basis,
+            spring=self.spring,
+            scaling=self.scaling,
+            approach=self.response.approach,
+            joint_names=self.joint_names,
+            units=self.units,
+        )
 
     def rollout(
         self,

@@ -1,12 +1,9 @@
 """One primitive from several: the mean of what a person showed more than once."""
 
-from typing import Any
-
 import torch
 
 from hrc_learn.dmp.joint import JointDMP
 from hrc_learn.dmp.pose import PoseDMP
-from hrc_learn.dmp.saved_joint import TENSORS
 
 
 def mean_primitive[Primitive: (JointDMP, PoseDMP)](primitives: Primitive) -> Primitive:
@@ -31,22 +28,15 @@ def mean_primitive[Primitive: (JointDMP, PoseDMP)](primitives: Primitive) -> Pri
 
 
 def _mean_of_joints(primitives: JointDMP) -> JointDMP:
-    weights = primitives.weights.detach()
-    batch = weights.ndim - 2
+    x, stamps = primitives.coordinates().detach(), primitives.stamps
+    batch = x.ndim - 2
 
     def mean(tensor: torch.Tensor) -> torch.Tensor:
         return tensor.flatten(0, batch - 1).mean(dim=0) if batch else tensor
 
-    buffers: dict[str, Any] = {name: mean(getattr(primitives, name)) for name in TENSORS[1:-1]}
-    samples = primitives.stamps.shape[-1]
-    return JointDMP(
-        weights=mean(weights),
-        stamps=torch.linspace(0.0, 1.0, samples, dtype=primitives.stamps.dtype),
-        basis=primitives.basis,
-        spring=primitives.spring,
-        scaling=primitives.scaling,
-        approach=primitives.response.approach,
-        joint_names=primitives.joint_names,
-        units=primitives.units,
-        **buffers,
+    return primitives.with_coordinates(
+        mean(x),
+        mean(primitives.duration),
+        amplitude=mean(primitives.amplitude),
+        stamps=torch.linspace(0, 1, stamps.shape[-1], dtype=stamps.dtype, device=stamps.device),
     )

@@ -191,38 +191,15 @@ class ContextualDMP(nn.Module):
 
 
 def _coordinates(primitives: JointDMP) -> Float[Tensor, "n K"]:
-    """X of each, the ends after the weights of a coordinate (float64)."""
-    p = primitives
-    rate = p.start_velocity * p.duration[:, None]
-    ends = torch.stack([rate, p.start, p.goal], dim=-1)
-    x = torch.cat([p.weights.detach(), ends], dim=-1).flatten(1)
-    return torch.cat([x, p.duration.log()[:, None]], dim=-1).double()
+    """X of each (float64)."""
+    x = primitives.coordinates().detach().flatten(1)
+    return torch.cat([x, primitives.duration.log()[:, None]], dim=-1).double()
 
 
 def _primitive(like: JointDMP, x: Float[Tensor, "*batch K"]) -> JointDMP:
     """The primitives with these coordinates, else like `like`."""
-    x = x.to(like.weights)
-    duration = x[..., -1].exp()
-    X = x[..., :-1].unflatten(-1, (like.weights.shape[-2], -1))
-    weights = X[..., :-3].contiguous()
-    dmp = JointDMP(
-        weights=weights,
-        start_velocity=X[..., -3] / duration[..., None],
-        start=X[..., -2],
-        goal=X[..., -1],
-        duration=duration,
-        amplitude=like.amplitude.expand(X.shape[:-1]),
-        stamps=like.stamps,
-        basis=like.basis,
-        spring=like.spring,
-        approach=like.response.approach,
-        joint_names=like.joint_names,
-        units=like.units,
-    )
-    # A parameter is a leaf, which no gradient passes.
-    del dmp.weights
-    dmp.register_buffer("weights", weights)
-    return dmp
+    D = like.weights.shape[-2]
+    return like.with_coordinates(x[..., :-1].unflatten(-1, (D, -1)), x[..., -1].exp())
 
 
 def _contexts(context: ArrayLike, primitives: JointDMP) -> Float[Tensor, "n C"]:

@@ -66,13 +66,15 @@ class DMPDistribution:
 
     def mean_primitive(self) -> JointDMP:
         """The most likely primitive."""
-        return self._primitive(self.mean)
+        return self.primitive.with_coordinates(self.mean)
 
     def sample(self, n: int, generator: torch.Generator | None = None) -> JointDMP:
         """A batch of n primitives drawn at random."""
         rank = self.spread.shape[1]
         z = torch.randn(n, rank, generator=generator, dtype=torch.float64).to(self.spread)
-        return self._primitive(self.mean + (z @ self.spread.mT).unflatten(-1, self.mean.shape))
+        return self.primitive.with_coordinates(
+            self.mean + (z @ self.spread.mT).unflatten(-1, self.mean.shape)
+        )
 
     def position(self, time: ArrayLike) -> tuple[Float[Tensor, "T D"], Float[Tensor, "T D"]]:
         """Mean and standard deviation of the motion at times [s]."""
@@ -137,32 +139,11 @@ class DMPDistribution:
         root = torch.einsum("tm,dmr->tdr", rows, spread)
         return (rows @ self.mean.mT).reshape(-1), root.flatten(0, 1)
 
-    def _primitive(self, x: Float[Tensor, "*batch D M"]) -> JointDMP:
-        like = self.primitive
-        x = x.to(like.weights)
-        batch, D = x.shape[:-2], x.shape[-2]
-        return JointDMP(
-            weights=x[..., :-3],
-            start_velocity=x[..., -3] / like.duration,
-            start=x[..., -2],
-            goal=x[..., -1],
-            duration=like.duration.expand(batch),
-            amplitude=like.amplitude.expand(*batch, D),
-            stamps=like.stamps,
-            basis=like.basis,
-            spring=like.spring,
-            approach=like.response.approach,
-            joint_names=like.joint_names,
-            units=like.units,
-        )
-
 
 def _coordinates(primitives: JointDMP) -> Float[Tensor, "*batch D M"]:
     if primitives.scaling != "none":
         raise ValueError(f"scaling {primitives.scaling!r} is not linear: fit with 'none'")
-    rate = primitives.start_velocity * primitives.duration[..., None]
-    ends = torch.stack([rate, primitives.start, primitives.goal], dim=-1)
-    return torch.cat([primitives.weights, ends], dim=-1).detach().double()
+    return primitives.coordinates().detach().double()
 
 
 def _free_forcing(primitive: JointDMP, slack: float) -> Float[Tensor, "DM DN"]:
