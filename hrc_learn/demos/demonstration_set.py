@@ -1,6 +1,6 @@
 """Several demonstrations of one robot."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import overload
 
 from .demonstration import Demonstration
@@ -73,6 +73,16 @@ class DemonstrationSet(Sequence[Demonstration]):
         return DemonstrationSet(
             [demo.select_joints(names) for demo in self], notes=self.notes, source=self.source
         )
+
+    def filter(self, wanted: Callable[[Demonstration], bool]) -> "DemonstrationSet":
+        """Only the demonstrations for which `wanted` is true."""
+        chosen = [demo for demo in self if wanted(demo)]
+        return DemonstrationSet(chosen, notes=self.notes, source=self.source)
+
+    def map(self, change: Callable[[Demonstration], Demonstration]) -> "DemonstrationSet":
+        """What `change` makes of each demonstration, such as a step of `demos.preparation`."""
+        changed = [change(demo) for demo in self]
+        return DemonstrationSet(changed, notes=self.notes, source=self.source)
 
     def padded(self) -> PaddedDemonstrations:
         """All demonstrations as tensors of one length, with a mask.

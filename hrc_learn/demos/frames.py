@@ -4,20 +4,27 @@ from collections.abc import Iterator, Sequence
 from itertools import groupby
 
 import numpy as np
+import pyarrow.parquet as pq
 from jaxtyping import Shaped
 
 from .finding import DatasetError
 from .layout import DatasetFolder, EpisodeEntry
-from .parquet import BadRowError, open_parquet, read_table, to_numpy
+from .parquet import BadRowError, open_parquet, read_table, row_group_starts, to_numpy
 
 RawFrames = dict[str, Shaped[np.ndarray, "_frames _components"]]
 """Column -> its values during one episode, in the type and unit they have on disk."""
+
+_BATCH_ROWS = 2**16
+"""Frames read at a time: enough for the speed of the disk, few enough for any memory."""
 
 
 def read_frames(
     folder: DatasetFolder, entries: Sequence[EpisodeEntry], keys: Sequence[str]
 ) -> Iterator[tuple[EpisodeEntry, RawFrames]]:
-    """Read columns of episodes, file by file, in the order of `entries`.
+    """Read columns of episodes, in the order of `entries`.
+
+    No more than some 65,000 frames are held at a time, or one row group where that is larger;
+    no row group is read twice.
 
     Args:
         folder: The dataset.
@@ -28,12 +35,8 @@ def read_frames(
         DatasetError: A file or column is missing or damaged, a column is not as wide as
             declared, or the rows are not those the metadata promise.
     """
-    promised = {
-        file: max(entry.start + entry.length for entry in group)
-        for file, group in folder.files().items()
-    }
     for file, group in groupby(entries, key=lambda entry: entry.file):
-        yield from _read_file(folder, file, list(group), keys, promised[file])
+        yield from _read_file(folder, file, list(group), keys)
 
 
 def slice_frames(columns: RawFrames, start: int, length: int) -> RawFrames:
@@ -42,14 +45,10 @@ def slice_frames(columns: RawFrames, start: int, length: int) -> RawFrames:
 
 
 def _read_file(
-    folder: DatasetFolder,
-    file: str,
-    entries: list[EpisodeEntry],
-    keys: Sequence[str],
-    promised: int,
+    folder: DatasetFolder, file: str, entries: list[EpisodeEntry], keys: Sequence[str]
 ) -> Iterator[tuple[EpisodeEntry, RawFrames]]:
     parquet = open_parquet(folder.root, file, entries[0].index)
-    require_rows(file, entries, parquet.metadata.num_rows, promised)
+    require_rows(file, entries, parquet.metadata.num_rows, folder.promised_rows[file])
     existing = parquet.schema_arrow.names
     for key in keys:
         if key not in existing:
@@ -57,11 +56,43 @@ def _read_file(
                 "the column is declared in meta/info.json, but missing", file=file, key=key
             )
     indices = [k for k in ("timestamp", "episode_index", "task_index") if k in existing]
+    wanted = [*dict.fromkeys([*keys, *indices])]
+    for batch in _batches(entries, row_group_starts(parquet.metadata)):
+        yield from _read_batch(folder, file, parquet, batch, wanted)
+
+
+def _batches(
+    entries: Sequence[EpisodeEntry], group_starts: Sequence[int]
+) -> Iterator[list[EpisodeEntry]]:
+    """Split episodes, in the order of their rows, where no row group spans the cut."""
+    batch: list[EpisodeEntry] = []
+    rows, last_group = 0, -1
+    for entry in entries:
+        ends = [entry.start, entry.start + max(entry.length, 1) - 1]
+        first, last = np.searchsorted(group_starts, ends, side="right") - 1
+        skips = first > last_group + 1
+        if batch and (skips or (rows >= _BATCH_ROWS and first > last_group)):
+            yield batch
+            batch, rows = [], 0
+        batch.append(entry)
+        rows += entry.length
+        last_group = last
+    if batch:
+        yield batch
+
+
+def _read_batch(
+    folder: DatasetFolder,
+    file: str,
+    parquet: pq.ParquetFile,
+    entries: list[EpisodeEntry],
+    keys: Sequence[str],
+) -> Iterator[tuple[EpisodeEntry, RawFrames]]:
     rows = slice(
         min(entry.start for entry in entries),
         max(entry.start + entry.length for entry in entries),
     )
-    table = read_table(parquet, file, [*dict.fromkeys([*keys, *indices])], rows)
+    table = read_table(parquet, file, keys, rows)
     columns = {}
     for key in table.column_names:
         try:

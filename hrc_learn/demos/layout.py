@@ -7,6 +7,7 @@ frames hold is the business of `frames` and `matching`.
 import json
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 from .features import INFO_PATH, Feature, read_features
@@ -50,6 +51,14 @@ class DatasetFolder:
         for entry in self.episodes:
             files.setdefault(entry.file, []).append(entry)
         return files
+
+    @cached_property
+    def promised_rows(self) -> dict[str, int]:
+        """Data file -> frames it should hold by the list of episodes."""
+        return {
+            file: max(entry.start + entry.length for entry in entries)
+            for file, entries in self.files().items()
+        }
 
 
 def open_folder(path: str | Path) -> DatasetFolder:

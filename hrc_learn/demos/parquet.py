@@ -1,6 +1,8 @@
 """Parquet files of a dataset as numpy arrays, with errors that say what to do."""
 
+from bisect import bisect_left, bisect_right
 from collections.abc import Collection, Sequence
+from itertools import accumulate
 from pathlib import Path
 
 import numpy as np
@@ -111,16 +113,18 @@ def to_numpy(column: pa.ChunkedArray) -> Shaped[np.ndarray, "rows components"]:
     return values.reshape(rows, len(values) // rows if rows else 0)
 
 
+def row_group_starts(metadata: pq.FileMetaData) -> list[int]:
+    """Row that each row group begins at."""
+    sizes = [metadata.row_group(i).num_rows for i in range(metadata.num_row_groups)]
+    return [0, *accumulate(sizes)][:-1]
+
+
 def _row_groups(metadata: pq.FileMetaData, rows: slice) -> tuple[list[int], int]:
     """Row groups that hold a range of rows, and the row the first of them begins at."""
-    groups, offset, start = [], 0, 0
-    for group in range(metadata.num_row_groups):
-        stop = start + metadata.row_group(group).num_rows
-        if start < rows.stop and stop > rows.start:
-            offset = offset if groups else start
-            groups.append(group)
-        start = stop
-    return groups, offset
+    starts = row_group_starts(metadata)
+    first = bisect_right(starts, rows.start) - 1
+    stop = bisect_left(starts, rows.stop)
+    return list(range(first, stop)), starts[first]
 
 
 def _flatten_ragged(array: pa.Array, rows: int) -> pa.Array:

@@ -4,7 +4,7 @@ LeRobot declares none, and radians, degrees, encoder ticks and -100..100 all occ
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 
 from .finding import DatasetError
@@ -114,6 +114,11 @@ def decide_units(
         else:
             decisions[role] = UnitDecision(role=role, unit=ROLES[role].unit)
     return decisions
+
+
+def guessed_from_values(roles: Iterable[str], stated: Collection[str]) -> list[str]:
+    """Quantities whose unit can only be told from the size of their values."""
+    return [role for role in roles if role in _GUESSABLE and role not in stated]
 
 
 def _check_declared(declared: Mapping[str, str]) -> None:
