@@ -25,5 +25,8 @@ from hrc_learn.dmp.stepper import StepperState as StepperState
 from hrc_learn.dmp.system.basis import GaussianBasis as GaussianBasis
 from hrc_learn.dmp.system.basis import PeriodicBasis as PeriodicBasis
 from hrc_learn.dmp.system.canonical import ExponentialPhase as ExponentialPhase
+from hrc_learn.dmp.system.canonical import SigmoidPhase as SigmoidPhase
+from hrc_learn.dmp.system.placed import PlacedBasis as PlacedBasis
+from hrc_learn.dmp.system.spline import SplineBasis as SplineBasis
 from hrc_learn.dmp.system.spring import SpringDamper as SpringDamper
 from hrc_learn.dmp.trajectory import Trajectory as Trajectory

@@ -18,6 +18,7 @@ from hrc_learn.dmp.scaling import check_paper_scale, check_scaling, forcing_scal
 from hrc_learn.dmp.state import DMPState
 from hrc_learn.dmp.stepping import advance, second_derivative
 from hrc_learn.dmp.system.basis import Basis, GaussianBasis
+from hrc_learn.dmp.system.parts import basis_config
 from hrc_learn.dmp.system.response import response_of
 from hrc_learn.dmp.system.spring import SpringDamper
 from hrc_learn.dmp.trajectory import Trajectory, broadcast_shapes
@@ -118,7 +119,7 @@ class JointDMP(nn.Module):
         approach: float = 0.0,
         joint_names: Sequence[str] | None = None,
         units: str = "rad",
-        basis: GaussianBasis | None = None,
+        basis: Basis | None = None,
         spring: SpringDamper | None = None,
         regularization: float = 1e-7,
     ) -> "JointDMP":
@@ -420,7 +421,7 @@ class JointDMP(nn.Module):
             "scaling": self.scaling,
             "approach": self.response.approach,
             "spring": asdict(self.spring),
-            "basis": {"type": type(self.basis).__name__, **asdict(self.basis)},
+            "basis": basis_config(self.basis),
         }
 
     def tensors(self) -> dict[str, Tensor]:

@@ -19,76 +19,13 @@ from hrc_learn.dmp.rotation.formulation import (
     find_formulation,
 )
 from hrc_learn.dmp.state import DMPState
-from hrc_learn.dmp.system.basis import GaussianBasis
+from hrc_learn.dmp.system.basis import Basis
 from hrc_learn.dmp.system.spring import SpringDamper
 from hrc_learn.geometry import quaternion
 from hrc_learn.storage import SavedModel, write_model
 
 NORM_TOLERANCE = 1e-2
 """How far from one the norm of a recorded quaternion may be before it is called broken."""
-
-
-class OrientationTrajectory:
-    """An orientation over time, each output computed when first asked for."""
-
-    def __init__(self, errors: ErrorMotion, goal: Float[Tensor, "*batch 4"], first: int = 0):
-        """Read the motion of an error, found in columns `first` to `first` + 3 of `errors`."""
-        self._errors = errors
-        self._goal = goal
-        self._columns = slice(first, first + 3)
-
-    @property
-    def time(self) -> Float[Tensor, "*batch T"]:
-        """Since the start of the motion [s]."""
-        return self._errors.time
-
-    @cached_property
-    def orientation(self) -> Float[Tensor, "*batch T 4"]:
-        """Unit quaternions (w, x, y, z), continuous in sign."""
-        return error_space.to_orientations(self._error, self._goal)
-
-    @cached_property
-    def angular_velocity(self) -> Float[Tensor, "*batch T 3"]:
-        """In the base frame [rad/s]."""
-        return error_space.angular_velocity(self._error, self._rate)
-
-    @cached_property
-    def angular_acceleration(self) -> Float[Tensor, "*batch T 3"]:
-        """In the base frame [rad/s^2]."""
-        curvature = self._errors.acceleration[..., self._columns]
-        return error_space.angular_acceleration(self._error, self._rate, curvature)
-
-    @property
-    def _error(self) -> Tensor:
-        return self._errors.position[..., self._columns]
-
-    @property
-    def _rate(self) -> Tensor:
-        return self._errors.velocity[..., self._columns]
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class OrientationState:
-    """Where an orientation primitive is while it is stepped."""
-
-    motion: DMPState
-    """Of the error to the goal."""
-    goal: Float[Tensor, "*batch 4"]
-
-    @property
-    def orientation(self) -> Float[Tensor, "*batch 4"]:
-        """Unit quaternion (w, x, y, z)."""
-        return error_space.to_orientation(self.motion.position, self.goal)
-
-    @property
-    def angular_velocity(self) -> Float[Tensor, "*batch 3"]:
-        """In the base frame [rad/s]."""
-        return error_space.angular_velocity(self.motion.position, self.motion.velocity)
-
-
-torch.export.register_dataclass(
-    OrientationState, serialized_type_name="hrc_learn.dmp.OrientationState"
-)
 
 
 class OrientationDMP(nn.Module):
@@ -133,7 +70,7 @@ class OrientationDMP(nn.Module):
         formulation: str = "log",
         method: str = "trajectory",
         approach: float = 0.0,
-        basis: GaussianBasis | None = None,
+        basis: Basis | None = None,
         spring: SpringDamper | None = None,
         regularization: float = 1e-7,
     ) -> "OrientationDMP":
@@ -281,67 +218,3 @@ class OrientationDMP(nn.Module):
             self.motion.start, rate, self.goal, start, goal, velocity
         )
         return error, rate, goal, duration
-
-
-def fitted_error(
-    time: ArrayLike, orientation: ArrayLike, mask: ArrayLike | None
-) -> tuple[Tensor, Tensor]:
-    """Errors (*B, T, 3) and goals (*B, 4) of checked demonstrations (*B, T, 4)."""
-    samples = check_samples(time, orientation, mask=mask, name="orientation")
-    if samples.position.shape[-2] != 4:
-        raise ValueError(
-            f"orientation must be quaternions (w, x, y, z), shape (..., T, 4), "
-            f"got {tuple(to_tensor(orientation).shape)}"
-        )
-    norm = samples.position.norm(dim=-2)
-    broken = samples.mask & ((norm - 1).abs() > NORM_TOLERANCE)
-    if broken.any():
-        i, k = broken.nonzero()[0].tolist()
-        raise ValueError(
-            f"{demo_label(i, samples.batch)}orientation has norm {norm[i, k].item():.4f} at "
-            f"sample {k}: not a unit quaternion. Interpolating across a sign flip does this."
-        )
-    unit = samples.columns / norm.masked_fill(~samples.mask, 1).reshape(*samples.batch, -1, 1)
-    return error_space.demonstrated_error(unit, samples.mask.reshape(unit.shape[:-1]))
-
-
-def unit_quaternion(value: ArrayLike, like: Tensor) -> Float[Tensor, "*batch 4"]:
-    """A quaternion given by the caller, normalised; dtype and device of `like`."""
-    q = to_tensor(value, dtype=like.dtype, device=like.device)
-    if q.ndim == 0 or q.shape[-1] != 4 or not (q.norm(dim=-1) > 0.5).all():
-        raise ValueError(f"an orientation must be unit quaternions (w, x, y, z), got {value}")
-    return quaternion.normalize(q)
-
-
-def error_ends(
-    error: Float[Tensor, "*batch 3"],
-    rate: Float[Tensor, "*#batch 3"],
-    demonstrated_goal: Float[Tensor, "*batch 4"],
-    start: ArrayLike | None,
-    goal: ArrayLike | None,
-    velocity: ArrayLike | None,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Error at the start of a motion, its rate [rad/s], and the goal.
-
-    Args:
-        error: At the start of the demonstration.
-        rate: Of that, when the motion takes as long as it shall.
-        demonstrated_goal: Where the demonstration ends.
-        start: New start; the demonstrated one is kept if None, as with all that follow.
-        goal: New goal.
-        velocity: New angular velocity [rad/s].
-    """
-    if start is None and goal is None and velocity is None:
-        return error, rate, demonstrated_goal
-    if velocity is None:
-        error_all, rate = torch.broadcast_tensors(error, rate)
-        omega = error_space.angular_velocity(error_all, rate)
-    else:
-        omega = to_tensor(velocity, dtype=error.dtype, device=error.device)
-    if start is None:
-        q = error_space.to_orientation(error, demonstrated_goal)
-    else:
-        q = unit_quaternion(start, error)
-    goal = demonstrated_goal if goal is None else unit_quaternion(goal, error)
-    error = error_space.nearest_turn(error_space.to_error(q, goal), error)
-    return error, error_space.error_rate(error, omega), goal

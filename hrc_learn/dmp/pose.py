@@ -18,7 +18,7 @@ from hrc_learn.dmp.orientation import (
 )
 from hrc_learn.dmp.pose_motion import BODY, ERROR, POSITION, PoseState, PoseTrajectory
 from hrc_learn.dmp.rotation.error import retarget, to_orientation
-from hrc_learn.dmp.system.basis import GaussianBasis
+from hrc_learn.dmp.system.basis import Basis
 from hrc_learn.dmp.system.spring import SpringDamper
 from hrc_learn.geometry import Pose
 from hrc_learn.storage import SavedModel, write_model
@@ -57,7 +57,7 @@ class PoseDMP(nn.Module):
         *,
         method: str = "trajectory",
         approach: float = 0.0,
-        basis: GaussianBasis | None = None,
+        basis: Basis | None = None,
         spring: SpringDamper | None = None,
         regularization: float = 1e-7,
     ) -> "PoseDMP":

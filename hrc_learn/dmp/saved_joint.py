@@ -6,8 +6,7 @@ from typing import Any
 from torch import Tensor
 
 from hrc_learn.dmp.fitting.report import FitReport
-from hrc_learn.dmp.system.basis import Basis, GaussianBasis, PeriodicBasis
-from hrc_learn.dmp.system.canonical import ExponentialPhase
+from hrc_learn.dmp.system.parts import restore_basis
 from hrc_learn.dmp.system.spring import SpringDamper
 from hrc_learn.storage import SavedModel
 
@@ -25,7 +24,7 @@ def saved_arguments(saved: SavedModel) -> dict[str, Any]:
     arguments = {
         **tensors,
         "spring": _part(saved, "spring", lambda fields: SpringDamper(**fields)),
-        "basis": _part(saved, "basis", _basis),
+        "basis": _part(saved, "basis", restore_basis),
         "scaling": saved.get("scaling", str),
         "approach": float(saved.get("approach", float, int)),
         "joint_names": saved.get("joint_names", list, NoneType),
@@ -57,13 +56,3 @@ def _part(saved: SavedModel, field: str, make: Any) -> Any:
         raise saved.invalid_field(field, f"{error} is missing") from None
     except (TypeError, ValueError) as error:
         raise saved.invalid_field(field, error) from None
-
-
-def _basis(fields: dict[str, Any]) -> Basis:
-    kind, fields = fields["type"], {k: v for k, v in fields.items() if k != "type"}
-    if kind == "PeriodicBasis":
-        return PeriodicBasis(**fields)
-    if kind != "GaussianBasis":
-        raise ValueError(f"unknown type {kind!r}")
-    phase = ExponentialPhase(**fields.pop("phase"))
-    return GaussianBasis(**fields, phase=phase)

@@ -66,7 +66,7 @@ def test_gaussians_are_the_papers_in_the_phase_domain():
     basis = GaussianBasis(count=9, domain="phase")
     s = torch.linspace(0, 1, 7, dtype=torch.float64)
     expected = np.stack([gaussians(basis, x) for x in s.numpy()])
-    np.testing.assert_allclose(basis.gaussians(s).numpy(), expected, atol=1e-12)
+    np.testing.assert_allclose(basis.kernels(s).numpy(), expected, atol=1e-12)
 
 
 @pytest.mark.parametrize(

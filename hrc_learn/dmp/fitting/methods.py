@@ -10,7 +10,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.dmp.fitting.samples import Samples
-from hrc_learn.dmp.system.basis import GaussianBasis
 from hrc_learn.dmp.system.response import Response
 
 METHODS = ("trajectory", "ridge", "lwr")
@@ -144,9 +143,8 @@ def ridge_operator(
 def _lwr_operator(response: Response, s: Tensor, regularization: float) -> Tensor:
     """w_i = (z' Gamma_i f) / (z' Gamma_i z), the paper's solution of its (Cost_i)."""
     del regularization  # each weight is a mean of its own samples: nothing is ill-posed
-    assert isinstance(response.basis, GaussianBasis)
     z = response.basis.phase(s)
-    weighted = (response.basis.gaussians(s) * z[:, None]).T
+    weighted = (response.basis.kernels(s) * z[:, None]).T
     # A Gaussian narrower than the sampling may see no sample: its weight is zero then.
     return weighted / (weighted @ z).clamp_min(torch.finfo(s.dtype).tiny)[:, None]
 

@@ -2,15 +2,59 @@
 
 import math
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import ClassVar, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.dmp.system.canonical import ExponentialPhase
+from hrc_learn.dmp.system.canonical import ExponentialPhase, Phase, check_positive
 
 DOMAINS = ("time", "phase")
+
+
+@runtime_checkable
+class Basis(Protocol):
+    """Functions that the weights of a forcing term multiply; a frozen, hashable dataclass."""
+
+    periodic: ClassVar[bool]
+    """Whether the forcing goes on for ever, with a period of one."""
+
+    @property
+    def count(self) -> int:
+        """N, the number of basis functions."""
+        ...
+
+    @property
+    def horizon(self) -> float:
+        """Normalised time after which the forcing is lost in rounding; the period, if any."""
+        ...
+
+    @property
+    def smooth_interval(self) -> float:
+        """Length over which the forcing, between knots, is a polynomial of low degree."""
+        ...
+
+    @property
+    def knot_spacing(self) -> float | None:
+        """The forcing is smooth but at multiples of this; None: everywhere."""
+        ...
+
+    def centre_times(self) -> Float[Tensor, "N"]:
+        """Normalised times at which the basis functions peak (float64)."""
+        ...
+
+    def phase(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """What fades the forcing term."""
+        ...
+
+    def kernels(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch N"]:
+        """Basis functions at normalised time `s`, neither normalised nor faded."""
+        ...
+
+    def forcing(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch N"]:
+        """What each unit weight adds to the forcing term at normalised time `s`."""
+        ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,12 +78,14 @@ class GaussianBasis:
     """sigma_i as a share of the distance between neighbouring centres."""
     domain: str = "time"
     """What the Gaussians are spread over: `"time"` or `"phase"`."""
-    phase: ExponentialPhase = field(default_factory=ExponentialPhase)
+    phase: Phase = field(default_factory=ExponentialPhase)
     """The canonical system, whose z fades the forcing term."""
     periodic: ClassVar[bool] = False
+    knot_spacing: ClassVar[None] = None
 
     def __post_init__(self):
-        _check_shape(self.count, self.width)
+        check_positive("width", self.width)
+        check_count(self.count)
         if self.domain not in DOMAINS:
             raise ValueError(f"unknown domain {self.domain!r}; there are {', '.join(DOMAINS)}")
 
@@ -50,7 +96,8 @@ class GaussianBasis:
             return self.phase.horizon
         # Past the end, the last Gaussian falls behind its follower by
         # exp((1/2 - x) / width^2) at x spacings; exp(-39) = 1e-17.
-        return 1 + (0.5 + 39 * self.width**2) / (self.count - 1)
+        end = 1 + (0.5 + 39 * self.width**2) / (self.count - 1)
+        return min(end, self.phase.horizon)
 
     @property
     def smooth_interval(self) -> float:
@@ -59,13 +106,14 @@ class GaussianBasis:
         Neighbours hand over along a logistic function of scale width^2 times the spacing,
         which is analytic within pi times that.
         """
-        return min(0.5, 1.4 * self.width**2) / (self.count - 1)
+        handover = min(0.5, 1.4 * self.width**2) / (self.count - 1)
+        return min(handover, self.phase.smooth_interval)
 
     def centre_times(self) -> Float[Tensor, "N"]:
         """Normalised times s_i at which the basis functions peak (float64)."""
         return torch.linspace(0, 1, self.count, dtype=torch.float64)
 
-    def gaussians(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch N"]:
+    def kernels(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch N"]:
         """Gaussians psi_i at normalised time `s`, not normalised."""
         return self._exponents(s).exp()[..., : self.count]
 
@@ -105,9 +153,12 @@ class PeriodicBasis:
     """Standard deviation of a bell as a share of the distance between centres."""
     periodic: ClassVar[bool] = True
     horizon: ClassVar[float] = 1.0
+    knot_spacing: ClassVar[float] = 1.0
+    """The table of the response has to close on itself."""
 
     def __post_init__(self):
-        _check_shape(self.count, self.width)
+        check_positive("width", self.width)
+        check_count(self.count)
 
     @property
     def smooth_interval(self) -> float:
@@ -122,18 +173,21 @@ class PeriodicBasis:
         """Normalised times c_i at which the basis functions peak (float64)."""
         return torch.arange(self.count, dtype=torch.float64) / self.count
 
+    def kernels(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch N"]:
+        """Bells psi_i at normalised time `s`, not normalised."""
+        return self._exponents(s).exp()
+
     def forcing(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch N"]:
         """What each unit weight adds to the forcing term at normalised time `s`."""
+        return torch.softmax(self._exponents(s), dim=-1)
+
+    def _exponents(self, s: Tensor) -> Tensor:
         sharpness = (self.count / (2 * math.pi * self.width)) ** 2
         angle = 2 * math.pi * (s[..., None] - self.centre_times().to(s))
-        return torch.softmax(sharpness * torch.cos(angle), dim=-1)
+        return sharpness * (torch.cos(angle) - 1)
 
 
-type Basis = GaussianBasis | PeriodicBasis
-
-
-def _check_shape(count: int, width: float) -> None:
+def check_count(count: int) -> None:
+    """Raise ValueError for fewer functions than can share anything."""
     if count < 2:
         raise ValueError(f"a basis needs at least 2 functions, got {count}")
-    if not (math.isfinite(width) and width > 0):
-        raise ValueError(f"width must be positive, got {width}")

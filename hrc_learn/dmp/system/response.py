@@ -4,18 +4,16 @@ import math
 from collections import OrderedDict
 from functools import lru_cache
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.dmp.system.approach import approach_state, minimum_jerk
 from hrc_learn.dmp.system.basis import Basis
+from hrc_learn.dmp.system.forced import accumulate, impulse
 from hrc_learn.dmp.system.piecewise import PiecewisePolynomial, chebyshev_points
 from hrc_learn.dmp.system.spring import SpringDamper
 
-GAUSS_POINTS = 12
-"""For the forcing over one piece of the table, which no basis function changes much in."""
 GRIDS_KEPT = 16
 
 
@@ -115,39 +113,25 @@ class Response:
 
     def _integrate(self) -> PiecewisePolynomial:
         """Solve for all basis functions at once, to where the forcing ends or starts over."""
+        propagate, forcing = self.spring.propagator, self.basis.forcing
         interval = min(self.basis.smooth_interval, self.spring.smooth_interval)
-        n_pieces = math.ceil(self.basis.horizon / interval)
-        if self.basis.periodic:
-            interval = self.basis.horizon / n_pieces
-        knots = interval * torch.arange(n_pieces, dtype=torch.float64)
+        if self.basis.knot_spacing is not None:
+            interval = self.basis.knot_spacing / math.ceil(self.basis.knot_spacing / interval)
+        # Rounding must not add a piece past the last knot.
+        n_pieces = math.ceil(self.basis.horizon / interval - 1e-9)
+        knots = interval * torch.arange(n_pieces + 1, dtype=torch.float64)
         points = interval * chebyshev_points()
-        # The forcing's share at each point of each piece, then the states at the knots by a
-        # parallel prefix sum, then both together.
-        share = torch.stack([self._impulse(knots, point) for point in points], dim=1)
-        rest = torch.zeros_like(share[:1, -1])
-        state = torch.cat([rest, share[:-1, -1]])
-        stride = 1
-        while stride < n_pieces:
-            E = self.spring.propagator(knots[stride])
-            state = torch.cat([state[:stride], state[stride:] + E @ state[:-stride]])
-            stride *= 2
+        share = torch.stack(
+            [impulse(propagate, forcing, knots[:-1], point) for point in points], dim=1
+        )
+        state = accumulate(propagate, knots, share[:, -1])
         if self.basis.periodic:
             # The start that a period leads back to: x = E x + (what is there from rest).
-            E = self.spring.propagator(interval * torch.tensor(n_pieces, dtype=torch.float64))
-            after = self.spring.propagator(points[-1]) @ state[-1] + share[-1, -1]
-            cycle = torch.linalg.solve(torch.eye(2, dtype=torch.float64) - E, after)
-            state = state + self.spring.propagator(knots) @ cycle
-        values = self.spring.propagator(points) @ state[:, None] + share
+            E = propagate(knots[-1])
+            cycle = torch.linalg.solve(torch.eye(2, dtype=torch.float64) - E, state[-1])
+            state = state + propagate(knots) @ cycle
+        values = propagate(points) @ state[:-1, None] + share
         return PiecewisePolynomial.interpolate(values, interval, self.basis.periodic)
-
-    def _impulse(
-        self, start: Float[Tensor, "pieces"], length: Float[Tensor, ""]
-    ) -> Float[Tensor, "pieces 2 N"]:
-        """State at start + length that the forcing since `start` has caused."""
-        nodes, weights = map(torch.from_numpy, np.polynomial.legendre.leggauss(GAUSS_POINTS))
-        u = length * (1 + nodes) / 2
-        kernel = self.spring.propagator(length - u)[..., 1] * (length / 2 * weights)[:, None]
-        return kernel.mT @ self.basis.forcing(start[:, None] + u)
 
 
 class _StateAt(torch.autograd.Function):

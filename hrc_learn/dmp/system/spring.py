@@ -9,6 +9,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+CRITICAL = 1e-12
+"""1 - 4 beta / alpha, nearer to zero than which the damping is critical."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class SpringDamper:
@@ -52,10 +55,7 @@ class SpringDamper:
 
         exp(A s) = C I + S (A + alpha / 2 I) by Cayley-Hamilton; see `modes` for C and S.
         """
-        C, S = self.modes(s, torch)
-        lean = S * (self.alpha / 2)
-        entries = torch.stack([C + lean, S, S * -self.stiffness, C - lean], dim=-1)
-        return entries.view(*s.shape, 2, 2)
+        return transition(s, self.alpha, self.beta / self.alpha)
 
     def modes(self, s: Any, xp: ModuleType) -> tuple[Any, Any]:
         """exp(-alpha s / 2) times cosh(r s) and sinh(r s) / r, r^2 = alpha^2 / 4 - alpha beta.
@@ -66,15 +66,30 @@ class SpringDamper:
             s: Normalised time, of a type that `xp` takes.
             xp: `torch` for tensors, `math` for numbers.
         """
-        half = self.alpha / 2
-        square = half**2 - self.stiffness
-        rate = math.sqrt(abs(square))
-        if rate < 1e-6 * half:
-            C = xp.exp(-half * s)
-            return C, s * C
-        if square > 0:
-            # Both exponents are negative: unlike cosh, nothing overflows at large s.
-            slow, fast = xp.exp((rate - half) * s), xp.exp((-rate - half) * s)
-            return (slow + fast) / 2, (slow - fast) / (2 * rate)
-        envelope = xp.exp(-half * s)
-        return envelope * xp.cos(rate * s), envelope * xp.sin(rate * s) / rate
+        return spring_modes(s, self.alpha, self.beta / self.alpha, xp)
+
+
+def transition(
+    s: Float[Tensor, "*batch"], alpha: Float[Tensor, ""] | float, ratio: float
+) -> Float[Tensor, "*batch 2 2"]:
+    """`SpringDamper.propagator` of alpha and beta = ratio alpha; differentiable in alpha."""
+    C, S = spring_modes(s, alpha, ratio, torch)
+    lean = S * (alpha / 2)
+    entries = torch.stack([C + lean, S, S * (-ratio * alpha**2), C - lean], dim=-1)
+    return entries.view(*s.shape, 2, 2)
+
+
+def spring_modes(s: Any, alpha: Any, ratio: float, xp: ModuleType) -> tuple[Any, Any]:
+    """`SpringDamper.modes` of alpha and beta = ratio alpha; which case it is, ratio says."""
+    half = alpha / 2
+    shape = 1 - 4 * ratio
+    rate = half * math.sqrt(abs(shape))
+    if abs(shape) < CRITICAL:
+        C = xp.exp(-half * s)
+        return C, s * C
+    if shape > 0:
+        # Both exponents are negative: unlike cosh, nothing overflows at large s.
+        slow, fast = xp.exp((rate - half) * s), xp.exp((-rate - half) * s)
+        return (slow + fast) / 2, (slow - fast) / (2 * rate)
+    envelope = xp.exp(-half * s)
+    return envelope * xp.cos(rate * s), envelope * xp.sin(rate * s) / rate
