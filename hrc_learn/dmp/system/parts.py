@@ -52,7 +52,8 @@ def _config(part: Any, known: Mapping[str, type[Any]]) -> dict[str, Any]:
 
 
 def _restore(fields: Mapping[str, Any], known: Mapping[str, type[Any]]) -> Any:
-    arguments = dict(fields)
+    # Tuples are lists in a file, and lists cannot be hashed.
+    arguments = {k: tuple(v) if isinstance(v, list) else v for k, v in fields.items()}
     kind = arguments.pop("type")
     if kind not in known:
         raise ValueError(f"unknown type {kind!r}; there are {', '.join(known)}")

@@ -36,9 +36,6 @@ class PlacedBasis:
     knot_spacing: ClassVar[None] = None
 
     def __post_init__(self):
-        for name in ("centres", "widths"):
-            # Lists, as files have them, could not be hashed.
-            object.__setattr__(self, name, tuple(float(x) for x in getattr(self, name)))
         check_count(self.count)
         if len(self.widths) != self.count:
             raise ValueError(f"{len(self.widths)} widths for {self.count} centres")

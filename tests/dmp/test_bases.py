@@ -1,0 +1,195 @@
+"""Every basis and phase: what the response makes of it, its laws, and its files."""
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+from demo_motions import arm_motion
+from scipy.integrate import solve_ivp
+from scipy.interpolate import BSpline
+
+from hrc_learn.dmp import (
+    ExponentialPhase,
+    GaussianBasis,
+    JointDMP,
+    PlacedBasis,
+    SigmoidPhase,
+    SplineBasis,
+    SpringDamper,
+    Stepper,
+)
+from hrc_learn.dmp.system.response import Response
+
+UNEVEN = PlacedBasis(
+    centres=(0.0, 0.1, 0.3, 0.33, 0.36, 0.6, 1.0), widths=(0.1, 0.1, 0.01, 0.02, 0.02, 0.2, 0.1)
+)
+
+
+@dataclass(frozen=True)
+class CosinePhase:
+    """A canonical system that this package does not know: half a cosine to a small rest."""
+
+    horizon: float = 2.0
+    smooth_interval: float = 0.2
+
+    def __call__(self, s):
+        return torch.exp(-3 * (1 - torch.cos(torch.pi * s / 2)) - 40 * (s / 2) ** 8)
+
+
+BASES = {
+    "gaussian, sigmoid": GaussianBasis(count=12, phase=SigmoidPhase()),
+    "gaussian, steep sigmoid": GaussianBasis(
+        count=12, phase=SigmoidPhase(steepness=300.0, middle=0.9)
+    ),
+    "gaussian, own phase": GaussianBasis(count=12, phase=CosinePhase()),
+    "spline": SplineBasis(count=12),
+    "spline, few": SplineBasis(count=3),
+    "spline, sigmoid": SplineBasis(count=20, phase=SigmoidPhase(steepness=200.0)),
+    "placed": UNEVEN,
+    "placed, sigmoid": PlacedBasis(
+        centres=UNEVEN.centres, widths=UNEVEN.widths, phase=SigmoidPhase()
+    ),
+}
+
+
+def phase_value(phase, s):
+    """What the docstrings of the phases state, in NumPy."""
+    if isinstance(phase, ExponentialPhase):
+        return np.exp(-phase.decay * s)
+    if isinstance(phase, SigmoidPhase):
+        a, m = phase.steepness, phase.middle
+        return (1 + np.exp(-a * m)) / (1 + np.exp(a * (s - m)))
+    return np.exp(-3 * (1 - np.cos(np.pi * s / 2)) - 40 * (s / 2) ** 8)
+
+
+@cache
+def splines(N):
+    """All splines at once; padded by ones without a weight, as SciPy's need full support."""
+    knots = (np.arange(N + 12) - 7) / (N - 1)
+    return BSpline(knots, np.eye(N + 8)[:, 4:-4], 3, extrapolate=False)
+
+
+def shares(basis, s):
+    """What the docstrings of the bases state, by another route than the code's."""
+    N = basis.count
+    if isinstance(basis, SplineBasis):
+        return np.nan_to_num(splines(N)(s))
+    if isinstance(basis, PlacedBasis):
+        c, sigma = np.array(basis.centres), np.array(basis.widths)
+        c = np.append(c, c[-1] + max(c[-1] - c[-2], sigma.max()))
+        sigma = np.append(sigma, sigma.max())
+    else:
+        c = np.arange(N + 1) / (N - 1)
+        sigma = basis.width / (N - 1)
+    exponent = -((s - c) ** 2) / (2 * sigma**2)
+    psi = np.exp(exponent - exponent.max())
+    return psi[:N] / psi.sum()
+
+
+@pytest.mark.parametrize("basis", BASES.values(), ids=BASES)
+def test_response_solves_the_differential_equation(basis):
+    """Against an adaptive solver, to well after the forcing has ended."""
+    spring = SpringDamper(alpha=20.0, beta=4.0)
+    weights = 300 * np.random.default_rng(0).standard_normal(basis.count)
+    times = np.append(0.0, np.sort(np.random.default_rng(1).uniform(0, 1.6, 40)))
+
+    def rhs(s, x):
+        force = shares(basis, s) @ weights * phase_value(basis.phase, s)
+        return [x[1], spring.alpha * (spring.beta * (1.1 - x[0]) - x[1]) + force]
+
+    span, start = (0.0, times[-1]), [0.3, -2.0]
+    expected = solve_ivp(
+        rhs, span, start, "DOP853", times, rtol=1e-12, atol=1e-12, max_step=0.02
+    ).y
+    H = Response(spring, basis).evaluate(torch.tensor(times)).numpy()
+    rows = H @ np.concatenate([weights, [-2.0, 0.3, 1.1]])
+    np.testing.assert_allclose(rows[:, :2].T, expected, atol=1e-8)
+
+
+@pytest.mark.parametrize("basis", BASES.values(), ids=BASES)
+def test_forcing_ends_where_the_basis_says(basis):
+    after = basis.horizon * torch.tensor([1 + 1e-9, 1.01, 1.5, 10.0], dtype=torch.float64)
+    assert basis.forcing(after).abs().max() < 1e-15
+    assert (basis.kernels(basis.centre_times()).argmax(-1) == torch.arange(basis.count)).all()
+
+
+def test_a_weight_of_a_spline_acts_on_its_support_alone():
+    """Before it nothing changes to the last bit; after it the spring alone goes on."""
+    basis = SplineBasis(count=30)
+    h, c = basis.knot_spacing, basis.centre_times()
+    s = torch.linspace(0, 1.2, 997, dtype=torch.float64)
+    support = (s[:, None] - c).abs() < 2 * h
+    forcing = basis.forcing(s)
+    assert ((forcing > 0) == support).all()
+    moved = Response(SpringDamper(), basis).evaluate(s)[:, 0, :30]
+    assert (moved[s[:, None] < c - 2 * h - 1e-9] == 0).all()
+
+
+def test_splines_add_up_to_one_until_they_fade():
+    basis = SplineBasis(count=30)
+    s = torch.linspace(0, 1 - 2 * basis.knot_spacing, 300, dtype=torch.float64)
+    torch.testing.assert_close(basis.kernels(s).sum(-1), torch.ones_like(s))
+
+
+def test_alike_and_equally_placed_gaussians_are_the_usual_ones():
+    usual = GaussianBasis(count=9)
+    placed = PlacedBasis(centres=tuple(k / 8 for k in range(9)), widths=(0.6 / 8,) * 9)
+    s = torch.linspace(0, 1.5, 100, dtype=torch.float64)
+    torch.testing.assert_close(placed.forcing(s), usual.forcing(s))
+
+
+@pytest.mark.parametrize("method", ["trajectory", "ridge", "lwr"])
+@pytest.mark.parametrize("basis", [SplineBasis(), UNEVEN, GaussianBasis(phase=SigmoidPhase())])
+def test_a_fit_steps_and_saves_on_it(basis, method, tmp_path):
+    time, position = arm_motion(moving_start=True)
+    dmp = JointDMP.fit(time, position, basis=basis, method=method)
+    assert dmp.fit_report.nrmse < (0.1 if basis is UNEVEN or method == "lwr" else 1e-4)
+    state, stepper = dmp.initial_state(), Stepper(dmp)
+    numpy_state = stepper.initial_state()
+    for dt in [0.05] * 20 + [0.4] * 8:
+        state, numpy_state = dmp.step(state, dt), stepper.step(numpy_state, dt)
+        np.testing.assert_allclose(
+            numpy_state.position, state.position.detach().numpy(), atol=1e-9
+        )
+    there = dmp.rollout(time=[20 * 0.05 + 8 * 0.4]).position[0]
+    torch.testing.assert_close(state.position, there, rtol=0, atol=1e-9)
+    dmp.save(tmp_path / "dmp")
+    loaded = JointDMP.load(tmp_path / "dmp")
+    assert loaded.basis == basis
+    assert torch.equal(loaded.rollout().position, dmp.rollout().position)
+
+
+def test_a_phase_of_the_callers_own_reproduces_but_is_not_saved(tmp_path):
+    time, position = arm_motion()
+    dmp = JointDMP.fit(time, position, basis=GaussianBasis(phase=CosinePhase()))
+    assert dmp.fit_report.nrmse < 1e-4
+    with pytest.raises(ValueError, match="CosinePhase cannot be saved; files hold Exponential"):
+        dmp.save(tmp_path / "dmp")
+
+
+def test_files_without_a_type_of_phase_are_read(tmp_path):
+    time, position = arm_motion()
+    JointDMP.fit(time, position).save(tmp_path / "dmp")
+    file = tmp_path / "dmp" / "config.json"
+    file.write_text(file.read_text().replace('"type": "ExponentialPhase",', ""))
+    assert JointDMP.load(tmp_path / "dmp").basis == GaussianBasis()
+
+
+@pytest.mark.parametrize(
+    ("make", "complaint"),
+    [
+        (lambda: SplineBasis(count=1), "at least 2"),
+        (lambda: PlacedBasis(centres=(0.0,), widths=(0.1,)), "at least 2"),
+        (lambda: PlacedBasis(centres=(0.0, 0.5), widths=(0.1,)), "1 widths for 2 centres"),
+        (lambda: PlacedBasis(centres=(0.5, 0.5), widths=(0.1, 0.1)), "must increase.*place 1"),
+        (lambda: PlacedBasis(centres=(0.0, 0.5), widths=(0.1, 0.0)), "width must be positive"),
+        (lambda: PlacedBasis(centres=(0.0, float("inf")), widths=(0.1, 0.1)), "finite"),
+        (lambda: SigmoidPhase(steepness=0.0), "steepness must be positive"),
+        (lambda: SigmoidPhase(middle=-1.0), "middle must be positive"),
+    ],
+)
+def test_impossible_parts_are_refused(make, complaint):
+    with pytest.raises(ValueError, match=complaint):
+        make()
