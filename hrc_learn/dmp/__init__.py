@@ -13,8 +13,8 @@ from hrc_learn.dmp.moving_goal import MovingGoal as MovingGoal
 from hrc_learn.dmp.moving_goal import MovingGoalState as MovingGoalState
 from hrc_learn.dmp.moving_goal import MovingTrajectory as MovingTrajectory
 from hrc_learn.dmp.orientation import OrientationDMP as OrientationDMP
-from hrc_learn.dmp.orientation import OrientationState as OrientationState
-from hrc_learn.dmp.orientation import OrientationTrajectory as OrientationTrajectory
+from hrc_learn.dmp.orientation_motion import OrientationState as OrientationState
+from hrc_learn.dmp.orientation_motion import OrientationTrajectory as OrientationTrajectory
 from hrc_learn.dmp.pose import PoseDMP as PoseDMP
 from hrc_learn.dmp.pose_motion import PoseState as PoseState
 from hrc_learn.dmp.pose_motion import PoseTrajectory as PoseTrajectory

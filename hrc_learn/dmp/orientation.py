@@ -1,39 +1,30 @@
 """Movement primitive of an orientation."""
 
-from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
-import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from hrc_learn.dmp.arrays import ArrayLike, to_tensor
 from hrc_learn.dmp.fitting.report import FitReport
-from hrc_learn.dmp.fitting.samples import check_samples, demo_label
+from hrc_learn.dmp.fitting.samples import check_samples
 from hrc_learn.dmp.joint import JointDMP
-from hrc_learn.dmp.rotation import error as error_space
-from hrc_learn.dmp.rotation.formulation import (
-    ErrorMotion,
-    UnknownFormulationError,
-    find_formulation,
-)
-from hrc_learn.dmp.state import DMPState
+from hrc_learn.dmp.orientation_motion import OrientationState, OrientationTrajectory
+from hrc_learn.dmp.rotation.demonstrated import fitted_error
+from hrc_learn.dmp.rotation.ends import error_ends, unit_quaternion
+from hrc_learn.dmp.rotation.error import reference_of, to_orientation
+from hrc_learn.dmp.rotation.formulation import UnknownFormulationError, find_formulation
 from hrc_learn.dmp.system.basis import Basis
 from hrc_learn.dmp.system.spring import SpringDamper
-from hrc_learn.geometry import quaternion
 from hrc_learn.storage import SavedModel, write_model
-
-NORM_TOLERANCE = 1e-2
-"""How far from one the norm of a recorded quaternion may be before it is called broken."""
 
 
 class OrientationDMP(nn.Module):
-    """Discrete movement primitive of an orientation.
+    """Movement primitive of an orientation.
 
-    The error e to the goal is the state of a linear primitive that ends at e = 0, exact at
-    all angles, or of that of Ude et al. 2014; see `formulation`. Both signs of any quaternion
-    give the same motion.
+    The error e to a reference, the goal unless said otherwise, is the state of a linear
+    primitive, exact at all angles, or of that of Ude et al. 2014; see `formulation`. Both
+    signs of any quaternion give the same motion.
     """
 
     goal: Tensor
@@ -46,8 +37,9 @@ class OrientationDMP(nn.Module):
         """Put a primitive together; `fit` is the usual way to one.
 
         Args:
-            motion: Of the error [rad], D = 3, with its goal at zero.
-            goal: Unit quaternion (w, x, y, z) that the error is taken to.
+            motion: Of the error [rad], D = 3. Where its own goal is not zero, the error is
+                taken to the reference exp(that) * goal: as primitives of several goals need.
+            goal: Unit quaternion (w, x, y, z) at which it ends.
             formulation: `"log"` or `"ude"`, what `motion` acts on.
 
         Raises:
@@ -112,7 +104,12 @@ class OrientationDMP(nn.Module):
     @property
     def start(self) -> Float[Tensor, "*batch 4"]:
         """Where the demonstration starts."""
-        return error_space.to_orientation(self.motion.start, self.goal)
+        return to_orientation(self.motion.start, self.reference)
+
+    @property
+    def reference(self) -> Float[Tensor, "*batch 4"]:
+        """What the error is taken to."""
+        return reference_of(self.motion.goal, self.goal)
 
     @property
     def duration(self) -> Float[Tensor, "*batch"]:
@@ -133,6 +130,7 @@ class OrientationDMP(nn.Module):
         start_velocity: ArrayLike | None = None,
         *,
         speed: ArrayLike | None = None,
+        amplitude: ArrayLike | None = None,
     ) -> OrientationTrajectory:
         """Motion from start to goal; without arguments, the demonstrated one.
 
@@ -146,10 +144,13 @@ class OrientationDMP(nn.Module):
             duration: [s], (*batch).
             start_velocity: Angular, in the base frame [rad/s], (*batch, 3).
             speed: Instead of a duration, how many times faster than the demonstration.
+            amplitude: Factor on the forcing term, (*batch): how wide a rhythm swings.
         """
-        error, rate, goal, duration = self._ends(start, goal, duration, start_velocity, speed)
-        errors = self._dynamics.rollout(self.motion, time, error, duration, rate)
-        return OrientationTrajectory(errors, goal)
+        error, rate, reference, duration = self._ends(
+            start, goal, duration, start_velocity, speed
+        )
+        errors = self._dynamics.rollout(self.motion, time, error, duration, rate, amplitude)
+        return OrientationTrajectory(errors, reference)
 
     def initial_state(
         self,
@@ -161,9 +162,12 @@ class OrientationDMP(nn.Module):
         speed: ArrayLike | None = None,
     ) -> OrientationState:
         """State at the start of a motion, for `step`; arguments as in `rollout`."""
-        error, rate, goal, duration = self._ends(start, goal, duration, start_velocity, speed)
+        error, rate, reference, duration = self._ends(
+            start, goal, duration, start_velocity, speed
+        )
         motion = self.motion.initial_state(error, None, duration, rate)
-        return OrientationState(motion=motion, goal=goal.expand(*motion.position.shape[:-1], 4))
+        reference = reference.expand(*motion.position.shape[:-1], 4)
+        return OrientationState(motion=motion, reference=reference)
 
     def step(
         self,
@@ -172,19 +176,35 @@ class OrientationDMP(nn.Module):
         *,
         goal: ArrayLike | None = None,
         goal_filter: float | None = None,
+        coupling: ArrayLike | None = None,
         slowdown: ArrayLike | None = None,
+        amplitude: ArrayLike | None = None,
     ) -> OrientationState:
         """Advance by `dt`; arguments as in `JointDMP.step`.
 
         A new goal changes neither orientation nor angular velocity at that moment, nor, with
-        a `goal_filter`, the angular acceleration.
+        a `goal_filter`, the angular acceleration. `coupling` is one, in the base frame
+        [rad/s^2], (*batch, 3).
         """
-        motion, target = state.motion, state.goal
+        motion, reference = state.motion, state.reference
         if goal is not None:
-            target = unit_quaternion(goal, state.goal).expand_as(state.goal)
-            motion = self._dynamics.retarget(self.motion, motion, state.goal, target)
-        motion = self._dynamics.step(self.motion, motion, dt, goal_filter, slowdown)
-        return OrientationState(motion=motion, goal=target)
+            goal = unit_quaternion(goal, reference)
+            reference = reference_of(self.motion.goal, goal).expand_as(reference)
+            motion = self._dynamics.retarget(self.motion, motion, state.reference, reference)
+        if coupling is not None:
+            coupling = self._dynamics.push(
+                motion, to_tensor(coupling, reference.dtype, reference.device)
+            )
+        motion = self._dynamics.step(
+            self.motion,
+            motion,
+            dt,
+            goal_filter=goal_filter,
+            coupling=coupling,
+            slowdown=slowdown,
+            amplitude=amplitude,
+        )
+        return OrientationState(motion=motion, reference=reference)
 
     def save(self, folder: str | Path) -> None:
         """Write config.json and model.safetensors into `folder`, replacing an older save."""
@@ -211,10 +231,10 @@ class OrientationDMP(nn.Module):
         velocity: ArrayLike | None,
         speed: ArrayLike | None,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Error at the start, its rate [rad/s], goal, and duration."""
+        """Error at the start, its rate [rad/s], what it is taken to, and duration."""
         duration = self.motion.resolve_duration(duration, speed)
         rate = self.motion.start_velocity * (self.motion.duration / duration)[..., None]
-        error, rate, goal = error_ends(
-            self.motion.start, rate, self.goal, start, goal, velocity
+        error, rate, reference = error_ends(
+            self.motion.start, rate, self.motion.goal, self.goal, start, goal, velocity
         )
-        return error, rate, goal, duration
+        return error, rate, reference, duration

@@ -11,13 +11,10 @@ from hrc_learn.dmp.arrays import ArrayLike, to_tensor
 from hrc_learn.dmp.fitting.report import FitReport
 from hrc_learn.dmp.fitting.samples import check_samples
 from hrc_learn.dmp.joint import JointDMP
-from hrc_learn.dmp.orientation import (
-    error_ends,
-    fitted_error,
-    unit_quaternion,
-)
 from hrc_learn.dmp.pose_motion import BODY, ERROR, POSITION, PoseState, PoseTrajectory
-from hrc_learn.dmp.rotation.error import retarget, to_orientation
+from hrc_learn.dmp.rotation.demonstrated import fitted_error
+from hrc_learn.dmp.rotation.ends import error_ends, unit_quaternion
+from hrc_learn.dmp.rotation.error import error_rate, reference_of, retarget, to_orientation
 from hrc_learn.dmp.system.basis import Basis
 from hrc_learn.dmp.system.spring import SpringDamper
 from hrc_learn.geometry import Pose
@@ -39,7 +36,8 @@ class PoseDMP(nn.Module):
 
         Args:
             motion: Of position (3), orientation error (3) and body (K).
-            goal_orientation: Unit quaternion (w, x, y, z) that the error is taken to.
+            goal_orientation: Unit quaternion (w, x, y, z) at which it ends; the error is taken
+                to a reference as in `OrientationDMP`.
         """
         super().__init__()
         self.motion = motion
@@ -109,14 +107,18 @@ class PoseDMP(nn.Module):
     @property
     def start(self) -> Pose:
         """Where the demonstration starts."""
-        error = self.motion.start[..., ERROR]
-        rotation = to_orientation(error, self.goal_orientation)
+        rotation = to_orientation(self.motion.start[..., ERROR], self.reference)
         return Pose(self.motion.start[..., POSITION], rotation)
 
     @property
     def goal(self) -> Pose:
         """Where the demonstration ends."""
         return Pose(self.motion.goal[..., POSITION], self.goal_orientation)
+
+    @property
+    def reference(self) -> Float[Tensor, "*batch 4"]:
+        """What the orientation error is taken to."""
+        return reference_of(self.motion.goal[..., ERROR], self.goal_orientation)
 
     @property
     def duration(self) -> Float[Tensor, "*batch"]:
@@ -143,6 +145,7 @@ class PoseDMP(nn.Module):
         speed: ArrayLike | None = None,
         start_body: ArrayLike | None = None,
         goal_body: ArrayLike | None = None,
+        amplitude: ArrayLike | None = None,
     ) -> PoseTrajectory:
         """Motion from start to goal; without arguments, the demonstrated one.
 
@@ -157,11 +160,12 @@ class PoseDMP(nn.Module):
             speed: Instead of a duration, how many times faster than the demonstration.
             start_body: (*batch, K).
             goal_body: (*batch, K).
+            amplitude: Factor on the forcing term, (*batch): how wide a rhythm swings.
         """
-        ends, goal_orientation = self._ends(
+        ends, reference = self._ends(
             start, goal, duration, start_velocity, speed, start_body, goal_body
         )
-        return PoseTrajectory(self.motion.rollout(time, **ends), goal_orientation)
+        return PoseTrajectory(self.motion.rollout(time, **ends, amplitude=amplitude), reference)
 
     def initial_state(
         self,
@@ -175,12 +179,12 @@ class PoseDMP(nn.Module):
         goal_body: ArrayLike | None = None,
     ) -> PoseState:
         """State at the start of a motion, for `step`; arguments as in `rollout`."""
-        ends, goal_orientation = self._ends(
+        ends, reference = self._ends(
             start, goal, duration, start_velocity, speed, start_body, goal_body
         )
         motion = self.motion.initial_state(**ends)
-        goal_orientation = goal_orientation.expand(*motion.position.shape[:-1], 4)
-        return PoseState(motion=motion, goal_orientation=goal_orientation)
+        reference = reference.expand(*motion.position.shape[:-1], 4)
+        return PoseState(motion=motion, reference=reference)
 
     def step(
         self,
@@ -192,6 +196,7 @@ class PoseDMP(nn.Module):
         goal_filter: float | None = None,
         coupling: ArrayLike | None = None,
         slowdown: ArrayLike | None = None,
+        amplitude: ArrayLike | None = None,
     ) -> PoseState:
         """Advance by `dt`, as `JointDMP.step`.
 
@@ -202,20 +207,24 @@ class PoseDMP(nn.Module):
             goal_body: New goal of the body from here on, (*batch, K).
             goal_filter: Rate, per duration, at which goals move to where they were last told
                 to be, so that no acceleration jumps; None: they are there at once.
-            coupling: Acceleration added to the position [m/s^2], (*batch, 3).
+            coupling: Acceleration added to the position [m/s^2], (*batch, 3), or to the pose,
+                (*batch, 6), its angular part [rad/s^2] in the base frame.
             slowdown: The clock runs 1 + slowdown times slower, (*batch), >= 0.
+            amplitude: Factor on the forcing term, (*batch).
         """
-        motion, rotation = state.motion, state.goal_orientation
+        motion, reference = state.motion, state.reference
         ends = motion.target
         if goal is not None:
-            rotation = unit_quaternion(goal.orientation, rotation).expand_as(rotation)
+            rotation = unit_quaternion(goal.orientation, reference)
+            reference = reference_of(self.motion.goal[..., ERROR], rotation)
+            reference = reference.expand_as(state.reference)
             curvature = self.motion.curvature(motion)
             error, rate, error_curvature = retarget(
                 motion.position[..., ERROR],
                 motion.rate[..., ERROR],
                 curvature[..., ERROR],
-                state.goal_orientation,
-                rotation,
+                state.reference,
+                reference,
             )
             motion = replace(
                 motion,
@@ -228,7 +237,7 @@ class PoseDMP(nn.Module):
         if goal_body is not None:
             ends = _replaced(ends, BODY, goal_body)
         if coupling is not None:
-            coupling = _replaced(torch.zeros_like(motion.position), POSITION, coupling)
+            coupling = _push(motion.position, coupling)
         motion = self.motion.step(
             motion,
             dt,
@@ -236,8 +245,9 @@ class PoseDMP(nn.Module):
             goal_filter=goal_filter,
             coupling=coupling,
             slowdown=slowdown,
+            amplitude=amplitude,
         )
-        return PoseState(motion=motion, goal_orientation=rotation)
+        return PoseState(motion=motion, reference=reference)
 
     def save(self, folder: str | Path) -> None:
         """Write config.json and model.safetensors into `folder`, replacing an older save."""
@@ -260,14 +270,15 @@ class PoseDMP(nn.Module):
         start_body: ArrayLike | None,
         goal_body: ArrayLike | None,
     ) -> tuple[dict[str, Tensor], Tensor]:
-        """Arguments for the linear primitive, and the goal's orientation."""
+        """Arguments for the linear primitive, and what the error is taken to."""
         like = self.motion.start
         duration = self.motion.resolve_duration(duration, speed)
         demonstrated = self.motion.start_velocity * (self.motion.duration / duration)[..., None]
         twist = None if velocity is None else to_tensor(velocity, like.dtype, like.device)
-        error, error_rate, goal_orientation = error_ends(
+        error, rate, reference = error_ends(
             like[..., ERROR],
             demonstrated[..., ERROR],
+            self.motion.goal[..., ERROR],
             self.goal_orientation,
             None if start is None else start.orientation,
             None if goal is None else goal.orientation,
@@ -282,18 +293,18 @@ class PoseDMP(nn.Module):
             ),
             "goal": _joined(
                 self.motion.goal[..., POSITION] if goal is None else goal.position,
-                torch.zeros_like(error),
+                self.motion.goal[..., ERROR],
                 self.motion.goal[..., BODY] if goal_body is None else goal_body,
                 like,
             ),
             "start_velocity": _joined(
                 demonstrated[..., POSITION] if twist is None else twist[..., :3],
-                error_rate,
+                rate,
                 demonstrated[..., BODY],
                 like,
             ),
             "duration": duration,
-        }, goal_orientation
+        }, reference
 
 
 def _joined(position: Tensor, error: Tensor, body: ArrayLike, like: Tensor) -> Tensor:
@@ -301,6 +312,16 @@ def _joined(position: Tensor, error: Tensor, body: ArrayLike, like: Tensor) -> T
     columns = [to_tensor(part, like.dtype, like.device) for part in (position, error, body)]
     batch = torch.broadcast_shapes(*(column.shape[:-1] for column in columns))
     return torch.cat([column.expand(*batch, -1) for column in columns], dim=-1)
+
+
+def _push(coordinates: Tensor, coupling: ArrayLike) -> Tensor:
+    """The coupling of the linear primitive for an acceleration of position or pose."""
+    coupling = to_tensor(coupling, coordinates.dtype, coordinates.device)
+    push = _replaced(torch.zeros_like(coordinates), POSITION, coupling[..., :3])
+    if coupling.shape[-1] == 3:
+        return push
+    # The second derivative of the error is linear in the angular acceleration.
+    return _replaced(push, ERROR, error_rate(coordinates[..., ERROR], coupling[..., 3:]))
 
 
 def _replaced(values: Tensor, columns: slice, new: ArrayLike) -> Tensor:

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.dmp.orientation import OrientationState, OrientationTrajectory
+from hrc_learn.dmp.orientation_motion import OrientationState, OrientationTrajectory
 from hrc_learn.dmp.state import DMPState
 from hrc_learn.dmp.trajectory import Trajectory
 from hrc_learn.geometry import Pose
@@ -19,9 +19,9 @@ POSITION, ERROR, BODY = slice(0, 3), slice(3, 6), slice(6, None)
 class PoseTrajectory:
     """A pose over time, each output computed when first asked for."""
 
-    def __init__(self, motion: Trajectory, goal: Float[Tensor, "*batch 4"]):
+    def __init__(self, motion: Trajectory, reference: Float[Tensor, "*batch 4"]):
         self._motion = motion
-        self._rotation = OrientationTrajectory(motion, goal, first=ERROR.start)
+        self._rotation = OrientationTrajectory(motion, reference, first=ERROR.start)
 
     @property
     def time(self) -> Float[Tensor, "*batch T"]:
@@ -84,8 +84,9 @@ class PoseState:
     """Where a pose primitive is while it is stepped."""
 
     motion: DMPState
-    """Of position, error to the goal, and body."""
-    goal_orientation: Float[Tensor, "*batch 4"]
+    """Of position, error to the reference, and body."""
+    reference: Float[Tensor, "*batch 4"]
+    """The goal's orientation, unless the primitive says otherwise."""
 
     @property
     def pose(self) -> Pose:
@@ -110,7 +111,7 @@ class PoseState:
             for name in ("position", "rate", "start", "goal", "way", "target", "forced")
         }
         return OrientationState(
-            motion=replace(self.motion, **columns), goal=self.goal_orientation
+            motion=replace(self.motion, **columns), reference=self.reference
         )
 
 

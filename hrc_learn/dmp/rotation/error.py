@@ -56,6 +56,13 @@ def to_orientation(
     return quaternion.multiply(quaternion.exp(-error), goal)
 
 
+def reference_of(
+    error: Float[Tensor, "*#batch 3"], q: Float[Tensor, "*#batch 4"]
+) -> Float[Tensor, "*batch 4"]:
+    """What orientation has this error: exp(e) * q."""
+    return quaternion.multiply(quaternion.exp(error), q)
+
+
 def to_orientations(
     error: Float[Tensor, "*#batch T 3"], goal: Float[Tensor, "*#batch 4"]
 ) -> Float[Tensor, "*batch T 4"]:

@@ -7,7 +7,7 @@ Either keeps the error e and de/ds as its state, so that all else is shared.
 """
 
 from dataclasses import replace
-from typing import Protocol, runtime_checkable
+from typing import Protocol, Unpack, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
@@ -16,6 +16,7 @@ from hrc_learn.dmp.arrays import ArrayLike
 from hrc_learn.dmp.fitting.samples import Samples
 from hrc_learn.dmp.joint import JointDMP
 from hrc_learn.dmp.rotation import error as error_space
+from hrc_learn.dmp.rotation.influences import Influences
 from hrc_learn.dmp.rotation.ude import UdeFormulation, UdeMotion
 from hrc_learn.dmp.state import DMPState
 from hrc_learn.dmp.trajectory import Trajectory
@@ -42,6 +43,7 @@ class Formulation(Protocol):
         start: Float[Tensor, "*#batch 3"],
         duration: Float[Tensor, "*#batch"],
         rate: Float[Tensor, "*#batch 3"],
+        amplitude: ArrayLike | None,
     ) -> ErrorMotion:
         """Motion of the error from `start` [rad] with its `rate` [rad/s]."""
         ...
@@ -51,20 +53,25 @@ class Formulation(Protocol):
         motion: JointDMP,
         state: DMPState,
         dt: ArrayLike,
-        goal_filter: float | None,
-        slowdown: ArrayLike | None,
+        **influences: Unpack[Influences],
     ) -> DMPState:
         """Advance by `dt`; arguments as in `JointDMP.step`."""
+        ...
+
+    def push(
+        self, state: DMPState, acceleration: Float[Tensor, "*#batch 3"]
+    ) -> Float[Tensor, "*batch 3"]:
+        """The coupling of `step` for an angular acceleration [rad/s^2]."""
         ...
 
     def retarget(
         self,
         motion: JointDMP,
         state: DMPState,
-        old_goal: Float[Tensor, "*batch 4"],
-        goal: Float[Tensor, "*batch 4"],
+        old: Float[Tensor, "*batch 4"],
+        new: Float[Tensor, "*batch 4"],
     ) -> DMPState:
-        """The same motion of the orientation, as errors to a new goal."""
+        """The same motion of the orientation, as errors to a new reference."""
         ...
 
 
@@ -81,31 +88,37 @@ class LogFormulation:
         start: Float[Tensor, "*#batch 3"],
         duration: Float[Tensor, "*#batch"],
         rate: Float[Tensor, "*#batch 3"],
+        amplitude: ArrayLike | None,
     ) -> ErrorMotion:
         """Exact."""
-        return motion.rollout(time, start, None, duration, rate)
+        return motion.rollout(time, start, None, duration, rate, amplitude=amplitude)
 
     def step(
         self,
         motion: JointDMP,
         state: DMPState,
         dt: ArrayLike,
-        goal_filter: float | None,
-        slowdown: ArrayLike | None,
+        **influences: Unpack[Influences],
     ) -> DMPState:
         """Exact at any step length."""
-        return motion.step(state, dt, goal_filter=goal_filter, slowdown=slowdown)
+        return motion.step(state, dt, **influences)
+
+    def push(
+        self, state: DMPState, acceleration: Float[Tensor, "*#batch 3"]
+    ) -> Float[Tensor, "*batch 3"]:
+        """Linear in the second derivative of the error."""
+        return error_space.error_rate(state.position, acceleration)
 
     def retarget(
         self,
         motion: JointDMP,
         state: DMPState,
-        old_goal: Float[Tensor, "*batch 4"],
-        goal: Float[Tensor, "*batch 4"],
+        old: Float[Tensor, "*batch 4"],
+        new: Float[Tensor, "*batch 4"],
     ) -> DMPState:
         """With a goal filter the angular acceleration goes on as it was."""
         error, rate, curvature = error_space.retarget(
-            state.position, state.rate, motion.curvature(state), old_goal, goal
+            state.position, state.rate, motion.curvature(state), old, new
         )
         state = replace(state, position=error, rate=rate)
         return replace(state, goal=motion.resting_point(state, curvature))

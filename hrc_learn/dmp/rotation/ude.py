@@ -15,6 +15,7 @@ stable at any length and exact about one axis. The logarithm is followed continu
 
 from dataclasses import replace
 from functools import cached_property
+from typing import Unpack
 
 import torch
 from jaxtyping import Float
@@ -25,6 +26,7 @@ from hrc_learn.dmp.fitting.methods import ridge_operator
 from hrc_learn.dmp.fitting.samples import Samples
 from hrc_learn.dmp.joint import JointDMP
 from hrc_learn.dmp.rotation import error as error_space
+from hrc_learn.dmp.rotation.influences import Influences
 from hrc_learn.dmp.rotation.left_jacobian import axis_drift, drift_free_rate
 from hrc_learn.dmp.state import DMPState
 from hrc_learn.dmp.trajectory import Trajectory
@@ -64,7 +66,7 @@ class UdeFormulation:
             change = (ridge_operator(motion.response, s, 1e-7) @ force).mT
             motion.weights += change.to(motion.weights)
             ends = motion.start, motion.duration, motion.start_velocity
-            reproduction = self.rollout(motion, None, *ends).position.mT
+            reproduction = self.rollout(motion, None, *ends, None).position.mT
         motion.fit_report = errors.compare(reproduction.reshape(errors.position.shape))
 
     def rollout(
@@ -74,41 +76,47 @@ class UdeFormulation:
         start: Float[Tensor, "*#batch 3"],
         duration: Float[Tensor, "*#batch"],
         rate: Float[Tensor, "*#batch 3"],
+        amplitude: ArrayLike | None,
     ) -> "UdeMotion":
         """Of order 4 in `LONGEST`."""
         s = motion.normalised_time(time, duration)
-        return UdeMotion(motion, s, start, duration, rate)
+        return UdeMotion(motion, s, start, duration, rate, amplitude)
 
     def step(
         self,
         motion: JointDMP,
         state: DMPState,
         dt: ArrayLike,
-        goal_filter: float | None,
-        slowdown: ArrayLike | None,
+        **influences: Unpack[Influences],
     ) -> DMPState:
         """Of order 4 in `dt`."""
         v = drift_free_rate(state.position, state.rate)
         begin = replace(state, rate=v)
         half = to_tensor(dt, v.dtype, v.device) / 2
-        middle = motion.step(begin, half, goal_filter=goal_filter, slowdown=slowdown)
-        end = motion.step(middle, half, goal_filter=goal_filter, slowdown=slowdown)
+        middle = motion.step(begin, half, **influences)
+        end = motion.step(middle, half, **influences)
         linear = [torch.stack([x.position, x.rate], dim=-2) for x in (begin, middle, end)]
         h = end.s - state.s
         left = deviation(torch.zeros_like(linear[0]), h, motion, linear)
         e, v = (linear[2] + left).unbind(-2)
         return replace(end, position=e, rate=v + axis_drift(e, v))
 
+    def push(
+        self, state: DMPState, acceleration: Float[Tensor, "*#batch 3"]
+    ) -> Float[Tensor, "*batch 3"]:
+        """On v, which is minus the angular velocity."""
+        return -acceleration
+
     def retarget(
         self,
         motion: JointDMP,
         state: DMPState,
-        old_goal: Float[Tensor, "*batch 4"],
-        goal: Float[Tensor, "*batch 4"],
+        old: Float[Tensor, "*batch 4"],
+        new: Float[Tensor, "*batch 4"],
     ) -> DMPState:
         """With a goal filter the angular acceleration goes on as it was."""
-        q = error_space.to_orientation(state.position, old_goal)
-        error = error_space.nearest_turn(error_space.to_error(q, goal), state.position)
+        q = error_space.to_orientation(state.position, old)
+        error = error_space.nearest_turn(error_space.to_error(q, new), state.position)
         v = drift_free_rate(state.position, state.rate)
         # The pull is alpha beta (e - goal): it stays when both move alike.
         return replace(
@@ -129,6 +137,7 @@ class UdeMotion:
         start: Float[Tensor, "*#batch 3"],
         duration: Float[Tensor, "*#batch"],
         rate: Float[Tensor, "*#batch 3"],
+        amplitude: ArrayLike | None,
     ):
         """Describe the motion.
 
@@ -138,9 +147,11 @@ class UdeMotion:
             start: Error [rad].
             duration: [s].
             rate: Of the error [rad/s].
+            amplitude: Factor on the forcing term.
         """
         start, per_s = torch.broadcast_tensors(start, rate * duration[..., None])
         self._motion = motion
+        self._amplitude = amplitude
         self._s = s
         self._duration = duration[..., None, None]
         self._start = start
@@ -213,7 +224,13 @@ class UdeMotion:
 
     def _rolled(self, s: Tensor) -> Trajectory:
         # A duration of one: times are s, velocities per s.
-        return self._motion.rollout(s, self._start, duration=1.0, start_velocity=self._first)
+        return self._motion.rollout(
+            s,
+            self._start,
+            duration=1.0,
+            start_velocity=self._first,
+            amplitude=self._amplitude,
+        )
 
 
 def deviation(
