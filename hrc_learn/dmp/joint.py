@@ -1,24 +1,24 @@
 """Movement primitive of joints, or of any coordinates that add up like them."""
 
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from hrc_learn.dmp.arguments import normalised_time, positive, vector
 from hrc_learn.dmp.arrays import ArrayLike, to_tensor
-from hrc_learn.dmp.fitting.methods import fit_samples
+from hrc_learn.dmp.fitting.motion import fit_motion
+from hrc_learn.dmp.fitting.options import FitOptions
 from hrc_learn.dmp.fitting.report import FitReport
 from hrc_learn.dmp.fitting.samples import check_samples
-from hrc_learn.dmp.saved_joint import TENSORS, saved_arguments
-from hrc_learn.dmp.scaling import check_paper_scale, check_scaling, forcing_scale
+from hrc_learn.dmp.saved_joint import TENSORS, joint_config, saved_arguments
+from hrc_learn.dmp.scaling import Demonstrated, NoScaling, Scaling, find_scaling
 from hrc_learn.dmp.state import DMPState
 from hrc_learn.dmp.stepping import advance, second_derivative
-from hrc_learn.dmp.system.basis import Basis, GaussianBasis
-from hrc_learn.dmp.system.parts import basis_config
+from hrc_learn.dmp.system.basis import Basis
 from hrc_learn.dmp.system.response import response_of
 from hrc_learn.dmp.system.spring import SpringDamper
 from hrc_learn.dmp.trajectory import Trajectory, broadcast_shapes
@@ -60,7 +60,7 @@ class JointDMP(nn.Module):
         stamps: Float[Tensor, "*#batch T"],
         basis: Basis,
         spring: SpringDamper,
-        scaling: str = "none",
+        scaling: str | Scaling = "none",
         approach: float = 0.0,
         joint_names: Sequence[str] | None = None,
         units: str = "rad",
@@ -74,18 +74,17 @@ class JointDMP(nn.Module):
             goal: g, where it ends.
             start_velocity: Per second, at `duration`.
             duration: tau [s].
-            amplitude: Range covered by each coordinate, for `scaling="amplitude"`.
+            amplitude: Range covered by each coordinate.
             stamps: Normalised times at which a rollout repeats the demonstration.
             basis: Shape of the forcing term.
             spring: The unforced dynamics.
-            scaling: `"none"`, `"paper"` or `"amplitude"`; see `scaling.py`.
+            scaling: Of the forcing term; see `scaling.py`.
             approach: Share of the motion along which a new goal is taken up; 0: at once.
             joint_names: D names.
             units: Of the coordinates.
             fit_report: Kept for the reader.
         """
         super().__init__()
-        check_scaling(scaling)
         _check_names(joint_names, weights.shape[-2])
         if weights.shape[-1] != basis.count:
             raise ValueError(f"{weights.shape[-1]} weights for {basis.count} basis functions")
@@ -99,7 +98,7 @@ class JointDMP(nn.Module):
             self.register_buffer(name, value)
         self.basis = basis
         self.spring = spring
-        self.scaling = scaling
+        self.forcing_scale = find_scaling(scaling)
         self.joint_names = None if joint_names is None else tuple(joint_names)
         self.units = units
         self.fit_report = fit_report
@@ -114,14 +113,10 @@ class JointDMP(nn.Module):
         velocity: ArrayLike | None = None,
         mask: ArrayLike | None = None,
         *,
-        method: str = "trajectory",
-        scaling: str = "none",
-        approach: float = 0.0,
+        scaling: str | Scaling = "none",
         joint_names: Sequence[str] | None = None,
         units: str = "rad",
-        basis: Basis | None = None,
-        spring: SpringDamper | None = None,
-        regularization: float = 1e-7,
+        **options: Unpack[FitOptions],
     ) -> "JointDMP":
         """Learn one primitive from each demonstration.
 
@@ -133,56 +128,52 @@ class JointDMP(nn.Module):
             velocity: Recorded velocity per second, like `position`. Without it, the default
                 method fits the start velocity along and the others differentiate positions.
             mask: (*B, T), false where a sample does not count (padding, dropouts).
-            method: `"trajectory"`, least squares on the positions, the closest
-                reproduction; `"ridge"`, regression on the force; `"lwr"`, the paper's.
-            scaling: Of the forcing term: `"none"`, `"paper"` or `"amplitude"`.
-            approach: Share of the motion, 0 to 1, along which a new start and goal are taken
-                up, smoothly; 0: at once, as the paper has it.
+            scaling: Of the forcing term: `"none"`, `"paper"`, `"amplitude"` or `"rotation"`.
             joint_names: D names, kept with the primitive.
             units: Of the coordinates.
-            basis: Shape of the forcing term.
-            spring: Gains; alpha = 25, critically damped, unless given.
-            regularization: Ridge, relative to the largest singular value.
+            options: How to fit; see `FitOptions`.
 
         Raises:
             ValueError: Bad samples (says which), or a scaling that the motion forbids.
         """
-        check_scaling(scaling)
-        samples = check_samples(time, position, velocity, mask)
-        _check_names(joint_names, samples.position.shape[1])
-        basis, spring = basis or GaussianBasis(count=n_basis), spring or SpringDamper()
-        response = response_of(spring, basis, approach)
-        weights, rate = fit_samples(method, response, samples, regularization)
+        scaling = find_scaling(scaling)
+        recorded = check_samples(time, position, velocity, mask)
+        _check_names(joint_names, recorded.position.shape[1])
+        fit = fit_motion(recorded, n_basis, **options)
+        samples = fit.samples
         # One where a coordinate never moves: nothing to scale, and nothing to divide by.
         amplitude = torch.where(samples.span > 0, samples.span, 1.0)
-        scale = forcing_scale(scaling, samples.first, samples.last, amplitude)
-        if scale is not None:
-            if scaling == "paper":
-                check_paper_scale(scale, amplitude, samples.batch, joint_names)
-            weights = weights / scale[..., None]
+        ends = Demonstrated(start=samples.first, goal=samples.last, amplitude=amplitude)
+        scaling.check(ends, samples.batch, joint_names)
 
         def batched(tensor: Tensor) -> Tensor:
             return tensor.to(samples.position.dtype).reshape(samples.batch + tensor.shape[1:])
 
         dmp = cls(
-            weights=batched(weights),
+            weights=batched(scaling.unscale(fit.weights.mT, ends).mT),
             start=batched(samples.first),
             goal=batched(samples.last),
-            start_velocity=batched(rate / samples.duration[:, None]),
+            start_velocity=batched(fit.rate / samples.duration[:, None]),
             duration=batched(samples.duration),
             amplitude=batched(amplitude),
             stamps=samples.s[0] if samples.shared else samples.s.reshape(*samples.batch, -1),
-            basis=basis,
-            spring=spring,
+            basis=fit.response.basis,
+            spring=fit.response.spring,
             scaling=scaling,
-            approach=approach,
+            approach=fit.response.approach,
             joint_names=joint_names,
             units=units,
         )
         with torch.no_grad():
             reproduction = dmp.rollout().position.mT.reshape(samples.position.shape)
-        dmp.fit_report = samples.compare(reproduction)
+        trust = None if fit.trust is None else batched(fit.trust).mT
+        dmp.fit_report = samples.compare(reproduction, trust)
         return dmp
+
+    @property
+    def scaling(self) -> str:
+        """Name of the scaling of the forcing term."""
+        return self.forcing_scale.name
 
     def coordinates(self) -> Float[Tensor, "*batch D M"]:
         """What the response maps to the demonstrated motion: weights, dy/ds, start, goal.
@@ -227,7 +218,7 @@ class JointDMP(nn.Module):
             stamps=(self.stamps if stamps is None else stamps).clone(),
             basis=self.basis,
             spring=self.spring,
-            scaling=self.scaling,
+            scaling=self.forcing_scale,
             approach=self.response.approach,
             joint_names=self.joint_names,
             units=self.units,
@@ -256,14 +247,15 @@ class JointDMP(nn.Module):
             goal: (*batch, D).
             duration: [s], (*batch).
             start_velocity: Per second, (*batch, D). By default the demonstrated one, changed
-                with the duration so that the path stays the same.
+                with the duration so that the path stays the same, and turned and dilated with
+                the way if the scaling is `"rotation"`.
             speed: Instead of a duration, how many times faster than the demonstration.
             amplitude: Factor on the forcing term, (*batch): how wide a rhythm swings.
         """
         start, goal, rate, duration = self._boundary(
             start, goal, duration, start_velocity, speed
         )
-        weights, ends = self._scaled_weights(start, goal), (rate, start, goal)
+        weights, ends = self._scaled(self.weights.mT, start, goal).mT, (rate, start, goal)
         if amplitude is not None:
             weights = weights * self._as_tensor(amplitude)[..., None, None]
         batch = broadcast_shapes(weights.shape[:-1], *(x.shape for x in ends))
@@ -347,10 +339,13 @@ class JointDMP(nn.Module):
         if coupling is not None:
             push = self._as_tensor(coupling) * state.duration[..., None] ** 2
         aim = target if goal_filter is None else state.goal
-        scale = forcing_scale(self.scaling, state.start, aim, self.amplitude)
-        if amplitude is not None:
-            factor = self._as_tensor(amplitude)[..., None]
-            scale = factor.expand_as(target) if scale is None else scale * factor
+
+        def scale(values: Tensor) -> Tensor:
+            values = self._scaled(values, state.start, aim)
+            if amplitude is None:
+                return values
+            return values * self._as_tensor(amplitude)[..., None, None]
+
         return advance(
             state,
             (self._as_tensor(dt) * pace / state.duration).double(),
@@ -365,8 +360,20 @@ class JointDMP(nn.Module):
 
     def curvature(self, state: DMPState) -> Float[Tensor, "*batch D"]:
         """d^2 y / ds^2 at a state that nothing couples to."""
-        scale = forcing_scale(self.scaling, state.start, state.goal, self.amplitude)
+
+        def scale(values: Tensor) -> Tensor:
+            return self._scaled(values, state.start, state.goal)
+
         return second_derivative(state, self.response, self.weights, scale)
+
+    def start_rate(
+        self, start: Float[Tensor, "*#batch D"], goal: Float[Tensor, "*#batch D"]
+    ) -> Float[Tensor, "*#batch D"]:
+        """Dy/ds that a motion between these starts with, unless told otherwise."""
+        rate = self.start_velocity * self.duration[..., None]
+        if not self.forcing_scale.turns_velocity:
+            return rate
+        return self._scaled(rate[..., None, :], start, goal)[..., 0, :]
 
     def resting_point(
         self, state: DMPState, curvature: Float[Tensor, "*batch D"]
@@ -379,10 +386,10 @@ class JointDMP(nn.Module):
         if duration is not None and speed is not None:
             raise ValueError("give a duration or a speed, not both")
         if duration is not None:
-            return self._positive("duration", duration)
-        return (
-            self.duration if speed is None else self.duration / self._positive("speed", speed)
-        )
+            return positive("duration", duration, self.duration)
+        if speed is not None:
+            return self.duration / positive("speed", speed, self.duration)
+        return self.duration
 
     def normalised_time(
         self, time: ArrayLike | None, duration: Float[Tensor, "*#batch"]
@@ -390,14 +397,7 @@ class JointDMP(nn.Module):
         """Times [s] of a rollout over its duration; of None, the demonstration's stamps."""
         if time is None:
             return self.stamps
-        time = to_tensor(time, dtype=torch.float64, device=duration.device)
-        if time.ndim == 0 or not (time >= 0).all():
-            raise ValueError("time must be an array of seconds since the start, none negative")
-        s = time / duration.double()[..., None]
-        # Rows that are all alike need one response matrix, not one each.
-        if s.ndim > 1 and not s.requires_grad and (s == s.reshape(-1, s.shape[-1])[0]).all():
-            return s.reshape(-1, s.shape[-1])[0]
-        return s
+        return normalised_time(time, duration)
 
     def save(self, folder: str | Path) -> None:
         """Write config.json and model.safetensors into `folder`, replacing an older save."""
@@ -415,18 +415,11 @@ class JointDMP(nn.Module):
 
     def config(self) -> dict[str, Any]:
         """What a saved primitive needs besides its tensors."""
-        return {
-            "joint_names": self.joint_names,
-            "units": {"coordinates": self.units, "time": "s"},
-            "scaling": self.scaling,
-            "approach": self.response.approach,
-            "spring": asdict(self.spring),
-            "basis": basis_config(self.basis),
-        }
+        return joint_config(self)
 
     def tensors(self) -> dict[str, Tensor]:
         """Learned numbers and residuals, by the names they are saved under."""
-        report = {} if self.fit_report is None else vars(self.fit_report)
+        report = {} if self.fit_report is None else self.fit_report.tensors()
         return dict(self.state_dict()) | {f"fit_report.{k}": v for k, v in report.items()}
 
     @classmethod
@@ -447,30 +440,20 @@ class JointDMP(nn.Module):
         speed: ArrayLike | None,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Start, goal, dy/ds at the start, and duration."""
-        start = self.start if start is None else self._coordinates("start", start)
-        goal = self.goal if goal is None else self._coordinates("goal", goal)
+        start = self.start if start is None else vector("start", start, self.start)
+        goal = self.goal if goal is None else vector("goal", goal, self.goal)
         duration = self.resolve_duration(duration, speed)
         if start_velocity is None:
-            return start, goal, self.start_velocity * self.duration[..., None], duration
-        velocity = self._coordinates("start_velocity", start_velocity)
+            return start, goal, self.start_rate(start, goal), duration
+        velocity = vector("start_velocity", start_velocity, self.start_velocity)
         return start, goal, velocity * duration[..., None], duration
 
-    def _scaled_weights(self, start: Tensor, goal: Tensor) -> Tensor:
-        scale = forcing_scale(self.scaling, start, goal, self.amplitude)
-        return self.weights if scale is None else self.weights * scale[..., None]
-
-    def _coordinates(self, name: str, value: ArrayLike) -> Tensor:
-        tensor = self._as_tensor(value)
-        D = self.weights.shape[-2]
-        if tensor.ndim == 0 or tensor.shape[-1] != D:
-            raise ValueError(f"{name} must have shape (..., {D}), got {tuple(tensor.shape)}")
-        return tensor
-
-    def _positive(self, name: str, value: ArrayLike) -> Tensor:
-        tensor = self._as_tensor(value)
-        if not (tensor > 0).all():
-            raise ValueError(f"{name} must be positive, got {tensor.min().item()}")
-        return tensor
+    def _scaled(self, values: Tensor, start: Tensor, goal: Tensor) -> Tensor:
+        """What (*batch, K, D) of the forcing term becomes between these ends."""
+        if isinstance(self.forcing_scale, NoScaling):
+            return values  # before the look-ups, which take as long as a step's arithmetic
+        shown = Demonstrated(start=self.start, goal=self.goal, amplitude=self.amplitude)
+        return self.forcing_scale.scale(values, start, goal, shown)
 
     def _as_tensor(self, value: ArrayLike) -> Tensor:
         return to_tensor(value, dtype=self.weights.dtype, device=self.weights.device)

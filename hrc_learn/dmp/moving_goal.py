@@ -91,9 +91,9 @@ class MovingGoal:
         """Take a primitive along.
 
         Raises:
-            ValueError: Its forcing scales with goal - start, which the moving frame changes.
+            ValueError: Its forcing follows start and goal, which the moving frame changes.
         """
-        if dmp.scaling == "paper":
+        if dmp.forcing_scale.follows_ends:
             raise ValueError("a moving goal needs a scaling that does not depend on start")
         self.dmp = dmp
 

@@ -1,16 +1,34 @@
 """What a saved joint primitive holds, read back as the arguments that make it again."""
 
+from dataclasses import asdict
 from types import NoneType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
 from hrc_learn.dmp.fitting.report import FitReport
-from hrc_learn.dmp.system.parts import restore_basis
+from hrc_learn.dmp.scaling import Scaling, find_scaling
+from hrc_learn.dmp.system.parts import basis_config, restore_basis
 from hrc_learn.dmp.system.spring import SpringDamper
 from hrc_learn.storage import SavedModel
 
+if TYPE_CHECKING:
+    from hrc_learn.dmp.joint import JointDMP
+
 TENSORS = ("weights", "start", "goal", "start_velocity", "duration", "amplitude", "stamps")
+
+
+def joint_config(dmp: "JointDMP") -> dict[str, Any]:
+    """What a saved primitive needs besides its tensors, as JSON values."""
+    return {
+        "joint_names": dmp.joint_names,
+        "units": {"coordinates": dmp.units, "time": "s"},
+        "scaling": dmp.scaling,
+        "scaled_columns": dmp.forcing_scale.columns,
+        "approach": dmp.response.approach,
+        "spring": asdict(dmp.spring),
+        "basis": basis_config(dmp.basis),
+    }
 
 
 def saved_arguments(saved: SavedModel) -> dict[str, Any]:
@@ -25,15 +43,32 @@ def saved_arguments(saved: SavedModel) -> dict[str, Any]:
         **tensors,
         "spring": _part(saved, "spring", lambda fields: SpringDamper(**fields)),
         "basis": _part(saved, "basis", restore_basis),
-        "scaling": saved.get("scaling", str),
+        "scaling": _scaling(saved),
         "approach": float(saved.get("approach", float, int)),
         "joint_names": saved.get("joint_names", list, NoneType),
         "units": saved.get("units", dict).get("coordinates", ""),
     }
     if "fit_report.rmse" in saved.tensors:
-        report = {name: saved.tensor(f"fit_report.{name}") for name in ("rmse", "peak", "span")}
+        names = ("rmse", "peak", "span", "trust")
+        report = {
+            n: saved.tensor(f"fit_report.{n}")
+            for n in names
+            if f"fit_report.{n}" in saved.tensors
+        }
         arguments["fit_report"] = FitReport(**report)
     return arguments
+
+
+def _scaling(saved: SavedModel) -> Scaling:
+    name = saved.get("scaling", str)
+    # Older files say nothing of columns: all were scaled.
+    columns = saved.config.get("scaled_columns")
+    if columns is not None:
+        columns = saved.get("scaled_columns", int)
+    try:
+        return find_scaling(name, columns)
+    except ValueError as error:
+        raise saved.invalid_field("scaling", error) from None
 
 
 def _check_shapes(saved: SavedModel, tensors: dict[str, Tensor]) -> None:

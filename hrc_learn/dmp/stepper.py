@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from hrc_learn.dmp.joint import JointDMP
+from hrc_learn.dmp.scaling import Demonstrated
 from hrc_learn.dmp.system.approach import quintic
 
 Vector = Float64[np.ndarray, "D"]
@@ -22,6 +23,8 @@ class StepperState(NamedTuple):
     """Position, and its derivative dy/ds."""
     forced: Pair
     """(y, dy/ds) that the unscaled forcing term alone has caused by `s`."""
+    scale: Float64[np.ndarray, "D D"] | None
+    """What start and goal make of the forcing term, from the right; None: nothing."""
     start: Vector
     goal: Vector
     way: Vector
@@ -60,18 +63,17 @@ class Stepper:
                 f"a stepper takes one primitive, got a batch {tuple(dmp.weights.shape[:-2])}"
             )
         forced, weights = dmp.response.forced, dmp.weights.detach().double().cpu()
-        if dmp.scaling == "amplitude":
-            weights = weights * dmp.amplitude.double().cpu()[:, None]
-        table = (forced.coefficients @ weights.T).numpy()
+        self._scaling, self._shown = dmp.forcing_scale, _demonstrated(dmp)
+        weights = weights.numpy().T
+        if not self._scaling.follows_ends:
+            weights = self._scaled(weights, self._shown.start, self._shown.goal)
+        table = forced.coefficients.cpu().numpy() @ weights
         self._table = np.ascontiguousarray(table.reshape(*table.shape[:2], -1))
         self._exponents = np.arange(table.shape[1])
         self._interval = forced.interval
         self._end = math.inf if forced.periodic else forced.end
         self._spring, self._approach = dmp.spring, dmp.response.approach
-        self._by_distance = dmp.scaling == "paper"
-        self._start, self._goal, self._velocity = (
-            x.double().cpu().numpy() for x in (dmp.start, dmp.goal, dmp.start_velocity)
-        )
+        self._velocity = dmp.start_velocity.detach().double().cpu().numpy()
         self._duration = dmp.duration.item()
         half = self._spring.alpha / 2
         self._transition = math.nan, np.eye(2)
@@ -85,15 +87,26 @@ class Stepper:
         start_velocity: Vector | None = None,
     ) -> StepperState:
         """State at the start of a motion; arguments as in `JointDMP.rollout`."""
-        start = self._start if start is None else start
-        rate = self._velocity * self._duration
-        duration = self._duration if duration is None else duration
+        y_0 = self._shown.start if start is None else start
+        g = self._shown.goal if goal is None else goal
+        tau = self._duration if duration is None else duration
         if start_velocity is not None:
-            rate = start_velocity * duration
-        y = np.stack([start, rate])
-        goal = self._goal if goal is None else goal
-        forced = self._forced(0.0)
-        return StepperState(0.0, y, forced, start, goal, goal - start, duration, 1.0)
+            rate = start_velocity * tau
+        else:
+            rate = self._velocity * self._duration
+            if self._scaling.turns_velocity:
+                rate = self._scaled(rate[None], y_0, g)[0]
+        return StepperState(
+            s=0.0,
+            y=np.stack([y_0, rate]),
+            forced=self._forced(0.0),
+            scale=self._scale(y_0, g),
+            start=y_0,
+            goal=g,
+            way=g - y_0,
+            duration=tau,
+            pace=1.0,
+        )
 
     def step(
         self,
@@ -104,8 +117,11 @@ class Stepper:
         slowdown: float = 0.0,
     ) -> StepperState:
         """Advance by `dt` [s]; arguments as in `JointDMP.step`."""
-        s, y, before, start, _, way, duration, _ = state
-        goal = state.goal if goal is None else goal
+        s, y, before, scale, start, at, way, duration, _ = state
+        if goal is None:
+            goal = at
+        else:
+            scale = self._scale(start, goal)
         pace = 1.0 / (1.0 + slowdown)
         ds = dt * pace / duration
         s += ds
@@ -118,16 +134,25 @@ class Stepper:
             self._transition = ds, self._propagator(ds)
         E = self._transition[1]
         forced = after = self._forced(s) if state.s < self._end else E @ before
-        if self._by_distance:
-            scale = goal - start
-            before, after = before * scale, after * scale
+        if scale is not None:
+            before, after = before @ scale, after @ scale
         if self._approach:
             before = before + self._approaching(state.s, way)
             after = after + self._approaching(s, way)
         y = E @ (y - rest - before)
         y += after
         y += rest
-        return StepperState(s, y, forced, start, goal, way, duration, pace)
+        return StepperState(s, y, forced, scale, start, goal, way, duration, pace)
+
+    def _scale(self, start: Vector, goal: Vector) -> Float64[np.ndarray, "D D"] | None:
+        if not self._scaling.follows_ends:
+            return None
+        return self._scaled(np.eye(len(start)), start, goal)
+
+    def _scaled(
+        self, values: Float64[np.ndarray, "K D"], start: Vector, goal: Vector
+    ) -> Float64[np.ndarray, "K D"]:
+        return self._scaling.scale(values, start, goal, self._shown, np)
 
     def _approaching(self, s: float, way: Vector) -> Pair:
         m, slope = quintic(min(s / self._approach, 1.0))
@@ -147,3 +172,10 @@ class Stepper:
         E[0, 0] += C
         E[1, 1] += C
         return E
+
+
+def _demonstrated(dmp: JointDMP) -> Demonstrated:
+    start, goal, amplitude = (
+        x.detach().double().cpu().numpy() for x in (dmp.start, dmp.goal, dmp.amplitude)
+    )
+    return Demonstrated(start=start, goal=goal, amplitude=amplitude)

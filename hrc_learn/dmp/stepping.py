@@ -5,6 +5,8 @@ equation alone, known at both ends of the step. What the state differs from the 
 dies out as the unforced spring has it. So no step is too long, whatever its length.
 """
 
+from collections.abc import Callable
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -24,7 +26,7 @@ def advance(
     *,
     response: Response,
     weights: Float[Tensor, "*#batch D N"],
-    scale: Float[Tensor, "*#batch D"] | None,
+    scale: Callable[[Tensor], Tensor],
     target: Float[Tensor, "*batch D"],
     goal_filter: float | None,
     push: Float[Tensor, "*#batch D"] | None,
@@ -37,7 +39,7 @@ def advance(
         ds: Step in normalised time (float64).
         response: Of the primitive.
         weights: Of the unscaled forcing term.
-        scale: Of the forcing term; None stands for one.
+        scale: What the ends make of (*batch, K, D) that the forcing term causes.
         target: Where the goal shall be.
         goal_filter: Rate dg/ds = -rate (g - target); None: the goal is there at once.
         push: Constant second derivative added to the motion, by s.
@@ -47,9 +49,7 @@ def advance(
     # Both transitions at once: over this step, and since the forcing has ended.
     E, coast = spring.propagator(torch.stack([ds, response.coasting(s)])).to(target)
     forced = coast @ (response.forced.to(s.device)(s).to(target) @ weights.mT)
-    before, after = state.forced, forced
-    if scale is not None:
-        before, after = before * scale[..., None, :], after * scale[..., None, :]
+    before, after = scale(state.forced), scale(forced)
     if response.approach:
         share, way = response.approach, state.way[..., None, :]
         before = before + approach_state(state.s, share).to(way)[..., None] * way
@@ -80,12 +80,11 @@ def second_derivative(
     state: DMPState,
     response: Response,
     weights: Float[Tensor, "*#batch D N"],
-    scale: Float[Tensor, "*#batch D"] | None,
+    scale: Callable[[Tensor], Tensor],
 ) -> Float[Tensor, "*batch D"]:
     """Y'' by s at a state, without coupling."""
-    force = (response.basis.forcing(state.s)[..., None, :].to(weights) @ weights.mT)[..., 0, :]
-    if scale is not None:
-        force = force * scale
+    force = response.basis.forcing(state.s)[..., None, :].to(weights) @ weights.mT
+    force = scale(force)[..., 0, :]
     if response.approach:
         force = force + state.way * response.approach_force(state.s).to(force)[..., None]
     return response.spring.acceleration(state.position - state.goal, state.rate) + force

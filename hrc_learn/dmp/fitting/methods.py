@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.dmp.fitting.samples import Samples
+from hrc_learn.dmp.system.basis import Basis
 from hrc_learn.dmp.system.response import Response
 
 METHODS = ("trajectory", "ridge", "lwr")
@@ -120,17 +121,25 @@ def _trajectory_operator(
     s = torch.tensor(stamps, dtype=torch.float64, device=device)
     H = response.evaluate(s)[:, 0]
     velocity, start, goal = H[:, N], H[:, N + 1], H[:, N + 2]
-    # Units in which the ridge weighs all alike: late weights act through a small phase, a
-    # velocity through no double integration.
-    unit = 1 / response.basis.phase(response.basis.centre_times().to(device))
-    if fit_rate:
-        size = (H[:, :N] * unit).norm(dim=0).amax() / velocity.norm()
-        unit = torch.cat([unit, size[None]])
+    unit = balanced_units(response.basis, H, int(fit_rate))
     K = unit[:, None] * _ridge_inverse(H[:, : N + fit_rate] * unit, regularization)
     from_samples = K.clone()
     from_samples[:, 0] -= K @ start
     from_samples[:, -1] -= K @ goal
     return from_samples, K @ velocity
+
+
+def balanced_units(
+    basis: Basis, A: Float[Tensor, "rows M"], others: int
+) -> Float[Tensor, "unknown"]:
+    """Units of the weights and `others` columns after them that a ridge weighs alike.
+
+    Late weights act through a small phase, and the ends of a motion through no integration.
+    """
+    unit = 1 / basis.phase(basis.centre_times().to(A))
+    norm = A.norm(dim=0)
+    size = (norm[: basis.count] * unit).amax()
+    return torch.cat([unit, size / norm[basis.count : basis.count + others]])
 
 
 def ridge_operator(

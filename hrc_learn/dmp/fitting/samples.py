@@ -62,8 +62,12 @@ class Samples:
         low, high = self._filled(self.position, self.first[..., None]).aminmax(dim=-1)
         return high - low
 
-    def compare(self, reproduction: Float[Tensor, "B D T"]) -> FitReport:
-        """Residuals of a reproduction, on the samples that count."""
+    def compare(
+        self,
+        reproduction: Float[Tensor, "B D T"],
+        trust: Float[Tensor, "*batch T D"] | None = None,
+    ) -> FitReport:
+        """Residuals of a reproduction, on the samples that count; `trust` is passed on."""
         zero = torch.zeros((), dtype=reproduction.dtype, device=reproduction.device)
         error = self._filled(reproduction - self.position, zero)
         low, high = error.aminmax(dim=-1)
@@ -72,7 +76,8 @@ class Samples:
             "peak": torch.maximum(-low, high),
             "span": self.span,
         }
-        return FitReport(**{k: v.reshape(*self.batch, -1) for k, v in residuals.items()})
+        residuals = {k: v.reshape(*self.batch, -1) for k, v in residuals.items()}
+        return FitReport(**residuals, trust=trust)
 
     def _at(self, index: Tensor) -> Tensor:
         return torch.take_along_dim(self.position, index[:, None, None], dim=-1)[..., 0]

@@ -160,7 +160,7 @@ class ContextualDMP(nn.Module):
         features = {"degree": phi.degree} if isinstance(phi, PolynomialFeatures) else None
         config = self.mean.config() | {"features": features}
         own = {name: getattr(self, name) for name in OWN_TENSORS}
-        report = {f"held_out.{k}": v for k, v in vars(self.held_out).items()}
+        report = {f"held_out.{k}": v for k, v in self.held_out.tensors().items()}
         write_model(folder, type(self).__name__, config, self.mean.tensors() | own | report)
 
     @classmethod
