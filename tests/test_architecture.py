@@ -22,11 +22,12 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 CORE: dict[str, set[str]] = {
     "pytree": set(),
     "storage": set(),
+    "distributed": set(),
     "geometry": set(),
     "kinematics": {"geometry"},
-    "dmp": {"storage", "geometry"},
+    "dmp": {"storage", "distributed", "geometry"},
     "regions": {"pytree", "geometry"},
-    "jacobian": {"pytree", "storage", "geometry"},
+    "jacobian": {"pytree", "storage", "distributed", "geometry"},
     "controller": {"pytree", "geometry", "kinematics", "regions", "jacobian"},
     "protocols": set(),
 }

@@ -12,4 +12,12 @@ from .estimators import PaperEstimator as PaperEstimator
 from .estimators import RecursiveLeastSquaresEstimator as RecursiveLeastSquaresEstimator
 from .fitting import ImageJacobianFitConfig as ImageJacobianFitConfig
 from .fitting import ImageJacobianFitReport as ImageJacobianFitReport
+from .gathering import Watched as Watched
+from .gathering import watched as watched
+from .held_out import CellErrors as CellErrors
+from .held_out import held_out_pairs as held_out_pairs
+from .learning import Learned as Learned
+from .learning import LearningConfig as LearningConfig
+from .learning import learn as learn
 from .network import RBFImageJacobian as RBFImageJacobian
+from .neurons import Neurons as Neurons

@@ -17,6 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.jacobian.pairs import PairConfig, PairStatistics
+from hrc_learn.jacobian.prior import weight_covariance
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,16 +67,24 @@ class Posterior:
     """Of either image row [(px/m)^2]."""
 
 
+def prior_precision(
+    centers: Float[Tensor, "K _"], config: ImageJacobianFitConfig
+) -> Float[Tensor, "P P"]:
+    """Inverse covariance of the weights before anything was seen."""
+    prior = weight_covariance(centers, config.bias_std, config.weight_std)
+    return torch.block_diag(*[torch.linalg.inv(prior)] * 6)
+
+
 def fit_weights(
     parts: Sequence[PairStatistics],
-    prior: Float[Tensor, "K K"],
+    precision: Float[Tensor, "P P"],
     config: ImageJacobianFitConfig,
 ) -> tuple[Posterior, ImageJacobianFitReport]:
     """Fit to all parts; each part in turn is held out to measure the error on unseen data.
 
     Args:
         parts: Statistics of parts of the data that were recorded apart.
-        prior: Covariance between neurons, the same for each of the six components.
+        precision: Of the prior (see `prior_precision`).
         config: Noise of the feature.
 
     Raises:
@@ -88,7 +97,6 @@ def fit_weights(
             "seen, or the tool moved less than min_step or more than max_step at a time."
         )
     total = reduce(add, parts)
-    precision = torch.block_diag(*[torch.linalg.inv(prior)] * 6)
     noise = 2 * config.pixel_noise**2
     held_out = _held_out_square(parts, precision, noise)
     noise = max(noise, held_out / 2)  # two coordinates

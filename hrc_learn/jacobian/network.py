@@ -16,9 +16,11 @@ from hrc_learn.jacobian.fitting import (
     ImageJacobianFitConfig,
     ImageJacobianFitReport,
     fit_weights,
+    prior_precision,
 )
-from hrc_learn.jacobian.gathering import statistics_by_part
-from hrc_learn.jacobian.prior import component_scale, weight_covariance
+from hrc_learn.jacobian.gathering import Watched, statistics_by_part, watched
+from hrc_learn.jacobian.neurons import Neurons, pose_inputs
+from hrc_learn.jacobian.prior import component_scale
 from hrc_learn.storage import SavedModel, write_model
 
 _KIND = "RBFImageJacobian"
@@ -42,6 +44,8 @@ class RBFImageJacobian(nn.Module):
     """Of the neurons, (K, n), in the units of the chosen components of r."""
     width: Tensor
     """Standard deviation of the neurons, one number in the same unit."""
+    reference: Tensor | None
+    """Orientation (w, x, y, z) from which the neurons count rotation; None: r itself."""
     covariance: Tensor | None
     """Posterior covariance of one image row of W, (6 K, 6 K) in (component, neuron) order,
     with rotation counted in metres (`rotation_scale`); None if not fitted."""
@@ -53,6 +57,7 @@ class RBFImageJacobian(nn.Module):
         *,
         weight: Float[Tensor, "12 K"] | None = None,
         input_indices: Sequence[int] = (0, 1),
+        reference: Float[Tensor, "4"] | None = None,
         normalized: bool = True,
     ):
         """Build a network; its dtype is that of `centers`.
@@ -62,7 +67,10 @@ class RBFImageJacobian(nn.Module):
             width: Standard deviation of the neurons.
             weight: W; zero if None.
             input_indices: Components of r = (x, y, z, three of the rotation vector) that the
-                neurons see. A rotation vector jumps at half turns; prefer positions.
+                neurons see. A rotation vector jumps at half turns; prefer positions, or
+                give a reference.
+            reference: Orientation in the middle of those to come: the last three inputs are
+                then the rotation vector from it (see `pose_inputs`).
             normalized: Whether neurons are divided by their sum (see `radial_basis`).
 
         Raises:
@@ -75,6 +83,9 @@ class RBFImageJacobian(nn.Module):
         self.normalized = normalized
         self.register_buffer("centers", centers.detach().clone())
         self.register_buffer("width", torch.as_tensor(width, dtype=centers.dtype))
+        if reference is not None:
+            reference = reference.detach().clone().to(centers)
+        self.register_buffer("reference", reference)
         self.register_buffer("covariance", None)
         if weight is None:
             weight = centers.new_zeros(12, len(centers))
@@ -153,19 +164,46 @@ class RBFImageJacobian(nn.Module):
         Raises:
             ValueError: Lengths differ, or no pair of key frames is left.
         """
-        network = cls(centers.double(), width, input_indices=input_indices)
+        neurons = Neurons(centers=centers, width=width, input_indices=tuple(input_indices))
+        return cls.fit_watched(watched(poses, features, visible), neurons, config)
+
+    @classmethod
+    def fit_watched(
+        cls,
+        demonstrations: Sequence[Watched],
+        neurons: Neurons,
+        config: ImageJacobianFitConfig | None = None,
+    ) -> RBFImageJacobian:
+        """Fit to demonstrations read one by one; of several processes, each reads its share.
+
+        Args:
+            demonstrations: In memory, or a sequence that reads them when asked.
+            neurons: Of the network; its dtype is that of their centres.
+            config: Noise, prior and the choice of key frames.
+
+        Returns:
+            The network, with `report` and `covariance` set; the same in all processes.
+
+        Raises:
+            ValueError: No pair of key frames is left.
+        """
         config = config or ImageJacobianFitConfig()
-        if visible is None:
-            visible = [~feature.isnan().any(-1) for feature in features]
-        parts = statistics_by_part(network.basis, poses, features, visible, config)
-        prior = weight_covariance(network.centers, config.bias_std, config.weight_std)
-        posterior, report = fit_weights(parts, prior, config)
+        network = cls(
+            neurons.centers.double(),
+            float(neurons.width),
+            input_indices=neurons.input_indices,
+            reference=neurons.reference,
+        )
+        K = len(network.centers)
+        parts = statistics_by_part(network.basis, K, demonstrations, config)
+        precision = prior_precision(network.centers, config)
+        posterior, report = fit_weights(parts, precision, config)
         rows = posterior.mean.mT.unflatten(-1, (6, -1))  # (2, 6, K)
         scale = component_scale(rows, config.rotation_scale)
         network.weight.data = (rows * scale[:, None]).flatten(0, 1)
         network.covariance = posterior.covariance
         network.report = report
-        return network.to(centers.dtype)
+        return network.to(neurons.centers.dtype)
 
     def forward(self, r: Pose | Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 2 6"]:
         """J_s_hat at a pose.
@@ -233,6 +271,7 @@ class RBFImageJacobian(nn.Module):
                 float(saved.tensor("width")),
                 weight=saved.tensor("weight"),
                 input_indices=saved.get("input_indices", list),
+                reference=saved.tensor("reference") if "reference" in saved.tensors else None,
                 normalized=saved.flag("normalized"),
             )
         except (TypeError, ValueError) as error:
@@ -242,12 +281,13 @@ class RBFImageJacobian(nn.Module):
         return network
 
     def _inputs(self, r: Pose | Tensor) -> Tensor:
-        if isinstance(r, Tensor):
-            vector = r
-        elif max(self.input_indices) < 3:
-            vector = r.position  # saves the logarithm of the orientation
+        if max(self.input_indices) < 3:  # saves the logarithm of the orientation
+            vector = r if isinstance(r, Tensor) else r.position
+        elif self.reference is None:
+            vector = r if isinstance(r, Tensor) else r.vector()
         else:
-            vector = r.vector()
+            pose = Pose.from_vector(r) if isinstance(r, Tensor) else r
+            vector = pose_inputs(pose, self.reference)
         return vector[..., self.input_indices]
 
 

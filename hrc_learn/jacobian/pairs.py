@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from hrc_learn import distributed
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian.prior import component_scale
 
@@ -40,8 +43,22 @@ class PairStatistics:
 
     @staticmethod
     def of(phi: Float[Tensor, "pairs P"], dx: Float[Tensor, "pairs 2"]) -> PairStatistics:
-        """Statistics of some pairs (see `demonstration_pairs`)."""
+        """Statistics of some pairs, from their regressors (see `KeyMotion`)."""
         return PairStatistics(phi.mT @ phi, phi.mT @ dx, dx.square().sum(), len(dx))
+
+    @staticmethod
+    def empty(regressors: int) -> PairStatistics:
+        """Statistics of no pairs."""
+        zeros = torch.zeros(regressors, regressors + 2, dtype=torch.float64)
+        return PairStatistics(zeros[:, 2:], zeros[:, :2], zeros.new_zeros(()), 0)
+
+    def over_processes(self) -> PairStatistics:
+        """Statistics of the pairs of all processes."""
+        total = distributed.differentiable_sum
+        pairs = torch.tensor(float(self.count), dtype=torch.float64)
+        return PairStatistics(
+            total(self.gram), total(self.cross), total(self.energy), int(total(pairs))
+        )
 
     def __add__(self, other: PairStatistics) -> PairStatistics:
         """Statistics of both sets of pairs together."""
@@ -58,34 +75,85 @@ class PairStatistics:
         return max(float(self.energy + change), 0.0)
 
 
-def demonstration_pairs(
-    theta: Float[Tensor, "time K"],
-    pose: Pose,
-    feature: Float[Tensor, "time 2"],
-    visible: Bool[Tensor, " time"],
-    config: PairConfig,
-) -> tuple[Float[Tensor, "pairs P"], Float[Tensor, "pairs 2"]]:
-    """Regressors and image motions between neighbouring key frames.
+@dataclass(frozen=True, eq=False)
+class KeyMotion:
+    """Motion from each key frame of a demonstration to the next one within reach."""
 
-    Args:
-        theta: Neurons along the demonstration.
-        pose: Of the tool, (time,).
-        feature: Image feature [px].
-        visible: Where the feature was found.
-        config: Choice of key frames.
+    before: Pose
+    """Of the tool at the first frame of each pair, (pairs,)."""
+    after: Pose
+    """At the second."""
+    dr: Float[Tensor, "pairs 6"]
+    """Motion of the tool, rotation counted in metres [m]."""
+    dx: Float[Tensor, "pairs 2"]
+    """Motion of its image [px]."""
+    frames: Int[Tensor, "pairs 2"]
+    """Which two frames."""
 
-    Returns:
-        phi = dr (x) theta of 6 K columns in (component, neuron) order [m], and dx [px].
-    """
-    keys = key_frames(pose, visible, config)
-    pose, theta = pose[keys], theta[keys]
-    scale = component_scale(theta, config.rotation_scale)
-    dr = pose[:-1].twist_to(pose[1:]) * scale
-    # The mean of both ends is exact to second order, like the Jacobian half-way.
-    theta = (theta[1:] + theta[:-1]) / 2
-    phi = (dr[:, :, None] * theta[:, None, :]).flatten(-2)
-    near = torch.linalg.vector_norm(dr, dim=-1) <= config.max_step
-    return phi[near], feature[keys].diff(dim=0)[near]
+    @staticmethod
+    def of(
+        pose: Pose,
+        feature: Float[Tensor, "time 2"],
+        visible: Bool[Tensor, " time"],
+        config: PairConfig,
+    ) -> KeyMotion:
+        """Motion along one demonstration.
+
+        Args:
+            pose: Of the tool, (time,).
+            feature: Image feature [px].
+            visible: Where the feature was found.
+            config: Choice of key frames.
+        """
+        keys = key_frames(pose, visible, config)
+        before, after = pose[keys[:-1]], pose[keys[1:]]
+        dr = before.twist_to(after) * component_scale(pose.position, config.rotation_scale)
+        near = torch.linalg.vector_norm(dr, dim=-1) <= config.max_step
+        return KeyMotion(
+            before=before[near],
+            after=after[near],
+            dr=dr[near],
+            dx=feature[keys].diff(dim=0)[near],
+            frames=torch.stack([keys[:-1], keys[1:]], dim=-1)[near],
+        )
+
+    @staticmethod
+    def joined(motions: Sequence[KeyMotion]) -> KeyMotion:
+        """The pairs of several demonstrations as one."""
+
+        def join(name: str) -> Any:
+            parts = [getattr(motion, name) for motion in motions]
+            if isinstance(parts[0], Tensor):
+                return torch.cat(parts)
+            return Pose(
+                torch.cat([part.position for part in parts]),
+                torch.cat([part.orientation for part in parts]),
+            )
+
+        return KeyMotion(*(join(field.name) for field in fields(KeyMotion)))
+
+    def split(self, parts: int) -> list[KeyMotion]:
+        """The pairs in order, in parts of nearly the same number."""
+        return [self[piece] for piece in torch.arange(len(self.dx)).tensor_split(parts)]
+
+    def thinned(self, most: int) -> KeyMotion:
+        """So many of the pairs at most, evenly chosen."""
+        pairs = len(self.dx)
+        return self if pairs <= most else self[torch.linspace(0, pairs - 1, most).long()]
+
+    def __getitem__(self, index: Tensor) -> KeyMotion:
+        """Some of the pairs."""
+        return KeyMotion(*(getattr(self, field.name)[index] for field in fields(self)))
+
+    def regressors(self, basis: Callable[[Pose], Tensor]) -> Float[Tensor, "pairs P"]:
+        """Columns phi = dr (x) theta, 6 K of them columns in (component, neuron) order [m].
+
+        Args:
+            basis: Neurons at poses, (pairs, K).
+        """
+        # The mean of both ends is exact to second order, like the Jacobian half-way.
+        theta = (basis(self.before) + basis(self.after)) / 2
+        return (self.dr[:, :, None] * theta[:, None, :]).flatten(-2)
 
 
 def key_frames(pose: Pose, visible: Bool[Tensor, " time"], config: PairConfig) -> Tensor:

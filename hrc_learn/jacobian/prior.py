@@ -14,7 +14,9 @@ def component_scale(like: Tensor, rotation_scale: float) -> Float[Tensor, "6"]:
 
 
 def weight_covariance(
-    centers: Float[Tensor, "K _"], bias_std: float, weight_std: float
+    centers: Float[Tensor, "K _"],
+    bias_std: float | Float[Tensor, ""],
+    weight_std: float | Float[Tensor, ""],
 ) -> Float[Tensor, "K K"]:
     """Prior covariance between neurons, for each entry of the Jacobian alone.
 

@@ -179,7 +179,7 @@ class Collaboration:
                 f"look: the camera does not see marker {item.marker.id} of {item.name!r}. Put "
                 "it into the camera's view, and the arm out of it."
             )
-        return self._aiming.target(pixel)
+        return self._aiming.target_of(pixel)
 
     def _aim(self, goals: Goals) -> float:
         self._station.enter("aim")

@@ -1,17 +1,34 @@
 """From demonstrations of aiming: the image Jacobian, and where in the image to aim."""
 
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import overload
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..demos import Demonstration, DemonstrationSet
+from ..demos import Demonstration, DemonstrationSet, DemonstrationSource
 from ..geometry import Pose
-from ..jacobian import RBFImageJacobian
+from ..jacobian import (
+    CellErrors,
+    ImageJacobianFitConfig,
+    Learned,
+    LearningConfig,
+    Neurons,
+    RBFImageJacobian,
+    Watched,
+    held_out_pairs,
+    learn,
+)
+from ..jacobian.learning import Round
+from ..kinematics import panda
 from .visual_target import OBJECT_FEATURE, VisualTarget
+
+type Demonstrations = DemonstrationSet | DemonstrationSource
+"""In memory, or read one by one."""
 
 _REST = 0.3
 """Time at the end of a demonstration in which the hand stands above the object [s]."""
@@ -22,12 +39,18 @@ class AimingSkill:
     """What was learned from demonstrations of aiming."""
 
     jacobian: RBFImageJacobian
-    target: VisualTarget
+    target: VisualTarget | None
+    """None where no object was watched."""
+    learned: Learned | None = None
+    """How neurons, noise and prior were learned; None where they were given."""
+    cells: CellErrors | None = None
+    """Held-out errors by place; None of a skill that was loaded."""
 
     def save(self, folder: Path) -> None:
         """Write into `folder/jacobian` and `folder/visual_target.json`."""
         self.jacobian.save(folder / "jacobian")
-        self.target.save(folder / "visual_target.json")
+        if self.target is not None:
+            self.target.save(folder / "visual_target.json")
 
     @classmethod
     def load(cls, folder: Path) -> "AimingSkill":
@@ -37,10 +60,24 @@ class AimingSkill:
             FileNotFoundError: If there is no such folder or file.
             ValueError: If a file is not one of ours.
         """
+        target = folder / "visual_target.json"
         return cls(
             jacobian=RBFImageJacobian.load(folder / "jacobian"),
-            target=VisualTarget.load(folder / "visual_target.json"),
+            target=VisualTarget.load(target) if target.exists() else None,
         )
+
+    def target_of(self, pixel: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
+        """Where the hand's marker should be, to stand above an object seen at a pixel.
+
+        Raises:
+            ValueError: If no object was watched in the demonstrations.
+        """
+        if self.target is None:
+            raise ValueError(
+                f"the aiming skill knows no visual target: its demonstrations lack "
+                f"{OBJECT_FEATURE}."
+            )
+        return self.target(pixel)
 
     def metrics(self) -> dict[str, float]:
         """How well image motion is predicted, and how well aiming.
@@ -49,60 +86,134 @@ class AimingSkill:
             ValueError: If the skill was loaded; its metrics are in metrics.json.
         """
         report = self.jacobian.report
-        if report is None:
+        if report is None or self.cells is None:
             raise ValueError("only a skill just fitted has metrics; see its metrics.json.")
-        return {
+        known = self.cells.relative[self.cells.pairs > 0]
+        values = {
             "pairs": float(report.pairs),
+            "neurons": float(len(self.jacobian.centers)),
             "motion_px": report.motion,
             "fit_error_px": report.error,
             "held_out_error_px": report.held_out_error,
             "held_out_relative": report.held_out_error / report.motion,
-            "target_error_px": self.target.error,
+            "held_out_relative_worst_cell": float(known.max()),
         }
+        if self.learned is not None:
+            first, best = self.learned.rounds[0], self.learned.rounds[self.learned.best]
+            values |= {
+                "pixel_noise_px": self.learned.config.pixel_noise,
+                "width": float(self.learned.neurons.width),
+                "learning_rounds": float(self.learned.best),
+                "before_learning_error_px": first.held_out_error,
+                "after_learning_error_px": best.held_out_error,
+            }
+        if self.target is not None:
+            values["target_error_px"] = self.target.error
+        return values
 
 
 def fit_aiming(
-    demos: DemonstrationSet, centers: Float[Tensor, "K 2"], width: float
+    demos: Demonstrations,
+    neurons: Neurons | None = None,
+    config: ImageJacobianFitConfig | None = None,
+    learning: LearningConfig | None = None,
+    on_round: Callable[[int, Round], None] = lambda number, state: None,
 ) -> AimingSkill:
-    """Fit image Jacobian and visual target.
+    """Fit image Jacobian and, where an object was watched, visual target.
 
     Args:
-        demos: With end-effector poses, image features, and the object's feature.
-        centers: Of the neurons, in x and y [m].
-        width: Of the neurons [m].
+        demos: With image features and end-effector poses, or joint positions of a Panda.
+        neurons: Of the network; None: about the poses that were shown.
+        config: Noise, prior and choice of key frames.
+        learning: How to learn neurons, noise and prior; None: not at all. Too few
+            demonstrations to hold one out are fitted without.
+        on_round: Told of every round of learning.
 
     Raises:
         ValueError: If a demonstration lacks a column; names it and the episode.
     """
-    for demo in demos:
-        _require(demo, demos.source)
-    poses = [
-        Pose(torch.from_numpy(demo.position), torch.from_numpy(demo.orientation))
-        for demo in demos
-    ]
-    jacobian = RBFImageJacobian.fit(
-        poses,
-        [torch.from_numpy(demo.feature) for demo in demos],
-        [torch.from_numpy(demo.feature_visible) for demo in demos],
-        centers=centers,
-        width=width,
+    camera = _Watching(demos)
+    config = config or ImageJacobianFitConfig()
+    neurons = neurons or Neurons.around(camera)
+    learned = None
+    if learning is not None and len(demos) >= learning.hold_out:
+        learned = learn(camera, neurons, config, learning, on_round)
+        neurons, config = learned.neurons, learned.config
+    network = RBFImageJacobian.fit_watched(camera, neurons, config)
+    cells = held_out_pairs(camera, network, config).by_cell()
+    return AimingSkill(
+        jacobian=network, target=_visual_target(demos), learned=learned, cells=cells
     )
-    ends = [_end(demo, demos.source) for demo in demos]
-    target = VisualTarget.fit(
-        np.array([objects for objects, _ in ends]), np.array([hands for _, hands in ends])
-    )
-    return AimingSkill(jacobian=jacobian, target=target)
 
 
-def _require(demo: Demonstration, source: str) -> None:
-    needed = ("position", "orientation", "feature", "feature_visible")
-    missing = [name for name in needed if getattr(demo, name) is None]
-    missing += [] if OBJECT_FEATURE in demo.extra else [OBJECT_FEATURE]
-    if missing:
+class _Watching(Sequence[Watched]):
+    """Demonstrations as the fit of an image Jacobian takes them, read when asked for."""
+
+    def __init__(self, demos: Sequence[Demonstration], source: str | None = None):
+        self._demos = demos
+        self._source = getattr(demos, "source", "") if source is None else source
+
+    @overload
+    def __getitem__(self, index: int) -> Watched: ...
+    @overload
+    def __getitem__(self, index: slice) -> "_Watching": ...
+    def __getitem__(self, index):
+        if isinstance(index, slice):
+            return _Watching(self._demos[index], self._source)
+        return _watched(self._demos[index], self._source)
+
+    def __len__(self) -> int:
+        return len(self._demos)
+
+    def __iter__(self) -> Iterator[Watched]:
+        return (_watched(demo, self._source) for demo in self._demos)
+
+
+def _watched(demo: Demonstration, source: str) -> Watched:
+    missing = [name for name in ("feature", "feature_visible") if getattr(demo, name) is None]
+    pose = _pose(demo)
+    missing += ["position, orientation"] if pose is None else []
+    if missing or pose is None or demo.feature is None or demo.feature_visible is None:
         raise ValueError(
             f"{source}, episode {demo.episode}: no {', '.join(missing)}. An image Jacobian "
-            "needs the hand's pose and its marker's pixel in every frame, and the object's."
+            "needs the hand's pose and its marker's pixel in every frame."
         )
+    return Watched(
+        pose=pose,
+        feature=torch.from_numpy(demo.feature).double(),
+        visible=torch.from_numpy(demo.feature_visible),
+    )
+
+
+def _pose(demo: Demonstration) -> Pose | None:
+    """Of the hand, as recorded or from the joints of a known arm."""
+    if demo.position is not None and demo.orientation is not None:
+        return Pose(_double(demo.position), _double(demo.orientation))
+    if demo.joint_position is not None and demo.joint_names == panda.joint_names:
+        return panda.forward(_double(demo.joint_position))
+    return None
+
+
+def _double(values: np.ndarray) -> Tensor:
+    return torch.from_numpy(values).double()
+
+
+def _visual_target(demos: Demonstrations) -> VisualTarget | None:
+    """From the ends of all demonstrations; None if in none an object was watched."""
+    ends, without = [], []
+    for demo in demos:
+        if OBJECT_FEATURE in demo.extra:
+            ends.append(_end(demo, demos.source))
+        else:
+            without.append(demo.episode)
+    if not ends:
+        return None
+    if without:
+        raise ValueError(
+            f"{demos.source}, episode {without[0]}: no {OBJECT_FEATURE}, which others have."
+        )
+    objects, hands = (np.array(column) for column in zip(*ends, strict=True))
+    return VisualTarget.fit(objects, hands)
 
 
 def _end(demo: Demonstration, source: str) -> tuple[np.ndarray, np.ndarray]:

@@ -6,8 +6,8 @@ from torch.testing import assert_close
 
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import ImageJacobianFitConfig, RBFImageJacobian, grid, paper_grid
-from hrc_learn.jacobian.gathering import statistics_by_part
-from hrc_learn.jacobian.pairs import PairConfig, demonstration_pairs, key_frames
+from hrc_learn.jacobian.gathering import statistics_by_part, watched
+from hrc_learn.jacobian.pairs import KeyMotion, PairConfig, key_frames
 
 CAMERA = Pinhole.overhead(roll=0.7)
 
@@ -102,10 +102,9 @@ def test_fit_is_ridge_regression():
     network = fit(poses, features)
     rows, targets = [], []
     for pose, x in zip(poses, features, strict=True):
-        theta = network.basis(pose).detach()
-        phi, dx = demonstration_pairs(theta, pose, x, torch.ones(80).bool(), config)
-        rows.append(phi)
-        targets.append(dx)
+        motion = KeyMotion.of(pose, x, torch.ones(80).bool(), config)
+        rows.append(motion.regressors(network.basis).detach())
+        targets.append(motion.dx)
     covariance = 1500.0**2 * torch.ones(9, 9) + 500.0**2 * torch.eye(9)
     prior = torch.linalg.inv(torch.block_diag(*[covariance.double()] * 6))
     A = torch.cat([*rows, network.report.noise * torch.linalg.cholesky(prior).mT])
@@ -121,16 +120,10 @@ def test_statistics_add_up_in_any_order():
     poses, features = record(7)
     config = PairConfig()
     network = RBFImageJacobian(paper_grid(), 0.1)
-    seen = [~x.isnan().any(-1) for x in features]
 
     def total(order):
-        parts = statistics_by_part(
-            network.basis,
-            [poses[i] for i in order],
-            [features[i] for i in order],
-            [seen[i] for i in order],
-            config,
-        )
+        demonstrations = watched([poses[i] for i in order], [features[i] for i in order])
+        parts = statistics_by_part(network.basis, 9, demonstrations, config)
         return sum(parts[1:], parts[0])
 
     one, other = total(range(7)), total([3, 6, 0, 2, 5, 1, 4])

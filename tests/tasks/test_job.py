@@ -8,7 +8,6 @@ import torch
 
 from hrc_learn.demos import DatasetWriter, load_demos
 from hrc_learn.human import PullSpell
-from hrc_learn.jacobian import paper_grid
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import World, open_camera
 from hrc_learn.tasks.collaboration import CollaborationConfig
@@ -57,7 +56,7 @@ def aiming(tmp_path_factory):
     eye = Eye.on(open_camera(world, "synthetic", rng=rng), WORKPLACE.scene)
     shown = [teach_aiming(world, WORKPLACE, eye, lesson, rng) for _ in range(5)]
     features = {OBJECT_FEATURE: OBJECT_FEATURE_NAMES}
-    skill = fit_aiming(recorded(folder / "demos", lesson, features, shown), paper_grid(), 0.1)
+    skill = fit_aiming(recorded(folder / "demos", lesson, features, shown))
     (folder / "model").mkdir()
     skill.save(folder / "model")
     assert skill.metrics()["held_out_relative"] < 0.15
