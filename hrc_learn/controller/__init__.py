@@ -15,6 +15,7 @@ from .safety import SafetyConfig as SafetyConfig
 from .safety import SafetyFilter as SafetyFilter
 from .safety import SafetyReport as SafetyReport
 from .safety import SafetyState as SafetyState
+from .separation import SeparationConfig as SeparationConfig
 from .table1 import GRIPPER_DOWN as GRIPPER_DOWN
 from .table1 import INITIAL_IMAGE_JACOBIAN as INITIAL_IMAGE_JACOBIAN
 from .table1 import table1_config as table1_config

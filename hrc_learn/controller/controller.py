@@ -168,7 +168,8 @@ class AdaptiveController(nn.Module):
             motion.joint_velocity,
             observation.dt,
             jacobian=J,
-            stop=stop,
+            human_distance=observation.human_distance,
+            stop=_either(stop, observation.stop),
             stale=stale,
             bounds=motion.bounds,
         )
@@ -326,6 +327,13 @@ def _effective_goals(
     known = target.isfinite().all(-1)
     target = torch.where(known.unsqueeze(-1), target, goals.vision.target)
     return goals.aimed_at(target), known
+
+
+def _either(a: Tensor | None, b: Tensor | None) -> Tensor | None:
+    """Whether one of two optional conditions holds."""
+    if a is None or b is None:
+        return b if a is None else a
+    return a | b
 
 
 def _trusted_position(

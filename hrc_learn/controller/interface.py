@@ -44,6 +44,11 @@ class Observation:
     with a later pose teaches the estimator a wrong Jacobian."""
     joint_state_stale: Bool[Tensor, "*batch"] | None = None
     """Whether the joint position is too old to be used; None: it is not."""
+    human_distance: Float[Tensor, "*batch"] | None = None
+    """Distance of the nearest person from the arm [m], by which the tool slows down and stops;
+    NaN: not known, stop. None: nobody is watched for."""
+    stop: Bool[Tensor, "*batch"] | None = None
+    """Whether to brake to rest and stay there, as a watchdog or a person asks; None: no."""
 
 
 @pytree

@@ -6,17 +6,28 @@ controller, the playback of a learned motion, a person's joystick.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import final
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from hrc_learn.controller.barrier import LimitBarrier
+from hrc_learn.controller.separation import SeparationConfig
 from hrc_learn.kinematics import JointLimits
 from hrc_learn.pytree import pytree
 
-INTERVENTIONS = ("velocity", "position", "acceleration", "tcp_speed", "invalid", "stopped")
+INTERVENTIONS = (
+    "velocity",
+    "position",
+    "acceleration",
+    "jerk",
+    "tcp_speed",
+    "separation",
+    "invalid",
+    "stopped",
+)
 """Kinds of interventions, in the order of the last axis of their flags and counts."""
 
 
@@ -26,8 +37,19 @@ class SafetyConfig:
     """Distance kept from every joint position limit [rad]."""
     rate: float = 5.0
     """Fastest decay of the remaining distance to a limit [1/s]; at most 1/dt."""
+    jerk_limited: bool = True
+    """Whether the jerk of each joint is limited, which starts to matter below 4 ms a step."""
     tcp_speed: float = 1.0
     """Cap on the speed of the tool centre point [m/s]; acts where a Jacobian is given."""
+    separation: SeparationConfig = field(default_factory=SeparationConfig)
+    """Lowers that cap where the distance to a person is given."""
+
+    def __post_init__(self):
+        for name in ("rate", "tcp_speed"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive, but is {getattr(self, name)}")
+        if self.margin < 0:
+            raise ValueError(f"margin must not be negative, but is {self.margin}")
 
 
 @pytree
@@ -37,6 +59,8 @@ class SafetyState:
 
     velocity: Float[Tensor, "*batch n"]
     """Velocity of the last step [rad/s]."""
+    acceleration: Float[Tensor, "*batch n"]
+    """By which it came about [rad/s^2]; zero where jerk is not limited."""
     position: Float[Tensor, "*batch n"]
     """Where the joints should be now [rad]: used while their measurement is invalid."""
     counts: Int[Tensor, "*batch kinds"]
@@ -68,77 +92,46 @@ def _index(kind: str) -> int:
 
 @final
 class SafetyFilter(nn.Module):
-    """Joint velocities that keep the limits of position, velocity and acceleration.
+    """Joint velocities that keep the limits of position, velocity, acceleration and jerk.
 
-    Position limits hold for *any* command, by a control barrier. With the distance delta to
-    the limit less its margin, a joint may approach at most with
+    They hold for *any* sequence of commands, by a control barrier (`LimitBarrier`), as long as
+    the arm moves as it is told. Where it does not, the limits of acceleration and jerk hold,
+    and the others as soon as those let them. Within its margin a joint is driven back.
 
-        h(delta) = sqrt(c^2 + 2 a delta) - c,   c = a / rate,   v <= min(h, v_max)
-
-    that is v^2/(2a) + v/rate <= delta: enough room to brake with the acceleration limit a,
-    and near the limit (where h = rate delta) an exponential approach. If it holds now it
-    can be made to hold one step later without braking harder than a, for every step
-    dt <= 1/rate, because with Q(v) = v^2/(2a) + v/rate
-
-        Q(v - a dt) = Q(v) - v dt - a dt (1/rate - dt/2) <= delta - v dt.
-
-    So the three limits never contradict each other while the arm moves as it is told. Where
-    it does not, the acceleration limit holds and the others as soon as it lets them. Past a
-    margin -h(-delta) drives the joint back inside.
-
-    Velocity, tool speed and acceleration are limited by scaling the whole vector, which
-    keeps its direction; only a position limit cuts single joints.
+    Velocity, tool speed, acceleration and jerk are limited by scaling the whole vector, which
+    keeps its direction; only the barrier cuts single joints. The acceleration fades in time
+    for the velocity to arrive without overshoot, so stops and resumes are smooth.
     """
-
-    velocity: Tensor
-    """v_max [rad/s]."""
-    acceleration: Tensor
-    """a [rad/s^2]."""
-    knee: Tensor
-    """c = a / rate [rad/s]."""
-    walls: Tensor
-    """Lower and upper limits, less the margin, with the signs of `sides` [rad]."""
-    sides: Tensor
-    knee_square: Tensor
-    twice_acceleration: Tensor
 
     def __init__(self, limits: JointLimits, config: SafetyConfig | None = None):
         super().__init__()
         self.config = config = config or SafetyConfig()
-        self.register_buffer("velocity", limits.velocity.clone())
-        self.register_buffer("acceleration", limits.acceleration.clone())
-        walls = torch.stack([-limits.lower - config.margin, limits.upper - config.margin])
-        self.register_buffer("walls", walls)
-        self.register_buffer("sides", torch.tensor([[1.0], [-1.0]]).to(walls))
-        knee = limits.acceleration / config.rate
-        self.register_buffer("knee", knee)
-        self.register_buffer("knee_square", knee * knee)
-        self.register_buffer("twice_acceleration", 2 * limits.acceleration)
+        self.barrier = LimitBarrier(
+            limits, margin=config.margin, rate=config.rate, jerk_limited=config.jerk_limited
+        )
 
     def initial_state(
         self,
         joint_position: Float[Tensor, "*batch n"],
         joint_velocity: Float[Tensor, "*batch n"] | None = None,
     ) -> SafetyState:
-        """State of an arm at rest, or moving with `joint_velocity` [rad/s]."""
+        """State of an arm at rest, or moving steadily with `joint_velocity` [rad/s]."""
         counts = joint_position.new_zeros(
             *joint_position.shape[:-1], len(INTERVENTIONS), dtype=torch.int64
         )
-        velocity = torch.zeros_like(joint_position)
-        if joint_velocity is not None:
-            velocity = velocity + joint_velocity
-        return SafetyState(velocity=velocity, position=joint_position, counts=counts)
+        still = torch.zeros_like(joint_position)
+        return SafetyState(
+            velocity=still.clone() if joint_velocity is None else still + joint_velocity,
+            acceleration=still,
+            position=joint_position,
+            counts=counts,
+        )
 
     def velocity_bounds(
         self, joint_position: Float[Tensor, "*batch n"]
     ) -> tuple[Tensor, Tensor]:
         """Lowest and highest velocity [rad/s] that position and velocity limits allow."""
-        room = torch.addcmul(self.walls, self.sides, joint_position.unsqueeze(-2))
-        square = torch.addcmul(self.knee_square, self.twice_acceleration, room.abs())
-        h = torch.minimum(square.sqrt() - self.knee, self.velocity)
-        bounds = torch.copysign(h, room) * -self.sides
-        lower, upper = bounds.unbind(-2)
-        return lower, upper
+        return self.barrier.velocity_bounds(joint_position)
 
     def step(
         self,
@@ -148,6 +141,7 @@ class SafetyFilter(nn.Module):
         dt: float | Float[Tensor, ""],
         *,
         jacobian: Float[Tensor, "*batch rows n"] | None = None,
+        human_distance: Float[Tensor, "*batch"] | None = None,
         stop: Bool[Tensor, "*batch"] | None = None,
         stale: Bool[Tensor, "*batch"] | None = None,
         bounds: tuple[Tensor, Tensor] | None = None,
@@ -160,6 +154,8 @@ class SafetyFilter(nn.Module):
             joint_velocity_command: Wanted [rad/s]. Not finite: brake to rest.
             dt: Time until the next step [s].
             jacobian: Of the tool centre point, linear rows first: enables its speed cap.
+            human_distance: Of the nearest person [m], who slows the tool down and stops it;
+                NaN, not known: stop. None: nobody is watched for.
             stop: Brake to rest for another reason.
             stale: The joint position is too old to be used: brake to rest.
             bounds: `velocity_bounds` of a trusted joint position, where they are known.
@@ -168,32 +164,34 @@ class SafetyFilter(nn.Module):
             The velocity (*batch, n) [rad/s], the next state, and what was done.
 
         Raises:
-            ValueError: dt is not in (0, 1/rate].
+            ValueError: dt is not in (0, 1/rate], or a distance comes without a Jacobian.
         """
         self._check_step(dt)
         q, u, invalid, stopped = self._trusted(
             state, joint_position, joint_velocity_command, stop, stale
         )
-        lower, upper = bounds or self.velocity_bounds(q)
+        bounds = bounds or self.velocity_bounds(q)
 
-        excess = _excess(u, self.velocity)
+        excess = _excess(u, self.barrier.velocity)
         u = u / excess.clamp(min=1)
-        inside = u.clamp(lower, upper)
-        target, speeding = self._cap_tcp_speed(inside, jacobian)
-
-        reach = self.acceleration * dt
-        change = target - state.velocity
-        jerky = _excess(change, reach)
-        v = torch.addcdiv(state.velocity, change, jerky.clamp(min=1))
-        # Last the bounds that no scaling may loosen. Should both exclude each other, the arm
-        # could not brake harder anyway.
-        v = v.clamp(lower, upper).clamp(state.velocity - reach, state.velocity + reach)
-
+        inside = u.clamp(*bounds)
         cut = (inside != u).any(-1, keepdim=True)
-        flags = torch.cat([excess > 1, cut, jerky > 1, speeding, invalid, stopped], dim=-1)
-        position = q + v * dt
-        next_state = SafetyState(velocity=v, position=position, counts=state.counts + flags)
-        return v, next_state, SafetyReport(flags=flags)
+        target, speeding, near = self._cap_tcp_speed(inside, jacobian, human_distance)
+        follow = self._follow_smoothly if self.config.jerk_limited else self._follow
+        v, acceleration, steep, sharp = follow(state, target, bounds, dt)
+
+        flags = [excess > 1, cut, steep > 1, sharp, speeding, near, invalid, stopped]
+        flags = torch.cat(flags, dim=-1)
+        return (
+            v,
+            SafetyState(
+                velocity=v,
+                acceleration=acceleration,
+                position=q + v * dt,
+                counts=state.counts + flags,
+            ),
+            SafetyReport(flags=flags),
+        )
 
     def _check_step(self, dt: float | Tensor) -> None:
         if not isinstance(dt, Tensor) and not 0 < dt <= 1 / self.config.rate:
@@ -219,12 +217,77 @@ class SafetyFilter(nn.Module):
         u = u.masked_fill(invalid | stopped, 0)
         return q, u, invalid, stopped
 
-    def _cap_tcp_speed(self, u: Tensor, jacobian: Tensor | None) -> tuple[Tensor, Tensor]:
+    def _cap_tcp_speed(
+        self, u: Tensor, jacobian: Tensor | None, human_distance: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """The command slowed down, and the flags `tcp_speed` and `separation`."""
+        never = torch.zeros_like(u[..., :1], dtype=torch.bool)
         if jacobian is None:
-            return u, torch.zeros_like(u[..., :1], dtype=torch.bool)
+            if human_distance is not None:
+                raise ValueError(
+                    "human_distance limits the speed of the tool, which needs its Jacobian: "
+                    "pass jacobian as well"
+                )
+            return u, never, never
         linear = torch.linalg.vecdot(jacobian[..., :3, :], u.unsqueeze(-2))
-        ratio = torch.linalg.vector_norm(linear, dim=-1, keepdim=True) / self.config.tcp_speed
-        return u / ratio.clamp(min=1), ratio > 1
+        speed = torch.linalg.vector_norm(linear, dim=-1, keepdim=True)
+        speeding = speed > self.config.tcp_speed
+        if human_distance is None:
+            return u / (speed / self.config.tcp_speed).clamp(min=1), speeding, never
+        safe = self.config.separation.highest_speed(human_distance).unsqueeze(-1)
+        cap = safe.clamp(max=self.config.tcp_speed)
+        # At a cap of zero everything rests, also what does not move the tool.
+        factor = cap / torch.maximum(speed, cap).clamp(min=torch.finfo(u.dtype).tiny)
+        return factor * u, speeding, (speed > safe) | (safe == 0)
+
+    def _follow(
+        self,
+        state: SafetyState,
+        target: Tensor,
+        bounds: tuple[Tensor, Tensor],
+        dt: float | Tensor,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Velocity as near to the target as the acceleration limit lets it come."""
+        reach = self.barrier.acceleration * dt
+        change = target - state.velocity
+        steep = _excess(change, reach)
+        v = torch.addcdiv(state.velocity, change, steep.clamp(min=1))
+        # Last the bounds that no scaling may loosen. Should both exclude each other, the arm
+        # could not brake harder anyway.
+        v = v.clamp(*bounds).clamp(state.velocity - reach, state.velocity + reach)
+        return v, state.acceleration, steep, torch.zeros_like(steep, dtype=torch.bool)
+
+    def _follow_smoothly(
+        self,
+        state: SafetyState,
+        target: Tensor,
+        bounds: tuple[Tensor, Tensor],
+        dt: float | Tensor,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """The same under a jerk limit.
+
+        The acceleration wanted is the largest share of change/dt, alike for all joints, with
+        which they keep their acceleration limits and can still fade it out in time:
+        a dt + a^2/(2 j) <= change.
+        """
+        barrier = self.barrier
+        most = barrier.jerk * dt
+        change = (target - state.velocity) / dt
+        steep = _excess(change, barrier.acceleration)
+        fading = 1 + torch.sqrt(1 + 2 * _excess(change, most))
+        wanted = change / torch.maximum(steep, fading / 2)
+        jerk = wanted - state.acceleration
+        excess = _excess(jerk, most)
+        acceleration = torch.addcdiv(state.acceleration, jerk, excess.clamp(min=1))
+        # As above, and here too what comes last is what the arm cannot exceed.
+        acceleration = acceleration.clamp(
+            *barrier.acceleration_bounds(state.velocity, bounds, dt)
+        )
+        acceleration = acceleration.clamp(
+            torch.maximum(state.acceleration - most, -barrier.acceleration),
+            torch.minimum(state.acceleration + most, barrier.acceleration),
+        )
+        return state.velocity + acceleration * dt, acceleration, steep, excess > 1
 
 
 def _excess(vector: Tensor, limit: Tensor) -> Tensor:

@@ -4,6 +4,7 @@ import pytest
 import sampling
 import torch
 from torch import Tensor
+from unchecked import shapes_unchecked
 
 from hrc_learn.controller import INTERVENTIONS, SafetyConfig, SafetyFilter, SafetyState
 from hrc_learn.kinematics import panda
@@ -36,48 +37,121 @@ def commands(kind: str, *batch: int, rng: torch.Generator) -> Tensor:
             raise AssertionError(kind)
 
 
+def at_the_brink(*batch: int, rng: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Joints so fast towards a limit that they must brake at once, and hard, to keep it."""
+    config, A = SafetyConfig(), LIMITS.acceleration
+    reserve = A**2 / (2 * LIMITS.jerk)
+    share = torch.rand(*batch, 7, generator=rng, dtype=torch.float64)
+    speed = LIMITS.velocity * share
+    v_hat = speed + reserve
+    room = v_hat**2 / (2 * A) + v_hat / config.rate + config.margin
+    up = torch.rand(*batch, 7, generator=rng) < 0.5
+    q = torch.where(up, LIMITS.upper - room, LIMITS.lower + room)
+    # Fast joints 4 and 6 may need more room than their range has from the other side.
+    return q.clamp(LIMITS.lower + 0.03, LIMITS.upper - 0.03), torch.where(up, speed, -speed)
+
+
 @pytest.mark.parametrize("kind", ["noise", "push", "bang-bang", "broken"])
-@pytest.mark.parametrize("dt", [0.001, 0.008, 0.05])
+@pytest.mark.parametrize("dt", [0.001, 0.003, 0.008, 0.05])
 def test_no_command_breaks_a_limit(kind: str, dt: float):
-    """Starts anywhere inside the limits; each step checks position, velocity, acceleration."""
+    """Each step checks position, velocity, acceleration and jerk: from rest anywhere inside
+    the limits, and from states that leave no choice but to brake."""
     safety = SafetyFilter(LIMITS)
     rng = sampling.generator(7)
-    q = inside(100, seed=1)
+    anywhere = inside(40, seed=1)
     # Some joints start right at a limit.
-    q = torch.where(torch.rand(100, 7, generator=rng) < 0.1, LIMITS.upper, q)
+    anywhere = torch.where(torch.rand(40, 7, generator=rng) < 0.1, LIMITS.upper, anywhere)
+    brink, speed = at_the_brink(40, rng=rng)
+    q, v = torch.cat([anywhere, brink]), torch.cat([0 * speed, speed])
+    state = safety.initial_state(q, v)
+    before = state
+    with shapes_unchecked():  # for speed
+        for k in range(250):
+            if k % 5 == 0:
+                u = commands(kind, 80, rng=rng)
+            v, state, _ = safety.step(state, q, u, dt)
+            q = q + v * dt
+            assert_limits_kept(q, before, state, dt)
+            before = state
+
+
+def assert_limits_kept(q: Tensor, before: SafetyState, state: SafetyState, dt: float) -> None:
+    rounding = 1 + 1e-9
+    a = (state.velocity - before.velocity) / dt
+    assert (q <= LIMITS.upper + ROUNDING).all()
+    assert (q >= LIMITS.lower - ROUNDING).all()
+    assert (state.velocity.abs() <= LIMITS.velocity).all()
+    assert (a.abs() <= LIMITS.acceleration * rounding).all()
+    assert ((a - before.acceleration).abs() <= LIMITS.jerk * dt * rounding).all()
+    torch.testing.assert_close(state.acceleration, a, rtol=0, atol=1e-9)
+
+
+def test_without_a_jerk_limit_the_others_hold():
+    safety = SafetyFilter(LIMITS, SafetyConfig(jerk_limited=False))
+    rng = sampling.generator(8)
+    q = inside(40, seed=2)
     state = safety.initial_state(q)
-    u = commands(kind, 100, rng=rng)
-    for k in range(400):
-        if k % 5 == 0:
-            u = commands(kind, 100, rng=rng)
+    most = 0.0
+    for _ in range(300):
         before = state.velocity
-        v, state, _ = safety.step(state, q, u, dt)
-        q = q + v * dt
-        assert v.isfinite().all()
+        v, state, _ = safety.step(state, q, 50 * torch.sign(q - LIMITS.middle), 0.002)
+        q = q + v * 0.002
         assert (v.abs() <= LIMITS.velocity).all()
-        assert ((v - before).abs() <= LIMITS.acceleration * dt * (1 + 1e-9)).all()
-        assert (q <= LIMITS.upper + ROUNDING).all()
-        assert (q >= LIMITS.lower - ROUNDING).all()
+        a = (v - before) / 0.002
+        most = max(most, a.abs().amax().item())
+        assert (a.abs() <= LIMITS.acceleration * (1 + 1e-9)).all()
+        assert LIMITS.contain(q).all()
+    assert most > 10
+    assert (state.acceleration == 0).all()
 
 
-def test_it_stops_short_of_the_limit_by_the_margin():
-    safety = SafetyFilter(LIMITS, SafetyConfig(margin=0.05))
+@pytest.mark.parametrize("dt", [0.0005, 0.001, 0.002])
+def test_a_stop_and_a_resume_are_smooth(dt: float):
+    """Jerk limited, without overshoot, along a straight line in joint space, and the whole
+    ramp hardly later than acceleration alone would have it."""
+    safety = SafetyFilter(LIMITS)
+    u = torch.tensor([0.5, -0.4, 0.3, 0.2, -0.1, 0.6, -0.7], dtype=torch.float64)
+    state, q = safety.initial_state(READY, u), READY
+    fastest = (u.abs() / LIMITS.acceleration).max().item()
+    for target in (0 * u, u):
+        speeds = []
+        for _ in range(round((fastest + 0.02) / dt)):
+            before = state
+            v, state, _ = safety.step(state, q, u, dt, stop=torch.tensor(not target.any()))
+            q = q + v * dt
+            assert_limits_kept(q, before, state, dt)
+            speeds.append(v @ u / (u @ u))
+            torch.testing.assert_close(v, speeds[-1] * u, rtol=0, atol=1e-9)
+        change = torch.stack(speeds).diff()
+        assert (change <= 1e-12).all() or (change >= -1e-12).all()
+        torch.testing.assert_close(v, target, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("jerk_limited", [True, False])
+def test_it_stops_short_of_the_limit_by_the_margin(jerk_limited: bool):
+    """With a jerk limit also by the room it takes to start braking."""
+    config = SafetyConfig(margin=0.05, jerk_limited=jerk_limited)
+    safety = SafetyFilter(LIMITS, config)
     q = READY
     state = safety.initial_state(q)
-    for _ in range(4000):
-        v, state, _ = safety.step(state, q, 9 * torch.ones(7, dtype=torch.float64), 0.002)
-        q = q + v * 0.002
-    torch.testing.assert_close(q, LIMITS.upper - 0.05, rtol=0, atol=1e-6)
+    with shapes_unchecked():
+        for _ in range(2000):
+            v, state, _ = safety.step(state, q, 9 * torch.ones(7, dtype=torch.float64), 0.004)
+            q = q + v * 0.004
+    v_hat = LIMITS.acceleration**2 / (2 * LIMITS.jerk) * jerk_limited
+    room = v_hat / config.rate + v_hat**2 / (2 * LIMITS.acceleration)
+    torch.testing.assert_close(q, LIMITS.upper - 0.05 - room, rtol=0, atol=1e-6)
 
 
 def test_a_joint_within_the_margin_is_driven_out_of_it():
     safety = SafetyFilter(LIMITS)
     q = LIMITS.lower + 0.001
     state = safety.initial_state(q)
-    for _ in range(1000):
-        v, state, _ = safety.step(state, q, torch.zeros(7, dtype=torch.float64), 0.004)
-        q = q + v * 0.004
-    torch.testing.assert_close(q, LIMITS.lower + 0.02, rtol=0, atol=1e-6)
+    for _ in range(600):
+        v, state, _ = safety.step(state, q, torch.zeros(7, dtype=torch.float64), 0.008)
+        q = q + v * 0.008
+    assert ((q >= LIMITS.lower + 0.02) & (q <= LIMITS.lower + 0.025)).all()
+    assert v.norm() < 1e-6
 
 
 def test_a_harmless_command_passes_unchanged():

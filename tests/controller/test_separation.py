@@ -1,0 +1,127 @@
+"""Speed and separation monitoring after ISO/TS 15066."""
+
+import math
+
+import pytest
+import sampling
+import torch
+from unchecked import shapes_unchecked
+
+from hrc_learn.controller import SafetyConfig, SafetyFilter, SeparationConfig
+from hrc_learn.kinematics import panda
+
+READY = panda.ready
+ACROSS = torch.tensor([1.4, 0.9, 0.3, 0.8, 0.3, -0.4, 0.8], dtype=torch.float64)
+"""Joint velocity that moves the tool at more than half a metre a second."""
+
+
+def tensor(*values: float) -> torch.Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def test_the_speed_solves_the_equation_of_the_standard():
+    config = SeparationConfig(human_speed=1.2, reaction_time=0.15, deceleration=3.0)
+    distance = torch.linspace(0.5, 4.0, 50, dtype=torch.float64)
+    v = config.highest_speed(distance)
+    human = 1.2 * (0.15 + v / 3.0)
+    arm = v * 0.15 + v**2 / (2 * 3.0)
+    torch.testing.assert_close(human + arm + config.clearance, distance)
+
+
+def test_a_person_too_close_or_lost_stops_and_nobody_hinders_nobody():
+    config = SeparationConfig()
+    speeds = config.highest_speed(tensor(0.0, 0.36, math.nan, -1.0, math.inf))
+    assert speeds[:4].tolist() == [0, 0, 0, 0]
+    assert speeds[4] == math.inf
+
+
+def test_the_tool_is_as_fast_as_the_distance_allows():
+    safety = SafetyFilter(panda.limits)
+    J = panda.jacobian(READY).expand(3, 6, 7)
+    q, u = READY.expand(3, 7), ACROSS.expand(3, 7)
+    distance = tensor(math.inf, 0.6, 0.1)
+    state = safety.initial_state(q)
+    for _ in range(200):
+        v, state, report = safety.step(state, q, u, 0.004, jacobian=J, human_distance=distance)
+    speed = (J @ v[..., None])[:, :3, 0].norm(dim=-1)
+    allowed = SeparationConfig().highest_speed(distance)
+    assert speed[0] > 0.5
+    assert speed[1].item() == pytest.approx(allowed[1].item())
+    assert 0 < speed[1] < 0.3
+    assert v[2].norm() == 0
+    assert report.acted("separation").tolist() == [False, True, True]
+    assert state.count("separation").tolist() == [0, 200, 200]
+
+
+def test_the_arm_rests_before_a_person_who_comes_running():
+    """At v_h straight towards it, with 80 ms of the reaction time spent until the arm is told:
+    who has come as near as the clearance meets a tool at rest. Then the person leaves."""
+    dt, config = 0.002, SeparationConfig(human_speed=1.6, reaction_time=0.1)
+    safety = SafetyFilter(panda.limits, SafetyConfig(separation=config))
+    q, state, v = READY, safety.initial_state(READY), torch.zeros(7).double()
+    closest, met, late = 3.0, math.inf, round(0.08 / dt)
+    distances = [3.0] * late
+    speeds = []
+    with shapes_unchecked():
+        for k in range(2600):
+            approach = 1.6 if k < 1200 else -1.6
+            J = panda.jacobian(q)
+            before = state
+            u = ACROSS * math.cos(2 * math.pi * k * dt / 1.5)
+            v, state, _ = safety.step(
+                state, q, u, dt, jacobian=J, human_distance=tensor(distances[k])[0]
+            )
+            q = q + v * dt
+            speed = (J @ v)[:3].norm().item()
+            closest = max(closest - approach * dt, 0.0) - speed * dt
+            distances.append(closest)
+            speeds.append(speed)
+            if closest <= config.clearance:
+                met = min(met, k)
+                assert speed < 1e-9
+            jerk = (state.acceleration - before.acceleration).abs()
+            assert (jerk <= panda.limits.jerk * dt * (1 + 1e-9)).all()
+    assert met < 1200
+    assert max(speeds[:400]) > 0.3
+    assert max(speeds[-200:]) > 0.3  # it has resumed
+
+
+def test_a_distance_without_a_jacobian_is_refused():
+    safety = SafetyFilter(panda.limits)
+    with pytest.raises(ValueError, match="pass jacobian as well"):
+        safety.step(
+            safety.initial_state(READY), READY, ACROSS, 0.01, human_distance=tensor(1.0)[0]
+        )
+
+
+def test_bad_settings_are_refused():
+    with pytest.raises(ValueError, match="deceleration must be positive"):
+        SeparationConfig(deceleration=0.0)
+    with pytest.raises(ValueError, match="human_speed must not be negative"):
+        SeparationConfig(human_speed=-1.0)
+    with pytest.raises(ValueError, match="margin must not be negative"):
+        SafetyConfig(margin=-0.1)
+    with pytest.raises(ValueError, match="tcp_speed must be positive"):
+        SafetyConfig(tcp_speed=0.0)
+
+
+def test_a_batch_is_a_loop():
+    rng = sampling.generator()
+    safety = SafetyFilter(panda.limits)
+    q = READY + 0.2 * torch.randn(4, 7, generator=rng, dtype=torch.float64)
+    distance = tensor(0.2, 0.5, 1.0, math.nan)
+    J = panda.jacobian(q)
+    u = ACROSS.expand(4, 7)
+    whole, _, _ = safety.step(
+        safety.initial_state(q, u), q, u, 0.004, jacobian=J, human_distance=distance
+    )
+    for k in range(4):
+        one, _, _ = safety.step(
+            safety.initial_state(q[k], u[k]),
+            q[k],
+            u[k],
+            0.004,
+            jacobian=J[k],
+            human_distance=distance[k],
+        )
+        torch.testing.assert_close(one, whole[k], rtol=0, atol=1e-15)
