@@ -21,3 +21,4 @@ from .table1 import INITIAL_IMAGE_JACOBIAN as INITIAL_IMAGE_JACOBIAN
 from .table1 import table1_config as table1_config
 from .table1 import table1_goals as table1_goals
 from .table1 import table1_joint_region as table1_joint_region
+from .watchdog import Watchdog as Watchdog

@@ -88,7 +88,6 @@ def assert_limits_kept(q: Tensor, before: SafetyState, state: SafetyState, dt: f
 
 def test_without_a_jerk_limit_the_others_hold():
     safety = SafetyFilter(LIMITS, SafetyConfig(jerk_limited=False))
-    rng = sampling.generator(8)
     q = inside(40, seed=2)
     state = safety.initial_state(q)
     most = 0.0
