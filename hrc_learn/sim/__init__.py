@@ -4,6 +4,7 @@ from .contacts import ContactMonitor as ContactMonitor
 from .contacts import Touch as Touch
 from .markers import Plate as Plate
 from .motion_log import MotionLog as MotionLog
+from .moving_bodies import MovingBodies as MovingBodies
 from .panda_model import PandaModelConfig as PandaModelConfig
 from .rendering import CameraKind as CameraKind
 from .rendering import EGLCamera as EGLCamera

@@ -1,0 +1,75 @@
+"""Everything that moves in a world, to be drawn: its shapes, and where it is."""
+
+# pyright: reportAttributeAccessIssue=false
+# MuJoCo ships no type stubs; its names come from a compiled module.
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from ..viz import Body, Box, Capsule
+from .contacts import body_geoms
+from .world import World
+
+
+class MovingBodies:
+    """The links of the arm, its fingers, and the objects."""
+
+    def __init__(self, world: World):
+        self._world = world
+        model = world.model
+        movers = ["link0", *(item.name for item in world.config.objects)]
+        geoms = body_geoms(model, movers)
+        self._indices = sorted({int(b) for b in model.geom_bodyid[geoms]})
+        self.names = tuple(model.body(b).name for b in self._indices)
+
+    def poses(self) -> tuple[Float[np.ndarray, "bodies 3"], Float[np.ndarray, "bodies 4"]]:
+        """Where they are now: positions [m] and unit quaternions (w, x, y, z)."""
+        data = self._world.data
+        return data.xpos[self._indices].copy(), data.xquat[self._indices].copy()
+
+    def drawn(
+        self,
+        positions: Float[np.ndarray, "time bodies 3"],
+        orientations: Float[np.ndarray, "time bodies 4"],
+    ) -> tuple[Body, ...]:
+        """The bodies as they are to be drawn, along poses collected over time."""
+        bodies = []
+        for i, index in enumerate(self._indices):
+            capsules, boxes = _shapes(self._world.model, index)
+            bodies.append(
+                Body(
+                    name=self.names[i],
+                    position=positions[:, i],
+                    orientation=orientations[:, i],
+                    capsules=capsules,
+                    boxes=boxes,
+                )
+            )
+        return tuple(bodies)
+
+
+def _shapes(model: mujoco.MjModel, body: int) -> tuple[tuple[Capsule, ...], tuple[Box, ...]]:
+    """Capsules and boxes of a body in its own frame."""
+    capsules, boxes = [], []
+    for g in np.flatnonzero(model.geom_bodyid == body):
+        kind, size, centre = model.geom_type[g], model.geom_size[g], model.geom_pos[g]
+        r, green, b, opacity = (float(c) for c in model.geom_rgba[g])
+        colour = (r, green, b, opacity)
+        R = np.empty(9)
+        mujoco.mju_quat2Mat(R, model.geom_quat[g])
+        R = R.reshape(3, 3)
+        if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
+            half = size[1] * R[:, 2]
+            start, end = _triple(centre - half), _triple(centre + half)
+            capsules.append(Capsule(start=start, end=end, radius=float(size[0]), colour=colour))
+        elif kind == mujoco.mjtGeom.mjGEOM_BOX:
+            # All boxes of ours are turned by multiples of a quarter turn.
+            half_size = _triple(np.abs(R @ size))
+            boxes.append(Box(centre=_triple(centre), half_size=half_size, colour=colour))
+    return tuple(capsules), tuple(boxes)
+
+
+def _triple(vector: np.ndarray) -> tuple[float, float, float]:
+    x, y, z = vector.tolist()
+    return x, y, z
