@@ -1,11 +1,13 @@
 """Movement primitive of an orientation."""
 
 from pathlib import Path
+from typing import Unpack
 
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from hrc_learn.dmp.arrays import ArrayLike, to_tensor
+from hrc_learn.dmp.fitting.options import FitOptions
 from hrc_learn.dmp.fitting.report import FitReport
 from hrc_learn.dmp.fitting.samples import check_samples
 from hrc_learn.dmp.joint import JointDMP
@@ -14,8 +16,6 @@ from hrc_learn.dmp.rotation.demonstrated import fitted_error
 from hrc_learn.dmp.rotation.ends import error_ends, unit_quaternion
 from hrc_learn.dmp.rotation.error import reference_of, to_orientation
 from hrc_learn.dmp.rotation.formulation import UnknownFormulationError, find_formulation
-from hrc_learn.dmp.system.basis import Basis
-from hrc_learn.dmp.system.spring import SpringDamper
 from hrc_learn.storage import SavedModel, write_model
 
 
@@ -60,11 +60,7 @@ class OrientationDMP(nn.Module):
         mask: ArrayLike | None = None,
         *,
         formulation: str = "log",
-        method: str = "trajectory",
-        approach: float = 0.0,
-        basis: Basis | None = None,
-        spring: SpringDamper | None = None,
-        regularization: float = 1e-7,
+        **options: Unpack[FitOptions],
     ) -> "OrientationDMP":
         """Learn one primitive from each demonstration.
 
@@ -76,28 +72,17 @@ class OrientationDMP(nn.Module):
             mask: (*B, T), false where a sample does not count.
             formulation: `"log"`, exact, or `"ude"`, integrated and for turns of less than 360
                 degrees.
-            method: As for `JointDMP.fit`, like all that follow.
-            approach: Share of the motion along which new ends are taken up.
-            basis: Shape of the forcing term.
-            spring: Gains.
-            regularization: Ridge.
+            options: How to fit; see `FitOptions`.
 
         Raises:
             ValueError: Bad samples (says which), or no such formulation.
         """
         dynamics = find_formulation(formulation)
         error, goal = fitted_error(time, orientation, mask)
-        motion = JointDMP.fit(
-            time,
-            error,
-            n_basis,
-            mask=mask,
-            method=method,
-            approach=approach,
-            basis=basis,
-            spring=spring,
-            regularization=regularization,
-        )
+        motion = JointDMP.fit(time, error, n_basis, mask=mask, **options)
+        if options.get("robust"):
+            # What it found stands for samples that may be far off.
+            error = motion.rollout().position.detach()
         dynamics.adapt(motion, check_samples(time, error, mask=mask))
         return cls(motion, goal, formulation)
 
