@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from ..geometry import quaternion
-from ..kinematics import panda
+from ..kinematics import LINK_CAPSULES, panda
 from .markers import Plate, add_plate
 
 _CAPSULE = mujoco.mjtGeom.mjGEOM_CAPSULE
@@ -43,22 +43,8 @@ class PandaModelConfig:
     """ArUco plate on the hand, in the hand's frame."""
 
 
-# (end points in the frame of the link [m], radius [m]); masses [kg] from franka_description.
-_LINKS: dict[int, tuple[float, list[tuple[tuple[float, ...], float]]]] = {
-    1: (4.97, [((0, 0, -0.19, 0, 0, -0.02), 0.06), ((0, -0.05, 0, 0, 0.03, 0), 0.06)]),
-    2: (0.65, [((0, -0.02, 0, 0, -0.12, 0), 0.06), ((0, 0, -0.04, 0, 0, 0.04), 0.06)]),
-    3: (
-        3.23,
-        [((0, 0, -0.16, 0, 0, -0.07), 0.06), ((0.0825, -0.03, 0, 0.0825, 0.03, 0), 0.055)],
-    ),
-    4: (
-        3.59,
-        [((0, 0, -0.04, 0, 0, 0.04), 0.06), ((-0.0825, 0.03, 0, -0.0825, 0.10, 0), 0.055)],
-    ),
-    5: (1.23, [((0, 0, -0.26, 0, 0, -0.19), 0.06), ((0, 0.08, -0.17, 0, 0.09, -0.02), 0.03)]),
-    6: (1.67, [((0, 0, -0.06, 0, 0, 0.02), 0.05), ((0.088, 0.0, 0, 0.088, 0.05, 0), 0.045)]),
-    7: (0.74, [((0, 0, -0.02, 0, 0, 0.062), 0.045)]),
-}
+# Masses of links 1 to 7 [kg], from franka_description.
+_MASSES = (4.97, 0.65, 3.23, 3.59, 1.23, 1.67, 0.74)
 
 # Neighbours whose primitives overlap by design (a static parent is not filtered by MuJoCo).
 _OVERLAPPING = (
@@ -79,13 +65,7 @@ def add_panda(spec: mujoco.MjSpec, config: PandaModelConfig) -> None:
     Joints are named as in `panda.joint_names`, fingers `finger_left` and `finger_right`.
     """
     base = spec.worldbody.add_body(name="link0")
-    base.add_geom(
-        name="link0",
-        type=_CAPSULE,
-        fromto=(-0.06, 0, 0.05, 0.0, 0, 0.07),
-        size=(0.07, 0, 0),
-        rgba=_WHITE,
-    )
+    _add_capsules(base, 0, mass=None)
     frames = panda.link_poses(torch.zeros(7, dtype=torch.float64)).matrix().numpy()
     body = base
     parent_frame = np.eye(4)
@@ -93,16 +73,7 @@ def add_panda(spec: mujoco.MjSpec, config: PandaModelConfig) -> None:
         body = _add_body(body, f"link{i + 1}", np.linalg.inv(parent_frame) @ frames[i])
         parent_frame = frames[i]
         _add_joint(spec, body, name, i, config)
-        mass, capsules = _LINKS[i + 1]
-        for k, (fromto, radius) in enumerate(capsules):
-            body.add_geom(
-                name=f"link{i + 1}_{k}",
-                type=_CAPSULE,
-                fromto=fromto,
-                size=(radius, 0, 0),
-                mass=mass / len(capsules),
-                rgba=_WHITE,
-            )
+        _add_capsules(body, i + 1, mass=_MASSES[i])
     # The hand's frame: at the flange, turned as the tool.
     flange, tool = frames[7], frames[8]
     hand_frame = np.linalg.inv(parent_frame) @ tool
@@ -121,6 +92,20 @@ def _add_body(parent, name: str, transform: np.ndarray):
     body = parent.add_body(name=name, pos=transform[:3, 3], quat=orientation)
     body.gravcomp = 1.0  # the real arm compensates its own weight
     return body
+
+
+def _add_capsules(body, link: int, mass: float | None) -> None:
+    capsules = [capsule for capsule in LINK_CAPSULES if capsule.link == link]
+    for k, capsule in enumerate(capsules):
+        geom = body.add_geom(
+            name=f"link{link}_{k}" if mass else f"link{link}",
+            type=_CAPSULE,
+            fromto=(*capsule.start, *capsule.end),
+            size=(capsule.radius, 0, 0),
+            rgba=_WHITE,
+        )
+        if mass is not None:
+            geom.mass = mass / len(capsules)
 
 
 def _add_joint(spec: mujoco.MjSpec, body, name: str, i: int, config: PandaModelConfig) -> None:

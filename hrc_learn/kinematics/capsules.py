@@ -1,0 +1,154 @@
+"""An arm as capsules: distances to itself and to boxes, batched."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import final
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hrc_learn.kinematics.chain import SerialChain
+
+# Halvings of a segment in the search for its point nearest to a box: 1e-6 of its length.
+_HALVINGS = 20
+
+
+@dataclass(frozen=True, kw_only=True)
+class Capsule:
+    """All points within a radius of a segment."""
+
+    link: int
+    """Number of the link it belongs to; 0 is the base."""
+    start: tuple[float, float, float]
+    """One end of the segment, in the frame of the link [m]."""
+    end: tuple[float, float, float]
+    """The other end [m]."""
+    radius: float
+    """[m]"""
+
+
+@final
+class CapsuleArm:
+    """Distances of an arm's capsules from each other and from obstacles.
+
+    Signed: negative is the depth to which two capsules overlap. Links are numbered as
+    `SerialChain.link_poses` lists their frames, from 1; 0 is the base.
+    """
+
+    def __init__(
+        self,
+        chain: SerialChain,
+        capsules: Sequence[Capsule],
+        overlapping: Sequence[tuple[int, int]] = (),
+    ):
+        """Put the capsules on the links.
+
+        Args:
+            chain: The arm.
+            capsules: Of its links.
+            overlapping: Pairs of links that overlap by design, besides neighbours.
+        """
+        self.chain = chain
+        self.capsules = tuple(capsules)
+        self._links = [capsule.link for capsule in capsules]
+        ends = [[capsule.start, capsule.end] for capsule in capsules]
+        self._ends = torch.tensor(ends, dtype=torch.float64)
+        self._radius = torch.tensor([c.radius for c in capsules], dtype=torch.float64)
+        apart = {frozenset(pair) for pair in overlapping}
+        pairs = [
+            (i, k)
+            for i, k in combinations(range(len(capsules)), 2)
+            if abs(self._links[i] - self._links[k]) > 1
+            and frozenset((self._links[i], self._links[k])) not in apart
+        ]
+        self._pairs = torch.tensor(pairs).mT
+        self._moving = [i for i, link in enumerate(self._links) if link > 0]
+
+    def segments(self, q: Float[Tensor, "*batch joints"]) -> Float[Tensor, "*batch C 2 3"]:
+        """Ends of all capsules in the base frame [m]."""
+        frames = self.chain.link_poses(q).matrix()
+        base = torch.eye(4, dtype=q.dtype, device=q.device).expand_as(frames[..., :1, :, :])
+        frames = torch.cat([base, frames], dim=-3)[..., self._links, :, :]
+        return self._ends.to(q) @ frames[..., :3, :3].mT + frames[..., None, :3, 3]
+
+    def pair_distances(self, q: Float[Tensor, "*batch joints"]) -> Float[Tensor, "*batch P"]:
+        """Distance of each pair of capsules that should not touch [m], see `pairs`."""
+        first, second = self._pairs
+        ends, radius = self.segments(q), self._radius.to(q)
+        distance = segment_distance(ends[..., first, :, :], ends[..., second, :, :])
+        return distance - radius[first] - radius[second]
+
+    @property
+    def pairs(self) -> list[tuple[int, int]]:
+        """Numbers of the two capsules of each pair."""
+        return [(int(i), int(k)) for i, k in self._pairs.mT]
+
+    def self_distance(self, q: Float[Tensor, "*batch joints"]) -> Float[Tensor, "*batch"]:
+        """Distance of the two nearest capsules that should not touch [m]."""
+        return self.pair_distances(q).amin(-1)
+
+    def box_distance(
+        self,
+        q: Float[Tensor, "*batch joints"],
+        centre: Float[Tensor, "3"],
+        half_size: Float[Tensor, "3"],
+    ) -> Float[Tensor, "*batch"]:
+        """Distance of the nearest moving link from a box along the base axes [m].
+
+        Inside the box it counts from the segment, not from the nearest wall.
+
+        Args:
+            q: Joint position [rad].
+            centre: Of the box [m].
+            half_size: Half of its edges [m].
+        """
+        ends = self.segments(q)[..., self._moving, :, :]
+        distance = segment_box_distance(ends, centre.to(q), half_size.to(q))
+        return (distance - self._radius.to(q)[self._moving]).amin(-1)
+
+
+def segment_distance(
+    first: Float[Tensor, "*batch 2 3"], second: Float[Tensor, "*batch 2 3"]
+) -> Float[Tensor, "*batch"]:
+    """Smallest distance between points of two segments (Ericson 2005, section 5.1.9)."""
+    start, along = first[..., 0, :], first[..., 1, :] - first[..., 0, :]
+    other, across = second[..., 0, :], second[..., 1, :] - second[..., 0, :]
+    offset = start - other
+    tiny = torch.finfo(first.dtype).tiny
+    a, e = ((v * v).sum(-1).clamp(min=tiny) for v in (along, across))
+    b, c, f = (along * across).sum(-1), (along * offset).sum(-1), (across * offset).sum(-1)
+    determinant = (a * e - b * b).clamp(min=0)
+    parallel = determinant <= 1e-12 * a * e
+    s = torch.where(parallel, 0.0, (b * f - c * e) / torch.where(parallel, 1.0, determinant))
+    t = ((b * s.clamp(0, 1) + f) / e).clamp(0, 1)
+    s = ((b * t - c) / a).clamp(0, 1)
+    gap = offset + s.unsqueeze(-1) * along - t.unsqueeze(-1) * across
+    return torch.linalg.vector_norm(gap, dim=-1)
+
+
+def segment_box_distance(
+    segment: Float[Tensor, "*batch 2 3"],
+    centre: Float[Tensor, "3"],
+    half_size: Float[Tensor, "3"],
+) -> Float[Tensor, "*batch"]:
+    """Smallest distance between points of a segment and a box; zero where they meet.
+
+    The distance from a convex set is convex along a line: its slope is bisected.
+    """
+    start, along = segment[..., 0, :], segment[..., 1, :] - segment[..., 0, :]
+
+    def outside(t: Tensor) -> Tensor:
+        """From the nearest point of the box to the point at t."""
+        offset = start + t.unsqueeze(-1) * along - centre
+        return offset - offset.clamp(-half_size, half_size)
+
+    low, high = torch.zeros_like(start[..., 0]), torch.ones_like(start[..., 0])
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        rising = (outside(middle) * along).sum(-1) > 0
+        low, high = torch.where(rising, low, middle), torch.where(rising, middle, high)
+    return torch.linalg.vector_norm(outside((low + high) / 2), dim=-1)
