@@ -62,7 +62,7 @@ LIBRARIES: dict[str, set[str]] = {
 LAZY_LIBRARIES: dict[str, set[str]] = {
     "kinematics": {"pytorch_kinematics", "frankik"},
     "cli": {"tyro", "rich"},
-    "demos": {"av"},
+    "demos": {"av", "scipy"},
     "vision": {"cv2"},
 }
 """Libraries that they may import in the functions that need them, and nowhere else."""

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import groupby
+from itertools import groupby, pairwise
 from typing import overload
 
 from .conversion import to_demonstration
@@ -110,7 +110,7 @@ def _runs(entries: Sequence[EpisodeEntry]) -> Iterator[list[EpisodeEntry]]:
     """Cut a sequence into runs of episodes that lie on disk in this order."""
     place = [(entry.file, entry.start) for entry in entries]
     cuts = [0]
-    for before, here in zip(place, place[1:], strict=False):
+    for before, here in pairwise(place):
         cuts.append(cuts[-1] + (here <= before))
     for _, run in groupby(zip(cuts, entries, strict=True), key=lambda pair: pair[0]):
         yield [entry for _, entry in run]
