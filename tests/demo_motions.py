@@ -2,6 +2,9 @@
 
 import torch
 
+PERIOD = 0.83
+"""Of `rhythm` [s]."""
+
 
 def minimum_jerk(s):
     """Quintic from 0 to 1 that starts and ends at rest."""
@@ -30,3 +33,15 @@ def turning_motion(n_samples=400, duration=3.0, seed=0):
 
     time, vector = arm_motion(n_samples, 3, duration, seed, moving_start=True)
     return time, quaternion.exp(vector)
+
+
+def rhythm(seed=0, n_samples=500, duration=4.2, n_joints=3):
+    """Time and a sum of four harmonics about a centre, from anywhere in the cycle."""
+    rng = torch.Generator().manual_seed(seed)
+    time = torch.linspace(0, duration, n_samples, dtype=torch.float64)
+    amplitude, shift = torch.rand(2, 4, n_joints, generator=rng, dtype=torch.float64)
+    y = torch.rand(n_joints, generator=rng, dtype=torch.float64).expand(n_samples, -1)
+    for k in range(4):
+        angle = 2 * torch.pi * (k + 1) * (time[:, None] / PERIOD + shift[k])
+        y = y + amplitude[k] / (k + 1) ** 2 * torch.sin(angle)
+    return time, y

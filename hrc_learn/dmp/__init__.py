@@ -9,6 +9,9 @@ from hrc_learn.dmp.generalisation.context import PolynomialFeatures as Polynomia
 from hrc_learn.dmp.generalisation.contextual import ContextualDMP as ContextualDMP
 from hrc_learn.dmp.generalisation.distribution import DMPDistribution as DMPDistribution
 from hrc_learn.dmp.joint import JointDMP as JointDMP
+from hrc_learn.dmp.limited import LimitedDMP as LimitedDMP
+from hrc_learn.dmp.limited_motion import LimitedState as LimitedState
+from hrc_learn.dmp.limited_motion import LimitedTrajectory as LimitedTrajectory
 from hrc_learn.dmp.moving_goal import MovingGoal as MovingGoal
 from hrc_learn.dmp.moving_goal import MovingGoalState as MovingGoalState
 from hrc_learn.dmp.moving_goal import MovingTrajectory as MovingTrajectory
@@ -19,6 +22,9 @@ from hrc_learn.dmp.pose import PoseDMP as PoseDMP
 from hrc_learn.dmp.pose_motion import PoseState as PoseState
 from hrc_learn.dmp.pose_motion import PoseTrajectory as PoseTrajectory
 from hrc_learn.dmp.rhythmic import fit_rhythmic as fit_rhythmic
+from hrc_learn.dmp.rhythmic_pose import fit_rhythmic_orientation as fit_rhythmic_orientation
+from hrc_learn.dmp.rhythmic_pose import fit_rhythmic_pose as fit_rhythmic_pose
+from hrc_learn.dmp.soft_limits import SoftLimits as SoftLimits
 from hrc_learn.dmp.state import DMPState as DMPState
 from hrc_learn.dmp.stepper import Stepper as Stepper
 from hrc_learn.dmp.stepper import StepperState as StepperState

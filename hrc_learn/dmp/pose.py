@@ -3,18 +3,25 @@
 from dataclasses import replace
 from pathlib import Path
 
-import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from hrc_learn.dmp.arrays import ArrayLike, to_tensor
 from hrc_learn.dmp.fitting.report import FitReport
-from hrc_learn.dmp.fitting.samples import check_samples
 from hrc_learn.dmp.joint import JointDMP
-from hrc_learn.dmp.pose_motion import BODY, ERROR, POSITION, PoseState, PoseTrajectory
+from hrc_learn.dmp.pose_columns import (
+    BODY,
+    ERROR,
+    POSITION,
+    demonstrated_columns,
+    joined,
+    pose_push,
+    replaced,
+)
+from hrc_learn.dmp.pose_motion import PoseState, PoseTrajectory
 from hrc_learn.dmp.rotation.demonstrated import fitted_error
 from hrc_learn.dmp.rotation.ends import error_ends, unit_quaternion
-from hrc_learn.dmp.rotation.error import error_rate, reference_of, retarget, to_orientation
+from hrc_learn.dmp.rotation.error import reference_of, retarget, to_orientation
 from hrc_learn.dmp.system.basis import Basis
 from hrc_learn.dmp.system.spring import SpringDamper
 from hrc_learn.geometry import Pose
@@ -77,19 +84,8 @@ class PoseDMP(nn.Module):
         Raises:
             ValueError: Bad samples; says which.
         """
-        checked = check_samples(time, position, mask=mask)
-        if checked.position.shape[-2] != 3:
-            raise ValueError(f"position must have 3 columns, got {checked.position.shape[-2]}")
         error, goal = fitted_error(time, orientation, mask)
-        columns = [checked.columns, error.to(checked.position)]
-        if body is not None:
-            shape = check_samples(time, body, mask=mask, name="body")
-            columns.append(shape.columns)
-        try:
-            coordinates = torch.cat(columns, dim=-1)
-        except RuntimeError:
-            shapes = ", ".join(str(tuple(column.shape)) for column in columns)
-            raise ValueError(f"position, orientation error and body differ: {shapes}") from None
+        coordinates = demonstrated_columns(time, position, error, body, mask)
         motion = JointDMP.fit(
             time,
             coordinates,
@@ -228,16 +224,16 @@ class PoseDMP(nn.Module):
             )
             motion = replace(
                 motion,
-                position=_replaced(motion.position, ERROR, error),
-                rate=_replaced(motion.rate, ERROR, rate),
+                position=replaced(motion.position, ERROR, error),
+                rate=replaced(motion.rate, ERROR, rate),
             )
-            curvature = _replaced(curvature, ERROR, error_curvature)
+            curvature = replaced(curvature, ERROR, error_curvature)
             motion = replace(motion, goal=self.motion.resting_point(motion, curvature))
-            ends = _replaced(ends, POSITION, goal.position)
+            ends = replaced(ends, POSITION, goal.position)
         if goal_body is not None:
-            ends = _replaced(ends, BODY, goal_body)
+            ends = replaced(ends, BODY, goal_body)
         if coupling is not None:
-            coupling = _push(motion.position, coupling)
+            coupling = pose_push(motion.position, coupling)
         motion = self.motion.step(
             motion,
             dt,
@@ -285,19 +281,19 @@ class PoseDMP(nn.Module):
             None if twist is None else twist[..., 3:],
         )
         return {
-            "start": _joined(
+            "start": joined(
                 like[..., POSITION] if start is None else start.position,
                 error,
                 like[..., BODY] if start_body is None else start_body,
                 like,
             ),
-            "goal": _joined(
+            "goal": joined(
                 self.motion.goal[..., POSITION] if goal is None else goal.position,
                 self.motion.goal[..., ERROR],
                 self.motion.goal[..., BODY] if goal_body is None else goal_body,
                 like,
             ),
-            "start_velocity": _joined(
+            "start_velocity": joined(
                 demonstrated[..., POSITION] if twist is None else twist[..., :3],
                 rate,
                 demonstrated[..., BODY],
@@ -305,28 +301,3 @@ class PoseDMP(nn.Module):
             ),
             "duration": duration,
         }, reference
-
-
-def _joined(position: Tensor, error: Tensor, body: ArrayLike, like: Tensor) -> Tensor:
-    """The columns of a linear primitive, broadcast and side by side."""
-    columns = [to_tensor(part, like.dtype, like.device) for part in (position, error, body)]
-    batch = torch.broadcast_shapes(*(column.shape[:-1] for column in columns))
-    return torch.cat([column.expand(*batch, -1) for column in columns], dim=-1)
-
-
-def _push(coordinates: Tensor, coupling: ArrayLike) -> Tensor:
-    """The coupling of the linear primitive for an acceleration of position or pose."""
-    coupling = to_tensor(coupling, coordinates.dtype, coordinates.device)
-    push = _replaced(torch.zeros_like(coordinates), POSITION, coupling[..., :3])
-    if coupling.shape[-1] == 3:
-        return push
-    # The second derivative of the error is linear in the angular acceleration.
-    return _replaced(push, ERROR, error_rate(coordinates[..., ERROR], coupling[..., 3:]))
-
-
-def _replaced(values: Tensor, columns: slice, new: ArrayLike) -> Tensor:
-    """`values` with some columns exchanged; differentiable in both."""
-    new = to_tensor(new, values.dtype, values.device)
-    stop = values.shape[-1] if columns.stop is None else columns.stop
-    new = new.expand(*values.shape[:-1], stop - columns.start)
-    return torch.cat([values[..., : columns.start], new, values[..., stop:]], dim=-1)

@@ -8,12 +8,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.dmp.orientation_motion import OrientationState, OrientationTrajectory
+from hrc_learn.dmp.pose_columns import BODY, ERROR, POSITION
 from hrc_learn.dmp.state import DMPState
 from hrc_learn.dmp.trajectory import Trajectory
 from hrc_learn.geometry import Pose
-
-POSITION, ERROR, BODY = slice(0, 3), slice(3, 6), slice(6, None)
-"""Columns of the coordinates that move under one phase."""
 
 
 class PoseTrajectory:

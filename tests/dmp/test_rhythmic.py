@@ -1,25 +1,12 @@
 import numpy as np
 import pytest
 import torch
+from demo_motions import PERIOD, rhythm
 from dmp_contract import DMPContract
 from scipy.integrate import solve_ivp
 
 from hrc_learn.dmp import PeriodicBasis, SpringDamper, Stepper, fit_rhythmic
 from hrc_learn.dmp.system.response import Response
-
-PERIOD = 0.83
-
-
-def rhythm(seed=0, n_samples=500, duration=4.2, n_joints=3):
-    """Time and a sum of four harmonics about a centre, from anywhere in the cycle."""
-    rng = torch.Generator().manual_seed(seed)
-    time = torch.linspace(0, duration, n_samples, dtype=torch.float64)
-    amplitude, shift = torch.rand(2, 4, n_joints, generator=rng, dtype=torch.float64)
-    y = torch.rand(n_joints, generator=rng, dtype=torch.float64).expand(n_samples, -1)
-    for k in range(4):
-        angle = 2 * torch.pi * (k + 1) * (time[:, None] / PERIOD + shift[k])
-        y = y + amplitude[k] / (k + 1) ** 2 * torch.sin(angle)
-    return time, y
 
 
 class TestRhythmic(DMPContract):

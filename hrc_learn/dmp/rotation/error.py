@@ -32,14 +32,20 @@ def demonstrated_error(
     Returns:
         Errors [rad], and the goal.
     """
-    T = mask.shape[-1]
-    index = torch.arange(T, device=mask.device).expand(mask.shape)
-    first = mask.long().argmax(-1, keepdim=True)
-    seen = torch.where(mask, index, first).cummax(-1).values
-    q = torch.take_along_dim(orientation, seen[..., None], dim=-2)
+    q = held(orientation, mask)
     goal = q[..., -1, :]
     backwards = to_error(q, goal[..., None, :]).flip(-2)
     return quaternion.unwrap_log(backwards).flip(-2), goal
+
+
+def held(
+    orientation: Float[Tensor, "*batch T 4"], mask: Bool[Tensor, "*batch T"]
+) -> Float[Tensor, "*batch T 4"]:
+    """Orientations along time, where `mask` is false the last before that counts."""
+    index = torch.arange(mask.shape[-1], device=mask.device).expand(mask.shape)
+    first = mask.long().argmax(-1, keepdim=True)
+    seen = torch.where(mask, index, first).cummax(-1).values
+    return torch.take_along_dim(orientation, seen[..., None], dim=-2)
 
 
 def to_error(
