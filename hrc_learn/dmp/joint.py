@@ -371,7 +371,7 @@ class JointDMP(nn.Module):
     ) -> Float[Tensor, "*#batch D"]:
         """Dy/ds that a motion between these starts with, unless told otherwise."""
         rate = self.start_velocity * self.duration[..., None]
-        if not self.forcing_scale.turns_velocity:
+        if not self.forcing_scale.turns:
             return rate
         return self._scaled(rate[..., None, :], start, goal)[..., 0, :]
 

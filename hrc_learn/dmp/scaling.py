@@ -56,8 +56,9 @@ class Scaling(ABC):
     name: ClassVar[str]
     follows_ends: ClassVar[bool] = False
     """Whether a new start or goal changes it; a motion is not linear in them then."""
-    turns_velocity: ClassVar[bool] = False
-    """Whether the demonstrated start velocity is scaled along."""
+    turns: ClassVar[bool] = False
+    """Whether the motion turns with its way: weights are in the demonstration's own frame, and
+    its start velocity is scaled along."""
 
     def scale(
         self,
@@ -191,7 +192,7 @@ class RotationScaling(Scaling):
 
     name: ClassVar[str] = "rotation"
     follows_ends: ClassVar[bool] = True
-    turns_velocity: ClassVar[bool] = True
+    turns: ClassVar[bool] = True
 
     def check(
         self, reference: Demonstrated, batch: tuple[int, ...], names: Sequence[str] | None
@@ -223,8 +224,8 @@ class RotationScaling(Scaling):
 
 def _half_way(a: Any, b: Any, xp: ModuleType) -> Any:
     """Unit vector along a + b, or square to a where that vanishes."""
-    square_to_a = xp.arange(a.shape[-1], device=a.device) == abs(a).argmin(-1)[..., None]
-    other = square_to_a - a * (a * square_to_a).sum(-1)[..., None]
+    axis = xp.arange(a.shape[-1], device=a.device) == abs(a).argmin(-1)[..., None]
+    other = -a * (a * axis).sum(-1)[..., None] + axis
     middle = a + b
     opposite = _squared(middle) < HALF_TURN**2
     middle = xp.where(opposite, other, middle)

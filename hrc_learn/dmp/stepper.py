@@ -94,7 +94,7 @@ class Stepper:
             rate = start_velocity * tau
         else:
             rate = self._velocity * self._duration
-            if self._scaling.turns_velocity:
+            if self._scaling.turns:
                 rate = self._scaled(rate[None], y_0, g)[0]
         return StepperState(
             s=0.0,

@@ -17,6 +17,9 @@ def mean_primitive[Primitive: (JointDMP, PoseDMP)](primitives: Primitive) -> Pri
 
     Returns:
         A primitive without batch dimensions, and without a fit report.
+
+    Raises:
+        ValueError: Primitives whose scaling turns them, each with the way of its own.
     """
     if isinstance(primitives, JointDMP):
         return _mean_of_joints(primitives)
@@ -28,6 +31,11 @@ def mean_primitive[Primitive: (JointDMP, PoseDMP)](primitives: Primitive) -> Pri
 
 
 def _mean_of_joints(primitives: JointDMP) -> JointDMP:
+    if primitives.forcing_scale.turns and primitives.weights.ndim > 2:
+        raise ValueError(
+            f"scaling {primitives.scaling!r} gives each primitive a frame of its own: fit with "
+            "'none' to average them"
+        )
     x, stamps = primitives.coordinates().detach(), primitives.stamps
     batch = x.ndim - 2
 
