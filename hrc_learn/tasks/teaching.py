@@ -3,17 +3,10 @@
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-import numpy as np
-import torch
-
-from ..controller import SafetyFilter
 from ..kinematics import panda
 from ..protocols import Human
 from ..sim import World
-from .motion import resolved_rate
-
-Frame = dict[str, np.ndarray | float | bool]
-"""Columns of one recorded instant, as `DatasetWriter.add_frame` takes them."""
+from .led_arm import Frame, LedArm, LedArmConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,28 +56,9 @@ def teach(
     Yields:
         A frame every `record_every` control steps.
     """
-    guard = SafetyFilter(panda.limits)
-    state = guard.initial_state(torch.from_numpy(world.arm.read().joint_position))
+    led = LedArm(panda, world.arm, human, LedArmConfig(dt=config.dt, damping=config.damping))
     for k in range(round(duration / config.dt)):
-        reading = world.arm.read()
-        asked = human.read(reading)
-        q = torch.from_numpy(reading.joint_position)
-        pose, J = panda.forward_and_jacobian(q)
-        wanted = resolved_rate(
-            J, torch.from_numpy(asked.twist), torch.from_numpy(asked.effort) / config.damping
-        )
-        velocity, state, _ = guard.step(state, q, wanted, config.dt)
+        instant = led.step()
         if k % config.record_every == 0:
-            yield {
-                "time": reading.time,
-                "joint_position": reading.joint_position,
-                "joint_velocity": reading.joint_velocity,
-                "position": pose.position.numpy(),
-                "orientation": pose.orientation.numpy(),
-                "gripper": reading.gripper_width,
-                "human_effort": asked.effort,
-                "command_velocity": velocity.numpy(),
-                **observe(),
-            }
-        world.arm.command(velocity.numpy())
+            yield {**instant.frame(), **observe()}
         world.advance(config.dt)
