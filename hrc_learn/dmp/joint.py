@@ -143,14 +143,14 @@ class JointDMP(nn.Module):
         samples = fit.samples
         # One where a coordinate never moves: nothing to scale, and nothing to divide by.
         amplitude = torch.where(samples.span > 0, samples.span, 1.0)
-        ends = Demonstrated(start=samples.first, goal=samples.last, amplitude=amplitude)
-        scaling.check(ends, samples.batch, joint_names)
+        shown = Demonstrated(*(x.double() for x in (samples.first, samples.last, amplitude)))
+        scaling.check(shown, samples.batch, joint_names)
 
         def batched(tensor: Tensor) -> Tensor:
             return tensor.to(samples.position.dtype).reshape(samples.batch + tensor.shape[1:])
 
         dmp = cls(
-            weights=batched(scaling.unscale(fit.weights.mT, ends).mT),
+            weights=batched(scaling.unscale(fit.weights.mT, shown).mT),
             start=batched(samples.first),
             goal=batched(samples.last),
             start_velocity=batched(fit.rate / samples.duration[:, None]),

@@ -2,11 +2,13 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Unpack
 
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from hrc_learn.dmp.arrays import ArrayLike, to_tensor
+from hrc_learn.dmp.fitting.options import FitOptions
 from hrc_learn.dmp.fitting.report import FitReport
 from hrc_learn.dmp.joint import JointDMP
 from hrc_learn.dmp.pose_columns import (
@@ -22,8 +24,7 @@ from hrc_learn.dmp.pose_motion import PoseState, PoseTrajectory
 from hrc_learn.dmp.rotation.demonstrated import fitted_error
 from hrc_learn.dmp.rotation.ends import error_ends, unit_quaternion
 from hrc_learn.dmp.rotation.error import reference_of, retarget, to_orientation
-from hrc_learn.dmp.system.basis import Basis
-from hrc_learn.dmp.system.spring import SpringDamper
+from hrc_learn.dmp.scaling import find_scaling
 from hrc_learn.geometry import Pose
 from hrc_learn.storage import SavedModel, write_model
 
@@ -60,11 +61,8 @@ class PoseDMP(nn.Module):
         body: ArrayLike | None = None,
         mask: ArrayLike | None = None,
         *,
-        method: str = "trajectory",
-        approach: float = 0.0,
-        basis: Basis | None = None,
-        spring: SpringDamper | None = None,
-        regularization: float = 1e-7,
+        scaling: str = "none",
+        **options: Unpack[FitOptions],
     ) -> "PoseDMP":
         """Learn one primitive from each demonstration.
 
@@ -75,14 +73,12 @@ class PoseDMP(nn.Module):
             n_basis: N, unless `basis` is given.
             body: Coordinates learned along, (*B, T, K), or (T,) for one.
             mask: (*B, T), false where a sample does not count.
-            method: As for `JointDMP.fit`, like all that follow.
-            approach: Share of the motion along which new ends are taken up.
-            basis: Shape of the forcing term.
-            spring: Gains.
-            regularization: Ridge.
+            scaling: Of the forcing term of the position, as for `JointDMP.fit`; `"rotation"`
+                turns and dilates its path with the way from start to goal.
+            options: How to fit; see `FitOptions`.
 
         Raises:
-            ValueError: Bad samples; says which.
+            ValueError: Bad samples (says which), or a scaling that the motion forbids.
         """
         error, goal = fitted_error(time, orientation, mask)
         coordinates = demonstrated_columns(time, position, error, body, mask)
@@ -92,11 +88,8 @@ class PoseDMP(nn.Module):
             n_basis,
             mask=mask,
             units="m, rad, body",
-            method=method,
-            approach=approach,
-            basis=basis,
-            spring=spring,
-            regularization=regularization,
+            scaling=find_scaling(scaling, columns=POSITION.stop),
+            **options,
         )
         return cls(motion, goal.to(coordinates))
 
@@ -280,24 +273,27 @@ class PoseDMP(nn.Module):
             None if goal is None else goal.orientation,
             None if twist is None else twist[..., 3:],
         )
+        start_columns = joined(
+            like[..., POSITION] if start is None else start.position,
+            error,
+            like[..., BODY] if start_body is None else start_body,
+            like,
+        )
+        goal_columns = joined(
+            self.motion.goal[..., POSITION] if goal is None else goal.position,
+            self.motion.goal[..., ERROR],
+            self.motion.goal[..., BODY] if goal_body is None else goal_body,
+            like,
+        )
+        if twist is None:
+            # Turned and dilated with the way, if the scaling has it so.
+            per_s = self.motion.start_rate(start_columns, goal_columns)
+            linear = (per_s / duration[..., None])[..., POSITION]
+        else:
+            linear = twist[..., :3]
         return {
-            "start": joined(
-                like[..., POSITION] if start is None else start.position,
-                error,
-                like[..., BODY] if start_body is None else start_body,
-                like,
-            ),
-            "goal": joined(
-                self.motion.goal[..., POSITION] if goal is None else goal.position,
-                self.motion.goal[..., ERROR],
-                self.motion.goal[..., BODY] if goal_body is None else goal_body,
-                like,
-            ),
-            "start_velocity": joined(
-                demonstrated[..., POSITION] if twist is None else twist[..., :3],
-                rate,
-                demonstrated[..., BODY],
-                like,
-            ),
+            "start": start_columns,
+            "goal": goal_columns,
+            "start_velocity": joined(linear, rate, demonstrated[..., BODY], like),
             "duration": duration,
         }, reference

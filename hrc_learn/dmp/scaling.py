@@ -29,7 +29,7 @@ NO_WAY = 1e-24
 """Square of the share of the demonstrated way below which a way has no direction."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Demonstrated:
     """What a demonstration gives a scaling to go by: (*batch, D) each, tensors or arrays."""
 

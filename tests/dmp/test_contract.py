@@ -127,6 +127,16 @@ class TestPose(DMPContract):
         )
 
 
+class TestJointTurningWithItsWay(TestJoint):
+    def fit(self, *demonstration, **kwargs):
+        return JointDMP.fit(*demonstration, scaling="rotation", **kwargs)
+
+
+class TestPoseTurningWithItsWay(TestPose):
+    def fit(self, time, position, orientation, body, **kwargs):
+        return PoseDMP.fit(time, position, orientation, body=body, scaling="rotation", **kwargs)
+
+
 class TestJointOnItsApproach(TestJoint):
     def fit(self, *demonstration, **kwargs):
         return JointDMP.fit(*demonstration, approach=0.8, **kwargs)

@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-from demo_motions import arm_motion
+from demo_motions import arm_motion, turning_motion
 from dmp_oracle import forcing
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -14,9 +14,10 @@ from hypothesis.extra.numpy import arrays
 from scipy.integrate import solve_ivp
 from torch.autograd import gradcheck
 
-from hrc_learn.dmp import JointDMP, Stepper
+from hrc_learn.dmp import JointDMP, PoseDMP, Stepper
 from hrc_learn.dmp.fitting.mean import mean_primitive
 from hrc_learn.dmp.scaling import SCALINGS, RotationScaling, find_scaling
+from hrc_learn.geometry import Pose
 
 quick = settings(max_examples=30, deadline=None)
 angles = st.floats(-3.1, 3.1)
@@ -309,3 +310,18 @@ def test_frames_of_several_demonstrations_have_no_mean():
     dmp = JointDMP.fit(TIME, torch.stack([POSITION, -POSITION]), 8, scaling="rotation")
     with pytest.raises(ValueError, match="frame of its own"):
         mean_primitive(dmp)
+
+
+def test_the_place_of_a_pose_turns_and_its_orientation_and_body_do_not():
+    time, orientation = turning_motion(n_samples=60)
+    body = arm_motion(n_samples=60, n_joints=2, seed=3)[1]
+    options = {"n_basis": 8, "body": body}
+    turning = PoseDMP.fit(time, POSITION, orientation, scaling="rotation", **options)
+    plain = PoseDMP.fit(time, POSITION, orientation, **options)
+    start, way = turning.start.position, turning.goal.position - turning.start.position
+    R = 1.5 * minimal_rotation(way, torch.tensor([0.2, 0.9, -0.4], dtype=torch.float64))
+    goal = Pose(start + R @ way, turning.goal.orientation)
+    moved, same = turning.rollout(goal=goal), plain.rollout(goal=goal)
+    close(moved.position, (turning.rollout().position - start) @ R.mT + start)
+    close(moved.orientation, same.orientation)
+    close(moved.body, same.body)
