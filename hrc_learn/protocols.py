@@ -5,7 +5,7 @@ Arrays are NumPy float64: that is what drivers and simulators speak.
 """
 
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -57,6 +57,25 @@ class Camera(Protocol):
 
 
 @dataclass(frozen=True, kw_only=True)
+class DrawnRegion:
+    """A box that a person has drawn for the hand, along the axes of the base frame."""
+
+    centre: tuple[float, float, float]
+    """[m]"""
+    half_size: tuple[float, float, float]
+    """[m]"""
+
+    def __post_init__(self) -> None:
+        if min(self.half_size) <= 0:
+            raise ValueError(f"a region's half_size must be positive, but is {self.half_size}.")
+
+
+Request = Literal["start", "stop", "save", "discard", "home", "finish"]
+"""What a person asks for once: of the demonstration being recorded, then of the arm (back to
+where it started) and of the session."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class HumanInput:
     """What a person asks for at one instant."""
 
@@ -64,6 +83,14 @@ class HumanInput:
     """Null-space effort d on the joints (paper, eq. globalControl)."""
     twist: Float[np.ndarray, " 6"] = field(default_factory=lambda: np.zeros(6))
     """End-effector motion, linear [m/s] and angular [rad/s], in the base frame."""
+    gripper: float | None = None
+    """Opening the gripper should have [m]; None: nothing is asked."""
+    region: DrawnRegion | None = None
+    """Where the hand should be; None: anywhere."""
+    target: tuple[float, float, float] | None = None
+    """Point marked for the hand, in the base frame [m]; None: none is."""
+    requests: tuple[Request, ...] = ()
+    """Asked for since the last reading, in this order."""
 
 
 @runtime_checkable
