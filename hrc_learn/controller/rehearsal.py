@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -104,6 +105,15 @@ class PinholeCamera:
         return (like.new_tensor(self.image_size) - 1) / 2
 
 
+@runtime_checkable
+class Projects(Protocol):
+    """Whatever says where a camera sees the marker on the hand."""
+
+    def project(self, tool: Pose) -> tuple[Float[Tensor, "*batch 2"], Bool[Tensor, "*batch"]]:
+        """Marker in the image [px], and whether it is inside the image."""
+        ...
+
+
 @dataclass(frozen=True, kw_only=True)
 class Imperfections:
     """What a real camera does to the measurement."""
@@ -126,7 +136,7 @@ class Imperfections:
 class VirtualCamera:
     """Turns tool poses into measurements, with the imperfections of a camera."""
 
-    camera: PinholeCamera
+    camera: Projects
     imperfections: Imperfections
     generator: torch.Generator
     _steps: int = 0
