@@ -5,6 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.geometry.constant import Constant
+from hrc_learn.geometry.small_matrices import inverse_norm, matmul, solve_positive
 
 SINGULAR_BELOW = 0.05
 """Smallest singular value of the Jacobian below which its inverse is damped, and the damping
@@ -49,16 +50,14 @@ def resolve(
     Returns:
         Joint velocity of the task, and that of the null space [rad/s].
     """
-    gram = J @ J.mT
+    gram = matmul(J, J.mT)
     eye = _EYE.like(J)
-    factor, _ = torch.linalg.cholesky_ex(torch.add(gram, eye, alpha=_FLOOR))
-    inverse = torch.cholesky_inverse(factor)
-    sigma_square = 1 / torch.linalg.vector_norm(inverse, dim=(-2, -1), keepdim=True)
+    sigma_square = 1 / inverse_norm(torch.add(gram, eye, alpha=_FLOOR))
     damping = (SINGULAR_BELOW**2 - sigma_square).clamp(min=0)
-    factor, _ = torch.linalg.cholesky_ex(torch.addcmul(gram, eye, damping))
+    damped = torch.addcmul(gram, eye, damping[..., None, None])
     wish = wish.unsqueeze(-1)
-    wrench = torch.cholesky_solve(torch.cat([twist.unsqueeze(-1), J @ wish], dim=-1), factor)
-    task, leak = (J.mT @ wrench).unbind(-1)
+    wrench = solve_positive(damped, torch.cat([twist.unsqueeze(-1), matmul(J, wish)], dim=-1))
+    task, leak = matmul(J.mT, wrench).unbind(-1)
     return task, wish.squeeze(-1) - leak
 
 

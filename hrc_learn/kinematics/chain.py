@@ -8,6 +8,7 @@ from torch import Tensor
 
 from hrc_learn.geometry import Pose
 from hrc_learn.geometry.constant import Constant
+from hrc_learn.geometry.small_matrices import matmul
 from hrc_learn.kinematics.limits import JointLimits
 
 
@@ -74,7 +75,7 @@ class SerialChain:
         Args:
             q: Joint positions [rad].
         """
-        return Pose.from_matrix(self._joint_frames(q)[-1] @ self._tip.like(q))
+        return Pose.from_matrix(matmul(self._joint_frames(q)[-1], self._tip.like(q)))
 
     def link_poses(self, q: Float[Tensor, "*batch joints"]) -> Pose:
         """Poses of the joint frames, the flange and the tool centre point, in this order.
@@ -86,7 +87,7 @@ class SerialChain:
             Pose with batch shape (*batch, joints + 2); index it as `poses[..., i]`.
         """
         frames = self._joint_frames(q)
-        tips = [frames[-1] @ self._flange.like(q), frames[-1] @ self._tip.like(q)]
+        tips = [matmul(frames[-1], self._flange.like(q)), matmul(frames[-1], self._tip.like(q))]
         return Pose.from_matrix(torch.stack([*frames, *tips], dim=-3))
 
     def jacobian(self, q: Float[Tensor, "*batch joints"]) -> Float[Tensor, "*batch 6 joints"]:
@@ -112,7 +113,7 @@ class SerialChain:
     ) -> tuple[Float[Tensor, "*batch 3 4"], Float[Tensor, "*batch 6 joints"]]:
         """`forward_and_jacobian` with the pose left as a matrix (R | p): no quaternion made."""
         frames = self._joint_frames(q)
-        tip = frames[-1] @ self._tip.like(q)
+        tip = matmul(frames[-1], self._tip.like(q))
         frames = torch.stack(frames, dim=-3)
         return tip, _screw_jacobian(frames[..., 2], frames[..., 3], tip[..., None, :, 3])
 
@@ -144,7 +145,7 @@ class SerialChain:
         first, *rest = steps.unbind(-3)
         frames = [first[..., :3, :]]
         for step in rest:
-            frames.append(frames[-1] @ step)
+            frames.append(matmul(frames[-1], step))
         return frames
 
 

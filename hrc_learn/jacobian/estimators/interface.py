@@ -6,11 +6,11 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any
 
-import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from hrc_learn.geometry import Pose
+from hrc_learn.geometry.small_matrices import matmul
 from hrc_learn.jacobian.network import RBFImageJacobian
 from hrc_learn.pytree import pytree
 
@@ -87,4 +87,4 @@ def evaluate(
     weight: Float[Tensor, "*batch 12 K"], theta: Float[Tensor, "*batch K"]
 ) -> Float[Tensor, "*batch 2 6"]:
     """J_s_hat from vec(J_s_hat^T) = W theta."""
-    return torch.matmul(weight, theta.unsqueeze(-1)).squeeze(-1).unflatten(-1, (2, 6))
+    return matmul(weight, theta.unsqueeze(-1)).squeeze(-1).unflatten(-1, (2, 6))

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hrc_learn.geometry import Pose
+from hrc_learn.geometry.small_matrices import matmul
 from hrc_learn.jacobian.estimators.interface import (
     ImageJacobianEstimator,
     Measurement,
@@ -66,7 +67,7 @@ class Pair:
     def error(self, weight: Float[Tensor, "*batch 12 K"]) -> Float[Tensor, "*batch 2"]:
         """Prediction error dx - J_s_hat dr [px]."""
         J = evaluate(weight, self.theta)
-        return self.dx - (J @ self.twist.unsqueeze(-1)).squeeze(-1)
+        return self.dx - matmul(J, self.twist.unsqueeze(-1)).squeeze(-1)
 
 
 class PairEstimator(ImageJacobianEstimator):

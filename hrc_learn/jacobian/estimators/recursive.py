@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from hrc_learn.geometry.small_matrices import matmul
 from hrc_learn.jacobian.estimators.key_frames import KeyFrame, Pair, PairEstimator
 from hrc_learn.jacobian.network import RBFImageJacobian
 from hrc_learn.jacobian.pairs import PairConfig
@@ -89,13 +90,12 @@ def condition(
         scale: Metres that each component of a twist counts for.
         noise: Variance of each coordinate of dx [px^2].
     """
-    phi = (pair.dr.unsqueeze(-1) * pair.theta.unsqueeze(-2)).flatten(-2).unsqueeze(-1)
-    P_phi = covariance @ phi  # (*batch, P, 1)
-    spread = phi.mT @ P_phi + noise
-    gain = P_phi / spread
-    change = pair.error(weight).unsqueeze(-1) * gain.squeeze(-1).unsqueeze(-2)
+    phi = (pair.dr.unsqueeze(-1) * pair.theta.unsqueeze(-2)).flatten(-2).unsqueeze(-2)
+    P_phi = matmul(phi, covariance)  # (*batch, 1, P); P is symmetric
+    spread = (P_phi * phi).sum(-1, keepdim=True) + noise
+    change = pair.error(weight).unsqueeze(-1) * (P_phi / spread)
     change = change.unflatten(-1, (6, -1)) * scale.unsqueeze(-1)  # (*batch, 2, 6, K)
-    # An outer product of a vector with itself is symmetric to the last bit. gain P_phi^T is
-    # not, and forgetting amplifies the difference until the covariance is none any more.
+    # An outer product of a vector with itself is symmetric to the last bit. That of the gain
+    # and P_phi is not, and forgetting amplifies the difference until the covariance is none.
     root = P_phi / spread.sqrt()
-    return weight + change.flatten(-3, -2), covariance - root @ root.mT
+    return weight + change.flatten(-3, -2), covariance - root.mT * root
