@@ -3,6 +3,7 @@
 from jaxtyping import Float
 from torch import Tensor
 
+from hrc_learn.geometry.small_matrices import matmul
 from hrc_learn.jacobian.estimators.interface import (
     ImageJacobianEstimator,
     Measurement,
@@ -54,6 +55,6 @@ def paper_rate(
     """
     xi_x = measurement.xi_x.unsqueeze(-1)
     J = evaluate(weight, theta)
-    s = (J.mT @ xi_x).squeeze(-1) + measurement.xi_r
+    s = matmul(J.mT, xi_x).squeeze(-1) + measurement.xi_r
     push = (xi_x * s.unsqueeze(-2)).flatten(-2)  # (*batch, 12)
     return -gain * push.unsqueeze(-1) * theta.unsqueeze(-2)
