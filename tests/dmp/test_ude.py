@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from hrc_learn.dmp import OrientationDMP
 from hrc_learn.dmp.rotation.error import angular_velocity
-from hrc_learn.dmp.rotation.left_jacobian import axis_drift, drift_free_rate
+from hrc_learn.geometry.left_jacobian import axis_drift, drift_free_rate
 from hrc_learn.geometry import quaternion
 
 GOAL = quaternion.exp(torch.tensor([0.9, -0.7, 0.6], dtype=torch.float64))

@@ -49,6 +49,20 @@ def drift_free_rate(
     return rate - half**2 / 2 * cross + c * torch.linalg.cross(e, cross)
 
 
+def left_jacobian(
+    phi: Float[Tensor, "*batch 3"], rate: Float[Tensor, "*batch 3"]
+) -> Float[Tensor, "*batch 3"]:
+    """J_l(phi) rate: the angular velocity in the base frame at which a rotation vector moves."""
+    return drift_free_rate(-phi, rate)
+
+
+def left_jacobian_transposed(
+    phi: Float[Tensor, "*batch 3"], slope: Float[Tensor, "*batch 3"]
+) -> Float[Tensor, "*batch 3"]:
+    """J_l(phi)^T slope: from a derivative over small rotations to one over phi."""
+    return drift_free_rate(phi, slope)
+
+
 def _polynomial(x: Tensor, coefficients: tuple[float, ...]) -> Tensor:
     """The constant term first."""
     value = torch.zeros_like(x)
