@@ -118,11 +118,18 @@ class KeyMotion:
         )
 
     @staticmethod
+    def empty() -> KeyMotion:
+        """No pairs."""
+        none = torch.zeros(0, 6, dtype=torch.float64)
+        pose = Pose(none[:, :3], none[:, :4])
+        return KeyMotion(pose, pose, none, none[:, :2], none[:, :2].long())
+
+    @staticmethod
     def joined(motions: Sequence[KeyMotion]) -> KeyMotion:
         """The pairs of several demonstrations as one."""
 
         def join(name: str) -> Any:
-            parts = [getattr(motion, name) for motion in motions]
+            parts = [getattr(motion, name) for motion in (KeyMotion.empty(), *motions)]
             if isinstance(parts[0], Tensor):
                 return torch.cat(parts)
             return Pose(
