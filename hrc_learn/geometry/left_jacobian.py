@@ -52,7 +52,7 @@ def drift_free_rate(
 def left_jacobian(
     phi: Float[Tensor, "*batch 3"], rate: Float[Tensor, "*batch 3"]
 ) -> Float[Tensor, "*batch 3"]:
-    """J_l(phi) rate: the angular velocity in the base frame at which a rotation vector moves."""
+    """J_l(phi) rate: the angular velocity at which a rotation vector moves, in the base frame."""
     return drift_free_rate(-phi, rate)
 
 
