@@ -37,7 +37,8 @@ class StagedEpisode:
     """One saved episode."""
 
     header: RecordingHeader
-    task: str
+    tasks: list[str]
+    """Texts of the tasks it shows, at least one."""
     statistics: Statistics
     table: pa.Table
 
@@ -55,7 +56,7 @@ def write_episode(path: Path, episode: StagedEpisode) -> None:
     """Write one episode so that `path` exists only once it is complete and on disk."""
     metadata = {
         "header": vars(episode.header),
-        "task": episode.task,
+        "tasks": episode.tasks,
         "statistics": episode.statistics,
     }
     table = episode.table.replace_schema_metadata({_METADATA_KEY: json.dumps(metadata)})
@@ -73,14 +74,18 @@ def read_episode(path: Path) -> StagedEpisode:
     metadata = json.loads(table.schema.metadata[_METADATA_KEY])
     return StagedEpisode(
         header=RecordingHeader(**metadata["header"]),
-        task=metadata["task"],
+        tasks=metadata["tasks"],
         statistics=metadata["statistics"],
         table=table,
     )
 
 
-def staged_paths(folder: Path) -> list[Path]:
+def staged_paths(folder: Path, first: int = 0) -> list[Path]:
     """Files of the saved episodes, in order.
+
+    Args:
+        folder: The staging folder.
+        first: Index of the first one: the episodes of the dataset that is appended to.
 
     Raises:
         DatasetError: None was saved, or one in the middle is gone.
@@ -88,7 +93,7 @@ def staged_paths(folder: Path) -> list[Path]:
     paths = sorted(folder.glob("episode_*.parquet"))
     if not paths:
         raise DatasetError("no episode was saved, so there is no dataset to write", file=folder)
-    for index, path in enumerate(paths):
+    for index, path in enumerate(paths, start=first):
         if path != episode_path(folder, index):
             raise DatasetError(
                 "this episode is missing from the recording; rename the later ones to close "
@@ -111,6 +116,9 @@ def to_table(values: dict[str, np.ndarray], features: dict[str, dict]) -> pa.Tab
 
 def _to_arrow(values: np.ndarray, dtype: str, width: int) -> pa.Array:
     contiguous = np.ascontiguousarray(values, dtype=dtype)
+    if contiguous.dtype == bool:
+        flat = pa.array(contiguous.reshape(-1))  # packed to bits
+        return flat if width == 1 else pa.FixedSizeListArray.from_arrays(flat, width)
     # Not pa.array(): it imports pandas, which would hold up the first episode for a second.
     buffers = [None, pa.py_buffer(contiguous)]
     flat = pa.Array.from_buffers(

@@ -1,6 +1,5 @@
 """Recording demonstrations as a LeRobot dataset of version 3.0."""
 
-import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -11,14 +10,15 @@ import numpy as np
 from .demonstration import Demonstration
 from .episode_buffer import Episode, EpisodeBuffer, complete, describe_difference, examine
 from .finding import DatasetError
-from .lerobot_v3 import INDEX_FEATURES, assemble
+from .layout import DatasetFolder, open_folder
+from .lerobot_v3 import INDEX_FEATURES
+from .recovery import begin, discard, recover_dataset
 from .schema import TIME_KEY, Column, columns_for, encode, lerobot_features
-from .sidecar import sidecar_content
+from .sidecar import read_sidecar, sidecar_content
 from .staging import (
     RecordingHeader,
     StagedEpisode,
     episode_path,
-    staged_paths,
     staging_folder,
     to_table,
     write_episode,
@@ -39,7 +39,7 @@ class DatasetWriter:
     Saved episodes wait in `ROOT.recording/`; `finalize`, which leaving the `with` block
     calls, turns them into the dataset in one step. If the recording breaks off, by an
     exception or a kill, the episodes saved until then stay there and `recover_dataset`
-    makes the dataset of them.
+    makes the dataset of them, or adds them to the one they were appended to.
     """
 
     def __init__(
@@ -54,11 +54,12 @@ class DatasetWriter:
         dtype: Literal["float32", "float64"] = "float32",
         frames: Mapping[str, str] | None = None,
         details: Mapping[str, object] | None = None,
+        append: bool = False,
     ):
         """Claim the folder; nothing is written into `root` before `finalize`.
 
         Args:
-            root: Folder of the dataset, which must not exist.
+            root: Folder of the dataset, which must not exist, unless it is appended to.
             fps: Frame rate [1/s]. True stamps are kept beside it where frames give `time`.
             robot_type: Name of the robot, as LeRobot's metadata keep it.
             joint_names: Joints, in the order of the values of `joint_position` and the like.
@@ -69,10 +70,14 @@ class DatasetWriter:
             frames: Names of the frames poses are given in, such as
                 {"base": "panda_link0", "ee": "panda_hand_tcp"}.
             details: Anything else worth keeping, as JSON values.
+            append: Add episodes to the dataset `root`, which a `DatasetWriter` wrote with the
+                same settings. It stays as it is, and readable, until `finalize` puts the
+                longer one in its place.
 
         Raises:
             FileExistsError: `root`, or an interrupted recording of it, is already there.
-            ValueError: An argument makes no sense.
+            ValueError: An argument makes no sense, or is not that of the dataset appended to.
+            DatasetError: The dataset to append to cannot be read.
         """
         self.root = Path(root)
         if not fps > 0:
@@ -93,10 +98,11 @@ class DatasetWriter:
         self._tasks: dict[str, int] = {}
         self._saved_frames = 0
         self.episodes = 0
+        self._earlier = self._continue() if append else None
         self._video_features = video_features(cameras or {}, self.fps)
         staging = staging_folder(self.root)
         self._images = CameraRecorder(cameras or {}, self.fps, staging)
-        self._staging = _claim(self.root)
+        self._staging = begin(self.root, self.episodes if append else None)
 
     def __enter__(self) -> "DatasetWriter":
         return self
@@ -111,11 +117,11 @@ class DatasetWriter:
             self.finalize()
             return
         self.discard_episode()
-        if not self.episodes:
-            shutil.rmtree(self._staging)
+        if not self._new_episodes:
+            discard(self._staging)
         else:
             error.add_note(
-                f"The {self.episodes} episodes saved before this are kept in "
+                f"The {self._new_episodes} episodes saved before this are kept in "
                 f"{self._staging}; hrc_learn.demos.recover_dataset({str(self.root)!r}) makes "
                 f"a dataset of them."
             )
@@ -218,10 +224,31 @@ class DatasetWriter:
                 f"the last episode holds {len(self._buffer)} unsaved frames: call "
                 f"save_episode() or discard_episode() before the recording ends"
             )
-        if not self.episodes:
-            shutil.rmtree(self._staging)
+        if not self._new_episodes:
+            discard(self._staging)
             raise DatasetError("no episode was saved, so there is no dataset", file=self.root)
         return recover_dataset(self.root)
+
+    @property
+    def _new_episodes(self) -> int:
+        return self.episodes - (len(self._earlier.episodes) if self._earlier else 0)
+
+    def _continue(self) -> DatasetFolder:
+        """Go on counting where the dataset ends that is appended to."""
+        folder, sidecar = open_folder(self.root), read_sidecar(self.root)
+        for name, theirs, ours in (
+            ("frame rate", folder.fps, self.fps),
+            ("robot", folder.robot_type, self.robot_type),
+            ("joints", sidecar.joint_names, self.joint_names),
+        ):
+            if theirs != ours:
+                raise ValueError(
+                    f"cannot append to {self.root}: its {name} is {theirs!r}, not {ours!r}"
+                )
+        self._tasks = {text: index for index, text in folder.tasks.items()}
+        self._saved_frames = sum(entry.length for entry in folder.episodes)
+        self.episodes = len(folder.episodes)
+        return folder
 
     def _open_task(self) -> str:
         if self._task is None:
@@ -243,9 +270,11 @@ class DatasetWriter:
         self._columns = columns
         values = self._with_indices(encode(columns, episode), task)
         header = self._header()
+        if self._earlier is not None:
+            _require_same_columns(self._earlier, header)
         staged = StagedEpisode(
             header=header,
-            task=task,
+            tasks=[task],
             statistics=episode_statistics(values) | self._images.finish(self.episodes),
             table=to_table(values, header.features),
         )
@@ -279,50 +308,15 @@ class DatasetWriter:
         )
 
 
-def recover_dataset(root: str | Path) -> Path:
-    """Make the dataset of a recording that was broken off, from the episodes it had saved.
-
-    Args:
-        root: Folder that the recording was to become.
-
-    Returns:
-        The same folder, now a dataset.
-
-    Raises:
-        FileNotFoundError: There is no recording of that name.
-        FileExistsError: There is a dataset of that name.
-        DatasetError: The recording holds no saved episode.
-    """
-    root = Path(root)
-    staging = staging_folder(root)
-    if not staging.is_dir():
-        raise FileNotFoundError(f"no interrupted recording at {staging}")
-    if root.exists():
-        raise FileExistsError(
-            f"{root} already exists: remove {staging} if it is the same recording, or move "
-            f"{root} away to make a dataset of it"
+def _require_same_columns(folder: DatasetFolder, header: RecordingHeader) -> None:
+    theirs, ours = folder.info["features"], header.features
+    differing = [key for key in theirs | ours if theirs.get(key) != ours.get(key)]
+    if differing:
+        raise ValueError(
+            f"cannot append to {folder.root}: {differing[0]} there is "
+            f"{theirs.get(differing[0])}, here {ours.get(differing[0])}; record the same "
+            f"quantities with the same settings, or a dataset of its own"
         )
-    assembled = staging / "dataset"
-    shutil.rmtree(assembled, ignore_errors=True)  # of an earlier attempt
-    assemble(staged_paths(staging), assembled)
-    assembled.rename(root)
-    shutil.rmtree(staging)
-    return root
-
-
-def _claim(root: Path) -> Path:
-    if root.exists():
-        raise FileExistsError(f"{root} already exists: choose another folder or remove it")
-    staging = staging_folder(root)
-    try:
-        staging.mkdir(parents=True)
-    except FileExistsError:
-        raise FileExistsError(
-            f"{staging} holds a recording that is still going on or was interrupted: "
-            f"hrc_learn.demos.recover_dataset({str(root)!r}) makes a dataset of its saved "
-            f"episodes; remove it to start anew"
-        ) from None
-    return staging
 
 
 def _check_feature_keys(features: Mapping[str, Sequence[str]]) -> None:
