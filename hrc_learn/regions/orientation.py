@@ -10,7 +10,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.geometry import quaternion
+from hrc_learn.geometry.left_jacobian import left_jacobian_transposed
 from hrc_learn.pytree import pytree, static
+from hrc_learn.regions.printed_derivative import printed_derivative
 from hrc_learn.regions.region import Region
 
 # Shorter axes are rounding noise. They occur at the goal, deep inside the cone, where the
@@ -34,6 +36,10 @@ class OrientationRegion(Region):
     effector about the base axes, k_o max(0, f) (alpha_o/2) n with the axis n of the error.
     `formulation="paper"` is the printed alpha_o k_o max(0, f) phi n (orient_diff_potential),
     which has the same direction and 2 phi times that length.
+
+    With `coordinates="rotation_vector"` it belongs to the analytic Jacobian: it is dP over the
+    rotation vector of x, J_l^T times the above. `formulation="paper"` is then the printed chain
+    (PartialV2Quat), (JacobianQuatAngAxisDetailed), which is twice as long.
     """
 
     goal: Float[Tensor, "*#batch 4"]
@@ -43,6 +49,7 @@ class OrientationRegion(Region):
     stiffness: float = static(0.02)
     """k_o."""
     formulation: Literal["exact", "paper"] = static("exact")
+    coordinates: Literal["rotation", "rotation_vector"] = static("rotation")
 
     @property
     def tolerance(self) -> float:
@@ -58,16 +65,24 @@ class OrientationRegion(Region):
         return self.sharpness * half_angle - 1
 
     def feedback(self, x: Float[Tensor, "*batch 4"]) -> tuple[Tensor, Tensor]:
-        """Potential of shape (*both,) and its gradient (*both, 3) over a rotation [1/rad]."""
+        """Potential of shape (*both,) and its gradient (*both, 3) [1/rad]."""
         error = self._error(x)
         sine = torch.linalg.vector_norm(error[..., 1:], dim=-1, keepdim=True)
         half_angle = torch.atan2(sine, error[..., :1])
         f = (self.sharpness * half_angle - 1).clamp(min=0)
         P = (0.5 * self.stiffness) * (f * f).squeeze(-1)
-        slope = (0.5 * self.stiffness * self.sharpness) * f
+        slope = (0.5 * self.stiffness * self.sharpness) * f / sine.clamp(min=_SHORTEST_AXIS)
+        if self.coordinates == "rotation_vector":
+            return P, self._over_rotation_vector(x, error, slope)
         if self.formulation == "paper":
             slope = slope * (4 * half_angle)
-        return P, slope / sine.clamp(min=_SHORTEST_AXIS) * error[..., 1:]
+        return P, slope * error[..., 1:]
+
+    def _over_rotation_vector(self, x: Tensor, error: Tensor, slope: Tensor) -> Tensor:
+        if self.formulation == "paper":
+            return -2 * slope * printed_derivative(quaternion.canonical(x), self.goal)
+        gradient = slope * error[..., 1:]
+        return left_jacobian_transposed(quaternion.log(x).expand_as(gradient), gradient)
 
     def _error(self, x: Tensor) -> Tensor:
         """P * p_g^-1 with the sign of the shortest rotation."""

@@ -6,6 +6,7 @@ import torch
 
 from hrc_learn.geometry import quaternion
 from hrc_learn.regions import OrientationRegion
+from hrc_learn.regions.printed_derivative import printed_derivative
 
 GOAL = quaternion.normalize(torch.tensor([-0.28, 0.63, 0.66, 0.28], dtype=torch.float64))
 
@@ -23,10 +24,12 @@ def test_the_tolerance_of_table_one_is_seven_and_a_half_degrees():
     assert (region.gradient(turned(0.99 * region.tolerance)) == 0).all()
 
 
+@pytest.mark.parametrize("coordinates", ["rotation", "rotation_vector"])
 @pytest.mark.parametrize("formulation", ["exact", "paper"])
-def test_both_signs_are_one_orientation(formulation):
-    region = OrientationRegion(goal=GOAL, formulation=formulation)
-    flipped = OrientationRegion(goal=-GOAL, formulation=formulation)
+def test_both_signs_are_one_orientation(formulation, coordinates):
+    options = {"formulation": formulation, "coordinates": coordinates}
+    region = OrientationRegion(goal=GOAL, **options)
+    flipped = OrientationRegion(goal=-GOAL, **options)
     half_turn = torch.tensor([0.0, 0.6, 0.0, 0.8], dtype=torch.float64)
     samples = torch.cat(
         [
@@ -56,6 +59,48 @@ def test_the_printed_form_is_twice_the_angle_too_long():
     for angle in (0.2, 1.0, 3.0):
         p = turned(angle)
         torch.testing.assert_close(paper.gradient(p), 2 * angle * exact.gradient(p))
+
+
+def test_the_printed_chain_over_the_rotation_vector_is_twice_the_derivative():
+    """(PartialV2Quat) counts the constraint of unit length twice: its errata."""
+    samples = sampling.quaternions(300, rng=sampling.generator(3))
+    exact = OrientationRegion(goal=GOAL, coordinates="rotation_vector")
+    paper = OrientationRegion(goal=GOAL, coordinates="rotation_vector", formulation="paper")
+    # Division by small components costs digits.
+    torch.testing.assert_close(
+        paper.gradient(samples), 2 * exact.gradient(samples), rtol=1e-7, atol=1e-9
+    )
+
+
+def test_the_printed_derivatives_entry_by_entry():
+    """(PartialV2Quat) and (JacobianQuatAngAxisDetailed) with every term written out."""
+    p = quaternion.canonical(sampling.quaternions(rng=sampling.generator(4)))
+    p_g = sampling.quaternions(rng=sampling.generator(5))
+    if quaternion.multiply(p, quaternion.conjugate(p_g))[0] < 0:
+        p_g = -p_g
+    v_o, *u_o = p.tolist()
+    v_g, *u_g = quaternion.conjugate(p_g).tolist()
+    ratios = [g / o for g, o in zip(u_g, u_o, strict=True)]
+    over_p = [v_g + v_o * sum(ratios)]
+    for i in range(3):
+        others = sum(ratios) - ratios[i]
+        over_p.append(-u_g[i] + u_o[i] * (-v_g / v_o + others))
+    r = quaternion.log(p).tolist()
+    phi = math.hypot(*r)
+    sine, cosine = math.sin(phi / 2), math.cos(phi / 2)
+    J_rot = [[-r_i / (2 * phi) * sine for r_i in r]]
+    for i in range(3):
+        row = []
+        for k in range(3):
+            product = r[i] * r[k]
+            entry = product / (2 * phi**2) * cosine - product / phi**3 * sine
+            if i == k:
+                rest = sum(r[m] ** 2 for m in range(3) if m != i)
+                entry = product / (2 * phi**2) * cosine + rest / phi**3 * sine
+            row.append(entry)
+        J_rot.append(row)
+    over_p, J_rot = (torch.tensor(m, dtype=torch.float64) for m in (over_p, J_rot))
+    torch.testing.assert_close(printed_derivative(p, p_g), over_p @ J_rot)
 
 
 def test_descending_the_gradient_turns_the_short_way_to_the_cone():

@@ -76,10 +76,14 @@ def position(rotated: bool, stiffness=4e-3) -> Case:
     return Case(make, lambda *b, rng: rand(*b, 3, rng=rng), delicate, 3)
 
 
-def orientation(formulation: str) -> Case:
+def step_rotation_vector(x: Tensor, step: Tensor) -> Tensor:
+    return quaternion.exp(quaternion.log(x) + step)
+
+
+def orientation(formulation: str, coordinates: str = "rotation") -> Case:
     def make(*batch: int, rng: torch.Generator) -> OrientationRegion:
         goal = sampling.quaternions(*batch, rng=rng)
-        return OrientationRegion(goal=goal, formulation=formulation)
+        return OrientationRegion(goal=goal, formulation=formulation, coordinates=coordinates)
 
     def delicate() -> Tensor:
         region = make(rng=sampling.generator())
@@ -93,7 +97,7 @@ def orientation(formulation: str) -> Case:
         delicate,
         3,
         exact=formulation == "exact",
-        move=rotate,
+        move=rotate if coordinates == "rotation" else step_rotation_vector,
     )
 
 
@@ -129,6 +133,8 @@ CASES = {
     "position-per-axis": position(rotated=True, stiffness=(4e-3, 4e-3, 4e-4)),
     "orientation": orientation("exact"),
     "orientation-paper": orientation("paper"),
+    "orientation-vector": orientation("exact", "rotation_vector"),
+    "orientation-vector-paper": orientation("paper", "rotation_vector"),
     "posture": posture(),
     "vision": vision("paper"),
     "vision-saturated": vision("saturated"),
