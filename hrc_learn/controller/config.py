@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Literal
 
 from hrc_learn.controller.activation import ActivationConfig
 from hrc_learn.controller.safety import SafetyConfig
@@ -25,6 +26,9 @@ class ControllerConfig:
     """Cap on the linear speed of the tool during a joint-space approach [m/s]."""
     approach_angular_speed: float = 2.0
     """Cap on its angular speed then [rad/s]."""
+    jacobian: Literal["geometric", "analytic"] = "geometric"
+    """By which gradients become motions of the tool: the analytic one counts rotation by the
+    rotation vector, whose rates differ from angular velocity the more the tool is turned."""
     null_damping: float = 3.0
     """c_d: effort divided by it is velocity."""
     null_space_yields: bool = True
@@ -45,6 +49,10 @@ class ControllerConfig:
         ):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, but is {getattr(self, name)}")
+        if self.jacobian not in ("geometric", "analytic"):
+            raise ValueError(
+                f"jacobian must be 'geometric' or 'analytic', but is {self.jacobian!r}"
+            )
         if self.hold_rate < 0:
             raise ValueError(f"hold_rate must not be negative, but is {self.hold_rate}")
 

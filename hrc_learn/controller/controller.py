@@ -13,10 +13,12 @@ from torch import Tensor, nn
 from torch.utils import _pytree
 
 from hrc_learn.controller.activation import Activation, HandOver, fade
+from hrc_learn.controller.analytic import analytic_descent
 from hrc_learn.controller.config import ControllerConfig
 from hrc_learn.controller.goals import Goals
 from hrc_learn.controller.hold import Hold, measure_drift, planned_motion
 from hrc_learn.controller.interface import Command, ControllerState, Observation
+from hrc_learn.controller.lyapunov import potential_rate
 from hrc_learn.controller.resolution import excess_speed, fit_null_space, resolve
 from hrc_learn.controller.safety import SafetyFilter
 from hrc_learn.geometry import Pose
@@ -161,7 +163,10 @@ class AdaptiveController(nn.Module):
             age=observation.feature_age,
         )
         feedback = self._feedback(state, goals, pose, activation)
-        motion, hold = self._motion(state, observation, goals, q, J, arrival, feedback.s)
+        descent = feedback.s
+        if self.config.jacobian == "analytic":
+            descent = analytic_descent(descent, pose.orientation)
+        motion, hold = self._motion(state, observation, goals, q, J, arrival, descent)
         v, safety, report = self.safety.step(
             state.safety,
             q,
@@ -190,6 +195,7 @@ class AdaptiveController(nn.Module):
             weight_norm=torch.linalg.vector_norm(state.estimator.weight, dim=(-2, -1)),
             vision_activation=activation.level,
             potential=feedback.potential,
+            potential_rate=potential_rate(feedback.s, J, v),
             safety=report,
         )
         estimator = self._adapted(state, observation, pose, seen & ~stale, activation, feedback)
@@ -253,14 +259,14 @@ class AdaptiveController(nn.Module):
         q: Tensor,
         J: Tensor,
         arrival: Tensor,
-        s: Tensor,
+        descent: Tensor,
     ) -> tuple[_Motion, Hold | None]:
         """Joint velocity of the law, and the pose hold where one is asked for."""
         d = observation.human_effort
         xi_q = self.joint_region.gradient(q)
         wish = (-xi_q if d is None else d - xi_q) / self.config.null_damping
 
-        twist = task_twist = -s / excess_speed(s, self.caps[0])
+        twist = task_twist = -descent / excess_speed(descent, self.caps[0])
         hold = None
         if d is not None and self.config.hold_rate > 0:
             # A joint-space approach has planned no path of the tool that could be held.

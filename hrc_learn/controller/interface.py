@@ -96,5 +96,8 @@ class Command:
     potential: Float[Tensor, "*batch"]
     """Sum of the task-space potentials P_v + P_t + P_o: the part of the Lyapunov function
     that needs no true weights."""
+    potential_rate: Float[Tensor, "*batch"]
+    """Its rate as the estimated image Jacobian has it [1/s]; not positive where the law acts
+    alone (`hrc_learn.controller.lyapunov`)."""
     safety: SafetyReport
     """What the safety filter did."""
