@@ -1,5 +1,7 @@
 """Which of the many postures for a tool pose to approach."""
 
+from collections.abc import Callable
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -10,6 +12,8 @@ from hrc_learn.kinematics import FrankaArm, UnreachableError
 # Beyond these a posture is as good as any [1], [rad].
 _GOOD_SINGULAR_VALUE = 0.2
 _GOOD_DISTANCE = 0.5
+# Postures nearer to each other lead along the same path [rad].
+_ALIKE = 0.5
 
 
 def comfortable_posture(
@@ -31,6 +35,16 @@ def comfortable_posture(
     Raises:
         UnreachableError: No candidate reaches the pose within the limits.
     """
+    return comfortable_postures(chain, pose, candidates=candidates)[0]
+
+
+def comfortable_postures(
+    chain: FrankaArm, pose: Pose, *, candidates: int = 29
+) -> Float[Tensor, "postures n"]:
+    """Inverse-kinematics solutions that differ, the most comfortable one first.
+
+    Arguments and errors are those of `comfortable_posture`.
+    """
     lower, upper = chain.limits.lower, chain.limits.upper
     q7 = torch.linspace(float(lower[-1]), float(upper[-1]), candidates, dtype=torch.float64)
     many = Pose(
@@ -49,4 +63,44 @@ def comfortable_posture(
     score = (distance / _GOOD_DISTANCE).clamp(max=1) + (smallest / _GOOD_SINGULAR_VALUE).clamp(
         max=1
     )
-    return solutions[score.argmax()].to(pose.position)
+    chosen: list[Tensor] = []
+    for posture in solutions[score.argsort(descending=True, stable=True)]:
+        if all(torch.linalg.vector_norm(posture - other) > _ALIKE for other in chosen):
+            chosen.append(posture)
+    return torch.stack(chosen).to(pose.position)
+
+
+def clear_posture(
+    postures: Float[Tensor, "postures n"],
+    start: Float[Tensor, "*batch n"],
+    clearance: Callable[[Tensor], Tensor],
+    *,
+    least: float = 0.03,
+    samples: int = 25,
+) -> Float[Tensor, "*batch n"]:
+    """The first posture whose straight path in joint space keeps clear of contacts.
+
+    A joint-space approach follows that path. Where none is clear, the posture whose path comes
+    least near to a contact.
+
+    Args:
+        postures: To choose from, the best first.
+        start: Where the arm is [rad].
+        clearance: Distance from all contacts [m] at joint positions (*points, n).
+        least: Distance to keep [m]; nearer to the start what the start has is enough.
+        samples: Points looked at along the path.
+    """
+    flat = start.reshape(-1, start.shape[-1])
+    best = postures[:1].expand_as(flat).clone()
+    found = torch.full_like(flat[:, 0], -torch.inf)
+    wanted = torch.minimum(clearance(flat), found.new_tensor(least))
+    share = torch.linspace(0, 1, samples, dtype=flat.dtype, device=flat.device)[1:, None]
+    for posture in postures:
+        open_ = (found < wanted).nonzero().flatten()
+        if len(open_) == 0:
+            break
+        path = torch.lerp(flat[open_, None], posture, share)
+        distance = clearance(path).amin(-1)
+        better = distance > found[open_]
+        best[open_[better]], found[open_[better]] = posture, distance[better]
+    return best.reshape(start.shape)

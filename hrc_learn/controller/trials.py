@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields
 from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from hrc_learn.controller.clearance import clearance
 from hrc_learn.controller.config import ControllerConfig
 from hrc_learn.controller.controller import AdaptiveController
 from hrc_learn.controller.goals import HALF_SIZE, Goals
 from hrc_learn.controller.interface import Command, ControllerState, Observation
-from hrc_learn.controller.posture import comfortable_posture
+from hrc_learn.controller.posture import clear_posture, comfortable_postures
 from hrc_learn.controller.rehearsal import (
     Imperfections,
     PinholeCamera,
@@ -40,6 +41,9 @@ ROLL_CLASSES = ((0, 30), (30, 60), (60, 90), (90, 135), (135, 180))
 CENTRE = (0.2, 0.5, 0.3)
 """Of the box: the middle of the paper's neurons in x and y [m]."""
 
+_SECONDS_BETWEEN_CONTACT_CHECKS = 0.024
+_START_CLEARANCE = 0.01
+
 
 @dataclass(frozen=True, kw_only=True)
 class TrialConfig:
@@ -62,6 +66,9 @@ class TrialConfig:
     """The paper's law as printed has Table I's gains and no joint-space approach."""
     initial_jacobian: Callable[[Tensor], Tensor] = lambda J: J
     """What to make of the paper's initial image Jacobian."""
+    contacts: bool = False
+    """Look for contacts of the arm with itself, the table and the pedestal, at a third more
+    time. Starts anywhere within the limits are free of them in any case."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,16 +83,28 @@ class TrialResult:
     vision_time: Float[Tensor, "trials"]
     """Of that, since the camera took over [s]."""
     violations: Int[Tensor, "trials"]
-    """Steps that broke a position, velocity or acceleration limit."""
+    """Steps that broke a limit of position, velocity, acceleration or jerk."""
+    touched: Bool[Tensor, "trials"]
+    """Whether the arm met itself, the table or the pedestal; False where not looked for."""
     peak_speed: Float[Tensor, "trials"]
     """Largest joint velocity over its limit."""
     hand_overs: Int[Tensor, "trials"]
     """How often the camera took over or let go."""
 
+    @staticmethod
+    def join(parts: Sequence[TrialResult]) -> TrialResult:
+        """The trials of several results."""
+        names = [field.name for field in fields(TrialResult)]
+        return TrialResult(
+            **{name: torch.cat([getattr(part, name) for part in parts]) for name in names}
+        )
+
     def summary(self) -> dict[str, float]:
         """Shares, medians and totals, by name."""
         figures = {
             "success": _share(self.success),
+            "free_success": _share(self.success & ~self.touched),
+            "touched": _share(self.touched),
             "t50": self.time.quantile(0.5, interpolation="higher").item(),
             "t95": self.time.quantile(0.95, interpolation="higher").item(),
             "vision_phase": _median(self.vision_time),
@@ -132,7 +151,7 @@ def run_trials(
     rng = torch.Generator().manual_seed(config.seed)
     scene = _draw(config, rng)
     controller = _controller(make_estimator, config, scene)
-    judge = _Judge(scene, controller, config.dt)
+    judge = _Judge(scene, controller, config)
     with torch.inference_mode():
         rehearse(
             controller,
@@ -178,11 +197,15 @@ def _draw(config: TrialConfig, rng: torch.Generator) -> _Scene:
 def _starts(config: TrialConfig, limits: JointLimits, rng: torch.Generator) -> Tensor:
     lower, upper = limits.lower + 0.03, limits.upper - 0.03
     shape = (config.count, len(lower))
-    if config.starts == "global":
+    if config.starts == "near":
+        noise = torch.randn(shape, generator=rng, dtype=torch.float64)
+        return (panda.ready + 0.4 * noise).clamp(lower, upper)
+    free: list[Tensor] = []
+    while sum(map(len, free)) < config.count:
         unit = torch.rand(shape, generator=rng, dtype=torch.float64)
-        return lower + unit * (upper - lower)
-    noise = torch.randn(shape, generator=rng, dtype=torch.float64)
-    return (panda.ready + 0.4 * noise).clamp(lower, upper)
+        q = lower + unit * (upper - lower)
+        free.append(q[clearance(q) > _START_CLEARANCE])
+    return torch.cat(free)[: config.count]
 
 
 def _controller(
@@ -199,7 +222,8 @@ def _controller(
         settings, region = table1_config(), table1_joint_region(panda.limits)
     else:
         down = quaternion.normalize(centre.new_tensor(GRIPPER_DOWN))
-        posture = comfortable_posture(panda, Pose(centre, down))
+        postures = comfortable_postures(panda, Pose(centre, down))
+        posture = clear_posture(postures, scene.start, clearance)
         goals = Goals.at(centre, down, scene.target).approached_by(posture)
         settings = ControllerConfig()
         region = JointRegion.from_limits(panda.limits.lower, panda.limits.upper)
@@ -211,8 +235,11 @@ def _controller(
 class _Judge:
     """Watches a rehearsal and keeps what the result needs."""
 
-    def __init__(self, scene: _Scene, controller: AdaptiveController, dt: float):
-        self.scene, self.controller, self.dt = scene, controller, dt
+    def __init__(self, scene: _Scene, controller: AdaptiveController, config: TrialConfig):
+        self.scene, self.controller, self.dt = scene, controller, config.dt
+        self.contact_steps = 0
+        if config.contacts:
+            self.contact_steps = max(1, round(_SECONDS_BETWEEN_CONTACT_CHECKS / config.dt))
         count = len(scene.start)
         self.taken_over = torch.full((count,), math.inf, dtype=torch.float64)
         self.entered = torch.full((count,), math.inf, dtype=torch.float64)
@@ -220,6 +247,8 @@ class _Judge:
         self.hand_overs = torch.zeros(count, dtype=torch.int64)
         self.peak_speed = torch.zeros(count, dtype=torch.float64)
         self.velocity = torch.zeros_like(scene.start)
+        self.acceleration = torch.zeros_like(scene.start)
+        self.touched = torch.zeros(count, dtype=torch.bool)
         self.active = torch.zeros(count, dtype=torch.bool)
         self.in_box = torch.zeros(count, dtype=torch.bool)
 
@@ -246,13 +275,18 @@ class _Judge:
         # 5 % beyond the wall count as in the box: a potential ends at the wall, not inside.
         self.in_box = ((tool.position - box.centre).abs() <= 1.05 * box.half_size).all(-1)
         self._check_limits(q, command.joint_velocity)
+        if self.contact_steps and step % self.contact_steps == 0:
+            self.touched |= clearance(q) < 0
 
     def _check_limits(self, q: Tensor, v: Tensor) -> None:
-        limits = panda.limits
-        reach = limits.acceleration * self.dt * (1 + 1e-9)
+        limits, rounding = panda.limits, 1 + 1e-9
+        acceleration = (v - self.velocity) / self.dt
+        jerk = (acceleration - self.acceleration) / self.dt
         broken = (q > limits.upper) | (q < limits.lower) | (v.abs() > limits.velocity)
-        broken |= ((v - self.velocity).abs() > reach) | ~v.isfinite()
+        broken |= acceleration.abs() > limits.acceleration * rounding
+        broken |= (jerk.abs() > limits.jerk * rounding) | ~v.isfinite()
         self.violations += broken.any(-1)
+        self.acceleration = acceleration
         self.peak_speed = torch.maximum(self.peak_speed, (v.abs() / limits.velocity).amax(-1))
         self.velocity = v
 
@@ -263,6 +297,7 @@ class _Judge:
             time=self.entered,
             vision_time=self.entered - self.taken_over,
             violations=self.violations,
+            touched=self.touched,
             peak_speed=self.peak_speed,
             hand_overs=self.hand_overs,
         )

@@ -4,10 +4,12 @@ from dataclasses import replace
 import pytest
 import torch
 
-from hrc_learn.controller import comfortable_posture
+from hrc_learn.controller import GRIPPER_DOWN, comfortable_posture
+from hrc_learn.controller.clearance import clearance
 from hrc_learn.controller.effort_trials import EffortConfig, run_effort_trials
+from hrc_learn.controller.posture import clear_posture, comfortable_postures
 from hrc_learn.controller.rehearsal import Imperfections
-from hrc_learn.controller.trials import TrialConfig, TrialResult, run_trials
+from hrc_learn.controller.trials import CENTRE, TrialConfig, TrialResult, _draw, run_trials
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import FixedEstimator, KalmanEstimator
 from hrc_learn.kinematics import UnreachableError, panda
@@ -44,11 +46,14 @@ def test_a_run_that_left_the_target_again_is_no_success():
         time=torch.tensor([1.0, 2.0, math.inf, 3.0, 4.0], dtype=torch.float64),
         vision_time=torch.tensor([0.5, 0.5, math.nan, 1.0, 1.0], dtype=torch.float64),
         violations=torch.tensor([0, 0, 2, 0, 0]),
+        touched=torch.tensor([False, True, False, False, False]),
         peak_speed=torch.full((5,), 0.7, dtype=torch.float64),
         hand_overs=torch.ones(5, dtype=torch.int64),
     )
     summary = result.summary()
     assert summary["success"] == 0.8
+    assert summary["free_success"] == 0.6
+    assert summary["touched"] == 0.2
     assert summary["t50"] == 3.0
     assert summary["t95"] == math.inf
     assert summary["violations"] == 2
@@ -70,6 +75,39 @@ def test_a_comfortable_posture_reaches_the_pose_far_from_trouble():
     distance = torch.minimum(q - panda.limits.lower, panda.limits.upper - q)
     assert distance.min() > 0.3
     assert torch.linalg.svdvals(panda.jacobian(q))[-1] > 0.1
+
+
+def test_a_clear_posture_is_the_first_with_a_free_path():
+    """In a plane with a wall at 1 that has a door between 2 and 3."""
+
+    def clearance(q: torch.Tensor) -> torch.Tensor:
+        wall = (q[..., 0] - 1).abs()
+        return torch.where((q[..., 1] - 2.5).abs() < 0.5, 1.0, wall) - 0.1
+
+    postures = torch.tensor([[2.0, 0.0], [2.0, 5.0], [0.0, 9.0]], dtype=torch.float64)
+    start = torch.tensor([[1.5, 0.0], [0.5, 1.5], [0.5, 0.0]], dtype=torch.float64)
+    chosen = clear_posture(postures, start, clearance)
+    assert chosen.tolist() == postures.tolist()
+    # Through the wall whichever it is: what comes least near.
+    walled = clear_posture(postures[:1], start[2], clearance)
+    assert walled.tolist() == [2.0, 0.0]
+
+
+def test_a_path_that_would_touch_is_not_taken():
+    """A start from which the straight way to the most comfortable posture meets the arm."""
+    rng = torch.Generator().manual_seed(0)
+    config = TrialConfig(count=250, starts="global")
+    starts = _draw(config, rng).start
+    assert (clearance(starts) > 0).all()
+    down = quaternion.normalize(torch.tensor(GRIPPER_DOWN, dtype=torch.float64))
+    pose = Pose(torch.tensor(CENTRE, dtype=torch.float64), down)
+    postures = comfortable_postures(panda, pose)
+    share = torch.linspace(0, 1, 50, dtype=torch.float64)[:, None]
+    blind = clearance(torch.lerp(starts[:, None], postures[0], share)).amin(-1)
+    q = starts[blind < 0]
+    assert len(q) >= 3
+    seeing = clear_posture(postures, q, clearance)
+    assert (clearance(torch.lerp(q[:, None], seeing[:, None], share)) > 0).all()
 
 
 def test_a_pose_out_of_reach_is_refused():

@@ -6,6 +6,7 @@ import pytest
 import sampling
 import torch
 
+from hrc_learn.controller.clearance import PEDESTAL, TABLE
 from hrc_learn.kinematics import LINK_CAPSULES, panda, panda_capsules
 from hrc_learn.sim import SceneConfig, build_scene
 
@@ -93,6 +94,14 @@ def outside(points: torch.Tensor, ends: torch.Tensor) -> torch.Tensor:
     offset = points[:, None] - start
     t = ((offset * along).sum(-1) / (along * along).sum(-1)).clamp(0, 1)
     return ((offset - t[..., None] * along).norm(dim=-1) - radius).amin(-1)
+
+
+def test_the_trials_have_the_table_and_the_pedestal_of_the_simulator(model):
+    for (centre, half_size), name in ((TABLE, "table"), (PEDESTAL, "pedestal")):
+        geom = model.geom(name)
+        place = model.body(geom.bodyid[0]).pos + geom.pos
+        assert place.tolist() == pytest.approx(centre)
+        assert geom.size.tolist() == pytest.approx(half_size)
 
 
 def test_links_touch_where_the_simulator_says_so(model):
