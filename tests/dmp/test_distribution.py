@@ -72,7 +72,7 @@ def test_via_points_and_via_velocities_are_passed(distribution):
     given = distribution.condition([1.0], via)
     torch.testing.assert_close(given.mean_primitive().rollout(time=[1.0]).position, via)
     assert given.position([1.0])[1].max() < 1e-5
-    slow = given.condition([1.0], [[0.0, 0.0]], order=1)
+    slow = given.condition([1.0], velocity=[[0.0, 0.0]])
     there = slow.mean_primitive().rollout(time=[1.0])
     torch.testing.assert_close(there.position, via, rtol=0, atol=1e-5)
     assert there.velocity.abs().max() < 1e-4
