@@ -1,22 +1,27 @@
 """Fit movement primitives to the demonstrations of a LeRobot dataset.
 
 Learns the motion of the joints, of any robot, and that of the hand where its pose is recorded.
-Several demonstrations give one primitive each and their mean, which is what is saved. Writes a
-folder with the primitives, the measured errors, demonstrations beside reproductions as a
-figure and a Rerun recording, and what it was made from.
+Several demonstrations give one primitive each and what they have in common: their mean, their
+distribution, a function of a context, or one primitive fitted to all of them in one pass.
+Writes a folder with the primitives, the measured errors, demonstrations beside reproductions
+as figures and a Rerun recording, and what it was made from.
 """
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
+import numpy as np
+import torch
 from rich.console import Console
 
-from hrc_learn import cli
-from hrc_learn.demos import load_demos
+from hrc_learn import cli, distributed
+from hrc_learn.demos import load_demos, open_demos
 from hrc_learn.output import new_folder
-from hrc_learn.tasks.fit_primitives import fit_primitives, fit_recording
-from hrc_learn.viz.figures import fit_joints_figure
+from hrc_learn.tasks.fit_many import fit_contextual, fit_streamed
+from hrc_learn.tasks.fit_primitives import FittedPrimitives, fit_primitives, fit_recording
+from hrc_learn.tasks.kinds import Kind
+from hrc_learn.viz.figures import fit_joints_figure, residual_figure
 from hrc_learn.viz.fit_dashboard import record_fit
 
 
@@ -28,15 +33,29 @@ class Args:
     """LeRobot dataset with the demonstrations."""
     out: Path
     """Folder for the model."""
-    n_basis: int = 60
-    """Number of basis functions."""
+    kinds: tuple[Kind, ...] = ()
+    """What to learn; joint and pose, or what there is of them, when empty."""
+    several: Literal["mean", "distribution", "contextual", "streamed"] = "mean"
+    """What to keep of several demonstrations: their mean; all of them as well, which a
+    DMPDistribution is made of; a primitive for every context; or one fitted to all in one
+    pass, one demonstration in memory at a time, and under torchrun in several processes."""
+    context: tuple[str, ...] = ()
+    """Columns whose first row is the context; start and goal when empty."""
+    n_basis: int | None = 60
+    """Number of basis functions; None: chosen by the error on samples held out."""
     method: Literal["trajectory", "ridge", "lwr"] = "trajectory"
     """Least squares on the motion, ridge regression on its force, or the paper's locally
     weighted regression."""
+    robust: Literal["huber", "tukey"] | None = None
+    """Trust samples that lie far off less."""
+    scaling: str = "none"
+    """How forcing scales with start and goal: none, paper, amplitude or rotation."""
     episodes: tuple[int, ...] = ()
     """Episodes to learn from; all when empty."""
     joint_names: tuple[str, ...] = ()
     """Joints to learn, by name and in this order; all when empty."""
+    seed: int = 0
+    """Of whatever is drawn at random."""
     overwrite: bool = False
     """Replace an older model in that folder."""
     json: Path | None = None
@@ -44,29 +63,79 @@ class Args:
 
 
 def main(args: Args) -> None:
+    torch.manual_seed(args.seed)
     console = Console()
+    if args.several == "streamed":
+        _fit_streamed(args)
+        return
     demos = load_demos(
-        args.dataset,
-        episodes=args.episodes or None,
-        joint_names=args.joint_names or None,
+        args.dataset, episodes=args.episodes or None, joint_names=args.joint_names or None
     )
     for note in demos.notes:
         console.print(f"note: {note}")
-    made_by = asdict(args) | {"dataset": args.dataset.resolve()}
-    with new_folder(args.out, made_by, args.overwrite) as folder:
-        with console.status(
-            f"Fitting {len(demos)} demonstrations, {args.n_basis} basis functions"
-        ):
-            fitted = fit_primitives(demos, args.n_basis, args.method)
+    with new_folder(args.out, _made_by(args), args.overwrite) as folder:
+        with console.status(f"Fitting {len(demos)} demonstrations"):
+            # Not every kind takes a scaling.
+            scaled: dict[str, Any] = {} if args.scaling == "none" else {"scaling": args.scaling}
+            fitted = fit_primitives(
+                demos,
+                args.n_basis,
+                args.method,
+                kinds=args.kinds,
+                robust=args.robust,
+                **scaled,
+            )
             metrics = fitted.metrics()
-        fitted.save(folder)
-        cli.write_json(folder / "metrics.json", metrics)
-        if fitted.joint is not None:
-            shown = fit_recording(fitted, f"Fit of {args.dataset.name}")
-            record_fit(folder / "fit.rrd", shown)
-            fit_joints_figure(shown).savefig(folder / "joints.png", dpi=120)
+            if args.several == "contextual":
+                metrics |= fit_contextual(fitted, demos, args.context, folder)
+        fitted.save(folder, each=args.several == "distribution")
+        if args.several == "distribution":
+            metrics |= {f"{k}_spread": _spread(fitted, k) for k in fitted.each}
+        _show(fitted, args, folder)
+        _finish(args, metrics, folder)
+
+
+def _fit_streamed(args: Args) -> None:
+    with distributed.processes() as rank:
+        demos = open_demos(
+            args.dataset, episodes=args.episodes or None, joint_names=args.joint_names or None
+        )
+        fits, metrics = fit_streamed(demos, args.n_basis or 60, kinds=args.kinds)
+        if rank:
+            return
+        with new_folder(args.out, _made_by(args), args.overwrite) as folder:
+            for kind, fit in fits.items():
+                fit.primitive.save(folder / kind)
+            _finish(args, metrics, folder)
+
+
+def _made_by(args: Args) -> dict:
+    return asdict(args) | {"dataset": args.dataset.resolve()}
+
+
+def _spread(fitted: FittedPrimitives, kind: str) -> float:
+    """Standard deviation of the motion over demonstrations, root mean square [rad or m]."""
+    distribution = fitted.distribution(kind)
+    durations = fitted.demonstrations.time.amax(dim=1)
+    time = torch.linspace(0, float(durations.mean()), 100, dtype=torch.float64)
+    return float(np.sqrt(np.square(distribution.position(time)[1].numpy()).mean()))
+
+
+def _show(fitted: FittedPrimitives, args: Args, folder: Path) -> None:
+    if set(fitted.each) == {"orientation"}:
+        return
+    shown = fit_recording(fitted, f"Fit of {args.dataset.name}")
+    record_fit(folder / "fit.rrd", shown)
+    name = "joints" if "joint" in fitted.each else "position"
+    fit_joints_figure(shown).savefig(folder / f"{name}.png", dpi=120)
+    if shown.residual:
+        residual_figure(shown).savefig(folder / "n_basis.png", dpi=120)
+
+
+def _finish(args: Args, metrics: dict[str, float], folder: Path) -> None:
+    cli.write_json(folder / "metrics.json", metrics)
     cli.show_values(f"Fit of {args.dataset}", metrics)
-    console.print(f"Model in {args.out}")
+    print(f"Model in {args.out}")
     if args.json is not None:
         cli.write_json(args.json, metrics)
 

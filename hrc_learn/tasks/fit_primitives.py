@@ -1,186 +1,197 @@
-"""From demonstrations to movement primitives: of the joints, and of the hand if it is known."""
+"""From demonstrations to movement primitives, and what is to be said about them."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from ..demos import DemonstrationSet, PaddedDemonstrations
 from ..dmp import JointDMP, PoseDMP
 from ..dmp.fitting.mean import mean_primitive
-from ..geometry import quaternion
-from ..kinematics import arm_angle, panda
+from ..dmp.fitting.selection import BasisSelection, select_basis_count
+from ..dmp.generalisation.distribution import DMPDistribution
+from ..kinematics import panda
 from ..viz import FitRecording, JointLimits
+from .kinds import Motions, Primitive, kinds_wanted
+from .reproduction_error import reproduction_error
+
+EACH = "each"
+"""Folder of the primitives of single demonstrations, where they are kept."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FittedPrimitives:
-    """Primitives of one motion, one for each demonstration and their mean."""
+    """Primitives of one motion, one for each demonstration and what they have in common."""
 
-    demonstrations: PaddedDemonstrations
-    joint: JointDMP | None
-    """One for each demonstration; None without joint positions."""
-    pose: PoseDMP | None
-    """The same for the hand, the arm angle as its body shape if the arm is a Panda."""
+    motions: Motions
+    each: Mapping[str, Primitive]
+    """By kind: one for each demonstration, as a batch."""
+    common: Mapping[str, Primitive]
+    """By kind: their mean, without batch dimensions."""
+    n_basis: int
+    selection: BasisSelection | None = None
+    """How the number of basis functions was chosen, if it was."""
+    options: Mapping[str, Any] = field(default_factory=dict)
+    """Of the fit."""
 
-    def save(self, folder: Path) -> None:
-        """Write the mean primitives into `folder/joint` and `folder/pose`."""
-        if self.joint is not None:
-            mean_primitive(self.joint).save(folder / "joint")
-        if self.pose is not None:
-            mean_primitive(self.pose).save(folder / "pose")
+    @property
+    def demonstrations(self) -> PaddedDemonstrations:
+        """What they were fitted to."""
+        return self.motions.demos
+
+    @property
+    def joint(self) -> JointDMP | None:
+        """One for each demonstration; None if joints were not learned."""
+        return cast(JointDMP | None, self.each.get("joint"))
+
+    @property
+    def pose(self) -> PoseDMP | None:
+        """The same for the hand, the arm angle as its body shape if the arm is a Panda."""
+        return cast(PoseDMP | None, self.each.get("pose"))
+
+    def save(self, folder: Path, each: bool = False) -> None:
+        """Write the common primitives into `folder/KIND`.
+
+        Args:
+            folder: Where.
+            each: Keep those of single demonstrations too, in `folder/each/KIND`: what a
+                `DMPDistribution` is made of.
+        """
+        for kind, primitive in self.common.items():
+            primitive.save(folder / kind)
+        for kind, primitives in self.each.items() if each else ():
+            primitives.save(folder / EACH / kind)
+
+    def distribution(self, kind: str) -> DMPDistribution:
+        """Gaussian over the primitives of one kind.
+
+        Raises:
+            ValueError: Of fewer than two demonstrations, or scaled primitives.
+        """
+        return DMPDistribution.fit(self.each[kind])
 
     def metrics(self) -> dict[str, float]:
         """How close the primitives come to their demonstrations.
 
-        `nrmse` divides by the largest range of any coordinate. `mean_` is the mean primitive,
-        given start, goal and duration of each demonstration.
+        `mean_` is the common primitive, given start, goal and duration of each.
         """
-        values: dict[str, float] = {"demonstrations": float(len(self.demonstrations.length))}
-        demos = self.demonstrations
-        if self.joint is not None and demos.joint_position is not None:
-            own = self.joint.rollout().position.detach()
-            values |= _compare("joint", own, demos.joint_position, demos.mask)
-            values |= _compare(
-                "mean_joint", self._mean_joints(), demos.joint_position, demos.mask
-            )
-        if (
-            self.pose is not None
-            and demos.position is not None
-            and demos.orientation is not None
-        ):
-            own = self.pose.rollout()
-            values |= _compare("position", own.position.detach(), demos.position, demos.mask)
-            turn = quaternion.angle(own.orientation.detach(), demos.orientation)[demos.mask]
-            values["orientation_rmse_deg"] = float(turn.square().mean().sqrt().rad2deg())
+        values = {"demonstrations": float(len(self.demonstrations.length))}
+        values["basis_functions"] = float(self.n_basis)
+        for kind in self.each:
+            own = self.motions.own(self.each[kind])
+            adapted = self.motions.adapted(kind, self.common[kind])
+            values |= reproduction_error(kind, self.motions, own).summary(kind)
+            values |= reproduction_error(kind, self.motions, adapted).summary(f"mean_{kind}")
         return values
-
-    def _mean_joints(self) -> Tensor:
-        assert self.joint is not None
-        mean = mean_primitive(self.joint)
-        return mean.rollout(
-            self.joint.stamps * self.joint.duration[..., None],
-            start=self.joint.start,
-            goal=self.joint.goal,
-            duration=self.joint.duration,
-            start_velocity=self.joint.start_velocity,
-        ).position.detach()
 
 
 def fit_primitives(
-    demos: DemonstrationSet, n_basis: int = 60, method: str = "trajectory"
+    demos: DemonstrationSet,
+    n_basis: int | None = 60,
+    method: str = "trajectory",
+    *,
+    kinds: Sequence[str] = (),
+    candidates: Sequence[int] = (10, 15, 20, 30, 40, 60, 80, 100),
+    **options: Any,
 ) -> FittedPrimitives:
-    """Fit one primitive to each demonstration.
+    """Fit one primitive to each demonstration, and their mean.
 
-    Joints need no robot model. Hand poses are taken as recorded, or computed if the joints are
-    a Panda's. Pauses at either end are kept: they are part of what was shown.
+    Joints are learned from any robot. The pose of the hand is learned where it was recorded,
+    or where the joints are those of a Panda, whose arm angle is then learned along.
 
     Args:
         demos: Demonstrations of one motion.
-        n_basis: Number of basis functions.
+        n_basis: Number of basis functions; None: the smallest of the candidates that
+            predicts samples held out as well as the best (see `select_basis_count`).
         method: See `JointDMP.fit`.
+        kinds: To learn; none: joints and pose, or what there is of them.
+        candidates: Numbers of basis functions to choose from.
+        options: Further options of the fit, such as `robust` or `scaling`.
 
     Raises:
-        ValueError: If the demonstrations hold neither joint positions nor poses.
+        ValueError: If the demonstrations hold no motion, or not what a kind needs.
     """
-    padded = demos.padded()
-    is_panda = demos.joint_names == panda.joint_names
-    if is_panda and padded.position is None and padded.joint_position is not None:
-        hand = panda.forward(padded.joint_position)
-        padded = _with_pose(padded, hand.position, hand.orientation)
-    joint = pose = None
-    if padded.joint_position is not None:
-        joint = JointDMP.fit(
-            padded.time,
-            padded.joint_position,
-            n_basis,
-            mask=padded.mask,
-            method=method,
-            joint_names=demos.joint_names,
-        )
-    if padded.position is not None and padded.orientation is not None:
-        pose = PoseDMP.fit(
-            padded.time,
-            padded.position,
-            padded.orientation,
-            n_basis,
-            body=_body_shape(padded.joint_position) if is_panda else None,
-            mask=padded.mask,
-            method=method,
-        )
-    if joint is None and pose is None:
-        raise ValueError(
-            f"{demos.source}: the demonstrations hold neither joint positions nor end-effector "
-            "poses, so there is no motion to learn. Look with datasets/check_dataset.py."
-        )
-    return FittedPrimitives(demonstrations=padded, joint=joint, pose=pose)
-
-
-def _with_pose(
-    padded: PaddedDemonstrations, position: Tensor, orientation: Tensor
-) -> PaddedDemonstrations:
-    return PaddedDemonstrations(
-        **{**vars(padded), "position": position, "orientation": orientation}
+    motions = Motions.of(demos)
+    kinds = kinds_wanted(motions, kinds)
+    options = {"method": method, **options}
+    selection = None
+    if n_basis is None:
+        selection = _select(motions, kinds[0], candidates, options)
+        n_basis = selection.count
+    each = {kind: motions.fit(kind, n_basis, **options) for kind in kinds}
+    return FittedPrimitives(
+        motions=motions,
+        each=each,
+        common={kind: mean_primitive(cast(Any, each[kind])) for kind in kinds},
+        n_basis=n_basis,
+        selection=selection,
+        options=options,
     )
 
 
-def _body_shape(joint_position: Tensor | None) -> Tensor | None:
-    """Arm angle along each demonstration, continuous, and alike in turns at the start [rad]."""
-    if joint_position is None:
-        return None
-    angle = np.unwrap(arm_angle(panda, joint_position).numpy(), axis=1)
-    start = np.unwrap(angle[:, :1], axis=0) - angle[:, :1]
-    return torch.from_numpy(angle + start)[..., None]
-
-
-def _compare(name: str, got: Tensor, wanted: Tensor, mask: Tensor) -> dict[str, float]:
-    error = torch.where(mask[..., None], got - wanted, 0.0)
-    samples = mask.sum(dim=-1, keepdim=True) * wanted.shape[-1]
-    rmse = (error.square().sum(dim=(-2, -1)) / samples.squeeze(-1)).sqrt()
-    low = torch.where(mask[..., None], wanted, torch.inf).amin(dim=-2)
-    high = torch.where(mask[..., None], wanted, -torch.inf).amax(dim=-2)
-    nrmse = rmse / (high - low).amax(dim=-1).clamp(min=1e-12)
-    return {
-        f"{name}_nrmse_median": float(nrmse.median()),
-        f"{name}_nrmse_max": float(nrmse.max()),
-        f"{name}_error_max": float(error.abs().max()),
-    }
+def _select(
+    motions: Motions, kind: str, candidates: Sequence[int], options: Mapping[str, Any]
+) -> BasisSelection:
+    """By the linear coordinates of a kind; orientations alone give none to choose by."""
+    if kind == "orientation":
+        raise ValueError(
+            "the number of basis functions is chosen by joints or positions: name it for "
+            "orientations alone."
+        )
+    shortest = int(motions.demos.length.min())
+    possible = [count for count in candidates if 2 * count <= shortest]
+    if not possible:
+        raise ValueError(
+            f"the shortest demonstration has {shortest} samples, too few to choose the number "
+            f"of basis functions from {', '.join(map(str, candidates))}: name it."
+        )
+    return select_basis_count(
+        motions.demos.time, motions.position(kind), possible, mask=motions.demos.mask, **options
+    )
 
 
 def fit_recording(fitted: FittedPrimitives, title: str) -> FitRecording:
-    """Joint demonstrations beside their reproductions, to be looked at.
+    """Demonstrations beside their reproductions, to be looked at.
+
+    Of the joints, or else of the position.
 
     Raises:
-        ValueError: If the demonstrations hold no joint positions.
+        ValueError: If neither was learned.
     """
-    demos, joint = fitted.demonstrations, fitted.joint
-    if joint is None or demos.joint_position is None:
-        raise ValueError(
-            "there are no joint positions to show; pose primitives have no figure."
-        )
-    reproduced = joint.rollout().position.detach()
-    lengths = demos.length.tolist()
+    kind = next((k for k in ("joint", "position", "pose") if k in fitted.each), None)
+    if kind is None:
+        raise ValueError("orientations alone have no figure: learn the pose, or positions.")
+    motions, lengths = fitted.motions, fitted.demonstrations.length.tolist()
+    shown, made = motions.position(kind), motions.own(fitted.each[kind]).position
+    assert made is not None
 
     def cut(padded: Tensor) -> tuple[np.ndarray, ...]:
         return tuple(
             values[:n].double().numpy() for values, n in zip(padded, lengths, strict=True)
         )
 
-    limits, demo_paths, reproduction_paths = None, (), ()
-    if joint.joint_names == panda.joint_names:
+    limits, paths, reproduced = None, (), ()
+    if kind != "joint":
+        paths, reproduced = cut(shown), cut(made)
+    elif motions.joint_names == panda.joint_names:
         limits = JointLimits(lower=panda.limits.lower.numpy(), upper=panda.limits.upper.numpy())
-        demo_paths = cut(panda.forward(demos.joint_position.double()).position)
-        reproduction_paths = cut(panda.forward(reproduced.double()).position)
+        paths = cut(panda.forward(shown.double()).position)
+        reproduced = cut(panda.forward(made.double()).position)
+    residual = {}
+    if (selection := fitted.selection) is not None:
+        residual = dict(zip(selection.candidates, selection.error.tolist(), strict=True))
     return FitRecording(
         title=title,
-        joint_names=joint.joint_names or (),
-        time=cut(demos.time),
-        demos=cut(demos.joint_position),
-        reproductions=cut(reproduced),
+        joint_names=motions.joint_names if kind == "joint" else ("x", "y", "z"),
+        time=cut(motions.demos.time),
+        demos=cut(shown),
+        reproductions=cut(made),
         joint_limits=limits,
-        n_basis=joint.basis.count,
-        demo_paths=demo_paths,
-        reproduction_paths=reproduction_paths,
+        n_basis=fitted.n_basis,
+        demo_paths=paths,
+        reproduction_paths=reproduced,
+        residual=residual,
     )

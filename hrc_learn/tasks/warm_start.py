@@ -125,7 +125,9 @@ def compare_starts(
     Returns:
         For `learned`, `guessed` (the paper's initial Jacobian, adapted alike) and `fixed`
         (the same, not adapted): median and 95th percentile of the time, and the share that
-        got there; and `speed_up`, the median of guessed over learned, start by start.
+        got there. `speed_up_over_guessed` and `speed_up_over_fixed` are medians of the other
+        time over that of the learned one, start by start; infinite where most of the others
+        never get there.
     """
     config, rng = config or WarmStartConfig(), torch.Generator()
     rng.manual_seed(config.seed)
@@ -159,8 +161,12 @@ def compare_starts(
         controller = AdaptiveController(panda, estimator, goals, config=config.control)
         times[name] = _converge(controller, turned, start, target, config)
         figures |= {f"{name}_{k}": v for k, v in _summary(times[name]).items()}
-    ratio = (times["guessed"] / times["learned"]).nan_to_num(nan=1.0)  # neither: inf / inf
-    return figures | {"speed_up": float(ratio.quantile(0.5, interpolation="lower"))}
+    for name in ("guessed", "fixed"):
+        ratio = (times[name] / times["learned"]).nan_to_num(
+            nan=1.0, posinf=math.inf
+        )  # neither: inf / inf
+        figures[f"speed_up_over_{name}"] = float(ratio.quantile(0.5, interpolation="lower"))
+    return figures
 
 
 def _postures(hand: Pose, near: Float[Tensor, "joints"]) -> Float[Tensor, "starts joints"]:
