@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Unpack
 
 import torch
 from jaxtyping import Float
@@ -14,18 +14,18 @@ from hrc_learn.dmp.fitting.motion import fit_motion
 from hrc_learn.dmp.fitting.options import FitOptions
 from hrc_learn.dmp.fitting.report import FitReport
 from hrc_learn.dmp.fitting.samples import check_samples
-from hrc_learn.dmp.saved_joint import TENSORS, joint_config, saved_arguments
+from hrc_learn.dmp.saved_joint import TENSORS, SavedJoint, saved_arguments
 from hrc_learn.dmp.scaling import Demonstrated, NoScaling, Scaling, find_scaling
 from hrc_learn.dmp.state import DMPState
-from hrc_learn.dmp.stepping import advance, second_derivative
+from hrc_learn.dmp.stepping import advance, begin, second_derivative
 from hrc_learn.dmp.system.basis import Basis
 from hrc_learn.dmp.system.response import response_of
 from hrc_learn.dmp.system.spring import SpringDamper
-from hrc_learn.dmp.trajectory import Trajectory, broadcast_shapes
-from hrc_learn.storage import SavedModel, write_model
+from hrc_learn.dmp.trajectory import Trajectory
+from hrc_learn.storage import SavedModel
 
 
-class JointDMP(nn.Module):
+class JointDMP(SavedJoint):
     """Discrete movement primitive of D coordinates under one phase.
 
     y'' = alpha (beta (g - y) - y') + scale * sum_i phi_i(s) w_i,   s = t / duration
@@ -34,19 +34,6 @@ class JointDMP(nn.Module):
     weights, start, start velocity and goal, computed exactly; see `Response`. Any number of
     leading batch dimensions: one primitive each.
     """
-
-    weights: Tensor
-    """A parameter, or a buffer where they were computed from what gradients flow to."""
-    start: Tensor
-    goal: Tensor
-    start_velocity: Tensor
-    duration: Tensor
-    amplitude: Tensor
-    stamps: Tensor
-    joint_names: tuple[str, ...] | None
-    """Names of the D coordinates."""
-    fit_report: FitReport | None
-    """How well the fit reproduces its demonstrations."""
 
     def __init__(
         self,
@@ -140,34 +127,10 @@ class JointDMP(nn.Module):
         recorded = check_samples(time, position, velocity, mask)
         _check_names(joint_names, recorded.position.shape[1])
         fit = fit_motion(recorded, n_basis, **options)
-        samples = fit.samples
-        # One where a coordinate never moves: nothing to scale, and nothing to divide by.
-        amplitude = torch.where(samples.span > 0, samples.span, 1.0)
-        shown = Demonstrated(*(x.double() for x in (samples.first, samples.last, amplitude)))
-        scaling.check(shown, samples.batch, joint_names)
-
-        def batched(tensor: Tensor) -> Tensor:
-            return tensor.to(samples.position.dtype).reshape(samples.batch + tensor.shape[1:])
-
-        dmp = cls(
-            weights=batched(scaling.unscale(fit.weights.mT, shown).mT),
-            start=batched(samples.first),
-            goal=batched(samples.last),
-            start_velocity=batched(fit.rate / samples.duration[:, None]),
-            duration=batched(samples.duration),
-            amplitude=batched(amplitude),
-            stamps=samples.s[0] if samples.shared else samples.s.reshape(*samples.batch, -1),
-            basis=fit.response.basis,
-            spring=fit.response.spring,
-            scaling=scaling,
-            approach=fit.response.approach,
-            joint_names=joint_names,
-            units=units,
-        )
+        arguments = fit.arguments(scaling, joint_names)
+        dmp = cls(**arguments, joint_names=joint_names, units=units)
         with torch.no_grad():
-            reproduction = dmp.rollout().position.mT.reshape(samples.position.shape)
-        trust = None if fit.trust is None else batched(fit.trust).mT
-        dmp.fit_report = samples.compare(reproduction, trust)
+            dmp.fit_report = fit.report(dmp.rollout().position)
         return dmp
 
     @property
@@ -255,12 +218,13 @@ class JointDMP(nn.Module):
         start, goal, rate, duration = self._boundary(
             start, goal, duration, start_velocity, speed
         )
-        weights, ends = self._scaled(self.weights.mT, start, goal).mT, (rate, start, goal)
+        weights, ends = self._scaled_weights(start, goal), (rate, start, goal)
         if amplitude is not None:
             weights = weights * self._as_tensor(amplitude)[..., None, None]
-        batch = broadcast_shapes(weights.shape[:-1], *(x.shape for x in ends))
-        if weights.shape[:-1] != batch or any(x.shape != batch for x in ends):
-            weights, ends = weights.expand(*batch, -1), [x.expand(batch) for x in ends]
+        shape = weights.shape[:-1]
+        if not rate.shape == start.shape == goal.shape == shape:
+            shape = torch.broadcast_shapes(shape, *(x.shape for x in ends))
+            weights, ends = weights.expand(*shape, -1), [x.expand(shape) for x in ends]
         return Trajectory(
             coordinates=torch.cat([weights, torch.stack(ends, dim=-1)], dim=-1),
             s=self.normalised_time(time, duration),
@@ -281,27 +245,7 @@ class JointDMP(nn.Module):
         start, goal, rate, duration = self._boundary(
             start, goal, duration, start_velocity, speed
         )
-        batch = broadcast_shapes(
-            self.weights.shape[:-2],
-            *(x.shape[:-1] for x in (start, goal, rate)),
-            duration.shape,
-        )
-        start, goal, rate = (x.expand(*batch, -1) for x in (start, goal, rate))
-        duration = duration.expand(batch)
-        s = torch.zeros_like(duration, dtype=torch.float64)
-        # Copies: an export takes one tensor in two places for one input.
-        return DMPState(
-            position=start.clone(),
-            rate=rate,
-            start=start,
-            goal=goal,
-            way=goal - start,
-            target=goal.clone(),
-            duration=duration,
-            pace=torch.ones_like(duration),
-            s=s,
-            forced=self.response.forced.to(s.device)(s).to(start) @ self.weights.mT,
-        )
+        return begin(self.response, self.weights, start, goal, rate, duration)
 
     def step(
         self,
@@ -332,9 +276,11 @@ class JointDMP(nn.Module):
             amplitude: Factor on the forcing term, (*batch).
         """
         target = state.target if goal is None else self._as_tensor(goal).expand_as(state.goal)
-        pace = torch.ones_like(state.pace)
+        # How long the motion takes at the pace of this step.
+        duration, pace = state.duration, torch.ones_like(state.pace)
         if slowdown is not None:
-            pace = pace / (1 + self._as_tensor(slowdown))
+            slower = 1 + self._as_tensor(slowdown)
+            duration, pace = duration * slower, pace / slower
         push = None
         if coupling is not None:
             push = self._as_tensor(coupling) * state.duration[..., None] ** 2
@@ -348,7 +294,7 @@ class JointDMP(nn.Module):
 
         return advance(
             state,
-            (self._as_tensor(dt) * pace / state.duration).double(),
+            (self._as_tensor(dt) / duration).double(),
             response=self.response,
             weights=self.weights,
             scale=scale,
@@ -399,10 +345,6 @@ class JointDMP(nn.Module):
             return self.stamps
         return normalised_time(time, duration)
 
-    def save(self, folder: str | Path) -> None:
-        """Write config.json and model.safetensors into `folder`, replacing an older save."""
-        write_model(folder, type(self).__name__, self.config(), self.tensors())
-
     @classmethod
     def load(cls, folder: str | Path) -> "JointDMP":
         """Read what `save` wrote.
@@ -412,15 +354,6 @@ class JointDMP(nn.Module):
             ValueError: Names the file and the field that is wrong.
         """
         return cls.restore(SavedModel(folder, cls.__name__))
-
-    def config(self) -> dict[str, Any]:
-        """What a saved primitive needs besides its tensors."""
-        return joint_config(self)
-
-    def tensors(self) -> dict[str, Tensor]:
-        """Learned numbers and residuals, by the names they are saved under."""
-        report = {} if self.fit_report is None else self.fit_report.tensors()
-        return dict(self.state_dict()) | {f"fit_report.{k}": v for k, v in report.items()}
 
     @classmethod
     def restore(cls, saved: SavedModel) -> "JointDMP":
@@ -454,6 +387,11 @@ class JointDMP(nn.Module):
             return values  # before the look-ups, which take as long as a step's arithmetic
         shown = Demonstrated(start=self.start, goal=self.goal, amplitude=self.amplitude)
         return self.forcing_scale.scale(values, start, goal, shown)
+
+    def _scaled_weights(self, start: Tensor, goal: Tensor) -> Tensor:
+        if isinstance(self.forcing_scale, NoScaling):
+            return self.weights
+        return self._scaled(self.weights.mT, start, goal).mT
 
     def _as_tensor(self, value: ArrayLike) -> Tensor:
         return to_tensor(value, dtype=self.weights.dtype, device=self.weights.device)

@@ -1,34 +1,66 @@
-"""What a saved joint primitive holds, read back as the arguments that make it again."""
+"""A joint primitive on disk, and read back as the arguments that make it again."""
 
 from dataclasses import asdict
+from pathlib import Path
 from types import NoneType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from torch import Tensor
+from torch import Tensor, nn
 
 from hrc_learn.dmp.fitting.report import FitReport
 from hrc_learn.dmp.scaling import Scaling, find_scaling
+from hrc_learn.dmp.system.basis import Basis
 from hrc_learn.dmp.system.parts import basis_config, restore_basis
+from hrc_learn.dmp.system.response import Response
 from hrc_learn.dmp.system.spring import SpringDamper
-from hrc_learn.storage import SavedModel
-
-if TYPE_CHECKING:
-    from hrc_learn.dmp.joint import JointDMP
+from hrc_learn.storage import SavedModel, write_model
 
 TENSORS = ("weights", "start", "goal", "start_velocity", "duration", "amplitude", "stamps")
 
 
-def joint_config(dmp: "JointDMP") -> dict[str, Any]:
-    """What a saved primitive needs besides its tensors, as JSON values."""
-    return {
-        "joint_names": dmp.joint_names,
-        "units": {"coordinates": dmp.units, "time": "s"},
-        "scaling": dmp.scaling,
-        "scaled_columns": dmp.forcing_scale.columns,
-        "approach": dmp.response.approach,
-        "spring": asdict(dmp.spring),
-        "basis": basis_config(dmp.basis),
-    }
+class SavedJoint(nn.Module):
+    """What a joint primitive is made of, and its way to disk."""
+
+    weights: Tensor
+    """A parameter, or a buffer where they were computed from what gradients flow to."""
+    start: Tensor
+    goal: Tensor
+    start_velocity: Tensor
+    duration: Tensor
+    amplitude: Tensor
+    stamps: Tensor
+    basis: Basis
+    spring: SpringDamper
+    response: Response
+    forcing_scale: Scaling
+    """What start and goal make of the forcing term."""
+    joint_names: tuple[str, ...] | None
+    """Names of the D coordinates."""
+    units: str
+    """Of the coordinates."""
+    fit_report: FitReport | None
+    """How well the fit reproduces its demonstrations."""
+
+    def save(self, folder: str | Path) -> None:
+        """Write config.json and model.safetensors into `folder`, replacing an older save."""
+        write_model(folder, type(self).__name__, self.config(), self.tensors())
+
+    def config(self) -> dict[str, Any]:
+        """What a saved primitive needs besides its tensors, as JSON values."""
+        return {
+            "joint_names": self.joint_names,
+            "units": {"coordinates": self.units, "time": "s"},
+            "scaling": self.forcing_scale.name,
+            "scaled_columns": self.forcing_scale.columns,
+            "approach": self.response.approach,
+            "spring": asdict(self.spring),
+            "basis": basis_config(self.basis),
+        }
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Learned numbers and residuals, by the names they are saved under."""
+        report = {} if self.fit_report is None else self.fit_report.tensors()
+        return dict(self.state_dict()) | {f"fit_report.{k}": v for k, v in report.items()}
 
 
 def saved_arguments(saved: SavedModel) -> dict[str, Any]:

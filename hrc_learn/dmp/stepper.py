@@ -69,14 +69,15 @@ class Stepper:
             weights = self._scaled(weights, self._shown.start, self._shown.goal)
         table = forced.coefficients.cpu().numpy() @ weights
         self._table = np.ascontiguousarray(table.reshape(*table.shape[:2], -1))
-        self._exponents = np.arange(table.shape[1])
+        self._exponents = np.arange(table.shape[1], dtype=float)
         self._interval = forced.interval
         self._end = math.inf if forced.periodic else forced.end
         self._spring, self._approach = dmp.spring, dmp.response.approach
         self._velocity = dmp.start_velocity.detach().double().cpu().numpy()
         self._duration = dmp.duration.item()
         half = self._spring.alpha / 2
-        self._transition = math.nan, np.eye(2)
+        self._stiffness = self._spring.stiffness
+        self._transition = math.nan, np.eye(2), np.zeros((2, 1))
         self._shifted = np.array([[half, 1.0], [-self._spring.stiffness, -half]])
 
     def initial_state(
@@ -125,23 +126,22 @@ class Stepper:
         pace = 1.0 / (1.0 + slowdown)
         ds = dt * pace / duration
         s += ds
-        rest = np.zeros(y.shape)
-        rest[0] = goal
-        if coupling is not None:
-            rest[0] += coupling * (duration**2 / self._spring.stiffness)
         if ds != self._transition[0]:
             # Loops repeat their step length: kept, it serves again.
-            self._transition = ds, self._propagator(ds)
-        E = self._transition[1]
-        forced = after = self._forced(s) if state.s < self._end else E @ before
+            E = self._propagator(ds)
+            self._transition = ds, E, np.array([[1.0 - E[0, 0]], [-E[1, 0]]])
+        _, E, attraction = self._transition
+        forced = after = self._forced(s) if state.s < self._end else E.dot(before)
         if scale is not None:
-            before, after = before @ scale, after @ scale
+            before, after = before.dot(scale), after.dot(scale)
         if self._approach:
             before = before + self._approaching(state.s, way)
             after = after + self._approaching(s, way)
-        y = E @ (y - rest - before)
+        # At rest the spring balances a push.
+        rest = goal if coupling is None else goal + coupling * (duration**2 / self._stiffness)
+        y = E.dot(y - before)
         y += after
-        y += rest
+        y += attraction * rest
         return StepperState(s, y, forced, scale, start, goal, way, duration, pace)
 
     def _scale(self, start: Vector, goal: Vector) -> Float64[np.ndarray, "D D"] | None:
@@ -163,8 +163,8 @@ class Stepper:
         x = (s % 1.0 if self._end == math.inf else min(s, self._end)) / self._interval
         piece = min(int(x), len(self._table) - 1)
         powers = (2.0 * (x - piece) - 1.0) ** self._exponents
-        forced = (powers @ self._table[piece]).reshape(2, -1)
-        return forced if s <= self._end else self._propagator(s - self._end) @ forced
+        forced = powers.dot(self._table[piece]).reshape(2, -1)
+        return forced if s <= self._end else self._propagator(s - self._end).dot(forced)
 
     def _propagator(self, s: float) -> Float64[np.ndarray, "2 2"]:
         C, S = self._spring.modes(s, math)

@@ -1,4 +1,4 @@
-"""One exact step of a primitive in closed loop.
+"""A primitive in closed loop: its first state, and one exact step.
 
 What moves a primitive is linear: each influence has a motion of its own that solves the
 equation alone, known at both ends of the step. What the state differs from the sum of those
@@ -15,9 +15,49 @@ from hrc_learn.dmp.state import DMPState
 from hrc_learn.dmp.system.approach import approach_state
 from hrc_learn.dmp.system.response import Response
 from hrc_learn.dmp.system.spring import SpringDamper
+from hrc_learn.dmp.trajectory import broadcast_shapes
 
 RESONANCE = 1e-3
 """How close to a mode of the spring a goal filter may come, relative to the stiffness."""
+
+
+def begin(
+    response: Response,
+    weights: Float[Tensor, "*#batch D N"],
+    start: Float[Tensor, "*#batch D"],
+    goal: Float[Tensor, "*#batch D"],
+    rate: Float[Tensor, "*#batch D"],
+    duration: Float[Tensor, "*#batch"],
+) -> DMPState:
+    """Where a motion starts.
+
+    Args:
+        response: Of the primitive.
+        weights: Of the unscaled forcing term.
+        start: y_0.
+        goal: g.
+        rate: dy/ds.
+        duration: [s].
+    """
+    batch = broadcast_shapes(
+        weights.shape[:-2], *(x.shape[:-1] for x in (start, goal, rate)), duration.shape
+    )
+    start, goal, rate = (x.expand(*batch, -1) for x in (start, goal, rate))
+    duration = duration.expand(batch)
+    s = torch.zeros_like(duration, dtype=torch.float64)
+    # Copies: an export takes one tensor in two places for one input.
+    return DMPState(
+        position=start.clone(),
+        rate=rate,
+        start=start,
+        goal=goal,
+        way=goal - start,
+        target=goal.clone(),
+        duration=duration,
+        pace=torch.ones_like(duration),
+        s=s,
+        forced=response.forced.to(s.device)(s).to(start) @ weights.mT,
+    )
 
 
 def advance(
@@ -54,16 +94,16 @@ def advance(
         share, way = response.approach, state.way[..., None, :]
         before = before + approach_state(state.s, share).to(way)[..., None] * way
         after = after + approach_state(s, share).to(way)[..., None] * way
-    goal, *attracted = _attracted(state.goal, target, ds, goal_filter, spring)
-    before, after = before + attracted[0], after + attracted[1]
-    if push is not None:
-        # At rest the spring balances a push.
-        resting = torch.stack([push / spring.stiffness, torch.zeros_like(push)], dim=-2)
-        before, after = before + resting, after + resting
-    y = torch.stack([state.position, state.rate], dim=-2)
+    goal = target
+    if goal_filter is not None:
+        goal, behind, ahead = _lagging(state.goal, target, ds, goal_filter, spring)
+        before, after = before + behind, after + ahead
+    # Seen from where it would rest: there the spring balances a push.
+    rest = target if push is None else target + push / spring.stiffness
+    y = torch.stack([state.position - rest, state.rate], dim=-2)
     moved = E @ (y - before) + after
     return DMPState(
-        position=moved[..., 0, :],
+        position=moved[..., 0, :] + rest,
         rate=moved[..., 1, :],
         start=state.start,
         goal=goal,
@@ -90,17 +130,14 @@ def second_derivative(
     return response.spring.acceleration(state.position - state.goal, state.rate) + force
 
 
-def _attracted(
-    goal: Tensor, target: Tensor, ds: Tensor, rate: float | None, spring: SpringDamper
+def _lagging(
+    goal: Tensor, target: Tensor, ds: Tensor, rate: float, spring: SpringDamper
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The goal after the step, and the (y, y') that goals alone lead to, before and after.
+    """The goal after the step, and the (y - target, y') it leads to, before and after.
 
     y_p = target + k (g - target), k = alpha beta / (rate^2 - alpha rate + alpha beta), solves
     the equation for a goal that decays to its target.
     """
-    if rate is None:
-        at_rest = torch.stack([target, torch.zeros_like(target)], dim=-2)
-        return target, at_rest, at_rest
     denominator = rate**2 - spring.alpha * rate + spring.stiffness
     if not rate > 0 or abs(denominator) < RESONANCE * spring.stiffness:
         raise ValueError(
@@ -110,7 +147,6 @@ def _attracted(
     lag_before = goal - target
     lag_after = lag_before * torch.exp(-rate * ds).to(goal)[..., None]
     before, after = (
-        torch.stack([target + gain * lag, -rate * gain * lag], dim=-2)
-        for lag in (lag_before, lag_after)
+        torch.stack([gain * lag, -rate * gain * lag], dim=-2) for lag in (lag_before, lag_after)
     )
     return target + lag_after, before, after

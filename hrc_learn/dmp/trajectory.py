@@ -34,39 +34,47 @@ class Trajectory:
         """
         self._coordinates = coordinates
         self._s = s
-        self._duration = duration[..., None]
+        self._duration = duration
         self._response = response
-        self._batch = broadcast_shapes(coordinates.shape[:-2], s.shape[:-1], duration.shape)
 
     @cached_property
     def time(self) -> Float[Tensor, "*batch T"]:
         """Since the start of the motion [s]."""
-        return (self._s * self._duration).to(self._coordinates.dtype).expand(*self._batch, -1)
+        time = self._s * self._duration[..., None]
+        return time.to(self._coordinates.dtype).expand(*self._batch, -1)
 
     @cached_property
     def position(self) -> Float[Tensor, "*batch T D"]:
         """In the units of the demonstration, [rad] or [m]."""
-        return self._output(0).expand(*self._batch, -1, -1)
+        return self._output(0)
 
     @cached_property
     def velocity(self) -> Float[Tensor, "*batch T D"]:
         """The same per second."""
-        return self._output(1).expand(*self._batch, -1, -1)
+        return self._output(1)
 
     @cached_property
     def acceleration(self) -> Float[Tensor, "*batch T D"]:
         """The same per second squared."""
-        return self._output(2).expand(*self._batch, -1, -1)
+        return self._output(2)
 
-    def _output(self, order: int) -> Tensor:
+    def _output(self, order: int) -> Float[Tensor, "*batch T D"]:
         X = self._coordinates
         if order:
-            X = X / self._duration[..., None] ** order
+            X = X / self._duration[..., None, None] ** order
         if self._s.ndim == 1 and not self._s.requires_grad:
             # One flat product: batched ones against a shared matrix are ten times slower.
             H = self._response.matrices(self._s, X.dtype)[order]
-            return (X.reshape(-1, X.shape[-1]) @ H).view(*X.shape[:-1], -1).mT
-        return self._rows[..., order, :].to(X.dtype) @ X.mT
+            y = X @ H if X.ndim == 2 else (X.flatten(0, -2) @ H).view(*X.shape[:-1], -1)
+        else:
+            y = X @ self._rows[..., order, :].to(X.dtype).mT
+        return y.mT if y.shape[:-2] == self._batch else y.mT.expand(*self._batch, -1, -1)
+
+    @cached_property
+    def _batch(self) -> torch.Size | tuple[int, ...]:
+        return broadcast_shapes(
+            self._coordinates.shape[:-2], self._s.shape[:-1], self._duration.shape
+        )
 
     @cached_property
     def _rows(self) -> Float[Tensor, "*#batch T 3 M"]:

@@ -63,8 +63,8 @@ def _fit(
     force = differentiate(s, rate) - response.spring.acceleration(position - goal, rate)
     if response.approach:
         force = force - (goal - position[..., :1]) * response.approach_force(s)
-    solve = ridge_operator if method == "ridge" else _lwr_operator
-    return _apply(force, solve(response, s, regularization)), rate[..., 0]
+    K = _force_operator(method, response, _key(s), s.device, regularization)
+    return _apply(force, K), rate[..., 0]
 
 
 def _apply(
@@ -95,7 +95,7 @@ def _trajectory(
     or, without, fitted along.
     """
     K, to_weights = _trajectory_operator(
-        response, tuple(s.tolist()), s.device, rate is None, regularization
+        response, _key(s), s.device, rate is None, regularization
     )
     unknown = _apply(position, K)
     if rate is None:
@@ -107,7 +107,7 @@ def _trajectory(
 @lru_cache(maxsize=16)
 def _trajectory_operator(
     response: Response,
-    stamps: tuple[float, ...],
+    stamps: bytes,
     device: torch.device,
     fit_rate: bool,
     regularization: float,
@@ -118,7 +118,7 @@ def _trajectory_operator(
     too, so that one matrix does it all.
     """
     N = response.basis.count
-    s = torch.tensor(stamps, dtype=torch.float64, device=device)
+    s = _stamps(stamps, device)
     H = response.evaluate(s)[:, 0]
     velocity, start, goal = H[:, N], H[:, N + 1], H[:, N + 2]
     unit = balanced_units(response.basis, H, int(fit_rate))
@@ -127,6 +127,15 @@ def _trajectory_operator(
     from_samples[:, 0] -= K @ start
     from_samples[:, -1] -= K @ goal
     return from_samples, K @ velocity
+
+
+def _key(s: Float[Tensor, "T"]) -> bytes:
+    """Stamps as something to look an operator up by."""
+    return s.cpu().numpy().tobytes()
+
+
+def _stamps(key: bytes, device: torch.device) -> Float[Tensor, "T"]:
+    return torch.frombuffer(bytearray(key), dtype=torch.float64).to(device)
 
 
 def balanced_units(
@@ -142,6 +151,16 @@ def balanced_units(
     return torch.cat([unit, size / norm[basis.count : basis.count + others]])
 
 
+@lru_cache(maxsize=16)
+def _force_operator(
+    method: str, response: Response, stamps: bytes, device: torch.device, regularization: float
+) -> Float[Tensor, "N T"]:
+    s = _stamps(stamps, device)
+    if method == "ridge":
+        return ridge_operator(response, s, regularization)
+    return _lwr_operator(response, s)
+
+
 def ridge_operator(
     response: Response, s: Float[Tensor, "T"], regularization: float
 ) -> Float[Tensor, "N T"]:
@@ -149,9 +168,9 @@ def ridge_operator(
     return _ridge_inverse(response.basis.forcing(s), regularization)
 
 
-def _lwr_operator(response: Response, s: Tensor, regularization: float) -> Tensor:
+def _lwr_operator(response: Response, s: Tensor) -> Tensor:
     """w_i = (z' Gamma_i f) / (z' Gamma_i z), the paper's solution of its (Cost_i)."""
-    del regularization  # each weight is a mean of its own samples: nothing is ill-posed
+    # Without a ridge: each weight is a mean of its own samples, so that nothing is ill-posed.
     z = response.basis.phase(s)
     weighted = (response.basis.kernels(s) * z[:, None]).T
     # A Gaussian narrower than the sampling may see no sample: its weight is zero then.

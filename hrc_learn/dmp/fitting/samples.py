@@ -42,17 +42,23 @@ class Samples:
     @cached_property
     def shared(self) -> bool:
         """Whether all demonstrations are sampled alike, so that one solve serves all."""
+        if len(self.s) == 1 or not self.complete:
+            return self.complete
         # 1e-12 of the motion: stamps that differ by the rounding of a start time are alike.
-        return self.complete and bool(((self.s - self.s[:1]).abs() < 1e-12).all())
+        return bool(((self.s - self.s[:1]).abs() < 1e-12).all())
 
     @cached_property
     def first(self) -> Float[Tensor, "B D"]:
         """Position at the first sample that counts."""
+        if self.complete:
+            return self.position[..., 0]
         return self._at(self.mask.long().argmax(-1))
 
     @cached_property
     def last(self) -> Float[Tensor, "B D"]:
         """Position at the last sample that counts."""
+        if self.complete:
+            return self.position[..., -1]
         return self._at(self.mask.shape[-1] - 1 - self.mask.flip(-1).long().argmax(-1))
 
     @cached_property
@@ -191,6 +197,14 @@ def _check_finite(
 
 
 def _normalised(time: Tensor, mask: Tensor, batch: Sequence[int]) -> tuple[Tensor, Tensor]:
+    """Time since the first sample over the duration, which comes with it."""
+    if mask.all():
+        first, last = time[:, :1], time[:, -1:]
+        elapsed = time - first
+        stalled = elapsed[:, 1:] <= elapsed[:, :-1]
+        if not stalled.any():
+            duration = last - first
+            return elapsed / duration, duration[..., 0]
     first = time.masked_fill(~mask, torch.inf).amin(-1, keepdim=True)
     last = time.masked_fill(~mask, -torch.inf).amax(-1, keepdim=True)
     elapsed = (time - first).masked_fill(~mask, 0)
