@@ -2,12 +2,16 @@
 
 from hrc_learn.dmp import coupling as coupling
 from hrc_learn.dmp import force as force
+from hrc_learn.dmp.dual_arm import DualArmDMP as DualArmDMP
+from hrc_learn.dmp.dual_arm import DualArmState as DualArmState
 from hrc_learn.dmp.fitting.report import FitReport as FitReport
 from hrc_learn.dmp.fitting.selection import BasisSelection as BasisSelection
 from hrc_learn.dmp.fitting.selection import select_basis_count as select_basis_count
 from hrc_learn.dmp.generalisation.context import PolynomialFeatures as PolynomialFeatures
 from hrc_learn.dmp.generalisation.contextual import ContextualDMP as ContextualDMP
 from hrc_learn.dmp.generalisation.distribution import DMPDistribution as DMPDistribution
+from hrc_learn.dmp.generalisation.kinds import with_ends as with_ends
+from hrc_learn.dmp.generalisation.through import through as through
 from hrc_learn.dmp.joint import JointDMP as JointDMP
 from hrc_learn.dmp.limited import LimitedDMP as LimitedDMP
 from hrc_learn.dmp.limited_motion import LimitedState as LimitedState
