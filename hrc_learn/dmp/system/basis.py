@@ -81,13 +81,17 @@ class GaussianBasis:
     phase: Phase = field(default_factory=ExponentialPhase)
     """The canonical system, whose z fades the forcing term."""
     periodic: ClassVar[bool] = False
-    knot_spacing: ClassVar[None] = None
 
     def __post_init__(self):
         check_positive("width", self.width)
         check_count(self.count)
         if self.domain not in DOMAINS:
             raise ValueError(f"unknown domain {self.domain!r}; there are {', '.join(DOMAINS)}")
+
+    @property
+    def knot_spacing(self) -> None:
+        """Smooth everywhere."""
+        return None
 
     @property
     def horizon(self) -> float:
@@ -153,8 +157,6 @@ class PeriodicBasis:
     """Standard deviation of a bell as a share of the distance between centres."""
     periodic: ClassVar[bool] = True
     horizon: ClassVar[float] = 1.0
-    knot_spacing: ClassVar[float] = 1.0
-    """The table of the response has to close on itself."""
 
     def __post_init__(self):
         check_positive("width", self.width)
@@ -164,6 +166,11 @@ class PeriodicBasis:
     def smooth_interval(self) -> float:
         """Length over which the forcing is a polynomial of low degree."""
         return min(0.5, 1.4 * self.width**2) / self.count
+
+    @property
+    def knot_spacing(self) -> float:
+        """A period: the table of the response has to close on itself."""
+        return 1.0
 
     def phase(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
         """What fades the forcing term: nothing."""

@@ -53,8 +53,10 @@ def _config(part: Any, known: Mapping[str, type[Any]]) -> dict[str, Any]:
 
 def _restore(fields: Mapping[str, Any], known: Mapping[str, type[Any]]) -> Any:
     # Tuples are lists in a file, and lists cannot be hashed.
-    arguments = {k: tuple(v) if isinstance(v, list) else v for k, v in fields.items()}
-    kind = arguments.pop("type")
+    arguments = {
+        k: tuple(v) if isinstance(v, list) else v for k, v in fields.items() if k != "type"
+    }
+    kind = fields["type"]
     if kind not in known:
         raise ValueError(f"unknown type {kind!r}; there are {', '.join(known)}")
     return known[kind](**arguments)

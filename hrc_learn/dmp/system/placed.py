@@ -33,7 +33,6 @@ class PlacedBasis:
     phase: Phase = field(default_factory=ExponentialPhase)
     """The canonical system, whose z fades the forcing term."""
     periodic: ClassVar[bool] = False
-    knot_spacing: ClassVar[None] = None
 
     def __post_init__(self):
         check_count(self.count)
@@ -54,6 +53,11 @@ class PlacedBasis:
     def count(self) -> int:
         """N, the number of basis functions."""
         return len(self.centres)
+
+    @property
+    def knot_spacing(self) -> None:
+        """Smooth everywhere."""
+        return None
 
     @property
     def horizon(self) -> float:
