@@ -108,7 +108,7 @@ def obstacles(figure: Figure) -> None:
             moved = JointDMP.fit(time, dmp.rollout().position.detach() + shift)
             free = moved.rollout().position.detach()
             path = run(moved, 2.6, change)
-            axes.plot(free[:, 0], free[:, 1], **DEMO | {"lw": 2.5})
+            axes.plot(*free.T[:2], **DEMO)
             axes.plot(*path.T[:2], color=palette.RUN)
             ends(axes, path[0, :2], path[-1, :2], palette.RUN)
         plane(axes, f"{title} around a ball")
