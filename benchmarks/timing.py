@@ -12,6 +12,7 @@ class Timing:
 
     median: float
     p99: float
+    least: float
 
 
 def time_calls(calls: dict[str, Callable[[], object]], repeats: int) -> dict[str, Timing]:
@@ -31,6 +32,7 @@ def time_calls(calls: dict[str, Callable[[], object]], repeats: int) -> dict[str
     return {
         name: Timing(
             median=statistics.median(values),
+            least=min(values),
             p99=sorted(values)[min(int(0.99 * len(values)), len(values) - 1)],
         )
         for name, values in seconds.items()

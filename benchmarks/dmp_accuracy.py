@@ -1,0 +1,106 @@
+"""How exact movement primitives are: reproduction, orientations, gradients."""
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hrc_learn.dmp import JointDMP, OrientationDMP
+from hrc_learn.geometry import quaternion
+
+TURNS = (10, 90, 179, 181, 200, 359, 361, 450, 720)
+"""Angles [deg] of noise-free rotations."""
+STEP = 1e-5
+"""Of central differences, relative to inputs of size one."""
+
+
+def measure_reproduction(folder: Path) -> dict[str, float]:
+    """Median error over recordings, relative to the largest range of each.
+
+    Args:
+        folder: Holds .npz files with stamps `t` (T,) [s] and joint positions `q` (T, D).
+
+    Raises:
+        ValueError: It holds none, or one without these.
+    """
+    files = sorted(folder.glob("*.npz"))
+    if not files:
+        raise ValueError(f"{folder} holds no .npz recordings")
+    figures = {}
+    for n_basis in (50, 100):
+        errors = []
+        for file in files:
+            with np.load(file) as recording:
+                if not {"t", "q"} <= set(recording.files):
+                    raise ValueError(f"{file} needs arrays 't' and 'q', has {recording.files}")
+                dmp = JointDMP.fit(recording["t"], recording["q"], n_basis)
+            assert dmp.fit_report is not None
+            errors.append(dmp.fit_report.nrmse.item())
+        figures[f"reproduction_{n_basis}_nrmse"] = float(np.median(errors))
+    return figures
+
+
+def measure_turns() -> dict[str, float]:
+    """Largest RMSE [deg] of noise-free turns about one axis."""
+    s = torch.linspace(0, 1, 1000, dtype=torch.float64)
+    axis = torch.tensor([0.48, 0.60, 0.64], dtype=torch.float64)
+    errors = []
+    for turn in TURNS:
+        angle = math.radians(turn) * s**3 * (10 - 15 * s + 6 * s**2)
+        shown = quaternion.exp(angle[:, None] * axis)
+        reproduced = OrientationDMP.fit(2 * s, shown).rollout().orientation.detach()
+        errors.append(quaternion.angle(reproduced, shown).square().mean().sqrt())
+    return {"orientation_deg": math.degrees(max(errors))}
+
+
+def measure_gradient_error() -> dict[str, float]:
+    """Derivatives of motions against central differences, relative, in float64."""
+    rng = torch.Generator().manual_seed(0)
+    s = torch.linspace(0, 1, 100, dtype=torch.float64)
+    vector = torch.stack([torch.sin(3 * s), s**2, torch.cos(2 * s)], dim=-1)
+    joint = JointDMP.fit(2 * s, vector, 8)
+    turning = OrientationDMP.fit(2 * s, quaternion.exp(vector), 8)
+    time = torch.linspace(0, 2.5, 9, dtype=torch.float64)
+
+    def move(weights: Tensor, start: Tensor, goal: Tensor, duration: Tensor) -> Tensor:
+        ends = {"start": start, "goal": goal, "duration": duration, "time": time}
+        return torch.func.functional_call(joint, {"weights": weights}, (), ends).velocity
+
+    def turn(weights: Tensor, start: Tensor, goal: Tensor, duration: Tensor) -> Tensor:
+        ends = {"start": start, "goal": goal, "duration": duration, "time": time}
+        changed = {"motion.weights": weights}
+        return torch.func.functional_call(turning, changed, (), ends).orientation
+
+    joint.forward, turning.forward = joint.rollout, turning.rollout
+    duration = torch.tensor(1.7, dtype=torch.float64)
+    cases = {
+        "joint": (move, (joint.weights, joint.start, joint.goal, duration)),
+        "orientation": (turn, (turning.motion.weights, turning.start, turning.goal, duration)),
+    }
+    return {
+        f"{name}_gradient_error": _gradient_error(function, inputs, rng)
+        for name, (function, inputs) in cases.items()
+    }
+
+
+def _gradient_error(
+    function: Callable[..., Tensor], inputs: tuple[Tensor, ...], rng: torch.Generator
+) -> float:
+    """Of a random sum of the outputs along a random direction of each input; the largest."""
+    inputs = tuple(x.detach().clone().requires_grad_() for x in inputs)
+    seed = torch.randn(function(*inputs).shape, generator=rng, dtype=torch.float64)
+    gradients = torch.autograd.grad(function(*inputs), inputs, seed)
+    errors = []
+    for i, (x, gradient) in enumerate(zip(inputs, gradients, strict=True)):
+        direction = x.detach().abs().max() * torch.randn(x.shape, generator=rng, dtype=x.dtype)
+        with torch.no_grad():
+            ahead, behind = (
+                (seed * function(*inputs[:i], x + h * direction, *inputs[i + 1 :])).sum()
+                for h in (STEP, -STEP)
+            )
+        exact = (gradient * direction).sum()
+        errors.append(abs(exact - (ahead - behind) / (2 * STEP)) / abs(exact))
+    return torch.stack(errors).max().item()
