@@ -8,7 +8,7 @@ from torch import Tensor
 
 from hrc_learn.geometry import Pose
 from hrc_learn.geometry.constant import Constant
-from hrc_learn.geometry.small_matrices import matmul
+from hrc_learn.kinematics import unrolled
 from hrc_learn.kinematics.limits import JointLimits
 
 
@@ -63,6 +63,8 @@ class SerialChain:
         )
         self._cosine = Constant(torch.stack([x, y, zero, zero], dim=-1))
         self._sine = Constant(torch.stack([y, -x, zero, zero], dim=-1))
+        self._mount_entries = self.mounts.tolist()
+        self._tip_entries = (self.flange @ self.tcp).tolist()
         self._flange = Constant(self.flange)
         self._tip = Constant(self.flange @ self.tcp)
 
@@ -75,7 +77,9 @@ class SerialChain:
         Args:
             q: Joint positions [rad].
         """
-        return Pose.from_matrix(matmul(self._joint_frames(q)[-1], self._tip.like(q)))
+        if torch.compiler.is_compiling():
+            return Pose.from_matrix(self.transform_and_jacobian(q)[0])  # J is never computed
+        return Pose.from_matrix(self._joint_frames(q)[-1] @ self._tip.like(q))
 
     def link_poses(self, q: Float[Tensor, "*batch joints"]) -> Pose:
         """Poses of the joint frames, the flange and the tool centre point, in this order.
@@ -87,7 +91,7 @@ class SerialChain:
             Pose with batch shape (*batch, joints + 2); index it as `poses[..., i]`.
         """
         frames = self._joint_frames(q)
-        tips = [matmul(frames[-1], self._flange.like(q)), matmul(frames[-1], self._tip.like(q))]
+        tips = [frames[-1] @ self._flange.like(q), frames[-1] @ self._tip.like(q)]
         return Pose.from_matrix(torch.stack([*frames, *tips], dim=-3))
 
     def jacobian(self, q: Float[Tensor, "*batch joints"]) -> Float[Tensor, "*batch 6 joints"]:
@@ -112,8 +116,10 @@ class SerialChain:
         self, q: Float[Tensor, "*batch joints"]
     ) -> tuple[Float[Tensor, "*batch 3 4"], Float[Tensor, "*batch 6 joints"]]:
         """`forward_and_jacobian` with the pose left as a matrix (R | p): no quaternion made."""
+        if torch.compiler.is_compiling():
+            return unrolled.transform_and_jacobian(q, self._mount_entries, self._tip_entries)
         frames = self._joint_frames(q)
-        tip = matmul(frames[-1], self._tip.like(q))
+        tip = frames[-1] @ self._tip.like(q)
         frames = torch.stack(frames, dim=-3)
         return tip, _screw_jacobian(frames[..., 2], frames[..., 3], tip[..., None, :, 3])
 
@@ -145,7 +151,7 @@ class SerialChain:
         first, *rest = steps.unbind(-3)
         frames = [first[..., :3, :]]
         for step in rest:
-            frames.append(matmul(frames[-1], step))
+            frames.append(frames[-1] @ step)
         return frames
 
 
@@ -156,4 +162,4 @@ def _screw_jacobian(
 ) -> Float[Tensor, "*batch 6 joints"]:
     """Twist of a frame at `point` for unit speed about each axis."""
     linear = torch.linalg.cross(axis, point - origin)
-    return torch.cat([linear, axis], dim=-1).mT
+    return torch.cat([linear.mT, axis.mT], dim=-2)
