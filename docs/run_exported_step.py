@@ -5,39 +5,42 @@
 The arm moves as it is told; a real loop would read its joints and write to its driver.
 """
 
-import io
+import math
 import statistics
 import sys
 import time
-import zipfile
 
-import numpy as np
 import torch
 
 DT = 0.002  # the step the package was exported with [s]
 
-package = sys.argv[1]
-with zipfile.ZipFile(package) as archive:
-    kept = np.load(io.BytesIO(archive.read("extra/hrc_learn.npz")))
-# Inputs in their order: the state, then the observation. Outputs: the command, then the state.
-state = [torch.from_numpy(kept[name]) for name in kept.files if name.startswith("state.")]
-names = [name for name in kept.files if name.startswith("observation.")]
-observation = [torch.from_numpy(kept[name]) for name in names]
-arrays = {name: x.numpy() for name, x in zip(names, observation, strict=True)}
-commands = [name for name in kept.files if name.startswith("command.")]
-velocity_at = commands.index("command.joint_velocity")
+# The public `torch._inductor.aoti_load_package` takes the same file, but seconds.
+loader = torch._C._aoti.AOTIModelPackageLoader(sys.argv[1], "model", False, 1, -1)
+says = loader.get_metadata()
 
-# torch.export's public `torch._inductor.aoti_load_package` takes the same file, but seconds.
-loader = torch._C._aoti.AOTIModelPackageLoader(package, "model", False, 1, -1)
+# Where each field stands in the three vectors of numbers.
+rows, sizes = {}, {"state": 0, "observation": 0, "command": 0}
+for line in says["hrc_learn.layout"].splitlines():
+    vector, name, _dtype, _batched, *shape = line.split()
+    first = sizes[vector]
+    sizes[vector] += math.prod(map(int, shape))
+    rows[vector, name] = slice(first, sizes[vector])
+
+# An arm at rest, the observation of the export, and room for the command.
+state, observation = (
+    torch.tensor([float(x) for x in says[f"hrc_learn.{vector}"].split()], dtype=torch.float64)
+    for vector in ("state", "observation")
+)
+command = torch.zeros(sizes["command"], dtype=torch.float64)
+q = observation[rows["observation", "joint_position"]].numpy()
+velocity = command[rows["command", "joint_velocity"]].numpy()
 
 seconds = []
 for _ in range(1000):
     began = time.perf_counter()
-    outputs = loader.run(state + observation)
-    velocity = outputs[velocity_at].numpy()
-    state = outputs[len(commands) :]
+    loader.run([state, observation, command])  # writes the command and the next state
     seconds.append(time.perf_counter() - began)
-    arrays["observation.joint_position"] += DT * velocity
+    q += DT * velocity
 
-print("joints at", *(f"{q:.9f}" for q in arrays["observation.joint_position"]))
+print("joints at", *(f"{angle:.9f}" for angle in q))
 print(f"median step {1e6 * statistics.median(seconds):.0f} us")

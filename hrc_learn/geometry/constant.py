@@ -14,6 +14,10 @@ class Constant:
         self._value = value
         self._ready: dict[tuple[torch.dtype, torch.device], Tensor] = {}
 
+    def __getstate__(self) -> dict[str, object]:
+        # What was met is no part of what it is.
+        return {"_value": self._value, "_ready": {}}
+
     def like(self, x: Tensor) -> Tensor:
         """The tensor on the device of `x`, and of its dtype if floating-point."""
         dtype = x.dtype if self._value.is_floating_point() else self._value.dtype

@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import os
-import platform
 import sys
-import zipfile
 from pathlib import Path
+from unittest import mock
 
-import numpy as np
 import torch
+from torch.utils import _pytree
 
 from hrc_learn.controller.controller import AdaptiveController
 from hrc_learn.controller.interface import Observation
-from hrc_learn.controller.runtime.flat import Example, FlatStep
+from hrc_learn.controller.runtime.fingerprint import UnknownCodeError, fingerprint
+from hrc_learn.controller.runtime.flat import FlatStep
+from hrc_learn.controller.runtime.package import describe, machine
 
-EXAMPLE = "extra/hrc_learn.npz"
-"""Entry of a package with names, shapes and dtypes of all tensors, and an initial state."""
+# Memory that a step may take from the stack [bytes]: allocations there are free, those of
+# torch cost more than the arithmetic. Threads commonly have 8 MB.
+_STACK = 2**20
 
 
 class NoCompilerError(RuntimeError):
@@ -30,8 +31,10 @@ def export_step(
 ) -> Path:
     """Compile a controller's step, unless an equal one was compiled before.
 
-    A package fits the machine it was built on: its name in the folder is a hash of torch's
-    version, of the instructions the processor has, and of the traced step with all weights.
+    A package fits the machine it was built on. Its name in the folder is a hash of torch's
+    version, of the processor, of the source of this library, and of all settings and weights
+    of the controller. With parts of your own, whose source it cannot know, it is one of the
+    traced step, which takes seconds more.
 
     Args:
         controller: Whose step.
@@ -47,46 +50,32 @@ def export_step(
         NoCompilerError: No C++ compiler was found, and no package either.
         ValueError: dt is not in (0, 1/rate] of the safety filter.
     """
+    folder = folder or _default_folder()
     step = FlatStep(controller, observation)
-    program = trace(step)
-    package = (folder or _default_folder()) / f"step-{_digest(program)}.pt2"
+    program = None
+    try:
+        key = fingerprint(machine(), controller, _structure(observation))
+    except UnknownCodeError:
+        program = trace(step, observation)
+        key = _digest(step, program)
+    package = folder / f"step-{key[:24]}.pt2"
     if package.is_file():
         return package
     _require_compiler()
-    package.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = package.with_name(f".{package.stem}.{os.getpid()}.pt2")
+    folder.mkdir(parents=True, exist_ok=True)
+    unfinished = folder / f".{package.stem}.{os.getpid()}.pt2"
     try:
-        with torch.no_grad():
-            torch._inductor.aoti_compile_and_package(program, package_path=str(unfinished))
-        _append_example(unfinished, step.example)
+        _compile(program or trace(step, observation), unfinished, describe(step, observation))
         unfinished.replace(package)
     finally:
         unfinished.unlink(missing_ok=True)
     return package
 
 
-def read_example(package: Path) -> Example:
-    """The named tensors that `export_step` kept in a package.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: It is not a package of ours.
-    """
-    try:
-        with zipfile.ZipFile(package) as archive:
-            arrays = np.load(io.BytesIO(archive.read(EXAMPLE)))
-    except (zipfile.BadZipFile, KeyError) as error:
-        raise ValueError(f"{package} was not written by export_step: {error}") from error
-    groups = {"state": {}, "observation": {}, "command": {}}
-    for name in arrays.files:
-        groups[name.split(".")[0]][name] = torch.from_numpy(arrays[name])
-    return Example(**groups)
-
-
-def trace(step: FlatStep) -> torch.export.ExportedProgram:
+def trace(step: FlatStep, observation: Observation) -> torch.export.ExportedProgram:
     """One graph of a step, as AOTInductor takes it."""
     with torch.no_grad():
-        program = torch.export.export(step, tuple(step.example.inputs), strict=False)
+        program = torch.export.export(step, tuple(step.example(observation)), strict=False)
     aten = torch.ops.aten
     for node in program.graph.nodes:
         # Inductor of torch 2.11 cannot raise a constant number to a power.
@@ -95,25 +84,44 @@ def trace(step: FlatStep) -> torch.export.ExportedProgram:
     return program
 
 
-def _digest(program: torch.export.ExportedProgram) -> str:
+def _compile(
+    program: torch.export.ExportedProgram, package: Path, says: dict[str, str]
+) -> None:
+    from torch._inductor.codegen import cpp_wrapper_cpu_array_ref
+
+    options = {"aot_inductor.allow_stack_allocation": True, "aot_inductor.metadata": says}
+    stack = mock.patch.object(
+        cpp_wrapper_cpu_array_ref, "MAX_STACK_ALLOCATION_SIZE", _STACK, create=True
+    )
+    with torch.no_grad(), stack:
+        torch._inductor.aoti_compile_and_package(
+            program, package_path=str(package), inductor_configs=options
+        )
+
+
+def _structure(observation: Observation) -> list[tuple[str, str]]:
+    """What of an example makes a difference to the step: all but the values of tensors."""
+    leaves, _ = _pytree.tree_flatten_with_path(observation)
+    return [
+        (
+            _pytree.keystr(path),
+            f"{x.dtype} {tuple(x.shape)}" if isinstance(x, torch.Tensor) else repr(x),
+        )
+        for path, x in leaves
+    ]
+
+
+def _digest(step: FlatStep, program: torch.export.ExportedProgram) -> str:
     """Hash of all that decides what a package computes and where it runs."""
     digest = hashlib.sha256()
-    for text in (
-        torch.__version__,
-        platform.machine(),
-        torch.backends.cpu.get_cpu_capability(),
-        program.graph,
-        program.graph_signature,
-    ):
+    fields = [field for layout in step.layouts for field in layout.fields]
+    for text in (machine(), program.graph, program.graph_signature, fields):
         digest.update(str(text).encode())
-    for node in program.graph.nodes:
-        if node.op == "placeholder":
-            value = node.meta["val"]
-            digest.update(f"{value.dtype} {tuple(value.shape)}".encode())
+    digest.update(step.first_state.numpy().tobytes())
     for name, value in sorted((program.state_dict | program.constants).items()):
         assert isinstance(value, torch.Tensor)
         digest.update(name.encode() + value.detach().cpu().numpy().tobytes())
-    return digest.hexdigest()[:24]
+    return digest.hexdigest()
 
 
 def _require_compiler() -> None:
@@ -125,14 +133,6 @@ def _require_compiler() -> None:
         raise NoCompilerError(
             "no C++ compiler found: install g++, or name one in CXX"
         ) from error
-
-
-def _append_example(package: Path, example: Example) -> None:
-    tensors = example.state | example.observation | example.command
-    buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **{name: x.numpy() for name, x in tensors.items()})
-    with zipfile.ZipFile(package, "a", zipfile.ZIP_STORED) as archive:
-        archive.writestr(EXAMPLE, buffer.getvalue())
 
 
 def _default_folder() -> Path:

@@ -1,88 +1,91 @@
-"""The control step as a function of plain tensors with names."""
+"""The control step as a function of three vectors of numbers."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, final
+from typing import NamedTuple, final
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 from torch.utils import _pytree
 
 from hrc_learn.controller.controller import AdaptiveController
 from hrc_learn.controller.interface import Observation
-
-STATE, OBSERVATION, COMMAND = "state", "observation", "command"
-"""What the names of tensors begin with."""
+from hrc_learn.controller.runtime.layout import Layout
 
 
-@dataclass(frozen=True, kw_only=True)
-class Example:
-    """Named tensors of one step, in the order in which the step takes and returns them."""
+class Vectors(NamedTuple):
+    """What a step takes, in this order."""
 
-    state: dict[str, Tensor]
-    """Of an arm at rest in the observed joint position."""
-    observation: dict[str, Tensor]
-    command: dict[str, Tensor]
-    """Their values mean nothing, their shapes and dtypes do."""
+    state: Tensor
+    observation: Tensor
+    command: Tensor
 
-    @property
-    def inputs(self) -> list[Tensor]:
-        """What the step takes."""
-        return [*self.state.values(), *self.observation.values()]
+
+class Layouts(NamedTuple):
+    """Where everything stands in them."""
+
+    state: Layout
+    observation: Layout
+    command: Layout
 
 
 @final
 class FlatStep(nn.Module):
-    """`AdaptiveController.step` on flat lists of tensors.
+    """`AdaptiveController.step` on vectors, in place.
 
-    It takes the tensors of the state, then those of the observation, and returns those of the
-    command, then those of the next state. What an observation leaves out, and a `dt` that is
-    a number, are constants.
+    It reads the vectors of state and observation, and writes those of the command and of the
+    next state. What an observation leaves out, and a `dt` that is a number, are constants.
     """
 
-    def __init__(self, controller: AdaptiveController, observation: Observation):
+    def __init__(
+        self,
+        controller: AdaptiveController,
+        observation: Observation,
+        dtype: torch.dtype = torch.float64,
+    ):
         """Take the structure of a step from an example.
 
         Args:
             controller: Whose step.
             observation: With exactly the fields that later ones will have.
+            dtype: Of the vectors; float32 counts to 16 million only.
         """
         super().__init__()
         self.controller = controller
-        state = controller.initial_state(observation.joint_position)
-        named_state = _named(STATE, state)
-        named_observation = _named(OBSERVATION, observation)
-        leaves, self._structure = _pytree.tree_flatten((state, observation))
-        self._constants = [None if isinstance(x, Tensor) else x for x in leaves]
+        q = observation.joint_position
+        state = controller.initial_state(controller.chain.ready.to(q).expand_as(q))
         with torch.no_grad():
             command, _ = controller.step(state, observation)
-        self.example = Example(
-            state=named_state, observation=named_observation, command=_named(COMMAND, command)
+        leaves, self._structure = _pytree.tree_flatten((state, observation))
+        self._constants = [None if isinstance(x, Tensor) else x for x in leaves]
+        trees = (state, observation, command)
+        self.layouts = Layouts(*(Layout.of(tree, q.shape[:-1], dtype) for tree in trees))
+        self.first_state = self.layouts.state.pack(tensors_of(state))
+
+    def example(self, observation: Observation) -> Vectors:
+        """Vectors before the first step: at rest in the ready posture."""
+        return Vectors(
+            self.first_state.clone(),
+            self.layouts.observation.pack(tensors_of(observation)),
+            self.layouts.command.empty(),
         )
 
-    def forward(self, *inputs: Tensor) -> list[Tensor]:
+    def forward(
+        self,
+        state: Float[Tensor, "states *batch"],
+        observation: Float[Tensor, "observations *batch"],
+        command: Float[Tensor, "commands *batch"],
+    ) -> None:
         """One step."""
-        tensors = iter(inputs)
-        leaves = [next(tensors) if x is None else x for x in self._constants]
-        state, observation = _pytree.tree_unflatten(leaves, self._structure)
-        command, state = self.controller.step(state, observation)
-        # Copies: a state that shares memory with an observation would change with the next.
-        # Contiguous as the example is: compiled code reads other layouts wrongly, unchecked.
-        kept = [_copy(x) for x in _pytree.tree_leaves(state)]
-        return [*_pytree.tree_leaves(command), *kept]
+        layouts = self.layouts
+        read = iter(layouts.state.unpack(state) + layouts.observation.unpack(observation))
+        leaves = [next(read) if x is None else x for x in self._constants]
+        said, following = self.controller.step(*_pytree.tree_unflatten(leaves, self._structure))
+        command.copy_(layouts.command.pack(tensors_of(said)))
+        state.copy_(layouts.state.pack(tensors_of(following)))
 
 
-def _named(prefix: str, tree: Any) -> dict[str, Tensor]:
-    """Copies of the tensors of a tree by their path, as in "state.safety.velocity"."""
-    leaves, _ = _pytree.tree_flatten_with_path(tree)
-    # Copies: an export takes one tensor in two places for one input.
-    return {
-        prefix + _pytree.keystr(path): _copy(x.detach())
-        for path, x in leaves
-        if isinstance(x, Tensor)
-    }
-
-
-def _copy(x: Tensor) -> Tensor:
-    return x.clone(memory_format=torch.contiguous_format)
+def tensors_of(tree: object) -> list[Tensor]:
+    """The tensors in a pytree."""
+    return [x for x in _pytree.tree_leaves(tree) if isinstance(x, Tensor)]

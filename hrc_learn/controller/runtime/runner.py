@@ -3,25 +3,26 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from abc import ABC, abstractmethod
 from pathlib import Path
-from typing import Any, final
+from typing import final
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch.utils import _pytree
 
 from hrc_learn.controller.controller import AdaptiveController
 from hrc_learn.controller.interface import Observation
-from hrc_learn.controller.runtime.export import NoCompilerError, export_step, read_example
-from hrc_learn.controller.runtime.flat import COMMAND, OBSERVATION, STATE, Example, FlatStep
+from hrc_learn.controller.runtime.export import NoCompilerError, export_step
+from hrc_learn.controller.runtime.flat import FlatStep, Layouts, Vectors, tensors_of
+from hrc_learn.controller.runtime.package import load
 
-_POSITIONS = (f"{STATE}.safety.position", f"{STATE}.hold.joint_position")
+_POSITIONS = ("safety.position", "hold.joint_position")
+"""Fields of the state that remember where the joints were."""
 
 
-@final
-class StepRunner:
+class StepRunner(ABC):
     """A control step with its state, driven by writing into arrays.
 
         runner.observation["joint_position"][:] = q
@@ -29,68 +30,33 @@ class StepRunner:
 
     Attributes:
         observation: Arrays to write each observation into, by field, as in "joint_position" or
-            "goals.vision.target". They share memory with what the step reads.
+            "goals.vision.target"; flags are 0 or 1. They are what the step reads.
         joint_velocity: What the last step commands [rad/s]; overwritten by the next.
     """
 
-    def __init__(self, run: Callable[[list[Tensor]], list[Tensor]], example: Example):
-        """Bind a step to its arrays.
+    def __init__(self, layouts: Layouts):
+        self._layouts = layouts
+        self._vectors = Vectors(*(layout.empty() for layout in layouts))
+        self.observation = layouts.observation.arrays(self._vectors.observation)
+        self._command = layouts.command.arrays(self._vectors.command)
+        self.joint_velocity: Float[np.ndarray, "*batch n"] = self._command["joint_velocity"]
 
-        Args:
-            run: From the tensors of state and observation to those of command and next state.
-            example: Of them.
-        """
-        self._run = run
-        self._first = list(example.state.values())
-        self._index = {name: k for k, name in enumerate(example.state)}
-        self._observation = list(example.observation.values())
-        self.observation = {
-            name.removeprefix(f"{OBSERVATION}."): x.numpy()
-            for name, x in example.observation.items()
-        }
-        self._commands = {
-            name.removeprefix(f"{COMMAND}."): k for k, name in enumerate(example.command)
-        }
-        self._count = len(self._commands)
-        self._velocity_index = self._commands["joint_velocity"]
-        self._velocity = torch.zeros_like(example.command[f"{COMMAND}.joint_velocity"])
-        self.joint_velocity: Float[np.ndarray, "*batch n"] = self._velocity.numpy()
-        self._outputs = list(example.command.values())
-        self.start(self.observation["joint_position"])
-
-    @classmethod
-    def load(cls, package: Path) -> StepRunner:
-        """Load what `export_step` wrote, in milliseconds.
-
-        Raises:
-            FileNotFoundError: There is no such file.
-            ValueError: It is not a package of ours.
-        """
-        example = read_example(package)  # first: it tells foreign files apart
-        return cls(open_package(package), example)
-
-    @classmethod
-    def eager(cls, controller: AdaptiveController, observation: Observation) -> StepRunner:
-        """The same step uncompiled; observations have the fields of the example."""
-        step = FlatStep(controller, observation)
-        return cls(torch.inference_mode()(lambda inputs: step(*inputs)), step.example)
-
+    @abstractmethod
     def start(self, joint_position: Float[np.ndarray, "*batch n"]) -> None:
         """Forget everything: the arm is at rest in a joint position [rad]."""
-        self._state = [x.clone() for x in self._first]
-        for name in _POSITIONS:
-            self._state[self._index[name]].copy_(torch.as_tensor(joint_position))
 
+    @abstractmethod
     def step(self) -> Float[np.ndarray, "*batch n"]:
         """Take one step on what stands in `observation`.
 
         Returns:
             `joint_velocity`.
         """
-        outputs = self._run(self._state + self._observation)
-        self._velocity.copy_(outputs[self._velocity_index])
-        self._outputs, self._state = outputs[: self._count], outputs[self._count :]
-        return self.joint_velocity
+
+    def observe(self, observation: Observation) -> None:
+        """Write all fields of an observation at once."""
+        vector = self._layouts.observation.pack(tensors_of(observation))
+        self._vectors.observation.copy_(vector)
 
     def command(self, field: str) -> np.ndarray:
         """One field of the last command, as in "xi_x" or "safety.flags".
@@ -98,9 +64,107 @@ class StepRunner:
         Raises:
             ValueError: There is no such field.
         """
-        if field not in self._commands:
-            raise ValueError(f"no field {field!r}; there are {', '.join(self._commands)}")
-        return self._outputs[self._commands[field]].numpy()
+        return _named(field, self._command)
+
+    def state(self, field: str) -> np.ndarray:
+        """One field of the state, as in "safety.counts".
+
+        Raises:
+            ValueError: There is no such field.
+        """
+        return _named(field, self._layouts.state.arrays(self._state_vector()))
+
+    @abstractmethod
+    def _state_vector(self) -> torch.Tensor:
+        """The state after the last step."""
+
+
+@final
+class PackageRunner(StepRunner):
+    """A step compiled ahead of time; it allocates nothing.
+
+    Numbers of the observation are NaN and its flags unset until they are written.
+    """
+
+    def __init__(self, package: Path):
+        """Load what `export_step` wrote, in milliseconds.
+
+        Raises:
+            FileNotFoundError: There is no such file.
+            ValueError: It is not a package of ours, or was built for another machine.
+        """
+        loaded = load(package)
+        super().__init__(loaded.layouts)
+        self._run = loaded.run
+        self._arguments = list(self._vectors)
+        self._first_state = loaded.first_state
+        self._vectors.state.copy_(loaded.first_state)
+
+    def start(self, joint_position: Float[np.ndarray, "*batch n"]) -> None:
+        self._vectors.state.copy_(self._first_state)
+        for field in _POSITIONS:
+            self.state(field)[...] = joint_position
+
+    def step(self) -> Float[np.ndarray, "*batch n"]:
+        self._run(self._arguments)
+        return self.joint_velocity
+
+    def _state_vector(self) -> torch.Tensor:
+        return self._vectors.state
+
+
+@final
+class EagerRunner(StepRunner):
+    """The same step uncompiled."""
+
+    def __init__(self, controller: AdaptiveController, observation: Observation):
+        """Take a step as it is; later observations have the fields of this one."""
+        super().__init__(FlatStep(controller, observation).layouts)
+        self._controller, self._said = controller, None
+        self._leaves, self._structure = _pytree.tree_flatten(observation)
+        views = iter(self._layouts.observation.views(self._vectors.observation))
+        self._views = [
+            (k, next(views), x.dtype)
+            for k, x in enumerate(self._leaves)
+            if isinstance(x, torch.Tensor)
+        ]
+        self.observe(observation)
+        self.start(self.observation["joint_position"])
+
+    def start(self, joint_position: Float[np.ndarray, "*batch n"]) -> None:
+        dtype = self._layouts.observation.fields[0].dtype
+        q = torch.tensor(joint_position, dtype=dtype)
+        self._state = self._controller.initial_state(q)
+
+    @torch.inference_mode()
+    def step(self) -> Float[np.ndarray, "*batch n"]:
+        for k, view, dtype in self._views:
+            self._leaves[k] = view.to(dtype)
+        observation = _pytree.tree_unflatten(self._leaves, self._structure)
+        command, state = self._controller.step(self._state, observation)
+        self._said, self._state = command, _pytree.tree_map(self._own, state)
+        self.joint_velocity[...] = command.joint_velocity.numpy()
+        return self.joint_velocity
+
+    def command(self, field: str) -> np.ndarray:
+        if self._said is not None:
+            vector = self._layouts.command.pack(tensors_of(self._said))
+            self._vectors.command.copy_(vector)
+        return super().command(field)
+
+    def _state_vector(self) -> torch.Tensor:
+        return self._layouts.state.pack(tensors_of(self._state))
+
+    def _own(self, x: torch.Tensor) -> torch.Tensor:
+        """A state that shared memory with an observation would change with the next."""
+        shared = self._vectors.observation.untyped_storage().data_ptr()
+        return x.clone() if x.untyped_storage().data_ptr() == shared else x
+
+
+def _named(field: str, arrays: dict[str, np.ndarray]) -> np.ndarray:
+    if field not in arrays:
+        raise ValueError(f"no field {field!r}; there are {', '.join(arrays)}")
+    return arrays[field]
 
 
 def open_step(
@@ -110,22 +174,14 @@ def open_step(
 
     Args:
         controller: Whose step.
-        observation: An example with exactly the fields that later ones will have.
+        observation: The first, with exactly the fields that later ones will have.
         folder: Where packages are kept; default: the user's cache.
     """
     try:
-        return StepRunner.load(export_step(controller, observation, folder))
+        runner = PackageRunner(export_step(controller, observation, folder))
     except NoCompilerError as error:
         warnings.warn(f"control steps run uncompiled and slower: {error}", stacklevel=2)
-        return StepRunner.eager(controller, observation)
-
-
-def open_package(package: Path) -> Callable[[list[Tensor]], list[Tensor]]:
-    """What runs a package: from the inputs of `FlatStep` to its outputs."""
-    try:
-        # Private, but ready in milliseconds; the public loader probes compilers for seconds.
-        loader: Any = torch._C._aoti.AOTIModelPackageLoader  # pyright: ignore
-        return loader(str(package), "model", False, 1, -1).run
-    except (AttributeError, TypeError):
-        model = torch._inductor.aoti_load_package(str(package))
-        return lambda inputs: list(model(*inputs))
+        return EagerRunner(controller, observation)
+    runner.observe(observation)
+    runner.start(runner.observation["joint_position"])
+    return runner
