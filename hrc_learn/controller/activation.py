@@ -34,7 +34,7 @@ class Activation:
     """Whether the feature is being followed."""
     level: Float[Tensor, "*batch"]
     """Share of vision feedback in the command, 0 to 1."""
-    feature: Float[Tensor, "*batch 2"]
+    feature: Float[Tensor, "*batch rows"]
     """Where the feature was last seen [px]: what fades out when it is lost."""
 
 
@@ -51,19 +51,19 @@ class HandOver(nn.Module):
         size = torch.tensor(config.image_size, dtype=torch.float64)
         self.register_buffer("edge", (size - 1) / 2)
 
-    def initial_state(self, like: Float[Tensor, "*batch n"]) -> Activation:
-        """Nothing seen yet, for the batch of `like`."""
+    def initial_state(self, like: Float[Tensor, "*batch n"], points: int = 1) -> Activation:
+        """Nothing seen yet, for the batch of `like` and a feature of so many points."""
         level = torch.zeros_like(like[..., 0])
         return Activation(
             active=torch.zeros_like(level, dtype=torch.bool),
             level=level,
-            feature=self.edge.expand(*level.shape, 2).clone(),
+            feature=self.edge.repeat(points).expand(*level.shape, -1).clone(),
         )
 
     def step(
         self,
         state: Activation,
-        feature: Float[Tensor, "*batch 2"],
+        feature: Float[Tensor, "*batch rows"],
         usable: Bool[Tensor, "*batch"],
         dt: float | Float[Tensor, ""],
         *,
@@ -88,7 +88,9 @@ class HandOver(nn.Module):
             stop = usable & late & state.active
             usable = usable & ~late
         # Distance to the nearest edge of the image; NaN compares as not seen.
-        depth = (self.edge - (feature - self.edge).abs()).amin(-1)
+        points = feature.shape[-1] // 2
+        edge = self.edge if points == 1 else self.edge.repeat(points)
+        depth = (edge - (feature - edge).abs()).amin(-1)
         seen = usable & (depth >= 0)
         active = seen & (state.active | (depth >= self.config.hysteresis))
         level = fade(state.level, active, dt, self.config.blend_time)

@@ -122,7 +122,9 @@ class AdaptiveController(nn.Module):
         J = self.chain.jacobian(joint_position)
         still = torch.zeros_like(J[..., 0])
         return ControllerState(
-            activation=self.hand_over.initial_state(joint_position),
+            activation=self.hand_over.initial_state(
+                joint_position, self.estimator.network.rows // 2
+            ),
             arrival=torch.zeros_like(joint_position[..., 0]),
             hold=Hold(
                 drift=still,

@@ -130,6 +130,11 @@ EXPERIMENTS: Mapping[str, Experiment] = {
         "recursive least squares", RecursiveLeastSquaresEstimator, suite="estimators"
     ),
     "broyden": _grasp("Broyden's update", BroydenEstimator, suite="estimators"),
+    "corners": _grasp(
+        "the four corners of the marker instead of its centre",
+        suite="estimators",
+        feature="corners",
+    ),
     "stress": _stress("random goals, cameras and efforts"),
     "stress_nan": _stress("the same with 1 % of measurements NaN", fault="nan"),
     "stress_late": _stress("the same, images and joint states late by 0.1 s", fault="late"),

@@ -41,7 +41,7 @@ class Goals:
         cls,
         centre: Float[Tensor, "*#batch 3"],
         orientation: Float[Tensor, "*#batch 4"],
-        target: Float[Tensor, "*#batch 2"] | None = None,
+        target: Float[Tensor, "*#batch rows"] | None = None,
         *,
         half_size: Sequence[float] = HALF_SIZE,
         image_size: tuple[int, int] = IMAGE_SIZE,
@@ -51,7 +51,8 @@ class Goals:
         Args:
             centre: Of the box for the tool centre point [m].
             orientation: Of the tool, a unit quaternion.
-            target: Of the feature in the image [px]; None switches the camera off.
+            target: Of the feature in the image [px], u and v of each of its points; None
+                switches the camera off.
             half_size: Of the box [m].
             image_size: Width and height of the image [px].
 
@@ -84,7 +85,7 @@ class Goals:
         """The same goals with another tool orientation."""
         return replace(self, orientation=replace(self.orientation, goal=orientation))
 
-    def aimed_at(self, target: Float[Tensor, "*#batch 2"]) -> Goals:
+    def aimed_at(self, target: Float[Tensor, "*#batch rows"]) -> Goals:
         """The same goals with another target in the image [px]."""
         return replace(self, vision=replace(self.vision, target=target))
 

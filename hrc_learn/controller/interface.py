@@ -22,13 +22,14 @@ class Observation:
 
     joint_position: Float[Tensor, "*batch n"]
     """Measured [rad]."""
-    feature: Float[Tensor, "*batch 2"]
-    """Measured feature (u, v) [px]; anything, also NaN, where it is not visible."""
+    feature: Float[Tensor, "*batch rows"]
+    """Measured feature (u, v) [px], or u and v of several points in turn, as the corners of a
+    marker; anything, also NaN, where it is not visible."""
     feature_visible: Bool[Tensor, "*batch"]
     """Whether the feature was found in the image."""
     dt: float | Float[Tensor, ""]
     """Time until the next step [s]."""
-    target: Float[Tensor, "*#batch 2"] | None = None
+    target: Float[Tensor, "*#batch rows"] | None = None
     """Target in the image [px]; None: that of the goals. NaN: not known, so the camera does
     not take part."""
     human_effort: Float[Tensor, "*batch n"] | None = None
@@ -79,7 +80,7 @@ class Command:
     """Wanted motion of the tool (linear [m/s], angular [rad/s])."""
     null_velocity: Float[Tensor, "*batch n"]
     """Joint velocity in the null space [rad/s]."""
-    xi_x: Float[Tensor, "*batch 2"]
+    xi_x: Float[Tensor, "*batch rows"]
     """Vision feedback, faded by the activation."""
     xi_r: Float[Tensor, "*batch 6"]
     """Cartesian feedback, position then orientation."""
@@ -87,7 +88,7 @@ class Command:
     """Joint-space feedback."""
     s: Float[Tensor, "*batch 6"]
     """J_s_hat^T xi_x + xi_r, which goes to zero where the law is stable."""
-    image_jacobian: Float[Tensor, "*batch 2 6"]
+    image_jacobian: Float[Tensor, "*batch rows 6"]
     """Estimate J_s_hat [px/m, px/rad]."""
     weight_norm: Float[Tensor, "*batch"]
     """Frobenius norm of the estimator's weights."""

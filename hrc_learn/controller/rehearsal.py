@@ -27,12 +27,15 @@ OVERHEAD = (0.0, 0.0, 1.0, 0.0)
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class PinholeCamera:
-    """Fixed camera that sees one marker on the hand."""
+    """Fixed camera that sees a marker on the hand."""
 
     pose: Pose
     """Of the camera in the base frame: it looks along its z axis, x right, y down."""
     marker: Float[Tensor, "*#batch 3"]
     """Marker in the frame of the tool centre point [m]."""
+    corners: Float[Tensor, "points 3"] | None = None
+    """Points of a feature that has several, from the marker in the tool's frame [m]; None: the
+    marker's centre is the feature."""
     focal_length: float = static(1600.0)
     """[px]"""
     image_size: tuple[int, int] = static((1440, 1080))
@@ -73,33 +76,42 @@ class PinholeCamera:
         position = point - height.unsqueeze(-1) * axis
         return cls(pose=Pose(position, orientation), marker=marker, **options)
 
-    def project(self, tool: Pose) -> tuple[Float[Tensor, "*batch 2"], Bool[Tensor, "*batch"]]:
-        """Marker in the image [px], and whether it is inside the image."""
-        ray = self._ray(tool)
+    def project(
+        self, tool: Pose
+    ) -> tuple[Float[Tensor, "*batch rows"], Bool[Tensor, "*batch"]]:
+        """Feature in the image [px], and whether all of it is inside the image."""
+        ray, _ = self._rays(tool)
         pixel = self.focal_length * ray[..., :2] / ray[..., 2:] + self._centre(ray)
         inside = (pixel >= 0) & (pixel <= 2 * self._centre(ray))
-        return pixel, inside.all(-1) & (ray[..., 2] > 0)
+        seen = inside.all(-1) & (ray[..., 2] > 0)
+        return pixel.flatten(-2), seen.all(-1)
 
-    def image_jacobian(self, tool: Pose) -> Float[Tensor, "*batch 2 6"]:
+    def image_jacobian(self, tool: Pose) -> Float[Tensor, "*batch rows 6"]:
         """True J_s: pixel velocity for a twist of the tool [px/m, px/rad]."""
-        ray = self._ray(tool)
+        ray, arm = self._rays(tool)
         x, y, z = ray.unbind(-1)
         zero = torch.zeros_like(z)
         rows = [torch.stack([z, zero, -x], -1), torch.stack([zero, z, -y], -1)]
         over_ray = self.focal_length * torch.stack(rows, -2) / (z * z)[..., None, None]
-        over_point = over_ray @ quaternion.to_matrix(
-            quaternion.conjugate(self.pose.orientation)
-        )
-        # Turning by w moves the marker by w x arm: a row g of d(pixel)/d(point) gives arm x g.
-        arm = quaternion.rotate(tool.orientation, self.marker)
+        rotation = quaternion.to_matrix(quaternion.conjugate(self.pose.orientation))
+        over_point = over_ray @ rotation.unsqueeze(-3)
+        # Turning by w moves a point by w x arm: a row g of d(pixel)/d(point) gives arm x g.
         arm, over_point = torch.broadcast_tensors(arm.unsqueeze(-2), over_point)
         over_turn = torch.linalg.cross(arm, over_point)
-        return torch.cat([over_point, over_turn], dim=-1)
+        return torch.cat([over_point, over_turn], dim=-1).flatten(-3, -2)
 
-    def _ray(self, tool: Pose) -> Tensor:
-        """Marker in the camera frame [m]."""
-        offset = tool.apply(self.marker) - self.pose.position
-        return quaternion.rotate(quaternion.conjugate(self.pose.orientation), offset)
+    def _rays(self, tool: Pose) -> tuple[Tensor, Tensor]:
+        """Points in the camera frame, and their arms on the tool in the base frame [m].
+
+        Both have an axis of points before the last.
+        """
+        points = self.marker.unsqueeze(-2)
+        if self.corners is not None:
+            points = points + self.corners
+        arm = quaternion.rotate(tool.orientation.unsqueeze(-2), points)
+        offset = arm + (tool.position - self.pose.position).unsqueeze(-2)
+        turn = quaternion.conjugate(self.pose.orientation).unsqueeze(-2)
+        return quaternion.rotate(turn, offset), arm
 
     def _centre(self, like: Tensor) -> Tensor:
         return (like.new_tensor(self.image_size) - 1) / 2
@@ -109,7 +121,9 @@ class PinholeCamera:
 class Projects(Protocol):
     """Whatever says where a camera sees the marker on the hand."""
 
-    def project(self, tool: Pose) -> tuple[Float[Tensor, "*batch 2"], Bool[Tensor, "*batch"]]:
+    def project(
+        self, tool: Pose
+    ) -> tuple[Float[Tensor, "*batch rows"], Bool[Tensor, "*batch"]]:
         """Marker in the image [px], and whether it is inside the image."""
         ...
 

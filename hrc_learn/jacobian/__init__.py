@@ -21,3 +21,5 @@ from .learning import LearningConfig as LearningConfig
 from .learning import learn as learn
 from .network import RBFImageJacobian as RBFImageJacobian
 from .neurons import Neurons as Neurons
+from .nominal import nominal_network as nominal_network
+from .stacking import stacked as stacked

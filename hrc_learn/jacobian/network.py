@@ -39,7 +39,7 @@ class RBFImageJacobian(nn.Module):
     """
 
     weight: nn.Parameter
-    """W, (12, K) [px/m and px/rad]."""
+    """W, (12, K) [px/m and px/rad]; 12 rows more for each further point of the feature."""
     centers: Tensor
     """Of the neurons, (K, n), in the units of the chosen components of r."""
     width: Tensor
@@ -55,7 +55,7 @@ class RBFImageJacobian(nn.Module):
         centers: Float[Tensor, "K n"],
         width: float,
         *,
-        weight: Float[Tensor, "12 K"] | None = None,
+        weight: Float[Tensor, "entries K"] | None = None,
         input_indices: Sequence[int] = (0, 1),
         reference: Float[Tensor, "4"] | None = None,
         normalized: bool = True,
@@ -95,7 +95,7 @@ class RBFImageJacobian(nn.Module):
     @classmethod
     def from_jacobian(
         cls,
-        jacobian: Float[Tensor, "2 6"],
+        jacobian: Float[Tensor, "rows 6"],
         centers: Float[Tensor, "K n"],
         width: float,
         *,
@@ -205,7 +205,12 @@ class RBFImageJacobian(nn.Module):
         network.report = report
         return network.to(neurons.centers.dtype)
 
-    def forward(self, r: Pose | Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 2 6"]:
+    @property
+    def rows(self) -> int:
+        """Rows of J_s_hat: u and v of every point of the feature."""
+        return self.weight.shape[0] // 6
+
+    def forward(self, r: Pose | Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch rows 6"]:
         """J_s_hat at a pose.
 
         Args:
@@ -214,7 +219,7 @@ class RBFImageJacobian(nn.Module):
         Returns:
             Rows u and v; columns linear [px/m] then angular [px/rad].
         """
-        return (self.basis(r) @ self.weight.mT).unflatten(-1, (2, 6))
+        return (self.basis(r) @ self.weight.mT).unflatten(-1, (-1, 6))
 
     def basis(self, r: Pose | Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch K"]:
         """Activation theta(r) of the neurons."""

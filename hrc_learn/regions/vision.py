@@ -29,11 +29,14 @@ class VisionRegion(Region):
     with constant strength further out, wherever the feature is seen:
 
     P = 2 k_v s^2 (sqrt(1 + rho^2/s^2) - 1),   rho^2 = f + 1,   s = 1/2
+
+    A feature of several points, such as the corners of a marker, has an ellipse round each of
+    them, and the mean of their potentials.
     """
 
-    target: Float[Tensor, "*#batch 2"]
-    """Desired feature position (u, v) [px]."""
-    half_size: Float[Tensor, "*#batch 2"]
+    target: Float[Tensor, "*#batch rows"]
+    """Desired feature position (u, v) [px], or u and v of several points in turn."""
+    half_size: Float[Tensor, "*#batch rows"]
     """Half axes b_1, b_2 of the ellipse, positive [px]. It should lie inside the image."""
     stiffness: float = static(0.3)
     """k_v."""
@@ -42,7 +45,7 @@ class VisionRegion(Region):
     @classmethod
     def inside_image(
         cls,
-        target: Float[Tensor, "*batch 2"],
+        target: Float[Tensor, "*batch rows"],
         image_size: tuple[int, int],
         border: float = 0.0,
         **options,
@@ -58,7 +61,7 @@ class VisionRegion(Region):
         Raises:
             ValueError: The target is not inside the image by more than the border.
         """
-        far_edge = target.new_tensor(image_size) - 1
+        far_edge = target.new_tensor(image_size).repeat(target.shape[-1] // 2) - 1
         half_size = torch.minimum(target, far_edge - target) - border
         if not bool((half_size > 0).all()):
             raise ValueError(
@@ -68,18 +71,30 @@ class VisionRegion(Region):
             )
         return cls(target=target, half_size=half_size, **options)
 
-    def value(self, x: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*both"]:
-        """F at the feature position x [px]."""
+    def value(self, x: Float[Tensor, "*batch rows"]) -> Float[Tensor, "*both"]:
+        """F at the feature position x [px]; of the point furthest out where it has several."""
         scaled = (x - self.target) / self.half_size
-        return (scaled * scaled).sum(-1) - 1
+        square = scaled * scaled
+        if square.shape[-1] > 2:
+            return square.unflatten(-1, (-1, 2)).sum(-1).amax(-1) - 1
+        return square.sum(-1) - 1
 
-    def feedback(self, x: Float[Tensor, "*batch 2"]) -> tuple[Tensor, Tensor]:
-        """Potential and its gradient over the feature position [1/px]."""
+    def feedback(self, x: Float[Tensor, "*batch rows"]) -> tuple[Tensor, Tensor]:
+        """Potential and its gradient over the feature position [1/px]; means over points."""
         scaled = (x - self.target) / self.half_size
+        if scaled.shape[-1] > 2:
+            P, gradient = self._steer(scaled.unflatten(-1, (-1, 2)))
+            points = P.shape[-1]
+            return P.mean(-1), gradient.flatten(-2) / (points * self.half_size)
+        P, gradient = self._steer(scaled)
+        return P, gradient / self.half_size
+
+    def _steer(self, scaled: Tensor) -> tuple[Tensor, Tensor]:
+        """Potential of a point and its gradient, at its normalised offset."""
         square = (scaled * scaled).sum(-1, keepdim=True)
         steer = self._saturated if self.formulation == "saturated" else self._paper
         P, slope = steer(square)
-        return P.squeeze(-1), slope * scaled / self.half_size
+        return P.squeeze(-1), slope * scaled
 
     def _paper(self, square: Tensor) -> tuple[Tensor, Tensor]:
         f = (square - 1).clamp(max=0)

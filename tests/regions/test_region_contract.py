@@ -101,17 +101,19 @@ def orientation(formulation: str, coordinates: str = "rotation") -> Case:
     )
 
 
-def vision(formulation: str) -> Case:
+def vision(formulation: str, points: int = 1) -> Case:
+    rows = 2 * points
+
     def make(*batch: int, rng: torch.Generator) -> VisionRegion:
-        target = 300 + 400 * rand(*batch, 2, rng=rng)
+        target = 300 + 400 * rand(*batch, rows, rng=rng)
         return VisionRegion.inside_image(target, (1440, 1080), formulation=formulation)
 
     def delicate() -> Tensor:
         region = make(rng=sampling.generator())
         edge = torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, -1.0], [3.0, 3.0]])
-        return region.target + edge * region.half_size
+        return region.target + edge.repeat(1, points) * region.half_size
 
-    return Case(make, lambda *b, rng: 1000 * rand(*b, 2, rng=rng), delicate, 2)
+    return Case(make, lambda *b, rng: 1000 * rand(*b, rows, rng=rng), delicate, rows)
 
 
 def posture() -> Case:
@@ -138,6 +140,8 @@ CASES = {
     "posture": posture(),
     "vision": vision("paper"),
     "vision-saturated": vision("saturated"),
+    "vision-corners": vision("paper", points=4),
+    "vision-corners-saturated": vision("saturated", points=4),
 }
 every_region = pytest.mark.parametrize("case", CASES.values(), ids=CASES.keys())
 exact_regions = pytest.mark.parametrize(

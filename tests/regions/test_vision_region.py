@@ -45,3 +45,16 @@ def test_the_saturated_form_agrees_near_the_target_and_never_lets_go():
     along = torch.tensor([0.1, 0.3, 1.0, 2.0], dtype=torch.float64)
     x = TARGET + along[:, None] * saturated.half_size * torch.tensor([1.0, 0.0])
     assert (saturated.gradient(x)[:, 0].diff() > 0).all()
+
+
+@pytest.mark.parametrize("formulation", ["paper", "saturated"])
+def test_several_points_have_the_mean_of_their_potentials(formulation):
+    targets = torch.tensor([[900.0, 400.0], [500.0, 600.0], [700.0, 300.0]]).double()
+    x = targets + torch.tensor([[30.0, -80.0], [700.0, 10.0], [-5.0, 60.0]])
+    together = VisionRegion.inside_image(targets.flatten(), IMAGE, formulation=formulation)
+    apart = VisionRegion.inside_image(targets, IMAGE, formulation=formulation)
+    P, gradient = apart.feedback(x)
+    torch.testing.assert_close(together.potential(x.flatten()), P.mean())
+    torch.testing.assert_close(together.gradient(x.flatten()), gradient.flatten() / 3)
+    assert together.value(x.flatten()) == apart.value(x).max()
+    assert together.value(x.flatten()) > 0  # the second point is out of its ellipse

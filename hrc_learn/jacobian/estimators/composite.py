@@ -35,7 +35,7 @@ class CompositeConfig(PairConfig):
 class CompositeState:
     """Weights and the frame that the next one is compared with."""
 
-    weight: Float[Tensor, "*batch 12 K"]
+    weight: Float[Tensor, "*batch entries K"]
     """W [px/m, px/rad]."""
     key: KeyFrame
     """Last key frame."""
@@ -59,7 +59,7 @@ class CompositeEstimator(PairEstimator):
     def __init__(self, network: RBFImageJacobian, config: CompositeConfig | None = None):
         self.config = config or CompositeConfig()
         super().__init__(network, self.config)
-        bound = self.config.weight_bound * self.scale.repeat(2).unsqueeze(-1)
+        bound = self.config.weight_bound * self.scale.repeat(network.rows).unsqueeze(-1)
         self.register_buffer("bound", bound, persistent=False)
 
     def initial_state(self, *batch: int) -> CompositeState:

@@ -22,13 +22,14 @@ class Measurement:
 
     pose: Pose
     """Of the tool when the image was taken."""
-    feature: Float[Tensor, "*batch 2"]
-    """Image feature [px]; anything, also NaN, where not `valid`."""
+    feature: Float[Tensor, "*batch rows"]
+    """Image feature [px], u and v of one point or of several in turn; anything, also NaN,
+    where not `valid`."""
     valid: Bool[Tensor, "*batch"]
     """Whether the feature is visible and stems from an image not used before."""
     dt: float | Float[Tensor, ""]
     """Time since the step before [s]."""
-    xi_x: Float[Tensor, "*batch 2"]
+    xi_x: Float[Tensor, "*batch rows"]
     """Vision feedback of the controller."""
     xi_r: Float[Tensor, "*batch 6"]
     """Cartesian feedback of the controller."""
@@ -39,7 +40,7 @@ class Measurement:
 class WeightState:
     """State of an estimator that remembers nothing but the weights."""
 
-    weight: Float[Tensor, "*batch 12 K"]
+    weight: Float[Tensor, "*batch entries K"]
     """W [px/m, px/rad], one matrix for each element of the batch."""
 
 
@@ -68,7 +69,7 @@ class ImageJacobianEstimator(nn.Module, ABC):
 
     def jacobian(
         self, state: Any, r: Pose | Float[Tensor, "*batch 6"]
-    ) -> Float[Tensor, "*batch 2 6"]:
+    ) -> Float[Tensor, "*batch rows 6"]:
         """J_s_hat at a pose with the weights of a state.
 
         Args:
@@ -77,14 +78,14 @@ class ImageJacobianEstimator(nn.Module, ABC):
         """
         return evaluate(state.weight, self.network.basis(r))
 
-    def initial_weight(self, *batch: int) -> Float[Tensor, "*batch 12 K"]:
+    def initial_weight(self, *batch: int) -> Float[Tensor, "*batch entries K"]:
         """The network's weights, once for each element of a batch."""
         weight = self.network.weight.detach()
         return weight.expand(*batch, *weight.shape).clone()
 
 
 def evaluate(
-    weight: Float[Tensor, "*batch 12 K"], theta: Float[Tensor, "*batch K"]
-) -> Float[Tensor, "*batch 2 6"]:
+    weight: Float[Tensor, "*batch entries K"], theta: Float[Tensor, "*batch K"]
+) -> Float[Tensor, "*batch rows 6"]:
     """J_s_hat from vec(J_s_hat^T) = W theta."""
-    return matmul(weight, theta.unsqueeze(-1)).squeeze(-1).unflatten(-1, (2, 6))
+    return matmul(weight, theta.unsqueeze(-1)).squeeze(-1).unflatten(-1, (-1, 6))

@@ -28,7 +28,7 @@ class KeyFrame:
 
     pose: Pose
     """Of the tool."""
-    feature: Float[Tensor, "*batch 2"]
+    feature: Float[Tensor, "*batch rows"]
     """Where the feature was [px]."""
     theta: Float[Tensor, "*batch K"]
     """Neurons at the pose."""
@@ -42,7 +42,7 @@ class KeyFrame:
         upright = like.new_tensor([1.0, 0, 0, 0]).expand(*batch, 4).clone()
         return KeyFrame(
             pose=Pose(like.new_zeros(*batch, 3), upright),
-            feature=like.new_zeros(*batch, 2),
+            feature=like.new_zeros(*batch, network.rows),
             theta=like.new_zeros(*batch, len(like)),
             present=torch.zeros(batch, dtype=torch.bool, device=like.device),
         )
@@ -57,14 +57,14 @@ class Pair:
     """Motion of the tool, linear [m] and angular [rad]."""
     dr: Float[Tensor, "*batch 6"]
     """The same with rotation counted in metres [m]."""
-    dx: Float[Tensor, "*batch 2"]
+    dx: Float[Tensor, "*batch rows"]
     """Motion of the feature [px]."""
     theta: Float[Tensor, "*batch K"]
     """Neurons half-way: the mean of both ends."""
     valid: Bool[Tensor, "*batch"]
     """Whether there is a pair."""
 
-    def error(self, weight: Float[Tensor, "*batch 12 K"]) -> Float[Tensor, "*batch 2"]:
+    def error(self, weight: Float[Tensor, "*batch entries K"]) -> Float[Tensor, "*batch rows"]:
         """Prediction error dx - J_s_hat dr [px]."""
         J = evaluate(weight, self.theta)
         return self.dx - matmul(J, self.twist.unsqueeze(-1)).squeeze(-1)

@@ -43,11 +43,11 @@ class PaperEstimator(ImageJacobianEstimator):
 
 
 def paper_rate(
-    weight: Float[Tensor, "*batch 12 K"],
+    weight: Float[Tensor, "*batch entries K"],
     theta: Float[Tensor, "*batch K"],
     measurement: Measurement,
     gain: float,
-) -> Float[Tensor, "*batch 12 K"]:
+) -> Float[Tensor, "*batch entries K"]:
     """W_dot of the printed law.
 
     xi_x'^T s is the outer product of xi_x and s, row by row: so d(J_s_hat)/dt =

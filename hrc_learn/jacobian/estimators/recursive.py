@@ -38,7 +38,7 @@ class RecursiveConfig(PairConfig):
 class RecursiveState:
     """Mean and covariance of the weights, and the frame to compare with next."""
 
-    weight: Float[Tensor, "*batch 12 K"]
+    weight: Float[Tensor, "*batch entries K"]
     """Mean of W [px/m, px/rad]."""
     covariance: Float[Tensor, "*batch P P"]
     """Of one image row, alike for both, in (component, neuron) order [(px/m)^2]."""
@@ -73,12 +73,12 @@ class RecursiveEstimator(PairEstimator):
 
 
 def condition(
-    weight: Float[Tensor, "*batch 12 K"],
+    weight: Float[Tensor, "*batch entries K"],
     covariance: Float[Tensor, "*batch P P"],
     pair: Pair,
     scale: Float[Tensor, "6"],
     noise: float,
-) -> tuple[Float[Tensor, "*batch 12 K"], Float[Tensor, "*batch P P"]]:
+) -> tuple[Float[Tensor, "*batch entries K"], Float[Tensor, "*batch P P"]]:
     """Mean and covariance given one more pair; unchanged where there is none.
 
     With phi = dr (x) theta and P the covariance, the gain is P phi / (phi' P phi + noise).
