@@ -1,0 +1,182 @@
+"""Exported primitives: NumPy steppers and traced programs against the eager step."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from demo_motions import arm_motion, turning_motion
+from unchecked import shapes_unchecked
+
+from hrc_learn.dmp import JointDMP, OrientationDMP, PoseDMP
+from hrc_learn.dmp.export import export_dmp, load_stepper, resting_inputs, state_tensors
+from hrc_learn.dmp.orientation_stepper import OrientationStepper
+from hrc_learn.dmp.pose_stepper import PoseStepper
+from hrc_learn.geometry import Pose, quaternion
+
+
+def make(kind, **options):
+    time, position = arm_motion(moving_start=True)
+    orientation = turning_motion()[1]
+    if kind == "joint":
+        return JointDMP.fit(time, position, 20, **options)
+    if kind == "orientation":
+        return OrientationDMP.fit(time, orientation, 20, **options)
+    return PoseDMP.fit(time, position[:, :3], orientation, 20, position[:, 3:5], **options)
+
+
+@pytest.fixture(scope="module")
+def exported():
+    """Of joints; tracing takes its time."""
+    with shapes_unchecked():
+        return export_dmp(make("joint"))
+
+
+def random_orientation(rng):
+    q = rng.standard_normal(4)
+    return q / np.linalg.norm(q)
+
+
+@pytest.mark.parametrize("approach", [0.0, 0.7])
+def test_an_orientation_stepper_does_what_the_primitive_does(approach):
+    """Over new goals, slow-downs, steps of all lengths, turns of more than half a circle."""
+    dmp = make("orientation", approach=approach)
+    rng = np.random.default_rng(0)
+    ends = {"start": random_orientation(rng), "goal": random_orientation(rng)}
+    stepper = OrientationStepper(dmp)
+    state, numpy_state = dmp.initial_state(**ends), stepper.initial_state(**ends)
+    for k in range(80):
+        dt = 10 ** rng.uniform(-3, -0.5)
+        change = {"slowdown": 1.0} if k % 3 == 0 else {}
+        change |= {"goal": 1.01 * random_orientation(rng)} if k % 7 == 0 else {}
+        state = dmp.step(state, dt, **change)
+        numpy_state = stepper.step(numpy_state, dt, **change)
+        same(numpy_state.orientation, state.orientation)
+        same(numpy_state.angular_velocity, state.angular_velocity)
+    assert numpy_state.motion.s > 1.0
+
+
+def test_a_pose_stepper_does_what_the_primitive_does():
+    dmp = make("pose")
+    rng = np.random.default_rng(1)
+    stepper = PoseStepper(dmp)
+    ends = {"start_velocity": rng.standard_normal(6), "duration": 2.0}
+    state, numpy_state = dmp.initial_state(**ends), stepper.initial_state(**ends)
+    for k in range(80):
+        dt, change, numpy_change = 10 ** rng.uniform(-4, -1), {}, {}
+        if k % 7 == 0:
+            position, orientation = rng.standard_normal(3), random_orientation(rng)
+            change["goal"] = Pose(torch.tensor(position), torch.tensor(orientation))
+            numpy_change |= {"position": position, "orientation": orientation}
+        if k % 5 == 0:
+            change["goal_body"] = numpy_change["body"] = rng.standard_normal(2)
+        if k % 4 == 0:
+            change["coupling"] = numpy_change["coupling"] = rng.standard_normal(3)
+        state = dmp.step(state, dt, **change, slowdown=0.5)
+        numpy_state = stepper.step(numpy_state, dt, **numpy_change, slowdown=0.5)
+        same(numpy_state.position, state.pose.position)
+        same(numpy_state.orientation, state.pose.orientation)
+        same(numpy_state.body, state.body)
+        same(numpy_state.twist, state.twist)
+
+
+def same(ours, theirs):
+    np.testing.assert_allclose(ours, theirs.detach().numpy(), rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "kind", ["joint", pytest.param("orientation", marks=pytest.mark.slow), "pose"]
+)
+def test_a_program_does_what_the_primitive_does(kind):
+    """In a batch that it was not traced with, over goals, pushes and slow-downs."""
+    dmp, batch, goal_filter = make(kind), 2, 6.0
+    with shapes_unchecked():
+        program = export_dmp(dmp, goal_filter=goal_filter).program.module()
+    rng = np.random.default_rng(2)
+    state = dmp.initial_state(duration=torch.tensor(rng.uniform(1, 3, batch)))
+    tensors = state_tensors(state)
+    for _ in range(12):
+        changes = {
+            name: torch.tensor(rng.uniform(0, 1, value.shape))
+            for name, value in resting_inputs(dmp, tensors).items()
+        }
+        dt = torch.tensor(rng.uniform(0.001, 0.2, batch))
+        tensors = program(tensors, dt, changes)
+        state = dmp.step(state, dt, goal_filter=goal_filter, **changes)
+        expected = state_tensors(state)
+        assert tensors.keys() == expected.keys()
+        for name, value in expected.items():
+            torch.testing.assert_close(tensors[name], value, rtol=1e-12, atol=1e-12, msg=name)
+
+
+def test_resting_inputs_change_nothing(exported):
+    dmp, program = exported.dmp, exported.program.module()
+    state = dmp.initial_state()
+    tensors = state_tensors(state)
+    for dt in (0.1, 0.4):
+        step = torch.tensor([dt], dtype=torch.float64)
+        tensors = program(tensors, step, resting_inputs(dmp, tensors))
+        state = dmp.step(state, dt)
+    torch.testing.assert_close(tensors["position"][0], state.position, rtol=0, atol=1e-12)
+
+
+def test_an_export_is_written_and_read(exported, tmp_path):
+    dmp = exported.dmp
+    with shapes_unchecked():
+        exported.save(tmp_path / "place")
+        exported.save(tmp_path / "place")
+        program = torch.export.load(tmp_path / "place" / "step.pt2").module()
+    assert dmp.weights.requires_grad
+    assert {p.name for p in tmp_path.iterdir()} == {"place"}
+    state = state_tensors(dmp.initial_state())
+    inputs = resting_inputs(dmp, state)
+    dt = torch.tensor([0.1], dtype=torch.float64)
+    stepper = load_stepper(tmp_path / "place")
+    after = stepper.step(stepper.initial_state(), 0.1).position
+    np.testing.assert_allclose(
+        program(state, dt, inputs)["position"][0].detach(), after, atol=1e-12
+    )
+
+
+def test_what_is_no_export_is_left_alone(exported, tmp_path):
+    (tmp_path / "thesis.tex").write_text("precious")
+    with pytest.raises(ValueError, match="holds more than an export"):
+        exported.save(tmp_path)
+    assert (tmp_path / "thesis.tex").read_text() == "precious"
+
+
+def test_what_cannot_be_stepped_is_refused(tmp_path):
+    time, position = arm_motion()
+    with pytest.raises(ValueError, match="takes one primitive, got a batch"):
+        export_dmp(JointDMP.fit(time, torch.stack([position, position])))
+    ude = make("orientation", formulation="ude")
+    with pytest.raises(ValueError, match="takes the formulation 'log', got 'ude'"):
+        OrientationStepper(ude)
+    ude.save(tmp_path / "ude")
+    with pytest.raises(ValueError, match="has no stepper, run the program"):
+        load_stepper(tmp_path / "ude")
+    with pytest.raises(FileNotFoundError, match="no model was saved here"):
+        load_stepper(tmp_path / "nothing")
+    make("joint").save(tmp_path / "joint")
+    config = tmp_path / "joint" / "config.json"
+    config.write_text(json.dumps(json.loads(config.read_text()) | {"kind": "Network"}))
+    with pytest.raises(ValueError, match="steps JointDMP, OrientationDMP, PoseDMP, got"):
+        load_stepper(tmp_path / "joint")
+
+
+def test_the_closed_form_is_the_derivative():
+    """Angular velocity of NumPy against that of tensors, from tiny to many turns."""
+    from hrc_learn.dmp.rotation import arrays, error
+
+    rng = np.random.default_rng(3)
+    for size in (0.0, 1e-9, 1e-4, 0.019, 0.021, 1.0, 3.1, 6.0, 14.0):
+        e = rng.standard_normal(3)
+        e *= size / np.linalg.norm(e)
+        rate = rng.standard_normal(3)
+        expected = error.angular_velocity(torch.tensor(e), torch.tensor(rate)).numpy()
+        np.testing.assert_allclose(arrays.angular_velocity(e, rate), expected, atol=1e-12)
+        q = quaternion.exp(torch.tensor(e)).numpy()
+        np.testing.assert_allclose(arrays.exp(e), q, atol=1e-15)
+        log = quaternion.log(torch.tensor(q)).numpy()
+        np.testing.assert_allclose(arrays.log(q), log, atol=1e-14)
+        np.testing.assert_allclose(arrays.log(-q), log, atol=1e-14)
