@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Unpack
+from typing import Any, Unpack
 
 import torch
 from jaxtyping import Float
@@ -344,6 +344,19 @@ class JointDMP(SavedJoint):
         if time is None:
             return self.stamps
         return normalised_time(time, duration)
+
+    def export(self, *, goal_filter: float | None = None) -> Any:
+        """An `ExportedDMP`: NumPy stepper, and the step as a `torch.export` program.
+
+        Args:
+            goal_filter: Of the program, as in `step`.
+
+        Raises:
+            ValueError: The primitive is a batch.
+        """
+        from hrc_learn.dmp.export import export_dmp  # which needs this module
+
+        return export_dmp(self, goal_filter=goal_filter)
 
     @classmethod
     def load(cls, folder: str | Path) -> "JointDMP":

@@ -1,7 +1,7 @@
 """Movement primitive of an orientation."""
 
 from pathlib import Path
-from typing import Unpack
+from typing import Any, Unpack
 
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -196,6 +196,19 @@ class OrientationDMP(nn.Module):
         tensors = {"goal_orientation": self.goal, **self.motion.tensors()}
         config = self.motion.config() | {"formulation": self.formulation}
         write_model(folder, "OrientationDMP", config, tensors)
+
+    def export(self, *, goal_filter: float | None = None) -> Any:
+        """An `ExportedDMP`: NumPy stepper, and the step as a `torch.export` program.
+
+        Args:
+            goal_filter: Of the program, as in `step`.
+
+        Raises:
+            ValueError: The primitive is a batch.
+        """
+        from hrc_learn.dmp.export import export_dmp  # which needs this module
+
+        return export_dmp(self, goal_filter=goal_filter)
 
     @classmethod
     def load(cls, folder: str | Path) -> "OrientationDMP":

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Unpack
+from typing import Any, Unpack
 
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -242,6 +242,19 @@ class PoseDMP(nn.Module):
         """Write config.json and model.safetensors into `folder`, replacing an older save."""
         tensors = {"goal_orientation": self.goal_orientation, **self.motion.tensors()}
         write_model(folder, "PoseDMP", self.motion.config(), tensors)
+
+    def export(self, *, goal_filter: float | None = None) -> Any:
+        """An `ExportedDMP`: NumPy stepper, and the step as a `torch.export` program.
+
+        Args:
+            goal_filter: Of the program, as in `step`.
+
+        Raises:
+            ValueError: The primitive is a batch.
+        """
+        from hrc_learn.dmp.export import export_dmp  # which needs this module
+
+        return export_dmp(self, goal_filter=goal_filter)
 
     @classmethod
     def load(cls, folder: str | Path) -> "PoseDMP":
