@@ -5,7 +5,7 @@ import torch
 from demo_motions import arm_motion, turning_motion
 from dmp_contract import DMPContract
 
-from hrc_learn.dmp import JointDMP, OrientationDMP, PoseDMP
+from hrc_learn.dmp import JointDMP, OrientationDMP, PoseDMP, SplineBasis
 from hrc_learn.dmp.rotation import ude
 from hrc_learn.geometry import Pose, quaternion
 
@@ -140,6 +140,13 @@ class TestPoseTurningWithItsWay(TestPose):
 class TestJointOnItsApproach(TestJoint):
     def fit(self, *demonstration, **kwargs):
         return JointDMP.fit(*demonstration, approach=0.8, **kwargs)
+
+
+class TestJointOnSplines(TestJoint):
+    reproduction = 2e-5
+
+    def fit(self, *demonstration, n_basis=50, **kwargs):
+        return JointDMP.fit(*demonstration, basis=SplineBasis(count=n_basis), **kwargs)
 
 
 class TestOrientationOnItsApproach(TestOrientation):
