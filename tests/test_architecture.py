@@ -36,10 +36,10 @@ CORE: dict[str, set[str]] = {
 EDGES: dict[str, set[str]] = {
     "cli": set(),
     "output": set(),
-    "demos": {*CORE},
+    "demos": {*CORE, "output"},
     "vision": {*CORE},
-    "human": {*CORE},
     "viz": {*CORE, "vision"},
+    "human": {*CORE, "viz"},
     "sim": {*CORE, "vision", "viz"},
 }
 """Edges likewise: where the package meets files, screens, simulators and people."""
@@ -64,6 +64,7 @@ LAZY_LIBRARIES: dict[str, set[str]] = {
     "cli": {"tyro", "rich"},
     "demos": {"av", "scipy"},
     "vision": {"cv2"},
+    "human": {"viser", "pygame"},
 }
 """Libraries that they may import in the functions that need them, and nowhere else."""
 

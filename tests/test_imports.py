@@ -45,6 +45,15 @@ print(tuple(panda.forward_and_jacobian(torch.zeros(7, dtype=torch.float64))[1].s
     assert run(code) == "(6, 7)"
 
 
+def test_the_person_needs_no_screen_until_a_page_is_opened():
+    code = """
+import sys
+import hrc_learn.human.page, hrc_learn.human.devices
+print([name for name in ("viser", "pygame", "rerun", "mujoco") if name in sys.modules])
+"""
+    assert run(code) == "[]"
+
+
 def test_datasets_is_hugging_faces_even_in_our_checkout():
     """Our folder of that name loses to an installed package while it is none itself."""
     code = "import importlib.util; print(importlib.util.find_spec('datasets').origin)"

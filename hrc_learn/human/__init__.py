@@ -1,7 +1,15 @@
-"""The person beside the arm: scripted experts."""
+"""The person beside the arm: scripted, at the keys, at a gamepad, or in a browser.
 
+The page in a browser is `hrc_learn.human.page`, devices are `hrc_learn.human.devices`; they
+import viser and pygame when they are opened.
+"""
+
+from .both_hands import BothHands as BothHands
 from .coarse_orientation import coarse_orientation as coarse_orientation
 from .coarse_orientation import gripper_down as gripper_down
+from .drag import DragConfig as DragConfig
+from .drag import drag_effort as drag_effort
+from .drag import hand_twist as hand_twist
 from .expert import GuidedPath as GuidedPath
 from .expert import ScriptedExpert as ScriptedExpert
 from .expert import Tremor as Tremor

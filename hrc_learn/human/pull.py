@@ -20,8 +20,9 @@ def pull_effort(
     joint: int,
     pull: Float[np.ndarray, "3"],
     mapping: PullMapping = "transpose",
+    point: Float[np.ndarray, "3"] | None = None,
 ) -> Float[np.ndarray, " joints"]:
-    """Effort d on the joints from a pull at one of them.
+    """Effort d on the joints from a pull at one of them, or at the link that it moves.
 
     With "transpose", d = J_joint^T f: the torques of a force, which never move the joint
     against the pull, not even after the projection into the null space of the task. The
@@ -33,12 +34,17 @@ def pull_effort(
         joint: Which joint is pulled, counted from 1.
         pull: Force [N] or velocity [m/s], in the base frame.
         mapping: How it acts on the joints.
+        point: Where the link is pulled, in the base frame [m]; the joint's origin if None.
 
     Raises:
         ValueError: If the arm has no such joint.
     """
     q = torch.as_tensor(joint_position, dtype=torch.float64)
-    J = chain.joint_jacobian(q, joint)[:3]
+    linear, angular = chain.joint_jacobian(q, joint).split(3)
+    J = linear
+    if point is not None:
+        lever = torch.as_tensor(point) - chain.link_poses(q).position[joint - 1]
+        J = linear + torch.linalg.cross(angular, lever[:, None], dim=0)
     f = torch.as_tensor(pull, dtype=torch.float64)
     if mapping == "transpose":
         return (J.mT @ f).numpy()

@@ -1,0 +1,175 @@
+"""What stands and moves in the page's scene: the arm, its virtual twin, the furniture."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+
+from ...viz import Body, Box
+from ...viz.palette import PERSON, SKY, rgba
+from .shapes import body_mesh
+
+if TYPE_CHECKING:
+    import viser
+
+_KNOBS = (2, 4, 6)
+"""Joints marked by a knob: shoulder, elbow, wrist. Between them the links are held."""
+_HAND_PARTS = ("hand", "finger_left", "finger_right")
+_PERSON = rgba(PERSON)[:3]
+
+
+class Stage:
+    """Draws bodies where they are, once as the arm itself and once as its twin."""
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        bodies: Sequence[Body],
+        boxes: Sequence[Box],
+        twin: tuple[float, float, float],
+    ):
+        """Set the stage.
+
+        Args:
+            server: Of the page.
+            bodies: What moves, with its shapes.
+            boxes: What stands.
+            twin: Where the virtual twin stands, from the arm [m].
+        """
+        self._scene = server.scene
+        self.twin = np.array(twin)
+        self._scene.add_frame("/twin", position=twin, show_axes=False)
+        self._bodies = tuple(bodies)
+        self._own = [self._draw("", body) for body in bodies]
+        # Things that are carried have no twin: what matters is what can be held.
+        self._copies = [
+            self._draw("/twin", body) if _is_part_of_arm(body) else None for body in bodies
+        ]
+        self._knobs = {joint: self._draw_knob("", joint) for joint in _KNOBS}
+        self._twin_knobs = {joint: self._draw_knob("/twin", joint) for joint in _KNOBS}
+        for box in boxes:
+            self._draw_box(box)
+        self._surroundings(server)
+        self._arrows = None
+
+    def handles(self) -> Iterator[tuple[viser.MeshHandle, int | None, np.ndarray]]:
+        """All that can be held: node, joint (None: the hand), and how far off the arm [m]."""
+        here = np.zeros(3)
+        for body, own, copy in zip(self._bodies, self._own, self._copies, strict=True):
+            joint = _joint_of(body)
+            if joint is not None or body.name in _HAND_PARTS:
+                yield own, joint, here
+                if copy is not None:
+                    yield copy, joint, self.twin
+        for joint in _KNOBS:
+            yield self._knobs[joint], joint, here
+            yield self._twin_knobs[joint], joint, self.twin
+
+    def move(
+        self,
+        positions: Float[np.ndarray, "bodies 3"],
+        orientations: Float[np.ndarray, "bodies 4"],
+        joints: Float[np.ndarray, "links 3"],
+    ) -> None:
+        """Put everything where it is.
+
+        Args:
+            positions: Of the bodies [m].
+            orientations: Of the bodies (wxyz).
+            joints: Origins of the arm's frames, for the knobs [m].
+        """
+        nodes = zip(self._own, self._copies, positions, orientations, strict=True)
+        for own, copy, position, orientation in nodes:
+            for node in (own, copy):
+                if node is not None:
+                    node.position, node.wxyz = position, orientation
+        for knobs in (self._knobs, self._twin_knobs):
+            for joint, knob in knobs.items():
+                knob.position = joints[joint - 1]
+
+    def show_twin(self, visible: bool) -> None:
+        """Show or hide the twin."""
+        for node in (*self._copies, *self._twin_knobs.values()):
+            if node is not None:
+                node.visible = visible
+
+    def point(self, arrows: Float[np.ndarray, "arrows 2 3"]) -> None:
+        """Show where from and where to the arm is pulled."""
+        if self._arrows is not None:
+            self._arrows.remove()
+            self._arrows = None
+        if len(arrows):
+            self._arrows = self._scene.add_arrows(
+                "/pull",
+                arrows,
+                _PERSON,
+                shaft_radius=0.008,
+                head_radius=0.022,
+                head_length=0.05,
+            )
+
+    def _draw(self, parent: str, body: Body) -> viser.MeshHandle:
+        mesh = body_mesh(body)
+        colour = tuple(round(255 * c) for c in (*body.capsules, *body.boxes)[0].colour[:3])
+        return self._scene.add_mesh_simple(
+            f"{parent}/arm/{body.name}",
+            mesh.vertices,
+            mesh.faces,
+            color=rgba(SKY)[:3] if parent else colour,
+            opacity=0.45 if parent else None,
+            flat_shading=False,
+            position=body.position[0],
+            wxyz=body.orientation[0],
+            cast_shadow=not parent,
+        )
+
+    def _draw_knob(self, parent: str, joint: int) -> viser.IcosphereHandle:
+        return self._scene.add_icosphere(
+            f"{parent}/knobs/joint{joint}",
+            radius=0.078,
+            color=_PERSON,
+            opacity=0.9,
+            cast_shadow=False,
+        )
+
+    def _draw_box(self, box: Box) -> None:
+        r, g, b, opacity = box.colour
+        self._scene.add_box(
+            f"/furniture/{box.name}",
+            color=(round(255 * r), round(255 * g), round(255 * b)),
+            dimensions=tuple(2 * h for h in box.half_size),
+            position=box.centre,
+            opacity=opacity if opacity < 1 else None,
+        )
+
+    def _surroundings(self, server: viser.ViserServer) -> None:
+        self._scene.world_axes.visible = False
+        # Shadows cost a machine without a GPU half its frames.
+        self._scene.configure_default_lights(cast_shadow=False)
+        self._scene.configure_environment_map("city", environment_intensity=0.5)
+        self._scene.add_grid(
+            "/floor", width=6.0, height=6.0, cell_size=0.25, position=(0.0, 0.5, -0.72)
+        )
+        self._scene.add_box(
+            "/furniture/pedestal",
+            color=(77, 77, 82),
+            dimensions=(0.24, 0.24, 0.72),
+            position=(-0.03, 0.0, -0.36),
+        )
+        server.initial_camera.position = (2.65, 1.05, 1.15)
+        server.initial_camera.look_at = (0.1, 0.47, 0.12)
+        server.initial_camera.fov = 0.9
+
+
+def _joint_of(body: Body) -> int | None:
+    """Joint that moves a link, by its name; None for what is no link that moves."""
+    match = re.fullmatch(r"link([1-9]\d*)", body.name)
+    return int(match[1]) if match else None
+
+
+def _is_part_of_arm(body: Body) -> bool:
+    return body.name.startswith("link") or body.name in _HAND_PARTS

@@ -1,0 +1,128 @@
+"""The page as people meet it: in a browser, with a mouse."""
+
+import numpy as np
+import pytest
+from page_in_browser import PATIENCE, Browser, Session, chromium, wait_until
+
+pytestmark = pytest.mark.browser
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory):
+    with Session(tmp_path_factory.mktemp("page") / "demos") as session:
+        yield session
+
+
+@pytest.fixture(scope="module")
+def browser(session, tmp_path_factory):
+    with chromium(tmp_path_factory.mktemp("chromium")) as tab:
+        yield Browser(tab, session.page)
+
+
+def still(session):
+    return not session.asked.effort.any() and not session.asked.twist.any()
+
+
+def test_a_dragged_elbow_yields_and_the_hand_stays(session, browser):
+    elbow, hand = session.frame(4), session.frame(-1)
+    with browser.dragging(elbow, by=(70, -10)):
+        wait_until(lambda: session.asked.effort.any(), "effort")
+        effort = session.asked.effort
+        wait_until(lambda: np.linalg.norm(session.frame(4) - elbow) > 0.02, "motion")
+    assert np.abs(effort).max() <= 20.0
+    assert not effort[5:].any()  # later joints do not move the forearm
+    wait_until(lambda: still(session), "rest")
+    # A spring never moves the joint against the pull: to the right of the screen is +y.
+    assert (session.frame(4) - elbow)[1] > 0
+    assert np.linalg.norm(session.frame(-1) - hand) < 5e-3
+
+
+def test_a_corner_that_is_dragged_sizes_the_region(session, browser):
+    editor = session.page._panel.region
+    before = editor._region
+    corner = np.array(before.centre) + before.half_size
+    with browser.dragging(corner, by=(40, -30)):
+        wait_until(lambda: editor._region != before, "another size")
+    after = editor._region
+    assert after.centre == before.centre
+    assert after.half_size[2] > before.half_size[2]
+    shown = [slider.value / 2 for slider in editor._sizes]
+    np.testing.assert_allclose(shown, after.half_size, atol=1e-3)
+    assert session.asked.region is None  # it is not in force
+
+
+@pytest.mark.slow
+def test_the_twin_is_held_as_the_arm_is(session, browser):
+    with browser.dragging(session.frame(4) + session.page._config.twin, by=(-50, 0)):
+        wait_until(lambda: session.asked.effort.any(), "effort")
+    wait_until(lambda: still(session), "rest")
+
+
+@pytest.mark.slow
+def test_the_hands_arrow_leads_along_its_axis(session, browser):
+    hand = session.frame(-1)
+    with browser.dragging(hand + np.array([0.0, 0.16, 0.0]), by=(60, 5)):
+        wait_until(lambda: session.asked.twist.any(), "motion")
+        linear = session.asked.twist[:3]
+        wait_until(lambda: session.frame(-1)[1] - hand[1] > 0.02, "the hand moved")
+    assert np.abs(linear[[0, 2]]).max() < 0.2 * linear[1]
+    wait_until(lambda: still(session), "rest")
+
+
+@pytest.mark.slow
+def test_a_region_in_force_draws_the_hand_in(session, browser):
+    browser.tab.get_by_label("In force").check()
+    wait_until(lambda: session.asked.region is not None, "a region")
+    region = session.asked.region
+
+    def inside():
+        offset = np.abs(session.frame(-1) - region.centre)
+        return (offset < np.array(region.half_size) + 0.01).all()
+
+    wait_until(inside, "the hand inside", timeout=300)
+    browser.tab.get_by_label("In force").uncheck()
+    wait_until(lambda: session.asked.region is None, "no region")
+
+
+@pytest.mark.slow
+def test_a_click_marks_the_target_on_the_table(session, browser):
+    browser.button("Mark the target").click()
+    point = np.array([0.45, 0.75, 0.0])
+    browser.tab.mouse.click(*browser.pixel(point))
+    wait_until(lambda: session.asked.target is not None, "a target")
+    np.testing.assert_allclose(session.asked.target[:2], point[:2], atol=0.01)
+    browser.button("Clear the target").click()
+    wait_until(lambda: session.asked.target is None, "no target")
+
+
+@pytest.mark.slow
+def test_a_rectangle_on_the_table_becomes_the_region(session, browser):
+    editor = session.page._panel.region
+    before = editor._region
+    browser.button("Draw on the table").click()
+    with browser.dragging([0.2, 0.6, 0.0], by=(60, 40)):
+        pass
+    wait_until(lambda: editor._region != before, "a region")
+    x, y, _ = editor._region.centre
+    assert -0.2 < x < 0.7
+    assert 0.5 < y < 1.0
+
+
+@pytest.mark.slow
+def test_a_browser_that_hangs_lets_go(session, browser):
+    with browser.dragging(session.frame(4), by=(60, 0)):
+        wait_until(lambda: session.asked.effort.any(), "effort")
+        hang = "setTimeout(() => { const t = Date.now(); while (Date.now() - t < 40000); }, 0)"
+        browser.tab.evaluate(hang)
+        wait_until(lambda: still(session), "a hand that is gone lets go", timeout=38)
+
+
+@pytest.mark.slow
+def test_a_browser_that_is_closed_lets_go(session, tmp_path):
+    with chromium(tmp_path) as tab:
+        browser = Browser(tab, session.page)
+        tab.mouse.move(*browser.pixel(session.frame(4)))
+        tab.mouse.down()
+        tab.mouse.move(*browser.pixel(session.frame(4) + np.array([0.0, 0.2, 0.0])))
+        wait_until(lambda: session.asked.effort.any(), "effort")
+    wait_until(lambda: still(session), "a hand that is gone lets go", timeout=PATIENCE)
