@@ -1,0 +1,58 @@
+"""The paced loop as a user runs it."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PROGRAM = Path(__file__).parents[2] / "control" / "serve_controller.py"
+
+
+def serve(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, PROGRAM, *arguments],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )
+
+
+def check(figures: dict[str, float], steps: int) -> None:
+    assert figures["steps"] == steps
+    for kind in ("step", "wake_up"):
+        values = [figures[f"{kind}_p{p}_us"] for p in ("50", "90", "99", "99.9", "100")]
+        assert values[0] > 0
+        assert values == sorted(values)
+    # The arm starts outside its box: it has to speed up, and nothing else may happen to it.
+    assert figures["safety_acceleration"] > 0
+    assert figures["safety_invalid"] == figures["safety_stopped"] == 0
+
+
+def test_it_reports_latencies_and_interventions(tmp_path):
+    done = serve(
+        "--step", "eager", "--rate", "100", "--duration", "1", "--json", tmp_path / "j"
+    )
+    assert done.returncode == 0, done.stderr
+    check(json.loads((tmp_path / "j").read_text()), steps=100)
+    assert "step_p99_us" in done.stdout
+
+
+def test_a_rate_of_nothing_is_bad_input():
+    done = serve("--rate", "0")
+    assert done.returncode == 2
+    assert "duration and rate must be positive" in done.stderr
+
+
+@pytest.mark.slow
+def test_it_runs_a_package_and_starts_again_in_no_time(tmp_path):
+    arguments = ("--packages", tmp_path, "--rate", "500", "--duration", "8", "--json")
+    for attempt in ("first", "second"):
+        done = serve(*arguments, tmp_path / attempt)
+        assert done.returncode == 0, done.stderr
+    figures = json.loads((tmp_path / "second").read_text())
+    check(figures, steps=4000)
+    assert figures["open_s"] < 2  # a compilation takes a minute
+    assert figures["pixel_error"] < 5
