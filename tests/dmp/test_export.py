@@ -45,8 +45,8 @@ def test_an_orientation_stepper_does_what_the_primitive_does(approach):
     ends = {"start": random_orientation(rng), "goal": random_orientation(rng)}
     stepper = OrientationStepper(dmp)
     state, numpy_state = dmp.initial_state(**ends), stepper.initial_state(**ends)
-    for k in range(80):
-        dt = 10 ** rng.uniform(-3, -0.5)
+    for k in range(30):
+        dt = 10 ** rng.uniform(-2, -0.3)
         change = {"slowdown": 1.0} if k % 3 == 0 else {}
         change |= {"goal": 1.01 * random_orientation(rng)} if k % 7 == 0 else {}
         state = dmp.step(state, dt, **change)
@@ -62,8 +62,8 @@ def test_a_pose_stepper_does_what_the_primitive_does():
     stepper = PoseStepper(dmp)
     ends = {"start_velocity": rng.standard_normal(6), "duration": 2.0}
     state, numpy_state = dmp.initial_state(**ends), stepper.initial_state(**ends)
-    for k in range(80):
-        dt, change, numpy_change = 10 ** rng.uniform(-4, -1), {}, {}
+    for k in range(30):
+        dt, change, numpy_change = 10 ** rng.uniform(-3, -0.5), {}, {}
         if k % 7 == 0:
             position, orientation = rng.standard_normal(3), random_orientation(rng)
             change["goal"] = Pose(torch.tensor(position), torch.tensor(orientation))
