@@ -8,7 +8,7 @@ and the measured values. Exit status 1 if the job failed or a target was missed.
 import json
 import shlex
 import sys
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 from rich.console import Console
@@ -22,6 +22,7 @@ from hrc_learn.tasks.collaboration import CollaborationConfig
 from hrc_learn.tasks.collaboration_report import write_collaboration_report
 from hrc_learn.tasks.evaluation import evaluate
 from hrc_learn.tasks.fit_aiming import AimingSkill
+from hrc_learn.tasks.gains import with_gains
 from hrc_learn.tasks.placing import PlacingSkill
 from hrc_learn.tasks.recording import record
 from hrc_learn.tasks.simulated_job import PULLS, simulate_collaboration
@@ -54,6 +55,8 @@ class Args:
     """Whether the scripted person pulls the elbow."""
     config: CollaborationConfig = field(default_factory=CollaborationConfig)
     """How the job is done."""
+    gains: Path | None = None
+    """gains.json of training/tune_controller.py, in place of those of the controller."""
     seed: int = 0
     """Seed of where the object lies and of image noise."""
     overwrite: bool = False
@@ -67,6 +70,7 @@ def main(args: Args) -> int:
     aiming, placing = AimingSkill.load(args.aiming), PlacingSkill.load(args.placing)
     fit = json.loads((args.placing / "metrics.json").read_text())
     demonstration = _demonstration(args.placing)
+    controller = with_gains(args.config.controller, args.gains)
     with new_folder(args.out, asdict(args), args.overwrite) as folder:
         console.print(f"Placing on the {args.shelf} shelf:")
         job = simulate_collaboration(
@@ -76,7 +80,7 @@ def main(args: Args) -> int:
             workplace=Workplace(shelf_x=args.shelf_x, shelf_depth=args.shelf_depth),
             camera=args.camera,
             pulls=PULLS if args.person else (),
-            config=args.config,
+            config=replace(args.config, controller=controller),
             seed=args.seed,
             on_phase=lambda phase, time: console.print(f"  {time:6.2f} s  {phase}"),
         )

@@ -51,11 +51,16 @@ def write_json(path: str | Path, values: Mapping[str, SupportsFloat]) -> None:
         path: File to write; its folder is made where missing.
         values: Name -> number. Numbers that are not finite become null, as JSON has none.
     """
+    content = {name: _number(value) for name, value in values.items()}
+    write_text(path, json.dumps(content, indent=2) + "\n")
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Write a file that is whole or not there at all; its folder is made where missing."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    content = {name: _number(value) for name, value in values.items()}
     unfinished = path.with_name(f".{path.name}.{os.getpid()}")
-    unfinished.write_text(json.dumps(content, indent=2) + "\n")
+    unfinished.write_text(text)
     unfinished.replace(path)
 
 

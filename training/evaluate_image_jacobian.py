@@ -18,9 +18,10 @@ from rich.console import Console
 from hrc_learn import cli
 from hrc_learn.demos import load_demos
 from hrc_learn.sim import World
+from hrc_learn.tasks.closed_loops import ClosedLoops, StartsConfig
 from hrc_learn.tasks.fit_aiming import AimingSkill
 from hrc_learn.tasks.true_jacobian import compare_with_truth, held_out_grid
-from hrc_learn.tasks.warm_start import WarmStartConfig, compare_starts
+from hrc_learn.tasks.warm_start import compare_starts
 from hrc_learn.tasks.workplace import Workplace
 
 MOST_ERROR = 0.05
@@ -39,7 +40,7 @@ class Args:
     """Of the hand, in the second of two grids [rad]; the first has it pointing down."""
     closed_loop: bool = True
     """Whether to run the closed loops, which take a minute or more."""
-    starts: WarmStartConfig = field(default_factory=WarmStartConfig)
+    starts: StartsConfig = field(default_factory=StartsConfig)
     """How starts are drawn."""
     json: Path | None = None
     """File for the measured values."""
@@ -62,15 +63,13 @@ def main(args: Args) -> int:
         figures |= {f"{name}_{key}": value for key, value in measured.items()}
     if args.closed_loop:
         workspace = torch.stack([shown.quantile(0.05, dim=0), shown.quantile(0.95, dim=0)])
+        near = workplace.hover_joints()
         with Console().status("Closed loops") as status:
+            loops = ClosedLoops.draw(camera, offset, workspace, near, args.starts)
             figures |= compare_starts(
                 network,
-                camera,
-                offset,
-                workspace,
-                workplace.hover_joints(),
-                args.starts,
-                lambda name: status.update(f"Closed loops from the {name} Jacobian"),
+                loops,
+                on_run=lambda name: status.update(f"Closed loops, {name} Jacobian"),
             )
     cli.show_values(f"Image Jacobian {args.model}", figures)
     if args.json is not None:

@@ -1,6 +1,6 @@
 """Figures of what training measured."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import matplotlib
 import numpy as np
@@ -73,4 +73,36 @@ def learning_figure(held_out: Sequence[float], best: int, unit: str) -> Figure:
             title="Error on demonstrations held out",
         )
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    return figure
+
+
+def measures_figure(
+    measures: Mapping[str, Float[np.ndarray, " demos"]],
+    episodes: Sequence[int],
+    units: Mapping[str, str],
+) -> Figure:
+    """Each measure over the demonstrations, with its median.
+
+    Args:
+        measures: Values by name.
+        episodes: Number of each demonstration.
+        units: Of the measures.
+    """
+    rows = -(-len(measures) // 2)
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(WIDTH, 1.9 * rows))
+        grid = figure.subplots(rows, 2, sharex=True, squeeze=False).ravel()
+        places = np.arange(len(episodes))
+        for axes, (name, values) in zip(grid, measures.items(), strict=False):
+            axes.bar(places, values, color=palette.RUN)
+            axes.axhline(float(np.median(values)), color=palette.LIMIT, lw=1.0)
+            unit = units.get(name, "")
+            axes.set_title(name.replace("_", " ") + (f" [{unit}]" if unit else ""))
+        for axes in grid[len(measures) :]:
+            axes.set_axis_off()
+        for axes in grid[max(len(measures) - 2, 0) : len(measures)]:
+            axes.tick_params(labelbottom=True)
+            if len(episodes) <= 20:
+                axes.set_xticks(places, [str(episode) for episode in episodes])
+        figure.supxlabel("episode (line: median)", fontsize=9)
     return figure

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from hrc_learn.dmp import JointDMP, PoseDMP
+from hrc_learn.dmp import JointDMP, OrientationDMP, PoseDMP
 from hrc_learn.dmp.fitting.mean import mean_primitive
 from hrc_learn.geometry import quaternion
 
@@ -49,3 +49,18 @@ def test_the_sign_of_a_quaternion_does_not_matter(sign):
         orientation[0, -1], orientation[1, -1], torch.tensor(0.5).double()
     )
     assert float(quaternion.angle(a.goal.orientation, middle)) < 1e-9
+
+
+def test_the_mean_of_orientations_is_that_of_their_poses():
+    """A pose that stands still and turns has the mean of its turns."""
+    time = torch.linspace(0, 1, 60, dtype=torch.float64)
+    reach = torch.tensor([0.8, 1.0, 1.3], dtype=torch.float64)[:, None, None]
+    axis = torch.tensor([0.2, -0.5, 1.0], dtype=torch.float64)
+    turn = quaternion.exp(reach * (time**2)[:, None] * axis)
+    mean = mean_primitive(OrientationDMP.fit(time, turn, 15))
+    still = torch.zeros(3, 60, 3, dtype=torch.float64)
+    pose = mean_primitive(PoseDMP.fit(time, still, turn, 15))
+    torch.testing.assert_close(
+        mean.rollout(time).orientation, pose.rollout(time).orientation, rtol=0, atol=1e-12
+    )
+    assert mean.goal.shape == (4,)

@@ -74,8 +74,8 @@ def test_without_the_body_shape_the_arm_hits_the_open_door():
 def test_each_primitive_repeats_its_demonstration_and_their_mean_comes_close(fitted):
     metrics = fitted.metrics()
     assert metrics["joint_nrmse_max"] < 1e-3
-    assert metrics["position_nrmse_max"] < 1e-3
-    assert metrics["orientation_rmse_deg"] < 0.05
+    assert metrics["pose_nrmse_max"] < 1e-3
+    assert metrics["pose_turn_rmse_max"] < 0.05
     assert metrics["mean_joint_nrmse_max"] < 1e-2
 
 

@@ -1,12 +1,17 @@
 """One primitive from several: the mean of what a person showed more than once."""
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from hrc_learn.dmp.joint import JointDMP
+from hrc_learn.dmp.orientation import OrientationDMP
 from hrc_learn.dmp.pose import PoseDMP
 
 
-def mean_primitive[Primitive: (JointDMP, PoseDMP)](primitives: Primitive) -> Primitive:
+def mean_primitive[Primitive: (JointDMP, OrientationDMP, PoseDMP)](
+    primitives: Primitive,
+) -> Primitive:
     """The mean over all batch dimensions of a primitive.
 
     A rollout is linear in weights, start, goal and start velocity. So for one duration, and
@@ -23,11 +28,17 @@ def mean_primitive[Primitive: (JointDMP, PoseDMP)](primitives: Primitive) -> Pri
     """
     if isinstance(primitives, JointDMP):
         return _mean_of_joints(primitives)
-    goals = primitives.goal_orientation.reshape(-1, 4)
+    motion = _mean_of_joints(primitives.motion)
+    if isinstance(primitives, OrientationDMP):
+        return OrientationDMP(motion, _mean_goal(primitives.goal), primitives.formulation)
+    return PoseDMP(motion, _mean_goal(primitives.goal_orientation))
+
+
+def _mean_goal(goals: Float[Tensor, "*batch 4"]) -> Float[Tensor, "4"]:
+    goals = goals.reshape(-1, 4)
     # Both signs are the same orientation: bring all to the side of the first.
     goals = goals * torch.where((goals @ goals[0])[:, None] < 0, -1.0, 1.0).to(goals)
-    goal = torch.nn.functional.normalize(goals.mean(dim=0), dim=-1)
-    return PoseDMP(_mean_of_joints(primitives.motion), goal)
+    return torch.nn.functional.normalize(goals.mean(dim=0), dim=-1)
 
 
 def _mean_of_joints(primitives: JointDMP) -> JointDMP:
