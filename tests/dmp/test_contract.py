@@ -143,7 +143,9 @@ class TestJointOnItsApproach(TestJoint):
 
 
 class TestJointOnSplines(TestJoint):
-    reproduction = 2e-5
+    """Their forcing fades over the last two spacings, and this motion ends in full swing."""
+
+    reproduction = 4e-4
 
     def fit(self, *demonstration, n_basis=50, **kwargs):
         return JointDMP.fit(*demonstration, basis=SplineBasis(count=n_basis), **kwargs)
