@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from .choosing import EpisodeFilter, OpenDataset, choose_episodes, locate
+from .counts import count_faults
 from .explicit_mapping import MappingSpec
 from .finding import DatasetError
 from .frames import RawFrames, read_frames
@@ -108,6 +109,8 @@ def open_reader(
     """
     root, episodes = locate(dataset, episodes)
     folder = open_folder(root)
+    for fault in count_faults(folder):
+        raise fault
     sidecar = read_sidecar(folder.root)
     return EpisodeReader(
         folder=folder,

@@ -53,6 +53,13 @@ def sidecar_content(
     }
 
 
+def sidecar_copy(sidecar: Sidecar, units: Mapping[str, str]) -> dict:
+    """What the file of a copy says, in these units; {} where there is nothing to be said."""
+    if not units and sidecar == Sidecar():
+        return {}
+    return {"format": _FORMAT, **vars(sidecar), "units": dict(units)}
+
+
 def read_sidecar(root: Path) -> Sidecar:
     """The dataset's sidecar, an empty one where there is none.
 

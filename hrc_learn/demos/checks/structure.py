@@ -1,12 +1,12 @@
 """Faults of the metadata and the files: what is missing, and what contradicts what."""
 
-from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
-from ..features import INFO_PATH, Feature, read_features
+from ..counts import count_faults
+from ..features import Feature, read_features
 from ..finding import DatasetError
 from ..frames import RawFrames, require_rows, slice_frames
 from ..layout import DatasetFolder, EpisodeEntry, read_episodes, read_info, read_tasks
@@ -38,7 +38,8 @@ def check_metadata(root: Path, report: Report) -> DatasetFolder | None:
         tasks=tasks,
         info=info,
     )
-    _check_counts(folder, report)
+    for fault in count_faults(folder):
+        report.add(fault)
     _check_statistics(folder, report)
     _check_videos(folder, report)
     return folder
@@ -104,34 +105,6 @@ def _attempt[T](report: Report, read: Callable[[], T]) -> T | None:
     except DatasetError as error:
         report.add(error)
         return None
-
-
-def _check_counts(folder: DatasetFolder, report: Report) -> None:
-    entries, info = folder.episodes, folder.info
-    if not entries:
-        report.error("the dataset holds no episodes")
-    for name, counted in (
-        ("total_episodes", len(entries)),
-        ("total_frames", sum(entry.length for entry in entries)),
-    ):
-        if info.get(name, counted) != counted:
-            report.error(
-                f"says {info[name]}, but the list of episodes counts {counted}",
-                file=INFO_PATH,
-                key=name,
-            )
-    repeated = [index for index, n in Counter(e.index for e in entries).items() if n > 1]
-    for index in repeated:
-        report.error("is listed more than once", episode=index)
-    missing = sorted(set(range(len(entries))) - {entry.index for entry in entries})
-    if missing and not repeated:
-        report.error(
-            "is missing from the list of episodes: indices must count from 0 without a gap",
-            episode=missing[0],
-        )
-    for entry in entries:
-        if entry.length <= 0:
-            report.error("has no frames", file=entry.file, episode=entry.index)
 
 
 def _sound_columns(

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from jaxtyping import Bool
 
 from ..features import Feature
 from ..frames import RawFrames
@@ -35,11 +36,9 @@ def check_finite(
 
 def check_repeats(entry: EpisodeEntry, frames: RawFrames, report: Report) -> None:
     """Frames that are copies of the one before: the robot was read too seldom, or stood."""
-    state = [v for key, v in frames.items() if key.startswith("observation.")]
-    state = [v for v in state if not _is_clock(v)]
-    if not state or entry.length < 3:
+    if entry.length < 3:
         return
-    same = np.logical_and.reduce([(v[1:] == v[:-1]).all(1) for v in state])
+    same = repeated_frames(frames)[1:]
     if same.all():
         report.warning(
             "the state never changes: the recorder lost the robot",
@@ -56,6 +55,17 @@ def check_repeats(entry: EpisodeEntry, frames: RawFrames, report: Report) -> Non
             episode=entry.index,
             frame=int(same.argmax()) + 1,
         )
+
+
+def repeated_frames(frames: RawFrames) -> Bool[np.ndarray, " frames"]:
+    """Frames whose observations are all those of the frame before, clocks left aside."""
+    length = len(next(iter(frames.values())))
+    state = [v for key, v in frames.items() if key.startswith("observation.")]
+    state = [v for v in state if not _is_clock(v)]
+    if not state or length < 2:
+        return np.zeros(length, dtype=bool)
+    same = np.logical_and.reduce([(v[1:] == v[:-1]).all(1) for v in state])
+    return np.concatenate([[False], same])
 
 
 def check_columns(

@@ -4,7 +4,7 @@ from dataclasses import replace
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Bool, Float, Float64, Int64
 
 from ..demonstration import Demonstration
 
@@ -153,10 +153,16 @@ def _extra(
 ) -> Float64[np.ndarray, "times components"]:
     moved = linear(known, values, time)
     whole = (values == np.rint(values)).all(0)
-    index = _interval(known, time)
-    nearest = index + (time - known[index] > known[index + 1] - time)
-    moved[:, whole] = values[nearest][:, whole]
+    moved[:, whole] = values[nearest_frames(known, time)][:, whole]
     return moved
+
+
+def nearest_frames(
+    known: Float64[np.ndarray, " frames"], time: Float64[np.ndarray, " times"]
+) -> Int64[np.ndarray, " times"]:
+    """Index of the frame nearest to each time."""
+    index = _interval(known, time)
+    return index + (time - known[index] > known[index + 1] - time)
 
 
 def _interval(known: np.ndarray, time: np.ndarray) -> np.ndarray:

@@ -1,0 +1,274 @@
+"""What a repair changes, and that its result is a sound dataset."""
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from lerobot_folders import FPS, joint_path, read_info, write_folder
+from scipy.spatial.transform import Rotation
+
+from hrc_learn.demos import DatasetError, DatasetWriter, check_dataset, load_demos
+from hrc_learn.demos.repair import RepairOptions, repair_dataset
+
+STATE = "observation.state"
+NAMES = ["a.pos", "b.pos", "c.pos"]
+VERSIONS = ["v3.0", "v2.1", "v2.0"]
+QUIET = RepairOptions(trim=False, drop_repeats=False, unwrap=False, fix_signs=False)
+
+
+def write(root, motions, names=NAMES, **options):
+    options = {"dtype": "float64", **options}
+    return write_folder(root, [{STATE: q} for q in motions], {STATE: names}, **options)
+
+
+def repaired(tmp_path, motions, options, names=NAMES, **how):
+    """Written, repaired, and found sound; what was said and what is there now."""
+    root = write(tmp_path / "old", motions, names, **how)
+    before = {p: p.read_bytes() for p in sorted(root.glob("**/*")) if p.is_file()}
+    report = repair_dataset(root, tmp_path / "new", options)
+    assert {p: p.read_bytes() for p in sorted(root.glob("**/*")) if p.is_file()} == before
+    assert check_dataset(tmp_path / "new").ok, str(check_dataset(tmp_path / "new"))
+    return report, load_demos(tmp_path / "new")
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+@pytest.mark.parametrize("without", [(), ("frame_index", "index", "task_index")])
+def test_what_is_sound_stays_as_it_is_in_every_version(tmp_path, version, without):
+    motions = [joint_path(60, seed=0), joint_path(45, seed=1)]
+    how = {"version": version, "without": without, "tasks": ("reach", "place")}
+    report, demos = repaired(tmp_path, motions, RepairOptions(trim=False), **how)
+    assert report.changed == 0
+    assert "episode 1: as it was" in str(report)
+    assert read_info(tmp_path / "new")["codebase_version"] == "v3.0"
+    assert [demo.task for demo in demos] == ["reach", "place"]
+    for demo, q in zip(demos, motions, strict=True):
+        np.testing.assert_array_equal(demo.joint_position, q)
+        np.testing.assert_allclose(demo.time, np.arange(len(q)) / FPS, atol=1e-6)
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_standing_still_is_trimmed(tmp_path, version):
+    q = joint_path(100, seed=2)
+    waiting = np.concatenate([np.repeat(q[:1], 70, 0), q, np.repeat(q[-1:], 90, 0)])
+    options = RepairOptions(drop_repeats=False, keep_rest=0.2)
+    report, (demo,) = repaired(tmp_path, [waiting], options, version=version)
+    assert report.changes[0][0].startswith("trimmed 1.")
+    assert 100 <= len(demo) <= 130
+    assert report.frames_before == 260
+    # Cut out in one piece, stamps and all.
+    start = round(demo.start_time * FPS)
+    np.testing.assert_array_equal(demo.joint_position, waiting[start : start + len(demo)])
+
+
+def test_repeated_frames_go_and_the_stamps_of_the_others_stay(tmp_path):
+    q = joint_path(60)
+    stalled = np.repeat(q[::2], 2, axis=0)
+    report, (demo,) = repaired(tmp_path, [stalled], RepairOptions(trim=False))
+    assert report.changes == {0: ("dropped 30 repeated frames",)}
+    np.testing.assert_array_equal(demo.joint_position, q[::2])
+    np.testing.assert_allclose(demo.time, 2 * np.arange(30) / FPS, atol=1e-6)
+
+
+def test_resampling_gives_a_regular_grid_at_any_rate(tmp_path):
+    stamps = np.cumsum(np.random.default_rng(0).uniform(0.012, 0.028, 150))
+    wave = np.stack([np.sin(stamps), np.cos(stamps), stamps], axis=1)
+    episode = {
+        STATE: wave,
+        "observation.time": stamps[:, None],
+        "observation.flag": stamps[:, None] > 1,
+    }
+    root = write_folder(tmp_path / "old", [episode], {STATE: NAMES}, dtype="float64")
+    report = repair_dataset(root, tmp_path / "new", RepairOptions(trim=False, fps=100))
+    assert report.changes[0][0].startswith("resampled 150 frames to ")
+    assert read_info(tmp_path / "new")["fps"] == 100
+    (demo,) = load_demos(tmp_path / "new")
+    np.testing.assert_allclose(np.diff(demo.time), 0.01, atol=1e-6)
+    t = demo.time + stamps[0]
+    expected = np.stack([np.sin(t), np.cos(t), t], axis=1)
+    np.testing.assert_allclose(demo.joint_position[3:-3], expected[3:-3], atol=1e-6)
+    assert set(np.unique(demo.extra["observation.flag"])) == {0.0, 1.0}
+
+
+@pytest.mark.parametrize(
+    ("turn", "unit"), [(2 * np.pi, "rad"), (360.0, "deg"), (4096.0, "tick")]
+)
+def test_encoders_that_wrapped_are_unwrapped_in_their_own_unit(tmp_path, turn, unit):
+    q = turn / (2 * np.pi) * (joint_path(60) + 1)
+    q[30:, 1] += turn
+    q[45:, 1] -= turn
+    q[20:, 2] += 0.3 * turn  # a jump that is no turn
+    root = write(tmp_path / "old", [q])
+    options = RepairOptions(trim=False)
+    report = repair_dataset(root, tmp_path / "new", options, units={"joint_position": unit})
+    assert report.changes == {0: ("unwrapped joint_position (b)",)}
+    (demo,) = load_demos(tmp_path / "new")  # the unit is remembered
+    smooth = q.copy()
+    smooth[30:45, 1] -= turn
+    np.testing.assert_allclose(demo.joint_position, 2 * np.pi / turn * smooth, rtol=1e-12)
+
+
+@pytest.mark.parametrize("names", [["qw", "qx", "qy", "qz"], ["qx", "qy", "qz", "qw"]])
+@pytest.mark.parametrize("fps", [None, 80])
+def test_signs_of_quaternions_are_fixed_on_disk(tmp_path, names, fps):
+    turn = Rotation.from_rotvec(np.linspace(0, 2, 60)[:, None] * np.array([0.6, 0, 0.8]))
+    q = turn.as_quat(scalar_first=names[0] == "qw")
+    q[17:40] *= -1
+    pose = np.hstack([joint_path(60), q])
+    options = RepairOptions(trim=False, fps=fps)
+    report, (demo,) = repaired(tmp_path, [pose], options, ["x", "y", "z", *names])
+    assert report.changes[0][0].startswith("fixed 2 jumps of the sign of quaternion")
+    table = pq.read_table(tmp_path / "new/data/chunk-000/file-000.parquet")
+    raw = np.array(table.column(STATE).to_pylist())[:, 3:]
+    assert (np.sum(raw[1:] * raw[:-1], axis=1) > 0).all()
+    expected = Rotation.from_rotvec(demo.time[:, None] * FPS / 59 * 2 * np.array([0.6, 0, 0.8]))
+    found = Rotation.from_quat(demo.orientation, scalar_first=True)
+    assert (found.inv() * expected).magnitude().max() < 1e-5
+
+
+def test_rotation_vectors_are_unwrapped(tmp_path):
+    turn = Rotation.from_rotvec(np.linspace(2, 5, 60)[:, None] * np.array([0, 0, 1]))
+    pose = np.hstack([joint_path(60), turn.as_rotvec()])
+    names = ["x", "y", "z", "wx", "wy", "wz"]
+    report, _ = repaired(tmp_path, [pose], RepairOptions(trim=False), names)
+    assert report.changes == {0: ("unwrapped rotation_vector (2)",)}
+    table = pq.read_table(tmp_path / "new/data/chunk-000/file-000.parquet")
+    raw = np.array(table.column(STATE).to_pylist())[:, 5]
+    np.testing.assert_allclose(raw, np.linspace(2, 5, 60), atol=1e-9)
+
+
+def test_bad_frames_go_only_when_asked_for(tmp_path):
+    q = joint_path(60)
+    q[12, 1], q[40:42] = np.nan, np.inf
+    root = write(tmp_path / "old", [joint_path(50, seed=1), q])
+    with pytest.raises(
+        DatasetError, match=r"not finite in 3 frames.*drop_bad_frames"
+    ) as raised:
+        repair_dataset(root, tmp_path / "new", QUIET)
+    assert (raised.value.episode, raised.value.frame) == (1, 12)
+    assert list(tmp_path.iterdir()) == [root]
+    report = repair_dataset(
+        root, tmp_path / "new", RepairOptions(trim=False, drop_bad_frames=True)
+    )
+    assert report.changes[1] == ("dropped 3 frames with values that are not finite",)
+    assert check_dataset(tmp_path / "new").ok
+    demo = load_demos(tmp_path / "new")[1]
+    sound = np.isfinite(q).all(1)
+    np.testing.assert_array_equal(demo.joint_position, q[sound])
+    np.testing.assert_allclose(demo.time, np.arange(60)[sound] / FPS, atol=1e-6)
+
+
+def test_bad_episodes_go_only_when_asked_for(tmp_path):
+    motions = [joint_path(50, seed=i) for i in range(4)]
+    motions[1][7] = np.nan
+    root = write(tmp_path / "old", motions, version="v2.1", tasks=("a", "b", "c", "d"))
+    (root / "data/chunk-000/episode_000002.parquet").write_bytes(b"PAR1")
+    with pytest.raises(DatasetError, match="episode 1"):
+        repair_dataset(root, tmp_path / "new")
+    options = RepairOptions(trim=False, drop_bad_episodes=True)
+    report = repair_dataset(root, tmp_path / "new", options)
+    assert list(report.changes) == [0, 3]
+    assert list(report.left_out) == [1, 2]
+    assert "truncated" in report.left_out[2]
+    assert "episode 3 (now 1): as it was" in str(report)
+    assert check_dataset(tmp_path / "new").ok
+    assert [demo.task for demo in load_demos(tmp_path / "new")] == ["a", "d"]
+
+
+def test_a_dataset_of_nothing_but_bad_episodes_is_none(tmp_path):
+    root = write(tmp_path / "old", [np.ones((60, 3))])
+    with pytest.raises(DatasetError, match=r"episode 0: .*rests all the time|no two frames"):
+        repair_dataset(root, tmp_path / "new")
+    with pytest.raises(DatasetError, match="no episode could be repaired"):
+        repair_dataset(root, tmp_path / "new", RepairOptions(drop_bad_episodes=True))
+    assert list(tmp_path.iterdir()) == [root]
+
+
+def test_nothing_is_overwritten(tmp_path):
+    root = write(tmp_path / "old", [joint_path(60)])
+    with pytest.raises(FileExistsError, match="exists"):
+        repair_dataset(root, root)
+    assert len(load_demos(root)) == 1
+
+
+def with_videos(root: Path) -> Path:
+    """Two episodes whose images grow brighter by 5 a frame; the arm waits 0.5 s at first."""
+    cameras = {"front": (32, 32)}
+    with DatasetWriter(root, 50, "any", ["a"], cameras=cameras) as writer:
+        for _ in range(2):
+            writer.start_episode("look")
+            for k in range(50):
+                image = np.full((32, 32, 3), 5 * k, np.uint8)
+                q = [0.02 * max(k - 25, 0)]
+                writer.add_frame(joint_position=q, images={"front": image})
+            writer.save_episode()
+    return root
+
+
+def test_trimmed_episodes_keep_the_part_of_their_video(tmp_path):
+    root = with_videos(tmp_path / "old")
+    options = RepairOptions(drop_repeats=False, keep_rest=0.0)
+    repair_dataset(root, tmp_path / "new", options)
+    assert check_dataset(tmp_path / "new").ok
+    demos = load_demos(tmp_path / "new")
+    rows = pq.read_table(tmp_path / "new/meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    for row, demo in zip(rows, demos, strict=True):
+        start = row["videos/observation.images.front/from_timestamp"]
+        assert 0.3 < start < 0.6
+        assert start == pytest.approx(demo.start_time)
+        assert row["videos/observation.images.front/to_timestamp"] == pytest.approx(
+            start + len(demo) / 50
+        )
+    videos = sorted((tmp_path / "new/videos").glob("**/*.mp4"))
+    assert [v.read_bytes() for v in videos] == [
+        v.read_bytes() for v in sorted((root / "videos").glob("**/*.mp4"))
+    ]
+
+
+@pytest.mark.parametrize("options", [RepairOptions(trim=False, fps=25)])
+def test_videos_that_would_need_new_frames_are_refused_or_left_out(tmp_path, options):
+    root = with_videos(tmp_path / "old")
+    with pytest.raises(DatasetError, match=r"encoded anew.*videos=False"):
+        repair_dataset(root, tmp_path / "new", options)
+    without = RepairOptions(trim=False, fps=25, videos=False)
+    report = repair_dataset(root, tmp_path / "new", without)
+    assert "observation.images.front: videos left out" in report.notes
+    assert not (tmp_path / "new/videos").exists()
+    assert check_dataset(tmp_path / "new").ok
+
+
+def test_videos_that_are_not_there_are_no_longer_declared(tmp_path):
+    how = {"videos": ["observation.images.front"], "version": "v2.1"}
+    report, _ = repaired(tmp_path, [joint_path(60)], RepairOptions(trim=False), **how)
+    assert any("no video of it is here" in note for note in report.notes)
+    assert "observation.images.front" not in read_info(tmp_path / "new")["features"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("version", VERSIONS)
+def test_lerobot_opens_what_it_refused(tmp_path, monkeypatch, version):
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    lerobot_dataset = pytest.importorskip("lerobot.datasets").LeRobotDataset
+    q = joint_path(60)
+    q[30] = np.nan
+    options = RepairOptions(trim=False, drop_bad_frames=True)
+    how = {"version": version, "videos": ["observation.images.front"], "dtype": "float32"}
+    repaired(tmp_path, [joint_path(50, seed=1), q], options, **how)
+    dataset = lerobot_dataset("local/new", root=tmp_path / "new", video_backend="pyav")
+    assert (dataset.num_episodes, dataset.num_frames) == (2, 109)
+    np.testing.assert_allclose(dataset[108][STATE].numpy(), q[59], atol=1e-6)
+
+
+@pytest.mark.slow
+def test_lerobot_decodes_the_images_of_the_frames_that_are_left(tmp_path, monkeypatch):
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    lerobot_dataset = pytest.importorskip("lerobot.datasets").LeRobotDataset
+    root = with_videos(tmp_path / "old")
+    options = RepairOptions(drop_repeats=False, keep_rest=0.0)
+    repair_dataset(root, tmp_path / "new", options)
+    old = lerobot_dataset("local/old", root=root, video_backend="pyav")
+    new = lerobot_dataset("local/new", root=tmp_path / "new", video_backend="pyav")
+    first = round(load_demos(tmp_path / "new")[0].start_time * 50)
+    key = "observation.images.front"
+    for k in (0, 5, 15):
+        np.testing.assert_array_equal(new[k][key].numpy(), old[first + k][key].numpy())
