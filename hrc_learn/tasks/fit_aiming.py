@@ -132,7 +132,7 @@ def fit_aiming(
     Raises:
         ValueError: If a demonstration lacks a column; names it and the episode.
     """
-    camera = _Watching(demos)
+    camera = Watching(demos)
     config = config or ImageJacobianFitConfig()
     neurons = neurons or Neurons.around(camera)
     learned = None
@@ -146,7 +146,7 @@ def fit_aiming(
     )
 
 
-class _Watching(Sequence[Watched]):
+class Watching(Sequence[Watched]):
     """Demonstrations as the fit of an image Jacobian takes them, read when asked for."""
 
     def __init__(self, demos: Sequence[Demonstration], source: str | None = None):
@@ -156,10 +156,10 @@ class _Watching(Sequence[Watched]):
     @overload
     def __getitem__(self, index: int) -> Watched: ...
     @overload
-    def __getitem__(self, index: slice) -> "_Watching": ...
+    def __getitem__(self, index: slice) -> "Watching": ...
     def __getitem__(self, index):
         if isinstance(index, slice):
-            return _Watching(self._demos[index], self._source)
+            return Watching(self._demos[index], self._source)
         return _watched(self._demos[index], self._source)
 
     def __len__(self) -> int:
