@@ -17,10 +17,10 @@ def unit_quaternion(value: ArrayLike, like: Tensor) -> Float[Tensor, "*batch 4"]
 
 
 def error_ends(
-    error: Float[Tensor, "*batch 3"],
+    error: Float[Tensor, "*#batch 3"],
     rate: Float[Tensor, "*#batch 3"],
-    goal_error: Float[Tensor, "*batch 3"],
-    demonstrated_goal: Float[Tensor, "*batch 4"],
+    goal_error: Float[Tensor, "*#batch 3"],
+    demonstrated_goal: Float[Tensor, "*#batch 4"],
     start: ArrayLike | None,
     goal: ArrayLike | None,
     velocity: ArrayLike | None,

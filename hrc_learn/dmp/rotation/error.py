@@ -6,13 +6,12 @@ primitives for robot control in the Cartesian space"; their logarithm is half of
 goal is e = 0. Moving start and goal alike by a rotation of the tool frame leaves e as it is.
 """
 
-from collections.abc import Callable
-
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hrc_learn.geometry import quaternion
+from hrc_learn.geometry.left_jacobian import drift_free_rate
 
 _NO_AXIS = 1e-9
 """Rotation vectors shorter than this [rad] have no direction of their own."""
@@ -82,8 +81,7 @@ def angular_velocity(
     error: Float[Tensor, "*batch 3"], rate: Float[Tensor, "*batch 3"]
 ) -> Float[Tensor, "*batch 3"]:
     """Angular velocity of q = exp(-e) * g in the base frame [rad/s], from de/dt."""
-    turn, turn_rate = _derivative(quaternion.exp, (-error,), (-rate,))
-    return 2 * quaternion.multiply(turn_rate, quaternion.conjugate(turn))[..., 1:]
+    return -drift_free_rate(error, rate)
 
 
 def angular_acceleration(
@@ -92,7 +90,7 @@ def angular_acceleration(
     curvature: Float[Tensor, "*batch 3"],
 ) -> Float[Tensor, "*batch 3"]:
     """Angular acceleration [rad/s^2], from e and its first two derivatives by time."""
-    return _derivative(angular_velocity, (error, rate), (rate, curvature))[1]
+    return torch.func.jvp(angular_velocity, (error, rate), (rate, curvature))[1]
 
 
 def error_rate(
@@ -140,11 +138,3 @@ def retarget(
     # The angular acceleration is linear in the curvature; the rest stems from turning itself.
     bias = angular_acceleration(new, new_rate, torch.zeros_like(new))
     return new, new_rate, error_rate(new, omega_rate - bias)
-
-
-def _derivative(
-    function: Callable[..., Tensor], at: tuple[Tensor, ...], along: tuple[Tensor, ...]
-) -> tuple[Tensor, Tensor]:
-    """Value and directional derivative."""
-    result = torch.func.jvp(function, at, along)
-    return result[0], result[1]
