@@ -1,0 +1,209 @@
+"""How well primitives predict a demonstration they have not seen.
+
+Each demonstration of a task is predicted from all others, given its start and goal, and then
+its pose at half time as well. Recordings are one file a task, TASK.npy, of shape
+(demonstrations, samples, 7): position and unit quaternion (w, x, y, z), sampled evenly.
+"""
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from hrc_learn import cli
+from hrc_learn.dmp import DMPDistribution, PoseDMP, PoseTrajectory, through, with_ends
+from hrc_learn.dmp.fitting.mean import mean_primitive
+from hrc_learn.geometry import Pose, quaternion
+
+DURATION = 5.0
+"""[s]; no figure depends on it."""
+HALF = DURATION / 2
+NOISE = 1e-4
+"""Standard deviation of what is given, in the units of the recording and in rad."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args:
+    recordings: Path
+    """Folder of TASK.npy files."""
+    n_basis: int = 50
+    """Basis functions of each primitive."""
+    json: Path | None = None
+    """Receives the figures as one flat object."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """Demonstrations of one task: primitives of all but one, and that one."""
+
+    others: PoseDMP
+    """Learned from the other demonstrations, as printed."""
+    gentle: PoseDMP
+    """The same, taking up new ends along a minimum-jerk approach."""
+    shown: Pose
+    """What is to be predicted, (T,)."""
+
+    @property
+    def ends(self) -> dict[str, Pose]:
+        return {"start": self.shown[0], "goal": self.shown[-1]}
+
+    @property
+    def via(self) -> Pose:
+        """At half time, (1,): between two samples if their number is even."""
+        T = len(self.shown.position)
+        before, after = self.shown[(T - 1) // 2], self.shown[T // 2]
+        middle = quaternion.slerp(before.orientation, after.orientation, 0.5)
+        return Pose(((before.position + after.position) / 2)[None], middle[None])
+
+
+def main(args: Args) -> None:
+    """Predict, print a table, write the figures."""
+    torch.set_num_threads(1)
+    files = sorted(args.recordings.glob("*.npy"))
+    if not files:
+        raise ValueError(f"no .npy files in {args.recordings}")
+    errors = {
+        file.stem: predict_each(read_poses(file), args.n_basis)
+        for file in track(files, description="tasks", transient=True)
+    }
+    show(errors)
+    if args.json:
+        cli.write_json(args.json, figures(errors))
+
+
+def read_poses(file: Path) -> Pose:
+    """Recorded poses of one task, (demonstrations, T)."""
+    recorded = np.load(file)
+    if recorded.ndim != 3 or recorded.shape[-1] != 7 or len(recorded) < 3:
+        raise ValueError(
+            f"{file}: expected (3 or more demonstrations, samples, 7), got {recorded.shape}"
+        )
+    values = torch.from_numpy(recorded).double()
+    return Pose(values[..., :3], values[..., 3:])
+
+
+def predict_each(poses: Pose, n_basis: int) -> dict[str, tuple[float, float]]:
+    """By method: median position error [% of the range] and orientation error [deg]."""
+    n, T = poses.position.shape[:2]
+    time = torch.linspace(0, DURATION, T, dtype=torch.float64)
+    columns = poses.position, poses.orientation
+    plain = PoseDMP.fit(time, *columns, n_basis)
+    gentle = PoseDMP.fit(time, *columns, n_basis, approach=1.0)
+    errors: dict[str, list[tuple[float, float]]] = {name: [] for name in METHODS}
+    for i in range(n):
+        rest = torch.arange(n) != i
+        task = Task(others=select(plain, rest), gentle=select(gentle, rest), shown=poses[i])
+        for name, predict in METHODS.items():
+            with torch.no_grad():
+                errors[name].append(error(predict(task).rollout(time), task.shown))
+    return {name: tuple(np.median(rows, axis=0)) for name, rows in errors.items()}
+
+
+def select(dmps: PoseDMP, rows: torch.Tensor) -> PoseDMP:
+    """Some of a batch of primitives."""
+    motion = dmps.motion
+    chosen = motion.with_coordinates(
+        motion.coordinates().detach()[rows],
+        motion.duration[rows],
+        amplitude=motion.amplitude[rows],
+    )
+    return PoseDMP(chosen, dmps.goal_orientation[rows])
+
+
+def error(motion: PoseTrajectory, shown: Pose) -> tuple[float, float]:
+    """RMSE of the position [% of the largest range] and of the orientation [deg]."""
+    off = (motion.position - shown.position).square().mean().sqrt()
+    low, high = shown.position.aminmax(dim=0)
+    turned = quaternion.angle(motion.orientation, shown.orientation).square().mean().sqrt()
+    return 100 * (off / (high - low).max()).item(), np.rad2deg(turned.item())
+
+
+def another(task: Task) -> PoseDMP:
+    """The demonstration whose start and goal are closest, adapted."""
+    start, goal = (
+        (own.position - new.position).norm(dim=-1)
+        for own, new in (
+            (task.others.start, task.shown[0]),
+            (task.others.goal, task.shown[-1]),
+        )
+    )
+    away = start + goal
+    nearest = torch.zeros(len(away), dtype=torch.bool)
+    nearest[away.argmin()] = True
+    return with_ends(mean_primitive(select(task.others, nearest)), **task.ends)
+
+
+def mean(task: Task) -> PoseDMP:
+    """The mean of all others, adapted."""
+    return with_ends(mean_primitive(task.others), **task.ends)
+
+
+def gentle_mean(task: Task) -> PoseDMP:
+    """The same along a minimum-jerk approach."""
+    return with_ends(mean_primitive(task.gentle), **task.ends)
+
+
+def conditioned(task: Task, slack: float, times: list[float]) -> PoseDMP:
+    """The distribution of the others, given the pose at these times."""
+    given = {0.0: task.shown[:1], HALF: task.via, DURATION: task.shown[-1:]}
+    where = [given[time] for time in times]
+    via = Pose(
+        torch.cat([pose.position for pose in where]),
+        torch.cat([pose.orientation for pose in where]),
+    )
+    distribution = DMPDistribution.fit(task.others, slack=slack)
+    return distribution.condition(times, via, noise=NOISE).mean_primitive()
+
+
+METHODS: dict[str, Callable[[Task], PoseDMP]] = {
+    "nearest": another,
+    "mean": mean,
+    "mean, approach": gentle_mean,
+    "distribution 0.3": lambda task: conditioned(task, 0.3, [0.0, DURATION]),
+    "via: mean, through": lambda task: through(mean(task), [HALF], task.via),
+    "via: mean, approach, through": lambda task: through(gentle_mean(task), [HALF], task.via),
+    "via: mean, around": lambda task: (
+        DMPDistribution.around(mean(task)).condition([HALF], task.via).mean_primitive()
+    ),
+    "via: distribution 0": lambda task: conditioned(task, 0.0, [0.0, HALF, DURATION]),
+    "via: distribution 0.1": lambda task: conditioned(task, 0.1, [0.0, HALF, DURATION]),
+    "via: distribution 0.3": lambda task: conditioned(task, 0.3, [0.0, HALF, DURATION]),
+}
+"""Those that begin with "via" know the pose at half time; numbers are the slack."""
+
+
+def show(errors: dict[str, dict[str, tuple[float, float]]]) -> None:
+    """A row for each method, with the median over all tasks last."""
+    table = Table("% of range / deg", *errors, "median")
+    for name in METHODS:
+        row = np.array([errors[task][name] for task in errors])
+        cells = [f"{position:.1f} / {angle:.1f}" for position, angle in row]
+        position, angle = np.median(row, axis=0)
+        table.add_row(name, *cells, f"{position:.2f} / {angle:.2f}")
+    Console(width=max(Console().width, 200)).print(table)
+
+
+def figures(errors: dict[str, dict[str, tuple[float, float]]]) -> dict[str, float]:
+    """Flat, by method, task and quantity."""
+    flat = {}
+    for name in METHODS:
+        key = name.replace(":", "").replace(",", "").replace(" ", "_")
+        rows = {task: errors[task][name] for task in errors}
+        rows["median"] = tuple(np.median(list(rows.values()), axis=0))
+        for task, (position, angle) in rows.items():
+            flat[f"{key}.{task}.position_percent"] = float(position)
+            flat[f"{key}.{task}.orientation_deg"] = float(angle)
+    return flat
+
+
+if __name__ == "__main__":
+    cli.run(main, Args)
