@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.integrate import solve_ivp
 from torch.autograd import gradcheck
+from unchecked import shapes_unchecked
 
 from hrc_learn.dmp import JointDMP, PoseDMP, Stepper
 from hrc_learn.dmp.fitting.mean import mean_primitive
@@ -216,7 +217,8 @@ def test_steps_solve_the_equation(scaling, n_steps):
     state = dmp.initial_state(goal=goals[0])
     x = torch.cat([state.position, state.rate]).detach().numpy()
     x = solve(solve(x, goals[0], (0.0, 0.5)), goals[1], (0.5, 1.1))
-    with torch.no_grad():
+    # Unchecked: a thousand steps with all their shapes checked take seconds.
+    with torch.no_grad(), shapes_unchecked():
         for k in range(n_steps):
             first = k < n_steps // 2
             dt = (0.5 if first else 0.6) / (n_steps // 2) * dmp.duration
@@ -234,7 +236,7 @@ def test_a_filtered_goal_that_scales_the_forcing_is_of_first_order():
             state = dmp.step(state, 2.0 / n_steps, goal=dmp.goal + 0.5, goal_filter=5.0)
         return state.position
 
-    with torch.no_grad():
+    with torch.no_grad(), shapes_unchecked():
         finest = end(640)
         errors = [(end(n) - finest).norm().item() for n in (20, 40, 80)]
     orders = np.log2(np.array(errors[:-1]) / errors[1:])
