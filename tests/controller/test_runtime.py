@@ -317,11 +317,8 @@ class TestPackage:
 
     def test_it_starts_again_anywhere(self, package):
         runners = [
-            kind(*arguments)
-            for kind, arguments in (
-                (EagerRunner, controller_and_observation()),
-                (open_step, (*controller_and_observation(), package.parent)),
-            )
+            EagerRunner(*controller_and_observation()),
+            open_step(*controller_and_observation(), package.parent),
         ]
         q = panda.ready.numpy() + 0.2
         for runner in runners:
