@@ -23,7 +23,12 @@ from hrc_learn.jacobian import (
     RecursiveLeastSquaresEstimator,
     paper_grid,
 )
-from hrc_learn.jacobian.estimators import CompositeConfig, KalmanConfig, LeastSquaresConfig
+from hrc_learn.jacobian.estimators import (
+    BroydenConfig,
+    CompositeConfig,
+    KalmanConfig,
+    LeastSquaresConfig,
+)
 from hrc_learn.jacobian.estimators.key_frames import Pair
 from hrc_learn.jacobian.estimators.recursive import condition
 
@@ -298,15 +303,25 @@ def test_composite_law_contains_the_papers():
     )
 
 
-def test_composite_weights_stay_bounded():
+@pytest.mark.parametrize(
+    "estimator",
+    [
+        BroydenEstimator(guess(), BroydenConfig(weight_bound=3000.0)),
+        CompositeEstimator(guess(), CompositeConfig(weight_bound=3000.0, noise_floor=0.0)),
+        RecursiveLeastSquaresEstimator(guess(), LeastSquaresConfig(weight_bound=3000.0)),
+        KalmanEstimator(guess(), KalmanConfig(weight_bound=3000.0)),
+    ],
+    ids=lambda estimator: type(estimator).__name__,
+)
+def test_weights_stay_bounded(estimator):
     """Whatever is measured: here features jump about the whole image."""
-    config = CompositeConfig(weight_bound=3000.0, noise_floor=0.0)
-    estimator = CompositeEstimator(guess(), config)
-    poses = wander(200, 4, rng=generator(18))
-    x = 1440 * torch.rand(4, 200, 2, generator=generator(19), dtype=torch.float64)
+    poses = wander(100, 4, rng=generator(18))
+    x = 1440 * torch.rand(4, 100, 2, generator=generator(19), dtype=torch.float64)
+    largest = []
     for state in run(estimator, poses, x):
         scaled = state.weight.unflatten(-2, (2, 6)) / torch.from_numpy(SCALE)[:, None]
-        assert float(scaled.abs().max()) <= 3000 * (1 + 1e-12)
+        largest.append(float(scaled.abs().max()))
+    assert 2999 < max(largest) <= 3000 * (1 + 1e-12)
 
 
 def test_kalman_filter_against_the_textbook():

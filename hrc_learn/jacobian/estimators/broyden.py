@@ -19,6 +19,8 @@ class BroydenConfig(PairConfig):
     """Least motion between key frames [m]: without a noise model it must be large."""
     gain: float = 0.5
     """Share of the prediction error that one pair removes, above 0 to 1."""
+    weight_bound: float = 2e4
+    """Largest entry of the weights [px/m], rotation counted with `rotation_scale`."""
 
 
 class BroydenEstimator(PairEstimator):
@@ -34,7 +36,7 @@ class BroydenEstimator(PairEstimator):
             ValueError: The network's neurons are not normalised.
         """
         self.config = config or BroydenConfig()
-        super().__init__(network, self.config)
+        super().__init__(network, self.config, self.config.weight_bound)
         if not network.normalized:
             raise ValueError(
                 "Broyden's update adds a constant Jacobian, which only normalised neurons can "
@@ -55,4 +57,4 @@ class BroydenEstimator(PairEstimator):
         step = self.config.gain * pair.error(state.weight) / size.unsqueeze(-1)
         change = step.unsqueeze(-1) * (pair.dr * self.scale).unsqueeze(-2)
         weight = state.weight + change.flatten(-2).unsqueeze(-1)
-        return CompositeState(weight=weight, key=key)
+        return CompositeState(weight=self.projected(weight), key=key)

@@ -54,13 +54,9 @@ class CompositeEstimator(PairEstimator):
     weights are bounded.
     """
 
-    bound: Tensor
-
     def __init__(self, network: RBFImageJacobian, config: CompositeConfig | None = None):
         self.config = config or CompositeConfig()
-        super().__init__(network, self.config)
-        bound = self.config.weight_bound * self.scale.repeat(network.rows).unsqueeze(-1)
-        self.register_buffer("bound", bound, persistent=False)
+        super().__init__(network, self.config, self.config.weight_bound)
 
     def initial_state(self, *batch: int) -> CompositeState:
         """The network's weights and no key frame."""
@@ -74,7 +70,7 @@ class CompositeEstimator(PairEstimator):
         rate = paper_rate(state.weight, theta, measurement, self.config.task_gain)
         change = measurement.dt * rate + self._correction(state.weight, pair)
         weight = state.weight + change
-        return CompositeState(weight=weight.clamp(-self.bound, self.bound), key=key)
+        return CompositeState(weight=self.projected(weight), key=key)
 
     def _correction(self, weight: Tensor, pair: Pair) -> Tensor:
         """Normalised gradient step on the prediction error; zero without a pair."""

@@ -69,4 +69,4 @@ class KalmanEstimator(RecursiveEstimator):
             self.scale,
             self.config.pair_noise,
         )
-        return RecursiveState(weight=weight, covariance=covariance, key=key)
+        return RecursiveState(weight=self.projected(weight), covariance=covariance, key=key)

@@ -76,10 +76,31 @@ class PairEstimator(ImageJacobianEstimator):
     scale: Tensor
     """Metres that each component of a twist counts for, (6,)."""
 
-    def __init__(self, network: RBFImageJacobian, config: PairConfig):
+    bound: Tensor
+    """Largest absolute value of each entry of the weights, (entries, 1)."""
+
+    def __init__(self, network: RBFImageJacobian, config: PairConfig, weight_bound: float):
+        """Prepare the scales.
+
+        Args:
+            network: Neurons and initial weights.
+            config: Choice of key frames.
+            weight_bound: Largest entry of the weights [px/m].
+        """
         super().__init__(network)
         scale = component_scale(network.centers, config.rotation_scale)
+        bound = weight_bound * scale.repeat(network.rows).unsqueeze(-1)
         self.register_buffer("scale", scale, persistent=False)
+        self.register_buffer("bound", bound, persistent=False)
+
+    def projected(
+        self, weight: Float[Tensor, "*batch entries K"]
+    ) -> Float[Tensor, "*batch entries K"]:
+        """Weights brought back within their bound, whatever was measured.
+
+        A projection on a convex set takes no estimate further from a truth inside the set.
+        """
+        return weight.clamp(-self.bound, self.bound)
 
     def advance(
         self,

@@ -26,6 +26,8 @@ class RecursiveConfig(PairConfig):
     """Prior standard deviation of the Jacobian as a whole [px/m]."""
     weight_std: float = 500.0
     """Prior standard deviation of each neuron's departure from it [px/m]."""
+    weight_bound: float = 2e4
+    """Largest entry of the weights [px/m], rotation counted with `rotation_scale`."""
 
     @property
     def pair_noise(self) -> float:
@@ -53,7 +55,7 @@ class RecursiveEstimator(PairEstimator):
     """Covariance to start with, (P, P)."""
 
     def __init__(self, network: RBFImageJacobian, config: RecursiveConfig):
-        super().__init__(network, config)
+        super().__init__(network, config, config.weight_bound)
         # The posterior of an offline fit, or else the prior.
         covariance = network.covariance
         if covariance is None:

@@ -55,4 +55,6 @@ class RecursiveLeastSquaresEstimator(RecursiveEstimator):
         )
         trace = covariance.diagonal(dim1=-2, dim2=-1).sum(-1)
         shrink = torch.clamp_max(self.largest_trace / trace, 1.0)[..., None, None]
-        return RecursiveState(weight=weight, covariance=covariance * shrink, key=key)
+        return RecursiveState(
+            weight=self.projected(weight), covariance=covariance * shrink, key=key
+        )
