@@ -76,7 +76,7 @@ class TrialConfig:
     """What to make of the paper's initial image Jacobian."""
     contacts: bool = False
     """Look for contacts of the arm with itself, the table and the pedestal, at a third more
-    time. Starts anywhere within the limits are free of them in any case."""
+    time. Starts are free of them in any case."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -207,13 +207,14 @@ def _draw(config: TrialConfig, rng: torch.Generator) -> _Scene:
 def _starts(config: TrialConfig, limits: JointLimits, rng: torch.Generator) -> Tensor:
     lower, upper = limits.lower + 0.03, limits.upper - 0.03
     shape = (config.count, len(lower))
-    if config.starts == "near":
-        noise = torch.randn(shape, generator=rng, dtype=torch.float64)
-        return (panda.ready + 0.4 * noise).clamp(lower, upper)
     free: list[Tensor] = []
     while sum(map(len, free)) < config.count:
-        unit = torch.rand(shape, generator=rng, dtype=torch.float64)
-        q = lower + unit * (upper - lower)
+        if config.starts == "near":
+            noise = torch.randn(shape, generator=rng, dtype=torch.float64)
+            q = (panda.ready + 0.4 * noise).clamp(lower, upper)
+        else:
+            unit = torch.rand(shape, generator=rng, dtype=torch.float64)
+            q = lower + unit * (upper - lower)
         free.append(q[clearance(q) > _START_CLEARANCE])
     return torch.cat(free)[: config.count]
 
