@@ -169,9 +169,9 @@ def test_the_goal_is_the_pose_of_the_object():
     expected = goal @ shown.inverse() @ last
     torch.testing.assert_close(ends.position[:, 0], expected.position, rtol=0, atol=1e-6)
     assert quaternion.angle(ends.orientation[:, 0], expected.orientation).max() < 1e-6
-    state = dmp.initial_state()
+    state = dmp.step(dmp.initial_state(), 0.1, goal=goal, goal_filter=5.0)
     for _ in range(150):
-        state = dmp.step(state, 0.1, goal=goal, goal_filter=5.0)
+        state = dmp.step(state, 0.1, goal_filter=5.0)
     torch.testing.assert_close(state.pose.position, expected.position, rtol=0, atol=1e-6)
 
 
