@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import platform
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -93,7 +95,21 @@ def load(path: Path) -> Package:
 def machine() -> str:
     """What compiled code depends on: torch, and the instructions of the processor."""
     capability = torch.backends.cpu.get_cpu_capability()
-    return f"torch {torch.__version__} on {platform.machine()} with {capability}"
+    return (
+        f"torch {torch.__version__} on {platform.machine()} with {capability}, "
+        f"instructions {_instructions()}"
+    )
+
+
+@cache
+def _instructions() -> str:
+    """Short hash of the extensions of the processor, all of which a compiler may use."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return "unknown"
+    flags = next((line for line in lines if line.startswith(("flags", "Features"))), "")
+    return hashlib.sha256(flags.encode()).hexdigest()[:8]
 
 
 def _text(vector: Tensor) -> str:
