@@ -16,6 +16,7 @@ from rich.table import Table
 
 from hrc_learn import cli
 from hrc_learn.demos import Demonstration, load_demos
+from hrc_learn.human.page import PageConfig
 from hrc_learn.output import MADE_BY, new_folder
 from hrc_learn.sim import CameraKind
 from hrc_learn.tasks.collaboration import CollaborationConfig
@@ -53,6 +54,11 @@ class Args:
     it can."""
     person: bool = True
     """Whether the scripted person pulls the elbow."""
+    page: bool = False
+    """Serve a page in the browser, from which people watch and pull at the body too. The run
+    takes as long as it would on a real arm then."""
+    port: int = 8080
+    """Port of that page."""
     config: CollaborationConfig = field(default_factory=CollaborationConfig)
     """How the job is done."""
     gains: Path | None = None
@@ -82,7 +88,9 @@ def main(args: Args) -> int:
             pulls=PULLS if args.person else (),
             config=replace(args.config, controller=controller),
             seed=args.seed,
+            page=PageConfig(port=args.port) if args.page else None,
             on_phase=lambda phase, time: console.print(f"  {time:6.2f} s  {phase}"),
+            on_page=lambda address: console.print(f"Page at [bold]{address}[/]"),
         )
         table = [] if job.result is None else evaluate(job, fit)
         with console.status("Writing recording and report"):

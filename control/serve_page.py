@@ -100,7 +100,7 @@ def _serve(
     metronome, steps, latest = Metronome(dt), 0, 0.0
     try:
         while page.alive and not session.finished:
-            session.step(metronome.missed)
+            session.step()
             steps += 1
             if duration is not None and steps * dt >= duration:
                 break

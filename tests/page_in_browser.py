@@ -61,7 +61,7 @@ class Session:
     def _run(self):
         metronome = Metronome(0.01)
         while not self._closing.is_set():
-            self.instant = self.session.step(metronome.missed)
+            self.instant = self.session.step()
             metronome.wait()
 
     def __enter__(self):

@@ -81,7 +81,7 @@ class DemonstrationRecorder:
         match request, self._state:
             case "start", "ready" | "stopped":
                 # Starting over is the quickest way to discard.
-                self._frames, self._state, self._note = [], "recording", "recording"
+                self._frames, self._state, self._note = [], "recording", ""
             case "stop", "recording":
                 self._state, self._note = "stopped", "save it or discard it"
             case "save", "recording" | "stopped":

@@ -83,12 +83,8 @@ class PageSession:
         self.led = LedArm(panda, world.arm, human, self._config.led)
         self._ticks, self._width = 0, None
 
-    def step(self, missed: int = 0) -> Instant:
-        """One control step of the arm, and of the world.
-
-        Args:
-            missed: Ticks that the loop was too slow for so far, to be shown.
-        """
+    def step(self) -> Instant:
+        """One control step of the arm, and of the world."""
         with torch.inference_mode():
             instant = self.led.step()
         if self._ticks % self._config.record_every == 0:
@@ -99,7 +95,7 @@ class PageSession:
         for request in instant.asked.requests:
             self._handle(request)
         if self._ticks % self._config.show_every == 0:
-            self._page.show(self._status(missed))
+            self._page.show(self._status())
         self._ticks += 1
         return instant
 
@@ -122,7 +118,7 @@ class PageSession:
             self._width = asked.gripper
             self.world.arm.move(asked.gripper)
 
-    def _status(self, missed: int) -> PageStatus:
+    def _status(self) -> PageStatus:
         status, world = self._recorder.status, self.world
         monitors = (world.cabinet_contacts, world.table_contacts, world.self_contacts)
         counts = self.led.safety.counts.tolist()
@@ -134,8 +130,6 @@ class PageSession:
             note=status.note,
             interventions=dict(zip(INTERVENTIONS, counts, strict=True)),
             contacts=sum(len(monitor.touches) for monitor in monitors),
-            rate=1 / self._config.led.dt,
-            missed=missed,
         )
 
 

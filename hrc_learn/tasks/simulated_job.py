@@ -1,20 +1,24 @@
 """The collaboration in simulation: everything put together, run once, kept for evaluation."""
 
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 
-from ..human import PullSpell, ScriptedPuller
+from ..human import BothHands, PullSpell, ScriptedPuller
+from ..human.page import PageConfig
 from ..kinematics import panda
+from ..protocols import Human
 from ..sim import CameraKind, MotionLog, ObjectConfig, World, open_camera
 from .collaboration import INTERACT, Collaboration, CollaborationConfig, CollaborationResult
 from .eye import Eye
 from .failure import TaskFailedError
 from .fit_aiming import AimingSkill
+from .page_beside import page_beside
 from .placing import PlacingSkill, Plan, check_plan
-from .station import Station
+from .station import Station, StationConfig
 from .workplace import Workplace
 
 PULLS = (
@@ -54,7 +58,9 @@ def simulate_collaboration(
     pulls: Sequence[PullSpell] = PULLS,
     config: CollaborationConfig | None = None,
     seed: int = 0,
+    page: PageConfig | None = None,
     on_phase: Callable[[str, float], None] = lambda phase, time: None,
+    on_page: Callable[[str], None] = lambda address: None,
 ) -> SimulatedJob:
     """Grasp an object that lies at random and put it on a shelf, in MuJoCo.
 
@@ -67,7 +73,10 @@ def simulate_collaboration(
         pulls: At the body, in time since the robot gives the person time.
         config: How the job is done.
         seed: Of where the object lies, and of image noise.
+        page: Serve a page from which people pull at the body too, and let the world go on in
+            real time; None: no page.
         on_phase: Told the name of each phase of the task, and when it begins [s].
+        on_page: Told the address of the page.
 
     Raises:
         ValueError: If there is no such shelf, or the arm cannot reach it.
@@ -90,14 +99,18 @@ def simulate_collaboration(
         check_plan(plan, world, item.name if world.holds(item.name) else None)
 
     result, failure = None, ""
-    with torch.inference_mode():
+    with torch.inference_mode(), ExitStack() as stack:
+        human, advance = person, motion.advance
+        if page is not None:
+            opened = page_beside(world, StationConfig().dt, page, on_page)
+            human, advance = _joined(person, motion.advance, *stack.enter_context(opened))
         station = Station(
             chain=panda,
             arm=world.arm,
             gripper=world.arm,
             eye=Eye.on(open_camera(world, camera, rng=rng), workplace.scene),
-            human=person,
-            advance=motion.advance,
+            human=human,
+            advance=advance,
             on_phase=enter,
         )
         task = Collaboration(station, workplace, aiming, placing, check, config)
@@ -115,3 +128,15 @@ def simulate_collaboration(
         result=result,
         failure=failure,
     )
+
+
+def _joined(
+    person: Human, advance: Callable[[float], None], at_page: Human, tick: Callable[[], None]
+) -> tuple[Human, Callable[[float], None]]:
+    """The person of the script with those at the page, and time that passes for both."""
+
+    def advance_and_show(duration: float) -> None:
+        advance(duration)
+        tick()
+
+    return BothHands(person, at_page), advance_and_show

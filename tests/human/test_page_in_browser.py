@@ -1,5 +1,7 @@
 """The page as people meet it: in a browser, with a mouse."""
 
+from contextlib import closing
+
 import numpy as np
 import pytest
 from page_in_browser import PATIENCE, Browser, Session, chromium, wait_until
@@ -118,11 +120,11 @@ def test_a_browser_that_hangs_lets_go(session, browser):
 
 
 @pytest.mark.slow
-def test_a_browser_that_is_closed_lets_go(session, tmp_path):
-    with chromium(tmp_path) as tab:
-        browser = Browser(tab, session.page)
-        tab.mouse.move(*browser.pixel(session.frame(4)))
+def test_a_browser_that_is_closed_lets_go(session, browser):
+    with closing(browser.tab.context.new_page()) as tab:
+        other = Browser(tab, session.page)
+        tab.mouse.move(*other.pixel(session.frame(4)))
         tab.mouse.down()
-        tab.mouse.move(*browser.pixel(session.frame(4) + np.array([0.0, 0.2, 0.0])))
+        tab.mouse.move(*other.pixel(session.frame(4) + np.array([0.0, 0.2, 0.0])))
         wait_until(lambda: session.asked.effort.any(), "effort")
     wait_until(lambda: still(session), "a hand that is gone lets go", timeout=PATIENCE)

@@ -53,7 +53,3 @@ class PageStatus:
     """Steps in which each kind of intervention of the safety filter was needed."""
     contacts: int = 0
     """Touches of the surroundings."""
-    rate: float = 0.0
-    """Of the control loop [1/s]."""
-    missed: int = 0
-    """Ticks that the loop was too slow for."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,10 +11,8 @@ from jaxtyping import Float
 
 from ...geometry import Pose
 from .grips import Grip, Grips
+from .library import Holdable, SceneNodeDragEvent, ViserServer
 from .stage import Stage
-
-if TYPE_CHECKING:
-    import viser
 
 _BASE_AXES = (1.0, 0.0, 0.0, 0.0)
 
@@ -27,7 +25,7 @@ class Handles:
 
     def __init__(
         self,
-        server: viser.ViserServer,
+        server: ViserServer,
         stage: Stage,
         grips: Grips,
         links: Callable[[], Pose | None],
@@ -64,10 +62,10 @@ class Handles:
         self._gizmo.disable_rotations = not turns
 
     def _connect(
-        self, node: viser.MeshHandle, joint: int | None, offset: Float[np.ndarray, "3"]
+        self, node: Holdable, joint: int | None, offset: Float[np.ndarray, "3"]
     ) -> None:
         @node.on_drag
-        async def dragged(event: viser.SceneNodeDragEvent) -> None:
+        async def dragged(event: SceneNodeDragEvent) -> None:
             pointer = np.array(event.end_position) - offset
             if event.phase == "start":
                 held = np.array(event.start_position) - offset

@@ -87,6 +87,7 @@ class Page:
         first = [np.stack([getattr(b, name)[0] for b in bodies]) for name in _POSE]
         self._poses: tuple[np.ndarray, np.ndarray] = (first[0], first[1])
         self._status = PageStatus()
+        self._placed, self._counted = 0, (0, time.monotonic())
         self._closing = Event()
         self._error: BaseException | None = None
         self._threads = [
@@ -127,8 +128,9 @@ class Page:
         positions: Float[np.ndarray, "bodies 3"],
         orientations: Float[np.ndarray, "bodies 4"],
     ) -> None:
-        """Tell where the bodies are now: positions [m], unit quaternions (wxyz)."""
+        """Tell after each step where the bodies are: positions [m], unit quaternions (wxyz)."""
         self._poses = (positions, orientations)
+        self._placed += 1
 
     def show(self, status: PageStatus) -> None:
         """Tell how the session stands."""
@@ -159,8 +161,14 @@ class Page:
                 self._handles.follow(links[-1])
                 if ticks % _PANEL_EVERY == 0:
                     people = len(self._server.get_clients())
-                    self._panel.refresh(self._status, asked.effort, people)
+                    self._panel.refresh(self._status, asked.effort, self._rate(), people)
             ticks += 1
+
+    def _rate(self) -> float:
+        """Steps that the loop has taken since the last time this was asked [1/s]."""
+        placed, began = self._counted
+        self._counted = self._placed, time.monotonic()
+        return (self._counted[0] - placed) / max(self._counted[1] - began, 1e-9)
 
     def _ask(self, state: ArmState) -> Asked:
         panel, drag = self._panel, self._panel.drag

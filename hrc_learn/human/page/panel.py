@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -16,10 +16,8 @@ from ...viz.palette import GREEN, GREY, PERSON, VERMILION
 from ..drag import DragConfig
 from ..held_keys import DIRECTIONS, HeldKeys
 from .config import PageConfig, PageStatus
+from .library import ViserServer
 from .region_editor import RegionEditor
-
-if TYPE_CHECKING:
-    import viser
 
 OPEN = 0.08
 """Width of the open gripper [m]."""
@@ -40,7 +38,7 @@ class Panel:
 
     def __init__(
         self,
-        server: viser.ViserServer,
+        server: ViserServer,
         boxes: Sequence[Box],
         config: PageConfig,
         request: Callable[[Request], None],
@@ -109,20 +107,25 @@ class Panel:
         )
 
     def refresh(
-        self, status: PageStatus, effort: Float[np.ndarray, " joints"], people: int
+        self,
+        status: PageStatus,
+        effort: Float[np.ndarray, " joints"],
+        rate: float,
+        people: int,
     ) -> None:
         """Show how the session stands.
 
         Args:
             status: Of the session.
             effort: That is asked for now.
+            rate: Steps that the loop takes [1/s].
             people: Browsers that show the page.
         """
         running = status.recording == "recording"
         self._next = "stop" if running else "start"
         self._switch.label = self._next.capitalize()
         self._switch.icon = _ICONS[self._next]
-        self._state.content = _state_html(status, people)
+        self._state.content = _state_html(status, rate, people)
         self._bars.content = _effort_html(effort, self._config.drag.largest_effort)
         self._safety.content = self._safety_html(status)
 
@@ -183,7 +186,7 @@ class Panel:
         return _interventions_html(status, more, self._latest)
 
 
-def _state_html(status: PageStatus, people: int) -> str:
+def _state_html(status: PageStatus, rate: float, people: int) -> str:
     colour = {"ready": GREY, "recording": VERMILION, "stopped": PERSON}[status.recording]
     words = {
         "ready": "ready",
@@ -196,8 +199,8 @@ def _state_html(status: PageStatus, people: int) -> str:
         f'<span style="color:white;background:{colour};border-radius:.8em;padding:.1em .7em">'
         f"{words}</span>&ensp;{status.saved} saved"
         f'<div style="opacity:.75;font-size:.85em">{html.escape(status.note) or "&nbsp;"}</div>'
-        f'<div style="opacity:.75;font-size:.85em">{status.rate:.0f} steps a second, '
-        f"{status.missed} missed, {people} connected</div></div>"
+        f'<div style="opacity:.75;font-size:.85em">{rate:.0f} steps a second, '
+        f"{people} connected</div></div>"
     )
 
 

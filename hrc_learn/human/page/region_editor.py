@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -14,9 +14,7 @@ from ...viz import Box
 from ...viz.palette import GREEN, VERMILION, rgba
 from ..rays import meet_box, meet_level, region_over, view_ray
 from .config import FIRST_REGION
-
-if TYPE_CHECKING:
-    import viser
+from .library import SceneClickEvent, SceneRectSelectEvent, ViserServer
 
 _COLOUR = rgba(GREEN)[:3]
 _DRAW: Any = "cube-plus"
@@ -29,7 +27,7 @@ _LIFTED = 0.08  # height of a target above what was clicked on [m]
 class RegionEditor:
     """The box in the scene, its controls in the panel, and the target's mark."""
 
-    def __init__(self, server: viser.ViserServer, boxes: Sequence[Box]):
+    def __init__(self, server: ViserServer, boxes: Sequence[Box]):
         """Draw the first region, not in force.
 
         Args:
@@ -145,7 +143,7 @@ class RegionEditor:
         self._draw.disabled = True
 
         @self._scene.on_rect_select()
-        def drawn(event: viser.SceneRectSelectEvent) -> None:
+        def drawn(event: SceneRectSelectEvent) -> None:
             self._scene.remove_rect_select_callback(drawn)
             self._draw.disabled = False
             footprint = self._footprint(event)
@@ -154,7 +152,7 @@ class RegionEditor:
                 height = 2 * self._region.half_size[2]
                 self.reshape(region_over(footprint, bottom, height))
 
-    def _footprint(self, event: viser.SceneRectSelectEvent) -> Float[np.ndarray, "4 3"] | None:
+    def _footprint(self, event: SceneRectSelectEvent) -> Float[np.ndarray, "4 3"] | None:
         """Where the middles of a rectangle's edges lie on the table."""
         (left, top), (right, bottom) = event.screen_min, event.screen_max
         x, y = (left + right) / 2, (top + bottom) / 2
@@ -170,7 +168,7 @@ class RegionEditor:
         self._mark_next_button.disabled = True
 
         @self._scene.on_click()
-        def clicked(event: viser.SceneClickEvent) -> None:
+        def clicked(event: SceneClickEvent) -> None:
             self._scene.remove_click_callback(clicked)
             self._mark_next_button.disabled = False
             point = self._surface(np.array(event.ray_origin), np.array(event.ray_direction))

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
 
 from ...viz import Body, Box
 from ...viz.palette import PERSON, SKY, rgba
+from .library import Holdable, IcosphereHandle, MeshHandle, ViserServer
 from .shapes import body_mesh
-
-if TYPE_CHECKING:
-    import viser
 
 _KNOBS = (2, 4, 6)
 """Joints marked by a knob: shoulder, elbow, wrist. Between them the links are held."""
@@ -27,7 +24,7 @@ class Stage:
 
     def __init__(
         self,
-        server: viser.ViserServer,
+        server: ViserServer,
         bodies: Sequence[Body],
         boxes: Sequence[Box],
         twin: tuple[float, float, float],
@@ -56,7 +53,7 @@ class Stage:
         self._surroundings(server)
         self._arrows = None
 
-    def handles(self) -> Iterator[tuple[viser.MeshHandle, int | None, np.ndarray]]:
+    def handles(self) -> Iterator[tuple[Holdable, int | None, np.ndarray]]:
         """All that can be held: node, joint (None: the hand), and how far off the arm [m]."""
         here = np.zeros(3)
         for body, own, copy in zip(self._bodies, self._own, self._copies, strict=True):
@@ -112,14 +109,15 @@ class Stage:
                 head_length=0.05,
             )
 
-    def _draw(self, parent: str, body: Body) -> viser.MeshHandle:
+    def _draw(self, parent: str, body: Body) -> MeshHandle:
         mesh = body_mesh(body)
-        colour = tuple(round(255 * c) for c in (*body.capsules, *body.boxes)[0].colour[:3])
+        red, green, blue, _ = (*body.capsules, *body.boxes)[0].colour
+        own = round(255 * red), round(255 * green), round(255 * blue)
         return self._scene.add_mesh_simple(
             f"{parent}/arm/{body.name}",
             mesh.vertices,
             mesh.faces,
-            color=rgba(SKY)[:3] if parent else colour,
+            color=rgba(SKY)[:3] if parent else own,
             opacity=0.45 if parent else None,
             flat_shading=False,
             position=body.position[0],
@@ -127,7 +125,7 @@ class Stage:
             cast_shadow=not parent,
         )
 
-    def _draw_knob(self, parent: str, joint: int) -> viser.IcosphereHandle:
+    def _draw_knob(self, parent: str, joint: int) -> IcosphereHandle:
         return self._scene.add_icosphere(
             f"{parent}/knobs/joint{joint}",
             radius=0.078,
@@ -141,12 +139,12 @@ class Stage:
         self._scene.add_box(
             f"/furniture/{box.name}",
             color=(round(255 * r), round(255 * g), round(255 * b)),
-            dimensions=tuple(2 * h for h in box.half_size),
+            dimensions=2 * np.array(box.half_size),
             position=box.centre,
             opacity=opacity if opacity < 1 else None,
         )
 
-    def _surroundings(self, server: viser.ViserServer) -> None:
+    def _surroundings(self, server: ViserServer) -> None:
         self._scene.world_axes.visible = False
         # Shadows cost a machine without a GPU half its frames.
         self._scene.configure_default_lights(cast_shadow=False)
