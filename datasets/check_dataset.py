@@ -4,6 +4,7 @@ Every finding names the file, episode, frame and column as closely as is known. 
 0 no errors, 1 errors in the data, 2 no dataset there.
 """
 
+import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -24,6 +25,8 @@ class Args:
     """Fastest each joint can turn [rad/s], such as: joint1 2.1 joint2 2.1."""
     strict: bool = False
     """Count warnings as errors in the exit status."""
+    findings: Path | None = None
+    """Receives every finding: a JSON list of kind, message, file, episode, frame, key."""
     json: Path | None = None
     """Receives the counts as one flat object."""
 
@@ -34,6 +37,8 @@ def main(args: Args) -> int:
         raise FileNotFoundError(f"there is no dataset at {args.path}")
     report = check_dataset(args.path, units=args.units, speed_limits=args.speed_limits)
     print(report)
+    if args.findings:
+        cli.write_text(args.findings, json.dumps(report.records(), indent=2) + "\n")
     if args.json:
         counts = {
             "errors": len(report.errors),

@@ -24,10 +24,7 @@ from .sidecar import SIDECAR_PATH
 from .staging import RecordingHeader, StagedEpisode, read_episode
 from .statistics import Statistics, combined_statistics
 from .video import video_path
-from .video_segment import VideoSegment, VideoShelf, link
-
-Segments = Mapping[str, VideoSegment]
-"""Video feature -> its images during one episode."""
+from .video_segment import Segments, VideoSegment, VideoShelf, link
 
 
 @dataclass

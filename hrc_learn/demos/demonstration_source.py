@@ -9,6 +9,7 @@ from .conversion import to_demonstration
 from .demonstration import Demonstration
 from .demonstration_set import DemonstrationSet
 from .episode_reader import EpisodeReader, RawEpisode
+from .image_features.attaching import with_feature
 from .layout import EpisodeEntry
 from .units import UnitDecision
 
@@ -103,6 +104,8 @@ class DemonstrationSource(Sequence[Demonstration]):
     def _convert(self, episode: RawEpisode) -> Demonstration:
         reader = self._reader
         demo = to_demonstration(reader.folder, episode, reader.matching, self._decisions)
+        if reader.extracted is not None:
+            demo = with_feature(demo, reader.extracted)
         return demo.select_joints(self.joint_names)
 
 

@@ -11,6 +11,8 @@ from .counts import count_faults
 from .explicit_mapping import MappingSpec
 from .finding import DatasetError
 from .frames import RawFrames, read_frames
+from .image_features.attaching import only_feature
+from .image_features.cache import FeatureCache
 from .layout import DatasetFolder, EpisodeEntry, open_folder
 from .matching import Matching, match_columns
 from .quantities import Quantities, frame_step, select_quantities
@@ -35,6 +37,8 @@ class EpisodeReader:
     sidecar: Sidecar
     matching: Matching
     entries: tuple[EpisodeEntry, ...]
+    extracted: FeatureCache | None = None
+    """Image feature kept beside the dataset, where it has none itself."""
 
     def read(
         self, entries: Sequence[EpisodeEntry], roles: Iterable[str] | None = None
@@ -60,6 +64,14 @@ class EpisodeReader:
             quantities = select_quantities(frames, selections)
             _refuse_non_finite(entry, quantities, self.matching)
             yield RawEpisode(entry=entry, frames=frames, quantities=quantities)
+
+    @property
+    def notes(self) -> list[str]:
+        """What had to be guessed, or comes from elsewhere."""
+        if self.extracted is None:
+            return [*self.matching.notes]
+        beside = f"feature: {self.extracted.name}, as it was extracted from the videos"
+        return [*self.matching.notes, beside]
 
     def decide_units(
         self, episodes: Iterable[RawEpisode], given: Mapping[str, str]
@@ -112,10 +124,13 @@ def open_reader(
     for fault in count_faults(folder):
         raise fault
     sidecar = read_sidecar(folder.root)
+    matching = match_columns(folder.features, sidecar, mapping)
+    has_own = "feature" in matching.selections or "feature" in (mapping or {})
     return EpisodeReader(
         folder=folder,
         sidecar=sidecar,
-        matching=match_columns(folder.features, sidecar, mapping),
+        matching=matching,
+        extracted=None if has_own else only_feature(folder.root),
         entries=choose_episodes(folder, episodes, tasks, where),
     )
 

@@ -12,6 +12,7 @@ from .demonstration_source import DemonstrationSource
 from .episode_reader import open_reader
 from .explicit_mapping import MappingSpec
 from .finding import UnitsWarning
+from .image_features.attaching import with_feature
 from .units import UnitDecision
 
 
@@ -56,11 +57,13 @@ def load_demos(
         to_demonstration(reader.folder, raw[entry.index], matching, decisions)
         for entry in reader.entries
     ]
+    if reader.extracted is not None:
+        demos = [with_feature(demo, reader.extracted) for demo in demos]
     if joint_names is not None:
         joint_columns(matching.joint_names, joint_names)
         demos = [demo.select_joints(joint_names) for demo in demos]
     _warn_of_conversions(reader.folder.root, decisions)
-    notes = [*matching.notes, *_guesses(decisions)]
+    notes = [*reader.notes, *_guesses(decisions)]
     return DemonstrationSet(demos, notes=notes, source=str(reader.folder.root))
 
 
@@ -85,7 +88,7 @@ def open_demos(
         joint_columns(reader.matching.joint_names, joint_names)
     decisions = reader.survey(units or {})
     _warn_of_conversions(reader.folder.root, decisions)
-    notes = (*reader.matching.notes, *_guesses(decisions))
+    notes = (*reader.notes, *_guesses(decisions))
     return DemonstrationSource(reader, decisions, joint_names, notes)
 
 

@@ -19,6 +19,10 @@ class VideoSegment:
     """Where they end [s]."""
 
 
+Segments = Mapping[str, VideoSegment]
+"""Video feature -> its images during one episode."""
+
+
 class VideoShelf:
     """Files of videos as they are placed in a new dataset: each once, whoever shares it."""
 

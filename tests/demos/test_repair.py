@@ -70,6 +70,30 @@ def test_repeated_frames_go_and_the_stamps_of_the_others_stay(tmp_path):
     np.testing.assert_allclose(demo.time, 2 * np.arange(30) / FPS, atol=1e-6)
 
 
+def test_pauses_stay(tmp_path):
+    q = joint_path(60)
+    pausing = np.concatenate(
+        [q[:30], np.repeat(q[30:31], 20, axis=0), q[31:40], q[40:41], q[40:]]
+    )
+    report, (demo,) = repaired(tmp_path, [pausing], RepairOptions(trim=False))
+    assert report.changes == {0: ("dropped 1 repeated frames",)}
+    np.testing.assert_array_equal(demo.joint_position, np.delete(pausing, 60, axis=0))
+
+
+def test_frames_stamped_no_later_go(tmp_path):
+    stamps = np.arange(60) / FPS
+    stamps[20:23] = stamps[19] - 0.01
+    episode = {STATE: joint_path(60), "observation.time": stamps[:, None]}
+    root = write_folder(tmp_path / "old", [episode], {STATE: NAMES}, dtype="float64")
+    with pytest.raises(DatasetError, match="stamps must increase"):
+        repair_dataset(root, tmp_path / "new", QUIET)
+    report = repair_dataset(root, tmp_path / "new", RepairOptions(trim=False))
+    assert report.changes == {0: ("dropped 3 frames whose stamp does not increase",)}
+    np.testing.assert_allclose(
+        load_demos(tmp_path / "new")[0].time, np.delete(stamps, [20, 21, 22])
+    )
+
+
 def test_resampling_gives_a_regular_grid_at_any_rate(tmp_path):
     stamps = np.cumsum(np.random.default_rng(0).uniform(0.012, 0.028, 150))
     wave = np.stack([np.sin(stamps), np.cos(stamps), stamps], axis=1)

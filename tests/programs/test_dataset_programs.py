@@ -12,7 +12,7 @@ import pytest
 from lerobot_folders import joint_path, write_folder
 
 from hrc_learn import cli
-from hrc_learn.demos import load_demos
+from hrc_learn.demos import DatasetWriter, load_demos
 
 PROGRAMS = Path(__file__).parents[2] / "datasets"
 
@@ -152,7 +152,68 @@ def test_check_of_nothing(program, tmp_path):
     assert "there is no dataset" in error
 
 
-@pytest.mark.parametrize("name", ["import_arrays", "check_dataset"])
+def test_findings_are_written_for_other_programs(program, recording, tmp_path):
+    program("import_arrays", recording, "--out", tmp_path / "set", "--joints", "q")
+    (tmp_path / "set/meta/stats.json").unlink()
+    program("check_dataset", tmp_path / "set", "--findings", tmp_path / "findings.json")
+    (finding,) = json.loads((tmp_path / "findings.json").read_text())
+    assert finding["kind"] == "warning"
+    assert "no statistics" in finding["message"]
+    assert finding["file"] == "meta/stats.json"
+    assert finding["episode"] is None
+
+
+def test_a_broken_dataset_is_repaired_checked_and_read(program, tmp_path):
+    q = joint_path(100)
+    stuck = np.concatenate([np.repeat(q[:1], 80, axis=0), q])
+    stuck[130, 1] = np.nan
+    names = {"observation.state": ["a", "b", "c"]}
+    root = write_folder(tmp_path / "old", [{"observation.state": stuck}], names, version="v2.0")
+    assert program("check_dataset", root)[0] == 1
+    status, _, error = program("repair_dataset", root, tmp_path / "new")
+    assert (status, error.count("\n")) == (2, 1)
+    assert "drop_bad_frames" in error
+    status, text, _ = program(
+        *("repair_dataset", root, tmp_path / "new", "--drop-bad-frames", "--fps", 40),
+        *("--units", "joint_position", "rad", "--json", tmp_path / "values.json"),
+    )
+    assert status == 0
+    assert "trimmed" in text
+    assert "resampled" in text
+    assert program("check_dataset", tmp_path / "new", "--strict")[0] == 0
+    values = json.loads((tmp_path / "values.json").read_text())
+    assert values["episodes_changed"] == values["episodes"] == 1
+    (demo,) = load_demos(tmp_path / "new")
+    assert values["frames"] == len(demo) < values["frames_before"] == 180
+    assert demo.fps == 40
+
+
+def test_markers_are_found_in_the_videos_of_a_dataset(program, tmp_path):
+    cv2 = pytest.importorskip("cv2")
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    marker = cv2.aruco.generateImageMarker(dictionary, 7, 60)
+    root = tmp_path / "set"
+    with DatasetWriter(root, 50, "any", ["a"], cameras={"front": (160, 240)}) as writer:
+        writer.start_episode("look")
+        for k in range(10):
+            image = np.full((160, 240, 3), 255, np.uint8)
+            image[40:100, 50 + 4 * k : 110 + 4 * k] = marker[..., None]
+            writer.add_frame(joint_position=[0.01 * k], images={"front": image})
+        writer.save_episode()
+    arguments = ("extract_features", root, "--marker", 7, "--json", tmp_path / "values.json")
+    status, text, _ = program(*arguments)
+    assert status == 0
+    assert "front.marker_7: 1 episodes looked at" in text
+    assert json.loads((tmp_path / "values.json").read_text())["seen_share"] == 1
+    (demo,) = load_demos(root)
+    # A square of pixels 50 to 109 has its middle at 79.5.
+    truth = np.stack([79.5 + 4 * np.arange(10), np.full(10, 69.5)], axis=1)
+    np.testing.assert_allclose(demo.feature, truth, atol=0.5)
+    assert "1 known before" in program(*arguments)[1]
+    assert program("extract_features", root, "--marker", 70)[0] == 2
+
+
+@pytest.mark.parametrize("name", ["import_arrays", "check_dataset", "repair_dataset"])
 def test_help_tells_what_the_program_is_for(name):
     done = subprocess.run(
         [sys.executable, PROGRAMS / f"{name}.py", "--help"], capture_output=True, text=True

@@ -36,7 +36,11 @@ def check_jumps(
     joint = int((speed[frame] / limits).argmax())
     step = change[frame, joint]
     wrapped = abs(abs(step) - 2 * np.pi) < 0.3
-    cause = "the encoder wrapped: unwrap it" if wrapped else "a glitch, or frames were lost"
+    cause = (
+        "the encoder wrapped: repair_dataset.py unwraps it"
+        if wrapped
+        else "a glitch, or frames were lost: look at it, or leave the episode out"
+    )
     report.warning(
         f"{joint_names[joint]} jumps by {step:.3g} rad in one frame "
         f"({speed[frame, joint]:.3g} rad/s, limit {limits[joint]:.3g}); {cause}. "
@@ -65,7 +69,7 @@ def check_stillness(
     ):
         if seconds > _STILL_SECONDS:
             report.warning(
-                f"{place} with {seconds:.1f} s of standing still: trim it before fitting",
+                f"{place} with {seconds:.1f} s of standing still: repair_dataset.py trims it",
                 file=entry.file,
                 episode=entry.index,
                 frame=frame,

@@ -53,5 +53,10 @@ class Report:
             f"{len(self.errors)} errors, {len(self.warnings)} warnings"
         )
 
+    def records(self) -> list[dict]:
+        """Every finding as plain values: kind, message, file, episode, frame, key."""
+        kinds = (("error", self.errors), ("warning", self.warnings))
+        return [{"kind": kind, **vars(finding)} for kind, found in kinds for finding in found]
+
     def __str__(self) -> str:
         return "\n".join(self.lines())

@@ -147,7 +147,9 @@ def _report_missing(file: str, key: str, report: Report) -> None:
     if key in INDEX_KEYS:
         # All files come from one recorder: the first one tells it for all.
         if not any(finding.key == key for finding in report.warnings):
-            message = "the column is missing: LeRobot cannot open this"
+            message = (
+                "the column is missing: LeRobot cannot open this, repair_dataset.py adds it"
+            )
             report.warning(message, file=file, key=key)
     else:
         report.error(

@@ -33,7 +33,8 @@ def check_stamps(
         k = int(stalled[0])
         report.error(
             f"stamps must increase, but go from {time[k]:.6f} s to {time[k + 1]:.6f} s "
-            f"({len(stalled)} times); drop the repeated frames",
+            f"({len(stalled)} times); repair_dataset.py drops the repeated "
+            f"frames",
             frame=k + 1,
             **place,
         )
@@ -41,7 +42,8 @@ def check_stamps(
     usual = float(np.median(steps))
     if abs(usual * fps - 1) > _RATE_TOLERANCE:
         report.warning(
-            f"frames are {1e3 * usual:.4g} ms apart ({1 / usual:.4g} Hz), but fps says {fps:g}",
+            f"frames are {1e3 * usual:.4g} ms apart ({1 / usual:.4g} Hz), but fps says "
+            f"{fps:g}; repair_dataset.py --fps {round(1 / usual)} resamples to the true rate",
             **place,
         )
     gaps = np.flatnonzero(steps > _GAP * usual)
@@ -49,15 +51,16 @@ def check_stamps(
         lost = int(np.rint(steps[gaps] / usual - 1).sum())
         report.warning(
             f"{len(gaps)} gaps, about {lost} frames lost; the first is "
-            f"{1e3 * steps[gaps[0]]:.4g} ms long",
+            f"{1e3 * steps[gaps[0]]:.4g} ms long; repair_dataset.py --fps {fps:g} fills them "
+            f"in",
             frame=int(gaps[0]) + 1,
             **place,
         )
     jitter = float(np.quantile(np.abs(np.delete(steps, gaps) - usual), 0.95)) / usual
     if jitter > _JITTER_TOLERANCE:
         report.warning(
-            f"steps vary by {100 * jitter:.0f} % (95th percentile); resample before taking "
-            f"differences",
+            f"steps vary by {100 * jitter:.0f} % (95th percentile); repair_dataset.py "
+            f"--fps {fps:g} resamples",
             **place,
         )
 

@@ -26,7 +26,8 @@ def check_finite(
             name = component_name(features.get(key), component)
             report.error(
                 f"{name} is {values[frame, component]} ({len(bad)} values are not finite); "
-                f"leave the episode out or repair the recording",
+                f"repair_dataset.py --drop-bad-frames (or --drop-bad-episodes) makes a copy "
+                f"without",
                 file=entry.file,
                 episode=entry.index,
                 frame=frame,
@@ -50,7 +51,8 @@ def check_repeats(entry: EpisodeEntry, frames: RawFrames, report: Report) -> Non
     elif same.mean() > _REPEATED:
         report.warning(
             f"{100 * same.mean():.0f} % of the frames repeat the one before; the recording is "
-            f"faster than the robot reports, or the robot stood still",
+            f"faster than the robot reports, or the robot stood still; repair_dataset.py drops "
+            f"them",
             file=entry.file,
             episode=entry.index,
             frame=int(same.argmax()) + 1,

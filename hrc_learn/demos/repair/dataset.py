@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ...output import replacing
-from ..assembly import Segments, assemble
+from ..assembly import assemble
 from ..explicit_mapping import MappingSpec
 from ..finding import DatasetError
 from ..frames import RawFrames, read_frames
@@ -18,13 +18,15 @@ from ..roles import INDEX_KEYS
 from ..sidecar import Sidecar, read_sidecar
 from ..staging import episode_path
 from ..units import decide_units
+from ..video_places import read_segments
+from ..video_segment import Segments
 from .angles import fix_signs, unwrap
 from .draft import Draft, Meaning
-from .dropping import drop_bad_frames, drop_repeats, trim
+from .dropping import drop_bad_frames, drop_late, drop_repeats, trim
 from .options import RepairOptions
 from .regridding import regrid
 from .report import RepairReport
-from .videos import cut_segments, read_segments
+from .videos import cut_segments
 from .writing import Recast
 
 Progress = Callable[[Sequence[EpisodeEntry]], Iterable[EpisodeEntry]]
@@ -141,9 +143,11 @@ def _repair(
     )
     draft = drop_bad_frames(draft, meaning, options.drop_bad_frames)
     if options.drop_repeats:
-        draft = drop_repeats(draft)
+        draft = drop_late(draft)
     if options.trim:
         draft = trim(draft, meaning, options.keep_rest)
+    if options.drop_repeats:
+        draft = drop_repeats(draft)
     if options.unwrap:
         draft = unwrap(draft, meaning)
     if options.fix_signs:

@@ -10,6 +10,9 @@ from ..demonstration import Demonstration
 from ..preparation import trim_rest
 from .draft import Draft, Meaning
 
+_PAUSE = 0.1
+"""Longest time between two reports of a robot that moves [s]."""
+
 
 def drop_bad_frames(draft: Draft, meaning: Meaning, allowed: bool) -> Draft:
     """Without the frames that hold values that are not finite.
@@ -27,16 +30,29 @@ def drop_bad_frames(draft: Draft, meaning: Meaning, allowed: bool) -> Draft:
     return draft.only(~bad, f"dropped {bad.sum()} frames with values that are not finite")
 
 
-def drop_repeats(draft: Draft) -> Draft:
-    """Without the frames that repeat the one before, and those stamped no later.
+def drop_late(draft: Draft) -> Draft:
+    """Without the frames whose stamp is not later than all before.
 
     Raises:
         DatasetError: No two frames are left.
     """
     highest = np.maximum.accumulate(draft.time)
-    late = np.concatenate([[True], draft.time[1:] > highest[:-1]])
-    draft = draft.only(late, f"dropped {(~late).sum()} frames whose stamp does not increase")
+    later = np.concatenate([[True], draft.time[1:] > highest[:-1]])
+    return draft.only(later, f"dropped {(~later).sum()} frames whose stamp does not increase")
+
+
+def drop_repeats(draft: Draft) -> Draft:
+    """Without the frames that repeat the one before, because the robot reports more slowly.
+
+    A frame repeated for longer than `_PAUSE` shows an arm that stands still; it stays.
+
+    Raises:
+        DatasetError: No two frames are left.
+    """
     repeated = repeated_frames(draft.frames)
+    begin = np.maximum.accumulate(np.where(repeated, 0, np.arange(len(draft))))
+    end = np.append(np.flatnonzero(~repeated)[1:], len(draft))[np.cumsum(~repeated) - 1] - 1
+    repeated &= draft.time[end] - draft.time[begin] <= _PAUSE
     return draft.only(~repeated, f"dropped {repeated.sum()} repeated frames")
 
 

@@ -12,7 +12,7 @@ class RepairOptions:
     keep_rest: float = 0.1
     """Standing still that is left at either end [s]."""
     drop_repeats: bool = True
-    """Drop frames that repeat the one before, and those whose stamp does not increase."""
+    """Drop frames that repeat the one before for up to 0.1 s, and those stamped no later."""
     unwrap: bool = True
     """Take whole turns out of joints and angles that jump by one."""
     fix_signs: bool = True

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 
-from ..assembly import Segments
 from ..finding import DatasetError
 from ..layout import DatasetFolder, EpisodeEntry
 from ..lerobot_v3 import INDEX_FEATURES
@@ -15,9 +14,10 @@ from ..schema import TIME_KEY
 from ..sidecar import Sidecar, sidecar_copy
 from ..staging import RecordingHeader, StagedEpisode, to_table, write_episode
 from ..statistics import episode_statistics
+from ..video_places import video_keys
+from ..video_segment import Segments
 from .draft import Draft, Meaning
 from .options import RepairOptions
-from .videos import video_keys
 
 
 class Recast:
