@@ -9,7 +9,10 @@ from .goals import Goals as Goals
 from .interface import Command as Command
 from .interface import ControllerState as ControllerState
 from .interface import Observation as Observation
+from .lyapunov import lyapunov_function as lyapunov_function
+from .posture import clear_posture as clear_posture
 from .posture import comfortable_posture as comfortable_posture
+from .posture import comfortable_postures as comfortable_postures
 from .safety import INTERVENTIONS as INTERVENTIONS
 from .safety import SafetyConfig as SafetyConfig
 from .safety import SafetyFilter as SafetyFilter
