@@ -21,7 +21,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from hrc_learn import cli
-from hrc_learn.demos import DatasetWriter, check_dataset, load_demos
+from hrc_learn.demos import DatasetWriter, check_dataset, load_demos, open_demos
 
 JOINTS = tuple(f"panda_joint{i}" for i in range(1, 8))
 
@@ -84,6 +84,9 @@ def measure_reading(root: Path, args: Args) -> dict[str, float]:
     floor = median_seconds(lambda: read_bare(root), args.repeats)
     loading = median_seconds(lambda: load_demos(root), args.repeats)
     one = median_seconds(lambda: load_demos(root, episodes=[args.episodes // 2]), args.repeats)
+    source = open_demos(root)
+    streaming = median_seconds(lambda: sum(map(len, source)), args.repeats)
+    taking = median_seconds(lambda: source[args.episodes // 2], args.repeats)
     demos = load_demos(root)
     padding = median_seconds(demos.padded, args.repeats)
     checking = median_seconds(lambda: check_dataset(root), 3)
@@ -92,6 +95,8 @@ def measure_reading(root: Path, args: Args) -> dict[str, float]:
         "load_demos_samples_per_s": frames / loading,
         "load_demos_over_bare_read": loading / floor,
         "load_one_episode_ms": 1e3 * one,
+        "open_demos_samples_per_s": frames / streaming,
+        "open_demos_take_one_ms": 1e3 * taking,
         "padded_samples_per_s": frames / padding,
         "check_samples_per_s": frames / checking,
     }
@@ -108,9 +113,11 @@ def measure_lerobot(root: Path, args: Args) -> dict[str, float]:
         "action": {"dtype": "float32", "shape": (7,), "names": None},
     }
     dataset = LeRobotDataset.create("local/peer", 50, features, root=root, use_videos=False)
+    start = time.perf_counter()
     for _ in range(args.frames):
         state, action = np.zeros(28, np.float32), np.zeros(7, np.float32)
         dataset.add_frame({"observation.state": state, "action": action, "task": "place"})
+    adding = time.perf_counter() - start
     start = time.perf_counter()
     dataset.save_episode()
     saving = time.perf_counter() - start
@@ -122,6 +129,7 @@ def measure_lerobot(root: Path, args: Args) -> dict[str, float]:
     reading = time.perf_counter() - start
     return {
         "lerobot_import_s": importing,
+        "lerobot_add_frame_us": 1e6 * adding / args.frames,
         "lerobot_save_episode_ms_per_frame": 1e3 * saving / args.frames,
         "lerobot_samples_per_s": args.frames / reading,
     }

@@ -141,6 +141,9 @@ def _cartesian(feature: Feature, notes: list[str]) -> list[Selection]:
         case 7:
             notes.append(f"{feature.key}: assumed to be x, y, z, qx, qy, qz, qw")
             return [position, _select("quaternion_xyzw", feature, indices[3:])]
+        case 9:
+            notes.append(f"{feature.key}: assumed to be x, y, z and two columns of a matrix")
+            return [position, _select("rotation_6d", feature, indices[3:])]
         case 16:
             return [_select("pose_matrix", feature, indices)]
     return []

@@ -18,6 +18,7 @@ JOINT_SUFFIXES = {
         "external_torque",
         "obs_external_torque",
     ),
+    "human_effort": ("human_effort", "human_torque"),
 }
 """`JOINT.SUFFIX`, as lerobot-record and the Franka plug-ins write them."""
 
@@ -32,6 +33,9 @@ _POSE_COMPONENTS = {
     **{f"r{name}": ("rotation_vector", slot) for name, slot in _XYZ.items()},
     **{f"q{name}": ("quaternion_wxyz", slot) for slot, name in enumerate("wxyz")},
     **{f"quat_{name}": ("quaternion_wxyz", slot) for slot, name in enumerate("wxyz")},
+    **{f"euler_{name}": ("euler_xyz", slot) for name, slot in _XYZ.items()},
+    **{f"rot6d_{slot}": ("rotation_6d", slot) for slot in range(6)},
+    **{f"r6d_{slot}": ("rotation_6d", slot) for slot in range(6)},
     "roll": ("euler_xyz", 0),
     "pitch": ("euler_xyz", 1),
     "yaw": ("euler_xyz", 2),
@@ -46,6 +50,7 @@ KEY_ROLES = {
     "position": "(?:ee|eef|tcp)_(?:pos|position)",
     "rotation_vector": "(?:ee|eef|tcp)_(?:rotvec|axis_angle|rot_axis_angle)",
     "euler_xyz": "(?:ee|eef|tcp)_(?:euler|rpy)",
+    "rotation_6d": "(?:ee|eef|tcp)_(?:rot6d|rotation_6d)",
     "quaternion_xyzw": "(?:ee|eef|tcp)_(?:quat|quaternion|orientation)",
     "cartesian": "cartesian_position|cartesian_pose|(?:ee|eef|tcp)_pose|(?:ee|eef|tcp)",
     "gripper": "gripper|gripper_position|gripper_width|gripper_pos",

@@ -18,7 +18,8 @@ def to_quaternion(
         values: Its components in our units.
 
     Raises:
-        ValueError: Quaternions are far from unit length, or matrices are no transforms.
+        ValueError: Quaternions are far from unit length, matrices are no transforms, or two
+            columns span no plane.
     """
     numbers = torch.from_numpy(values)
     match role:
@@ -29,7 +30,11 @@ def to_quaternion(
         case "rotation_vector":
             orientation = quaternion.exp(numbers)
         case "euler_xyz":
-            orientation = _from_euler(numbers)
+            orientation = _from_euler(numbers, (2, 1, 0))
+        case "euler_intrinsic_xyz":
+            orientation = _from_euler(numbers, (0, 1, 2))
+        case "rotation_6d":
+            orientation = _from_two_columns(numbers)
         case _:
             orientation = quaternion.from_matrix(as_transforms(numbers)[:, :3, :3])
     return quaternion.continuous(orientation).numpy()
@@ -67,11 +72,26 @@ def _unit(q: Tensor) -> Tensor:
     return quaternion.normalize(q)
 
 
-def _from_euler(angles: Tensor) -> Tensor:
-    """Roll, pitch, yaw about fixed axes: R = Rz(yaw) Ry(pitch) Rx(roll)."""
+def _from_euler(angles: Tensor, order: tuple[int, int, int]) -> Tensor:
+    """Turns about the axes x, y, z, multiplied from left to right in this order.
+
+    About fixed axes, R = Rz(yaw) Ry(pitch) Rx(roll); about turning ones, R = Rx Ry Rz.
+    """
     axes = torch.eye(3, dtype=angles.dtype)
-    roll, pitch, yaw = (
-        quaternion.exp(angle[:, None] * axis)
-        for angle, axis in zip(angles.unbind(-1), axes, strict=True)
-    )
-    return quaternion.multiply(yaw, quaternion.multiply(pitch, roll))
+    first, second, third = (quaternion.exp(angles[:, k, None] * axes[k]) for k in order)
+    return quaternion.multiply(first, quaternion.multiply(second, third))
+
+
+def _from_two_columns(values: Tensor) -> Tensor:
+    """Two columns of a rotation matrix, made orthonormal (Zhou et al., CVPR 2019, eq. 15)."""
+    first, second = values[:, :3], values[:, 3:]
+    third = torch.linalg.cross(first, second)
+    lost = (third.norm(dim=-1) < 1e-6).nonzero()
+    if len(lost):
+        raise ValueError(
+            f"the two columns at frame {int(lost[0])} span no plane: they hold no rotation"
+        )
+    first = first / first.norm(dim=-1, keepdim=True)
+    third = third / third.norm(dim=-1, keepdim=True)
+    matrix = torch.stack([first, torch.linalg.cross(third, first), third], dim=-1)
+    return quaternion.from_matrix(matrix)

@@ -23,6 +23,8 @@ ROLES: dict[str, Role] = {
     "quaternion_xyzw": Role(width=4, unit="1"),
     "rotation_vector": Role(width=3, unit="rad"),
     "euler_xyz": Role(width=3, unit="rad"),
+    "euler_intrinsic_xyz": Role(width=3, unit="rad"),
+    "rotation_6d": Role(width=6, unit="1"),
     "pose_matrix": Role(width=16, unit="m"),
     "gripper": Role(width=1, unit="m"),
     "feature": Role(width=2, unit="px"),
@@ -31,14 +33,18 @@ ROLES: dict[str, Role] = {
     "command_position": Role(width=None, unit="rad"),
     "command_velocity": Role(width=None, unit="rad/s"),
 }
-"""Every role. `euler_xyz` is roll, pitch, yaw about the fixed axes x, y, z;
-`pose_matrix` a flattened 4x4 homogeneous transform."""
+"""Every role. `euler_xyz` is roll, pitch, yaw about the fixed axes x, y, z,
+`euler_intrinsic_xyz` angles about the axes x, y, z as they turn along; `rotation_6d` the first
+two columns of the rotation matrix, one after the other; `pose_matrix` a flattened 4x4
+homogeneous transform."""
 
 ORIENTATION_ROLES = (
     "quaternion_wxyz",
     "quaternion_xyzw",
     "rotation_vector",
     "euler_xyz",
+    "euler_intrinsic_xyz",
+    "rotation_6d",
     "pose_matrix",
 )
 """The encodings of an orientation, preferred first."""

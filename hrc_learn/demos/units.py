@@ -30,7 +30,11 @@ encoders of hobby servos count; where their zero lies is not known."""
 # Two turns: wrists go past one, and no demonstration stays within 13 degrees.
 _JOINT_LIMITS = {"rad": 4 * math.pi, "deg": 400.0}
 _REACH = {"m": 5.0, "cm": 500.0}
-_ROTATION_LIMIT = {"euler_xyz": 2 * math.pi + 0.1, "rotation_vector": 4 * math.pi}
+_ROTATION_LIMIT = {
+    "euler_xyz": 2 * math.pi + 0.1,
+    "euler_intrinsic_xyz": 2 * math.pi + 0.1,
+    "rotation_vector": 4 * math.pi,
+}
 
 _FOLLOWERS = {
     "joint_velocity": "joint_position",

@@ -157,6 +157,9 @@ def test_droid_convention(tmp_path):
         (["qw", "qx", "qy", "qz"], lambda r: r.as_quat(scalar_first=True)),
         (["ee.wx", "ee.wy", "ee.wz"], lambda r: r.as_rotvec()),
         (["roll", "pitch", "yaw"], lambda r: r.as_euler("xyz")),
+        (["eef_euler_x", "eef_euler_y", "eef_euler_z"], lambda r: r.as_euler("xyz")),
+        (["eef_quat_x", "eef_quat_y", "eef_quat_z", "eef_quat_w"], lambda r: r.as_quat()),
+        ([f"ee.rot6d_{i}" for i in range(6)], lambda r: two_columns(r)),
     ],
 )
 def test_orientations_turn_continuous_in_every_encoding(tmp_path, names, encode):
@@ -169,6 +172,42 @@ def test_orientations_turn_continuous_in_every_encoding(tmp_path, names, encode)
     orientation = load_demos(root)[0].orientation
     assert_same_rotation(orientation, turn)
     assert np.abs(np.diff(orientation, axis=0)).max() < 0.1
+
+
+@pytest.mark.parametrize(
+    ("role", "encode"),
+    [
+        ("quaternion_wxyz", lambda r: r.as_quat(scalar_first=True)),
+        ("quaternion_xyzw", lambda r: r.as_quat()),
+        ("rotation_vector", lambda r: r.as_rotvec()),
+        ("euler_xyz", lambda r: r.as_euler("xyz")),
+        ("euler_intrinsic_xyz", lambda r: r.as_euler("XYZ")),
+        ("rotation_6d", lambda r: 3 * two_columns(r)),
+    ],
+)
+def test_orientations_are_mapped_in_every_encoding(tmp_path, role, encode):
+    turn = Rotation.from_rotvec(joint_path(50, seed=4))
+    episode = {STATE: joint_path(50), "observation.tool": encode(turn)}
+    root = write_folder(tmp_path / "set", [episode], {STATE: PANDA}, dtype="float64")
+    demo = load_demos(root, mapping={role: "observation.tool"})[0]
+    assert_same_rotation(demo.orientation, turn)
+
+
+def test_columns_that_are_no_rotation_are_told(tmp_path):
+    columns = np.ones((50, 6))
+    root = write_folder(tmp_path / "set", [{"observation.tcp_rot6d": columns}], {})
+    with pytest.raises(DatasetError, match="frame 0 span no plane"):
+        load_demos(root)
+
+
+def test_the_persons_effort_is_found_by_name_and_by_key(tmp_path):
+    q = joint_path()
+    names = [*(f"{j}.pos" for j in PANDA), *(f"{j}.human_torque" for j in PANDA)]
+    by_name = write_folder(tmp_path / "a", [{STATE: np.hstack([q, 2 * q])}], {STATE: names})
+    np.testing.assert_allclose(load_demos(by_name)[0].human_effort, 2 * q, atol=1e-6)
+    episode = {STATE: q, "observation.human_effort": 3 * q}
+    by_key = write_folder(tmp_path / "b", [episode], {STATE: PANDA})
+    np.testing.assert_allclose(load_demos(by_key)[0].human_effort, 3 * q, atol=1e-6)
 
 
 def test_true_stamps_are_preferred_and_begin_at_zero(tmp_path):
@@ -354,6 +393,11 @@ def transforms(q: np.ndarray, order) -> np.ndarray:
     T[:, :3, :3] = Rotation.from_rotvec(q).as_matrix()
     T[:, :3, 3] = q / 2
     return np.array([matrix.flatten(order) for matrix in T])
+
+
+def two_columns(rotation: Rotation) -> np.ndarray:
+    """The first two columns of the matrices, one after the other."""
+    return rotation.as_matrix()[:, :, :2].transpose(0, 2, 1).reshape(-1, 6)
 
 
 def assert_same_rotation(orientation: np.ndarray, expected: Rotation) -> None:

@@ -8,7 +8,7 @@ from ...geometry import quaternion
 from ..frames import RawFrames
 from .draft import Draft, Meaning
 
-_ANGLES = ("joint_position", "command_position", "euler_xyz")
+_ANGLES = ("joint_position", "command_position", "euler_xyz", "euler_intrinsic_xyz")
 _TOLERANCE = 0.3 / (2 * np.pi)
 """How far a jump may be from whole turns and still be one, in turns: what moves in a frame."""
 
