@@ -9,8 +9,6 @@ from hrc_learn.protocols import ArmState, DrawnRegion, HumanInput
 from hrc_learn.tasks.led_arm import LedArm, LedArmConfig
 from hrc_learn.tasks.workplace import Workplace
 
-DT = 0.01
-
 
 class IdealArm:
     def __init__(self):
@@ -42,14 +40,14 @@ class Wish:
         return self.asked
 
 
-def lead(seconds, **asked):
+def lead(seconds, dt=0.04, **asked):
     arm = IdealArm()
-    led = LedArm(panda, arm, Wish(**asked), LedArmConfig(dt=DT))
+    led = LedArm(panda, arm, Wish(**asked), LedArmConfig(dt=dt))
     start = arm.hand()
-    for _ in range(round(seconds / DT)):
+    for _ in range(round(seconds / dt)):
         led.step()
-        arm.q += DT * arm.velocity
-        arm.time += DT
+        arm.q += dt * arm.velocity
+        arm.time += dt
     return arm, start
 
 
@@ -57,17 +55,18 @@ def test_the_hand_goes_where_it_is_led():
     way = np.array([0.0, 0.1, -0.05])
     arm, start = lead(1.0, twist=np.concatenate([way, np.zeros(3)]))
     moved = (arm.hand().position - start.position).numpy()
-    # It takes a moment to come up to speed.
+    # It takes a moment to come up to speed, and steps of 40 ms cut curves.
     np.testing.assert_allclose(moved, way, atol=0.05 * 0.1)
-    assert np.linalg.norm(start.twist_to(arm.hand())[3:]) < 2e-3
+    assert np.linalg.norm(start.twist_to(arm.hand())[3:]) < 5e-3
 
 
 def test_a_pull_at_the_body_leaves_the_hand_where_it_is():
     q = Workplace().home_joints()
     effort = 3.0 * panda.joint_jacobian(q, 4)[:3].mT.numpy() @ np.array([0.0, 4.0, 0.0])
-    arm, start = lead(1.0, effort=effort)
-    assert np.abs(arm.q - q.numpy()).max() > 0.1
-    assert float(start.twist_to(arm.hand()).norm()) < 5e-3
+    arm, start = lead(0.6, dt=0.01, effort=effort)
+    assert np.abs(arm.q - q.numpy()).max() > 0.05
+    # What is left is the drift of a step of 10 ms.
+    assert float(start.twist_to(arm.hand()).norm()) < 3e-3
 
 
 def test_a_region_draws_the_hand_in_no_faster_than_it_may():
@@ -84,7 +83,7 @@ def test_a_region_draws_the_hand_in_no_faster_than_it_may():
 def test_a_target_is_reached():
     target = (0.5, 0.1, 0.4)
     arm, _ = lead(6.0, target=target)
-    np.testing.assert_allclose(arm.hand().position.numpy(), target, atol=2e-3)
+    np.testing.assert_allclose(arm.hand().position.numpy(), target, atol=3e-3)
 
 
 def test_the_hand_that_leads_knows_better_than_the_region():
