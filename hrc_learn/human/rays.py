@@ -31,13 +31,23 @@ def view_ray(
     return (turned / turned.norm()).numpy()
 
 
-def meet_level(
-    origin: Float[np.ndarray, "3"], direction: Float[np.ndarray, "3"], height: float
+def meet_plane(
+    origin: Float[np.ndarray, "3"], direction: Float[np.ndarray, "3"], axis: int, value: float
 ) -> Float[np.ndarray, "3"] | None:
-    """Where a ray meets the horizontal plane at a height [m]; None if it never does."""
-    if abs(direction[2]) < 1e-9:
+    """Where a ray meets a plane on which one coordinate is the same everywhere.
+
+    Args:
+        origin: Of the ray [m].
+        direction: Unit vector.
+        axis: Which coordinate: 2 for a horizontal plane.
+        value: Of the coordinate on the plane [m].
+
+    Returns:
+        The point [m]; None if the ray leads away from the plane or along it.
+    """
+    if abs(direction[axis]) < 1e-9:
         return None
-    distance = (height - origin[2]) / direction[2]
+    distance = (value - origin[axis]) / direction[axis]
     return origin + distance * direction if distance > 0 else None
 
 

@@ -47,6 +47,9 @@ def test_a_corner_that_is_dragged_sizes_the_region(session, browser):
         wait_until(lambda: editor._region != before, "another size")
     after = editor._region
     assert after.centre == before.centre
+    # The camera looks along -x, so the pointer sizes y and z.
+    assert after.half_size[0] == pytest.approx(before.half_size[0])
+    assert after.half_size[1] > before.half_size[1]
     assert after.half_size[2] > before.half_size[2]
     shown = [slider.value / 2 for slider in editor._sizes]
     np.testing.assert_allclose(shown, after.half_size, atol=1e-3)

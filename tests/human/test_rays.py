@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hrc_learn.geometry import quaternion
-from hrc_learn.human.rays import meet_box, meet_level, region_over, view_ray
+from hrc_learn.human.rays import meet_box, meet_plane, region_over, view_ray
 
 FIELD, ASPECT = 1.1, 1.6
 EYE = np.array([2.0, 0.5, 1.5])
@@ -38,12 +38,18 @@ def test_what_the_camera_projects_the_ray_hits():
         point = np.array([*rng.uniform(-0.8, 0.8, 2), 0.25])
         ray = view_ray(project(point, R), orientation, FIELD, ASPECT)
         assert np.linalg.norm(ray) == pytest.approx(1.0)
-        np.testing.assert_allclose(meet_level(EYE, ray, 0.25), point, atol=1e-9)
+        np.testing.assert_allclose(meet_plane(EYE, ray, 2, 0.25), point, atol=1e-9)
 
 
-def test_a_ray_that_leads_away_meets_no_level():
-    assert meet_level(EYE, np.array([0.0, 0.6, 0.8]), 0.0) is None
-    assert meet_level(EYE, np.array([0.0, 1.0, 0.0]), 0.0) is None
+def test_a_ray_that_leads_away_meets_no_plane():
+    assert meet_plane(EYE, np.array([0.0, 0.6, 0.8]), 2, 0.0) is None
+    assert meet_plane(EYE, np.array([0.0, 1.0, 0.0]), 2, 0.0) is None
+    assert meet_plane(EYE, np.array([0.6, 0.8, 0.0]), 0, 0.0) is None
+
+
+def test_a_ray_meets_upright_planes_too():
+    point = meet_plane(EYE, np.array([-0.6, 0.0, -0.8]), 0, 0.8)
+    np.testing.assert_allclose(point, [0.8, 0.5, -0.1], atol=1e-12)
 
 
 CENTRE, HALF = np.array([0.2, -0.1, 0.3]), np.array([0.3, 0.2, 0.1])

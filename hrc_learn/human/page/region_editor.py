@@ -12,7 +12,7 @@ from jaxtyping import Float
 from ...protocols import DrawnRegion
 from ...viz import Box
 from ...viz.palette import GREEN, VERMILION, rgba
-from ..rays import meet_box, meet_level, region_over, view_ray
+from ..rays import meet_box, meet_plane, region_over, view_ray
 from .config import FIRST_REGION
 from .library import SceneClickEvent, SceneRectSelectEvent, ViserServer
 
@@ -115,8 +115,16 @@ class RegionEditor:
         self._region = DrawnRegion(centre=(x, y, z), half_size=self._region.half_size)
 
     async def _corner_dragged(self, event: Any) -> None:
-        offset = np.array(event.end_position) - self._region.centre
-        a, b, c = np.clip(offset, _SMALLEST, _LARGEST).tolist()
+        # Two sizes follow the pointer; the third, along the view, could only be guessed.
+        corner = np.array(self._region.centre) + self._region.half_size
+        eye = event.client.camera.position
+        view = np.array(event.end_position) - eye
+        axis = int(np.abs(view).argmax())
+        place = meet_plane(eye, view / np.linalg.norm(view), axis, corner[axis])
+        if place is None:
+            return
+        half_size = np.clip(place - self._region.centre, _SMALLEST, _LARGEST)
+        a, b, c = half_size.tolist()
         self.reshape(DrawnRegion(centre=self._region.centre, half_size=(a, b, c)))
 
     async def _mark_dragged(self, event: Any) -> None:
@@ -160,7 +168,7 @@ class RegionEditor:
         points = []
         for screen in ((left, y), (right, y), (x, top), (x, bottom)):
             ray = view_ray(screen, camera.wxyz, camera.fov, camera.aspect)
-            points.append(meet_level(camera.position, ray, 0.0))
+            points.append(meet_plane(camera.position, ray, 2, 0.0))
         return None if any(p is None for p in points) else np.array(points)
 
     def _mark_next(self) -> None:
@@ -186,7 +194,7 @@ class RegionEditor:
         nearest = min(distances, default=np.inf)
         if np.isfinite(nearest):
             return origin + nearest * direction
-        return meet_level(origin, direction, 0.0)
+        return meet_plane(origin, direction, 2, 0.0)
 
 
 def _doubled(half_size: tuple[float, float, float]) -> tuple[float, float, float]:
