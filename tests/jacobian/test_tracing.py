@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from graphs import library_calls
 from pinhole import Pinhole, wander
 from sampling import generator
 from torch.testing import assert_close
@@ -76,6 +77,7 @@ def test_exports(Estimator):
     step, inputs = step_and_inputs(Estimator, 3)
     with shapes_unchecked():
         program = torch.export.export(step, inputs)
+        assert not library_calls(program)
         assert_close(program.module()(*inputs), step(*inputs))
 
 
