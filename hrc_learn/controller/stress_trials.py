@@ -14,6 +14,7 @@ from torch.utils import _pytree
 from hrc_learn.controller.controller import AdaptiveController
 from hrc_learn.controller.goals import Goals
 from hrc_learn.controller.interface import Observation
+from hrc_learn.controller.limit_watch import LimitWatch
 from hrc_learn.controller.rehearsal import Imperfections, PinholeCamera, VirtualCamera
 from hrc_learn.controller.table1 import INITIAL_IMAGE_JACOBIAN
 from hrc_learn.geometry import quaternion
@@ -93,7 +94,9 @@ def run_stress_trials(config: StressConfig) -> StressResult:
     controller, camera = _controller(count, rng)
     virtual = VirtualCamera(camera=camera, imperfections=config.imperfections(), generator=rng)
     state = controller.initial_state(q)
-    judge = _Judge(state.safety.velocity, config.dt)
+    watch = LimitWatch(limits, state.safety.velocity, config.dt)
+    beyond = torch.zeros(count, 4, dtype=torch.int64)
+    unknown = torch.zeros(count, dtype=torch.int64)
     joints = _JointReadings(config, rng)
     with torch.inference_mode():
         for k in range(round(config.duration / config.dt)):
@@ -110,10 +113,15 @@ def run_stress_trials(config: StressConfig) -> StressResult:
             )
             command, state = controller.step(state, observation)
             q = q + config.dt * command.joint_velocity
-            judge.look(q, command.joint_velocity, (command, state))
-    return StressResult(
-        beyond=judge.beyond, unknown=judge.unknown, interventions=state.safety.counts
-    )
+            beyond += watch.beyond(q, command.joint_velocity)
+            unknown += _unknown((q, command, state))
+    return StressResult(beyond=beyond, unknown=unknown, interventions=state.safety.counts)
+
+
+def _unknown(everything: object) -> Bool[Tensor, "trials"]:
+    """Where any tensor holds a NaN or an infinity."""
+    leaves = [leaf for leaf in _pytree.tree_leaves(everything) if leaf.dim() > 1]
+    return ~torch.stack([leaf.isfinite().flatten(1).all(-1) for leaf in leaves]).all(0)
 
 
 def _uniform(rng: torch.Generator, *shape: int) -> Tensor:
@@ -164,28 +172,3 @@ class _JointReadings:
             self.away = torch.where(begins, _LATE, self.away - self.dt)
             return q, self.away > 0
         return q, None
-
-
-class _Judge:
-    """Counts what must not happen."""
-
-    def __init__(self, velocity: Tensor, dt: float):
-        self.velocity, self.acceleration, self.dt = velocity, torch.zeros_like(velocity), dt
-        self.beyond = torch.zeros(len(velocity), 4, dtype=torch.int64)
-        self.unknown = torch.zeros(len(velocity), dtype=torch.int64)
-
-    def look(self, q: Tensor, v: Tensor, everything: object) -> None:
-        limits, rounding = panda.limits, 1 + 1e-9
-        acceleration = (v - self.velocity) / self.dt
-        jerk = (acceleration - self.acceleration) / self.dt
-        broken = [
-            (q > limits.upper) | (q < limits.lower),
-            v.abs() > limits.velocity,
-            acceleration.abs() > limits.acceleration * rounding,
-            jerk.abs() > limits.jerk * rounding,
-        ]
-        self.beyond += torch.stack([flags.any(-1) for flags in broken], dim=-1)
-        leaves = _pytree.tree_leaves(everything)
-        finite = [leaf.isfinite().flatten(1).all(-1) for leaf in leaves if leaf.dim() > 1]
-        self.unknown += ~torch.stack([q.isfinite().all(-1), *finite]).all(0)
-        self.velocity, self.acceleration = v, acceleration

@@ -16,6 +16,7 @@ from hrc_learn.controller.config import ControllerConfig
 from hrc_learn.controller.controller import AdaptiveController
 from hrc_learn.controller.goals import HALF_SIZE, Goals
 from hrc_learn.controller.interface import Command, ControllerState, Observation
+from hrc_learn.controller.limit_watch import LimitWatch
 from hrc_learn.controller.posture import clear_posture, comfortable_postures
 from hrc_learn.controller.rehearsal import (
     Imperfections,
@@ -258,8 +259,8 @@ class _Judge:
         self.violations = torch.zeros(count, dtype=torch.int64)
         self.hand_overs = torch.zeros(count, dtype=torch.int64)
         self.peak_speed = torch.zeros(count, dtype=torch.float64)
-        self.velocity = torch.zeros_like(scene.start)
-        self.acceleration = torch.zeros_like(scene.start)
+        still = torch.zeros_like(scene.start)
+        self.watch = LimitWatch(panda.limits, still, config.dt)
         self.touched = torch.zeros(count, dtype=torch.bool)
         self.active = torch.zeros(count, dtype=torch.bool)
         self.in_box = torch.zeros(count, dtype=torch.bool)
@@ -287,21 +288,12 @@ class _Judge:
         box = self.controller.goals.position
         # 5 % beyond the wall count as in the box: a potential ends at the wall, not inside.
         self.in_box = ((tool.position - box.centre).abs() <= 1.05 * box.half_size).all(-1)
-        self._check_limits(q, command.joint_velocity)
+        v = command.joint_velocity
+        self.violations += self.watch.beyond(q, v).any(-1) | ~v.isfinite().all(-1)
+        speed = (v.abs() / panda.limits.velocity).amax(-1)
+        self.peak_speed = torch.maximum(self.peak_speed, speed)
         if self.contact_steps and step % self.contact_steps == 0:
             self.touched |= clearance(q) < 0
-
-    def _check_limits(self, q: Tensor, v: Tensor) -> None:
-        limits, rounding = panda.limits, 1 + 1e-9
-        acceleration = (v - self.velocity) / self.dt
-        jerk = (acceleration - self.acceleration) / self.dt
-        broken = (q > limits.upper) | (q < limits.lower) | (v.abs() > limits.velocity)
-        broken |= acceleration.abs() > limits.acceleration * rounding
-        broken |= (jerk.abs() > limits.jerk * rounding) | ~v.isfinite()
-        self.violations += broken.any(-1)
-        self.acceleration = acceleration
-        self.peak_speed = torch.maximum(self.peak_speed, (v.abs() / limits.velocity).amax(-1))
-        self.velocity = v
 
     def result(self) -> TrialResult:
         return TrialResult(
