@@ -41,7 +41,7 @@ class Args:
     """Rounds of the search."""
     population: int = 8
     """Gains tried in each."""
-    starts: StartsConfig = field(default_factory=lambda: StartsConfig(starts=48))
+    starts: StartsConfig = field(default_factory=lambda: StartsConfig(count=48))
     """How closed loops are drawn; their seed is that of the search."""
     held_out_seed: int = 1000
     """Seed of the closed loops of the final figures."""

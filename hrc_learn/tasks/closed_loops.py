@@ -29,7 +29,8 @@ from .workplace import nearest_configuration
 class StartsConfig:
     """How starts are drawn. Lengths [m], angles [rad]."""
 
-    starts: int = 200
+    count: int = 200
+    """Of starts."""
     largest_roll: float = math.pi
     """Of the camera about its axis, either way; 0: as the demonstrations saw it."""
     tilt: float = 0.1
@@ -41,9 +42,11 @@ class StartsConfig:
     dt: float = 0.008
     """Control step [s]."""
     seed: int = 0
+    """Of starts, targets, cameras and noise."""
     imperfections: Imperfections = field(
         default_factory=lambda: Imperfections(frame_steps=4, latency_frames=1, noise=0.5)
     )
+    """Of the measurement."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -107,7 +110,7 @@ class ClosedLoops:
             near: Joints with the hand in it, near which starts are chosen [rad].
             config: How.
         """
-        rng, n = torch.Generator().manual_seed(config.seed), config.starts
+        rng, n = torch.Generator().manual_seed(config.seed), config.count
 
         def uniform(*shape: int) -> Tensor:
             return 2 * torch.rand(n, *shape, generator=rng, dtype=torch.float64) - 1

@@ -137,6 +137,9 @@ def run(monkeypatch, capsys, tmp_path):
         ),
         ("training/fit_dmp.py", ["--dataset", "none", "--out", "new"], "none"),
         ("training/fit_image_jacobian.py", ["--dataset", "none", "--out", "new"], "none"),
+        ("training/evaluate.py", ["none", "none"], "none"),
+        ("training/evaluate_image_jacobian.py", ["none", "none"], "none"),
+        ("training/tune_controller.py", ["--out", "new", "--resume"], "new.search.json"),
         (
             "control/run_collaboration.py",
             ["--placing", "none", "--aiming", "none", "--out", "new"],
