@@ -104,7 +104,8 @@ class PageSession:
             self.finished = True
         elif request == "home":
             # A jump of the arm has no place in a demonstration.
-            self._recorder.handle("stop")
+            if self._recorder.status.state == "recording":
+                self._recorder.handle("stop")
             self._go_home()
             self.led.restart()
         else:

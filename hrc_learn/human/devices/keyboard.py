@@ -48,8 +48,7 @@ class TerminalKeyboard:
             config: Fastest motion of the hand, and how it turns.
         """
         self._chain, self._typed = chain, typed
-        # A key that is held repeats after a quarter to half a second, then every 30 ms.
-        self._keys = keys or HeldKeys(holds_for=0.3)
+        self._keys = keys or HeldKeys()
         self._config = config or DragConfig()
         self._gripper: float | None = None
 
