@@ -1,5 +1,6 @@
 """A package must be built anew when anything changes that the step depends on."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -16,13 +17,24 @@ from hrc_learn.controller import (
 from hrc_learn.controller.runtime.export import _structure
 from hrc_learn.controller.runtime.fingerprint import UnknownCodeError, fingerprint
 from hrc_learn.geometry import quaternion
-from hrc_learn.jacobian import FixedEstimator, KalmanEstimator, RBFImageJacobian, paper_grid
+from hrc_learn.jacobian import (
+    FixedEstimator,
+    ImageJacobianEstimator,
+    KalmanEstimator,
+    RBFImageJacobian,
+    paper_grid,
+)
 from hrc_learn.kinematics import panda
 
 DOUBLE = torch.float64
 
 
-def controller(scale: float = 1.0, half_size: float = 0.1, kind=KalmanEstimator, **config):
+def controller(
+    scale: float = 1.0,
+    half_size: float = 0.1,
+    kind: Callable[[RBFImageJacobian], ImageJacobianEstimator] = KalmanEstimator,
+    **config: float,
+) -> AdaptiveController:
     J = scale * torch.tensor(INITIAL_IMAGE_JACOBIAN, dtype=DOUBLE)
     estimator = kind(RBFImageJacobian.from_jacobian(J, paper_grid(), 0.1))
     down = quaternion.normalize(torch.tensor(GRIPPER_DOWN, dtype=DOUBLE))
