@@ -44,13 +44,14 @@ def address(log: Path, timeout: float = 180.0) -> str:
     pytest.fail(f"no page within {timeout} s: {log.read_text()}")
 
 
-def show(tab, keys: str) -> None:
+def show(tab, keys: str, seconds: float = 4.0) -> None:
     """Lead the hand by keys, each held for a while as a keyboard repeats them."""
-    tab.locator("canvas").first.hover(position={"x": 20, "y": 20})
+    tab.mouse.move(100, 400)
     for key in keys:
-        for _ in range(25):
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
             tab.keyboard.press(key)
-            time.sleep(0.04)
+            time.sleep(0.03)
 
 
 def test_ones_own_demonstration_is_recorded_learned_and_reproduced(tmp_path):
