@@ -114,7 +114,7 @@ def _table(kind: str, demos: DemonstrationSet, error: ReproductionError) -> Tabl
     for i, demo in enumerate(demos):
         table.add_row(str(demo.episode), *(f"{x[i]:.3g}" for x in columns.values()))
     table.add_section()
-    table.add_row("median", *(f"{x.median():.3g}" for x in columns.values()))
+    table.add_row("median", *(f"{x.quantile(0.5):.3g}" for x in columns.values()))
     return table
 
 

@@ -194,4 +194,5 @@ def fit_recording(fitted: FittedPrimitives, title: str) -> FitRecording:
         demo_paths=paths,
         reproduction_paths=reproduced,
         residual=residual,
+        unit="rad" if kind == "joint" else "m",
     )

@@ -36,7 +36,7 @@ class ReproductionError:
         """Median and maximum of each, by name."""
         figures = {}
         for name, values in self.columns().items():
-            figures[f"{prefix}_{name}_median"] = float(values.median())
+            figures[f"{prefix}_{name}_median"] = float(values.quantile(0.5))
             figures[f"{prefix}_{name}_max"] = float(values.max())
         return figures
 

@@ -106,7 +106,12 @@ def fit_joints_figure(fit: FitRecording, most: int = 4) -> Figure:
     reproductions = list(zip(fit.time, fit.reproductions, strict=True))[:most]
     demos = list(zip(fit.time, fit.demos, strict=True))[:most]
     return _joints(
-        fit.joint_names, reproductions, demos, fit.joint_limits, label="reproduction"
+        fit.joint_names,
+        reproductions,
+        demos,
+        fit.joint_limits,
+        label="reproduction",
+        unit=fit.unit,
     )
 
 
@@ -212,6 +217,7 @@ def _joints(
     limits: JointLimits | None,
     *,
     label: str,
+    unit: str = "rad",
 ) -> Figure:
     rows = -(-len(names) // 2)
     with matplotlib.rc_context(STYLE):
@@ -222,7 +228,7 @@ def _joints(
                 axes.plot(time, values[:, i], color=palette.DEMO, lw=3.5, label="demonstration")
             for time, values in done:
                 axes.plot(time, values[:, i], color=palette.RUN, label=label)
-            axes.set(title=name, ylabel="rad")
+            axes.set(title=name, ylabel=unit)
             axes.margins(x=0)
             if limits is not None:
                 draw_limits(axes, float(limits.lower[i]), float(limits.upper[i]))

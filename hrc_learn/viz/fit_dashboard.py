@@ -51,11 +51,11 @@ def fit_tabs(fit: FitRecording, most: int) -> list[Tab]:
         demo, reproduction = fit.demos[i], fit.reproductions[i]
         root = f"demonstration_{i + 1}"
         plots = [
-            joint_plot(root, name, j, reproduction, demo, fit.joint_limits)
+            joint_plot(root, name, j, reproduction, demo, fit.joint_limits, fit.unit)
             for j, name in enumerate(fit.joint_names)
         ]
         error = several(f"{root}/error", fit.joint_names, 1e3 * (reproduction - demo))
-        plots.append(Plot(title="Error, all joints [mrad]", curves=(error,)))
+        plots.append(Plot(title=f"Error, all together [m{fit.unit}]", curves=(error,)))
         tabs.append(Tab(title=f"Demonstration {i + 1}", plots=tuple(plots), columns=2))
     return tabs
 
@@ -90,7 +90,8 @@ def _summary(fit: FitRecording) -> str:
     worst = [
         1e3 * np.abs(r - d).max() for r, d in zip(fit.reproductions, fit.demos, strict=True)
     ]
-    lines += ["", "| demonstration | duration [s] | largest error [mrad] |", "|---|---|---|"]
+    lines += ["", f"| demonstration | duration [s] | largest error [m{fit.unit}] |"]
+    lines += ["|---|---|---|"]
     for i, (time, error) in enumerate(zip(fit.time, worst, strict=True)):
         lines.append(f"| {i + 1} | {time[-1] - time[0]:.2f} | {error:.3g} |")
     if fit.residual:

@@ -159,6 +159,7 @@ def joint_plot(
     position: np.ndarray,
     demo: np.ndarray | None,
     limits: JointLimits | None,
+    unit: str = "rad",
 ) -> Plot:
     """Position of joint i over its demonstration and between its limits."""
     curves = []
@@ -173,7 +174,7 @@ def joint_plot(
         curves.append(single(path, "demonstration", demo[:, i], palette.DEMO, width=5.0))
     path = f"{root}/{name}/position"
     curves.append(single(path, "position", position[:, i], palette.RUN_ON_DARK))
-    return Plot(title=f"{name} [rad]", curves=tuple(curves))
+    return Plot(title=f"{name} [{unit}]", curves=tuple(curves))
 
 
 def _safety(run: RunRecording) -> Tab:

@@ -218,6 +218,8 @@ class FitRecording:
     """Normalised RMS error of the fit for each number of basis functions tried."""
     n_basis: int | None = None
     """The number of basis functions used."""
+    unit: str = "rad"
+    """Of the joints, or "m" where they are positions."""
 
     def __post_init__(self) -> None:
         if not len(self.time) == len(self.demos) == len(self.reproductions) > 0:
