@@ -1,7 +1,4 @@
-"""Errors of orientations in NumPy, one at a time, for loops that count microseconds.
-
-The functions of `error.py`, in closed form where those differentiate.
-"""
+"""Errors of orientations in NumPy, one at a time, for loops that count microseconds."""
 
 import numpy as np
 from jaxtyping import Float64
@@ -80,8 +77,7 @@ def velocity_map(error: Vector) -> Float64[np.ndarray, "3 3"]:
         # Half angles: 1 - cos cancels for small ones.
         first = 2 * (np.sin(angle / 2) / angle) ** 2
         second = (angle - np.sin(angle)) / (angle * square)
-    x, y, z = error
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    cross = skew(error)
     return first * cross - second * (cross @ cross) - np.eye(3)
 
 
@@ -90,13 +86,35 @@ def angular_velocity(error: Vector, rate: Vector) -> Vector:
     return velocity_map(error) @ rate
 
 
+def error_rate(error: Vector, velocity: Vector) -> Vector:
+    """Rate of an error, of an angular velocity: the inverse of `angular_velocity`.
+
+    Whole turns away the error has a rate about its own axis only.
+    """
+    square = float(error @ error)
+    half = square**0.5 / 2
+    sinc = np.sin(half) / half if half > SMALL else 1.0
+    if abs(sinc) < SINGULAR:
+        return -(error @ velocity) / square * error
+    near = half < 10 * SMALL
+    share = 1 / 12 + square / 720 if near else (1 - np.cos(half) / sinc) / square
+    cross = skew(error)
+    across = cross @ velocity
+    return -velocity - 0.5 * across - share * (cross @ across)
+
+
+def skew(v: Vector) -> Float64[np.ndarray, "3 3"]:
+    """The matrix [v] with [v] u = v x u."""
+    x, y, z = v
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
 def retarget(
     error: Vector, rate: Vector, old_goal: Quaternion, goal: Quaternion
 ) -> tuple[Vector, Vector]:
     """Error to a new goal and its rate, for the same orientation and angular velocity."""
     new = nearest_turn(to_error(to_orientation(error, old_goal), goal), error)
-    omega = angular_velocity(error, rate)
-    return new, np.linalg.pinv(velocity_map(new), rcond=SINGULAR) @ omega
+    return new, error_rate(new, angular_velocity(error, rate))
 
 
 def nearest_turn(error: Vector, reference: Vector) -> Vector:

@@ -1,5 +1,6 @@
 """Starts and goals of an orientation as a caller gives them, in terms of errors."""
 
+import torch
 from jaxtyping import Float
 from torch import Tensor, broadcast_tensors
 
@@ -11,7 +12,9 @@ from hrc_learn.geometry import quaternion
 def unit_quaternion(value: ArrayLike, like: Tensor) -> Float[Tensor, "*batch 4"]:
     """A quaternion given by the caller, normalised; dtype and device of `like`."""
     q = to_tensor(value, dtype=like.dtype, device=like.device)
-    if q.ndim == 0 or q.shape[-1] != 4 or not (q.norm(dim=-1) > 0.5).all():
+    shaped = q.ndim > 0 and q.shape[-1] == 4
+    # A tracer cannot look at values.
+    if not (shaped and (torch.compiler.is_compiling() or (q.norm(dim=-1) > 0.5).all())):
         raise ValueError(f"an orientation must be unit quaternions (w, x, y, z), got {value}")
     return quaternion.normalize(q)
 

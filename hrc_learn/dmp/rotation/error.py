@@ -11,13 +11,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hrc_learn.geometry import quaternion
-from hrc_learn.geometry.left_jacobian import drift_free_rate
+from hrc_learn.geometry.left_jacobian import axis_drift, drift_free_rate, drift_free_slope
 
 _NO_AXIS = 1e-9
 """Rotation vectors shorter than this [rad] have no direction of their own."""
-
-_SINGULAR = 1e-3
-"""Share of an angular velocity that still counts as rate of the error."""
 
 
 def demonstrated_error(
@@ -90,7 +87,7 @@ def angular_acceleration(
     curvature: Float[Tensor, "*batch 3"],
 ) -> Float[Tensor, "*batch 3"]:
     """Angular acceleration [rad/s^2], from e and its first two derivatives by time."""
-    return torch.func.jvp(angular_velocity, (error, rate), (rate, curvature))[1]
+    return -drift_free_slope(error, rate, curvature)
 
 
 def error_rate(
@@ -101,10 +98,8 @@ def error_rate(
     Whole turns away from the goal the error has a rate about its own axis only: what the
     velocity holds across it is lost there.
     """
-    unit = torch.eye(3, dtype=error.dtype, device=error.device)
-    rows = error[..., None, :].expand(*error.shape, 3)
-    columns = angular_velocity(rows, unit.expand(rows.shape)).mT
-    return (torch.linalg.pinv(columns, rtol=_SINGULAR) @ velocity[..., None])[..., 0]
+    error, velocity = torch.broadcast_tensors(error, velocity)
+    return -velocity - axis_drift(error, velocity)
 
 
 def nearest_turn(

@@ -29,7 +29,7 @@ from hrc_learn.dmp.rotation import error as error_space
 from hrc_learn.dmp.rotation.influences import Influences
 from hrc_learn.dmp.state import DMPState
 from hrc_learn.dmp.trajectory import Trajectory
-from hrc_learn.geometry.left_jacobian import axis_drift, drift_free_rate
+from hrc_learn.geometry.left_jacobian import axis_drift, drift_free_rate, drift_free_slope
 
 LONGEST = 1 / 200
 """Longest step of a rollout, in s; the fourth power of it is what the rollout is off by."""
@@ -60,8 +60,7 @@ class UdeFormulation:
                     "orientation is a whole turn or more from its end: formulation 'ude' "
                     "cannot follow that, use 'log'"
                 )
-            derivative = torch.func.jvp(drift_free_rate, (e, rate), (rate, curvature))
-            v, slope = derivative[0], derivative[1]
+            v, slope = drift_free_rate(e, rate), drift_free_slope(e, rate, curvature)
             force = slope - curvature + motion.spring.alpha * (v - rate)
             change = (ridge_operator(motion.response, s, 1e-7) @ force).mT
             motion.weights += change.to(motion.weights)
