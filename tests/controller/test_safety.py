@@ -208,9 +208,10 @@ def test_a_fault_brakes_to_rest_along_a_straight_line_and_resumes_smoothly(fault
         )
         q = q + v * dt
         assert ((v - before).abs() <= LIMITS.acceleration * dt * (1 + 1e-9)).all()
-        assert (v.norm() == 0) or torch.allclose(v / v.norm(), u / u.norm())
+        if v.norm() > 1e-12:  # below that rounding alone
+            torch.testing.assert_close(v / v.norm(), u / u.norm())
         torch.testing.assert_close(state.position, q)
-    assert v.norm() == 0
+    assert v.norm() < 1e-12
     assert report.acted("stopped" if "stop" in fault else "invalid")
     v, state, _ = safety.step(state, q, u, dt)
     assert 0 < v.norm() < 0.2
@@ -223,7 +224,8 @@ def test_one_faulty_arm_of_a_batch_leaves_the_others_alone():
     v, _, report = safety.step(safety.initial_state(READY.expand(3, 7)), q, u, 0.01)
     assert report.acted("invalid").tolist() == [False, True, False]
     assert v[1].norm() == 0
-    torch.testing.assert_close(v[[0, 2]], u[[0, 2]])
+    # Within a step but for what it takes to fade the acceleration out.
+    torch.testing.assert_close(v[[0, 2]], u[[0, 2]], rtol=0.02, atol=0)
 
 
 def test_interventions_are_counted_by_kind():
