@@ -21,9 +21,9 @@ from hrc_learn.demos.repair import RepairOptions, repair_dataset
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
-    path: Annotated[Path, tyro.conf.Positional]
+    path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OLD")]
     """Folder of the dataset to repair, version 2.0, 2.1 or 3.0."""
-    out: Annotated[Path, tyro.conf.Positional]
+    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="NEW")]
     """Folder of the new one; must not exist."""
     options: Annotated[RepairOptions, tyro.conf.arg(name="")] = field(
         default_factory=RepairOptions
