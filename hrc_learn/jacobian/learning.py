@@ -107,7 +107,10 @@ def learn(
     on_round(0, rounds[0])
     best, kept = 0, model.state_dict_copy()
     while len(rounds) <= learning.rounds and len(rounds) - 1 - best < learning.patience:
-        optimiser.step(loss)
+        try:
+            optimiser.step(loss)
+        except torch.linalg.LinAlgError:
+            break  # a step so long that nothing could be solved: the best so far is kept
         rounds.append(model.judge(training, held_out))
         on_round(len(rounds) - 1, rounds[-1])
         limit = (1 - learning.least_gain) * rounds[best].held_out_error
