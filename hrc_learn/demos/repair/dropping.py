@@ -56,7 +56,7 @@ def drop_repeats(draft: Draft) -> Draft:
     return draft.only(~repeated, f"dropped {repeated.sum()} repeated frames")
 
 
-def trim(draft: Draft, meaning: Meaning, keep: float) -> Draft:
+def trim(draft: Draft, meaning: Meaning, keep: float | int) -> Draft:
     """Without standing still before and after the motion.
 
     Raises:

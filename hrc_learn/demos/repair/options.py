@@ -9,7 +9,7 @@ class RepairOptions:
 
     trim: bool = True
     """Cut off standing still before and after the motion."""
-    keep_rest: float = 0.1
+    keep_rest: float | int = 0.1
     """Standing still that is left at either end [s]."""
     drop_repeats: bool = True
     """Drop frames that repeat the one before for up to 0.1 s, and those stamped no later."""
@@ -21,7 +21,7 @@ class RepairOptions:
     """Drop frames with values that are not finite."""
     drop_bad_episodes: bool = False
     """Leave out episodes that cannot be read or repaired."""
-    fps: float | None = None
+    fps: float | int | None = None
     """Resample to a regular grid of this rate [1/s]; None leaves the frames as they are."""
     videos: bool = True
     """Keep the videos. Frames dropped in the middle and resampling would need new ones."""

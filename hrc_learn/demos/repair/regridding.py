@@ -15,7 +15,7 @@ from .draft import Draft, Meaning
 _SMOOTH = ("joint_position", "joint_velocity", "position")
 
 
-def regrid(draft: Draft, meaning: Meaning, fps: float) -> Draft:
+def regrid(draft: Draft, meaning: Meaning, fps: float | int) -> Draft:
     """Resample every column, as `preparation.resample` does.
 
     Rotation vectors and Euler angles are interpolated as they are: unwrap them first.

@@ -45,7 +45,7 @@ class Recast:
         self.tasks = [folder.tasks[index] for index in self._task_index]
         self._add_time = "time" not in meaning.matching.selections and options.fps is None
         self._header = RecordingHeader(
-            fps=options.fps or folder.fps,
+            fps=float(options.fps or folder.fps),
             robot_type=folder.robot_type or "unknown",
             features=self._features(),
             sidecar=self._sidecar(sidecar, units),
