@@ -32,6 +32,7 @@ PICTURES: dict[str, tuple[Picture, float]] = {
     "force": (loop_pictures.force, 2.8),
     "orientation": (space_pictures.orientation, 3.1),
     "pose": (space_pictures.pose, 3.4),
+    "dual_arm": (space_pictures.dual_arm, 2.8),
     "bases": (training_pictures.bases, 2.4),
     "learned_basis": (training_pictures.learned_basis, 2.6),
     "obstacle_training": (training_pictures.obstacle_training, 2.8),

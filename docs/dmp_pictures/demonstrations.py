@@ -44,6 +44,16 @@ def swing() -> tuple[Tensor, Tensor]:
     return time, torch.cat([position, quaternion.exp(vector)], -1)
 
 
+def carried() -> tuple[Tensor, Tensor, Tensor]:
+    """Times, positions (T, 2, 3) and orientations (T, 2, 4) of two hands with one object."""
+    time, path = swing()
+    m = rise(time / time[-1])
+    turn = quaternion.exp(torch.stack([0 * m, 0 * m, 0.6 * m], -1))
+    hold = torch.tensor([[-0.15, 0.0, 0.0], [0.15, 0.0, 0.0]], dtype=torch.float64)
+    hands = path[:, None, :3] + quaternion.rotate(turn[:, None], hold)
+    return time, hands, turn[:, None].expand(-1, 2, -1)
+
+
 def knock() -> tuple[Tensor, Tensor]:
     """A slow reach with a knock of some hundredths of its 2 s [rad]."""
     time, s = stamps(2.0, 300)
