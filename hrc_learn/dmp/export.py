@@ -16,17 +16,20 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 from torch.export import Dim, ExportedProgram
+from torch.utils._pytree import tree_map
 
 from hrc_learn.dmp.joint import JointDMP
 from hrc_learn.dmp.orientation import OrientationDMP
 from hrc_learn.dmp.orientation_motion import OrientationState
 from hrc_learn.dmp.orientation_stepper import OrientationStepper
 from hrc_learn.dmp.pose import PoseDMP
-from hrc_learn.dmp.pose_columns import BODY
+from hrc_learn.dmp.pose_columns import BODY, ERROR, POSITION
 from hrc_learn.dmp.pose_motion import PoseState
 from hrc_learn.dmp.pose_stepper import PoseStepper
+from hrc_learn.dmp.rotation.error import to_orientation
 from hrc_learn.dmp.state import DMPState
 from hrc_learn.dmp.stepper import Stepper
+from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.storage import saved_kind
 
 REFERENCE = "reference"
@@ -34,6 +37,8 @@ PRIMITIVE, PROGRAM = "primitive", "step.pt2"
 STATE = tuple(field.name for field in fields(DMPState))
 TRACED_BATCH = 3
 """Any but 0 and 1, which a tracer would take for constants."""
+SAME = 8
+"""Angles of fewer roundings than this are none."""
 
 type Exportable = JointDMP | OrientationDMP | PoseDMP
 type Tensors = dict[str, Tensor]
@@ -49,9 +54,9 @@ class ExportedDMP:
     program: ExportedProgram
     """(state, dt, inputs) -> state, dictionaries of tensors (B, ...), dt (B,) [s].
 
-    A state is what `state_tensors` makes of one. Inputs are `slowdown`, of joints `goal` and
-    `coupling` as well, of a pose `goal_body`; all are needed, `resting_inputs` change nothing.
-    A new goal of an orientation takes derivatives that cannot be traced: the stepper has it.
+    A state is what `state_tensors` makes of one. Inputs are `slowdown`, `coupling` and `goal`,
+    for a pose instead of that `goal_position`, `goal_orientation` and `goal_body`, and its
+    coupling is (B, 6); all are needed, and `resting_inputs` change nothing.
     """
 
     def save(self, folder: str | Path) -> None:
@@ -124,7 +129,7 @@ def state_tensors(state: DMPState | OrientationState | PoseState) -> Tensors:
     return {name: x.detach().clone() for name, x in tensors.items()}
 
 
-class _Step(nn.Module):
+class StepModule(nn.Module):
     """The step of a primitive between dictionaries of tensors."""
 
     def __init__(self, dmp: Exportable, goal_filter: float | None):
@@ -136,16 +141,34 @@ class _Step(nn.Module):
         motion = DMPState(**{k: x for k, x in state.items() if k != REFERENCE})
         options: dict[str, Any] = {"goal_filter": self.goal_filter}
         options["slowdown"] = inputs["slowdown"]
+        options["coupling"] = inputs["coupling"]
         if isinstance(self.dmp, JointDMP):
-            options |= {"goal": inputs["goal"], "coupling": inputs["coupling"]}
-            return _tensors(self.dmp.step(motion, dt, **options))
+            return _tensors(self.dmp.step(motion, dt, goal=inputs["goal"], **options))
         if isinstance(self.dmp, OrientationDMP):
-            turn = OrientationState(motion=motion, reference=state[REFERENCE])
-            turn = self.dmp.step(turn, dt, **options)
-            return _tensors(turn.motion) | {REFERENCE: turn.reference.clone()}
-        pose = PoseState(motion=motion, reference=state[REFERENCE])
-        pose = self.dmp.step(pose, dt, goal_body=inputs["goal_body"], **options)
-        return _tensors(pose.motion) | {REFERENCE: pose.reference.clone()}
+            before = OrientationState(motion=motion, reference=state[REFERENCE])
+            before = _where_new(self.dmp.retarget(before, inputs["goal"]), before)
+            after = self.dmp.step(before, dt, **options)
+        else:
+            before = PoseState(motion=motion, reference=state[REFERENCE])
+            goal = Pose(inputs["goal_position"], inputs["goal_orientation"])
+            before = _where_new(self.dmp.retarget(before, goal), before)
+            after = self.dmp.step(before, dt, goal_body=inputs["goal_body"], **options)
+        return _tensors(after.motion) | {REFERENCE: after.reference.clone()}
+
+
+def _where_new[S: (OrientationState, PoseState)](new: S, old: S) -> S:
+    """A state with a new goal, where that is another one.
+
+    Whole turns away from its goal an orientation would lose velocity to one that stays.
+    """
+    away = quaternion.angle(new.reference, old.reference)
+    changed = away > SAME * torch.finfo(away.dtype).eps
+    changed = changed | (new.motion.target != old.motion.target).any(-1)
+
+    def choose(new: Tensor, old: Tensor) -> Tensor:
+        return torch.where(changed.reshape(-1, *[1] * (old.ndim - 1)), new, old)
+
+    return tree_map(choose, new, old)
 
 
 def _tensors(state: DMPState) -> Tensors:
@@ -171,7 +194,8 @@ def _program(dmp: Exportable, goal_filter: float | None) -> ExportedProgram:
         arguments = state, torch.full_like(state["pace"], 1e-3), inputs
         first = {0: Dim("batch", min=1)}
         shapes = dict.fromkeys(state, first), first, dict.fromkeys(inputs, first)
-        return torch.export.export(_Step(dmp, goal_filter), arguments, dynamic_shapes=shapes)
+        step = StepModule(dmp, goal_filter)
+        return torch.export.export(step, arguments, dynamic_shapes=shapes)
     finally:
         for name, parameter in dmp.named_parameters():
             parameter.requires_grad_(trained[name])
@@ -179,10 +203,18 @@ def _program(dmp: Exportable, goal_filter: float | None) -> ExportedProgram:
 
 def resting_inputs(dmp: Exportable, state: Mapping[str, Tensor]) -> Tensors:
     """Inputs of the program that change nothing: the goal as it is, and no influence."""
-    resting = {"slowdown": torch.zeros_like(state["pace"])}
-    target = state["target"]
+    target, slowdown = state["target"], torch.zeros_like(state["pace"])
     if isinstance(dmp, JointDMP):
-        return resting | {"goal": target.clone(), "coupling": torch.zeros_like(target)}
-    if isinstance(dmp, PoseDMP):
-        return resting | {"goal_body": target[:, BODY].clone()}
-    return resting
+        goals, push = {"goal": target.clone()}, torch.zeros_like(target)
+    elif isinstance(dmp, OrientationDMP):
+        goals = {"goal": to_orientation(dmp.motion.goal.detach(), state[REFERENCE])}
+        push = torch.zeros_like(target)
+    else:
+        error = dmp.motion.goal.detach()[ERROR]
+        goals = {
+            "goal_position": target[:, POSITION].clone(),
+            "goal_orientation": to_orientation(error, state[REFERENCE]),
+            "goal_body": target[:, BODY].clone(),
+        }
+        push = torch.zeros_like(target[:, :6])
+    return {"slowdown": slowdown, "coupling": push, **goals}

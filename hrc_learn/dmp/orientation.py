@@ -171,11 +171,9 @@ class OrientationDMP(nn.Module):
         a `goal_filter`, the angular acceleration. `coupling` is one, in the base frame
         [rad/s^2], (*batch, 3).
         """
-        motion, reference = state.motion, state.reference
         if goal is not None:
-            goal = unit_quaternion(goal, reference)
-            reference = reference_of(self.motion.goal, goal).expand_as(reference)
-            motion = self._dynamics.retarget(self.motion, motion, state.reference, reference)
+            state = self.retarget(state, goal)
+        motion, reference = state.motion, state.reference
         if coupling is not None:
             coupling = self._dynamics.push(
                 motion, to_tensor(coupling, reference.dtype, reference.device)
@@ -190,6 +188,20 @@ class OrientationDMP(nn.Module):
             amplitude=amplitude,
         )
         return OrientationState(motion=motion, reference=reference)
+
+    def retarget(self, state: OrientationState, goal: ArrayLike) -> OrientationState:
+        """The same orientation, angular velocity and acceleration, with a new goal to go to.
+
+        The acceleration lasts if the next steps have a `goal_filter`.
+
+        Args:
+            state: Of a motion.
+            goal: Unit quaternion, (*batch, 4).
+        """
+        old = state.reference
+        new = reference_of(self.motion.goal, unit_quaternion(goal, old)).expand_as(old)
+        motion = self._dynamics.retarget(self.motion, state.motion, old, new)
+        return OrientationState(motion=motion, reference=new)
 
     def save(self, folder: str | Path) -> None:
         """Write config.json and model.safetensors into `folder`, replacing an older save."""

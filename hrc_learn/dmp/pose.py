@@ -21,9 +21,10 @@ from hrc_learn.dmp.pose_columns import (
     replaced,
 )
 from hrc_learn.dmp.pose_motion import PoseState, PoseTrajectory
+from hrc_learn.dmp.rotation import error as error_space
 from hrc_learn.dmp.rotation.demonstrated import fitted_error
 from hrc_learn.dmp.rotation.ends import error_ends, unit_quaternion
-from hrc_learn.dmp.rotation.error import reference_of, retarget, to_orientation
+from hrc_learn.dmp.rotation.error import reference_of, to_orientation
 from hrc_learn.dmp.scaling import find_scaling
 from hrc_learn.geometry import Pose
 from hrc_learn.storage import SavedModel, write_model
@@ -201,28 +202,10 @@ class PoseDMP(nn.Module):
             slowdown: The clock runs 1 + slowdown times slower, (*batch), >= 0.
             amplitude: Factor on the forcing term, (*batch).
         """
-        motion, reference = state.motion, state.reference
-        ends = motion.target
         if goal is not None:
-            rotation = unit_quaternion(goal.orientation, reference)
-            reference = reference_of(self.motion.goal[..., ERROR], rotation)
-            reference = reference.expand_as(state.reference)
-            curvature = self.motion.curvature(motion)
-            error, rate, error_curvature = retarget(
-                motion.position[..., ERROR],
-                motion.rate[..., ERROR],
-                curvature[..., ERROR],
-                state.reference,
-                reference,
-            )
-            motion = replace(
-                motion,
-                position=replaced(motion.position, ERROR, error),
-                rate=replaced(motion.rate, ERROR, rate),
-            )
-            curvature = replaced(curvature, ERROR, error_curvature)
-            motion = replace(motion, goal=self.motion.resting_point(motion, curvature))
-            ends = replaced(ends, POSITION, goal.position)
+            state = self.retarget(state, goal)
+        motion = state.motion
+        ends = motion.target
         if goal_body is not None:
             ends = replaced(ends, BODY, goal_body)
         if coupling is not None:
@@ -236,7 +219,30 @@ class PoseDMP(nn.Module):
             slowdown=slowdown,
             amplitude=amplitude,
         )
-        return PoseState(motion=motion, reference=reference)
+        return PoseState(motion=motion, reference=state.reference)
+
+    def retarget(self, state: PoseState, goal: Pose) -> PoseState:
+        """The same pose, twist and acceleration, with a new goal to go to.
+
+        The acceleration lasts if the next steps have a `goal_filter`.
+
+        Args:
+            state: Of a motion.
+            goal: (*batch).
+        """
+        motion, old = state.motion, state.reference
+        rotation = unit_quaternion(goal.orientation, old)
+        new = reference_of(self.motion.goal[..., ERROR], rotation).expand_as(old)
+        values = motion.position, motion.rate, self.motion.curvature(motion)
+        error, error_rate, error_curvature = (x[..., ERROR] for x in values)
+        turned = error_space.retarget(error, error_rate, error_curvature, old, new)
+        position, rate, curvature = (
+            replaced(x, ERROR, part) for x, part in zip(values, turned, strict=True)
+        )
+        target = replaced(motion.target, POSITION, goal.position)
+        motion = replace(motion, position=position, rate=rate, target=target)
+        motion = replace(motion, goal=self.motion.resting_point(motion, curvature))
+        return PoseState(motion=motion, reference=new)
 
     def save(self, folder: str | Path) -> None:
         """Write config.json and model.safetensors into `folder`, replacing an older save."""
