@@ -9,6 +9,7 @@ from hrc_learn.human.page import PageConfig
 from hrc_learn.protocols import HumanInput
 from hrc_learn.sim import World
 from hrc_learn.tasks.page_beside import page_beside
+from hrc_learn.tasks.simulated_job import _joined
 from hrc_learn.tasks.workplace import Workplace
 
 
@@ -35,3 +36,25 @@ def test_who_pulls_at_the_page_is_heard_by_the_task_in_real_time():
         while human.read(world.arm.read()).effort.any():
             assert time.monotonic() < end
             time.sleep(0.02)
+
+
+class Pulling:
+    def __init__(self, effort):
+        self._effort = effort
+
+    def read(self, state):
+        return HumanInput(effort=self._effort.copy())
+
+
+def test_the_script_and_the_page_pull_together_and_time_passes_for_both():
+    passed = []
+    human, advance = _joined(
+        Pulling(np.arange(7.0)),
+        lambda duration: passed.append(duration),
+        Pulling(np.ones(7)),
+        lambda: passed.append("shown"),
+    )
+    asked = human.read(World().arm.read())
+    np.testing.assert_array_equal(asked.effort, np.arange(7.0) + 1)
+    advance(0.01)
+    assert passed == [0.01, "shown"]
