@@ -18,12 +18,14 @@ from pathlib import Path
 import torch
 from dmp_accuracy import measure_gradient_error, measure_reproduction, measure_turns
 from dmp_peers import measure_peers
+from operations import count_operations
 from rich.console import Console
 from rich.table import Table
 from timing import Timing, time_calls
 
 from hrc_learn import cli
 from hrc_learn.dmp import JointDMP, PoseDMP, Stepper
+from hrc_learn.dmp.export import resting_inputs, state_tensors
 from hrc_learn.geometry import quaternion
 
 JOINTS, SAMPLES, BASIS = 7, 1000, 50
@@ -117,6 +119,7 @@ def measure_rollouts(batch: int, repeats: int) -> dict[str, float]:
         f"rollout_{batch}_of_gemm": t["gemm"].median / t["rollout"].median,
         f"rollout_{batch}_least_us": 1e6 * t["rollout"].least,
         f"rollout_{batch}_of_gemm_least": t["gemm"].least / t["rollout"].least,
+        f"rollout_{batch}_operations": count_operations(calls["rollout"]),
         f"rollout_{batch}_per_s": batch / t["rollout"].median,
         f"rollout_with_derivatives_{batch}_per_s": batch / t["everything"].median,
     }
@@ -133,6 +136,7 @@ def measure_fits(batch: int, repeats: int) -> dict[str, float]:
     return {
         f"fit_{batch}_ms": 1e3 * t["trajectory"].median,
         f"fit_{batch}_least_ms": 1e3 * t["trajectory"].least,
+        f"fit_{batch}_operations": count_operations(calls["trajectory"]),
         f"fit_ridge_{batch}_ms": 1e3 * t["ridge"].median,
     }
 
@@ -153,24 +157,28 @@ def measure_poses(repeats: int) -> dict[str, float]:
 
 @torch.no_grad()
 def measure_steps(repeats: int) -> dict[str, float]:
-    """One closed-loop step of 1 ms."""
+    """One closed-loop step of 1 ms: eager, in NumPy, and as an exported program."""
     time, position = demonstrations(1)
     dmp = JointDMP.fit(time.double(), position.double())
     stepper = Stepper(dmp)
     state, plain = dmp.step(dmp.initial_state(), 0.5), stepper.initial_state()
+    program, tensors = dmp.export().program.module(), state_tensors(state)
+    dt, resting = torch.tensor([1e-3], dtype=torch.float64), resting_inputs(dmp, tensors)
     calls: dict[str, Callable[[], object]] = {
         "step": lambda: dmp.step(state, 1e-3),
         "stepper": lambda: stepper.step(plain, 1e-3),
+        "step_program": lambda: program(tensors, dt, resting),
     }
     t: dict[str, Timing] = time_calls(calls, 40 * repeats)
-    return {
-        "step_us": 1e6 * t["step"].median,
-        "step_least_us": 1e6 * t["step"].least,
-        "step_p99_us": 1e6 * t["step"].p99,
-        "stepper_us": 1e6 * t["stepper"].median,
-        "stepper_least_us": 1e6 * t["stepper"].least,
-        "stepper_p99_us": 1e6 * t["stepper"].p99,
-    }
+    figures: dict[str, float] = {}
+    for name, call in calls.items():
+        figures |= {
+            f"{name}_us": 1e6 * t[name].median,
+            f"{name}_least_us": 1e6 * t[name].least,
+            f"{name}_p99_us": 1e6 * t[name].p99,
+            f"{name}_operations": count_operations(call),
+        }
+    return figures
 
 
 def measure_gradients(repeats: int) -> dict[str, float]:
