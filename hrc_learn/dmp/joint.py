@@ -294,7 +294,7 @@ class JointDMP(SavedJoint):
 
         return advance(
             state,
-            (self._as_tensor(dt) / duration).double(),
+            self._step_length(dt, duration),
             response=self.response,
             weights=self.weights,
             scale=scale,
@@ -405,6 +405,12 @@ class JointDMP(SavedJoint):
         if isinstance(self.forcing_scale, NoScaling):
             return self.weights
         return self._scaled(self.weights.mT, start, goal).mT
+
+    def _step_length(self, dt: ArrayLike, duration: Tensor) -> Tensor:
+        """Ds in float64. A number is multiplied as it is: to divide it takes a tensor."""
+        if not isinstance(dt, float):
+            dt = to_tensor(dt, dtype=torch.float64, device=duration.device)
+        return duration.double().reciprocal() * dt
 
     def _as_tensor(self, value: ArrayLike) -> Tensor:
         return to_tensor(value, dtype=self.weights.dtype, device=self.weights.device)

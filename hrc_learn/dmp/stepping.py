@@ -13,6 +13,7 @@ from torch import Tensor
 
 from hrc_learn.dmp.state import DMPState
 from hrc_learn.dmp.system.approach import approach_state
+from hrc_learn.dmp.system.known import as_numbers
 from hrc_learn.dmp.system.response import Response
 from hrc_learn.dmp.system.spring import SpringDamper
 from hrc_learn.dmp.trajectory import broadcast_shapes
@@ -86,9 +87,11 @@ def advance(
         pace: Kept in the state for its velocity.
     """
     spring, s = response.spring, state.s + ds
-    # Both transitions at once: over this step, and since the forcing has ended.
-    E, coast = spring.propagator(torch.stack([ds, response.coasting(s)])).to(target)
-    forced = coast @ (response.forced.to(s.device)(s).to(target) @ weights.mT)
+    now, span = as_numbers(s, ds)
+    E, coast = _transitions(spring, span, response.coasting(now))
+    forced = response.forced.to(s.device)(now).to(target) @ weights.mT
+    if coast is not None:
+        forced = coast.to(target) @ forced
     before, after = scale(state.forced), scale(forced)
     if response.approach:
         share, way = response.approach, state.way[..., None, :]
@@ -101,10 +104,10 @@ def advance(
     # Seen from where it would rest: there the spring balances a push.
     rest = target if push is None else target + push / spring.stiffness
     y = torch.stack([state.position - rest, state.rate], dim=-2)
-    moved = E @ (y - before) + after
+    offset, velocity = _product_plus(E.to(target), y - before, after).unbind(dim=-2)
     return DMPState(
-        position=moved[..., 0, :] + rest,
-        rate=moved[..., 1, :],
+        position=offset + rest,
+        rate=velocity,
         start=state.start,
         goal=goal,
         way=state.way,
@@ -128,6 +131,21 @@ def second_derivative(
     if response.approach:
         force = force + state.way * response.approach_force(state.s).to(force)[..., None]
     return response.spring.acceleration(state.position - state.goal, state.rate) + force
+
+
+def _transitions(
+    spring: SpringDamper, ds: Tensor | float, coast: Tensor | float
+) -> tuple[Tensor, Tensor | None]:
+    """Over a step, and since the forcing has ended; None: it is known not to have."""
+    if isinstance(ds, Tensor) and isinstance(coast, Tensor):
+        step, rest = spring.propagator(torch.stack([ds, coast]))  # both at once
+        return step, rest
+    return spring.propagator(ds), spring.propagator(coast) if coast else None
+
+
+def _product_plus(A: Tensor, x: Tensor, b: Tensor) -> Tensor:
+    """A x + b, in one call where there is one."""
+    return torch.addmm(b, A, x) if A.ndim == x.ndim == b.ndim == 2 else A @ x + b
 
 
 def _lagging(

@@ -70,3 +70,14 @@ def test_no_matrix_holds_numbers_that_make_products_slow():
     exact = dmp.response.evaluate(dmp.stamps.double())[:, 0]
     position = dmp.response.matrices(dmp.stamps, torch.float32)[0].mT.double()
     torch.testing.assert_close(position, exact, rtol=0, atol=1e-7)
+
+
+def test_what_inference_leaves_behind_serves_a_backward_pass():
+    """Tables, operators and matrices are shared by all primitives with the same parts."""
+    with torch.inference_mode():
+        fitted(1).rollout()
+    dmp = fitted(1)
+    step = dmp.step(dmp.initial_state(), 0.3)
+    (dmp.rollout().position.sum() + step.position.sum()).backward()
+    assert dmp.weights.grad is not None
+    assert dmp.weights.grad.isfinite().all()

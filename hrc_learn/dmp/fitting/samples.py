@@ -1,5 +1,6 @@
 """Demonstrations as a primitive takes them: checked, batched, in normalised time."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -185,7 +186,7 @@ def _check_finite(
 ) -> Tensor:
     """The values, none of them NaN or infinite; where the mask is true none may be."""
     # A sum is finite unless a summand is not or it overflows: the second look sorts that out.
-    if values.sum().isfinite():
+    if math.isfinite(values.sum().item()):
         return values
     bad = ~values.isfinite() & mask[:, None]
     if bad.any():

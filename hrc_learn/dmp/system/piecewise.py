@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 DEGREE = 12
@@ -24,13 +24,13 @@ class PiecewisePolynomial:
     """Length of a piece."""
     periodic: bool = False
     """Whether the last piece is followed by the first."""
-    _exponents: Int[Tensor, "P"] = field(init=False)
+    _exponents: Float[Tensor, "1 P"] = field(init=False)
     _moved: dict[torch.device, "PiecewisePolynomial"] = field(default_factory=dict)
 
     def __post_init__(self):
         # Now and not when first needed: that may be while a program is traced, and what is
         # made there is no tensor to keep.
-        exponents = torch.arange(DEGREE + 1, device=self.coefficients.device)
+        exponents = torch.arange(DEGREE + 1)[None].to(self.coefficients)
         object.__setattr__(self, "_exponents", exponents)
 
     @classmethod
@@ -49,11 +49,19 @@ class PiecewisePolynomial:
     @property
     def end(self) -> float:
         """Where the last piece ends."""
-        return self.interval * len(self.coefficients)
+        return self.interval * self.coefficients.shape[0]
 
-    def __call__(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch rows columns"]:
+    def __call__(
+        self, s: Float[Tensor, "*batch"] | float
+    ) -> Float[Tensor, "*batch rows columns"]:
         """Value at `s`; past the end of what is not periodic, the value at the end."""
         pieces, P, *shape = self.coefficients.shape
+        if not isinstance(s, Tensor):
+            x = s / self.interval
+            x = x % pieces if self.periodic else min(max(x, 0.0), float(pieces))
+            piece = min(int(x), pieces - 1)
+            powers = torch.pow(2 * (x - piece) - 1, self._exponents)
+            return (powers @ self.coefficients[piece].view(P, -1)).view(shape)
         x = s / self.interval
         x = x % pieces if self.periodic else x.clamp(0, pieces)
         piece = x.detach().long().clamp(max=pieces - 1)

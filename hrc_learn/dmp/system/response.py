@@ -45,7 +45,9 @@ class Response:
         self.approach = approach
         self.size = basis.count + 3
         """Number of coordinates: N weights, start velocity, start, goal."""
-        self.forced = self._integrate()
+        # Tensors made in inference mode cannot take part in a backward pass later.
+        with torch.inference_mode(False):
+            self.forced = self._integrate()
         """(y, y') that unit weights alone cause, (2, N): from rest at the goal at s = 0, or,
         of a periodic basis, the limit cycle."""
         self._matrices: OrderedDict[tuple, tuple[Tensor, Tensor, Tensor]] = OrderedDict()
@@ -68,25 +70,31 @@ class Response:
                 return matrices
         key = (s.detach().cpu().numpy().tobytes(), s.dtype, s.device, dtype)
         if key not in self._matrices:
-            rows = _without_subnormals(self.evaluate(s.detach().double()).to(dtype))
-            position, velocity, acceleration = rows.permute(1, 2, 0).contiguous()
-            self._matrices[key] = position, velocity, acceleration
+            self._matrices[key] = self._transposed(s, dtype)
             if len(self._matrices) > GRIDS_KEPT:
                 self._matrices.popitem(last=False)
         self._matrices.move_to_end(key)
         self._latest = s.detach().clone(), self._matrices[key]
         return self._matrices[key]
 
+    @torch.inference_mode(False)
+    def _transposed(self, s: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
+        """`matrices`, for all calls to come."""
+        H = self.evaluate(s.detach().clone().double()).to(dtype)
+        position, velocity, acceleration = _without_subnormals(H).permute(1, 2, 0).contiguous()
+        return position, velocity, acceleration
+
     def evaluate(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 3 M"]:
         """Rows H(s), H'(s), H''(s); differentiable any number of times in `s`."""
         state = _StateAt.apply(s, self)
         return torch.cat([state, self._acceleration(s, state)], dim=-2)
 
-    def coasting(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    def coasting(self, s: Float[Tensor, "*batch"] | float) -> Float[Tensor, "*batch"] | float:
         """How long the spring alone has moved on what the forcing caused until it ended."""
         if self.basis.periodic:
-            return torch.zeros_like(s)
-        return (s - self.forced.end).clamp(min=0)
+            return 0 * s
+        past = s - self.forced.end
+        return past.clamp(min=0) if isinstance(past, Tensor) else max(past, 0.0)
 
     def state(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 2 M"]:
         """Rows H(s), H'(s)."""

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from types import ModuleType
 from typing import Any
 
@@ -50,11 +51,14 @@ class SpringDamper:
         """Y'' of the unforced system, `offset` being y - g."""
         return -self.stiffness * offset - self.alpha * velocity
 
-    def propagator(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 2 2"]:
+    def propagator(self, s: Float[Tensor, "*batch"] | float) -> Float[Tensor, "*batch 2 2"]:
         """Transition matrix exp(A s): maps (y - g, y') at 0 to the same at `s`.
 
         exp(A s) = C I + S (A + alpha / 2 I) by Cayley-Hamilton; see `modes` for C and S.
+        Of a number it is not to be changed in place: it serves again.
         """
+        if not isinstance(s, Tensor):
+            return _known_transition(self, s)
         return transition(s, self.alpha, self.beta / self.alpha)
 
     def modes(self, s: Any, xp: ModuleType) -> tuple[Any, Any]:
@@ -77,6 +81,18 @@ def transition(
     lean = S * (alpha / 2)
     entries = torch.stack([C + lean, S, S * (-ratio * alpha**2), C - lean], dim=-1)
     return entries.view(*s.shape, 2, 2)
+
+
+@lru_cache(maxsize=64)
+def _known_transition(spring: SpringDamper, s: float) -> Float[Tensor, "2 2"]:
+    """`SpringDamper.propagator` of a number: loops repeat their step length."""
+    C, S = spring.modes(s, math)
+    lean = S * spring.alpha / 2
+    # What is made in inference mode cannot take part in a backward pass later.
+    with torch.inference_mode(False):
+        return torch.tensor(
+            [[C + lean, S], [-spring.stiffness * S, C - lean]], dtype=torch.float64
+        )
 
 
 def spring_modes(s: Any, alpha: Any, ratio: float, xp: ModuleType) -> tuple[Any, Any]:
