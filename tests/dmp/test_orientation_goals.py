@@ -47,10 +47,10 @@ def test_no_goal_makes_the_path_flip():
 
 def test_goals_close_to_each_other_have_paths_close_to_each_other():
     dmp = fitted(approach=1.0)
-    near = torch.deg2rad(torch.arange(0, 150, 2.0)).double()[:, None, None] * axes()
+    near = torch.deg2rad(torch.arange(0, 150, 3.0)).double()[:, None, None] * axes()
     motion = dmp.rollout(goal=quaternion.multiply(quaternion.exp(near), dmp.goal))
     q = motion.orientation
-    assert torch.rad2deg(quaternion.angle(q[1:], q[:-1])).max() < 6
+    assert torch.rad2deg(quaternion.angle(q[1:], q[:-1])).max() < 9
 
 
 def test_switched_at_half_time_the_acceleration_goes_on_and_no_path_flips():
@@ -65,9 +65,9 @@ def test_switched_at_half_time_the_acceleration_goes_on_and_no_path_flips():
         soon = acceleration(dmp, dmp.step(state, 0.001, goal_filter=4.0))
         assert (soon - before).norm(dim=-1).max() < 0.1 * peak
         way = torch.zeros(5, 36, dtype=torch.float64)
-        for _ in range(200):
-            state = dmp.step(state, 0.02, goal_filter=4.0)
-            way += 0.02 * state.angular_velocity.norm(dim=-1)
+        for _ in range(80):
+            state = dmp.step(state, 0.05, goal_filter=4.0)
+            way += 0.05 * state.angular_velocity.norm(dim=-1)
     assert quaternion.angle(state.orientation, goal).max() < 5e-3
     # Half of the turn was left, and the state was moving on in its sense.
     assert (torch.rad2deg(way) < TURN / 2 + AWAY[:, None] + 5).all()

@@ -7,6 +7,7 @@ from demo_motions import minimum_jerk, turning_motion
 from dmp_oracle import forcing
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
+from unchecked import shapes_unchecked
 
 from hrc_learn.dmp import OrientationDMP
 from hrc_learn.dmp.rotation.error import angular_velocity
@@ -121,8 +122,9 @@ def test_a_goal_that_jumps_moves_nothing_and_a_filtered_one_pulls_no_harder(dmp)
     torch.testing.assert_close(filtered, before, rtol=0, atol=5e-2)
     assert (acceleration(state, goal=GOAL) - before).norm() > 5
     late = dmp.step(state, 0.02, goal=GOAL, goal_filter=8.0)
-    for _ in range(400):
-        late = dmp.step(late, 0.02, goal_filter=8.0)
+    with torch.no_grad(), shapes_unchecked():
+        for _ in range(100):
+            late = dmp.step(late, 0.08, goal_filter=8.0)
     assert quaternion.angle(late.orientation, GOAL) < 1e-6
 
 
@@ -138,7 +140,7 @@ def test_drift_agrees_with_the_derivative_of_the_exponential():
 
 
 def test_angular_acceleration_is_that_of_the_error(dmp):
-    t = torch.linspace(0, 3, 3001, dtype=torch.float64)
+    t = torch.linspace(0, 3, 1501, dtype=torch.float64)
     got = dmp.rollout(t, goal=GOAL)
     numeric = (got.angular_velocity[2:] - got.angular_velocity[:-2]) / (t[2] - t[0])
     torch.testing.assert_close(numeric, got.angular_acceleration[1:-1], rtol=0, atol=1e-2)
