@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from torch.autograd import gradcheck
+from unchecked import shapes_unchecked
 
 
 class DMPContract:
@@ -113,11 +114,11 @@ class DMPContract:
             if name.startswith("rate of"):
                 assert value.abs().max() < 1e-9, name
 
-    @pytest.mark.parametrize("n_steps", [1, 20, 1000])
+    @pytest.mark.parametrize("n_steps", [1, 20, 200])
     def test_steps_end_where_the_rollout_does(self, dmp, n_steps):
         arguments = self.arguments(*self.ends(4))
         state = dmp.initial_state(**arguments, duration=2.0)
-        with torch.no_grad():
+        with torch.no_grad(), shapes_unchecked():
             for _ in range(n_steps):
                 state = dmp.step(state, 1.7 / n_steps)
             there = self.outputs(dmp.rollout(time=[1.7], **arguments, duration=2.0))
@@ -136,7 +137,8 @@ class DMPContract:
         dmp.requires_grad_(False)
         state = dmp.initial_state()
         dt = torch.tensor(0.02, dtype=torch.float64)
-        program = torch.export.export(Step(), (state, dt)).module()
+        with shapes_unchecked():
+            program = torch.export.export(Step(), (state, dt)).module()
         exported = state
         for _ in range(5):
             state, exported = dmp.step(state, dt), program(exported, dt)
@@ -167,7 +169,8 @@ class DMPContract:
         time = dmp.duration * torch.tensor([0.1, 0.7, 1.2], dtype=torch.float64)
         inputs = (dmp.get_parameter(weights[0]), *self.ends(5), dmp.duration, time)
         inputs = tuple(x.detach().clone().requires_grad_() for x in inputs)
-        assert gradcheck(outputs, inputs, atol=1e-6, rtol=1e-6)
+        with shapes_unchecked():
+            assert gradcheck(outputs, inputs, atol=1e-6, rtol=1e-6)
 
     def test_a_saved_primitive_is_the_same(self, dmp, tmp_path):
         dmp.save(tmp_path / "saved")
