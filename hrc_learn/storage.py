@@ -66,7 +66,7 @@ class SavedModel:
 
     def __init__(self, folder: str | Path, kind: str):
         self.folder = Path(folder)
-        self.config = self._read_config()
+        self.config = _read_config(self.folder)
         for field, wanted in (("format", FORMAT), ("version", VERSION), ("kind", kind)):
             found = self.get(field, type(wanted))
             if found != wanted:
@@ -112,18 +112,6 @@ class SavedModel:
         """The complaint of a constructor, with the folder that caused it."""
         return ValueError(f"{self.folder}: {complaint}")
 
-    def _read_config(self) -> dict[str, Any]:
-        path = self.folder / CONFIG
-        if not path.is_file():
-            raise FileNotFoundError(f"{path} does not exist: no model was saved here")
-        try:
-            config = json.loads(path.read_text())
-        except ValueError as error:
-            raise ValueError(f"{path}: not valid JSON ({error})") from None
-        if not isinstance(config, dict):
-            raise ValueError(f"{path}: must hold one JSON object")
-        return config
-
     def _read_tensors(self) -> dict[str, Tensor]:
         path = self.folder / MODEL
         if not path.is_file():
@@ -132,6 +120,29 @@ class SavedModel:
             return load_file(path)
         except SafetensorError as error:
             raise ValueError(f"{path}: not a safetensors file ({error})") from None
+
+
+def saved_kind(folder: str | Path) -> str:
+    """Class of the model in a folder, for who can read several.
+
+    Raises:
+        FileNotFoundError: No saved model there.
+        ValueError: Its config is not one.
+    """
+    return str(_read_config(Path(folder)).get("kind"))
+
+
+def _read_config(folder: Path) -> dict[str, Any]:
+    path = folder / CONFIG
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} does not exist: no model was saved here")
+    try:
+        config = json.loads(path.read_text())
+    except ValueError as error:
+        raise ValueError(f"{path}: not valid JSON ({error})") from None
+    if not isinstance(config, dict):
+        raise ValueError(f"{path}: must hold one JSON object")
+    return config
 
 
 def _umask() -> int:
