@@ -76,8 +76,7 @@ def measure_mp_pytorch(demonstration: Demonstration, n_basis: int) -> dict[str, 
         times, params, start, velocity = arguments
 
         def call() -> Tensor:
-            mp.update_inputs(times, params, None, times[:, 0], start, velocity)
-            return mp.get_traj_pos()
+            return mp.get_traj_pos(times, params, times[:, 0], start, velocity)
 
         return call
 

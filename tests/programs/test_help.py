@@ -56,10 +56,13 @@ def options(config: type, prefix: str = "") -> Iterator[tuple[str, str]]:
     hints = typing.get_type_hints(config, include_extras=True)
     for field in dataclasses.fields(config):
         hint, name = hints[field.name], f"{prefix}{field.name.replace('_', '-')}"
-        if isinstance(hint, type) and dataclasses.is_dataclass(hint):
-            yield from options(hint, f"{name}.")
+        markers = getattr(hint, "__metadata__", ())
+        kind = getattr(hint, "__origin__", hint) if markers else hint
+        if isinstance(kind, type) and dataclasses.is_dataclass(kind):
+            unnamed = any(getattr(marker, "name", None) == "" for marker in markers)
+            yield from options(kind, prefix if unnamed else f"{name}.")
         else:
-            positional = tyro.conf.Positional in getattr(hint, "__metadata__", ())
+            positional = tyro.conf.Positional in markers
             yield "" if positional else f"--{name}", texts.get(field.name, "")
 
 

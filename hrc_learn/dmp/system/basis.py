@@ -156,11 +156,15 @@ class PeriodicBasis:
     width: float = 0.6
     """Standard deviation of a bell as a share of the distance between centres."""
     periodic: ClassVar[bool] = True
-    horizon: ClassVar[float] = 1.0
 
     def __post_init__(self):
         check_positive("width", self.width)
         check_count(self.count)
+
+    @property
+    def horizon(self) -> float:
+        """The period."""
+        return 1.0
 
     @property
     def smooth_interval(self) -> float:
