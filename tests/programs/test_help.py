@@ -4,10 +4,8 @@ import ast
 import dataclasses
 import importlib.util
 import inspect
-import os
 import re
 import runpy
-import subprocess
 import sys
 import textwrap
 import typing
@@ -85,17 +83,38 @@ def words(text: str) -> str:
     return " ".join(re.sub(r"[│╭╮╰╯─]", " ", text).split())
 
 
+class Outcome(typing.NamedTuple):
+    """How a program ended."""
+
+    status: object
+    output: str
+    error: str
+
+
+@pytest.fixture
+def run(monkeypatch, capsys, tmp_path):
+    """Runs a program in this process, in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    # Programs change how warnings look; that must not outlive the test.
+    monkeypatch.setattr(warnings, "formatwarning", warnings.formatwarning)
+
+    def run(program: str | Path, *arguments: str) -> Outcome:
+        path = ROOT / program
+        monkeypatch.setattr(sys, "argv", [str(program), *arguments])
+        monkeypatch.syspath_prepend(path.parent)
+        with pytest.raises(SystemExit) as ended:
+            runpy.run_path(str(path), run_name="__main__")
+        return Outcome(ended.value.code, *capsys.readouterr())
+
+    return run
+
+
 @every_program
-def test_help_explains_every_option(program):
-    done = subprocess.run(
-        [sys.executable, program, "--help"],
-        capture_output=True,
-        text=True,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-    )
-    assert done.returncode == 0, done.stderr
-    assert done.stderr == ""
-    shown = words(done.stdout)
+def test_help_explains_every_option(program, run):
+    status, output, error = run(program, "--help")
+    assert status == 0
+    assert error == ""
+    shown = words(output)
     summary = ast.get_docstring(ast.parse(program.read_text()))
     assert summary is not None
     assert words(summary.splitlines()[0]) in shown
@@ -110,22 +129,6 @@ def test_help_explains_every_option(program):
 @every_program
 def test_every_program_writes_its_figures_as_json(program):
     assert "json" in {field.name for field in dataclasses.fields(arguments_of(program))}
-
-
-@pytest.fixture
-def run(monkeypatch, capsys, tmp_path):
-    """Runs a program in this process, in an empty folder: exit status and stderr."""
-    monkeypatch.chdir(tmp_path)
-    # Programs change how warnings look; that must not outlive the test.
-    monkeypatch.setattr(warnings, "formatwarning", warnings.formatwarning)
-
-    def run(program: str, *arguments: str) -> tuple[int, str]:
-        monkeypatch.setattr(sys, "argv", [program, *arguments])
-        with pytest.raises(SystemExit) as ended:
-            runpy.run_path(str(ROOT / program), run_name="__main__")
-        return ended.value.code, capsys.readouterr().err  # pyright: ignore
-
-    return run
 
 
 @pytest.mark.parametrize(
@@ -152,7 +155,7 @@ def run(monkeypatch, capsys, tmp_path):
     ],
 )
 def test_bad_input_is_one_line_and_leaves_nothing(run, tmp_path, program, arguments, message):
-    status, error = run(program, *arguments)
+    status, _, error = run(program, *arguments)
     assert status == 2
     assert message in error
     assert error.startswith("error: ")
@@ -161,6 +164,6 @@ def test_bad_input_is_one_line_and_leaves_nothing(run, tmp_path, program, argume
 
 
 def test_an_unknown_option_is_told_apart_from_the_work_failing(run):
-    status, error = run("training/fit_dmp.py", "--datset", "demos", "--out", "new")
+    status, _, error = run("training/fit_dmp.py", "--datset", "demos", "--out", "new")
     assert status == 2
     assert "--datset" in error
