@@ -43,7 +43,9 @@ def test_translation(motion, shift, spring, scaling):
 def test_time_rescaling(motion, duration, spring):
     plain = JointDMP.fit(TIME, motion, 12, spring=spring)
     slow = JointDMP.fit(duration * TIME, motion, 12, spring=spring)
-    close(slow.weights, plain.weights, plain.weights.abs().max().item())
+    # A motion that rests has weights of rounding only.
+    largest = plain.weights.abs().max().item() + size_of(motion)
+    close(slow.weights, plain.weights, largest)
     close(duration * slow.rollout().velocity, plain.rollout().velocity, 1e3 * size_of(motion))
 
 
