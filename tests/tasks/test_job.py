@@ -139,6 +139,7 @@ def _axis_z(orientation):
     return quaternion.to_matrix(torch.from_numpy(orientation))[..., :, 2].numpy()
 
 
+@pytest.mark.slow
 def test_a_person_who_keeps_away_changes_nothing(aiming, placing):
     config = CollaborationConfig(interaction=0.5)
     job = simulate_collaboration(
