@@ -162,8 +162,8 @@ class TestOrientationOfUde(TestOrientation):
     reproduction = 1e-4
 
     @pytest.mark.slow
-    def test_motion_settles_at_the_goal_from_anywhere(self):
-        super().test_motion_settles_at_the_goal_from_anywhere()
+    def test_motion_settles_at_the_goal_from_anywhere(self, dmp):
+        super().test_motion_settles_at_the_goal_from_anywhere(dmp)
 
     def fit(self, *demonstration, **kwargs):
         return OrientationDMP.fit(*demonstration, formulation="ude", **kwargs)
