@@ -34,17 +34,17 @@ CORE: dict[str, set[str]] = {
 """Core packages in the order they build on each other, with what each may import."""
 
 EDGES: dict[str, set[str]] = {
-    "cli": set(),
     "output": set(),
+    "cli": {"output"},
     "demos": {*CORE, "output"},
     "vision": {*CORE},
-    "viz": {*CORE, "vision"},
+    "viz": {*CORE, "vision", "output"},
     "human": {*CORE, "viz"},
     "sim": {*CORE, "vision", "viz"},
 }
 """Edges likewise: where the package meets files, screens, simulators and people."""
 
-LAYERS = CORE | EDGES | {"tasks": {*CORE, *EDGES}}
+LAYERS = CORE | EDGES | {"tasks": {*CORE, *EDGES}, "lerobot": {*CORE, *EDGES, "tasks"}}
 
 LIBRARIES: dict[str, set[str]] = {
     **{package: {"torch", "jaxtyping", "numpy", "safetensors"} for package in CORE},
@@ -56,6 +56,7 @@ LIBRARIES: dict[str, set[str]] = {
     "viz": {"jaxtyping", "numpy", "rerun", "matplotlib", "mpl_toolkits", "cycler", "PIL"},
     "sim": {"torch", "jaxtyping", "numpy", "mujoco"},
     "tasks": {"torch", "jaxtyping", "numpy"},
+    "lerobot": {"torch", "jaxtyping", "numpy", "lerobot"},
 }
 """Libraries that modules of a package may import as soon as they are imported."""
 
@@ -64,7 +65,9 @@ LAZY_LIBRARIES: dict[str, set[str]] = {
     "cli": {"tyro", "rich"},
     "demos": {"av", "scipy"},
     "vision": {"cv2"},
+    "viz": {"rich"},
     "human": {"viser", "pygame"},
+    "tasks": {"rich"},
 }
 """Libraries that they may import in the functions that need them, and nowhere else."""
 
@@ -76,6 +79,9 @@ DISTRIBUTIONS = {
     "mpl_toolkits": "matplotlib",
     "cycler": "matplotlib",
     "PIL": "matplotlib",
+    # Requirements of lerobot's own.
+    "torchvision": "lerobot",
+    "gymnasium": "lerobot",
 }
 """What a library is called in pyproject.toml where that is not its name in code."""
 
