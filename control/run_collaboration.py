@@ -12,7 +12,6 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 from rich.console import Console
-from rich.table import Table
 
 from hrc_learn import cli
 from hrc_learn.demos import Demonstration, load_demos
@@ -20,7 +19,7 @@ from hrc_learn.human.page import PageConfig
 from hrc_learn.output import MADE_BY, new_folder
 from hrc_learn.sim import CameraKind
 from hrc_learn.tasks.collaboration import CollaborationConfig
-from hrc_learn.tasks.collaboration_report import write_collaboration_report
+from hrc_learn.tasks.collaboration_report import collaboration_report
 from hrc_learn.tasks.evaluation import evaluate
 from hrc_learn.tasks.fit_aiming import AimingSkill
 from hrc_learn.tasks.gains import with_gains
@@ -29,7 +28,7 @@ from hrc_learn.tasks.recording import record
 from hrc_learn.tasks.simulated_job import PULLS, simulate_collaboration
 from hrc_learn.tasks.workplace import Workplace
 from hrc_learn.viz import Box
-from hrc_learn.viz.report import Measurement
+from hrc_learn.viz.report import show_measurements, write_report
 from hrc_learn.viz.run_dashboard import record_run
 
 
@@ -76,7 +75,8 @@ def main(args: Args) -> int:
     aiming, placing = AimingSkill.load(args.aiming), PlacingSkill.load(args.placing)
     fit = json.loads((args.placing / "metrics.json").read_text())
     demonstration = _demonstration(args.placing)
-    controller = with_gains(args.config.controller, args.gains)
+    controller = with_gains(args.config.grasping.controller, args.gains)
+    grasping = replace(args.config.grasping, controller=controller)
     with new_folder(args.out, asdict(args), args.overwrite) as folder:
         console.print(f"Placing on the {args.shelf} shelf:")
         job = simulate_collaboration(
@@ -86,7 +86,7 @@ def main(args: Args) -> int:
             workplace=Workplace(shelf_x=args.shelf_x, shelf_depth=args.shelf_depth),
             camera=args.camera,
             pulls=PULLS if args.person else (),
-            config=replace(args.config, controller=controller),
+            config=replace(args.config, grasping=grasping),
             seed=args.seed,
             page=PageConfig(port=args.port) if args.page else None,
             on_phase=lambda phase, time: console.print(f"  {time:6.2f} s  {phase}"),
@@ -100,23 +100,22 @@ def main(args: Args) -> int:
                 job.world,
                 job.motion,
                 plan=None if job.result is None else job.result.plan,
-                region=_region(job.workplace, args.config.aiming.half_size),
+                region=_region(job.workplace, args.config.grasping.aiming.half_size),
                 demonstration=demonstration,
             )
             record_run(folder / "run.rrd", run)
             if table:
                 command = shlex.join(["python", *sys.argv])
-                page = folder / "report.html"
-                write_collaboration_report(page, run, table, asdict(args), command)
+                write_report(folder, collaboration_report(run, table, asdict(args), command))
         job.station.log.save(folder / "log.npz")
-        values = {_key(m): m.value for m in table}
+        values = {m.key: m.value for m in table}
         cli.write_json(folder / "measured.json", values)
     if args.json is not None:
         cli.write_json(args.json, values)
     if job.failure:
         print(f"failed: {job.failure}", file=sys.stderr)
     else:
-        _show(console, table)
+        show_measurements(table)
     console.print(f"Recording  rerun {args.out / 'run.rrd'}")
     if table:
         console.print(f"Report     {args.out / 'report.html'}")
@@ -133,21 +132,6 @@ def _demonstration(placing: Path) -> Demonstration | None:
     """The first demonstration the placing motion was learned from, if it is still there."""
     dataset = Path(json.loads((placing / MADE_BY).read_text())["dataset"])
     return load_demos(dataset, episodes=[0])[0] if dataset.is_dir() else None
-
-
-def _key(m: Measurement) -> str:
-    unit = f"_{m.unit}" if m.unit else ""
-    return m.name.replace(",", "").replace(" ", "_").lower() + unit
-
-
-def _show(console: Console, table: list[Measurement]) -> None:
-    shown = Table("measured", "value", "target", "", title="Measured")
-    marks = {True: "[green]ok[/]", False: "[red]missed[/]", None: ""}
-    for m in table:
-        sign = ">=" if m.at_least else "<="
-        bound = "" if m.target is None else f"{sign} {m.target:g} {m.unit}"
-        shown.add_row(m.name, f"{m.value:.4g} {m.unit}", bound, marks[m.ok])
-    console.print(shown)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..controller import AdaptiveController, ControllerState, Goals, Observation
 from ..geometry import Pose
-from .failure import TaskFailedError
+from .failure import MissedGraspError
 from .station import Station
 
 
@@ -96,14 +96,14 @@ class Aimer:
             Time it took [s].
 
         Raises:
-            TaskFailedError: If it takes too long.
+            MissedGraspError: If it takes too long.
         """
         begin = reached = self._station.time
         while self._station.time - reached < self._config.dwell:
             if not self.error(goals) < self._config.tolerance:
                 reached = self._station.time
             if self._station.time - begin > self._config.patience:
-                raise TaskFailedError(
+                raise MissedGraspError(
                     f"aiming: after {self._config.patience:.0f} s the marker is still "
                     f"{self.error(goals):.1f} px from its target (NaN: not seen)."
                 )

@@ -8,24 +8,14 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-import numpy as np
-import torch
-from jaxtyping import Float
-
-from ..controller import AdaptiveController, ControllerConfig, Goals
+from ..controller import Goals
 from ..geometry import Pose
-from ..jacobian import KalmanEstimator
-from ..sim import HAND_MARKER, ObjectConfig
-from .aiming import Aimer, AimingConfig
-from .failure import TaskFailedError
+from ..sim import ObjectConfig
 from .fit_aiming import AimingSkill
-from .motion import joint_line
+from .grasping import OPEN, Grasping, GraspingConfig, GraspResult
 from .placing import PlacingSkill, Plan, PlanningSpace
 from .station import Station
 from .workplace import Workplace, nearest_configuration
-
-OPEN, CLOSED = 0.08, 0.0
-"""Widths the gripper is told to take [m]."""
 
 INTERACT, TRANSFER, RELEASE = "interact", "transfer", "release"
 """Phases that others look for in the log."""
@@ -35,35 +25,15 @@ INTERACT, TRANSFER, RELEASE = "interact", "transfer", "release"
 class CollaborationConfig:
     """How the job is done."""
 
-    aiming: AimingConfig = field(default_factory=AimingConfig)
-    controller: ControllerConfig = field(
-        default_factory=lambda: ControllerConfig(hold_rate=10.0)
-    )
-    """Settings of the adaptive controller; it holds the hand firmly against the drift that
-    steps of 10 ms leave."""
+    grasping: GraspingConfig = field(default_factory=GraspingConfig)
+    """How objects are grasped."""
     interaction: float = 11.0
     """How long the robot goes on aiming while the person reaches under its arm [s]."""
-    lift: float = 0.20
-    """How far an object is lifted before it is carried off [m]."""
     speed: float = 1.5
     """How many times faster than demonstrated the object is carried to the shelf."""
     planning: PlanningSpace = "pose"
     """Space in which the way to the shelf is planned; "joint" is the paper's, which bends the
     way into shelves that were not demonstrated."""
-    attempts: int = 3
-    """Grasps tried."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class GraspResult:
-    """How an object was grasped."""
-
-    aim_time: float
-    """From the start of aiming until the target was reached [s]."""
-    pixel_error: float
-    """When the hand went down [px]."""
-    attempts: int
-    """Grasps tried."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,16 +77,10 @@ class Collaboration:
         """
         self._station = station
         self._workplace = workplace
-        self._aiming = aiming
         self._placing = placing
         self._check = check
         self._config = config = config or CollaborationConfig()
-        estimator = KalmanEstimator(aiming.jacobian.double())
-        goals = config.aiming.goals(workplace.hover(), None)
-        controller = AdaptiveController(
-            station.chain, estimator, goals, config=config.controller
-        )
-        self._aimer = Aimer(station, controller, HAND_MARKER, config.aiming)
+        self._grasping = Grasping(station, workplace, aiming, config.grasping, check=check)
 
     def run(self, item: ObjectConfig, shelf: str) -> CollaborationResult:
         """Do the whole job for one object.
@@ -132,95 +96,15 @@ class Collaboration:
         """
         goal = self._workplace.shelf(shelf, item)
         nearest_configuration(goal, near=self._placing.joint.goal)  # before anything moves
-        grasp = self._grasp(item)
-        self._go_home()
+        grasp = self._grasping.grasp(item, on_aimed=self._interact)
+        self._grasping.go_home()
         plan, release = self._transfer(goal)
         self._retreat(plan)
         return CollaborationResult(grasp=grasp, plan=plan, release=release)
 
-    def _grasp(self, item: ObjectConfig) -> GraspResult:
-        self._station.gripper.move(OPEN)
-        for attempt in range(1, self._config.attempts + 1):
-            goals = self._goals_above(item)
-            aim_time = self._aim(goals)
-            if attempt == 1:
-                self._interact(goals)
-            pixel_error = self._aimer.error(goals)
-            if self._close_on(item):
-                return GraspResult(
-                    aim_time=aim_time,
-                    pixel_error=pixel_error,
-                    attempts=attempt,
-                )
-            self._rise()
-            self._go_home()
-        raise TaskFailedError(
-            f"grasp: {self._config.attempts} times the fingers closed on nothing. Is the "
-            "object where its marker says?"
-        )
-
-    def _goals_above(self, item: ObjectConfig) -> Goals:
-        target = self._look_for(item)
-        try:
-            goals = self._config.aiming.goals(self._workplace.hover(), target)
-        except ValueError as error:
-            raise TaskFailedError(
-                f"look: {item.name!r} lies where the camera would not see the hand above it: "
-                "put it nearer to the middle of the image."
-            ) from error
-        return goals.approached_by(self._workplace.hover_joints())
-
-    def _look_for(self, item: ObjectConfig) -> Float[np.ndarray, "2"]:
-        """Pixel to aim at, from a look at the table before the arm is over it."""
-        self._station.enter("look")
-        pixel = self._station.look().pixels.get(item.marker.id)
-        if pixel is None:
-            raise TaskFailedError(
-                f"look: the camera does not see marker {item.marker.id} of {item.name!r}. Put "
-                "it into the camera's view, and the arm out of it."
-            )
-        return self._aiming.target_of(pixel)
-
-    def _aim(self, goals: Goals) -> float:
-        self._station.enter("aim")
-        self._station.watching = True
-        return self._aimer.aim(goals)
-
     def _interact(self, goals: Goals) -> None:
         self._station.enter(INTERACT)
-        self._aimer.hold(goals, self._config.interaction)
-
-    def _close_on(self, item: ObjectConfig) -> bool:
-        """Go down, close the fingers; whether there is something between them."""
-        self._station.enter("grasp")
-        self._station.watching = False
-        hover = self._workplace.hover()
-        position = self._station.pose.position.clone()
-        position[2] = item.half_size[2]
-        self._station.move_straight(Pose(position, hover.orientation), speed=0.08)
-        self._station.gripper.move(CLOSED)
-        self._station.stay(0.7)
-        grasped = self._station.state.gripper_width > item.half_size[0]
-        if grasped:
-            self._rise()
-        else:
-            self._station.gripper.move(OPEN)
-        return grasped
-
-    def _rise(self) -> None:
-        self._station.enter("lift")
-        pose = self._station.pose
-        up = torch.tensor([0.0, 0.0, self._config.lift], dtype=torch.float64)
-        self._station.move_straight(Pose(pose.position + up, pose.orientation))
-
-    def _go_home(self) -> None:
-        self._station.enter("home")
-        home = self._workplace.home_joints()
-        dt = self._station.config.dt
-        path = joint_line(self._station.joints, home, speed=0.6, dt=dt)
-        plan = Plan(goal=self._workplace.home(), dt=dt, path=path.numpy())
-        self._check(plan)
-        self._station.play(plan.path)
+        self._grasping.aimer.hold(goals, self._config.interaction)
 
     def _transfer(self, goal: Pose) -> tuple[Plan, Pose]:
         """Carry to the shelf along the learned motion; the plan, and where the hand let go."""
