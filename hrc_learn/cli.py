@@ -5,12 +5,13 @@ Exit status: 0 done, 1 the work failed, 2 bad input. Bad input ends in one line 
 
 import json
 import math
-import os
 import sys
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NoReturn, SupportsFloat
+
+from .output import new_file
 
 
 def run[Args](main: Callable[[Args], int | None], args: type[Args]) -> NoReturn:
@@ -59,9 +60,8 @@ def write_text(path: str | Path, text: str) -> None:
     """Write a file that is whole or not there at all; its folder is made where missing."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}")
-    unfinished.write_text(text)
-    unfinished.replace(path)
+    with new_file(path) as part:
+        part.write_text(text)
 
 
 def _warning_line(message: Warning | str, *_place: object, **_line: object) -> str:

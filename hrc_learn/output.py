@@ -1,4 +1,4 @@
-"""Folders of results that are whole or not there at all."""
+"""Files and folders of results that are whole or not there at all."""
 
 import json
 import os
@@ -10,6 +10,24 @@ from typing import Any
 
 MADE_BY = "made_by.json"
 """File in each folder of results: what it was made from."""
+
+
+@contextmanager
+def new_file(path: Path) -> Iterator[Path]:
+    """A place beside `path` to write a file, which takes its name only when it is complete.
+
+    Args:
+        path: Where the file will be; replaces one that is there. Its folder must exist.
+
+    Yields:
+        The place to write to.
+    """
+    part = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        yield part
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
 
 
 @contextmanager

@@ -295,5 +295,6 @@ def test_the_wheel_holds_the_package_alone(tmp_path):
     roots = {name.split("/")[0] for name in names}
     information = f"hrc_learn-{PROJECT['version']}.dist-info"
     assert roots == {"hrc_learn", information}
-    packed = {name for name in names if name.startswith("hrc_learn/") and name.endswith(".py")}
-    assert packed == {str(path.relative_to(ROOT)) for path in SOURCES}
+    packed = {name for name in names if name.startswith("hrc_learn/")}
+    data = (ROOT / "hrc_learn").rglob("*.css")
+    assert packed == {str(path.relative_to(ROOT)) for path in (*SOURCES, *data)}

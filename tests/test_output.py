@@ -1,11 +1,11 @@
-"""Folders of results: whole or not there at all."""
+"""Files and folders of results: whole or not there at all."""
 
 import json
 from pathlib import Path
 
 import pytest
 
-from hrc_learn.output import MADE_BY, new_folder, replacing
+from hrc_learn.output import MADE_BY, new_file, new_folder, replacing
 
 MARK = "mark"
 
@@ -35,6 +35,27 @@ def contents(path: Path) -> dict[str, str]:
         for file in path.rglob("*")
         if file.is_file()
     }
+
+
+def test_a_file_appears_only_when_it_is_complete(tmp_path):
+    path = tmp_path / "file"
+    with new_file(path) as part:
+        part.write_text("new")
+        assert not path.exists()
+    assert contents(tmp_path) == {"file": "new"}
+
+
+def test_a_file_that_fails_leaves_the_old_one_alone(tmp_path):
+    (tmp_path / "file").write_text("old")
+
+    def fail() -> None:
+        with new_file(tmp_path / "file") as part:
+            part.write_text("half")
+            raise WorkFailedError
+
+    with pytest.raises(WorkFailedError):
+        fail()
+    assert contents(tmp_path) == {"file": "old"}
 
 
 def test_a_folder_appears_only_when_it_is_complete(tmp_path):

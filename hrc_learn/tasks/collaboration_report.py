@@ -1,27 +1,20 @@
-"""The page that tells how a run of the collaboration went."""
+"""The report that tells how a run of the collaboration went."""
 
-import platform
 from collections.abc import Mapping, Sequence
-from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
 
 from ..viz import RunRecording
-from ..viz.report import Measurement, Section, write_report
-
-_PACKAGES = ("hrc-learn", "torch", "mujoco", "lerobot", "opencv-python-headless", "rerun-sdk")
+from ..viz.report import Measurement, Picture, Report, Section, software_versions
 
 
-def write_collaboration_report(
-    path: Path,
+def collaboration_report(
     run: RunRecording,
     table: Sequence[Measurement],
     configuration: Mapping[str, object],
     command: str,
-) -> None:
-    """Write the page with figures, table and how to do it again.
+) -> Report:
+    """Figures, table and how to do it again.
 
     Args:
-        path: HTML file.
         run: What happened.
         table: What was measured.
         configuration: Of the run.
@@ -29,8 +22,7 @@ def write_collaboration_report(
     """
     from ..viz import figures
 
-    write_report(
-        path,
+    return Report(
         title=run.title,
         summary=(
             "An arm grasps an object with a camera that nobody calibrated, while a person "
@@ -47,11 +39,13 @@ def write_collaboration_report(
                     "object. The image Jacobian was learned from them, and adapts online."
                 ),
                 figures=(
-                    (
+                    Picture(
+                        "image",
                         figures.image_figure(run),
                         "The marker's path in the image, and its error.",
                     ),
-                    (
+                    Picture(
+                        "image_jacobian",
                         figures.image_jacobian_figure(run),
                         "Image Jacobian: the controller's estimate, and the simulator's truth.",
                     ),
@@ -63,7 +57,9 @@ def write_collaboration_report(
                     "The pull acts in the null space of the hand's task: the elbow yields, the "
                     "hand stays."
                 ),
-                figures=((figures.person_figure(run), "Effort, elbow and hand."),),
+                figures=(
+                    Picture("person", figures.person_figure(run), "Effort, elbow and hand."),
+                ),
             ),
             Section(
                 heading="Carrying and placing",
@@ -72,22 +68,16 @@ def write_collaboration_report(
                     "arm did."
                 ),
                 figures=(
-                    (figures.paths_figure(run), "Paths of the hand."),
-                    (figures.joints_figure(run), "Joint positions and their limits."),
+                    Picture("paths", figures.paths_figure(run), "Paths of the hand."),
+                    Picture(
+                        "joints",
+                        figures.joints_figure(run),
+                        "Joint positions and their limits.",
+                    ),
                 ),
             ),
         ),
         configuration=configuration,
-        versions={"python": platform.python_version(), **_versions()},
-        rerun_command=command,
+        versions=software_versions(),
+        command=command,
     )
-
-
-def _versions() -> dict[str, str]:
-    found = {}
-    for name in _PACKAGES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "not installed"
-    return found

@@ -10,6 +10,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from jaxtyping import Float, Int
 
+from ..output import new_file
 from .panels import Curves, Plot, Tab
 from .recording import Body, Box, Capsule
 
@@ -24,20 +25,16 @@ def rrd_file(
     path: str | os.PathLike[str], title: str, blueprint: rrb.Blueprint
 ) -> Iterator[rr.RecordingStream]:
     """A recording stream into a file that appears only when it is complete."""
-    path = Path(path)
-    part = path.with_name(path.name + ".part")
     stream = rr.RecordingStream("hrc_learn")
-    try:
-        stream.save(part, default_blueprint=blueprint)
-        stream.send_recording_name(title)
-        stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        yield stream
-        stream.flush()
-        stream.disconnect()
-        part.replace(path)
-    finally:
-        stream.disconnect()
-        part.unlink(missing_ok=True)
+    with new_file(Path(path)) as part:
+        try:
+            stream.save(part, default_blueprint=blueprint)
+            stream.send_recording_name(title)
+            stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+            yield stream
+            stream.flush()
+        finally:
+            stream.disconnect()
 
 
 def seconds(time: Float[np.ndarray, " time"]) -> list[rr.TimeColumn]:

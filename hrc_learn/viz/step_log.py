@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..output import new_file
+
 Value = np.ndarray | np.generic | float | int | bool
 """A measurement of one step: an array of any shape, or a number."""
 
@@ -128,17 +130,11 @@ class StepLog:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write columns and events as one .npz file, which appears only when complete."""
-        path = Path(path)
-        part = path.with_name(path.name + ".part")
         arrays: dict[str, Any] = {f"column/{name}": self[name] for name in self.names}
         arrays["event/time"] = np.array([event.time for event in self.events], dtype=float)
         arrays["event/text"] = np.array([event.text for event in self.events], dtype=str)
-        try:
-            with part.open("wb") as file:
-                np.savez(file, **arrays)
-            part.replace(path)
-        finally:
-            part.unlink(missing_ok=True)
+        with new_file(Path(path)) as part, part.open("wb") as file:
+            np.savez(file, **arrays)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> "StepLog":

@@ -1,13 +1,28 @@
 import base64
 import math
+import platform
+from dataclasses import replace
 from html.parser import HTMLParser
 from io import BytesIO
 
+import numpy as np
 import pytest
+import torch
 from matplotlib.figure import Figure
 from PIL import Image
 
-from hrc_learn.viz.report import Measurement, Section, flatten, write_report
+from hrc_learn.viz.report import (
+    Measurement,
+    Picture,
+    Report,
+    Section,
+    flatten,
+    read_report,
+    reports_page,
+    show_measurements,
+    software_versions,
+    write_report,
+)
 
 VOID = {"meta", "img", "br", "link", "hr"}
 NASTY = '<script>alert("x")</script> & co'
@@ -21,6 +36,8 @@ class Page(HTMLParser):
         self.open: list[str] = []
         self.texts: list[str] = []
         self.images: list[str] = []
+        self.links: list[str] = []
+        self.anchors: list[str] = []
         self.rows: list[list[str]] = []
         self.tags: set[str] = set()
         self.feed(html)
@@ -31,7 +48,10 @@ class Page(HTMLParser):
         values = dict(attrs)
         if tag == "img":
             self.images.append(values["src"])
-        assert "href" not in values
+        if "href" in values:
+            self.links.append(values["href"])
+        if "id" in values:
+            self.anchors.append(values["id"])
         if tag == "tr":
             self.rows.append([])
         if tag == "td":
@@ -54,62 +74,85 @@ def figure() -> Figure:
     return fig
 
 
-def write(path, **changes) -> Page:
+def report(**changes) -> Report:
     content = {
         "title": "Grasp",
         "summary": "First.\n\nSecond.",
         "table": [Measurement(name="Goal error", value=0.312, unit="mm", target=2)],
-        "sections": [Section(heading="Path", text="Text.", figures=[(figure(), "A caption")])],
+        "sections": [
+            Section(
+                heading="Path", text="Text.", figures=[Picture("path", figure(), "A caption")]
+            )
+        ],
         "configuration": {"controller": {"k_v": 0.3}, "seed": 0},
         "versions": {"numpy": "2.2.6"},
-        "rerun_command": "python run.py --seed 0",
+        "command": "python run.py --seed 0",
     }
-    write_report(path, **(content | changes))
-    return Page(path.read_text(encoding="utf-8"))
+    return Report(**(content | changes))
 
 
-def test_the_page_holds_everything_it_was_given(tmp_path):
-    page = write(tmp_path / "report.html")
-    text = " ".join(page.texts)
+def page(**changes) -> Page:
+    return Page(reports_page("Page", [report(**changes)]))
+
+
+def row(m: Measurement) -> list[str]:
+    (found,) = [row for row in page(table=[m]).rows if row and row[0] == m.name]
+    return found
+
+
+def test_the_page_holds_everything_it_was_given():
+    shown = page()
+    text = " ".join(shown.texts)
     for part in ("Grasp", "First.", "Second.", "Path", "A caption", "python run.py --seed 0"):
         assert part in text
-    assert ["Goal error", "0.312 mm", "≤ 2 mm", "✓ ok"] in page.rows
-    assert ["controller.k_v", "0.3"] in page.rows
-    assert ["numpy", "2.2.6"] in page.rows
-    assert [file.name for file in tmp_path.iterdir()] == ["report.html"]
+    assert ["Goal error", "0.312 mm", "≤ 2 mm", "✓ ok"] in shown.rows
+    assert ["controller.k_v", "0.3"] in shown.rows
+    assert ["numpy", "2.2.6"] in shown.rows
 
 
-def test_every_image_is_in_the_page_and_can_be_decoded(tmp_path):
-    section = Section(heading="Two", figures=[(figure(), "one"), (figure(), "two")])
-    page = write(tmp_path / "report.html", sections=[section])
-    assert len(page.images) == 2
-    for source in page.images:
+def test_what_there_is_none_of_takes_no_place():
+    shown = Page(reports_page("Page", [Report(title="Bare", summary="Text.")]))
+    assert not {"table", "details", "pre", "section"} & shown.tags
+
+
+def test_every_picture_is_in_the_page_and_can_be_decoded():
+    image = np.zeros((4, 6, 3), dtype=np.uint8)
+    image[1, 2] = (10, 200, 30)
+    pictures = [Picture("one", figure(), "one"), Picture("two", image, "two")]
+    images = []
+    for source in page(sections=[Section(heading="Two", figures=pictures)]).images:
         kind, data = source.split(",", 1)
         assert kind == "data:image/png;base64"
-        assert Image.open(BytesIO(base64.b64decode(data))).size == (450, 300)
+        images.append(Image.open(BytesIO(base64.b64decode(data))))
+    assert [image.size for image in images] == [(450, 300), (6, 4)]
+    np.testing.assert_array_equal(np.asarray(images[1]), image)
 
 
-def test_nothing_is_fetched_from_elsewhere(tmp_path):
-    page = write(tmp_path / "report.html")
-    html = (tmp_path / "report.html").read_text(encoding="utf-8")
+def test_nothing_is_fetched_from_elsewhere():
+    html = reports_page("Page", [report(), report()])
     assert "http" not in html
     assert "url(" not in html
-    assert not {"script", "link", "iframe"} & page.tags
+    assert not {"script", "link", "iframe"} & Page(html).tags
 
 
-def test_all_text_is_escaped(tmp_path):
-    page = write(
-        tmp_path / "report.html",
+def test_all_text_is_escaped():
+    hurt = report(
         title=NASTY,
         summary=NASTY,
-        table=[Measurement(name=NASTY, value=1.0, unit=NASTY, target=2.0)],
-        sections=[Section(heading=NASTY, text=NASTY, figures=[(figure(), f"{NASTY}'\"")])],
+        table=[Measurement(name=NASTY, value=1.0, unit=NASTY, target=2.0, claim=NASTY)],
+        sections=[
+            Section(heading=NASTY, text=NASTY, figures=[Picture("x", figure(), f"{NASTY}'\"")])
+        ],
         configuration={NASTY: NASTY},
         versions={NASTY: NASTY},
-        rerun_command=NASTY,
+        command=NASTY,
     )
-    assert "script" not in page.tags
-    assert "".join(page.texts).count(NASTY) >= 12
+    for shown in (
+        Page(reports_page(NASTY, [hurt])),
+        Page(reports_page(NASTY, [hurt, hurt])),
+    ):
+        assert "script" not in shown.tags
+        assert "".join(shown.texts).count(NASTY) >= 13
 
 
 @pytest.mark.parametrize(
@@ -126,27 +169,32 @@ def test_all_text_is_escaped(tmp_path):
         (5.0, None, False, None),
     ],
 )
-def test_targets_are_judged(tmp_path, value, target, at_least, ok):
+def test_targets_are_judged(value, target, at_least, ok):
     m = Measurement(name="x", value=value, target=target, at_least=at_least)
     assert m.ok is ok
-    page = write(tmp_path / "report.html", table=[m])
     marks = {True: "✓ ok", False: "✗ missed", None: ""}
-    (row,) = [row for row in page.rows if row and row[0] == "x"]
-    assert row[3] == marks[ok]
-    assert row[2].startswith("" if target is None else "≥" if at_least else "≤")
+    _, _, bound, mark = row(m)
+    assert mark == marks[ok]
+    assert bound.startswith("" if target is None else "≥" if at_least else "≤")
 
 
-def test_the_verdict_counts_what_was_missed(tmp_path):
-    good = Measurement(name="a", value=1, target=2)
-    bad = Measurement(name="b", value=3, target=2)
-    free = Measurement(name="c", value=3)
-    verdicts = {
-        (good, free): "All 1 targets reached.",
-        (good, bad, free): "1 of 2 targets missed.",
-    }
-    for table, verdict in verdicts.items():
-        assert verdict in write(tmp_path / "report.html", table=table).texts
-    assert not any("target" in t for t in write(tmp_path / "r.html", table=[free]).texts[4:8])
+GOOD = Measurement(name="a", value=1, target=2)
+BAD = Measurement(name="b", value=3, target=2)
+FREE = Measurement(name="c", value=3)
+
+
+@pytest.mark.parametrize(
+    ("table", "verdict"),
+    [
+        ((GOOD, FREE), "The target reached."),
+        ((GOOD, GOOD), "All 2 targets reached."),
+        ((GOOD, BAD, FREE), "1 of 2 targets missed."),
+        ((FREE,), ""),
+    ],
+)
+def test_the_verdict_counts_what_was_missed(table, verdict):
+    said = [text for text in page(table=table).texts if "target" in text]
+    assert said == ([verdict] if verdict else [])
 
 
 @pytest.mark.parametrize(
@@ -159,19 +207,129 @@ def test_the_verdict_counts_what_was_missed(tmp_path):
         (math.nan, "nan"),
     ],
 )
-def test_numbers_are_short(tmp_path, value, text):
-    page = write(tmp_path / "report.html", table=[Measurement(name="x", value=value)])
-    assert ["x", text, "", ""] in page.rows
+def test_numbers_are_short(value, text):
+    assert row(Measurement(name="x", value=value)) == ["x", text, "", ""]
+
+
+def test_claims_of_the_paper_have_a_column_where_there_are_any():
+    claimed = Measurement(name="time", value=10.5, unit="s", claim="10 s (Fig. 8)")
+    shown = page(table=[claimed, FREE])
+    assert "The paper says" in shown.texts
+    assert ["time", "10.5 s", "", "", "10 s (Fig. 8)"] in shown.rows
+    assert ["c", "3", "", "", ""] in shown.rows
+    assert "The paper says" not in page(table=[FREE]).texts
+
+
+@pytest.mark.parametrize(
+    ("name", "unit", "key"),
+    [
+        ("goal error at the shelf, angle", "deg", "goal_error_at_the_shelf_angle_deg"),
+        ("Joint-limit violations", "", "joint_limit_violations"),
+    ],
+)
+def test_keys_are_single_words(name, unit, key):
+    assert Measurement(name=name, value=1, unit=unit).key == key
+
+
+def test_measurements_are_printed_beside_their_targets(capsys):
+    show_measurements([GOOD, BAD, FREE])
+    lines = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
+    assert "│ a │ 1 │ ≤ 2 │ ok │" in lines
+    assert "│ b │ 3 │ ≤ 2 │ missed │" in lines
+    assert "│ c │ 3 │ │ │" in lines
+
+
+def test_several_reports_are_listed_with_their_verdicts_first():
+    reports = [report(title=f"Run {i}", table=[m]) for i, m in enumerate((GOOD, BAD), 1)]
+    shown = Page(reports_page("Both", reports))
+    assert shown.rows[:2] == [
+        ["Run 1", "The target reached."],
+        ["Run 2", "1 of 1 targets missed."],
+    ]
+    assert [f"#{anchor}" for anchor in shown.anchors] == shown.links
+    assert len(shown.images) == 2
+    with pytest.raises(ValueError, match="at least one report"):
+        reports_page("None", [])
+
+
+def test_a_folder_holds_page_pictures_and_what_they_were_made_from(tmp_path):
+    write_report(tmp_path, report())
+    files = {str(f.relative_to(tmp_path)) for f in tmp_path.rglob("*") if f.is_file()}
+    assert files == {"report.html", "report.json", "figures/path.png"}
+    assert Image.open(tmp_path / "figures/path.png").size == (450, 300)
+    html = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert html == reports_page("Grasp", [read_report(tmp_path)])
+
+
+def test_a_report_is_read_as_it_was_written(tmp_path):
+    table = [
+        Measurement(name="a", value=math.nan, unit="s", target=1.5, claim="“none” ≤ 2"),
+        Measurement(name="b", value=7, target=1, at_least=True),
+    ]
+    configuration = {"out": tmp_path, "gains": {"k": 0.3}, "pulls": (1, 2), "loose": None}
+    write_report(tmp_path, report(table=table, configuration=configuration))
+    read = read_report(tmp_path)
+    assert math.isnan(read.table[0].value)
+    assert replace(read.table[0], value=0) == replace(table[0], value=0)
+    assert read.table[1] == table[1]
+    assert read.configuration == {
+        "out": str(tmp_path),
+        "gains.k": 0.3,
+        "pulls": "(1, 2)",
+        "loose": None,
+    }
+    (section,) = read.sections
+    assert (section.heading, section.text) == ("Path", "Text.")
+    assert read.versions == {"numpy": "2.2.6"}
+    assert read.command == "python run.py --seed 0"
+    assert read.pictures[0].drawing == (tmp_path / "figures/path.png").read_bytes()
 
 
 def test_a_failed_report_leaves_the_old_one_alone(tmp_path):
-    path = tmp_path / "report.html"
-    path.write_text("old")
+    write_report(tmp_path, report())
+    before = {f: f.read_bytes() for f in tmp_path.rglob("*") if f.is_file()}
     broken = figure()
     broken.savefig = None
+    pictures = [Picture("path", np.zeros((2, 2, 3), np.uint8), ""), Picture("b", broken, "")]
     with pytest.raises(TypeError):
-        write(path, sections=[Section(heading="x", figures=[(broken, "x")])])
-    assert path.read_text() == "old"
+        write_report(tmp_path, report(sections=[Section(heading="x", figures=pictures)]))
+    assert {f: f.read_bytes() for f in tmp_path.rglob("*") if f.is_file()} == before
+
+
+def test_folders_that_are_no_runs_are_refused(tmp_path):
+    with pytest.raises(FileNotFoundError, match="nowhere is not a folder"):
+        read_report(tmp_path / "nowhere")
+    with pytest.raises(ValueError, match=r"holds no report\.json: .* not the folder of a run"):
+        read_report(tmp_path)
+    for text, complaint in (
+        ("{", r"report\.json is damaged"),
+        ('{"title": "x"}', "is not a report of ours"),
+        ('{"format": "hrc_learn report", "version": 99}', "is of version 99"),
+    ):
+        (tmp_path / "report.json").write_text(text)
+        with pytest.raises(ValueError, match=complaint):
+            read_report(tmp_path)
+
+
+def test_a_missing_picture_is_named(tmp_path):
+    write_report(tmp_path, report())
+    (tmp_path / "figures/path.png").unlink()
+    with pytest.raises(FileNotFoundError, match=r"path\.png"):
+        read_report(tmp_path)
+
+
+def test_pictures_need_names_that_files_can_have():
+    with pytest.raises(ValueError, match=r"cannot be named '\.\./a b'"):
+        Picture("../a b", b"", "")
+    twice = Section(heading="x", figures=[Picture("a", b"", ""), Picture("a", b"", "")])
+    with pytest.raises(ValueError, match="two pictures named 'a'"):
+        report(sections=[twice])
+
+
+def test_versions_name_the_software():
+    versions = software_versions()
+    assert versions["python"] == platform.python_version()
+    assert versions["torch"] == torch.__version__.split("+")[0]
 
 
 def test_nested_configuration_is_flattened():

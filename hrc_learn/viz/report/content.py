@@ -1,0 +1,156 @@
+"""What a report holds: text, measured values beside their targets, and pictures."""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from io import BytesIO
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import UInt8
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_DPI = 150
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measurement:
+    """One measured value and what it had to reach."""
+
+    name: str
+    """What was measured, in words."""
+    value: float | int
+    unit: str = ""
+    target: float | int | None = None
+    """Bound that the value has to keep; None only reports it."""
+    at_least: bool = False
+    """Whether the target is a lower bound; it is an upper one otherwise."""
+    claim: str = ""
+    """What the paper states about it, in words; empty where it says nothing."""
+
+    @property
+    def ok(self) -> bool | None:
+        """Whether the target is kept, None without one. NaN keeps none."""
+        if self.target is None:
+            return None
+        return self.value >= self.target if self.at_least else self.value <= self.target
+
+    @property
+    def shown(self) -> str:
+        """Value and unit, as a reader wants them."""
+        return f"{short(self.value)} {self.unit}".rstrip()
+
+    @property
+    def bound(self) -> str:
+        """The target in the same way, empty without one."""
+        if self.target is None:
+            return ""
+        return f"{'≥' if self.at_least else '≤'} {short(self.target)} {self.unit}".rstrip()
+
+    @property
+    def key(self) -> str:
+        """Name and unit as one word, under which programs write the value with --json."""
+        words = re.findall(r"\w+", self.name.lower())
+        return "_".join([*words, *([self.unit] if self.unit else [])])
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture with its caption."""
+
+    name: str
+    """Of its file, without an ending: letters, digits, hyphens and underscores."""
+    drawing: "Figure | UInt8[np.ndarray, 'height width 3'] | bytes"
+    """A matplotlib figure, an image, or a finished PNG file."""
+    caption: str
+
+    def __post_init__(self) -> None:
+        if not re.fullmatch(r"[\w-]+", self.name):
+            raise ValueError(
+                f"a picture cannot be named {self.name!r}: "
+                "letters, digits, hyphens and underscores name files everywhere."
+            )
+
+    def png(self) -> bytes:
+        """The picture as a PNG file."""
+        if isinstance(self.drawing, bytes):
+            return self.drawing
+        buffer = BytesIO()
+        if isinstance(self.drawing, np.ndarray):
+            from PIL import Image
+
+            Image.fromarray(self.drawing).save(buffer, "PNG", optimize=True)
+        else:
+            self.drawing.savefig(buffer, format="png", dpi=_DPI)
+        return buffer.getvalue()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Section:
+    """A heading, paragraphs and pictures."""
+
+    heading: str
+    text: str = ""
+    """Plain text; blank lines part paragraphs."""
+    figures: Sequence[Picture] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """What a run did and measured.
+
+    Raises:
+        ValueError: If two pictures have the same name.
+    """
+
+    title: str
+    summary: str
+    """What was done, in plain text; blank lines part paragraphs."""
+    table: Sequence[Measurement] = ()
+    """Everything measured, with targets where there are any."""
+    sections: Sequence[Section] = ()
+    configuration: Mapping[str, object] = field(default_factory=dict)
+    """What the run was configured with; nested mappings are flattened."""
+    versions: Mapping[str, str] = field(default_factory=dict)
+    """Of the software, by name."""
+    command: str = ""
+    """The command line that does all this again."""
+
+    def __post_init__(self) -> None:
+        names = [picture.name for section in self.sections for picture in section.figures]
+        twice = {name for name in names if names.count(name) > 1}
+        if twice:
+            raise ValueError(f"report {self.title!r} has two pictures named {twice.pop()!r}.")
+
+    @property
+    def targets(self) -> int:
+        """How many values had a target."""
+        return sum(m.ok is not None for m in self.table)
+
+    @property
+    def missed(self) -> tuple[Measurement, ...]:
+        """What did not keep its target."""
+        return tuple(m for m in self.table if m.ok is False)
+
+    @property
+    def pictures(self) -> tuple[Picture, ...]:
+        """Those of all sections, in order."""
+        return tuple(picture for section in self.sections for picture in section.figures)
+
+
+def short(value: float | int) -> str:
+    """Three significant digits; whole numbers in full."""
+    return str(int(value)) if float(value).is_integer() and abs(value) < 1e9 else f"{value:.3g}"
+
+
+def flatten(mapping: Mapping[str, object], prefix: str = "") -> dict[str, object]:
+    """Nested mappings as one, keys joined by dots."""
+    flat: dict[str, object] = {}
+    for key, value in mapping.items():
+        if isinstance(value, Mapping):
+            flat |= flatten(value, f"{prefix}{key}.")
+        else:
+            flat[f"{prefix}{key}"] = value
+    return flat
