@@ -55,10 +55,12 @@ def test_the_job_is_done_and_every_target_met(work):
     assert measured["object_stands_on_the_shelf"] == 1
     assert measured["collisions_with_the_cabinet"] == 0
     assert {path.name for path in out.iterdir()} == {
+        "figures",
         "log.npz",
         "made_by.json",
         "measured.json",
         "report.html",
+        "report.json",
         "run.rrd",
     }
 
