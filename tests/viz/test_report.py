@@ -1,6 +1,7 @@
 import base64
 import math
 import platform
+import re
 from dataclasses import replace
 from html.parser import HTMLParser
 from io import BytesIO
@@ -243,13 +244,34 @@ def test_several_reports_are_listed_with_their_verdicts_first():
     reports = [report(title=f"Run {i}", table=[m]) for i, m in enumerate((GOOD, BAD), 1)]
     shown = Page(reports_page("Both", reports))
     assert shown.rows[:2] == [
-        ["Run 1", "The target reached."],
-        ["Run 2", "1 of 1 targets missed."],
+        ["1", "Run 1", "The target reached."],
+        ["2", "Run 2", "1 of 1 targets missed."],
     ]
-    assert [f"#{anchor}" for anchor in shown.anchors] == shown.links
+    assert shown.links == ["#run1", "#run2"]
+    assert shown.anchors == ["run1", "run2"]
     assert len(shown.images) == 2
     with pytest.raises(ValueError, match="at least one report"):
         reports_page("None", [])
+
+
+def test_what_several_runs_measured_stands_side_by_side():
+    def run(error: float, **others: float) -> Report:
+        table = [Measurement(name="error", value=error, unit="mm", target=2)]
+        table += [Measurement(name=name, value=value) for name, value in others.items()]
+        return report(table=table)
+
+    alone = report(table=[Measurement(name="alone", value=1)])
+    html = reports_page("All", [run(1, time=3), alone, run(5, jerk=4), run(2, time=9)])
+    shown = Page(html)
+    heads = html.split("Side by side")[1].split("</thead>")[0]
+    assert re.findall(r"#run(\d)", heads) == ["1", "3", "4"]
+    start = 4 + 1  # after the overview and the head of the table
+    end = shown.rows.index([], start)  # the head of the first report's own table
+    assert shown.rows[start:end] == [
+        ["error", "1 mm", "5 mm", "2 mm"],
+        ["time", "3", "", "9"],
+    ]
+    assert 'class="n miss">5 mm' in html
 
 
 def test_a_folder_holds_page_pictures_and_what_they_were_made_from(tmp_path):

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from importlib.resources import files
 
+from .comparison import side_by_side
 from .content import Measurement, Picture, Report, Section, flatten
 
 
@@ -31,14 +32,15 @@ def reports_page(title: str, reports: Sequence[Report]) -> str:
             f"<article>{_report(report, f'run{i}')}</article>"
             for i, report in enumerate(reports, 1)
         ]
-        body = "\n".join([f"<h1>{escape(title)}</h1>", _overview(reports), *articles])
+        heading = f"<h1>{escape(title)}</h1>"
+        body = "\n".join([heading, _overview(reports), side_by_side(reports), *articles])
     style = files(__package__).joinpath("style.css").read_text(encoding="utf-8")
     return _PAGE.format(title=escape(title), style=style, body=body)
 
 
 def _overview(reports: Sequence[Report]) -> str:
     rows = "\n".join(
-        f'<tr><td><a href="#run{i}">{escape(report.title)}</a></td>'
+        f'<tr><td class="n">{i}</td><td><a href="#run{i}">{escape(report.title)}</a></td>'
         f"<td>{_verdict(report)}</td></tr>"
         for i, report in enumerate(reports, 1)
     )

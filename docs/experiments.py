@@ -1,0 +1,111 @@
+"""Refresh the pictures and tables of docs/experiments.md from the folders of runs.
+
+The page decides what is shown: each `images/KIND_NAME.png` in it is made from the picture NAME
+in the report of that kind of run, and the lines between `<!-- KIND measured -->` and
+`<!-- end -->` become the table of what that run measured.
+
+python docs/experiments.py --placing outputs/placing --grasping outputs/grasping
+"""
+
+import re
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+
+from PIL import Image
+
+from hrc_learn import cli
+from hrc_learn.viz.report import Measurement, Report, read_report
+
+PAGE = Path(__file__).with_name("experiments.md")
+WIDTH = 1000
+"""Of the pictures, at most [px]."""
+COLOURS = 128
+"""Of a picture: what flat areas and lines need, in a quarter of the bytes."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args:
+    """Which runs to show."""
+
+    placing: Path | None = None
+    """Folder of control/run_placing.py; what the page shows of it stays as it is without."""
+    grasping: Path | None = None
+    """Folder of control/run_grasping.py, likewise."""
+    collaboration: Path | None = None
+    """Folder of control/run_collaboration.py, likewise."""
+    page: Path = PAGE
+    """The page; its pictures are in images/ beside it."""
+
+
+def main(args: Args) -> None:
+    runs = {
+        "placing": args.placing,
+        "grasping": args.grasping,
+        "collaboration": args.collaboration,
+    }
+    reports = {kind: read_report(run) for kind, run in runs.items() if run is not None}
+    if not reports:
+        raise ValueError("no run: give --placing, --grasping or --collaboration")
+    text = args.page.read_text()
+    pictures: dict[str, bytes] = {}
+    for kind, report in reports.items():
+        pictures |= shown_pictures(kind, report, text)
+        text = with_table(kind, report, text)
+    for name, content in pictures.items():
+        path = args.page.parent / "images" / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(content)
+        print(f"{path}: {len(content) / 1e3:.0f} kB")
+    cli.write_text(args.page, text)
+
+
+def shown_pictures(kind: str, report: Report, page: str) -> dict[str, bytes]:
+    """The pictures of a report that a page shows, by the names of their files."""
+    there = {picture.name: picture for picture in report.pictures}
+    wanted = dict.fromkeys(re.findall(rf"images/{kind}_([\w-]+)\.png", page))
+    unknown = wanted.keys() - there.keys()
+    if unknown:
+        raise ValueError(
+            f"the page shows a picture {min(unknown)!r} of {kind}, but the report has "
+            f"{', '.join(there)}"
+        )
+    return {f"{kind}_{name}.png": small(there[name].png()) for name in wanted}
+
+
+def small(png: bytes) -> bytes:
+    """A picture no wider than the page, with few colours."""
+    image = Image.open(BytesIO(png)).convert("RGB")
+    if image.width > WIDTH:
+        height = round(image.height * WIDTH / image.width)
+        image = image.resize((WIDTH, height), Image.Resampling.LANCZOS)
+    buffer = BytesIO()
+    image.quantize(COLOURS).save(buffer, "PNG", optimize=True)
+    return buffer.getvalue()
+
+
+def with_table(kind: str, report: Report, page: str) -> str:
+    """The page with what was measured between the marks of a kind of run, if it has them."""
+    begin, end = f"<!-- {kind} measured -->", "<!-- end -->"
+    before, found, rest = page.partition(begin)
+    if not found:
+        return page
+    _, closed, after = rest.partition(end)
+    if not closed:
+        raise ValueError(f"{begin} in the page is not followed by {end}")
+    claims = any(m.claim for m in report.table)
+    heads = ["measured", "value", "target", *(["the paper says"] if claims else [])]
+    rows = [heads, ["---", "---:", "---:", "---"][: len(heads)]]
+    rows += [cells(m)[: len(heads)] for m in report.table]
+    table = "\n".join(f"| {' | '.join(row)} |" for row in rows)
+    return f"{before}{begin}\n\n{table}\n\n{end}{after}"
+
+
+def cells(m: Measurement) -> list[str]:
+    """A row of the table; a value that missed its target is marked."""
+    missed = " **(missed)**" if m.ok is False else ""
+    return [text.replace("|", "\\|") for text in (m.name, m.shown + missed, m.bound, m.claim)]
+
+
+if __name__ == "__main__":
+    cli.run(main, Args)

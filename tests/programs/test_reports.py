@@ -1,0 +1,142 @@
+"""One page from several runs, and the page of experiments in docs/."""
+
+import importlib.util
+import json
+import sys
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from hrc_learn import cli
+from hrc_learn.viz.report import Measurement, Picture, Report, Section, write_report
+
+ROOT = Path(__file__).parents[2]
+IMAGES = ROOT / "docs" / "images"
+
+
+def load(path: Path):
+    """A program as a module."""
+    name = f"{path.parent.name}_{path.stem}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    # Registered, as dataclasses look themselves up there.
+    sys.modules[name] = module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def runs(tmp_path):
+    """Folders of two runs, the second of which missed a target."""
+    shades = np.arange(1200, dtype=np.uint8)[None, :, None]
+    image = np.broadcast_to(shades, (600, 1200, 3)).copy()
+    folders = []
+    for i, error in enumerate((0.3, 3.0), 1):
+        table = [
+            Measurement(name="error", value=error, unit="mm", target=2, claim="none | small"),
+            Measurement(name="time", value=10 * i, unit="s"),
+        ]
+        section = Section(heading="Paths", figures=[Picture("paths", image, "A path")])
+        report = Report(title=f"Run number {i}", summary="", table=table, sections=[section])
+        folders.append(tmp_path / f"run_{i}")
+        write_report(folders[-1], report)
+    return folders
+
+
+def test_one_page_is_made_from_several_runs(runs, tmp_path):
+    out, figures = tmp_path / "new" / "page.html", tmp_path / "figures.json"
+    program = load(ROOT / "control" / "report.py")
+    program.main(program.Args(runs=tuple(runs), out=out, title="Both", json=figures))
+    html = out.read_text(encoding="utf-8")
+    for part in ("<h1>Both</h1>", "Run number 1", "Run number 2", "Side by side"):
+        assert part in html
+    assert html.count("data:image/png") == 2
+    assert json.loads(figures.read_text()) == {
+        "run_1_error_mm": 0.3,
+        "run_1_time_s": 10,
+        "run_2_error_mm": 3.0,
+        "run_2_time_s": 20,
+    }
+
+
+def test_a_single_run_has_its_own_page(runs, tmp_path):
+    program = load(ROOT / "control" / "report.py")
+    program.main(program.Args(runs=(runs[0],), out=tmp_path / "page.html"))
+    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert page == (runs[0] / "report.html").read_text(encoding="utf-8")
+
+
+def test_what_is_no_run_is_bad_input(runs, tmp_path, monkeypatch, capsys):
+    out = tmp_path / "page.html"
+    program = load(ROOT / "control" / "report.py")
+    monkeypatch.setattr(
+        sys, "argv", ["report.py", *map(str, [runs[0], tmp_path, "--out", out])]
+    )
+    with pytest.raises(SystemExit) as ended:
+        cli.run(program.main, program.Args)
+    assert ended.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"{tmp_path} holds no report.json" in line
+    assert not out.exists()
+
+
+PAGE = """# Page
+![paths](images/placing_paths.png) and ![other](images/grasping_paths.png)
+<!-- placing measured -->
+old
+<!-- end -->
+kept
+"""
+
+
+@pytest.fixture
+def experiments():
+    return load(ROOT / "docs" / "experiments.py")
+
+
+def test_pictures_and_tables_of_the_page_are_refreshed(runs, tmp_path, experiments):
+    page = tmp_path / "page.md"
+    page.write_text(PAGE)
+    experiments.main(experiments.Args(placing=runs[1], page=page))
+    text = page.read_text()
+    assert text.startswith(PAGE[: PAGE.index("old")])
+    assert text.endswith(PAGE[PAGE.index("<!-- end") :])
+    assert "| measured | value | target | the paper says |" in text
+    assert "| error | 3 mm **(missed)** | ≤ 2 mm | none \\| small |" in text
+    assert "| time | 20 s |  |  |" in text
+    assert "old" not in text
+    assert [path.name for path in (tmp_path / "images").iterdir()] == ["placing_paths.png"]
+    picture = Image.open(BytesIO((tmp_path / "images/placing_paths.png").read_bytes()))
+    assert picture.size == (1000, 500)
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("![](images/placing_joints.png)", "'joints' of placing, but the report has paths"),
+        ("<!-- placing measured -->", "is not followed by <!-- end -->"),
+    ],
+)
+def test_a_page_that_a_run_cannot_fill_is_left_alone(
+    runs, tmp_path, experiments, text, complaint
+):
+    page = tmp_path / "page.md"
+    page.write_text(text)
+    with pytest.raises(ValueError, match=complaint):
+        experiments.main(experiments.Args(placing=runs[0], page=page))
+    assert page.read_text() == text
+    assert not (tmp_path / "images").exists()
+
+
+def test_a_page_needs_a_run(experiments):
+    with pytest.raises(ValueError, match="no run: give --placing"):
+        experiments.main(experiments.Args())
+
+
+def test_the_pictures_of_the_page_are_there_and_small():
+    text = (ROOT / "docs" / "experiments.md").read_text()
+    shown = {part.split(")")[0] for part in text.split("(images/")[1:]}
+    for name in shown:
+        assert 5_000 < (IMAGES / name).stat().st_size < 200_000, name
