@@ -1,0 +1,122 @@
+"""A policy's first primitives, by regression instead of gradients."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
+
+from ...dmp import JointDMP
+from ...dmp.fitting.ridge import RidgeFit, fit_ridge
+from ...dmp.system.response import Response
+from .motion import ContextualMotion
+
+REGULARIZATIONS = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
+"""Of the regression, chosen from by the error on demonstrations left out."""
+FEWEST = 4
+"""Demonstrations from which a regression can be told from chance."""
+SMALLEST_VARIATION = 0.05
+"""Share of its spread by which a number of the context must differ between demonstrations."""
+MARGIN = 0.5
+"""Share of the demonstrated range by which contexts may lie outside."""
+
+
+@torch.no_grad()
+def fit_closed_form(
+    motion: ContextualMotion,
+    demonstrations: Sequence[Float[Tensor, "_frames A"]],
+    contexts: Float[Tensor, "n C"],
+    fps: float,
+) -> float:
+    """Set base and slopes of `motion` from demonstrations.
+
+    One primitive is fitted to each demonstration. Of few, or where the context explains
+    nothing, their mean is kept; else a ridge regression on the context, as strong as predicts
+    demonstrations left out best.
+
+    Args:
+        motion: Changed in place.
+        demonstrations: Coordinates frame by frame.
+        contexts: Of each, whitened.
+        fps: Frames a second.
+
+    Returns:
+        Root mean square error of the motions of demonstrations left out, in the spread of the
+        coordinates; NaN of one demonstration.
+    """
+    x = _fit_each(motion.response, demonstrations, fps)
+    c = contexts.double()
+    regression = _best_regression(motion, c, x)
+    motion.base.copy_(regression.base)
+    motion.slopes.copy_(regression.slopes)
+    motion.centre.copy_(c.mean(0))
+    low, high = torch.aminmax(c, dim=0)
+    motion.low.copy_(low - MARGIN * (high - low))
+    motion.high.copy_(high + MARGIN * (high - low))
+    return regression.error
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Regression:
+    """x = base + (c - mean) slopes."""
+
+    base: Float[Tensor, "K"]
+    slopes: Float[Tensor, "C K"]
+    error: float
+    """Of demonstrations left out."""
+
+
+def _fit_each(
+    response: Response, demonstrations: Sequence[Tensor], fps: float
+) -> Float[Tensor, "n K"]:
+    """Coordinates of a primitive each, as `ContextualMotion` counts them."""
+    position = pad_sequence([d.double() for d in demonstrations], batch_first=True)
+    lengths = torch.tensor([len(d) for d in demonstrations])
+    frame = torch.arange(position.shape[1])
+    dmp = JointDMP.fit(
+        frame.double() / fps,
+        position,
+        mask=frame < lengths[:, None],
+        basis=response.basis,
+        spring=response.spring,
+    )
+    each = dmp.coordinates()
+    each[..., :-3] /= response.spring.stiffness
+    return torch.cat([each.flatten(1), dmp.duration.log()[:, None]], dim=-1)
+
+
+def _best_regression(motion: ContextualMotion, c: Tensor, x: Tensor) -> Regression:
+    n = len(x)
+    mean = x.mean(0)
+    left_out = (x - mean) * n / (n - 1) if n > 1 else x * torch.nan
+    best = Regression(
+        base=mean, slopes=c.new_zeros(c.shape[1], len(mean)), error=_error(motion, left_out)
+    )
+    varies = c.std(0, correction=0) > SMALLEST_VARIATION
+    if n < FEWEST or not varies.any():
+        return best
+    for regularization in REGULARIZATIONS:
+        fit = fit_ridge(c[:, varies], x, regularization)
+        error = _error(motion, fit.held_out)
+        if error < best.error:
+            best = Regression(base=mean, slopes=_slopes(fit, varies), error=error)
+    return best
+
+
+def _slopes(fit: RidgeFit, varies: Tensor) -> Tensor:
+    slopes = fit.coefficients.new_zeros(len(varies), fit.coefficients.shape[1])
+    slopes[varies] = fit.coefficients[1:] / fit.scale[:, None]
+    return slopes
+
+
+def _error(motion: ContextualMotion, difference: Float[Tensor, "n K"]) -> float:
+    """What a difference in coordinates makes of the motion, root mean square."""
+    # The map to motions is linear in all but the duration, which shifts them in time.
+    per_coordinate = difference[:, :-1].unflatten(-1, (motion.width, -1)).clone()
+    per_coordinate[..., :-3] *= motion.response.spring.stiffness
+    s = torch.linspace(0, 1, 100, dtype=torch.float64)
+    position, _, _ = motion.response.matrices(s, torch.float64)
+    square = (per_coordinate @ position).square().mean() + difference[:, -1].square().mean()
+    return float(square.sqrt())
