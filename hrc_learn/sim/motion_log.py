@@ -16,6 +16,9 @@ class MotionLog:
         self._positions: list[np.ndarray] = []
         self._orientations: list[np.ndarray] = []
 
+    def __len__(self) -> int:
+        return len(self._orientations)
+
     def advance(self, duration: float) -> None:
         """Note where everything is, then let the world go on [s]."""
         position, orientation = self._bodies.poses()
@@ -23,6 +26,11 @@ class MotionLog:
         self._orientations.append(orientation)
         self._world.advance(duration)
 
-    def bodies(self) -> tuple[Body, ...]:
-        """Everything that moved, as it is to be drawn."""
-        return self._bodies.drawn(np.stack(self._positions), np.stack(self._orientations))
+    def bodies(self, steps: int | None = None) -> tuple[Body, ...]:
+        """Everything that moved, as it is to be drawn.
+
+        Args:
+            steps: The first steps only.
+        """
+        positions = np.stack(self._positions[:steps])
+        return self._bodies.drawn(positions, np.stack(self._orientations[:steps]))

@@ -30,7 +30,7 @@ def evaluate(job: SimulatedJob, fit: Mapping[str, float]) -> list[Measurement]:
         raise ValueError(f"the job failed, so there is nothing to measure: {job.failure}")
     station, world, result = job.station, job.world, job.result
     distance, angle = result.goal_error
-    deviation = Deviation.of(station)
+    deviation = Deviation.of(station.log)
     touches = world.cabinet_contacts.touches + _carried_touches(station, world)
     placed = world.rests_on(job.item.name, f"board_{job.shelf}")
     at_most = [
@@ -72,5 +72,5 @@ def limit_violations(station: Station) -> int:
 
 def _carried_touches(station: Station, world: World) -> list[Touch]:
     """Touches of the cabinet by the object before it was let go."""
-    release, _ = span(station, RELEASE)
+    release, _ = span(station.log, RELEASE)
     return [touch for touch in world.object_contacts.touches if touch.start < release]

@@ -1,5 +1,6 @@
 """From what a station logged, and what the simulator knows, to a recording to look at."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,15 +9,16 @@ from jaxtyping import Float
 
 from .. import viz
 from ..demos import Demonstration
-from ..geometry import quaternion
+from ..geometry import Pose, quaternion
 from ..kinematics import panda
 from ..sim import MotionLog, World
+from ..viz import LoggedSteps
 from .collaboration import INTERACT, TRANSFER
 from .placing import Plan
 from .station import SAFETY_COLUMNS, Station
 
 ELBOW, TOOL = 3, 8
-"""Frames of the elbow and of the tool among the logged links."""
+"""Frames of the elbow and of the tool among the links."""
 
 
 def record(
@@ -29,7 +31,7 @@ def record(
     region: viz.Box | None = None,
     demonstration: Demonstration | None = None,
 ) -> viz.RunRecording:
-    """Everything worth looking at in a run of the collaboration.
+    """Everything worth looking at in a run of the collaboration, over or still going on.
 
     Args:
         title: What it was.
@@ -40,9 +42,11 @@ def record(
         region: Box above the table in which the camera takes over.
         demonstration: One that the way was learned from.
     """
-    log = station.log
+    # Another thread may ask while the loop goes on: both logs as far as both have come.
+    log = station.log.snapshot(len(motion))
     time, safety = log["time"], log["safety"]
-    deviation = Deviation.of(station)
+    images = tuple(station.images)
+    deviation = Deviation.of(log)
     limits = panda.limits
     return viz.RunRecording(
         title=title,
@@ -50,22 +54,22 @@ def record(
         joint_names=panda.joint_names,
         joint_position=log["joint_position"],
         joint_limits=viz.JointLimits(lower=limits.lower.numpy(), upper=limits.upper.numpy()),
-        demo_joint_position=_matching_demonstration(station, plan, demonstration),
-        position=log["link_position"][:, TOOL],
+        demo_joint_position=_matching_demonstration(log, plan, demonstration),
+        position=link_poses(log).position[:, TOOL].numpy(),
         demo_path=None if demonstration is None else demonstration.position,
         plan_path=None if plan is None else plan.hand.position.numpy(),
-        bodies=motion.bodies(),
+        bodies=motion.bodies(len(log)),
         boxes=tuple(world.config.boxes()),
         region=region,
         camera=viz.CameraRecording(
             model=world.config.camera,
             feature=log["feature"],
             target=log["target"],
-            image_time=np.array([kept.time for kept in station.images]),
-            images=tuple(kept.image for kept in station.images),
+            image_time=np.array([kept.time for kept in images]),
+            images=tuple(kept.image for kept in images),
         ),
         image_jacobian=log["image_jacobian"],
-        true_image_jacobian=true_image_jacobian(station, world),
+        true_image_jacobian=true_image_jacobian(log, world),
         weight_norm=log["weight_norm"],
         potentials={"task space": log["potential"]},
         human_effort=log["human_effort"],
@@ -77,23 +81,26 @@ def record(
     )
 
 
-def span(station: Station, phase: str) -> tuple[float, float]:
-    """Start and end of the first time a phase was entered [s]; empty if it never was."""
-    events = station.log.events
+def span(log: LoggedSteps, phase: str) -> tuple[float, float]:
+    """Start and end of the first time a phase was entered [s].
+
+    Infinite is the end of the last one, and empty the span of one that never was.
+    """
+    events = log.events
     for event, following in zip(events, [*events[1:], None], strict=True):
         if event.text == phase:
-            return event.time, station.time if following is None else following.time
+            return event.time, math.inf if following is None else following.time
     return 0.0, 0.0
 
 
 def _matching_demonstration(
-    station: Station, plan: Plan | None, demonstration: Demonstration | None
+    log: LoggedSteps, plan: Plan | None, demonstration: Demonstration | None
 ) -> Float[np.ndarray, "time joints"] | None:
     """Demonstrated joints at the same share of the way to the shelf, NaN elsewhere [rad]."""
     if plan is None or demonstration is None or demonstration.joint_position is None:
         return None
-    time = station.log["time"]
-    start, end = span(station, TRANSFER)
+    time = log["time"]
+    start, end = span(log, TRANSFER)
     share = (time - start) / plan.duration * demonstration.duration
     joints = np.column_stack(
         [np.interp(share, demonstration.time, q) for q in demonstration.joint_position.T]
@@ -101,17 +108,19 @@ def _matching_demonstration(
     return np.where(((time >= start) & (time < end))[:, None], joints, np.nan)
 
 
-def true_image_jacobian(station: Station, world: World) -> Float[np.ndarray, "time 2 6"]:
+def true_image_jacobian(log: LoggedSteps, world: World) -> Float[np.ndarray, "time 2 6"]:
     """True image Jacobian of the hand's marker wherever the controller used its estimate."""
-    log = station.log
     used = np.isfinite(log["image_jacobian"]).all(axis=(1, 2))
     jacobian = np.full_like(log["image_jacobian"], np.nan)
-    tool = log["link_position"][used, TOOL]
-    turn = torch.from_numpy(log["link_orientation"][used, TOOL])
-    offset = torch.from_numpy(world.hand_marker_offset())
-    marker = tool + quaternion.rotate(turn, offset.expand(len(tool), 3)).numpy()
-    jacobian[used] = world.config.camera.image_jacobian(marker, tool)
+    tool = link_poses(log)[torch.from_numpy(used), TOOL]
+    marker = tool.apply(torch.from_numpy(world.hand_marker_offset())).numpy()
+    jacobian[used] = world.config.camera.image_jacobian(marker, tool.position.numpy())
     return jacobian
+
+
+def link_poses(log: LoggedSteps) -> Pose:
+    """Poses of the joint frames, the flange and the tool at every step, (time, links)."""
+    return panda.link_poses(torch.from_numpy(log["joint_position"]))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -126,21 +135,21 @@ class Deviation:
     """Of the elbow [m]."""
 
     @classmethod
-    def of(cls, station: Station) -> "Deviation":
+    def of(cls, log: LoggedSteps) -> "Deviation":
         """From the first pull at the body on, until the time left to the person is over."""
-        log = station.log
         time = log["time"]
-        start, end = span(station, INTERACT)
+        start, end = span(log, INTERACT)
         within = (time >= start) & (time < end)
         pulled = within & (np.abs(log["human_effort"]).max(axis=1) > 0)
         first = int(pulled.argmax()) if pulled.any() else 0
         rows = within & (np.arange(len(time)) >= first) & bool(pulled.any())
+        links = link_poses(log)
 
         def distance(link: int) -> Float[np.ndarray, " time"]:
-            position = log["link_position"][:, link]
+            position = links.position[:, link].numpy()
             return np.where(rows, np.linalg.norm(position - position[first], axis=1), np.nan)
 
-        turn = torch.from_numpy(log["link_orientation"][:, TOOL])
+        turn = links.orientation[:, TOOL]
         angle = quaternion.angle(turn, turn[first]).numpy()
         return cls(
             position=distance(TOOL),

@@ -5,6 +5,8 @@ it is asked for: `hrc_learn.viz.run_dashboard` and `fit_dashboard` import rerun,
 `hrc_learn.viz.figures` imports matplotlib.
 """
 
+from .logged_steps import Event as Event
+from .logged_steps import LoggedSteps as LoggedSteps
 from .recording import Body as Body
 from .recording import Box as Box
 from .recording import CameraRecording as CameraRecording
@@ -13,5 +15,4 @@ from .recording import FitRecording as FitRecording
 from .recording import JointLimits as JointLimits
 from .recording import RunRecording as RunRecording
 from .recording import arm_bodies as arm_bodies
-from .step_log import Event as Event
 from .step_log import StepLog as StepLog

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from ..vision import CameraModel
-from .step_log import Event
+from .logged_steps import Event
 
 Colour = tuple[float, float, float, float]
 """Red, green, blue, opacity, each 0 to 1."""

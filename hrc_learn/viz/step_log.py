@@ -1,27 +1,17 @@
 """A log that a control loop can afford: about a microsecond a step, no files, no threads."""
 
 import os
-from collections.abc import Iterator, Mapping
-from pathlib import Path
-from typing import Any, NamedTuple
+from collections.abc import Mapping
 
 import numpy as np
 
-from ..output import new_file
+from .logged_steps import Event, LoggedSteps
 
 Value = np.ndarray | np.generic | float | int | bool
 """A measurement of one step: an array of any shape, or a number."""
 
 
-class Event(NamedTuple):
-    """Something worth a line of text, such as a task entering its next phase."""
-
-    time: float
-    """[s]"""
-    text: str
-
-
-class StepLog:
+class StepLog(LoggedSteps):
     """Columns of whatever a loop measures, one row a step.
 
     The first row decides the columns and their shapes; every later row must bring the same
@@ -47,41 +37,23 @@ class StepLog:
         """
         if block < 1:
             raise ValueError(f"block must be at least one row, but is {block}.")
+        # The length is counted up last, so that another thread sees whole rows only.
+        super().__init__(blocks=(), length=0, events=())
         self._block = block
         self._dtype: np.dtype | None = None
-        self._blocks: list[np.ndarray] = []
         self._columns: list[tuple[str, np.ndarray]] = []  # of the last block
         self._first = 0  # rows before the last block
-        self._length = 0  # counted last, so that another thread sees whole rows only
-        self.events: list[Event] = []
-        """What happened when, in the order of the calls."""
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the columns, in the order of the first row."""
-        return () if self._dtype is None else self._dtype.names or ()
+    def snapshot(self, rows: int | None = None) -> LoggedSteps:
+        """What is logged so far, which does not grow; shares memory with the log.
 
-    def __len__(self) -> int:
-        return self._length
+        Another thread may take it while the loop appends.
 
-    def __contains__(self, name: str) -> bool:
-        return name in self.names
-
-    def __getitem__(self, name: str) -> np.ndarray:
-        """One column, (T, ...): a copy, whatever is logged afterwards."""
-        if name not in self:
-            raise KeyError(f"{name!r} is not logged; the columns are {list(self.names)}.")
-        return np.concatenate([block[name] for block in self.blocks()])
-
-    def blocks(self, start: int = 0) -> Iterator[np.ndarray]:
-        """The rows from `start` on, as structured arrays that share memory with the log.
-
-        Another thread may read while the loop appends.
+        Args:
+            rows: The first rows only.
         """
-        length = self._length
-        for i in range(start // self._block, len(self._blocks)):
-            before = i * self._block
-            yield self._blocks[i][max(start - before, 0) : max(length - before, 0)]
+        length = len(self) if rows is None else min(rows, len(self))
+        return LoggedSteps(self._blocks, length, self.events)
 
     def append(self, **values: Value) -> None:
         """Add a row.
@@ -127,14 +99,6 @@ class StepLog:
     def event(self, time: float, text: str) -> None:
         """Note that something happened at a time [s]."""
         self.events.append(Event(float(time), text))
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write columns and events as one .npz file, which appears only when complete."""
-        arrays: dict[str, Any] = {f"column/{name}": self[name] for name in self.names}
-        arrays["event/time"] = np.array([event.time for event in self.events], dtype=float)
-        arrays["event/text"] = np.array([event.text for event in self.events], dtype=str)
-        with new_file(Path(path)) as part, part.open("wb") as file:
-            np.savez(file, **arrays)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> "StepLog":
@@ -186,8 +150,8 @@ class StepLog:
     def _extend(self) -> None:
         assert self._dtype is not None
         rows = np.zeros(self._block, dtype=self._dtype)
-        self._columns = [(name, rows[name]) for name in self.names]
         self._blocks.append(rows)
+        self._columns = [(name, rows[name]) for name in self.names]
         self._first = (len(self._blocks) - 1) * self._block
 
 

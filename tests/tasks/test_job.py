@@ -101,8 +101,8 @@ def test_the_phases_come_in_order(job):
 
 def test_the_estimated_image_jacobian_is_close_to_the_true_one(job):
     estimate = job.station.log["image_jacobian"]
-    true = true_image_jacobian(job.station, job.world)
-    start, end = span(job.station, "interact")
+    true = true_image_jacobian(job.station.log, job.world)
+    start, end = span(job.station.log, "interact")
     time = job.station.log["time"]
     rows = (time >= start) & (time < end)
     difference = (estimate - true)[rows, :, :2]
@@ -110,8 +110,8 @@ def test_the_estimated_image_jacobian_is_close_to_the_true_one(job):
 
 
 def test_deviations_count_from_the_first_pull(job):
-    deviation = Deviation.of(job.station)
-    start, end = span(job.station, "interact")
+    deviation = Deviation.of(job.station.log)
+    start, end = span(job.station.log, "interact")
     time = job.station.log["time"]
     outside = (time < start) | (time >= end)
     assert np.isnan(deviation.position[outside]).all()
@@ -146,7 +146,7 @@ def test_a_person_who_keeps_away_changes_nothing(aiming, placing):
         aiming, placing[0], "middle", camera="synthetic", pulls=(), config=config, seed=5
     )
     assert job.failure == ""
-    assert Deviation.of(job.station).elbow_most_moved == 0.0
+    assert Deviation.of(job.station.log).elbow_most_moved == 0.0
     assert job.world.rests_on("box", "board_middle")
 
 

@@ -115,3 +115,17 @@ def test_a_long_log_is_read_back_across_blocks(tmp_path):
 def test_a_block_holds_at_least_a_row():
     with pytest.raises(ValueError, match="at least one row"):
         StepLog(block=0)
+
+
+@pytest.mark.parametrize("rows", [None, 5, 8, 10, 99])
+def test_a_snapshot_does_not_grow(rows):
+    log = filled(10, block=8)
+    log.event(0.0, "start")
+    taken = log.snapshot(rows)
+    log.append(time=1.0, joint=np.zeros(7), J=np.zeros((2, 6)), pushed=True)
+    log.event(1.0, "end")
+    length = 10 if rows is None else min(rows, 10)
+    assert len(taken) == length
+    np.testing.assert_array_equal(taken["time"], np.arange(length) / 125)
+    assert taken.events == [Event(0.0, "start")]
+    assert not len(StepLog().snapshot())
