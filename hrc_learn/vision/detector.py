@@ -7,6 +7,9 @@ from jaxtyping import Float, UInt8
 
 from .markers import MODULES, dictionary
 
+_CLOSE_LOOK_EVERY = 5
+"""Images from one search at full resolution for a marker that stays unseen to the next."""
+
 Corners = Float[np.ndarray, "4 2"]
 """Pixels of top left, top right, bottom right, bottom left corner of the upright marker."""
 
@@ -17,6 +20,7 @@ class MarkerDetector:
     A marker is looked for round its last position first, where that fails in the whole image
     at half resolution, and only then at full resolution; corners are always refined at full
     resolution. That takes a fraction of the time of a plain search and is no less accurate.
+    While a marker stays unseen, full resolution is tried on every few images only.
     """
 
     def __init__(self, ids: Iterable[int]):
@@ -38,21 +42,27 @@ class MarkerDetector:
         parameters.minMarkerDistanceRate = 0.05
         self._aruco = cv2.aruco.ArucoDetector(dictionary(), parameters)
         self._last: dict[int, Corners] = {}
+        self._in_vain: dict[int, int] = {}
 
     def detect(
-        self, image: UInt8[np.ndarray, "h w 3"] | UInt8[np.ndarray, "h w"]
+        self,
+        image: UInt8[np.ndarray, "h w 3"] | UInt8[np.ndarray, "h w"],
+        ids: Iterable[int] | None = None,
     ) -> dict[int, Corners]:
         """Corners of the markers seen in an image, by id.
 
         Args:
             image: RGB or grey.
+            ids: Those of the detector's markers that matter now; None: all of them. A marker
+                that is out of sight costs a search of the whole image.
         """
+        wanted = self.ids if ids is None else self.ids.intersection(ids)
         found: dict[int, Corners] = {}
-        for id, corners in self._last.items():
-            found |= self._search_near(image, id, corners)
-        if missing := self.ids.difference(found):
+        for id in wanted.intersection(self._last):
+            found |= self._search_near(image, id, self._last.pop(id))
+        if missing := wanted.difference(found):
             found |= self._search_everywhere(image, missing)
-        self._last = found
+        self._last |= found
         return {id: corners.copy() for id, corners in found.items()}
 
     def _search_near(self, image: np.ndarray, id: int, last: Corners) -> dict[int, Corners]:
@@ -73,10 +83,17 @@ class MarkerDetector:
             # Pixel k of the half image covers pixels 2k and 2k + 1 of the whole one. It only
             # says where to look: its corners may be pixels off.
             found |= self._search_near(grey, id, 2.0 * corners + 0.5)
-        if missing := ids.difference(found):  # hidden, or too small and tilted for half
+        if missing := self._worth_a_close_look(ids, found):
             rough = self._search(grey, missing)
             found |= {id: _refine(grey, corners) for id, corners in rough.items()}
         return found
+
+    def _worth_a_close_look(self, ids: frozenset[int], found: Iterable[int]) -> frozenset[int]:
+        """Markers still missing if a full search is due: hidden, or too tilted for half."""
+        missing = ids.difference(found)
+        self._in_vain = {id: self._in_vain.get(id, -1) + 1 for id in missing}
+        due = any(count % _CLOSE_LOOK_EVERY == 0 for count in self._in_vain.values())
+        return missing if due else frozenset()
 
     def _search(self, grey: np.ndarray, ids: frozenset[int]) -> dict[int, Corners]:
         corners, found, _ = self._aruco.detectMarkers(np.ascontiguousarray(grey))

@@ -93,3 +93,31 @@ def test_centre_is_the_image_of_the_middle_and_not_the_mean():
     corners = corners[:, :2] / corners[:, 2:]
     np.testing.assert_allclose(centre(corners), [400.0, 300.0], atol=1e-9)
     assert np.linalg.norm(corners.mean(axis=0) - [400.0, 300.0]) > 5
+
+
+def test_only_the_markers_that_matter_now_are_looked_for():
+    near, far = np.eye(4), np.eye(4)
+    near[:3, 3], far[:3, 3] = [0.5, 0.0, 0.2], [0.7, 0.2, 0.0]
+    image = camera_on(overhead(), {7: near, 9: far}, MARKER, Marker(9, 0.05)).read()
+    detector = MarkerDetector([7, 9])
+    both = detector.detect(image)
+    assert set(detector.detect(image, [7, 30])) == {7}
+    assert detector.detect(image, []) == {}
+    np.testing.assert_allclose(detector.detect(image)[9], both[9], atol=0.1)
+
+
+def test_a_marker_too_tilted_for_half_resolution_is_found_sooner_or_later():
+    """Whatever the search has tried in vain before."""
+    model, shown = overhead(), {}
+    tilted = np.eye(4)
+    tilt = np.deg2rad(73)
+    tilted[:3, :3] = [[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]]
+    tilted[:3, 3] = [0.5, 0.35, 0.0]
+    camera = camera_on(model, shown, Marker(7, 0.03))
+    detector = MarkerDetector([7])
+    for _ in range(3):
+        assert detector.detect(camera.read()) == {}
+    shown[7] = tilted
+    half = [detector.detect(camera.read()) for _ in range(6)]
+    assert any(half)
+    assert not half[0]
