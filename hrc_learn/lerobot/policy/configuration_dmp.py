@@ -9,7 +9,7 @@ from lerobot.optim import AdamWConfig
 from ...demos.features import flatten_names
 
 EARLIEST = -1_000_000
-"""Offset in frames from which LeRobot, which stays within the episode, takes its first frame."""
+"""Offset [frames] at which LeRobot, as it stays within the episode, takes its first frame."""
 
 
 @PreTrainedConfig.register_subclass("dmp")

@@ -68,8 +68,8 @@ class ObservationEncoder(nn.Module):
     def numbers(self, observation: Observation) -> Float[Tensor, "*batch C"]:
         """The numbers alone, whitened."""
         if not self.widths:
-            image = observation[self.images[0]]
-            return image.new_zeros(*image.shape[:-3], 0)
+            batch = observation[self.images[0]].shape[:-3] if observation else ()
+            return self.mean.new_zeros(*batch, 0)
         values = torch.cat([observation[key] for key in self.widths], dim=-1)
         return (values.to(self.mean) - self.mean) / self.std
 

@@ -40,7 +40,8 @@ class ContextualMotion(nn.Module):
     stiffness, where they are as large as the motion.
     """
 
-    base: Tensor
+    centre: Tensor
+    """Context of base."""
     low: Tensor
     high: Tensor
 
