@@ -6,6 +6,7 @@ controller, the playback of a learned motion, a person's joystick.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import final
 
@@ -29,6 +30,10 @@ INTERVENTIONS = (
     "stopped",
 )
 """Kinds of interventions, in the order of the last axis of their flags and counts."""
+
+# Share of a limit, or joint velocity [rad/s], beyond which an intervention is reported. Below
+# is rounding, in float32 too: a command led along a limit would be flagged by chance.
+_NOTICED = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,7 +82,7 @@ class SafetyReport:
     """What the filter did in this step."""
 
     flags: Bool[Tensor, "*batch kinds"]
-    """Whether each of `INTERVENTIONS` was needed."""
+    """Whether each of `INTERVENTIONS` was needed, by more than rounding."""
 
     def acted(self, kind: str) -> Bool[Tensor, "*batch"]:
         """Whether one kind of intervention was needed."""
@@ -175,12 +180,13 @@ class SafetyFilter(nn.Module):
         excess = _excess(u, self.barrier.velocity)
         u = u / excess.clamp(min=1)
         inside = u.clamp(*bounds)
-        cut = (inside != u).any(-1, keepdim=True)
+        cut = torch.linalg.vector_norm(inside - u, math.inf, dim=-1, keepdim=True) > _NOTICED
         target, speeding, near = self._cap_tcp_speed(inside, jacobian, human_distance)
         follow = self._follow_smoothly if self.config.jerk_limited else self._follow
         v, acceleration, steep, sharp = follow(state, target, bounds, dt)
 
-        flags = [excess > 1, cut, steep > 1, sharp, speeding, near, invalid, stopped]
+        steep, sharp = _acts(steep), _acts(sharp)
+        flags = [_acts(excess), cut, steep, sharp, speeding, near, invalid, stopped]
         flags = torch.cat(flags, dim=-1)
         return (
             v,
@@ -231,14 +237,15 @@ class SafetyFilter(nn.Module):
             return u, never, never
         linear = torch.linalg.vecdot(jacobian[..., :3, :], u.unsqueeze(-2))
         speed = torch.linalg.vector_norm(linear, dim=-1, keepdim=True)
-        speeding = speed > self.config.tcp_speed
+        excess = speed / self.config.tcp_speed
+        speeding = _acts(excess)
         if human_distance is None:
-            return u / (speed / self.config.tcp_speed).clamp(min=1), speeding, never
+            return u / excess.clamp(min=1), speeding, never
         safe = self.config.separation.highest_speed(human_distance).unsqueeze(-1)
         cap = safe.clamp(max=self.config.tcp_speed)
         # At a cap of zero everything rests, also what does not move the tool.
         factor = cap / torch.maximum(speed, cap).clamp(min=torch.finfo(u.dtype).tiny)
-        return factor * u, speeding, (speed > safe) | (safe == 0)
+        return factor * u, speeding, (speed > (1 + _NOTICED) * safe) | (safe == 0)
 
     def _follow(
         self,
@@ -247,7 +254,11 @@ class SafetyFilter(nn.Module):
         bounds: tuple[Tensor, Tensor],
         dt: float | Tensor,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Velocity as near to the target as the acceleration limit lets it come."""
+        """Velocity as near to the target as the acceleration limit lets it come.
+
+        Returns:
+            Velocity, acceleration, and by how much acceleration and jerk were too large.
+        """
         reach = self.barrier.acceleration * dt
         change = target - state.velocity
         steep = _excess(change, reach)
@@ -255,7 +266,7 @@ class SafetyFilter(nn.Module):
         # Last the bounds that no scaling may loosen. Should both exclude each other, the arm
         # could not brake harder anyway.
         v = v.clamp(*bounds).clamp(state.velocity - reach, state.velocity + reach)
-        return v, state.acceleration, steep, torch.zeros_like(steep, dtype=torch.bool)
+        return v, state.acceleration, steep, torch.zeros_like(steep)
 
     def _follow_smoothly(
         self,
@@ -287,9 +298,14 @@ class SafetyFilter(nn.Module):
             torch.maximum(state.acceleration - most, -barrier.acceleration),
             torch.minimum(state.acceleration + most, barrier.acceleration),
         )
-        return state.velocity + acceleration * dt, acceleration, steep, excess > 1
+        return state.velocity + acceleration * dt, acceleration, steep, excess
 
 
 def _excess(vector: Tensor, limit: Tensor) -> Tensor:
     """Largest ratio of a component to its limit; at most 1 where all keep them."""
     return (vector / limit).abs().amax(-1, keepdim=True)
+
+
+def _acts(excess: Tensor) -> Bool[Tensor, "..."]:
+    """Whether what is divided by a ratio of at least 1 changes by more than rounding."""
+    return excess > 1 + _NOTICED

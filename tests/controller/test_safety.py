@@ -242,6 +242,24 @@ def test_interventions_are_counted_by_kind():
     assert state.counts.shape == (len(INTERVENTIONS),)
 
 
+@pytest.mark.parametrize(("beyond", "flagged"), [(1e-13, False), (1e-3, True)])
+def test_rounding_is_no_intervention(beyond: float, flagged: bool):
+    """Commands are often led exactly along a limit: here of position, and of acceleration."""
+    safety, dt = SafetyFilter(LIMITS), 0.002
+    q = READY.clone()
+    q[1] = LIMITS.upper[1] - 0.1
+    u = torch.zeros_like(q)
+    u[1] = safety.velocity_bounds(q)[1][1] * (1 + beyond)
+    steady = safety.initial_state(q, u.clone())
+    _, _, report = safety.step(steady, q, u, dt)
+    assert bool(report.acted("position")) == flagged
+    u = LIMITS.acceleration * dt * (1 + beyond)
+    _, _, report = SafetyFilter(LIMITS, SafetyConfig(jerk_limited=False)).step(
+        safety.initial_state(READY), READY, u, dt
+    )
+    assert bool(report.acted("acceleration")) == flagged
+
+
 @pytest.mark.parametrize("dt", [0.0, -0.01, 0.3])
 def test_a_step_that_voids_the_guarantee_is_refused(dt: float):
     safety = SafetyFilter(LIMITS)
