@@ -19,6 +19,10 @@ from .safety import SafetyFilter as SafetyFilter
 from .safety import SafetyReport as SafetyReport
 from .safety import SafetyState as SafetyState
 from .separation import SeparationConfig as SeparationConfig
+from .smoothing import BROKEN as BROKEN
+from .smoothing import ChunkSmoother as ChunkSmoother
+from .smoothing import SmoothReport as SmoothReport
+from .smoothing import SmoothState as SmoothState
 from .table1 import GRIPPER_DOWN as GRIPPER_DOWN
 from .table1 import INITIAL_IMAGE_JACOBIAN as INITIAL_IMAGE_JACOBIAN
 from .table1 import table1_config as table1_config

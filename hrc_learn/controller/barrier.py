@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from hrc_learn.kinematics import JointLimits
+from hrc_learn.kinematics import MotionLimits
 
 # Of v_max: sums of rounded numbers must not exceed a limit in the last digit.
 _ROUNDING = 1e-12
@@ -56,7 +56,7 @@ class LimitBarrier(nn.Module):
     reserve: Tensor
     """A^2/(2 j), what it takes to start braking [rad/s]; zero without a jerk limit."""
 
-    def __init__(self, limits: JointLimits, *, margin: float, rate: float, jerk_limited: bool):
+    def __init__(self, limits: MotionLimits, *, margin: float, rate: float, jerk_limited: bool):
         """Prepare the constants.
 
         Args:

@@ -9,6 +9,7 @@ from .franka import FrankaArm as FrankaArm
 from .franka import panda as panda
 from .inverse import UnreachableError as UnreachableError
 from .limits import JointLimits as JointLimits
+from .limits import MotionLimits as MotionLimits
 from .panda_capsules import LINK_CAPSULES as LINK_CAPSULES
 from .panda_capsules import panda_capsules as panda_capsules
 from .pseudo_inverse import null_space_projector as null_space_projector

@@ -10,8 +10,11 @@ from torch import Tensor
 
 
 @dataclass(frozen=True, kw_only=True)
-class JointLimits:
-    """Limits of each joint, float64; velocities and up are symmetric."""
+class MotionLimits:
+    """Limits of each joint's motion, float64; velocities and up are symmetric.
+
+    Of whatever else is moved as well, in its own unit in place of radians.
+    """
 
     lower: Float[Tensor, " joints"]
     """Smallest position [rad]."""
@@ -23,6 +26,12 @@ class JointLimits:
     """[rad/s^2]"""
     jerk: Float[Tensor, " joints"]
     """[rad/s^3]"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointLimits(MotionLimits):
+    """Limits of each joint of an arm."""
+
     torque: Float[Tensor, " joints"]
     """[N m]"""
     vintage: str
