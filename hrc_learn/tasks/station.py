@@ -4,7 +4,7 @@ Tasks know the protocols only. What passes time is handed in: a simulator's phys
 clock that waits for real hardware.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -19,6 +19,7 @@ from ..protocols import Arm, ArmState, Gripper, Human, HumanInput
 from ..viz import StepLog
 from .eye import Eye
 from .motion import path_velocity, resolved_rate, straight_line
+from .sight import Sight, Transport, TransportConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,23 +31,13 @@ class StationConfig:
     look_every: int = 4
     """Control steps from one image to the next, while the task watches the camera."""
     keep_every: int = 40
-    """Control steps from one image kept for the recording to the next."""
+    """Control steps from one image kept for the recording to the next; 0: none is kept."""
+    transport: TransportConfig = field(default_factory=TransportConfig)
+    """What happens to images on their way from the camera."""
     damping: float = 3.0
     """c_d: effort that moves the body by one unit of joint speed (paper, Table I)."""
     pose_gain: float = 4.0
     """How fast an error of pose is corrected on given motions [1/s]."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Sight:
-    """What the camera saw last."""
-
-    time: float = -np.inf
-    """When the image was taken [s]."""
-    joints: Float[Tensor, " joints"] | None = None
-    """Joint positions at that time [rad]."""
-    pixels: Mapping[int, Float[np.ndarray, "2"]] = field(default_factory=dict)
-    """Centre of each marker in it, by number (u, v) [px]."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -65,9 +56,9 @@ class Station:
         chain: Kinematics of the arm.
         gripper: Its gripper's driver.
         state: Newest reading of the arm.
-        sight: Newest detection of markers.
+        sight: Newest detection of markers that has arrived.
         asked: What the person asks for now.
-        watching: Whether images are taken and markers looked for at every `look_every` steps.
+        watching: Markers looked for in an image every `look_every` steps; none: no image.
         log: Columns of every step so far, and the phases of the task.
         images: Images kept for the recording.
     """
@@ -78,28 +69,31 @@ class Station:
         chain: SerialChain,
         arm: Arm,
         gripper: Gripper,
-        eye: Eye,
+        eye: Eye | None = None,
         human: Human,
         advance: Callable[[float], None],
         config: StationConfig | None = None,
         on_phase: Callable[[str, float], None] = lambda phase, time: None,
+        rng: np.random.Generator | None = None,
     ):
-        """Take hold of the parts and look once.
+        """Take hold of the parts.
 
         Args:
             chain: Kinematics of the arm.
             arm: Its driver.
             gripper: Its gripper's driver.
-            eye: The fixed camera and what finds markers in its images.
+            eye: The fixed camera and what finds markers in its images; None where a task
+                needs none.
             human: The person beside the arm.
             advance: Lets a given time pass [s].
             config: How the loop runs.
             on_phase: Told the name of each phase of the task, and when it begins [s].
+            rng: Decides which images are lost.
         """
         self.config = config or StationConfig()
         self.chain = chain
         self.gripper = gripper
-        self.watching = False
+        self.watching: Collection[int] = ()
         self.log = StepLog()
         self.images: list[KeptImage] = []
         self._arm, self._eye, self._human = arm, eye, human
@@ -109,7 +103,7 @@ class Station:
         self.state: ArmState = arm.read()
         self.asked: HumanInput = human.read(self.state)
         self.sight = Sight()
-        self.look()
+        self._transport = Transport(self.config.transport, rng or np.random.default_rng(0))
         self._guard = self._safety.initial_state(self.joints)
 
     @property
@@ -132,10 +126,19 @@ class Station:
         self.log.event(self.time, phase)
         self._on_phase(phase, self.time)
 
-    def look(self) -> Sight:
-        """Take an image and find the markers in it."""
-        pixels = self._eye.look()
-        self.sight = Sight(time=self.time, joints=self.joints, pixels=pixels)
+    def look(self, ids: Collection[int] | None = None) -> None:
+        """Take an image and find markers in it, all unless told; it may be late, or lost."""
+        pixels = {} if self._eye is None else self._eye.look(ids)
+        self._transport.send(Sight(time=self.time, joints=self.joints, pixels=pixels))
+        self._receive()
+
+    def see(self, ids: Collection[int] | None = None) -> Sight:
+        """The scene as it is now: holds still until an image taken from now on has arrived."""
+        now = self.time
+        self.look(ids)
+        while self.sight.time < now:
+            self.stay(self.config.look_every * self.config.dt)
+            self.look(ids)
         return self.sight
 
     def step(self, joint_velocity: Float[Tensor, " joints"]) -> None:
@@ -211,14 +214,11 @@ class Station:
             self.step(velocity + self.config.pose_gain * error)
 
     def _send(self, velocity: Float[Tensor, " joints"], **columns) -> None:
-        links = self.chain.link_poses(self.joints)
         self.log.append(
             time=self.time,
             joint_position=self.state.joint_position,
             joint_velocity=self.state.joint_velocity,
             command_velocity=velocity.numpy(),
-            link_position=links.position.numpy(),
-            link_orientation=links.orientation.numpy(),
             human_effort=self.asked.effort,
             gripper=self.state.gripper_width,
             **columns,
@@ -228,11 +228,15 @@ class Station:
         self._ticks += 1
         self.state = self._arm.read()
         self.asked = self._human.read(self.state)
-        keep = self._ticks % self.config.keep_every == 0
-        if keep or (self.watching and self._ticks % self.config.look_every == 0):
-            self.look()
-        if keep and self._eye.image is not None:
-            self.images.append(KeptImage(time=self.time, image=self._eye.image))
+        self._receive()
+        if self.watching and self._ticks % self.config.look_every == 0:
+            self.look(self.watching)
+        keep_every = self.config.keep_every if self._eye is not None else 0
+        if keep_every and self._ticks % keep_every == 0:
+            self.images.append(KeptImage(time=self.time, image=self._eye.read()))
+
+    def _receive(self) -> None:
+        self.sight = self._transport.newest(self.time) or self.sight
 
 
 _NAN = float("nan")

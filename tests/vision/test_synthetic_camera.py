@@ -96,16 +96,18 @@ def test_a_marker_cut_by_the_edge_reaches_it():
     assert changed.sum() > 500
 
 
-def test_a_frame_takes_a_few_milliseconds():
+def test_a_frame_takes_a_fraction_of_one_redrawn_as_a_whole():
     model, shown = overhead(), {}
-    camera = camera_on(model, shown, MARKER)
-    took = []
-    for pose in poses_in_view(model, MARKER, 20, seed=1):
+    camera, rng = camera_on(model, shown, MARKER), np.random.default_rng(0)
+    took, redrawn = [], []
+    for pose in poses_in_view(model, MARKER, 10, seed=1):
         shown[7] = pose
-        start = time.perf_counter()
-        camera.read()
-        took.append(time.perf_counter() - start)
-    assert min(took) < 8e-3  # 1.5 ms on one quiet core; a whole frame redrawn takes 30
+        start = time.thread_time()
+        image = camera.read()
+        took.append(time.thread_time() - start)
+        ImageNoise().degrade(image, rng)
+        redrawn.append(time.thread_time() - start - took[-1])
+    assert min(took) < 0.5 * min(redrawn)  # 1.5 ms against 30 on one quiet core
 
 
 @pytest.mark.parametrize(
