@@ -40,7 +40,8 @@ def solve_all(
     tip = Pose(position, orientation).matrix()
     flange = tip @ torch.linalg.inv(chain.tcp)
     q7 = torch.as_tensor(q7, dtype=torch.float64).cpu()
-    shape = torch.broadcast_shapes(flange.shape[:-2], q7.shape)
+    # Not torch's: that one imports sympy when it is first called, which takes seconds.
+    shape = np.broadcast_shapes(flange.shape[:-2], q7.shape)
     flanges = flange.expand(*shape, 4, 4).reshape(-1, 4, 4)
     angles = q7.expand(shape).reshape(-1)
 
