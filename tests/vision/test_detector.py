@@ -111,7 +111,11 @@ def test_a_marker_too_tilted_for_half_resolution_is_found_sooner_or_later():
     model, shown = overhead(), {}
     tilted = np.eye(4)
     tilt = np.deg2rad(73)
-    tilted[:3, :3] = [[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]]
+    tilted[:3, :3] = [
+        [1, 0, 0],
+        [0, np.cos(tilt), -np.sin(tilt)],
+        [0, np.sin(tilt), np.cos(tilt)],
+    ]
     tilted[:3, 3] = [0.5, 0.35, 0.0]
     camera = camera_on(model, shown, Marker(7, 0.03))
     detector = MarkerDetector([7])
