@@ -15,7 +15,7 @@ class Rrd:
         self.blueprints = len(reader.blueprints())
         self._batches = [
             (chunk.entity_path.lstrip("/"), chunk.is_static, chunk.to_record_batch())
-            for chunk in reader.store().stream()
+            for chunk in reader.stream()
         ]
 
     @property
@@ -31,6 +31,10 @@ class Rrd:
             if entity == path and is_static == static and component in batch.schema.names
             for row in batch.column(component).to_pylist()
         ]
+
+    def rows(self, path: str, *, static: bool = False) -> int:
+        """How often anything was sent to an entity."""
+        return sum(entity == path and still == static for entity, still, _ in self._batches)
 
     def time(self, path: str) -> np.ndarray:
         """Times of an entity's rows [s]."""

@@ -1,5 +1,7 @@
 """A small made-up run and fit with every field filled, for the tests of `hrc_learn.viz`."""
 
+from dataclasses import fields
+
 import numpy as np
 
 from hrc_learn.vision import CameraModel
@@ -67,7 +69,7 @@ def sample_run(**changes) -> RunRecording:
         capsules=(Capsule(start=(0.0, 0.0, -0.1), end=(0.0, 0.0, 0.0), radius=0.03),),
         boxes=(Box(centre=(0.0, 0.0, 0.05), half_size=(0.02, 0.05, 0.05)),),
     )
-    fields = {
+    values = {
         "title": "Grasp",
         "time": time,
         "joint_names": NAMES,
@@ -92,7 +94,34 @@ def sample_run(**changes) -> RunRecording:
         "safety": {"velocity limit": time > 3.0},
         "phases": (Event(0.0, "Approach"), Event(1.0, "Servo")),
     }
-    return RunRecording(**(fields | changes))
+    return RunRecording(**(values | changes))
+
+
+def until(run: RunRecording, steps: int) -> RunRecording:
+    """The first steps of a run, as it was recorded while it still went on."""
+    now = run.time[steps - 1]
+    changes = _cut(run, steps) | {"demo_path": run.demo_path, "plan_path": run.plan_path}
+    for name in ("potentials", "safety"):
+        changes[name] = {key: values[:steps] for key, values in changes[name].items()}
+    changes["bodies"] = tuple(Body(**_cut(body, steps)) for body in run.bodies)
+    changes["phases"] = tuple(phase for phase in run.phases if phase.time <= now)
+    if run.camera is not None:
+        taken = int((run.camera.image_time <= now).sum())
+        images = {
+            "images": run.camera.images[:taken],
+            "image_time": run.camera.image_time[:taken],
+        }
+        changes["camera"] = CameraRecording(**_cut(run.camera, steps) | images)
+    return RunRecording(**changes)
+
+
+def _cut(recorded, steps: int) -> dict:
+    """Fields with as many rows as the run has steps, cut."""
+    values = {field.name: getattr(recorded, field.name) for field in fields(recorded)}
+    return {
+        name: value[:steps] if isinstance(value, np.ndarray) and len(value) == STEPS else value
+        for name, value in values.items()
+    }
 
 
 def sample_fit(**changes) -> FitRecording:
@@ -100,7 +129,7 @@ def sample_fit(**changes) -> FitRecording:
     times = tuple(np.linspace(0.0, 2.0 + i, 80 + 10 * i) for i in range(3))
     demos = tuple(np.sin(t[:, None] + np.arange(7)) for t in times)
     paths = tuple(demo[:, :3] for demo in demos)
-    fields = {
+    values = {
         "title": "Placing",
         "joint_names": NAMES,
         "time": times,
@@ -112,4 +141,4 @@ def sample_fit(**changes) -> FitRecording:
         "residual": {10: 1e-2, 30: 1e-3, 50: 1e-4},
         "n_basis": 50,
     }
-    return FitRecording(**(fields | changes))
+    return FitRecording(**(values | changes))

@@ -1,61 +1,44 @@
-"""Curves of a running loop in a Rerun viewer, sent by a thread of its own."""
+"""A thread that shows a running loop, so that the loop pays for its log only."""
 
 import threading
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import TracebackType
 
-import numpy as np
 import rerun as rr
-import rerun.blueprint as rrb
-from jaxtyping import Shaped
 
-from .panels import Plot, several
-from .rerun_file import plot_view, send_style, send_values
-from .step_log import StepLog
+from .recording import RunRecording
+from .rerun_file import begin
+from .run_stream import RunStream
+
+_SHARE = 0.2
 
 
 class LiveSender:
-    """Sends what a loop adds to a `StepLog`, a few times a second, until it is closed.
+    """Calls a function a few times a second, and once more when it is closed.
 
-    The loop pays for its log only. What it has logged when the `with` block ends is sent
-    before the block is left; an error of the thread is raised there.
+    An error of the function ends the thread and is raised where the `with` block is left.
 
-        with LiveSender(log, stream, ["joint_position", "feature"]):
+        log = StepLog()
+        with LiveSender(LogStream(log, stream, ["joint_position", "feature"]).send):
             ...  # the loop, which appends to `log`
-
-    `stream` is any recording stream: `stream.serve_grpc()`, `stream.spawn()` or
-    `stream.connect_grpc()` show it in a viewer, `stream.save()` keeps it.
     """
 
-    def __init__(
-        self,
-        log: StepLog,
-        stream: rr.RecordingStream,
-        columns: Sequence[str],
-        *,
-        time: str = "time",
-        period: float = 0.1,
-    ):
+    def __init__(self, send: Callable[[], object], *, period: float = 0.25):
         """Prepare the thread; it starts with the `with` block.
 
         Args:
-            log: What the loop appends to.
-            stream: Where to send.
-            columns: Columns of the log to send.
-            time: Column that holds the time [s].
-            period: How often to send [s].
+            send: Sends what is new.
+            period: How often [s]; less often where sending would take more than a fifth of
+                the time.
         """
-        self._log, self._stream = log, stream
-        self._columns, self._time, self._period = tuple(columns), time, period
-        self._sent = 0
+        self._send, self._period = send, period
         self._closing = threading.Event()
         self._error: Exception | None = None
         self._thread = threading.Thread(target=self._run, name="LiveSender", daemon=True)
 
     def __enter__(self) -> "LiveSender":
-        views = [plot_view(_plot(name, np.empty((0, 1)))) for name in self._columns]
-        layout = rrb.Blueprint(rrb.Grid(contents=views), collapse_panels=True)
-        self._stream.send_blueprint(layout)
         self._thread.start()
         return self
 
@@ -71,28 +54,43 @@ class LiveSender:
             raise self._error
 
     def _run(self) -> None:
+        pause = self._period
         try:
-            while not self._closing.wait(self._period):
+            while not self._closing.wait(pause):
+                began = time.monotonic()
                 self._send()
+                pause = max(self._period, (time.monotonic() - began) * (1 / _SHARE - 1))
             self._send()
-            self._stream.flush()
         except Exception as error:  # handed over to the thread that closes
             self._error = error
 
-    def _send(self) -> None:
-        for rows in self._log.blocks(self._sent):
-            if len(rows):
-                for name in self._columns:
-                    values = rows[name].reshape(len(rows), -1)
-                    for curves in _plot(name, values).curves:
-                        if not self._sent:
-                            send_style(self._stream, curves)
-                        send_values(self._stream, rows[self._time], curves)
-                self._sent += len(rows)
 
+@contextmanager
+def live_dashboard(
+    stream: rr.RecordingStream,
+    snapshot: Callable[[], RunRecording | None],
+    *,
+    period: float = 0.25,
+) -> Iterator[None]:
+    """Show a run while it goes on, as `record_run` keeps it afterwards.
 
-def _plot(name: str, values: Shaped[np.ndarray, "rows curves"]) -> Plot:
-    count = values.shape[1]
-    names = [name] if count == 1 else [f"{name} {i + 1}" for i in range(count)]
-    curves = several(f"live/{name}", names, values.astype(float))
-    return Plot(title=name, curves=(curves,), legend=True)
+    Args:
+        stream: Where to send; `hrc_learn.viz.serving` gives one that a browser shows.
+        snapshot: The run so far, None before there is anything; called by another thread.
+        period: How often to send [s].
+    """
+    sender = RunStream(stream)
+    begun = False
+
+    def send() -> None:
+        nonlocal begun
+        run = snapshot()
+        if run is not None:
+            if not begun:
+                begin(stream, run.title)
+                begun = True
+            sender.send(run)
+
+    with LiveSender(send, period=period):
+        yield
+    stream.flush()

@@ -1,7 +1,7 @@
 """Writing one .rrd file: all or nothing, columns instead of single values."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -22,19 +22,55 @@ _PATH_POINTS = 400
 
 @contextmanager
 def rrd_file(
-    path: str | os.PathLike[str], title: str, blueprint: rrb.Blueprint
+    path: str | os.PathLike[str], title: str, blueprint: rrb.Blueprint | None = None
 ) -> Iterator[rr.RecordingStream]:
-    """A recording stream into a file that appears only when it is complete."""
+    """A recording stream into a file that appears only when it is complete.
+
+    Args:
+        path: The file.
+        title: What it shows.
+        blueprint: Its layout; None: what writes the stream sends it.
+    """
     stream = rr.RecordingStream("hrc_learn")
     with new_file(Path(path)) as part:
         try:
             stream.save(part, default_blueprint=blueprint)
-            stream.send_recording_name(title)
-            stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+            begin(stream, title)
             yield stream
             stream.flush()
         finally:
             stream.disconnect()
+
+
+def begin(stream: rr.RecordingStream, title: str) -> None:
+    """Name a recording, and say which way is up."""
+    stream.send_recording_name(title)
+    stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+
+
+Logged = rr.AsComponents | tuple[rr.AsComponents, ...]
+
+
+class StillThings:
+    """Sends what has no time, once, and again only if it changed."""
+
+    def __init__(self, stream: rr.RecordingStream):
+        self._stream = stream
+        self._sent: dict[str, object] = {}
+
+    def send(self, path: str, value: object, make: Callable[[], Logged]) -> None:
+        """Send to an entity what has changed.
+
+        Args:
+            path: The entity.
+            value: By which a change is told.
+            make: Of the value what is to be sent.
+        """
+        if path in self._sent and self._sent[path] == value:
+            return
+        self._sent[path] = value
+        made = make()
+        self._stream.log(path, *(made if isinstance(made, tuple) else (made,)), static=True)
 
 
 def seconds(time: Float[np.ndarray, " time"]) -> list[rr.TimeColumn]:
@@ -46,18 +82,17 @@ def send_curves(
     stream: rr.RecordingStream, time: Float[np.ndarray, " time"], curves: Curves
 ) -> None:
     """Send curves with their names and colours; they break off where they are NaN."""
-    send_style(stream, curves)
+    stream.log(curves.path, style(curves), static=True)
     send_values(stream, time, curves)
 
 
-def send_style(stream: rr.RecordingStream, curves: Curves) -> None:
-    """Send names, colours and widths of curves."""
-    style = rr.SeriesLines(
+def style(curves: Curves) -> rr.SeriesLines:
+    """Names, colours and widths of curves."""
+    return rr.SeriesLines(
         names=curves.names,
         colors=curves.colours,
         widths=[curves.width] * len(curves.names),
     )
-    stream.log(curves.path, style, static=True)
 
 
 def send_values(
@@ -71,26 +106,35 @@ def send_values(
     )
 
 
-def send_body(
+def body_path(body: Body) -> str:
+    """Entity of a body."""
+    return f"world/bodies/{body.name}"
+
+
+def send_shapes(still: StillThings, body: Body) -> None:
+    """Send what a body looks like."""
+    path = body_path(body)
+    if body.capsules:
+        still.send(f"{path}/capsules", body.capsules, lambda: capsules(body.capsules))
+    if body.boxes:
+        still.send(f"{path}/boxes", body.boxes, lambda: boxes(body.boxes))
+
+
+def send_poses(
     stream: rr.RecordingStream,
     time: Float[np.ndarray, " time"],
     body: Body,
     at: Int[np.ndarray, " chosen"],
 ) -> None:
-    """Send the shape of a body once and its pose at the chosen samples."""
-    path = f"world/bodies/{body.name}"
+    """Send the pose of a body at the chosen samples."""
     stream.send_columns(
-        path,
+        body_path(body),
         seconds(time[at]),
         rr.Transform3D.columns(
             translation=body.position[at],
             quaternion=np.roll(body.orientation[at], -1, axis=-1),  # rerun: x, y, z, w
         ),
     )
-    if body.capsules:
-        stream.log(f"{path}/capsules", capsules(body.capsules), static=True)
-    if body.boxes:
-        stream.log(f"{path}/boxes", boxes(body.boxes), static=True)
 
 
 def boxes(shapes: tuple[Box, ...]) -> rr.Boxes3D:
