@@ -1,5 +1,6 @@
 """Aiming at an object with an uncalibrated camera: the adaptive controller at work."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -8,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..controller import AdaptiveController, ControllerState, Goals, Observation
+from ..controller.goals import IMAGE_SIZE
 from ..geometry import Pose
 from .failure import MissedGraspError
 from .station import Station
@@ -23,6 +25,16 @@ class AimingConfig:
     """How long it has to stay there [s]."""
     patience: float = 40.0
     """After which aiming is given up [s]."""
+    unseen_patience: float = 10.0
+    """How long the hand's marker may stay out of sight [s]."""
+    probe: float = 0.06
+    """Height above the box from which the hand comes down into it, the marker kept on its
+    target [m]. From this motion the controller learns how height looks to a camera that may
+    have been moved: without it the object, which lies deeper, would be missed. 0: none."""
+    probe_tolerance: float = 10.0
+    """Distance of the feature from the target at which the hand comes down [px]."""
+    border: float = 50.0
+    """Distance that the target keeps from the edge of the image [px]."""
     half_size: tuple[float, float, float] = (0.12, 0.12, 0.003)
     """Box in which the camera takes over [m]. Flat: the image tells little about height, and
     an object has to be met at the height at which aiming was taught."""
@@ -32,20 +44,20 @@ class AimingConfig:
     rate: float = 4.0
     """How fast the hand returns into the box from above or below, and into the cone [1/s]."""
 
-    def goals(self, above: Pose, target: Float[np.ndarray, "2"] | None) -> Goals:
+    def goals(self, above: Pose, target: Float[np.ndarray, "2"]) -> Goals:
         """Goals of aiming.
 
         Args:
             above: Middle of the box above the table, and orientation of the hand.
-            target: Where in the image the hand's marker should be [px]; None: anywhere.
-
-        Raises:
-            ValueError: If the target lies outside the image.
+            target: Where in the image the hand's marker should be [px]. One outside the image
+                is brought to its border: on the way there the image Jacobian is learned, which
+                may have put it outside.
         """
+        target = np.clip(target, self.border, np.array(IMAGE_SIZE) - 1 - self.border)
         goals = Goals.at(
             above.position,
             above.orientation,
-            None if target is None else torch.from_numpy(target),
+            torch.from_numpy(target),
             half_size=self.half_size,
         )
         # Near the border of a region its excess decays at 4 k_c / h^2 and k_o (alpha_o / 2)^2.
@@ -53,11 +65,37 @@ class AimingConfig:
         sharpness = 2 / self.angle
         return replace(
             goals,
+            # Pulls from wherever the marker is seen; the paper's region may leave it outside.
+            vision=replace(goals.vision, formulation="saturated"),
             position=replace(goals.position, stiffness=(4e-4, 4e-4, upright)),
             orientation=replace(
                 goals.orientation, sharpness=sharpness, stiffness=4 * self.rate / sharpness**2
             ),
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Aim:
+    """What to aim at. Where that is in the image depends on what is known of the camera."""
+
+    config: AimingConfig
+    above: Pose
+    """Middle of the box above the table, and orientation of the hand."""
+    posture: Float[Tensor, " joints"] | None
+    """Joint positions with the hand there, by which it is approached [rad]; None: it is
+    approached by the Cartesian regions."""
+    target: Callable[[Float[np.ndarray, "2 6"]], Float[np.ndarray, "2"]]
+    """Where the hand's marker should be [px], given the image Jacobian there."""
+
+    def raised(self, height: float) -> "Aim":
+        """The same from higher up [m]."""
+        up = self.above.position.new_tensor([0.0, 0.0, height])
+        return replace(self, above=Pose(self.above.position + up, self.above.orientation))
+
+    def goals(self, image_jacobian: Float[np.ndarray, "2 6"]) -> Goals:
+        """Goals by an estimate of the image Jacobian."""
+        goals = self.config.goals(self.above, self.target(image_jacobian))
+        return goals.approached_by(self.posture)
 
 
 class Aimer:
@@ -86,47 +124,54 @@ class Aimer:
         self._controller = controller
         self._marker = marker
         self._config = config or AimingConfig()
-        self._last_image = -np.inf
+        self._last_image = self._last_seen = -np.inf
+        self._known = (np.nan, np.zeros((2, 6)))  # when, and the image Jacobian then
         self.state: ControllerState = controller.initial_state(station.joints)
 
-    def aim(self, goals: Goals) -> float:
-        """Bring the hand's marker to the target.
+    def aim(self, aim: Aim) -> float:
+        """Bring the hand's marker to the target, first from higher up.
 
         Returns:
             Time it took [s].
 
         Raises:
-            MissedGraspError: If it takes too long.
+            MissedGraspError: If it takes too long, or the marker stays out of sight.
         """
-        begin = reached = self._station.time
-        while self._station.time - reached < self._config.dwell:
-            if not self.error(goals) < self._config.tolerance:
-                reached = self._station.time
-            if self._station.time - begin > self._config.patience:
-                raise MissedGraspError(
-                    f"aiming: after {self._config.patience:.0f} s the marker is still "
-                    f"{self.error(goals):.1f} px from its target (NaN: not seen)."
-                )
-            self.step(goals)
-        return reached - begin
+        begin, config = self._station.time, self._config
+        if config.probe > 0:
+            self._reach(aim.raised(config.probe), config.probe_tolerance, begin)
+        return self._reach(aim, config.tolerance, begin) - begin
 
-    def hold(self, goals: Goals, duration: float) -> None:
+    def _reach(self, aim: Aim, tolerance: float, begin: float) -> float:
+        """Steps until the marker has stayed at the target; when it came there [s]."""
+        reached = self._last_seen = self._station.time
+        while self._station.time - reached < self._config.dwell:
+            self.step(aim)
+            if not self.error(aim) < tolerance:
+                reached = self._station.time
+            self._check(aim, self._station.time - begin)
+        return reached
+
+    def hold(self, aim: Aim, duration: float) -> None:
         """Keep aiming for a while [s], whatever the person does to the body."""
         end = self._station.time + duration
         while self._station.time < end:
-            self.step(goals)
+            self.step(aim)
 
-    def error(self, goals: Goals) -> float:
+    def error(self, aim: Aim) -> float:
         """Distance of the feature from its target [px]; NaN if it is not seen."""
-        return float(np.linalg.norm(self._feature() - goals.vision.target.numpy()))
+        return float(np.linalg.norm(self._feature() - aim.target(self._image_jacobian())))
 
-    def step(self, goals: Goals) -> None:
+    def step(self, aim: Aim) -> None:
         """One step of the controller."""
         sight = self._station.sight
         feature = torch.from_numpy(self._feature())
         seen = torch.tensor(bool(torch.isfinite(feature).all()))
         new = torch.tensor(sight.time > self._last_image)
         self._last_image = sight.time
+        if seen:
+            self._last_seen = sight.time
+        goals = aim.goals(self._image_jacobian())
         command, self.state = self._controller.step(
             self.state,
             Observation(
@@ -142,6 +187,29 @@ class Aimer:
             ),
         )
         self._station.obey(command, goals.vision.target.numpy(), feature.numpy())
+
+    def _image_jacobian(self) -> Float[np.ndarray, "2 6"]:
+        """Estimate where the hand was in the newest image [px/m, px/rad]."""
+        sight = self._station.sight
+        if sight.time != self._known[0]:
+            joints = self._station.joints if sight.joints is None else sight.joints
+            pose = self._station.chain.forward(joints)
+            estimate = self._controller.estimator.jacobian(self.state.estimator, pose)
+            self._known = sight.time, estimate.numpy()
+        return self._known[1]
+
+    def _check(self, aim: Aim, spent: float) -> None:
+        if self._station.time - self._last_seen > self._config.unseen_patience:
+            raise MissedGraspError(
+                f"aiming: for {self._config.unseen_patience:.0f} s the camera has not seen the "
+                f"hand's marker {self._marker}. If nothing covers it, put the object nearer to "
+                "the middle of the image."
+            )
+        if spent > self._config.patience:
+            raise MissedGraspError(
+                f"aiming: after {spent:.0f} s the marker is still {self.error(aim):.1f} px "
+                "from its target (NaN: not seen)."
+            )
 
     def _feature(self) -> Float[np.ndarray, "2"]:
         return self._station.sight.pixels.get(self._marker, np.full(2, np.nan))

@@ -8,9 +8,9 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from ..controller import Goals
 from ..geometry import Pose
 from ..sim import ObjectConfig
+from .aiming import Aim
 from .fit_aiming import AimingSkill
 from .grasping import OPEN, Grasping, GraspingConfig, GraspResult
 from .placing import PlacingSkill, Plan, PlanningSpace
@@ -102,9 +102,9 @@ class Collaboration:
         self._retreat(plan)
         return CollaborationResult(grasp=grasp, plan=plan, release=release)
 
-    def _interact(self, goals: Goals) -> None:
+    def _interact(self, aim: Aim) -> None:
         self._station.enter(INTERACT)
-        self._grasping.aimer.hold(goals, self._config.interaction)
+        self._grasping.aimer.hold(aim, self._config.interaction)
 
     def _transfer(self, goal: Pose) -> tuple[Plan, Pose]:
         """Carry to the shelf along the learned motion; the plan, and where the hand let go."""

@@ -1,5 +1,6 @@
 """From demonstrations of aiming: the image Jacobian, and where in the image to aim."""
 
+import copy
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -66,8 +67,14 @@ class AimingSkill:
             target=VisualTarget.load(target) if target.exists() else None,
         )
 
-    def target_of(self, pixel: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
+    def target_of(
+        self, pixel: Float[np.ndarray, "2"], jacobian: Float[np.ndarray, "2 6"]
+    ) -> Float[np.ndarray, "2"]:
         """Where the hand's marker should be, to stand above an object seen at a pixel.
+
+        Args:
+            pixel: Of the object's marker [px].
+            jacobian: Estimate of the image Jacobian of the hand's marker [px/m, px/rad].
 
         Raises:
             ValueError: If no object was watched in the demonstrations.
@@ -77,7 +84,7 @@ class AimingSkill:
                 f"the aiming skill knows no visual target: its demonstrations lack "
                 f"{OBJECT_FEATURE}."
             )
-        return self.target(pixel)
+        return self.target.seen_by(pixel, jacobian)
 
     def metrics(self) -> dict[str, float]:
         """How well image motion is predicted, and how well aiming.
@@ -109,6 +116,7 @@ class AimingSkill:
             }
         if self.target is not None:
             values["target_error_px"] = self.target.error
+            values["target_error_by_offset_px"] = self.target.offset_error
         return values
 
 
@@ -142,7 +150,7 @@ def fit_aiming(
     network = RBFImageJacobian.fit_watched(camera, neurons, config)
     cells = held_out_pairs(camera, network, config).by_cell()
     return AimingSkill(
-        jacobian=network, target=_visual_target(demos), learned=learned, cells=cells
+        jacobian=network, target=_visual_target(demos, network), learned=learned, cells=cells
     )
 
 
@@ -198,12 +206,13 @@ def _double(values: np.ndarray) -> Tensor:
     return torch.from_numpy(values).double()
 
 
-def _visual_target(demos: Demonstrations) -> VisualTarget | None:
+def _visual_target(demos: Demonstrations, network: RBFImageJacobian) -> VisualTarget | None:
     """From the ends of all demonstrations; None if in none an object was watched."""
     ends, without = [], []
+    network = copy.deepcopy(network).double()
     for demo in demos:
         if OBJECT_FEATURE in demo.extra:
-            ends.append(_end(demo, demos.source))
+            ends.append(_end(demo, demos.source, network))
         else:
             without.append(demo.episode)
     if not ends:
@@ -212,19 +221,23 @@ def _visual_target(demos: Demonstrations) -> VisualTarget | None:
         raise ValueError(
             f"{demos.source}, episode {without[0]}: no {OBJECT_FEATURE}, which others have."
         )
-    objects, hands = (np.array(column) for column in zip(*ends, strict=True))
-    return VisualTarget.fit(objects, hands)
+    objects, hands, jacobians = (np.array(column) for column in zip(*ends, strict=True))
+    return VisualTarget.fit(objects, hands, jacobians)
 
 
-def _end(demo: Demonstration, source: str) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels of the object and of the hand above it, at rest at the end of a demonstration."""
-    assert demo.feature is not None
-    assert demo.feature_visible is not None
-    at_rest = demo.time > demo.time[-1] - _REST
-    last = np.flatnonzero(demo.feature_visible & at_rest)
+def _end(
+    demo: Demonstration, source: str, network: RBFImageJacobian
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pixels of object and hand, at rest at the end, and the image Jacobian there."""
+    watched = _watched(demo, source)
+    at_rest = torch.from_numpy(demo.time > demo.time[-1] - _REST)
+    last = (watched.visible & at_rest).nonzero()[:, 0]
     if not len(last):
         raise ValueError(
             f"{source}, episode {demo.episode}: the hand's marker is not seen in the last "
             f"{_REST} s, where the hand stands above the object. Leave this episode out."
         )
-    return demo.extra[OBJECT_FEATURE][last, :2].mean(axis=0), demo.feature[last].mean(axis=0)
+    with torch.no_grad():
+        jacobian = network(watched.pose[last]).mean(dim=0)
+    pixels = demo.extra[OBJECT_FEATURE][last.numpy(), :2].mean(axis=0)
+    return pixels, watched.feature[last].mean(dim=0).numpy(), jacobian.numpy()

@@ -8,17 +8,19 @@ is begun anew from home.
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from torch import Tensor
 
 from ..controller import AdaptiveController, ControllerConfig, Goals
 from ..geometry import Pose
 from ..jacobian import ImageJacobianEstimator, KalmanEstimator
 from ..sim import HAND_MARKER, ObjectConfig
-from .aiming import Aimer, AimingConfig
-from .failure import MissedGraspError, TaskFailedError
+from .aiming import Aim, Aimer, AimingConfig
+from .failure import BlockedPathError, MissedGraspError, TaskFailedError
 from .fit_aiming import AimingSkill
 from .motion import joint_line
 from .placing import Plan
@@ -27,6 +29,11 @@ from .workplace import Workplace
 
 OPEN, CLOSED = 0.08, 0.0
 """Widths the gripper is told to take [m]."""
+
+type TargetLaw = Callable[
+    [Float[np.ndarray, "2"], Float[np.ndarray, "2 6"]], Float[np.ndarray, "2"]
+]
+"""From the object's marker [px] and the image Jacobian to where the hand's should be [px]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,6 +46,9 @@ class GraspingConfig:
     )
     """Settings of the adaptive controller; it holds the hand firmly against the drift that
     steps of 10 ms leave."""
+    approach: bool = True
+    """Whether the table is approached in joint space, along a way that was checked; else the
+    Cartesian regions lead from the start, as in the paper."""
     patience: float = 5.0
     """How long an object that is not seen is waited for [s]."""
     lift: float = 0.20
@@ -80,6 +90,7 @@ class Grasping:
         config: GraspingConfig | None = None,
         *,
         estimator: ImageJacobianEstimator | None = None,
+        target: TargetLaw | None = None,
         check: Callable[[Plan], None] = lambda plan: None,
     ):
         """Bring station and skill together.
@@ -91,23 +102,24 @@ class Grasping:
             config: How objects are grasped.
             estimator: Of the image Jacobian; None: a Kalman filter that starts from the
                 learned one.
+            target: Where the hand's marker should be; None: as learned.
             check: Raises if a plan may not be carried out.
         """
         self._station = station
         self._workplace = workplace
-        self._aiming = aiming
+        self._target = target or aiming.target_of
         self._config = config = config or GraspingConfig()
         self._check = check
         controller = AdaptiveController(
             station.chain,
             estimator or KalmanEstimator(aiming.jacobian.double()),
-            config.aiming.goals(workplace.hover(), None),
+            Goals.at(workplace.hover().position, workplace.hover().orientation),
             config=config.controller,
         )
         self.aimer = Aimer(station, controller, HAND_MARKER, config.aiming)
 
     def grasp(
-        self, item: ObjectConfig, on_aimed: Callable[[Goals], None] = lambda goals: None
+        self, item: ObjectConfig, on_aimed: Callable[[Aim], None] = lambda aim: None
     ) -> GraspResult:
         """Grasp an object and lift it.
 
@@ -122,12 +134,12 @@ class Grasping:
         self._station.gripper.move(OPEN)
         setbacks: list[str] = []
         while True:
-            goals = self.goals_above(item)
+            aim = self.look_for(item)
             try:
-                aim_time = self.aim(goals)
+                aim_time = self.aim(aim)
                 if not setbacks:
-                    on_aimed(goals)
-                pixel_error = self.aimer.error(goals)
+                    on_aimed(aim)
+                pixel_error = self.aimer.error(aim)
                 self.close_on(item)
             except MissedGraspError as error:
                 setbacks.append(str(error))
@@ -140,49 +152,51 @@ class Grasping:
                     aim_time=aim_time, pixel_error=pixel_error, setbacks=tuple(setbacks)
                 )
 
-    def goals_above(self, item: ObjectConfig) -> Goals:
-        """Goals that bring the hand above an object, from a look at it.
-
-        Raises:
-            TaskFailedError: If the object is not seen, or lies where the hand above it would
-                not be.
-        """
-        target = self.look_for(item)
-        try:
-            goals = self._config.aiming.goals(self._workplace.hover(), target)
-        except ValueError as error:
-            raise TaskFailedError(
-                f"look: {item.name!r} lies where the camera would not see the hand above it: "
-                "put it nearer to the middle of the image."
-            ) from error
-        return goals.approached_by(self._workplace.hover_joints())
-
-    def look_for(self, item: ObjectConfig) -> Float[np.ndarray, "2"]:
-        """Pixel to aim at, from a look at the table before the arm is over it.
+    def look_for(self, item: ObjectConfig) -> Aim:
+        """Where to aim, from a look at the table before the arm is over it.
 
         Raises:
             TaskFailedError: If the object's marker stays out of sight.
         """
         self._station.enter("look")
         give_up = self._station.time + self._config.patience
-        while (pixel := self._station.look().pixels.get(item.marker.id)) is None:
+        while (pixel := self._station.see().pixels.get(item.marker.id)) is None:
             if self._station.time >= give_up:
                 raise TaskFailedError(
                     f"look: the camera does not see marker {item.marker.id} of "
                     f"{item.name!r}. Put it into the camera's view, and the arm out of it."
                 )
             self._station.stay(self._station.config.look_every * self._station.config.dt)
-        return self._aiming.target_of(pixel)
+        return Aim(
+            config=self._config.aiming,
+            above=self._workplace.hover(),
+            posture=self._posture() if self._config.approach else None,
+            target=partial(self._target, pixel),
+        )
 
-    def aim(self, goals: Goals) -> float:
+    def _posture(self) -> Float[Tensor, " joints"]:
+        """Joint positions above the table to which, and home from which, the way is free."""
+        blocked: TaskFailedError | None = None
+        for posture in self._workplace.hover_postures():
+            try:
+                self._line(self._station.joints, posture)
+                self._line(posture, self._workplace.home_joints())
+            except BlockedPathError as error:
+                blocked = blocked or error
+            else:
+                return posture
+        assert blocked is not None
+        raise blocked
+
+    def aim(self, aim: Aim) -> float:
         """Bring the hand above the object; the time it took [s].
 
         Raises:
             MissedGraspError: If it takes too long.
         """
         self._station.enter("aim")
-        self._station.watching = True
-        return self.aimer.aim(goals)
+        self._station.watching = (HAND_MARKER,)
+        return self.aimer.aim(aim)
 
     def close_on(self, item: ObjectConfig) -> None:
         """Go down and close the fingers.
@@ -191,7 +205,7 @@ class Grasping:
             MissedGraspError: If there is nothing between them.
         """
         self._station.enter("grasp")
-        self._station.watching = False
+        self._station.watching = ()
         position = self._station.pose.position.clone()
         position[2] = item.half_size[2]
         down = Pose(position, self._workplace.hover().orientation)
@@ -217,16 +231,20 @@ class Grasping:
             BlockedPathError: If the way is not free.
         """
         self._station.enter("home")
-        home = self._workplace.home_joints()
-        dt = self._station.config.dt
-        path = joint_line(self._station.joints, home, speed=0.6, dt=dt)
-        plan = Plan(goal=self._workplace.home(), dt=dt, path=path.numpy())
-        self._check(plan)
+        plan = self._line(self._station.joints, self._workplace.home_joints())
         self._station.play(plan.path)
+
+    def _line(self, start: Float[Tensor, " joints"], goal: Float[Tensor, " joints"]) -> Plan:
+        """A straight line in joint space, checked."""
+        dt = self._station.config.dt
+        path = joint_line(start, goal, speed=0.6, dt=dt)
+        plan = Plan(goal=self._station.chain.forward(goal), dt=dt, path=path.numpy())
+        self._check(plan)
+        return plan
 
     def start_over(self) -> None:
         """Open the fingers and go home, clear of the table and of the camera's view."""
-        self._station.watching = False
+        self._station.watching = ()
         self._station.gripper.move(OPEN)
         self._station.stay(0.3)
         if self._station.pose.position[2] < self._workplace.hover_height:

@@ -3,6 +3,10 @@
 The hand's marker and the object's are at different heights and places, so aiming is not
 bringing one upon the other. With an uncalibrated camera the offset has to be learned: each
 demonstration ends with the hand right above an object, and tells one pair of pixels.
+
+For a camera that stands as it did then, a map from pixel to pixel is all it takes. One that has
+been moved since shows the same offset in space from another side: the image Jacobian, which
+adapts to it, tells how it looks from there.
 """
 
 import json
@@ -29,16 +33,26 @@ class VisualTarget:
     """Maps (u, v, 1) of the object's marker to (u, v) of the hand's [px]."""
     error: float
     """Leave-one-out error, root mean square [px]; NaN from fewer than five demonstrations."""
+    offset: Float[np.ndarray, "3"] | None = None
+    """From the object's marker to the hand's, base frame [m], as the image Jacobian at the
+    hand's has it: shorter than it is by perspective, which shrinks what is further away. None
+    where no image Jacobian was at hand."""
+    offset_error: float = float("nan")
+    """As `error`, of targets by the offset [px]."""
 
     @classmethod
     def fit(
-        cls, objects: Float[np.ndarray, "demos 2"], hands: Float[np.ndarray, "demos 2"]
+        cls,
+        objects: Float[np.ndarray, "demos 2"],
+        hands: Float[np.ndarray, "demos 2"],
+        jacobians: Float[np.ndarray, "demos 2 6"] | None = None,
     ) -> "VisualTarget":
         """Fit to the ends of demonstrations.
 
         Args:
             objects: Pixels of the object's marker [px].
             hands: Pixels of the hand's marker when the hand stood right above it [px].
+            jacobians: Image Jacobians of the hand's marker there [px/m, px/rad].
 
         Raises:
             ValueError: If there are fewer than three demonstrations, or they lie on a line.
@@ -49,24 +63,42 @@ class VisualTarget:
                 f"{len(objects)} demonstrations do not determine where to aim: at least three "
                 "are needed, with objects that do not lie on one line in the image."
             )
-        solution, *_ = np.linalg.lstsq(design, hands, rcond=None)
-        # Leave-one-out residuals of a linear fit, from its hat matrix (Allen 1974, PRESS).
-        leverage = np.einsum("ij,ji->i", design, np.linalg.pinv(design))
-        error = float("nan")
-        if len(objects) > 4:
-            press = (hands - design @ solution) / (1.0 - leverage)[:, None]
-            error = float(np.sqrt((press**2).sum(axis=1).mean()))
-        return cls(matrix=solution.T, error=error)
+        matrix, error = _solved(np.kron(design, np.eye(2)), hands)
+        offset, offset_error = None, float("nan")
+        if jacobians is not None:
+            offset, offset_error = _solved(jacobians[..., :3].reshape(-1, 3), hands - objects)
+        return cls(
+            matrix=matrix.reshape(3, 2).T,
+            error=error,
+            offset=offset,
+            offset_error=offset_error,
+        )
 
     def __call__(self, pixel: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
         """Where the hand's marker should be for an object's marker at `pixel` [px]."""
         return self.matrix @ np.append(pixel, 1.0)
 
+    def seen_by(
+        self, pixel: Float[np.ndarray, "2"], jacobian: Float[np.ndarray, "2 6"]
+    ) -> Float[np.ndarray, "2"]:
+        """The same for a camera that may have been moved since the demonstrations.
+
+        Args:
+            pixel: Of the object's marker [px].
+            jacobian: Estimate of the image Jacobian of the hand's marker [px/m, px/rad].
+        """
+        return self(pixel) if self.offset is None else pixel + jacobian[:, :3] @ self.offset
+
     def save(self, path: Path) -> None:
         """Write to a JSON file, whole or not at all."""
         partial = path.with_suffix(".partial")
-        error = None if np.isnan(self.error) else self.error
-        content = {"version": 1, "matrix": self.matrix.tolist(), "error_px": error}
+        content = {
+            "version": 1,
+            "matrix": self.matrix.tolist(),
+            "error_px": _or_none(self.error),
+            "offset_m": None if self.offset is None else self.offset.tolist(),
+            "offset_error_px": _or_none(self.offset_error),
+        }
         partial.write_text(json.dumps(content, indent=2))
         partial.replace(path)
 
@@ -81,8 +113,33 @@ class VisualTarget:
         content = json.loads(path.read_text())
         if content.get("version") != 1 or "matrix" not in content:
             raise ValueError(f"{path} is not a visual target of a known version: fit it again.")
-        error = content["error_px"]
+        offset = content.get("offset_m")
         return cls(
             matrix=np.array(content["matrix"]),
-            error=float("nan") if error is None else float(error),
+            error=_or_nan(content["error_px"]),
+            offset=None if offset is None else np.array(offset),
+            offset_error=_or_nan(content.get("offset_error_px")),
         )
+
+
+def _solved(
+    design: Float[np.ndarray, "equations unknowns"], pixels: Float[np.ndarray, "demos 2"]
+) -> tuple[Float[np.ndarray, " unknowns"], float]:
+    """Least squares on pixels, two equations a demonstration, and their leave-one-out error."""
+    solution, *_ = np.linalg.lstsq(design, pixels.ravel(), rcond=None)
+    if len(pixels) < 5:
+        return solution, float("nan")
+    residuals = pixels - (design @ solution).reshape(-1, 2)
+    # From the blocks of the hat matrix, of both equations that go at once (Allen 1974, PRESS).
+    hat = (design @ np.linalg.pinv(design)).reshape(len(pixels), 2, len(pixels), 2)
+    own = hat[np.arange(len(pixels)), :, np.arange(len(pixels))]
+    press = np.linalg.solve(np.eye(2) - own, residuals[..., None])
+    return solution, float(np.sqrt((press**2).sum(axis=(1, 2)).mean()))
+
+
+def _or_none(error: float) -> float | None:
+    return None if np.isnan(error) else error
+
+
+def _or_nan(error: float | None) -> float:
+    return float("nan") if error is None else float(error)

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from ..controller.posture import comfortable_postures
 from ..geometry import Pose, quaternion
 from ..human import coarse_orientation, gripper_down
 from ..kinematics import UnreachableError, panda
@@ -62,6 +63,10 @@ class Workplace:
         Where it stands upright, joints 1 and 3 are in line, and nobody can pull the elbow.
         """
         return panda.inverse(self.hover(), self.hover_q7, near=_LEANING_FORWARD)
+
+    def hover_postures(self) -> list[torch.Tensor]:
+        """Joint positions with the hand above the table, the preferred ones first."""
+        return [self.hover_joints(), *comfortable_postures(panda, self.hover())]
 
     def random_object_pose(
         self, reach: tuple[float, float, float], rng: np.random.Generator

@@ -22,6 +22,24 @@ def test_an_affine_offset_is_found_exactly(n):
     np.testing.assert_allclose(target(np.array([500.0, 600.0])), matrix @ [500, 600, 1])
 
 
+def test_the_offset_in_space_is_found_whatever_way_the_camera_is_turned():
+    rng = np.random.default_rng(3)
+    objects, offset = rng.uniform(200, 900, (6, 2)), np.array([0.12, -0.01, 0.18])
+    jacobians = rng.normal(0, 1500, (6, 2, 6))
+    target = VisualTarget.fit(objects, objects + jacobians[..., :3] @ offset, jacobians)
+    np.testing.assert_allclose(target.offset, offset, atol=1e-9)
+    pixel, turned = np.array([500.0, 600.0]), rng.normal(0, 1500, (2, 6))
+    expected = pixel + turned[:, :3] @ offset
+    np.testing.assert_allclose(target.seen_by(pixel, turned), expected, atol=1e-6)
+
+
+def test_without_an_image_jacobian_the_camera_is_taken_to_stand_still():
+    objects, hands, matrix = demonstrations(5)
+    target, pixel = VisualTarget.fit(objects, hands), np.array([500.0, 600.0])
+    expected = matrix @ np.append(pixel, 1.0)
+    np.testing.assert_allclose(target.seen_by(pixel, np.ones((2, 6))), expected)
+
+
 def test_the_error_is_what_leaving_each_demonstration_out_gives():
     objects, hands, _ = demonstrations(9, noise=2.0)
     misses = []
@@ -30,6 +48,19 @@ def test_the_error_is_what_leaving_each_demonstration_out_gives():
         left_out = VisualTarget.fit(objects[rest], hands[rest])
         misses.append(np.sum((left_out(objects[i]) - hands[i]) ** 2))
     assert VisualTarget.fit(objects, hands).error == pytest.approx(np.sqrt(np.mean(misses)))
+
+
+def test_the_error_of_the_offset_is_what_leaving_each_demonstration_out_gives():
+    rng = np.random.default_rng(4)
+    objects, jacobians = rng.uniform(200, 900, (7, 2)), rng.normal(0, 1500, (7, 2, 6))
+    hands = objects + jacobians[..., :3] @ [0.12, -0.01, 0.18] + rng.normal(0, 2, (7, 2))
+    misses = []
+    for i in range(7):
+        rest = np.arange(7) != i
+        left_out = VisualTarget.fit(objects[rest], hands[rest], jacobians[rest])
+        misses.append(np.sum((left_out.seen_by(objects[i], jacobians[i]) - hands[i]) ** 2))
+    target = VisualTarget.fit(objects, hands, jacobians)
+    assert target.offset_error == pytest.approx(np.sqrt(np.mean(misses)))
 
 
 def test_too_few_or_collinear_demonstrations_are_refused():
@@ -43,11 +74,13 @@ def test_too_few_or_collinear_demonstrations_are_refused():
 
 def test_it_survives_the_disk(tmp_path):
     objects, hands, _ = demonstrations(7, noise=1.0)
-    target = VisualTarget.fit(objects, hands)
+    jacobians = np.random.default_rng(5).normal(size=(7, 2, 6))
+    target = VisualTarget.fit(objects, hands, jacobians)
     target.save(tmp_path / "target.json")
     loaded = VisualTarget.load(tmp_path / "target.json")
     np.testing.assert_array_equal(loaded.matrix, target.matrix)
-    assert loaded.error == target.error
+    np.testing.assert_array_equal(loaded.offset, target.offset)
+    assert (loaded.error, loaded.offset_error) == (target.error, target.offset_error)
     assert [path.name for path in tmp_path.iterdir()] == ["target.json"]
 
 

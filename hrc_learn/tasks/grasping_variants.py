@@ -1,0 +1,65 @@
+"""Image Jacobians that a grasp can start from, learned or guessed, and laws to adapt them."""
+
+import copy
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from ..jacobian import (
+    CompositeEstimator,
+    FixedEstimator,
+    ImageJacobianEstimator,
+    KalmanEstimator,
+    PaperEstimator,
+    RBFImageJacobian,
+)
+from .warm_start import guessed_network
+
+
+@dataclass(frozen=True, kw_only=True)
+class GraspingVariant:
+    """One way to know the image Jacobian."""
+
+    says: str
+    estimator: Callable[[RBFImageJacobian], ImageJacobianEstimator]
+    """From the learned image Jacobian."""
+
+
+def from_learned(learned: RBFImageJacobian) -> ImageJacobianEstimator:
+    """A Kalman filter that starts from the learned Jacobian, but does not rely on it.
+
+    The camera may have been moved since it was learned, about which the covariance of the fit
+    knows nothing; the wide prior of a guess takes its place.
+    """
+    network = copy.deepcopy(learned).double()
+    network.covariance = None
+    return KalmanEstimator(network)
+
+
+DEFAULT = "learned"
+
+VARIANTS: Mapping[str, GraspingVariant] = {
+    DEFAULT: GraspingVariant(
+        says="Kalman filter from the learned Jacobian", estimator=from_learned
+    ),
+    "kalman": GraspingVariant(
+        says="Kalman filter from the paper's guess",
+        estimator=lambda _: KalmanEstimator(guessed_network()),
+    ),
+    "composite": GraspingVariant(
+        says="composite law from the paper's guess",
+        estimator=lambda _: CompositeEstimator(guessed_network()),
+    ),
+    "paper": GraspingVariant(
+        says="the paper's law from its guess",
+        estimator=lambda _: PaperEstimator(guessed_network()),
+    ),
+    "fixed": GraspingVariant(
+        says="the paper's guess, not adapted",
+        estimator=lambda _: FixedEstimator(guessed_network()),
+    ),
+    "unadapted": GraspingVariant(
+        says="the learned Jacobian, not adapted",
+        estimator=lambda learned: FixedEstimator(copy.deepcopy(learned).double()),
+    ),
+}
+"""What can be compared, the default first."""
