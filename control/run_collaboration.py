@@ -26,6 +26,7 @@ from hrc_learn.tasks.gains import with_gains
 from hrc_learn.tasks.placing import PlacingSkill
 from hrc_learn.tasks.recording import record
 from hrc_learn.tasks.simulated_job import PULLS, simulate_collaboration
+from hrc_learn.tasks.watching import ServeConfig, serving, unwatched
 from hrc_learn.tasks.workplace import Workplace
 from hrc_learn.viz import Box
 from hrc_learn.viz.report import show_measurements, write_report
@@ -58,6 +59,10 @@ class Args:
     takes as long as it would on a real arm then."""
     port: int = 8080
     """Port of that page."""
+    serve: bool = False
+    """Serve the dashboard in the browser while the run goes on."""
+    serving: ServeConfig = field(default_factory=ServeConfig)
+    """Where, with --serve."""
     config: CollaborationConfig = field(default_factory=CollaborationConfig)
     """How the job is done."""
     gains: Path | None = None
@@ -77,6 +82,11 @@ def main(args: Args) -> int:
     demonstration = _demonstration(args.placing)
     controller = with_gains(args.config.grasping.controller, args.gains)
     grasping = replace(args.config.grasping, controller=controller)
+    title = f"Collaboration, {args.shelf} shelf"
+
+    def opened(address: str) -> None:
+        console.print(f"Dashboard at [bold]{address}[/]")
+
     with new_folder(args.out, asdict(args), args.overwrite) as folder:
         console.print(f"Placing on the {args.shelf} shelf:")
         job = simulate_collaboration(
@@ -89,13 +99,14 @@ def main(args: Args) -> int:
             config=replace(args.config, grasping=grasping),
             seed=args.seed,
             page=PageConfig(port=args.port) if args.page else None,
+            watch=serving(title, args.serving, opened) if args.serve else unwatched,
             on_phase=lambda phase, time: console.print(f"  {time:6.2f} s  {phase}"),
             on_page=lambda address: console.print(f"Page at [bold]{address}[/]"),
         )
         table = [] if job.result is None else evaluate(job, fit)
         with console.status("Writing recording and report"):
             run = record(
-                f"Collaboration, {args.shelf} shelf",
+                title,
                 job.station,
                 job.world,
                 job.motion,

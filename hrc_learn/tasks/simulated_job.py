@@ -19,6 +19,7 @@ from .fit_aiming import AimingSkill
 from .page_beside import page_beside
 from .placing import PlacingSkill, Plan, check_plan
 from .station import Station, StationConfig
+from .watching import Watch, unwatched
 from .workplace import Workplace
 
 PULLS = (
@@ -59,6 +60,7 @@ def simulate_collaboration(
     config: CollaborationConfig | None = None,
     seed: int = 0,
     page: PageConfig | None = None,
+    watch: Watch = unwatched,
     on_phase: Callable[[str, float], None] = lambda phase, time: None,
     on_page: Callable[[str], None] = lambda address: None,
 ) -> SimulatedJob:
@@ -75,6 +77,7 @@ def simulate_collaboration(
         seed: Of where the object lies, and of image noise.
         page: Serve a page from which people pull at the body too, and let the world go on in
             real time; None: no page.
+        watch: Watches from the side, such as `serving` a dashboard.
         on_phase: Told the name of each phase of the task, and when it begins [s].
         on_page: Told the address of the page.
 
@@ -113,6 +116,7 @@ def simulate_collaboration(
             advance=advance,
             on_phase=enter,
         )
+        stack.enter_context(watch(station, world, motion))
         task = Collaboration(station, workplace, aiming, placing, check, config)
         try:
             result = task.run(item, shelf)
