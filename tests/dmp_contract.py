@@ -3,6 +3,8 @@
 A variant says in a subclass how it is made and read, and inherits all the checks.
 """
 
+from copy import deepcopy
+
 import numpy as np
 import pytest
 import torch
@@ -44,9 +46,15 @@ class DMPContract:
         """Largest distance between a rollout and a demonstration."""
         raise NotImplementedError
 
+    @pytest.fixture(scope="class")
+    @classmethod
+    def fitted(cls):
+        contract = cls()
+        return contract.fit(*contract.demonstrate(0))
+
     @pytest.fixture
-    def dmp(self):
-        return self.fit(*self.demonstrate(0))
+    def dmp(self, fitted):
+        return deepcopy(fitted)
 
     def batch(self, n):
         time, *columns = zip(*(self.demonstrate(seed) for seed in range(n)), strict=True)
