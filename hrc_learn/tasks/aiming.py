@@ -138,9 +138,18 @@ class Aimer:
             MissedGraspError: If it takes too long, or the marker stays out of sight.
         """
         begin, config = self._station.time, self._config
+        self._resume()
         if config.probe > 0:
             self._reach(aim.raised(config.probe), config.probe_tolerance, begin)
         return self._reach(aim, config.tolerance, begin) - begin
+
+    def _resume(self) -> None:
+        """Tell the estimate how long nobody has watched: the camera may have been moved."""
+        pause = self._station.time - self._last_image
+        if 0 < pause < np.inf:
+            estimator = self._controller.estimator
+            resumed = estimator.resumed(self.state.estimator, pause)
+            self.state = replace(self.state, estimator=resumed)
 
     def _reach(self, aim: Aim, tolerance: float, begin: float) -> float:
         """Steps until the marker has stayed at the target; when it came there [s]."""

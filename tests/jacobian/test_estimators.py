@@ -499,3 +499,27 @@ def test_learning_can_be_differentiated(Estimator):
 
     weight = state.weight.clone().requires_grad_()
     assert torch.autograd.gradcheck(last_jacobian, weight, eps=1e-2)
+
+
+@pytest.mark.parametrize("Estimator", LEARNING)
+def test_what_was_seen_before_a_pause_is_not_compared_with_what_is_seen_after(Estimator):
+    poses = wander(21, 2, rng=generator(11))
+    x = CAMERA.project(poses)
+    estimator = Estimator(guess())
+    state = run(estimator, poses[:, :20], x[:, :20])[-1]
+    # The camera jumps in the pause: paired with the image before it would teach nonsense.
+    after, jumped = poses[:, 20:], x[:, 20:] + 400.0
+    wary = run(estimator, after, jumped, estimator.resumed(state, 2.0))[-1]
+    unwary = run(estimator, after, jumped, state)[-1]
+    assert_close(wary.weight, state.weight)
+    assert not torch.equal(unwary.weight, state.weight)
+
+
+def test_a_kalman_filter_drifts_through_a_pause_as_through_steps():
+    poses = wander(1, 1, rng=generator(12))
+    estimator = KalmanEstimator(guess())
+    state = stepped = estimator.initial_state(1)
+    unseen = measurement(poses[:, 0], CAMERA.project(poses)[:, 0], valid=False, dt=0.1)
+    for _ in range(10):
+        stepped = estimator.update(stepped, unseen)
+    assert_close(estimator.resumed(state, 1.0).covariance, stepped.covariance)

@@ -67,6 +67,18 @@ class ImageJacobianEstimator(nn.Module, ABC):
     def update(self, state: Any, measurement: Measurement) -> Any:
         """State after one control step."""
 
+    def resumed(self, state: Any, pause: float) -> Any:
+        """State after a pause in which nobody watched.
+
+        What was seen before it must not be compared with what is seen after it: meanwhile the
+        camera may have been moved.
+
+        Args:
+            state: At the end of the watching before.
+            pause: [s]
+        """
+        return state
+
     def jacobian(
         self, state: Any, r: Pose | Float[Tensor, "*batch 6"]
     ) -> Float[Tensor, "*batch rows 6"]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -57,6 +57,11 @@ class KalmanEstimator(RecursiveEstimator):
         K = len(network.centers)
         walk = torch.block_diag(*[network.centers.new_ones(K, K)] * 6)
         self.register_buffer("walk", self.config.drift**2 * walk, persistent=False)
+
+    def resumed(self, state: RecursiveState, pause: float) -> RecursiveState:
+        """No key frame, and the drift of the pause."""
+        state = super().resumed(state, pause)
+        return replace(state, covariance=state.covariance + pause * self.walk)
 
     def update(self, state: RecursiveState, measurement: Measurement) -> RecursiveState:
         """Drift for dt, then one pair if there is a new one."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -101,6 +102,11 @@ class PairEstimator(ImageJacobianEstimator):
         A projection on a convex set takes no estimate further from a truth inside the set.
         """
         return weight.clamp(-self.bound, self.bound)
+
+    def resumed(self, state: Any, pause: float) -> Any:
+        """The same weights, and no key frame."""
+        batch = state.weight.shape[:-2]
+        return replace(state, key=KeyFrame.absent(self.network, *batch))
 
     def advance(
         self,
