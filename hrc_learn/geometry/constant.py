@@ -26,7 +26,9 @@ class Constant:
         key = (dtype, x.device)
         tensor = self._ready.get(key)
         if tensor is None:
-            tensor = self._value.to(device=x.device, dtype=dtype)
+            # Once kept, it must serve autograd as well.
+            with torch.inference_mode(False):
+                tensor = self._value.to(device=x.device, dtype=dtype)
             if _outlives_the_call(tensor):
                 self._ready[key] = tensor
         return tensor
