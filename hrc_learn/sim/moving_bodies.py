@@ -9,16 +9,19 @@ from jaxtyping import Float
 
 from ..viz import Body, Box, Capsule
 from .contacts import body_geoms
+from .scene import COVER
 from .world import World
 
 
 class MovingBodies:
-    """The links of the arm, its fingers, and the objects."""
+    """The links of the arm, its fingers, the objects, and what people put in the way."""
 
     def __init__(self, world: World):
         self._world = world
         model = world.model
-        movers = ["link0", *(item.name for item in world.config.objects)]
+        obstacles = (box.name for box in world.config.obstacles)
+        objects = (item.name for item in world.config.objects)
+        movers = ["link0", *objects, *obstacles, COVER]
         geoms = body_geoms(model, movers)
         self._indices = sorted({int(b) for b in model.geom_bodyid[geoms]})
         self.names = tuple(model.body(b).name for b in self._indices)

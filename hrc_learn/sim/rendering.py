@@ -13,6 +13,7 @@ from jaxtyping import UInt8
 
 from ..protocols import Camera
 from ..vision import CameraModel, ImageNoise, Lens, Marker, SyntheticCamera
+from .covering import covers_in
 from .world import World
 
 CameraKind = Literal["auto", "egl", "synthetic"]
@@ -207,5 +208,11 @@ def open_camera(
         markers.append(world.config.arm.marker.marker)
     sight = MarkerSight(world, model, markers)
     return SyntheticCamera(
-        model, markers, world.marker_poses, rng=rng, noise=noise, hidden=sight.hidden
+        model,
+        markers,
+        world.marker_poses,
+        rng=rng,
+        noise=noise,
+        hidden=sight.hidden,
+        covers=lambda: covers_in(world, model),
     )

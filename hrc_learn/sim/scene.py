@@ -24,6 +24,14 @@ _BOX = mujoco.mjtGeom.mjGEOM_BOX
 HAND_MARKER = 7
 """ArUco number of the plate on the hand."""
 
+COVER = "cover"
+"""Name of the board that hides markers from the camera."""
+COVER_HALF_SIZE = (0.07, 0.09, 0.004)
+"""[m]"""
+COVER_COLOUR = (0.55, 0.36, 0.30, 1.0)
+NOWHERE = (0.0, 0.0, -5.0)
+"""Where things are that are not in the scene: far below the floor [m]."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class CabinetConfig:
@@ -146,6 +154,8 @@ class SceneConfig:
     cabinet: CabinetConfig = field(default_factory=CabinetConfig)
     objects: tuple[ObjectConfig, ...] = (ObjectConfig(),)
     camera: CameraModel = field(default_factory=overhead_camera)
+    obstacles: tuple[Box, ...] = ()
+    """Things that people put in the way and take away again (`World.move_obstacle`)."""
     timestep: float = 0.002
     """Physics step [s]."""
 
@@ -163,8 +173,11 @@ def build_scene(config: SceneConfig) -> mujoco.MjSpec:
     add_panda(spec, config.arm)
     for box in config.boxes():
         _add_box(spec, box)
+    for obstacle in config.obstacles:
+        _add_box(spec, obstacle).mocap = True
     for item in config.objects:
         _add_object(spec, item)
+    _add_cover(spec)
     return spec
 
 
@@ -215,9 +228,23 @@ def _add_surroundings(spec: mujoco.MjSpec) -> None:
     )
 
 
-def _add_box(spec: mujoco.MjSpec, box: Box) -> None:
+def _add_box(spec: mujoco.MjSpec, box: Box):
     body = spec.worldbody.add_body(name=box.name, pos=box.centre)
     body.add_geom(name=box.name, type=_BOX, size=box.half_size, rgba=box.colour)
+    return body
+
+
+def _add_cover(spec: mujoco.MjSpec) -> None:
+    """A board that somebody may hold before the camera; nothing can touch it."""
+    body = spec.worldbody.add_body(name=COVER, pos=NOWHERE, mocap=True)
+    body.add_geom(
+        name=COVER,
+        type=_BOX,
+        size=COVER_HALF_SIZE,
+        rgba=COVER_COLOUR,
+        contype=0,
+        conaffinity=0,
+    )
 
 
 def _add_object(spec: mujoco.MjSpec, item: ObjectConfig) -> None:

@@ -24,8 +24,8 @@ class World:
     Attributes:
         config: What stands in it.
         arm: The arm and its gripper.
-        cabinet_contacts: Touches of the arm or its hand with the cabinet.
-        object_contacts: Touches of objects with the cabinet.
+        cabinet_contacts: Touches of the arm or its hand with the cabinet or an obstacle.
+        object_contacts: Touches of objects with them.
         table_contacts: Touches of the arm or its hand with the table.
         self_contacts: Touches of the arm with itself.
     """
@@ -35,7 +35,8 @@ class World:
         self.model = build_scene(self.config).compile()
         self.data = mujoco.MjData(self.model)
         self.arm = MujocoArm(self.model, self.data)
-        cabinet = [box.name for box in self.config.cabinet.boxes()]
+        obstacles = [box.name for box in self.config.obstacles]
+        cabinet = [box.name for box in self.config.cabinet.boxes()] + obstacles
         self.cabinet_contacts = ContactMonitor(self.model, _ARM_BODIES, cabinet)
         objects = [item.name for item in self.config.objects]
         self.object_contacts = ContactMonitor(self.model, objects, cabinet)
@@ -106,6 +107,18 @@ class World:
         self.advance(0.5)
         self.data.time = 0.0
 
+    def move_obstacle(
+        self, name: str, centre: tuple[float, float, float] | Float[np.ndarray, "3"]
+    ) -> None:
+        """Put an obstacle, or the cover, somewhere at once; `NOWHERE` takes it away.
+
+        Args:
+            name: Of the obstacle.
+            centre: In the base frame [m].
+        """
+        self.data.mocap_pos[self.model.body(name).mocapid[0]] = centre
+        mujoco.mj_kinematics(self.model, self.data)
+
     def _object(self, name: str):
         for item in self.config.objects:
             if item.name == name:
@@ -173,10 +186,11 @@ class World:
         """
         data = mujoco.MjData(self.model)
         data.qpos[:] = self.data.qpos
+        data.mocap_pos[:] = self.data.mocap_pos
         in_hand = None
         if carried is not None:
             in_hand = np.linalg.inv(self.arm.tcp_pose()) @ self.object_pose(carried)
-        boxes = [box.name for box in self.config.boxes()]
+        boxes = [box.name for box in (*self.config.boxes(), *self.config.obstacles)]
         movers = _ARM_BODIES if carried is None else (*_ARM_BODIES, carried)
         monitors = [
             ContactMonitor(self.model, movers, boxes),

@@ -7,4 +7,5 @@ from .imaging import ImageNoise as ImageNoise
 from .imaging import Lens as Lens
 from .markers import Marker as Marker
 from .markers import marker_texture as marker_texture
+from .synthetic_camera import Cover as Cover
 from .synthetic_camera import SyntheticCamera as SyntheticCamera

@@ -4,7 +4,8 @@ It renders what matters to visual servoing, in a fraction of a renderer's time: 
 machines without OpenGL use it in place of the simulator's camera.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Set
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
@@ -15,6 +16,17 @@ from .markers import PLATE_MODULES, Marker, marker_texture
 
 MarkerPoses = Callable[[], Mapping[int, Float[np.ndarray, "4 4"]]]
 """Returns the pose of each marker now, by its id: p_base = pose @ p_marker."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Cover:
+    """A flat board in one colour before everything else."""
+
+    corners: Float[np.ndarray, "corners 3"]
+    """Of a convex outline, in the base frame [m]."""
+    colour: tuple[float, float, float]
+    """Red, green, blue, 0 to 1."""
+
 
 _MODULE_PIXELS = (1, 2, 4, 8, 16, 32, 64)  # texture resolutions, one octave apart
 _PAPER, _INK = 235.0, 25.0  # grey levels of a lit print
@@ -37,6 +49,7 @@ class SyntheticCamera:
         rng: np.random.Generator,
         noise: ImageNoise | None = None,
         hidden: Callable[[], Set[int]] = frozenset,
+        covers: Callable[[], Sequence[Cover]] = tuple,
         background: UInt8[np.ndarray, "h w 3"] | None = None,
     ):
         """Draw everything that stays the same from frame to frame.
@@ -48,6 +61,7 @@ class SyntheticCamera:
             rng: Source of the noise.
             noise: Blur and noise of the sensor; the defaults of `ImageNoise` when None.
             hidden: Called at each frame; ids that something covers now.
+            covers: Called at each frame; boards held before the camera now.
             background: What is seen where no marker is; a plain table top when None.
 
         Raises:
@@ -55,7 +69,7 @@ class SyntheticCamera:
         """
         self.model = model
         self.markers = _by_id(markers)
-        self._poses, self._hidden = poses, hidden
+        self._poses, self._hidden, self._covers = poses, hidden, covers
         self._rng, self._noise = rng, noise or ImageNoise()
         self._clean = table_top(model.width, model.height) if background is None else background
         if self._clean.shape[:2] != (model.height, model.width):
@@ -73,6 +87,7 @@ class SyntheticCamera:
     def read(self) -> UInt8[np.ndarray, "h w 3"]:
         """The image now, RGB."""
         drawn = [self._draw(marker, pose) for marker, pose in self._visible()]
+        drawn += [self._draw_cover(cover) for cover in self._covers()]
         image = self._background.copy()
         for roi in drawn:
             image[roi] = self._noise.degrade(self._canvas[roi], self._rng)
@@ -102,10 +117,7 @@ class SyntheticCamera:
 
         corners = marker.plate_corners @ pose[:3, :3].T + pose[:3, 3]
         pixels = self.model.project(corners)
-        low = np.maximum(np.floor(pixels.min(axis=0)).astype(int) - self._margin, 0)
-        high = np.maximum(np.ceil(pixels.max(axis=0)).astype(int) + self._margin + 1, 0)
-        roi = np.s_[low[1] : high[1], low[0] : high[0]]  # slices end at the image's edge
-
+        roi = self._around(pixels)
         texture = self._textures[marker.id][_octave(pixels)]
         where = self._texture_coordinates(
             self._rays[roi], pose, marker.plate_size, len(texture) - 2
@@ -115,6 +127,22 @@ class SyntheticCamera:
         # Grey is already weighted by opacity, so this is exact at the soft edges too.
         self._canvas[roi] = np.rint(grey + (1.0 - alpha) * self._canvas[roi])
         return roi
+
+    def _draw_cover(self, cover: Cover) -> tuple[slice, slice]:
+        """Paint a board over what has been drawn and return the region it touched."""
+        import cv2
+
+        pixels = self.model.project(cover.corners)
+        colour = tuple(255.0 * c for c in cover.colour)
+        outline = np.rint(pixels).astype(np.int32)
+        cv2.fillConvexPoly(self._canvas, outline, colour, cv2.LINE_AA)
+        return self._around(pixels)
+
+    def _around(self, pixels: Float[np.ndarray, "corners 2"]) -> tuple[slice, slice]:
+        """Part of the image about some pixels, with room for the blur."""
+        low = np.maximum(np.floor(pixels.min(axis=0)).astype(int) - self._margin, 0)
+        high = np.maximum(np.ceil(pixels.max(axis=0)).astype(int) + self._margin + 1, 0)
+        return np.s_[low[1] : high[1], low[0] : high[0]]  # slices end at the image's edge
 
     def _texture_coordinates(
         self,
