@@ -1,7 +1,11 @@
 """The workplace in MuJoCo: arm, furniture, objects, cameras, contacts."""
 
+from .changing_camera import CameraChange as CameraChange
+from .changing_camera import ChangingCamera as ChangingCamera
 from .contacts import ContactMonitor as ContactMonitor
 from .contacts import Touch as Touch
+from .covering import Occluder as Occluder
+from .covering import Occlusion as Occlusion
 from .markers import Plate as Plate
 from .motion_log import MotionLog as MotionLog
 from .moving_bodies import MovingBodies as MovingBodies
@@ -12,6 +16,7 @@ from .rendering import OffscreenRenderer as OffscreenRenderer
 from .rendering import RenderingUnavailableError as RenderingUnavailableError
 from .rendering import open_camera as open_camera
 from .scene import HAND_MARKER as HAND_MARKER
+from .scene import NOWHERE as NOWHERE
 from .scene import CabinetConfig as CabinetConfig
 from .scene import ObjectConfig as ObjectConfig
 from .scene import SceneConfig as SceneConfig
