@@ -5,62 +5,25 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from taught_skills import WORKPLACE, taught_aiming, taught_placing
 
-from hrc_learn.demos import DatasetWriter, load_demos
 from hrc_learn.human import PullSpell
-from hrc_learn.kinematics import panda
-from hrc_learn.sim import World, open_camera
 from hrc_learn.tasks.collaboration import CollaborationConfig
 from hrc_learn.tasks.evaluation import evaluate
-from hrc_learn.tasks.eye import Eye
-from hrc_learn.tasks.fit_aiming import AimingSkill, fit_aiming
-from hrc_learn.tasks.fit_primitives import fit_primitives
-from hrc_learn.tasks.placing import PlacingSkill
 from hrc_learn.tasks.recording import Deviation, record, span, true_image_jacobian
 from hrc_learn.tasks.simulated_job import simulate_collaboration
-from hrc_learn.tasks.teach_aiming import AimingLesson, teach_aiming
-from hrc_learn.tasks.teach_placing import PlacingLesson, teach_placing
-from hrc_learn.tasks.visual_target import OBJECT_FEATURE, OBJECT_FEATURE_NAMES
-from hrc_learn.tasks.workplace import Workplace
 
-WORKPLACE = Workplace()
 PULL = (PullSpell(start=0.3, duration=3.5, towards=(0.4, 0.0, 0.5), strongest=60.0),)
-
-
-def recorded(folder, lesson, features, demonstrations):
-    with DatasetWriter(
-        folder, lesson.fps, "panda", panda.joint_names, features=features
-    ) as writer:
-        for frames in demonstrations:
-            writer.start_episode("show")
-            for frame in frames:
-                writer.add_frame(images=None, **frame)
-            writer.save_episode()
-    return load_demos(folder)
 
 
 @pytest.fixture(scope="module")
 def placing(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("placing")
-    lesson, world = PlacingLesson(), World(WORKPLACE.scene)
-    frames, _ = teach_placing(world, WORKPLACE, "middle", lesson, np.random.default_rng(0))
-    fitted = fit_primitives(recorded(folder / "demos", lesson, {}, [frames]))
-    fitted.save(folder / "model")
-    return PlacingSkill.load(folder / "model"), fitted.metrics()
+    return taught_placing(tmp_path_factory.mktemp("placing"))
 
 
 @pytest.fixture(scope="module")
 def aiming(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("aiming")
-    lesson, rng, world = AimingLesson(duration=5.0), np.random.default_rng(1), World()
-    eye = Eye.on(open_camera(world, "synthetic", rng=rng), WORKPLACE.scene)
-    shown = [teach_aiming(world, WORKPLACE, eye, lesson, rng) for _ in range(5)]
-    features = {OBJECT_FEATURE: OBJECT_FEATURE_NAMES}
-    skill = fit_aiming(recorded(folder / "demos", lesson, features, shown))
-    (folder / "model").mkdir()
-    skill.save(folder / "model")
-    assert skill.metrics()["held_out_relative"] < 0.15
-    return AimingSkill.load(folder / "model")
+    return taught_aiming(tmp_path_factory.mktemp("aiming"))
 
 
 @pytest.fixture(scope="module")
