@@ -54,6 +54,9 @@ class Args:
     """Episodes to learn from; all when empty."""
     joint_names: tuple[str, ...] = ()
     """Joints to learn, by name and in this order; all when empty."""
+    as_lerobot_policy: bool = False
+    """Write the folder of a trained LeRobot policy instead, of type dmp: from observations to
+    the dataset's own actions, joints or the hand, in closed form."""
     seed: int = 0
     """Of whatever is drawn at random."""
     overwrite: bool = False
@@ -65,6 +68,9 @@ class Args:
 def main(args: Args) -> None:
     torch.manual_seed(args.seed)
     console = Console()
+    if args.as_lerobot_policy:
+        _fit_policy(args, console)
+        return
     if args.several == "streamed":
         _fit_streamed(args)
         return
@@ -107,6 +113,30 @@ def _fit_streamed(args: Args) -> None:
             for kind, fit in fits.items():
                 fit.primitive.save(folder / kind)
             _finish(args, metrics, folder)
+
+
+def _fit_policy(args: Args, console: Console) -> None:
+    # LeRobot takes ten seconds to import.
+    from hrc_learn.lerobot.policy.saving import write_closed_form_policy
+
+    given = (args.kinds, args.context, args.joint_names, args.robust)
+    if any(given) or (args.several, args.method, args.scaling) != (
+        "mean",
+        "trajectory",
+        "none",
+    ):
+        raise ValueError(
+            "--as-lerobot-policy learns the dataset's actions from its observations: of what "
+            "to learn and how, it takes --n-basis and --episodes alone"
+        )
+    if args.n_basis is None:
+        raise ValueError("--as-lerobot-policy needs a number of basis functions: --n-basis 50")
+    with new_folder(args.out, _made_by(args), args.overwrite) as folder:
+        with console.status("Fitting a policy"):
+            metrics = write_closed_form_policy(
+                args.dataset, folder, n_basis=args.n_basis, episodes=args.episodes or None
+            )
+        _finish(args, metrics, folder)
 
 
 def _made_by(args: Args) -> dict:

@@ -94,7 +94,7 @@ def _best_regression(motion: ContextualMotion, c: Tensor, x: Tensor) -> Regressi
     best = Regression(
         base=mean, slopes=c.new_zeros(c.shape[1], len(mean)), error=_error(motion, left_out)
     )
-    varies = c.std(0, correction=0) > SMALLEST_VARIATION
+    varies = (c - c.mean(0)).square().mean(0).sqrt() > SMALLEST_VARIATION
     if n < FEWEST or not varies.any():
         return best
     for regularization in REGULARIZATIONS:

@@ -1,6 +1,7 @@
 """The policy `dmp` as LeRobot calls it."""
 
 import logging
+import math
 from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
@@ -65,6 +66,8 @@ class DMPPolicy(PreTrainedPolicy):
         config.fps = _frame_rate(config, dataset_meta)
         self.config = config
         self.planner = _planner(config, 1 / config.fps)
+        self.left_out_error = math.nan
+        """Of demonstrations left out of the closed form, in the spread of the actions."""
         if config.pretrained_path is None:
             self._whiten(dataset_stats)
             self._fit(dataset_meta)
@@ -149,11 +152,11 @@ class DMPPolicy(PreTrainedPolicy):
             return
         keys = (ACTION, *self.planner.encoder.widths)
         episodes = read_episodes(root, keys, self.config.fit_episodes)
-        error = self.planner.fit(episodes, ACTION)
+        self.left_out_error = self.planner.fit(episodes, ACTION)
         logger.info(
             "fitted %d demonstrations in closed form, error of one left out %.3f of the spread",
             len(episodes),
-            error,
+            self.left_out_error,
         )
 
 
@@ -168,6 +171,7 @@ def _planner(config: DMPConfig, step: float) -> MotionPlanner:
     )
     (width,) = (config.output_features or {})[ACTION].shape
     names = config.action_feature_names
+    states = config.state_names if OBS_STATE in widths else None
     return MotionPlanner(
         encoder,
         ActionChart(width, rotation_triples(names)),
@@ -178,7 +182,7 @@ def _planner(config: DMPConfig, step: float) -> MotionPlanner:
             features=2 * encoder.size,
             hidden=config.hidden_dim,
         ),
-        measured=matched_columns(names, config.state_names, (width, widths.get(OBS_STATE, 0))),
+        measured=matched_columns(names, states, (width, widths.get(OBS_STATE, 0))),
         step=step,
         chunk_size=config.chunk_size,
     )

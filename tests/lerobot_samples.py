@@ -1,0 +1,108 @@
+"""Demonstrations and policies small enough to be made in every test."""
+
+from collections.abc import Mapping
+
+import torch
+from lerobot.configs import FeatureType, PolicyFeature
+from torch import Tensor
+
+from hrc_learn.dmp.system.approach import quintic
+from hrc_learn.lerobot import DMPConfig
+from hrc_learn.lerobot.policy.modeling_dmp import DMPPolicy
+from hrc_learn.lerobot.policy.windows import Windows
+
+FPS = 20.0
+NAMES = ["a.pos", "b.pos"]
+STATE = "observation.state"
+GOAL = "observation.environment_state"
+type Episode = dict[str, Tensor]
+
+
+def reaching(count: int, seed: int = 0) -> list[Episode]:
+    """From near the origin, in a bow, to goals that the environment's state gives."""
+    rng = torch.Generator().manual_seed(seed)
+    episodes = []
+    for _ in range(count):
+        start = 0.1 * torch.randn(2, generator=rng)
+        goal = torch.tensor([1.0, -2.0]) + 0.5 * torch.randn(2, generator=rng)
+        frames = int(torch.randint(36, 45, (), generator=rng))
+        u = torch.linspace(0, 1, frames)[:, None]
+        path = start + (goal - start) * quintic(u)[0]
+        path = path + 0.3 * torch.sin(torch.pi * u) ** 2 * torch.tensor([-1.0, 1.0])
+        episodes.append(
+            {
+                # More than the action's components, and in another order.
+                STATE: torch.cat([path[:, 1:], torch.zeros(frames, 1), path[:, :1]], dim=-1),
+                GOAL: goal.expand(frames, -1),
+                "action": path,
+            }
+        )
+    return episodes
+
+
+def stats_of(episodes: list[Episode]) -> dict[str, dict[str, Tensor]]:
+    columns = {key: torch.cat([e[key] for e in episodes]) for key in episodes[0]}
+    return {key: {"mean": x.mean(0), "std": x.std(0)} for key, x in columns.items()}
+
+
+def config_for(episode: Mapping[str, Tensor], **changes) -> DMPConfig:
+    """Settings for what the episode holds; images are (frames, C, H, W)."""
+    kinds = {STATE: FeatureType.STATE, GOAL: FeatureType.ENV}
+    inputs = {
+        key: PolicyFeature(kinds.get(key, FeatureType.VISUAL), tuple(x.shape[1:]))
+        for key, x in episode.items()
+        if key != "action"
+    }
+    action = PolicyFeature(FeatureType.ACTION, tuple(episode["action"].shape[1:]))
+    settings = {
+        "chunk_size": 10,
+        "n_action_steps": 6,
+        "n_basis": 12,
+        "hidden_dim": 16,
+        "n_keypoints": 4,
+        "fps": FPS,
+        "state_names": ["b.pos", "gripper.pos", "a.pos"],
+        "action_feature_names": NAMES,
+        "device": "cpu",
+        "push_to_hub": False,
+    }
+    return DMPConfig(
+        input_features=inputs, output_features={"action": action}, **settings | changes
+    )
+
+
+def fitted_policy(episodes: list[Episode], **changes) -> DMPPolicy:
+    policy = DMPPolicy(config_for(episodes[0], **changes), dataset_stats=stats_of(episodes))
+    policy.planner.fit(episodes, "action")
+    return policy
+
+
+def shaken(policy: DMPPolicy, seed: int = 0) -> DMPPolicy:
+    """The same after a training that went astray: what is seen changes the motion wildly."""
+    rng = torch.Generator().manual_seed(seed)
+    last = policy.planner.motion.network[-1]
+    with torch.no_grad():
+        last.weight.copy_(0.3 * torch.randn(last.weight.shape, generator=rng))
+    return policy
+
+
+def windows(policy: DMPPolicy, episodes: list[Episode]) -> Windows:
+    seen = policy.config.observation_delta_indices
+    deltas = {key: seen for key in episodes[0] if key != "action"}
+    deltas["action"] = policy.config.action_delta_indices
+    return Windows(episodes, deltas, FPS)
+
+
+def played(policy: DMPPolicy, episode: Episode, frames: int | None = None) -> Tensor:
+    """Actions of a policy that sees an episode go by, (frames, A)."""
+    policy.reset()
+    frames = len(episode["action"]) if frames is None else frames
+    last = len(episode["action"]) - 1
+    return torch.cat(
+        [
+            policy.select_action(
+                {key: x[min(k, last)][None] for key, x in episode.items() if key != "action"}
+            )
+            for k in range(frames)
+        ]
+    )
