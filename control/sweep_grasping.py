@@ -48,6 +48,8 @@ class Args:
     """Receives all figures as one flat object."""
     figure: Path | None = None
     """Receives a picture of the times to the target by experiment, as .png or .svg."""
+    recording: Path | None = None
+    """Receives a Rerun recording: success by class of camera, and arrival over time."""
 
 
 def main(args: Args) -> int:
@@ -71,6 +73,8 @@ def main(args: Args) -> int:
         cli.write_json(args.json, figures)
     if args.figure is not None:
         _draw(args.figure, results)
+    if args.recording is not None:
+        _record(args.recording, results)
     return 1 if missed else 0
 
 
@@ -79,6 +83,22 @@ def _draw(path: Path, results: dict[str, Any]) -> None:
 
     times = {name: r.time.numpy() for name, r in results.items() if hasattr(r, "time")}
     arrival_figure(times).savefig(path, dpi=150)
+
+
+def _record(path: Path, results: dict[str, Any]) -> None:
+    from hrc_learn.viz import SweepRecording, SweptTrials
+    from hrc_learn.viz.sweep_dashboard import record_sweep  # rerun takes a second
+
+    trials = {
+        name: SweptTrials(
+            success=r.success.numpy(), arrival=r.time.numpy(), group=r.roll_class.numpy()
+        )
+        for name, r in results.items()
+        if hasattr(r, "roll_class")
+    }
+    groups = tuple(f"{low}-{high} deg" for low, high in ROLL_CLASSES)
+    title = "Grasping, by how far the camera is turned from what the controller believes"
+    record_sweep(path, SweepRecording(title=title, groups=groups, experiments=trials))
 
 
 def _chosen(args: Args) -> list[str]:

@@ -16,3 +16,5 @@ from .recording import JointLimits as JointLimits
 from .recording import RunRecording as RunRecording
 from .recording import arm_bodies as arm_bodies
 from .step_log import StepLog as StepLog
+from .sweep_recording import SweepRecording as SweepRecording
+from .sweep_recording import SweptTrials as SweptTrials

@@ -78,7 +78,7 @@ def _regions(run: RunRecording) -> Tab:
     plots = tuple(
         Plot(
             title=f"Potential of the region: {name} [-]",
-            curves=(single(f"regions/{_slug(name)}", name, values, palette.RUN_ON_DARK),),
+            curves=(single(f"regions/{slug(name)}", name, values, palette.RUN_ON_DARK),),
         )
         for name, values in run.potentials.items()
     )
@@ -181,7 +181,7 @@ def _safety(run: RunRecording) -> Tab:
     plots = []
     for name, values in run.safety.items():
         values = values.astype(float)
-        curves = single(f"safety/{_slug(name)}", name, values, palette.LIMIT)
+        curves = single(f"safety/{slug(name)}", name, values, palette.LIMIT)
         # A guard that never acted is a line at the bottom, not in the middle.
         top = max(1.0, float(np.nanmax(values, initial=0.0)))
         room = (-0.05 * top, 1.05 * top)
@@ -189,7 +189,7 @@ def _safety(run: RunRecording) -> Tab:
     return Tab(title="Safety", plots=tuple(plots))
 
 
-def _slug(name: str) -> str:
+def slug(name: str) -> str:
     """A name as a part of an entity path, which slashes and blanks would break up."""
     return re.sub(r"\W+", "_", name).strip("_")
 
