@@ -5,4 +5,8 @@
 for.
 """
 
+from . import envs as envs
+from . import processor as processor
+from . import robots as robots
+from . import teleoperators as teleoperators
 from .policy import DMPConfig as DMPConfig

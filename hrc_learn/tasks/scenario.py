@@ -13,7 +13,6 @@ from ..human import GuidedPath, ScriptedExpert, Tremor, gripper_down
 from ..kinematics import panda
 from ..protocols import ArmState, Human, HumanInput
 from ..sim import World
-from .simulated_job import OBJECT_REACH
 from .teach_placing import PlacingLesson, placing_expert
 from .workplace import Workplace, nearest_configuration
 
@@ -88,7 +87,7 @@ class Grasping(Scenario):
     """Take a thing that lies at random on the table, and lift it."""
 
     workplace: Workplace = field(default_factory=Workplace)
-    reach: tuple[float, float, float] = OBJECT_REACH
+    reach: tuple[float, float, float] = (0.10, 0.08, 0.0)
     """How far from the middle of the table it lies [m]."""
     approach: float = 4.0
     """From above the middle of the table down to the thing [s]."""

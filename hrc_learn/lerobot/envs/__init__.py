@@ -1,0 +1,3 @@
+"""Placing and grasping as environments for lerobot-eval."""
+
+from .config_panda_env import PandaEnvConfig as PandaEnvConfig

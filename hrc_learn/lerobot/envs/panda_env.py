@@ -1,0 +1,99 @@
+"""A scenario of the simulated Panda as a Gymnasium environment."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from ...tasks.scenario_run import ScenarioView
+from ..panda_names import action_names
+from ..robots import MujocoPanda, MujocoPandaConfig
+from ..robots.mujoco_panda import CAMERA
+
+_PICTURE = (240, 180)
+"""Size of the pictures of `render` [px]."""
+_STEADY = 0.3
+"""How long the job must stay done to count [s]: a thing that topples rests for a moment."""
+
+
+class PandaEnv(gym.Env):
+    """The job is done, and the episode over, once MuJoCo's contacts say so for a while.
+
+    The same seed and actions lead to the same end.
+    """
+
+    def __init__(self, config: MujocoPandaConfig, max_episode_steps: int):
+        """Set up.
+
+        Args:
+            config: Of the robot, with the scenario.
+            max_episode_steps: Actions after which an episode has failed.
+        """
+        self._robot = MujocoPanda(config)
+        self._robot.connect()
+        self._actions = action_names(config.action_space)
+        self._max_episode_steps = max_episode_steps
+        self._steps = self._done = 0
+        self._view: ScenarioView | None = None
+        self.task = config.scenario
+        self.task_description = self._robot.run.scenario.task
+        self.metadata = {"render_modes": ["rgb_array"], "render_fps": round(config.fps)}
+        self.render_mode = "rgb_array"
+        values = self._robot.observation_features
+        self._state = [name for name, shape in values.items() if shape is float]
+        self.action_space = _unbounded(len(self._actions))
+        spaces: dict[str, gym.Space] = {"agent_pos": _unbounded(len(self._state))}
+        if CAMERA in values:
+            image = gym.spaces.Box(0, 255, values[CAMERA], np.uint8)
+            spaces["pixels"] = gym.spaces.Dict({CAMERA: image})
+        self.observation_space = gym.spaces.Dict(spaces)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Begin as a seed has it, or as the next random number."""
+        super().reset(seed=seed)
+        if seed is None:
+            seed = int(self.np_random.integers(2**31))
+        self._robot.begin(seed)
+        self._steps = self._done = 0
+        return self._observation(), {"is_success": False}
+
+    def step(
+        self, action: Float[np.ndarray, " values"]
+    ) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        """Send an action, and let 1/fps pass. The reward is one for a job done."""
+        self._robot.send_action(
+            dict(zip(self._actions, np.asarray(action).tolist(), strict=True))
+        )
+        self._steps += 1
+        self._done = self._done + 1 if self._robot.run.succeeded() else 0
+        success = self._done * self._robot.dt >= _STEADY
+        late = self._steps >= self._max_episode_steps and not success
+        return self._observation(), float(success), success, late, {"is_success": success}
+
+    def render(self) -> UInt8[np.ndarray, "height width 3"]:
+        """A picture of the workplace."""
+        if self._view is None:
+            self._view = ScenarioView(self._robot.run, *_PICTURE)
+        return self._view.read()
+
+    def close(self) -> None:
+        """Let go of the robot."""
+        if self._robot.is_connected:
+            self._robot.disconnect()
+
+    def _observation(self) -> dict[str, Any]:
+        values = self._robot.get_observation()
+        state = np.array([values[name] for name in self._state], dtype=np.float32)
+        observation: dict[str, Any] = {"agent_pos": state}
+        if CAMERA in values:
+            observation["pixels"] = {CAMERA: values[CAMERA]}
+        return observation
+
+
+def _unbounded(size: int) -> gym.spaces.Box:
+    return gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)

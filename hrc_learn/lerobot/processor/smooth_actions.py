@@ -1,0 +1,224 @@
+"""The steps: one that watches where the robot is, one that smooths what it is sent."""
+
+from __future__ import annotations
+
+import logging
+import math
+import weakref
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from lerobot.configs import PipelineFeatureType, PolicyFeature
+from lerobot.lerobot_types import EnvTransition, TransitionKey
+from lerobot.processor import ProcessorStep, ProcessorStepRegistry
+from lerobot.utils.constants import OBS_STATE
+from torch import Tensor
+
+from ...controller import ChunkSmoother, SmoothReport, SmoothState
+from ...kinematics import MotionLimits
+from .changes import Changes
+
+_MEASURED: dict[str, Tensor] = {}
+"""Newest state of the robot, by the name of the pair of steps."""
+
+_JUMP = 5.0
+"""A robot that moves this many times faster than its limit was put there: an episode began."""
+
+_Features = dict[PipelineFeatureType, dict[str, PolicyFeature]]
+
+
+@ProcessorStepRegistry.register("hrc_learn_watch_state")
+@dataclass
+class WatchStateStep(ProcessorStep):
+    """Keeps the state as the robot reports it, for the `SmoothActionsStep` of the same name.
+
+    Belongs into the preprocessor, before what normalises.
+    """
+
+    pair: str = "smooth"
+    """Name that both steps of a policy share."""
+
+    def __call__(self, transition: EnvTransition) -> EnvTransition:
+        observation = transition.get(TransitionKey.OBSERVATION) or {}
+        state = observation.get(OBS_STATE)
+        if state is not None:
+            _MEASURED[self.pair] = torch.atleast_2d(state).detach().cpu()
+        return transition
+
+    def reset(self) -> None:
+        _MEASURED.pop(self.pair, None)
+
+    def get_config(self) -> dict[str, Any]:
+        return {"pair": self.pair}
+
+    def transform_features(self, features: _Features) -> _Features:
+        return features
+
+
+@ProcessorStepRegistry.register("hrc_learn_smooth_actions")
+@dataclass
+class SmoothActionsStep(ProcessorStep):
+    """Keeps actions within limits of position, velocity, acceleration and jerk.
+
+    Belongs at the end of the postprocessor, where actions have their units. Takes one action at
+    a time, (batch, values), as lerobot-rollout and lerobot-eval hand them on, or whole chunks
+    (batch, steps, values). A motion begins where the robot is, and anew where it is put; a
+    chunk begins where the robot is on the one before. See `ChunkSmoother`.
+    """
+
+    fps: float
+    """Actions a second, of the policy's data."""
+    names: list[str]
+    """Of an action's values."""
+    velocity: list[float]
+    """Limit of each value [1/s]."""
+    acceleration: list[float]
+    """[1/s^2]"""
+    jerk: list[float]
+    """[1/s^3]"""
+    lower: list[float | None]
+    """Lowest of each value; None: no limit."""
+    upper: list[float | None]
+    """Highest of each value; None: no limit."""
+    state_columns: list[int]
+    """Where each value is measured in `observation.state`; -1: nowhere."""
+    pair: str = "smooth"
+    """Name of the `WatchStateStep` that tells where the robot is."""
+    changes: Changes = field(init=False, repr=False)
+    """What was changed since the last reset."""
+
+    def __post_init__(self) -> None:
+        for name in ("velocity", "acceleration", "jerk", "lower", "upper", "state_columns"):
+            if len(getattr(self, name)) != len(self.names):
+                raise ValueError(
+                    f"smooth actions: {name} must have one entry for each of "
+                    f"{', '.join(self.names)}, but has {len(getattr(self, name))}."
+                )
+        self._smoother = ChunkSmoother(self._limits(), 1.0 / self.fps)
+        self._columns = torch.tensor(self.state_columns)
+        self._state: SmoothState | None = None
+        self._chunk: Tensor | None = None
+        self._before: Tensor | None = None
+        self.changes = Changes(self.names)
+        weakref.finalize(self, _log, self.changes)
+
+    def __call__(self, transition: EnvTransition) -> EnvTransition:
+        action = transition.get(TransitionKey.ACTION)
+        if not isinstance(action, Tensor):
+            return transition
+        if action.shape[-1] != len(self.names):
+            raise ValueError(
+                f"smooth actions: the policy's actions have {action.shape[-1]} values, but "
+                f"limits are given for {', '.join(self.names)}."
+            )
+        whole = action.dim() == 3
+        chunk = (action if whole else action.unsqueeze(-2)).detach().cpu()
+        with torch.inference_mode():
+            state = self._start(chunk, whole)
+            smooth, self._state, report = self._smoother(chunk, state)
+        self._keep(smooth, report, whole)
+        smooth = smooth.to(action)
+        return {**transition, TransitionKey.ACTION: smooth if whole else smooth.squeeze(-2)}  # pyright: ignore[reportReturnType]
+
+    def reset(self) -> None:
+        """Forget the motion: the next one begins where the robot then is."""
+        _log(self.changes)
+        self.changes.clear()
+        self._state = self._chunk = self._before = None
+
+    def get_config(self) -> dict[str, Any]:
+        return {
+            "fps": self.fps,
+            "names": self.names,
+            "velocity": self.velocity,
+            "acceleration": self.acceleration,
+            "jerk": self.jerk,
+            "lower": self.lower,
+            "upper": self.upper,
+            "state_columns": self.state_columns,
+            "pair": self.pair,
+        }
+
+    def transform_features(self, features: _Features) -> _Features:
+        return features
+
+    def _limits(self) -> MotionLimits:
+        def tensor(values: list[float], missing: float = math.nan) -> Tensor:
+            return torch.tensor(
+                [missing if v is None else v for v in values], dtype=torch.float64
+            )
+
+        return MotionLimits(
+            lower=tensor(self.lower, -math.inf),  # pyright: ignore[reportArgumentType]
+            upper=tensor(self.upper, math.inf),  # pyright: ignore[reportArgumentType]
+            velocity=tensor(self.velocity),
+            acceleration=tensor(self.acceleration),
+            jerk=tensor(self.jerk),
+        )
+
+    def _start(self, chunk: Tensor, whole: bool) -> SmoothState:
+        """Where the motion goes on from."""
+        measured = self._measured(chunk)
+        fresh = self._smoother.initial_state(measured)
+        if self._state is None or self._state.position.shape != measured.shape:
+            self._before = measured
+            return fresh
+        state = self._state
+        if whole and self._chunk is not None:
+            state = self._reached(measured, self._chunk)
+        jumped = self._jumped(measured)
+        self._before = measured
+        return _where(jumped, fresh, state) if jumped.any() else state
+
+    def _measured(self, chunk: Tensor) -> Float[Tensor, "batch values"]:
+        """Where the robot is; values that are not measured are where they are sent."""
+        here = chunk[..., 0, :].to(torch.float64)
+        state = _MEASURED.get(self.pair)
+        if state is None or state.shape[0] != here.shape[0]:
+            return here
+        if int(self._columns.max()) >= state.shape[-1]:
+            raise ValueError(
+                f"smooth actions: state_columns reach {int(self._columns.max())}, but the "
+                f"state has {state.shape[-1]} values."
+            )
+        values = state[..., self._columns.clamp(min=0)].to(here)
+        return torch.where(self._columns >= 0, values, here)
+
+    def _jumped(self, measured: Tensor) -> Bool[Tensor, " batch"]:
+        """Whether the robot was put somewhere, which no motion explains."""
+        if self._before is None or self._before.shape != measured.shape:
+            return torch.ones(measured.shape[:-1], dtype=torch.bool)
+        farthest = _JUMP * self._smoother.barrier.velocity / self.fps
+        moved = (measured - self._before).abs() > farthest
+        return (moved & (self._columns >= 0)).any(-1)
+
+    def _reached(self, measured: Tensor, chunk: Tensor) -> SmoothState:
+        """State on the chunk before, where it is nearest to the robot."""
+        scaled = (chunk - measured.unsqueeze(-2)) / self._smoother.barrier.velocity
+        seen = torch.where(self._columns >= 0, scaled, 0.0)
+        nearest = seen.square().sum(-1).argmin(-1).clamp(min=2)
+        rows = torch.arange(len(chunk))
+        last, middle, first = (chunk[rows, nearest - k] for k in range(3))
+        velocity = (last - middle) * self.fps
+        state = self._smoother.initial_state(last, velocity)
+        acceleration = (velocity - (middle - first) * self.fps) * self.fps
+        return replace(state, acceleration=acceleration)
+
+    def _keep(self, smooth: Tensor, report: SmoothReport, whole: bool) -> None:
+        self.changes.add(report)
+        self._chunk = smooth.to(torch.float64) if whole and smooth.shape[-2] > 2 else None
+
+
+def _where(rows: Bool[Tensor, " batch"], yes: SmoothState, no: SmoothState) -> SmoothState:
+    values = {
+        name: torch.where(rows.unsqueeze(-1), getattr(yes, name), getattr(no, name))
+        for name in vars(no)
+    }
+    return replace(no, **values)
+
+
+def _log(changes: Changes) -> None:
+    if changes.steps:
+        logging.info("smooth actions: %s", changes)

@@ -1,0 +1,59 @@
+"""Settings of the simulated Panda."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from lerobot.robots import RobotConfig
+
+from ..panda_names import ActionSpace
+from ..scenarios import ScenarioName, check_scenario
+
+
+@dataclass
+class ImagesConfig:
+    """Images of the simulated workplace."""
+
+    kind: Literal["none", "auto", "egl", "synthetic"] = "none"
+    """Which camera: "egl" renders everything, "synthetic" draws the markers on the table only
+    and needs no OpenGL, "auto" renders where that is possible."""
+    width: int = 160
+    """[px]"""
+    height: int = 120
+    """[px]"""
+
+
+@RobotConfig.register_subclass("mujoco_panda")
+@dataclass(kw_only=True)
+class MujocoPandaConfig(RobotConfig):
+    """The Panda in our MuJoCo workplace; `--robot.type=mujoco_panda`."""
+
+    scenario: ScenarioName = "placing"
+    """What is to be done: "placing" or "grasping"."""
+    shelf: str = "middle"
+    """Where to place: "lower", "middle" or "upper"."""
+    fps: float = 50.0
+    """Commands a second of simulated time: the rate of the dataset, or of the rollout."""
+    seed: int = 0
+    """Of the first beginning; each one after has the next."""
+    action_space: ActionSpace = "joint"
+    """What actions give: positions of the joints, or of the hand ("ee")."""
+    velocity: bool = False
+    """Whether joint velocities are observed."""
+    hand: bool = False
+    """Whether the pose of the hand is observed; it is where actions give it."""
+    pixels: bool = False
+    """Whether the pixel of the object is observed, as the fixed camera saw it at the beginning:
+    what a policy needs to grasp without images."""
+    images: ImagesConfig = field(default_factory=ImagesConfig)
+    """Images to be observed."""
+    restart_after_pause: float = 0.0
+    """Begin anew when no command came for this long [s]; 0: never. lerobot-record tells a robot
+    nothing of its episodes, but pauses to save each one."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_scenario(self.scenario, self.shelf, self.pixels)
+        if not 5 <= self.fps <= 500:
+            raise ValueError(f"fps must be from 5 to 500, but is {self.fps}.")
+        if self.restart_after_pause < 0:
+            raise ValueError("restart_after_pause must not be negative.")

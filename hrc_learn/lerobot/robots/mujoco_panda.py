@@ -1,0 +1,101 @@
+"""The simulated Panda as a LeRobot robot."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+
+from ...geometry import Pose
+from ...protocols import Arm
+from ..panda_names import DOWN, PIXELS
+from ..scenarios import make_scenario
+from .config_mujoco_panda import MujocoPandaConfig
+from .panda_robot import PandaRobot
+
+if TYPE_CHECKING:
+    from ...tasks.scenario_run import ScenarioRun
+
+CAMERA = "front"
+
+
+class MujocoPanda(PandaRobot):
+    """The Panda in our MuJoCo workplace, for lerobot-record, -replay, -teleoperate, -rollout.
+
+    Simulated time passes by 1/fps with every action, whatever the clock says: a loop that is
+    late records the same frames, only later.
+
+    Attributes:
+        run: The scenario under way, while connected.
+    """
+
+    config_class = MujocoPandaConfig
+    name = "mujoco_panda"
+    run: ScenarioRun
+
+    def __init__(self, config: MujocoPandaConfig):
+        super().__init__(
+            config, config.action_space, velocity=config.velocity, hand=config.hand
+        )
+        self.config = config
+        self.dt = 1.0 / config.fps
+        self._last = float("inf")
+
+    @property
+    def observation_features(self) -> dict[str, Any]:
+        images = self.config.images
+        features = super().observation_features
+        if self.config.pixels:
+            features |= dict.fromkeys(PIXELS, float)
+        if images.kind != "none":
+            features[CAMERA] = (images.height, images.width, 3)
+        return features
+
+    @property
+    def arm(self) -> Arm:
+        return self.run.world.arm
+
+    def _open(self) -> None:
+        from ...tasks.scenario_run import ScenarioRun, ScenarioView
+
+        config, images = self.config, self.config.images
+        scenario = make_scenario(config.scenario, config.shelf)
+        self.run = ScenarioRun(scenario, config.fps, seed=config.seed)
+        if images.kind != "none":
+            self.cameras = {
+                CAMERA: ScenarioView(self.run, images.width, images.height, images.kind)
+            }
+
+    def _close(self) -> None:
+        self.cameras = {}
+
+    def get_observation(self) -> dict[str, Any]:
+        self._need_connection()
+        pause = self.config.restart_after_pause
+        if pause and self.run.commands and time.monotonic() - self._last > pause:
+            self.begin(self.run.seed + 1)
+        values = super().get_observation()
+        for name, camera in self.cameras.items():
+            values[name] = camera.read()
+        return values
+
+    def begin(self, seed: int) -> None:
+        """Put everything in place as a seed has it."""
+        self.run.begin(seed)
+        self.beginnings += 1
+        self._rotation = DOWN
+
+    def _further_values(self) -> dict[str, float]:
+        if not self.config.pixels:
+            return {}
+        return dict(zip(PIXELS, map(float, self.run.object_pixel()), strict=True))
+
+    def _joints_at(self, pose: Pose) -> Float[np.ndarray, "7"]:
+        return self.run.servo.joints_at(pose)
+
+    def _command(self, joints: Float[np.ndarray, "7"], width: float) -> Float[np.ndarray, "7"]:
+        sent = self.run.command(joints, width)
+        self._last = time.monotonic()
+        return sent

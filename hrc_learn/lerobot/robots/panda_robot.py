@@ -1,0 +1,141 @@
+"""What the simulated and the real Panda have in common as LeRobot robots."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from lerobot.robots import Robot, RobotConfig
+from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
+
+from ...geometry import Pose
+from ...protocols import Arm, ArmState
+from ..connected import CONNECTED
+from ..panda_names import (
+    DOWN,
+    GRIPPER,
+    HAND,
+    JOINTS,
+    VELOCITIES,
+    ActionSpace,
+    action_names,
+    action_of,
+    observed,
+    target_of,
+)
+
+
+class PandaRobot(Robot):
+    """A Panda led by positions of its joints, or of its hand.
+
+    Actions of either space are obeyed, and values they do not name are left alone, so that
+    lerobot-rollout's way back to the first position works as well. What an action asks for is
+    done within the limits of the joints only; `send_action` returns what was done.
+
+    Attributes:
+        space: Of the actions that it declares.
+        dt: Time between actions [s].
+        beginnings: How often everything has been put in place, which only a simulation can.
+    """
+
+    dt: float
+
+    def __init__(self, config: RobotConfig, space: ActionSpace, *, velocity: bool, hand: bool):
+        super().__init__(config)
+        self.space: ActionSpace = space
+        self.cameras: dict[str, Any] = {}
+        self.beginnings = 0
+        hand = hand or space == "ee"
+        self._names = (
+            *JOINTS,
+            *(VELOCITIES if velocity else ()),
+            *(HAND if hand else ()),
+            GRIPPER,
+        )
+        self._rotation = DOWN
+        self._connected = False
+
+    @property
+    def observation_features(self) -> dict[str, Any]:
+        return dict.fromkeys(self._names, float)
+
+    @property
+    def action_features(self) -> dict[str, Any]:
+        return dict.fromkeys(action_names(self.space), float)
+
+    @property
+    def is_connected(self) -> bool:
+        return self._connected
+
+    @property
+    def is_calibrated(self) -> bool:
+        return True
+
+    def calibrate(self) -> None:
+        """Nothing to do: a Panda has absolute encoders."""
+
+    def configure(self) -> None:
+        """Nothing to do."""
+
+    def connect(self, calibrate: bool = True) -> None:
+        if self._connected:
+            raise DeviceAlreadyConnectedError(f"{self} is connected already.")
+        self._open()
+        self._connected = True
+        CONNECTED.append(self)
+
+    def disconnect(self) -> None:
+        self._need_connection()
+        self._connected = False
+        CONNECTED.remove(self)
+        self._close()
+
+    def get_observation(self) -> dict[str, Any]:
+        self._need_connection()
+        values = observed(self.arm.read(), self._names, self._rotation)
+        if HAND[0] in values:
+            self._rotation = np.array([values[name] for name in HAND[3:]])
+        return values | self._further_values()
+
+    def send_action(self, action: dict[str, Any]) -> dict[str, float]:
+        self._need_connection()
+        where, width = target_of(action)
+        joints = self._joints_at(where) if isinstance(where, Pose) else where
+        sent = self._command(joints, width)
+        return action_of(self.space, sent, width, self._rotation)
+
+    @property
+    @abstractmethod
+    def arm(self) -> Arm:
+        """The arm, to be read."""
+
+    @abstractmethod
+    def _open(self) -> None:
+        """Take hold of it."""
+
+    @abstractmethod
+    def _close(self) -> None:
+        """Let it go."""
+
+    @abstractmethod
+    def _joints_at(self, pose: Pose) -> Float[np.ndarray, "7"]:
+        """Joint positions that bring the hand to a pose [rad]."""
+
+    @abstractmethod
+    def _command(self, joints: Float[np.ndarray, "7"], width: float) -> Float[np.ndarray, "7"]:
+        """Send joints [rad] and gripper [m]; where the joints are really sent [rad]."""
+
+    def read_state(self) -> ArmState:
+        """The newest reading of the arm, for whoever leads it."""
+        self._need_connection()
+        return self.arm.read()
+
+    def _further_values(self) -> dict[str, float]:
+        """Observed beside the arm's own."""
+        return {}
+
+    def _need_connection(self) -> None:
+        if not self._connected:
+            raise DeviceNotConnectedError(f"{self} is not connected: call connect() first.")

@@ -1,0 +1,128 @@
+"""Leading an arm by the hand, handed on as positions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from lerobot.teleoperators import Teleoperator, TeleoperatorConfig
+from lerobot.utils.errors import DeviceNotConnectedError
+
+from ...kinematics import panda
+from ...protocols import ArmState, Human, HumanInput
+from ..connected import connected_robot
+from ..panda_names import DOWN, JOINTS, ActionSpace, action_names, action_of
+from ..robots.panda_robot import PandaRobot
+
+
+class Lead:
+    """Turns what a person asks for into positions that an arm is sent to, one after another.
+
+    Attributes:
+        robot: That is led.
+        beginning: Of the robot's, that it started from.
+    """
+
+    def __init__(self, robot: PandaRobot, human: Human):
+        """Begin where the arm is.
+
+        Args:
+            robot: That is led.
+            human: Who leads it.
+        """
+        from ...tasks.led_arm import LedArm, LedArmConfig
+
+        self.robot, self.beginning = robot, robot.beginnings
+        self._velocity = np.zeros(len(JOINTS))
+        self._led = LedArm(panda, self, human, LedArmConfig(dt=robot.dt))
+        state = robot.read_state()
+        self._joints, self._width = state.joint_position.copy(), state.gripper_width
+        self._rotation = DOWN
+
+    def read(self) -> ArmState:
+        """The arm's newest reading."""
+        return self.robot.read_state()
+
+    def command(self, joint_velocity: Float[np.ndarray, " joints"]) -> None:
+        """Keep the velocity that the arm should have [rad/s]."""
+        self._velocity = joint_velocity
+
+    def next(self) -> tuple[dict[str, float], HumanInput]:
+        """The action that comes next, and what was asked for."""
+        with torch.inference_mode():
+            instant = self._led.step()
+        here = instant.state.joint_position
+        # A blocked arm is not to be wound up.
+        self._joints = here + np.clip(self._joints - here, -_SLACK, _SLACK)
+        self._joints = self._joints + self._velocity * self.robot.dt
+        if instant.asked.gripper is not None:
+            self._width = instant.asked.gripper
+        action = action_of(self.robot.space, self._joints, self._width, self._rotation)
+        if self.robot.space == "ee":
+            self._rotation = np.array(list(action.values())[3:6])
+        return action, instant.asked
+
+
+_SLACK = 0.05
+"""How far the positions may be ahead of the arm [rad]."""
+
+
+class PandaTeleoperator(Teleoperator):
+    """What those who lead one of our Pandas have in common."""
+
+    def __init__(self, config: TeleoperatorConfig, robot_id: str | None):
+        super().__init__(config)
+        self._robot_id, self._connected = robot_id, False
+        self._led: Lead | None = None
+
+    @property
+    def action_features(self) -> dict[str, type]:
+        return dict.fromkeys(action_names(self._space), float)
+
+    @property
+    def _space(self) -> ActionSpace:
+        try:
+            return self._find().space
+        except DeviceNotConnectedError:
+            return "joint"
+
+    @property
+    def feedback_features(self) -> dict[str, type]:
+        return {}
+
+    @property
+    def is_connected(self) -> bool:
+        return self._connected
+
+    @property
+    def is_calibrated(self) -> bool:
+        return True
+
+    def calibrate(self) -> None:
+        """Nothing to do."""
+
+    def configure(self) -> None:
+        """Nothing to do."""
+
+    def send_feedback(self, feedback: dict[str, object]) -> None:
+        """Nothing is felt."""
+
+    def disconnect(self) -> None:
+        self._connected, self._led = False, None
+
+    def _need_connection(self) -> None:
+        if not self._connected:
+            raise DeviceNotConnectedError(f"{self} is not connected: call connect() first.")
+
+    def _lead(self, robot: PandaRobot, human: Callable[[], Human]) -> Lead:
+        """The lead of a robot, anew whenever everything has been put in place."""
+        led = self._led
+        if led is None or led.robot is not robot or led.beginning != robot.beginnings:
+            led = self._led = Lead(robot, human())
+        return led
+
+    def _find(self) -> PandaRobot:
+        """The robot that is led, which is connected after its teleoperator."""
+        return connected_robot(self._robot_id)

@@ -1,0 +1,83 @@
+"""The page in a browser as a LeRobot teleoperator."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from typing import TYPE_CHECKING
+
+from lerobot.utils.errors import DeviceAlreadyConnectedError
+
+from ..robots.mujoco_panda import MujocoPanda
+from ..robots.panda_robot import PandaRobot
+from .config_panda_page import PandaPageConfig
+from .leading import PandaTeleoperator
+
+if TYPE_CHECKING:
+    from ...human.page import Page
+    from ...sim import MovingBodies, World
+
+_NOTE = "LeRobot records: its own keys begin and end episodes"
+
+
+class PandaPage(PandaTeleoperator):
+    """A person leads the hand, the body and the gripper in a browser.
+
+    Shows the arm where the robot reports it, simulated or real. "Home" begins the scenario of a
+    `mujoco_panda` anew; what concerns recording is left to LeRobot.
+
+    Attributes:
+        page: While connected.
+    """
+
+    config_class = PandaPageConfig
+    name = "panda_page"
+    page: Page
+    _bodies: MovingBodies
+    _ghost: World
+    _shown: World
+
+    def __init__(self, config: PandaPageConfig):
+        super().__init__(config, config.robot_id)
+        self.config = config
+        self._open = ExitStack()
+
+    def connect(self, calibrate: bool = True) -> None:
+        from ...human.page import Page, PageConfig, PageStatus
+        from ...kinematics import panda
+        from ...sim import MovingBodies, World
+
+        if self._connected:
+            raise DeviceAlreadyConnectedError(f"{self} is connected already.")
+        self._ghost = self._shown = World()
+        self._bodies = MovingBodies(self._ghost)
+        drawn = self._bodies.drawn(*(poses[None] for poses in self._bodies.poses()))
+        config = PageConfig(host=self.config.host, port=self.config.port)
+        page = Page(panda, drawn, self._ghost.config.boxes(), config)
+        self.page = self._open.enter_context(page)
+        self.page.show(PageStatus(title="LeRobot", note=_NOTE))
+        self._connected = True
+
+    def disconnect(self) -> None:
+        super().disconnect()
+        self._open.close()
+
+    def get_action(self) -> dict[str, float]:
+        self._need_connection()
+        robot = self._find()
+        action, asked = self._lead(robot, lambda: self.page.human).next()
+        self._show(robot)
+        if "home" in asked.requests and isinstance(robot, MujocoPanda):
+            robot.begin(robot.run.seed + 1)
+        return action
+
+    def _show(self, robot: PandaRobot) -> None:
+        """Show where the arm is, and in simulation everything else as well."""
+        from ...sim import MovingBodies
+
+        world = robot.run.world if isinstance(robot, MujocoPanda) else self._ghost
+        if world is self._ghost:
+            state = robot.read_state()
+            self._ghost.reset(state.joint_position, gripper_width=state.gripper_width)
+        if world is not self._shown:
+            self._shown, self._bodies = world, MovingBodies(world)
+        self.page.place(*self._bodies.poses())
