@@ -33,6 +33,11 @@ class AimingConfig:
     have been moved: without it the object, which lies deeper, would be missed. 0: none."""
     probe_tolerance: float = 10.0
     """Distance of the feature from the target at which the hand comes down [px]."""
+    probe_reach: float = 0.015
+    """Height looks different elsewhere: a hand that moves further sideways than this once it
+    came down goes up again, and comes down where it then is [m]."""
+    most_probes: int = 3
+    """How often the hand comes down at most."""
     border: float = 50.0
     """Distance that the target keeps from the edge of the image [px]."""
     half_size: tuple[float, float, float] = (0.12, 0.12, 0.003)
@@ -139,9 +144,15 @@ class Aimer:
         """
         begin, config = self._station.time, self._config
         self._resume()
-        if config.probe > 0:
-            self._reach(aim.raised(config.probe), config.probe_tolerance, begin)
-        return self._reach(aim, config.tolerance, begin) - begin
+        reached = begin
+        for _ in range(config.most_probes if config.probe > 0 else 1):
+            if config.probe > 0:
+                self._reach(aim.raised(config.probe), config.probe_tolerance, begin)
+            above = self._station.pose.position[:2]
+            reached = self._reach(aim, config.tolerance, begin)
+            if (self._station.pose.position[:2] - above).norm() < config.probe_reach:
+                break
+        return reached - begin
 
     def _resume(self) -> None:
         """Tell the estimate how long nobody has watched: the camera may have been moved."""

@@ -175,18 +175,16 @@ class Grasping:
         )
 
     def _posture(self) -> Float[Tensor, " joints"]:
-        """Joint positions above the table to which, and home from which, the way is free."""
-        blocked: TaskFailedError | None = None
-        for posture in self._workplace.hover_postures():
-            try:
-                self._line(self._station.joints, posture)
-                self._line(posture, self._workplace.home_joints())
-            except BlockedPathError as error:
-                blocked = blocked or error
-            else:
+        """Joint positions above the table to which, and home from which, the way is free.
+
+        Where there are none, the arm goes home first.
+        """
+        postures, home = self._workplace.hover_postures(), self._workplace.home_joints()
+        for posture in postures:
+            if self._free(self._station.joints, posture) and self._free(posture, home):
                 return posture
-        assert blocked is not None
-        raise blocked
+        self.go_home()
+        return postures[0]
 
     def aim(self, aim: Aim) -> float:
         """Bring the hand above the object; the time it took [s].
@@ -225,22 +223,34 @@ class Grasping:
         self._station.move_straight(Pose(pose.position + up, pose.orientation))
 
     def go_home(self) -> None:
-        """Move the joints home.
+        """Move the joints home, by way of another posture where the straight way is not free.
 
         Raises:
-            BlockedPathError: If the way is not free.
+            BlockedPathError: If no way is free.
         """
         self._station.enter("home")
-        plan = self._line(self._station.joints, self._workplace.home_joints())
+        here, home = self._station.joints, self._workplace.home_joints()
+        if not self._free(here, home):
+            for via in self._workplace.hover_postures():
+                if self._free(here, via) and self._free(via, home):
+                    self._station.play(self._line(here, via).path)
+                    break
+        plan = self._line(self._station.joints, home)
+        self._check(plan)
         self._station.play(plan.path)
 
+    def _free(self, start: Float[Tensor, " joints"], goal: Float[Tensor, " joints"]) -> bool:
+        try:
+            self._check(self._line(start, goal))
+        except BlockedPathError:
+            return False
+        return True
+
     def _line(self, start: Float[Tensor, " joints"], goal: Float[Tensor, " joints"]) -> Plan:
-        """A straight line in joint space, checked."""
+        """A straight line in joint space."""
         dt = self._station.config.dt
         path = joint_line(start, goal, speed=0.6, dt=dt)
-        plan = Plan(goal=self._station.chain.forward(goal), dt=dt, path=path.numpy())
-        self._check(plan)
-        return plan
+        return Plan(goal=self._station.chain.forward(goal), dt=dt, path=path.numpy())
 
     def start_over(self) -> None:
         """Open the fingers and go home, clear of the table and of the camera's view."""

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from jaxtyping import Float
+from torch import Tensor
 
 from ..geometry import quaternion
 from ..kinematics import panda
@@ -75,7 +76,7 @@ class GraspingSetting:
         """Draw a setting.
 
         The arm starts anywhere within its joint limits where it touches nothing, does not hide
-        the object from the camera, and has a straight way in joint space to above the table.
+        the object from the camera, and is not shut in: straight lines in joint space lead home.
 
         Args:
             workplace: With the camera as it stood in the demonstrations.
@@ -93,7 +94,7 @@ class GraspingSetting:
         eye = Eye.on(open_camera(world, camera, rng=rng), workplace.scene)
         for start in _starts(workplace, config, rng):
             world.reset(start, {item.name: pose})
-            if item.marker.id in eye.look() and _has_a_way_in(world, workplace, start):
+            if item.marker.id in eye.look() and _has_a_way(world, workplace, start):
                 return cls(workplace=workplace, start=start, object_pose=pose)
         raise AssertionError("starts never end")
 
@@ -136,10 +137,12 @@ def _starts(
             yield q
 
 
-def _has_a_way_in(world: World, workplace: Workplace, start: Float[np.ndarray, "7"]) -> bool:
-    joints = torch.from_numpy(start)
-    paths = (
-        joint_line(joints, posture, speed=0.6, dt=_PATH_STEP)
-        for posture in workplace.hover_postures()
-    )
-    return any(not world.collisions_along(path.numpy()) for path in paths)
+def _has_a_way(world: World, workplace: Workplace, start: Float[np.ndarray, "7"]) -> bool:
+    """Whether straight lines in joint space lead home, at once or by way of the table."""
+
+    def free(a: Float[Tensor, "7"], b: Float[Tensor, "7"]) -> bool:
+        return not world.collisions_along(joint_line(a, b, 0.6, _PATH_STEP).numpy())
+
+    here, home = torch.from_numpy(start), workplace.home_joints()
+    postures = workplace.hover_postures()
+    return free(here, home) or any(free(here, q) and free(q, home) for q in postures)
