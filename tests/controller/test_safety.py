@@ -86,6 +86,7 @@ def assert_limits_kept(q: Tensor, before: SafetyState, state: SafetyState, dt: f
     torch.testing.assert_close(state.acceleration, a, rtol=0, atol=1e-9)
 
 
+@shapes_unchecked()  # for speed
 def test_without_a_jerk_limit_the_others_hold():
     safety = SafetyFilter(LIMITS, SafetyConfig(jerk_limited=False))
     q = inside(40, seed=2)
@@ -105,6 +106,7 @@ def test_without_a_jerk_limit_the_others_hold():
 
 
 @pytest.mark.parametrize("dt", [0.0005, 0.001, 0.002])
+@shapes_unchecked()  # for speed
 def test_a_stop_and_a_resume_are_smooth(dt: float):
     """Jerk limited, without overshoot, along a straight line in joint space, and the whole
     ramp hardly later than acceleration alone would have it."""
@@ -175,6 +177,7 @@ def test_speed_and_acceleration_keep_the_direction():
     torch.testing.assert_close(v, u * LIMITS.velocity[4] / 8.0)
 
 
+@shapes_unchecked()  # for speed
 def test_the_tool_is_capped_where_a_jacobian_is_given():
     safety = SafetyFilter(LIMITS, SafetyConfig(tcp_speed=0.2))
     u = torch.tensor([1.5, 0.5, 0, 0, 0, 0, 0], dtype=torch.float64)

@@ -3,6 +3,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from unchecked import shapes_unchecked
 
 from hrc_learn.controller import GRIPPER_DOWN, comfortable_posture
 from hrc_learn.controller.clearance import clearance
@@ -19,6 +20,7 @@ QUICK = TrialConfig(
 )
 
 
+@shapes_unchecked()  # for speed
 def test_adaptation_succeeds_where_the_fixed_jacobian_cannot():
     adaptive = run_trials(KalmanEstimator, QUICK)
     fixed = run_trials(FixedEstimator, replace(QUICK, duration=4.0))
@@ -119,6 +121,7 @@ def test_a_pose_out_of_reach_is_refused():
         comfortable_posture(panda, far)
 
 
+@shapes_unchecked()  # for speed
 def test_a_pull_moves_the_elbow_far_and_the_tool_hardly():
     config = EffortConfig(count=6, force=12.0, dt=0.01, away=1.5, back=0.5)
     summary = run_effort_trials(config).summary()
