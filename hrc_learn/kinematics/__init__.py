@@ -1,7 +1,7 @@
 """Serial arms: forward kinematics, Jacobians and their inverses; the Panda."""
 
 from .arm_angle import arm_angle as arm_angle
-from .arm_angle import arm_angle_motion as arm_angle_motion
+from .arm_angle import arm_angle_and_motion as arm_angle_and_motion
 from .capsules import Capsule as Capsule
 from .capsules import CapsuleArm as CapsuleArm
 from .chain import SerialChain as SerialChain

@@ -26,7 +26,7 @@ def arm_angle(chain: SerialChain, q: Float[Tensor, "*batch 7"]) -> Float[Tensor,
         chain: A seven-joint arm with shoulder, elbow and wrist at joints 2, 4 and 6.
         q: Joint positions [rad].
     """
-    points = chain.link_poses(q).position
+    points = chain.joint_origins(q)
     axis = points[..., _WRIST, :] - points[..., _SHOULDER, :]
     axis = torch.nn.functional.normalize(axis, dim=-1)
     upper_arm = points[..., _ELBOW, :] - points[..., _SHOULDER, :]
@@ -37,12 +37,12 @@ def arm_angle(chain: SerialChain, q: Float[Tensor, "*batch 7"]) -> Float[Tensor,
     return torch.atan2((upper_arm * side).sum(-1), (upper_arm * above).sum(-1))
 
 
-def arm_angle_motion(
+def arm_angle_and_motion(
     chain: SerialChain,
     q: Float[Tensor, "*batch 7"],
     jacobian: Float[Tensor, "*batch 6 7"],
-) -> Float[Tensor, "*batch 7"]:
-    """Joint motion that turns the arm angle by one radian a second and leaves the hand alone.
+) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 7"]]:
+    """`arm_angle`, and the joint motion that turns it at 1 rad/s and leaves the hand alone.
 
     Args:
         chain: The arm.
@@ -50,7 +50,7 @@ def arm_angle_motion(
         jacobian: Of the hand, at q.
 
     Returns:
-        Joint velocities [rad/s] for an arm angle rate of 1 rad/s; bounded near configurations
+        The angle [rad], and joint velocities [rad/s]; these are bounded near configurations
         in which the null space does not move the elbow.
     """
     N = null_space_projector(jacobian)
@@ -58,7 +58,8 @@ def arm_angle_motion(
     longest = N.norm(dim=-2).argmax(dim=-1)
     column = N.gather(-1, longest[..., None, None].expand(*N.shape[:-1], 1)).squeeze(-1)
     direction = torch.nn.functional.normalize(column, dim=-1)
-    turned = arm_angle(chain, torch.stack([q + _STEP * direction, q - _STEP * direction]))
-    difference = torch.remainder(turned[0] - turned[1] + torch.pi, 2 * torch.pi) - torch.pi
+    step = _STEP * direction
+    angle, after, before = arm_angle(chain, torch.stack([q, q + step, q - step]))
+    difference = torch.remainder(after - before + torch.pi, 2 * torch.pi) - torch.pi
     rate = (difference / (2 * _STEP)).unsqueeze(-1)
-    return direction * rate / (rate * rate + 1e-2)
+    return angle, direction * rate / (rate * rate + 1e-2)

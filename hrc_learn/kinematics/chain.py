@@ -94,6 +94,16 @@ class SerialChain:
         tips = [frames[-1] @ self._flange.like(q), frames[-1] @ self._tip.like(q)]
         return Pose.from_matrix(torch.stack([*frames, *tips], dim=-3))
 
+    def joint_origins(
+        self, q: Float[Tensor, "*batch joints"]
+    ) -> Float[Tensor, "*batch joints 3"]:
+        """Origins of the joint frames in the base frame [m]: `link_poses` without the turns.
+
+        Args:
+            q: Joint positions [rad].
+        """
+        return torch.stack([frame[..., 3] for frame in self._joint_frames(q)], dim=-2)
+
     def jacobian(self, q: Float[Tensor, "*batch joints"]) -> Float[Tensor, "*batch 6 joints"]:
         """Geometric Jacobian of the tool centre point.
 

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ..dmp import JointDMP, PoseDMP
 from ..geometry import Pose
-from ..kinematics import SerialChain, arm_angle, arm_angle_motion, panda
+from ..kinematics import SerialChain, arm_angle, arm_angle_and_motion, panda
 from ..regions import JointRegion
 from ..sim import World
 from .failure import BlockedPathError
@@ -161,10 +161,9 @@ def follow_pose(
     for k in range(len(angle) - 1):
         pose, J = chain.forward_and_jacobian(q)
         wanted = twist[k] + gain * pose.twist_to(hand[k])
-        error = (
-            torch.remainder(angle[k] - arm_angle(chain, q) + torch.pi, 2 * torch.pi) - torch.pi
-        )
-        shape = arm_angle_motion(chain, q, J) * (rate[k] + angle_gain * error)
+        shown, motion = arm_angle_and_motion(chain, q, J)
+        error = torch.remainder(angle[k] - shown + torch.pi, 2 * torch.pi) - torch.pi
+        shape = motion * (rate[k] + angle_gain * error)
         q = q + dt * resolved_rate(J, wanted, shape - limits.gradient(q))
         path.append(q)
     return torch.stack(path)

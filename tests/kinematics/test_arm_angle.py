@@ -5,7 +5,7 @@ from sampling import generator
 from torch.testing import assert_close
 
 from hrc_learn.geometry import quaternion
-from hrc_learn.kinematics import arm_angle, arm_angle_motion, panda
+from hrc_learn.kinematics import arm_angle, arm_angle_and_motion, panda
 
 
 def regular_configurations(*batch, seed):
@@ -44,7 +44,8 @@ def test_motion_turns_the_arm_and_leaves_the_hand_alone():
     J = panda.jacobian(q)
     J_regular = torch.linalg.svdvals(J)[:, -1] > 0.05
     q, J = q[J_regular], J[J_regular]
-    motion = arm_angle_motion(panda, q, J)
+    angle, motion = arm_angle_and_motion(panda, q, J)
+    assert_close(angle, arm_angle(panda, q))
     assert float((J @ motion[..., None]).abs().max()) < 1e-9
     step = 1e-5
     after, before = arm_angle(panda, q + step * motion), arm_angle(panda, q - step * motion)
