@@ -82,6 +82,10 @@ def _regions(run: RunRecording) -> Tab:
         )
         for name, values in run.potentials.items()
     )
+    if run.potential_rate is not None:
+        rate = single("regions/rate", "dV/dt", run.potential_rate, palette.PURPLE)
+        title = "Rate of the potential, dV/dt, if the image Jacobian is as estimated [1/s]"
+        plots += (Plot(title=title, curves=(rate,)),)
     return Tab(title="Regions", plots=plots)
 
 
@@ -164,17 +168,20 @@ def joint_plot(
     """Position of joint i over its demonstration and between its limits."""
     curves = []
     if limits is not None:
-        bounds = np.broadcast_to([limits.lower[i], limits.upper[i]], (len(position), 2))
-        names, red = ("lower limit", "upper limit"), palette.rgba(palette.LIMIT)
-        curves.append(
-            Curves(path=f"{root}/{name}/limits", names=names, values=bounds, colours=(red, red))
-        )
+        curves.append(limit_curves(f"{root}/{name}/limits", limits, i, len(position)))
     if demo is not None:
         path = f"{root}/{name}/demonstration"
         curves.append(single(path, "demonstration", demo[:, i], palette.DEMO, width=5.0))
     path = f"{root}/{name}/position"
     curves.append(single(path, "position", position[:, i], palette.RUN_ON_DARK))
     return Plot(title=f"{name} [{unit}]", curves=tuple(curves))
+
+
+def limit_curves(path: str, limits: JointLimits, i: int, steps: int) -> Curves:
+    """Both limits of joint i."""
+    bounds = np.broadcast_to([limits.lower[i], limits.upper[i]], (steps, 2))
+    names, red = ("lower limit", "upper limit"), palette.rgba(palette.LIMIT)
+    return Curves(path=path, names=names, values=bounds, colours=(red, red))
 
 
 def _safety(run: RunRecording) -> Tab:

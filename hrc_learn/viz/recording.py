@@ -136,6 +136,9 @@ class RunRecording:
     potentials: Mapping[str, Float[np.ndarray, " time"]] = field(default_factory=dict)
     """Potential of each region, or a Lyapunov function, by name."""
 
+    potential_rate: Float[np.ndarray, " time"] | None = None
+    """Rate of the sum of the potentials that the estimated image Jacobian predicts [1/s]."""
+
     human_effort: Float[np.ndarray, "time joints"] | None = None
     """Null-space effort d of the person, on each joint."""
     elbow_motion: Float[np.ndarray, " time"] | None = None
@@ -185,6 +188,7 @@ _SERIES = (
     "image_jacobian",
     "true_image_jacobian",
     "weight_norm",
+    "potential_rate",
     "human_effort",
     "elbow_motion",
     "position_deviation",
