@@ -4,6 +4,8 @@ from collections.abc import Sequence
 
 ROTATION = ("wx", "wy", "wz")
 """Last part of the names of a rotation vector's components, as LeRobot has them."""
+ENDINGS = ("", ".pos")
+"""What may follow it: lerobot-rollout hands on no names but those with an ending."""
 
 
 def rotation_triples(names: Sequence[str] | None) -> list[list[int]]:
@@ -13,9 +15,14 @@ def rotation_triples(names: Sequence[str] | None) -> list[list[int]]:
         names: Of all components; None: unknown, so that there is none.
     """
     index = {name: i for i, name in enumerate(names or ())}
-    stems = [name.removesuffix(ROTATION[0]) for name in index if name.endswith(ROTATION[0])]
-    triples = [[stem + part for part in ROTATION] for stem in stems]
-    return [[index[name] for name in triple] for triple in triples if index.keys() >= {*triple}]
+    triples = []
+    for name in index:
+        for ending in ENDINGS:
+            stem = name.removesuffix(ROTATION[0] + ending)
+            triple = [stem + part + ending for part in ROTATION]
+            if stem != name and index.keys() >= {*triple}:
+                triples.append([index[part] for part in triple])
+    return triples
 
 
 def matched_columns(

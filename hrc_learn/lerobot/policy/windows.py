@@ -18,7 +18,7 @@ class Windows:
         self,
         episodes: Sequence[Mapping[str, Tensor]],
         deltas: Mapping[str, Sequence[int] | None],
-        fps: float,
+        fps: float | int,
     ):
         """Lay the episodes out.
 
