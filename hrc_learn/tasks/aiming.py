@@ -206,7 +206,9 @@ class Aimer:
                 dt=self._station.config.dt,
             ),
         )
-        self._station.obey(command, goals.vision.target.numpy(), feature.numpy())
+        approach = 0.0 if aim.posture is None else 1.0 - float(self.state.arrival)
+        target = goals.vision.target.numpy()
+        self._station.obey(command, target, feature.numpy(), approach)
 
     def _image_jacobian(self) -> Float[np.ndarray, "2 6"]:
         """Estimate where the hand was in the newest image [px/m, px/rad]."""

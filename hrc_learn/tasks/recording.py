@@ -72,6 +72,7 @@ def record(
         true_image_jacobian=true_image_jacobian(log, world),
         weight_norm=log["weight_norm"],
         potentials={"task space": log["potential"]},
+        potential_rate=log["potential_rate"],
         human_effort=log["human_effort"],
         elbow_motion=deviation.elbow,
         position_deviation=deviation.position,

@@ -154,7 +154,11 @@ class Station:
         self._send(safe, safety=report.flags.numpy(), **_NOTHING_SEEN)
 
     def obey(
-        self, command: Command, target: Float[np.ndarray, "2"], feature: np.ndarray
+        self,
+        command: Command,
+        target: Float[np.ndarray, "2"],
+        feature: np.ndarray,
+        approach: float = 0.0,
     ) -> None:
         """Carry out one step of the adaptive controller, which has its own safety filter.
 
@@ -162,6 +166,7 @@ class Station:
             command: Of the controller.
             target: Where the feature should be [px].
             feature: Where it is; NaN if it is not seen [px].
+            approach: Share of a joint-space approach in the command.
         """
         self._guard = self._safety.initial_state(self.joints, command.joint_velocity)
         self._send(
@@ -172,7 +177,9 @@ class Station:
             image_jacobian=command.image_jacobian.numpy(),
             weight_norm=float(command.weight_norm),
             potential=float(command.potential),
+            potential_rate=float(command.potential_rate),
             vision_activation=float(command.vision_activation),
+            approach=approach,
         )
 
     def follow(self, goal: Pose, twist: Float[Tensor, "6"]) -> None:
@@ -246,7 +253,9 @@ _NOTHING_SEEN = {
     "image_jacobian": np.full((2, 6), _NAN),
     "weight_norm": _NAN,
     "potential": _NAN,
+    "potential_rate": _NAN,
     "vision_activation": _NAN,
+    "approach": _NAN,
 }
 
 SAFETY_COLUMNS = INTERVENTIONS
