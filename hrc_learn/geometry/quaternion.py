@@ -119,10 +119,23 @@ def from_matrix(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
     """
     entries = R.flatten(-2)[..., _OUTER_INDEX.like(R)] * _OUTER_SIGN.like(R)
     outer = entries.sum(-2).unflatten(-1, (4, 4)) + _OUTER_OFFSET.like(R)
+    return normalize(_row_of_largest_diagonal(outer))
+
+
+def _row_of_largest_diagonal(outer: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4"]:
+    if torch.compiler.is_compiling():
+        # A look-up by index becomes C++ of inductor of torch 2.11 that fails for a batch.
+        row, *others = outer.unbind(-2)
+        largest = row[..., 0]
+        for k, other in enumerate(others, start=1):
+            larger = other[..., k] > largest
+            row = torch.where(larger[..., None], other, row)
+            largest = torch.where(larger, other[..., k], largest)
+        return row
     largest = outer.diagonal(dim1=-2, dim2=-1).argmax(-1)
     # Not take_along_dim: exporting it fixes the batch size.
     row = outer.gather(-2, largest[..., None, None].expand(*outer.shape[:-2], 1, 4))
-    return normalize(row.squeeze(-2))
+    return row.squeeze(-2)
 
 
 def angle(

@@ -96,6 +96,15 @@ def test_from_matrix_inverts_to_matrix(turn):
     same_rotation(quaternion.from_matrix(quaternion.to_matrix(q)), q, atol=1e-15)
 
 
+def test_from_matrix_is_the_same_where_it_is_compiled(monkeypatch):
+    """Also where several components are largest, as in a third of a turn about (1, 1, 1)."""
+    ties = 0.5 * torch.tensor([[1, 1, 1, 1], [2**0.5, 2**0.5, 0, 0]], dtype=torch.float64)
+    R = quaternion.to_matrix(torch.cat([quaternions(200, rng=generator(12)), ties]))
+    eager = quaternion.from_matrix(R)
+    monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)
+    assert torch.equal(quaternion.from_matrix(R), eager)
+
+
 def test_slerp_turns_at_constant_rate_the_short_way():
     rng = generator(6)
     p, q = quaternions(30, rng=rng), quaternions(30, rng=rng)
