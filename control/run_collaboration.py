@@ -1,12 +1,16 @@
-"""Grasp an object beside a person, carry it to the cabinet and put it on a shelf.
+"""Grasp objects beside a person, carry them to the cabinet and put them on shelves.
 
 In simulation: the learned skills run on MuJoCo's arm, an uncalibrated camera watches, and a
-scripted person pulls the elbow aside while the arm aims. Writes a Rerun recording, a report
-and the measured values. Exit status 1 if the job failed or a target was missed.
+scripted person pulls the elbow aside while the arm aims. The camera may be moved between two
+objects, the marker may be hidden, images may be late or lost. Writes a Rerun recording, a
+report and the measured values. Exit status 1 if the job failed or a target was missed.
+
+The paper's third experiment: --shelves lower middle upper --occlusion 0 4.
 """
 
 import json
 import shlex
+import shutil
 import sys
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -17,19 +21,30 @@ from hrc_learn import cli
 from hrc_learn.demos import Demonstration, load_demos
 from hrc_learn.human.page import PageConfig
 from hrc_learn.output import MADE_BY, new_folder
-from hrc_learn.sim import CameraKind
+from hrc_learn.sim import CameraChange, CameraKind, Occlusion
 from hrc_learn.tasks.collaboration import CollaborationConfig
 from hrc_learn.tasks.collaboration_report import collaboration_report
+from hrc_learn.tasks.collaboration_trials import CollaborationTrials, workplace_for
 from hrc_learn.tasks.evaluation import evaluate
 from hrc_learn.tasks.fit_aiming import AimingSkill
 from hrc_learn.tasks.gains import with_gains
 from hrc_learn.tasks.placing import PlacingSkill
 from hrc_learn.tasks.recording import record
-from hrc_learn.tasks.simulated_job import PULLS, simulate_collaboration
+from hrc_learn.tasks.repetition import repeat
+from hrc_learn.tasks.repetition_summary import Summary
+from hrc_learn.tasks.sight import TransportConfig
+from hrc_learn.tasks.simulated_job import (
+    PULLS,
+    Disturbances,
+    SimulatedJob,
+    simulate_collaboration,
+)
+from hrc_learn.tasks.station import StationConfig
+from hrc_learn.tasks.trial_file import Trial
 from hrc_learn.tasks.watching import ServeConfig, serving, unwatched
 from hrc_learn.tasks.workplace import Workplace
 from hrc_learn.viz import Box
-from hrc_learn.viz.report import show_measurements, write_report
+from hrc_learn.viz.report import Measurement, show_measurements, write_report
 from hrc_learn.viz.run_dashboard import record_run
 
 
@@ -45,10 +60,22 @@ class Args:
     """Folder for recording, report and measured values."""
     shelf: str = "middle"
     """Where to put the object: lower, middle or upper."""
+    shelves: tuple[str, ...] = ()
+    """Where to put each of two or three objects, in place of --shelf."""
     shelf_x: float = 0.40
     """Where along the board [m], in the robot's base frame."""
     shelf_depth: float = 0.10
     """How far behind the board's front edge [m]."""
+    occlusion: tuple[tuple[float, float], ...] = ()
+    """Spells in which a board hides the hand's marker: start and duration [s]."""
+    camera_moved: bool = False
+    """Move and turn the camera between two objects."""
+    camera_change: CameraChange = field(default_factory=CameraChange)
+    """How far, with --camera-moved."""
+    latency: float = 0.0
+    """From an image being taken until its markers are known [s]."""
+    drop: float = 0.0
+    """Share of the images that are lost."""
     camera: CameraKind = "auto"
     """Camera: rendered by "egl", or "synthetic", which needs no OpenGL; "auto" renders where
     it can."""
@@ -68,7 +95,11 @@ class Args:
     gains: Path | None = None
     """gains.json of training/tune_controller.py, in place of those of the controller."""
     seed: int = 0
-    """Seed of where the object lies and of image noise."""
+    """Seed of where the objects lie and of image noise."""
+    seeds: int = 0
+    """Do the job so many times more, with this seed and those after it, and sum up."""
+    processes: int = 1
+    """Of the repetitions, at once."""
     overwrite: bool = False
     """Replace an older run in that folder."""
     json: Path | None = None
@@ -77,60 +108,139 @@ class Args:
 
 def main(args: Args) -> int:
     console = Console()
-    aiming, placing = AimingSkill.load(args.aiming), PlacingSkill.load(args.placing)
+    trials = _trials(args)
     fit = json.loads((args.placing / "metrics.json").read_text())
-    demonstration = _demonstration(args.placing)
-    controller = with_gains(args.config.grasping.controller, args.gains)
-    grasping = replace(args.config.grasping, controller=controller)
-    title = f"Collaboration, {args.shelf} shelf"
-
-    def opened(address: str) -> None:
-        console.print(f"Dashboard at [bold]{address}[/]")
-
     with new_folder(args.out, asdict(args), args.overwrite) as folder:
-        console.print(f"Placing on the {args.shelf} shelf:")
-        job = simulate_collaboration(
-            aiming,
-            placing,
-            args.shelf,
-            workplace=Workplace(shelf_x=args.shelf_x, shelf_depth=args.shelf_depth),
-            camera=args.camera,
-            pulls=PULLS if args.person else (),
-            config=replace(args.config, grasping=grasping),
-            seed=args.seed,
-            page=PageConfig(port=args.port) if args.page else None,
-            watch=serving(title, args.serving, opened) if args.serve else unwatched,
-            on_phase=lambda phase, time: console.print(f"  {time:6.2f} s  {phase}"),
-            on_page=lambda address: console.print(f"Page at [bold]{address}[/]"),
-        )
-        table = [] if job.result is None else evaluate(job, fit)
+        console.print(f"Placing on the {_shelves(args)}:")
+        job = _run(args, trials, console)
+        delivered = any(errand.release is not None for errand in job.errands)
+        table = evaluate(job, fit) if delivered else []
+        repeated = _repeat(args, trials)
         with console.status("Writing recording and report"):
-            run = record(
-                title,
-                job.station,
-                job.world,
-                job.motion,
-                plan=None if job.result is None else job.result.plan,
-                region=_region(job.workplace, args.config.grasping.aiming.half_size),
-                demonstration=demonstration,
-            )
-            record_run(folder / "run.rrd", run)
-            if table:
-                command = shlex.join(["python", *sys.argv])
-                write_report(folder, collaboration_report(run, table, asdict(args), command))
-        job.station.log.save(folder / "log.npz")
-        values = {m.key: m.value for m in table}
+            _write(args, folder, job, table, repeated)
+        values = _values(table, repeated)
         cli.write_json(folder / "measured.json", values)
+    _trial_file(args).unlink(missing_ok=True)
     if args.json is not None:
         cli.write_json(args.json, values)
+    show_measurements(table)
+    if repeated:
+        console.print(Summary.of(repeated).table("Collaboration"))
     if job.failure:
         print(f"failed: {job.failure}", file=sys.stderr)
-    else:
-        show_measurements(table)
     console.print(f"Recording  rerun {args.out / 'run.rrd'}")
     if table:
         console.print(f"Report     {args.out / 'report.html'}")
     return 1 if job.failure or any(m.ok is False for m in table) else 0
+
+
+def _trials(args: Args) -> CollaborationTrials:
+    """The job as it is to be done, once or many times."""
+    controller = with_gains(args.config.grasping.controller, args.gains)
+    grasping = replace(args.config.grasping, controller=controller)
+    transport = TransportConfig(latency=args.latency, dropped=args.drop)
+    return CollaborationTrials(
+        aiming=args.aiming.resolve(),
+        placing=args.placing.resolve(),
+        shelves=args.shelves or (args.shelf,),
+        shelf_x=args.shelf_x,
+        shelf_depth=args.shelf_depth,
+        person=args.person,
+        disturbances=Disturbances(
+            occlusions=tuple(Occlusion(start=s, duration=d) for s, d in args.occlusion),
+            camera_change=args.camera_change if args.camera_moved else None,
+        ),
+        station=StationConfig(keep_every=0, transport=transport),
+        config=replace(args.config, grasping=grasping),
+    )
+
+
+def _run(args: Args, trials: CollaborationTrials, console: Console) -> SimulatedJob:
+    """Once, watched and recorded."""
+
+    def opened(address: str) -> None:
+        console.print(f"Dashboard at [bold]{address}[/]")
+
+    return simulate_collaboration(
+        AimingSkill.load(args.aiming),
+        PlacingSkill.load(args.placing),
+        trials.shelves,
+        workplace=workplace_for(trials.shelves, args.shelf_x, args.shelf_depth),
+        camera=args.camera,
+        pulls=PULLS if args.person else (),
+        disturbances=trials.disturbances,
+        config=trials.config,
+        station_config=replace(trials.station, keep_every=StationConfig().keep_every),
+        seed=args.seed,
+        page=PageConfig(port=args.port) if args.page else None,
+        watch=serving(_title(args), args.serving, opened) if args.serve else unwatched,
+        on_phase=lambda phase, time: console.print(f"  {time:6.2f} s  {phase}"),
+        on_page=lambda address: console.print(f"Page at [bold]{address}[/]"),
+    )
+
+
+def _repeat(args: Args, trials: CollaborationTrials) -> list[Trial]:
+    if args.seeds < 0:
+        raise ValueError(f"--seeds must not be negative, but is {args.seeds}.")
+    if not args.seeds:
+        return []
+    return repeat(
+        trials,
+        range(args.seed, args.seed + args.seeds),
+        _trial_file(args),
+        made_by=asdict(trials),
+        processes=args.processes,
+        title="Collaborations",
+    )
+
+
+def _trial_file(args: Args) -> Path:
+    """Beside the folder, which is there only when all is done: a stopped run goes on."""
+    return args.out.with_name(f"{args.out.name}.trials.jsonl")
+
+
+def _write(
+    args: Args,
+    folder: Path,
+    job: SimulatedJob,
+    table: list[Measurement],
+    repeated: list[Trial],
+) -> None:
+    run = record(
+        _title(args),
+        job.station,
+        job.world,
+        job.motion,
+        plans=[errand.plan for errand in job.errands if errand.plan is not None],
+        cameras=job.cameras,
+        region=_region(job.workplace, args.config.grasping.aiming.half_size),
+        demonstration=_demonstration(args.placing),
+    )
+    record_run(folder / "run.rrd", run)
+    if table:
+        command = shlex.join(["python", *sys.argv])
+        report = collaboration_report(run, job, table, asdict(args), command, repeated)
+        write_report(folder, report)
+    job.station.log.save(folder / "log.npz")
+    if (trials := _trial_file(args)).exists():
+        shutil.copy(trials, folder / "trials.jsonl")
+
+
+def _values(table: list[Measurement], repeated: list[Trial]) -> dict[str, float | int]:
+    values: dict[str, float | int] = {m.key: m.value for m in table}
+    if repeated:
+        figures = Summary.of(repeated).figures()
+        values |= {f"repeated_{name}": value for name, value in figures.items()}
+    return values
+
+
+def _shelves(args: Args) -> str:
+    names = args.shelves or (args.shelf,)
+    return f"{names[0]} shelf" if len(names) == 1 else f"shelves {', '.join(names)}"
+
+
+def _title(args: Args) -> str:
+    return f"Collaboration, {_shelves(args)}"
 
 
 def _region(workplace: Workplace, half_size: tuple[float, float, float]) -> Box:

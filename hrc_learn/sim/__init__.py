@@ -9,6 +9,7 @@ from .covering import Occlusion as Occlusion
 from .markers import Plate as Plate
 from .motion_log import MotionLog as MotionLog
 from .moving_bodies import MovingBodies as MovingBodies
+from .panda_model import FINGER_STROKE as FINGER_STROKE
 from .panda_model import PandaModelConfig as PandaModelConfig
 from .rendering import CameraKind as CameraKind
 from .rendering import EGLCamera as EGLCamera

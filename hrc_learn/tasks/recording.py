@@ -1,6 +1,7 @@
 """From what a station logged, and what the simulator knows, to a recording to look at."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +13,7 @@ from ..demos import Demonstration
 from ..geometry import Pose, quaternion
 from ..kinematics import panda
 from ..sim import MotionLog, World
+from ..vision import CameraModel
 from ..viz import LoggedSteps
 from .collaboration import INTERACT, TRANSFER
 from .placing import Plan
@@ -27,7 +29,8 @@ def record(
     world: World,
     motion: MotionLog,
     *,
-    plan: Plan | None = None,
+    plans: Sequence[Plan] = (),
+    cameras: Sequence[tuple[float, CameraModel]] = (),
     region: viz.Box | None = None,
     demonstration: Demonstration | None = None,
 ) -> viz.RunRecording:
@@ -38,7 +41,8 @@ def record(
         station: That ran it.
         world: That it ran in; tells what only a simulator knows.
         motion: Where everything was.
-        plan: The way to the shelf, if it came to that.
+        plans: The ways to the shelves, in turn, as far as it came to that.
+        cameras: The true cameras, and from when on each watched [s]; the world's when none.
         region: Box above the table in which the camera takes over.
         demonstration: One that the way was learned from.
     """
@@ -47,6 +51,7 @@ def record(
     time, safety = log["time"], log["safety"]
     images = tuple(station.images)
     deviation = Deviation.of(log)
+    cameras = cameras or ((-math.inf, world.config.camera),)
     limits = panda.limits
     return viz.RunRecording(
         title=title,
@@ -54,22 +59,22 @@ def record(
         joint_names=panda.joint_names,
         joint_position=log["joint_position"],
         joint_limits=viz.JointLimits(lower=limits.lower.numpy(), upper=limits.upper.numpy()),
-        demo_joint_position=_matching_demonstration(log, plan, demonstration),
+        demo_joint_position=_matching_demonstration(log, plans, demonstration),
         position=link_poses(log).position[:, TOOL].numpy(),
         demo_path=None if demonstration is None else demonstration.position,
-        plan_path=None if plan is None else plan.hand.position.numpy(),
+        plan_path=_there_and_back(plans),
         bodies=motion.bodies(len(log)),
         boxes=tuple(world.config.boxes()),
         region=region,
         camera=viz.CameraRecording(
-            model=world.config.camera,
+            model=cameras[-1][1],
             feature=log["feature"],
             target=log["target"],
             image_time=np.array([kept.time for kept in images]),
             images=tuple(kept.image for kept in images),
         ),
         image_jacobian=log["image_jacobian"],
-        true_image_jacobian=true_image_jacobian(log, world),
+        true_image_jacobian=true_image_jacobian(log, world, cameras),
         weight_norm=log["weight_norm"],
         potentials={"task space": log["potential"]},
         potential_rate=log["potential_rate"],
@@ -82,40 +87,62 @@ def record(
     )
 
 
-def span(log: LoggedSteps, phase: str) -> tuple[float, float]:
-    """Start and end of the first time a phase was entered [s].
-
-    Infinite is the end of the last one, and empty the span of one that never was.
-    """
+def spans(log: LoggedSteps, phase: str) -> list[tuple[float, float]]:
+    """Start and end of each time a phase was entered [s]; infinite is the end of the last."""
     events = log.events
-    for event, following in zip(events, [*events[1:], None], strict=True):
-        if event.text == phase:
-            return event.time, math.inf if following is None else following.time
-    return 0.0, 0.0
+    return [
+        (event.time, math.inf if following is None else following.time)
+        for event, following in zip(events, [*events[1:], None], strict=True)
+        if event.text == phase
+    ]
+
+
+def span(log: LoggedSteps, phase: str) -> tuple[float, float]:
+    """The first of them; empty if there is none."""
+    return next(iter(spans(log, phase)), (0.0, 0.0))
+
+
+def _there_and_back(plans: Sequence[Plan]) -> Float[np.ndarray, "samples 3"] | None:
+    """Path of the hand along all plans; it backs out of a shelf the way it went in."""
+    paths = [plan.hand.position.numpy() for plan in plans]
+    return np.concatenate([np.vstack([path, path[::-1]]) for path in paths]) if paths else None
 
 
 def _matching_demonstration(
-    log: LoggedSteps, plan: Plan | None, demonstration: Demonstration | None
+    log: LoggedSteps, plans: Sequence[Plan], demonstration: Demonstration | None
 ) -> Float[np.ndarray, "time joints"] | None:
     """Demonstrated joints at the same share of the way to the shelf, NaN elsewhere [rad]."""
-    if plan is None or demonstration is None or demonstration.joint_position is None:
+    if not plans or demonstration is None or demonstration.joint_position is None:
         return None
     time = log["time"]
-    start, end = span(log, TRANSFER)
-    share = (time - start) / plan.duration * demonstration.duration
-    joints = np.column_stack(
-        [np.interp(share, demonstration.time, q) for q in demonstration.joint_position.T]
-    )
-    return np.where(((time >= start) & (time < end))[:, None], joints, np.nan)
+    matching = np.full_like(log["joint_position"], np.nan)
+    for plan, (start, end) in zip(plans, spans(log, TRANSFER), strict=False):
+        rows = (time >= start) & (time < end)
+        share = (time[rows] - start) / plan.duration * demonstration.duration
+        for joint, shown in enumerate(demonstration.joint_position.T):
+            matching[rows, joint] = np.interp(share, demonstration.time, shown)
+    return matching
 
 
-def true_image_jacobian(log: LoggedSteps, world: World) -> Float[np.ndarray, "time 2 6"]:
-    """True image Jacobian of the hand's marker wherever the controller used its estimate."""
+def true_image_jacobian(
+    log: LoggedSteps, world: World, cameras: Sequence[tuple[float, CameraModel]]
+) -> Float[np.ndarray, "time 2 6"]:
+    """True image Jacobian of the hand's marker wherever the controller used its estimate.
+
+    Args:
+        log: Of the run.
+        world: That knows where the marker is on the hand.
+        cameras: The true ones, and from when on each watched [s].
+    """
     used = np.isfinite(log["image_jacobian"]).all(axis=(1, 2))
     jacobian = np.full_like(log["image_jacobian"], np.nan)
-    tool = link_poses(log)[torch.from_numpy(used), TOOL]
-    marker = tool.apply(torch.from_numpy(world.hand_marker_offset())).numpy()
-    jacobian[used] = world.config.camera.image_jacobian(marker, tool.position.numpy())
+    poses, offset = link_poses(log), torch.from_numpy(world.hand_marker_offset())
+    ends = [*(start for start, _ in cameras[1:]), math.inf]
+    for (start, camera), end in zip(cameras, ends, strict=True):
+        rows = used & (log["time"] >= start) & (log["time"] < end)
+        tool = poses[torch.from_numpy(rows), TOOL]
+        marker = tool.apply(offset).numpy()
+        jacobian[rows] = camera.image_jacobian(marker, tool.position.numpy())
     return jacobian
 
 

@@ -2,22 +2,34 @@
 
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
+from jaxtyping import Float
 
 from ..human import BothHands, PullSpell, ScriptedPuller
 from ..human.page import PageConfig
 from ..kinematics import panda
 from ..protocols import Human
-from ..sim import CameraKind, MotionLog, ObjectConfig, World, open_camera
-from .collaboration import INTERACT, Collaboration, CollaborationConfig, CollaborationResult
+from ..sim import (
+    CameraChange,
+    CameraKind,
+    ChangingCamera,
+    MotionLog,
+    Occluder,
+    Occlusion,
+    World,
+    open_camera,
+)
+from ..vision import CameraModel
+from .collaboration import INTERACT, Collaboration, CollaborationConfig
+from .errand import Errand
 from .eye import Eye
-from .failure import TaskFailedError
 from .fit_aiming import AimingSkill
 from .page_beside import page_beside
 from .placing import PlacingSkill, Plan, check_plan
+from .scattering import scatter
 from .station import Station, StationConfig
 from .watching import Watch, unwatched
 from .workplace import Workplace
@@ -29,7 +41,19 @@ PULLS = (
 """A worker reaches under the arm: the elbow is drawn aside, and let back."""
 
 OBJECT_REACH = (0.10, 0.08, 0.0)
-"""How far from the middle of the table objects lie [m]."""
+"""How far from the middle of the table a single object lies [m]."""
+OBJECTS_REACH = (0.12, 0.10)
+"""The same of several."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Disturbances:
+    """What happens to camera and images beside the job."""
+
+    occlusions: tuple[Occlusion, ...] = ()
+    """Spells in which the hand's marker is hidden."""
+    camera_change: CameraChange | None = None
+    """How the camera is changed between two objects; None: it stays."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,57 +65,79 @@ class SimulatedJob:
     """As it was left."""
     station: Station
     motion: MotionLog
-    item: ObjectConfig
-    shelf: str
-    result: CollaborationResult | None
-    """What the task reports; None if it failed."""
-    failure: str = ""
-    """Why it failed."""
+    errands: tuple[Errand, ...]
+    """What became of each object, in turn."""
+    cameras: tuple[tuple[float, CameraModel], ...]
+    """The true cameras, and from when on each watched [s]."""
+    disturbances: Disturbances = field(default_factory=Disturbances)
+
+    @property
+    def failure(self) -> str:
+        """Why objects were not delivered, as the robot sees it; empty if all were."""
+        failures = [errand.failure for errand in self.errands if errand.failure]
+        if left := len(self.workplace.scene.objects) - len(self.errands):
+            failures.append(f"{left} objects were not begun with")
+        return "; ".join(failures)
 
 
 def simulate_collaboration(
     aiming: AimingSkill,
     placing: PlacingSkill,
-    shelf: str,
+    shelves: Sequence[str],
     *,
     workplace: Workplace | None = None,
     camera: CameraKind = "auto",
     pulls: Sequence[PullSpell] = PULLS,
+    disturbances: Disturbances | None = None,
     config: CollaborationConfig | None = None,
+    station_config: StationConfig | None = None,
     seed: int = 0,
     page: PageConfig | None = None,
     watch: Watch = unwatched,
+    on_start: Callable[[World, Station], None] = lambda world, station: None,
     on_phase: Callable[[str, float], None] = lambda phase, time: None,
     on_page: Callable[[str], None] = lambda address: None,
 ) -> SimulatedJob:
-    """Grasp an object that lies at random and put it on a shelf, in MuJoCo.
+    """Grasp objects that lie at random and put them on shelves, in MuJoCo.
 
     Args:
         aiming: Learned image Jacobian and visual target.
         placing: Learned placing motion.
-        shelf: Where to put the object.
+        shelves: Where to put each of the scene's objects, in turn.
         workplace: Where.
         camera: Which kind of camera watches.
         pulls: At the body, in time since the robot gives the person time.
+        disturbances: What happens to camera and images meanwhile.
         config: How the job is done.
-        seed: Of where the object lies, and of image noise.
+        station_config: How the loop runs; images may be late or lost.
+        seed: Of where the objects lie, and of image noise.
         page: Serve a page from which people pull at the body too, and let the world go on in
             real time; None: no page.
         watch: Watches from the side, such as `serving` a dashboard.
+        on_start: Shown world and station before the job begins.
         on_phase: Told the name of each phase of the task, and when it begins [s].
         on_page: Told the address of the page.
 
     Raises:
-        ValueError: If there is no such shelf, or the arm cannot reach it.
+        ValueError: If shelves and objects do not go together, there is no such shelf, or the
+            arm cannot reach it.
     """
     workplace, rng = workplace or Workplace(), np.random.default_rng(seed)
-    workplace.shelf(shelf)
-    item = workplace.scene.objects[0]
+    disturbances = disturbances or Disturbances()
+    station_config = station_config or StationConfig()
+    items = workplace.scene.objects
+    _check_shelves(workplace, shelves)
     world = World(workplace.scene)
-    pose = workplace.random_object_pose(OBJECT_REACH, rng)
-    world.reset(workplace.home_joints().numpy(), {item.name: pose})
-    person = ScriptedPuller(panda, pulls, begin=None)
-    motion = MotionLog(world)
+    world.reset(workplace.home_joints().numpy(), _places(workplace, rng))
+    person, motion = ScriptedPuller(panda, pulls, begin=None), MotionLog(world)
+    occluder = Occluder(world, disturbances.occlusions)
+    eyes = ChangingCamera(
+        workplace.scene.camera, lambda model: open_camera(world, camera, model, rng=rng)
+    )
+
+    def advance(duration: float) -> None:
+        motion.advance(duration)
+        occluder.update()
 
     def enter(phase: str, time: float) -> None:
         on_phase(phase, time)
@@ -99,39 +145,80 @@ def simulate_collaboration(
             person.begin(time)
 
     def check(plan: Plan) -> None:
-        check_plan(plan, world, item.name if world.holds(item.name) else None)
+        held = (item.name for item in items if world.holds(item.name))
+        check_plan(plan, world, next(held, None))
 
-    result, failure = None, ""
+    def before(number: int) -> None:
+        change = disturbances.camera_change
+        if change is not None and number > 0:
+            model = change.applied(eyes.model, _watched(workplace, world), rng)
+            eyes.change(world.time, model)
+
     with torch.inference_mode(), ExitStack() as stack:
-        human, advance = person, motion.advance
+        human, passing = person, advance
         if page is not None:
-            opened = page_beside(world, StationConfig().dt, page, on_page)
-            human, advance = _joined(person, motion.advance, *stack.enter_context(opened))
+            opened = page_beside(world, station_config.dt, page, on_page)
+            human, passing = _joined(person, advance, *stack.enter_context(opened))
         station = Station(
             chain=panda,
             arm=world.arm,
             gripper=world.arm,
-            eye=Eye.on(open_camera(world, camera, rng=rng), workplace.scene),
+            eye=Eye.on(eyes, workplace.scene),
             human=human,
-            advance=advance,
+            advance=passing,
+            config=station_config,
             on_phase=enter,
+            rng=rng,
         )
         stack.enter_context(watch(station, world, motion))
+        on_start(world, station)
         task = Collaboration(station, workplace, aiming, placing, check, config)
-        try:
-            result = task.run(item, shelf)
-        except TaskFailedError as error:
-            failure = str(error)
+        errands = task.run(list(zip(items, shelves, strict=True)), before)
     return SimulatedJob(
         workplace=workplace,
         world=world,
         station=station,
         motion=motion,
-        item=item,
-        shelf=shelf,
-        result=result,
-        failure=failure,
+        errands=tuple(errands),
+        cameras=tuple(eyes.history),
+        disturbances=disturbances,
     )
+
+
+def with_objects(workplace: Workplace, items: Sequence) -> Workplace:
+    """The workplace with these objects on its table."""
+    return replace(workplace, scene=replace(workplace.scene, objects=tuple(items)))
+
+
+def _check_shelves(workplace: Workplace, shelves: Sequence[str]) -> None:
+    items = workplace.scene.objects
+    for name in shelves:
+        workplace.shelf(name)
+    if len(shelves) != len(items) or len(set(shelves)) != len(shelves):
+        raise ValueError(
+            f"each of the {len(items)} objects needs a shelf of its own, but the shelves are "
+            f"{', '.join(shelves)}."
+        )
+
+
+def _places(
+    workplace: Workplace, rng: np.random.Generator
+) -> dict[str, Float[np.ndarray, "4 4"]]:
+    items = workplace.scene.objects
+    if len(items) == 1:
+        return {items[0].name: workplace.random_object_pose(OBJECT_REACH, rng)}
+    return scatter(items, workplace.table_centre, OBJECTS_REACH, rng)
+
+
+def _watched(workplace: Workplace, world: World) -> Float[np.ndarray, "points 3"]:
+    """What a camera has to see: where objects lie, and the hand's marker when above them."""
+    reach = np.array([*OBJECTS_REACH, 0.0])
+    signs = np.array([[a, b, 0.0] for a in (-1, 1) for b in (-1, 1)])
+    hover = workplace.hover()
+    marker = hover.apply(torch.from_numpy(world.hand_marker_offset())).numpy()
+    on_table = np.array([*workplace.table_centre, workplace.scene.objects[0].half_size[2]])
+    # Markers and their plates reach as far as this about their centres, and a margin more.
+    return np.concatenate([middle + signs * (reach + 0.05) for middle in (on_table, marker)])
 
 
 def _joined(

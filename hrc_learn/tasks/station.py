@@ -209,16 +209,30 @@ class Station:
         for _ in range(round(settle / self.config.dt)):
             self.follow(goal, still)
 
-    def play(self, path: Float[np.ndarray, "steps joints"]) -> None:
+    def play(
+        self,
+        path: Float[np.ndarray, "steps joints"],
+        until: Callable[[], bool] = lambda: False,
+    ) -> int:
         """Move the joints along a path sampled at the control step.
 
         The person's effort is not followed meanwhile: a planned path avoids obstacles only as
         it was planned.
+
+        Args:
+            path: Joint positions [rad].
+            until: Asked before each step whether to leave it at that.
+
+        Returns:
+            Samples of the path that were gone to.
         """
         for k, q in enumerate(path):
+            if until():
+                return k
             error = torch.from_numpy(q) - self.joints
             velocity = torch.from_numpy(path_velocity(path, k, self.config.dt))
             self.step(velocity + self.config.pose_gain * error)
+        return len(path)
 
     def _send(self, velocity: Float[Tensor, " joints"], **columns) -> None:
         self.log.append(
@@ -238,8 +252,8 @@ class Station:
         self._receive()
         if self.watching and self._ticks % self.config.look_every == 0:
             self.look(self.watching)
-        keep_every = self.config.keep_every if self._eye is not None else 0
-        if keep_every and self._ticks % keep_every == 0:
+        every = self.config.keep_every
+        if self._eye is not None and every and self._ticks % every == 0:
             self.images.append(KeptImage(time=self.time, image=self._eye.read()))
 
     def _receive(self) -> None:

@@ -11,7 +11,7 @@ from taught_skills import taught_aiming, taught_placing
 from hrc_learn.human.page import Page, PageConfig
 from hrc_learn.tasks import page_beside
 from hrc_learn.tasks.collaboration import CollaborationConfig
-from hrc_learn.tasks.recording import ELBOW, TOOL, Deviation, span
+from hrc_learn.tasks.recording import ELBOW, TOOL, Deviation, link_poses, span
 from hrc_learn.tasks.simulated_job import simulate_collaboration
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
@@ -28,7 +28,7 @@ class Job:
         self.done = simulate_collaboration(
             aiming,
             placing,
-            "middle",
+            ("middle",),
             camera="synthetic",
             pulls=(),
             config=CollaborationConfig(interaction=60.0),
@@ -50,7 +50,7 @@ class Job:
         return events[-1].text if events else ""
 
     def link(self, index: int) -> np.ndarray:
-        return self.station.log.snapshot()["link_position"][-1, index]
+        return link_poses(self.station.log.snapshot()).position[-1, index].numpy()
 
     def __enter__(self):
         self._thread.start()
@@ -84,7 +84,8 @@ def test_the_elbow_yields_to_the_mouse_while_the_hand_aims(tmp_path, monkeypatch
     assert deviation.elbow_most_moved > 0.05
     assert deviation.most_moved < 1e-3
     # To the right of the screen is +y.
-    moved = log["link_position"][:, ELBOW] - elbow
+    links = link_poses(log).position.numpy()
+    moved = links[:, ELBOW] - elbow
     assert moved[effort > 0][-1, 1] > 0
-    assert np.isfinite(log["link_position"][:, TOOL]).all()
+    assert np.isfinite(links[:, TOOL]).all()
     assert result.world.rests_on("box", "board_middle")
