@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from ..tasks.scenario import Scenario
 
-ScenarioName = Literal["placing", "grasping"]
-
+SCENARIOS = ("placing", "grasping")
 SHELVES = ("lower", "middle", "upper")
 
 
@@ -18,10 +17,8 @@ def check_scenario(name: str, shelf: str, pixels: bool) -> None:
     Raises:
         ValueError: There is no such scenario or shelf, or its object has no pixel.
     """
-    if name not in get_args(ScenarioName):
-        raise ValueError(
-            f"no scenario {name!r}: there are {', '.join(get_args(ScenarioName))}."
-        )
+    if name not in SCENARIOS:
+        raise ValueError(f"no scenario {name!r}: there are {', '.join(SCENARIOS)}.")
     if shelf not in SHELVES:
         raise ValueError(f"no shelf {shelf!r}: there are {', '.join(SHELVES)}.")
     if pixels and name == "placing":

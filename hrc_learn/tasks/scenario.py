@@ -136,7 +136,7 @@ class Grasping(Scenario):
     def succeeded(self, world: World) -> bool:
         item = self.workplace.scene.objects[0]
         bottom = world.object_pose(item.name)[2, 3] - max(item.half_size)
-        return world.holds(item.name) and bottom > 0.5 * self.height
+        return world.holds(item.name) and bool(bottom > 0.5 * self.height)
 
 
 class InTurn:

@@ -1,6 +1,7 @@
 """A scenario under way in simulation: begun by seed, moved by targets, looked at."""
 
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -51,6 +52,7 @@ class ScenarioRun:
         self.scenario, self.dt = scenario, 1.0 / fps
         self.world = World(scenario.workplace.scene)
         self.servo = PositionServo(panda, self.world.arm, self.dt, servo)
+        self._noise = np.random.default_rng(0)
         self.begin(seed)
 
     def begin(self, seed: int) -> None:
@@ -86,22 +88,30 @@ class ScenarioRun:
         Raises:
             ValueError: The object was not in its view.
         """
+        marker = self.scenario.workplace.scene.objects[0].marker.id
         if self._pixel is None:
-            scene = self.scenario.workplace.scene
-            marker, poses = scene.objects[0].marker, self.world.marker_poses()
-            camera = SyntheticCamera(
-                scene.camera,
-                [marker],
-                lambda: {marker.id: poses[marker.id]},
-                rng=np.random.default_rng([self.seed, 1]),
-            )
-            self._pixel = Eye.on(camera, scene).look().get(marker.id)
+            self._noise.bit_generator.state = np.random.default_rng(
+                [self.seed, 1]
+            ).bit_generator.state
+            self._pixel = self._eye.look().get(marker)
         if self._pixel is None:
             raise ValueError(
-                f"the fixed camera does not see marker {marker.id} at the beginning: leave out "
+                f"the fixed camera does not see marker {marker} at the beginning: leave out "
                 "the pixels of the object."
             )
         return self._pixel
+
+    @cached_property
+    def _eye(self) -> Eye:
+        """Of the fixed camera, before which nothing but the object is ever seen."""
+        scene = self.scenario.workplace.scene
+        marker = scene.objects[0].marker
+
+        def poses() -> dict[int, np.ndarray]:
+            return {marker.id: self.world.marker_poses()[marker.id]}
+
+        camera = SyntheticCamera(scene.camera, [marker], poses, rng=self._noise)
+        return Eye.on(camera, scene)
 
     def succeeded(self) -> bool:
         """Whether the job is done, by MuJoCo's contacts."""

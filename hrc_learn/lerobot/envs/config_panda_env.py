@@ -68,7 +68,7 @@ class PandaEnvConfig(EnvConfig):
     def robot_config(self) -> MujocoPandaConfig:
         """Settings of the robot in it."""
         return MujocoPandaConfig(
-            scenario=self.task or "placing",  # pyright: ignore[reportArgumentType]
+            scenario=self.task or "placing",
             shelf=self.shelf,
             fps=float(self.fps),
             action_space=self.action_space,

@@ -10,7 +10,6 @@ from .limits import ActionLimits
 
 PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor.json", "policy_postprocessor.json"
 WATCH, SMOOTH = "hrc_learn_watch_state", "hrc_learn_smooth_actions"
-_NORMALISES = "normalizer_processor"
 
 
 def add_smoothing(checkpoint: Path, limits: ActionLimits) -> None:
@@ -29,9 +28,7 @@ def add_smoothing(checkpoint: Path, limits: ActionLimits) -> None:
     before, after = (_read(checkpoint / name) for name in (PREPROCESSOR, POSTPROCESSOR))
     watch = {"registry_name": WATCH, "config": {"pair": "smooth"}}
     smooth = {"registry_name": SMOOTH, "config": {**asdict(limits), "pair": "smooth"}}
-    names = [step.get("registry_name") for step in before["steps"]]
-    place = names.index(_NORMALISES) if _NORMALISES in names else len(names)
-    before["steps"].insert(place, watch)
+    before["steps"].insert(0, watch)  # before a step that renames or normalises the state
     after["steps"].append(smooth)
     # Without the one that watches, the other still works: so it comes first.
     _write(checkpoint / PREPROCESSOR, before)

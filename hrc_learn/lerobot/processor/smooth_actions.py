@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import weakref
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -34,7 +35,7 @@ _Features = dict[PipelineFeatureType, dict[str, PolicyFeature]]
 class WatchStateStep(ProcessorStep):
     """Keeps the state as the robot reports it, for the `SmoothActionsStep` of the same name.
 
-    Belongs into the preprocessor, before what normalises.
+    Belongs at the beginning of the preprocessor, where the state has its name and units.
     """
 
     pair: str = "smooth"
@@ -145,17 +146,12 @@ class SmoothActionsStep(ProcessorStep):
         return features
 
     def _limits(self) -> MotionLimits:
-        def tensor(values: list[float], missing: float = math.nan) -> Tensor:
-            return torch.tensor(
-                [missing if v is None else v for v in values], dtype=torch.float64
-            )
-
         return MotionLimits(
-            lower=tensor(self.lower, -math.inf),  # pyright: ignore[reportArgumentType]
-            upper=tensor(self.upper, math.inf),  # pyright: ignore[reportArgumentType]
-            velocity=tensor(self.velocity),
-            acceleration=tensor(self.acceleration),
-            jerk=tensor(self.jerk),
+            lower=_tensor(self.lower, missing=-math.inf),
+            upper=_tensor(self.upper, missing=math.inf),
+            velocity=_tensor(self.velocity),
+            acceleration=_tensor(self.acceleration),
+            jerk=_tensor(self.jerk),
         )
 
     def _start(self, chunk: Tensor, whole: bool) -> SmoothState:
@@ -209,6 +205,10 @@ class SmoothActionsStep(ProcessorStep):
     def _keep(self, smooth: Tensor, report: SmoothReport, whole: bool) -> None:
         self.changes.add(report)
         self._chunk = smooth.to(torch.float64) if whole and smooth.shape[-2] > 2 else None
+
+
+def _tensor(values: Sequence[float | None], missing: float = math.nan) -> Float[Tensor, " n"]:
+    return torch.tensor([missing if v is None else v for v in values], dtype=torch.float64)
 
 
 def _where(rows: Bool[Tensor, " batch"], yes: SmoothState, no: SmoothState) -> SmoothState:

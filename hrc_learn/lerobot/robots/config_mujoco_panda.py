@@ -6,7 +6,7 @@ from typing import Literal
 from lerobot.robots import RobotConfig
 
 from ..panda_names import ActionSpace
-from ..scenarios import ScenarioName, check_scenario
+from ..scenarios import check_scenario
 
 
 @dataclass
@@ -27,7 +27,7 @@ class ImagesConfig:
 class MujocoPandaConfig(RobotConfig):
     """The Panda in our MuJoCo workplace; `--robot.type=mujoco_panda`."""
 
-    scenario: ScenarioName = "placing"
+    scenario: str = "placing"
     """What is to be done: "placing" or "grasping"."""
     shelf: str = "middle"
     """Where to place: "lower", "middle" or "upper"."""
