@@ -5,6 +5,8 @@ it is asked for: `hrc_learn.viz.run_dashboard` and `fit_dashboard` import rerun,
 `hrc_learn.viz.figures` imports matplotlib.
 """
 
+from .demonstrations_recording import DemonstrationsRecording as DemonstrationsRecording
+from .demonstrations_recording import ShownDemonstration as ShownDemonstration
 from .logged_steps import Event as Event
 from .logged_steps import LoggedSteps as LoggedSteps
 from .recording import Body as Body
