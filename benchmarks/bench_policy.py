@@ -1,11 +1,13 @@
 """Compare the policy `dmp` with a small ACT, trained on the same demonstrations.
 
-Demonstrations of placing are recorded in simulation, or read from earlier runs; policies learn
-from the first one and from more of them. Each then plays demonstrations it has not seen, from
-their start and for their goal, on an arm that follows exactly. Reported are the distance of
-the hand's path from the one shown, where it ends, and how abruptly actions change where one
-chunk follows another.
+A scripted expert shows a job in simulation, such as grasping a thing that lies anywhere and is
+seen once. Policies learn from one demonstration and from more, and then do the job from
+beginnings they have not seen. Reported are successes, by MuJoCo's contacts, the distance of
+the hand from the path that the expert takes from there, and how abruptly commands change where
+one chunk follows another.
 """
+
+from __future__ import annotations
 
 import os
 
@@ -13,14 +15,14 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
 import torch
 from jaxtyping import Float
-from placing_lessons import GOAL, placing_lessons, write_lessons_of_placing
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
@@ -28,28 +30,34 @@ from torch import Tensor
 
 from hrc_learn import cli
 from hrc_learn.kinematics import panda
-from hrc_learn.lerobot.policy.episodes import read_episodes
-from hrc_learn.lerobot.policy.windows import Windows
+
+# LeRobot takes ten seconds to import: only once there is something to do.
+if TYPE_CHECKING:
+    from hrc_learn.lerobot.envs import PandaEnvConfig
 
 STATE, ACTION = "observation.state", "action"
-SEEN = (STATE, GOAL)
-NEAR = 0.01
-"""Distance from the goal [m] at which a thing is in its place."""
+ENVIRONMENT = "observation.environment_state"
+HELD_OUT = 1000
+"""Number of the first beginning that no policy learns from."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
     data: Path
     """Folder of the demonstrations; recorded into it where it does not hold them."""
+    task: Literal["grasping", "placing"] = "grasping"
+    """What is shown and done."""
     demonstrations: tuple[int, ...] = (1, 10)
     """How many to learn from."""
-    held_out: int = 10
-    """How many to play that were not learned from."""
-    steps: int = 2000
+    beginnings: int = 10
+    """How many to do the job from that were not learned from."""
+    policies: tuple[str, ...] = ("dmp-fit", "dmp", "act")
+    """dmp-fit: in closed form; dmp: trained from there; act: a small one."""
+    steps: int = 1000
     """Of training."""
     batch_size: int = 32
-    policies: tuple[str, ...] = ("dmp-fit", "dmp", "act")
-    """dmp-fit: in closed form; dmp: trained from there; act: small, state only."""
+    fps: int = 25
+    """Commands a second."""
     seed: int = 0
     """Of weights and batches."""
     json: Path | None = None
@@ -57,73 +65,113 @@ class Args:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Played:
-    """How a policy did on demonstrations it had not seen."""
+class Figures:
+    """How a policy did from beginnings it had not seen."""
 
-    path: float
-    """Distance from the hand's path at the same time, root mean square [m]."""
-    goal: float
-    """Distance from where the hand ought to end, mean [m]."""
-    placed: float
-    """Share that ended within 1 cm."""
+    success: float
+    """Share."""
+    path_mm: float
+    """Distance of the hand from the expert's at the same time, root mean square [mm]."""
     seam: float
-    """Largest change of the joints' velocity from one action to the next where chunks meet,
-    over the largest within chunks."""
-    seconds: float
+    """Largest change of the joints' commanded velocity where chunks meet, over the largest
+    within chunks."""
+    jerk: float
+    """Root mean square of the third difference of the joints' commands where chunks meet
+    [rad/s^3]."""
+    train_s: float
     """CPU time of training [s]."""
 
-    def row(self) -> list[str]:
-        return [
-            f"{1e3 * self.path:.1f}",
-            f"{1e3 * self.goal:.1f}",
-            f"{100 * self.placed:.0f} %",
-            f"{self.seam:.2f}",
-            f"{self.seconds:.0f}",
-        ]
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Done:
+    """What came of one beginning."""
+
+    success: bool
+    joints: Float[Tensor, "T 7"]
+    """As measured before each command [rad]."""
+    commands: Float[Tensor, "T 7"]
+    """[rad]"""
 
 
 def main(args: Args) -> None:
+    from hrc_learn.lerobot.envs import PandaEnvConfig
+    from hrc_learn.lerobot.policy.episodes import read_episodes
+
     torch.set_num_threads(1)
-    held_out = _recorded(args.data / f"held_out_{args.held_out}", args.held_out, seed=100)
-    table = Table("policy", "demonstrations", "path [mm]", "goal [mm]", "placed", "seam", "s")
+    env = PandaEnvConfig(task=args.task, fps=args.fps, pixels=args.task == "grasping")
+    held_out = _recorded(args, env, HELD_OUT, args.beginnings)
+    expert = [episode[STATE][:, :7] for episode in read_episodes(held_out, (STATE,))]
+    table = Table("policy", "demonstrations", *Figures.__dataclass_fields__)
     figures: dict[str, float] = {}
-    shown = read_episodes(held_out, (*SEEN, ACTION))
     for count in args.demonstrations:
-        dataset = _recorded(args.data / f"shown_{count}", count, seed=0)
+        dataset = _recorded(args, env, 0, count)
         for name in args.policies:
-            played = _measure(name, dataset, shown, args)
-            table.add_row(name, str(count), *played.row())
-            figures |= {f"{name}_{count}_{k}": v for k, v in vars(played).items()}
+            result = vars(_measure(name, dataset, env, expert, args))
+            table.add_row(name, str(count), *(f"{value:.3g}" for value in result.values()))
+            figures |= {f"{name}_{count}_{key}": value for key, value in result.items()}
+            if args.json is not None:
+                cli.write_json(args.json, figures)
     Console().print(table)
-    if args.json is not None:
-        cli.write_json(args.json, figures)
 
 
-def _recorded(folder: Path, count: int, seed: int) -> Path:
+def _recorded(args: Args, env: PandaEnvConfig, first: int, count: int) -> Path:
+    folder = args.data / f"{args.task}_{args.fps}hz_from_{first}_{count}"
     if not folder.exists():
-        lessons = track(placing_lessons(count, seed), f"Recording {folder.name}", total=count)
-        write_lessons_of_placing(folder, iter(lessons))
+        from shown_scenarios import record_shown
+
+        seeds = track(range(first, first + count), f"Recording {folder.name}")
+        record_shown(folder, env, seeds)
     return folder
 
 
-def _measure(name: str, dataset: Path, shown: Sequence[dict], args: Args) -> Played:
+def _measure(
+    name: str, dataset: Path, env: PandaEnvConfig, expert: Sequence[Tensor], args: Args
+) -> Figures:
+    torch.manual_seed(args.seed)
+    began = time.process_time()
+    config, act = _policy(name, dataset, args)
+    seconds = time.process_time() - began
+    done = _do(act, env, len(expert), f"{name}, {dataset.name}")
+    return Figures(
+        success=float(np.mean([d.success for d in done])),
+        path_mm=1e3 * _path_error([d.joints for d in done], expert),
+        **_seams([d.commands for d in done], config.n_action_steps, args.fps),
+        train_s=seconds,
+    )
+
+
+def _policy(name: str, dataset: Path, args: Args) -> tuple[Any, Callable[[Tensor | None], Any]]:
+    """A trained policy's settings, and what maps states to actions; of None, it resets."""
     from lerobot.datasets import LeRobotDatasetMetadata
     from lerobot.policies import make_policy, make_pre_post_processors
 
-    torch.manual_seed(args.seed)
     meta = LeRobotDatasetMetadata(f"local/{dataset.name}", root=dataset)
-    config = _config(name)
-    began = time.process_time()
+    stats: Any = dict(meta.stats or {})
+    stats[ENVIRONMENT] = stats[STATE]
+    config = _config(name, len(stats[STATE]["mean"]))
     policy = make_policy(config, ds_meta=meta)
-    stats: Any = meta.stats
     before, after = make_pre_post_processors(config, dataset_stats=stats)
     if name != "dmp-fit":
-        _train(policy, before, _windows(dataset, config), args, f"{name}, {dataset.name}")
-    seconds = time.process_time() - began
-    return _judge(_play(policy, before, after, shown), shown, config.n_action_steps, seconds)
+        _train(policy, before, dataset, args, f"{name}, {dataset.name}")
+    policy.eval()
+
+    @torch.no_grad()
+    def act(state: Tensor | None) -> Tensor | None:
+        if state is None:
+            policy.reset()
+            return None
+        return after(policy.select_action(before(_observation(state))))[0]
+
+    return config, act
 
 
-def _config(name: str) -> Any:
+def _observation(state: Tensor) -> dict[str, Tensor]:
+    """ACT demands images or the environment's state: it gets the state there as well."""
+    return {STATE: state, ENVIRONMENT: state}
+
+
+def _config(name: str, width: int) -> Any:
+    from lerobot.configs import FeatureType, PolicyFeature
     from lerobot.policies import ACTConfig
 
     from hrc_learn.lerobot import DMPConfig
@@ -136,6 +184,7 @@ def _config(name: str) -> Any:
         case "act":
             return ACTConfig(
                 **common,
+                input_features={ENVIRONMENT: PolicyFeature(FeatureType.ENV, (width,))},
                 dim_model=128,
                 n_heads=4,
                 dim_feedforward=512,
@@ -147,16 +196,17 @@ def _config(name: str) -> Any:
     raise ValueError(f"--policies takes dmp-fit, dmp and act, not {name!r}")
 
 
-def _windows(dataset: Path, config: Any) -> Windows:
-    keys = (*SEEN, ACTION)
-    deltas: dict[str, Sequence[int] | None] = {ACTION: config.action_delta_indices}
-    deltas |= dict.fromkeys(SEEN, config.observation_delta_indices)
-    return Windows(read_episodes(dataset, keys), deltas, fps=25)
-
-
-def _train(policy: Any, before: Any, samples: Windows, args: Args, title: str) -> None:
+def _train(policy: Any, before: Any, dataset: Path, args: Args, title: str) -> None:
     """As lerobot-train does it, with batches from memory."""
-    optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
+    from hrc_learn.lerobot.policy.episodes import read_episodes
+    from hrc_learn.lerobot.policy.windows import Windows
+
+    config = policy.config
+    episodes = [e | _observation(e[STATE]) for e in read_episodes(dataset, (STATE, ACTION))]
+    deltas: dict[str, Sequence[int] | None] = {ACTION: config.action_delta_indices}
+    deltas |= dict.fromkeys((STATE, ENVIRONMENT), config.observation_delta_indices)
+    samples = Windows(episodes, deltas, args.fps)
+    optimizer = config.get_optimizer_preset().build(policy.get_optim_params())
     rng = torch.Generator().manual_seed(args.seed)
     policy.train()
     for _ in track(range(args.steps), title):
@@ -167,42 +217,57 @@ def _train(policy: Any, before: Any, samples: Windows, args: Args, title: str) -
         optimizer.step()
 
 
-@torch.no_grad()
-def _play(
-    policy: Any, before: Any, after: Any, shown: Sequence[dict]
-) -> Float[Tensor, "n T 7"]:
-    """Joints of an arm that follows, all demonstrations at once."""
-    policy.eval()
-    policy.reset()
-    q = torch.stack([episode[STATE][0] for episode in shown])
-    goal = torch.stack([episode[GOAL][0] for episode in shown])
-    path = []
-    for _ in range(max(len(episode[ACTION]) for episode in shown)):
-        q = after(policy.select_action(before({STATE: q, GOAL: goal})))
-        path.append(q)
-    return torch.stack(path, dim=1)
+def _do(
+    act: Callable[[Tensor | None], Any], config: PandaEnvConfig, count: int, title: str
+) -> list[Done]:
+    from hrc_learn.lerobot.envs.panda_env import PandaEnv
+
+    env, done = PandaEnv(**config.gym_kwargs), []
+    for seed in track(range(HELD_OUT, HELD_OUT + count), title):
+        act(None)
+        seen, _ = env.reset(seed=seed)
+        states, commands, over, info = [], [], False, {}
+        while not over:
+            states.append(torch.from_numpy(seen["agent_pos"].copy()))
+            commands.append(act(states[-1][None]))
+            seen, _, success, late, info = env.step(commands[-1].numpy())
+            over = success or late
+        done.append(
+            Done(
+                success=bool(info["is_success"]),
+                joints=torch.stack(states)[:, :7],
+                commands=torch.stack(commands)[:, :7],
+            )
+        )
+    env.close()
+    return done
 
 
-def _judge(
-    joints: Float[Tensor, "n T 7"], shown: Sequence[dict], chunk: int, seconds: float
-) -> Played:
-    hand = panda.forward(joints.double()).position
-    paths, ends = [], []
-    for made, episode in zip(hand, shown, strict=True):
-        true = panda.forward(episode[ACTION].double()).position
-        distance = (made[: len(true)] - true).norm(dim=-1)
-        paths.append(distance.square().mean())
-        ends.append(distance[-1])
-    change = joints.diff(dim=1).diff(dim=1).abs().amax(dim=(0, 2))
-    # Change k is between the actions k, k + 1 and k + 2; a seam is before action m chunk.
-    at_seam = torch.tensor([(k + 2) % chunk < 2 for k in range(len(change))])
-    return Played(
-        path=float(torch.stack(paths).mean().sqrt()),
-        goal=float(torch.stack(ends).mean()),
-        placed=float((torch.stack(ends) < NEAR).double().mean()),
-        seam=float(change[at_seam].max() / change[~at_seam].max()),
-        seconds=seconds,
-    )
+def _path_error(made: Sequence[Tensor], shown: Sequence[Tensor]) -> float:
+    square = []
+    for ours, theirs in zip(made, shown, strict=True):
+        frames = min(len(ours), len(theirs))
+        hands = (panda.forward(q[:frames].double()).position for q in (ours, theirs))
+        square.append((next(hands) - next(hands)).square().sum(-1).mean())
+    return float(torch.stack(square).mean().sqrt())
+
+
+def _seams(commands: Sequence[Tensor], chunk: int, fps: int) -> dict[str, float]:
+    """Of commands in chunks of so many: `Figures.seam` and `Figures.jerk`."""
+    at_seams, within, jerk = [], [], []
+    for q in commands:
+        change = q.double().diff(n=2, dim=0).abs().amax(-1)
+        # Change k is of the commands k, k + 1 and k + 2; a seam is before command m chunk.
+        crosses = (torch.arange(len(change)) + 2) % chunk < 2
+        at_seams.append(change[crosses].max())
+        within.append(change[~crosses].max())
+        third = q.double().diff(n=3, dim=0)
+        crosses = (torch.arange(len(third)) + 3) % chunk < 3
+        jerk.append(third[crosses].square().mean())
+    return {
+        "seam": float(torch.stack(at_seams).max() / torch.stack(within).max()),
+        "jerk": float(torch.stack(jerk).mean().sqrt()) * fps**3,
+    }
 
 
 if __name__ == "__main__":
