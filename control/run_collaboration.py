@@ -161,6 +161,8 @@ def _run(args: Args, trials: CollaborationTrials, console: Console) -> Simulated
     def opened(address: str) -> None:
         console.print(f"Dashboard at [bold]{address}[/]")
 
+    # As many images whatever the number of objects: a gigabyte of memory holds 200.
+    keep_every = StationConfig().keep_every * len(trials.shelves)
     return simulate_collaboration(
         AimingSkill.load(args.aiming),
         PlacingSkill.load(args.placing),
@@ -170,7 +172,7 @@ def _run(args: Args, trials: CollaborationTrials, console: Console) -> Simulated
         pulls=PULLS if args.person else (),
         disturbances=trials.disturbances,
         config=trials.config,
-        station_config=replace(trials.station, keep_every=StationConfig().keep_every),
+        station_config=replace(trials.station, keep_every=keep_every),
         seed=args.seed,
         page=PageConfig(port=args.port) if args.page else None,
         watch=serving(_title(args), args.serving, opened) if args.serve else unwatched,

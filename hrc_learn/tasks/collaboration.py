@@ -305,14 +305,11 @@ class Collaboration:
         """From home, unless it has been tried often enough."""
         self._note(errand, mishap, what)
         self._grasping.start_over()
-        if errand.attempts > self._config.grasping.attempts or self._often(errand, mishap):
+        if errand.attempts == self._config.grasping.attempts:
             errand.failure = what
             return Phase.OVER
+        errand.attempts += 1
         return Phase.LOOK
-
-    def _often(self, errand: Errand, mishap: Mishap) -> bool:
-        times = sum(recovery.mishap == mishap for recovery in errand.recoveries)
-        return times >= self._config.grasping.attempts
 
     def _dropped(self, item: ObjectConfig) -> bool:
         """Whether the fingers have closed further than the object lets them."""

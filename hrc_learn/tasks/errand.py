@@ -53,6 +53,8 @@ class Errand:
     """Of the hand when it let go on the shelf."""
     failure: str = ""
     """Why the task was given up."""
+    attempts: int = 1
+    """Times it was begun with."""
     recoveries: list[Recovery] = field(default_factory=list)
     span: tuple[float, float] = (0.0, 0.0)
     """When it was begun with and when it was over [s]."""
@@ -61,12 +63,6 @@ class Errand:
     def delivered(self) -> bool:
         """Whether the hand let go of the object at its shelf, as the robot sees it."""
         return self.release is not None and not self.failure
-
-    @property
-    def attempts(self) -> int:
-        """Times the object was begun with."""
-        again = ("missed grasp", "dropped object")
-        return 1 + sum(recovery.mishap in again for recovery in self.recoveries)
 
     @property
     def goal_error(self) -> tuple[float, float]:

@@ -49,10 +49,12 @@ def test_the_job_is_done_and_every_target_met(work):
         *("control/run_collaboration.py", "--placing", work / "placing"),
         *("--aiming", work / "aiming", "--out", out, "--shelf", "lower"),
         *("--camera", "synthetic", "--seed", 3, "--json", work / "measured.json"),
+        *("--config.interaction", 5, "--occlusion", 0, 3, "--latency", 0.04, "--drop", 0.1),
     )
     assert "missed" not in done.stdout
     measured = json.loads((work / "measured.json").read_text())
-    assert measured["object_stands_on_the_shelf"] == 1
+    assert measured["objects_that_stand_on_their_shelf"] == 1
+    assert measured["recovered_from_marker_out_of_sight"] == 1
     assert measured["collisions_with_the_cabinet"] == 0
     assert {path.name for path in out.iterdir()} == {
         "figures",
@@ -69,6 +71,7 @@ def test_an_unknown_shelf_and_a_missing_model_are_bad_input(work):
     models = ("--placing", work / "placing", "--aiming", work / "aiming")
     for arguments, reason in (
         ((*models, "--shelf", "attic"), "lower, middle, upper"),
+        ((*models, "--shelves", "lower", "lower"), "a shelf of its own"),
         (("--placing", work / "nowhere", "--aiming", work / "aiming"), "nowhere"),
     ):
         out = work / "refused"

@@ -251,7 +251,7 @@ def with_obstacle(centre, half_size):
 
 @pytest.mark.slow
 def test_a_blocked_way_is_gone_round(aiming, placing):
-    workplace = with_obstacle((0.52, -0.14, 0.22), (0.05, 0.03, 0.05))
+    workplace = with_obstacle((0.55, -0.10, 0.305), (0.05, 0.02, 0.04))
     job = provoked(aiming, placing, workplace, seed=5)
     assert set(mishaps(job)) == {"blocked way"}
     assert verdict(job) == ""
