@@ -13,6 +13,8 @@ from hrc_learn.sim import World
 from hrc_learn.tasks.failure import BlockedPathError
 from hrc_learn.tasks.fit_primitives import fit_primitives
 from hrc_learn.tasks.placing import PlacingSkill, check_plan
+from hrc_learn.tasks.placing_figures import placing_figures
+from hrc_learn.tasks.placing_run import place
 from hrc_learn.tasks.teach_placing import PlacingLesson, teach_placing
 from hrc_learn.tasks.workplace import Workplace
 
@@ -125,6 +127,22 @@ def test_check_plan_names_what_would_be_hit(skill, world):
     hasty = np.linspace(HOME.numpy(), HOME.numpy() + 0.3, 3)
     with pytest.raises(BlockedPathError, match="slower"):
         check_plan(replace(plan, path=hasty), world)
+
+
+def test_a_placing_carried_out_ends_on_the_shelf_as_it_was_shown(skill, demos):
+    run = place(skill, WORKPLACE, "middle", HOME, space="joint", speed=2.5)
+    figures = placing_figures(run, WORKPLACE, demos[0])
+    assert figures.faults == []
+    assert figures.placed
+    assert figures.jerk < 1e-2
+    # Measured by the simulator, so not exactly what was planned.
+    assert 0 < figures.goal_distance < 5e-4
+    np.testing.assert_allclose(run.path[-1], run.plan.goal.position.numpy(), atol=1e-3)
+    assert [event.text for event in run.station.log.events] == [
+        "transfer",
+        "release",
+        "retreat",
+    ]
 
 
 def test_a_goal_out_of_reach_is_refused_before_anything_is_planned(skill):
