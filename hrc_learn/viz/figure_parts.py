@@ -100,9 +100,9 @@ def legend_in_free_cell(figure: Figure, grid: np.ndarray, used: int) -> None:
     figure.supxlabel("time [s]", fontsize=9)
 
 
-def space(figure: Figure) -> Axes3D:
-    """Axes in three dimensions."""
-    axes = figure.add_subplot(projection="3d", computed_zorder=False)
+def space(figure: Figure, position: tuple[int, int, int] = (1, 1, 1)) -> Axes3D:
+    """Axes in three dimensions, in a cell of a grid: rows, columns, number of the cell."""
+    axes = figure.add_subplot(*position, projection="3d", computed_zorder=False)
     assert isinstance(axes, Axes3D)
     axes.view_init(elev=24, azim=35)
     for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
@@ -112,11 +112,11 @@ def space(figure: Figure) -> Axes3D:
     return axes
 
 
-def frame_space(axes: Axes3D, points: Float[np.ndarray, "n 3"]) -> None:
+def frame_space(axes: Axes3D, points: Float[np.ndarray, "n 3"], zoom: float = 1.12) -> None:
     """Show the surroundings of some points, one metre as long on every axis."""
     low, high = points.min(axis=0) - _SURROUNDINGS, points.max(axis=0) + _SURROUNDINGS
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    axes.set_box_aspect(tuple(high - low), zoom=1.12)  # pyright: ignore[reportArgumentType]
+    axes.set_box_aspect(tuple(high - low), zoom=zoom)  # pyright: ignore[reportArgumentType]
 
 
 def near(boxes: tuple[Box, ...], points: Float[np.ndarray, "n 3"]) -> list[Box]:
