@@ -90,10 +90,10 @@ class ScenarioRun:
         """
         marker = self.scenario.workplace.scene.objects[0].marker.id
         if self._pixel is None:
-            self._noise.bit_generator.state = np.random.default_rng(
-                [self.seed, 1]
-            ).bit_generator.state
-            self._pixel = self._eye.look().get(marker)
+            eye = self._eye  # whose background takes random numbers when it is first made
+            noise = np.random.default_rng([self.seed, 1])
+            self._noise.bit_generator.state = noise.bit_generator.state
+            self._pixel = eye.look().get(marker)
         if self._pixel is None:
             raise ValueError(
                 f"the fixed camera does not see marker {marker} at the beginning: leave out "
