@@ -175,7 +175,10 @@ def _show(names: list[str], figures: dict[str, float]) -> list[Criterion]:
     if criteria:
         console.print(table)
     if any(c.number == "1" for c in criteria):
-        console.print("Figures 6 and 8 need the simulator: control/run_collaboration.py")
+        console.print(
+            "Figures 6 and 8 need the simulator: control/run_placing.py --seeds 40 and "
+            "control/run_collaboration.py --seeds 50"
+        )
     return [c for c in criteria if not c.met(figures[c.key])]
 
 
