@@ -35,7 +35,8 @@ class Measurement:
         """Whether the target is kept, None without one. NaN keeps none."""
         if self.target is None:
             return None
-        return self.value >= self.target if self.at_least else self.value <= self.target
+        # A bool of Python's own: numpy's is neither True nor False to an `is`.
+        return bool(self.value >= self.target if self.at_least else self.value <= self.target)
 
     @property
     def shown(self) -> str:
