@@ -17,7 +17,7 @@ counted:
   back where it was.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 
@@ -262,7 +262,7 @@ class Collaboration:
                     return way
         return None
 
-    def _ways(self, goal: Pose):
+    def _ways(self, goal: Pose) -> Iterator[Way]:
         return ways_to(
             goal,
             self._station.joints,

@@ -17,6 +17,7 @@ from ..sim import (
     CameraKind,
     ChangingCamera,
     MotionLog,
+    ObjectConfig,
     Occluder,
     Occlusion,
     World,
@@ -185,7 +186,7 @@ def simulate_collaboration(
     )
 
 
-def with_objects(workplace: Workplace, items: Sequence) -> Workplace:
+def with_objects(workplace: Workplace, items: Sequence[ObjectConfig]) -> Workplace:
     """The workplace with these objects on its table."""
     return replace(workplace, scene=replace(workplace.scene, objects=tuple(items)))
 
