@@ -174,15 +174,16 @@ def test_targets_are_judged(value, target, at_least, ok):
     m = Measurement(name="x", value=value, target=target, at_least=at_least)
     assert m.ok is ok
 
+    marks = {True: "✓ ok", False: "✗ missed", None: ""}
+    _, _, bound, mark = row(m)
+    assert mark == marks[ok]
+    assert bound.startswith("" if target is None else "≥" if at_least else "≤")
+
 
 def test_verdicts_on_numpy_values_are_true_or_false():
     """Programs ask whether a verdict `is False`, which numpy's own never is."""
     missed = Measurement(name="error", value=np.float64(3.0), target=2.0)
     assert missed.ok is False
-    marks = {True: "✓ ok", False: "✗ missed", None: ""}
-    _, _, bound, mark = row(m)
-    assert mark == marks[ok]
-    assert bound.startswith("" if target is None else "≥" if at_least else "≤")
 
 
 GOOD = Measurement(name="a", value=1, target=2)
