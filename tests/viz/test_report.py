@@ -173,7 +173,6 @@ def test_all_text_is_escaped():
 def test_targets_are_judged(value, target, at_least, ok):
     m = Measurement(name="x", value=value, target=target, at_least=at_least)
     assert m.ok is ok
-
     marks = {True: "✓ ok", False: "✗ missed", None: ""}
     _, _, bound, mark = row(m)
     assert mark == marks[ok]
