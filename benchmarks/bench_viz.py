@@ -1,8 +1,9 @@
 """What logging costs the control loop, writing a recording costs a run, and a camera a frame.
 
 The row logged is that of the collaboration task: 62 numbers and a flag in 13 columns. The
-floor is one bare NumPy row of the same width. Medians of CPU time on one thread, of calls
-made in turn.
+floor is one bare NumPy row of the same width. `log_live_us` is the prepared row again, while
+another thread sends all of it to a viewer: CPU time of the loop's thread alone, without what it
+waits for the interpreter. Medians of CPU time on one thread, of calls made in turn.
 """
 
 import os
@@ -10,21 +11,25 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import tempfile
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
+import rerun as rr
 from timing import time_calls
 
 from hrc_learn import cli
 from hrc_learn.vision import CameraModel, Marker, MarkerDetector, SyntheticCamera
 from hrc_learn.viz import CameraRecording, RunRecording, StepLog
+from hrc_learn.viz.live import LiveSender
+from hrc_learn.viz.log_stream import LogStream
 from hrc_learn.viz.run_dashboard import record_run
 
 STEPS = 200  # timed together, since one takes less than the clock resolves
-TARGETS = {"log_step_us": 2.0, "camera_ms": 4.0, "detect_ms": 4.0}
+TARGETS = {"log_step_us": 2.0, "log_live_us": 2.0, "camera_ms": 4.0, "detect_ms": 4.0}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +45,7 @@ class Args:
 def main(args: Args) -> None:
     """Measure, print a table with the targets, write the figures."""
     cv2.setNumThreads(1)
-    figures = measure_log(args.repeats)
+    figures = measure_log(args.repeats) | measure_live(args.repeats)
     figures |= measure_vision(args.repeats)
     figures |= measure_recording(args.seconds)
     for name, value in figures.items():
@@ -88,6 +93,27 @@ def measure_log(repeats: int) -> dict[str, float]:
     }
     timings = time_calls(calls, repeats)
     return {name: 1e6 * timing.median / STEPS for name, timing in timings.items()}
+
+
+def measure_live(repeats: int) -> dict[str, float]:
+    """Microseconds of the loop's thread for a step, of which another thread sends every one."""
+    values = step_values()
+    log, spent = StepLog(), []
+    row = log.prepare(**values)
+    columns = [name for name in log.names if name != "time"]
+    stream = rr.RecordingStream("benchmark")
+    with tempfile.TemporaryDirectory() as folder:
+        stream.save(Path(folder) / "live.rrd")
+        with LiveSender(LogStream(log, stream, columns).send, period=0.05):
+            for k in range(repeats):
+                began = time.thread_time()
+                for step in range(STEPS):
+                    row["time"] = (k * STEPS + step) / 1000
+                    log.append_row(row)
+                spent.append(time.thread_time() - began)
+                time.sleep(STEPS / 10_000)  # a loop waits for its next tick
+        stream.disconnect()
+    return {"log_live_us": 1e6 * float(np.median(spent)) / STEPS}
 
 
 def step_values() -> dict[str, np.ndarray | float | bool]:
@@ -139,10 +165,10 @@ def measure_recording(seconds: float) -> dict[str, float]:
 
 def long_run(seconds: float) -> RunRecording:
     """A run with the most voluminous fields filled."""
-    time = np.arange(0.0, seconds, 1 / 125)
-    steps = len(time)
+    times = np.arange(0.0, seconds, 1 / 125)
+    steps = len(times)
     model = CameraModel()
-    feature = np.stack([700 + 50 * np.sin(time), 500 + 50 * np.cos(time)], axis=-1)
+    feature = np.stack([700 + 50 * np.sin(times), 500 + 50 * np.cos(times)], axis=-1)
     frames = int(3 * seconds)
     image = SyntheticCamera(model, [], dict, rng=np.random.default_rng(0)).read()
     camera = CameraRecording(
@@ -154,10 +180,10 @@ def long_run(seconds: float) -> RunRecording:
     )
     return RunRecording(
         title="benchmark",
-        time=time,
+        time=times,
         joint_names=tuple(f"joint{i}" for i in range(1, 8)),
-        joint_position=np.sin(time[:, None] + np.arange(7)),
-        position=np.sin(time[:, None] + np.arange(3)),
+        joint_position=np.sin(times[:, None] + np.arange(7)),
+        position=np.sin(times[:, None] + np.arange(3)),
         camera=camera,
         image_jacobian=np.random.default_rng(0).normal(size=(steps, 2, 6)),
         human_effort=np.zeros((steps, 7)),
