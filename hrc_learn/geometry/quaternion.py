@@ -54,6 +54,8 @@ def multiply(
     p: Float[Tensor, "*#batch 4"], q: Float[Tensor, "*#batch 4"]
 ) -> Float[Tensor, "*batch 4"]:
     """Hamilton product: rotate by q, then by p."""
+    if torch.compiler.is_compiling():
+        return _written_out_product(p, q)
     # Sums instead of a matmul: TF32 tensor cores would round the product to three digits.
     left = p[..., _PRODUCT_INDEX.like(p)].unflatten(-1, (4, 4)) * _PRODUCT_SIGN.like(p)
     return (left * q[..., None, :]).sum(-1)
@@ -117,25 +119,14 @@ def from_matrix(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
     (Markley 2008, "Unit quaternion from rotation matrix"): accurate at every angle, and a
     unit quaternion even where R is a rotation only to rounding.
     """
+    if torch.compiler.is_compiling():
+        return _written_out_from_matrix(R)
     entries = R.flatten(-2)[..., _OUTER_INDEX.like(R)] * _OUTER_SIGN.like(R)
     outer = entries.sum(-2).unflatten(-1, (4, 4)) + _OUTER_OFFSET.like(R)
-    return normalize(_row_of_largest_diagonal(outer))
-
-
-def _row_of_largest_diagonal(outer: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4"]:
-    if torch.compiler.is_compiling():
-        # A look-up by index becomes C++ of inductor of torch 2.11 that fails for a batch.
-        row, *others = outer.unbind(-2)
-        largest = row[..., 0]
-        for k, other in enumerate(others, start=1):
-            larger = other[..., k] > largest
-            row = torch.where(larger[..., None], other, row)
-            largest = torch.where(larger, other[..., k], largest)
-        return row
     largest = outer.diagonal(dim1=-2, dim2=-1).argmax(-1)
     # Not take_along_dim: exporting it fixes the batch size.
     row = outer.gather(-2, largest[..., None, None].expand(*outer.shape[:-2], 1, 4))
-    return row.squeeze(-2)
+    return normalize(row.squeeze(-2))
 
 
 def angle(
@@ -200,3 +191,38 @@ def unwrap_log(v: Float[Tensor, "*batch time 3"]) -> Float[Tensor, "*batch time 
     turns = torch.round(signed.diff(dim=-1) / (2 * torch.pi)).cumsum(-1)
     turns = torch.cat([torch.zeros_like(length[..., :1]), turns], dim=-1)
     return v - (2 * torch.pi * turns * sign)[..., None] * axis
+
+
+# A compiler makes one loop over the batch of what follows, but has to look up every number of
+# what is picked by index above; and inductor of torch 2.11 makes C++ of the `gather` in
+# `from_matrix` that does not compile for a batch.
+
+
+def _written_out_product(p: Tensor, q: Tensor) -> Tensor:
+    """`multiply` component by component."""
+    (a, b, c, d), (w, x, y, z) = p.unbind(-1), q.unbind(-1)
+    parts = [
+        a * w - b * x - c * y - d * z,
+        a * x + b * w + c * z - d * y,
+        a * y - b * z + c * w + d * x,
+        a * z + b * y - c * x + d * w,
+    ]
+    return torch.stack(parts, dim=-1)
+
+
+def _written_out_from_matrix(R: Tensor) -> Tensor:
+    """`from_matrix` component by component."""
+    a, b, c, d, e, f, g, h, i = R.flatten(-2).unbind(-1)
+    wx, wy, wz, xy, xz, yz = h - f, c - g, d - b, b + d, c + g, f + h
+    row, *others = [
+        [a + e + i + 1, wx, wy, wz],
+        [wx, a - e - i + 1, xy, xz],
+        [wy, xy, e - a - i + 1, yz],
+        [wz, xz, yz, i - a - e + 1],
+    ]
+    largest = row[0]
+    for k, other in enumerate(others, start=1):
+        larger = other[k] > largest
+        row = [torch.where(larger, new, old) for new, old in zip(other, row, strict=True)]
+        largest = torch.where(larger, other[k], largest)
+    return normalize(torch.stack(row, dim=-1))

@@ -96,13 +96,15 @@ def test_from_matrix_inverts_to_matrix(turn):
     same_rotation(quaternion.from_matrix(quaternion.to_matrix(q)), q, atol=1e-15)
 
 
-def test_from_matrix_is_the_same_where_it_is_compiled(monkeypatch):
+def test_what_is_compiled_is_the_same(monkeypatch):
     """Also where several components are largest, as in a third of a turn about (1, 1, 1)."""
     ties = 0.5 * torch.tensor([[1, 1, 1, 1], [2**0.5, 2**0.5, 0, 0]], dtype=torch.float64)
-    R = quaternion.to_matrix(torch.cat([quaternions(200, rng=generator(12)), ties]))
-    eager = quaternion.from_matrix(R)
+    p = torch.cat([quaternions(200, rng=generator(12)), ties])
+    q, R = quaternions(3, 1, rng=generator(13)), quaternion.to_matrix(p)
+    row, product = quaternion.from_matrix(R), quaternion.multiply(p, q)
     monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)
-    assert torch.equal(quaternion.from_matrix(R), eager)
+    assert_close(quaternion.from_matrix(R), row, rtol=0, atol=1e-15)
+    assert_close(quaternion.multiply(p, q), product, rtol=0, atol=1e-15)
 
 
 def test_slerp_turns_at_constant_rate_the_short_way():
