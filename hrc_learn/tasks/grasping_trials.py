@@ -1,7 +1,7 @@
 """A grasp as one trial of many, each with a setting of its own."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,8 @@ from .grasping_variants import DEFAULT, VARIANTS
 from .simulated_grasp import SimulatedGrasp, simulate_grasp
 from .workplace import Workplace
 
+_PATIENCE = 20.0  # with a variant that is only compared [s]
+
 
 @dataclass(frozen=True, kw_only=True)
 class GraspingTrials:
@@ -23,8 +25,6 @@ class GraspingTrials:
 
     aiming: Path
     """Folder of the learned image Jacobian and visual target."""
-    variant: str = DEFAULT
-    """Name in `VARIANTS`."""
     setting: GraspingSettingConfig = field(
         default_factory=lambda: GraspingSettingConfig(random_camera=True)
     )
@@ -36,20 +36,30 @@ class GraspingTrials:
         outcome = GraspOutcome.of(self.run(seed))
         return outcome.values() | ({"failure": outcome.failure} if outcome.failure else {})
 
-    def run(self, seed: int, variant: str | None = None) -> SimulatedGrasp:
-        """One grasp, by another variant if told.
+    def run(self, seed: int) -> SimulatedGrasp:
+        """One grasp, all of it."""
+        return self._grasp(seed, DEFAULT, told_target=False, config=self.config)
 
-        One that is not the default aims but once, at the pixel that it is told.
+    def compare(self, seed: int, variant: str) -> SimulatedGrasp:
+        """The same by a variant in `VARIANTS`, for comparison.
+
+        It is told the pixel to aim at, goes straight there, and tries but once.
         """
-        variant = variant or self.variant
+        aiming = replace(self.config.aiming, probe=0.0, patience=_PATIENCE)
+        config = replace(self.config, aiming=aiming, attempts=1)
+        return self._grasp(seed, variant, told_target=True, config=config)
+
+    def _grasp(
+        self, seed: int, variant: str, *, told_target: bool, config: GraspingConfig
+    ) -> SimulatedGrasp:
         skill, rng = AimingSkill.load(self.aiming), np.random.default_rng(seed)
         setting = GraspingSetting.draw(Workplace(), self.setting, rng, self.camera)
         return simulate_grasp(
             skill,
             setting,
             estimator=VARIANTS[variant].estimator(skill.jacobian),
-            told_target=variant != DEFAULT,
+            told_target=told_target,
             camera=self.camera,
-            config=self.config,
+            config=config,
             rng=np.random.default_rng([seed, 1]),
         )

@@ -22,6 +22,8 @@ class GraspingVariant:
     says: str
     estimator: Callable[[RBFImageJacobian], ImageJacobianEstimator]
     """From the learned image Jacobian."""
+    claim: str = ""
+    """What the paper states about it."""
 
 
 def from_learned(learned: RBFImageJacobian) -> ImageJacobianEstimator:
@@ -51,10 +53,12 @@ VARIANTS: Mapping[str, GraspingVariant] = {
     ),
     "paper": GraspingVariant(
         says="the paper's law from its guess",
+        claim="reaches the target, faster than without adaptation (Fig. 10)",
         estimator=lambda _: PaperEstimator(guessed_network()),
     ),
     "fixed": GraspingVariant(
         says="the paper's guess, not adapted",
+        claim="reaches the target, slower (Fig. 10)",
         estimator=lambda _: FixedEstimator(guessed_network()),
     ),
     "unadapted": GraspingVariant(
