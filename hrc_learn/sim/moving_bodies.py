@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..viz import Body, Box, Capsule
+from ..viz.panda_meshes import panda_mesh
 from .contacts import body_geoms
 from .scene import COVER
 from .world import World
@@ -47,6 +48,7 @@ class MovingBodies:
                     orientation=orientations[:, i],
                     capsules=capsules,
                     boxes=boxes,
+                    mesh=panda_mesh(self.names[i]),
                 )
             )
         return tuple(bodies)
@@ -69,7 +71,16 @@ def _shapes(model: mujoco.MjModel, body: int) -> tuple[tuple[Capsule, ...], tupl
         elif kind == mujoco.mjtGeom.mjGEOM_BOX:
             # All boxes of ours are turned by multiples of a quarter turn.
             half_size = _triple(np.abs(R @ size))
-            boxes.append(Box(centre=_triple(centre), half_size=half_size, colour=colour))
+            name = model.geom(g).name
+            # Meshes of the arm show all but the markers on it.
+            boxes.append(
+                Box(
+                    centre=_triple(centre),
+                    half_size=half_size,
+                    colour=colour,
+                    name=name if name.endswith("_plate") else "",
+                )
+            )
     return tuple(capsules), tuple(boxes)
 
 

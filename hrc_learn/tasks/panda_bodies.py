@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from ..kinematics import panda, panda_capsules
 from ..viz import Body, Capsule
+from ..viz.panda_meshes import panda_mesh
 
 
 def panda_bodies(joint_position: Float[np.ndarray, "time 7"]) -> tuple[Body, ...]:
@@ -28,12 +29,15 @@ def panda_bodies(joint_position: Float[np.ndarray, "time 7"]) -> tuple[Body, ...
         shapes[capsule.link].append(
             Capsule(start=capsule.start, end=capsule.end, radius=capsule.radius)
         )
+    last = position.shape[1] - 1
+    names = {link: "tool" if link == last else f"link{link}" for link in shapes}
     return tuple(
         Body(
-            name=f"link{link}",
+            name=names[link],
             position=position[:, link],
             orientation=orientation[:, link],
             capsules=tuple(capsules),
+            mesh=panda_mesh(names[link]),
         )
         for link, capsules in shapes.items()
     )

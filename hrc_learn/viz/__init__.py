@@ -15,6 +15,7 @@ from .recording import CameraRecording as CameraRecording
 from .recording import Capsule as Capsule
 from .recording import FitRecording as FitRecording
 from .recording import JointLimits as JointLimits
+from .recording import MeshFile as MeshFile
 from .recording import RunRecording as RunRecording
 from .recording import arm_bodies as arm_bodies
 from .step_log import StepLog as StepLog

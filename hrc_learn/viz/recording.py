@@ -5,6 +5,7 @@ Whatever is None or empty drops its panel or figure. Times are seconds from the 
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -43,6 +44,17 @@ class Box:
     name: str = ""
 
 
+@dataclass(frozen=True, kw_only=True)
+class MeshFile:
+    """A drawn shape in a file, in the frame of the body that carries it."""
+
+    path: Path
+    turn: float = 0.0
+    """About z [rad]."""
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """[m]"""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Body:
     """Something rigid that moves: a link of the arm, a finger, the object it carries."""
@@ -54,6 +66,9 @@ class Body:
     """Unit quaternion (w, x, y, z)."""
     capsules: tuple[Capsule, ...] = ()
     boxes: tuple[Box, ...] = ()
+    mesh: MeshFile | None = None
+    """Drawn in place of capsules and nameless boxes, where the file is there and the viewer
+    can."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

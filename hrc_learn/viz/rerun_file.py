@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 
 from ..output import new_file
 from .panels import Curves, Plot, Tab
-from .recording import Body, Box, Capsule
+from .recording import Body, Box, Capsule, MeshFile
 
 TIMELINE = "time"
 """All that is recorded lies on this timeline [s]: the viewer shows one at a time."""
@@ -113,11 +113,23 @@ def body_path(body: Body) -> str:
 
 def send_shapes(still: StillThings, body: Body) -> None:
     """Send what a body looks like."""
-    path = body_path(body)
-    if body.capsules:
+    path, mesh, plain = body_path(body), body.mesh, body.boxes
+    if mesh is not None:
+        still.send(f"{path}/mesh", mesh, lambda: _asset(mesh))
+        plain = tuple(box for box in body.boxes if box.name)
+    elif body.capsules:
         still.send(f"{path}/capsules", body.capsules, lambda: capsules(body.capsules))
-    if body.boxes:
-        still.send(f"{path}/boxes", body.boxes, lambda: boxes(body.boxes))
+    if plain:
+        still.send(f"{path}/boxes", plain, lambda: boxes(plain))
+
+
+def _asset(mesh: MeshFile) -> tuple[rr.Asset3D, rr.Transform3D]:
+    """A mesh where it is on its body."""
+    # Rerun tells most kinds of files by their contents, but takes COLLADA for any XML.
+    kind = "model/vnd.collada+xml" if mesh.path.suffix == ".dae" else None
+    turn = rr.RotationAxisAngle(axis=(0, 0, 1), radians=mesh.turn)
+    place = rr.Transform3D(translation=mesh.offset, rotation=turn)
+    return rr.Asset3D(path=mesh.path, media_type=kind), place
 
 
 def send_poses(
