@@ -88,7 +88,8 @@ def _grasping(run: RunRecording, objects: Mapping[str, tuple[float, float]]) -> 
             Picture(
                 "marker",
                 collaboration_figures.marker_figure(run, objects),
-                "The marker's paths in the image, and its distance from the target.",
+                "The marker's paths, over the camera's first image, and its distance from the "
+                "target.",
             ),
             Picture(
                 "image_jacobian",

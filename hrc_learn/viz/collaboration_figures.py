@@ -56,7 +56,7 @@ def trajectories_figure(run: RunRecording, objects: Spans) -> Figure:
             axes.plot(*path.T, color=colour, lw=2.0, label=f"carried: {name}")
             if len(path):
                 axes.plot(*path[-1], "s", color=colour, ms=5)
-        axes.legend(loc="upper left")
+        axes.legend(loc="upper right")
         axes.set_title("Paths of the tool centre point (square: let go)", loc="left")
         frame_space(axes, points)
     return figure
@@ -136,7 +136,7 @@ def hand_figure(run: RunRecording) -> Figure:
 
 def timeline_figure(run: RunRecording, objects: Spans) -> Figure:
     """What the robot was about, object by object, and what people did meanwhile."""
-    events = _lasting(run)
+    events = [(event, end) for event, end in _lasting(run) if end > event.time]
     names = list(dict.fromkeys(event.text for event, _ in events))
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, 0.9 + 0.26 * (len(names) + 2)))
@@ -149,7 +149,7 @@ def timeline_figure(run: RunRecording, objects: Spans) -> Figure:
             axes.broken_barh([bar], (names.index(event.text) - 0.38, 0.76), color=colour)
         rows = {"person pulls": _acting(run), "marker unseen": _wanted_unseen(run)}
         for k, (active, colour) in enumerate(
-            zip(rows.values(), (palette.PERSON, _HIDDEN), strict=True), start=len(names)
+            zip(rows.values(), (palette.PURPLE, _HIDDEN), strict=True), start=len(names)
         ):
             bars = [(run.time[a], run.time[b] - run.time[a]) for a, b in spells(active)]
             axes.broken_barh(bars, (k - 0.38, 0.76), color=colour)
