@@ -65,7 +65,9 @@ def grasping_report(
                     Picture(
                         "regions",
                         grasping_figures.regions_figure(default, shares, activity.potentials),
-                        "Shares of the feedback in the command, and potentials of the regions.",
+                        "Shares of the feedback in the command, and potentials of the regions. "
+                        "The position's jumps where the hand is sent up and down to learn how "
+                        "height looks.",
                     ),
                     Picture(
                         "joints",

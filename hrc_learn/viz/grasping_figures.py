@@ -16,6 +16,7 @@ from .recording import CameraRecording, RunRecording
 
 _REACHED = 5.0  # pixel error that counts as there
 _NOTHING_LEFT = 1e-6  # of a potential
+_REGIONS = (palette.ORANGE, palette.VERMILION, palette.GREEN)  # Cartesian ones alike
 
 
 def variants_figure(runs: Mapping[str, RunRecording], target: Float[np.ndarray, "2"]) -> Figure:
@@ -37,7 +38,9 @@ def variants_figure(runs: Mapping[str, RunRecording], target: Float[np.ndarray, 
         # The most important one is drawn last, on top.
         for k, (name, camera) in reversed(list(enumerate(cameras.items()))):
             time, known = runs[name].time - min(starts), seen[name]
-            style = {"color": palette.SERIES[k], "lw": 2.2 if k == 0 else 1.1, "label": name}
+            # Every other one is dashed: laws that do not differ lie upon one another.
+            style = {"color": palette.SERIES[k], "ls": "--" if k % 2 else "-", "label": name}
+            style["lw"] = 2.2 if k == 0 else 1.3
             image.plot(*np.where(known[:, None], camera.feature, np.nan).T, **style)
             distance = np.linalg.norm(camera.feature - target, axis=1)
             error.plot(time, np.where(known, distance, np.nan), **style)
@@ -115,18 +118,18 @@ def regions_figure(
     Args:
         run: For its times and phases.
         shares: Of each kind of feedback in the command, 0 to 1; NaN while none was active.
-        potentials: Of each region.
+        potentials: Of the regions of position, orientation and vision.
     """
     active = np.logical_or.reduce([np.isfinite(values) for values in shares.values()])
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, 4.2))
         above, below = figure.subplots(2, 1, sharex=True, height_ratios=[1, 1.4])
-        for colour, (name, values) in zip(palette.SERIES, shares.items(), strict=False):
-            above.fill_between(run.time, values, alpha=0.18, color=colour, lw=0)
-            above.plot(run.time, values, color=colour, label=name)
+        for k, (name, values) in enumerate(shares.items()):
+            colour = palette.SERIES[k]
+            above.fill_between(run.time, values, alpha=0.15, color=colour, lw=0)
+            above.plot(run.time, values, color=colour, ls="--" if k % 2 else "-", label=name)
         above.set(ylabel="share [-]", ylim=(-0.03, 1.08), title="Which feedback leads the arm")
-        colours = palette.SERIES[len(shares) - len(potentials) :]
-        for colour, (name, values) in zip(colours, potentials.items(), strict=False):
+        for colour, (name, values) in zip(_REGIONS, potentials.items(), strict=True):
             below.plot(
                 run.time, np.where(values > 1e-6, values, np.nan), color=colour, label=name
             )
