@@ -1,11 +1,14 @@
 """Demonstrations and policies small enough to be made in every test."""
 
 from collections.abc import Mapping
+from pathlib import Path
 
+import numpy as np
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
 from torch import Tensor
 
+from hrc_learn.demos import DatasetWriter
 from hrc_learn.dmp.system.approach import quintic
 from hrc_learn.lerobot import DMPConfig
 from hrc_learn.lerobot.policy.modeling_dmp import DMPPolicy
@@ -38,6 +41,31 @@ def reaching(count: int, seed: int = 0) -> list[Episode]:
             }
         )
     return episodes
+
+
+def write_dataset(folder: Path, episodes: list[Episode], *, images: bool = False) -> Path:
+    """Write them as a LeRobot dataset of an arm that is where it is sent."""
+    rng = np.random.default_rng(0)
+    with DatasetWriter(
+        folder,
+        fps=FPS,
+        robot_type="point",
+        joint_names=("a", "b"),
+        features={GOAL: ("goal.a", "goal.b")},
+        cameras={"front": (32, 48)} if images else None,
+    ) as writer:
+        for episode in episodes:
+            writer.start_episode("reach")
+            for action, goal in zip(episode["action"], episode[GOAL], strict=True):
+                seen = {"front": rng.integers(0, 255, (32, 48, 3), np.uint8)}
+                writer.add_frame(
+                    images=seen if images else None,
+                    joint_position=action.numpy(),
+                    command_position=action.numpy(),
+                    **{GOAL: goal.numpy()},
+                )
+            writer.save_episode()
+    return folder
 
 
 def stats_of(episodes: list[Episode]) -> dict[str, dict[str, Tensor]]:

@@ -1,6 +1,7 @@
 """What LeRobot, and whoever trusts a policy with an arm, may expect of `dmp`."""
 
 from dataclasses import fields
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -17,6 +18,7 @@ from lerobot_samples import (
     shaken,
     stats_of,
     windows,
+    write_dataset,
 )
 
 from hrc_learn.lerobot import DMPConfig
@@ -98,6 +100,33 @@ def test_ten_demonstrations_lead_to_goals_between_them():
         assert (reached - episode[GOAL][0]).norm() < 0.02
     # One that does not see the goal cannot.
     assert (played(mean, HELD_OUT[0], 60)[-1] - HELD_OUT[0][GOAL][0]).norm() > 0.1
+
+
+def test_what_explains_nothing_is_not_followed():
+    """Goals that are somebody else's: demonstrations left out say that the mean is better."""
+    others = [
+        e | {GOAL: o[GOAL][:1].expand(len(e["action"]), -1)}
+        for e, o in zip(SHOWN, HELD_OUT * 2, strict=True)
+    ]
+    one, other = ({GOAL: torch.full((1, 2), x), STATE: torch.zeros(1, 3)} for x in (-1.0, 1.0))
+    policy, misled = fitted_policy(SHOWN), fitted_policy(others)
+
+    def difference(policy):
+        ends = [policy.planner.open(seen).context for seen in (one, other)]
+        slopes = policy.planner.motion.slopes
+        return float(((ends[0] - ends[1]) @ slopes).norm())
+
+    assert difference(misled) < 0.1 * difference(policy)
+
+
+def test_beyond_what_was_shown_it_goes_no_farther():
+    """By half of the range shown, however far away the goal is seen."""
+    policy = fitted_policy(SHOWN)
+    far = SHOWN[0] | {GOAL: SHOWN[0][GOAL] + 100}
+    goals = torch.stack([e[GOAL][0] for e in SHOWN])
+    farthest = goals.amax(0) + 0.5 * (goals.amax(0) - goals.amin(0))
+    reached = played(policy, far, 60)[-1]
+    torch.testing.assert_close(reached, farthest, rtol=0, atol=0.1)
 
 
 def test_training_takes_up_what_the_closed_form_leaves():
@@ -207,13 +236,28 @@ def test_processors_leave_numbers_as_they_are():
     torch.testing.assert_close(after(SHOWN[0]["action"][:1]), SHOWN[0]["action"][:1])
 
 
+def test_a_dataset_on_disk_is_fitted_by_its_episodes(tmp_path, caplog):
+    folder = write_dataset(tmp_path / "set", SHOWN[:3])
+    shown = [e | {STATE: e["action"]} for e in SHOWN[:3]]
+    stats, meta = stats_of(shown), SimpleNamespace(root=folder, fps=FPS)
+    config = config_for(shown[0], fps=None, fit_episodes=[2, 0], state_names=["a.pos", "b.pos"])
+    policy = DMPPolicy(config, dataset_stats=stats, dataset_meta=meta)
+    assert config.fps == FPS
+    like = DMPPolicy(config, dataset_stats=stats)
+    like.planner.fit([shown[0], shown[2]], "action")
+    torch.testing.assert_close(played(policy, shown[1]), played(like, shown[1]))
+    # Of a dataset that is streamed nothing lies on disk.
+    DMPPolicy(config, dataset_meta=SimpleNamespace(root=tmp_path, fps=FPS))
+    assert "training starts from standing still" in caplog.text
+
+
 def test_tuning_for_other_actions_or_rates_is_refused(tmp_path):
     fitted_policy(SHOWN).save_pretrained(tmp_path)
     config = DMPConfig.from_pretrained(tmp_path)
     config.pretrained_path = tmp_path
     with pytest.raises(ValueError, match=r"trained for the actions a\.pos, b\.pos; .* c\.pos"):
         config.set_dataset_feature_metadata({"action": {"names": ["c.pos", "b.pos"]}})
-    meta = type("Meta", (), {"fps": 2 * FPS, "root": tmp_path})
+    meta = SimpleNamespace(root=tmp_path, fps=2 * FPS)
     with pytest.raises(ValueError, match="for 20 actions a second, the dataset has 40"):
         DMPPolicy(config, dataset_meta=meta)
 

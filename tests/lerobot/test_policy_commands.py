@@ -7,12 +7,10 @@ import sys
 import sysconfig
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-from lerobot_samples import FPS, GOAL, STATE, reaching, windows
+from lerobot_samples import FPS, GOAL, STATE, reaching, windows, write_dataset
 
-from hrc_learn.demos import DatasetWriter
 from hrc_learn.lerobot.policy.episodes import read_episodes
 from hrc_learn.lerobot.policy.modeling_dmp import DMPPolicy
 
@@ -22,46 +20,20 @@ ROOT = Path(__file__).parents[2]
 COMMANDS = Path(sys.executable).parent
 OFFLINE = os.environ | {"HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1"}
 DISCOVER = "--policy.discover_packages_path=hrc_learn.lerobot"
+ALSO_OF_A_PATH = "--discover_packages_path=hrc_learn.lerobot"
+"""With `--policy.path` LeRobot reads all that begins with `--policy.` a second time."""
 SMALL = ("--policy.hidden_dim=16", "--policy.n_basis=12", "--policy.chunk_size=8")
 SMALL = (*SMALL, "--policy.n_action_steps=4", "--policy.optimizer_lr=0.003")
 
 
-def write(folder: Path, *, images: bool) -> Path:
-    cameras = {"front": (32, 48)} if images else None
-    rng = np.random.default_rng(0)
-    with DatasetWriter(
-        folder,
-        fps=FPS,
-        robot_type="point",
-        joint_names=("a", "b"),
-        features={GOAL: ("goal.a", "goal.b")},
-        cameras=cameras,
-    ) as writer:
-        for episode in reaching(4):
-            writer.start_episode("reach")
-            for action, goal in zip(episode["action"], episode[GOAL], strict=True):
-                q = action.numpy().astype(float)
-                seen = (
-                    {"front": rng.integers(0, 255, (32, 48, 3), np.uint8)} if images else None
-                )
-                writer.add_frame(
-                    images=seen,
-                    joint_position=q,
-                    command_position=q,
-                    **{GOAL: goal.numpy().astype(float)},
-                )
-            writer.save_episode()
-    return folder
-
-
 @pytest.fixture(scope="module")
 def numbers(tmp_path_factory) -> Path:
-    return write(tmp_path_factory.mktemp("numbers") / "set", images=False)
+    return write_dataset(tmp_path_factory.mktemp("numbers") / "set", reaching(4))
 
 
 @pytest.fixture(scope="module")
 def pictures(tmp_path_factory) -> Path:
-    return write(tmp_path_factory.mktemp("pictures") / "set", images=True)
+    return write_dataset(tmp_path_factory.mktemp("pictures") / "set", reaching(4), images=True)
 
 
 def train(*arguments: object, ranks: int = 1) -> str:
@@ -121,11 +93,11 @@ def test_train_resume_tune_and_load_with_images(pictures, tmp_path):
     assert config["action_feature_names"] == ["a.pos", "b.pos"]
     saved = checkpoint(out, "000002") / "train_config.json"
     resumed = train(DISCOVER, f"--config_path={saved}", "--resume=true", "--steps=6")
-    assert "step:3 " in resumed.replace("step:3\t", "step:3 ")
+    assert "Resuming data order at epoch 0, sample 8" in resumed
     assert checkpoint(out, "000006").is_dir()
     tuned = tmp_path / "tuned"
     start = f"--policy.path={checkpoint(out)}"
-    train(DISCOVER, start, *common(pictures, tuned), "--batch_size=4", "--steps=1")
+    train(ALSO_OF_A_PATH, start, *common(pictures, tuned), "--batch_size=4", "--steps=1")
     assert len(first_action_in_a_fresh_process(checkpoint(tuned))) == 2
 
 
@@ -154,7 +126,7 @@ def test_a_closed_form_policy_is_a_checkpoint(numbers, tmp_path):
     assert first_action_in_a_fresh_process(folder) == [0.0, 0.0]
     tuned = tmp_path / "tuned"
     start = f"--policy.path={folder}"
-    train(DISCOVER, start, *common(numbers, tuned), "--batch_size=4", "--steps=1")
+    train(ALSO_OF_A_PATH, start, *common(numbers, tuned), "--batch_size=4", "--steps=1")
     refused = subprocess.run([*fit, "--kinds", "joint"], capture_output=True, text=True)
     assert refused.returncode == 2
     assert "takes --n-basis and --episodes alone" in refused.stderr
