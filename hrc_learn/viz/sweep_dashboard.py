@@ -95,17 +95,21 @@ def _line(cells: list[str]) -> str:
 
 
 def _blueprint(sweep: SweepRecording, tabs: list[Tab]) -> rrb.Blueprint:
-    classes = ", ".join(sweep.groups)
     bars = [
-        rrb.BarChartView(origin=_bars(name), name=f"{name}: success [%] by class ({classes})")
+        rrb.BarChartView(
+            origin=_bars(name),
+            name=f"{name}: success [%]",
+            plot_legend=rrb.PlotLegend(visible=False),
+        )
         for name in sweep.experiments
     ]
-    success = rrb.Grid(contents=bars, grid_columns=_COLUMNS, name="Success by class")
+    order = f"Success by class: {', '.join(sweep.groups)}"
+    success = rrb.Grid(contents=bars, grid_columns=_COLUMNS, name=order)
     return rrb.Blueprint(
         rrb.Horizontal(
             rrb.TextDocumentView(origin="/summary", name="Sweep"),
             rrb.Tabs(contents=[*(tab_view(tab) for tab in tabs), success], active_tab=0),
-            column_shares=[2, 3],
+            column_shares=[1, 1],
         ),
         rrb.TimePanel(state="collapsed", timeline=TIMELINE),
         collapse_panels=True,
