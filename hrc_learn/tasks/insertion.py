@@ -28,18 +28,11 @@ class Insertion:
         Args:
             path: Of the hand [m].
             goal: Where it should end [m].
-            edge: y at which the insertion begins, when it is crossed for the last time [m].
-
-        Raises:
-            ValueError: If the path never gets behind the edge.
+            edge: y at which the insertion begins, when it is crossed for the last time [m]. A
+                path that ends in front of it has no samples.
         """
         outside = np.flatnonzero(path[:, 1] > edge)
         first = int(outside[-1]) + 1 if len(outside) else 0
-        if first == len(path):
-            raise ValueError(
-                f"the path ends at y = {path[-1, 1]:.3f} m, in front of the edge at {edge:.3f} "
-                "m: it never goes in."
-            )
         return cls(offset=path[first:] - goal)
 
     @property
@@ -58,5 +51,5 @@ class Insertion:
         return np.hypot(self.offset[:, 0] - there[0], self.offset[:, 2] - there[1])
 
     def bend(self, other: "Insertion") -> float:
-        """Largest of these distances [m]."""
-        return float(self.aside(other).max())
+        """Largest of these distances [m]; infinite if the hand never got in."""
+        return float(self.aside(other).max()) if len(self.offset) else np.inf

@@ -100,9 +100,19 @@ def way_in(path: Float[np.ndarray, "steps 3"], goal: Pose, workplace: Workplace)
 
 
 def demonstrated_way_in(demonstration: Demonstration, workplace: Workplace) -> Insertion:
-    """What was shown there, relative to where it ended."""
+    """What was shown there, relative to where it ended.
+
+    Raises:
+        ValueError: If the hand was never led into the cabinet.
+    """
     path = hand_path(demonstration)
-    return Insertion.of(path, path[-1], _edge(workplace))
+    shown = Insertion.of(path, path[-1], _edge(workplace))
+    if not len(shown.offset):
+        raise ValueError(
+            f"demonstration {demonstration.episode} ends at y = {path[-1, 1]:.3f} m, in front "
+            f"of the cabinet at {_edge(workplace):.3f} m: give demonstrations of placing."
+        )
+    return shown
 
 
 def _edge(workplace: Workplace) -> float:

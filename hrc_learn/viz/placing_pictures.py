@@ -143,16 +143,17 @@ def bend_figure(ways: Mapping[str, Mapping[str, WayIn]], bound: float) -> Figure
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, 2.9))
         panels = figure.subplots(1, len(ways), sharey=True, squeeze=False)[0]
-        for axes, (way, by_shelf) in zip(panels, ways.items(), strict=True):
+        for axes, (title, by_shelf) in zip(panels, ways.items(), strict=True):
             for shelf, colour in shelf_colours(list(by_shelf)).items():
                 left, aside = 1e3 * by_shelf[shelf].left, 1e3 * by_shelf[shelf].aside
                 axes.plot(left, aside, color=colour, label=f"{shelf} shelf")
             axes.axhline(1e3 * bound, color=palette.LIMIT, lw=1, ls="--", label="bound")
-            axes.set(title=way.capitalize(), xlabel="way left to the goal [mm]")
+            axes.set(title=title.capitalize(), xlabel="way left to the goal [mm]")
             axes.set_yscale("log")
             axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
             axes.set_ylim(0.1, 400)
-            axes.set_xlim(1e3 * max(w.left.max() for w in by_shelf.values()), 0)
+            longest = max(way.left.max(initial=1e-3) for way in by_shelf.values())
+            axes.set_xlim(1e3 * longest, 0)
         panels[0].set_ylabel("off the demonstrated way [mm]")
         _legend_above(figure)
     return figure
