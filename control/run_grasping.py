@@ -31,6 +31,7 @@ from hrc_learn.tasks.grasping_variants import VARIANTS
 from hrc_learn.tasks.repetition import repeat
 from hrc_learn.tasks.repetition_summary import Summary
 from hrc_learn.tasks.trial_file import Trial
+from hrc_learn.tasks.watching import ServeConfig, serving, unwatched
 from hrc_learn.viz.report import Measurement, show_measurements, write_report
 from hrc_learn.viz.run_dashboard import record_run
 
@@ -54,6 +55,10 @@ class Args:
     camera: CameraKind = "auto"
     """Camera: rendered by "egl", or "synthetic", which needs no OpenGL; "auto" renders where
     it can."""
+    serve: bool = False
+    """Serve the dashboard of the grasp in the browser while it goes on."""
+    serving: ServeConfig = field(default_factory=ServeConfig)
+    """Where, with --serve."""
     config: GraspingConfig = field(default_factory=GraspingConfig)
     """How objects are grasped."""
     gains: Path | None = None
@@ -82,10 +87,18 @@ def main(args: Args) -> int:
         camera=args.camera,
         config=replace(args.config, controller=controller),
     )
+
+    def opened(address: str) -> None:
+        console.print(f"Dashboard at [bold]{address}[/]")
+
     with new_folder(args.out, asdict(args), args.overwrite) as folder:
         with console.status("Grasping") as status:
             experiment = GraspingExperiment.run(
-                trials, args.seed, others, lambda what: status.update(f"Grasping: {what}")
+                trials,
+                args.seed,
+                others,
+                lambda what: status.update(f"Grasping: {what}"),
+                serving("Grasping", args.serving, opened) if args.serve else unwatched,
             )
         many = _repeat(args, trials)
         table = evaluate_grasping(experiment) + (evaluate_many(many) if many else [])

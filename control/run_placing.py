@@ -12,7 +12,7 @@ import shlex
 import shutil
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +40,7 @@ from hrc_learn.tasks.placing_trials import PlacingTrials
 from hrc_learn.tasks.repetition import Run, repeat
 from hrc_learn.tasks.repetition_summary import Summary
 from hrc_learn.tasks.trial_file import Trial
+from hrc_learn.tasks.watching import ServeConfig, serving, unwatched
 from hrc_learn.tasks.workplace import Workplace
 from hrc_learn.viz.report import Measurement, show_measurements, write_report
 from hrc_learn.viz.run_dashboard import record_run
@@ -67,6 +68,10 @@ class Args:
     """Of the repetitions, at once."""
     seed: int = 0
     """First seed of starts and demonstrations."""
+    serve: bool = False
+    """Serve the dashboard of the reproduction in the browser while it goes on."""
+    serving: ServeConfig = field(default_factory=ServeConfig)
+    """Where, with --serve."""
     pictures: bool = True
     """Whether to render pictures of the arm, where this machine can."""
     overwrite: bool = False
@@ -80,6 +85,10 @@ def main(args: Args) -> int:
     console = Console()
     skill, dataset = PlacingSkill.load(args.placing), args.demonstrations or _dataset(args)
     demonstration = load_demos(dataset, episodes=[0])[0]
+
+    def opened(address: str) -> None:
+        console.print(f"Dashboard at [bold]{address}[/]")
+
     with new_folder(args.out, asdict(args), args.overwrite) as folder:
         with console.status("Placing") as status:
             experiment = run_placing_experiment(
@@ -89,6 +98,7 @@ def main(args: Args) -> int:
                 speed=args.speed,
                 seed=args.seed,
                 on_step=lambda what: status.update(f"Placing: {what}"),
+                watch=serving("Placing", args.serving, opened) if args.serve else unwatched,
             )
         table = evaluate_placing(experiment)
         starts = _repeat(

@@ -14,6 +14,7 @@ from .grasping_outcome import GraspOutcome
 from .grasping_trials import GraspingTrials
 from .grasping_variants import VARIANTS
 from .simulated_grasp import SimulatedGrasp
+from .watching import Watch, unwatched
 
 REACHED = 5.0
 """Distance of the marker from where it truly should be that counts as there [px]."""
@@ -36,6 +37,7 @@ class GraspingExperiment:
         seed: int,
         variants: Sequence[str],
         on_run: Callable[[str], None] = lambda what: None,
+        watch: Watch = unwatched,
     ) -> "GraspingExperiment":
         """Grasp, then compare.
 
@@ -44,9 +46,10 @@ class GraspingExperiment:
             seed: Of the setting.
             variants: What to compare.
             on_run: Told of each run as it begins.
+            watch: Watches the grasp from the side.
         """
         on_run("the whole grasp")
-        grasp, compared = trials.run(seed), {}
+        grasp, compared = trials.run(seed, watch), {}
         for variant in dict.fromkeys(variants):
             on_run(VARIANTS[variant].says)
             compared[variant] = trials.compare(seed, variant)

@@ -14,6 +14,7 @@ from .grasping_outcome import GraspOutcome
 from .grasping_setting import GraspingSetting, GraspingSettingConfig
 from .grasping_variants import DEFAULT, VARIANTS
 from .simulated_grasp import SimulatedGrasp, simulate_grasp
+from .watching import Watch, unwatched
 from .workplace import Workplace
 
 _PATIENCE = 20.0  # with a variant that is only compared [s]
@@ -36,9 +37,9 @@ class GraspingTrials:
         outcome = GraspOutcome.of(self.run(seed))
         return outcome.values() | ({"failure": outcome.failure} if outcome.failure else {})
 
-    def run(self, seed: int) -> SimulatedGrasp:
-        """One grasp, all of it."""
-        return self._grasp(seed, DEFAULT, told_target=False, config=self.config)
+    def run(self, seed: int, watch: Watch = unwatched) -> SimulatedGrasp:
+        """One grasp, all of it, which somebody may watch."""
+        return self._grasp(seed, DEFAULT, told_target=False, config=self.config, watch=watch)
 
     def compare(self, seed: int, variant: str) -> SimulatedGrasp:
         """The same by a variant in `VARIANTS`, for comparison.
@@ -50,7 +51,13 @@ class GraspingTrials:
         return self._grasp(seed, variant, told_target=True, config=config)
 
     def _grasp(
-        self, seed: int, variant: str, *, told_target: bool, config: GraspingConfig
+        self,
+        seed: int,
+        variant: str,
+        *,
+        told_target: bool,
+        config: GraspingConfig,
+        watch: Watch = unwatched,
     ) -> SimulatedGrasp:
         skill, rng = AimingSkill.load(self.aiming), np.random.default_rng(seed)
         setting = GraspingSetting.draw(Workplace(), self.setting, rng, self.camera)
@@ -62,4 +69,5 @@ class GraspingTrials:
             camera=self.camera,
             config=config,
             rng=np.random.default_rng([seed, 1]),
+            watch=watch,
         )

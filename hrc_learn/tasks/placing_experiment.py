@@ -18,6 +18,7 @@ from .body_shape import ShownWay, demonstrate
 from .placing import PlacingSkill, PlanningSpace
 from .placing_figures import PlacingFigures, hand_path, placing_figures
 from .placing_run import PlacingRun, place
+from .watching import Watch, unwatched
 from .workplace import Workplace
 
 SPACES: dict[PlanningSpace, str] = {"joint": "joint space", "pose": "task space"}
@@ -72,6 +73,7 @@ def run_placing_experiment(
     speed: float = 1.5,
     seed: int = 0,
     on_step: Callable[[str], None] = lambda what: None,
+    watch: Watch = unwatched,
 ) -> PlacingExperiment:
     """Do it once, in MuJoCo.
 
@@ -82,6 +84,7 @@ def run_placing_experiment(
         speed: How many times faster than demonstrated.
         seed: Of the demonstrations with and without body shape.
         on_step: Told what comes next.
+        watch: Watches the reproduction of the demonstration from the side.
 
     Raises:
         ValueError: If the demonstration is not of this arm or ends at none of the shelves.
@@ -94,7 +97,8 @@ def run_placing_experiment(
     for space, name in SPACES.items():
         for shelf in workplace.shelf_names():
             on_step(f"{shelf} shelf in {name}")
-            run = place(skill, workplace, shelf, start, space=space, speed=speed)
+            watched = watch if (space, shelf) == ("joint", shown_shelf) else unwatched
+            run = place(skill, workplace, shelf, start, space=space, speed=speed, watch=watched)
             runs[space, shelf] = run
             figures[space, shelf] = placing_figures(run, workplace, demonstration)
     for shape_body in (True, False):

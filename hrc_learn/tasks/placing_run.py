@@ -18,6 +18,7 @@ from ..sim import MotionLog, Touch, World
 from .grasping import OPEN
 from .placing import PlacingSkill, Plan, PlanningSpace
 from .station import Station
+from .watching import Watch, unwatched
 from .workplace import Workplace
 
 TRANSFER, RELEASE, RETREAT = "transfer", "release", "retreat"
@@ -75,6 +76,7 @@ def place(
     space: PlanningSpace,
     speed: float = 1.5,
     world: World | None = None,
+    watch: Watch = unwatched,
 ) -> PlacingRun:
     """Carry the scene's first object, already in the hand, to a shelf and let go of it.
 
@@ -86,6 +88,7 @@ def place(
         space: Follow the primitive of the joints, as the paper does, or that of the pose.
         speed: How many times faster than demonstrated.
         world: Of that workplace, to be used again; a new one if None.
+        watch: Watches from the side, such as `serving` a dashboard.
 
     Raises:
         ValueError: If there is no such shelf, or the arm cannot reach it.
@@ -95,14 +98,14 @@ def place(
     world = world or World(workplace.scene)
     world.hold(item.name, start.numpy())
     motion = MotionLog(world)
-    with torch.inference_mode():
-        station = Station(
-            chain=panda,
-            arm=world.arm,
-            gripper=world.arm,
-            human=ScriptedPuller(panda, ()),
-            advance=motion.advance,
-        )
+    station = Station(
+        chain=panda,
+        arm=world.arm,
+        gripper=world.arm,
+        human=ScriptedPuller(panda, ()),
+        advance=motion.advance,
+    )
+    with torch.inference_mode(), watch(station, world, motion):
         plan = skill.plan(station.joints, goal, space=space, dt=station.config.dt, speed=speed)
         station.enter(TRANSFER)
         station.play(plan.path)

@@ -17,6 +17,7 @@ from .grasping import Grasping, GraspingConfig, GraspResult
 from .grasping_setting import GraspingSetting
 from .placing import Plan, check_plan
 from .station import Station
+from .watching import Watch, unwatched
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,6 +45,7 @@ def simulate_grasp(
     camera: CameraKind = "auto",
     config: GraspingConfig | None = None,
     rng: np.random.Generator,
+    watch: Watch = unwatched,
     on_phase: Callable[[str, float], None] = lambda phase, time: None,
 ) -> SimulatedGrasp:
     """Grasp an object and carry it home, in MuJoCo.
@@ -57,6 +59,7 @@ def simulate_grasp(
         camera: Which kind of camera watches.
         config: How objects are grasped.
         rng: Source of image noise.
+        watch: Watches from the side, such as `serving` a dashboard.
         on_phase: Told the name of each phase of the task, and when it begins [s].
     """
     world, workplace = setting.world(), setting.workplace
@@ -87,8 +90,9 @@ def simulate_grasp(
             check=check,
         )
         try:
-            result = task.grasp(item)
-            task.go_home()
+            with watch(station, world, motion):
+                result = task.grasp(item)
+                task.go_home()
         except TaskFailedError as error:
             failure = str(error)
     return SimulatedGrasp(
