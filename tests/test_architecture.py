@@ -56,7 +56,7 @@ LIBRARIES: dict[str, set[str]] = {
     "viz": {"jaxtyping", "numpy", "rerun", "matplotlib", "mpl_toolkits", "cycler", "PIL"},
     "sim": {"torch", "jaxtyping", "numpy", "mujoco"},
     "tasks": {"torch", "jaxtyping", "numpy"},
-    "lerobot": {"torch", "jaxtyping", "numpy", "lerobot"},
+    "lerobot": {"torch", "jaxtyping", "numpy", "lerobot", "gymnasium"},
 }
 """Libraries that modules of a package may import as soon as they are imported."""
 
@@ -68,6 +68,7 @@ LAZY_LIBRARIES: dict[str, set[str]] = {
     "viz": {"rich"},
     "human": {"viser", "pygame"},
     "tasks": {"rich"},
+    "lerobot": {"torchvision"},
 }
 """Libraries that they may import in the functions that need them, and nowhere else."""
 
