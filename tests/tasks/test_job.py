@@ -12,6 +12,7 @@ from taught_skills import WORKPLACE, taught_aiming, taught_placing
 
 from hrc_learn.human import PullSpell
 from hrc_learn.sim import NOWHERE, CameraChange, Occlusion
+from hrc_learn.tasks.aiming import AimingConfig
 from hrc_learn.tasks.collaboration import CollaborationConfig
 from hrc_learn.tasks.collaboration_trials import measured, verdict
 from hrc_learn.tasks.evaluation import evaluate
@@ -28,6 +29,11 @@ from hrc_learn.viz import Box
 
 PULL = (PullSpell(start=0.3, duration=2.0, towards=(0.4, 0.0, 0.5), strongest=60.0),)
 BRIEF = CollaborationConfig(interaction=0.0)
+HASTY = replace(
+    BRIEF,
+    grasping=GraspingConfig(aiming=AimingConfig(unseen_patience=1.0), patience=0.1, attempts=1),
+)
+"""Gives up at once."""
 SHELVES = ("lower", "middle", "upper")
 
 
@@ -142,10 +148,7 @@ def moved_camera(dx, dy):
     [((1.5, 0.0), "does not see marker 11"), ((-0.46, 0.0), "nearer to the middle")],
 )
 def test_what_the_camera_cannot_see_is_reported(aiming, placing, shift, reason):
-    workplace = moved_camera(*shift)
-    job = simulate_collaboration(
-        aiming, placing[0], ("middle",), workplace=workplace, camera="synthetic", pulls=()
-    )
+    job = provoked(aiming, placing, moved_camera(*shift), HASTY)
     assert reason in job.failure
     with pytest.raises(ValueError, match="nothing to measure"):
         evaluate(job, placing[1])
@@ -287,8 +290,7 @@ def test_where_no_way_gets_free_the_object_is_put_back(aiming, placing):
 
 @pytest.mark.slow
 def test_a_marker_that_stays_hidden_ends_the_attempts_cleanly(aiming, placing):
-    aim = replace(GraspingConfig().aiming, unseen_patience=2.0)
-    config = replace(BRIEF, grasping=replace(GraspingConfig(), aiming=aim, attempts=2))
+    config = replace(BRIEF, grasping=replace(HASTY.grasping, attempts=2))
     hidden = Disturbances(occlusions=(Occlusion(start=0.0, duration=1e3),))
     job = provoked(aiming, placing, config=config, disturbances=hidden, seed=5)
     assert mishaps(job) == ["marker out of sight", "marker out of sight"]
