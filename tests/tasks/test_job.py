@@ -31,9 +31,9 @@ PULL = (PullSpell(start=0.3, duration=2.0, towards=(0.4, 0.0, 0.5), strongest=60
 BRIEF = CollaborationConfig(interaction=0.0)
 HASTY = replace(
     BRIEF,
-    grasping=GraspingConfig(aiming=AimingConfig(unseen_patience=1.0), patience=0.1, attempts=1),
+    grasping=GraspingConfig(aiming=AimingConfig(unseen_patience=2.5), patience=0.1, attempts=1),
 )
-"""Gives up at once."""
+"""Gives up as soon as the arm has come to where it should see its marker."""
 SHELVES = ("lower", "middle", "upper")
 
 
