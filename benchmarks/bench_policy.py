@@ -16,7 +16,7 @@ os.environ.setdefault("HF_HUB_OFFLINE", "1")
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -117,10 +117,14 @@ def main(args: Args) -> None:
 def _recorded(args: Args, env: PandaEnvConfig, first: int, count: int) -> Path:
     folder = args.data / f"{args.task}_{args.fps}hz_from_{first}_{count}"
     if not folder.exists():
-        from shown_scenarios import record_shown
+        from hrc_learn.lerobot.recording import record_expert
 
-        seeds = track(range(first, first + count), f"Recording {folder.name}")
-        record_shown(folder, env, seeds)
+        robot = replace(env.robot_config(), seed=first)
+        shown = record_expert(folder, robot, count)
+        for _, succeeded in track(shown, f"Recording {folder.name}", total=count):
+            # One shown again from elsewhere would no longer belong to its beginning.
+            if not succeeded:
+                raise RuntimeError(f"the expert failed from a beginning after {first}")
     return folder
 
 
