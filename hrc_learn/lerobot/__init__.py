@@ -1,8 +1,8 @@
 """At home in LeRobot: importing this registers what its command lines then know by name.
 
 `--policy.discover_packages_path=hrc_learn.lerobot` does so, and so does installing
-`plugins/lerobot_policy_dmp`. Only configurations are imported, what they configure when asked
-for.
+`plugins/lerobot_policy_dmp`. Networks, simulator, browser page and drivers are imported when
+they are asked for.
 """
 
 from . import envs as envs
