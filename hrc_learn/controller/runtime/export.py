@@ -5,7 +5,10 @@ from __future__ import annotations
 import hashlib
 import os
 import sys
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 import torch
@@ -40,7 +43,8 @@ def export_step(
         controller: Whose step.
         observation: An example with exactly the fields that later ones will have. Fields
             left out, and a `dt` that is a number, become constants; so do the controller's
-            own goals where it brings none. Its batch dimensions are those of the package.
+            own goals where it brings none. Its batch dimensions and dtype are those of the
+            package; float32 counts interventions to 16 million only.
         folder: Where packages are kept; default: the user's cache.
 
     Returns:
@@ -65,7 +69,9 @@ def export_step(
     folder.mkdir(parents=True, exist_ok=True)
     unfinished = folder / f".{package.stem}.{os.getpid()}.pt2"
     try:
-        _compile(program or trace(step, observation), unfinished, describe(step, observation))
+        program = program or trace(step, observation)
+        with _batch_last(step.layouts.state.batch):
+            _compile(program, unfinished, describe(step, observation))
         unfinished.replace(package)
     finally:
         unfinished.unlink(missing_ok=True)
@@ -97,6 +103,34 @@ def _compile(
         torch._inductor.aoti_compile_and_package(
             program, package_path=str(package), inductor_configs=options
         )
+
+
+def _batch_last(batch: Sequence[int]) -> AbstractContextManager[Any]:
+    """Has inductor lay out whatever has the batch first with the batch last in memory.
+
+    So it loops over the batch innermost, a vector register of elements at a time. Left alone it
+    keeps intermediate results with the batch first, and transposes them all along.
+    """
+    if not batch:
+        return nullcontext()
+    from torch._inductor import ir
+
+    plain, batch = ir.FlexibleLayout.__init__, list(batch)
+
+    def init(
+        self: Any,
+        device: torch.device,
+        dtype: torch.dtype,
+        size: Sequence[Any],
+        stride_order: Sequence[Any] | None = None,
+        is_pinned: bool = False,
+    ) -> None:
+        if not stride_order and list(size[: len(batch)]) == batch:
+            inner, outer = range(len(batch)), range(len(batch), len(size))
+            stride_order = [*reversed(inner), *reversed(outer)]
+        plain(self, device, dtype, size, stride_order, is_pinned)
+
+    return mock.patch.object(ir.FlexibleLayout, "__init__", init)
 
 
 def _structure(observation: Observation) -> list[tuple[str, str]]:

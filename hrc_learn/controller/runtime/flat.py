@@ -38,18 +38,13 @@ class FlatStep(nn.Module):
     next state. What an observation leaves out, and a `dt` that is a number, are constants.
     """
 
-    def __init__(
-        self,
-        controller: AdaptiveController,
-        observation: Observation,
-        dtype: torch.dtype = torch.float64,
-    ):
+    def __init__(self, controller: AdaptiveController, observation: Observation):
         """Take the structure of a step from an example.
 
         Args:
             controller: Whose step.
-            observation: With exactly the fields that later ones will have.
-            dtype: Of the vectors; float32 counts to 16 million only.
+            observation: With exactly the fields that later ones will have. The vectors are of
+                the dtype of its joint position.
         """
         super().__init__()
         self.controller = controller
@@ -60,7 +55,7 @@ class FlatStep(nn.Module):
         leaves, self._structure = _pytree.tree_flatten((state, observation))
         self._constants = [None if isinstance(x, Tensor) else x for x in leaves]
         trees = (state, observation, command)
-        self.layouts = Layouts(*(Layout.of(tree, q.shape[:-1], dtype) for tree in trees))
+        self.layouts = Layouts(*(Layout.of(tree, q.shape[:-1], q.dtype) for tree in trees))
         self.first_state = self.layouts.state.pack(tensors_of(state))
 
     def example(self, observation: Observation) -> Vectors:

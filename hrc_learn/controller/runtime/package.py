@@ -18,7 +18,7 @@ from hrc_learn.controller.interface import Observation
 from hrc_learn.controller.runtime.flat import FlatStep, Layouts
 from hrc_learn.controller.runtime.layout import Field, Layout
 
-_LAYOUT, _BATCH = "hrc_learn.layout", "hrc_learn.batch"
+_LAYOUT, _BATCH, _DTYPE = "hrc_learn.layout", "hrc_learn.batch", "hrc_learn.dtype"
 _STATE, _OBSERVATION = "hrc_learn.state", "hrc_learn.observation"
 _BUILT_FOR = "hrc_learn.built_for"
 
@@ -43,8 +43,8 @@ def describe(step: FlatStep, observation: Observation) -> dict[str, str]:
     its shape. Rows follow each other in the order of the lines.
     """
     lines = [
-        " ".join([vector, field.name, str(field.dtype).removeprefix("torch."),
-                  str(int(field.batched)), *map(str, field.shape)])
+        " ".join([vector, field.name, _name(field.dtype), str(int(field.batched)),
+                  *map(str, field.shape)])
         for vector, layout in step.layouts._asdict().items()
         for field in layout.fields
     ]  # fmt: skip
@@ -52,6 +52,7 @@ def describe(step: FlatStep, observation: Observation) -> dict[str, str]:
     return {
         _LAYOUT: "\n".join(lines),
         _BATCH: " ".join(map(str, step.layouts.state.batch)),
+        _DTYPE: _name(step.layouts.state.dtype),
         _STATE: _text(example.state),
         _OBSERVATION: _text(example.observation),
         _BUILT_FOR: machine(),
@@ -79,16 +80,17 @@ def load(path: Path) -> Package:
             "step on this machine"
         )
     batch = [int(n) for n in says[_BATCH].split()]
+    dtype: torch.dtype = getattr(torch, says[_DTYPE])
     fields: dict[str, list[Field]] = {vector: [] for vector in Layouts._fields}
     for line in says[_LAYOUT].splitlines():
-        vector, name, dtype, batched, *shape = line.split()
-        field = Field(name, getattr(torch, dtype), batched == "1", tuple(map(int, shape)))
+        vector, name, kind, batched, *shape = line.split()
+        field = Field(name, getattr(torch, kind), batched == "1", tuple(map(int, shape)))
         fields[vector].append(field)
     return Package(
         run=run,
-        layouts=Layouts(*(Layout(part, batch) for part in fields.values())),
-        first_state=_vector(says[_STATE], batch),
-        example=_vector(says[_OBSERVATION], batch),
+        layouts=Layouts(*(Layout(part, batch, dtype) for part in fields.values())),
+        first_state=_vector(says[_STATE], batch, dtype),
+        example=_vector(says[_OBSERVATION], batch, dtype),
     )
 
 
@@ -116,8 +118,12 @@ def _text(vector: Tensor) -> str:
     return " ".join(map(repr, vector.flatten().tolist()))
 
 
-def _vector(text: str, batch: list[int]) -> Tensor:
-    numbers = torch.tensor([float(x) for x in text.split()], dtype=torch.float64)
+def _name(dtype: torch.dtype) -> str:
+    return str(dtype).removeprefix("torch.")
+
+
+def _vector(text: str, batch: list[int], dtype: torch.dtype) -> Tensor:
+    numbers = torch.tensor([float(x) for x in text.split()], dtype=dtype)
     return numbers.reshape((-1, *batch))
 
 
