@@ -53,12 +53,12 @@ VARIANTS: Mapping[str, GraspingVariant] = {
     ),
     "paper": GraspingVariant(
         says="the paper's law from its guess",
-        claim="reaches the target, faster than without adaptation (Fig. 10)",
+        claim="reaches the target, faster than without adaptation (Experiment 2)",
         estimator=lambda _: PaperEstimator(guessed_network()),
     ),
     "fixed": GraspingVariant(
         says="the paper's guess, not adapted",
-        claim="reaches the target, slower (Fig. 10)",
+        claim="reaches the target, slower (Experiment 2)",
         estimator=lambda _: FixedEstimator(guessed_network()),
     ),
     "unadapted": GraspingVariant(

@@ -1,6 +1,7 @@
 """Figures of grasps: several ways to know the camera side by side, and which region led."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -38,9 +39,8 @@ def variants_figure(runs: Mapping[str, RunRecording], target: Float[np.ndarray, 
         # The most important one is drawn last, on top.
         for k, (name, camera) in reversed(list(enumerate(cameras.items()))):
             time, known = runs[name].time - min(starts), seen[name]
-            # Every other one is dashed: laws that do not differ lie upon one another.
-            style = {"color": palette.SERIES[k], "ls": "--" if k % 2 else "-", "label": name}
-            style["lw"] = 2.2 if k == 0 else 1.3
+            width = 2.2 if k == 0 else 1.3
+            style = {"color": palette.SERIES[k], "lw": width, "label": name, **_dashed(k)}
             image.plot(*np.where(known[:, None], camera.feature, np.nan).T, **style)
             distance = np.linalg.norm(camera.feature - target, axis=1)
             error.plot(time, np.where(known, distance, np.nan), **style)
@@ -57,6 +57,11 @@ def variants_figure(runs: Mapping[str, RunRecording], target: Float[np.ndarray, 
         handles, labels = error.get_legend_handles_labels()
         figure.legend(handles[::-1], labels[::-1], loc="outside lower center", ncols=2)
     return figure
+
+
+def _dashed(k: int) -> dict[str, Any]:
+    """Every other curve is dashed and on top: some lie exactly upon one another."""
+    return {"ls": "--", "zorder": 3} if k % 2 else {"ls": "-", "zorder": 2}
 
 
 def _seen(camera: CameraRecording) -> Bool[np.ndarray, " time"]:
@@ -127,12 +132,11 @@ def regions_figure(
         for k, (name, values) in enumerate(shares.items()):
             colour = palette.SERIES[k]
             above.fill_between(run.time, values, alpha=0.15, color=colour, lw=0)
-            above.plot(run.time, values, color=colour, ls="--" if k % 2 else "-", label=name)
+            above.plot(run.time, values, color=colour, label=name, **_dashed(k))
         above.set(ylabel="share [-]", ylim=(-0.03, 1.08), title="Which feedback leads the arm")
         for colour, (name, values) in zip(_REGIONS, potentials.items(), strict=True):
-            below.plot(
-                run.time, np.where(values > 1e-6, values, np.nan), color=colour, label=name
-            )
+            left = np.where(values > _NOTHING_LEFT, values, np.nan)
+            below.plot(run.time, left, color=colour, label=name)
         below.set(
             xlabel="time [s]", ylabel="potential [-]", yscale="log", title="What is left to do"
         )
