@@ -19,8 +19,8 @@ BROKEN = ("position", "velocity", "acceleration", "jerk")
 _SHARE = 0.8
 """Of the limits, what a correction counts on; the motion that is followed needs the rest."""
 _POSITION_RATE, _VELOCITY_RATE = 0.35, 0.7
-"""Fastest decay of errors, in shares of the sampling rate. A simulated step of any size and
-slope settles without overshoot up to about twice these."""
+"""Fastest decay of errors, in shares of the sampling rate: of those tried, the fastest with
+which steps of 0.03 to 1 rad settle without overshoot at 20 and 50 samples a second."""
 _ROUNDING = 1 + 1e-6
 _ABSURD = 1e50
 """Squares of much larger numbers overflow."""
