@@ -42,7 +42,10 @@ def _default(experiment: GraspingExperiment) -> Iterable[Measurement]:
         claim="9.2 s (Experiment 2)",
     )
     yield Measurement(
-        name="time of the whole grasp", value=outcome.duration, unit="s", claim="15 s (Experiment 2)"
+        name="time of the whole grasp",
+        value=outcome.duration,
+        unit="s",
+        claim="15 s (Experiment 2)",
     )
     yield Measurement(
         name="pixel error when the hand goes down",
