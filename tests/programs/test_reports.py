@@ -112,6 +112,18 @@ def test_pictures_and_tables_of_the_page_are_refreshed(runs, tmp_path, experimen
     assert picture.size == (1000, 500)
 
 
+def test_lines_keep_their_colours_beside_a_photograph(experiments):
+    rng = np.random.default_rng(0)
+    photograph = rng.integers(150, 220, size=(300, 400, 3), dtype=np.uint8)
+    lines = {40: (0, 114, 178), 80: (0, 158, 115), 120: (230, 159, 0)}
+    for row, colour in lines.items():
+        photograph[row] = colour
+    small = experiments.small(Picture("x", photograph, "").png())
+    shown = np.asarray(Image.open(BytesIO(small)).convert("RGB")).astype(int)
+    for row, colour in lines.items():
+        assert np.abs(shown[row] - colour).max() < 10
+
+
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
