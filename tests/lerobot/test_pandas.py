@@ -21,6 +21,7 @@ from lerobot.teleoperators import TeleoperatorConfig, make_teleoperator_from_con
 from lerobot.utils.errors import DeviceNotConnectedError
 from unchecked import shapes_unchecked
 
+from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import panda
 from hrc_learn.lerobot.connected import CONNECTED
 from hrc_learn.lerobot.envs import PandaEnvConfig
@@ -40,7 +41,7 @@ from hrc_learn.lerobot.processor.adding import (
     remove_smoothing,
 )
 from hrc_learn.lerobot.processor.limits import ActionLimits
-from hrc_learn.lerobot.robots import FrankaPandaConfig, MujocoPandaConfig
+from hrc_learn.lerobot.robots import FrankaPandaConfig, MujocoPanda, MujocoPandaConfig
 from hrc_learn.lerobot.teleoperators import PandaExpertConfig, PandaPageConfig
 
 READY = panda.ready.numpy()
@@ -57,6 +58,7 @@ def nothing_left_connected(tmp_path, monkeypatch):
 def simulated(tmp_path, **settings):
     config = MujocoPandaConfig(calibration_dir=tmp_path, fps=FPS, **settings)
     robot = make_robot_from_config(config)
+    assert isinstance(robot, MujocoPanda)
     robot.connect()
     return robot
 
@@ -76,11 +78,13 @@ def test_an_action_says_where_it_came_from(space):
     joints = READY + 0.1
     where, width = target_of(action_of(space, joints, 0.05))
     assert width == 0.05
-    if space == "joint":
-        np.testing.assert_array_equal(where, joints)
-    else:
+    if isinstance(where, Pose):
+        assert space == "ee"
         expected = panda.forward(torch.from_numpy(joints))
         assert float(where.twist_to(expected).abs().max()) < 1e-9
+    else:
+        assert space == "joint"
+        np.testing.assert_array_equal(where, joints)
 
 
 def test_rotation_vectors_go_on_past_half_a_turn():
@@ -173,7 +177,7 @@ def test_the_expert_succeeds_and_the_environment_says_so(tmp_path):
 
     config = PandaEnvConfig(task="grasping", fps=int(FPS), **settings)
     env = config.create_envs(1)["panda"][0]
-    state, _ = env.reset(seed=[4])
+    state, _ = env.reset(seed=4)
     assert state["agent_pos"].shape == (1, *config.features["agent_pos"].shape)
     np.testing.assert_allclose(state["agent_pos"][0], list(first.values()), rtol=1e-6)
     with shapes_unchecked():
@@ -190,7 +194,7 @@ def test_the_expert_succeeds_and_the_environment_says_so(tmp_path):
 def test_an_episode_ends_when_its_time_is_up():
     env = PandaEnvConfig(task="grasping", fps=int(FPS), episode_length=2).create_envs(1)
     vector = env["panda"][0]
-    state, _ = vector.reset(seed=[0])
+    state, _ = vector.reset(seed=0)
     still = state["agent_pos"].astype(np.float32)
     assert not vector.step(still)[3].any()
     *_, terminated, truncated, info = vector.step(still)
