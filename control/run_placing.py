@@ -237,7 +237,7 @@ def _side_by_side(experiment: PlacingExperiment) -> Table:
             f"{row['contacts']}",
             f"{row['limit_violations']}",
             f"{row['peak_speed_share']:.2f}",
-            f"{row['jerk_share']:.1e}",
+            f"{row['jerk_share']:.0e}",
         )
     return table
 
