@@ -277,11 +277,62 @@ def test_a_missing_file_is_named(tmp_path):
         PackageRunner(tmp_path / "step.pt2")
 
 
+@pytest.mark.parametrize("dtype", [DOUBLE, torch.float32])
+@pytest.mark.parametrize("batch", [(), (3, 2)])
+def test_a_package_tells_all_it_takes_to_call_it(monkeypatch, tmp_path, dtype, batch):
+    controller, one = controller_and_observation()
+    observation = Observation(
+        joint_position=panda.ready.to(dtype).expand(*batch, 7).contiguous(),
+        feature=one.feature.to(dtype).expand(*batch, 2).contiguous(),
+        feature_visible=torch.ones(batch, dtype=torch.bool),
+        dt=0.002,
+    )
+    step = FlatStep(controller.to(dtype), observation)
+    (path := tmp_path / "step.pt2").touch()
+    says = package_module.describe(step, observation)
+    monkeypatch.setattr(package_module, "_open", lambda path: (step, says))
+    kept, example = load(path), step.example(observation)
+    for ours, theirs in zip(step.layouts, kept.layouts, strict=True):
+        assert (theirs.fields, theirs.batch) == (ours.fields, batch)
+        assert theirs.empty().dtype == dtype
+    torch.testing.assert_close(kept.first_state, example.state, rtol=0, atol=0)
+    torch.testing.assert_close(kept.example, example.observation, rtol=0, atol=0)
+
+
 @pytest.fixture(scope="module")
 def package(tmp_path_factory) -> Path:
     with shapes_unchecked():
         controller, observation = controller_and_observation()
         return export_step(controller, observation, tmp_path_factory.mktemp("packages"))
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:the exported step of a batch is experimental")
+@pytest.mark.xfail(reason="some arms differ by 1e-4 rad/s; the cause is not yet known")
+def test_a_batch_is_exported_as_one_step(tmp_path):
+    """In closed loop, with rounding that adds up; each arm starts in a posture of its own."""
+    controller, one = controller_and_observation()
+    noise = torch.randn(40, 7, generator=sampling.generator(), dtype=DOUBLE)
+    q = panda.ready + 0.3 * noise
+    observation = Observation(
+        joint_position=q,
+        feature=one.feature + 100 * q[:, :2],
+        feature_visible=torch.arange(40) % 4 != 0,
+        human_effort=0.1 * q,
+        dt=0.002,
+    )
+    runners = [
+        EagerRunner(controller, observation),
+        open_step(controller, observation, tmp_path),
+    ]
+    assert isinstance(runners[1], PackageRunner)
+    for _ in range(200):
+        eager, exported = (runner.step() for runner in runners)
+        np.testing.assert_allclose(exported, eager, rtol=0, atol=1e-10)
+        for runner in runners:
+            runner.observation["joint_position"][:] += 0.002 * runner.joint_velocity
+            runner.observation["feature"][:] += runner.joint_velocity[:, :2]
+    assert np.abs(runners[0].joint_velocity).max() > 0.1
 
 
 @pytest.mark.slow
