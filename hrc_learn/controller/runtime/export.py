@@ -59,8 +59,8 @@ def export_step(
     step = FlatStep(controller, observation)
     if step.layouts.state.batch:
         warnings.warn(
-            "the exported step of a batch is experimental: in closed loop it was seen to differ "
-            "from the uncompiled one by 1e-4 rad/s; compare both before relying on it",
+            "the exported step of a batch is experimental: in closed loop it was seen to "
+            "differ from the uncompiled one by 1e-4 rad/s; compare both before relying on it",
             stacklevel=2,
         )
     program = None
