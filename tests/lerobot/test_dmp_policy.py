@@ -56,7 +56,8 @@ def test_losses_chunks_and_gradients_whatever_it_sees(episodes):
     each, _ = policy.forward(batch, reduction="none")
     assert loss.shape == ()
     assert each.shape == (6,)
-    assert values == {"rmse": pytest.approx(loss.item() ** 0.5)}
+    square = each.sum() * batch["action_is_pad"].shape[1] / (~batch["action_is_pad"]).sum()
+    assert values == {"rmse": pytest.approx(square.item() ** 0.5)}
     loss.backward()
     for name, parameter in policy.named_parameters():
         if parameter.numel():
@@ -81,8 +82,10 @@ def test_padding_is_not_learned():
     batch["action"] = torch.where(absent[..., None], 100.0, batch["action"])
     torch.testing.assert_close(policy.forward(batch)[0], loss, rtol=0, atol=0)
     torch.testing.assert_close(policy.forward(batch, reduction="none")[0], each, rtol=0, atol=0)
-    # The mean is over all actions that are there.
-    torch.testing.assert_close(loss, (each * (~absent).sum(-1)).sum() / (~absent).sum())
+    # Two halves of a batch, each in a process of its own, average to the whole.
+    halves = [{key: x[part] for key, x in batch.items()} for part in (slice(1), slice(1, 3))]
+    one, two = (policy.forward(half)[0] for half in halves)
+    torch.testing.assert_close((one + 2 * two) / 3, loss)
 
 
 def test_one_demonstration_is_repeated_without_training():

@@ -87,11 +87,16 @@ class DMPPolicy(PreTrainedPolicy):
     ) -> tuple[Tensor, dict[str, float]]:
         """Mean square error of chunks, in the spread of each component of the action.
 
+        Actions after the end of an episode count as none.
+
         Args:
             batch: As LeRobot loads it by the config's delta indices: observations (B, 2, ...),
                 the first of the episode and the current one, `action` (B, chunk, A),
                 `action_is_pad` and `timestamp`.
-            reduction: "none" for one loss each, (B), else the mean over all actions.
+            reduction: "none" for one loss each, (B), else their mean.
+
+        Returns:
+            The loss, and the root mean square error of the actions present.
         """
         encoder, chart = self.planner.encoder, self.planner.chart
         keys = (*encoder.widths, *encoder.images)
@@ -101,9 +106,10 @@ class DMPPolicy(PreTrainedPolicy):
         difference = predicted - chart.to_coordinates(batch[ACTION])
         present = ~batch[f"{ACTION}_is_pad"]
         square = difference.square().mean(-1) * present
-        mean = square.sum() / present.sum()
-        rmse = {"rmse": float(mean.detach().sqrt())}
-        return (square.sum(-1) / present.sum(-1) if reduction == "none" else mean), rmse
+        rmse = {"rmse": float((square.detach().sum() / present.sum()).sqrt())}
+        # By chunks, not by the actions present: so batches of several processes average alike.
+        each = square.mean(-1)
+        return (each if reduction == "none" else each.mean()), rmse
 
     @torch.no_grad()
     def predict_action_chunk(
