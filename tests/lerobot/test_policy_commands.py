@@ -102,13 +102,13 @@ def test_train_resume_tune_and_load_with_images(pictures, tmp_path):
 
 
 def test_two_ranks_learn_what_one_learns(numbers, tmp_path):
-    """The same sixteen samples a step, in one batch or in two."""
+    """The same sixteen samples a step, in one batch or in two, before an epoch ends."""
     losses = {}
     episodes = read_episodes(numbers, (STATE, GOAL, "action"))
     for ranks in (1, 2):
         out = tmp_path / f"ranks{ranks}"
         new = (DISCOVER, "--policy.type=dmp", *SMALL, *common(numbers, out), "--seed=0")
-        log = train(*new, f"--batch_size={16 // ranks}", "--steps=12", ranks=ranks)
+        log = train(*new, f"--batch_size={16 // ranks}", "--steps=8", ranks=ranks)
         assert f"{16 // ranks} x {ranks} = 16" in log
         policy = DMPPolicy.from_pretrained(checkpoint(out))
         samples = windows(policy, episodes)
