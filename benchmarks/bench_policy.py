@@ -56,6 +56,7 @@ class Args:
     steps: int = 1000
     """Of training."""
     batch_size: int = 32
+    """Samples in each step of training."""
     fps: int = 25
     """Commands a second."""
     seed: int = 0
