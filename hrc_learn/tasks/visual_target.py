@@ -19,6 +19,9 @@ from jaxtyping import Float
 OBJECT_FEATURE = "observation.object_feature"
 """Column of a dataset with the object's marker in the image."""
 OBJECT_FEATURE_NAMES = ("u", "v", "visible")
+LONGEST_OFFSET = 0.3
+"""Of the hand's marker from the object's [m]. From few demonstrations along a flat box the
+image Jacobian knows little about height; only an offset of metres would explain the rest."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +69,8 @@ class VisualTarget:
         matrix, error = _solved(np.kron(design, np.eye(2)), hands)
         offset, offset_error = None, float("nan")
         if jacobians is not None:
-            offset, offset_error = _solved(jacobians[..., :3].reshape(-1, 3), hands - objects)
+            directions = jacobians[..., :3].reshape(-1, 3)
+            offset, offset_error = _solved(directions, hands - objects, LONGEST_OFFSET)
         return cls(
             matrix=matrix.reshape(3, 2).T,
             error=error,
@@ -123,18 +127,46 @@ class VisualTarget:
 
 
 def _solved(
-    design: Float[np.ndarray, "equations unknowns"], pixels: Float[np.ndarray, "demos 2"]
+    design: Float[np.ndarray, "equations unknowns"],
+    pixels: Float[np.ndarray, "demos 2"],
+    longest: float = np.inf,
 ) -> tuple[Float[np.ndarray, " unknowns"], float]:
-    """Least squares on pixels, two equations a demonstration, and their leave-one-out error."""
-    solution, *_ = np.linalg.lstsq(design, pixels.ravel(), rcond=None)
+    """Least squares on pixels, two equations a demonstration, and their leave-one-out error.
+
+    A solution longer than `longest` is shortened by the ridge penalty that takes.
+    """
+    inverse = _ridge_inverse(design, pixels.ravel(), longest)
+    solution = inverse @ pixels.ravel()
     if len(pixels) < 5:
         return solution, float("nan")
     residuals = pixels - (design @ solution).reshape(-1, 2)
     # From the blocks of the hat matrix, of both equations that go at once (Allen 1974, PRESS).
-    hat = (design @ np.linalg.pinv(design)).reshape(len(pixels), 2, len(pixels), 2)
+    hat = (design @ inverse).reshape(len(pixels), 2, len(pixels), 2)
     own = hat[np.arange(len(pixels)), :, np.arange(len(pixels))]
     press = np.linalg.solve(np.eye(2) - own, residuals[..., None])
     return solution, float(np.sqrt((press**2).sum(axis=(1, 2)).mean()))
+
+
+def _ridge_inverse(
+    design: Float[np.ndarray, "equations unknowns"],
+    values: Float[np.ndarray, " equations"],
+    longest: float,
+) -> Float[np.ndarray, "unknowns equations"]:
+    """Pseudo-inverse, damped just enough to keep the solution as short as asked for."""
+    u, s, vt = np.linalg.svd(design, full_matrices=False)
+    s = np.maximum(s, 1e-12 * s[0])
+    along = u.T @ values
+
+    def length(penalty: float) -> float:
+        return float(np.linalg.norm(s * along / (s**2 + penalty)))
+
+    low, high = 0.0, 0.0
+    if length(0.0) > longest:
+        high = float(s[0] * np.linalg.norm(along)) / longest
+        while high - low > 1e-6 * high:
+            middle = (low + high) / 2
+            low, high = (middle, high) if length(middle) > longest else (low, middle)
+    return (vt.T * (s / (s**2 + high))) @ u.T
 
 
 def _or_none(error: float) -> float | None:

@@ -3,7 +3,7 @@ import json
 import numpy as np
 import pytest
 
-from hrc_learn.tasks.visual_target import VisualTarget
+from hrc_learn.tasks.visual_target import LONGEST_OFFSET, VisualTarget
 
 
 def demonstrations(n, noise=0.0, seed=0):
@@ -48,6 +48,23 @@ def test_the_error_is_what_leaving_each_demonstration_out_gives():
         left_out = VisualTarget.fit(objects[rest], hands[rest])
         misses.append(np.sum((left_out(objects[i]) - hands[i]) ** 2))
     assert VisualTarget.fit(objects, hands).error == pytest.approx(np.sqrt(np.mean(misses)))
+
+
+def test_an_offset_that_only_metres_would_explain_is_kept_short():
+    rng = np.random.default_rng(3)
+    objects = rng.uniform(200, 900, (5, 2))
+    level = np.array([[-1600.0, 0.0, 0.0], [0.0, 1600.0, 0.0]])
+    jacobians = np.zeros((5, 2, 6))
+    jacobians[..., :3] = level
+    jacobians[:, 0, 2] = rng.uniform(-5, 5, 5)  # height, of which nothing is known
+    hands = objects + level @ np.array([0.12, 0.0, 0.0]) + rng.normal(0, 10, (5, 2))
+    free, *_ = np.linalg.lstsq(
+        jacobians[..., :3].reshape(-1, 3), (hands - objects).ravel(), rcond=None
+    )
+    assert np.linalg.norm(free) > 2 * LONGEST_OFFSET
+    offset = VisualTarget.fit(objects, hands, jacobians).offset
+    assert np.linalg.norm(offset) == pytest.approx(LONGEST_OFFSET, rel=1e-5)
+    np.testing.assert_allclose(offset[:2], [0.12, 0.0], atol=0.01)
 
 
 def test_the_error_of_the_offset_is_what_leaving_each_demonstration_out_gives():
