@@ -132,6 +132,7 @@ def test_beyond_what_was_shown_it_goes_no_farther():
     torch.testing.assert_close(reached, farthest, rtol=0, atol=0.1)
 
 
+@pytest.mark.slow
 def test_training_takes_up_what_the_closed_form_leaves():
     """Goals in the cube root of what is seen: no straight line fits, the network does."""
     bent = [e | {GOAL: e[GOAL].sign() * e[GOAL].abs() ** 3} for e in SHOWN]

@@ -156,6 +156,7 @@ def test_settings_that_make_no_sense_are_refused(settings, message):
         MujocoPandaConfig(**settings)
 
 
+@pytest.mark.slow
 def test_the_expert_succeeds_and_the_environment_says_so(tmp_path):
     """What was shown on the robot is done again in the environment, by poses of the hand."""
     settings = {"action_space": "ee", "pixels": True}
