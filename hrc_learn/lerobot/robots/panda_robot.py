@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 from lerobot.robots import Robot, RobotConfig
-from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 
 from ...geometry import Pose
 from ...protocols import Arm, ArmState
 from ..connected import CONNECTED
+from ..device import Device
 from ..panda_names import (
     DOWN,
     GRIPPER,
@@ -27,7 +27,7 @@ from ..panda_names import (
 )
 
 
-class PandaRobot(Robot):
+class PandaRobot(Device, Robot):
     """A Panda led by positions of its joints, or of its hand.
 
     Actions of either space are obeyed, and values they do not name are left alone, so that
@@ -55,7 +55,6 @@ class PandaRobot(Robot):
             GRIPPER,
         )
         self._rotation = DOWN
-        self._connected = False
 
     @property
     def observation_features(self) -> dict[str, Any]:
@@ -65,32 +64,14 @@ class PandaRobot(Robot):
     def action_features(self) -> dict[str, Any]:
         return dict.fromkeys(action_names(self.space), float)
 
-    @property
-    def is_connected(self) -> bool:
-        return self._connected
-
-    @property
-    def is_calibrated(self) -> bool:
-        return True
-
-    def calibrate(self) -> None:
-        """Nothing to do: a Panda has absolute encoders."""
-
-    def configure(self) -> None:
-        """Nothing to do."""
-
     def connect(self, calibrate: bool = True) -> None:
-        if self._connected:
-            raise DeviceAlreadyConnectedError(f"{self} is connected already.")
-        self._open()
-        self._connected = True
+        super().connect(calibrate)
         CONNECTED.append(self)
 
     def disconnect(self) -> None:
         self._need_connection()
-        self._connected = False
         CONNECTED.remove(self)
-        self._close()
+        super().disconnect()
 
     def get_observation(self) -> dict[str, Any]:
         self._need_connection()
@@ -112,14 +93,6 @@ class PandaRobot(Robot):
         """The arm, to be read."""
 
     @abstractmethod
-    def _open(self) -> None:
-        """Take hold of it."""
-
-    @abstractmethod
-    def _close(self) -> None:
-        """Let it go."""
-
-    @abstractmethod
     def _joints_at(self, pose: Pose) -> Float[np.ndarray, "7"]:
         """Joint positions that bring the hand to a pose [rad]."""
 
@@ -135,7 +108,3 @@ class PandaRobot(Robot):
     def _further_values(self) -> dict[str, float]:
         """Observed beside the arm's own."""
         return {}
-
-    def _need_connection(self) -> None:
-        if not self._connected:
-            raise DeviceNotConnectedError(f"{self} is not connected: call connect() first.")

@@ -13,6 +13,7 @@ from lerobot.utils.errors import DeviceNotConnectedError
 from ...kinematics import panda
 from ...protocols import ArmState, Human, HumanInput
 from ..connected import connected_robot
+from ..device import Device
 from ..panda_names import DOWN, JOINTS, ActionSpace, action_names, action_of
 from ..robots.panda_robot import PandaRobot
 
@@ -69,12 +70,12 @@ _SLACK = 0.05
 """How far the positions may be ahead of the arm [rad]."""
 
 
-class PandaTeleoperator(Teleoperator):
+class PandaTeleoperator(Device, Teleoperator):
     """What those who lead one of our Pandas have in common."""
 
     def __init__(self, config: TeleoperatorConfig, robot_id: str | None):
         super().__init__(config)
-        self._robot_id, self._connected = robot_id, False
+        self._robot_id = robot_id
         self._led: Lead | None = None
 
     @property
@@ -92,29 +93,14 @@ class PandaTeleoperator(Teleoperator):
     def feedback_features(self) -> dict[str, type]:
         return {}
 
-    @property
-    def is_connected(self) -> bool:
-        return self._connected
-
-    @property
-    def is_calibrated(self) -> bool:
-        return True
-
-    def calibrate(self) -> None:
-        """Nothing to do."""
-
-    def configure(self) -> None:
-        """Nothing to do."""
-
     def send_feedback(self, feedback: dict[str, object]) -> None:
         """Nothing is felt."""
 
-    def disconnect(self) -> None:
-        self._connected, self._led = False, None
+    def _open(self) -> None:
+        """Nothing is held beside what is led."""
 
-    def _need_connection(self) -> None:
-        if not self._connected:
-            raise DeviceNotConnectedError(f"{self} is not connected: call connect() first.")
+    def _close(self) -> None:
+        self._led = None
 
     def _lead(self, robot: PandaRobot, human: Callable[[], Human]) -> Lead:
         """The lead of a robot, anew whenever everything has been put in place."""

@@ -21,9 +21,6 @@ class PandaExpert(PandaTeleoperator):
         super().__init__(config, config.robot_id)
         self.config = config
 
-    def connect(self, calibrate: bool = True) -> None:
-        self._connected = True
-
     def get_action(self) -> dict[str, float]:
         self._need_connection()
         robot = self._find()

@@ -5,8 +5,6 @@ from __future__ import annotations
 from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
-from lerobot.utils.errors import DeviceAlreadyConnectedError
-
 from ..robots.mujoco_panda import MujocoPanda
 from ..robots.panda_robot import PandaRobot
 from .config_panda_page import PandaPageConfig
@@ -39,27 +37,24 @@ class PandaPage(PandaTeleoperator):
     def __init__(self, config: PandaPageConfig):
         super().__init__(config, config.robot_id)
         self.config = config
-        self._open = ExitStack()
+        self._served = ExitStack()
 
-    def connect(self, calibrate: bool = True) -> None:
+    def _open(self) -> None:
         from ...human.page import Page, PageConfig, PageStatus
         from ...kinematics import panda
         from ...sim import MovingBodies, World
 
-        if self._connected:
-            raise DeviceAlreadyConnectedError(f"{self} is connected already.")
         self._ghost = self._shown = World()
         self._bodies = MovingBodies(self._ghost)
         drawn = self._bodies.drawn(*(poses[None] for poses in self._bodies.poses()))
         config = PageConfig(host=self.config.host, port=self.config.port)
         page = Page(panda, drawn, self._ghost.config.boxes(), config)
-        self.page = self._open.enter_context(page)
+        self.page = self._served.enter_context(page)
         self.page.show(PageStatus(title="LeRobot", note=_NOTE))
-        self._connected = True
 
-    def disconnect(self) -> None:
-        super().disconnect()
-        self._open.close()
+    def _close(self) -> None:
+        super()._close()
+        self._served.close()
 
     def get_action(self) -> dict[str, float]:
         self._need_connection()

@@ -1,0 +1,91 @@
+"""The simulated Panda as a LeRobot robot, and who leads it."""
+
+import time
+
+import pytest
+from lerobot.robots import make_robot_from_config
+from lerobot.teleoperators import make_teleoperator_from_config
+from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
+
+from hrc_learn.lerobot.panda_names import GRIPPER, HAND, JOINTS, PIXELS
+from hrc_learn.lerobot.robots import MujocoPandaConfig
+from hrc_learn.lerobot.teleoperators import PandaExpertConfig
+
+FPS = 20.0
+
+
+def test_what_a_robot_declares_it_reports(simulated):
+    robot = simulated(scenario="grasping", fps=FPS, pixels=True, velocity=True, hand=True)
+    values = robot.get_observation()
+    assert values.keys() == robot.observation_features.keys()
+    assert values.keys() >= {*JOINTS, *HAND, *PIXELS, GRIPPER}
+    assert all(name.endswith((".pos", ".vel")) for name in values)
+    assert all(isinstance(value, float) for value in values.values())
+
+
+def test_the_sim_goes_where_it_is_sent_and_time_passes_by_actions(simulated):
+    robot = simulated(scenario="grasping", fps=FPS)
+    here = robot.get_observation()
+    for k in range(10):
+        wanted = {name: here[name] + 0.002 * k for name in JOINTS} | {GRIPPER: 0.06}
+        sent = robot.send_action(wanted)
+        assert sent == pytest.approx(wanted, abs=1e-6)
+    there = robot.get_observation()
+    assert robot.run.world.time == pytest.approx(10 / FPS)
+    for name in JOINTS:
+        assert there[name] == pytest.approx(here[name] + 0.018, abs=1e-3)
+    assert there[GRIPPER] == pytest.approx(0.06, abs=3e-3)
+
+
+def test_a_sim_that_pauses_begins_anew(simulated):
+    robot = simulated(scenario="grasping", fps=FPS, restart_after_pause=0.05)
+    first = robot.get_observation()
+    robot.send_action({name: first[name] for name in (*JOINTS, GRIPPER)})
+    time.sleep(0.06)
+    robot.get_observation()
+    assert (robot.run.seed, robot.run.commands, robot.beginnings) == (1, 0, 1)
+
+
+@pytest.mark.parametrize(
+    "device",
+    [
+        lambda folder: make_robot_from_config(MujocoPandaConfig(calibration_dir=folder)),
+        lambda folder: make_teleoperator_from_config(PandaExpertConfig(calibration_dir=folder)),
+    ],
+    ids=["robot", "teleoperator"],
+)
+def test_devices_are_connected_and_disconnected_once(device, tmp_path):
+    device = device(tmp_path)
+    with pytest.raises(DeviceNotConnectedError, match="connect"):
+        device.disconnect()
+    device.connect()
+    assert device.is_connected
+    assert device.is_calibrated
+    with pytest.raises(DeviceAlreadyConnectedError, match="already"):
+        device.connect()
+    device.disconnect()
+    assert not device.is_connected
+
+
+def test_what_is_not_connected_says_so(tmp_path):
+    robot = make_robot_from_config(MujocoPandaConfig(calibration_dir=tmp_path))
+    with pytest.raises(DeviceNotConnectedError, match="connect"):
+        robot.get_observation()
+    teleoperator = make_teleoperator_from_config(PandaExpertConfig(calibration_dir=tmp_path))
+    teleoperator.connect()
+    with pytest.raises(DeviceNotConnectedError, match="mujoco_panda or franka_panda"):
+        teleoperator.get_action()
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"scenario": "pouring"}, "no scenario 'pouring'"),
+        ({"shelf": "attic"}, "no shelf 'attic'"),
+        ({"pixels": True}, "object in the hand"),
+        ({"fps": 1.0}, "fps must be"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(settings, message):
+    with pytest.raises(ValueError, match=message):
+        MujocoPandaConfig(**settings)

@@ -1,0 +1,23 @@
+"""The names by which LeRobot's command lines know what is ours."""
+
+from lerobot.configs import PreTrainedConfig
+from lerobot.envs.configs import EnvConfig
+from lerobot.processor import ProcessorStepRegistry
+from lerobot.robots import RobotConfig
+from lerobot.teleoperators import TeleoperatorConfig
+
+from hrc_learn.lerobot import DMPConfig
+from hrc_learn.lerobot.envs import PandaEnvConfig
+from hrc_learn.lerobot.robots import FrankaPandaConfig, MujocoPandaConfig
+from hrc_learn.lerobot.teleoperators import PandaExpertConfig, PandaPageConfig
+
+
+def test_lerobot_knows_them_by_name():
+    assert RobotConfig.get_choice_class("mujoco_panda") is MujocoPandaConfig
+    assert RobotConfig.get_choice_class("franka_panda") is FrankaPandaConfig
+    assert TeleoperatorConfig.get_choice_class("panda_expert") is PandaExpertConfig
+    assert TeleoperatorConfig.get_choice_class("panda_page") is PandaPageConfig
+    assert EnvConfig.get_choice_class("panda") is PandaEnvConfig
+    for step in ("hrc_learn_watch_state", "hrc_learn_smooth_actions"):
+        assert ProcessorStepRegistry.get(step)
+    assert PreTrainedConfig.get_choice_class("dmp") is DMPConfig
