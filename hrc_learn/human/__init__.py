@@ -10,6 +10,8 @@ from .coarse_orientation import gripper_down as gripper_down
 from .drag import DragConfig as DragConfig
 from .drag import drag_effort as drag_effort
 from .drag import hand_twist as hand_twist
+from .eased import Eased as Eased
+from .eased import EasingConfig as EasingConfig
 from .expert import GuidedPath as GuidedPath
 from .expert import ScriptedExpert as ScriptedExpert
 from .expert import Tremor as Tremor

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from ..controller import INTERVENTIONS
-from ..human import BothHands
+from ..human import BothHands, Eased, EasingConfig
 from ..human.page import Page, PageStatus
 from ..kinematics import panda
 from ..protocols import Human, HumanInput, Request
@@ -29,6 +29,8 @@ class PageSessionConfig:
 
     led: LedArmConfig = field(default_factory=LedArmConfig)
     """How the arm follows."""
+    easing: EasingConfig = field(default_factory=EasingConfig)
+    """How fast the motion of a hand that is led may change."""
     record_every: int = 2
     """Control steps from one recorded frame to the next."""
     show_every: int = 10
@@ -79,7 +81,7 @@ class PageSession:
         self._bodies = MovingBodies(world)
         self._home = workplace.home_joints().numpy()
         self._go_home()
-        human = BothHands(page.human, *beside) if beside else page.human
+        human = Eased(BothHands(page.human, *beside), self._config.easing)
         self.led = LedArm(panda, world.arm, human, self._config.led)
         self._ticks, self._width = 0, None
 
