@@ -28,7 +28,7 @@ from .collaboration import INTERACT, Collaboration, CollaborationConfig
 from .errand import Errand
 from .eye import Eye
 from .fit_aiming import AimingSkill
-from .page_beside import page_beside
+from .page_beside import PageBeside, page_beside
 from .placing import PlacingSkill, Plan, check_plan
 from .scattering import scatter
 from .station import Station, StationConfig
@@ -156,10 +156,11 @@ def simulate_collaboration(
             eyes.change(world.time, model)
 
     with torch.inference_mode(), ExitStack() as stack:
-        human, passing = person, advance
+        human, passing, beside = person, advance, None
         if page is not None:
             opened = page_beside(world, station_config.dt, page, on_page)
-            human, passing = _joined(person, advance, *stack.enter_context(opened))
+            beside = stack.enter_context(opened)
+            human, passing = _joined(person, advance, beside)
         station = Station(
             chain=panda,
             arm=world.arm,
@@ -171,6 +172,8 @@ def simulate_collaboration(
             on_phase=enter,
             rng=rng,
         )
+        if beside is not None:
+            beside.follow(station)
         stack.enter_context(watch(station, world, motion))
         on_start(world, station)
         task = Collaboration(station, workplace, aiming, placing, check, config)
@@ -223,12 +226,12 @@ def _watched(workplace: Workplace, world: World) -> Float[np.ndarray, "points 3"
 
 
 def _joined(
-    person: Human, advance: Callable[[float], None], at_page: Human, tick: Callable[[], None]
+    person: Human, advance: Callable[[float], None], beside: PageBeside
 ) -> tuple[Human, Callable[[float], None]]:
     """The person of the script with those at the page, and time that passes for both."""
 
     def advance_and_show(duration: float) -> None:
         advance(duration)
-        tick()
+        beside.tick()
 
-    return BothHands(person, at_page), advance_and_show
+    return BothHands(person, beside.human), advance_and_show

@@ -40,7 +40,7 @@ def test_a_dragged_elbow_yields_and_the_hand_stays(session, browser):
 
 
 def test_a_corner_that_is_dragged_sizes_the_region(session, browser):
-    editor = session.page._panel.region
+    editor = session.page._panel._region
     before = editor._region
     corner = np.array(before.centre) + before.half_size
     with browser.dragging(corner, by=(40, -30)):
@@ -102,7 +102,7 @@ def test_a_click_marks_the_target_on_the_table(session, browser):
 
 @pytest.mark.slow
 def test_a_rectangle_on_the_table_becomes_the_region(session, browser):
-    editor = session.page._panel.region
+    editor = session.page._panel._region
     before = editor._region
     browser.button("Draw on the table").click()
     with browser.dragging([0.2, 0.6, 0.0], by=(60, 40)):

@@ -5,7 +5,7 @@ import re
 import numpy as np
 
 from hrc_learn.human.page import PageStatus
-from hrc_learn.human.page.panel import _effort_html, _interventions_html, _state_html
+from hrc_learn.human.page.panel_html import effort_html, interventions_html, state_html
 
 
 def bars(html):
@@ -16,7 +16,7 @@ def bars(html):
 
 
 def test_efforts_are_bars_from_the_middle_to_either_side():
-    html = _effort_html(np.array([10.0, -5.0, 0.0, 40.0]), largest=20.0)
+    html = effort_html(np.array([10.0, -5.0, 0.0, 40.0]), largest=20.0)
     assert bars(html) == [(50.0, 25.0), (37.5, 12.5), (50.0, 0.0), (50.0, 50.0)]
     assert "+10.0" in html
     assert "-5.0" in html
@@ -24,7 +24,7 @@ def test_efforts_are_bars_from_the_middle_to_either_side():
 
 def test_interventions_are_counted_and_the_new_ones_stand_out():
     status = PageStatus(interventions={"velocity": 3, "tcp_speed": 7, "jerk": 0}, contacts=2)
-    html = _interventions_html(status, more=["tcp_speed"], latest="tcp_speed")
+    html = interventions_html(status, more=["tcp_speed"], latest="tcp_speed")
     rows = re.findall(r"<tr.*?</tr>", html)
     assert [re.sub(r"<.*?>", " ", row).split() for row in rows] == [
         ["velocity", "3"],
@@ -36,15 +36,23 @@ def test_interventions_are_counted_and_the_new_ones_stand_out():
 
 
 def test_a_filter_that_has_not_acted_is_said_to():
-    html = _interventions_html(PageStatus(interventions={"velocity": 0}), more=[], latest="")
+    html = interventions_html(PageStatus(interventions={"velocity": 0}), more=[], latest="")
     assert "has not had to act" in html
 
 
 def test_what_others_have_written_is_not_taken_for_the_pages_own():
-    html = _state_html(PageStatus(title="<script>", note="<b>"), rate=100.0, people=2)
+    html = state_html(PageStatus(title="<script>", note="<b>"), rate=100.0, people=2)
     assert "<script>" not in html
     assert "<b>" not in html
     assert "2 connected" in html
-    assert "recording 1.5 s" in _state_html(
+    assert "recording 1.5 s" in state_html(
         PageStatus(recording="recording", seconds=1.5), rate=0.0, people=0
     )
+
+
+def test_an_arm_that_works_by_itself_says_what_it_does_and_records_nothing():
+    html = state_html(PageStatus(doing="aim & wait", seconds=12.34), rate=0.0, people=0)
+    assert "aim &amp; wait" in html
+    assert "12.3 s" in html
+    assert "saved" not in html
+    assert "ready" not in html

@@ -41,10 +41,12 @@ class PageStatus:
 
     title: str = ""
     """What is led here."""
+    doing: str = ""
+    """What an arm that works by itself is doing; empty where a person leads and records."""
     recording: Literal["ready", "recording", "stopped"] = "ready"
     """Stopped: a demonstration waits to be saved or discarded."""
     seconds: float = 0.0
-    """Length of the demonstration in hand [s]."""
+    """Length of the demonstration in hand, or how long the arm has been at work [s]."""
     saved: int = 0
     """Demonstrations saved."""
     note: str = ""

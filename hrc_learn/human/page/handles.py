@@ -29,6 +29,8 @@ class Handles:
         stage: Stage,
         grips: Grips,
         links: Callable[[], Pose | None],
+        *,
+        leads: bool = True,
     ):
         """Connect.
 
@@ -38,28 +40,34 @@ class Handles:
             grips: Who holds what.
             links: Frames of the arm as they are now (see `SerialChain.link_poses`); None
                 before the arm is known.
+            leads: Whether the hand can be held, too, and has a handle.
         """
         self._grips, self._links, self._turns = grips, links, False
         for node, joint, offset in stage.handles():
-            self._connect(node, joint, offset)
-        self._gizmo = server.scene.add_transform_controls(
-            "/hand_handle", scale=0.2, disable_rotations=True, depth_test=False
-        )
-        self._gizmo.on_update(self._gizmo_dragged)
+            if leads or joint is not None:
+                self._connect(node, joint, offset)
+        self._gizmo = None
+        if leads:
+            self._gizmo = server.scene.add_transform_controls(
+                "/hand_handle", scale=0.2, disable_rotations=True, depth_test=False
+            )
+            self._gizmo.on_update(self._gizmo_dragged)
         server.on_client_disconnect(lambda client: grips.release_all(client.client_id))
 
     def follow(self, hand: Pose) -> None:
         """Keep the hand's handle at the hand while nobody holds it."""
-        if any(handle == self._gizmo.name for _, handle in self._grips.held()):
+        gizmo = self._gizmo
+        if gizmo is None or any(handle == gizmo.name for _, handle in self._grips.held()):
             return
-        self._gizmo.position = hand.position.numpy()
+        gizmo.position = hand.position.numpy()
         # A hand that is only moved is moved along the axes of the base.
-        self._gizmo.wxyz = hand.orientation.numpy() if self._turns else _BASE_AXES
+        gizmo.wxyz = hand.orientation.numpy() if self._turns else _BASE_AXES
 
     def let_turn(self, turns: bool) -> None:
         """Whether the hand's handle has rings to turn it by."""
         self._turns = turns
-        self._gizmo.disable_rotations = not turns
+        if self._gizmo is not None:
+            self._gizmo.disable_rotations = not turns
 
     def _connect(
         self, node: Holdable, joint: int | None, offset: Float[np.ndarray, "3"]
@@ -93,7 +101,7 @@ class Handles:
         self._grips.take(holder, name, Grip(joint=joint, held_at=held_at, pointer=pointer))
 
     async def _gizmo_dragged(self, event: Any) -> None:
-        name, pointer = self._gizmo.name, event.target.position.copy()
+        name, pointer = event.target.name, event.target.position.copy()
         if event.client_id is None:
             return
         if event.phase == "start":

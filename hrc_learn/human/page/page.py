@@ -54,6 +54,7 @@ class Page:
         config: PageConfig | None = None,
         *,
         task: str = "",
+        leads: bool = True,
     ):
         """Serve the page; it follows the arm within the `with` block.
 
@@ -64,6 +65,8 @@ class Page:
             boxes: What stands.
             config: Of the page.
             task: What is to be shown, in words.
+            leads: Whether the person leads the hand, draws regions and records. Beside an arm
+                that works by itself, people pull at the body, and nothing else is offered.
         """
         import viser
 
@@ -74,7 +77,9 @@ class Page:
         self.url = f"http://{config.host}:{self._server.get_port()}"
         self._grips = Grips(config.patience)
         self._stage = Stage(self._server, bodies, boxes, config.twin)
-        self._handles = Handles(self._server, self._stage, self._grips, self._links)
+        self._handles = Handles(
+            self._server, self._stage, self._grips, self._links, leads=leads
+        )
         self._panel = Panel(
             self._server,
             boxes,
@@ -83,6 +88,7 @@ class Page:
             self._stage.show_twin,
             self._handles.let_turn,
             task,
+            leads=leads,
         )
         first = [np.stack([getattr(b, name)[0] for b in bodies]) for name in _POSE]
         self._poses: tuple[np.ndarray, np.ndarray] = (first[0], first[1])
@@ -182,15 +188,15 @@ class Page:
                 effort=asked.effort,
                 twist=twist,
                 gripper=panel.gripper,
-                region=panel.region.region,
-                target=panel.region.target,
+                region=panel.region,
+                target=panel.target,
             )
         )
         return asked
 
     def _keyed(self, state: ArmState, drag: DragConfig) -> Float[np.ndarray, "6"]:
         """Motion of the hand that the keys ask for."""
-        direction = self._panel.keys.direction()
+        direction = self._panel.direction()
         if not direction.any():
             return np.zeros(6)
         hand = self._chain.forward(_joints(state))
