@@ -227,6 +227,9 @@ class MujocoArm:
         self._fingers = np.array([model.joint(n).qposadr[0] for n in fingers])
         self._finger_servos = np.array([model.actuator(n).id for n in fingers])
         self._reference = np.zeros(len(names))
+        # Position errors [rad] from which on the servos pull no harder.
+        strongest = model.actuator_forcerange[self._position_servos, 1]
+        self._reach = strongest / model.actuator_gainprm[self._position_servos, 0]
         self._velocity = np.zeros(len(names))
 
     def read(self) -> ArmState:
@@ -259,8 +262,14 @@ class MujocoArm:
         self.drive()
 
     def drive(self) -> None:
-        """Advance the servos' reference by one physics step."""
-        self._reference += self._velocity * self._model.opt.timestep
+        """Advance the servos' reference by one physics step.
+
+        It waits for joints that are held up by a contact: what they missed is not made up for
+        once they come free.
+        """
+        q = self._data.qpos[self.joints]
+        reference = self._reference + self._velocity * self._model.opt.timestep
+        self._reference = np.clip(reference, q - self._reach, q + self._reach)
         self._data.ctrl[self._position_servos] = self._reference
         self._data.ctrl[self._velocity_servos] = self._velocity
 

@@ -40,6 +40,22 @@ def test_arm_follows_a_velocity_without_lag(world):
     np.testing.assert_allclose(state.joint_velocity, velocity, atol=1e-3)
 
 
+def test_an_arm_that_was_held_up_goes_on_from_where_it_is(world):
+    world.reset(np.array([-0.2, 1.2, 0.0, -1.0, 0.0, 2.0, 0.8]))
+    swing = np.array([-0.5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    world.arm.command(swing)
+    world.advance(4.0)
+    stuck = world.arm.read()
+    assert any(touch.second == "cabinet_door" for touch in world.cabinet_contacts.touches)
+    assert abs(stuck.joint_velocity[0]) < 0.05
+    world.arm.command(-swing)
+    world.advance(0.5)
+    back = world.arm.read()
+    # Two seconds of it were spent at the door: they are not made up for on the way back.
+    assert back.joint_position[0] - stuck.joint_position[0] == pytest.approx(0.25, abs=0.05)
+    np.testing.assert_allclose(back.joint_velocity, -swing, atol=0.02)
+
+
 def test_a_held_object_stays_in_the_hand_while_the_arm_swings(world, workplace):
     world.hold("box", workplace.home_joints().numpy())
     assert world.holds("box")
