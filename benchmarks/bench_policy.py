@@ -4,7 +4,8 @@ A scripted expert shows a job in simulation, such as grasping a thing that lies 
 seen once. Policies learn from one demonstration and from more, and then do the job from
 beginnings they have not seen. Reported are successes, by MuJoCo's contacts, the distance of
 the hand from the path that the expert takes from there, and how abruptly commands change where
-one chunk follows another.
+one chunk follows another. For those that are trained, the file of figures also says what
+the loss was at first, half-way and at last.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 from torch import Tensor
+from torch.optim.lr_scheduler import CosineAnnealingLR
 
 from hrc_learn import cli
 from hrc_learn.kinematics import panda
@@ -54,7 +56,7 @@ class Args:
     policies: tuple[str, ...] = ("dmp-fit", "dmp", "act")
     """dmp-fit: in closed form; dmp: trained from there; act: a small one."""
     steps: int = 1000
-    """Of training."""
+    """Of training, over which the learning rate falls to nothing along a cosine."""
     batch_size: int = 32
     """Samples in each step of training."""
     fps: int = 25
@@ -107,9 +109,11 @@ def main(args: Args) -> None:
     for count in args.demonstrations:
         dataset = _recorded(args, env, 0, count)
         for name in args.policies:
-            result = vars(_measure(name, dataset, env, expert, args))
-            table.add_row(name, str(count), *(f"{value:.3g}" for value in result.values()))
-            figures |= {f"{name}_{count}_{key}": value for key, value in result.items()}
+            result, losses = _measure(name, dataset, env, expert, args)
+            row = dict(vars(result))
+            table.add_row(name, str(count), *(f"{value:.3g}" for value in row.values()))
+            row |= {f"loss_{when}": value for when, value in losses.items()}
+            figures |= {f"{name}_{count}_{key}": value for key, value in row.items()}
             if args.json is not None:
                 cli.write_json(args.json, figures)
     Console().print(table)
@@ -131,33 +135,40 @@ def _recorded(args: Args, env: PandaEnvConfig, first: int, count: int) -> Path:
 
 def _measure(
     name: str, dataset: Path, env: PandaEnvConfig, expert: Sequence[Tensor], args: Args
-) -> Figures:
+) -> tuple[Figures, dict[str, float]]:
     torch.manual_seed(args.seed)
     began = time.process_time()
-    config, act = _policy(name, dataset, args)
+    config, act, losses = _policy(name, dataset, args)
     seconds = time.process_time() - began
     done = _do(act, env, len(expert), f"{name}, {dataset.name}")
-    return Figures(
+    figures = Figures(
         success=float(np.mean([d.success for d in done])),
         path_mm=1e3 * _path_error([d.joints for d in done], expert),
         **_seams([d.commands for d in done], config.n_action_steps, args.fps),
         train_s=seconds,
     )
+    return figures, losses
 
 
-def _policy(name: str, dataset: Path, args: Args) -> tuple[Any, Callable[[Tensor | None], Any]]:
-    """A trained policy's settings, and what maps states to actions; of None, it resets."""
+def _policy(
+    name: str, dataset: Path, args: Args
+) -> tuple[Any, Callable[[Tensor | None], Any], dict[str, float]]:
+    """A trained policy's settings, what maps states to actions, and the losses of training.
+
+    Of None instead of a state, the policy resets.
+    """
     from lerobot.datasets import LeRobotDatasetMetadata
     from lerobot.policies import make_policy, make_pre_post_processors
 
     meta = LeRobotDatasetMetadata(f"local/{dataset.name}", root=dataset)
     stats: Any = dict(meta.stats or {})
-    stats[ENVIRONMENT] = stats[STATE]
+    stats[STATE] = stats[ENVIRONMENT] = _blind_to_constants(stats[STATE])
     config = _config(name, len(stats[STATE]["mean"]))
     policy = make_policy(config, ds_meta=meta)
     before, after = make_pre_post_processors(config, dataset_stats=stats)
+    losses = {}
     if name != "dmp-fit":
-        _train(policy, before, dataset, args, f"{name}, {dataset.name}")
+        losses = _train(policy, before, dataset, args, f"{name}, {dataset.name}")
     policy.eval()
 
     @torch.no_grad()
@@ -167,7 +178,17 @@ def _policy(name: str, dataset: Path, args: Args) -> tuple[Any, Callable[[Tensor
             return None
         return after(policy.select_action(before(_observation(state))))[0]
 
-    return config, act
+    return config, act, losses
+
+
+def _blind_to_constants(stats: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Statistics by which a component that never changed, as in one demonstration, is no input.
+
+    LeRobot divides by its spread of nothing, and the policy would be thrown anywhere.
+    """
+    from hrc_learn.lerobot.policy.encoder import SMALLEST_SPREAD
+
+    return stats | {"std": np.where(stats["std"] > SMALLEST_SPREAD, stats["std"], np.inf)}
 
 
 def _observation(state: Tensor) -> dict[str, Tensor]:
@@ -190,19 +211,19 @@ def _config(name: str, width: int) -> Any:
             return ACTConfig(
                 **common,
                 input_features={ENVIRONMENT: PolicyFeature(FeatureType.ENV, (width,))},
-                dim_model=128,
+                dim_model=64,
                 n_heads=4,
-                dim_feedforward=512,
-                n_encoder_layers=3,
+                dim_feedforward=256,
+                n_encoder_layers=2,
                 use_vae=False,
                 dropout=0.0,
-                optimizer_lr=3e-4,
+                optimizer_lr=1e-3,
             )
     raise ValueError(f"--policies takes dmp-fit, dmp and act, not {name!r}")
 
 
-def _train(policy: Any, before: Any, dataset: Path, args: Args, title: str) -> None:
-    """As lerobot-train does it, with batches from memory."""
+def _train(policy: Any, before: Any, dataset: Path, args: Args, title: str) -> dict[str, float]:
+    """As lerobot-train does it, with batches from memory; mean losses of some tenths of it."""
     from hrc_learn.lerobot.policy.episodes import read_episodes
     from hrc_learn.lerobot.policy.windows import Windows
 
@@ -212,7 +233,8 @@ def _train(policy: Any, before: Any, dataset: Path, args: Args, title: str) -> N
     deltas |= dict.fromkeys((STATE, ENVIRONMENT), config.observation_delta_indices)
     samples = Windows(episodes, deltas, args.fps)
     optimizer = config.get_optimizer_preset().build(policy.get_optim_params())
-    rng = torch.Generator().manual_seed(args.seed)
+    schedule = CosineAnnealingLR(optimizer, args.steps)
+    rng, losses = torch.Generator().manual_seed(args.seed), []
     policy.train()
     for _ in track(range(args.steps), title):
         loss, _ = policy.forward(before(samples.draw(args.batch_size, rng)))
@@ -220,6 +242,10 @@ def _train(policy: Any, before: Any, dataset: Path, args: Args, title: str) -> N
         loss.backward()
         torch.nn.utils.clip_grad_norm_(policy.parameters(), 10.0)
         optimizer.step()
+        schedule.step()
+        losses.append(loss.item())
+    tenths = np.array_split(losses, 10)
+    return {"first": tenths[0].mean(), "middle": tenths[4].mean(), "last": tenths[9].mean()}
 
 
 def _do(

@@ -1,7 +1,7 @@
 """A Panda behind the `Arm` and `Gripper` protocols, by the driver package `franky`.
 
-Written against the published interface of franky (PyPI: franky-control; franky-panda for the
-firmware of the first Panda), tested with a fake that speaks it. NOT RUN ON HARDWARE.
+Written against the published interface of franky 2.0 (PyPI: franky-control), tested with a fake
+that speaks it. NOT RUN ON HARDWARE.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def _import_franky() -> Any:
         return importlib.import_module("franky")
     except ImportError as error:
         raise ImportError(
-            "a real Panda needs the driver package franky: pip install franky-control (or "
-            "franky-panda, for the firmware of the first Panda), on a machine with a real-time "
+            "a real Panda needs the driver package franky: pip install franky-control, in the "
+            "build for the server version of its control box, on a machine with a real-time "
             "kernel."
         ) from error
