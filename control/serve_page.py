@@ -1,8 +1,9 @@
 """Lead the simulated arm in a browser, and record demonstrations of your own.
 
 Open the address that is printed. Drag a link or a knob of the arm, or of its virtual twin, to
-shape the body; drag the hand's handle to lead the hand. Start, stop, save. Ends with "Finish",
-with Ctrl-C, or after --duration, and leaves a LeRobot dataset if anything was saved.
+shape the body; drag the hand's handle to lead the hand, such as to a green field on a shelf.
+Start, stop, save. Ends with "Finish", with Ctrl-C, or after --duration, and leaves a LeRobot
+dataset if anything was saved.
 """
 
 import os
@@ -26,6 +27,7 @@ from hrc_learn.kinematics import panda
 from hrc_learn.protocols import Human
 from hrc_learn.sim import MovingBodies, World
 from hrc_learn.tasks.demonstration_recorder import DemonstrationRecorder
+from hrc_learn.tasks.landing import landing_places
 from hrc_learn.tasks.page_session import FEATURES, PageSession, PageSessionConfig
 from hrc_learn.tasks.workplace import Workplace
 
@@ -70,7 +72,8 @@ def main(args: Args) -> None:
         details={"taught by": "a person at the page"},
     )
     drawn = bodies.drawn(*(poses[None] for poses in bodies.poses()))
-    page = Page(panda, drawn, workplace.scene.boxes(), args.page, task=args.task)
+    stands = [*workplace.scene.boxes(), *landing_places(workplace)]
+    page = Page(panda, drawn, stands, args.page, task=args.task)
     with DemonstrationRecorder(writer, lambda: page.task) as recorder, page:
         session = PageSession(
             workplace, page, recorder, world, beside=_beside(args.beside), config=args.session

@@ -12,6 +12,7 @@ from ..kinematics import panda
 from ..protocols import Human, HumanInput, Request
 from ..sim import MovingBodies, World
 from .demonstration_recorder import DemonstrationRecorder
+from .landing import way_left
 from .led_arm import Frame, Instant, LedArm, LedArmConfig
 from .workplace import Workplace
 
@@ -97,7 +98,7 @@ class PageSession:
         for request in instant.asked.requests:
             self._handle(request)
         if self._ticks % self._config.show_every == 0:
-            self._page.show(self._status())
+            self._page.show(self._status(instant))
         self._ticks += 1
         return instant
 
@@ -121,8 +122,11 @@ class PageSession:
             self._width = asked.gripper
             self.world.arm.move(asked.gripper)
 
-    def _status(self) -> PageStatus:
+    def _status(self, instant: Instant) -> PageStatus:
         status, world = self._recorder.status, self.world
+        notes = [status.note]
+        if status.state != "ready":
+            notes.insert(0, way_left(self._workplace, instant.pose.position.numpy()))
         monitors = (world.cabinet_contacts, world.table_contacts, world.self_contacts)
         counts = self.led.safety.counts.tolist()
         return PageStatus(
@@ -130,7 +134,7 @@ class PageSession:
             recording=status.state,
             seconds=status.seconds,
             saved=status.saved,
-            note=status.note,
+            note="; ".join(filter(None, notes)),
             interventions=dict(zip(INTERVENTIONS, counts, strict=True)),
             contacts=sum(len(monitor.touches) for monitor in monitors),
         )
