@@ -15,7 +15,8 @@ from .shapes import body_mesh
 
 _KNOBS = (2, 4, 6)
 """Joints marked by a knob: shoulder, elbow, wrist. Between them the links are held."""
-_HAND_PARTS = ("hand", "finger_left", "finger_right")
+_HAND_PARTS = ("link7", "hand", "finger_left", "finger_right")
+"""What moves with the hand, the last link too: whoever pulls at it leads the hand."""
 _PERSON = rgba(PERSON)[:3]
 
 
@@ -57,8 +58,9 @@ class Stage:
         """All that can be held: node, joint (None: the hand), and how far off the arm [m]."""
         here = np.zeros(3)
         for body, own, copy in zip(self._bodies, self._own, self._copies, strict=True):
-            joint = _joint_of(body)
-            if joint is not None or body.name in _HAND_PARTS:
+            is_hand = body.name in _HAND_PARTS
+            joint = None if is_hand else _joint_of(body)
+            if is_hand or joint is not None:
                 yield own, joint, here
                 if copy is not None:
                     yield copy, joint, self.twin
