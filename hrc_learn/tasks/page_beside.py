@@ -4,8 +4,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from ..controller.runtime import Metronome
+from ..human import BothHands
 from ..human.page import Page, PageConfig, PageHuman, PageStatus
 from ..kinematics import panda
+from ..protocols import Human
 from ..sim import MovingBodies, World
 from .collaboration import INTERACT
 from .station import SAFETY_COLUMNS, Station
@@ -40,15 +42,32 @@ class PageBeside:
         """Tell from the log of a station what the task is doing."""
         self._station = station
 
+    def joined(
+        self, person: Human, advance: Callable[[float], None]
+    ) -> tuple[Human, Callable[[float], None]]:
+        """A person with those at the page, and time that passes for both.
+
+        Args:
+            person: Beside the arm.
+            advance: Lets a given time pass in the world [s].
+        """
+
+        def advance_and_show(duration: float) -> None:
+            advance(duration)
+            self.tick()
+
+        return BothHands(person, self.human), advance_and_show
+
     def tick(self) -> None:
         """After each control step: show where everything is, and let real time pass."""
         self._page.place(*self._bodies.poses())
         if self._ticks % _SHOW_EVERY == 0 and self._station is not None:
-            self._page.show(self._status(self._station))
+            self._page.show(self.status(self._station))
         self._ticks += 1
         self._metronome.wait()
 
-    def _status(self, station: Station) -> PageStatus:
+    def status(self, station: Station) -> PageStatus:
+        """What the page says of a task that runs on a station."""
         world, log = self._world, station.log
         phase = log.events[-1].text if log.events else "getting ready"
         acted = log["safety"].sum(axis=0) if len(log) else [0] * len(SAFETY_COLUMNS)

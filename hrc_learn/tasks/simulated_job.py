@@ -8,10 +8,9 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from ..human import BothHands, PullSpell, ScriptedPuller
+from ..human import PullSpell, ScriptedPuller
 from ..human.page import PageConfig
 from ..kinematics import panda
-from ..protocols import Human
 from ..sim import (
     CameraChange,
     CameraKind,
@@ -28,7 +27,7 @@ from .collaboration import INTERACT, Collaboration, CollaborationConfig
 from .errand import Errand
 from .eye import Eye
 from .fit_aiming import AimingSkill
-from .page_beside import PageBeside, page_beside
+from .page_beside import page_beside
 from .placing import PlacingSkill, Plan, check_plan
 from .scattering import scatter
 from .station import Station, StationConfig
@@ -123,7 +122,7 @@ def simulate_collaboration(
         ValueError: If shelves and objects do not go together, there is no such shelf, or the
             arm cannot reach it.
     """
-    workplace, rng = workplace or Workplace(), np.random.default_rng(seed)
+    workplace, rng = aiming.approached(workplace or Workplace()), np.random.default_rng(seed)
     disturbances = disturbances or Disturbances()
     station_config = station_config or StationConfig()
     items = workplace.scene.objects
@@ -160,7 +159,7 @@ def simulate_collaboration(
         if page is not None:
             opened = page_beside(world, station_config.dt, page, on_page)
             beside = stack.enter_context(opened)
-            human, passing = _joined(person, advance, beside)
+            human, passing = beside.joined(person, advance)
         station = Station(
             chain=panda,
             arm=world.arm,
@@ -223,15 +222,3 @@ def _watched(workplace: Workplace, world: World) -> Float[np.ndarray, "points 3"
     on_table = np.array([*workplace.table_centre, workplace.scene.objects[0].half_size[2]])
     # Markers and their plates reach as far as this about their centres, and a margin more.
     return np.concatenate([middle + signs * (reach + 0.05) for middle in (on_table, marker)])
-
-
-def _joined(
-    person: Human, advance: Callable[[float], None], beside: PageBeside
-) -> tuple[Human, Callable[[float], None]]:
-    """The person of the script with those at the page, and time that passes for both."""
-
-    def advance_and_show(duration: float) -> None:
-        advance(duration)
-        beside.tick()
-
-    return BothHands(person, beside.human), advance_and_show
