@@ -3,8 +3,9 @@
 Learns how the image of the hand's marker moves with the hand, as a radial basis function
 network over the workspace, with its uncertainty; and, where an object was watched, where that
 image should be to stand right above it. Neurons, noise and prior are learned by the gradient
-of the evidence until demonstrations held out say stop. Writes the model, the measured errors
-and figures of them. Under torchrun each process reads its share of the demonstrations.
+of the evidence until demonstrations held out say stop. Writes the model, the measured errors,
+figures of them and a Rerun recording of how learning converged. Under torchrun each process
+reads its share of the demonstrations.
 """
 
 from dataclasses import asdict, dataclass, field
@@ -14,7 +15,7 @@ from typing import Literal
 from rich.console import Console
 
 from hrc_learn import cli, distributed
-from hrc_learn.demos import open_demos
+from hrc_learn.demos import DemonstrationSource, open_demos
 from hrc_learn.jacobian import (
     CellErrors,
     ImageJacobianFitConfig,
@@ -24,6 +25,8 @@ from hrc_learn.jacobian import (
 )
 from hrc_learn.output import new_folder
 from hrc_learn.tasks.fit_aiming import AimingSkill, fit_aiming
+from hrc_learn.tasks.learning_recording import learning_recording
+from hrc_learn.viz.learning_dashboard import record_learning
 from hrc_learn.viz.learning_figures import learning_figure, workspace_figure
 
 
@@ -81,14 +84,16 @@ def main(args: Args) -> None:
                 ),
             )
         if rank == 0:
-            _write(args, skill, console)
+            _write(args, skill, demos, console)
 
 
 def _grid(args: Args) -> Neurons:
     return Neurons(centers=grid(args.x, args.y), width=args.width)
 
 
-def _write(args: Args, skill: AimingSkill, console: Console) -> None:
+def _write(
+    args: Args, skill: AimingSkill, demos: DemonstrationSource, console: Console
+) -> None:
     metrics = skill.metrics()
     with new_folder(args.out, asdict(args), args.overwrite) as folder:
         skill.save(folder)
@@ -99,8 +104,11 @@ def _write(args: Args, skill: AimingSkill, console: Console) -> None:
             held_out = [state.held_out_error for state in skill.learned.rounds]
             figure = learning_figure(held_out, skill.learned.best, "px")
             figure.savefig(folder / "learning.png", dpi=120)
+        title = f"Image Jacobian from {args.dataset.name}"
+        record_learning(folder / "fit.rrd", learning_recording(skill, demos, title))
     cli.show_values(f"Image Jacobian from {args.dataset}", metrics)
     console.print(f"Model in {args.out}")
+    console.print(f"Recording  rerun {args.out / 'fit.rrd'}")
     if args.json is not None:
         cli.write_json(args.json, metrics)
 

@@ -52,19 +52,30 @@ class Round:
     """Negative logarithm of the probability of the image motion, per pair."""
     held_out_error: float
     """Root mean square over the pairs of demonstrations held out [px]."""
+    neurons: Neurons
+    """As they were then."""
+    config: ImageJacobianFitConfig
+    """With noise and prior as they were then."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Learned:
-    """The best of all rounds."""
+    """All rounds, of which the best is the result."""
 
-    neurons: Neurons
-    config: ImageJacobianFitConfig
-    """With noise and prior as learned."""
     rounds: tuple[Round, ...]
     """The first before anything was learned."""
     best: int
     """Which round the result is of."""
+
+    @property
+    def neurons(self) -> Neurons:
+        """As learned."""
+        return self.rounds[self.best].neurons
+
+    @property
+    def config(self) -> ImageJacobianFitConfig:
+        """With noise and prior as learned."""
+        return self.rounds[self.best].config
 
 
 def learn(
@@ -105,7 +116,7 @@ def learn(
 
     rounds = [model.judge(training, held_out)]
     on_round(0, rounds[0])
-    best, kept = 0, model.state_dict_copy()
+    best = 0
     while len(rounds) <= learning.rounds and len(rounds) - 1 - best < learning.patience:
         try:
             optimiser.step(loss)
@@ -115,11 +126,8 @@ def learn(
         on_round(len(rounds) - 1, rounds[-1])
         limit = (1 - learning.least_gain) * rounds[best].held_out_error
         if rounds[-1].held_out_error < limit:
-            best, kept = len(rounds) - 1, model.state_dict_copy()
-    model.load_state_dict(kept)
-    return Learned(
-        neurons=model.neurons(), config=model.fit_config(), rounds=tuple(rounds), best=best
-    )
+            best = len(rounds) - 1
+    return Learned(rounds=tuple(rounds), best=best)
 
 
 class Evidence(nn.Module):
@@ -186,11 +194,12 @@ class Evidence(nn.Module):
         weights = solve(self.statistics(training), precision, noise).mean
         unseen = self.statistics(held_out)
         error = (unseen.squared_error(weights) / unseen.count) ** 0.5
-        return Round(evidence=float(self(training)), held_out_error=error)
-
-    def state_dict_copy(self) -> dict[str, Tensor]:
-        """The parameters as they are now."""
-        return {name: value.clone() for name, value in self.state_dict().items()}
+        return Round(
+            evidence=float(self(training)),
+            held_out_error=error,
+            neurons=self.neurons(),
+            config=config,
+        )
 
     def _prior(self) -> Float[Tensor, "K K"]:
         return weight_covariance(self.centers, self.log_bias.exp(), self.log_weight.exp())

@@ -7,6 +7,8 @@ it is asked for: `hrc_learn.viz.run_dashboard` and `fit_dashboard` import rerun,
 
 from .demonstrations_recording import DemonstrationsRecording as DemonstrationsRecording
 from .demonstrations_recording import ShownDemonstration as ShownDemonstration
+from .learning_recording import ErrorMap as ErrorMap
+from .learning_recording import LearningRecording as LearningRecording
 from .logged_steps import Event as Event
 from .logged_steps import LoggedSteps as LoggedSteps
 from .recording import Body as Body

@@ -99,11 +99,14 @@ def send_values(
     stream: rr.RecordingStream, time: Float[np.ndarray, " time"], curves: Curves
 ) -> None:
     """Send the samples of curves."""
+    send_rows(stream, seconds(time), curves)
+
+
+def send_rows(stream: rr.RecordingStream, index: list[rr.TimeColumn], curves: Curves) -> None:
+    """Send the samples of curves on a timeline of any kind."""
     values = np.asarray(curves.values, dtype=np.float64)
     columns = rr.Scalars.columns(scalars=values.ravel())
-    stream.send_columns(
-        curves.path, seconds(time), columns.partition([values.shape[1]] * len(values))
-    )
+    stream.send_columns(curves.path, index, columns.partition([values.shape[1]] * len(values)))
 
 
 def body_path(body: Body) -> str:
