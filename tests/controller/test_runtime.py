@@ -14,16 +14,11 @@ import pytest
 import sampling
 import torch
 from graphs import library_calls
+from step_equality import assert_equal_steps, controller_and_observation
 from torch import Tensor
 from unchecked import shapes_unchecked
 
-from hrc_learn.controller import (
-    GRIPPER_DOWN,
-    INITIAL_IMAGE_JACOBIAN,
-    AdaptiveController,
-    Goals,
-    Observation,
-)
+from hrc_learn.controller import Observation
 from hrc_learn.controller.runtime import (
     EagerRunner,
     NoCompilerError,
@@ -36,8 +31,6 @@ from hrc_learn.controller.runtime import package as package_module
 from hrc_learn.controller.runtime.export import trace
 from hrc_learn.controller.runtime.flat import FlatStep, tensors_of
 from hrc_learn.controller.runtime.package import load
-from hrc_learn.geometry import quaternion
-from hrc_learn.jacobian import KalmanEstimator, RBFImageJacobian, paper_grid
 from hrc_learn.kinematics import panda
 
 ROOT = Path(__file__).parents[2]
@@ -51,112 +44,12 @@ def _no_shape_checks() -> Iterator[None]:
         yield
 
 
-def controller_and_observation(
-    q: Tensor = panda.ready,
-) -> tuple[AdaptiveController, Observation]:
-    J = torch.tensor(INITIAL_IMAGE_JACOBIAN, dtype=DOUBLE)
-    network = RBFImageJacobian.from_jacobian(J, paper_grid(), 0.1)
-    down = quaternion.normalize(q.new_tensor(GRIPPER_DOWN))
-    goals = Goals.at(q.new_tensor((0.4, 0.1, 0.4)), down, q.new_tensor((700.0, 500.0)))
-    controller = AdaptiveController(panda, KalmanEstimator(network), goals)
-    observation = Observation(
-        joint_position=q,
-        feature=q.new_tensor((600.0, 600.0)),
-        feature_visible=torch.tensor(True),
-        feature_new=torch.tensor(True),
-        feature_age=torch.tensor(0.0, dtype=DOUBLE),
-        image_joint_position=q,
-        human_effort=torch.zeros_like(q),
-        goals=goals,
-        dt=0.002,
-    )
-    return controller, observation
-
-
-def observe_at_random(arrays: dict[str, np.ndarray], rng: np.random.Generator) -> None:
-    """Anything a robot may report: lost and NaN features, people, NaN and fast joints."""
-    lower, upper = panda.limits.lower.numpy(), panda.limits.upper.numpy()
-    near = arrays["joint_position"] + 0.003 * rng.standard_normal(7)
-    anywhere = rng.uniform(lower, upper)
-    arrays["image_joint_position"][:] = near
-    arrays["joint_position"][:] = near if rng.random() < 0.9 else anywhere
-    arrays["feature"][:] += 3 * rng.standard_normal(2)
-    if rng.random() < 0.1 or not np.isfinite(arrays["feature"]).all():
-        arrays["feature"][:] = rng.uniform(-100, 1500, 2)
-    arrays["feature_visible"][...] = rng.random() < 0.8
-    arrays["feature_new"][...] = rng.random() < 0.5
-    arrays["feature_age"][...] = rng.uniform(0, 0.3)
-    arrays["human_effort"][:] = 2 * rng.standard_normal(7) * (rng.random() < 0.5)
-    arrays["goals.vision.target"][:] = rng.uniform(200, 900, 2)
-    arrays["goals.vision_enabled"][...] = rng.random() < 0.9
-
-
-def spoil_at_random(arrays: dict[str, np.ndarray], rng: np.random.Generator) -> None:
-    for name, share in (("feature", 0.1), ("joint_position", 0.02), ("human_effort", 0.01)):
-        if rng.random() < share:
-            arrays[name].flat[0] = np.nan
-
-
-# Largest difference allowed where it is not 1e-12.
-TOLERANCES = {
-    # That of a velocity over a step of 2 ms.
-    "safety.acceleration": 1e-12 / 0.002,
-    # Scaled for one joint to touch its limit: errors of the task are divided by what this joint
-    # moves in the null space.
-    "null_velocity": 1e-11,
-    # Sums of products of weights up to 2e4, of variances up to 2.5e6.
-    "image_jacobian": 2e4 * 1e-12,
-    "weight_norm": 2e5 * 1e-12,
-    "estimator.covariance": 2.5e6 * 1e-12,
-    # What 1500 px within a millimetre ask for, with positions right to 1e-15 m.
-    "estimator.weight": (1500 / 1e-3) * 1e-12,
-}
-
-
-def assert_equal_steps(run, steps: int) -> None:
-    """Compares single steps from states that the eager step has reached."""
-    controller, observation = controller_and_observation()
-    step = FlatStep(controller, observation)
-    expected = step.example(observation)
-    first = expected.state.clone()
-    arrays = step.layouts.observation.arrays(expected.observation)
-    states = step.layouts.state.arrays(expected.state)
-    rng, followed = np.random.default_rng(0), 0
-    for k in range(steps):
-        if not np.isfinite(arrays["joint_position"]).all():
-            arrays["joint_position"][:] = panda.ready.numpy()
-        observe_at_random(arrays, rng)
-        spoil_at_random(arrays, rng)
-        if k % 100 == 0:
-            expected.state.copy_(first)
-        actual = [x.clone() for x in expected]
-        with torch.no_grad():
-            step(*expected)
-            run(actual)
-        for layout, e, a in zip(step.layouts, expected, actual, strict=True):
-            for field, x, y in zip(
-                layout.fields, layout.views(e), layout.views(a), strict=True
-            ):
-                exact = not field.dtype.is_floating_point
-                atol = 0 if exact else TOLERANCES.get(field.name, 1e-12)
-                torch.testing.assert_close(
-                    y,
-                    x,
-                    rtol=0,
-                    atol=atol,
-                    equal_nan=True,
-                    msg=lambda why, k=k, name=field.name: f"step {k}, {name}: {why}",
-                )
-        followed += int(states["activation.active"])
-    assert 0.1 * steps < followed < 0.9 * steps
-
-
 def test_the_traced_step_equals_the_eager_one_and_is_written_out():
     controller, observation = controller_and_observation()
     traced = trace(FlatStep(controller, observation), observation)
     assert not library_calls(traced)
     program = traced.module()
-    assert_equal_steps(lambda vectors: program(*vectors), 100)
+    assert_equal_steps(controller, observation, lambda vectors: program(*vectors), 100)
 
 
 class TestArrays:
@@ -307,40 +200,11 @@ def package(tmp_path_factory) -> Path:
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:the exported step of a batch is experimental")
-@pytest.mark.xfail(reason="some arms differ by 1e-4 rad/s; the cause is not yet known")
-def test_a_batch_is_exported_as_one_step(tmp_path):
-    """In closed loop, with rounding that adds up; each arm starts in a posture of its own."""
-    controller, one = controller_and_observation()
-    noise = torch.randn(40, 7, generator=sampling.generator(), dtype=DOUBLE)
-    q = panda.ready + 0.3 * noise
-    observation = Observation(
-        joint_position=q,
-        feature=one.feature + 100 * q[:, :2],
-        feature_visible=torch.arange(40) % 4 != 0,
-        human_effort=0.1 * q,
-        dt=0.002,
-    )
-    runners = [
-        EagerRunner(controller, observation),
-        open_step(controller, observation, tmp_path),
-    ]
-    assert isinstance(runners[1], PackageRunner)
-    for _ in range(200):
-        eager, exported = (runner.step() for runner in runners)
-        np.testing.assert_allclose(exported, eager, rtol=0, atol=1e-10)
-        for runner in runners:
-            runner.observation["joint_position"][:] += 0.002 * runner.joint_velocity
-            runner.observation["feature"][:] += runner.joint_velocity[:, :2]
-    assert np.abs(runners[0].joint_velocity).max() > 0.1
-
-
-@pytest.mark.slow
 class TestPackage:
     """Built once, in a minute or two."""
 
     def test_it_equals_the_eager_step(self, package):
-        assert_equal_steps(load(package).run, 10_000)
+        assert_equal_steps(*controller_and_observation(), load(package).run, 10_000)
 
     def test_it_is_built_once(self, package):
         built = package.stat().st_mtime_ns
