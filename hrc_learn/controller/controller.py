@@ -2,47 +2,31 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple, final
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
 from torch.utils import _pytree
 
-from hrc_learn.controller.activation import Activation, HandOver, fade
+from hrc_learn.controller.activation import Activation, HandOver
 from hrc_learn.controller.analytic import analytic_descent
+from hrc_learn.controller.approach import approach_velocity, next_arrival
 from hrc_learn.controller.config import ControllerConfig
+from hrc_learn.controller.feedback import Feedback, regional_feedback
 from hrc_learn.controller.goals import Goals
 from hrc_learn.controller.hold import Hold, measure_drift, planned_motion
 from hrc_learn.controller.interface import Command, ControllerState, Observation
 from hrc_learn.controller.lyapunov import potential_rate
 from hrc_learn.controller.resolution import excess_speed, fit_null_space, resolve
 from hrc_learn.controller.safety import SafetyFilter
+from hrc_learn.controller.sensing import effective_goals, either, trusted_position
 from hrc_learn.geometry import Pose
 from hrc_learn.jacobian import ImageJacobianEstimator, Measurement
 from hrc_learn.kinematics import SerialChain
-from hrc_learn.regions import JointRegion, PostureRegion
-
-# Keeps the cap on the pixel rate finite at the target.
-_ONE_PIXEL_PER_SECOND = 1.0
-
-
-# Region function of the posture beyond which a joint-space approach begins anew: at the
-# default tolerance of 0.5 rad, a distance of 1.5 rad.
-_FAR_AWAY = 2.0
-
-
-class _Feedback(NamedTuple):
-    """Regional feedback vectors and their combination."""
-
-    xi_x: Tensor
-    xi_r: Tensor
-    s: Tensor
-    image_jacobian: Tensor
-    potential: Tensor
+from hrc_learn.regions import JointRegion
 
 
 class _Motion(NamedTuple):
@@ -152,10 +136,17 @@ class AdaptiveController(nn.Module):
         Raises:
             ValueError: dt is not in (0, 1/rate] of the safety filter.
         """
-        goals, known = _effective_goals(observation, self.goals)
-        q, stale = _trusted_position(state, observation)
+        goals, known = effective_goals(observation, self.goals)
+        q, stale = trusted_position(observation, state.safety.position)
         pose, J = self.chain.forward_and_jacobian(q)
-        arrival = self._arrival(state, goals, q, observation.dt)
+        arrival = next_arrival(
+            state.arrival,
+            goals.posture,
+            q,
+            state.activation.active,
+            observation.dt,
+            self.config.activation.blend_time,
+        )
         usable = observation.feature_visible & goals.vision_enabled & known
         activation, seen, stop = self.hand_over.step(
             state.activation,
@@ -164,7 +155,8 @@ class AdaptiveController(nn.Module):
             observation.dt,
             age=observation.feature_age,
         )
-        feedback = self._feedback(state, goals, pose, activation)
+        J_s = self.estimator.jacobian(state.estimator, pose)
+        feedback = regional_feedback(goals, pose, activation, J_s, self.config.vision_rate)
         descent = feedback.s
         if self.config.jacobian == "analytic":
             descent = analytic_descent(descent, pose.orientation)
@@ -176,7 +168,7 @@ class AdaptiveController(nn.Module):
             observation.dt,
             jacobian=J,
             human_distance=observation.human_distance,
-            stop=_either(stop, observation.stop),
+            stop=either(stop, observation.stop),
             stale=stale,
             bounds=motion.bounds,
         )
@@ -193,7 +185,7 @@ class AdaptiveController(nn.Module):
             xi_r=feedback.xi_r,
             xi_q=motion.xi_q,
             s=feedback.s,
-            image_jacobian=feedback.image_jacobian,
+            image_jacobian=J_s,
             weight_norm=torch.linalg.vector_norm(state.estimator.weight, dim=(-2, -1)),
             vision_activation=activation.level,
             potential=feedback.potential,
@@ -208,50 +200,6 @@ class AdaptiveController(nn.Module):
             safety=safety,
             estimator=estimator,
         )
-
-    def _arrival(
-        self, state: ControllerState, goals: Goals, q: Tensor, dt: float | Tensor
-    ) -> Float[Tensor, "*batch"]:
-        """Share in which task-space feedback has taken over from a joint-space approach.
-
-        It does so inside the posture region: earlier it would lead an arm from whatever
-        posture it is in, and many of those end at a joint limit. Once it has, it keeps the
-        lead, also where a person or the task moves the joints out of the region, unless the
-        posture lies far away, as when a new phase begins.
-        """
-        if goals.posture is None:
-            return torch.zeros_like(state.arrival)
-        f = goals.posture.value(q)
-        leads = (state.arrival > 0) & ((f <= _FAR_AWAY) | state.activation.active)
-        return fade(state.arrival, leads | (f <= 0), dt, self.config.activation.blend_time)
-
-    def _feedback(
-        self, state: ControllerState, goals: Goals, pose: Pose, activation: Activation
-    ) -> _Feedback:
-        """Regional feedback in image and Cartesian space."""
-        P_t, xi_position = goals.position.feedback(pose.position)
-        P_o, xi_orientation = goals.orientation.feedback(pose.orientation)
-        P_v, xi_x = goals.vision.feedback(activation.feature)
-        xi_r = torch.cat([xi_position, xi_orientation], dim=-1)
-        J_s = self.estimator.jacobian(state.estimator, pose)
-        error = activation.feature - goals.vision.target
-        share = activation.level.unsqueeze(-1)
-        if self.config.vision_rate < math.inf:
-            share = share / self._excess_rate(J_s, xi_x, error)
-        xi_x = share * xi_x
-        s = torch.linalg.vecdot(J_s, xi_x.unsqueeze(-1), dim=-2) + xi_r
-        return _Feedback(xi_x, xi_r, s, J_s, P_t + P_o + activation.level * P_v)
-
-    def _excess_rate(
-        self, J_s: Tensor, xi_x: Tensor, error: Tensor
-    ) -> Float[Tensor, "*batch 1"]:
-        """What to divide vision feedback by to keep the rate of the pixel error; at least 1."""
-        push = torch.linalg.vecdot(J_s, xi_x.unsqueeze(-1), dim=-2)
-        speed = torch.linalg.vecdot(J_s, push.unsqueeze(-2))
-        speed = torch.linalg.vector_norm(speed, dim=-1, keepdim=True)
-        distance = torch.linalg.vector_norm(error, dim=-1, keepdim=True)
-        allowed = self.config.vision_rate * distance + _ONE_PIXEL_PER_SECOND
-        return (speed / allowed).clamp(min=1)
 
     def _motion(
         self,
@@ -278,20 +226,12 @@ class AdaptiveController(nn.Module):
 
         task, null = resolve(J, twist, wish)
         if goals.posture is not None:
-            approach = self._approach(goals.posture, q, J)
+            approach = approach_velocity(goals.posture, q, J, self.caps[1])
             task = torch.lerp(approach, task, arrival.unsqueeze(-1))
         bounds = self.safety.velocity_bounds(q)
         if self.config.null_space_yields:
             null = fit_null_space(task, null, *bounds)
         return _Motion(task + null, null, twist, task_twist, xi_q, bounds), hold
-
-    def _approach(
-        self, posture: PostureRegion, q: Tensor, J: Tensor
-    ) -> Float[Tensor, "*batch n"]:
-        """Joint velocity towards a posture, as slow as the caps of the tool ask [rad/s]."""
-        velocity = -posture.gradient(q)
-        twist = torch.linalg.vecdot(J, velocity.unsqueeze(-2))
-        return velocity / excess_speed(twist, self.caps[1])
 
     def _adapted(
         self,
@@ -300,7 +240,7 @@ class AdaptiveController(nn.Module):
         pose: Pose,
         seen: Tensor,
         activation: Activation,
-        feedback: _Feedback,
+        feedback: Feedback,
     ) -> Any:
         """State of the estimator after what the camera saw."""
         q = observation.image_joint_position
@@ -322,34 +262,3 @@ class AdaptiveController(nn.Module):
             xi_r=feedback.xi_r,
         )
         return self.estimator.update(state.estimator, measurement)
-
-
-def _effective_goals(
-    observation: Observation, default: Goals
-) -> tuple[Goals, Bool[Tensor, "*batch"] | bool]:
-    """Goals of this step, and whether the target is known: one that is NaN is not."""
-    goals = default if observation.goals is None else observation.goals
-    target = observation.target
-    if target is None:
-        return goals, True
-    known = target.isfinite().all(-1)
-    target = torch.where(known.unsqueeze(-1), target, goals.vision.target)
-    return goals.aimed_at(target), known
-
-
-def _either(a: Tensor | None, b: Tensor | None) -> Tensor | None:
-    """Whether one of two optional conditions holds."""
-    if a is None or b is None:
-        return b if a is None else a
-    return a | b
-
-
-def _trusted_position(
-    state: ControllerState, observation: Observation
-) -> tuple[Tensor, Bool[Tensor, "*batch"]]:
-    """Measured joint position, or the expected one where that is NaN or stale."""
-    q = observation.joint_position
-    stale = ~q.isfinite().all(-1)
-    if observation.joint_state_stale is not None:
-        stale = stale | observation.joint_state_stale
-    return torch.where(stale.unsqueeze(-1), state.safety.position, q), stale
