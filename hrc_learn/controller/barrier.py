@@ -35,9 +35,13 @@ class LimitBarrier(nn.Module):
 
     while below A dt the joint gets no further than v_hat dt <= rate dt delta <= delta. So a
     step that keeps all limits always exists. It takes equal steps, in which the joint moves
-    by v dt, and a start inside the set: at rest that is delta >= A^2/(2 j rate), 3 mrad for
-    a Panda at 5 1/s, which the margin covers. From rest nearer to a limit, or past it, a
-    joint moves inwards only.
+    by v dt, and a start inside the set. At rest v_hat = A^2/(2 j), so that is
+
+        delta >= A^3/(8 j^2) + A^2/(2 j rate),
+
+    3 mrad for a Panda at 5 1/s, which the margin covers; the first term, the way on which
+    the acceleration ramps down, counts where A/j is long, as for slow axes. From rest nearer
+    to a limit, or past it, a joint moves inwards only.
     """
 
     velocity: Tensor
