@@ -1,10 +1,11 @@
-"""From demonstrations of aiming: the image Jacobian, and where in the image to aim."""
+"""From demonstrations of aiming: the image Jacobian, where to aim, and how to hold the hand."""
 
 import copy
+import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import overload
+from typing import NamedTuple, overload
 
 import numpy as np
 import torch
@@ -26,7 +27,9 @@ from ..jacobian import (
 )
 from ..jacobian.learning import Round
 from ..kinematics import panda
+from .approach import Approach
 from .visual_target import OBJECT_FEATURE, VisualTarget
+from .workplace import Workplace
 
 type Demonstrations = DemonstrationSet | DemonstrationSource
 """In memory, or read one by one."""
@@ -42,16 +45,20 @@ class AimingSkill:
     jacobian: RBFImageJacobian
     target: VisualTarget | None
     """None where no object was watched."""
+    approach: Approach | None = None
+    """None where no object was watched."""
     learned: Learned | None = None
     """How neurons, noise and prior were learned; None where they were given."""
     cells: CellErrors | None = None
     """Held-out errors by place; None of a skill that was loaded."""
 
     def save(self, folder: Path) -> None:
-        """Write into `folder/jacobian` and `folder/visual_target.json`."""
+        """Write `folder/jacobian`, `folder/visual_target.json`, `folder/approach.json`."""
         self.jacobian.save(folder / "jacobian")
         if self.target is not None:
             self.target.save(folder / "visual_target.json")
+        if self.approach is not None:
+            self.approach.save(folder / "approach.json")
 
     @classmethod
     def load(cls, folder: Path) -> "AimingSkill":
@@ -61,10 +68,11 @@ class AimingSkill:
             FileNotFoundError: If there is no such folder or file.
             ValueError: If a file is not one of ours.
         """
-        target = folder / "visual_target.json"
+        target, approach = folder / "visual_target.json", folder / "approach.json"
         return cls(
             jacobian=RBFImageJacobian.load(folder / "jacobian"),
             target=VisualTarget.load(target) if target.exists() else None,
+            approach=Approach.load(approach) if approach.exists() else None,
         )
 
     def target_of(
@@ -85,6 +93,13 @@ class AimingSkill:
                 f"{OBJECT_FEATURE}."
             )
         return self.target.seen_by(pixel, jacobian)
+
+    def approached(self, workplace: Workplace) -> Workplace:
+        """A workplace where the hand comes to objects as the demonstrations did."""
+        if self.approach is None:
+            return workplace
+        w, x, y, z = self.approach.orientation.tolist()
+        return replace(workplace, hover_orientation=(w, x, y, z))
 
     def metrics(self) -> dict[str, float]:
         """How well image motion is predicted, and how well aiming.
@@ -117,6 +132,9 @@ class AimingSkill:
         if self.target is not None:
             values["target_error_px"] = self.target.error
             values["target_error_by_offset_px"] = self.target.offset_error
+        if self.approach is not None:
+            values["approach_spread_deg"] = math.degrees(self.approach.spread)
+            values["approach_turned_deg"] = math.degrees(self.approach.turned)
         return values
 
 
@@ -127,7 +145,7 @@ def fit_aiming(
     learning: LearningConfig | None = None,
     on_round: Callable[[int, Round], None] = lambda number, state: None,
 ) -> AimingSkill:
-    """Fit image Jacobian and, where an object was watched, visual target.
+    """Fit image Jacobian and, where an object was watched, visual target and approach.
 
     Args:
         demos: With image features and end-effector poses, or joint positions of a Panda.
@@ -149,8 +167,13 @@ def fit_aiming(
         neurons, config = learned.neurons, learned.config
     network = RBFImageJacobian.fit_watched(camera, neurons, config)
     cells = held_out_pairs(camera, network, config).by_cell()
+    ends = _ends(demos, network)
     return AimingSkill(
-        jacobian=network, target=_visual_target(demos, network), learned=learned, cells=cells
+        jacobian=network,
+        target=_visual_target(ends) if ends else None,
+        approach=Approach.fit([end.path for end in ends]) if ends else None,
+        learned=learned,
+        cells=cells,
     )
 
 
@@ -206,8 +229,17 @@ def _double(values: np.ndarray) -> Tensor:
     return torch.from_numpy(values).double()
 
 
-def _visual_target(demos: Demonstrations, network: RBFImageJacobian) -> VisualTarget | None:
-    """From the ends of all demonstrations; None if in none an object was watched."""
+class _End(NamedTuple):
+    """How a demonstration came to stand above the object."""
+
+    object_pixel: Float[np.ndarray, "2"]
+    hand_pixel: Float[np.ndarray, "2"]
+    jacobian: Float[np.ndarray, "2 6"]
+    path: Pose
+
+
+def _ends(demos: Demonstrations, network: RBFImageJacobian) -> list[_End]:
+    """Of all demonstrations if an object was watched in them; none if in none."""
     ends, without = [], []
     network = copy.deepcopy(network).double()
     for demo in demos:
@@ -215,20 +247,15 @@ def _visual_target(demos: Demonstrations, network: RBFImageJacobian) -> VisualTa
             ends.append(_end(demo, demos.source, network))
         else:
             without.append(demo.episode)
-    if not ends:
-        return None
-    if without:
+    if ends and without:
         raise ValueError(
             f"{demos.source}, episode {without[0]}: no {OBJECT_FEATURE}, which others have."
         )
-    objects, hands, jacobians = (np.array(column) for column in zip(*ends, strict=True))
-    return VisualTarget.fit(objects, hands, jacobians)
+    return ends
 
 
-def _end(
-    demo: Demonstration, source: str, network: RBFImageJacobian
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pixels of object and hand, at rest at the end, and the image Jacobian there."""
+def _end(demo: Demonstration, source: str, network: RBFImageJacobian) -> _End:
+    """Means over the rest at the end."""
     watched = _watched(demo, source)
     at_rest = torch.from_numpy(demo.time > demo.time[-1] - _REST)
     last = (watched.visible & at_rest).nonzero()[:, 0]
@@ -239,5 +266,17 @@ def _end(
         )
     with torch.no_grad():
         jacobian = network(watched.pose[last]).mean(dim=0)
-    pixels = demo.extra[OBJECT_FEATURE][last.numpy(), :2].mean(axis=0)
-    return pixels, watched.feature[last].mean(dim=0).numpy(), jacobian.numpy()
+    return _End(
+        object_pixel=demo.extra[OBJECT_FEATURE][last.numpy(), :2].mean(axis=0),
+        hand_pixel=watched.feature[last].mean(dim=0).numpy(),
+        jacobian=jacobian.numpy(),
+        path=watched.pose,
+    )
+
+
+def _visual_target(ends: Sequence[_End]) -> VisualTarget:
+    return VisualTarget.fit(
+        np.array([end.object_pixel for end in ends]),
+        np.array([end.hand_pixel for end in ends]),
+        np.array([end.jacobian for end in ends]),
+    )

@@ -61,7 +61,7 @@ def _default(experiment: GraspingExperiment) -> Iterable[Measurement]:
         target=PLACE,
     )
     yield Measurement(
-        name="hand off the vertical when it goes down",
+        name="hand turned from the shown approach as it goes down",
         value=float(np.rad2deg(outcome.angle_error)),
         unit="deg",
         target=1.0,

@@ -1,7 +1,7 @@
 """A grasp in simulation: everything put together, run once, kept for evaluation."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -62,7 +62,9 @@ def simulate_grasp(
         watch: Watches from the side, such as `serving` a dashboard.
         on_phase: Told the name of each phase of the task, and when it begins [s].
     """
-    world, workplace = setting.world(), setting.workplace
+    workplace = aiming.approached(setting.workplace)
+    setting = replace(setting, workplace=workplace)
+    world = setting.world()
     item, motion = workplace.scene.objects[0], MotionLog(world)
 
     def check(plan: Plan) -> None:

@@ -1,6 +1,7 @@
 """The expert shows the camera's image: moves the marked hand about, and ends above an object.
 
-The image Jacobian is learned from the motion, and from the ends where to aim.
+The image Jacobian is learned from the motion, and from the ends where to aim and how the hand
+is turned to go on to the object.
 """
 
 from dataclasses import dataclass
@@ -27,6 +28,8 @@ class AimingLesson(TeachingConfig):
     """From the first point to above the object [s]."""
     points: int = 4
     """Random points passed before the object."""
+    descent: float = 0.06
+    """Height from which the hand at last comes straight down, as onto the object [m]."""
     reach: tuple[float, float, float] = (0.10, 0.08, 0.06)
     """How far from the middle of the table the points lie, and how far above hovering [m]."""
     wobble: float = 0.12
@@ -45,7 +48,8 @@ def aiming_expert(
     middle = workplace.hover().position.numpy()
     spread = rng.uniform(-1, 1, (lesson.points, 3)) * lesson.reach
     spread[:, 2] = np.abs(spread[:, 2])
-    path = GuidedPath(np.vstack([middle + spread, above]), lesson.duration)
+    higher = above + np.array([0.0, 0.0, lesson.descent])
+    path = GuidedPath(np.vstack([middle + spread, higher, above]), lesson.duration)
     rates, phases = rng.uniform(0.8, 1.6, 3), rng.uniform(0, 2 * np.pi, 3)
 
     def orientation(_position: torch.Tensor, time: float) -> torch.Tensor:

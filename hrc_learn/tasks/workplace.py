@@ -31,6 +31,8 @@ class Workplace:
     """Middle of the part of the table that the camera sees well [m]."""
     hover_height: float = 0.17
     """Of the tool centre point while it aims at an object [m]."""
+    hover_orientation: tuple[float, float, float, float] = tuple(gripper_down().tolist())
+    """Of the hand above the table (wxyz)."""
     hover_q7: float = -0.1
     """Joint 7 above the table [rad]."""
     shelf_x: float = 0.40
@@ -54,8 +56,9 @@ class Workplace:
         return panda.inverse(home, self.home_q7, near=_LEANING_FORWARD)
 
     def hover(self) -> Pose:
-        """Hand above the middle of the table, pointing down."""
-        return Pose(_vector(*self.table_centre, self.hover_height), gripper_down())
+        """Hand above the middle of the table."""
+        position = _vector(*self.table_centre, self.hover_height)
+        return Pose(position, _vector(*self.hover_orientation))
 
     def hover_joints(self) -> torch.Tensor:
         """Joint positions with the hand above the table, the upper arm well off the vertical.

@@ -11,11 +11,12 @@ import pytest
 import torch
 from unchecked import shapes_unchecked
 
-from hrc_learn.geometry import Pose
+from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import RBFImageJacobian, paper_grid
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import World
 from hrc_learn.tasks.aiming import AimingConfig
+from hrc_learn.tasks.approach import Approach
 from hrc_learn.tasks.fit_aiming import AimingSkill
 from hrc_learn.tasks.grasping_evaluation import evaluate_many
 from hrc_learn.tasks.grasping_outcome import GraspOutcome
@@ -181,3 +182,23 @@ def test_the_program_grasps_and_compares(skill, tmp_path):
     assert values["grasps_successes"] == 1
     files = {path.name for path in (tmp_path / "run").rglob("*")}
     assert files >= {"report.html", "run.rrd", "compared_fixed.rrd", "variants.png"}
+
+
+@pytest.mark.slow
+@shapes_unchecked()
+def test_the_hand_is_turned_as_the_demonstrations_approached(skill):
+    """By 8 degrees about the axis along which the fingers close."""
+    axis = torch.tensor([0.14, 0.0, 0.0], dtype=torch.float64)
+    shown = quaternion.multiply(quaternion.exp(axis), WORKPLACE.hover().orientation)
+    tilted = replace(skill, approach=Approach(orientation=shown, spread=0.0, turned=0.14))
+    run = simulate_grasp(tilted, turned(20), camera="synthetic", rng=np.random.default_rng(0))
+    outcome = GraspOutcome.of(run)
+    assert outcome.failure == ""
+    assert outcome.angle_error < 0.02
+    hand = panda.forward(torch.from_numpy(run.station.log["joint_position"]))
+    down = np.flatnonzero(run.station.log["time"] >= phase_time(run, "lift"))[0]
+    assert float(quaternion.angle(hand.orientation[down], shown)) < 0.02
+
+
+def phase_time(run, phase):
+    return next(event.time for event in run.station.log.events if event.text == phase)
