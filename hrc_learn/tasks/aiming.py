@@ -23,14 +23,21 @@ class AimingConfig:
     """Distance of the feature from the target at which it counts as reached [px]."""
     dwell: float = 0.4
     """How long it has to stay there [s]."""
+    height_tolerance: float = 0.01
+    """How far above or below the middle of the box the hand may then be [m]."""
     patience: float = 40.0
     """After which aiming is given up [s]."""
     unseen_patience: float = 10.0
     """How long the hand's marker may stay out of sight [s]."""
-    probe: float = 0.06
-    """Height above the box from which the hand comes down into it, the marker kept on its
-    target [m]. From this motion the controller learns how height looks to a camera that may
-    have been moved: without it the object, which lies deeper, would be missed. 0: none."""
+    probe: float = 0.03
+    """Height above the box from which the hand comes down into it, along the line from the
+    object's marker to its own [m]. From this motion the controller learns how that line looks
+    to a camera that may have been moved, and so where on it the marker has to be. The longer,
+    the less matters noise, and the more perspective, which makes the line look longer from
+    nearer to the camera. 0: none."""
+    probe_speed: float = 0.05
+    """How fast the hand comes down from there: no faster than the camera can lead it along the
+    line [m/s]."""
     probe_tolerance: float = 10.0
     """Distance of the feature from the target at which the hand comes down [px]."""
     probe_reach: float = 0.015
@@ -49,6 +56,10 @@ class AimingConfig:
     rate: float = 4.0
     """How fast the hand returns into the box from above or below, and into the cone [1/s]."""
 
+    def within(self, pixel: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
+        """A pixel, or the nearest one that keeps its distance from the edge of the image."""
+        return np.clip(pixel, self.border, np.array(IMAGE_SIZE) - 1 - self.border)
+
     def goals(self, above: Pose, target: Float[np.ndarray, "2"]) -> Goals:
         """Goals of aiming.
 
@@ -58,11 +69,10 @@ class AimingConfig:
                 is brought to its border: on the way there the image Jacobian is learned, which
                 may have put it outside.
         """
-        target = np.clip(target, self.border, np.array(IMAGE_SIZE) - 1 - self.border)
         goals = Goals.at(
             above.position,
             above.orientation,
-            torch.from_numpy(target),
+            torch.from_numpy(self.within(target)),
             half_size=self.half_size,
         )
         # Near the border of a region its excess decays at 4 k_c / h^2 and k_o (alpha_o / 2)^2.
@@ -91,16 +101,30 @@ class Aim:
     approached by the Cartesian regions."""
     target: Callable[[Float[np.ndarray, "2 6"]], Float[np.ndarray, "2"]]
     """Where the hand's marker should be [px], given the image Jacobian there."""
+    line: Float[np.ndarray, "3"]
+    """Direction from the object's marker to the hand's, base frame; it leads up."""
 
-    def raised(self, height: float) -> "Aim":
-        """The same from higher up [m]."""
-        up = self.above.position.new_tensor([0.0, 0.0, height])
-        return replace(self, above=Pose(self.above.position + up, self.above.orientation))
+    raised: float = 0.0
+    """Height above there at which to stay for now, further away along the line [m]."""
 
-    def goals(self, image_jacobian: Float[np.ndarray, "2 6"]) -> Goals:
-        """Goals by an estimate of the image Jacobian."""
-        goals = self.config.goals(self.above, self.target(image_jacobian))
+    def goals(self, image_jacobian: Float[np.ndarray, "2 6"], hand: Pose) -> Goals:
+        """Goals by an estimate of the image Jacobian, with the hand where it is."""
+        away = torch.from_numpy(self._away(self.raised))
+        above = Pose(self.above.position + away, self.above.orientation)
+        goals = self.config.goals(above, self.pixel(image_jacobian, hand))
         return goals.approached_by(self.posture)
+
+    def pixel(
+        self, image_jacobian: Float[np.ndarray, "2 6"], hand: Pose
+    ) -> Float[np.ndarray, "2"]:
+        """Where the marker should be for the hand to be on the line, at the height it has."""
+        height = float(hand.position[2] - self.above.position[2])
+        away = self._away(min(max(height, 0.0), self.config.probe))
+        pixel = self.target(image_jacobian) + image_jacobian[:, :3] @ away
+        return self.config.within(pixel) if self.raised else pixel
+
+    def _away(self, height: float) -> Float[np.ndarray, "3"]:
+        return height / self.line[2] * self.line
 
 
 class Aimer:
@@ -147,7 +171,8 @@ class Aimer:
         reached = begin
         for _ in range(config.most_probes if config.probe > 0 else 1):
             if config.probe > 0:
-                self._reach(aim.raised(config.probe), config.probe_tolerance, begin)
+                self._reach(replace(aim, raised=config.probe), config.probe_tolerance, begin)
+                self._come_down(aim)
             above = self._station.pose.position[:2]
             reached = self._reach(aim, config.tolerance, begin)
             if (self._station.pose.position[:2] - above).norm() < config.probe_reach:
@@ -163,14 +188,21 @@ class Aimer:
             self.state = replace(self.state, estimator=resumed)
 
     def _reach(self, aim: Aim, tolerance: float, begin: float) -> float:
-        """Steps until the marker has stayed at the target; when it came there [s]."""
+        """Steps until marker and height have stayed at the target; when they came there [s]."""
         reached = self._last_seen = self._station.time
         while self._station.time - reached < self._config.dwell:
             self.step(aim)
-            if not self.error(aim) < tolerance:
+            if not (self.error(aim) < tolerance and self._at_height(aim)):
                 reached = self._station.time
             self._check(aim, self._station.time - begin)
         return reached
+
+    def _come_down(self, aim: Aim) -> None:
+        """Along the line, from as high up as a probe begins."""
+        config = self._config
+        drop = config.probe_speed * self._station.config.dt
+        for height in np.arange(config.probe, 0.0, -drop):
+            self.step(replace(aim, raised=float(height)))
 
     def hold(self, aim: Aim, duration: float) -> None:
         """Keep aiming for a while [s], whatever the person does to the body."""
@@ -180,7 +212,8 @@ class Aimer:
 
     def error(self, aim: Aim) -> float:
         """Distance of the feature from its target [px]; NaN if it is not seen."""
-        return float(np.linalg.norm(self._feature() - aim.target(self._image_jacobian())))
+        target = aim.pixel(self._image_jacobian(), self._station.pose)
+        return float(np.linalg.norm(self._feature() - target))
 
     def step(self, aim: Aim) -> None:
         """One step of the controller."""
@@ -191,7 +224,7 @@ class Aimer:
         self._last_image = sight.time
         if seen:
             self._last_seen = sight.time
-        goals = aim.goals(self._image_jacobian())
+        goals = aim.goals(self._image_jacobian(), self._station.pose)
         command, self.state = self._controller.step(
             self.state,
             Observation(
@@ -219,6 +252,10 @@ class Aimer:
             estimate = self._controller.estimator.jacobian(self.state.estimator, pose)
             self._known = sight.time, estimate.numpy()
         return self._known[1]
+
+    def _at_height(self, aim: Aim) -> bool:
+        wrong = self._station.pose.position[2] - aim.above.position[2] - aim.raised
+        return abs(float(wrong)) < self._config.height_tolerance
 
     def _check(self, aim: Aim, spent: float) -> None:
         if self._station.time - self._last_seen > self._config.unseen_patience:

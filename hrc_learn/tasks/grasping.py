@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..controller import AdaptiveController, ControllerConfig, Goals
-from ..geometry import Pose
+from ..geometry import Pose, quaternion
 from ..jacobian import ImageJacobianEstimator, KalmanEstimator
 from ..sim import HAND_MARKER, ObjectConfig
 from .aiming import Aim, Aimer, AimingConfig
@@ -25,6 +25,7 @@ from .fit_aiming import AimingSkill
 from .motion import joint_line
 from .placing import Plan
 from .station import Station
+from .visual_target import UP
 from .workplace import Workplace
 
 OPEN, CLOSED = 0.08, 0.0
@@ -97,7 +98,8 @@ class Grasping:
 
         Args:
             station: Arm, gripper, camera and person.
-            workplace: Where things are, roughly: the region over the table, home.
+            workplace: Where things are, roughly: the region over the table, home. How the hand
+                is turned there it tells; `AimingSkill.approached` has it turned as was shown.
             aiming: Learned image Jacobian and visual target.
             config: How objects are grasped.
             estimator: Of the image Jacobian; None: a Kalman filter that starts from the
@@ -108,6 +110,7 @@ class Grasping:
         self._station = station
         self._workplace = workplace
         self._target = target or aiming.target_of
+        self._offset_line = UP if aiming.target is None else aiming.target.line()
         self._config = config = config or GraspingConfig()
         self._check = check
         controller = AdaptiveController(
@@ -172,6 +175,7 @@ class Grasping:
             above=self._workplace.hover(),
             posture=self._posture() if self._config.approach else None,
             target=partial(self._target, pixel),
+            line=self._offset_line,
         )
 
     def _posture(self) -> Float[Tensor, " joints"]:
@@ -204,16 +208,20 @@ class Grasping:
         """
         self._station.enter("grasp")
         self._station.watching = ()
-        position = self._station.pose.position.clone()
-        position[2] = item.half_size[2]
-        down = Pose(position, self._workplace.hover().orientation)
-        self._station.move_straight(down, speed=0.08)
+        self._station.move_straight(self._before(item), speed=0.08)
         self._station.gripper.move(CLOSED)
         self._station.stay(0.7)
         if self._station.state.gripper_width <= item.half_size[0]:
             raise MissedGraspError(
                 f"grasp: the fingers closed on nothing. Is {item.name!r} where its marker says?"
             )
+
+    def _before(self, item: ObjectConfig) -> Pose:
+        """Hand with its fingers about the object, on from here the way the hand points."""
+        position, orientation = self._station.pose.position, self._workplace.hover().orientation
+        direction = quaternion.to_matrix(orientation)[:, 2]
+        drop = (item.half_size[2] - position[2]) / direction[2]
+        return Pose(position + drop * direction, orientation)
 
     def rise(self) -> None:
         """Lift the hand straight up."""

@@ -19,6 +19,7 @@ from jaxtyping import Float
 OBJECT_FEATURE = "observation.object_feature"
 """Column of a dataset with the object's marker in the image."""
 OBJECT_FEATURE_NAMES = ("u", "v", "visible")
+UP = np.array([0.0, 0.0, 1.0])
 LONGEST_OFFSET = 0.3
 """Of the hand's marker from the object's [m]. From few demonstrations along a flat box the
 image Jacobian knows little about height; only an offset of metres would explain the rest."""
@@ -92,6 +93,15 @@ class VisualTarget:
             jacobian: Estimate of the image Jacobian of the hand's marker [px/m, px/rad].
         """
         return self(pixel) if self.offset is None else pixel + jacobian[:, :3] @ self.offset
+
+    def line(self) -> Float[np.ndarray, "3"]:
+        """Direction from the object's marker to the hand's above it, base frame.
+
+        Straight up where demonstrations told no offset, or one that leads aside.
+        """
+        if self.offset is None or self.offset[2] < 0.5 * np.linalg.norm(self.offset):
+            return UP
+        return self.offset / np.linalg.norm(self.offset)
 
     def save(self, path: Path) -> None:
         """Write to a JSON file, whole or not at all."""
