@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+from unchecked import shapes_unchecked
 
 from hrc_learn.demos import DatasetWriter, DemonstrationSet, load_demos
 from hrc_learn.kinematics import panda
@@ -32,6 +33,7 @@ def recorded(folder: Path, lesson, features, demonstrations) -> DemonstrationSet
     return load_demos(folder)
 
 
+@shapes_unchecked()
 def taught_placing(folder: Path) -> tuple[PlacingSkill, dict[str, float]]:
     """Placing, from one demonstration, and the errors of the fit."""
     lesson, world = PlacingLesson(), World(WORKPLACE.scene)
@@ -41,6 +43,7 @@ def taught_placing(folder: Path) -> tuple[PlacingSkill, dict[str, float]]:
     return PlacingSkill.load(folder / "model"), fitted.metrics()
 
 
+@shapes_unchecked()
 def taught_aiming(folder: Path) -> AimingSkill:
     """Aiming, from five demonstrations."""
     lesson, rng, world = AimingLesson(duration=5.0), np.random.default_rng(1), World()

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from taught_skills import WORKPLACE, taught_aiming, taught_placing
+from unchecked import shapes_unchecked
 
 from hrc_learn.human import PullSpell
 from hrc_learn.sim import NOWHERE, CameraChange, Occlusion
@@ -48,6 +49,7 @@ def aiming(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
+@shapes_unchecked()
 def job(aiming, placing):
     return simulate_collaboration(
         aiming,

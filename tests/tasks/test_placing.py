@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from unchecked import shapes_unchecked
 
 from hrc_learn.demos import DatasetWriter, load_demos
 from hrc_learn.geometry import Pose
@@ -23,6 +24,7 @@ HOME = WORKPLACE.home_joints()
 
 
 @pytest.fixture(scope="module")
+@shapes_unchecked()
 def demos(tmp_path_factory):
     """Two demonstrations, recorded to disk and read back."""
     folder = tmp_path_factory.mktemp("demos") / "placing"
@@ -66,6 +68,7 @@ def test_the_expert_ends_at_the_shelf_and_pulls_the_body_on_the_way(demos):
         assert demo.joint_names == panda.joint_names
 
 
+@shapes_unchecked()
 def test_without_the_body_shape_the_arm_hits_the_open_door():
     world = World(WORKPLACE.scene)
     lesson = PlacingLesson(shape_body=False)
