@@ -139,11 +139,11 @@ class EagerRunner(StepRunner):
     @torch.inference_mode()
     def step(self) -> Float[np.ndarray, "*batch n"]:
         for k, view, dtype in self._views:
-            self._leaves[k] = view.to(dtype)
+            # A state that shared memory with an observation would change with the next.
+            self._leaves[k] = view.to(dtype, copy=True)
         observation = _pytree.tree_unflatten(self._leaves, self._structure)
-        command, state = self._controller.step(self._state, observation)
-        self._said, self._state = command, _pytree.tree_map(self._own, state)
-        self.joint_velocity[...] = command.joint_velocity.numpy()
+        self._said, self._state = self._controller.step(self._state, observation)
+        self.joint_velocity[...] = self._said.joint_velocity.numpy()
         return self.joint_velocity
 
     def command(self, field: str) -> np.ndarray:
@@ -154,11 +154,6 @@ class EagerRunner(StepRunner):
 
     def _state_vector(self) -> torch.Tensor:
         return self._layouts.state.pack(tensors_of(self._state))
-
-    def _own(self, x: torch.Tensor) -> torch.Tensor:
-        """A state that shared memory with an observation would change with the next."""
-        shared = self._vectors.observation.untyped_storage().data_ptr()
-        return x.clone() if x.untyped_storage().data_ptr() == shared else x
 
 
 def _named(field: str, arrays: dict[str, np.ndarray]) -> np.ndarray:
