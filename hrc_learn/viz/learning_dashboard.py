@@ -10,7 +10,7 @@ import rerun.blueprint as rrb
 from . import palette
 from .learning_recording import ErrorMap, LearningRecording
 from .panels import Curves, Plot, Tab, single, slug
-from .rerun_file import look_at_all, rrd_file, send_rows, style, tab_view, thin
+from .rerun_file import rrd_file, send_rows, style, tab_view, thin
 
 ROUND = "round"
 """The timeline: every round one step."""
@@ -101,7 +101,7 @@ def _summary(learning: LearningRecording) -> str:
     lines = [f"# {learning.title}", ""]
     if learning.curves:
         last = len(learning.centers) - 1
-        lines += [f"Round {learning.best} of {last} was kept.", ""]
+        lines += [f"Round {learning.best} of {last} was kept: the dots.", ""]
     lines += ["| measured | value |", "|---|---|"]
     lines += [f"| {n.replace('_', ' ')} | {v:.4g} |" for n, v in learning.measured.items()]
     return "\n".join(lines)
@@ -109,14 +109,14 @@ def _summary(learning: LearningRecording) -> str:
 
 def _blueprint(learning: LearningRecording, tab: Tab) -> rrb.Blueprint:
     left: list[rrb.View] = [rrb.TextDocumentView(origin="/summary", name="Fit")]
-    every = [path for path in (*learning.paths, *learning.centers) if len(path)]
+    every = learning.paths or [path for path in learning.centers if len(path)]
     if every:
         left.insert(
             0,
             rrb.Spatial3DView(
                 origin="/world",
                 name="Hand (grey), neurons (orange), error on held-out image motion (blue)",
-                eye_controls=look_at_all(np.concatenate(every)),
+                eye_controls=_look_down(np.concatenate(every)),
             ),
         )
     columns: list[rrb.Container | rrb.View] = [
@@ -128,4 +128,15 @@ def _blueprint(learning: LearningRecording, tab: Tab) -> rrb.Blueprint:
         rrb.Horizontal(contents=columns, column_shares=[1] * len(columns)),
         rrb.TimePanel(state="collapsed", timeline=ROUND),
         collapse_panels=True,
+    )
+
+
+def _look_down(points: np.ndarray) -> rrb.EyeControls3D:
+    """An eye above the workspace, so near and steep that every cell can be read."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    middle, reach = (low + high) / 2, max(float(np.linalg.norm(high - low)), 0.2)
+    return rrb.EyeControls3D(
+        position=middle + reach * np.array([0.75, 0.2, 1.0]),
+        look_target=middle,
+        eye_up=(0.0, 0.0, 1.0),
     )

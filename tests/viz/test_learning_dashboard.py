@@ -62,7 +62,7 @@ def test_cells_say_their_error_in_percent_and_empty_ones_are_left_out(tmp_path):
 
 def test_the_summary_says_what_was_kept_and_measured(tmp_path):
     ((text,),) = recorded(tmp_path).column("summary", "TextDocument:text", static=True)
-    assert "Round 2 of 3 was kept." in text
+    assert "Round 2 of 3 was kept" in text
     assert "| held out error px | 0.25 |" in text.splitlines()
 
 
