@@ -8,9 +8,11 @@ import pytest
 import sampling
 import torch
 from step_equality import assert_equal_steps, controller_and_observation
+from torch.fx.experimental.proxy_tensor import make_fx
 from unchecked import shapes_unchecked
 
 from hrc_learn.controller.runtime import EagerRunner, PackageRunner, export_step
+from hrc_learn.controller.runtime.batch_last import joining_batch_last
 from hrc_learn.controller.runtime.package import load
 from hrc_learn.kinematics import panda
 
@@ -28,6 +30,22 @@ def _no_shape_checks() -> Iterator[None]:
 def package(tmp_path_factory, _no_shape_checks) -> Path:
     controller, observation = controller_and_observation(panda.ready.expand(ARMS, 7))
     return export_step(controller, observation, tmp_path_factory.mktemp("packages"))
+
+
+def test_what_is_joined_has_the_batch_last():
+    def join(a, b):
+        return torch.cat([torch.cat([a, b], 1), torch.cat([b, a], -2)], -1), torch.cat([a, a])
+
+    rng = sampling.generator()
+    a, b = torch.randn(5, 4, 3, generator=rng), torch.randn(5, 2, 3, generator=rng)
+    module = make_fx(join, tracing_mode="fake")(a, b)
+    joining_batch_last([5])(module.graph)
+    module.recompile()
+    for ours, theirs in zip(module(a, b), join(a, b), strict=True):
+        assert torch.equal(ours, theirs)
+    joins = module.graph.find_nodes(op="call_function", target=torch.ops.aten.cat.default)
+    shapes = [tuple(node.meta["val"].shape) for node in joins]
+    assert sorted(shapes) == [(6, 3, 5), (6, 3, 5), (6, 6, 5), (10, 4, 3)]
 
 
 @pytest.mark.slow

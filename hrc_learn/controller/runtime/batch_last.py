@@ -55,7 +55,7 @@ def batch_last(batch: Sequence[int]) -> Iterator[dict[str, Any]]:
         mock.patch.object(ir.FlexibleLayout, "__init__", lay_out),
         mock.patch.object(ir.View, "create", staticmethod(decided_view)),
     ):
-        yield {"post_grad_custom_post_pass": _joining_batch_last(order)}
+        yield {"post_grad_custom_post_pass": joining_batch_last(order)}
 
 
 def _leads(batch: Sequence[int], size: Sequence[Any]) -> bool:
@@ -69,7 +69,7 @@ def _fill_order(first: int, axes: int) -> list[int]:
     return [*reversed(range(first)), *reversed(range(first, axes))]
 
 
-def _joining_batch_last(batch: list[int]) -> Callable[[Graph], None]:
+def joining_batch_last(batch: list[int]) -> Callable[[Graph], None]:
     """A pass over a graph that turns tensors before they are joined, and the whole back.
 
     Inductor writes parts straight into the whole, which it lays out without asking.
