@@ -27,6 +27,7 @@ from hrc_learn.controller import (
     AdaptiveController,
     Goals,
     Observation,
+    SafetyConfig,
 )
 from hrc_learn.controller.rehearsal import PinholeCamera
 from hrc_learn.controller.runtime import EagerRunner, Metronome, StepRunner, open_step
@@ -53,7 +54,7 @@ class Args:
     """Whether to compile the step ahead of time, where there is a C++ compiler."""
     packages: Path | None = None
     """Folder in which compiled steps are kept; default: the user's cache. The first start
-    compiles, in a minute or two; later ones take a tenth of a second."""
+    compiles, in a minute or two; later ones, at any rate, take a tenth of a second."""
     json: Path | None = None
     """File for the measured values."""
 
@@ -71,6 +72,8 @@ class Latencies:
 def main(args: Args) -> None:
     if not (args.duration > 0 and args.rate > 0):
         raise ValueError("duration and rate must be positive")
+    if args.rate < (slowest := SafetyConfig().rate):
+        raise ValueError(f"rate must be at least {slowest:g}, as the safety filter asks")
     torch.set_num_threads(1)
     dt = 1 / args.rate
     camera = _camera()
@@ -134,7 +137,8 @@ def _controller(camera: PinholeCamera, dt: float) -> tuple[AdaptiveController, O
         feature_new=torch.tensor(False),
         image_joint_position=q,
         human_effort=torch.zeros_like(q),
-        dt=dt,
+        # A tensor, so that one package serves all rates.
+        dt=torch.tensor(dt, dtype=torch.float64),
     )
     return controller, observation
 

@@ -40,10 +40,14 @@ def test_it_reports_latencies_and_interventions(tmp_path):
     assert "step_p99_us" in done.stdout
 
 
-def test_a_rate_of_nothing_is_bad_input():
-    done = serve("--rate", "0")
+@pytest.mark.parametrize(
+    ("rate", "why"),
+    [("0", "duration and rate must be positive"), ("4", "rate must be at least 5")],
+)
+def test_a_rate_too_low_is_bad_input(rate, why):
+    done = serve("--rate", rate)
     assert done.returncode == 2
-    assert "duration and rate must be positive" in done.stderr
+    assert why in done.stderr
 
 
 @pytest.mark.slow
