@@ -25,8 +25,9 @@ from hrc_learn.output import new_folder
 from hrc_learn.sim import World
 from hrc_learn.tasks.closed_loops import ClosedLoops, StartsConfig
 from hrc_learn.tasks.gains import TUNED
+from hrc_learn.tasks.initial_jacobian import guessed_network
 from hrc_learn.tasks.search import Search
-from hrc_learn.tasks.warm_start import guessed_network, summary
+from hrc_learn.tasks.warm_start import summary
 from hrc_learn.tasks.workplace import Workplace
 from hrc_learn.viz.learning_figures import learning_figure
 

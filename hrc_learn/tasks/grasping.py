@@ -17,11 +17,12 @@ from torch import Tensor
 
 from ..controller import AdaptiveController, ControllerConfig, Goals
 from ..geometry import Pose, quaternion
-from ..jacobian import ImageJacobianEstimator, KalmanEstimator
+from ..jacobian import ImageJacobianEstimator
 from ..sim import HAND_MARKER, ObjectConfig
 from .aiming import Aim, Aimer, AimingConfig
 from .failure import BlockedPathError, MissedGraspError, TaskFailedError
 from .fit_aiming import AimingSkill
+from .initial_jacobian import from_learned
 from .motion import joint_line
 from .placing import Plan
 from .station import Station
@@ -103,7 +104,7 @@ class Grasping:
             aiming: Learned image Jacobian and visual target.
             config: How objects are grasped.
             estimator: Of the image Jacobian; None: a Kalman filter that starts from the
-                learned one.
+                learned one, wherever the camera may have been moved since.
             target: Where the hand's marker should be; None: as learned.
             check: Raises if a plan may not be carried out.
         """
@@ -115,7 +116,7 @@ class Grasping:
         self._check = check
         controller = AdaptiveController(
             station.chain,
-            estimator or KalmanEstimator(aiming.jacobian.double()),
+            estimator or from_learned(aiming.jacobian),
             Goals.at(workplace.hover().position, workplace.hover().orientation),
             config=config.controller,
         )

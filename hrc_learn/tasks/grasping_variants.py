@@ -12,7 +12,7 @@ from ..jacobian import (
     PaperEstimator,
     RBFImageJacobian,
 )
-from .warm_start import guessed_network
+from .initial_jacobian import from_learned, guessed_network
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,17 +24,6 @@ class GraspingVariant:
     """From the learned image Jacobian."""
     claim: str = ""
     """What the paper states about it."""
-
-
-def from_learned(learned: RBFImageJacobian) -> ImageJacobianEstimator:
-    """A Kalman filter that starts from the learned Jacobian, but does not rely on it.
-
-    The camera may have been moved since it was learned, about which the covariance of the fit
-    knows nothing; the wide prior of a guess takes its place.
-    """
-    network = copy.deepcopy(learned).double()
-    network.covariance = None
-    return KalmanEstimator(network)
 
 
 DEFAULT = "learned"

@@ -8,15 +8,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..controller import ControllerConfig
-from ..controller.table1 import INITIAL_IMAGE_JACOBIAN
 from ..jacobian import (
     FixedEstimator,
     ImageJacobianEstimator,
     KalmanEstimator,
     RBFImageJacobian,
-    paper_grid,
 )
 from .closed_loops import ClosedLoops, turn_rows
+from .initial_jacobian import guessed_network
 
 
 class _Turned(KalmanEstimator):
@@ -32,12 +31,6 @@ class _Turned(KalmanEstimator):
     def initial_weight(self, *batch: int) -> Float[Tensor, "*batch 12 K"]:
         rows = super().initial_weight(*batch).unflatten(-2, (2, 6))
         return torch.einsum("nij,njck->nick", self._turn, rows).flatten(1, 2)
-
-
-def guessed_network() -> RBFImageJacobian:
-    """The paper's initial image Jacobian, the same everywhere."""
-    guess = torch.tensor(INITIAL_IMAGE_JACOBIAN, dtype=torch.float64)
-    return RBFImageJacobian.from_jacobian(guess, paper_grid(), 0.1)
 
 
 def compare_starts(
