@@ -7,12 +7,20 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Literal
 
+import numpy as np
+from jaxtyping import Float
+
 from ..demos import DatasetError, DatasetWriter
 from ..protocols import Request
 from .led_arm import Frame
 
 RecorderState = Literal["ready", "recording", "stopped"]
 """Stopped: a demonstration waits to be saved or discarded."""
+
+_STILL = 0.005
+"""Motion of a joint [rad], or of the gripper [m], below which a person has not begun yet."""
+_REST = 0.3
+"""Rest that is kept before and after the motion [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,6 +38,8 @@ class RecorderStatus:
 
 class DemonstrationRecorder:
     """Keeps the frames of one demonstration at a time, and writes those that are worth it.
+
+    A person needs seconds from the button to the arm, and back: that rest is left out.
 
     Episodes are written by a thread, so that the control loop never waits for the disk. The
     dataset is complete when the `with` block has ended; without any episode there is none.
@@ -102,6 +112,7 @@ class DemonstrationRecorder:
             self._note = "nothing to save: the demonstration has no frames"
             return
         self._note = "saved"
+        frames = without_rest(frames)
         self._writing.append(self._thread.submit(self._write, frames, self._task()))
 
     def _write(self, frames: list[Frame], task: str) -> int:
@@ -112,3 +123,26 @@ class DemonstrationRecorder:
             return self._writer.save_episode()
         finally:
             self._writer.discard_episode()
+
+
+def without_rest(frames: list[Frame]) -> list[Frame]:
+    """Frames from shortly before the arm begins to move until shortly after it has stopped.
+
+    All of them where it never moves.
+    """
+    state = np.stack([_state(frame) for frame in frames])
+    away = np.flatnonzero((np.abs(state - state[0]) > _STILL).any(axis=1))
+    not_there = np.flatnonzero((np.abs(state - state[-1]) > _STILL).any(axis=1))
+    if not len(away):
+        return frames
+    time = np.array([float(frame["time"]) for frame in frames])
+    first = np.searchsorted(time, time[away[0]] - _REST)
+    end = len(frames)
+    if len(not_there):
+        end = np.searchsorted(time, time[not_there[-1]] + _REST, side="right")
+    return frames[int(first) : int(end)]
+
+
+def _state(frame: Frame) -> Float[np.ndarray, " n"]:
+    """What moves: joints [rad] and gripper [m]."""
+    return np.append(frame["joint_position"], frame.get("gripper", 0.0))

@@ -5,7 +5,7 @@ import pytest
 
 from hrc_learn.demos import DatasetWriter, load_demos
 from hrc_learn.kinematics import panda
-from hrc_learn.tasks.demonstration_recorder import DemonstrationRecorder
+from hrc_learn.tasks.demonstration_recorder import DemonstrationRecorder, without_rest
 
 FPS = 50.0
 
@@ -114,3 +114,47 @@ def test_what_was_saved_before_a_failure_is_not_lost(folder):
     with pytest.raises(RuntimeError, match="cable") as caught:
         fail()
     assert "recover_dataset" in caught.value.__notes__[0]
+
+
+def resting_frames(moves):
+    """Two seconds of rest, a second in which something moves, two of rest."""
+    return [
+        {
+            "time": 10.0 + k / FPS,
+            "joint_position": np.zeros(7),
+            "gripper": 0.08,
+            **moves(np.clip(k / FPS - 2.0, 0.0, 1.0)),
+        }
+        for k in range(251)
+    ]
+
+
+@pytest.mark.parametrize(
+    "moves",
+    [
+        lambda share: {"joint_position": np.array([0, 0, 0, 0.5 * share, 0, 0, 0])},
+        lambda share: {"gripper": 0.08 - 0.05 * share},
+        # There and back: the ends alone would tell of no motion.
+        lambda share: {"joint_position": np.full(7, np.sin(np.pi * share))},
+    ],
+)
+def test_rest_before_and_after_the_motion_is_left_out(moves):
+    kept = without_rest(resting_frames(moves))
+    assert kept[0]["time"] == pytest.approx(11.7, abs=0.12)
+    assert kept[-1]["time"] == pytest.approx(13.3, abs=0.12)
+    assert kept[0]["time"] <= 12.0
+    assert kept[-1]["time"] >= 13.0
+
+
+def test_an_arm_that_never_moves_keeps_what_was_recorded():
+    frames = resting_frames(lambda share: {})
+    assert without_rest(frames) == frames
+    assert without_rest(frames[:1]) == frames[:1]
+
+
+def test_a_motion_that_is_cut_off_is_kept_to_its_end():
+    moves = resting_frames(lambda share: {"joint_position": np.full(7, share)})
+    frames = moves[:130]
+    kept = without_rest(frames)
+    assert kept[-1] is frames[-1]
+    assert kept[0]["time"] == pytest.approx(11.7, abs=0.12)
