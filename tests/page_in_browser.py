@@ -89,11 +89,11 @@ class Session:
 class Browser:
     """A page shown in Chromium, and its mouse."""
 
-    def __init__(self, tab, page: Page, timeout: float = 180.0):
+    def __init__(self, tab, page: Page, timeout: float = 180.0, *, leads: bool = True):
         self.tab = tab
         tab.set_default_timeout(1e3 * timeout)
         tab.goto(page.url)
-        self.button("Start").wait_for()
+        (self.button("Start") if leads else tab.get_by_text("Safety filter")).wait_for()
         wait_until(page._server.get_clients, "a client", timeout)
         clients = page._server.get_clients()
         self._client = clients[max(clients)]
