@@ -197,7 +197,7 @@ def _observation(state: Tensor) -> dict[str, Tensor]:
 
 
 def _config(name: str, width: int) -> Any:
-    from lerobot.configs import FeatureType, PolicyFeature
+    from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature
     from lerobot.policies import ACTConfig
 
     from hrc_learn.lerobot import DMPConfig
@@ -211,6 +211,10 @@ def _config(name: str, width: int) -> Any:
             return ACTConfig(
                 **common,
                 input_features={ENVIRONMENT: PolicyFeature(FeatureType.ENV, (width,))},
+                # By default it takes the environment's state as it is, here hundreds of pixels.
+                normalization_mapping=dict.fromkeys(
+                    ("STATE", "ENV", "ACTION"), NormalizationMode.MEAN_STD
+                ),
                 dim_model=64,
                 n_heads=4,
                 dim_feedforward=256,
