@@ -5,11 +5,9 @@ import dataclasses
 import importlib.util
 import inspect
 import re
-import runpy
 import sys
 import textwrap
 import typing
-import warnings
 from collections.abc import Iterator
 from functools import cache
 from itertools import pairwise
@@ -83,35 +81,9 @@ def words(text: str) -> str:
     return " ".join(re.sub(r"[│╭╮╰╯─]", " ", text).split())
 
 
-class Outcome(typing.NamedTuple):
-    """How a program ended."""
-
-    status: object
-    output: str
-    error: str
-
-
-@pytest.fixture
-def run(monkeypatch, capsys, tmp_path):
-    """Runs a program in this process, in an empty folder."""
-    monkeypatch.chdir(tmp_path)
-    # Programs change how warnings look; that must not outlive the test.
-    monkeypatch.setattr(warnings, "formatwarning", warnings.formatwarning)
-
-    def run(program: str | Path, *arguments: str) -> Outcome:
-        path = ROOT / program
-        monkeypatch.setattr(sys, "argv", [str(program), *arguments])
-        monkeypatch.syspath_prepend(path.parent)
-        with pytest.raises(SystemExit) as ended:
-            runpy.run_path(str(path), run_name="__main__")
-        return Outcome(ended.value.code, *capsys.readouterr())
-
-    return run
-
-
 @every_program
-def test_help_explains_every_option(program, run):
-    status, output, error = run(program, "--help")
+def test_help_explains_every_option(program, run_here):
+    status, output, error = run_here(program, "--help")
     assert status == 0
     assert error == ""
     shown = words(output)
@@ -154,8 +126,10 @@ def test_every_program_writes_its_figures_as_json(program):
         ("benchmarks/bench_dmp.py", ["--compare", "none.json"], "none.json"),
     ],
 )
-def test_bad_input_is_one_line_and_leaves_nothing(run, tmp_path, program, arguments, message):
-    status, _, error = run(program, *arguments)
+def test_bad_input_is_one_line_and_leaves_nothing(
+    run_here, tmp_path, program, arguments, message
+):
+    status, _, error = run_here(program, *arguments)
     assert status == 2
     assert message in error
     assert error.startswith("error: ")
@@ -163,7 +137,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(run, tmp_path, program, argume
     assert not list(tmp_path.iterdir())
 
 
-def test_an_unknown_option_is_told_apart_from_the_work_failing(run):
-    status, _, error = run("training/fit_dmp.py", "--datset", "demos", "--out", "new")
+def test_an_unknown_option_is_told_apart_from_the_work_failing(run_here):
+    status, _, error = run_here("training/fit_dmp.py", "--datset", "demos", "--out", "new")
     assert status == 2
     assert "--datset" in error

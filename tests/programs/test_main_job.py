@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 
 
-def run(program, *arguments, status=0):
+def run(program, *arguments):
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     done = subprocess.run(
         [sys.executable, program, *map(str, arguments)],
@@ -22,7 +22,7 @@ def run(program, *arguments, status=0):
         timeout=300,
         check=False,
     )
-    assert done.returncode == status, done.stdout + done.stderr
+    assert done.returncode == 0, done.stdout + done.stderr
     return done
 
 
@@ -67,7 +67,7 @@ def test_the_job_is_done_and_every_target_met(work):
     }
 
 
-def test_an_unknown_shelf_and_a_missing_model_are_bad_input(work):
+def test_an_unknown_shelf_and_a_missing_model_are_bad_input(work, run_here):
     models = ("--placing", work / "placing", "--aiming", work / "aiming")
     for arguments, reason in (
         ((*models, "--shelf", "attic"), "lower, middle, upper"),
@@ -75,30 +75,33 @@ def test_an_unknown_shelf_and_a_missing_model_are_bad_input(work):
         (("--placing", work / "nowhere", "--aiming", work / "aiming"), "nowhere"),
     ):
         out = work / "refused"
-        done = run("control/run_collaboration.py", *arguments, "--out", out, status=2)
-        assert reason in done.stderr
-        assert len(done.stderr.strip().splitlines()) == 1
+        done = run_here("control/run_collaboration.py", *arguments, "--out", out)
+        assert done.status == 2
+        assert reason in done.error
+        assert len(done.error.strip().splitlines()) == 1
         assert not out.exists()
 
 
-def test_nothing_is_overwritten_unasked(work):
+def test_nothing_is_overwritten_unasked(work, run_here):
     arguments = ("--dataset", work / "placing_demos", "--out", work / "placing")
     before = (work / "placing" / "made_by.json").read_text()
-    done = run("training/fit_dmp.py", *arguments, status=2)
-    assert "exists" in done.stderr
+    done = run_here("training/fit_dmp.py", *arguments)
+    assert done.status == 2
+    assert "exists" in done.error
     assert (work / "placing" / "made_by.json").read_text() == before
-    run("training/fit_dmp.py", *arguments, "--overwrite")
+    assert run_here("training/fit_dmp.py", *arguments, "--overwrite").status == 0
 
 
-def test_a_missing_dataset_and_unknown_joints_are_bad_input(work):
+def test_a_missing_dataset_and_unknown_joints_are_bad_input(work, run_here):
     out = work / "none"
-    done = run("training/fit_dmp.py", "--dataset", work / "absent", "--out", out, status=2)
-    assert "absent" in done.stderr
-    done = run(
+    done = run_here("training/fit_dmp.py", "--dataset", work / "absent", "--out", out)
+    assert done.status == 2
+    assert "absent" in done.error
+    done = run_here(
         *("training/fit_dmp.py", "--dataset", work / "placing_demos", "--out", out),
         *("--joint-names", "elbow"),
-        status=2,
     )
-    assert "elbow" in done.stderr
-    assert "panda_joint1" in done.stderr
+    assert done.status == 2
+    assert "elbow" in done.error
+    assert "panda_joint1" in done.error
     assert not out.exists()
