@@ -113,7 +113,8 @@ def _jacobian_plot(run: RunRecording, row: int, pixel: str, half: str) -> Plot:
     if run.true_image_jacobian is not None:
         true = run.true_image_jacobian[:, row, columns]
         names = tuple(f"{name} true" for name in names)
-        curves.insert(0, several(f"{path}/true", names, true, width=5.0, light=True))
+        # The viewer draws entities by name: the thin estimate has to come after it.
+        curves.insert(0, several(f"{path}/actual", names, true, width=5.0, light=True))
         title += "; pale: true"
     return Plot(title=title, curves=tuple(curves))
 
@@ -122,7 +123,7 @@ def _person(run: RunRecording) -> Tab:
     plots = []
     if run.human_effort is not None:
         effort = several("person/effort", run.joint_names, run.human_effort)
-        title = "Null-space effort d of the person, by joint [-]"
+        title = "Null-space effort d of the person, by joint [N m]"
         plots.append(Plot(title=title, curves=(effort,), legend=True, share=2.0))
     if run.elbow_motion is not None:
         elbow = single("person/elbow", "elbow", 1e3 * run.elbow_motion, palette.PERSON)
@@ -192,8 +193,9 @@ def _safety(run: RunRecording) -> Tab:
         # A guard that never acted is a line at the bottom, not in the middle.
         top = max(1.0, float(np.nanmax(values, initial=0.0)))
         room = (-0.05 * top, 1.05 * top)
-        plots.append(Plot(title=f"Safety filter: {name}", curves=(curves,), range=room))
-    return Tab(title="Safety", plots=tuple(plots))
+        kind = name.replace("_", " ")
+        plots.append(Plot(title=f"Safety filter: {kind}", curves=(curves,), range=room))
+    return Tab(title="Safety", plots=tuple(plots), columns=2)
 
 
 def slug(name: str) -> str:

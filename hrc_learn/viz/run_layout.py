@@ -35,7 +35,9 @@ def run_layout(run: RunRecording) -> rrb.Blueprint:
     tabs = [tab_view(tab) for tab in run_tabs(run)]
     right: list[rrb.Container | rrb.View] = [rrb.Tabs(contents=tabs, active_tab=0)]
     if run.phases:
-        right.append(rrb.TextLogView(origin="/phases", name="Phases of the task"))
+        # The text tells the time as well: all other columns would only narrow it.
+        text = rrb.TextLogColumns(timeline_columns=[], text_log_columns=["Body"])
+        right.append(rrb.TextLogView(origin="/phases", name="Phases of the task", columns=text))
     return rrb.Blueprint(
         rrb.Horizontal(
             rrb.Vertical(contents=left, row_shares=[3, 2][: len(left)]),

@@ -52,13 +52,13 @@ def test_all_twelve_entries_of_the_jacobian_are_shown_beside_the_truth():
     shown = curves(run_tabs(run))
     for kind, expected in (
         ("estimate", run.image_jacobian),
-        ("true", run.true_image_jacobian),
+        ("actual", run.true_image_jacobian),
     ):
         for row, pixel in enumerate("uv"):
             for half, columns in (("linear", slice(0, 3)), ("angular", slice(3, 6))):
                 c = shown[f"image_jacobian/{pixel}_{half}/{kind}"]
                 np.testing.assert_array_equal(c.values, expected[:, row, columns])
-    assert shown["image_jacobian/u_linear/true"].width > 2
+    assert shown["image_jacobian/u_linear/actual"].width > 2
 
 
 def test_lengths_are_shown_in_millimetres_and_angles_in_degrees():
