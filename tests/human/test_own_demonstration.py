@@ -103,9 +103,10 @@ def test_ones_own_demonstration_is_recorded_learned_and_run(tmp_path):
     run("training/fit_dmp.py", "--dataset", demos, "--out", model, "--json", tmp_path / "fit")
     (demo,) = load_demos(demos)
     motion = JointDMP.load(model / "joint").rollout(time=torch.from_numpy(demo.time))
-    error = np.abs(motion.position.detach().numpy() - demo.joint_position).max()
-    # 60 basis functions smooth starts and stops, the more so the slower a busy machine is.
-    assert error < 0.03
+    error = motion.position.detach().numpy() - demo.joint_position
+    # 60 basis functions smooth a motion that stops at every tap of a key, but not its way.
+    assert np.sqrt(np.square(error).mean()) < 0.02
+    assert np.abs(error[-1]).max() < 0.01
     # Nobody shaped the body, so that other shelves may be missed.
     options = ("--out", tmp_path / "run", "--no-pictures", "--json", tmp_path / "measured")
     run("control/run_placing.py", "--placing", model, *options, status=(0, 1))
