@@ -19,8 +19,8 @@ RecorderState = Literal["ready", "recording", "stopped"]
 
 _STILL = 0.005
 """Motion of a joint [rad], or of the gripper [m], below which a person has not begun yet."""
-_REST = 0.3
-"""Rest that is kept before and after the motion [s]."""
+_REST = (0.3, 1.0)
+"""Rest that is kept before and after the motion [s]: primitives smooth, and have to arrive."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -136,10 +136,10 @@ def without_rest(frames: list[Frame]) -> list[Frame]:
     if not len(away):
         return frames
     time = np.array([float(frame["time"]) for frame in frames])
-    first = np.searchsorted(time, time[away[0]] - _REST)
+    first = np.searchsorted(time, time[away[0]] - _REST[0])
     end = len(frames)
     if len(not_there):
-        end = np.searchsorted(time, time[not_there[-1]] + _REST, side="right")
+        end = np.searchsorted(time, time[not_there[-1]] + _REST[1], side="right")
     return frames[int(first) : int(end)]
 
 
