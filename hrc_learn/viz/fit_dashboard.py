@@ -110,7 +110,7 @@ def _blueprint(fit: FitRecording, tabs: list[Tab]) -> rrb.Blueprint:
             rrb.Spatial3DView(
                 origin="/world",
                 name="Paths: demonstrations (grey), reproductions (blue, dots: now)",
-                eye_controls=look_at_all(every),
+                eye_controls=look_at_all(every, base=bool(fit.boxes)),
             )
         )
     left.append(rrb.TextDocumentView(origin="/summary", name="Fit"))

@@ -54,7 +54,7 @@ def _send_world(stream: rr.RecordingStream, learning: LearningRecording) -> None
     if learning.paths:
         strips = [thin(path) for path in learning.paths]
         grey = palette.rgba(palette.DEMO)
-        drawn = rr.LineStrips3D(strips, radii=0.0015, colors=[grey])
+        drawn = rr.LineStrips3D(strips, radii=0.0008, colors=[grey])
         stream.log("world/demonstrations", drawn, static=True)
     if learning.errors is not None:
         stream.log("world/errors", _cells(learning.errors), static=True)
@@ -81,7 +81,7 @@ def _cells(errors: ErrorMap) -> rr.Boxes3D:
     half = np.meshgrid(np.diff(errors.x) / 2, np.diff(errors.y) / 2, indexing="ij")
     known = np.isfinite(errors.share)
     share, flat = errors.share[known], np.full(int(known.sum()), _THICKNESS)
-    shades = matplotlib.colormaps["Blues"](0.3 + 0.7 * share / share.max(initial=1e-12))
+    shades = matplotlib.colormaps["Blues"](0.15 + 0.5 * share / share.max(initial=1e-12))
     return rr.Boxes3D(
         centers=np.stack([x[known], y[known], errors.z + 0 * flat], axis=-1),
         half_sizes=np.stack([half[0][known], half[1][known], flat], axis=-1),

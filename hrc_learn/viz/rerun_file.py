@@ -204,13 +204,19 @@ def plot_view(plot: Plot) -> rrb.TimeSeriesView:
         contents=[f"/{curves.path}" for curves in plot.curves],
         name=plot.title,
         axis_y=None if plot.range is None else rrb.ScalarAxis(range=plot.range),
-        plot_legend=rrb.PlotLegend("RightTop", visible=plot.legend),
+        # Most curves that need a legend begin low or at zero.
+        plot_legend=rrb.PlotLegend("LeftTop", visible=plot.legend),
     )
 
 
-def look_at_all(path: Float[np.ndarray, "n 3"]) -> rrb.EyeControls3D:
-    """An eye in front of the robot, to its left, that sees the base and the whole path."""
-    points = np.concatenate([path, np.zeros((1, 3))])
+def look_at_all(path: Float[np.ndarray, "n 3"], *, base: bool = True) -> rrb.EyeControls3D:
+    """An eye in front of the robot, to its left, that sees the whole path.
+
+    Args:
+        path: Points to see [m].
+        base: Whether to see the robot's base as well.
+    """
+    points = np.concatenate([path, np.zeros((1, 3))]) if base else path
     low, high = points.min(axis=0), points.max(axis=0)
     middle, reach = (low + high) / 2, max(float(np.linalg.norm(high - low)), 0.5)
     return rrb.EyeControls3D(
