@@ -19,7 +19,7 @@ RecorderState = Literal["ready", "recording", "stopped"]
 
 _STILL = 0.005
 """Motion of a joint [rad], or of the gripper [m], below which a person has not begun yet."""
-_REST = (0.3, 1.0)
+_REST = (0.3, 0.7)
 """Rest that is kept before and after the motion [s]: primitives smooth, and have to arrive."""
 
 

@@ -141,7 +141,7 @@ def resting_frames(moves):
 def test_rest_before_and_after_the_motion_is_left_out(moves):
     kept = without_rest(resting_frames(moves))
     assert kept[0]["time"] == pytest.approx(11.7, abs=0.12)
-    assert kept[-1]["time"] == pytest.approx(14.0, abs=0.12)
+    assert kept[-1]["time"] == pytest.approx(13.7, abs=0.12)
     assert kept[0]["time"] <= 12.0
     assert kept[-1]["time"] >= 13.0
 
