@@ -30,7 +30,7 @@ def batch_last(batch: Sequence[int]) -> Iterator[dict[str, Any]]:
     from torch._inductor import ir
 
     order, view = list(batch), ir.View.create
-    plain = ir.FlexibleLayout.__init__
+    plain, preferred = ir.FlexibleLayout.__init__, ir.ComputedBuffer.get_fill_order
 
     def lay_out(
         self: Any,
@@ -44,6 +44,13 @@ def batch_last(batch: Sequence[int]) -> Iterator[dict[str, Any]]:
             stride_order = _fill_order(len(order), len(size))
         plain(self, device, dtype, size, stride_order, is_pinned)
 
+    def fill_order(self: Any) -> Any:
+        # Inductor would take that of what a buffer is computed from, and transpose.
+        size = self.get_size()
+        if isinstance(self.layout, ir.FlexibleLayout) and _leads(order, size):
+            return _fill_order(len(order), len(size))
+        return preferred(self)
+
     def decided_view(x: Any, new_size: Sequence[Any]) -> Any:
         # Inductor copies the strides of what it looks at, and may yet change those of the
         # latter: by its own lights only what has the last axis last is still undecided.
@@ -53,6 +60,7 @@ def batch_last(batch: Sequence[int]) -> Iterator[dict[str, Any]]:
 
     with (
         mock.patch.object(ir.FlexibleLayout, "__init__", lay_out),
+        mock.patch.object(ir.ComputedBuffer, "get_fill_order", fill_order),
         mock.patch.object(ir.View, "create", staticmethod(decided_view)),
     ):
         yield {"post_grad_custom_post_pass": joining_batch_last(order)}
