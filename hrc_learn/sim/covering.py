@@ -62,6 +62,7 @@ def covers_in(world: World, model: CameraModel) -> list[Cover]:
     centre = world.data.body(COVER).xpos
     x, y, z = COVER_HALF_SIZE
     corners = centre + np.array([[-x, -y, z], [x, -y, z], [x, y, z], [-x, y, z]])
-    if not model.in_view(corners).any():
+    # Taken away it lies under the floor, which hides it from every camera.
+    if np.array_equal(centre, NOWHERE) or not model.in_view(corners).any():
         return []
     return [Cover(corners=corners, colour=COVER_COLOUR[:3])]

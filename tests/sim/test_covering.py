@@ -1,7 +1,10 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from hrc_learn.sim import HAND_MARKER, NOWHERE, Occluder, Occlusion, World, open_camera
+from hrc_learn.sim.covering import covers_in
 from hrc_learn.tasks.eye import Eye
 from hrc_learn.tasks.workplace import Workplace
 
@@ -43,6 +46,20 @@ def test_the_board_is_drawn_between_camera_and_marker(world):
     np.testing.assert_allclose(pixel / 255, (0.55, 0.36, 0.30), atol=0.06)
     world.move_obstacle("cover", NOWHERE)
     assert (camera.read()[:40] == before[:40]).all()
+
+
+def test_a_board_that_is_taken_away_is_seen_by_no_camera(world):
+    """Not even by one that would see it through the floor."""
+    camera = WORKPLACE.scene.camera
+    pose = camera.pose.copy()
+    pose[:2, 3] = NOWHERE[:2]
+    above = replace(camera, pose=pose)
+    assert above.in_view(np.array([NOWHERE])).all()
+    world.move_obstacle("cover", NOWHERE)
+    assert covers_in(world, above) == []
+    world.move_obstacle("cover", (*NOWHERE[:2], 0.5))
+    assert len(covers_in(world, above)) == 1
+    world.move_obstacle("cover", NOWHERE)
 
 
 def test_nothing_touches_the_board(world):
