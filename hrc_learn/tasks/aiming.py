@@ -50,6 +50,9 @@ class AimingConfig:
     half_size: tuple[float, float, float] = (0.12, 0.12, 0.003)
     """Box in which the camera takes over [m]. Flat: the image tells little about height, and
     an object has to be met at the height at which aiming was taught."""
+    unseen_half_size: tuple[float, float, float] = (0.03, 0.03, 0.003)
+    """The same until the camera has seen the hand's marker: one that was moved may not see all
+    of the box, but will see its middle [m]."""
     angle: float = 0.01
     """Tolerated turn of the hand [rad]. The paper's cone of 7.6 degrees would leave the marker
     1 cm off the place it was taught to be at."""
@@ -60,7 +63,9 @@ class AimingConfig:
         """A pixel, or the nearest one that keeps its distance from the edge of the image."""
         return np.clip(pixel, self.border, np.array(IMAGE_SIZE) - 1 - self.border)
 
-    def goals(self, above: Pose, target: Float[np.ndarray, "2"]) -> Goals:
+    def goals(
+        self, above: Pose, target: Float[np.ndarray, "2"], *, found: bool = True
+    ) -> Goals:
         """Goals of aiming.
 
         Args:
@@ -68,12 +73,13 @@ class AimingConfig:
             target: Where in the image the hand's marker should be [px]. One outside the image
                 is brought to its border: on the way there the image Jacobian is learned, which
                 may have put it outside.
+            found: Whether the camera has seen the hand's marker.
         """
         goals = Goals.at(
             above.position,
             above.orientation,
             torch.from_numpy(self.within(target)),
-            half_size=self.half_size,
+            half_size=self.half_size if found else self.unseen_half_size,
         )
         # Near the border of a region its excess decays at 4 k_c / h^2 and k_o (alpha_o / 2)^2.
         upright = self.rate / 4 * self.half_size[2] ** 2
@@ -107,11 +113,13 @@ class Aim:
     raised: float = 0.0
     """Height above there at which to stay for now, further away along the line [m]."""
 
-    def goals(self, image_jacobian: Float[np.ndarray, "2 6"], hand: Pose) -> Goals:
+    def goals(
+        self, image_jacobian: Float[np.ndarray, "2 6"], hand: Pose, *, found: bool = True
+    ) -> Goals:
         """Goals by an estimate of the image Jacobian, with the hand where it is."""
         away = torch.from_numpy(self._away(self.raised))
         above = Pose(self.above.position + away, self.above.orientation)
-        goals = self.config.goals(above, self.pixel(image_jacobian, hand))
+        goals = self.config.goals(above, self.pixel(image_jacobian, hand), found=found)
         return goals.approached_by(self.posture)
 
     def pixel(
@@ -155,6 +163,7 @@ class Aimer:
         self._config = config or AimingConfig()
         self._last_image = self._last_seen = -np.inf
         self._known = (np.nan, np.zeros((2, 6)))  # when, and the image Jacobian then
+        self._found = False
         self.state: ControllerState = controller.initial_state(station.joints)
 
     def aim(self, aim: Aim) -> float:
@@ -167,6 +176,7 @@ class Aimer:
             MissedGraspError: If it takes too long, or the marker stays out of sight.
         """
         begin, config = self._station.time, self._config
+        self._found = False
         self._resume()
         reached = begin
         for _ in range(config.most_probes if config.probe > 0 else 1):
@@ -223,8 +233,8 @@ class Aimer:
         new = torch.tensor(sight.time > self._last_image)
         self._last_image = sight.time
         if seen:
-            self._last_seen = sight.time
-        goals = aim.goals(self._image_jacobian(), self._station.pose)
+            self._last_seen, self._found = sight.time, True
+        goals = aim.goals(self._image_jacobian(), self._station.pose, found=self._found)
         command, self.state = self._controller.step(
             self.state,
             Observation(
