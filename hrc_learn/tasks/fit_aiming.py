@@ -3,7 +3,7 @@
 import copy
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, overload
 
@@ -29,7 +29,6 @@ from ..jacobian.learning import Round
 from ..kinematics import panda
 from .approach import Approach
 from .visual_target import OBJECT_FEATURE, VisualTarget
-from .workplace import Workplace
 
 type Demonstrations = DemonstrationSet | DemonstrationSource
 """In memory, or read one by one."""
@@ -93,13 +92,6 @@ class AimingSkill:
                 f"{OBJECT_FEATURE}."
             )
         return self.target.seen_by(pixel, jacobian)
-
-    def approached(self, workplace: Workplace) -> Workplace:
-        """A workplace where the hand comes to objects as the demonstrations did."""
-        if self.approach is None:
-            return workplace
-        w, x, y, z = self.approach.orientation.tolist()
-        return replace(workplace, hover_orientation=(w, x, y, z))
 
     def metrics(self) -> dict[str, float]:
         """How well image motion is predicted, and how well aiming.

@@ -100,7 +100,7 @@ class Grasping:
         Args:
             station: Arm, gripper, camera and person.
             workplace: Where things are, roughly: the region over the table, home. How the hand
-                is turned there it tells; `AimingSkill.approached` has it turned as was shown.
+                is turned there it tells; `Workplace.approached` has it turned as was shown.
             aiming: Learned image Jacobian and visual target.
             config: How objects are grasped.
             estimator: Of the image Jacobian; None: a Kalman filter that starts from the

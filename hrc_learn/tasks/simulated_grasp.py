@@ -62,7 +62,7 @@ def simulate_grasp(
         watch: Watches from the side, such as `serving` a dashboard.
         on_phase: Told the name of each phase of the task, and when it begins [s].
     """
-    workplace = aiming.approached(setting.workplace)
+    workplace = setting.workplace.approached(aiming.approach)
     setting = replace(setting, workplace=workplace)
     world = setting.world()
     item, motion = workplace.scene.objects[0], MotionLog(world)

@@ -122,7 +122,8 @@ def simulate_collaboration(
         ValueError: If shelves and objects do not go together, there is no such shelf, or the
             arm cannot reach it.
     """
-    workplace, rng = aiming.approached(workplace or Workplace()), np.random.default_rng(seed)
+    workplace = (workplace or Workplace()).approached(aiming.approach)
+    rng = np.random.default_rng(seed)
     disturbances = disturbances or Disturbances()
     station_config = station_config or StationConfig()
     items = workplace.scene.objects

@@ -1,7 +1,7 @@
 """Where things happen in the simulated workplace: home, table, shelves."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -12,6 +12,7 @@ from ..geometry import Pose, quaternion
 from ..human import coarse_orientation, gripper_down
 from ..kinematics import UnreachableError, panda
 from ..sim import ObjectConfig, SceneConfig
+from .approach import Approach
 
 
 def _vector(*values: float) -> torch.Tensor:
@@ -59,6 +60,13 @@ class Workplace:
         """Hand above the middle of the table."""
         position = _vector(*self.table_centre, self.hover_height)
         return Pose(position, _vector(*self.hover_orientation))
+
+    def approached(self, approach: Approach | None) -> "Workplace":
+        """The same where the hand comes to objects as was shown; None: as it is."""
+        if approach is None:
+            return self
+        w, x, y, z = approach.orientation.tolist()
+        return replace(self, hover_orientation=(w, x, y, z))
 
     def hover_joints(self) -> torch.Tensor:
         """Joint positions with the hand above the table, the upper arm well off the vertical.
