@@ -150,7 +150,7 @@ def test_a_viewer_that_connects_gets_the_run(tmp_path):
             assert arrives(got, size=200_000)
         finally:
             os.killpg(viewer.pid, signal.SIGINT)
-            viewer.wait(timeout=30)
+            viewer.wait(timeout=120)
     rrd = Rrd(got)
     joint = run_tabs(run)[-2].plots[0].curves[-1]
     np.testing.assert_array_equal(rrd.scalars(joint.path), joint.values)
