@@ -41,7 +41,7 @@ class AimingConfig:
     probe_tolerance: float = 10.0
     """Distance of the feature from the target at which the hand comes down [px]."""
     probe_reach: float = 0.015
-    """Height looks different elsewhere: a hand that moves further sideways than this once it
+    """The line looks different elsewhere: a hand that moves further sideways than this once it
     came down goes up again, and comes down where it then is [m]."""
     most_probes: int = 3
     """How often the hand comes down at most."""
@@ -109,7 +109,6 @@ class Aim:
     """Where the hand's marker should be [px], given the image Jacobian there."""
     line: Float[np.ndarray, "3"]
     """Direction from the object's marker to the hand's, base frame; it leads up."""
-
     raised: float = 0.0
     """Height above there at which to stay for now, further away along the line [m]."""
 
