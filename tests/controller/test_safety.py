@@ -42,7 +42,7 @@ def at_the_brink(*batch: int, rng: torch.Generator) -> tuple[Tensor, Tensor]:
     config, A = SafetyConfig(), LIMITS.acceleration
     reserve = A**2 / (2 * LIMITS.jerk)
     share = torch.rand(*batch, 7, generator=rng, dtype=torch.float64)
-    speed = LIMITS.velocity * share
+    speed = (1 - config.velocity_margin) * LIMITS.velocity * share
     v_hat = speed + reserve
     room = v_hat**2 / (2 * A) + v_hat / config.rate + config.margin
     up = torch.rand(*batch, 7, generator=rng) < 0.5
@@ -80,7 +80,8 @@ def assert_limits_kept(q: Tensor, before: SafetyState, state: SafetyState, dt: f
     a = (state.velocity - before.velocity) / dt
     assert (q <= LIMITS.upper + ROUNDING).all()
     assert (q >= LIMITS.lower - ROUNDING).all()
-    assert (state.velocity.abs() <= LIMITS.velocity).all()
+    allowed = (1 - SafetyConfig().velocity_margin) * LIMITS.velocity
+    assert (state.velocity.abs() <= allowed).all()
     assert (a.abs() <= LIMITS.acceleration * rounding).all()
     assert ((a - before.acceleration).abs() <= LIMITS.jerk * dt * rounding).all()
     torch.testing.assert_close(state.acceleration, a, rtol=0, atol=1e-9)
@@ -174,7 +175,8 @@ def test_speed_and_acceleration_keep_the_direction():
     assert report.acted("acceleration")
     for _ in range(100):
         v, state, _ = safety.step(state, READY, u, 0.01)
-    torch.testing.assert_close(v, u * LIMITS.velocity[4] / 8.0)
+    allowed = (1 - SafetyConfig().velocity_margin) * LIMITS.velocity
+    torch.testing.assert_close(v, u * allowed[4] / 8.0)
 
 
 @shapes_unchecked()  # for speed

@@ -101,6 +101,8 @@ def test_bad_settings_are_refused():
         SeparationConfig(human_speed=-1.0)
     with pytest.raises(ValueError, match="margin must not be negative"):
         SafetyConfig(margin=-0.1)
+    with pytest.raises(ValueError, match=r"velocity_margin must be in \[0, 1\)"):
+        SafetyConfig(velocity_margin=1.0)
     with pytest.raises(ValueError, match="tcp_speed must be positive"):
         SafetyConfig(tcp_speed=0.0)
 

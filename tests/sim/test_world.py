@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 import torch
 
+from hrc_learn.controller import SafetyConfig, SafetyFilter
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import World
 from hrc_learn.tasks.workplace import Workplace
@@ -38,6 +39,35 @@ def test_arm_follows_a_velocity_without_lag(world):
     # The servos must make up the start's jerk; what is left is the load of gravity and inertia.
     np.testing.assert_allclose(state.joint_position, start + 2.0 * velocity, atol=1e-3)
     np.testing.assert_allclose(state.joint_velocity, velocity, atol=1e-3)
+
+
+@pytest.mark.parametrize("joint", range(7))
+def test_the_filter_allows_for_what_the_servo_overshoots(world, joint):
+    """What counts is the measured velocity: it keeps the limit, and breaks it if the command
+    may use all of it."""
+
+    def fastest(config: SafetyConfig) -> float:
+        start = torch.from_numpy(_OUT_OF_THE_WAY)
+        world.reset(_OUT_OF_THE_WAY)
+        safety = SafetyFilter(panda.limits, config)
+        state = safety.initial_state(start)
+        shares = []
+        for k in range(60):
+            command = torch.zeros(7).double()
+            command[joint] = 3 * panda.limits.velocity[joint] * (1 if k < 30 else -1)
+            q = torch.from_numpy(world.arm.read().joint_position)
+            velocity, state, _ = safety.step(state, q, command, 0.01)
+            world.arm.command(velocity.numpy())
+            world.advance(0.01)
+            measured = world.arm.read().joint_velocity
+            shares.append(np.abs(measured / panda.limits.velocity.numpy()).max())
+        return max(shares)
+
+    assert fastest(SafetyConfig()) <= 1
+    assert fastest(SafetyConfig(velocity_margin=0.0)) > 1
+
+
+_OUT_OF_THE_WAY = np.array([0.0, -0.8, 0.0, -1.8, 0.0, 1.6, 0.8])
 
 
 def test_an_arm_that_was_held_up_goes_on_from_where_it_is(world):
