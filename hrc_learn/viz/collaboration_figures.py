@@ -110,7 +110,7 @@ def hand_figure(run: RunRecording) -> Figure:
     acting = np.linalg.norm(effort, axis=1) > 0
     rows = [
         ("position [m]", "Translation of the hand", run.position, "xyz"),
-        ("effort d [-]", "Null-space effort of the person, by joint", effort, None),
+        ("effort d [N m]", "Null-space effort of the person, by joint", effort, None),
     ]
     if hand is not None:
         turn = _euler_angles(hand.orientation)

@@ -117,7 +117,7 @@ def _recorded(
         ("Joints [rad]", "joints", joint_names, demo.joint_position),
         ("Tool centre point [m]", "position", ("x", "y", "z"), demo.position),
         ("Feature in the image [px]", "feature", ("u (right)", "v (down)"), demo.feature),
-        ("Effort of the person [-]", "effort", joint_names, demo.human_effort),
+        ("Effort of the person [N m]", "effort", joint_names, demo.human_effort),
         ("Gripper [m]", "gripper", ("opening",), demo.gripper),
     ):
         if values is not None:

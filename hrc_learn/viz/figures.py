@@ -123,7 +123,7 @@ def person_figure(run: RunRecording) -> Figure:
     effort = needed(run.human_effort, "human_effort")
     acting = np.linalg.norm(effort, axis=1) > 0
     rows = [
-        ("effort d [-]", "Null-space effort of the person, by joint", effort),
+        ("effort d [N m]", "Null-space effort of the person, by joint", effort),
         ("elbow [mm]", "Elbow moved", scaled(run.elbow_motion, 1e3)),
         ("position [mm]", "Deviation of the end effector", scaled(run.position_deviation, 1e3)),
         ("rotation [deg]", "", scaled(run.rotation_deviation, 180 / np.pi)),
