@@ -41,8 +41,9 @@ class AimingConfig:
     probe_tolerance: float = 10.0
     """Distance of the feature from the target at which the hand comes down [px]."""
     probe_reach: float = 0.015
-    """The line looks different elsewhere: a hand that moves further sideways than this once it
-    came down goes up again, and comes down where it then is [m]."""
+    """The line looks different elsewhere, and one motion may not tell it well: a hand that has
+    come further off it than this by the time it is down goes up again, and comes down where
+    it then is [m]."""
     most_probes: int = 3
     """How often the hand comes down at most."""
     border: float = 50.0
@@ -130,6 +131,11 @@ class Aim:
         pixel = self.target(image_jacobian) + image_jacobian[:, :3] @ away
         return self.config.within(pixel) if self.raised else pixel
 
+    def aside(self, hand: Pose, before: Pose) -> float:
+        """How far a hand has left the line that it was on before, sideways [m]."""
+        moved = (hand.position - before.position).numpy()
+        return float(np.linalg.norm((moved - self._away(moved[2]))[:2]))
+
     def _away(self, height: float) -> Float[np.ndarray, "3"]:
         return height / self.line[2] * self.line
 
@@ -166,7 +172,7 @@ class Aimer:
         self.state: ControllerState = controller.initial_state(station.joints)
 
     def aim(self, aim: Aim) -> float:
-        """Bring the hand's marker to the target, first from higher up.
+        """Bring the hand's marker to the target, first from higher up, along a line.
 
         Returns:
             Time it took [s].
@@ -177,14 +183,14 @@ class Aimer:
         begin, config = self._station.time, self._config
         self._found = False
         self._resume()
-        reached = begin
+        reached, above = begin, self._station.pose
         for _ in range(config.most_probes if config.probe > 0 else 1):
             if config.probe > 0:
                 self._reach(replace(aim, raised=config.probe), config.probe_tolerance, begin)
+                above = self._station.pose
                 self._come_down(aim)
-            above = self._station.pose.position[:2]
             reached = self._reach(aim, config.tolerance, begin)
-            if (self._station.pose.position[:2] - above).norm() < config.probe_reach:
+            if config.probe == 0 or aim.aside(self._station.pose, above) < config.probe_reach:
                 break
         return reached - begin
 

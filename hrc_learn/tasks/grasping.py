@@ -18,6 +18,7 @@ from torch import Tensor
 from ..controller import AdaptiveController, ControllerConfig, Goals
 from ..geometry import Pose, quaternion
 from ..jacobian import ImageJacobianEstimator
+from ..kinematics import panda_capsules
 from ..sim import HAND_MARKER, ObjectConfig
 from .aiming import Aim, Aimer, AimingConfig
 from .failure import BlockedPathError, MissedGraspError, TaskFailedError
@@ -30,6 +31,13 @@ from .visual_target import UP
 from .workplace import Workplace
 
 OPEN, CLOSED = 0.08, 0.0
+# Least distance of the arm's capsules from where things may lie: the plate with the hand's
+# marker stands out from them [m].
+_CLEAR = 0.06
+# Samples of a way of which one is looked at for that.
+_EVERY = 5
+# Largest distance of a joint from its place at home that counts as there [rad].
+_AT_HOME = 0.05
 """Widths the gripper is told to take [m]."""
 
 type TargetLaw = Callable[
@@ -159,18 +167,21 @@ class Grasping:
     def look_for(self, item: ObjectConfig) -> Aim:
         """Where to aim, from a look at the table before the arm is over it.
 
+        An arm that stands elsewhere than at home, and so may hide the object, goes there if it
+        is not seen.
+
         Raises:
             TaskFailedError: If the object's marker stays out of sight.
         """
-        self._station.enter("look")
-        give_up = self._station.time + self._config.patience
-        while (pixel := self._station.see().pixels.get(item.marker.id)) is None:
-            if self._station.time >= give_up:
-                raise TaskFailedError(
-                    f"look: the camera does not see marker {item.marker.id} of "
-                    f"{item.name!r}. Put it into the camera's view, and the arm out of it."
-                )
-            self._station.stay(self._station.config.look_every * self._station.config.dt)
+        pixel = self._find(item)
+        if pixel is None and not self._at_home():
+            self.go_home()
+            pixel = self._find(item)
+        if pixel is None:
+            raise TaskFailedError(
+                f"look: the camera does not see marker {item.marker.id} of {item.name!r}. "
+                "Put it into the camera's view, and the arm out of it."
+            )
         return Aim(
             config=self._config.aiming,
             above=self._workplace.hover(),
@@ -179,14 +190,30 @@ class Grasping:
             line=self._offset_line,
         )
 
+    def _find(self, item: ObjectConfig) -> Float[np.ndarray, "2"] | None:
+        """Pixel of an object's marker; None if it stays out of sight."""
+        self._station.enter("look")
+        give_up = self._station.time + self._config.patience
+        while (pixel := self._station.see().pixels.get(item.marker.id)) is None:
+            if self._station.time >= give_up:
+                return None
+            self._station.stay(self._station.config.look_every * self._station.config.dt)
+        return pixel
+
+    def _at_home(self) -> bool:
+        away = self._station.joints - self._workplace.home_joints()
+        return float(away.abs().max()) < _AT_HOME
+
     def _posture(self) -> Float[Tensor, " joints"]:
         """Joint positions above the table to which, and home from which, the way is free.
 
-        Where there are none, the arm goes home first.
+        Where there are none, the arm goes home first. Nobody knows yet where on the table
+        things lie, so the way keeps clear of all places where they may.
         """
         postures, home = self._workplace.hover_postures(), self._workplace.home_joints()
         for posture in postures:
-            if self._free(self._station.joints, posture) and self._free(posture, home):
+            here = self._station.joints
+            if self._free(here, posture, _CLEAR) and self._free(posture, home):
                 return posture
         self.go_home()
         return postures[0]
@@ -239,21 +266,36 @@ class Grasping:
         """
         self._station.enter("home")
         here, home = self._station.joints, self._workplace.home_joints()
-        if not self._free(here, home):
-            for via in self._workplace.hover_postures():
-                if self._free(here, via) and self._free(via, home):
-                    self._station.play(self._line(here, via).path)
-                    break
+        postures = self._workplace.hover_postures()
+        for clear in (_CLEAR, None):
+            if self._free(here, home, clear):
+                break
+            ways = (q for q in postures if self._free(here, q, clear) and self._free(q, home))
+            if (via := next(ways, None)) is not None:
+                self._station.play(self._line(here, via).path)
+                break
         plan = self._line(self._station.joints, home)
         self._check(plan)
         self._station.play(plan.path)
 
-    def _free(self, start: Float[Tensor, " joints"], goal: Float[Tensor, " joints"]) -> bool:
+    def _free(
+        self,
+        start: Float[Tensor, " joints"],
+        goal: Float[Tensor, " joints"],
+        clear: float | None = None,
+    ) -> bool:
+        """Whether the arm may go straight, and, if asked, this far [m] off things anywhere."""
+        plan = self._line(start, goal)
         try:
-            self._check(self._line(start, goal))
+            self._check(plan)
         except BlockedPathError:
             return False
-        return True
+        if clear is None:
+            return True
+        path = torch.from_numpy(plan.path[::_EVERY])
+        return bool(
+            (panda_capsules.box_distance(path, *self._workplace.things()) > clear).all()
+        )
 
     def _line(self, start: Float[Tensor, " joints"], goal: Float[Tensor, " joints"]) -> Plan:
         """A straight line in joint space."""

@@ -30,6 +30,8 @@ class Workplace:
     """Joint 7 at home [rad]: the elbow leans to the left, away from the cabinet."""
     table_centre: tuple[float, float] = (0.24, 0.54)
     """Middle of the part of the table that the camera sees well [m]."""
+    table_reach: tuple[float, float] = (0.14, 0.14)
+    """How far from there the edges of things may be, along x and y [m]."""
     hover_height: float = 0.17
     """Of the tool centre point while it aims at an object [m]."""
     hover_orientation: tuple[float, float, float, float] = tuple(gripper_down().tolist())
@@ -78,6 +80,12 @@ class Workplace:
     def hover_postures(self) -> list[torch.Tensor]:
         """Joint positions with the hand above the table, the preferred ones first."""
         return [self.hover_joints(), *comfortable_postures(panda, self.hover())]
+
+    def things(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Where things may lie on the table: centre and half edges of a box [m]."""
+        highest = 2 * max(item.half_size[2] for item in self.scene.objects)
+        half = _vector(*self.table_reach, highest / 2)
+        return _vector(*self.table_centre, highest / 2), half
 
     def random_object_pose(
         self, reach: tuple[float, float, float], rng: np.random.Generator
