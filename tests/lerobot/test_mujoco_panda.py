@@ -37,13 +37,27 @@ def test_the_sim_goes_where_it_is_sent_and_time_passes_by_actions(simulated):
     assert there[GRIPPER] == pytest.approx(0.06, abs=3e-3)
 
 
-def test_a_sim_that_pauses_begins_anew(simulated):
-    robot = simulated(scenario="grasping", fps=FPS, restart_after_pause=0.05)
-    first = robot.get_observation()
-    robot.send_action({name: first[name] for name in (*JOINTS, GRIPPER)})
-    time.sleep(0.06)
+def test_a_sim_begins_anew_with_the_recorders_next_episode(simulated, monkeypatch):
+    """Not when the loop hangs within one."""
+    clock = [100.0]
+    monkeypatch.setattr(time, "monotonic", lambda: clock[0])
+    robot = simulated(scenario="grasping", fps=FPS, episode_time=2.0)
+
+    def frame(pause):
+        clock[0] += pause
+        seen = robot.get_observation()
+        robot.send_action({name: seen[name] for name in (*JOINTS, GRIPPER)})
+        return robot.run.seed, robot.run.commands, robot.beginnings
+
+    robot.get_observation()  # somebody looks before the first episode
+    clock[0] += 5.0
     robot.get_observation()
-    assert (robot.run.seed, robot.run.commands, robot.beginnings) == (1, 0, 1)
+    assert frame(0.0) == (0, 1, 0)
+    assert frame(1.5) == (0, 2, 0)  # hangs
+    assert frame(0.5 + 0.5 / FPS) == (0, 3, 0)  # the last frame, a little late
+    assert frame(1.2 / FPS) == (1, 1, 1)  # saved; the next episode
+    assert frame(1.9) == (1, 2, 1)
+    assert frame(0.3) == (2, 1, 2)
 
 
 @pytest.mark.parametrize(

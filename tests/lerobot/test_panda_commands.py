@@ -46,7 +46,7 @@ def recorded(tmp_path_factory):
         DISCOVER,
         *ROBOT,
         SEEN,
-        "--robot.restart_after_pause=0.2",
+        "--robot.episode_time=9",
         "--teleop.type=panda_expert",
         "--dataset.repo_id=local/grasping",
         f"--dataset.root={home / 'set'}",

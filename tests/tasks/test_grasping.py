@@ -13,16 +13,18 @@ from unchecked import shapes_unchecked
 
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import RBFImageJacobian, paper_grid
-from hrc_learn.kinematics import panda
+from hrc_learn.kinematics import panda, panda_capsules
 from hrc_learn.sim import World
-from hrc_learn.tasks.aiming import AimingConfig
+from hrc_learn.tasks.aiming import Aim, AimingConfig
 from hrc_learn.tasks.approach import Approach
 from hrc_learn.tasks.fit_aiming import AimingSkill
+from hrc_learn.tasks.grasping import GraspingConfig
 from hrc_learn.tasks.grasping_evaluation import evaluate_many
 from hrc_learn.tasks.grasping_outcome import GraspOutcome
 from hrc_learn.tasks.grasping_recording import RegionActivity, record_grasp
 from hrc_learn.tasks.grasping_setting import GraspingSetting, GraspingSettingConfig
 from hrc_learn.tasks.grasping_variants import VARIANTS
+from hrc_learn.tasks.motion import joint_line
 from hrc_learn.tasks.simulated_grasp import simulate_grasp
 from hrc_learn.tasks.trial_file import Trial
 from hrc_learn.tasks.visual_target import VisualTarget
@@ -202,3 +204,71 @@ def test_the_hand_is_turned_as_the_demonstrations_approached(skill):
 
 def phase_time(run, phase):
     return next(event.time for event in run.station.log.events if event.text == phase)
+
+
+SWEPT = 17
+"""Seed of a start from where the straight way in joint space to the most comfortable posture
+above the table leads through the object."""
+
+
+def test_the_arm_comes_to_the_table_clear_of_what_lies_there(skill):
+    """Nobody told it where that is."""
+    config = GraspingSettingConfig(random_camera=True)
+    setting = GraspingSetting.draw(WORKPLACE, config, np.random.default_rng(SWEPT))
+    start, item = torch.from_numpy(setting.start), WORKPLACE.scene.objects[0]
+    lies = torch.from_numpy(setting.object_pose[:3, 3])
+    half_size = torch.tensor(item.half_size, dtype=torch.float64)
+
+    def distance(path):
+        return float(panda_capsules.box_distance(path, lies, half_size).min())
+
+    assert distance(joint_line(start, WORKPLACE.hover_joints(), 0.6, 0.05)) < 0
+    with shapes_unchecked():
+        run = grasped(skill, setting)
+    log = run.station.log
+    coming = log["time"] < phase_time(run, "grasp")
+    assert distance(torch.from_numpy(log["joint_position"][coming])) > 0.05
+    assert GraspOutcome.of(run).failure == ""
+
+
+@pytest.mark.slow
+def test_coming_down_again_finds_the_object_by_any_camera(skill):
+    """Cameras moved, tilted and turned by any angle."""
+
+    def worst(most_probes):
+        aiming = AimingConfig(most_probes=most_probes)
+        trials = [
+            simulate_grasp(
+                skill,
+                GraspingSetting.draw(WORKPLACE, setting, np.random.default_rng(seed)),
+                camera="synthetic",
+                config=GraspingConfig(aiming=aiming),
+                rng=np.random.default_rng([seed, 1]),
+            )
+            for seed in (1, 12, 19, 27)
+        ]
+        outcomes = [GraspOutcome.of(trial) for trial in trials]
+        assert not any(outcome.failure for outcome in outcomes)
+        return max(outcome.place_error for outcome in outcomes)
+
+    setting = GraspingSettingConfig(random_camera=True)
+    with shapes_unchecked():
+        again, once = worst(3), worst(1)
+    assert again < 0.012
+    assert again < 0.6 * once
+
+
+def test_a_hand_that_comes_down_along_the_line_stays_on_it():
+    line = np.array([0.3, -0.2, 1.0])
+    line /= np.linalg.norm(line)
+    hover = WORKPLACE.hover()
+    aim = Aim(config=AimingConfig(), above=hover, posture=None, target=lambda J: J, line=line)
+
+    def hand(along, aside=(0.0, 0.0, 0.0)):
+        moved = along * line + np.array(aside)
+        return Pose(hover.position + torch.from_numpy(moved), hover.orientation)
+
+    assert aim.aside(hand(0.0), hand(0.03)) == pytest.approx(0.0, abs=1e-12)
+    assert aim.aside(hand(0.04), hand(0.01)) == pytest.approx(0.0, abs=1e-12)
+    there = hand(0.0, (0.012, 0.005, 0.0))
+    assert aim.aside(there, hand(0.03)) == pytest.approx(0.013, abs=1e-12)

@@ -46,14 +46,14 @@ class MujocoPandaConfig(RobotConfig):
     what a policy needs to grasp without images."""
     images: ImagesConfig = field(default_factory=ImagesConfig)
     """Images to be observed."""
-    restart_after_pause: float = 0.0
-    """Begin anew when no command came for this long [s]; 0: never. lerobot-record tells a robot
-    nothing of its episodes, but pauses to save each one."""
+    episode_time: float = 0.0
+    """Begin anew when this much time [s] has passed, as `--dataset.episode_time_s` says when
+    lerobot-record ends an episode, of which it tells a robot nothing; 0: never."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_scenario(self.scenario, self.shelf, self.pixels)
         if not 5 <= self.fps <= 500:
             raise ValueError(f"fps must be from 5 to 500, but is {self.fps}.")
-        if self.restart_after_pause < 0:
-            raise ValueError("restart_after_pause must not be negative.")
+        if self.episode_time < 0:
+            raise ValueError("episode_time must not be negative.")

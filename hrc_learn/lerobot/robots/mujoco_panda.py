@@ -41,7 +41,7 @@ class MujocoPanda(PandaRobot):
         )
         self.config = config
         self.dt = 1.0 / config.fps
-        self._last = float("inf")
+        self._began = 0.0
 
     @property
     def observation_features(self) -> dict[str, Any]:
@@ -73,13 +73,24 @@ class MujocoPanda(PandaRobot):
 
     def get_observation(self) -> dict[str, Any]:
         self._need_connection()
-        pause = self.config.restart_after_pause
-        if pause and self.run.commands and time.monotonic() - self._last > pause:
-            self.begin(self.run.seed + 1)
+        self._begin_anew_in_time()
         values = super().get_observation()
         for name, camera in self.cameras.items():
             values[name] = camera.read()
         return values
+
+    def _begin_anew_in_time(self) -> None:
+        """With the recorder's next episode.
+
+        It ends one at the first frame that would come late, and takes longer than a frame to
+        save it: so much may be allowed for a last frame, whatever else the machine has to do.
+        """
+        now, length = time.monotonic(), self.config.episode_time
+        if not self.run.commands:
+            self._began = now
+        elif length and now - self._began > length + self.dt:
+            self.begin(self.run.seed + 1)
+            self._began = now
 
     def begin(self, seed: int) -> None:
         """Put everything in place as a seed has it."""
@@ -96,6 +107,4 @@ class MujocoPanda(PandaRobot):
         return self.run.servo.joints_at(pose)
 
     def _command(self, joints: Float[np.ndarray, "7"], width: float) -> Float[np.ndarray, "7"]:
-        sent = self.run.command(joints, width)
-        self._last = time.monotonic()
-        return sent
+        return self.run.command(joints, width)
