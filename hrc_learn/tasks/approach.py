@@ -15,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..geometry import Pose, quaternion
+from ..output import new_file
 
 NEAR = 0.05
 """Length of the last stretch of a path, whose direction is its tangent there [m]."""
@@ -67,15 +68,14 @@ class Approach:
 
     def save(self, path: Path) -> None:
         """Write to a JSON file, whole or not at all."""
-        partial = path.with_suffix(".partial")
         content = {
             "version": 1,
             "orientation_wxyz": self.orientation.tolist(),
             "spread_rad": self.spread,
             "turned_rad": self.turned,
         }
-        partial.write_text(json.dumps(content, indent=2))
-        partial.replace(path)
+        with new_file(path) as part:
+            part.write_text(json.dumps(content, indent=2))
 
     @classmethod
     def load(cls, path: Path) -> "Approach":

@@ -16,6 +16,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from ..output import new_file
+
 OBJECT_FEATURE = "observation.object_feature"
 """Column of a dataset with the object's marker in the image."""
 OBJECT_FEATURE_NAMES = ("u", "v", "visible")
@@ -105,7 +107,6 @@ class VisualTarget:
 
     def save(self, path: Path) -> None:
         """Write to a JSON file, whole or not at all."""
-        partial = path.with_suffix(".partial")
         content = {
             "version": 1,
             "matrix": self.matrix.tolist(),
@@ -113,8 +114,8 @@ class VisualTarget:
             "offset_m": None if self.offset is None else self.offset.tolist(),
             "offset_error_px": _or_none(self.offset_error),
         }
-        partial.write_text(json.dumps(content, indent=2))
-        partial.replace(path)
+        with new_file(path) as part:
+            part.write_text(json.dumps(content, indent=2))
 
     @classmethod
     def load(cls, path: Path) -> "VisualTarget":
