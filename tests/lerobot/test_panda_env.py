@@ -15,7 +15,7 @@ FPS = 20
 def test_the_expert_succeeds_and_the_environment_says_so(simulated, tmp_path):
     """What was shown on the robot is done again in the environment, by poses of the hand."""
     settings = {"action_space": "ee", "pixels": True}
-    robot = simulated(scenario="grasping", fps=FPS, seed=4, **settings)
+    robot = simulated(scenario="grasping", fps=float(FPS), seed=4, **settings)
     expert = make_teleoperator_from_config(PandaExpertConfig(calibration_dir=tmp_path))
     expert.connect()
     shown, first = [], robot.get_observation()
