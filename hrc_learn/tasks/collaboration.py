@@ -13,8 +13,8 @@ counted:
   it sees it again; if it stays unseen, the arm goes home and looks anew;
 - the object is out of sight: it is waited for;
 - a missed grasp, an object dropped over the table: again, from home;
-- a blocked way: another via point, another arm angle, then waiting; at last the object is put
-  back where it was.
+- a blocked way: another height, via point or arm angle, then waiting; at last the object is
+  put back where it was.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -244,7 +244,7 @@ class Collaboration:
         if played < len(plan.path):
             self._station.play(plan.path[:played][::-1])
             return self._begin_again(errand, "dropped object", "lost on the way to the shelf")
-        self._station.move_straight(errand.goal)
+        self._station.move_straight(plan.goal)
         return Phase.RELEASE
 
     def _free_way(self, errand: Errand) -> Way | None:

@@ -36,7 +36,7 @@ class Errand:
     item: ObjectConfig
     shelf: str
     goal: Pose
-    """Of the hand where it lets go."""
+    """Of the hand where it lets go, if the thing is held in the middle."""
     time_for_person: float = 0.0
     """How long to go on aiming while a person reaches under the arm [s]."""
     aim: Aim | None = None
@@ -73,5 +73,6 @@ class Errand:
         """
         if self.release is None:
             raise ValueError(f"{self.item.name!r} never came to its shelf: {self.failure}")
-        twist = self.release.twist_to(self.goal)
+        goal = self.goal if self.plan is None else self.plan.goal
+        twist = self.release.twist_to(goal)
         return float(twist[:3].norm()), float(twist[3:].norm())

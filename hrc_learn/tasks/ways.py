@@ -1,6 +1,7 @@
 """Ways to a shelf: the learned one, and others for when that is blocked."""
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -23,6 +24,8 @@ _VIA_POINTS = {
 """Offsets from home [m]."""
 _ARM_ANGLES = {"with the elbow further out": -0.35, "with the elbow further in": 0.35}
 """Changes of joint 7 at home, which turn the elbow about the line to the wrist [rad]."""
+_RAISED = 0.008
+"""How much higher a thing that sits low in the hand is put down [m]."""
 
 
 class Way(NamedTuple):
@@ -44,8 +47,9 @@ def ways_to(
 ) -> Iterator[Way]:
     """Ways from where the arm is to a shelf, the learned one first, planned when asked for.
 
-    Another way begins at another via point or arm angle. The primitive brings hand and body
-    back to what was learned as it nears its goal: the way into the shelf stays as it is.
+    Another way ends a little higher, as a thing that sits low in the hand needs it, or begins
+    at another via point or arm angle. The primitive brings hand and body back to what was
+    learned as it nears its goal: the way into the shelf stays as it is.
 
     Args:
         goal: Of the hand.
@@ -57,10 +61,14 @@ def ways_to(
         speed: How many times faster than demonstrated.
     """
 
-    def learned(begin: Tensor) -> Plan:
+    def learned(begin: Tensor, goal: Pose = goal) -> Plan:
         return skill.plan(begin, goal, space=space, dt=dt, speed=speed)
 
     yield Way("as learned", learned(start))
+    up = goal.position.new_tensor([0.0, 0.0, _RAISED])
+    with suppress(UnreachableError):
+        raised = Pose(goal.position + up, goal.orientation)
+        yield Way("a little higher", learned(start, raised))
     for name, via in _vias(workplace):
         first = joint_line(start, via, speed=0.6, dt=dt).numpy()
         rest = learned(via)

@@ -47,7 +47,7 @@ def address(log: Path, timeout: float = 180.0) -> str:
 KEYS = {"up": "u", "down": "o", "left": "j", "right": "l", "away": "i", "back": "k"}
 
 
-def lead(tab, way: str, until: float = 0.0, timeout: float = 120.0) -> None:
+def lead(tab, way: str, until: float = 0.0, timeout: float = 400.0) -> None:
     """Tap the key for a direction until the page says that no more than `until` cm are left."""
     end = time.monotonic() + timeout
     note = tab.get_by_text("middle shelf:")

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -17,6 +18,7 @@ from hrc_learn.tasks.placing import PlacingSkill, check_plan
 from hrc_learn.tasks.placing_figures import placing_figures
 from hrc_learn.tasks.placing_run import place
 from hrc_learn.tasks.teach_placing import PlacingLesson, teach_placing
+from hrc_learn.tasks.ways import ways_to
 from hrc_learn.tasks.workplace import Workplace
 
 WORKPLACE = Workplace()
@@ -187,3 +189,24 @@ def test_demonstrations_without_motion_are_refused():
     empty = DemonstrationSet([Demonstration(time=time, gripper=np.zeros(20), fps=20.0)])
     with pytest.raises(ValueError, match="neither joint positions nor"):
         fit_primitives(empty)
+
+
+@pytest.mark.parametrize(("low", "name"), [(0.0, "as learned"), (0.0065, "a little higher")])
+def test_a_thing_that_sits_low_in_the_hand_is_put_down_higher(skill, low, name):
+    world, goal = World(WORKPLACE.scene), WORKPLACE.shelf("middle")
+    world.hold("box", HOME.numpy())
+    # Once the hand points level, its x points down.
+    world.data.joint("box").qpos[:3] += low * world.arm.tcp_pose()[:3, 0]
+    mujoco.mj_forward(world.model, world.data)
+
+    def free(way):
+        try:
+            check_plan(way.plan, world, "box")
+        except BlockedPathError:
+            return False
+        return True
+
+    ways = ways_to(goal, HOME, skill, WORKPLACE, space="pose", dt=0.01, speed=1.5)
+    way = next(filter(free, ways))
+    assert way.name == name
+    assert 0 <= float(way.plan.goal.position[2] - goal.position[2]) < 0.01
