@@ -4,6 +4,7 @@
 # MuJoCo ships no type stubs; its names come from a compiled module.
 
 import sys
+import weakref
 from collections.abc import Set
 from typing import Literal
 
@@ -38,6 +39,8 @@ class OffscreenRenderer:
         world.model.vis.global_.offheight = max(height, world.model.vis.global_.offheight)
         self._gl = _open_context(width, height)
         self._context = mujoco.MjrContext(world.model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        self._free = weakref.finalize(self, _free, self._gl, self._context)
+        self._free.atexit = False
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
         self._scene = mujoco.MjvScene(world.model, maxgeom=1000)
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
@@ -66,8 +69,15 @@ class OffscreenRenderer:
 
     def close(self) -> None:
         """Free the OpenGL context."""
-        self._context.free()
-        self._gl.free()
+        self._free()
+
+
+def _free(gl, context: mujoco.MjrContext) -> None:
+    # OpenGL frees by number, and another renderer that is current has the same numbers: its
+    # images would be black from then on.
+    gl.make_current()
+    context.free()
+    gl.free()
 
 
 def _open_context(width: int, height: int):

@@ -49,6 +49,19 @@ def projected(world):
 
 
 @pytest.mark.egl
+def test_a_camera_sees_on_when_the_one_before_it_is_gone(world):
+    camera = egl_or_skip(world)
+    seen = set(detected(world, camera.read()))
+    camera = EGLCamera(world, rng=np.random.default_rng(0))  # the first one is dropped here
+    assert set(detected(world, camera.read())) == seen
+    other = EGLCamera(world, rng=np.random.default_rng(0))
+    other.close()
+    other.close()
+    assert set(detected(world, camera.read())) == seen
+    camera.close()
+
+
+@pytest.mark.egl
 def test_rendered_markers_stand_where_the_camera_model_says(world):
     camera = egl_or_skip(world)
     found = detected(world, camera.read())
