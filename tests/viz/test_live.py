@@ -149,7 +149,7 @@ def test_a_viewer_that_connects_gets_the_run(tmp_path):
         try:
             assert arrives(got, size=200_000)
         finally:
-            os.killpg(viewer.pid, signal.SIGINT)
+            os.killpg(viewer.pid, signal.SIGTERM)
             viewer.wait(timeout=120)
     rrd = Rrd(got)
     joint = run_tabs(run)[-2].plots[0].curves[-1]
