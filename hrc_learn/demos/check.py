@@ -5,7 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from .checks import motion, structure, timing, values
+from .checks.motion import check_commands, check_duplicates, check_jumps, check_stillness
+from .checks.structure import check_file, check_indices, check_metadata
+from .checks.timing import check_length, check_stamps
+from .checks.values import check_columns, check_finite, check_repeats
 from .checks.meaning import Understood, check_joint_sets, understand
 from .checks.report import Report
 from .explicit_mapping import MappingSpec, parse_mapping
@@ -38,14 +41,14 @@ def check_dataset(
     for role, unit in (units or {}).items():
         unit_factor(role, unit)
     report = Report(path=Path(path))
-    folder = structure.check_metadata(report.path, report)
+    folder = check_metadata(report.path, report)
     if folder is None:
         return report
     parse_mapping(mapping or {}, folder.features)
     episodes = _check_frames(folder, report)
     report.episodes = len(episodes)
     report.frames = sum(entry.length for entry, _ in episodes)
-    values.check_columns(folder, episodes, report)
+    check_columns(folder, episodes, report)
     try:
         matching, understood = understand(folder, episodes, mapping or {}, units or {}, report)
     except DatasetError as error:
@@ -55,7 +58,7 @@ def check_dataset(
     for episode in understood:
         _check_episode(folder, episode, matching, speed_limits or {}, report)
     moving = [(episode.entry, _motion(episode)) for episode in understood]
-    motion.check_duplicates([(e, m) for e, m in moving if m is not None], report)
+    check_duplicates([(e, m) for e, m in moving if m is not None], report)
     return report
 
 
@@ -65,14 +68,14 @@ def _check_frames(
     """Everything that needs no understanding of the columns."""
     sound = []
     for file, entries in folder.files().items():
-        for entry, frames in structure.check_file(folder, file, entries, report):
-            structure.check_indices(folder, entry, frames, report)
-            values.check_finite(folder.features, entry, frames, report)
-            values.check_repeats(entry, frames, report)
-            timing.check_length(entry, folder.fps, report)
+        for entry, frames in check_file(folder, file, entries, report):
+            check_indices(folder, entry, frames, report)
+            check_finite(folder.features, entry, frames, report)
+            check_repeats(entry, frames, report)
+            check_length(entry, folder.fps, report)
             if "timestamp" in frames:
                 stamps = frames["timestamp"][:, 0].astype(float)
-                timing.check_stamps(entry, "timestamp", stamps, folder.fps, report)
+                check_stamps(entry, "timestamp", stamps, folder.fps, report)
             sound.append((entry, frames))
     return sound
 
@@ -86,18 +89,18 @@ def _check_episode(
 ) -> None:
     entry, time, quantities = episode.entry, episode.time, episode.quantities
     if "time" in quantities:
-        timing.check_stamps(entry, "time", time, folder.fps, report)
+        check_stamps(entry, "time", time, folder.fps, report)
     if (np.diff(time) <= 0).any():
         return  # reported as an error; speeds make no sense
     moving = _motion(episode)
     if moving is not None:
-        motion.check_stillness(entry, time, moving, report)
+        check_stillness(entry, time, moving, report)
     joints = quantities.get("joint_position")
     if joints is None:
         return
-    motion.check_jumps(entry, time, joints, matching.joint_names, speed_limits, report)
+    check_jumps(entry, time, joints, matching.joint_names, speed_limits, report)
     if "command_position" in quantities:
-        motion.check_commands(entry, joints, quantities["command_position"], report)
+        check_commands(entry, joints, quantities["command_position"], report)
 
 
 def _motion(episode: Understood) -> np.ndarray | None:

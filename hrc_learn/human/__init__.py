@@ -4,6 +4,7 @@ The page in a browser is `hrc_learn.human.page`, devices are `hrc_learn.human.de
 import viser and pygame when they are opened.
 """
 
+from ..geometry.minimum_jerk import minimum_jerk as minimum_jerk
 from .both_hands import BothHands as BothHands
 from .coarse_orientation import coarse_orientation as coarse_orientation
 from .coarse_orientation import gripper_down as gripper_down
@@ -15,7 +16,6 @@ from .eased import EasingConfig as EasingConfig
 from .expert import GuidedPath as GuidedPath
 from .expert import ScriptedExpert as ScriptedExpert
 from .expert import Tremor as Tremor
-from .expert import minimum_jerk as minimum_jerk
 from .pull import PullMapping as PullMapping
 from .pull import PullSpell as PullSpell
 from .pull import ScriptedPuller as ScriptedPuller

@@ -8,16 +8,11 @@ from jaxtyping import Float
 from scipy.interpolate import PchipInterpolator
 
 from ..geometry import Pose
+from ..geometry.minimum_jerk import minimum_jerk
 from ..kinematics import SerialChain
 from ..protocols import ArmState, HumanInput
 from .coarse_orientation import coarse_orientation
 from .pull import PullSpell, ScriptedPuller
-
-
-def minimum_jerk(x: float) -> tuple[float, float]:
-    """Progress and its slope at share `x` of the duration (Flash and Hogan 1985)."""
-    x = min(max(x, 0.0), 1.0)
-    return x**3 * (10 - 15 * x + 6 * x**2), 30 * x**2 * (1 - x) ** 2
 
 
 class GuidedPath:

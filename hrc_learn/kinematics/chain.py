@@ -8,7 +8,7 @@ from torch import Tensor
 
 from hrc_learn.geometry import Pose
 from hrc_learn.geometry.constant import Constant
-from hrc_learn.kinematics import unrolled
+from hrc_learn.kinematics.unrolled import transform_and_jacobian
 from hrc_learn.kinematics.limits import JointLimits
 
 
@@ -127,7 +127,7 @@ class SerialChain:
     ) -> tuple[Float[Tensor, "*batch 3 4"], Float[Tensor, "*batch 6 joints"]]:
         """`forward_and_jacobian` with the pose left as a matrix (R | p): no quaternion made."""
         if torch.compiler.is_compiling():
-            return unrolled.transform_and_jacobian(q, self._mount_entries, self._tip_entries)
+            return transform_and_jacobian(q, self._mount_entries, self._tip_entries)
         frames = self._joint_frames(q)
         tip = frames[-1] @ self._tip.like(q)
         frames = torch.stack(frames, dim=-3)
