@@ -6,7 +6,7 @@ from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from typing import Any
 
-from .recording import MeshFile
+from .shapes import MeshFile
 
 _FOLDER = "cmeel.prefix/share/example-robot-data/robots/panda_description/meshes/visual"
 _TCP = 0.1034  # from the hand's frame along z [m]

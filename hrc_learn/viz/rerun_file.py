@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 
 from ..output import new_file
 from .panels import Curves, Plot, Tab
-from .recording import Body, Box, Capsule, MeshFile
+from .shapes import Body, Box, Capsule, MeshFile
 
 TIMELINE = "time"
 """All that is recorded lies on this timeline [s]: the viewer shows one at a time."""
