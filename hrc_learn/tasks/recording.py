@@ -8,13 +8,12 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from .. import viz
 from ..demos import Demonstration
 from ..geometry import Pose, quaternion
 from ..kinematics import panda
 from ..sim import MotionLog, World
 from ..vision import CameraModel
-from ..viz import LoggedSteps
+from ..viz import Box, CameraRecording, JointLimits, LoggedSteps, RunRecording
 from .collaboration import INTERACT, TRANSFER
 from .placing import Plan
 from .station import SAFETY_COLUMNS, Station
@@ -31,9 +30,9 @@ def record(
     *,
     plans: Sequence[Plan] = (),
     cameras: Sequence[tuple[float, CameraModel]] = (),
-    region: viz.Box | None = None,
+    region: Box | None = None,
     demonstration: Demonstration | None = None,
-) -> viz.RunRecording:
+) -> RunRecording:
     """Everything worth looking at in a run of the collaboration, over or still going on.
 
     Args:
@@ -53,12 +52,12 @@ def record(
     deviation = Deviation.of(log)
     cameras = cameras or ((-math.inf, world.config.camera),)
     limits = panda.limits
-    return viz.RunRecording(
+    return RunRecording(
         title=title,
         time=time,
         joint_names=panda.joint_names,
         joint_position=log["joint_position"],
-        joint_limits=viz.JointLimits(lower=limits.lower.numpy(), upper=limits.upper.numpy()),
+        joint_limits=JointLimits(lower=limits.lower.numpy(), upper=limits.upper.numpy()),
         demo_joint_position=_matching_demonstration(log, plans, demonstration),
         position=link_poses(log).position[:, TOOL].numpy(),
         demo_path=None if demonstration is None else demonstration.position,
@@ -66,7 +65,7 @@ def record(
         bodies=motion.bodies(len(log)),
         boxes=tuple(world.config.boxes()),
         region=region,
-        camera=viz.CameraRecording(
+        camera=CameraRecording(
             model=cameras[-1][1],
             feature=log["feature"],
             target=log["target"],
