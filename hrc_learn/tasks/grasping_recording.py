@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from .. import viz
+from ..viz import Box, RunRecording
 from ..kinematics import panda
 from .aiming import AimingConfig
 from .recording import record
@@ -53,7 +53,7 @@ class RegionActivity:
         )
 
 
-def record_grasp(run: SimulatedGrasp, config: AimingConfig, title: str) -> viz.RunRecording:
+def record_grasp(run: SimulatedGrasp, config: AimingConfig, title: str) -> RunRecording:
     """Everything worth looking at in a grasp.
 
     Args:
@@ -62,7 +62,7 @@ def record_grasp(run: SimulatedGrasp, config: AimingConfig, title: str) -> viz.R
         title: What it was.
     """
     hover = run.setting.workplace.hover().position.tolist()
-    region = viz.Box(centre=(hover[0], hover[1], hover[2]), half_size=config.half_size)
+    region = Box(centre=(hover[0], hover[1], hover[2]), half_size=config.half_size)
     recording = record(title, run.station, run.world, run.motion, region=region)
     activity = RegionActivity.of(run, config)
     shares = {
