@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NoReturn, SupportsFloat
 
-from .output import new_file
+from hrc_learn.output import new_file
 
 
 def run[Args](main: Callable[[Args], int | None], args: type[Args]) -> NoReturn:

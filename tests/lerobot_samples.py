@@ -12,7 +12,7 @@ from hrc_learn.demos import DatasetWriter
 from hrc_learn.dmp.system.approach import quintic
 from hrc_learn.lerobot import DMPConfig
 from hrc_learn.lerobot.policy.modeling_dmp import DMPPolicy
-from hrc_learn.lerobot.policy.windows import Windows
+from hrc_learn.lerobot.policy.sample_windows import Windows
 
 FPS = 20.0
 NAMES = ["a.pos", "b.pos"]

@@ -22,29 +22,45 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 CORE: dict[str, set[str]] = {
     "pytree": set(),
     "storage": set(),
+    "output": set(),
     "distributed": set(),
+    "protocols": set(),
     "geometry": set(),
-    "kinematics": {"geometry"},
+    "kinematics": {"output", "geometry"},
     "dmp": {"storage", "distributed", "geometry"},
     "regions": {"pytree", "geometry"},
     "jacobian": {"pytree", "storage", "distributed", "geometry"},
     "controller": {"pytree", "geometry", "kinematics", "regions", "jacobian"},
-    "protocols": set(),
+    "deploy": {"pytree", "geometry", "kinematics", "regions", "jacobian", "controller"},
 }
 """Core packages in the order they build on each other, with what each may import."""
 
 EDGES: dict[str, set[str]] = {
-    "output": set(),
-    "cli": {"output"},
-    "demos": {*CORE, "output"},
+    "demos": {*CORE},
     "vision": {*CORE},
-    "viz": {*CORE, "vision", "output"},
-    "human": {*CORE, "viz"},
+    "viz": {*CORE, "vision"},
     "sim": {*CORE, "vision", "viz"},
 }
-"""Edges likewise: where the package meets files, screens, simulators and people."""
+"""Edges likewise: where the package meets files, screens and simulators."""
 
-LAYERS = CORE | EDGES | {"tasks": {*CORE, *EDGES}, "lerobot": {*CORE, *EDGES, "tasks"}}
+WORK: dict[str, set[str]] = {
+    "skills": {*CORE, *EDGES},
+    "learning": {*CORE, *EDGES, "skills"},
+    "hardware": {*CORE, *EDGES},
+    "teleoperation": {*CORE, *EDGES, "skills"},
+}
+"""What puts them to work: skills, learning, people and real devices."""
+
+LAYERS = (
+    CORE
+    | EDGES
+    | WORK
+    | {
+        "experiments": {*CORE, *EDGES, *WORK},
+        "lerobot": {*CORE, *EDGES, *WORK},
+        "cli": {"output"},
+    }
+)
 
 LIBRARIES: dict[str, set[str]] = {
     **{package: {"torch", "jaxtyping", "numpy", "safetensors"} for package in CORE},
@@ -52,10 +68,22 @@ LIBRARIES: dict[str, set[str]] = {
     "output": set(),
     "demos": {"torch", "jaxtyping", "numpy", "pyarrow"},
     "vision": {"jaxtyping", "numpy"},
-    "human": {"torch", "jaxtyping", "numpy", "scipy"},
-    "viz": {"jaxtyping", "numpy", "rerun", "matplotlib", "mpl_toolkits", "cycler", "PIL"},
+    "viz": {
+        "torch",
+        "jaxtyping",
+        "numpy",
+        "rerun",
+        "matplotlib",
+        "mpl_toolkits",
+        "cycler",
+        "PIL",
+    },
     "sim": {"torch", "jaxtyping", "numpy", "mujoco"},
-    "tasks": {"torch", "jaxtyping", "numpy"},
+    "skills": {"torch", "jaxtyping", "numpy"},
+    "learning": {"torch", "jaxtyping", "numpy"},
+    "hardware": {"torch", "jaxtyping", "numpy"},
+    "teleoperation": {"torch", "jaxtyping", "numpy", "scipy"},
+    "experiments": {"torch", "jaxtyping", "numpy", "matplotlib"},
     "lerobot": {"torch", "jaxtyping", "numpy", "lerobot", "gymnasium"},
 }
 """Libraries that modules of a package may import as soon as they are imported."""
@@ -66,8 +94,9 @@ LAZY_LIBRARIES: dict[str, set[str]] = {
     "demos": {"av", "scipy"},
     "vision": {"cv2"},
     "viz": {"rich"},
-    "human": {"viser", "pygame"},
-    "tasks": {"rich"},
+    "hardware": {"franky"},
+    "teleoperation": {"viser", "pygame"},
+    "experiments": {"rich"},
     "lerobot": {"torchvision"},
 }
 """Libraries that they may import in the functions that need them, and nowhere else."""

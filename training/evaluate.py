@@ -17,10 +17,10 @@ from rich.table import Table
 
 from hrc_learn import cli
 from hrc_learn.demos import DemonstrationSet, load_demos, open_demos
+from hrc_learn.learning.channels import KINDS, Motions, load_primitive
+from hrc_learn.learning.reproduction_error import ReproductionError, reproduction_error
 from hrc_learn.output import MADE_BY, new_folder
-from hrc_learn.tasks.kinds import KINDS, Motions, load_primitive
-from hrc_learn.tasks.reproduction_error import ReproductionError, reproduction_error
-from hrc_learn.viz.learning_figures import measures_figure
+from hrc_learn.viz.figures import measures_figure
 
 UNITS = {
     "nrmse": "",

@@ -3,12 +3,7 @@ import torch
 from demo_motions import PERIOD, rhythm, turning_motion
 from dmp_contract import DMPContract
 
-from hrc_learn.dmp import (
-    OrientationDMP,
-    PoseDMP,
-    fit_rhythmic_orientation,
-    fit_rhythmic_pose,
-)
+from hrc_learn.dmp import OrientationDMP, PoseDMP, fit_rhythmic_orientation, fit_rhythmic_pose
 from hrc_learn.dmp.rotation.error import to_error
 from hrc_learn.dmp.rotation.mean import intrinsic_mean
 from hrc_learn.geometry import quaternion

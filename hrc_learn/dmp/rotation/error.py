@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hrc_learn.geometry import quaternion
-from hrc_learn.geometry.left_jacobian import axis_drift, drift_free_rate, drift_free_slope
+from hrc_learn.geometry.rotation_rates import axis_drift, drift_free_rate, drift_free_slope
 
 _NO_AXIS = 1e-9
 """Rotation vectors shorter than this [rad] have no direction of their own."""

@@ -29,7 +29,7 @@ from hrc_learn.dmp.rotation import error as error_space
 from hrc_learn.dmp.rotation.influences import Influences
 from hrc_learn.dmp.state import DMPState
 from hrc_learn.dmp.trajectory import Trajectory
-from hrc_learn.geometry.left_jacobian import axis_drift, drift_free_rate, drift_free_slope
+from hrc_learn.geometry.rotation_rates import axis_drift, drift_free_rate, drift_free_slope
 
 LONGEST = 1 / 200
 """Longest step of a rollout, in s; the fourth power of it is what the rollout is off by."""
