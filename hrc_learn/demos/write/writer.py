@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -159,7 +159,7 @@ class DatasetWriter:
             )
         self._task = task
 
-    def add_frame(self, *, images: Mapping[str, Image] | None = None, **values) -> None:
+    def add_frame(self, *, images: Mapping[str, Image] | None = None, **values: Any) -> None:
         """Add one frame to the open episode.
 
         The first episode saved fixes which quantities are recorded; all later ones
