@@ -229,13 +229,13 @@ def _config(name: str, width: int) -> Any:
 def _train(policy: Any, before: Any, dataset: Path, args: Args, title: str) -> dict[str, float]:
     """As lerobot-train does it, with batches from memory; mean losses of some tenths of it."""
     from hrc_learn.lerobot.policy.closed_form import read_episodes
-    from hrc_learn.lerobot.policy.sample_windows import Windows
+    from hrc_learn.lerobot.policy.sample_windows import SampleWindows
 
     config = policy.config
     episodes = [e | _observation(e[STATE]) for e in read_episodes(dataset, (STATE, ACTION))]
     deltas: dict[str, Sequence[int] | None] = {ACTION: config.action_delta_indices}
     deltas |= dict.fromkeys((STATE, ENVIRONMENT), config.observation_delta_indices)
-    samples = Windows(episodes, deltas, args.fps)
+    samples = SampleWindows(episodes, deltas, args.fps)
     optimizer = config.get_optimizer_preset().build(policy.get_optim_params())
     schedule = CosineAnnealingLR(optimizer, args.steps)
     rng, losses = torch.Generator().manual_seed(args.seed), []

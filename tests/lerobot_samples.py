@@ -12,7 +12,7 @@ from hrc_learn.demos import DatasetWriter
 from hrc_learn.dmp.system.approach import quintic
 from hrc_learn.lerobot import DMPConfig
 from hrc_learn.lerobot.policy.modeling_dmp import DMPPolicy
-from hrc_learn.lerobot.policy.sample_windows import Windows
+from hrc_learn.lerobot.policy.sample_windows import SampleWindows
 
 FPS = 20.0
 NAMES = ["a.pos", "b.pos"]
@@ -114,11 +114,11 @@ def shaken(policy: DMPPolicy, seed: int = 0) -> DMPPolicy:
     return policy
 
 
-def windows(policy: DMPPolicy, episodes: list[Episode]) -> Windows:
+def windows(policy: DMPPolicy, episodes: list[Episode]) -> SampleWindows:
     seen = policy.config.observation_delta_indices
     deltas = {key: seen for key in episodes[0] if key != "action"}
     deltas["action"] = policy.config.action_delta_indices
-    return Windows(episodes, deltas, FPS)
+    return SampleWindows(episodes, deltas, FPS)
 
 
 def played(policy: DMPPolicy, episode: Episode, frames: int | None = None) -> Tensor:

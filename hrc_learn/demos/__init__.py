@@ -7,9 +7,9 @@ from hrc_learn.demos.image_features import Detector as Detector
 from hrc_learn.demos.image_features import attach_features as attach_features
 from hrc_learn.demos.image_features import extract_features as extract_features
 from hrc_learn.demos.issue import DatasetError as DatasetError
-from hrc_learn.demos.issue import Finding as Finding
-from hrc_learn.demos.issue import Report as Report
+from hrc_learn.demos.issue import Issue as Issue
 from hrc_learn.demos.issue import UnitsWarning as UnitsWarning
+from hrc_learn.demos.issue import ValidationReport as ValidationReport
 from hrc_learn.demos.read.component_names import ROLES as ROLES
 from hrc_learn.demos.read.reader import DemonstrationSource as DemonstrationSource
 from hrc_learn.demos.read.reader import load_demos as load_demos

@@ -63,8 +63,9 @@ def decode(
 #
 #     NAME.features/CAMERA.FEATURE/episode_000000.parquet    u, v, visible: one row a frame
 #
-# The dataset itself is never touched. Each file is whole or not there, and says of which video
-# it was made, so that an extraction goes on where it was broken off and notices new recordings.
+# The dataset itself is never touched. Each file is whole or not there, and says of which
+# video it was made, so that an extraction goes on where it was broken off and notices new
+# recordings.
 
 _SOURCE = b"hrc_learn.video"
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 @dataclass(frozen=True, kw_only=True)
-class Finding:
+class Issue:
     """One fault or oddity of a dataset, located as closely as is known."""
 
     message: str
@@ -45,7 +45,7 @@ class DatasetError(ValueError):
         frame: int | None = None,
         key: str | None = None,
     ):
-        self.finding = Finding(
+        self.finding = Issue(
             message=message,
             file=None if file is None else str(file),
             episode=episode,
@@ -79,13 +79,13 @@ class UnitsWarning(UserWarning):
 
 
 @dataclass(kw_only=True)
-class Report:
+class ValidationReport:
     """What is wrong with a dataset (errors), and what is odd (warnings)."""
 
     path: Path
-    errors: list[Finding] = field(default_factory=list)
+    errors: list[Issue] = field(default_factory=list)
     """Faults that lose data or mislead a reader."""
-    warnings: list[Finding] = field(default_factory=list)
+    warnings: list[Issue] = field(default_factory=list)
     """Oddities worth a look before training."""
     episodes: int = 0
     """Episodes whose frames could be read."""
@@ -98,12 +98,12 @@ class Report:
         return not self.errors
 
     def error(self, message: str, **place) -> None:
-        """Add an error; `place` as in `Finding`."""
-        self.errors.append(Finding(message=message, **place))
+        """Add an error; `place` as in `Issue`."""
+        self.errors.append(Issue(message=message, **place))
 
     def warning(self, message: str, **place) -> None:
-        """Add a warning; `place` as in `Finding`."""
-        self.warnings.append(Finding(message=message, **place))
+        """Add a warning; `place` as in `Issue`."""
+        self.warnings.append(Issue(message=message, **place))
 
     def add(self, error: DatasetError) -> None:
         """Add what a reading function raised."""
@@ -113,7 +113,7 @@ class Report:
     def lines(self) -> Iterator[str]:
         """The report in words; findings alike but for the episode share a line."""
         for kind, findings in (("error", self.errors), ("warning", self.warnings)):
-            alike: dict[tuple, list[Finding]] = {}
+            alike: dict[tuple, list[Issue]] = {}
             for finding in findings:
                 alike.setdefault((finding.key, finding.message), []).append(finding)
             for first, *others in alike.values():

@@ -248,13 +248,13 @@ def serving(title: str, config: ServeConfig, on_open: Callable[[str], None]) -> 
     def watch(station: Station, world: World, motion: MotionLog) -> Iterator[None]:
         from hrc_learn.viz.live_dashboard import (
             live_dashboard,  # rerun takes a second
-            served,
+            serve_stream,
         )
 
         def snapshot():
             return record(title, station, world, motion) if len(motion) else None
 
-        with served(config.port, config.data_port) as server:
+        with serve_stream(config.port, config.data_port) as server:
             on_open(server.viewer)
             with live_dashboard(server.stream, snapshot, period=config.period):
                 yield

@@ -12,10 +12,10 @@ from hrc_learn.learning.fit_visual_servo import Demonstrations, Watching
 from hrc_learn.skills.visual_servoing import AimingSkill
 from hrc_learn.viz import (
     DemonstrationsRecording,
+    DemonstrationTrace,
     ErrorMap,
     JointLimits,
     LearningRecording,
-    ShownDemonstration,
 )
 from hrc_learn.viz.arm_bodies import panda_bodies
 
@@ -114,14 +114,14 @@ def demonstrations_recording(demos: DemonstrationSet, title: str) -> Demonstrati
     )
 
 
-def _shown(demo: Demonstration, is_panda: bool) -> ShownDemonstration:
+def _shown(demo: Demonstration, is_panda: bool) -> DemonstrationTrace:
     q, position = demo.joint_position, demo.position
     bodies = ()
     if is_panda and q is not None:
         bodies = panda_bodies(q)
         if position is None:
             position = panda.forward(torch.from_numpy(q)).position.numpy()
-    return ShownDemonstration(
+    return DemonstrationTrace(
         episode=demo.episode,
         task=demo.task,
         time=demo.time,

@@ -71,8 +71,7 @@ class Device:
 # Which of our robots are connected in this process.
 #
 # LeRobot tells a teleoperator nothing of the robot it leads. One that leads the hand, rather
-# than
-# copying joints of its own, needs to know where the arm is.
+# than copying joints of its own, needs to know where the arm is.
 
 CONNECTED: list[PandaRobot] = []
 """In the order they were connected in."""

@@ -7,12 +7,12 @@ it is asked for: `hrc_learn.viz.run_dashboard` and `fit_dashboard` import rerun,
 
 from hrc_learn.viz.recordings import CameraRecording as CameraRecording
 from hrc_learn.viz.recordings import DemonstrationsRecording as DemonstrationsRecording
+from hrc_learn.viz.recordings import DemonstrationTrace as DemonstrationTrace
 from hrc_learn.viz.recordings import ErrorMap as ErrorMap
 from hrc_learn.viz.recordings import FitRecording as FitRecording
 from hrc_learn.viz.recordings import JointLimits as JointLimits
 from hrc_learn.viz.recordings import LearningRecording as LearningRecording
 from hrc_learn.viz.recordings import RunRecording as RunRecording
-from hrc_learn.viz.recordings import ShownDemonstration as ShownDemonstration
 from hrc_learn.viz.recordings import SweepRecording as SweepRecording
 from hrc_learn.viz.recordings import SweptTrials as SweptTrials
 from hrc_learn.viz.step_log import Event as Event

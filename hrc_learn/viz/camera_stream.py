@@ -9,7 +9,7 @@ from PIL import Image
 
 from hrc_learn.viz import palette
 from hrc_learn.viz.recordings import CameraRecording
-from hrc_learn.viz.rerun_stream import StillThings, seconds, thin
+from hrc_learn.viz.rerun_stream import StaticShapes, seconds, thin
 
 _CROSS = 60.0  # half the size of the mark of the target [px]
 _ROOT = "world/camera/image"
@@ -18,7 +18,7 @@ _ROOT = "world/camera/image"
 class CameraStream:
     """Sends the frustum of a camera, its images, and marks over them."""
 
-    def __init__(self, stream: rr.RecordingStream, still: StillThings, quality: int):
+    def __init__(self, stream: rr.RecordingStream, still: StaticShapes, quality: int):
         """Send to a recording stream.
 
         Args:

@@ -10,11 +10,11 @@ from jaxtyping import Float
 
 from hrc_learn.viz import palette
 from hrc_learn.viz.panels import Curves, Plot, Tab, limit_curves, several, single
-from hrc_learn.viz.recordings import DemonstrationsRecording, ShownDemonstration
+from hrc_learn.viz.recordings import DemonstrationsRecording, DemonstrationTrace
 from hrc_learn.viz.rerun_stream import (
     TIMELINE,
-    StillThings,
-    look_at_all,
+    StaticShapes,
+    frame_view,
     rrd_file,
     samples,
     seconds,
@@ -29,7 +29,7 @@ _POINT_RATE = 30.0
 
 Timed = tuple[Float[np.ndarray, "_"], Curves]
 """Curves, and the times of their samples [s]."""
-Shown = tuple[Tab, list[Timed]]
+DemonstrationView = tuple[Tab, list[Timed]]
 """A tab, and all that is drawn in it."""
 
 
@@ -53,7 +53,7 @@ def record_demonstrations(
                 send_curves(stream, time, curve)
 
 
-def _together(shown: DemonstrationsRecording) -> Shown:
+def _together(shown: DemonstrationsRecording) -> DemonstrationView:
     """Every joint, and the feature, of all demonstrations over one another."""
     drawn = [
         (f"{name} [rad]", _limits(shown, j) + _over_one_another(shown, "joint_position", j))
@@ -99,7 +99,7 @@ def _colour(k: int) -> str:
     return palette.SERIES_ON_DARK[k % len(palette.SERIES_ON_DARK)]
 
 
-def _alone(shown: DemonstrationsRecording, demo: ShownDemonstration) -> Shown:
+def _alone(shown: DemonstrationsRecording, demo: DemonstrationTrace) -> DemonstrationView:
     """Everything that was recorded of one demonstration."""
     plots = tuple(
         Plot(title=title, curves=(curves,), legend=True)
@@ -110,7 +110,7 @@ def _alone(shown: DemonstrationsRecording, demo: ShownDemonstration) -> Shown:
 
 
 def _recorded(
-    joint_names: tuple[str, ...], demo: ShownDemonstration
+    joint_names: tuple[str, ...], demo: DemonstrationTrace
 ) -> Iterator[tuple[str, Curves]]:
     root = f"episode_{demo.episode}"
     for title, name, names, values in (
@@ -138,7 +138,7 @@ def _send_space(stream: rr.RecordingStream, shown: DemonstrationsRecording) -> N
         at = samples(demo.time, _POINT_RATE)
         columns = rr.Points3D.columns(positions=demo.position[at])
         stream.send_columns(now, seconds(demo.time[at]), columns)
-    first, still = shown.demonstrations[0], StillThings(stream)
+    first, still = shown.demonstrations[0], StaticShapes(stream)
     for body in first.bodies:
         send_shapes(still, body)
         send_poses(stream, first.time, body, samples(first.time, _POINT_RATE))
@@ -166,7 +166,7 @@ def _blueprint(shown: DemonstrationsRecording, tabs: list[Tab]) -> rrb.Blueprint
             rrb.Spatial3DView(
                 origin="/world",
                 name=f"Paths of the hand, dots: now{arm}",
-                eye_controls=look_at_all(np.concatenate(paths)),
+                eye_controls=frame_view(np.concatenate(paths)),
             )
         )
     left.append(rrb.TextDocumentView(origin="/summary", name="Demonstrations"))

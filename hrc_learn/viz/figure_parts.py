@@ -60,7 +60,7 @@ def finite_span(
         axes.set_xlim(time[known][0], time[known][-1])
 
 
-def spells(active: Bool[np.ndarray, " time"]) -> list[tuple[int, int]]:
+def active_intervals(active: Bool[np.ndarray, " time"]) -> list[tuple[int, int]]:
     """First and last index of every run of true samples."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], active, [False]]).astype(int)))
     return [(int(a), int(b) - 1) for a, b in zip(edges[::2], edges[1::2], strict=True)]
@@ -70,7 +70,7 @@ def shade(
     axes: Axes, time: Float[np.ndarray, " time"], active: Bool[np.ndarray, " time"]
 ) -> None:
     """Shade the spells in which something was active."""
-    for first, last in spells(active):
+    for first, last in active_intervals(active):
         axes.axvspan(time[first], time[last], color=palette.PERSON, alpha=0.13, lw=0)
 
 

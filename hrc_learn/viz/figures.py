@@ -29,8 +29,8 @@ from hrc_learn.viz.recordings import FitRecording, JointLimits, RunRecording
 
 # Figures of runs and fits for reports and papers.
 #
-# Plain matplotlib `Figure` objects: no pyplot, no global state, no window. Every function takes
-# the recording that the dashboards take, and raises ValueError where it lacks the data.
+# Plain matplotlib `Figure` objects: no pyplot, no global state, no window. Every function
+# takes the recording that the dashboards take, and raises ValueError where it lacks the data.
 
 
 def image_figure(run: RunRecording) -> Figure:

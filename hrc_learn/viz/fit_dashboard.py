@@ -24,7 +24,7 @@ from hrc_learn.viz.recordings import ErrorMap, FitRecording, LearningRecording
 from hrc_learn.viz.rerun_stream import (
     TIMELINE,
     boxes,
-    look_at_all,
+    frame_view,
     rrd_file,
     samples,
     seconds,
@@ -126,7 +126,7 @@ def _blueprint(fit: FitRecording, tabs: list[Tab]) -> rrb.Blueprint:
             rrb.Spatial3DView(
                 origin="/world",
                 name="Paths: demonstrations (grey), reproductions (blue, dots: now)",
-                eye_controls=look_at_all(every, base=bool(fit.boxes)),
+                eye_controls=frame_view(every, base=bool(fit.boxes)),
             )
         )
     left.append(rrb.TextDocumentView(origin="/summary", name="Fit"))

@@ -106,7 +106,7 @@ def live_dashboard(
 # A recording stream that a browser shows while it is written.
 
 
-class Served(NamedTuple):
+class DashboardServer(NamedTuple):
     """A stream that is served on this machine."""
 
     stream: rr.RecordingStream
@@ -117,7 +117,7 @@ class Served(NamedTuple):
 
 
 @contextmanager
-def served(port: int = 9090, data_port: int = 9876) -> Iterator[Served]:
+def serve_stream(port: int = 9090, data_port: int = 9876) -> Iterator[DashboardServer]:
     """Serve a stream and a viewer for it, for as long as the `with` block lasts.
 
     Who opens the page later sees all that was sent before, as far as a gigabyte goes.
@@ -135,7 +135,9 @@ def served(port: int = 9090, data_port: int = 9876) -> Iterator[Served]:
     data = stream.serve_grpc(grpc_port=data_port)
     rr.serve_web_viewer(web_port=port, open_browser=False, connect_to=data)
     try:
-        yield Served(stream, f"http://127.0.0.1:{port}?url={quote(data, safe='')}", data)
+        yield DashboardServer(
+            stream, f"http://127.0.0.1:{port}?url={quote(data, safe='')}", data
+        )
     finally:
         stream.disconnect()
 

@@ -39,7 +39,7 @@ def rgba(colour: str, opacity: float = 1.0) -> tuple[int, int, int, int]:
     return r, g, b, round(255 * opacity)
 
 
-def lighter(colour: str, share: float = 0.55) -> tuple[int, int, int, int]:
+def lighten(colour: str, share: float = 0.55) -> tuple[int, int, int, int]:
     """A colour mixed with white, for the curve that lies behind."""
     r, g, b, a = rgba(colour)
     return *(round(c + share * (255 - c)) for c in (r, g, b)), a  # pyright: ignore[reportReturnType]

@@ -223,5 +223,5 @@ def several(
     names = tuple(names)
     colours = palette.SERIES_ON_DARK
     chosen = [colours[i % len(colours)] for i in range(len(names))]
-    mixed = tuple(palette.lighter(c) if light else palette.rgba(c) for c in chosen)
+    mixed = tuple(palette.lighten(c) if light else palette.rgba(c) for c in chosen)
     return Curves(path=path, names=names, values=values, colours=mixed, width=width)

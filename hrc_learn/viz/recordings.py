@@ -206,7 +206,7 @@ class FitRecording:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class ShownDemonstration:
+class DemonstrationTrace:
     """One demonstration; whatever was not recorded is None.
 
     Raises:
@@ -261,7 +261,7 @@ class DemonstrationsRecording:
 
     title: str
     joint_names: tuple[str, ...]
-    demonstrations: tuple[ShownDemonstration, ...]
+    demonstrations: tuple[DemonstrationTrace, ...]
     joint_limits: JointLimits | None = None
     notes: tuple[str, ...] = ()
     """What was guessed or odd when they were read."""

@@ -51,7 +51,7 @@ def begin(stream: rr.RecordingStream, title: str) -> None:
 Logged = rr.AsComponents | tuple[rr.AsComponents, ...]
 
 
-class StillThings:
+class StaticShapes:
     """Sends what has no time, once, and again only if it changed."""
 
     def __init__(self, stream: rr.RecordingStream):
@@ -114,7 +114,7 @@ def body_path(body: Body) -> str:
     return f"world/bodies/{body.name}"
 
 
-def send_shapes(still: StillThings, body: Body) -> None:
+def send_shapes(still: StaticShapes, body: Body) -> None:
     """Send what a body looks like."""
     path, mesh, plain = body_path(body), body.mesh, body.boxes
     if mesh is not None:
@@ -209,7 +209,7 @@ def plot_view(plot: Plot) -> rrb.TimeSeriesView:
     )
 
 
-def look_at_all(path: Float[np.ndarray, "n 3"], *, base: bool = True) -> rrb.EyeControls3D:
+def frame_view(path: Float[np.ndarray, "n 3"], *, base: bool = True) -> rrb.EyeControls3D:
     """An eye in front of the robot, to its left, that sees the whole path.
 
     Args:

@@ -15,9 +15,9 @@ from hrc_learn.viz.panels import Plot, run_tabs, several
 from hrc_learn.viz.recordings import RunRecording
 from hrc_learn.viz.rerun_stream import (
     TIMELINE,
-    StillThings,
+    StaticShapes,
     boxes,
-    look_at_all,
+    frame_view,
     plot_view,
     rrd_file,
     samples,
@@ -46,7 +46,7 @@ def run_layout(run: RunRecording) -> rrb.Blueprint:
         origin="/world",
         contents=["+ /world/**", "- /world/camera/image/**"],
         name="Robot: path of the run (blue), demonstration (grey), plan (orange)",
-        eye_controls=look_at_all(_sights(run)),
+        eye_controls=frame_view(_sights(run)),
     )
     left: list[rrb.View] = [scene]
     if run.camera is not None:
@@ -100,7 +100,7 @@ class RunStream:
             stream: Into a file or to a viewer.
             image_quality: Of the JPEG images, 1 to 95.
         """
-        self._stream, self._still = stream, StillThings(stream)
+        self._stream, self._still = stream, StaticShapes(stream)
         self._camera = CameraStream(stream, self._still, image_quality)
         self._rows = self._phases = 0
         self._outline: tuple | None = None
@@ -229,7 +229,7 @@ class LogStream:
             columns: Columns of the log to send.
             time: Column that holds the time [s].
         """
-        self._log, self._stream, self._still = log, stream, StillThings(stream)
+        self._log, self._stream, self._still = log, stream, StaticShapes(stream)
         self._columns, self._time = tuple(columns), time
         self._rows = 0
         views = [plot_view(_plot(name, np.empty((0, 1)))) for name in self._columns]

@@ -63,9 +63,9 @@ def set_value(values, where, value):
 
 def find(findings, message):
     """The one finding whose text matches."""
-    matching = [f for f in findings if re.search(message, f.message)]
-    assert len(matching) == 1, f"{message!r} in {[str(f) for f in findings]}"
-    return matching[0]
+    column_mapping = [f for f in findings if re.search(message, f.message)]
+    assert len(column_mapping) == 1, f"{message!r} in {[str(f) for f in findings]}"
+    return column_mapping[0]
 
 
 def test_a_sound_dataset_has_no_findings_but_the_guess_of_units(root):

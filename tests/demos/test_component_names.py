@@ -2,7 +2,11 @@
 
 import pytest
 
-from hrc_learn.demos.read.component_names import Meaning, meaning_of_component, role_of_key
+from hrc_learn.demos.read.component_names import (
+    ComponentMeaning,
+    meaning_of_component,
+    role_of_key,
+)
 
 
 @pytest.mark.parametrize(
@@ -25,7 +29,7 @@ from hrc_learn.demos.read.component_names import Meaning, meaning_of_component, 
     ],
 )
 def test_names_that_speak(name, role, slot):
-    assert meaning_of_component(name) == Meaning(role, slot)
+    assert meaning_of_component(name) == ComponentMeaning(role, slot)
 
 
 @pytest.mark.parametrize(

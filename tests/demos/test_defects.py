@@ -7,7 +7,7 @@ import pytest
 from broken_copies import DEFECTS, HARMLESS, STATE, Copy
 from lerobot_folders import joint_path, write_folder
 
-from hrc_learn.demos import DatasetError, Finding, check_dataset, load_demos
+from hrc_learn.demos import DatasetError, Issue, check_dataset, load_demos
 
 NETWORK = re.compile(r"hub|network|internet|offline|download|connection", re.IGNORECASE)
 
@@ -24,7 +24,7 @@ def copy(tmp_path, request):
     return Copy(root)
 
 
-def assert_place(found: Finding, defect, copy: Copy) -> None:
+def assert_place(found: Issue, defect, copy: Copy) -> None:
     versions_own = {
         "data": copy.data,
         "episodes": "meta/episodes" if copy.v3 else copy.episodes_file,

@@ -21,7 +21,7 @@ def test_a_station_is_shown_while_it_works(tmp_path, monkeypatch):
     def into_a_file(port, data_port):
         stream = rr.RecordingStream("test")
         stream.save(tmp_path / "live.rrd")
-        yield servers.Served(stream, f"http://viewer:{port}", f"data:{data_port}")
+        yield servers.DashboardServer(stream, f"http://viewer:{port}", f"data:{data_port}")
         stream.disconnect()
 
     monkeypatch.setattr(servers, "served", into_a_file)

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from hrc_learn.geometry import quaternion
-from hrc_learn.lerobot.policy.action_encoding import ActionChart
+from hrc_learn.lerobot.policy.action_encoding import ActionEncoding
 
 
 def poses(tilt: float) -> torch.Tensor:
@@ -17,9 +17,9 @@ def poses(tilt: float) -> torch.Tensor:
 
 def test_there_and_back_is_the_same_pose():
     shown = poses(0.3)
-    chart = ActionChart(6, [[3, 4, 5]]).double()
-    chart.learn([shown])
-    back = chart.to_actions(chart.to_coordinates(shown))
+    encoding = ActionEncoding(6, [[3, 4, 5]]).double()
+    encoding.learn([shown])
+    back = encoding.to_actions(encoding.to_coordinates(shown))
     torch.testing.assert_close(back[:, :3], shown[:, :3], rtol=0, atol=1e-9)
     p, q = (quaternion.exp(x[:, 3:]) for x in (back, shown))
     assert quaternion.angle(p, q).max() < 1e-7
@@ -29,24 +29,24 @@ def test_coordinates_are_white_and_turn_smoothly_where_vectors_jump():
     shown = poses(0.3)
     # The shortest vectors jump from one side to the other.
     assert shown[:, 3:].diff(dim=0).norm(dim=-1).max() > 5
-    chart = ActionChart(6, [[3, 4, 5]]).double()
-    chart.learn([shown[:10], shown[10:]])
-    coordinates = chart.to_coordinates(shown)
+    encoding = ActionEncoding(6, [[3, 4, 5]]).double()
+    encoding.learn([shown[:10], shown[10:]])
+    coordinates = encoding.to_coordinates(shown)
     torch.testing.assert_close(coordinates.std(0), torch.ones(6).double())
     assert coordinates.mean(0).abs().max() < 1e-9
     assert coordinates.diff(dim=0).abs().max() < 2
-    assert chart.to_actions(coordinates)[:, 3:].diff(dim=0).norm(dim=-1).max() < 0.5
+    assert encoding.to_actions(coordinates)[:, 3:].diff(dim=0).norm(dim=-1).max() < 0.5
 
 
 def test_what_never_moves_is_not_blown_up():
-    chart = ActionChart(2, []).double()
+    encoding = ActionEncoding(2, []).double()
     shown = torch.tensor([[1.0, 5.0], [2.0, 5.0]], dtype=torch.float64)
-    chart.learn([shown])
-    assert chart.to_coordinates(shown + 1e-3)[:, 1].abs().max() <= 1 + 1e-9
+    encoding.learn([shown])
+    assert encoding.to_coordinates(shown + 1e-3)[:, 1].abs().max() <= 1 + 1e-9
 
 
 def test_more_than_half_a_turn_is_refused():
     angle = torch.linspace(-4, 4, 50, dtype=torch.float64)[:, None]
     turning = angle * torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     with pytest.raises(ValueError, match="demonstration 0 turns the hand by more than half"):
-        ActionChart(3, [[0, 1, 2]]).double().learn([turning])
+        ActionEncoding(3, [[0, 1, 2]]).double().learn([turning])

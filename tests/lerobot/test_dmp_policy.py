@@ -115,7 +115,7 @@ def test_what_explains_nothing_is_not_followed():
     policy, misled = fitted_policy(SHOWN), fitted_policy(others)
 
     def difference(policy):
-        ends = [policy.planner.open(seen).context for seen in (one, other)]
+        ends = [policy.planner.initial_plan(seen).context for seen in (one, other)]
         slopes = policy.planner.motion.slopes
         return float(((ends[0] - ends[1]) @ slopes).norm())
 

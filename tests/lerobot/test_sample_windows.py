@@ -2,7 +2,7 @@ import pytest
 import torch
 from lerobot_samples import reaching
 
-from hrc_learn.lerobot.policy.sample_windows import Windows
+from hrc_learn.lerobot.policy.sample_windows import SampleWindows
 
 EPISODES = reaching(3)
 DELTAS = {"observation.state": [-1000, 0], "action": [-2, 0, 5], "observation.goal": None}
@@ -10,7 +10,7 @@ DELTAS = {"observation.state": [-1000, 0], "action": [-2, 0, 5], "observation.go
 
 def test_samples_are_what_a_loop_over_frames_gives():
     episodes = [e | {"observation.goal": e["observation.environment_state"]} for e in EPISODES]
-    samples = Windows(episodes, DELTAS, fps=20)
+    samples = SampleWindows(episodes, DELTAS, fps=20)
     batch = samples.batch(torch.arange(len(samples)))
     k = 0
     for episode in episodes:
@@ -28,7 +28,7 @@ def test_samples_are_what_a_loop_over_frames_gives():
 
 
 def test_samples_are_drawn_from_all_frames():
-    samples = Windows(EPISODES, {"action": None}, fps=20)
+    samples = SampleWindows(EPISODES, {"action": None}, fps=20)
     drawn = samples.draw(500, torch.Generator().manual_seed(0))
     again = samples.draw(500, torch.Generator().manual_seed(0))
     assert drawn["action"].equal(again["action"])

@@ -1,5 +1,6 @@
 """Processor steps that keep any policy's actions within limits."""
 
+import gc
 import json
 
 import numpy as np
@@ -13,7 +14,7 @@ from lerobot.processor.converters import (
     transition_to_policy_action,
 )
 
-from hrc_learn.lerobot.processor import add_smoothing
+from hrc_learn.lerobot.processor import WatchStateStep, add_smoothing
 from hrc_learn.lerobot.processor.action_limits import ActionLimits
 from hrc_learn.lerobot.processor.checkpoint_steps import (
     POSTPROCESSOR,
@@ -139,3 +140,15 @@ def test_actions_of_another_width_are_refused(checkpoint):
     _, after, _ = loaded(checkpoint)
     with pytest.raises(ValueError, match="3 values"):
         after(torch.zeros(1, 3))
+
+
+def test_a_step_that_is_gone_is_no_longer_asked():
+    """Two policies in one process: what the first one saw is not taken for the second's."""
+    watch = WatchStateStep(pair="of a policy")
+    watch(batch_to_transition({"observation.state": torch.tensor([[0.25, 0.5]])}))
+    seen = WatchStateStep.newest_state("of a policy")
+    assert seen is not None
+    assert seen.tolist() == [[0.25, 0.5]]
+    del watch
+    gc.collect()
+    assert WatchStateStep.newest_state("of a policy") is None

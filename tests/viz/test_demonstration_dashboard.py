@@ -5,11 +5,11 @@ import pytest
 from rrd_reading import Rrd
 from sample_runs import LIMITS, NAMES, sample_run
 
-from hrc_learn.viz import DemonstrationsRecording, ShownDemonstration
+from hrc_learn.viz import DemonstrationsRecording, DemonstrationTrace
 from hrc_learn.viz.demonstration_dashboard import record_demonstrations
 
 
-def shown(episode: int, steps: int, **changes) -> ShownDemonstration:
+def shown(episode: int, steps: int, **changes) -> DemonstrationTrace:
     time = np.arange(steps) / 50
     feature = np.stack([100 + time, 200 - time], axis=-1)
     feature[3:6] = np.nan
@@ -20,7 +20,7 @@ def shown(episode: int, steps: int, **changes) -> ShownDemonstration:
         "human_effort": np.ones((steps, 7)),
         "gripper": np.full(steps, 0.04),
     }
-    return ShownDemonstration(episode=episode, task="place", time=time, **(values | changes))
+    return DemonstrationTrace(episode=episode, task="place", time=time, **(values | changes))
 
 
 @pytest.fixture(scope="module")

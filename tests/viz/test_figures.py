@@ -10,7 +10,7 @@ from sample_runs import NAMES, STEPS, sample_fit, sample_run
 
 from hrc_learn.geometry import Box
 from hrc_learn.viz import figures
-from hrc_learn.viz.figure_parts import near, spells
+from hrc_learn.viz.figure_parts import active_intervals, near
 
 RUN_FIGURES = [
     figures.image_figure,
@@ -139,8 +139,8 @@ def test_a_fit_without_residuals_has_no_residual_figure():
 def test_spells_are_the_runs_of_true_samples():
     active = np.zeros(STEPS, dtype=bool)
     active[[0, 1, 5, 198, 199]] = True
-    assert spells(active) == [(0, 1), (5, 5), (198, 199)]
-    assert spells(np.zeros(4, dtype=bool)) == []
+    assert active_intervals(active) == [(0, 1), (5, 5), (198, 199)]
+    assert active_intervals(np.zeros(4, dtype=bool)) == []
 
 
 def test_boxes_are_cut_to_the_surroundings_of_the_paths():

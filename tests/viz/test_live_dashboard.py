@@ -15,7 +15,7 @@ from rrd_reading import Rrd
 from sample_runs import sample_run, until
 
 from hrc_learn.viz import StepLog
-from hrc_learn.viz.live_dashboard import LiveSender, live_dashboard, served
+from hrc_learn.viz.live_dashboard import LiveSender, live_dashboard, serve_stream
 from hrc_learn.viz.panels import run_tabs
 from hrc_learn.viz.run_dashboard import LogStream, record_run
 
@@ -133,7 +133,7 @@ def test_a_viewer_that_connects_gets_the_run(tmp_path):
         pytest.skip("no rerun command beside python")
     run, got = sample_run(), tmp_path / "got.rrd"
     page, data = free_ports()
-    with served(page, data) as server:
+    with serve_stream(page, data) as server:
         assert server.viewer.startswith(f"http://127.0.0.1:{page}?url=")
         with live_dashboard(server.stream, lambda: run):
             pass
@@ -171,5 +171,5 @@ def test_a_port_that_is_taken_is_said():
         taken.bind(("", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        with pytest.raises(ValueError, match=f"port {port} is taken"), served(port):
+        with pytest.raises(ValueError, match=f"port {port} is taken"), serve_stream(port):
             pass

@@ -18,7 +18,7 @@ from hrc_learn.store import settle
 # Where the parts of a LeRobot dataset lie, for its versions 2.0, 2.1 and 3.0.
 #
 # Reads the metadata alone. The three versions end in one form, `DatasetFolder`; what the
-# frames hold is the business of `frames` and `matching`.
+# frames hold is the business of `frames` and `column_mapping`.
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -28,7 +28,7 @@ Segments = Mapping[str, VideoSegment]
 """Video feature -> its images during one episode."""
 
 
-class VideoShelf:
+class VideoPlacement:
     """Files of videos as they are placed in a new dataset: each once, whoever shares it."""
 
     def __init__(self, root: Path, taken: Mapping[str, int] | None = None):

@@ -13,7 +13,7 @@ from hrc_learn.demos.read.component_names import (
     INDEX_KEYS,
     ORIENTATION_ROLES,
     ROLES,
-    Meaning,
+    ComponentMeaning,
     meaning_of_component,
     role_of_key,
     says_joint_quantity,
@@ -29,7 +29,7 @@ _RANGE = re.compile(r"(.+)\[(\d*):?(\d*)\]")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Selection:
+class ColumnSelection:
     """Columns that hold one quantity."""
 
     role: str
@@ -40,10 +40,10 @@ class Selection:
     numbered: bool = False
     """Whether the dataset gave no names, so that the labels only count."""
 
-    def only(self, labels: Sequence[str]) -> "Selection":
+    def only(self, labels: Sequence[str]) -> "ColumnSelection":
         """The columns of these labels, in this order."""
         place = dict(zip(self.labels, self.columns, strict=True))
-        return Selection(
+        return ColumnSelection(
             role=self.role,
             columns=tuple(place[label] for label in labels),
             labels=tuple(labels),
@@ -53,7 +53,7 @@ class Selection:
 
 def parse_mapping(
     mapping: MappingSpec, features: Mapping[str, Feature]
-) -> dict[str, Selection]:
+) -> dict[str, ColumnSelection]:
     """The columns a mapping asks for.
 
     Raises:
@@ -73,7 +73,7 @@ def parse_mapping(
 
 def _selection(
     role: str, columns: str | Sequence[str], features: Mapping[str, Feature]
-) -> Selection:
+) -> ColumnSelection:
     if isinstance(columns, str):
         places = _feature_range(role, columns, features)
     else:
@@ -86,7 +86,7 @@ def _selection(
         f"joint_{n + 1}" if known is None else _label(known[index], role)
         for n, (known, (_, index)) in enumerate(zip(names, places, strict=True))
     )
-    return Selection(
+    return ColumnSelection(
         role=role, columns=tuple(places), labels=labels, numbered=any(n is None for n in names)
     )
 
@@ -149,10 +149,10 @@ _COMMANDS = {"joint_position": "command_position", "joint_velocity": "command_ve
 
 
 @dataclass(frozen=True, kw_only=True)
-class Matching:
+class ColumnMapping:
     """What the columns of a dataset mean."""
 
-    selections: dict[str, Selection]
+    selections: dict[str, ColumnSelection]
     """By role."""
     joint_names: tuple[str, ...]
     extra: tuple[str, ...]
@@ -163,9 +163,9 @@ class Matching:
     """Quantities of other joints than `joint_names`: role -> their joints."""
 
 
-def match_columns(
+def map_columns(
     features: Mapping[str, Feature], sidecar: Sidecar, mapping: MappingSpec | None = None
-) -> Matching:
+) -> ColumnMapping:
     """Find the quantities among the features.
 
     Args:
@@ -203,7 +203,7 @@ def match_columns(
         for key, feature in usable.items()
         if any((key, index) not in taken for index in range(feature.width))
     ]
-    return Matching(
+    return ColumnMapping(
         selections=found,
         joint_names=names,
         extra=tuple(extra),
@@ -213,8 +213,8 @@ def match_columns(
 
 
 def _override(
-    found: dict[str, Selection], mapping: MappingSpec, features: Mapping[str, Feature]
-) -> dict[str, Selection]:
+    found: dict[str, ColumnSelection], mapping: MappingSpec, features: Mapping[str, Feature]
+) -> dict[str, ColumnSelection]:
     explicit = parse_mapping(mapping, features)
     dropped = set(mapping)
     if dropped & set(ORIENTATION_ROLES):
@@ -222,9 +222,11 @@ def _override(
     return {role: s for role, s in found.items() if role not in dropped} | explicit
 
 
-def _by_convention(features: Mapping[str, Feature], notes: list[str]) -> dict[str, Selection]:
-    whole: dict[str, Selection] = {}
-    by_component: dict[str, Selection] = {}
+def _by_convention(
+    features: Mapping[str, Feature], notes: list[str]
+) -> dict[str, ColumnSelection]:
+    whole: dict[str, ColumnSelection] = {}
+    by_component: dict[str, ColumnSelection] = {}
     for feature in features.values():
         selections = _of_whole_feature(feature, notes)
         known = whole if selections else by_component
@@ -233,7 +235,7 @@ def _by_convention(features: Mapping[str, Feature], notes: list[str]) -> dict[st
     return by_component | whole
 
 
-def _of_whole_feature(feature: Feature, notes: list[str]) -> list[Selection]:
+def _of_whole_feature(feature: Feature, notes: list[str]) -> list[ColumnSelection]:
     """Selections of a feature whose key says what it is, [] for all others."""
     role = role_of_key(feature.key)
     if role is None or (_is_command(feature) and role not in _COMMANDS):
@@ -257,7 +259,7 @@ def _of_whole_feature(feature: Feature, notes: list[str]) -> list[Selection]:
     return [_select(role, feature, indices)]
 
 
-def _cartesian(feature: Feature, notes: list[str]) -> list[Selection]:
+def _cartesian(feature: Feature, notes: list[str]) -> list[ColumnSelection]:
     """A pose in one feature without telling names: told apart by its width."""
     indices = range(feature.width)
     position = _select("position", feature, indices[:3])
@@ -278,7 +280,7 @@ def _cartesian(feature: Feature, notes: list[str]) -> list[Selection]:
     return []
 
 
-def _of_components(feature: Feature, notes: list[str]) -> list[Selection]:
+def _of_components(feature: Feature, notes: list[str]) -> list[ColumnSelection]:
     """Selections of a feature of mixed content, such as `observation.state`."""
     mixed = feature.key in (*_STATE_KEYS, *_ACTION_KEYS)
     names = feature.names
@@ -296,15 +298,15 @@ def _of_components(feature: Feature, notes: list[str]) -> list[Selection]:
         ]
     elif not any(map(says_joint_quantity, names)):
         meanings = [
-            meaning or Meaning("joint_position", name)
+            meaning or ComponentMeaning("joint_position", name)
             for name, meaning in zip(names, meanings, strict=True)
         ]
     return _grouped(feature, meanings, notes)
 
 
 def _grouped(
-    feature: Feature, meanings: Sequence[Meaning | None], notes: list[str]
-) -> list[Selection]:
+    feature: Feature, meanings: Sequence[ComponentMeaning | None], notes: list[str]
+) -> list[ColumnSelection]:
     groups: dict[str, dict[str | int, int]] = {}
     for index, meaning in enumerate(meanings):
         if meaning is not None:
@@ -326,7 +328,9 @@ def _grouped(
         labels = tuple(map(str, order))
         columns = tuple((feature.key, slots[slot]) for slot in order)
         selections.append(
-            Selection(role=role, columns=columns, labels=labels, numbered=feature.names is None)
+            ColumnSelection(
+                role=role, columns=columns, labels=labels, numbered=feature.names is None
+            )
         )
     return selections
 
@@ -334,14 +338,16 @@ def _grouped(
 _POSES = ("position", *ORIENTATION_ROLES)
 
 
-def _select(role: str, feature: Feature, indices: Sequence[int]) -> Selection:
+def _select(role: str, feature: Feature, indices: Sequence[int]) -> ColumnSelection:
     names = feature.names or tuple(f"joint_{i + 1}" for i in range(feature.width))
     labels = tuple(
         names[i].rpartition(".")[0] if says_joint_quantity(names[i]) else names[i]
         for i in indices
     )
     columns = tuple((feature.key, index) for index in indices)
-    return Selection(role=role, columns=columns, labels=labels, numbered=feature.names is None)
+    return ColumnSelection(
+        role=role, columns=columns, labels=labels, numbered=feature.names is None
+    )
 
 
 def _is_command(feature: Feature) -> bool:
@@ -349,8 +355,8 @@ def _is_command(feature: Feature) -> bool:
 
 
 def _align_joints(
-    found: dict[str, Selection],
-) -> tuple[tuple[str, ...], dict[str, Selection], dict[str, tuple[str, ...]]]:
+    found: dict[str, ColumnSelection],
+) -> tuple[tuple[str, ...], dict[str, ColumnSelection], dict[str, tuple[str, ...]]]:
     """Bring every quantity that goes by joints into the order of the first such one.
 
     Returns:
@@ -374,7 +380,9 @@ def _align_joints(
     return _joint_names(first, aligned), aligned, unmatched
 
 
-def _joint_names(first: Selection, aligned: Mapping[str, Selection]) -> tuple[str, ...]:
+def _joint_names(
+    first: ColumnSelection, aligned: Mapping[str, ColumnSelection]
+) -> tuple[str, ...]:
     if not first.numbered:
         return first.labels
     named = [s for role, s in aligned.items() if role in JOINT_FIELDS and not s.numbered]

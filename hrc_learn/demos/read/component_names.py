@@ -63,7 +63,7 @@ KEY_ROLES = {
 
 
 @dataclass(frozen=True)
-class Meaning:
+class ComponentMeaning:
     """What one component stands for."""
 
     role: str
@@ -71,26 +71,26 @@ class Meaning:
     """Joint name, or index of the component within its role."""
 
 
-def meaning_of_component(name: str) -> Meaning | None:
+def meaning_of_component(name: str) -> ComponentMeaning | None:
     """What a name says on its own; None where it says nothing (a bare joint name, say)."""
     plain = name.strip().lower()
     matrix = _MATRIX.fullmatch(plain)
     if matrix:
-        return Meaning("pose_matrix", int(matrix[1]))
+        return ComponentMeaning("pose_matrix", int(matrix[1]))
     ee = _EE.fullmatch(plain)
     component = _POSE_COMPONENTS.get(ee[1] if ee else plain)
     if component:
-        return Meaning(*component)
+        return ComponentMeaning(*component)
     stem, _, suffix = name.strip().rpartition(".")
     roles = [role for role, names in JOINT_SUFFIXES.items() if suffix.lower() in names]
     if (ee and "gripper" in ee[1]) or ("gripper" in plain and (not stem or roles)):
         # A gripper's velocity or force is of no use here and must not pass for its opening.
-        return Meaning("gripper", name) if roles in ([], ["joint_position"]) else None
+        return ComponentMeaning("gripper", name) if roles in ([], ["joint_position"]) else None
     if stem and roles:
-        return Meaning(roles[0], stem)
+        return ComponentMeaning(roles[0], stem)
     prefix, _, number = plain.rpartition("_")
     if number.isdigit() and prefix in _JOINT_PREFIXES:
-        return Meaning(_JOINT_PREFIXES[prefix], f"joint_{number}")
+        return ComponentMeaning(_JOINT_PREFIXES[prefix], f"joint_{number}")
     return None
 
 

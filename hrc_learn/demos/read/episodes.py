@@ -19,7 +19,12 @@ from hrc_learn.demos.format.dataset_folder import (
 from hrc_learn.demos.format.features import Sidecar, read_sidecar
 from hrc_learn.demos.image_features import FeatureCache, only_feature
 from hrc_learn.demos.issue import DatasetError
-from hrc_learn.demos.read.column_mapping import MappingSpec, Matching, Selection, match_columns
+from hrc_learn.demos.read.column_mapping import (
+    ColumnMapping,
+    ColumnSelection,
+    MappingSpec,
+    map_columns,
+)
 from hrc_learn.demos.read.frames import RawFrames, read_frames
 from hrc_learn.demos.read.value_encodings import (
     UnitDecision,
@@ -34,7 +39,9 @@ Quantities = dict[str, Float64[np.ndarray, "_frames _components"]]
 """Role -> values during one episode."""
 
 
-def select_quantities(frames: RawFrames, selections: Mapping[str, Selection]) -> Quantities:
+def select_quantities(
+    frames: RawFrames, selections: Mapping[str, ColumnSelection]
+) -> Quantities:
     """Values of every role, as float64."""
     return {role: _columns(frames, selection.columns) for role, selection in selections.items()}
 
@@ -86,7 +93,7 @@ def locate(
     return Path(dataset.root), dataset.episodes if episodes is None else episodes
 
 
-def choose_episodes(
+def select_episodes(
     folder: DatasetFolder,
     episodes: Sequence[int] | None = None,
     tasks: str | Sequence[str] | None = None,
@@ -160,7 +167,7 @@ class EpisodeReader:
 
     folder: DatasetFolder
     sidecar: Sidecar
-    matching: Matching
+    column_mapping: ColumnMapping
     entries: tuple[EpisodeEntry, ...]
     extracted: FeatureCache | None = None
     """Image feature kept beside the dataset, where it has none itself."""
@@ -177,7 +184,7 @@ class EpisodeReader:
         Raises:
             DatasetError: They cannot be read, or hold values that are not finite.
         """
-        selections, extra = self.matching.selections, self.matching.extra
+        selections, extra = self.column_mapping.selections, self.column_mapping.extra
         if roles is not None:
             selections, extra = {role: selections[role] for role in roles}, ()
         keys = {key for s in selections.values() for key, _ in s.columns} | {*extra}
@@ -187,16 +194,16 @@ class EpisodeReader:
             if not entry.length:
                 raise DatasetError("has no frames", file=entry.file, episode=entry.index)
             quantities = select_quantities(frames, selections)
-            _refuse_non_finite(entry, quantities, self.matching)
+            _refuse_non_finite(entry, quantities, self.column_mapping)
             yield RawEpisode(entry=entry, frames=frames, quantities=quantities)
 
     @property
     def notes(self) -> list[str]:
         """What had to be guessed, or comes from elsewhere."""
         if self.extracted is None:
-            return [*self.matching.notes]
+            return [*self.column_mapping.notes]
         beside = f"feature: {self.extracted.name}, as it was extracted from the videos"
-        return [*self.matching.notes, beside]
+        return [*self.column_mapping.notes, beside]
 
     def decide_units(
         self, episodes: Iterable[RawEpisode], given: Mapping[str, str]
@@ -206,7 +213,7 @@ class EpisodeReader:
         Raises:
             DatasetError: A unit is unknown, or does not fit its quantity.
         """
-        largest = dict.fromkeys(self.matching.selections, 0.0)
+        largest = dict.fromkeys(self.column_mapping.selections, 0.0)
         steps = []
         for episode in episodes:
             for role, values in episode.quantities.items():
@@ -224,9 +231,9 @@ class EpisodeReader:
         for role, unit in given.items():  # before anything long is read
             unit_factor(role, unit)
         stated = {*self.sidecar.units, *given}
-        roles = {*guessed_from_values(self.matching.selections, stated)}
+        roles = {*guessed_from_values(self.column_mapping.selections, stated)}
         entries = self.entries if roles else self.entries[:1]
-        if "time" in self.matching.selections and "time" not in stated:
+        if "time" in self.column_mapping.selections and "time" not in stated:
             roles.add("time")
         episodes = self.read(tuple(dict.fromkeys(entries)), roles) if roles else ()
         return self.decide_units(episodes, given)
@@ -249,14 +256,14 @@ def open_reader(
     for fault in count_faults(folder):
         raise fault
     sidecar = read_sidecar(folder.root)
-    matching = match_columns(folder.features, sidecar, mapping)
-    has_own = "feature" in matching.selections or "feature" in (mapping or {})
+    column_mapping = map_columns(folder.features, sidecar, mapping)
+    has_own = "feature" in column_mapping.selections or "feature" in (mapping or {})
     return EpisodeReader(
         folder=folder,
         sidecar=sidecar,
-        matching=matching,
+        column_mapping=column_mapping,
         extracted=None if has_own else only_feature(folder.root),
-        entries=choose_episodes(folder, episodes, tasks, where),
+        entries=select_episodes(folder, episodes, tasks, where),
     )
 
 
@@ -264,7 +271,9 @@ def _place(entry: EpisodeEntry) -> tuple[str, int]:
     return entry.file, entry.start
 
 
-def _refuse_non_finite(entry: EpisodeEntry, quantities: Quantities, matching: Matching) -> None:
+def _refuse_non_finite(
+    entry: EpisodeEntry, quantities: Quantities, column_mapping: ColumnMapping
+) -> None:
     seen = quantities.get("feature_visible")
     for role, values in quantities.items():
         # The sum is finite unless a value is not: far cheaper than a mask.
@@ -276,7 +285,7 @@ def _refuse_non_finite(entry: EpisodeEntry, quantities: Quantities, matching: Ma
             bad &= seen != 0
         if bad.any():
             frame, component = (int(i) for i in np.argwhere(bad)[0])
-            selection = matching.selections[role]
+            selection = column_mapping.selections[role]
             raise DatasetError(
                 f"{role} is {values[frame, component]} there; leave the episode out "
                 f"(episodes=[...]) or repair the recording",

@@ -166,7 +166,7 @@ def _entry_at(entries: Sequence[EpisodeEntry], row: int) -> EpisodeEntry:
 # When each frame was taken.
 
 
-def stamps(
+def frame_timestamps(
     folder: DatasetFolder,
     entry: EpisodeEntry,
     frames: RawFrames,

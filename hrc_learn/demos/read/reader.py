@@ -18,7 +18,7 @@ from hrc_learn.demos.demonstration import (
 from hrc_learn.demos.format.dataset_folder import DatasetFolder, EpisodeEntry
 from hrc_learn.demos.image_features import with_feature
 from hrc_learn.demos.issue import DatasetError, UnitsWarning
-from hrc_learn.demos.read.column_mapping import MappingSpec, Matching
+from hrc_learn.demos.read.column_mapping import ColumnMapping, MappingSpec
 from hrc_learn.demos.read.component_names import ORIENTATION_ROLES
 from hrc_learn.demos.read.episodes import (
     EpisodeFilter,
@@ -28,7 +28,7 @@ from hrc_learn.demos.read.episodes import (
     RawEpisode,
     open_reader,
 )
-from hrc_learn.demos.read.frames import RawFrames, stamps
+from hrc_learn.demos.read.frames import RawFrames, frame_timestamps
 from hrc_learn.demos.read.value_encodings import UnitDecision, matrix_position, to_quaternion
 
 # From quantities in the units on disk to a `Demonstration`.
@@ -37,20 +37,20 @@ from hrc_learn.demos.read.value_encodings import UnitDecision, matrix_position, 
 def to_demonstration(
     folder: DatasetFolder,
     episode: RawEpisode,
-    matching: Matching,
+    column_mapping: ColumnMapping,
     decisions: Mapping[str, UnitDecision],
 ) -> Demonstration:
     """Convert one episode.
 
     Raises:
-        DatasetError: Its stamps do not increase, or its orientations are none.
+        DatasetError: Its timestamps do not increase, or its orientations are none.
     """
     entry, frames, quantities = episode.entry, episode.frames, episode.quantities
     scaled = {
         role: values if decisions[role].factor == 1 else values * decisions[role].factor
         for role, values in quantities.items()
     }
-    time = stamps(folder, entry, frames, scaled.get("time"))
+    time = frame_timestamps(folder, entry, frames, scaled.get("time"))
     fields = {role: scaled[role] for role in JOINT_FIELDS if role in scaled}
     fields |= {role: scaled[role] for role in ("position", "feature") if role in scaled}
     if "gripper" in scaled:
@@ -63,8 +63,8 @@ def to_demonstration(
         fps=folder.fps,
         episode=entry.index,
         task=_task(folder, entry, frames),
-        joint_names=matching.joint_names,
-        extra={key: frames[key].astype(float) for key in matching.extra},
+        joint_names=column_mapping.joint_names,
+        extra={key: frames[key].astype(float) for key in column_mapping.extra},
         **fields | _pose(entry, quantities, scaled, decisions),
     )
 
@@ -140,7 +140,7 @@ class DemonstrationSource(Sequence[Demonstration]):
         """
         self._reader = reader
         self._decisions = dict(decisions)
-        names = reader.matching.joint_names if joint_names is None else joint_names
+        names = reader.column_mapping.joint_names if joint_names is None else joint_names
         self.joint_names = tuple(names)
         self.notes = tuple(notes)
         self.source = str(reader.folder.root)
@@ -194,7 +194,7 @@ class DemonstrationSource(Sequence[Demonstration]):
 
     def _convert(self, episode: RawEpisode) -> Demonstration:
         reader = self._reader
-        demo = to_demonstration(reader.folder, episode, reader.matching, self._decisions)
+        demo = to_demonstration(reader.folder, episode, reader.column_mapping, self._decisions)
         if reader.extracted is not None:
             demo = with_feature(demo, reader.extracted)
         return demo.select_joints(self.joint_names)
@@ -247,17 +247,17 @@ def load_demos(
             key where known, and what to do.
     """
     reader = open_reader(path, episodes, mapping, tasks, where)
-    matching = reader.matching
+    column_mapping = reader.column_mapping
     raw = {e.entry.index: e for e in reader.read(tuple(dict.fromkeys(reader.entries)))}
     decisions = reader.decide_units(raw.values(), units or {})
     demos = [
-        to_demonstration(reader.folder, raw[entry.index], matching, decisions)
+        to_demonstration(reader.folder, raw[entry.index], column_mapping, decisions)
         for entry in reader.entries
     ]
     if reader.extracted is not None:
         demos = [with_feature(demo, reader.extracted) for demo in demos]
     if joint_names is not None:
-        joint_columns(matching.joint_names, joint_names)
+        joint_columns(column_mapping.joint_names, joint_names)
         demos = [demo.select_joints(joint_names) for demo in demos]
     _warn_of_conversions(reader.folder.root, decisions)
     notes = [*reader.notes, *_guesses(decisions)]
@@ -282,7 +282,7 @@ def open_demos(
     """
     reader = open_reader(path, episodes, mapping, tasks, where)
     if joint_names is not None:
-        joint_columns(reader.matching.joint_names, joint_names)
+        joint_columns(reader.column_mapping.joint_names, joint_names)
     decisions = reader.survey(units or {})
     _warn_of_conversions(reader.folder.root, decisions)
     notes = (*reader.notes, *_guesses(decisions))

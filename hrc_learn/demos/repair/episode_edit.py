@@ -16,7 +16,7 @@ from hrc_learn.demos.format.dataset_folder import EpisodeEntry
 from hrc_learn.demos.issue import DatasetError
 from hrc_learn.demos.preprocessing import resample, trim_rest
 from hrc_learn.demos.preprocessing.resampling import nearest_frames
-from hrc_learn.demos.read.column_mapping import Matching
+from hrc_learn.demos.read.column_mapping import ColumnMapping
 from hrc_learn.demos.read.episodes import Quantities, select_quantities
 from hrc_learn.demos.read.frames import RawFrames
 from hrc_learn.demos.read.value_encodings import UnitDecision, to_quaternion
@@ -27,10 +27,10 @@ from hrc_learn.geometry import quaternion
 
 
 @dataclass(frozen=True, kw_only=True)
-class Meaning:
+class ColumnSemantics:
     """What the columns of the dataset mean, and in which units."""
 
-    matching: Matching
+    column_mapping: ColumnMapping
     units: dict[str, UnitDecision]
 
     def whole_turn(self, role: str) -> float:
@@ -39,7 +39,7 @@ class Meaning:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Draft:
+class EpisodeEdit:
     """One episode as far as it has been repaired."""
 
     entry: EpisodeEntry
@@ -55,11 +55,11 @@ class Draft:
     def __len__(self) -> int:
         return len(self.time)
 
-    def quantities(self, meaning: Meaning) -> Quantities:
+    def quantities(self, semantics: ColumnSemantics) -> Quantities:
         """Quantities in the units on disk."""
-        return select_quantities(self.frames, meaning.matching.selections)
+        return select_quantities(self.frames, semantics.column_mapping.selections)
 
-    def only(self, wanted: Bool[np.ndarray, " _frames"], change: str) -> "Draft":
+    def only(self, wanted: Bool[np.ndarray, " _frames"], change: str) -> "EpisodeEdit":
         """The wanted frames alone.
 
         Raises:
@@ -77,7 +77,7 @@ class Draft:
             changes=(*self.changes, change),
         )
 
-    def with_columns(self, columns: RawFrames, change: str) -> "Draft":
+    def with_columns(self, columns: RawFrames, change: str) -> "EpisodeEdit":
         """Some columns replaced."""
         return replace(self, frames=self.frames | columns, changes=(*self.changes, change))
 
@@ -102,10 +102,10 @@ _TOLERANCE = 0.3 / (2 * np.pi)
 """How far a jump may be from whole turns and still be one, in turns: what moves in a frame."""
 
 
-def unwrap(draft: Draft, meaning: Meaning) -> Draft:
+def unwrap(edit: EpisodeEdit, semantics: ColumnSemantics) -> EpisodeEdit:
     """Joints, Euler angles and rotation vectors without jumps by whole turns."""
-    for role, values in draft.quantities(meaning).items():
-        turn = meaning.whole_turn(role) if role in (*_ANGLES, "rotation_vector") else None
+    for role, values in edit.quantities(semantics).items():
+        turn = semantics.whole_turn(role) if role in (*_ANGLES, "rotation_vector") else None
         if turn is None:
             continue
         if role == "rotation_vector":
@@ -116,23 +116,23 @@ def unwrap(draft: Draft, meaning: Meaning) -> Draft:
         # Beyond rounding: a rotation vector is changed in its last digit by scaling.
         changed = np.abs(smooth - values).max(0) > 1e-6 * turn
         if changed.any():
-            labels = meaning.matching.selections[role].labels
+            labels = semantics.column_mapping.selections[role].labels
             names = ", ".join(labels[int(i)] for i in np.flatnonzero(changed))
-            draft = _with_quantity(draft, meaning, role, smooth, f"unwrapped {role} ({names})")
-    return draft
+            edit = _with_quantity(edit, semantics, role, smooth, f"unwrapped {role} ({names})")
+    return edit
 
 
-def fix_signs(draft: Draft, meaning: Meaning) -> Draft:
+def fix_signs(edit: EpisodeEdit, semantics: ColumnSemantics) -> EpisodeEdit:
     """Quaternions whose sign does not jump."""
-    for role, values in draft.quantities(meaning).items():
+    for role, values in edit.quantities(semantics).items():
         if not role.startswith("quaternion"):
             continue
         flips = (values[1:] * values[:-1]).sum(1) < 0
         if flips.any():
             sign = np.concatenate([[1.0], np.cumprod(np.where(flips, -1.0, 1.0))])
             change = f"fixed {flips.sum()} jumps of the sign of {role}"
-            draft = _with_quantity(draft, meaning, role, values * sign[:, None], change)
-    return draft
+            edit = _with_quantity(edit, semantics, role, values * sign[:, None], change)
+    return edit
 
 
 def _turns(
@@ -146,17 +146,17 @@ def _turns(
 
 
 def _with_quantity(
-    draft: Draft,
-    meaning: Meaning,
+    edit: EpisodeEdit,
+    semantics: ColumnSemantics,
     role: str,
     values: Float64[np.ndarray, "frames columns"],
     change: str,
-) -> Draft:
+) -> EpisodeEdit:
     columns: RawFrames = {}
-    for number, (key, index) in enumerate(meaning.matching.selections[role].columns):
-        column = columns.setdefault(key, draft.frames[key].copy())
+    for number, (key, index) in enumerate(semantics.column_mapping.selections[role].columns):
+        column = columns.setdefault(key, edit.frames[key].copy())
         column[:, index] = values[:, number]
-    return draft.with_columns(columns, change)
+    return edit.with_columns(columns, change)
 
 
 # An episode at the frames of a regular grid.
@@ -164,7 +164,9 @@ def _with_quantity(
 _SMOOTH = ("joint_position", "joint_velocity", "position")
 
 
-def regrid(draft: Draft, meaning: Meaning, fps: float | int) -> Draft:
+def resample_to_grid(
+    edit: EpisodeEdit, semantics: ColumnSemantics, fps: float | int
+) -> EpisodeEdit:
     """Resample every column, as `preparation.resample` does.
 
     Rotation vectors and Euler angles are interpolated as they are: unwrap them first.
@@ -173,9 +175,9 @@ def regrid(draft: Draft, meaning: Meaning, fps: float | int) -> Draft:
         DatasetError: The stamps do not increase, or the episode is shorter than a period, or
             holds transforms, which cannot be interpolated by their entries.
     """
-    quantities = draft.quantities(meaning)
+    quantities = edit.quantities(semantics)
     if "pose_matrix" in quantities:
-        raise draft.bad(
+        raise edit.bad(
             "holds poses as matrices, which are not resampled; map them away "
             "(mapping={'pose_matrix': None}) or leave the frames as they are (no fps)",
             key="pose_matrix",
@@ -186,35 +188,37 @@ def regrid(draft: Draft, meaning: Meaning, fps: float | int) -> Draft:
         if role:
             fields["orientation"] = to_quaternion(role, quantities[role])
         demo = Demonstration(
-            time=draft.time - draft.time[0],
-            joint_names=meaning.matching.joint_names,
+            time=edit.time - edit.time[0],
+            joint_names=semantics.column_mapping.joint_names,
             fps=fps,
-            extra={key: values.astype(float) for key, values in draft.frames.items()},
+            extra={key: values.astype(float) for key, values in edit.frames.items()},
             **fields,
         )
         moved = resample(demo, fps)
     except ValueError as error:
-        raise draft.bad(str(error)) from error
+        raise edit.bad(str(error)) from error
     columns: RawFrames = dict(moved.extra)
     for name in fields:
         values = getattr(moved, name)
         if name == "orientation" and role == "quaternion_xyzw":
             values = np.roll(values, -1, axis=1)
-        taken = meaning.matching.selections[role if name == "orientation" else name].columns
+        taken = semantics.column_mapping.selections[
+            role if name == "orientation" else name
+        ].columns
         for number, (key, index) in enumerate(taken):
             columns[key][:, index] = values[:, number]
     nearest = nearest_frames(demo.time, np.minimum(moved.time, demo.time[-1]))
-    for key, values in draft.frames.items():
+    for key, values in edit.frames.items():
         if values.dtype.kind not in "f":
             columns[key] = values[nearest]
     return replace(
-        draft,
+        edit,
         frames=columns,
-        time=moved.time + draft.time[0],
+        time=moved.time + edit.time[0],
         kept=None,
         changes=(
-            *draft.changes,
-            f"resampled {len(draft)} frames to {len(moved)} at {fps:g} Hz",
+            *edit.changes,
+            f"resampled {len(edit)} frames to {len(moved)} at {fps:g} Hz",
         ),
     )
 
@@ -225,34 +229,36 @@ _PAUSE = 0.1
 """Longest time between two reports of a robot that moves [s]."""
 
 
-def drop_bad_frames(draft: Draft, meaning: Meaning, allowed: bool) -> Draft:
+def drop_bad_frames(
+    edit: EpisodeEdit, semantics: ColumnSemantics, allowed: bool
+) -> EpisodeEdit:
     """Without the frames that hold values that are not finite.
 
     Raises:
         DatasetError: There are some, and dropping them is not allowed; or too few are left.
     """
-    bad = ~_finite(draft, meaning)
+    bad = ~_finite(edit, semantics)
     if bad.any() and not allowed:
-        raise draft.bad(
+        raise edit.bad(
             f"holds values that are not finite in {bad.sum()} frames; drop those "
             f"(drop_bad_frames), or the episode (drop_bad_episodes)",
             frame=int(bad.argmax()),
         )
-    return draft.only(~bad, f"dropped {bad.sum()} frames with values that are not finite")
+    return edit.only(~bad, f"dropped {bad.sum()} frames with values that are not finite")
 
 
-def drop_late(draft: Draft) -> Draft:
+def drop_late(edit: EpisodeEdit) -> EpisodeEdit:
     """Without the frames whose stamp is not later than all before.
 
     Raises:
         DatasetError: No two frames are left.
     """
-    highest = np.maximum.accumulate(draft.time)
-    later = np.concatenate([[True], draft.time[1:] > highest[:-1]])
-    return draft.only(later, f"dropped {(~later).sum()} frames whose stamp does not increase")
+    highest = np.maximum.accumulate(edit.time)
+    later = np.concatenate([[True], edit.time[1:] > highest[:-1]])
+    return edit.only(later, f"dropped {(~later).sum()} frames whose stamp does not increase")
 
 
-def drop_repeats(draft: Draft) -> Draft:
+def drop_repeats(edit: EpisodeEdit) -> EpisodeEdit:
     """Without the frames that repeat the one before, because the robot reports more slowly.
 
     A frame repeated for longer than `_PAUSE` shows an arm that stands still; it stays.
@@ -260,49 +266,49 @@ def drop_repeats(draft: Draft) -> Draft:
     Raises:
         DatasetError: No two frames are left.
     """
-    repeated = repeated_frames(draft.frames)
-    begin = np.maximum.accumulate(np.where(repeated, 0, np.arange(len(draft))))
-    end = np.append(np.flatnonzero(~repeated)[1:], len(draft))[np.cumsum(~repeated) - 1] - 1
-    repeated &= draft.time[end] - draft.time[begin] <= _PAUSE
-    return draft.only(~repeated, f"dropped {repeated.sum()} repeated frames")
+    repeated = repeated_frames(edit.frames)
+    begin = np.maximum.accumulate(np.where(repeated, 0, np.arange(len(edit))))
+    end = np.append(np.flatnonzero(~repeated)[1:], len(edit))[np.cumsum(~repeated) - 1] - 1
+    repeated &= edit.time[end] - edit.time[begin] <= _PAUSE
+    return edit.only(~repeated, f"dropped {repeated.sum()} repeated frames")
 
 
-def trim(draft: Draft, meaning: Meaning, keep: float | int) -> Draft:
+def trim(edit: EpisodeEdit, semantics: ColumnSemantics, keep: float | int) -> EpisodeEdit:
     """Without standing still before and after the motion.
 
     Raises:
         DatasetError: The arm stands still all the time, or stamps do not increase.
     """
-    quantities, units = draft.quantities(meaning), meaning.units
+    quantities, units = edit.quantities(semantics), semantics.units
     role = next((r for r in ("joint_position", "position") if r in quantities), None)
     if role is None:
-        return draft
+        return edit
     moving: dict[str, Any] = {role: quantities[role] * units[role].factor}
-    names = meaning.matching.joint_names if role == "joint_position" else ()
+    names = semantics.column_mapping.joint_names if role == "joint_position" else ()
     try:
         demo = Demonstration(
-            time=draft.time - draft.time[0],
+            time=edit.time - edit.time[0],
             joint_names=names,
             fps=1.0,
-            episode=draft.entry.index,
-            extra={"frame": np.arange(len(draft), dtype=float)[:, None]},
+            episode=edit.entry.index,
+            extra={"frame": np.arange(len(edit), dtype=float)[:, None]},
             **moving,
         )
         left = trim_rest(demo, keep=keep).extra["frame"][:, 0].astype(int)
     except ValueError as error:
-        raise draft.bad(str(error)) from error
-    wanted = np.zeros(len(draft), dtype=bool)
+        raise edit.bad(str(error)) from error
+    wanted = np.zeros(len(edit), dtype=bool)
     wanted[left] = True
     lead = demo.time[left[0]]
     tail = demo.time[-1] - demo.time[left[-1]]
-    return draft.only(wanted, f"trimmed {lead:.2f} s at the beginning, {tail:.2f} s at the end")
+    return edit.only(wanted, f"trimmed {lead:.2f} s at the beginning, {tail:.2f} s at the end")
 
 
-def _finite(draft: Draft, meaning: Meaning) -> Bool[np.ndarray, " _frames"]:
+def _finite(edit: EpisodeEdit, semantics: ColumnSemantics) -> Bool[np.ndarray, " _frames"]:
     """Frames whose values all are; a feature that was not seen need not be."""
-    finite = np.isfinite(draft.time)
-    unseen = _unseen_columns(draft, meaning)
-    for key, values in draft.frames.items():
+    finite = np.isfinite(edit.time)
+    unseen = _unseen_columns(edit, semantics)
+    for key, values in edit.frames.items():
         sound = np.isfinite(values.astype(float))
         for index, lost in unseen.get(key, ()):
             sound[lost, index] = True
@@ -311,13 +317,13 @@ def _finite(draft: Draft, meaning: Meaning) -> Bool[np.ndarray, " _frames"]:
 
 
 def _unseen_columns(
-    draft: Draft, meaning: Meaning
+    edit: EpisodeEdit, semantics: ColumnSemantics
 ) -> dict[str, list[tuple[int, Bool[np.ndarray, " frames"]]]]:
-    selections = meaning.matching.selections
+    selections = semantics.column_mapping.selections
     if not {"feature", "feature_visible"} <= selections.keys():
         return {}
     ((key, index),) = selections["feature_visible"].columns
-    lost = ~(draft.frames[key][:, index] > 0)
+    lost = ~(edit.frames[key][:, index] > 0)
     columns: dict[str, list] = {}
     for key, index in selections["feature"].columns:
         columns.setdefault(key, []).append((index, lost))

@@ -10,25 +10,25 @@ from hrc_learn.demos.format.dataset_folder import DatasetFolder, EpisodeEntry, o
 from hrc_learn.demos.format.features import Sidecar, read_sidecar
 from hrc_learn.demos.format.video_segments import Segments, read_segments
 from hrc_learn.demos.issue import DatasetError
-from hrc_learn.demos.read.column_mapping import MappingSpec, match_columns
+from hrc_learn.demos.read.column_mapping import MappingSpec, map_columns
 from hrc_learn.demos.read.component_names import INDEX_KEYS
 from hrc_learn.demos.read.episodes import frame_step, select_quantities
 from hrc_learn.demos.read.frames import RawFrames, read_frames
 from hrc_learn.demos.read.value_encodings import decide_units
 from hrc_learn.demos.repair.episode_edit import (
-    Draft,
-    Meaning,
+    ColumnSemantics,
+    EpisodeEdit,
     RepairOptions,
     RepairReport,
     drop_bad_frames,
     drop_late,
     drop_repeats,
     fix_signs,
-    regrid,
+    resample_to_grid,
     trim,
     unwrap,
 )
-from hrc_learn.demos.repair.rewrite import Recast, cut_segments
+from hrc_learn.demos.repair.rewrite import ColumnRewriter, cut_segments
 from hrc_learn.demos.write.assembly import assemble
 from hrc_learn.demos.write.staging import episode_path
 from hrc_learn.store import DATASET, replacing
@@ -68,9 +68,9 @@ def repair_dataset(
     folder, sidecar = open_folder(path), read_sidecar(Path(path))
     if not folder.episodes:
         raise DatasetError("the dataset holds no episodes", file=folder.root)
-    meaning = _understand(folder, sidecar, mapping, units)
+    semantics = _resolve(folder, sidecar, mapping, units)
     segments = read_segments(folder) if options.videos else {}
-    recast = Recast(folder, sidecar, meaning, options, units, segments)
+    recast = ColumnRewriter(folder, sidecar, semantics, options, units, segments)
     report = RepairReport(path=Path(out), notes=recast.notes)
     with replacing(out, DATASET) as target:
         staging = target / "episodes"
@@ -79,17 +79,17 @@ def repair_dataset(
         for entry in progress(folder.episodes) if progress else folder.episodes:
             report.frames_before += entry.length
             try:
-                draft = _repair(folder, entry, meaning, options)
-                cut = cut_segments(draft, recast.videos_of(entry), folder.fps)
+                edit = _repair(folder, entry, semantics, options)
+                cut = cut_segments(edit, recast.videos_of(entry), folder.fps)
             except DatasetError as error:
                 if not options.drop_bad_episodes:
                     raise
                 report.left_out[entry.index] = error.finding.message
                 continue
-            recast.stage(episode_path(staging, len(report.changes)), draft, report.frames)
+            recast.stage(episode_path(staging, len(report.changes)), edit, report.frames)
             videos.append(cut)
-            report.changes[entry.index] = draft.changes
-            report.frames += len(draft)
+            report.changes[entry.index] = edit.changes
+            report.frames += len(edit)
         if not report.changes:
             raise DatasetError("no episode could be repaired", file=folder.root)
         paths = [episode_path(staging, i) for i in range(len(report.changes))]
@@ -98,23 +98,25 @@ def repair_dataset(
     return report
 
 
-def _understand(
+def _resolve(
     folder: DatasetFolder,
     sidecar: Sidecar,
     mapping: MappingSpec | None,
     units: Mapping[str, str],
-) -> Meaning:
+) -> ColumnSemantics:
     """Find the quantities, and guess units from whatever can be read and is finite."""
-    matching = match_columns(folder.features, sidecar, mapping)
-    largest = dict.fromkeys(matching.selections, 0.0)
+    column_mapping = map_columns(folder.features, sidecar, mapping)
+    largest = dict.fromkeys(column_mapping.selections, 0.0)
     step = 1.0
     for _, frames in _readable(folder, folder.episodes):
-        quantities = select_quantities(frames, matching.selections)
+        quantities = select_quantities(frames, column_mapping.selections)
         for role, values in quantities.items():
             finite = np.abs(values[np.isfinite(values)])
             largest[role] = max(largest[role], float(finite.max(initial=0.0)))
         step = frame_step(quantities.get("time"), folder.fps)
-    return Meaning(matching=matching, units=decide_units(largest, sidecar.units, units, step))
+    return ColumnSemantics(
+        column_mapping=column_mapping, units=decide_units(largest, sidecar.units, units, step)
+    )
 
 
 def _readable(
@@ -136,45 +138,48 @@ def _read(folder: DatasetFolder, entry: EpisodeEntry) -> RawFrames:
 
 
 def _repair(
-    folder: DatasetFolder, entry: EpisodeEntry, meaning: Meaning, options: RepairOptions
-) -> Draft:
+    folder: DatasetFolder,
+    entry: EpisodeEntry,
+    semantics: ColumnSemantics,
+    options: RepairOptions,
+) -> EpisodeEdit:
     frames = _read(folder, entry)
-    draft = Draft(
+    edit = EpisodeEdit(
         entry=entry,
         frames={k: v for k, v in frames.items() if k not in INDEX_KEYS or k == "task_index"},
-        time=_stamps(folder, frames, meaning),
+        time=_stamps(folder, frames, semantics),
         kept=np.arange(entry.length),
     )
-    draft = drop_bad_frames(draft, meaning, options.drop_bad_frames)
+    edit = drop_bad_frames(edit, semantics, options.drop_bad_frames)
     if options.drop_repeats:
-        draft = drop_late(draft)
+        edit = drop_late(edit)
     if options.trim:
-        draft = trim(draft, meaning, options.keep_rest)
+        edit = trim(edit, semantics, options.keep_rest)
     if options.drop_repeats:
-        draft = drop_repeats(draft)
+        edit = drop_repeats(edit)
     if options.unwrap:
-        draft = unwrap(draft, meaning)
+        edit = unwrap(edit, semantics)
     if options.fix_signs:
-        draft = fix_signs(draft, meaning)
+        edit = fix_signs(edit, semantics)
     if options.fps is not None:
-        draft = regrid(draft, meaning, options.fps)
-    _require_order(draft)
-    return draft
+        edit = resample_to_grid(edit, semantics, options.fps)
+    _require_order(edit)
+    return edit
 
 
-def _stamps(folder: DatasetFolder, frames: RawFrames, meaning: Meaning) -> np.ndarray:
-    if "time" in meaning.matching.selections:
-        ((key, index),) = meaning.matching.selections["time"].columns
-        return frames[key][:, index].astype(float) * meaning.units["time"].factor
+def _stamps(folder: DatasetFolder, frames: RawFrames, semantics: ColumnSemantics) -> np.ndarray:
+    if "time" in semantics.column_mapping.selections:
+        ((key, index),) = semantics.column_mapping.selections["time"].columns
+        return frames[key][:, index].astype(float) * semantics.units["time"].factor
     if "timestamp" in frames:
         return frames["timestamp"][:, 0].astype(float)
     return np.arange(len(next(iter(frames.values())))) / folder.fps
 
 
-def _require_order(draft: Draft) -> None:
-    stalled = np.flatnonzero(np.diff(draft.time) <= 0)
+def _require_order(edit: EpisodeEdit) -> None:
+    stalled = np.flatnonzero(np.diff(edit.time) <= 0)
     if len(stalled):
-        raise draft.bad(
+        raise edit.bad(
             "stamps must increase; let repeated frames be dropped (drop_repeats), or leave the "
             "episode out (drop_bad_episodes)",
             frame=int(stalled[0]) + 1,

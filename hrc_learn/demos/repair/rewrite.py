@@ -12,7 +12,7 @@ from hrc_learn.demos.format.lerobot_v3 import INDEX_FEATURES, episode_statistics
 from hrc_learn.demos.format.video_segments import Segments, VideoSegment, video_keys
 from hrc_learn.demos.issue import DatasetError
 from hrc_learn.demos.read.component_names import INDEX_KEYS
-from hrc_learn.demos.repair.episode_edit import Draft, Meaning, RepairOptions
+from hrc_learn.demos.repair.episode_edit import ColumnSemantics, EpisodeEdit, RepairOptions
 from hrc_learn.demos.write.schema import TIME_KEY
 from hrc_learn.demos.write.staging import (
     RecordingHeader,
@@ -24,7 +24,7 @@ from hrc_learn.demos.write.staging import (
 # The columns of a repaired dataset, as LeRobot wants them.
 
 
-class Recast:
+class ColumnRewriter:
     """How episodes of one dataset are written into another of version 3.0.
 
     Attributes:
@@ -36,7 +36,7 @@ class Recast:
         self,
         folder: DatasetFolder,
         sidecar: Sidecar,
-        meaning: Meaning,
+        semantics: ColumnSemantics,
         options: RepairOptions,
         units: Mapping[str, str],
         segments: Mapping[int, Segments],
@@ -47,7 +47,9 @@ class Recast:
         self._cameras = self._choose_cameras(options)
         self._task_index = {index: n for n, index in enumerate(sorted(folder.tasks))}
         self.tasks = [folder.tasks[index] for index in self._task_index]
-        self._add_time = "time" not in meaning.matching.selections and options.fps is None
+        self._add_time = (
+            "time" not in semantics.column_mapping.selections and options.fps is None
+        )
         self._header = RecordingHeader(
             fps=float(options.fps or folder.fps),
             robot_type=folder.robot_type or "unknown",
@@ -72,14 +74,14 @@ class Recast:
             )
         return {key: found[key] for key in self._cameras}
 
-    def stage(self, path: Path, draft: Draft, frames_before: int) -> None:
+    def stage(self, path: Path, edit: EpisodeEdit, frames_before: int) -> None:
         """Write one episode beside the new dataset."""
         number = int(path.stem.rpartition("_")[2])
-        count = np.arange(len(draft))
-        tasks = self._tasks(draft)
-        values = {k: v for k, v in draft.frames.items() if k in self._header.features}
+        count = np.arange(len(edit))
+        tasks = self._tasks(edit)
+        values = {k: v for k, v in edit.frames.items() if k in self._header.features}
         if self._add_time:
-            values[TIME_KEY] = draft.time[:, None]
+            values[TIME_KEY] = edit.time[:, None]
         values |= {
             "timestamp": count / self._header.fps,
             "frame_index": count,
@@ -139,19 +141,17 @@ class Recast:
             units["time"] = "s"
         return sidecar_copy(replace(sidecar, columns=columns), units)
 
-    def _tasks(self, draft: Draft) -> np.ndarray:
-        if "task_index" in draft.frames:
-            return np.array(
-                [self._task_index[int(i)] for i in draft.frames["task_index"][:, 0]]
-            )
-        texts = draft.entry.tasks or self.tasks[:1]
-        return np.full(len(draft), self.tasks.index(texts[0]))
+    def _tasks(self, edit: EpisodeEdit) -> np.ndarray:
+        if "task_index" in edit.frames:
+            return np.array([self._task_index[int(i)] for i in edit.frames["task_index"][:, 0]])
+        texts = edit.entry.tasks or self.tasks[:1]
+        return np.full(len(edit), self.tasks.index(texts[0]))
 
 
 # Images of repaired episodes: the parts of the old videos that show what is left.
 
 
-def cut_segments(draft: Draft, segments: Segments, fps: float) -> Segments:
+def cut_segments(edit: EpisodeEdit, segments: Segments, fps: float) -> Segments:
     """The images of those frames that are left.
 
     Raises:
@@ -159,13 +159,13 @@ def cut_segments(draft: Draft, segments: Segments, fps: float) -> Segments:
     """
     if not segments:
         return {}
-    if draft.kept is None or (np.diff(draft.kept) != 1).any():
-        raise draft.bad(
+    if edit.kept is None or (np.diff(edit.kept) != 1).any():
+        raise edit.bad(
             "its videos would have to be encoded anew, because frames were dropped in the "
             "middle or resampled: leave the videos out (videos=False), or the frames as they "
             "are (drop_repeats=False, drop_bad_frames=False, fps=None)"
         )
-    first, count = int(draft.kept[0]), len(draft.kept)
+    first, count = int(edit.kept[0]), len(edit.kept)
     return {
         key: VideoSegment(
             file=segment.file,

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from hrc_learn.demos.format.dataset_folder import DatasetFolder, EpisodeEntry
-from hrc_learn.demos.issue import DatasetError, Report
-from hrc_learn.demos.read.column_mapping import MappingSpec, Matching, parse_mapping
+from hrc_learn.demos.issue import DatasetError, ValidationReport
+from hrc_learn.demos.read.column_mapping import ColumnMapping, MappingSpec, parse_mapping
 from hrc_learn.demos.read.frames import RawFrames
 from hrc_learn.demos.read.value_encodings import unit_factor
 from hrc_learn.demos.validation.data_checks import (
@@ -18,10 +18,14 @@ from hrc_learn.demos.validation.data_checks import (
     check_jumps,
     check_length,
     check_repeats,
-    check_stamps,
     check_stillness,
+    check_timestamps,
 )
-from hrc_learn.demos.validation.semantic_checks import Understood, check_joint_sets, understand
+from hrc_learn.demos.validation.semantic_checks import (
+    DatasetSemantics,
+    check_joint_sets,
+    resolve_semantics,
+)
 from hrc_learn.demos.validation.structure_checks import (
     check_file,
     check_indices,
@@ -34,7 +38,7 @@ def check_dataset(
     mapping: MappingSpec | None = None,
     units: Mapping[str, str] | None = None,
     speed_limits: Mapping[str, float | int] | None = None,
-) -> Report:
+) -> ValidationReport:
     """Examine a LeRobot dataset of version 2.0, 2.1 or 3.0.
 
     Whatever can be read is looked at, whatever else is broken.
@@ -50,7 +54,7 @@ def check_dataset(
     """
     for role, unit in (units or {}).items():
         unit_factor(role, unit)
-    report = Report(path=Path(path))
+    report = ValidationReport(path=Path(path))
     folder = check_metadata(report.path, report)
     if folder is None:
         return report
@@ -60,20 +64,22 @@ def check_dataset(
     report.frames = sum(entry.length for entry, _ in episodes)
     check_columns(folder, episodes, report)
     try:
-        matching, understood = understand(folder, episodes, mapping or {}, units or {}, report)
+        column_mapping, semantics = resolve_semantics(
+            folder, episodes, mapping or {}, units or {}, report
+        )
     except DatasetError as error:
         report.add(error)
         return report
-    check_joint_sets(matching, report)
-    for episode in understood:
-        _check_episode(folder, episode, matching, speed_limits or {}, report)
-    moving = [(episode.entry, _motion(episode)) for episode in understood]
+    check_joint_sets(column_mapping, report)
+    for episode in semantics:
+        _check_episode(folder, episode, column_mapping, speed_limits or {}, report)
+    moving = [(episode.entry, _motion(episode)) for episode in semantics]
     check_duplicates([(e, m) for e, m in moving if m is not None], report)
     return report
 
 
 def _check_frames(
-    folder: DatasetFolder, report: Report
+    folder: DatasetFolder, report: ValidationReport
 ) -> list[tuple[EpisodeEntry, RawFrames]]:
     """Everything that needs no understanding of the columns."""
     sound = []
@@ -85,21 +91,21 @@ def _check_frames(
             check_length(entry, folder.fps, report)
             if "timestamp" in frames:
                 stamps = frames["timestamp"][:, 0].astype(float)
-                check_stamps(entry, "timestamp", stamps, folder.fps, report)
+                check_timestamps(entry, "timestamp", stamps, folder.fps, report)
             sound.append((entry, frames))
     return sound
 
 
 def _check_episode(
     folder: DatasetFolder,
-    episode: Understood,
-    matching: Matching,
+    episode: DatasetSemantics,
+    column_mapping: ColumnMapping,
     speed_limits: Mapping[str, float | int],
-    report: Report,
+    report: ValidationReport,
 ) -> None:
     entry, time, quantities = episode.entry, episode.time, episode.quantities
     if "time" in quantities:
-        check_stamps(entry, "time", time, folder.fps, report)
+        check_timestamps(entry, "time", time, folder.fps, report)
     if (np.diff(time) <= 0).any():
         return  # reported as an error; speeds make no sense
     moving = _motion(episode)
@@ -108,11 +114,11 @@ def _check_episode(
     joints = quantities.get("joint_position")
     if joints is None:
         return
-    check_jumps(entry, time, joints, matching.joint_names, speed_limits, report)
+    check_jumps(entry, time, joints, column_mapping.joint_names, speed_limits, report)
     if "command_position" in quantities:
         check_commands(entry, joints, quantities["command_position"], report)
 
 
-def _motion(episode: Understood) -> np.ndarray | None:
+def _motion(episode: DatasetSemantics) -> np.ndarray | None:
     """What moves: the joints, or the position where no joints are known."""
     return episode.quantities.get("joint_position", episode.quantities.get("position"))

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float64
 
 from hrc_learn.demos.format.dataset_folder import DatasetFolder, EpisodeEntry
 from hrc_learn.demos.format.features import Feature
-from hrc_learn.demos.issue import Report
+from hrc_learn.demos.issue import ValidationReport
 from hrc_learn.demos.read.component_names import INDEX_KEYS
 from hrc_learn.demos.read.frames import RawFrames
 
@@ -18,7 +18,10 @@ _REPEATED = 0.05
 
 
 def check_finite(
-    features: Mapping[str, Feature], entry: EpisodeEntry, frames: RawFrames, report: Report
+    features: Mapping[str, Feature],
+    entry: EpisodeEntry,
+    frames: RawFrames,
+    report: ValidationReport,
 ) -> None:
     """Every number is one."""
     for key, values in frames.items():
@@ -37,7 +40,7 @@ def check_finite(
             )
 
 
-def check_repeats(entry: EpisodeEntry, frames: RawFrames, report: Report) -> None:
+def check_repeats(entry: EpisodeEntry, frames: RawFrames, report: ValidationReport) -> None:
     """Frames that are copies of the one before: the robot was read too seldom, or stood."""
     if entry.length < 3:
         return
@@ -73,7 +76,9 @@ def repeated_frames(frames: RawFrames) -> Bool[np.ndarray, " frames"]:
 
 
 def check_columns(
-    folder: DatasetFolder, episodes: Sequence[tuple[EpisodeEntry, RawFrames]], report: Report
+    folder: DatasetFolder,
+    episodes: Sequence[tuple[EpisodeEntry, RawFrames]],
+    report: ValidationReport,
 ) -> None:
     """Components that never change, or that sit at an end of their range."""
     keys = {key for _, frames in episodes for key in frames} - {*INDEX_KEYS}
@@ -135,7 +140,7 @@ def check_jumps(
     joint_position: Joints,
     joint_names: Sequence[str],
     speed_limits: Mapping[str, float | int],
-    report: Report,
+    report: ValidationReport,
 ) -> None:
     """Steps no joint can make: lost frames, glitches, encoders that wrapped."""
     change = np.diff(joint_position, axis=0)
@@ -165,7 +170,10 @@ def check_jumps(
 
 
 def check_stillness(
-    entry: EpisodeEntry, time: Times, motion: Float64[np.ndarray, "frames _"], report: Report
+    entry: EpisodeEntry,
+    time: Times,
+    motion: Float64[np.ndarray, "frames _"],
+    report: ValidationReport,
 ) -> None:
     """Waiting before or after the motion, which a fit would reproduce."""
     span = float(np.ptp(motion, axis=0).max())
@@ -189,7 +197,7 @@ def check_stillness(
 
 
 def check_commands(
-    entry: EpisodeEntry, joint_position: Joints, command: Joints, report: Report
+    entry: EpisodeEntry, joint_position: Joints, command: Joints, report: ValidationReport
 ) -> None:
     """Actions that are the state over again teach a policy to stand still."""
     if joint_position.shape == command.shape and np.array_equal(joint_position, command):
@@ -202,7 +210,8 @@ def check_commands(
 
 
 def check_duplicates(
-    episodes: Sequence[tuple[EpisodeEntry, Float64[np.ndarray, "_frames _"]]], report: Report
+    episodes: Sequence[tuple[EpisodeEntry, Float64[np.ndarray, "_frames _"]]],
+    report: ValidationReport,
 ) -> None:
     """Episodes that show the same motion to within a thousandth of its span."""
     seen: list[tuple[EpisodeEntry, np.ndarray]] = []
@@ -232,12 +241,12 @@ _SHORT_FRAMES = 10
 _SHORT_SECONDS = 0.5
 
 
-def check_stamps(
+def check_timestamps(
     entry: EpisodeEntry,
     key: str,
     time: Float64[np.ndarray, " frames"],
     fps: float,
-    report: Report,
+    report: ValidationReport,
 ) -> None:
     """Order, rate, regularity and gaps of the stamps [s] of one episode."""
     place = {"file": entry.file, "episode": entry.index, "key": key}
@@ -283,7 +292,7 @@ def check_stamps(
         )
 
 
-def check_length(entry: EpisodeEntry, fps: float, report: Report) -> None:
+def check_length(entry: EpisodeEntry, fps: float, report: ValidationReport) -> None:
     """Episodes too short to be a demonstration."""
     seconds = entry.length / fps
     if entry.length < _SHORT_FRAMES or seconds < _SHORT_SECONDS:

@@ -9,8 +9,8 @@ from jaxtyping import Float64
 from hrc_learn.demos.demonstration import JOINT_FIELDS
 from hrc_learn.demos.format.dataset_folder import DatasetFolder, EpisodeEntry
 from hrc_learn.demos.format.features import read_sidecar
-from hrc_learn.demos.issue import DatasetError, Report
-from hrc_learn.demos.read.column_mapping import MappingSpec, Matching, match_columns
+from hrc_learn.demos.issue import DatasetError, ValidationReport
+from hrc_learn.demos.read.column_mapping import ColumnMapping, MappingSpec, map_columns
 from hrc_learn.demos.read.component_names import ORIENTATION_ROLES
 from hrc_learn.demos.read.episodes import Quantities, frame_step, select_quantities
 from hrc_learn.demos.read.frames import RawFrames
@@ -18,7 +18,7 @@ from hrc_learn.demos.read.value_encodings import UnitDecision, decide_units, to_
 
 
 @dataclass(frozen=True, kw_only=True)
-class Understood:
+class DatasetSemantics:
     """One episode in our units."""
 
     entry: EpisodeEntry
@@ -27,51 +27,51 @@ class Understood:
     quantities: Quantities
 
 
-def understand(
+def resolve_semantics(
     folder: DatasetFolder,
     episodes: Sequence[tuple[EpisodeEntry, RawFrames]],
     mapping: MappingSpec,
     units: Mapping[str, str],
-    report: Report,
-) -> tuple[Matching, list[Understood]]:
+    report: ValidationReport,
+) -> tuple[ColumnMapping, list[DatasetSemantics]]:
     """Find the quantities, decide on their units, and convert what is sound.
 
     Raises:
         DatasetError: The mapping, the units or the sidecar are wrong.
     """
     sidecar = read_sidecar(folder.root)
-    matching = match_columns(folder.features, sidecar, mapping)
+    column_mapping = map_columns(folder.features, sidecar, mapping)
     raw = [
-        (entry, frames, select_quantities(frames, matching.selections))
+        (entry, frames, select_quantities(frames, column_mapping.selections))
         for entry, frames in episodes
-        if _sound(frames, matching)
+        if _sound(frames, column_mapping)
     ]
     largest = {
         role: max((float(np.abs(q[role]).max()) for _, _, q in raw), default=0.0)
-        for role in matching.selections
+        for role in column_mapping.selections
     }
     step = frame_step(raw[0][2].get("time"), folder.fps) if raw else 1.0
     decisions = decide_units(largest, sidecar.units, units, step) if raw else {}
-    _report_guesses(matching, decisions, report)
-    understood = []
+    _report_guesses(column_mapping, decisions, report)
+    semantics = []
     for entry, frames, quantities in raw:
         scaled = {role: v * decisions[role].factor for role, v in quantities.items()}
         _check_orientation(entry, quantities, scaled, report)
         time = scaled["time"][:, 0] if "time" in scaled else _timestamps(folder, entry, frames)
-        understood.append(Understood(entry=entry, time=time, quantities=scaled))
-    return matching, understood
+        semantics.append(DatasetSemantics(entry=entry, time=time, quantities=scaled))
+    return column_mapping, semantics
 
 
-def check_joint_sets(matching: Matching, report: Report) -> None:
+def check_joint_sets(column_mapping: ColumnMapping, report: ValidationReport) -> None:
     """Quantities that go by joints should be of the same ones."""
-    for role, others in matching.unmatched.items():
+    for role, others in column_mapping.unmatched.items():
         message = (
             f"{role} is of the joints {', '.join(others)}, the rest of "
-            f"{', '.join(matching.joint_names)}"
+            f"{', '.join(column_mapping.joint_names)}"
         )
-        if set(others) < set(matching.joint_names):
+        if set(others) < set(column_mapping.joint_names):
             report.warning(f"{message}: it is left among the extra columns", key=role)
-        elif len(others) == len(matching.joint_names):
+        elif len(others) == len(column_mapping.joint_names):
             report.warning(f"{message}: leader and follower? They are not compared", key=role)
         else:
             report.error(
@@ -79,14 +79,14 @@ def check_joint_sets(matching: Matching, report: Report) -> None:
                 f"(mapping={{{role!r}: [...]}}) or leave it out ({{{role!r}: None}})",
                 key=role,
             )
-    if not any(role in matching.selections for role in (*JOINT_FIELDS, "position")):
+    if not any(role in column_mapping.selections for role in (*JOINT_FIELDS, "position")):
         report.error(
             "no joints and no poses found among the columns: name them (mapping={...})"
         )
 
 
-def _sound(frames: RawFrames, matching: Matching) -> bool:
-    columns = [column for s in matching.selections.values() for column in s.columns]
+def _sound(frames: RawFrames, column_mapping: ColumnMapping) -> bool:
+    columns = [column for s in column_mapping.selections.values() for column in s.columns]
     return all(
         key in frames
         and len(frames[key]) > 1
@@ -97,10 +97,12 @@ def _sound(frames: RawFrames, matching: Matching) -> bool:
 
 
 def _report_guesses(
-    matching: Matching, decisions: Mapping[str, UnitDecision], report: Report
+    column_mapping: ColumnMapping,
+    decisions: Mapping[str, UnitDecision],
+    report: ValidationReport,
 ) -> None:
-    unmatched = tuple(f"{role} is of other joints" for role in matching.unmatched)
-    for note in matching.notes:
+    unmatched = tuple(f"{role} is of other joints" for role in column_mapping.unmatched)
+    for note in column_mapping.notes:
         if not note.startswith(unmatched):
             report.warning(note)
     for decision in decisions.values():
@@ -109,7 +111,7 @@ def _report_guesses(
 
 
 def _check_orientation(
-    entry: EpisodeEntry, quantities: Quantities, scaled: Quantities, report: Report
+    entry: EpisodeEntry, quantities: Quantities, scaled: Quantities, report: ValidationReport
 ) -> None:
     role = next((role for role in ORIENTATION_ROLES if role in quantities), None)
     if role is None:

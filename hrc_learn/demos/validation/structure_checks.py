@@ -15,12 +15,12 @@ from hrc_learn.demos.format.dataset_folder import (
 )
 from hrc_learn.demos.format.features import Feature, read_features
 from hrc_learn.demos.format.parquet import BadRowError, open_parquet, read_table, to_numpy
-from hrc_learn.demos.issue import DatasetError, Report
+from hrc_learn.demos.issue import DatasetError, ValidationReport
 from hrc_learn.demos.read.component_names import INDEX_KEYS
 from hrc_learn.demos.read.frames import RawFrames, require_rows, slice_frames
 
 
-def check_metadata(root: Path, report: Report) -> DatasetFolder | None:
+def check_metadata(root: Path, report: ValidationReport) -> DatasetFolder | None:
     """Read as much of the metadata as can be read; None where nothing can be made of it."""
     info = _attempt(report, lambda: read_info(root))
     if info is None:
@@ -51,7 +51,7 @@ def check_metadata(root: Path, report: Report) -> DatasetFolder | None:
 
 
 def check_file(
-    folder: DatasetFolder, file: str, entries: list[EpisodeEntry], report: Report
+    folder: DatasetFolder, file: str, entries: list[EpisodeEntry], report: ValidationReport
 ) -> list[tuple[EpisodeEntry, RawFrames]]:
     """Read one data file as far as it goes; its episodes with the columns that are sound."""
     try:
@@ -72,7 +72,7 @@ def check_file(
 
 
 def check_indices(
-    folder: DatasetFolder, entry: EpisodeEntry, frames: RawFrames, report: Report
+    folder: DatasetFolder, entry: EpisodeEntry, frames: RawFrames, report: ValidationReport
 ) -> None:
     """The columns by which LeRobot counts: contiguous, and of this episode."""
     count = np.arange(entry.length)
@@ -104,7 +104,7 @@ def check_indices(
             )
 
 
-def _attempt[T](report: Report, read: Callable[[], T]) -> T | None:
+def _attempt[T](report: ValidationReport, read: Callable[[], T]) -> T | None:
     try:
         return read()
     except DatasetError as error:
@@ -113,7 +113,11 @@ def _attempt[T](report: Report, read: Callable[[], T]) -> T | None:
 
 
 def _sound_columns(
-    folder: DatasetFolder, file: str, table, entries: list[EpisodeEntry], report: Report
+    folder: DatasetFolder,
+    file: str,
+    table,
+    entries: list[EpisodeEntry],
+    report: ValidationReport,
 ) -> RawFrames:
     columns = {}
     for key, feature in folder.features.items():
@@ -148,7 +152,7 @@ def _sound_columns(
     return columns
 
 
-def _report_missing(file: str, key: str, report: Report) -> None:
+def _report_missing(file: str, key: str, report: ValidationReport) -> None:
     if key in INDEX_KEYS:
         # All files come from one recorder: the first one tells it for all.
         if not any(finding.key == key for finding in report.warnings):
@@ -162,7 +166,7 @@ def _report_missing(file: str, key: str, report: Report) -> None:
         )
 
 
-def _check_statistics(folder: DatasetFolder, report: Report) -> None:
+def _check_statistics(folder: DatasetFolder, report: ValidationReport) -> None:
     files = ("meta/stats.json", "meta/episodes_stats.jsonl")
     if not any((folder.root / file).is_file() for file in files):
         report.warning(
@@ -171,7 +175,7 @@ def _check_statistics(folder: DatasetFolder, report: Report) -> None:
         )
 
 
-def _check_videos(folder: DatasetFolder, report: Report) -> None:
+def _check_videos(folder: DatasetFolder, report: ValidationReport) -> None:
     for key, feature in folder.features.items():
         if feature.dtype != "video":
             continue

@@ -23,7 +23,7 @@ from hrc_learn.demos.format.lerobot_v3 import (
     write_tasks,
 )
 from hrc_learn.demos.format.parquet import read_rows
-from hrc_learn.demos.format.video_segments import Segments, VideoSegment, VideoShelf, link
+from hrc_learn.demos.format.video_segments import Segments, VideoPlacement, VideoSegment, link
 from hrc_learn.demos.write.staging import RecordingHeader, StagedEpisode, read_episode
 from hrc_learn.demos.write.video_encoder import video_path
 
@@ -103,7 +103,7 @@ def assemble(
     index = _carry_over(earlier, target) if earlier is not None else _Index()
     index.tasks |= dict.fromkeys(tasks)
     taken = {key: _count_videos(index, key) for key in cameras}
-    shelf = VideoShelf(target, taken)
+    shelf = VideoPlacement(target, taken)
     if videos is None:
         videos = [_recorded_videos(path, cameras, header.fps) for path in paths]
     segments = iter(videos)

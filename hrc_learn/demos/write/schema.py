@@ -14,8 +14,8 @@ from hrc_learn.geometry import quaternion
 
 # How recorded quantities become the columns of a LeRobot dataset.
 #
-# One `observation.state` as lerobot-record writes it (every quantity of the robot, told
-# apart by name), so that LeRobot's own tools and viewers understand the dataset.
+# One `observation.state` as lerobot-record writes it (every quantity of the robot, told apart
+# by name), so that LeRobot's own tools and viewers understand the dataset.
 
 STATE_KEY = "observation.state"
 TIME_KEY = "observation.time"

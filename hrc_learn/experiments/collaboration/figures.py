@@ -16,6 +16,7 @@ from hrc_learn.viz import Event, RunRecording, palette
 from hrc_learn.viz.figure_parts import (
     STYLE,
     WIDTH,
+    active_intervals,
     draw_box,
     finite_span,
     frame_space,
@@ -23,7 +24,6 @@ from hrc_learn.viz.figure_parts import (
     needed,
     shade,
     space,
-    spells,
 )
 
 Spans = Mapping[str, tuple[float, float]]
@@ -150,7 +150,9 @@ def timeline_figure(run: RunRecording, objects: Spans) -> Figure:
         for k, (active, colour) in enumerate(
             zip(rows.values(), (palette.PURPLE, _HIDDEN), strict=True), start=len(names)
         ):
-            bars = [(run.time[a], run.time[b] - run.time[a]) for a, b in spells(active)]
+            bars = [
+                (run.time[a], run.time[b] - run.time[a]) for a, b in active_intervals(active)
+            ]
             axes.broken_barh(bars, (k - 0.38, 0.76), color=colour)
         axes.set_yticks(range(len(names) + len(rows)), [*names, *rows])
         axes.invert_yaxis()
@@ -216,5 +218,5 @@ def _shade(
     active: Bool[np.ndarray, " time"],
     colour: str,
 ) -> None:
-    for first, last in spells(active):
+    for first, last in active_intervals(active):
         axes.axvspan(time[first], time[last], color=colour, alpha=0.25, lw=0)

@@ -15,7 +15,7 @@ SMALLEST_SPREAD = 1e-3
 """Components that vary by less are not blown up to a spread of one."""
 
 
-class ActionChart(nn.Module):
+class ActionEncoding(nn.Module):
     """Actions as coordinates of mean zero and spread one, and back.
 
     A rotation vector becomes the error e = log(r conj(q)) to a reference r, in which an

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from hrc_learn.lerobot.policy.action_encoding import ActionChart
+from hrc_learn.lerobot.policy.action_encoding import ActionEncoding
 from hrc_learn.lerobot.policy.closed_form import fit_closed_form
 from hrc_learn.lerobot.policy.observation_encoder import Observation, ObservationEncoder
 from hrc_learn.lerobot.policy.primitive_head import ContextualMotion, Primitives
@@ -33,7 +33,7 @@ class Start:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Opening:
+class InitialPlan:
     """What is kept of the first observation of an episode."""
 
     context: Float[Tensor, "B C"]
@@ -70,7 +70,7 @@ class MotionPlanner(nn.Module):
     def __init__(
         self,
         encoder: ObservationEncoder,
-        chart: ActionChart,
+        encoding: ActionEncoding,
         motion: ContextualMotion,
         *,
         measured: Sequence[int],
@@ -81,7 +81,7 @@ class MotionPlanner(nn.Module):
 
         Args:
             encoder: Of observations.
-            chart: From actions to coordinates.
+            encoding: From actions to coordinates.
             motion: From what is seen to primitives of these coordinates.
             measured: For each component of the action its column of `observation.state`, -1
                 for those that are not measured.
@@ -90,13 +90,13 @@ class MotionPlanner(nn.Module):
         """
         super().__init__()
         self.encoder = encoder
-        self.chart = chart
+        self.encoding = encoding
         self.motion = motion
         self.step = step
         self.chunk_size = chunk_size
         self.register_buffer("measured", torch.tensor(measured), persistent=False)
 
-    def open(self, observation: Observation) -> Opening:
+    def initial_plan(self, observation: Observation) -> InitialPlan:
         """Begin an episode: where the arm is, as far as that is measured."""
         context, features = self.encoder.numbers(observation), self.encoder(observation)
         clock = features.new_zeros(len(features))
@@ -104,17 +104,17 @@ class MotionPlanner(nn.Module):
         position = primitives.start
         if (self.measured >= 0).any():
             values = observation[STATE][:, None, self.measured.clamp_min(0)].to(position)
-            seen = self.chart.to_coordinates(values)[:, 0]
+            seen = self.encoding.to_coordinates(values)[:, 0]
             position = torch.where(self.measured >= 0, seen, position)
         velocity = primitives.start_velocity
         start = Start(position=position, velocity=velocity, elapsed=clock, lead=clock)
-        return Opening(context=context, features=features, start=start)
+        return InitialPlan(context=context, features=features, start=start)
 
-    def plan(self, opening: Opening, observation: Observation, start: Start) -> Chunk:
+    def plan(self, plan_start: InitialPlan, observation: Observation, start: Start) -> Chunk:
         """The next chunk of an episode, for what is seen now."""
-        return self._plan(opening, self.encoder(observation), start)
+        return self._plan(plan_start, self.encoder(observation), start)
 
-    def rehearse(
+    def condition(
         self, first: Observation, now: Observation, clock: Float[Tensor, "B"]
     ) -> Chunk:
         """The chunk at a time of an episode that until then runs as its first observation told.
@@ -127,11 +127,11 @@ class MotionPlanner(nn.Module):
             now: The one at `clock`.
             clock: Since the start of the episode [s].
         """
-        opening = self.open(first)
-        begin = opening.start
+        plan_start = self.initial_plan(first)
+        begin = plan_start.start
         elapsed = (clock - self.step).clamp_min(0)
         primitives = self._primitives(
-            opening.context, opening.features, opening.features, begin.clock
+            plan_start.context, plan_start.features, plan_start.features, begin.clock
         )
         position, velocity = self._continued(primitives, begin, elapsed[:, None])
         start = Start(
@@ -140,7 +140,7 @@ class MotionPlanner(nn.Module):
             elapsed=elapsed,
             lead=clock - elapsed,
         )
-        return self._plan(opening, self.encoder(now), start)
+        return self._plan(plan_start, self.encoder(now), start)
 
     def fit(self, demonstrations: Sequence[Mapping[str, Tensor]], action: str) -> float:
         """Start from demonstrations in closed form, numbers being whitened already.
@@ -152,15 +152,17 @@ class MotionPlanner(nn.Module):
         Returns:
             As of `fit_closed_form`.
         """
-        actions = [shown[action].to(self.chart.mean) for shown in demonstrations]
-        self.chart.learn(actions)
+        actions = [shown[action].to(self.encoding.mean) for shown in demonstrations]
+        self.encoding.learn(actions)
         first = [{key: d[key][0] for key in self.encoder.widths} for d in demonstrations]
         contexts = torch.stack([self.encoder.numbers(seen) for seen in first])
-        coordinates = [self.chart.to_coordinates(shown) for shown in actions]
+        coordinates = [self.encoding.to_coordinates(shown) for shown in actions]
         return fit_closed_form(self.motion, coordinates, contexts, 1 / self.step)
 
-    def _plan(self, opening: Opening, seen: Float[Tensor, "B F"], start: Start) -> Chunk:
-        primitives = self._primitives(opening.context, opening.features, seen, start.clock)
+    def _plan(self, plan_start: InitialPlan, seen: Float[Tensor, "B F"], start: Start) -> Chunk:
+        primitives = self._primitives(
+            plan_start.context, plan_start.features, seen, start.clock
+        )
         steps = self.step * torch.arange(self.chunk_size).to(start.lead)
         position, velocity = self._continued(primitives, start, start.lead[:, None] + steps)
         return Chunk(position=position, velocity=velocity, clock=start.clock)

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from hrc_learn.demos.format.dataset_folder import open_folder
-from hrc_learn.demos.read.episodes import choose_episodes
+from hrc_learn.demos.read.episodes import select_episodes
 from hrc_learn.demos.read.frames import read_frames
 from hrc_learn.dmp import JointDMP
 from hrc_learn.dmp.fitting.ridge import RidgeFit, fit_ridge
@@ -151,7 +151,7 @@ def read_episodes(
         DatasetError: A `ValueError` that says what of the dataset cannot be read.
     """
     folder = open_folder(root)
-    chosen = choose_episodes(folder, episodes)
+    chosen = select_episodes(folder, episodes)
     if len(chosen) > MOST:
         spread = np.linspace(0, len(chosen) - 1, MOST).round().astype(int)
         chosen = tuple(chosen[i] for i in spread)

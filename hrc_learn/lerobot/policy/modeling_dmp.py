@@ -16,11 +16,11 @@ from torch import Tensor
 from hrc_learn.dmp import GaussianBasis, SpringDamper
 from hrc_learn.dmp.system.response import response_of
 from hrc_learn.lerobot.policy.action_encoding import (
-    ActionChart,
+    ActionEncoding,
     matched_columns,
     rotation_triples,
 )
-from hrc_learn.lerobot.policy.chunk_planner import MotionPlanner, Opening, Start
+from hrc_learn.lerobot.policy.chunk_planner import InitialPlan, MotionPlanner, Start
 from hrc_learn.lerobot.policy.closed_form import read_episodes
 from hrc_learn.lerobot.policy.configuration_dmp import DMPConfig
 from hrc_learn.lerobot.policy.observation_encoder import ObservationEncoder
@@ -81,7 +81,7 @@ class DMPPolicy(PreTrainedPolicy):
 
     def reset(self) -> None:
         """Forget the motion that is under way: an episode begins."""
-        self._underway: tuple[Opening, Start] | None = None
+        self._underway: tuple[InitialPlan, Start] | None = None
         self._action_queue: deque[Tensor] = deque()
 
     def forward(
@@ -100,12 +100,12 @@ class DMPPolicy(PreTrainedPolicy):
         Returns:
             The loss, and the root mean square error of the actions present.
         """
-        encoder, chart = self.planner.encoder, self.planner.chart
+        encoder, encoding = self.planner.encoder, self.planner.encoding
         keys = (*encoder.widths, *encoder.images)
         first, now = ({key: batch[key][:, i] for key in keys} for i in (0, 1))
-        clock = batch["timestamp"].flatten().to(chart.mean)
-        predicted = self.planner.rehearse(first, now, clock).position
-        difference = predicted - chart.to_coordinates(batch[ACTION])
+        clock = batch["timestamp"].flatten().to(encoding.mean)
+        predicted = self.planner.condition(first, now, clock).position
+        difference = predicted - encoding.to_coordinates(batch[ACTION])
         present = ~batch[f"{ACTION}_is_pad"]
         square = difference.square().mean(-1) * present
         rmse = {"rmse": float((square.detach().sum() / present.sum()).sqrt())}
@@ -126,14 +126,14 @@ class DMPPolicy(PreTrainedPolicy):
         """
         self.eval()
         if self._underway is None:
-            opening = self.planner.open(batch)
-            start = opening.start
+            plan_start = self.planner.initial_plan(batch)
+            start = plan_start.start
         else:
-            opening, start = self._underway
-        chunk = self.planner.plan(opening, batch, start)
+            plan_start, start = self._underway
+        chunk = self.planner.plan(plan_start, batch, start)
         start = chunk.start_after(self.config.n_action_steps, self.planner.step)
-        self._underway = opening, start
-        return self.planner.chart.to_actions(chunk.position)
+        self._underway = plan_start, start
+        return self.planner.encoding.to_actions(chunk.position)
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **_: Any) -> Float[Tensor, "B A"]:
@@ -148,7 +148,7 @@ class DMPPolicy(PreTrainedPolicy):
             return
         self.planner.encoder.whiten(stats)
         mean, std = (torch.as_tensor(stats[ACTION][k]) for k in ("mean", "std"))
-        self.planner.chart.whiten(std, mean)
+        self.planner.encoding.whiten(std, mean)
 
     def _fit(self, dataset_meta: Any) -> None:
         """Start from the demonstrations, if they lie on disk."""
@@ -182,7 +182,7 @@ def _planner(config: DMPConfig, step: float) -> MotionPlanner:
     states = config.state_names if OBS_STATE in widths else None
     return MotionPlanner(
         encoder,
-        ActionChart(width, rotation_triples(names)),
+        ActionEncoding(width, rotation_triples(names)),
         ContextualMotion(
             response_of(SpringDamper(), GaussianBasis(count=config.n_basis)),
             width,

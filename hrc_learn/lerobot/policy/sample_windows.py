@@ -11,7 +11,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 
-class Windows:
+class SampleWindows:
     """Samples of all frames of episodes, with the steps around each that a policy asks for."""
 
     def __init__(

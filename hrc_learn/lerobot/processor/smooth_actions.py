@@ -93,15 +93,16 @@ class WatchStateStep(ProcessorStep):
 
     # LeRobot builds both steps of a policy from files, each without the other: the one that
     # smooths finds the one that watches by name, for as long as somebody holds it.
-    _alive: ClassVar[WeakValueDictionary[str, WatchStateStep]] = WeakValueDictionary()
+    _alive: ClassVar[WeakValueDictionary[str, Any]] = WeakValueDictionary()
 
     def __post_init__(self) -> None:
         self._alive[self.pair] = self
 
     @classmethod
-    def named(cls, pair: str) -> WatchStateStep | None:
-        """The newest step of that name that is still in use."""
-        return cls._alive.get(pair)
+    def newest_state(cls, pair: str) -> Tensor | None:
+        """What the step of that name saw last; None where no such step is in use."""
+        step = cls._alive.get(pair)
+        return None if step is None else step.state
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
         observation = transition.get(TransitionKey.OBSERVATION) or {}
@@ -233,8 +234,7 @@ class SmoothActionsStep(ProcessorStep):
     def _measured(self, chunk: Tensor) -> Float[Tensor, "batch values"]:
         """Where the robot is; values that are not measured are where they are sent."""
         here = chunk[..., 0, :].to(torch.float64)
-        watch = WatchStateStep.named(self.pair)
-        state = None if watch is None else watch.state
+        state = WatchStateStep.newest_state(self.pair)
         if state is None or state.shape[0] != here.shape[0]:
             return here
         if int(self._columns.max()) >= state.shape[-1]:

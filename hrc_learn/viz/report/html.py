@@ -61,7 +61,7 @@ def _report(report: Report, anchor: str) -> str:
             _paragraphs(report.summary),
             _measurements(report.table),
             *(_section(section) for section in report.sections),
-            _again(report.command),
+            _reproduce(report.command),
             _details("Configuration", flatten(report.configuration)),
             _details("Versions", report.versions),
         ]
@@ -125,8 +125,8 @@ def _paragraphs(text: str) -> str:
     return "\n".join(f"<p>{escape(part)}</p>" for part in parts if part)
 
 
-def _again(command: str) -> str:
-    return f"<h2>Again</h2>\n<pre>{escape(command)}</pre>" if command else ""
+def _reproduce(command: str) -> str:
+    return f"<h2>Reproduce</h2>\n<pre>{escape(command)}</pre>" if command else ""
 
 
 def _details(summary: str, values: Mapping[str, object]) -> str:
