@@ -6,10 +6,10 @@ from matplotlib.figure import Figure
 
 from hrc_learn.dmp import (
     ContextualDMP,
-    DMPDistribution,
     JointDMP,
     MovingGoal,
     PolynomialFeatures,
+    ProbabilisticDMP,
     fit_rhythmic,
     through,
 )
@@ -117,7 +117,7 @@ def distribution(figure: Figure) -> None:
 
     demos = demonstrations.rise(s) + random(0.12) * torch.sin(torch.pi * s)
     demos = demos + random(0.06) * torch.sin(2 * torch.pi * s) + random(0.05) * s
-    known = DMPDistribution.fit(JointDMP.fit(time.expand(12, -1), demos[..., None], 20))
+    known = ProbabilisticDMP.fit(JointDMP.fit(time.expand(12, -1), demos[..., None], 20))
     via = (1.0, 0.85)
     given = known.condition([via[0]], [[via[1]]], noise=0.005)
     for axes, belief, colour, title in zip(

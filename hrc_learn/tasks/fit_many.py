@@ -12,8 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..demos import Demonstration, DemonstrationSet, DemonstrationSource
-from ..dmp import ContextualDMP
-from ..dmp.fitting.shared import SharedFit, fit_shared
+from ..dmp import ContextualDMP, SharedFit, fit_shared
 from .fit_primitives import FittedPrimitives
 from .kinds import KINDS
 

@@ -9,10 +9,14 @@ import numpy as np
 from torch import Tensor
 
 from ..demos import DemonstrationSet, PaddedDemonstrations
-from ..dmp import JointDMP, PoseDMP
-from ..dmp.fitting.mean import mean_primitive
-from ..dmp.fitting.selection import BasisSelection, select_basis_count
-from ..dmp.generalisation.distribution import DMPDistribution
+from ..dmp import (
+    BasisSelection,
+    JointDMP,
+    PoseDMP,
+    ProbabilisticDMP,
+    mean_primitive,
+    select_basis_count,
+)
 from ..kinematics import panda
 from ..viz import FitRecording, JointLimits
 from .kinds import Motions, Primitive, kinds_wanted
@@ -58,20 +62,20 @@ class FittedPrimitives:
         Args:
             folder: Where.
             each: Keep those of single demonstrations too, in `folder/each/KIND`: what a
-                `DMPDistribution` is made of.
+                `ProbabilisticDMP` is made of.
         """
         for kind, primitive in self.common.items():
             primitive.save(folder / kind)
         for kind, primitives in self.each.items() if each else ():
             primitives.save(folder / EACH / kind)
 
-    def distribution(self, kind: str) -> DMPDistribution:
+    def distribution(self, kind: str) -> ProbabilisticDMP:
         """Gaussian over the primitives of one kind.
 
         Raises:
             ValueError: Of fewer than two demonstrations, or scaled primitives.
         """
-        return DMPDistribution.fit(self.each[kind])
+        return ProbabilisticDMP.fit(self.each[kind])
 
     def metrics(self) -> dict[str, float]:
         """How close the primitives come to their demonstrations.

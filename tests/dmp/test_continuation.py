@@ -1,11 +1,7 @@
 import pytest
 import torch
 
-from hrc_learn.dmp import JointDMP
-from hrc_learn.dmp.continuation import continue_motion
-from hrc_learn.dmp.system.basis import GaussianBasis
-from hrc_learn.dmp.system.response import response_of
-from hrc_learn.dmp.system.spring import SpringDamper
+from hrc_learn.dmp import GaussianBasis, JointDMP, SpringDamper, continue_motion, response_of
 
 RESPONSE = response_of(SpringDamper(), GaussianBasis(count=12))
 

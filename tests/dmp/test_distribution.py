@@ -4,7 +4,7 @@ import torch
 from demo_motions import arm_motion, minimum_jerk
 from scipy.stats import multivariate_normal
 
-from hrc_learn.dmp import DMPDistribution, JointDMP
+from hrc_learn.dmp import JointDMP, ProbabilisticDMP
 
 S = torch.linspace(0, 1, 200, dtype=torch.float64)
 
@@ -27,7 +27,7 @@ def dense(rows):
 @pytest.fixture(scope="module")
 def distribution():
     time, motions = family()
-    return DMPDistribution.fit(JointDMP.fit(time, motions, n_basis=15))
+    return ProbabilisticDMP.fit(JointDMP.fit(time, motions, n_basis=15))
 
 
 def test_moments_are_those_of_the_demonstrations(distribution):
@@ -82,7 +82,7 @@ def test_one_primitive_bends_through_via_points_and_keeps_its_ends():
     time, position = arm_motion(n_joints=2)
     dmp = JointDMP.fit(time, position)
     via = torch.tensor([[0.4, torch.nan]], dtype=torch.float64)
-    bent = DMPDistribution.around(dmp).condition([1.5], via).mean_primitive()
+    bent = ProbabilisticDMP.around(dmp).condition([1.5], via).mean_primitive()
     plain, moved = dmp.rollout().position, bent.rollout().position
     assert bent.rollout(time=[1.5]).position[0, 0].item() == pytest.approx(0.4, abs=1e-6)
     torch.testing.assert_close(moved[:, 1], plain[:, 1])
@@ -101,7 +101,7 @@ def test_slack_reaches_what_no_mixture_passes():
     times = [0.5, 1.0, 1.6]
 
     def miss(slack):
-        given = DMPDistribution.fit(primitives, slack=slack).condition(times, via)
+        given = ProbabilisticDMP.fit(primitives, slack=slack).condition(times, via)
         return (given.mean_primitive().rollout(time=times).position - via).abs().max()
 
     assert miss(0.0) > 0.1
@@ -134,12 +134,12 @@ def test_conditioning_is_differentiable(distribution):
 def test_what_cannot_be_is_refused(distribution):
     time, position = arm_motion()
     with pytest.raises(ValueError, match="at least 2"):
-        DMPDistribution.fit(JointDMP.fit(time, position))
+        ProbabilisticDMP.fit(JointDMP.fit(time, position))
     both = torch.stack([position, position])
     with pytest.raises(ValueError, match=r"needs one primitive, got a batch \(2,\)"):
-        DMPDistribution.around(JointDMP.fit(time, both))
+        ProbabilisticDMP.around(JointDMP.fit(time, both))
     with pytest.raises(ValueError, match="not linear"):
-        DMPDistribution.fit(JointDMP.fit(time, both, scaling="amplitude"))
+        ProbabilisticDMP.fit(JointDMP.fit(time, both, scaling="amplitude"))
     with pytest.raises(ValueError, match=r"value must have shape \(1, 2\)"):
         distribution.condition([0.5], [0.0, 0.0, 0.0])
     with pytest.raises(ValueError, match="none negative"):

@@ -7,8 +7,8 @@ from demo_motions import arm_motion
 from scipy.stats import multivariate_normal
 from torch.autograd import gradcheck
 
-from hrc_learn.dmp import DMPDistribution, LimitedDMP, OrientationDMP, PoseDMP
-from hrc_learn.dmp.rotation.error import nearest_turn, to_error
+from hrc_learn.dmp import LimitedDMP, OrientationDMP, PoseDMP, ProbabilisticDMP
+from hrc_learn.dmp.orientation_error import nearest_turn, to_error
 from hrc_learn.geometry import Pose, quaternion
 
 NAN = torch.nan
@@ -32,7 +32,7 @@ def orientation(*vector):
 
 @pytest.fixture(scope="module")
 def distribution():
-    return DMPDistribution.fit(OrientationDMP.fit(*turns(), n_basis=15))
+    return ProbabilisticDMP.fit(OrientationDMP.fit(*turns(), n_basis=15))
 
 
 def test_goals_of_their_own_are_taken_about_one_reference(distribution):
@@ -45,7 +45,7 @@ def test_goals_of_their_own_are_taken_about_one_reference(distribution):
 
 
 def test_via_orientations_are_passed_by_either_sign_and_velocities_too():
-    distribution = DMPDistribution.fit(OrientationDMP.fit(*turns(), n_basis=15), slack=0.3)
+    distribution = ProbabilisticDMP.fit(OrientationDMP.fit(*turns(), n_basis=15), slack=0.3)
     via = orientation(0.4, -0.2, 0.1)[None]
     omega = torch.tensor([[0.3, 0.1, -0.2]], dtype=torch.float64)
     one, other = (
@@ -60,7 +60,7 @@ def test_via_orientations_are_passed_by_either_sign_and_velocities_too():
 def test_demonstrations_with_other_signs_are_the_same(distribution):
     time, q = turns()
     sign = torch.where(torch.arange(6) % 2 == 0, 1.0, -1.0)[:, None, None]
-    flipped = DMPDistribution.fit(OrientationDMP.fit(time, sign * q, n_basis=15))
+    flipped = ProbabilisticDMP.fit(OrientationDMP.fit(time, sign * q, n_basis=15))
     one, other = (d.mean_primitive().rollout().orientation for d in (distribution, flipped))
     assert quaternion.angle(one, other).max() < 1e-6
 
@@ -100,7 +100,7 @@ def poses(n=5):
 def test_any_of_position_orientation_twist_and_body_can_be_given():
     time, position, q, body = poses()
     pose = PoseDMP.fit(time, position, q, body=body, n_basis=15)
-    distribution = DMPDistribution.fit(pose, slack=0.3)
+    distribution = ProbabilisticDMP.fit(pose, slack=0.3)
     where = Pose(torch.tensor([[0.1, NAN, 0.2], [NAN] * 3]).double(), torch.full((2, 4), NAN))
     turn = Pose(torch.full((1, 3), NAN), orientation(0.5, 0.0, -0.1)[None])
     twist = torch.tensor([[NAN, 0.5, NAN, 0.1, 0.2, 0.3]]).double()
@@ -119,7 +119,7 @@ def test_one_pose_bends_through_via_points_and_keeps_its_ends():
     time, position, q, body = (column[0] if column.ndim > 1 else column for column in poses())
     dmp = PoseDMP.fit(time, position, q, body=body)
     via = Pose(torch.tensor([[0.3, 0.1, 0.0]]).double(), orientation(0.9, 0.3, 0.0)[None])
-    bent = DMPDistribution.around(dmp).condition([1.0], via).mean_primitive()
+    bent = ProbabilisticDMP.around(dmp).condition([1.0], via).mean_primitive()
     there = bent.rollout(time=[1.0])
     torch.testing.assert_close(there.position, via.position, rtol=0, atol=1e-5)
     assert quaternion.angle(there.orientation, via.orientation) < 1e-5
@@ -131,7 +131,7 @@ def test_limited_joints_stay_inside_whatever_is_sampled():
     time, position = arm_motion(n_joints=2)
     lower, upper = position.amin(0) - 0.05, position.amax(0) + 0.05
     dmp = LimitedDMP.fit(time, position, lower, upper)
-    wild = DMPDistribution.around(dmp, slack=3.0)
+    wild = ProbabilisticDMP.around(dmp, slack=3.0)
     moved = wild.sample(50, torch.Generator().manual_seed(0)).rollout().position
     assert ((moved > lower) & (moved < upper)).all()
     via = ((lower + 3 * upper) / 4)[None]
@@ -142,7 +142,7 @@ def test_limited_joints_stay_inside_whatever_is_sampled():
 def test_a_via_orientation_is_on_the_branch_of_the_motion():
     axis = torch.tensor([0.0, 0.6, 0.8], dtype=torch.float64)
     dmp = OrientationDMP.fit(S, quaternion.exp(9 * S[:, None] * axis))
-    around = DMPDistribution.around(dmp)
+    around = ProbabilisticDMP.around(dmp)
     via = quaternion.exp(4.6 * axis)[None]
     error = to_error(via, dmp.reference)
     expected = nearest_turn(error, dmp.motion.rollout(time=[0.5]).position)
@@ -158,10 +158,10 @@ def random_inputs(*widths):
 def test_conditioning_has_exact_gradients():
     """With respect to time, via orientation and velocity, prior mean and spread."""
     time, q = turns(3)
-    prior = DMPDistribution.fit(OrientationDMP.fit(time[::10], q[:, ::10], n_basis=2))
+    prior = ProbabilisticDMP.fit(OrientationDMP.fit(time[::10], q[:, ::10], n_basis=2))
 
     def conditioned(at, vector, omega, mean, spread):
-        given = DMPDistribution(primitive=prior.primitive, mean=mean, spread=spread)
+        given = ProbabilisticDMP(primitive=prior.primitive, mean=mean, spread=spread)
         given = given.condition(at, quaternion.exp(vector), omega, noise=0.05)
         return given.mean_primitive().rollout(time=[1.4]).orientation
 
@@ -174,7 +174,7 @@ def test_conditioning_has_exact_gradients():
 def test_conditioning_of_poses_has_exact_gradients():
     time, position, q, _ = poses(3)
     fitted = PoseDMP.fit(time[::10], position[:, ::10], q[:, ::10], n_basis=4)
-    prior = DMPDistribution.fit(fitted)
+    prior = ProbabilisticDMP.fit(fitted)
 
     def conditioned(at, where, vector, twist):
         via = Pose(where, quaternion.exp(vector))

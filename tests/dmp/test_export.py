@@ -8,16 +8,14 @@ import torch
 from demo_motions import arm_motion, turning_motion
 from unchecked import shapes_unchecked
 
-from hrc_learn.dmp import JointDMP, OrientationDMP, PoseDMP
-from hrc_learn.dmp.export import (
+from hrc_learn.dmp import JointDMP, OrientationDMP, OrientationStepper, PoseDMP, PoseStepper
+from hrc_learn.dmp.exported_dmp import (
     StepModule,
     export_dmp,
     load_stepper,
     resting_inputs,
     state_tensors,
 )
-from hrc_learn.dmp.orientation_stepper import OrientationStepper
-from hrc_learn.dmp.pose_stepper import PoseStepper
 from hrc_learn.geometry import Pose, quaternion
 
 
@@ -195,7 +193,8 @@ def test_what_cannot_be_stepped_is_refused(tmp_path):
 
 def test_the_closed_form_is_the_derivative():
     """Angular velocity of NumPy against that of tensors, from tiny to many turns."""
-    from hrc_learn.dmp.rotation import arrays, error
+    from hrc_learn.dmp import numpy_orientation as arrays
+    from hrc_learn.dmp import orientation_error as error
 
     rng = np.random.default_rng(3)
     for size in (0.0, 1e-9, 1e-4, 0.019, 0.021, 1.0, 3.1, 6.0, 2 * np.pi, 14.0):

@@ -5,7 +5,7 @@ import torch
 from demo_motions import arm_motion
 
 from hrc_learn.dmp import JointDMP, SpringDamper
-from hrc_learn.dmp.system.known import as_numbers
+from hrc_learn.dmp.closed_loop import host_values
 
 SPRINGS = [
     SpringDamper(),
@@ -47,6 +47,6 @@ def test_derivatives_by_times_are_kept():
 
 def test_only_single_plain_times_are_read():
     time = torch.tensor(0.5, dtype=torch.float64)
-    assert as_numbers(time, time) == (0.5, 0.5)
+    assert host_values(time, time) == (0.5, 0.5)
     for kept in (time[None], time.clone().requires_grad_()):
-        assert as_numbers(time, kept) == (time, kept)
+        assert host_values(time, kept) == (time, kept)

@@ -5,8 +5,7 @@ from dmp_contract import DMPContract
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hrc_learn.dmp import JointDMP, LimitedDMP
-from hrc_learn.dmp.soft_limits import SoftLimits
+from hrc_learn.dmp import JointDMP, LimitedDMP, SoftLimits
 
 LOWER = torch.tensor([-2.9, -1.8, -2.0], dtype=torch.float64)
 UPPER = torch.tensor([2.9, 1.8, 2.2], dtype=torch.float64)

@@ -5,8 +5,7 @@ from demo_motions import PERIOD, rhythm
 from dmp_contract import DMPContract
 from scipy.integrate import solve_ivp
 
-from hrc_learn.dmp import PeriodicBasis, SpringDamper, Stepper, fit_rhythmic
-from hrc_learn.dmp.system.response import Response
+from hrc_learn.dmp import PeriodicBasis, Response, SpringDamper, Stepper, fit_rhythmic
 
 
 class TestRhythmic(DMPContract):

@@ -9,8 +9,7 @@ from hrc_learn.dmp import (
     fit_rhythmic_orientation,
     fit_rhythmic_pose,
 )
-from hrc_learn.dmp.rotation.error import to_error
-from hrc_learn.dmp.rotation.mean import intrinsic_mean
+from hrc_learn.dmp.orientation_error import intrinsic_mean, to_error
 from hrc_learn.geometry import quaternion
 
 CENTRE = quaternion.exp(torch.tensor([1.5, -2.0, 0.4], dtype=torch.float64))

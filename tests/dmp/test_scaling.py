@@ -15,9 +15,8 @@ from scipy.integrate import solve_ivp
 from torch.autograd import gradcheck
 from unchecked import shapes_unchecked
 
-from hrc_learn.dmp import JointDMP, PoseDMP, Stepper
-from hrc_learn.dmp.fitting.mean import mean_primitive
-from hrc_learn.dmp.scaling import SCALINGS, RotationScaling, find_scaling
+from hrc_learn.dmp import JointDMP, PoseDMP, Stepper, mean_primitive
+from hrc_learn.dmp.forcing_scale import SCALINGS, RotationScaling, find_scaling
 from hrc_learn.geometry import Pose
 
 quick = settings(max_examples=30, deadline=None)

@@ -4,10 +4,8 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from hrc_learn.dmp import JointDMP
-from hrc_learn.dmp.fitting.least_squares import LeastSquares
-from hrc_learn.dmp.fitting.mean import mean_primitive
-from hrc_learn.dmp.fitting.shared import fit_shared
+from hrc_learn.dmp import JointDMP, mean_primitive
+from hrc_learn.dmp.fitting.streaming import LeastSquares, fit_shared
 
 
 def demonstrations(n=4, frames=150, seed=0):

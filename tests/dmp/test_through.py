@@ -5,11 +5,11 @@ from demo_motions import arm_motion, minimum_jerk, turning_motion
 from torch.autograd import gradcheck
 
 from hrc_learn.dmp import (
-    DMPDistribution,
     JointDMP,
     LimitedDMP,
     OrientationDMP,
     PoseDMP,
+    ProbabilisticDMP,
     fit_rhythmic,
     through,
     with_ends,
@@ -110,7 +110,7 @@ def test_via_points_far_outside_of_the_demonstration_cause_no_overshoot(far):
 def test_as_conditioning_without_noise_it_passes_but_keeps_the_end():
     """`around` makes the least change of the forcing, wherever that leads to at the end."""
     dmp = JointDMP.fit(*arm_motion(n_joints=1))
-    soft = DMPDistribution.around(dmp).condition([1.2], [[0.7]]).mean_primitive()
+    soft = ProbabilisticDMP.around(dmp).condition([1.2], [[0.7]]).mean_primitive()
     hard = through(dmp, [1.2], [[0.7]])
     for bent in (soft, hard):
         assert bent.rollout(time=[1.2]).position.item() == pytest.approx(0.7, abs=1e-5)

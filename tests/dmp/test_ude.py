@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from unchecked import shapes_unchecked
 
 from hrc_learn.dmp import OrientationDMP
-from hrc_learn.dmp.rotation.error import angular_velocity
+from hrc_learn.dmp.orientation_error import angular_velocity
 from hrc_learn.geometry import quaternion
 from hrc_learn.geometry.left_jacobian import axis_drift, drift_free_rate
 

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from ...dmp.rotation.error import nearest_turn, to_error, to_orientation
+from ...dmp.orientation_error import nearest_turn, to_error, to_orientation
 from ...geometry import quaternion
 
 SMALLEST_SPREAD = 1e-3

@@ -8,9 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from ...dmp import JointDMP
-from ...dmp.fitting.ridge import RidgeFit, fit_ridge
-from ...dmp.system.response import Response
+from ...dmp import JointDMP, Response, RidgeFit, fit_ridge
 from .motion import ContextualMotion
 
 REGULARIZATIONS = (1e-3, 1e-2, 1e-1, 1.0, 10.0)

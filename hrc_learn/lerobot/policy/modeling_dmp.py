@@ -13,9 +13,7 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
 
-from ...dmp.system.basis import GaussianBasis
-from ...dmp.system.response import response_of
-from ...dmp.system.spring import SpringDamper
+from ...dmp import GaussianBasis, SpringDamper, response_of
 from .chart import ActionChart
 from .columns import matched_columns, rotation_triples
 from .configuration_dmp import DMPConfig

@@ -7,8 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from ...dmp.continuation import continue_motion
-from ...dmp.system.response import Response
+from ...dmp import Response, continue_motion
 
 HARMONICS = 4
 """Sines and cosines of the phase that the network sees."""
