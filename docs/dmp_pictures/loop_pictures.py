@@ -79,7 +79,7 @@ def stopping(figure: Figure) -> None:
                 measured = measured + 100 * DT * (state.position - measured)
             robot.append(measured)
             followed.append(measured.item())
-            return {"slowdown": phase_stopping(state.position, measured, gain)}
+            return {"phase_stopping": phase_stopping(state.position, measured, gain)}
 
         path = run(dmp, 3.0, change)[:, 0]
         t = DT * np.arange(1, len(path) + 1)

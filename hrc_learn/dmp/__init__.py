@@ -28,16 +28,17 @@ from hrc_learn.dmp.limited_dmp import LimitedDMP as LimitedDMP
 from hrc_learn.dmp.limited_dmp import LimitedState as LimitedState
 from hrc_learn.dmp.limited_dmp import LimitedTrajectory as LimitedTrajectory
 from hrc_learn.dmp.limited_dmp import SoftLimits as SoftLimits
-from hrc_learn.dmp.moving_goal_dmp import MovingGoal as MovingGoal
+from hrc_learn.dmp.motion_primitive import MotionPrimitive as MotionPrimitive
+from hrc_learn.dmp.moving_goal_dmp import MovingGoalDMP as MovingGoalDMP
 from hrc_learn.dmp.moving_goal_dmp import MovingGoalState as MovingGoalState
 from hrc_learn.dmp.moving_goal_dmp import MovingTrajectory as MovingTrajectory
 from hrc_learn.dmp.numpy_stepper import OrientationStepper as OrientationStepper
 from hrc_learn.dmp.numpy_stepper import PoseStepper as PoseStepper
 from hrc_learn.dmp.numpy_stepper import Stepper as Stepper
 from hrc_learn.dmp.numpy_stepper import StepperState as StepperState
+from hrc_learn.dmp.orientation_coordinates import OrientationState as OrientationState
+from hrc_learn.dmp.orientation_coordinates import OrientationTrajectory as OrientationTrajectory
 from hrc_learn.dmp.orientation_dmp import OrientationDMP as OrientationDMP
-from hrc_learn.dmp.orientation_dmp import OrientationState as OrientationState
-from hrc_learn.dmp.orientation_dmp import OrientationTrajectory as OrientationTrajectory
 from hrc_learn.dmp.pose_dmp import PoseDMP as PoseDMP
 from hrc_learn.dmp.pose_dmp import PoseState as PoseState
 from hrc_learn.dmp.pose_dmp import PoseTrajectory as PoseTrajectory
@@ -46,15 +47,18 @@ from hrc_learn.dmp.probabilistic.contextual_dmp import PolynomialFeatures as Pol
 from hrc_learn.dmp.probabilistic.contextual_dmp import RidgeFit as RidgeFit
 from hrc_learn.dmp.probabilistic.contextual_dmp import fit_ridge as fit_ridge
 from hrc_learn.dmp.probabilistic.linear_view import mean_primitive as mean_primitive
+from hrc_learn.dmp.probabilistic.linear_view import (
+    via_point_primitive as via_point_primitive,
+)
 from hrc_learn.dmp.probabilistic.linear_view import with_ends as with_ends
 from hrc_learn.dmp.probabilistic.probabilistic_dmp import ProbabilisticDMP as ProbabilisticDMP
-from hrc_learn.dmp.probabilistic.vmp import through as via_point_primitive
 from hrc_learn.dmp.rhythmic_dmp import fit_rhythmic as fit_rhythmic
 from hrc_learn.dmp.rhythmic_dmp import fit_rhythmic_orientation as fit_rhythmic_orientation
 from hrc_learn.dmp.rhythmic_dmp import fit_rhythmic_pose as fit_rhythmic_pose
 
 # Names of earlier versions.
 force = coupling
+MovingGoal = MovingGoalDMP
 through = via_point_primitive
 DMPDistribution = ProbabilisticDMP
 PlacedBasis = LearnedGaussianBasis

@@ -1,15 +1,43 @@
-"""What callers may pass, and the same as checked tensors."""
+"""What callers may pass, and the same as checked tensors.
+
+Tensors, arrays and nested lists of integers or floats alike. `...` stands for any number of
+leading batch axes. Axes are named for the reader (`_T`, `_D`) and not bound, as arguments of
+one call broadcast and demonstrations of one list differ in length; where sizes have to agree,
+they are compared where the values are used.
+"""
+
+from collections.abc import Sequence
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
-type ArrayLike = Tensor | np.ndarray | list | tuple | float
+type Nested = Sequence
+"""Lists or tuples, of numbers or of more of them."""
+type Number = float | int | np.number
+type ArrayLike = Real[Tensor, "..."] | Real[np.ndarray, "..."] | Nested | Number
+"""Any array of numbers."""
+type Scalars = ArrayLike
+"""One number for each primitive, (*batch): durations [s], gains, steps [s]."""
+type Times = Real[Tensor, "... _T"] | Real[np.ndarray, "... _T"] | Nested
+"""Times [s], (T,) for all of a batch or (*batch, T)."""
+type Row = Real[Tensor, "_T"] | Real[np.ndarray, "_T"]
+"""Of one coordinate, (T,)."""
+type Points = Real[Tensor, "... _T _D"] | Real[np.ndarray, "... _T _D"] | Row | Nested
+"""Values along time, (*batch, T, D); (T,) where D = 1."""
+type Vectors = Real[Tensor, "... _D"] | Real[np.ndarray, "... _D"] | Nested
+"""A value for each primitive, (*batch, D)."""
+type Quaternions = Real[Tensor, "... 4"] | Real[np.ndarray, "... 4"] | Nested
+"""Unit quaternions (w, x, y, z), (*batch, 4) or along time (*batch, T, 4)."""
+type Mask = Bool[Tensor, "... _T"] | Bool[np.ndarray, "... _T"] | Times
+"""False (or zero) where a sample does not count, (T,) or (*batch, T)."""
 
 
 def to_tensor(
-    values: ArrayLike, dtype: torch.dtype | None = None, device: torch.device | None = None
+    values: ArrayLike | Mask,
+    dtype: torch.dtype | None = None,
+    device: torch.device | None = None,
 ) -> Tensor:
     """As `torch.as_tensor`, also of arrays that are read-only or run backwards."""
     if isinstance(values, Tensor) and values.dtype == dtype and values.device == device:
@@ -20,7 +48,7 @@ def to_tensor(
 
 
 def vector(
-    name: str, value: ArrayLike, like: Float[Tensor, "*batch D"]
+    name: str, value: Vectors, like: Float[Tensor, "*batch D"]
 ) -> Float[Tensor, "*other D"]:
     """One number for each coordinate that `like` has, with its dtype and device.
 
@@ -34,7 +62,7 @@ def vector(
     return tensor
 
 
-def positive(name: str, value: ArrayLike, like: Tensor) -> Float[Tensor, "*batch"]:
+def positive(name: str, value: Scalars, like: Tensor) -> Float[Tensor, "*batch"]:
     """Numbers above zero, with dtype and device of `like`.
 
     Raises:
@@ -47,7 +75,7 @@ def positive(name: str, value: ArrayLike, like: Tensor) -> Float[Tensor, "*batch
 
 
 def normalised_time(
-    time: ArrayLike, duration: Float[Tensor, "*#batch"]
+    time: Times, duration: Float[Tensor, "*#batch"]
 ) -> Float[Tensor, "*#batch T"]:
     """Times [s] since the start of a motion over its duration (float64).
 

@@ -5,11 +5,14 @@ without this package:
 
     program = torch.export.load("place/step.pt2").module()
     state = program(state, dt, inputs)
+
+What the dictionaries hold is registered here for each kind of primitive and of state.
 """
 
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from functools import singledispatch
 from pathlib import Path
 from typing import Any
 
@@ -19,23 +22,28 @@ from torch.export import Dim, ExportedProgram
 from torch.utils._pytree import tree_map
 
 from hrc_learn.dmp.closed_loop import DMPState
+from hrc_learn.dmp.dual_arm_dmp import DualArmDMP, DualArmState
 from hrc_learn.dmp.joint_dmp import JointDMP
-from hrc_learn.dmp.numpy_stepper import OrientationStepper, PoseStepper, Stepper
-from hrc_learn.dmp.orientation_dmp import OrientationDMP, OrientationState
+from hrc_learn.dmp.limited_dmp import LimitedDMP, LimitedState
+from hrc_learn.dmp.motion_primitive import AdaptedPrimitive, export_primitive
+from hrc_learn.dmp.moving_goal_dmp import MovingGoalDMP, MovingGoalState
+from hrc_learn.dmp.numpy_stepper import AnyStepper, freeze_stepper
+from hrc_learn.dmp.orientation_coordinates import OrientationState
+from hrc_learn.dmp.orientation_dmp import OrientationDMP
 from hrc_learn.dmp.orientation_error import to_orientation
 from hrc_learn.dmp.pose_dmp import BODY, ERROR, POSITION, PoseDMP, PoseState
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.storage import saved_kind
 
-REFERENCE = "reference"
 PRIMITIVE, PROGRAM = "primitive", "step.pt2"
 STATE = tuple(field.name for field in fields(DMPState))
 TRACED_BATCH = 3
 """Any but 0 and 1, which a tracer would take for constants."""
 SAME = 8
 """Angles of fewer roundings than this are none."""
+TRACED_STEP = 1e-3
+"""Step [s] that a program is traced with; any other will do as well when it runs."""
 
-type Exportable = JointDMP | OrientationDMP | PoseDMP
 type Tensors = dict[str, Tensor]
 
 
@@ -43,15 +51,17 @@ type Tensors = dict[str, Tensor]
 class ExportedDMP:
     """A primitive ready to leave Python's training side."""
 
-    dmp: Exportable
-    stepper: Stepper | OrientationStepper | PoseStepper | None
-    """One motion in NumPy, float64; None for what is integrated (`formulation="ude"`)."""
+    dmp: AdaptedPrimitive
+    stepper: AnyStepper | None
+    """One motion in NumPy, float64; None for what has none (limits, moving goals, two arms) and
+    for what is integrated (`formulation="ude"`)."""
     program: ExportedProgram
     """(state, dt, inputs) -> state, dictionaries of tensors (B, ...), dt (B,) [s].
 
-    A state is what `state_tensors` makes of one. Inputs are `slowdown`, `coupling` and `goal`,
-    for a pose instead of that `goal_position`, `goal_orientation` and `goal_body`, and its
-    coupling is (B, 6); all are needed, and `resting_inputs` change nothing.
+    A state is what `state_tensors` makes of one. Inputs are `phase_stopping`, `coupling` and
+    `goal`; for a pose instead of that `goal_position`, `goal_orientation` and `goal_body`, and
+    its coupling is (B, 6); for two arms the object's `goal_position` and `goal_orientation`
+    and a coupling (B, 2, 6). All are needed, and `resting_inputs` change nothing.
     """
 
     def save(self, folder: str | Path) -> None:
@@ -75,7 +85,7 @@ class ExportedDMP:
             shutil.rmtree(temporary, ignore_errors=True)
 
 
-def export_dmp(dmp: Exportable, *, goal_filter: float | None = None) -> ExportedDMP:
+def export_dmp(dmp: AdaptedPrimitive, *, goal_filter: float | None = None) -> ExportedDMP:
     """Freeze one primitive.
 
     Args:
@@ -85,13 +95,19 @@ def export_dmp(dmp: Exportable, *, goal_filter: float | None = None) -> Exported
     Raises:
         ValueError: The primitive is a batch.
     """
-    linear = dmp if isinstance(dmp, JointDMP) else dmp.motion
-    if linear.weights.ndim != 2:
-        raise ValueError(f"export takes one primitive, got a batch {linear.weights.shape[:-2]}")
-    return ExportedDMP(dmp=dmp, stepper=_stepper(dmp), program=_program(dmp, goal_filter))
+    kind: Any = dmp
+    if kind.duration.ndim:
+        raise ValueError(
+            f"export takes one primitive, got a batch {tuple(kind.duration.shape)}"
+        )
+    return ExportedDMP(dmp=dmp, stepper=freeze_stepper(dmp), program=_program(dmp, goal_filter))
 
 
-def load_stepper(folder: str | Path) -> Stepper | OrientationStepper | PoseStepper:
+# Where `AdaptedPrimitive.export` finds it: nothing below this module has to know of it.
+export_primitive.register(AdaptedPrimitive, export_dmp)
+
+
+def load_stepper(folder: str | Path) -> AnyStepper:
     """The NumPy stepper of what `ExportedDMP.save` wrote, or of a saved primitive.
 
     Raises:
@@ -100,55 +116,176 @@ def load_stepper(folder: str | Path) -> Stepper | OrientationStepper | PoseStepp
     """
     folder = Path(folder)
     folder = folder / PRIMITIVE if (folder / PRIMITIVE).is_dir() else folder
-    kinds: dict[str, type[Exportable]] = {
-        kind.__name__: kind for kind in (JointDMP, OrientationDMP, PoseDMP)
-    }
+    kinds = {kind.__name__: kind for kind in freeze_stepper.registry if kind is not object}
     kind = saved_kind(folder)
     if kind not in kinds:
         raise ValueError(f"{folder}: steps {', '.join(kinds)}, got {kind!r}")
-    stepper = _stepper(kinds[kind].load(folder))
+    stepper = freeze_stepper(kinds[kind].load(folder))
     if stepper is None:
         raise ValueError(f"{folder}: its formulation has no stepper, run the program instead")
     return stepper
 
 
-def state_tensors(state: DMPState | OrientationState | PoseState) -> Tensors:
-    """A state as the program takes it: (*batch, ...) by name, a batch axis where none was."""
-    motion = state if isinstance(state, DMPState) else state.motion
-    tensors = {name: getattr(motion, name) for name in STATE}
-    if not isinstance(state, DMPState):
-        tensors[REFERENCE] = state.reference
-    if motion.duration.ndim == 0:
-        tensors = {name: x[None] for name, x in tensors.items()}
-    # One tensor in two places would be one input to a tracer.
-    return {name: x.detach().clone() for name, x in tensors.items()}
-
-
 class StepModule(nn.Module):
     """The step of a primitive between dictionaries of tensors."""
 
-    def __init__(self, dmp: Exportable, goal_filter: float | None):
+    def __init__(self, dmp: AdaptedPrimitive, goal_filter: float | None):
         super().__init__()
         self.dmp = dmp
         self.goal_filter = goal_filter
 
     def forward(self, state: Tensors, dt: Tensor, inputs: Tensors) -> Tensors:
-        motion = DMPState(**{k: x for k, x in state.items() if k != REFERENCE})
-        options: dict[str, Any] = {"goal_filter": self.goal_filter}
-        options["slowdown"] = inputs["slowdown"]
-        options["coupling"] = inputs["coupling"]
-        if isinstance(self.dmp, JointDMP):
-            return _tensors(self.dmp.step(motion, dt, goal=inputs["goal"], **options))
-        if isinstance(self.dmp, OrientationDMP):
-            before = OrientationState(motion=motion, reference=state[REFERENCE])
-            before = _where_new(self.dmp.retarget(before, inputs["goal"]), before)
-            after = self.dmp.step(before, dt, **options)
-        else:
-            before = PoseState(motion=motion, reference=state[REFERENCE])
-            goal = Pose(inputs["goal_position"], inputs["goal_orientation"])
+        before, goals = given_state(self.dmp, state), given_goals(self.dmp, inputs)
+        options = {name: inputs[name] for name in ("phase_stopping", "coupling")}
+        if self.dmp.adapter.error_columns is not None:
+            goal = goals.pop("goal")
             before = _where_new(self.dmp.retarget(before, goal), before)
-            after = self.dmp.step(before, dt, goal_body=inputs["goal_body"], **options)
-        return _tensors(after.motion) | {REFERENCE: after.reference.clone()}
+        after = self.dmp.step(before, dt, goal_filter=self.goal_filter, **goals, **options)
+        # Copies: a program must not hand back what it was given.
+        return {name: x.clone() for name, x in _named(after).items()}
+
+
+def state_tensors(state: Any) -> Tensors:
+    """A state as the program takes it: (*batch, ...) by name, a batch axis where none was."""
+    tensors = _named(state)
+    # Two arms are one primitive: their durations are (*batch, 2).
+    arms = isinstance(state, DualArmState)
+    if tensors["arms.duration" if arms else "duration"].ndim == int(arms):
+        tensors = {name: x[None] for name, x in tensors.items()}
+    # One tensor in two places would be one input to a tracer.
+    return {name: x.detach().clone() for name, x in tensors.items()}
+
+
+@singledispatch
+def _named(state: Any) -> Tensors:
+    """All of a state that changes along a motion, by name."""
+    raise TypeError(f"no program has a state of {type(state).__name__}")
+
+
+@_named.register(DMPState)
+def _name_columns(state: DMPState) -> Tensors:
+    return {name: getattr(state, name) for name in STATE}
+
+
+@_named.register(LimitedState)
+def _name_limited(state: LimitedState) -> Tensors:
+    return _name_columns(state.motion)  # the limits are the primitive's own
+
+
+@_named.register(MovingGoalState)
+def _name_moving_goal(state: MovingGoalState) -> Tensors:
+    return _name_columns(state.motion) | {"goal_velocity": state.goal_velocity}
+
+
+@_named.register(OrientationState)
+@_named.register(PoseState)
+def _name_errors(state: OrientationState | PoseState) -> Tensors:
+    return _name_columns(state.motion) | {"reference": state.reference}
+
+
+@_named.register(DualArmState)
+def _name_arms(state: DualArmState) -> Tensors:
+    arms, planned = _name_errors(state.arms), _name_errors(state.planned)
+    tensors = {f"arms.{name}": x for name, x in arms.items()}
+    tensors |= {f"planned.{name}": x for name, x in planned.items()}
+    held = {"held_position": state.held.position, "held_orientation": state.held.orientation}
+    return tensors | held
+
+
+@singledispatch
+def given_state(dmp: Any, tensors: Tensors) -> Any:
+    """The state that `state_tensors` made tensors of."""
+    raise TypeError(f"no exporter is registered for {type(dmp).__name__}")
+
+
+@given_state.register(JointDMP)
+def _joint_state(dmp: JointDMP, tensors: Tensors) -> DMPState:
+    return DMPState(**{name: tensors[name] for name in STATE})
+
+
+@given_state.register(LimitedDMP)
+def _limited_state(dmp: LimitedDMP, tensors: Tensors) -> LimitedState:
+    return LimitedState(motion=_joint_state(dmp.motion, tensors), limits=dmp.limits)
+
+
+@given_state.register(MovingGoalDMP)
+def _moving_goal_state(dmp: MovingGoalDMP, tensors: Tensors) -> MovingGoalState:
+    motion = _joint_state(dmp.motion, tensors)
+    return MovingGoalState(motion=motion, goal_velocity=tensors["goal_velocity"])
+
+
+@given_state.register(OrientationDMP)
+def _orientation_state(dmp: OrientationDMP, tensors: Tensors) -> OrientationState:
+    motion = _joint_state(dmp.motion, tensors)
+    return OrientationState(motion=motion, reference=tensors["reference"])
+
+
+@given_state.register(PoseDMP)
+def _pose_state(dmp: PoseDMP, tensors: Tensors) -> PoseState:
+    return PoseState(motion=_joint_state(dmp.motion, tensors), reference=tensors["reference"])
+
+
+@given_state.register(DualArmDMP)
+def _dual_arm_state(dmp: DualArmDMP, tensors: Tensors) -> DualArmState:
+    def hands(part: str) -> PoseState:
+        own = {k.removeprefix(part): x for k, x in tensors.items() if k.startswith(part)}
+        return _pose_state(dmp.arms, own)
+
+    held = Pose(tensors["held_position"], tensors["held_orientation"])
+    return DualArmState(arms=hands("arms."), planned=hands("planned."), held=held)
+
+
+@singledispatch
+def resting_inputs(dmp: Any, state: Mapping[str, Tensor]) -> Tensors:
+    """Inputs of the program that change nothing: the goal as it is, and no coupling."""
+    target = state["target"]
+    return _inputs(state["pace"], torch.zeros_like(target), goal=target.clone())
+
+
+@resting_inputs.register(LimitedDMP)
+def _rest_limited(dmp: LimitedDMP, state: Mapping[str, Tensor]) -> Tensors:
+    target = state["target"]
+    goal = dmp.limits.constrain(target)
+    return _inputs(state["pace"], torch.zeros_like(target), goal=goal)
+
+
+@resting_inputs.register(OrientationDMP)
+def _rest_orientation(dmp: OrientationDMP, state: Mapping[str, Tensor]) -> Tensors:
+    goal = to_orientation(dmp.motion.goal.detach(), state["reference"])
+    return _inputs(state["pace"], torch.zeros_like(state["target"]), goal=goal)
+
+
+@resting_inputs.register(PoseDMP)
+def _rest_pose(dmp: PoseDMP, state: Mapping[str, Tensor]) -> Tensors:
+    target, error = state["target"], dmp.motion.goal.detach()[..., ERROR]
+    goals = {
+        "goal_position": target[..., POSITION].clone(),
+        "goal_orientation": to_orientation(error, state["reference"]),
+        "goal_body": target[..., BODY].clone(),
+    }
+    return _inputs(state["pace"], torch.zeros_like(target[..., :6]), **goals)
+
+
+@resting_inputs.register(DualArmDMP)
+def _rest_arms(dmp: DualArmDMP, state: Mapping[str, Tensor]) -> Tensors:
+    planned = {"target": state["planned.target"], "reference": state["planned.reference"]}
+    hands = _rest_pose(dmp.arms, planned | {"pace": state["planned.pace"]})
+    hand = Pose(hands["goal_position"][..., 0, :], hands["goal_orientation"][..., 0, :])
+    goal = hand @ dmp.grasp[..., 0].inverse()
+    goals = {"goal_position": goal.position, "goal_orientation": goal.orientation}
+    return _inputs(state["planned.pace"][..., 0], hands["coupling"], **goals)
+
+
+def _inputs(pace: Tensor, coupling: Tensor, **goals: Tensor) -> Tensors:
+    return {"phase_stopping": torch.zeros_like(pace), "coupling": coupling, **goals}
+
+
+def given_goals(dmp: AdaptedPrimitive, inputs: Tensors) -> dict[str, Any]:
+    """Goals among the inputs of a program, as arguments of `step`."""
+    if "goal" in inputs:
+        return {"goal": inputs["goal"]}
+    goal = Pose(inputs["goal_position"], inputs["goal_orientation"])
+    return {"goal": goal} | {k: inputs[k] for k in ("goal_body",) if k in inputs}
 
 
 def _where_new[S: (OrientationState, PoseState)](new: S, old: S) -> S:
@@ -166,50 +303,18 @@ def _where_new[S: (OrientationState, PoseState)](new: S, old: S) -> S:
     return tree_map(choose, new, old)
 
 
-def _tensors(state: DMPState) -> Tensors:
-    # Copies: a program must not hand back what it was given.
-    return {name: getattr(state, name).clone() for name in STATE}
-
-
-def _stepper(dmp: Exportable) -> Stepper | OrientationStepper | PoseStepper | None:
-    if isinstance(dmp, PoseDMP):
-        return PoseStepper(dmp)
-    if isinstance(dmp, JointDMP):
-        return Stepper(dmp)
-    return OrientationStepper(dmp) if dmp.formulation == "log" else None
-
-
-def _program(dmp: Exportable, goal_filter: float | None) -> ExportedProgram:
+def _program(dmp: AdaptedPrimitive, goal_filter: float | None) -> ExportedProgram:
     trained = {name: p.requires_grad for name, p in dmp.named_parameters()}
     dmp.requires_grad_(False)
     try:
         state = state_tensors(dmp.initial_state())
         state = {k: x.repeat(TRACED_BATCH, *[1] * (x.ndim - 1)) for k, x in state.items()}
         inputs = resting_inputs(dmp, state)
-        arguments = state, torch.full_like(state["pace"], 1e-3), inputs
+        dt = torch.full((TRACED_BATCH,), TRACED_STEP).to(dmp.motion.duration)
         first = {0: Dim("batch", min=1)}
         shapes = dict.fromkeys(state, first), first, dict.fromkeys(inputs, first)
         step = StepModule(dmp, goal_filter)
-        return torch.export.export(step, arguments, dynamic_shapes=shapes)
+        return torch.export.export(step, (state, dt, inputs), dynamic_shapes=shapes)
     finally:
         for name, parameter in dmp.named_parameters():
             parameter.requires_grad_(trained[name])
-
-
-def resting_inputs(dmp: Exportable, state: Mapping[str, Tensor]) -> Tensors:
-    """Inputs of the program that change nothing: the goal as it is, and no influence."""
-    target, slowdown = state["target"], torch.zeros_like(state["pace"])
-    if isinstance(dmp, JointDMP):
-        goals, push = {"goal": target.clone()}, torch.zeros_like(target)
-    elif isinstance(dmp, OrientationDMP):
-        goals = {"goal": to_orientation(dmp.motion.goal.detach(), state[REFERENCE])}
-        push = torch.zeros_like(target)
-    else:
-        error = dmp.motion.goal.detach()[ERROR]
-        goals = {
-            "goal_position": target[:, POSITION].clone(),
-            "goal_orientation": to_orientation(error, state[REFERENCE]),
-            "goal_body": target[:, BODY].clone(),
-        }
-        push = torch.zeros_like(target[:, :6])
-    return {"slowdown": slowdown, "coupling": push, **goals}

@@ -9,23 +9,26 @@ humanoid robots"; this transformation leaves the middle of the range as it is.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
-from typing import Any, Unpack
+from typing import Unpack
 
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from hrc_learn.dmp._system.response import Trajectory
-from hrc_learn.dmp._types import ArrayLike, to_tensor
+from hrc_learn.dmp._types import Mask, Points, Scalars, Times, Vectors, to_tensor
 from hrc_learn.dmp.closed_loop import DMPState
+from hrc_learn.dmp.coordinate_adapter import CoordinateAdapter, Retargeted
 from hrc_learn.dmp.fitting.motion_samples import FitReport, check_samples, demo_label
 from hrc_learn.dmp.fitting.solvers import FitOptions
-from hrc_learn.dmp.joint_dmp import JointDMP
-from hrc_learn.storage import SavedModel, write_model
+from hrc_learn.dmp.joint_dmp import JointDMP, given_points
+from hrc_learn.dmp.linear_primitive import ColumnEnds, LinearPrimitive
+from hrc_learn.dmp.motion_primitive import AdaptedPrimitive
+from hrc_learn.storage import SavedModel
 
+TENSORS = ("lower", "upper", "softness")
 CLOSEST = 1e-6
 """How close to a limit a joint comes, in units of the softness."""
 
@@ -136,19 +139,107 @@ class LimitedState:
 torch.export.register_dataclass(LimitedState, serialized_type_name="hrc_learn.dmp.LimitedState")
 
 
-TENSORS = ("lower", "upper", "softness")
+@dataclass(frozen=True, eq=False)
+class LimitedCoordinates(CoordinateAdapter[Vectors, LimitedTrajectory, LimitedState]):
+    """Coordinates without bounds for joints that have them; the frame are the limits."""
+
+    limits: SoftLimits
+
+    def ends(
+        self,
+        motion: LinearPrimitive,
+        start: Vectors | None,
+        goal: Vectors | None,
+        duration: Tensor,
+        velocity: Vectors | None,
+    ) -> tuple[ColumnEnds, SoftLimits]:
+        """Released from the limits; a goal beyond one is taken to the nearest place within.
+
+        Raises:
+            ValueError: A start that is not between the limits.
+        """
+        limits = self.limits
+        q = limits.constrain(motion.start) if start is None else self._as_tensor(start)
+        x = None
+        if start is not None:
+            if not limits.contain(q).all():
+                raise ValueError(f"start {q.tolist()} is not between the limits")
+            x = limits.release(limits.clamp(q))
+        rate = None
+        if velocity is not None:
+            q, joint_rate = torch.broadcast_tensors(q, self._as_tensor(velocity))
+            rate = torch.func.jvp(limits.release, (limits.clamp(q),), (joint_rate,))[1]
+        return ColumnEnds(x, None if goal is None else self._released(goal), rate), limits
+
+    def trajectory(self, columns: Trajectory, frame: SoftLimits) -> LimitedTrajectory:
+        """Joints along the columns."""
+        return LimitedTrajectory(columns, frame)
+
+    def begin(self, columns: DMPState, frame: SoftLimits) -> tuple[DMPState, SoftLimits]:
+        """Copies of the limits: an export takes a buffer of the module for no input."""
+        copies = (x.clone() for x in (frame.lower, frame.upper, frame.softness))
+        return columns, SoftLimits(*copies)
+
+    def state(self, columns: DMPState, frame: SoftLimits) -> LimitedState:
+        """The columns with the limits."""
+        return LimitedState(motion=columns, limits=frame)
+
+    def columns(self, state: LimitedState) -> tuple[DMPState, SoftLimits]:
+        """The columns and the limits."""
+        return state.motion, state.limits
+
+    def retarget(
+        self,
+        motion: LinearPrimitive,
+        columns: DMPState,
+        frame: SoftLimits,
+        goal: Vectors | None,
+    ) -> Retargeted:
+        """The goal, or the nearest place within the limits."""
+        return Retargeted(columns, frame, None if goal is None else self._released(goal))
+
+    def via_points(
+        self,
+        motion: LinearPrimitive,
+        s: Tensor,
+        position: Tensor,
+        velocity: Tensor,
+        value: Points | None,
+        rate: Points | None,
+    ) -> tuple[Tensor, Tensor]:
+        """Released from the limits, which via points have to lie between."""
+        limits = self.limits
+        q, joint_rate = given_points(value, position), given_points(rate, velocity, "velocity")
+        if (q.isfinite() & ~limits.contain(q)).any():
+            raise ValueError(f"via point {q.tolist()} is not between the limits")
+        there = limits.clamp(torch.where(q.isnan(), limits.constrain(position), q))
+        released = torch.func.jvp(limits.release, (there,), (joint_rate.nan_to_num(),))
+        return (
+            released[0].masked_fill(q.isnan(), torch.nan),
+            released[1].masked_fill(joint_rate.isnan(), torch.nan),
+        )
+
+    def _released(self, goal: Vectors) -> Tensor:
+        return self.limits.release(self.limits.clamp(self._as_tensor(goal)))
+
+    def _as_tensor(self, value: Vectors) -> Tensor:
+        return to_tensor(value, self.limits.lower.dtype, self.limits.lower.device)
 
 
-class LimitedDMP(nn.Module):
+class LimitedDMP(AdaptedPrimitive[Vectors, LimitedTrajectory, LimitedState]):
     """Movement primitive in coordinates that cannot leave the joint limits.
 
     A `JointDMP` moves x, and q = constrain(x) lies between its limits whatever x is: for any
-    goal, push or step. See `SoftLimits`.
+    goal, push or step. See `SoftLimits`. Values are joints (*batch, D), velocities the same
+    per second; a goal beyond a limit is taken to the nearest place within. A coupling acts on
+    the coordinates without bounds: as it is in the middle of the range, fading towards the
+    limits.
     """
 
     lower: Tensor
     upper: Tensor
     softness: Tensor
+    motion: JointDMP
     fit_report: FitReport | None
     """How well the fit reproduces its demonstrations, in joints."""
 
@@ -186,12 +277,12 @@ class LimitedDMP(nn.Module):
     @classmethod
     def fit(
         cls,
-        time: ArrayLike,
-        position: ArrayLike,
-        lower: ArrayLike,
-        upper: ArrayLike,
+        time: Times,
+        position: Points,
+        lower: Vectors | Scalars,
+        upper: Vectors | Scalars,
         n_basis: int = 50,
-        mask: ArrayLike | None = None,
+        mask: Mask | None = None,
         *,
         softness: float = 0.02,
         joint_names: Sequence[str] | None = None,
@@ -200,7 +291,7 @@ class LimitedDMP(nn.Module):
         """Learn one primitive from each demonstration.
 
         Args:
-            time: Stamps [s], (T,) or (*B, T).
+            time: Timestamps [s], (T,) or (*B, T).
             position: (*B, T, D), all of it between the limits.
             lower: Limits of the joints, (D,), in their units.
             upper: (D,).
@@ -264,101 +355,29 @@ class LimitedDMP(nn.Module):
         """Of the demonstration [s]."""
         return self.motion.duration
 
-    def rollout(
-        self,
-        time: ArrayLike | None = None,
-        start: ArrayLike | None = None,
-        goal: ArrayLike | None = None,
-        duration: ArrayLike | None = None,
-        start_velocity: ArrayLike | None = None,
-        *,
-        speed: ArrayLike | None = None,
-    ) -> LimitedTrajectory:
-        """Motion from start to goal, between the limits; arguments as in `JointDMP.rollout`.
+    @property
+    def adapter(self) -> LimitedCoordinates:
+        """Coordinates without bounds."""
+        return LimitedCoordinates(self.limits)
 
-        A goal beyond a limit is taken to the nearest place within.
+    def with_motion[S: "LimitedDMP"](
+        self: S, motion: JointDMP, frame: SoftLimits | None = None
+    ) -> S:
+        """Around another motion of the coordinates, within the same limits."""
+        return type(self)(motion, self.lower, self.upper, self.softness)
 
-        Raises:
-            ValueError: A start that is not between the limits.
-        """
-        ends = self._ends(start, goal, start_velocity)
-        free = self.motion.rollout(time, duration=duration, speed=speed, **ends)
-        return LimitedTrajectory(free, self.limits)
-
-    def initial_state(
-        self,
-        start: ArrayLike | None = None,
-        goal: ArrayLike | None = None,
-        duration: ArrayLike | None = None,
-        start_velocity: ArrayLike | None = None,
-        *,
-        speed: ArrayLike | None = None,
-    ) -> LimitedState:
-        """State at the start of a motion, for `step`; arguments as in `rollout`."""
-        ends = self._ends(start, goal, start_velocity)
-        motion = self.motion.initial_state(duration=duration, speed=speed, **ends)
-        # Copies: an export takes a buffer of the module for no input.
-        limits = SoftLimits(self.lower.clone(), self.upper.clone(), self.softness.clone())
-        return LimitedState(motion=motion, limits=limits)
-
-    def step(
-        self,
-        state: LimitedState,
-        dt: ArrayLike,
-        *,
-        goal: ArrayLike | None = None,
-        coupling: ArrayLike | None = None,
-        **influences: Any,
-    ) -> LimitedState:
-        """Advance by `dt`; arguments as in `JointDMP.step`.
-
-        A coupling acts on the coordinates without bounds: as it is in the middle of the
-        range, fading towards the limits.
-        """
-        if goal is not None:
-            goal = self.limits.release(self.limits.clamp(self._as_tensor(goal)))
-        motion = self.motion.step(state.motion, dt, goal=goal, coupling=coupling, **influences)
-        return replace(state, motion=motion)
-
-    def save(self, folder: str | Path) -> None:
-        """Write config.json and model.safetensors into `folder`, replacing an older save."""
-        own = {f"limits.{name}": getattr(self, name) for name in TENSORS}
-        write_model(
-            folder, "LimitedDMP", self.motion.config(), {**own, **self.motion.tensors()}
-        )
+    def _own_tensors(self) -> dict[str, Tensor]:
+        return {f"limits.{name}": getattr(self, name) for name in TENSORS}
 
     @classmethod
-    def load(cls, folder: str | Path) -> "LimitedDMP":
-        """Read what `save` wrote; complains as `JointDMP.load`."""
-        saved = SavedModel(folder, "LimitedDMP")
+    def _restored[S: "LimitedDMP"](cls: type[S], saved: SavedModel) -> S:
         lower, upper, softness = (saved.tensor(f"limits.{name}") for name in TENSORS)
         try:
             return cls(JointDMP.restore(saved), lower, upper, softness)
         except ValueError as error:
             raise saved.invalid(error) from None
 
-    def _ends(
-        self, start: ArrayLike | None, goal: ArrayLike | None, velocity: ArrayLike | None
-    ) -> dict[str, Tensor]:
-        """Start, goal and start velocity of the coordinates without bounds."""
-        limits, ends = self.limits, {}
-        q = self.start if start is None else self._as_tensor(start)
-        if start is not None:
-            if not limits.contain(q).all():
-                raise ValueError(f"start {q.tolist()} is not between the limits")
-            ends["start"] = limits.release(limits.clamp(q))
-        if goal is not None:
-            ends["goal"] = limits.release(limits.clamp(self._as_tensor(goal)))
-        if velocity is not None:
-            q, rate = torch.broadcast_tensors(q, self._as_tensor(velocity))
-            q = limits.clamp(q)
-            ends["start_velocity"] = torch.func.jvp(limits.release, (q,), (rate,))[1]
-        return ends
 
-    def _as_tensor(self, value: ArrayLike) -> Tensor:
-        return to_tensor(value, self.lower.dtype, self.lower.device)
-
-
-def _limit(value: ArrayLike, like: Tensor) -> Tensor:
+def _limit(value: Vectors | Scalars, like: Tensor) -> Tensor:
     """Of every joint, (D,)."""
     return to_tensor(value, like.dtype, like.device).expand(like.shape[-1]).clone()

@@ -1,6 +1,7 @@
 """Closed-loop steps in NumPy, of one primitive each, for loops that count microseconds."""
 
 import math
+from functools import singledispatch
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -118,7 +119,7 @@ class Stepper:
         dt: float,
         goal: Vector | None = None,
         coupling: Vector | None = None,
-        slowdown: float = 0.0,
+        phase_stopping: float = 0.0,
     ) -> StepperState:
         """Advance by `dt` [s]; arguments as in `JointDMP.step`."""
         s, y, before, scale, start, at, way, duration, _ = state
@@ -126,7 +127,7 @@ class Stepper:
             goal = at
         else:
             scale = self._scale(start, goal)
-        pace = 1.0 / (1.0 + slowdown)
+        pace = 1.0 / (1.0 + phase_stopping)
         ds = dt * pace / duration
         s += ds
         if ds != self._transition[0]:
@@ -232,7 +233,7 @@ class OrientationStepper:
         state: OrientationStepperState,
         dt: float,
         goal: Float64[np.ndarray, "4"] | None = None,
-        slowdown: float = 0.0,
+        phase_stopping: float = 0.0,
     ) -> OrientationStepperState:
         """Advance by `dt` [s]; a new goal is there at once."""
         motion, reference = state
@@ -240,7 +241,7 @@ class OrientationStepper:
             reference = arrays.reference_of(self._goal, goal)
             ends = arrays.retarget(motion.y[0], motion.y[1], state.reference, reference)
             motion = motion._replace(y=np.stack(ends))
-        motion = self._motion.step(motion, dt, slowdown=slowdown)
+        motion = self._motion.step(motion, dt, phase_stopping=phase_stopping)
         return OrientationStepperState(motion, reference)
 
 
@@ -310,7 +311,7 @@ class PoseStepper:
         orientation: Float64[np.ndarray, "4"] | None = None,
         body: Float64[np.ndarray, "K"] | None = None,
         coupling: Float64[np.ndarray, "3"] | None = None,
-        slowdown: float = 0.0,
+        phase_stopping: float = 0.0,
     ) -> PoseStepperState:
         """Advance by `dt` [s].
 
@@ -321,7 +322,7 @@ class PoseStepper:
             orientation: Of the goal, likewise.
             body: Goal of the body, likewise.
             coupling: Acceleration added to the position [m/s^2].
-            slowdown: The clock runs 1 + slowdown times slower.
+            phase_stopping: The clock runs 1 + this times slower.
         """
         motion, rotation = state
         goal, push = motion.goal, None
@@ -337,4 +338,34 @@ class PoseStepper:
         if coupling is not None:
             push = np.zeros_like(goal)
             push[POSITION] = coupling
-        return PoseStepperState(self._motion.step(motion, dt, goal, push, slowdown), rotation)
+        return PoseStepperState(
+            self._motion.step(motion, dt, goal, push, phase_stopping), rotation
+        )
+
+
+type AnyStepper = Stepper | OrientationStepper | PoseStepper
+
+
+@singledispatch
+def freeze_stepper(primitive: Any) -> AnyStepper | None:
+    """The NumPy stepper of one primitive; None: only its exported program steps it.
+
+    Raises:
+        ValueError: The primitive is a batch.
+    """
+    return None
+
+
+@freeze_stepper.register(JointDMP)
+def _freeze_joints(primitive: JointDMP) -> AnyStepper | None:
+    return Stepper(primitive)
+
+
+@freeze_stepper.register(OrientationDMP)
+def _freeze_orientation(primitive: OrientationDMP) -> AnyStepper | None:
+    return OrientationStepper(primitive) if primitive.formulation == "log" else None
+
+
+@freeze_stepper.register(PoseDMP)
+def _freeze_pose(primitive: PoseDMP) -> AnyStepper | None:
+    return PoseStepper(primitive)

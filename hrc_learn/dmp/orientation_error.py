@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, broadcast_tensors
 
-from hrc_learn.dmp._types import ArrayLike, to_tensor
+from hrc_learn.dmp._types import Mask, Quaternions, Times, Vectors, to_tensor
 from hrc_learn.dmp.fitting.motion_samples import check_samples, demo_label
 from hrc_learn.geometry import quaternion
 from hrc_learn.geometry.left_jacobian import axis_drift, drift_free_rate, drift_free_slope
@@ -137,7 +137,7 @@ def retarget(
     return new, new_rate, error_rate(new, omega_rate - bias)
 
 
-def unit_quaternion(value: ArrayLike, like: Tensor) -> Float[Tensor, "*batch 4"]:
+def unit_quaternion(value: Quaternions, like: Tensor) -> Float[Tensor, "*batch 4"]:
     """A quaternion given by the caller, normalised; dtype and device of `like`."""
     q = to_tensor(value, dtype=like.dtype, device=like.device)
     shaped = q.ndim > 0 and q.shape[-1] == 4
@@ -152,9 +152,9 @@ def error_ends(
     rate: Float[Tensor, "*#batch 3"],
     goal_error: Float[Tensor, "*#batch 3"],
     demonstrated_goal: Float[Tensor, "*#batch 4"],
-    start: ArrayLike | None,
-    goal: ArrayLike | None,
-    velocity: ArrayLike | None,
+    start: Quaternions | None,
+    goal: Quaternions | None,
+    velocity: Vectors | None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Error at the start of a motion, its rate [rad/s], and the reference it is taken to.
 
@@ -245,14 +245,14 @@ NORM_TOLERANCE = 1e-2
 
 
 def fitted_error(
-    time: ArrayLike, orientation: ArrayLike, mask: ArrayLike | None
+    time: Times, orientation: Quaternions, mask: Mask | None
 ) -> tuple[Float[Tensor, "*B T 3"], Float[Tensor, "*B 4"]]:
     """Errors and goals of demonstrations that end."""
     return demonstrated_error(*_checked(time, orientation, mask))
 
 
 def centred_error(
-    time: ArrayLike, orientation: ArrayLike, mask: ArrayLike | None
+    time: Times, orientation: Quaternions, mask: Mask | None
 ) -> tuple[Float[Tensor, "*B T 3"], Float[Tensor, "*B 4"]]:
     """Errors of demonstrations to their mean orientation, and that.
 
@@ -275,7 +275,7 @@ def centred_error(
 
 
 def _checked(
-    time: ArrayLike, orientation: ArrayLike, mask: ArrayLike | None
+    time: Times, orientation: Quaternions, mask: Mask | None
 ) -> tuple[Float[Tensor, "*B T 4"], Bool[Tensor, "*B T"]]:
     """Unit quaternions and which of them count."""
     samples = check_samples(time, orientation, mask=mask, name="orientation")

@@ -2,85 +2,36 @@
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
-from typing import Any, Unpack
+from typing import Any, ClassVar, Unpack
 
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
-from hrc_learn.dmp import orientation_error as error_space
+from hrc_learn.dmp import orientation_error
 from hrc_learn.dmp._system.response import Trajectory
-from hrc_learn.dmp._types import ArrayLike, to_tensor
+from hrc_learn.dmp._types import Mask, Points, Quaternions, Times, Vectors, to_tensor
 from hrc_learn.dmp.closed_loop import DMPState
+from hrc_learn.dmp.coordinate_adapter import CoordinateAdapter, Retargeted
 from hrc_learn.dmp.fitting.motion_samples import FitReport, check_samples
 from hrc_learn.dmp.fitting.solvers import FitOptions
 from hrc_learn.dmp.forcing_scale import find_scaling
-from hrc_learn.dmp.joint_dmp import JointDMP
-from hrc_learn.dmp.orientation_dmp import OrientationState, OrientationTrajectory
+from hrc_learn.dmp.joint_dmp import JointDMP, given_points
+from hrc_learn.dmp.linear_primitive import ColumnEnds, LinearPrimitive
+from hrc_learn.dmp.motion_primitive import AdaptedPrimitive
+from hrc_learn.dmp.orientation_coordinates import OrientationTrajectory, via_errors
 from hrc_learn.dmp.orientation_error import (
     error_ends,
-    error_rate,
     fitted_error,
     reference_of,
     to_orientation,
     unit_quaternion,
 )
 from hrc_learn.geometry import Pose
-from hrc_learn.storage import SavedModel, write_model
+from hrc_learn.storage import SavedModel
 
 POSITION, ERROR, BODY = slice(0, 3), slice(3, 6), slice(6, None)
-"""Columns of the coordinates that move under one phase."""
-
-
-def demonstrated_columns(
-    time: ArrayLike,
-    position: ArrayLike,
-    error: Tensor,
-    body: ArrayLike | None,
-    mask: ArrayLike | None,
-) -> Tensor:
-    """Checked samples (*B, T, 6 + K), in the dtype of the position.
-
-    Raises:
-        ValueError: Bad samples; says which.
-    """
-    checked = check_samples(time, position, mask=mask)
-    if checked.position.shape[-2] != 3:
-        raise ValueError(f"position must have 3 columns, got {checked.position.shape[-2]}")
-    columns = [checked.columns, error.to(checked.position)]
-    if body is not None:
-        columns.append(check_samples(time, body, mask=mask, name="body").columns)
-    try:
-        return torch.cat(columns, dim=-1)
-    except RuntimeError:
-        shapes = ", ".join(str(tuple(column.shape)) for column in columns)
-        raise ValueError(f"position, orientation error and body differ: {shapes}") from None
-
-
-def joined(position: Tensor, error: Tensor, body: ArrayLike, like: Tensor) -> Tensor:
-    """The columns of a linear primitive, broadcast and side by side."""
-    columns = [to_tensor(part, like.dtype, like.device) for part in (position, error, body)]
-    batch = torch.broadcast_shapes(*(column.shape[:-1] for column in columns))
-    return torch.cat([column.expand(*batch, -1) for column in columns], dim=-1)
-
-
-def pose_push(coordinates: Tensor, coupling: ArrayLike) -> Tensor:
-    """The coupling of the linear primitive for an acceleration of position or pose."""
-    coupling = to_tensor(coupling, coordinates.dtype, coordinates.device)
-    push = replaced(torch.zeros_like(coordinates), POSITION, coupling[..., :3])
-    if coupling.shape[-1] == 3:
-        return push
-    # The second derivative of the error is linear in the angular acceleration.
-    return replaced(push, ERROR, error_rate(coordinates[..., ERROR], coupling[..., 3:]))
-
-
-def replaced(values: Tensor, columns: slice, new: ArrayLike) -> Tensor:
-    """`values` with some columns exchanged; differentiable in both."""
-    new = to_tensor(new, values.dtype, values.device)
-    stop = values.shape[-1] if columns.stop is None else columns.stop
-    new = new.expand(*values.shape[:-1], stop - columns.start)
-    return torch.cat([values[..., : columns.start], new, values[..., stop:]], dim=-1)
+"""Columns of a pose: position [m], orientation error [rad], and what moves along."""
 
 
 class PoseTrajectory:
@@ -158,42 +109,187 @@ class PoseState:
     @property
     def pose(self) -> Pose:
         """Position [m] and orientation."""
-        return Pose(self.motion.position[..., POSITION], self._rotation.orientation)
+        columns = self.motion.position
+        rotation = orientation_error.to_orientation(columns[..., ERROR], self.reference)
+        return Pose(columns[..., POSITION], rotation)
 
     @property
     def twist(self) -> Float[Tensor, "*batch 6"]:
         """(linear [m/s], angular [rad/s]) in the base frame."""
-        linear = self.motion.velocity[..., POSITION]
-        return torch.cat([linear, self._rotation.angular_velocity], dim=-1)
+        columns, velocity = self.motion.position, self.motion.velocity
+        angular = orientation_error.angular_velocity(columns[..., ERROR], velocity[..., ERROR])
+        return torch.cat([velocity[..., POSITION], angular], dim=-1)
 
     @property
     def body(self) -> Float[Tensor, "*batch K"]:
         """Coordinates learned along."""
         return self.motion.position[..., BODY]
 
-    @property
-    def _rotation(self) -> OrientationState:
-        columns = {
-            name: getattr(self.motion, name)[..., ERROR]
-            for name in ("position", "rate", "start", "goal", "way", "target", "forced")
-        }
-        return OrientationState(
-            motion=replace(self.motion, **columns), reference=self.reference
-        )
-
 
 torch.export.register_dataclass(PoseState, serialized_type_name="hrc_learn.dmp.PoseState")
 
 
-class PoseDMP(nn.Module):
+@dataclass(frozen=True, eq=False)
+class PoseCoordinates(CoordinateAdapter[Pose, PoseTrajectory, PoseState]):
+    """Position, orientation error and body side by side; the frame is the error's reference."""
+
+    goal_orientation: Tensor
+    """Unit quaternion at which the demonstration ends, (*batch, 4)."""
+    error_columns: ClassVar[slice] = ERROR
+    has_body: ClassVar[bool] = True
+
+    def reference(self, motion: LinearPrimitive) -> Float[Tensor, "*batch 4"]:
+        """What the demonstrated error is taken to."""
+        return reference_of(motion.goal[..., ERROR], self.goal_orientation)
+
+    def ends(
+        self,
+        motion: LinearPrimitive,
+        start: Pose | None,
+        goal: Pose | None,
+        duration: Tensor,
+        velocity: Vectors | None,
+        start_body: Vectors | None = None,
+        goal_body: Vectors | None = None,
+    ) -> tuple[ColumnEnds, Tensor]:
+        """A new orientation moves the start's error or the reference, the rest its columns."""
+        like = motion.start
+        demonstrated = motion.start_velocity * (motion.duration / duration)[..., None]
+        twist = None if velocity is None else to_tensor(velocity, like.dtype, like.device)
+        error, rate, reference = error_ends(
+            like[..., ERROR],
+            demonstrated[..., ERROR],
+            motion.goal[..., ERROR],
+            self.goal_orientation,
+            None if start is None else start.orientation,
+            None if goal is None else goal.orientation,
+            None if twist is None else twist[..., 3:],
+        )
+        start_columns = joined(
+            like[..., POSITION] if start is None else start.position,
+            error,
+            like[..., BODY] if start_body is None else start_body,
+            like,
+        )
+        goal_columns = joined(
+            motion.goal[..., POSITION] if goal is None else goal.position,
+            motion.goal[..., ERROR],
+            motion.goal[..., BODY] if goal_body is None else goal_body,
+            like,
+        )
+        if twist is None:
+            # Turned and dilated with the way, if the scaling has it so.
+            per_s = motion.start_rate(start_columns, goal_columns)
+            linear = (per_s / duration[..., None])[..., POSITION]
+        else:
+            linear = twist[..., :3]
+        velocity_columns = joined(linear, rate, demonstrated[..., BODY], like)
+        return ColumnEnds(start_columns, goal_columns, velocity_columns), reference
+
+    def trajectory(self, columns: Trajectory, frame: Tensor) -> PoseTrajectory:
+        """Poses along the columns."""
+        return PoseTrajectory(columns, frame)
+
+    def begin(self, columns: DMPState, frame: Tensor) -> tuple[DMPState, Tensor]:
+        """A reference for each of the batch."""
+        return columns, frame.expand(*columns.position.shape[:-1], 4)
+
+    def state(self, columns: DMPState, frame: Tensor) -> PoseState:
+        """The columns with their reference."""
+        return PoseState(motion=columns, reference=frame)
+
+    def columns(self, state: PoseState) -> tuple[DMPState, Tensor]:
+        """The columns and their reference."""
+        return state.motion, state.reference
+
+    def retarget(
+        self,
+        motion: LinearPrimitive,
+        columns: DMPState,
+        frame: Tensor,
+        goal: Pose | None,
+        goal_body: Vectors | None = None,
+    ) -> Retargeted:
+        """The same pose, twist and acceleration, as the error to a new reference."""
+        target = columns.target
+        if goal is not None:
+            rotation = unit_quaternion(goal.orientation, frame)
+            new = reference_of(motion.goal[..., ERROR], rotation).expand_as(frame)
+            values = columns.position, columns.rate, motion.curvature(columns)
+            error, error_rate, error_curvature = (x[..., ERROR] for x in values)
+            turned = orientation_error.retarget(error, error_rate, error_curvature, frame, new)
+            position, rate, curvature = (
+                replaced(x, ERROR, part) for x, part in zip(values, turned, strict=True)
+            )
+            target = replaced(target, POSITION, goal.position)
+            columns = replace(columns, position=position, rate=rate)
+            columns = replace(columns, goal=motion.resting_point(columns, curvature))
+            frame = new
+        if goal_body is not None:
+            target = replaced(target, BODY, goal_body)
+        return Retargeted(columns, frame, target)
+
+    def external_acceleration(
+        self, motion: LinearPrimitive, columns: DMPState, frame: Tensor, coupling: Any
+    ) -> Tensor | None:
+        """Of the position [m/s^2], (3), or of the pose, (6), in the base frame."""
+        if coupling is None:
+            return None
+        values = columns.position
+        coupling = to_tensor(coupling, values.dtype, values.device)
+        push = replaced(torch.zeros_like(values), POSITION, coupling[..., :3])
+        if coupling.shape[-1] == 3:
+            return push
+        # The second derivative of the error is linear in the angular acceleration.
+        rate = orientation_error.error_rate(values[..., ERROR], coupling[..., 3:])
+        return replaced(push, ERROR, rate)
+
+    def via_points(
+        self,
+        motion: LinearPrimitive,
+        s: Tensor,
+        position: Tensor,
+        velocity: Tensor,
+        value: Pose | Any,
+        rate: Points | None,
+        body: Points | None = None,
+        body_velocity: Points | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """Each part of a pose on its own; NaN leaves it free."""
+        if value is not None and not isinstance(value, Pose):
+            raise ValueError(
+                "the value of a pose's via points is a Pose; NaN leaves parts free"
+            )
+        place = None if value is None else value.position
+        rotation = None if value is None else value.orientation
+        twist = given_points(rate, velocity, "velocity", columns=6)
+        error, error_rate = via_errors(
+            self.reference(motion), position[..., ERROR], rotation, twist[..., 3:]
+        )
+        place = given_points(place, position[..., POSITION])
+        body = given_points(body, position[..., BODY], "body")
+        body_rate = given_points(body_velocity, velocity[..., BODY], "body_velocity")
+        return (
+            torch.cat([place, error, body], dim=-1),
+            torch.cat([twist[..., :3], error_rate, body_rate], dim=-1),
+        )
+
+
+class PoseDMP(AdaptedPrimitive[Pose, PoseTrajectory, PoseState]):
     """Discrete movement primitive of a pose under one phase.
 
     Position, orientation error (see `orientation_error`) and, if given, K coordinates of the
     arm's body shape are columns of one linear primitive. The body, such as a redundant joint
     or an arm angle, keeps its demonstrated shape when the pose is sent to another goal.
+
+    Values are `Pose`s, velocities twists (linear [m/s], angular [rad/s]), (*batch, 6),
+    couplings accelerations of the position [m/s^2], (*batch, 3), or of the pose, (*batch, 6),
+    the angular part in the base frame. `rollout`, `initial_state` and `with_ends` also take
+    `start_body` and `goal_body`, (*batch, K), and so does `step` take `goal_body`.
     """
 
     goal_orientation: Tensor
+    motion: JointDMP
 
     def __init__(self, motion: JointDMP, goal_orientation: Float[Tensor, "*batch 4"]):
         """Put a primitive together; `fit` is the usual way to one.
@@ -210,12 +306,12 @@ class PoseDMP(nn.Module):
     @classmethod
     def fit(
         cls,
-        time: ArrayLike,
-        position: ArrayLike,
-        orientation: ArrayLike,
+        time: Times,
+        position: Points,
+        orientation: Quaternions,
         n_basis: int = 50,
-        body: ArrayLike | None = None,
-        mask: ArrayLike | None = None,
+        body: Points | None = None,
+        mask: Mask | None = None,
         *,
         scaling: str = "none",
         **options: Unpack[FitOptions],
@@ -223,7 +319,7 @@ class PoseDMP(nn.Module):
         """Learn one primitive from each demonstration.
 
         Args:
-            time: Stamps [s], (T,) or (*B, T).
+            time: Timestamps [s], (T,) or (*B, T).
             position: (*B, T, 3) [m]. Its floating dtype is the primitive's.
             orientation: Unit quaternions (w, x, y, z), (*B, T, 4); signs may flip.
             n_basis: N, unless `basis` is given.
@@ -248,6 +344,11 @@ class PoseDMP(nn.Module):
             **options,
         )
         return cls(motion, goal.to(coordinates))
+
+    @property
+    def adapter(self) -> PoseCoordinates:
+        """Position, error and body."""
+        return PoseCoordinates(self.goal_orientation)
 
     @property
     def start(self) -> Pose:
@@ -279,195 +380,54 @@ class PoseDMP(nn.Module):
         """
         return self.motion.fit_report
 
-    def rollout(
-        self,
-        time: ArrayLike | None = None,
-        start: Pose | None = None,
-        goal: Pose | None = None,
-        duration: ArrayLike | None = None,
-        start_velocity: ArrayLike | None = None,
-        *,
-        speed: ArrayLike | None = None,
-        start_body: ArrayLike | None = None,
-        goal_body: ArrayLike | None = None,
-        amplitude: ArrayLike | None = None,
-    ) -> PoseTrajectory:
-        """Motion from start to goal; without arguments, the demonstrated one.
+    def with_motion[S: "PoseDMP"](self: S, motion: JointDMP, frame: Tensor | None = None) -> S:
+        """Around another motion of the columns, to this reference or another."""
+        reference = self.reference if frame is None else frame
+        return type(self)(motion, to_orientation(motion.goal[..., ERROR], reference))
 
-        All arguments broadcast over the batch, and gradients flow to each of them.
-
-        Args:
-            time: Since the start of the motion [s], (T,) or (*batch, T).
-            start: New start, (*batch).
-            goal: New goal, (*batch).
-            duration: [s], (*batch).
-            start_velocity: Twist (linear [m/s], angular [rad/s]), (*batch, 6).
-            speed: Instead of a duration, how many times faster than the demonstration.
-            start_body: (*batch, K).
-            goal_body: (*batch, K).
-            amplitude: Factor on the forcing term, (*batch): how wide a rhythm swings.
-        """
-        ends, reference = self._ends(
-            start, goal, duration, start_velocity, speed, start_body, goal_body
-        )
-        return PoseTrajectory(self.motion.rollout(time, **ends, amplitude=amplitude), reference)
-
-    def initial_state(
-        self,
-        start: Pose | None = None,
-        goal: Pose | None = None,
-        duration: ArrayLike | None = None,
-        start_velocity: ArrayLike | None = None,
-        *,
-        speed: ArrayLike | None = None,
-        start_body: ArrayLike | None = None,
-        goal_body: ArrayLike | None = None,
-    ) -> PoseState:
-        """State at the start of a motion, for `step`; arguments as in `rollout`."""
-        ends, reference = self._ends(
-            start, goal, duration, start_velocity, speed, start_body, goal_body
-        )
-        motion = self.motion.initial_state(**ends)
-        reference = reference.expand(*motion.position.shape[:-1], 4)
-        return PoseState(motion=motion, reference=reference)
-
-    def step(
-        self,
-        state: PoseState,
-        dt: ArrayLike,
-        *,
-        goal: Pose | None = None,
-        goal_body: ArrayLike | None = None,
-        goal_filter: float | None = None,
-        coupling: ArrayLike | None = None,
-        slowdown: ArrayLike | None = None,
-        amplitude: ArrayLike | None = None,
-    ) -> PoseState:
-        """Advance by `dt`, as `JointDMP.step`.
-
-        Args:
-            state: From `initial_state` or the last step.
-            dt: [s], (*batch).
-            goal: New goal from here on; changes neither pose nor twist of the moment.
-            goal_body: New goal of the body from here on, (*batch, K).
-            goal_filter: Rate, per duration, at which goals move to where they were last told
-                to be, so that no acceleration jumps; None: they are there at once.
-            coupling: Acceleration added to the position [m/s^2], (*batch, 3), or to the pose,
-                (*batch, 6), its angular part [rad/s^2] in the base frame.
-            slowdown: The clock runs 1 + slowdown times slower, (*batch), >= 0.
-            amplitude: Factor on the forcing term, (*batch).
-        """
-        if goal is not None:
-            state = self.retarget(state, goal)
-        motion = state.motion
-        ends = motion.target
-        if goal_body is not None:
-            ends = replaced(ends, BODY, goal_body)
-        if coupling is not None:
-            coupling = pose_push(motion.position, coupling)
-        motion = self.motion.step(
-            motion,
-            dt,
-            goal=ends,
-            goal_filter=goal_filter,
-            coupling=coupling,
-            slowdown=slowdown,
-            amplitude=amplitude,
-        )
-        return PoseState(motion=motion, reference=state.reference)
-
-    def retarget(self, state: PoseState, goal: Pose) -> PoseState:
-        """The same pose, twist and acceleration, with a new goal to go to.
-
-        The acceleration lasts if the next steps have a `goal_filter`.
-
-        Args:
-            state: Of a motion.
-            goal: (*batch).
-        """
-        motion, old = state.motion, state.reference
-        rotation = unit_quaternion(goal.orientation, old)
-        new = reference_of(self.motion.goal[..., ERROR], rotation).expand_as(old)
-        values = motion.position, motion.rate, self.motion.curvature(motion)
-        error, error_rate, error_curvature = (x[..., ERROR] for x in values)
-        turned = error_space.retarget(error, error_rate, error_curvature, old, new)
-        position, rate, curvature = (
-            replaced(x, ERROR, part) for x, part in zip(values, turned, strict=True)
-        )
-        target = replaced(motion.target, POSITION, goal.position)
-        motion = replace(motion, position=position, rate=rate, target=target)
-        motion = replace(motion, goal=self.motion.resting_point(motion, curvature))
-        return PoseState(motion=motion, reference=new)
-
-    def save(self, folder: str | Path) -> None:
-        """Write config.json and model.safetensors into `folder`, replacing an older save."""
-        tensors = {"goal_orientation": self.goal_orientation, **self.motion.tensors()}
-        write_model(folder, "PoseDMP", self.motion.config(), tensors)
-
-    def export(self, *, goal_filter: float | None = None) -> Any:
-        """An `ExportedDMP`: NumPy stepper, and the step as a `torch.export` program.
-
-        Args:
-            goal_filter: Of the program, as in `step`.
-
-        Raises:
-            ValueError: The primitive is a batch.
-        """
-        from hrc_learn.dmp.exported_dmp import export_dmp
-
-        return export_dmp(self, goal_filter=goal_filter)
+    def _own_tensors(self) -> dict[str, Tensor]:
+        return {"goal_orientation": self.goal_orientation}
 
     @classmethod
-    def load(cls, folder: str | Path) -> "PoseDMP":
-        """Read what `save` wrote; complains as `JointDMP.load`."""
-        saved = SavedModel(folder, "PoseDMP")
+    def _restored[S: "PoseDMP"](cls: type[S], saved: SavedModel) -> S:
         return cls(JointDMP.restore(saved), saved.tensor("goal_orientation"))
 
-    def _ends(
-        self,
-        start: Pose | None,
-        goal: Pose | None,
-        duration: ArrayLike | None,
-        velocity: ArrayLike | None,
-        speed: ArrayLike | None,
-        start_body: ArrayLike | None,
-        goal_body: ArrayLike | None,
-    ) -> tuple[dict[str, Tensor], Tensor]:
-        """Arguments for the linear primitive, and what the error is taken to."""
-        like = self.motion.start
-        duration = self.motion.resolve_duration(duration, speed)
-        demonstrated = self.motion.start_velocity * (self.motion.duration / duration)[..., None]
-        twist = None if velocity is None else to_tensor(velocity, like.dtype, like.device)
-        error, rate, reference = error_ends(
-            like[..., ERROR],
-            demonstrated[..., ERROR],
-            self.motion.goal[..., ERROR],
-            self.goal_orientation,
-            None if start is None else start.orientation,
-            None if goal is None else goal.orientation,
-            None if twist is None else twist[..., 3:],
-        )
-        start_columns = joined(
-            like[..., POSITION] if start is None else start.position,
-            error,
-            like[..., BODY] if start_body is None else start_body,
-            like,
-        )
-        goal_columns = joined(
-            self.motion.goal[..., POSITION] if goal is None else goal.position,
-            self.motion.goal[..., ERROR],
-            self.motion.goal[..., BODY] if goal_body is None else goal_body,
-            like,
-        )
-        if twist is None:
-            # Turned and dilated with the way, if the scaling has it so.
-            per_s = self.motion.start_rate(start_columns, goal_columns)
-            linear = (per_s / duration[..., None])[..., POSITION]
-        else:
-            linear = twist[..., :3]
-        return {
-            "start": start_columns,
-            "goal": goal_columns,
-            "start_velocity": joined(linear, rate, demonstrated[..., BODY], like),
-            "duration": duration,
-        }, reference
+
+def demonstrated_columns(
+    time: Times,
+    position: Points,
+    error: Tensor,
+    body: Points | None,
+    mask: Mask | None,
+) -> Tensor:
+    """Checked samples (*B, T, 6 + K), in the dtype of the position.
+
+    Raises:
+        ValueError: Bad samples; says which.
+    """
+    checked = check_samples(time, position, mask=mask)
+    if checked.position.shape[-2] != 3:
+        raise ValueError(f"position must have 3 columns, got {checked.position.shape[-2]}")
+    columns = [checked.columns, error.to(checked.position)]
+    if body is not None:
+        columns.append(check_samples(time, body, mask=mask, name="body").columns)
+    try:
+        return torch.cat(columns, dim=-1)
+    except RuntimeError:
+        shapes = ", ".join(str(tuple(column.shape)) for column in columns)
+        raise ValueError(f"position, orientation error and body differ: {shapes}") from None
+
+
+def joined(position: Tensor, error: Tensor, body: Vectors, like: Tensor) -> Tensor:
+    """The columns of a linear primitive, broadcast and side by side."""
+    columns = [to_tensor(part, like.dtype, like.device) for part in (position, error, body)]
+    batch = torch.broadcast_shapes(*(column.shape[:-1] for column in columns))
+    return torch.cat([column.expand(*batch, -1) for column in columns], dim=-1)
+
+
+def replaced(values: Tensor, columns: slice, new: Vectors) -> Tensor:
+    """`values` with some columns exchanged; differentiable in both."""
+    new = to_tensor(new, values.dtype, values.device)
+    stop = values.shape[-1] if columns.stop is None else columns.stop
+    new = new.expand(*values.shape[:-1], stop - columns.start)
+    return torch.cat([values[..., : columns.start], new, values[..., stop:]], dim=-1)

@@ -9,7 +9,7 @@ from torch import Tensor
 from hrc_learn.dmp._system.bases import PeriodicBasis
 from hrc_learn.dmp._system.response import Response, response_of
 from hrc_learn.dmp._system.spring import SpringDamper
-from hrc_learn.dmp._types import ArrayLike
+from hrc_learn.dmp._types import Mask, Points, Quaternions, Times
 from hrc_learn.dmp.fitting.motion_samples import check_samples
 from hrc_learn.dmp.joint_dmp import JointDMP
 from hrc_learn.dmp.orientation_dmp import OrientationDMP
@@ -24,11 +24,11 @@ GOLDEN = (5**0.5 - 1) / 2
 
 
 def fit_rhythmic(
-    time: ArrayLike,
-    position: ArrayLike,
+    time: Times,
+    position: Points,
     n_basis: int = 25,
     period: float | None = None,
-    mask: ArrayLike | None = None,
+    mask: Mask | None = None,
     *,
     joint_names: Sequence[str] | None = None,
     units: str = "rad",
@@ -39,10 +39,10 @@ def fit_rhythmic(
 
     The result is a `JointDMP` on a `PeriodicBasis`: its duration is the period, its goal the
     centre of the oscillation. From any start its motion goes over to the limit cycle, as the
-    demonstration's does; `duration` (or `speed`) and `amplitude` modulate the rhythm.
+    demonstration's does; `duration` (or `speed`) and `forcing_gain` modulate the rhythm.
 
     Args:
-        time: Stamps [s], (T,) or (*B, T).
+        time: Timestamps [s], (T,) or (*B, T).
         position: (T, D) or (*B, T, D).
         n_basis: Basis functions a period.
         period: [s]; found from the positions unless given.
@@ -81,7 +81,7 @@ def fit_rhythmic(
         start_velocity=batched(rate / tau[:, None]),
         duration=batched(tau),
         amplitude=batched(torch.where(samples.span > 0, samples.span, 1.0)),
-        stamps=(samples.s * (samples.duration / tau)[:, None]).reshape(*samples.batch, -1),
+        timestamps=(samples.s * (samples.duration / tau)[:, None]).reshape(*samples.batch, -1),
         basis=basis,
         spring=spring,
         joint_names=joint_names,
@@ -168,11 +168,11 @@ def _mean_of_last_cycles(s: Tensor, y: Tensor) -> Tensor:
 
 
 def fit_rhythmic_orientation(
-    time: ArrayLike,
-    orientation: ArrayLike,
+    time: Times,
+    orientation: Quaternions,
     n_basis: int = 25,
     period: float | None = None,
-    mask: ArrayLike | None = None,
+    mask: Mask | None = None,
     *,
     spring: SpringDamper | None = None,
     regularization: float = 1e-7,
@@ -180,10 +180,10 @@ def fit_rhythmic_orientation(
     """Learn a rhythm of an orientation from each demonstration of one cycle or more.
 
     The error to the mean orientation swings as a `fit_rhythmic` primitive; the goal of the
-    result is the centre of that. `duration` (or `speed`) and `amplitude` modulate it.
+    result is the centre of that. `duration` (or `speed`) and `forcing_gain` modulate it.
 
     Args:
-        time: Stamps [s], (T,) or (*B, T).
+        time: Timestamps [s], (T,) or (*B, T).
         orientation: Unit quaternions (w, x, y, z), (*B, T, 4), within half a turn of their
             mean; signs may flip.
         n_basis: Basis functions a period.
@@ -204,13 +204,13 @@ def fit_rhythmic_orientation(
 
 
 def fit_rhythmic_pose(
-    time: ArrayLike,
-    position: ArrayLike,
-    orientation: ArrayLike,
+    time: Times,
+    position: Points,
+    orientation: Quaternions,
     n_basis: int = 25,
-    body: ArrayLike | None = None,
+    body: Points | None = None,
     period: float | None = None,
-    mask: ArrayLike | None = None,
+    mask: Mask | None = None,
     *,
     spring: SpringDamper | None = None,
     regularization: float = 1e-7,

@@ -1,12 +1,11 @@
-"""Linear primitives, bases and phases as JSON values and tensors, and back."""
+"""Bases and phases as JSON values, and saved linear primitives read back."""
 
 from collections.abc import Mapping
 from dataclasses import asdict
-from pathlib import Path
 from types import NoneType
 from typing import Any
 
-from torch import Tensor, nn
+from torch import Tensor
 
 from hrc_learn.dmp._system.bases import (
     Basis,
@@ -16,11 +15,10 @@ from hrc_learn.dmp._system.bases import (
     SplineBasis,
 )
 from hrc_learn.dmp._system.canonical import ExponentialPhase, SigmoidPhase
-from hrc_learn.dmp._system.response import Response
 from hrc_learn.dmp._system.spring import SpringDamper
 from hrc_learn.dmp.fitting.motion_samples import FitReport
 from hrc_learn.dmp.forcing_scale import Scaling, find_scaling
-from hrc_learn.storage import SavedModel, write_model
+from hrc_learn.storage import SavedModel
 
 BASES: dict[str, type[Any]] = {
     basis.__name__: basis
@@ -79,61 +77,20 @@ def _restore(fields: Mapping[str, Any], known: Mapping[str, type[Any]]) -> Any:
     return known[kind](**arguments)
 
 
-TENSORS = ("weights", "start", "goal", "start_velocity", "duration", "amplitude", "stamps")
+TENSORS = ("weights", "start", "goal", "start_velocity", "duration", "amplitude", "timestamps")
 
 
-class SavedJoint(nn.Module):
-    """What a joint primitive is made of, and its way to disk."""
-
-    weights: Tensor
-    """A parameter, or a buffer where they were computed from what gradients flow to."""
-    start: Tensor
-    goal: Tensor
-    start_velocity: Tensor
-    duration: Tensor
-    amplitude: Tensor
-    stamps: Tensor
-    basis: Basis
-    spring: SpringDamper
-    response: Response
-    forcing_scale: Scaling
-    """What start and goal make of the forcing term."""
-    joint_names: tuple[str, ...] | None
-    """Names of the D coordinates."""
-    units: str
-    """Of the coordinates."""
-    fit_report: FitReport | None
-    """How well the fit reproduces its demonstrations."""
-
-    def save(self, folder: str | Path) -> None:
-        """Write config.json and model.safetensors into `folder`, replacing an older save."""
-        write_model(folder, type(self).__name__, self.config(), self.tensors())
-
-    def config(self) -> dict[str, Any]:
-        """What a saved primitive needs besides its tensors, as JSON values."""
-        return {
-            "joint_names": self.joint_names,
-            "units": {"coordinates": self.units, "time": "s"},
-            "scaling": self.forcing_scale.name,
-            "scaled_columns": self.forcing_scale.columns,
-            "approach": self.response.approach,
-            "spring": asdict(self.spring),
-            "basis": basis_config(self.basis),
-        }
-
-    def tensors(self) -> dict[str, Tensor]:
-        """Learned numbers and residuals, by the names they are saved under."""
-        report = {} if self.fit_report is None else self.fit_report.tensors()
-        return dict(self.state_dict()) | {f"fit_report.{k}": v for k, v in report.items()}
-
-
-def saved_arguments(saved: SavedModel) -> dict[str, Any]:
-    """Arguments of `JointDMP`.
+def linear_arguments(saved: SavedModel) -> dict[str, Any]:
+    """Arguments of `LinearPrimitive`.
 
     Raises:
         ValueError: Names the file and the field that is wrong.
     """
-    tensors = {name: saved.tensor(name) for name in TENSORS}
+    # Older files call the timestamps "stamps".
+    names = {
+        n: "stamps" if n == "timestamps" and n not in saved.tensors else n for n in TENSORS
+    }
+    tensors = {name: saved.tensor(stored) for name, stored in names.items()}
     _check_shapes(saved, tensors)
     arguments = {
         **tensors,
@@ -168,7 +125,7 @@ def _scaling(saved: SavedModel) -> Scaling:
 
 
 def _check_shapes(saved: SavedModel, tensors: dict[str, Tensor]) -> None:
-    """All but the stamps follow from the shape of the weights."""
+    """All but the timestamps follow from the shape of the weights."""
     weights = tensors["weights"]
     for name in TENSORS[1:-1]:
         shape = weights.shape[:-2] if name == "duration" else weights.shape[:-1]

@@ -1,32 +1,35 @@
-"""What may act on a primitive over a step, besides itself."""
+"""The orientation primitive of Ude et al. 2014, whose state is the angular velocity.
 
-from dataclasses import replace
+eta' = alpha (beta log(g conj q) - eta) + f,   q' = (0, eta) q / 2,   eta = tau omega
+
+("Orientation in Cartesian space dynamic movement primitives", eq. 16; primes by s = t / tau,
+the logarithm here the full angle). With the error e = log(g conj q) and v = -eta,
+
+    v' = alpha (beta (0 - e) - v) - f,   e' = v + n(e, v),   n = e x v / 2 + c e x (e x v)
+
+which is the linear primitive but for n, zero while the axis of the turn stays. So the linear
+part is solved exactly, as ever, and n is integrated by Runge and Kutta's method of order 4 on
+what is left (Lawson 1967, "Generalized Runge-Kutta processes for stable systems"): a step is
+stable at any length and exact about one axis. The logarithm is followed continuously.
+"""
+
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TypedDict, Unpack
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.dmp import orientation_error as error_space
+from hrc_learn.dmp import orientation_error
 from hrc_learn.dmp._system.response import Trajectory
-from hrc_learn.dmp._types import ArrayLike, to_tensor
+from hrc_learn.dmp._types import Scalars, Times, to_tensor
 from hrc_learn.dmp.closed_loop import DMPState
 from hrc_learn.dmp.fitting.motion_samples import Samples
 from hrc_learn.dmp.fitting.solvers import ridge_operator
-from hrc_learn.dmp.joint_dmp import JointDMP
+from hrc_learn.dmp.linear_primitive import ColumnEnds, LinearPrimitive
+from hrc_learn.dmp.orientation_coordinates import OrientationCoordinates
 from hrc_learn.geometry.left_jacobian import axis_drift, drift_free_rate, drift_free_slope
-
-
-class Influences(TypedDict):
-    """Arguments of `JointDMP.step` that an orientation passes on."""
-
-    goal_filter: float | None
-    coupling: ArrayLike | None
-    """Second derivative added to the error, or to what stands for it, per s^2."""
-    slowdown: ArrayLike | None
-    amplitude: ArrayLike | None
-
 
 LONGEST = 1 / 200
 """Longest step of a rollout, in s; the fourth power of it is what the rollout is off by."""
@@ -34,93 +37,95 @@ LONGEST = 1 / 200
 SAMPLES = 10
 """Times per basis function at which the force of a demonstration is read."""
 
+RIDGE = 1e-7
+"""Of the regression of that force, relative to its largest singular value: as in `fit`."""
 
-class UdeFormulation:
-    """See the module."""
 
-    def adapt(self, motion: JointDMP, errors: Samples) -> None:
-        """Add to the weights what the other state takes to follow the same path.
+@dataclass(frozen=True, eq=False)
+class UdeCoordinates(OrientationCoordinates):
+    """The error as ever, but what moves linearly is (e, v), up to the drift of its axis."""
 
-        Raises:
-            ValueError: The demonstration passes a whole turn from its goal, where e' has no
-                bound.
-        """
-        count = SAMPLES * motion.basis.count
-        s = torch.linspace(0, 1, count, dtype=torch.float64, device=motion.weights.device)
-        with torch.no_grad():
-            linear = motion.rollout(s, duration=1.0, start_velocity=_per_s(motion))
-            e, rate, curvature = (
-                x.double() for x in (linear.position, linear.velocity, linear.acceleration)
-            )
-            if (e.norm(dim=-1) >= 2 * torch.pi).any():
-                raise ValueError(
-                    "orientation is a whole turn or more from its end: formulation 'ude' "
-                    "cannot follow that, use 'log'"
-                )
-            v, slope = drift_free_rate(e, rate), drift_free_slope(e, rate, curvature)
-            force = slope - curvature + motion.spring.alpha * (v - rate)
-            change = (ridge_operator(motion.response, s, 1e-7) @ force).mT
-            motion.weights += change.to(motion.weights)
-            ends = motion.start, motion.duration, motion.start_velocity
-            reproduction = self.rollout(motion, None, *ends, None).position.mT
-        motion.fit_report = errors.compare(reproduction.reshape(errors.position.shape))
+    linear: ClassVar[bool] = False
 
-    def rollout(
+    def roll(
         self,
-        motion: JointDMP,
-        time: ArrayLike | None,
-        start: Float[Tensor, "*#batch 3"],
-        duration: Float[Tensor, "*#batch"],
-        rate: Float[Tensor, "*#batch 3"],
-        amplitude: ArrayLike | None,
+        motion: LinearPrimitive,
+        ends: ColumnEnds,
+        duration: Tensor,
+        time: Times | None,
+        forcing_gain: Scalars | None,
     ) -> "UdeMotion":
         """Of order 4 in `LONGEST`."""
         s = motion.normalised_time(time, duration)
-        return UdeMotion(motion, s, start, duration, rate, amplitude)
+        start, velocity = to_tensor(ends.start), to_tensor(ends.velocity)  # pyright: ignore[reportArgumentType]
+        return UdeMotion(motion, s, start, duration, velocity, forcing_gain)
 
-    def step(
-        self,
-        motion: JointDMP,
-        state: DMPState,
-        dt: ArrayLike,
-        **influences: Unpack[Influences],
+    def advance(
+        self, motion: LinearPrimitive, columns: DMPState, dt: Any, **step: Any
     ) -> DMPState:
         """Of order 4 in `dt`."""
-        v = drift_free_rate(state.position, state.rate)
-        begin = replace(state, rate=v)
+        v = drift_free_rate(columns.position, columns.rate)
+        begin = replace(columns, rate=v)
         half = to_tensor(dt, v.dtype, v.device) / 2
-        middle = motion.step(begin, half, **influences)
-        end = motion.step(middle, half, **influences)
+        middle = motion.advance(begin, half, **step)
+        end = motion.advance(middle, half, **step)
         linear = [torch.stack([x.position, x.rate], dim=-2) for x in (begin, middle, end)]
-        h = end.s - state.s
+        h = end.s - columns.s
         left = deviation(torch.zeros_like(linear[0]), h, motion, linear)
         e, v = (linear[2] + left).unbind(-2)
         return replace(end, position=e, rate=v + axis_drift(e, v))
 
-    def push(
-        self, state: DMPState, acceleration: Float[Tensor, "*#batch 3"]
-    ) -> Float[Tensor, "*batch 3"]:
+    def external_acceleration(
+        self, motion: LinearPrimitive, columns: DMPState, frame: Tensor, coupling: Any
+    ) -> Tensor | None:
         """On v, which is minus the angular velocity."""
-        return -acceleration
+        if coupling is None:
+            return None
+        return -to_tensor(coupling, frame.dtype, frame.device)
 
-    def retarget(
-        self,
-        motion: JointDMP,
-        state: DMPState,
-        old: Float[Tensor, "*batch 4"],
-        new: Float[Tensor, "*batch 4"],
+    def _to_reference(
+        self, motion: LinearPrimitive, columns: DMPState, old: Tensor, new: Tensor
     ) -> DMPState:
         """With a goal filter the angular acceleration goes on as it was."""
-        q = error_space.to_orientation(state.position, old)
-        error = error_space.nearest_turn(error_space.to_error(q, new), state.position)
-        v = drift_free_rate(state.position, state.rate)
+        q = orientation_error.to_orientation(columns.position, old)
+        error = orientation_error.to_error(q, new)
+        error = orientation_error.nearest_turn(error, columns.position)
+        v = drift_free_rate(columns.position, columns.rate)
         # The pull is alpha beta (e - goal): it stays when both move alike.
         return replace(
-            state,
+            columns,
             position=error,
             rate=v + axis_drift(error, v),
-            goal=state.goal + error - state.position,
+            goal=columns.goal + error - columns.position,
         )
+
+
+def follow_errors(motion: LinearPrimitive, errors: Samples) -> None:
+    """Add to fitted weights what the other state takes to follow the same path.
+
+    Raises:
+        ValueError: The demonstration passes a whole turn from its goal, where e' has no
+            bound.
+    """
+    count = SAMPLES * motion.basis.count
+    s = torch.linspace(0, 1, count, dtype=torch.float64, device=motion.weights.device)
+    with torch.no_grad():
+        linear = motion.roll(ColumnEnds(velocity=_per_s(motion)), _one(motion), s)
+        e, rate, curvature = (
+            x.double() for x in (linear.position, linear.velocity, linear.acceleration)
+        )
+        if (e.norm(dim=-1) >= 2 * torch.pi).any():
+            raise ValueError(
+                "orientation is a whole turn or more from its end: formulation 'ude' "
+                "cannot follow that, use 'log'"
+            )
+        v, slope = drift_free_rate(e, rate), drift_free_slope(e, rate, curvature)
+        force = slope - curvature + motion.spring.alpha * (v - rate)
+        change = (ridge_operator(motion.response, s, RIDGE) @ force).mT
+        motion.weights += change.to(motion.weights)
+        ends = motion.start, motion.duration, motion.start_velocity
+        reproduction = UdeMotion(motion, motion.timestamps, *ends, None).position.mT
+    motion.fit_report = errors.compare(reproduction.reshape(errors.position.shape))
 
 
 class UdeMotion:
@@ -128,12 +133,12 @@ class UdeMotion:
 
     def __init__(
         self,
-        motion: JointDMP,
+        motion: LinearPrimitive,
         s: Float[Tensor, "*#batch T"],
         start: Float[Tensor, "*#batch 3"],
         duration: Float[Tensor, "*#batch"],
         rate: Float[Tensor, "*#batch 3"],
-        amplitude: ArrayLike | None,
+        forcing_gain: Scalars | None,
     ):
         """Describe the motion.
 
@@ -143,11 +148,11 @@ class UdeMotion:
             start: Error [rad].
             duration: [s].
             rate: Of the error [rad/s].
-            amplitude: Factor on the forcing term.
+            forcing_gain: Factor on the forcing term.
         """
         start, per_s = torch.broadcast_tensors(start, rate * duration[..., None])
         self._motion = motion
-        self._amplitude = amplitude
+        self._forcing_gain = forcing_gain
         self._s = s
         self._duration = duration[..., None, None]
         self._start = start
@@ -220,19 +225,14 @@ class UdeMotion:
 
     def _rolled(self, s: Tensor) -> Trajectory:
         # A duration of one: times are s, velocities per s.
-        return self._motion.rollout(
-            s,
-            self._start,
-            duration=1.0,
-            start_velocity=self._first,
-            amplitude=self._amplitude,
-        )
+        ends = ColumnEnds(self._start, None, self._first)
+        return self._motion.roll(ends, _one(self._motion), s, self._forcing_gain)
 
 
 def deviation(
     z: Float[Tensor, "*#batch 2 3"],
     h: Float[Tensor, "*#batch"],
-    motion: JointDMP,
+    motion: LinearPrimitive,
     linear: list[Tensor] | tuple[Tensor, ...],
 ) -> Float[Tensor, "*batch 2 3"]:
     """What z = (e, v) - linear, z' = A z + (n, 0), becomes over a step of `h`.
@@ -260,6 +260,11 @@ def _slope(x: Float[Tensor, "*batch 2 3"]) -> Float[Tensor, "*batch 2 3"]:
     return torch.stack([drift, torch.zeros_like(drift)], dim=-2)
 
 
-def _per_s(motion: JointDMP) -> Tensor:
+def _per_s(motion: LinearPrimitive) -> Tensor:
     """Demonstrated start velocity, per s."""
     return motion.start_velocity * motion.duration[..., None]
+
+
+def _one(motion: LinearPrimitive) -> Tensor:
+    """The duration of a motion whose times are s."""
+    return motion.resolve_duration(1.0, None)

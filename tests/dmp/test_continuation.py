@@ -20,7 +20,7 @@ def primitive(batch: tuple[int, ...], seed: int = 0) -> JointDMP:
         start_velocity=draw(3),
         duration=1 + draw().abs(),
         amplitude=torch.ones(*batch, 3, dtype=torch.float64),
-        stamps=torch.linspace(0, 1, 5, dtype=torch.float64),
+        timestamps=torch.linspace(0, 1, 5, dtype=torch.float64),
         basis=RESPONSE.basis,
         spring=RESPONSE.spring,
     )
@@ -120,5 +120,5 @@ def test_an_approach_cannot_be_continued():
             dmp.start_velocity,
             duration=dmp.duration,
             elapsed=dmp.duration,
-            time=dmp.stamps,
+            time=dmp.timestamps,
         )

@@ -51,7 +51,7 @@ def test_an_orientation_stepper_does_what_the_primitive_does(approach):
     state, numpy_state = dmp.initial_state(**ends), stepper.initial_state(**ends)
     for k in range(18):
         dt = 10 ** rng.uniform(-1.2, -0.2)
-        change = {"slowdown": 1.0} if k % 3 == 0 else {}
+        change = {"phase_stopping": 1.0} if k % 3 == 0 else {}
         change |= {"goal": 1.01 * random_orientation(rng)} if k % 7 == 0 else {}
         state = dmp.step(state, dt, **change)
         numpy_state = stepper.step(numpy_state, dt, **change)
@@ -76,8 +76,8 @@ def test_a_pose_stepper_does_what_the_primitive_does():
             change["goal_body"] = numpy_change["body"] = rng.standard_normal(2)
         if k % 4 == 0:
             change["coupling"] = numpy_change["coupling"] = rng.standard_normal(3)
-        state = dmp.step(state, dt, **change, slowdown=0.5)
-        numpy_state = stepper.step(numpy_state, dt, **numpy_change, slowdown=0.5)
+        state = dmp.step(state, dt, **change, phase_stopping=0.5)
+        numpy_state = stepper.step(numpy_state, dt, **numpy_change, phase_stopping=0.5)
         same(numpy_state.position, state.pose.position)
         same(numpy_state.orientation, state.pose.orientation)
         same(numpy_state.body, state.body)

@@ -209,14 +209,16 @@ class Trajectory:
             response: Of the primitive.
         """
         self._coordinates = coordinates
-        self._s = s
-        self._duration = duration
+        self.s = s
+        """Normalised times."""
+        self.duration = duration
+        """[s]."""
         self._response = response
 
     @cached_property
     def time(self) -> Float[Tensor, "*batch T"]:
         """Since the start of the motion [s]."""
-        time = self._s * self._duration[..., None]
+        time = self.s * self.duration[..., None]
         return time.to(self._coordinates.dtype).expand(*self._batch, -1)
 
     @cached_property
@@ -237,10 +239,10 @@ class Trajectory:
     def _output(self, order: int) -> Float[Tensor, "*batch T D"]:
         X = self._coordinates
         if order:
-            X = X / self._duration[..., None, None] ** order
-        if self._s.ndim == 1 and not self._s.requires_grad:
+            X = X / self.duration[..., None, None] ** order
+        if self.s.ndim == 1 and not self.s.requires_grad:
             # One flat product: batched ones against a shared matrix are ten times slower.
-            H = self._response.matrices(self._s, X.dtype)[order]
+            H = self._response.matrices(self.s, X.dtype)[order]
             y = X @ H if X.ndim == 2 else (X.flatten(0, -2) @ H).view(*X.shape[:-1], -1)
         else:
             y = X @ self._rows[..., order, :].to(X.dtype).mT
@@ -249,12 +251,12 @@ class Trajectory:
     @cached_property
     def _batch(self) -> torch.Size | tuple[int, ...]:
         return broadcast_shapes(
-            self._coordinates.shape[:-2], self._s.shape[:-1], self._duration.shape
+            self._coordinates.shape[:-2], self.s.shape[:-1], self.duration.shape
         )
 
     @cached_property
     def _rows(self) -> Float[Tensor, "*#batch T 3 M"]:
-        return self._response.evaluate(self._s.double())
+        return self._response.evaluate(self.s.double())
 
 
 def broadcast_shapes(*shapes: tuple[int, ...]) -> tuple[int, ...]:

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.dmp._types import ArrayLike
+from hrc_learn.dmp._types import Points, Times
 from hrc_learn.dmp.fitting.motion_samples import check_samples
 from hrc_learn.dmp.joint_dmp import JointDMP
 
@@ -28,8 +28,8 @@ class BasisSelection:
 
 
 def select_basis_count(
-    time: ArrayLike,
-    position: ArrayLike,
+    time: Times,
+    position: Points,
     candidates: Sequence[int] = (10, 15, 20, 30, 40, 50, 70, 100),
     *,
     n_folds: int = 5,
@@ -41,7 +41,7 @@ def select_basis_count(
     the start and the goal.
 
     Args:
-        time: Stamps [s], (T,) or (*B, T).
+        time: Timestamps [s], (T,) or (*B, T).
         position: (T,), (T, D) or (*B, T, D).
         candidates: Counts to try.
         n_folds: Fits per candidate.

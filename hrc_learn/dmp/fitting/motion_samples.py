@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from hrc_learn.dmp._types import ArrayLike, to_tensor
+from hrc_learn.dmp._types import Mask, Points, Times, to_tensor
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -124,17 +124,17 @@ class Samples:
 
 
 def check_samples(
-    time: ArrayLike,
-    position: ArrayLike,
-    velocity: ArrayLike | None = None,
-    mask: ArrayLike | None = None,
+    time: Times,
+    position: Points,
+    velocity: Points | None = None,
+    mask: Mask | None = None,
     *,
     name: str = "position",
 ) -> Samples:
     """Check and batch what the caller recorded.
 
     Args:
-        time: Stamps [s], (T,) or (*B, T); any origin, any spacing.
+        time: Timestamps [s], (T,) or (*B, T); any origin, any spacing.
         position: (T,), (T, D) or (*B, T, D). Of the same shape as `time`: D = 1.
         velocity: Like `position`, or None.
         mask: Like `time`, true where a sample counts; None: all do. The others may hold
@@ -189,7 +189,7 @@ def check_samples(
     )
 
 
-def _floating(values: ArrayLike) -> Tensor:
+def _floating(values: Points) -> Tensor:
     tensor = to_tensor(values)
     return tensor if tensor.is_floating_point() else tensor.to(torch.get_default_dtype())
 

@@ -134,7 +134,7 @@ def _trajectory(
 @lru_cache(maxsize=16)
 def _trajectory_operator(
     response: Response,
-    stamps: bytes,
+    timestamps: bytes,
     device: torch.device,
     fit_rate: bool,
     regularization: float,
@@ -145,7 +145,7 @@ def _trajectory_operator(
     too, so that one matrix does it all.
     """
     N = response.basis.count
-    s = _stamps(stamps, device)
+    s = _timestamps(timestamps, device)
     H = response.evaluate(s)[:, 0]
     velocity, start, goal = H[:, N], H[:, N + 1], H[:, N + 2]
     unit = balanced_units(response.basis, H, int(fit_rate))
@@ -161,15 +161,19 @@ def _key(s: Float[Tensor, "T"]) -> bytes:
     return s.cpu().numpy().tobytes()
 
 
-def _stamps(key: bytes, device: torch.device) -> Float[Tensor, "T"]:
+def _timestamps(key: bytes, device: torch.device) -> Float[Tensor, "T"]:
     return torch.frombuffer(bytearray(key), dtype=torch.float64).to(device)
 
 
 @lru_cache(maxsize=16)
 def _force_operator(
-    method: str, response: Response, stamps: bytes, device: torch.device, regularization: float
+    method: str,
+    response: Response,
+    timestamps: bytes,
+    device: torch.device,
+    regularization: float,
 ) -> Float[Tensor, "N T"]:
-    s = _stamps(stamps, device)
+    s = _timestamps(timestamps, device)
     if method == "ridge":
         return ridge_operator(response, s, regularization)
     return _lwr_operator(response, s)
@@ -224,6 +228,7 @@ class MotionFit:
         amplitude = torch.where(samples.span > 0, samples.span, 1.0)
         shown = Demonstrated(*(x.double() for x in (samples.first, samples.last, amplitude)))
         scaling.check(shown, samples.batch, names)
+        s = samples.s[0] if samples.shared else samples.s.view(*samples.batch, -1)
         return {
             "weights": self._batched(scaling.unscale(self.weights.mT, shown).mT),
             "start": self._batched(samples.first),
@@ -231,7 +236,7 @@ class MotionFit:
             "start_velocity": self._batched(self.rate / samples.duration[:, None]),
             "duration": self._batched(samples.duration),
             "amplitude": self._batched(amplitude),
-            "stamps": samples.s[0] if samples.shared else samples.s.view(*samples.batch, -1),
+            "timestamps": s,
             "basis": self.response.basis,
             "spring": self.response.spring,
             "scaling": scaling,

@@ -19,7 +19,7 @@ from hrc_learn import distributed
 from hrc_learn.dmp._system.bases import Basis, GaussianBasis, balanced_units
 from hrc_learn.dmp._system.response import Response, response_of
 from hrc_learn.dmp._system.spring import SpringDamper
-from hrc_learn.dmp._types import ArrayLike
+from hrc_learn.dmp._types import Points, Times
 from hrc_learn.dmp.fitting.motion_samples import Samples, check_samples
 from hrc_learn.dmp.joint_dmp import JointDMP
 
@@ -95,7 +95,7 @@ def _triangle(rows: Float[Tensor, "rows n"]) -> Float[Tensor, "n n"]:
     return torch.linalg.qr(rows, mode="r").R
 
 
-_STAMPS = 1000
+TIMESTAMPS = 1000
 """Samples of a rollout without arguments: demonstrations need not be sampled alike."""
 
 
@@ -111,7 +111,7 @@ class SharedFit:
 
 
 def fit_shared(
-    demonstrations: Sequence[tuple[ArrayLike, ArrayLike]],
+    demonstrations: Sequence[tuple[Times, Points]],
     n_basis: int = 50,
     *,
     basis: Basis | None = None,
@@ -129,7 +129,7 @@ def fit_shared(
     several processes, each reads its share, and all return the same.
 
     Args:
-        demonstrations: Stamps (T,) [s] and positions (T, D) of each; read one by one, so a
+        demonstrations: Timestamps (T,) [s] and positions (T, D) of each; read one by one, so a
             sequence that loads them when asked is enough.
         n_basis: N, unless `basis` is given.
         basis: Shape of the forcing term.
@@ -159,7 +159,7 @@ def fit_shared(
         start_velocity=X[-1] / duration,
         duration=duration,
         amplitude=torch.where(amplitude > 0, amplitude, 1.0),
-        stamps=torch.linspace(0, 1, _STAMPS, dtype=torch.float64),
+        timestamps=torch.linspace(0, 1, TIMESTAMPS, dtype=torch.float64),
         basis=response.basis,
         spring=response.spring,
         approach=approach,
@@ -181,9 +181,7 @@ class _Totals:
     """Over demonstrations: start, goal, range, duration."""
 
 
-def _gather(
-    demonstrations: Sequence[tuple[ArrayLike, ArrayLike]], response: Response
-) -> _Totals:
+def _gather(demonstrations: Sequence[tuple[Times, Points]], response: Response) -> _Totals:
     """Everything a fit needs, of the demonstrations of all processes."""
     N, D = response.basis.count, None
     problem, sums = None, None
@@ -202,7 +200,7 @@ def _gather(
     return _Totals(problem.over_processes(), distributed.sum_over_processes(sums))
 
 
-def _checked(index: int, time: ArrayLike, position: ArrayLike) -> Samples:
+def _checked(index: int, time: Times, position: Points) -> Samples:
     try:
         samples = check_samples(time, position)
     except ValueError as error:

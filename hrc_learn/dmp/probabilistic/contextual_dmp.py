@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from hrc_learn.dmp._types import ArrayLike, to_tensor
+from hrc_learn.dmp._types import ArrayLike, Mask, Points, Times, Vectors, to_tensor
 from hrc_learn.dmp.fitting.motion_samples import FitReport, check_samples
 from hrc_learn.dmp.joint_dmp import JointDMP
 from hrc_learn.dmp.probabilistic.linear_view import mean_primitive
@@ -168,11 +168,11 @@ class ContextualDMP(nn.Module):
     @classmethod
     def fit(
         cls,
-        time: ArrayLike,
-        position: ArrayLike,
-        context: ArrayLike,
+        time: Times,
+        position: Points,
+        context: Vectors,
         n_basis: int = 50,
-        mask: ArrayLike | None = None,
+        mask: Mask | None = None,
         *,
         features: FeatureMap | None = None,
         regularization: float = 1e-6,
@@ -181,7 +181,7 @@ class ContextualDMP(nn.Module):
         """Learn from one demonstration for each of several contexts.
 
         Args:
-            time: Stamps [s], (T,) or (n, T).
+            time: Timestamps [s], (T,) or (n, T).
             position: (n, T, D), n >= 2.
             context: (n, C), or (n,) for C = 1.
             n_basis: N.
@@ -219,7 +219,7 @@ class ContextualDMP(nn.Module):
             features=features,
         )
 
-    def at(self, context: ArrayLike) -> JointDMP:
+    def at(self, context: Vectors) -> JointDMP:
         """Primitives for contexts (*batch, C); gradients flow to them and to the coefficients.
 
         What is learned here are the coefficients: the weights of the result are a buffer.
@@ -287,7 +287,7 @@ def _primitive(like: JointDMP, x: Float[Tensor, "*batch K"]) -> JointDMP:
     return like.with_coordinates(x[..., :-1].unflatten(-1, (D, -1)), x[..., -1].exp())
 
 
-def _contexts(context: ArrayLike, primitives: JointDMP) -> Float[Tensor, "n C"]:
+def _contexts(context: Vectors, primitives: JointDMP) -> Float[Tensor, "n C"]:
     weights = primitives.weights
     tensor = to_tensor(context, dtype=torch.float64, device=weights.device)
     tensor = tensor[:, None] if tensor.ndim == 1 else tensor

@@ -1,7 +1,7 @@
-"""Every kind of primitive as a linear one, and back.
+"""What is done alike with primitives of every kind: ends, via points, means, common references.
 
-Orientations, poses and limited joints move linearly in coordinates of their own: what is true
-of linear primitives is worked out once, on their `motion`.
+Orientations, poses and limited joints move linearly in columns of their own: what is true of
+linear primitives is worked out once, on their `motion`.
 """
 
 from typing import Any
@@ -10,118 +10,44 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from hrc_learn.dmp._types import Points, Times
 from hrc_learn.dmp.joint_dmp import JointDMP
-from hrc_learn.dmp.limited_dmp import LimitedDMP
-from hrc_learn.dmp.orientation_dmp import OrientationDMP
-from hrc_learn.dmp.orientation_error import (
-    intrinsic_mean,
-    nearest_turn,
-    to_error,
-    to_orientation,
-)
-from hrc_learn.dmp.pose_dmp import ERROR, PoseDMP, replaced
+from hrc_learn.dmp.linear_primitive import ColumnEnds, LinearPrimitive
+from hrc_learn.dmp.motion_primitive import AdaptedPrimitive
+from hrc_learn.dmp.orientation_error import intrinsic_mean, nearest_turn, reference_of, to_error
 
 SAME = 1e-9
-"""Orientations closer than this [rad] are one."""
-
-type Primitive = JointDMP | OrientationDMP | PoseDMP | LimitedDMP
+"""Orientations closer than this [rad] are one: well above rounding, well below any sensor."""
 
 
-def motion_of(primitive: Primitive) -> JointDMP:
-    """The linear primitive inside.
+def via_point_primitive[P: AdaptedPrimitive](
+    primitive: P,
+    time: Times,
+    value: Any = None,
+    velocity: Points | None = None,
+    *,
+    body: Points | None = None,
+    body_velocity: Points | None = None,
+    within: tuple[float | int, float | int] | None = None,
+) -> P:
+    """The primitive, changed so that it passes through via points exactly.
 
-    Raises:
-        ValueError: The formulation of Ude et al., which is not linear.
+    As `AdaptedPrimitive.condition`, whose arguments it takes.
     """
-    if isinstance(primitive, JointDMP):
-        return primitive
-    if isinstance(primitive, OrientationDMP) and primitive.formulation != "log":
-        raise ValueError(
-            f"formulation {primitive.formulation!r} is not linear: fit with 'log' instead"
-        )
-    return primitive.motion
+    return primitive.condition(
+        time, value, velocity, body=body, body_velocity=body_velocity, within=within
+    )
 
 
-def with_motion[P: Primitive](primitive: P, motion: JointDMP, reference: Any = None) -> P:
-    """A primitive of the same kind around another linear one.
-
-    Args:
-        primitive: The kind, and what its coordinates mean.
-        motion: Takes the place of its own.
-        reference: What errors are now taken to; the primitive's own if None.
-    """
-    made: Any = motion
-    if isinstance(primitive, OrientationDMP | PoseDMP):
-        reference = primitive.reference if reference is None else reference
-        error = motion.goal[..., error_columns(primitive)]
-        made = type(primitive)(motion, to_orientation(error, reference))
-    elif isinstance(primitive, LimitedDMP):
-        made = LimitedDMP(motion, primitive.lower, primitive.upper, primitive.softness)
-    return made
-
-
-def error_columns(primitive: OrientationDMP | PoseDMP) -> slice:
-    """Which coordinates of its motion are the orientation error."""
-    return ERROR if isinstance(primitive, PoseDMP) else slice(0, 3)
-
-
-def with_ends[P: Primitive](primitive: P, **ends: Any) -> P:
+def with_ends[P: AdaptedPrimitive](primitive: P, **ends: Any) -> P:
     """The primitive whose own motion has these ends.
 
-    Args:
-        primitive: Whose forcing does not follow start and goal.
-        ends: Those of its `initial_state`: start, goal, duration, start_velocity and more.
-
-    Raises:
-        ValueError: A scaling that means other weights for other ends.
+    As `AdaptedPrimitive.with_ends`, whose arguments it takes.
     """
-    motion = motion_of(primitive)
-    if motion.forcing_scale.follows_ends:
-        raise ValueError(f"scaling {motion.scaling!r} changes with the ends: fit with 'none'")
-    state: Any = primitive.initial_state(**ends)
-    moved = state if isinstance(primitive, JointDMP) else state.motion
-    rest = torch.stack([moved.rate, moved.position, moved.goal], dim=-1)
-    weights = motion.weights.expand(*rest.shape[:-1], -1)
-    x = torch.cat([weights, rest], dim=-1)
-    motion = motion.with_coordinates(x, moved.duration)
-    return with_motion(primitive, motion, getattr(state, "reference", None))
+    return primitive.with_ends(**ends)
 
 
-def alike[P: Primitive](primitives: P) -> P:
-    """A batch of primitives in coordinates that mean the same for all of them.
-
-    Orientations with goals of their own are taken as errors to the mean of those. That is
-    not linear, so the errors are fitted anew.
-    """
-    if not isinstance(primitives, OrientationDMP | PoseDMP):
-        return primitives
-    own = primitives.reference
-    reference = intrinsic_mean(own.reshape(-1, 4))
-    motion = motion_of(primitives)
-    if (to_error(own, reference).abs() < SAME).all():
-        return primitives
-    if motion.basis.periodic:
-        raise ValueError("rhythms about different centres have no distribution")
-    with torch.no_grad():
-        shown = primitives.rollout()
-        columns = motion.rollout().position
-    part = error_columns(primitives)
-    error = nearest_turn(to_error(shown.orientation, reference), columns[..., part])
-    fitted = JointDMP.fit(
-        shown.time,
-        error,
-        basis=motion.basis,
-        spring=motion.spring,
-        approach=motion.response.approach,
-    )
-    x = replaced(motion.coordinates().mT, part, fitted.coordinates().mT).mT
-    motion = motion.with_coordinates(x.detach(), motion.duration)
-    return with_motion(primitives, motion, reference.expand_as(own))
-
-
-def mean_primitive[Primitive: (JointDMP, OrientationDMP, PoseDMP)](
-    primitives: Primitive,
-) -> Primitive:
+def mean_primitive[P: AdaptedPrimitive](primitives: P) -> P:
     """The mean over all batch dimensions of a primitive.
 
     A rollout is linear in weights, start, goal and start velocity. So for one duration, and
@@ -136,12 +62,58 @@ def mean_primitive[Primitive: (JointDMP, OrientationDMP, PoseDMP)](
     Raises:
         ValueError: Primitives whose scaling turns them, each with the way of its own.
     """
-    if isinstance(primitives, JointDMP):
-        return _mean_of_joints(primitives)
-    motion = _mean_of_joints(primitives.motion)
-    if isinstance(primitives, OrientationDMP):
-        return OrientationDMP(motion, _mean_goal(primitives.goal), primitives.formulation)
-    return PoseDMP(motion, _mean_goal(primitives.goal_orientation))
+    motion, columns = _mean_motion(primitives.motion), primitives.adapter.error_columns
+    if columns is None:
+        return primitives.with_motion(motion)
+    goal = _mean_goal(_goal_orientation(primitives))
+    return primitives.with_motion(motion, reference_of(motion.goal[..., columns], goal))
+
+
+def alike[P: AdaptedPrimitive](primitives: P) -> P:
+    """A batch of primitives in columns that mean the same for all of them.
+
+    Orientations with goals of their own are taken as errors to the mean of those. That is
+    not linear, so the errors are fitted anew.
+    """
+    columns = primitives.adapter.error_columns
+    if columns is None:
+        return primitives
+    own = reference(primitives)
+    middle = intrinsic_mean(own.reshape(-1, 4))
+    motion = primitives.linear_motion()
+    if (to_error(own, middle).abs() < SAME).all():
+        return primitives
+    if motion.basis.periodic:
+        raise ValueError("rhythms about different centres have no distribution")
+    with torch.no_grad():
+        shown: Any = primitives.rollout()
+        errors = shown_columns(motion)[..., columns]
+    fitted = JointDMP.fit(
+        shown.time,
+        nearest_turn(to_error(shown.orientation, middle), errors),
+        basis=motion.basis,
+        spring=motion.spring,
+        approach=motion.response.approach,
+    )
+    x = motion.coordinates().detach().clone()
+    x[..., columns, :] = fitted.coordinates().detach()
+    motion = motion.with_coordinates(x, motion.duration)
+    return primitives.with_motion(motion, middle.expand_as(own))
+
+
+def reference(primitive: Any) -> Float[Tensor, "*batch 4"]:
+    """What orientation errors of a primitive that has them are taken to."""
+    return primitive.reference
+
+
+def shown_columns(motion: LinearPrimitive) -> Float[Tensor, "*batch T D"]:
+    """Columns along the demonstration."""
+    return motion.roll(ColumnEnds(), motion.duration).position
+
+
+def _goal_orientation(primitives: Any) -> Float[Tensor, "*batch 4"]:
+    goal = primitives.goal
+    return goal if isinstance(goal, Tensor) else goal.orientation
 
 
 def _mean_goal(goals: Float[Tensor, "*batch 4"]) -> Float[Tensor, "4"]:
@@ -151,21 +123,21 @@ def _mean_goal(goals: Float[Tensor, "*batch 4"]) -> Float[Tensor, "4"]:
     return torch.nn.functional.normalize(goals.mean(dim=0), dim=-1)
 
 
-def _mean_of_joints(primitives: JointDMP) -> JointDMP:
-    if primitives.forcing_scale.turns and primitives.weights.ndim > 2:
+def _mean_motion(motions: LinearPrimitive) -> LinearPrimitive:
+    if motions.forcing_scale.turns and motions.weights.ndim > 2:
         raise ValueError(
-            f"scaling {primitives.scaling!r} gives each primitive a frame of its own: fit with "
+            f"scaling {motions.scaling!r} gives each primitive a frame of its own: fit with "
             "'none' to average them"
         )
-    x, stamps = primitives.coordinates().detach(), primitives.stamps
+    x, count = motions.coordinates().detach(), motions.timestamps.shape[-1]
     batch = x.ndim - 2
 
-    def mean(tensor: torch.Tensor) -> torch.Tensor:
+    def mean(tensor: Tensor) -> Tensor:
         return tensor.flatten(0, batch - 1).mean(dim=0) if batch else tensor
 
-    return primitives.with_coordinates(
+    return motions.with_coordinates(
         mean(x),
-        mean(primitives.duration),
-        amplitude=mean(primitives.amplitude),
-        stamps=torch.linspace(0, 1, stamps.shape[-1], dtype=stamps.dtype, device=stamps.device),
+        mean(motions.duration),
+        amplitude=mean(motions.amplitude),
+        timestamps=torch.linspace(0, 1, count, dtype=torch.float64).to(motions.timestamps),
     )

@@ -6,21 +6,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.dmp._types import ArrayLike, to_tensor
-from hrc_learn.dmp.joint_dmp import JointDMP
-from hrc_learn.dmp.probabilistic.linear_view import (
-    Primitive,
-    alike,
-    mean_primitive,
-    motion_of,
-    with_motion,
-)
-from hrc_learn.dmp.probabilistic.vmp import ViaPoints, via_points
+from hrc_learn.dmp._types import ArrayLike, Points, Times, to_tensor
+from hrc_learn.dmp.linear_primitive import LinearPrimitive
+from hrc_learn.dmp.motion_primitive import AdaptedPrimitive
+from hrc_learn.dmp.probabilistic.linear_view import alike, mean_primitive
+from hrc_learn.dmp.probabilistic.vmp import ViaPoints
 from hrc_learn.geometry import Pose
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class ProbabilisticDMP[P: Primitive]:
+class ProbabilisticDMP[P: AdaptedPrimitive]:
     """Gaussian over the coordinates x = (weights, start velocity, start, goal) of a primitive.
 
     A motion is linear in its coordinates, y(s) = H(s) x, so it is Gaussian too: means,
@@ -47,15 +42,15 @@ class ProbabilisticDMP[P: Primitive]:
         Raises:
             ValueError: Fewer than two, or scaled primitives, whose motion is not linear.
         """
-        motion = motion_of(primitives)
+        motion = primitives.linear_motion()
         batch = motion.weights.shape[:-2]
         if batch.numel() < 2 or not batch:
             raise ValueError("a distribution needs a batch of at least 2 primitives")
         _coordinates(motion)
         primitives = alike(primitives)
-        motion = motion_of(primitives)
+        motion = primitives.linear_motion()
         x = _coordinates(motion).flatten(0, -3)
-        mean, middle = x.mean(0), mean_primitive(motion)
+        mean, middle = x.mean(0), mean_primitive(primitives).motion
         reference = getattr(primitives, "reference", None)
         if reference is not None:
             reference = reference.reshape(-1, 4)[0]
@@ -63,7 +58,7 @@ class ProbabilisticDMP[P: Primitive]:
         if slack:
             spread = torch.cat([spread, _free_forcing(middle, slack)], dim=1)
         return cls(
-            primitive=with_motion(primitives, middle, reference), mean=mean, spread=spread
+            primitive=primitives.with_motion(middle, reference), mean=mean, spread=spread
         )
 
     @classmethod
@@ -77,7 +72,7 @@ class ProbabilisticDMP[P: Primitive]:
             slack: Standard deviation of the forcing term, alike at all times, in units of the
                 force that holds a coordinate away from its goal by the range it covers.
         """
-        motion = motion_of(primitive)
+        motion = primitive.linear_motion()
         certain = _coordinates(motion)
         if certain.ndim != 2:
             raise ValueError(f"needs one primitive, got a batch {tuple(certain.shape[:-2])}")
@@ -95,13 +90,13 @@ class ProbabilisticDMP[P: Primitive]:
             self.mean + (z @ self.spread.mT).unflatten(-1, self.mean.shape)
         )
 
-    def position(self, time: ArrayLike) -> tuple[Float[Tensor, "T D"], Float[Tensor, "T D"]]:
+    def position(self, time: Times) -> tuple[Float[Tensor, "T D"], Float[Tensor, "T D"]]:
         """Mean and standard deviation of the motion at times [s].
 
         Of the coordinates that move linearly: joints, position, error to the primitive's
         reference, body. `mean_primitive().rollout` has orientations.
         """
-        motion = motion_of(self.primitive)
+        motion = self.primitive.linear_motion()
         time = to_tensor(time, torch.float64, motion.start.device)
         if time.ndim != 1 or not (time >= 0).all():
             raise ValueError("time must be (n,), none negative")
@@ -112,12 +107,12 @@ class ProbabilisticDMP[P: Primitive]:
 
     def condition(
         self,
-        time: ArrayLike,
-        value: ArrayLike | Pose | None = None,
-        velocity: ArrayLike | None = None,
+        time: Times,
+        value: Points | Pose | None = None,
+        velocity: Points | None = None,
         *,
-        body: ArrayLike | None = None,
-        body_velocity: ArrayLike | None = None,
+        body: Points | None = None,
+        body_velocity: Points | None = None,
         noise: ArrayLike = 1e-6,
     ) -> "ProbabilisticDMP[P]":
         """The distribution, given where the motion passes at some times, and how fast.
@@ -136,7 +131,7 @@ class ProbabilisticDMP[P: Primitive]:
                 orientation [rad]), or per second; of all alike, or (D,) or (n, D).
         """
         via = self._via(time, value, velocity, body, body_velocity)
-        motion = motion_of(self.primitive)
+        motion = self.primitive.linear_motion()
         H, tau = motion.response.evaluate(via.s), motion.duration.double()
         mean, root = self._observe(torch.cat([H[:, 0], H[:, 1] / tau]))
         wanted = torch.cat([via.position, via.rate / tau]).reshape(-1)
@@ -157,10 +152,10 @@ class ProbabilisticDMP[P: Primitive]:
 
     def log_prob(
         self,
-        time: ArrayLike,
-        value: ArrayLike | Pose,
+        time: Times,
+        value: Points | Pose,
         *,
-        body: ArrayLike | None = None,
+        body: Points | None = None,
         noise: float,
     ) -> Float[Tensor, ""]:
         """Log density of what was observed at times (n,), with that sensor noise.
@@ -169,7 +164,8 @@ class ProbabilisticDMP[P: Primitive]:
         not observed.
         """
         via = self._via(time, value, None, body, None)
-        mean, root = self._observe(motion_of(self.primitive).response.evaluate(via.s)[:, 0])
+        motion = self.primitive.linear_motion()
+        mean, root = self._observe(motion.response.evaluate(via.s)[:, 0])
         seen = ~via.position.isnan().reshape(-1)
         diagonal = torch.full_like(mean[seen], noise**2)
         observed = torch.distributions.LowRankMultivariateNormal(
@@ -179,15 +175,15 @@ class ProbabilisticDMP[P: Primitive]:
 
     def _via(
         self,
-        time: ArrayLike,
-        value: ArrayLike | Pose | None,
-        velocity: ArrayLike | None,
-        body: ArrayLike | None,
-        body_velocity: ArrayLike | None,
+        time: Times,
+        value: Points | Pose | None,
+        velocity: Points | None,
+        body: Points | None,
+        body_velocity: Points | None,
     ) -> ViaPoints:
         with torch.no_grad():
             middle = self.mean_primitive()
-        via = via_points(middle, time, value, velocity, body=body, body_velocity=body_velocity)
+        via = middle.via_points(time, value, velocity, body=body, body_velocity=body_velocity)
         if via.position.ndim != 2:
             raise ValueError(f"via points must be (n, D), got {tuple(via.position.shape)}")
         return via
@@ -199,17 +195,17 @@ class ProbabilisticDMP[P: Primitive]:
         return (rows @ self.mean.mT).reshape(-1), root.flatten(0, 1)
 
     def _with_coordinates(self, x: Float[Tensor, "*batch D M"]) -> P:
-        motion = motion_of(self.primitive)
-        return with_motion(self.primitive, motion.with_coordinates(x))
+        motion = self.primitive.linear_motion()
+        return self.primitive.with_motion(motion.with_coordinates(x))
 
 
-def _coordinates(primitives: JointDMP) -> Float[Tensor, "*batch D M"]:
+def _coordinates(primitives: LinearPrimitive) -> Float[Tensor, "*batch D M"]:
     if primitives.scaling != "none":
         raise ValueError(f"scaling {primitives.scaling!r} is not linear: fit with 'none'")
     return primitives.coordinates().detach().double()
 
 
-def _free_forcing(primitive: JointDMP, slack: float) -> Float[Tensor, "DM DN"]:
+def _free_forcing(primitive: LinearPrimitive, slack: float) -> Float[Tensor, "DM DN"]:
     """Spread of weights that are independent and make the forcing vary alike at all times."""
     basis, amplitude = primitive.basis, primitive.amplitude.detach().double()
     D, N = len(amplitude), basis.count

@@ -19,7 +19,7 @@ from hrc_learn.dmp._system.canonical import ExponentialPhase, Phase
 from hrc_learn.dmp._system.forced_response import accumulate, impulse
 from hrc_learn.dmp._system.minimum_jerk import approach_state
 from hrc_learn.dmp._system.spring import SpringDamper, transition
-from hrc_learn.dmp._types import ArrayLike
+from hrc_learn.dmp._types import Mask, Points, Times
 from hrc_learn.dmp.fitting.motion_samples import check_samples
 from hrc_learn.dmp.joint_dmp import JointDMP
 from hrc_learn.dmp.training.gradient_descent import (
@@ -42,12 +42,12 @@ USUAL_WIDTH = 0.6
 
 
 def learn_basis(
-    time: ArrayLike,
-    position: ArrayLike,
+    time: Times,
+    position: Points,
     n_basis: int = 20,
     *,
     learn: Sequence[str] = ("centres", "widths"),
-    mask: ArrayLike | None = None,
+    mask: Mask | None = None,
     held_out: int = 5,
     spring: SpringDamper | None = None,
     phase: Phase | None = None,
@@ -64,7 +64,7 @@ def learn_basis(
     the spring stable whatever is learned.
 
     Args:
-        time: Stamps [s], (T,) or (*B, T).
+        time: Timestamps [s], (T,) or (*B, T).
         position: (T, D) or (*B, T, D).
         n_basis: N.
         learn: Some of `"centres"`, `"widths"`, `"gain"`.

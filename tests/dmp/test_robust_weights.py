@@ -76,7 +76,7 @@ def test_a_robust_fit_is_the_weighted_least_squares_fit_of_its_trust():
     dmp = JointDMP.fit(time, position, 10, robust="huber")
     residual = (position - dmp.rollout().position.detach())[:, 0]
     spread = 1.4826 * residual.abs().median()
-    H = dmp.response.evaluate(dmp.stamps)[:, 0]
+    H = dmp.response.evaluate(dmp.timestamps)[:, 0]
     # At the minimum no weight, no start velocity can lower it: its gradient is zero.
     influence = residual.clamp(-1.345 * spread, 1.345 * spread)
     gradient = H[:, :11].mT @ influence

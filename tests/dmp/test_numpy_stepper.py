@@ -25,7 +25,7 @@ def test_it_does_what_the_primitive_does(scaling, spring, approach):
     rng = np.random.default_rng(0)
     for k in range(120):
         dt = 10 ** rng.uniform(-4, -0.5)
-        change = {"slowdown": 1.0} if k % 3 == 0 else {}
+        change = {"phase_stopping": 1.0} if k % 3 == 0 else {}
         change |= {"goal": rng.standard_normal(7)} if k % 7 == 0 else {}
         change |= {"coupling": rng.standard_normal(7)} if k % 5 == 0 else {}
         state = dmp.step(state, dt, **change)
