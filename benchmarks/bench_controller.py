@@ -35,8 +35,8 @@ from hrc_learn.controller import (
     Observation,
     SafetyFilter,
 )
-from hrc_learn.controller.resolution import resolve
-from hrc_learn.controller.runtime import EagerRunner, StepRunner, open_step
+from hrc_learn.controller.resolved_rate import resolve
+from hrc_learn.deploy import EagerRunner, StepRunner, open_step
 from hrc_learn.geometry import quaternion
 from hrc_learn.jacobian import (
     CompositeEstimator,
@@ -44,8 +44,8 @@ from hrc_learn.jacobian import (
     ImageJacobianEstimator,
     KalmanEstimator,
     RBFImageJacobian,
+    grid,
 )
-from hrc_learn.jacobian.basis import grid
 from hrc_learn.kinematics import panda
 
 BATCHES = (1024, 8192)
@@ -224,7 +224,8 @@ def _mink_call() -> Callable[[], object]:
     import mink  # pyright: ignore[reportMissingImports]
     import mujoco
 
-    from hrc_learn.sim.panda_model import PandaModelConfig, add_panda
+    from hrc_learn.sim import PandaModelConfig
+    from hrc_learn.sim.panda_model import add_panda
 
     spec = mujoco.MjSpec()  # pyright: ignore[reportAttributeAccessIssue]
     spec.compiler.degree = False

@@ -98,7 +98,7 @@ class Done:
 
 def main(args: Args) -> None:
     from hrc_learn.lerobot.envs import PandaEnvConfig
-    from hrc_learn.lerobot.policy.episodes import read_episodes
+    from hrc_learn.lerobot.policy.closed_form import read_episodes
 
     torch.set_num_threads(1)
     env = PandaEnvConfig(task=args.task, fps=args.fps, pixels=args.task == "grasping")
@@ -122,7 +122,7 @@ def main(args: Args) -> None:
 def _recorded(args: Args, env: PandaEnvConfig, first: int, count: int) -> Path:
     folder = args.data / f"{args.task}_{args.fps}hz_from_{first}_{count}"
     if not folder.exists():
-        from hrc_learn.lerobot.recording import record_expert
+        from hrc_learn.lerobot.expert_recording import record_expert
 
         robot = replace(env.robot_config(), seed=first)
         shown = record_expert(folder, robot, count)
@@ -186,7 +186,7 @@ def _blind_to_constants(stats: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
     LeRobot divides by its spread of nothing, and the policy would be thrown anywhere.
     """
-    from hrc_learn.lerobot.policy.encoder import SMALLEST_SPREAD
+    from hrc_learn.lerobot.policy.observation_encoder import SMALLEST_SPREAD
 
     return stats | {"std": np.where(stats["std"] > SMALLEST_SPREAD, stats["std"], np.inf)}
 
@@ -228,8 +228,8 @@ def _config(name: str, width: int) -> Any:
 
 def _train(policy: Any, before: Any, dataset: Path, args: Args, title: str) -> dict[str, float]:
     """As lerobot-train does it, with batches from memory; mean losses of some tenths of it."""
-    from hrc_learn.lerobot.policy.episodes import read_episodes
-    from hrc_learn.lerobot.policy.windows import Windows
+    from hrc_learn.lerobot.policy.closed_form import read_episodes
+    from hrc_learn.lerobot.policy.sample_windows import Windows
 
     config = policy.config
     episodes = [e | _observation(e[STATE]) for e in read_episodes(dataset, (STATE, ACTION))]

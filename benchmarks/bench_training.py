@@ -19,8 +19,8 @@ from hrc_learn import cli
 from hrc_learn.demos import DatasetWriter, Demonstration, open_demos
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import ImageJacobianFitConfig, Neurons, RBFImageJacobian
-from hrc_learn.tasks.fit_aiming import Watching
-from hrc_learn.tasks.fit_many import fit_streamed
+from hrc_learn.learning.fit_primitives import fit_streamed
+from hrc_learn.learning.fit_visual_servo import Watching
 
 JOINTS = tuple(f"joint{i + 1}" for i in range(7))
 

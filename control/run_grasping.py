@@ -18,20 +18,20 @@ from pathlib import Path
 from rich.console import Console
 
 from hrc_learn import cli
-from hrc_learn.output import new_folder
+from hrc_learn.experiments.grasping.experiment import (
+    VARIANTS,
+    GraspingExperiment,
+    GraspingTrials,
+)
+from hrc_learn.experiments.grasping.metrics import evaluate_grasping, evaluate_many
+from hrc_learn.experiments.grasping.report import record_grasp
+from hrc_learn.experiments.grasping.trial import GraspingSettingConfig
+from hrc_learn.experiments.monte_carlo import Summary, Trial, repeat
+from hrc_learn.experiments.run_recording import ServeConfig, serving, unwatched
+from hrc_learn.learning.tuning import with_gains
 from hrc_learn.sim import CameraKind
-from hrc_learn.tasks.gains import with_gains
-from hrc_learn.tasks.grasping import GraspingConfig
-from hrc_learn.tasks.grasping_evaluation import evaluate_grasping, evaluate_many
-from hrc_learn.tasks.grasping_experiment import GraspingExperiment
-from hrc_learn.tasks.grasping_recording import record_grasp
-from hrc_learn.tasks.grasping_setting import GraspingSettingConfig
-from hrc_learn.tasks.grasping_trials import GraspingTrials
-from hrc_learn.tasks.grasping_variants import VARIANTS
-from hrc_learn.tasks.repetition import repeat
-from hrc_learn.tasks.repetition_summary import Summary
-from hrc_learn.tasks.trial_file import Trial
-from hrc_learn.tasks.watching import ServeConfig, serving, unwatched
+from hrc_learn.skills.grasping import GraspingConfig
+from hrc_learn.store import new_folder
 from hrc_learn.viz.report import Measurement, show_measurements, write_report
 from hrc_learn.viz.run_dashboard import record_run
 
@@ -161,7 +161,9 @@ def _write(
     table: Sequence[Measurement],
     many: Sequence[Trial],
 ) -> None:
-    from hrc_learn.tasks.grasping_report import grasping_report  # matplotlib takes a second
+    from hrc_learn.experiments.grasping.report import (
+        grasping_report,  # matplotlib takes a second
+    )
 
     runs = {"run": ("Grasping", experiment.grasp)} | {
         f"compared_{name}": (f"Aiming, {VARIANTS[name].says}", run)

@@ -7,7 +7,6 @@ from many random starts. Writes Rerun recordings, a report and the measured valu
 1 if a target was missed.
 """
 
-import json
 import shlex
 import shutil
 import sys
@@ -21,27 +20,25 @@ from rich.table import Table
 
 from hrc_learn import cli
 from hrc_learn.demos import load_demos
-from hrc_learn.output import MADE_BY, new_folder
-from hrc_learn.sim import RenderingUnavailableError
-from hrc_learn.tasks.body_shape import BodyShapeTrials
-from hrc_learn.tasks.placing import PlacingSkill
-from hrc_learn.tasks.placing_evaluation import (
+from hrc_learn.experiments.monte_carlo import Run, Summary, Trial, repeat
+from hrc_learn.experiments.placing.experiment import (
+    SPACES,
+    BodyShapeTrials,
+    PlacingExperiment,
+    PlacingTrials,
+    run_placing_experiment,
+)
+from hrc_learn.experiments.placing.metrics import (
     evaluate_lessons,
     evaluate_placing,
     evaluate_random_starts,
 )
-from hrc_learn.tasks.placing_experiment import (
-    SPACES,
-    PlacingExperiment,
-    run_placing_experiment,
-)
-from hrc_learn.tasks.placing_recording import record_placing
-from hrc_learn.tasks.placing_trials import PlacingTrials
-from hrc_learn.tasks.repetition import Run, repeat
-from hrc_learn.tasks.repetition_summary import Summary
-from hrc_learn.tasks.trial_file import Trial
-from hrc_learn.tasks.watching import ServeConfig, serving, unwatched
-from hrc_learn.tasks.workplace import Workplace
+from hrc_learn.experiments.placing.report import record_placing
+from hrc_learn.experiments.run_recording import ServeConfig, serving, unwatched
+from hrc_learn.sim import RenderingUnavailableError
+from hrc_learn.sim.workplace import Workplace
+from hrc_learn.skills.placing import PlacingSkill
+from hrc_learn.store import new_folder, read_made_by
 from hrc_learn.viz.report import Measurement, show_measurements, write_report
 from hrc_learn.viz.run_dashboard import record_run
 
@@ -144,7 +141,7 @@ def _check(args: Args) -> None:
 
 def _dataset(args: Args) -> Path:
     """The dataset that the motion was learned from."""
-    path = Path(json.loads((args.placing / MADE_BY).read_text())["dataset"])
+    path = Path(read_made_by(args.placing)["dataset"])
     if not path.is_dir():
         raise FileNotFoundError(
             f"{path}, which {args.placing} was learned from, is not there any more: name the "
@@ -178,7 +175,7 @@ def _write(
     table: Sequence[Measurement],
     starts: Sequence[Trial],
 ) -> None:
-    from hrc_learn.tasks.placing_report import placing_report  # matplotlib takes a second
+    from hrc_learn.experiments.placing.report import placing_report  # matplotlib takes a second
 
     for (space, shelf), run in experiment.runs.items():
         if space == "pose":
@@ -199,7 +196,7 @@ def _write(
 
 
 def _pictures(experiment: PlacingExperiment) -> Mapping[str, Any] | None:
-    from hrc_learn.tasks.placing_snapshots import take_pictures
+    from hrc_learn.experiments.placing.snapshots import take_pictures
 
     try:
         return take_pictures(experiment)

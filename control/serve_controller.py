@@ -29,13 +29,13 @@ from hrc_learn.controller import (
     Observation,
     SafetyConfig,
 )
-from hrc_learn.controller.rehearsal import PinholeCamera
-from hrc_learn.controller.runtime import EagerRunner, Metronome, StepRunner, open_step
+from hrc_learn.deploy import EagerRunner, Metronome, StepRunner, open_step
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import KalmanEstimator, RBFImageJacobian, paper_grid
 from hrc_learn.kinematics import panda
 from hrc_learn.protocols import Arm
 from hrc_learn.sim import SceneConfig, World
+from hrc_learn.sim.closed_loop import PinholeCamera
 
 FRAME_TIME = 0.032
 """From one image to the next [s]."""

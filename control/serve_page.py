@@ -19,17 +19,21 @@ import torch
 from rich.console import Console
 
 from hrc_learn import cli
-from hrc_learn.controller.runtime import Metronome
 from hrc_learn.demos import DatasetWriter
-from hrc_learn.human.devices import Gamepad, TerminalKeyboard
-from hrc_learn.human.page import Page, PageConfig
+from hrc_learn.deploy import Metronome
 from hrc_learn.kinematics import panda
 from hrc_learn.protocols import Human
 from hrc_learn.sim import MovingBodies, World
-from hrc_learn.tasks.demonstration_recorder import DemonstrationRecorder
-from hrc_learn.tasks.landing import landing_places
-from hrc_learn.tasks.page_session import FEATURES, PageSession, PageSessionConfig
-from hrc_learn.tasks.workplace import Workplace
+from hrc_learn.sim.workplace import Workplace
+from hrc_learn.teleoperation.demonstration_recorder import DemonstrationRecorder
+from hrc_learn.teleoperation.devices import Gamepad, TerminalKeyboard
+from hrc_learn.teleoperation.page import Page, PageConfig
+from hrc_learn.teleoperation.page_session import (
+    FEATURES,
+    PageSession,
+    PageSessionConfig,
+    landing_places,
+)
 
 SWITCH_INTERVAL = 0.0005
 """Longest that the page's threads keep the interpreter from the control loop [s]."""

@@ -17,9 +17,15 @@ from rich.progress import Progress
 from rich.table import Table
 
 from hrc_learn import cli
-from hrc_learn.controller.acceptance import CRITERIA, Criterion, compared
-from hrc_learn.controller.experiments import EXPERIMENTS, chunks, run_chunk
-from hrc_learn.controller.trials import ROLL_CLASSES
+from hrc_learn.experiments.controller.grasp_trials import ROLL_CLASSES
+from hrc_learn.experiments.controller.sweep import (
+    CRITERIA,
+    EXPERIMENTS,
+    Criterion,
+    chunks,
+    compared,
+    run_chunk,
+)
 
 CHUNK = 250
 """Trials in one batch: their tensors stay in the cache."""
@@ -79,7 +85,7 @@ def main(args: Args) -> int:
 
 
 def _draw(path: Path, results: dict[str, Any]) -> None:
-    from hrc_learn.viz.sweep_figures import arrival_figure  # matplotlib takes a second
+    from hrc_learn.viz.figures import arrival_figure  # matplotlib takes a second
 
     times = {name: r.time.numpy() for name, r in results.items() if hasattr(r, "time")}
     arrival_figure(times).savefig(path, dpi=150)

@@ -16,7 +16,7 @@ import tyro
 from rich.progress import track
 
 from hrc_learn import cli
-from hrc_learn.demos.image_features import Detector, extract_features
+from hrc_learn.demos import Detector, extract_features
 from hrc_learn.vision import MarkerDetector, centre
 
 

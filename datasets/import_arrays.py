@@ -17,8 +17,7 @@ import tyro
 
 from hrc_learn import cli
 from hrc_learn.demos import DatasetWriter, Demonstration
-from hrc_learn.demos.array_files import read_table
-from hrc_learn.demos.arrays import ArraySources, demonstrations_from_table
+from hrc_learn.demos.read.arrays import ArraySources, demonstrations_from_table, read_table
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -40,7 +40,7 @@ class Args:
 
 
 def main(args: Args) -> int:
-    from hrc_learn.lerobot.recording import record_expert
+    from hrc_learn.lerobot.expert_recording import record_expert
     from hrc_learn.lerobot.robots import MujocoPandaConfig
 
     if args.episodes < 1:

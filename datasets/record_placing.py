@@ -15,11 +15,11 @@ from rich.progress import track
 
 from hrc_learn import cli
 from hrc_learn.sim import World
-from hrc_learn.tasks.failure import TaskFailedError
-from hrc_learn.tasks.lessons import write_lessons
-from hrc_learn.tasks.teach_placing import PlacingLesson, teach_placing_cleanly
-from hrc_learn.tasks.teaching import Frame
-from hrc_learn.tasks.workplace import Workplace
+from hrc_learn.sim.workplace import Workplace
+from hrc_learn.skills.work_cell import TaskFailedError
+from hrc_learn.teleoperation.hand_guiding import Frame
+from hrc_learn.teleoperation.paired_demonstrations import write_lessons
+from hrc_learn.teleoperation.scripted_demonstrations import PlacingLesson, teach_placing_cleanly
 
 
 @dataclass(frozen=True, kw_only=True)

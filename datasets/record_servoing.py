@@ -13,12 +13,12 @@ from rich.progress import track
 
 from hrc_learn import cli
 from hrc_learn.sim import CameraKind, World, open_camera
-from hrc_learn.tasks.eye import Eye
-from hrc_learn.tasks.lessons import write_lessons
-from hrc_learn.tasks.teach_aiming import AimingLesson, teach_aiming
-from hrc_learn.tasks.teaching import Frame
-from hrc_learn.tasks.visual_target import OBJECT_FEATURE, OBJECT_FEATURE_NAMES
-from hrc_learn.tasks.workplace import Workplace
+from hrc_learn.sim.workplace import Workplace
+from hrc_learn.skills.marker_sensor import Eye
+from hrc_learn.skills.visual_target import OBJECT_FEATURE, OBJECT_FEATURE_NAMES
+from hrc_learn.teleoperation.hand_guiding import Frame
+from hrc_learn.teleoperation.paired_demonstrations import write_lessons
+from hrc_learn.teleoperation.scripted_demonstrations import AimingLesson, teach_aiming
 
 
 @dataclass(frozen=True, kw_only=True)

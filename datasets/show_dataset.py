@@ -13,8 +13,8 @@ import tyro
 
 from hrc_learn import cli
 from hrc_learn.demos import load_demos
-from hrc_learn.tasks.demonstrations_recording import demonstrations_recording
-from hrc_learn.viz.demonstrations_dashboard import record_demonstrations
+from hrc_learn.learning.fit_recordings import demonstrations_recording
+from hrc_learn.viz.demonstration_dashboard import record_demonstrations
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 import torch
 
-from hrc_learn.controller.runtime import Metronome
 from hrc_learn.demos import DatasetWriter
-from hrc_learn.human import DragConfig
-from hrc_learn.human.page import Page, PageConfig
+from hrc_learn.deploy import Metronome
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import MovingBodies, World
-from hrc_learn.tasks.demonstration_recorder import DemonstrationRecorder
-from hrc_learn.tasks.page_session import FEATURES, PageSession, PageSessionConfig
-from hrc_learn.tasks.workplace import Workplace
+from hrc_learn.sim.workplace import Workplace
+from hrc_learn.teleoperation import DragConfig
+from hrc_learn.teleoperation.demonstration_recorder import DemonstrationRecorder
+from hrc_learn.teleoperation.page import Page, PageConfig
+from hrc_learn.teleoperation.page_session import FEATURES, PageSession, PageSessionConfig
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
 OPTIONS = (

@@ -4,17 +4,9 @@ from dataclasses import fields
 
 import numpy as np
 
+from hrc_learn.geometry import Body, Box, Capsule
 from hrc_learn.vision import CameraModel
-from hrc_learn.viz import (
-    Body,
-    Box,
-    CameraRecording,
-    Capsule,
-    Event,
-    FitRecording,
-    JointLimits,
-    RunRecording,
-)
+from hrc_learn.viz import CameraRecording, Event, FitRecording, JointLimits, RunRecording
 
 STEPS = 200
 OPTIONAL = (

@@ -4,10 +4,10 @@ import torch
 from torch import Tensor
 
 from hrc_learn.controller import AdaptiveController, ControllerConfig, Goals, Observation
-from hrc_learn.controller.rehearsal import PinholeCamera
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import FixedEstimator, RBFImageJacobian, paper_grid
 from hrc_learn.kinematics import panda
+from hrc_learn.sim.closed_loop import PinholeCamera
 
 DOUBLE = torch.float64
 LIMITS = panda.limits

@@ -7,15 +7,20 @@ from unchecked import shapes_unchecked
 
 from hrc_learn.demos import DatasetWriter, DemonstrationSet, load_demos
 from hrc_learn.kinematics import panda
+from hrc_learn.learning.fit_primitives import fit_primitives
+from hrc_learn.learning.fit_visual_servo import fit_aiming
 from hrc_learn.sim import World, open_camera
-from hrc_learn.tasks.eye import Eye
-from hrc_learn.tasks.fit_aiming import AimingSkill, fit_aiming
-from hrc_learn.tasks.fit_primitives import fit_primitives
-from hrc_learn.tasks.placing import PlacingSkill
-from hrc_learn.tasks.teach_aiming import AimingLesson, teach_aiming
-from hrc_learn.tasks.teach_placing import PlacingLesson, teach_placing
-from hrc_learn.tasks.visual_target import OBJECT_FEATURE, OBJECT_FEATURE_NAMES
-from hrc_learn.tasks.workplace import Workplace
+from hrc_learn.sim.workplace import Workplace
+from hrc_learn.skills.marker_sensor import Eye
+from hrc_learn.skills.placing import PlacingSkill
+from hrc_learn.skills.visual_servoing import AimingSkill
+from hrc_learn.skills.visual_target import OBJECT_FEATURE, OBJECT_FEATURE_NAMES
+from hrc_learn.teleoperation.scripted_demonstrations import (
+    AimingLesson,
+    PlacingLesson,
+    teach_aiming,
+    teach_placing,
+)
 
 WORKPLACE = Workplace()
 

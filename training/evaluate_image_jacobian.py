@@ -17,12 +17,16 @@ from rich.console import Console
 
 from hrc_learn import cli
 from hrc_learn.demos import load_demos
+from hrc_learn.experiments.initialization_study import (
+    ClosedLoops,
+    StartsConfig,
+    compare_starts,
+    compare_with_truth,
+    held_out_grid,
+)
 from hrc_learn.sim import World
-from hrc_learn.tasks.closed_loops import ClosedLoops, StartsConfig
-from hrc_learn.tasks.fit_aiming import AimingSkill
-from hrc_learn.tasks.true_jacobian import compare_with_truth, held_out_grid
-from hrc_learn.tasks.warm_start import compare_starts
-from hrc_learn.tasks.workplace import Workplace
+from hrc_learn.sim.workplace import Workplace
+from hrc_learn.skills.visual_servoing import AimingSkill
 
 MOST_ERROR = 0.05
 LEAST_SPEED_UP = 1.5

@@ -17,10 +17,15 @@ from rich.console import Console
 
 from hrc_learn import cli, distributed
 from hrc_learn.demos import load_demos, open_demos
-from hrc_learn.output import new_folder
-from hrc_learn.tasks.fit_many import fit_contextual, fit_streamed
-from hrc_learn.tasks.fit_primitives import FittedPrimitives, fit_primitives, fit_recording
-from hrc_learn.tasks.kinds import Kind
+from hrc_learn.learning.channels import Kind
+from hrc_learn.learning.fit_primitives import (
+    FittedPrimitives,
+    fit_contextual,
+    fit_primitives,
+    fit_recording,
+    fit_streamed,
+)
+from hrc_learn.store import new_folder
 from hrc_learn.viz.figures import fit_joints_figure, residual_figure
 from hrc_learn.viz.fit_dashboard import record_fit
 
@@ -117,7 +122,7 @@ def _fit_streamed(args: Args) -> None:
 
 def _fit_policy(args: Args, console: Console) -> None:
     # LeRobot takes ten seconds to import.
-    from hrc_learn.lerobot.policy.saving import write_closed_form_policy
+    from hrc_learn.lerobot.policy.closed_form_checkpoint import write_closed_form_policy
 
     given = (args.kinds, args.context, args.joint_names, args.robust)
     if any(given) or (args.several, args.method, args.scaling) != (

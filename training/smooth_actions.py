@@ -32,8 +32,9 @@ class Args:
 
 
 def main(args: Args) -> None:
-    from hrc_learn.lerobot.processor.adding import add_smoothing, remove_smoothing
-    from hrc_learn.lerobot.processor.limits import demonstrated_limits
+    from hrc_learn.lerobot.processor import add_smoothing
+    from hrc_learn.lerobot.processor.action_limits import demonstrated_limits
+    from hrc_learn.lerobot.processor.checkpoint_steps import remove_smoothing
 
     if not args.checkpoint.is_dir():
         raise FileNotFoundError(f"there is no folder {args.checkpoint}")

@@ -11,18 +11,27 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.utils import _pytree
 
-from hrc_learn.controller.activation import Activation, HandOver
-from hrc_learn.controller.analytic import analytic_descent
-from hrc_learn.controller.approach import approach_velocity, next_arrival
+from hrc_learn.controller.blending import Activation, HandOver, approach_velocity, next_arrival
 from hrc_learn.controller.config import ControllerConfig
-from hrc_learn.controller.feedback import Feedback, regional_feedback
-from hrc_learn.controller.goals import Goals
-from hrc_learn.controller.hold import Hold, measure_drift, planned_motion
-from hrc_learn.controller.interface import Command, ControllerState, Observation
-from hrc_learn.controller.lyapunov import potential_rate
-from hrc_learn.controller.resolution import excess_speed, fit_null_space, resolve
-from hrc_learn.controller.safety import SafetyFilter
-from hrc_learn.controller.sensing import effective_goals, either, trusted_position
+from hrc_learn.controller.feedback import (
+    Feedback,
+    analytic_descent,
+    effective_goals,
+    either,
+    regional_feedback,
+    trusted_position,
+)
+from hrc_learn.controller.interface import Command, ControllerState, Goals, Observation
+from hrc_learn.controller.monitors import potential_rate
+from hrc_learn.controller.resolved_rate import (
+    Hold,
+    excess_speed,
+    fit_null_space,
+    measure_drift,
+    planned_motion,
+    resolve,
+)
+from hrc_learn.controller.safety_filter import SafetyFilter
 from hrc_learn.geometry import Pose
 from hrc_learn.jacobian import ImageJacobianEstimator, Measurement
 from hrc_learn.kinematics import SerialChain

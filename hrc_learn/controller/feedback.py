@@ -1,4 +1,6 @@
-"""Regional feedback in image and Cartesian space."""
+"""Regional feedback in image and Cartesian space, and the validation of the measurements
+behind it.
+"""
 
 from __future__ import annotations
 
@@ -6,12 +8,15 @@ import math
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from hrc_learn.controller.activation import Activation
-from hrc_learn.controller.goals import Goals
-from hrc_learn.geometry import Pose
+from hrc_learn.controller.blending import Activation
+from hrc_learn.controller.interface import Goals, Observation
+from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.geometry.rotation_rates import left_jacobian, left_jacobian_transposed
+
+# Regional feedback in image and Cartesian space.
 
 # Keeps the cap on the pixel rate finite at the target.
 _ONE_PIXEL_PER_SECOND = 1.0
@@ -69,3 +74,65 @@ def _excess_rate(
     distance = torch.linalg.vector_norm(error, dim=-1, keepdim=True)
     allowed = vision_rate * distance + _ONE_PIXEL_PER_SECOND
     return (speed / allowed).clamp(min=1)
+
+
+# The law with the analytic Jacobian, whose orientation rows are those of a rotation vector.
+
+
+def analytic_descent(
+    s: Float[Tensor, "*batch 6"], orientation: Float[Tensor, "*batch 4"]
+) -> Float[Tensor, "*batch 6"]:
+    """Twist B B^T s, to which -J_A^+ (J_sA^T xi_x + xi_rA) amounts (but for the sign).
+
+    With r_dot = B^-1 twist, B = diag(I, J_l(phi)) for the rotation vector phi of the tool, the
+    analytic Jacobian is J_A = B^-1 J, so J_A^+ = J^+ B, and a gradient over r is B^T times one
+    over small motions of the tool. So s of the geometric form serves both laws; they differ in
+    the metric by which a gradient becomes a motion.
+
+    Args:
+        s: J_s_hat^T xi_x + xi_r of the geometric form.
+        orientation: Of the tool.
+    """
+    phi = quaternion.log(orientation)
+    turn = left_jacobian(phi, left_jacobian_transposed(phi, s[..., 3:]))
+    return torch.cat([s[..., :3], turn], dim=-1)
+
+
+# What of an observation can be trusted, and what stands in for the rest.
+
+
+def trusted_position(
+    observation: Observation, expected: Float[Tensor, "*batch n"]
+) -> tuple[Float[Tensor, "*batch n"], Bool[Tensor, "*batch"]]:
+    """Joint position [rad]: measured, or the expected one where that is NaN or stale.
+
+    Returns:
+        The position, and where it is the expected one.
+    """
+    q = observation.joint_position
+    stale = ~q.isfinite().all(-1)
+    if observation.joint_state_stale is not None:
+        stale = stale | observation.joint_state_stale
+    return torch.where(stale.unsqueeze(-1), expected, q), stale
+
+
+def effective_goals(
+    observation: Observation, default: Goals
+) -> tuple[Goals, Bool[Tensor, "*batch"] | bool]:
+    """Goals of this step, and whether the target is known: one that is NaN is not."""
+    goals = default if observation.goals is None else observation.goals
+    target = observation.target
+    if target is None:
+        return goals, True
+    known = target.isfinite().all(-1)
+    target = torch.where(known.unsqueeze(-1), target, goals.vision.target)
+    return goals.aimed_at(target), known
+
+
+def either(
+    a: Bool[Tensor, "*batch"] | None, b: Bool[Tensor, "*batch"] | None
+) -> Bool[Tensor, "*batch"] | None:
+    """Whether one of two optional conditions holds."""
+    if a is None or b is None:
+        return b if a is None else a
+    return a | b

@@ -1,16 +1,20 @@
 """Demonstrations: recorded as LeRobot datasets, read back as plain arrays, checked."""
 
-from .check import check_dataset as check_dataset
-from .checks.report import Report as Report
-from .demonstration import Demonstration as Demonstration
-from .demonstration_set import DemonstrationSet as DemonstrationSet
-from .demonstration_source import DemonstrationSource as DemonstrationSource
-from .finding import DatasetError as DatasetError
-from .finding import Finding as Finding
-from .finding import UnitsWarning as UnitsWarning
-from .padding import PaddedDemonstrations as PaddedDemonstrations
-from .reader import load_demos as load_demos
-from .reader import open_demos as open_demos
-from .roles import ROLES as ROLES
-from .writer import DatasetWriter as DatasetWriter
-from .writer import recover_dataset as recover_dataset
+from hrc_learn.demos.demonstration import Demonstration as Demonstration
+from hrc_learn.demos.demonstration import DemonstrationSet as DemonstrationSet
+from hrc_learn.demos.demonstration import PaddedDemonstrations as PaddedDemonstrations
+from hrc_learn.demos.image_features import Detector as Detector
+from hrc_learn.demos.image_features import attach_features as attach_features
+from hrc_learn.demos.image_features import extract_features as extract_features
+from hrc_learn.demos.issue import DatasetError as DatasetError
+from hrc_learn.demos.issue import Finding as Finding
+from hrc_learn.demos.issue import Report as Report
+from hrc_learn.demos.issue import UnitsWarning as UnitsWarning
+from hrc_learn.demos.read.component_names import ROLES as ROLES
+from hrc_learn.demos.read.reader import DemonstrationSource as DemonstrationSource
+from hrc_learn.demos.read.reader import load_demos as load_demos
+from hrc_learn.demos.read.reader import open_demos as open_demos
+from hrc_learn.demos.validation.check import check_dataset as check_dataset
+from hrc_learn.demos.write.recovery import recover_all as recover_all
+from hrc_learn.demos.write.recovery import recover_dataset as recover_dataset
+from hrc_learn.demos.write.writer import DatasetWriter as DatasetWriter

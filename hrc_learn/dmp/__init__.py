@@ -11,8 +11,8 @@ from hrc_learn.dmp._system.response import Response as Response
 from hrc_learn.dmp._system.response import Trajectory as Trajectory
 from hrc_learn.dmp._system.response import response_of as response_of
 from hrc_learn.dmp._system.spring import SpringDamper as SpringDamper
-from hrc_learn.dmp.closed_loop import DMPState as DMPState
-from hrc_learn.dmp.closed_loop import continue_motion as continue_motion
+from hrc_learn.dmp.closed_loop_step import DMPState as DMPState
+from hrc_learn.dmp.closed_loop_step import continue_motion as continue_motion
 from hrc_learn.dmp.dual_arm_dmp import DualArmDMP as DualArmDMP
 from hrc_learn.dmp.dual_arm_dmp import DualArmState as DualArmState
 from hrc_learn.dmp.exported_dmp import ExportedDMP as ExportedDMP

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, NamedTuple
 from torch import Tensor
 
 from hrc_learn.dmp._types import Scalars, Times
-from hrc_learn.dmp.closed_loop import DMPState
+from hrc_learn.dmp.closed_loop_step import DMPState
 from hrc_learn.dmp.linear_primitive import ColumnEnds, LinearPrimitive
 
 

@@ -9,7 +9,6 @@ without this package:
 What the dictionaries hold is registered here for each kind of primitive and of state.
 """
 
-import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import singledispatch
@@ -21,7 +20,8 @@ from torch import Tensor, nn
 from torch.export import Dim, ExportedProgram
 from torch.utils._pytree import tree_map
 
-from hrc_learn.dmp.closed_loop import DMPState
+from hrc_learn import store
+from hrc_learn.dmp.closed_loop_step import DMPState
 from hrc_learn.dmp.dual_arm_dmp import DualArmDMP, DualArmState
 from hrc_learn.dmp.joint_dmp import JointDMP
 from hrc_learn.dmp.limited_dmp import LimitedDMP, LimitedState
@@ -68,21 +68,13 @@ class ExportedDMP:
         """Write the primitive and `step.pt2` into `folder`, replacing an older export.
 
         Raises:
-            ValueError: `folder` holds anything else; it is left alone.
+            InTheWayError: A ValueError: `folder` holds anything else; it is left alone.
+            BusyError: Another process is writing there.
         """
-        folder = Path(folder)
-        if folder.exists() and not {p.name for p in folder.iterdir()} <= {PRIMITIVE, PROGRAM}:
-            raise ValueError(f"{folder} holds more than an export: choose another folder")
-        temporary = folder.with_name(f".{folder.name}.new")
-        shutil.rmtree(temporary, ignore_errors=True)
-        try:
-            self.dmp.save(temporary / PRIMITIVE)
-            torch.export.save(self.program, temporary / PROGRAM)
-            if folder.exists():
-                shutil.rmtree(folder)
-            temporary.rename(folder)
-        finally:
-            shutil.rmtree(temporary, ignore_errors=True)
+        with store.replacing(folder, store.EXPORT, overwrite=True) as new:
+            new.mkdir()
+            self.dmp.save(new / PRIMITIVE)
+            torch.export.save(self.program, new / PROGRAM)
 
 
 def export_dmp(dmp: AdaptedPrimitive, *, goal_filter: float | None = None) -> ExportedDMP:
@@ -115,6 +107,7 @@ def load_stepper(folder: str | Path) -> AnyStepper:
         ValueError: Names the file and the field that is wrong.
     """
     folder = Path(folder)
+    store.settle(folder)
     folder = folder / PRIMITIVE if (folder / PRIMITIVE).is_dir() else folder
     kinds = {kind.__name__: kind for kind in freeze_stepper.registry if kind is not object}
     kind = saved_kind(folder)

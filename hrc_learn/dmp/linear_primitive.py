@@ -12,13 +12,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from hrc_learn.dmp import closed_loop
+from hrc_learn.dmp import closed_loop_step
 from hrc_learn.dmp._system.bases import Basis
 from hrc_learn.dmp._system.response import Response, Trajectory, response_of
 from hrc_learn.dmp._system.spring import SpringDamper
 from hrc_learn.dmp._types import Scalars, Times, Vectors, normalised_time, positive, to_tensor
 from hrc_learn.dmp._types import vector as checked_vector
-from hrc_learn.dmp.closed_loop import DMPState
+from hrc_learn.dmp.closed_loop_step import DMPState
 from hrc_learn.dmp.fitting.motion_samples import FitReport
 from hrc_learn.dmp.forcing_scale import Demonstrated, NoScaling, Scaling, find_scaling
 from hrc_learn.dmp.serialization import TENSORS, basis_config, linear_arguments
@@ -209,7 +209,7 @@ class LinearPrimitive(nn.Module):
     def begin(self, ends: ColumnEnds, duration: Float[Tensor, "*#batch"]) -> DMPState:
         """State at the start of a motion [s], for `advance`."""
         start, goal, rate = self.boundary(ends, duration)
-        return closed_loop.begin(self.response, self.weights, start, goal, rate, duration)
+        return closed_loop_step.begin(self.response, self.weights, start, goal, rate, duration)
 
     def advance(
         self,
@@ -238,7 +238,7 @@ class LinearPrimitive(nn.Module):
             # Second derivatives by s are tau^2 times those by t.
             push = self._as_tensor(external_acceleration) * state.duration[..., None] ** 2
         aim = target if goal_filter is None else state.goal
-        return closed_loop.advance(
+        return closed_loop_step.advance(
             state,
             self._step_length(dt, duration),
             response=self.response,
@@ -265,7 +265,7 @@ class LinearPrimitive(nn.Module):
     def curvature(self, state: DMPState) -> Float[Tensor, "*batch D"]:
         """d^2 y / ds^2 at a state that nothing couples to."""
         scale = self._scale_between(state.start, state.goal, None)
-        return closed_loop.second_derivative(state, self.response, self.weights, scale)
+        return closed_loop_step.second_derivative(state, self.response, self.weights, scale)
 
     def start_rate(
         self, start: Float[Tensor, "*#batch D"], goal: Float[Tensor, "*#batch D"]

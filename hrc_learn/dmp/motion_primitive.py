@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from hrc_learn.dmp._types import Points, Scalars, Times, to_tensor
-from hrc_learn.dmp.closed_loop import DMPState
+from hrc_learn.dmp.closed_loop_step import DMPState
 from hrc_learn.dmp.coordinate_adapter import CoordinateAdapter
 from hrc_learn.dmp.linear_primitive import ColumnEnds, LinearPrimitive
 from hrc_learn.dmp.probabilistic.vmp import ViaPoints, through_via_points

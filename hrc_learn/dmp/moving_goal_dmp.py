@@ -18,7 +18,7 @@ from torch import Tensor
 
 from hrc_learn.dmp._system.response import Trajectory
 from hrc_learn.dmp._types import Mask, Points, Times, Vectors, to_tensor
-from hrc_learn.dmp.closed_loop import DMPState
+from hrc_learn.dmp.closed_loop_step import DMPState
 from hrc_learn.dmp.coordinate_adapter import CoordinateAdapter, Retargeted
 from hrc_learn.dmp.fitting.motion_samples import FitReport
 from hrc_learn.dmp.fitting.solvers import FitOptions

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from hrc_learn.dmp import numpy_orientation as arrays
-from hrc_learn.dmp._system.minimum_jerk import quintic
+from hrc_learn.dmp._system.quintic_curves import quintic
 from hrc_learn.dmp.forcing_scale import Demonstrated
 from hrc_learn.dmp.joint_dmp import JointDMP
 from hrc_learn.dmp.orientation_dmp import OrientationDMP

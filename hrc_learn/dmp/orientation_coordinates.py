@@ -14,7 +14,7 @@ from torch import Tensor
 
 from hrc_learn.dmp import orientation_error
 from hrc_learn.dmp._types import Points, Quaternions, Vectors, to_tensor
-from hrc_learn.dmp.closed_loop import DMPState
+from hrc_learn.dmp.closed_loop_step import DMPState
 from hrc_learn.dmp.coordinate_adapter import CoordinateAdapter, Retargeted
 from hrc_learn.dmp.joint_dmp import given_points
 from hrc_learn.dmp.linear_primitive import ColumnEnds, LinearPrimitive

@@ -1,4 +1,10 @@
 """Rotations and poses; every delicate numeric of the package is in `numerics`."""
 
-from . import quaternion as quaternion
-from .pose import Pose as Pose
+from hrc_learn.geometry import quaternion as quaternion
+from hrc_learn.geometry.minimum_jerk import minimum_jerk as minimum_jerk
+from hrc_learn.geometry.pose import Pose as Pose
+from hrc_learn.geometry.shapes import Body as Body
+from hrc_learn.geometry.shapes import Box as Box
+from hrc_learn.geometry.shapes import Capsule as Capsule
+from hrc_learn.geometry.shapes import MeshFile as MeshFile
+from hrc_learn.geometry.shapes import arm_bodies as arm_bodies

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.geometry.constant import Constant
+from hrc_learn.geometry.constants import Constant
 from hrc_learn.geometry.numerics import arctan_ratio, cos_and_sinc, safe_norm
 
 # Row i of the matrix P with p * q = P q, as components of p and their signs.

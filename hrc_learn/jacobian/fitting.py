@@ -16,8 +16,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.jacobian.pairs import PairConfig, PairStatistics
-from hrc_learn.jacobian.prior import weight_covariance
+from hrc_learn.jacobian.radial_basis import weight_covariance
+from hrc_learn.jacobian.samples import PairConfig, PairStatistics
 
 
 @dataclass(frozen=True, kw_only=True)

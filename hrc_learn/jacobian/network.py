@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -11,17 +11,18 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from hrc_learn.geometry import Pose
-from hrc_learn.jacobian.basis import radial_basis
 from hrc_learn.jacobian.fitting import (
     ImageJacobianFitConfig,
     ImageJacobianFitReport,
     fit_weights,
     prior_precision,
 )
-from hrc_learn.jacobian.gathering import Watched, statistics_by_part, watched
-from hrc_learn.jacobian.neurons import Neurons, pose_inputs
-from hrc_learn.jacobian.prior import component_scale
+from hrc_learn.jacobian.radial_basis import component_scale, radial_basis
+from hrc_learn.jacobian.rbf_centers import Neurons, pose_inputs
+from hrc_learn.jacobian.samples import Watched, statistics_by_part, watched
 from hrc_learn.storage import SavedModel, write_model
+
+# The image Jacobian as a network of radial basis functions of the tool's pose.
 
 _KIND = "RBFImageJacobian"
 _UNITS = {"position": "m", "rotation": "rad", "jacobian": "px/m, px/rad", "pixels": "u, v"}
@@ -311,3 +312,82 @@ def _checked_indices(indices: Sequence[int], centers: Tensor) -> tuple[int, ...]
             f"but got {tuple(indices)} for centers with {centers.shape[-1]} columns."
         )
     return tuple(indices)
+
+
+# One network for a feature of several points.
+
+
+def stacked(networks: Sequence[RBFImageJacobian]) -> RBFImageJacobian:
+    """One network for all points of a feature, from one for each of them.
+
+    Points fitted to the same demonstrations have the same regressors, so their image rows share
+    one covariance: here that of the least certain point.
+
+    Raises:
+        ValueError: Their neurons differ.
+    """
+    first = networks[0]
+    for i, other in enumerate(networks[1:], start=1):
+        if not _same_neurons(first, other):
+            raise ValueError(
+                f"network {i} has other neurons than network 0: fit all points with the same "
+                "centers, width and input_indices"
+            )
+    stack = RBFImageJacobian(
+        first.centers,
+        float(first.width),
+        weight=torch.cat([network.weight.detach() for network in networks]),
+        input_indices=first.input_indices,
+        reference=first.reference,
+        normalized=first.normalized,
+    )
+    known = [network.covariance for network in networks if network.covariance is not None]
+    if len(known) == len(networks):
+        stack.covariance = max(known, key=lambda covariance: float(covariance.trace()))
+    return stack
+
+
+def _same_neurons(a: RBFImageJacobian, b: RBFImageJacobian) -> bool:
+    references = [network.reference for network in (a, b) if network.reference is not None]
+    return (
+        torch.equal(a.centers, b.centers)
+        and torch.equal(a.width, b.width)
+        and (a.input_indices, a.normalized) == (b.input_indices, b.normalized)
+        and (not references or (len(references) == 2 and torch.equal(*references)))
+    )
+
+
+# Prior that knows depth and rotation: a network that starts as the model of a rough camera.
+
+
+def nominal_network(
+    model: Callable[[Pose], Tensor],
+    around: Pose,
+    centers: Float[Tensor, "K n"],
+    width: float,
+    *,
+    input_indices: Sequence[int] = (0, 1, 2),
+) -> RBFImageJacobian:
+    """A network that agrees with a model of the image Jacobian at its neurons.
+
+    A rough guess of where the camera stands tells how the Jacobian shrinks with the depth of
+    the marker and how it turns with the tool; one Jacobian for the whole workspace cannot.
+    Online estimators start from it as from any other network.
+
+    Args:
+        model: From poses (K,) to image Jacobians (K, rows, 6), such as
+            `PinholeCamera.image_jacobian`.
+        around: Pose of the tool in the middle of the workspace; supplies the components of r
+            that the neurons do not see.
+        centers: Of the neurons.
+        width: Of the neurons.
+        input_indices: Components of r = (x, y, z, three of the rotation vector) that the
+            neurons see; depth needs z.
+    """
+    network = RBFImageJacobian(centers, width, input_indices=input_indices)
+    r = around.vector().to(centers).expand(len(centers), 6).clone()
+    r[:, list(network.input_indices)] = centers
+    with torch.no_grad():
+        J = model(Pose.from_vector(r))
+    network.weight.data = J.flatten(1).mT.contiguous()
+    return network

@@ -5,8 +5,8 @@
 they are asked for.
 """
 
-from . import envs as envs
-from . import processor as processor
-from . import robots as robots
-from . import teleoperators as teleoperators
-from .policy import DMPConfig as DMPConfig
+from hrc_learn.lerobot import envs as envs
+from hrc_learn.lerobot import processor as processor
+from hrc_learn.lerobot import robots as robots
+from hrc_learn.lerobot import teleoperators as teleoperators
+from hrc_learn.lerobot.policy.configuration_dmp import DMPConfig as DMPConfig

@@ -1,8 +1,8 @@
 """Regions of joint, Cartesian and image space and the potentials that steer by them."""
 
-from .joint import JointRegion as JointRegion
-from .orientation import OrientationRegion as OrientationRegion
-from .position import PositionRegion as PositionRegion
-from .posture import PostureRegion as PostureRegion
-from .region import Region as Region
-from .vision import VisionRegion as VisionRegion
+from hrc_learn.regions.joint import JointRegion as JointRegion
+from hrc_learn.regions.joint import PostureRegion as PostureRegion
+from hrc_learn.regions.orientation import OrientationRegion as OrientationRegion
+from hrc_learn.regions.position import PositionRegion as PositionRegion
+from hrc_learn.regions.region import Region as Region
+from hrc_learn.regions.vision import VisionRegion as VisionRegion

@@ -1,13 +1,13 @@
 """Who touches whom, from MuJoCo's contact list."""
 
-# pyright: reportAttributeAccessIssue=false
-# MuJoCo ships no type stubs; its names come from a compiled module.
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
+
+# pyright: reportAttributeAccessIssue=false
+# MuJoCo ships no type stubs; its names come from a compiled module.
 
 
 @dataclass(frozen=True, kw_only=True)

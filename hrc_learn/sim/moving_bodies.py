@@ -1,17 +1,19 @@
-"""Everything that moves in a world, to be drawn: its shapes, and where it is."""
-
-# pyright: reportAttributeAccessIssue=false
-# MuJoCo ships no type stubs; its names come from a compiled module.
+"""Everything that moves in a world, to be drawn: shapes, poses, and where they have been."""
 
 import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from ..viz import Body, Box, Capsule
-from ..viz.panda_meshes import panda_mesh
-from .contacts import body_geoms
-from .scene import COVER
-from .world import World
+from hrc_learn.geometry import Body, Box, Capsule
+from hrc_learn.sim.contacts import body_geoms
+from hrc_learn.sim.scene import COVER
+from hrc_learn.sim.world import World
+from hrc_learn.viz.arm_bodies import panda_mesh
+
+# Everything that moves in a world, to be drawn: its shapes, and where it is.
+
+# pyright: reportAttributeAccessIssue=false
+# MuJoCo ships no type stubs; its names come from a compiled module.
 
 
 class MovingBodies:
@@ -87,3 +89,35 @@ def _shapes(model: mujoco.MjModel, body: int) -> tuple[tuple[Capsule, ...], tupl
 def _triple(vector: np.ndarray) -> tuple[float, float, float]:
     x, y, z = vector.tolist()
     return x, y, z
+
+
+# Where everything that moves has been, to be drawn afterwards.
+
+
+class MotionLog:
+    """Remembers where everything that moves was after each step of the station."""
+
+    def __init__(self, world: World):
+        self._world = world
+        self._bodies = MovingBodies(world)
+        self._positions: list[np.ndarray] = []
+        self._orientations: list[np.ndarray] = []
+
+    def __len__(self) -> int:
+        return len(self._orientations)
+
+    def advance(self, duration: float) -> None:
+        """Note where everything is, then let the world go on [s]."""
+        position, orientation = self._bodies.poses()
+        self._positions.append(position)
+        self._orientations.append(orientation)
+        self._world.advance(duration)
+
+    def bodies(self, steps: int | None = None) -> tuple[Body, ...]:
+        """Everything that moved, as it is to be drawn.
+
+        Args:
+            steps: The first steps only.
+        """
+        positions = np.stack(self._positions[:steps])
+        return self._bodies.drawn(positions, np.stack(self._orientations[:steps]))

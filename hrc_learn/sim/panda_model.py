@@ -5,18 +5,19 @@ one table of numbers. Capsules and boxes follow the published link shapes to abo
 centimetre: they render ten times faster than meshes without a GPU and give clean contacts.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# MuJoCo ships no type stubs; its names come from a compiled module.
-
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 import torch
 
-from ..geometry import quaternion
-from ..kinematics import LINK_CAPSULES, panda
-from .markers import Plate, add_plate
+from hrc_learn.geometry import quaternion
+from hrc_learn.kinematics import LINK_CAPSULES, panda
+from hrc_learn.sim.marker_plates import Plate, add_plate
+
+# pyright: reportAttributeAccessIssue=false
+# MuJoCo ships no type stubs; its names come from a compiled module.
+
 
 _CAPSULE = mujoco.mjtGeom.mjGEOM_CAPSULE
 _BOX = mujoco.mjtGeom.mjGEOM_BOX

@@ -1,8 +1,5 @@
 """The workplace as a camera sees it: rendered by OpenGL without a screen, or without OpenGL."""
 
-# pyright: reportAttributeAccessIssue=false
-# MuJoCo ships no type stubs; its names come from a compiled module.
-
 import sys
 import weakref
 from collections.abc import Set
@@ -12,10 +9,14 @@ import mujoco
 import numpy as np
 from jaxtyping import UInt8
 
-from ..protocols import Camera
-from ..vision import CameraModel, ImageNoise, Lens, Marker, SyntheticCamera
-from .covering import covers_in
-from .world import World
+from hrc_learn.protocols import Camera
+from hrc_learn.sim.camera_disturbances import covers_in
+from hrc_learn.sim.world import World
+from hrc_learn.vision import CameraModel, ImageNoise, Lens, Marker, SyntheticCamera
+
+# pyright: reportAttributeAccessIssue=false
+# MuJoCo ships no type stubs; its names come from a compiled module.
+
 
 CameraKind = Literal["auto", "egl", "synthetic"]
 

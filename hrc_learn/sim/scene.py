@@ -4,9 +4,6 @@ The robot stands at the origin. To its left (+y) is the table, which people shar
 right (-y) the cabinet, whose open door stands in the way of a careless elbow.
 """
 
-# pyright: reportAttributeAccessIssue=false
-# MuJoCo ships no type stubs; its names come from a compiled module.
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
@@ -14,10 +11,14 @@ from types import MappingProxyType
 import mujoco
 import numpy as np
 
-from ..vision import CameraModel, Marker
-from ..viz import Box
-from .markers import Plate, add_plate
-from .panda_model import PandaModelConfig, add_panda
+from hrc_learn.geometry import Box
+from hrc_learn.sim.marker_plates import Plate, add_plate
+from hrc_learn.sim.panda_model import PandaModelConfig, add_panda
+from hrc_learn.vision import CameraModel, Marker
+
+# pyright: reportAttributeAccessIssue=false
+# MuJoCo ships no type stubs; its names come from a compiled module.
+
 
 _BOX = mujoco.mjtGeom.mjGEOM_BOX
 

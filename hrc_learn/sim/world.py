@@ -1,19 +1,20 @@
 """The workplace in motion: MuJoCo behind the `Arm` and `Gripper` protocols."""
 
-# pyright: reportAttributeAccessIssue=false
-# MuJoCo ships no type stubs; its names come from a compiled module.
-
 from collections.abc import Mapping
 
 import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from ..kinematics import panda
-from ..protocols import ArmState
-from .contacts import ContactMonitor, Touch
-from .panda_model import FINGER_STROKE
-from .scene import HAND_MARKER, SceneConfig, build_scene
+from hrc_learn.kinematics import panda
+from hrc_learn.protocols import ArmState
+from hrc_learn.sim.contacts import ContactMonitor, Touch
+from hrc_learn.sim.panda_model import FINGER_STROKE
+from hrc_learn.sim.scene import HAND_MARKER, SceneConfig, build_scene
+
+# pyright: reportAttributeAccessIssue=false
+# MuJoCo ships no type stubs; its names come from a compiled module.
+
 
 _ARM_BODIES = ("link1",)  # the tree from link 1 on, hand and fingers included
 

@@ -1,11 +1,11 @@
 """Cameras, lenses and ArUco features, in numpy; OpenCV is imported where it is used."""
 
-from .camera_model import CameraModel as CameraModel
-from .detector import MarkerDetector as MarkerDetector
-from .detector import centre as centre
-from .imaging import ImageNoise as ImageNoise
-from .imaging import Lens as Lens
-from .markers import Marker as Marker
-from .markers import marker_texture as marker_texture
-from .synthetic_camera import Cover as Cover
-from .synthetic_camera import SyntheticCamera as SyntheticCamera
+from hrc_learn.vision.camera_model import CameraModel as CameraModel
+from hrc_learn.vision.imaging import ImageNoise as ImageNoise
+from hrc_learn.vision.imaging import Lens as Lens
+from hrc_learn.vision.markers import Marker as Marker
+from hrc_learn.vision.markers import MarkerDetector as MarkerDetector
+from hrc_learn.vision.markers import centre as centre
+from hrc_learn.vision.markers import marker_texture as marker_texture
+from hrc_learn.vision.synthetic_camera import Cover as Cover
+from hrc_learn.vision.synthetic_camera import SyntheticCamera as SyntheticCamera

@@ -5,8 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from .camera_model import CameraModel
-from .distortion import NONE, undistort
+from hrc_learn.vision.camera_model import NONE, CameraModel, undistort
 
 _POOL = 1 << 16  # samples of noise drawn for an image
 _BAND = 16  # rows

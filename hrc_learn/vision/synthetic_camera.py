@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
-from .camera_model import CameraModel
-from .imaging import ImageNoise, pixel_rays
-from .markers import PLATE_MODULES, Marker, marker_texture
+from hrc_learn.vision.camera_model import CameraModel
+from hrc_learn.vision.imaging import ImageNoise, pixel_rays
+from hrc_learn.vision.markers import PLATE_MODULES, Marker, marker_texture
 
 MarkerPoses = Callable[[], Mapping[int, Float[np.ndarray, "4 4"]]]
 """Returns the pose of each marker now, by its id: p_base = pose @ p_marker."""

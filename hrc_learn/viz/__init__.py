@@ -5,21 +5,16 @@ it is asked for: `hrc_learn.viz.run_dashboard` and `fit_dashboard` import rerun,
 `hrc_learn.viz.figures` imports matplotlib.
 """
 
-from .demonstrations_recording import DemonstrationsRecording as DemonstrationsRecording
-from .demonstrations_recording import ShownDemonstration as ShownDemonstration
-from .learning_recording import ErrorMap as ErrorMap
-from .learning_recording import LearningRecording as LearningRecording
-from .logged_steps import Event as Event
-from .logged_steps import LoggedSteps as LoggedSteps
-from .recording import Body as Body
-from .recording import Box as Box
-from .recording import CameraRecording as CameraRecording
-from .recording import Capsule as Capsule
-from .recording import FitRecording as FitRecording
-from .recording import JointLimits as JointLimits
-from .recording import MeshFile as MeshFile
-from .recording import RunRecording as RunRecording
-from .recording import arm_bodies as arm_bodies
-from .step_log import StepLog as StepLog
-from .sweep_recording import SweepRecording as SweepRecording
-from .sweep_recording import SweptTrials as SweptTrials
+from hrc_learn.viz.recordings import CameraRecording as CameraRecording
+from hrc_learn.viz.recordings import DemonstrationsRecording as DemonstrationsRecording
+from hrc_learn.viz.recordings import ErrorMap as ErrorMap
+from hrc_learn.viz.recordings import FitRecording as FitRecording
+from hrc_learn.viz.recordings import JointLimits as JointLimits
+from hrc_learn.viz.recordings import LearningRecording as LearningRecording
+from hrc_learn.viz.recordings import RunRecording as RunRecording
+from hrc_learn.viz.recordings import ShownDemonstration as ShownDemonstration
+from hrc_learn.viz.recordings import SweepRecording as SweepRecording
+from hrc_learn.viz.recordings import SweptTrials as SweptTrials
+from hrc_learn.viz.step_log import Event as Event
+from hrc_learn.viz.step_log import LoggedSteps as LoggedSteps
+from hrc_learn.viz.step_log import StepLog as StepLog

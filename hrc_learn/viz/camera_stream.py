@@ -7,9 +7,9 @@ import rerun as rr
 from jaxtyping import Float, Int, UInt8
 from PIL import Image
 
-from . import palette
-from .recording import CameraRecording
-from .rerun_file import StillThings, seconds, thin
+from hrc_learn.viz import palette
+from hrc_learn.viz.recordings import CameraRecording
+from hrc_learn.viz.rerun_stream import StillThings, seconds, thin
 
 _CROSS = 60.0  # half the size of the mark of the target [px]
 _ROOT = "world/camera/image"

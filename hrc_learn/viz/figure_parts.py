@@ -12,8 +12,8 @@ from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
-from . import palette
-from .recording import Box
+from hrc_learn.geometry import Box
+from hrc_learn.viz import palette
 
 STYLE: dict[Any, Any] = {
     "font.size": 9.0,

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Shaped
 
-from . import palette
-from .recording import JointLimits, RunRecording
+from hrc_learn.viz import palette
+from hrc_learn.viz.recordings import JointLimits, RunRecording
 
 Colour = tuple[int, int, int, int]
 

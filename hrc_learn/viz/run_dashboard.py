@@ -1,10 +1,192 @@
-"""A run as one Rerun recording: the robot in 3D, what its camera saw, and every curve."""
+"""A run as a Rerun recording: the robot in 3D, what its camera saw, and every curve."""
 
 import os
+from collections.abc import Sequence
+from dataclasses import replace
 
-from .recording import RunRecording
-from .rerun_file import rrd_file
-from .run_stream import RunStream
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from jaxtyping import Float, Int, Shaped
+
+from hrc_learn.viz import palette
+from hrc_learn.viz.camera_stream import CameraStream
+from hrc_learn.viz.panels import Plot, run_tabs, several
+from hrc_learn.viz.recordings import RunRecording
+from hrc_learn.viz.rerun_stream import (
+    TIMELINE,
+    StillThings,
+    boxes,
+    look_at_all,
+    plot_view,
+    rrd_file,
+    samples,
+    seconds,
+    send_poses,
+    send_shapes,
+    send_values,
+    style,
+    tab_view,
+    thin,
+)
+from hrc_learn.viz.step_log import LoggedSteps
+
+# How the dashboard of a run is laid out.
+
+
+def run_outline(run: RunRecording) -> tuple:
+    """What the layout depends on: runs with equal ones share a layout."""
+    plots = [(tab.title, [plot.title for plot in tab.plots]) for tab in run_tabs(run)]
+    return plots, run.camera is not None, bool(run.phases)
+
+
+def run_layout(run: RunRecording) -> rrb.Blueprint:
+    """The robot and its camera beside tabs of curves."""
+    scene = rrb.Spatial3DView(
+        origin="/world",
+        contents=["+ /world/**", "- /world/camera/image/**"],
+        name="Robot: path of the run (blue), demonstration (grey), plan (orange)",
+        eye_controls=look_at_all(_sights(run)),
+    )
+    left: list[rrb.View] = [scene]
+    if run.camera is not None:
+        left.append(
+            rrb.Spatial2DView(
+                origin="/world/camera/image",
+                name="Camera: feature (orange dot), target (green cross), path (blue) [px]",
+                contents=["$origin/**"],
+            )
+        )
+    tabs = [tab_view(tab) for tab in run_tabs(run)]
+    right: list[rrb.Container | rrb.View] = [rrb.Tabs(contents=tabs, active_tab=0)]
+    if run.phases:
+        # The text tells the time as well: all other columns would only narrow it.
+        text = rrb.TextLogColumns(timeline_columns=[], text_log_columns=["Body"])
+        right.append(rrb.TextLogView(origin="/phases", name="Phases of the task", columns=text))
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            rrb.Vertical(contents=left, row_shares=[3, 2][: len(left)]),
+            rrb.Vertical(contents=right, row_shares=[5, 1][: len(right)]),
+            column_shares=[1, 1],
+        ),
+        rrb.TimePanel(state="collapsed", timeline=TIMELINE),
+        collapse_panels=True,
+    )
+
+
+def _sights(run: RunRecording) -> Float[np.ndarray, "n 3"]:
+    """What the first look at the scene should not miss: the path and the camera."""
+    eyes = [] if run.camera is None else [run.camera.model.pose[None, :3, 3]]
+    return np.concatenate([run.position, *eyes])
+
+
+# Sending a run to Rerun, all at once or as it grows.
+
+_POSE_RATE = 30.0  # robot poses sent a second
+_PATH_RATE = 6.0  # times a second at which the growing path is sent anew
+
+
+class RunStream:
+    """Sends what is new in a run, and the layout that shows it.
+
+    One call sends a finished run; one call every now and then, with ever longer recordings of
+    it, sends one that still goes on. What arrives is the same.
+    """
+
+    def __init__(self, stream: rr.RecordingStream, *, image_quality: int = 75):
+        """Send to a recording stream.
+
+        Args:
+            stream: Into a file or to a viewer.
+            image_quality: Of the JPEG images, 1 to 95.
+        """
+        self._stream, self._still = stream, StillThings(stream)
+        self._camera = CameraStream(stream, self._still, image_quality)
+        self._rows = self._phases = 0
+        self._outline: tuple | None = None
+
+    def send(self, run: RunRecording) -> None:
+        """Send all of a run that was not sent before.
+
+        Args:
+            run: The same run as before, as long or longer.
+        """
+        outline = run_outline(run)
+        if outline != self._outline:
+            self._stream.send_blueprint(run_layout(run))
+            self._outline = outline
+        self._send_scene(run)
+        if len(run.time) > self._rows:
+            self._send_rows(run, self._rows)
+            self._rows = len(run.time)
+        if run.camera is not None:
+            self._camera.send_images(run.camera)
+        self._send_phases(run)
+
+    def _send_scene(self, run: RunRecording) -> None:
+        if run.boxes:
+            self._still.send("world/scene", run.boxes, lambda: boxes(run.boxes))
+        if run.region is not None:
+            region = rr.Boxes3D(
+                centers=[run.region.centre],
+                half_sizes=[run.region.half_size],
+                colors=[palette.rgba(palette.TARGET)],
+                radii=[0.002],
+                labels=[run.region.name or "region"],
+                show_labels=False,
+            )
+            self._still.send("world/region", run.region, lambda: region)
+        for name, line, colour, radius in (
+            ("demonstration", run.demo_path, palette.DEMO, 0.006),
+            ("plan", run.plan_path, palette.ORANGE, 0.005),
+        ):
+            if line is not None:
+                strip = rr.LineStrips3D(
+                    [thin(line)], radii=[radius], colors=[palette.rgba(colour)]
+                )
+                self._still.send(f"world/paths/{name}", line.tobytes(), lambda s=strip: s)
+        for body in run.bodies:
+            send_shapes(self._still, body)
+
+    def _send_rows(self, run: RunRecording, first: int) -> None:
+        time = run.time
+        at = first + samples(time[first:], _POSE_RATE)
+        ends = first + samples(time[first:], _PATH_RATE)
+        for body in run.bodies:
+            send_poses(self._stream, time, body, at)
+        self._send_path(run, ends)
+        if run.camera is not None:
+            self._camera.send_overlays(time, run.camera, at, ends)
+        for tab in run_tabs(run):
+            for plot in tab.plots:
+                for curves in plot.curves:
+                    self._still.send(curves.path, curves.names, lambda c=curves: style(c))
+                    new = replace(curves, values=curves.values[first:])
+                    send_values(self._stream, time[first:], new)
+
+    def _send_path(self, run: RunRecording, ends: Int[np.ndarray, " ends"]) -> None:
+        path, colours = "world/paths/run", [palette.rgba(palette.RUN_ON_DARK)]
+        self._still.send(
+            path, None, lambda: rr.LineStrips3D.from_fields(radii=[0.003], colors=colours)
+        )
+        strips = [thin(run.position[: end + 1]) for end in ends]
+        columns = rr.LineStrips3D.columns(strips=strips)
+        self._stream.send_columns(path, seconds(run.time[ends]), columns)
+
+    def _send_phases(self, run: RunRecording) -> None:
+        new = run.phases[self._phases :]
+        self._phases += len(new)
+        if new:
+            when = seconds(np.array([phase.time for phase in new], dtype=float))
+            # The viewer's own column of times is too narrow for decimals.
+            texts = [f"{phase.time:.1f} s: {phase.text}" for phase in new]
+            levels = ["INFO"] * len(texts)
+            self._stream.send_columns(
+                "phases", when, rr.TextLog.columns(text=texts, level=levels)
+            )
+
+
+# A run as one Rerun recording: the robot in 3D, what its camera saw, and every curve.
 
 
 def record_run(
@@ -19,3 +201,54 @@ def record_run(
     """
     with rrd_file(path, run.title) as stream:
         RunStream(stream, image_quality=image_quality).send(run)
+
+
+# Curves of any log, sent to Rerun as it grows.
+
+
+class LogStream:
+    """Sends the chosen columns of a log, and a grid of plots that shows them.
+
+    `stream` is any recording stream: `stream.serve_grpc()`, `stream.spawn()` or
+    `stream.connect_grpc()` show it in a viewer, `stream.save()` keeps it.
+    """
+
+    def __init__(
+        self,
+        log: LoggedSteps,
+        stream: rr.RecordingStream,
+        columns: Sequence[str],
+        *,
+        time: str = "time",
+    ):
+        """Send the layout.
+
+        Args:
+            log: What a loop appends to.
+            stream: Where to send.
+            columns: Columns of the log to send.
+            time: Column that holds the time [s].
+        """
+        self._log, self._stream, self._still = log, stream, StillThings(stream)
+        self._columns, self._time = tuple(columns), time
+        self._rows = 0
+        views = [plot_view(_plot(name, np.empty((0, 1)))) for name in self._columns]
+        stream.send_blueprint(rrb.Blueprint(rrb.Grid(contents=views), collapse_panels=True))
+
+    def send(self) -> None:
+        """Send the rows that were not sent before."""
+        for rows in self._log.blocks(self._rows):
+            if len(rows):
+                for name in self._columns:
+                    values = rows[name].reshape(len(rows), -1)
+                    for curves in _plot(name, values).curves:
+                        self._still.send(curves.path, None, lambda c=curves: style(c))
+                        send_values(self._stream, rows[self._time], curves)
+                self._rows += len(rows)
+
+
+def _plot(name: str, values: Shaped[np.ndarray, "rows curves"]) -> Plot:
+    count = values.shape[1]
+    names = [name] if count == 1 else [f"{name} {i + 1}" for i in range(count)]
+    curves = several(f"live/{name}", names, values.astype(float))
+    return Plot(title=name, curves=(curves,), legend=True)

@@ -7,10 +7,10 @@ import rerun as rr
 import rerun.blueprint as rrb
 from jaxtyping import Float
 
-from . import palette
-from .panels import Plot, Tab, several, slug
-from .rerun_file import TIMELINE, rrd_file, send_curves, tab_view
-from .sweep_recording import SweepRecording, SweptTrials
+from hrc_learn.viz import palette
+from hrc_learn.viz.panels import Plot, Tab, several, slug
+from hrc_learn.viz.recordings import SweepRecording, SweptTrials
+from hrc_learn.viz.rerun_stream import TIMELINE, rrd_file, send_curves, tab_view
 
 _SAMPLES = 400
 _COLUMNS = 2

@@ -22,7 +22,6 @@ from torch.utils import _pytree
 from unchecked import shapes_unchecked
 
 from hrc_learn.controller import AdaptiveController, ControllerConfig, Goals
-from hrc_learn.controller.rehearsal import PinholeCamera
 from hrc_learn.geometry import Pose
 from hrc_learn.jacobian import (
     CompositeEstimator,
@@ -31,6 +30,7 @@ from hrc_learn.jacobian import (
     PaperEstimator,
 )
 from hrc_learn.kinematics import null_space_projector, panda, pseudo_inverse
+from hrc_learn.sim.closed_loop import PinholeCamera
 
 
 class TestTheLaw:

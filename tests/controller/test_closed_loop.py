@@ -31,7 +31,6 @@ from hrc_learn.controller import (
     table1_goals,
     table1_joint_region,
 )
-from hrc_learn.controller.rehearsal import Imperfections, VirtualCamera, rehearse
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import (
     CompositeEstimator,
@@ -40,6 +39,7 @@ from hrc_learn.jacobian import (
     PaperEstimator,
 )
 from hrc_learn.kinematics import panda, pseudo_inverse
+from hrc_learn.sim.closed_loop import Imperfections, VirtualCamera, rehearse
 
 
 @pytest.fixture(autouse=True)

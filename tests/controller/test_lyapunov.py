@@ -5,8 +5,14 @@ import torch
 from torch import Tensor
 from unchecked import shapes_unchecked
 
-from hrc_learn.controller import AdaptiveController, ControllerConfig, Goals, Observation
-from hrc_learn.controller.lyapunov import lyapunov_function, lyapunov_rate
+from hrc_learn.controller import (
+    AdaptiveController,
+    ControllerConfig,
+    Goals,
+    Observation,
+    lyapunov_function,
+)
+from hrc_learn.controller.monitors import lyapunov_rate
 from hrc_learn.geometry import quaternion
 from hrc_learn.jacobian import FixedEstimator, PaperEstimator, RBFImageJacobian, paper_grid
 from hrc_learn.kinematics import panda, pseudo_inverse

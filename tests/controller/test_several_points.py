@@ -9,8 +9,7 @@ from torch.utils import _pytree
 from unchecked import shapes_unchecked
 
 from hrc_learn.controller import HandOver
-from hrc_learn.controller.rehearsal import Imperfections, PinholeCamera
-from hrc_learn.controller.trials import CORNERS, TrialConfig, run_trials
+from hrc_learn.experiments.controller.grasp_trials import CORNERS, TrialConfig, run_trials
 from hrc_learn.geometry import Pose
 from hrc_learn.jacobian import (
     BroydenEstimator,
@@ -24,6 +23,7 @@ from hrc_learn.jacobian import (
     stacked,
 )
 from hrc_learn.kinematics import panda
+from hrc_learn.sim.closed_loop import Imperfections, PinholeCamera
 
 DOUBLE = torch.float64
 J0 = torch.tensor([[-1500.0, 0, 0, 0, -200, 60], [0, 2400, 170, -200, 0, 180]], dtype=DOUBLE)

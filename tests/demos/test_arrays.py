@@ -6,8 +6,7 @@ from lerobot_folders import joint_path
 from scipy.spatial.transform import Rotation
 
 from hrc_learn.demos import DatasetError
-from hrc_learn.demos.array_files import read_table
-from hrc_learn.demos.arrays import ArraySources, demonstrations_from_table
+from hrc_learn.demos.read.arrays import ArraySources, demonstrations_from_table, read_table
 
 TIME = np.cumsum(np.random.default_rng(0).uniform(0.002, 0.004, 40))
 Q = joint_path(40)

@@ -4,8 +4,14 @@ import numpy as np
 import pytest
 from lerobot_folders import joint_path, write_folder
 
-from hrc_learn.demos import DatasetError, DatasetWriter, load_demos, open_demos
-from hrc_learn.demos.image_features import attach_features, extract_features
+from hrc_learn.demos import (
+    DatasetError,
+    DatasetWriter,
+    attach_features,
+    extract_features,
+    load_demos,
+    open_demos,
+)
 from hrc_learn.demos.repair import RepairOptions, repair_dataset
 
 SIZE = (48, 64)

@@ -5,9 +5,14 @@ from sampling import generator
 from torch.testing import assert_close
 
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.jacobian import ImageJacobianFitConfig, RBFImageJacobian, grid, paper_grid
-from hrc_learn.jacobian.gathering import statistics_by_part, watched
-from hrc_learn.jacobian.pairs import KeyMotion, PairConfig, key_frames
+from hrc_learn.jacobian import (
+    ImageJacobianFitConfig,
+    RBFImageJacobian,
+    grid,
+    paper_grid,
+    watched,
+)
+from hrc_learn.jacobian.samples import KeyMotion, PairConfig, key_frames, statistics_by_part
 
 CAMERA = Pinhole.overhead(roll=0.7)
 

@@ -9,11 +9,7 @@ from arm_samples import joint_positions
 from sampling import generator
 from torch.testing import assert_close
 
-from hrc_learn.kinematics import (
-    from_pytorch_kinematics,
-    panda,
-    to_pytorch_kinematics,
-)
+from hrc_learn.kinematics import from_pytorch_kinematics, panda, to_pytorch_kinematics
 
 # Axes along x, -z and a slant, a fixed joint in the middle and one at the end.
 ODD_ARM = """

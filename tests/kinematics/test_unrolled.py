@@ -5,7 +5,7 @@ from graphs import library_calls
 from unchecked import shapes_unchecked
 
 from hrc_learn.kinematics import panda
-from hrc_learn.kinematics.unrolled import transform_and_jacobian
+from hrc_learn.kinematics.chain import transform_and_jacobian
 
 MOUNTS, TIP = panda.mounts.tolist(), (panda.flange @ panda.tcp).tolist()
 

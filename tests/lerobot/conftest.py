@@ -2,7 +2,7 @@
 
 import pytest
 
-from hrc_learn.lerobot.connected import CONNECTED
+from hrc_learn.lerobot.panda_device import CONNECTED
 from hrc_learn.lerobot.robots import MujocoPanda, MujocoPandaConfig
 
 

@@ -1,6 +1,6 @@
 import pytest
 
-from hrc_learn.lerobot.policy.columns import matched_columns, rotation_triples
+from hrc_learn.lerobot.policy.action_encoding import matched_columns, rotation_triples
 
 HAND = ["ee.x", "ee.y", "ee.z", "ee.wx", "ee.wy", "ee.wz", "ee.gripper_pos"]
 

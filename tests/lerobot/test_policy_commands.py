@@ -11,7 +11,7 @@ import pytest
 import torch
 from lerobot_samples import FPS, GOAL, STATE, reaching, windows, write_dataset
 
-from hrc_learn.lerobot.policy.episodes import read_episodes
+from hrc_learn.lerobot.policy.closed_form import read_episodes
 from hrc_learn.lerobot.policy.modeling_dmp import DMPPolicy
 
 pytestmark = pytest.mark.slow

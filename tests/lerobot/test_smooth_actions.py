@@ -13,13 +13,13 @@ from lerobot.processor.converters import (
     transition_to_policy_action,
 )
 
-from hrc_learn.lerobot.processor.adding import (
+from hrc_learn.lerobot.processor import add_smoothing
+from hrc_learn.lerobot.processor.action_limits import ActionLimits
+from hrc_learn.lerobot.processor.checkpoint_steps import (
     POSTPROCESSOR,
     PREPROCESSOR,
-    add_smoothing,
     remove_smoothing,
 )
-from hrc_learn.lerobot.processor.limits import ActionLimits
 
 LIMITS = ActionLimits(
     names=["a.pos", "b.pos"],

@@ -6,7 +6,7 @@ import pytest
 import sampling
 import torch
 
-from hrc_learn.controller.clearance import PEDESTAL, TABLE
+from hrc_learn.experiments.controller.grasp_trials import PEDESTAL, TABLE
 from hrc_learn.kinematics import LINK_CAPSULES, panda, panda_capsules
 from hrc_learn.sim import SceneConfig, build_scene
 

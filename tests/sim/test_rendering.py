@@ -12,7 +12,7 @@ from hrc_learn.sim import (
     open_camera,
     rendering,
 )
-from hrc_learn.tasks.workplace import Workplace
+from hrc_learn.sim.workplace import Workplace
 from hrc_learn.vision import MarkerDetector, SyntheticCamera, centre
 
 WORKPLACE = Workplace()

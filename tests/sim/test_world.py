@@ -5,7 +5,7 @@ import torch
 from hrc_learn.controller import SafetyConfig, SafetyFilter
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import World
-from hrc_learn.tasks.workplace import Workplace
+from hrc_learn.sim.workplace import Workplace
 
 
 @pytest.fixture(scope="module")

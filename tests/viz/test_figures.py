@@ -8,9 +8,9 @@ import pytest
 from PIL import Image
 from sample_runs import NAMES, STEPS, sample_fit, sample_run
 
+from hrc_learn.geometry import Box
 from hrc_learn.viz import figures
 from hrc_learn.viz.figure_parts import near, spells
-from hrc_learn.viz.recording import Box
 
 RUN_FIGURES = [
     figures.image_figure,

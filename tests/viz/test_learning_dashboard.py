@@ -3,7 +3,7 @@ import pytest
 from rrd_reading import Rrd
 
 from hrc_learn.viz import ErrorMap, LearningRecording
-from hrc_learn.viz.learning_dashboard import record_learning
+from hrc_learn.viz.fit_dashboard import record_learning
 
 ROUNDS, NEURONS = 4, 3
 ERROR, WIDTH = "Error on demonstrations held out [px]", "Width of the neurons [m]"

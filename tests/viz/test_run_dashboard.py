@@ -6,9 +6,10 @@ from PIL import Image
 from rrd_reading import Rrd
 from sample_runs import OPTIONAL, sample_run
 
-from hrc_learn.viz import Capsule, RunRecording
+from hrc_learn.geometry import Capsule
+from hrc_learn.viz import RunRecording
 from hrc_learn.viz.panels import run_tabs
-from hrc_learn.viz.rerun_file import capsules, samples, thin
+from hrc_learn.viz.rerun_stream import capsules, samples, thin
 from hrc_learn.viz.run_dashboard import record_run
 
 

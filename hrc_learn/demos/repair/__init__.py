@@ -1,5 +1,5 @@
 """What can be repaired of a dataset, in a copy."""
 
-from .dataset import repair_dataset as repair_dataset
-from .options import RepairOptions as RepairOptions
-from .report import RepairReport as RepairReport
+from hrc_learn.demos.repair.episode_edit import RepairOptions as RepairOptions
+from hrc_learn.demos.repair.episode_edit import RepairReport as RepairReport
+from hrc_learn.demos.repair.repair import repair_dataset as repair_dataset

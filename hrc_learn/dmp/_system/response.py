@@ -15,7 +15,7 @@ from hrc_learn.dmp._system.forced_response import (
     chebyshev_points,
     impulse,
 )
-from hrc_learn.dmp._system.minimum_jerk import approach_state, minimum_jerk
+from hrc_learn.dmp._system.quintic_curves import approach_state, minimum_jerk
 from hrc_learn.dmp._system.spring import SpringDamper
 
 GRIDS_KEPT = 16

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from hrc_learn.dmp._system.bases import LearnedGaussianBasis, placed_activation
 from hrc_learn.dmp._system.canonical import ExponentialPhase, Phase
 from hrc_learn.dmp._system.forced_response import accumulate, impulse
-from hrc_learn.dmp._system.minimum_jerk import approach_state
+from hrc_learn.dmp._system.quintic_curves import approach_state
 from hrc_learn.dmp._system.spring import SpringDamper, transition
 from hrc_learn.dmp._types import Mask, Points, Times
 from hrc_learn.dmp.fitting.motion_samples import check_samples

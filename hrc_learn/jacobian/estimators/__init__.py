@@ -1,16 +1,18 @@
 """Online estimators of the image Jacobian, behind one interface."""
 
-from .broyden import BroydenConfig as BroydenConfig
-from .broyden import BroydenEstimator as BroydenEstimator
-from .composite import CompositeConfig as CompositeConfig
-from .composite import CompositeEstimator as CompositeEstimator
-from .fixed import FixedEstimator as FixedEstimator
-from .interface import ImageJacobianEstimator as ImageJacobianEstimator
-from .interface import Measurement as Measurement
-from .kalman import KalmanConfig as KalmanConfig
-from .kalman import KalmanEstimator as KalmanEstimator
-from .paper import PaperEstimator as PaperEstimator
-from .recursive_least_squares import LeastSquaresConfig as LeastSquaresConfig
-from .recursive_least_squares import (
+from hrc_learn.jacobian.estimators.broyden import BroydenConfig as BroydenConfig
+from hrc_learn.jacobian.estimators.broyden import BroydenEstimator as BroydenEstimator
+from hrc_learn.jacobian.estimators.estimator import FixedEstimator as FixedEstimator
+from hrc_learn.jacobian.estimators.estimator import (
+    ImageJacobianEstimator as ImageJacobianEstimator,
+)
+from hrc_learn.jacobian.estimators.estimator import Measurement as Measurement
+from hrc_learn.jacobian.estimators.gradient import CompositeConfig as CompositeConfig
+from hrc_learn.jacobian.estimators.gradient import CompositeEstimator as CompositeEstimator
+from hrc_learn.jacobian.estimators.gradient import PaperEstimator as PaperEstimator
+from hrc_learn.jacobian.estimators.recursive import KalmanConfig as KalmanConfig
+from hrc_learn.jacobian.estimators.recursive import KalmanEstimator as KalmanEstimator
+from hrc_learn.jacobian.estimators.recursive import LeastSquaresConfig as LeastSquaresConfig
+from hrc_learn.jacobian.estimators.recursive import (
     RecursiveLeastSquaresEstimator as RecursiveLeastSquaresEstimator,
 )

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from hrc_learn.jacobian.estimators.composite import CompositeState
-from hrc_learn.jacobian.estimators.interface import Measurement
+from hrc_learn.jacobian.estimators.estimator import Measurement
+from hrc_learn.jacobian.estimators.gradient import CompositeState
 from hrc_learn.jacobian.estimators.key_frames import KeyFrame, PairEstimator
 from hrc_learn.jacobian.network import RBFImageJacobian
-from hrc_learn.jacobian.pairs import PairConfig
+from hrc_learn.jacobian.samples import PairConfig
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,14 +11,14 @@ from torch import Tensor
 
 from hrc_learn.geometry import Pose
 from hrc_learn.geometry.small_matrices import matmul
-from hrc_learn.jacobian.estimators.interface import (
+from hrc_learn.jacobian.estimators.estimator import (
     ImageJacobianEstimator,
     Measurement,
     evaluate,
 )
 from hrc_learn.jacobian.network import RBFImageJacobian
-from hrc_learn.jacobian.pairs import PairConfig
-from hrc_learn.jacobian.prior import component_scale
+from hrc_learn.jacobian.radial_basis import component_scale
+from hrc_learn.jacobian.samples import PairConfig
 from hrc_learn.pytree import pytree
 
 

@@ -1,19 +1,22 @@
-"""Recursive Bayesian estimation of the weights: one Gaussian for both image rows."""
+"""Recursive estimation of the weights: least squares with forgetting, and a Kalman filter."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.geometry.small_matrices import matmul
+from hrc_learn.jacobian.estimators.estimator import Measurement
 from hrc_learn.jacobian.estimators.key_frames import KeyFrame, Pair, PairEstimator
 from hrc_learn.jacobian.network import RBFImageJacobian
-from hrc_learn.jacobian.pairs import PairConfig
-from hrc_learn.jacobian.prior import weight_covariance
+from hrc_learn.jacobian.radial_basis import weight_covariance
+from hrc_learn.jacobian.samples import PairConfig
 from hrc_learn.pytree import pytree
+
+# Recursive Bayesian estimation of the weights: one Gaussian for both image rows.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,3 +104,112 @@ def condition(
     # and P_phi is not, and forgetting amplifies the difference until the covariance is none.
     root = P_phi / spread.sqrt()
     return weight + change.flatten(-3, -2), covariance - root.mT * root
+
+
+# Recursive least squares with exponential forgetting.
+
+
+@dataclass(frozen=True, kw_only=True)
+class LeastSquaresConfig(RecursiveConfig):
+    """Prior, noise and forgetting."""
+
+    forgetting: float = 0.99
+    """Weight of all that was learned against each new pair, 0 to 1."""
+
+
+class RecursiveLeastSquaresEstimator(RecursiveEstimator):
+    """Weighted least squares over all pairs so far, a pair k ago counting forgetting^k.
+
+    Forgetting inflates the covariance where nothing new is seen; it is kept from growing
+    beyond the prior, which bounds the gain (no covariance wind-up).
+    """
+
+    largest_trace: Tensor
+
+    def __init__(self, network: RBFImageJacobian, config: LeastSquaresConfig | None = None):
+        self.config = config or LeastSquaresConfig()
+        super().__init__(network, self.config)
+        trace = self.first_covariance.diagonal().sum()
+        self.register_buffer("largest_trace", trace, persistent=False)
+
+    def update(self, state: RecursiveState, measurement: Measurement) -> RecursiveState:
+        """One pair if there is a new one."""
+        theta = self.network.basis(measurement.pose)
+        key, pair = self.advance(state.key, measurement, theta, self.config)
+        # Forgetting is one more pair against a covariance divided by the factor.
+        kept = 1 - (1 - self.config.forgetting) * pair.valid.to(state.covariance.dtype)
+        weight, covariance = condition(
+            state.weight,
+            state.covariance / kept[..., None, None],
+            pair,
+            self.scale,
+            self.config.pair_noise,
+        )
+        trace = covariance.diagonal(dim1=-2, dim2=-1).sum(-1)
+        shrink = torch.clamp_max(self.largest_trace / trace, 1.0)[..., None, None]
+        return RecursiveState(
+            weight=self.projected(weight), covariance=covariance * shrink, key=key
+        )
+
+
+# Kalman filter on the weights.
+
+
+@dataclass(frozen=True, kw_only=True)
+class KalmanConfig(RecursiveConfig):
+    """Prior, noise and drift."""
+
+    drift: float = 100.0
+    """Random walk of the Jacobian as a whole [px/m/sqrt(s)]."""
+
+
+class KalmanEstimator(RecursiveEstimator):
+    """Random walk on a bias Jacobian plus the weights, observed through dx = J_s dr.
+
+    With normalised neurons a bias is the same change of every neuron's weight, so it needs no
+    state of its own, only its covariance. Both image rows see the same regressors and share
+    one covariance.
+    """
+
+    walk: Tensor
+
+    def __init__(self, network: RBFImageJacobian, config: KalmanConfig | None = None):
+        """Set up the filter.
+
+        Args:
+            network: Neurons and initial weights. If fitted offline, its covariance is where
+                the filter starts.
+            config: Prior, noise and drift.
+
+        Raises:
+            ValueError: The network's neurons are not normalised.
+        """
+        self.config = config or KalmanConfig()
+        super().__init__(network, self.config)
+        if not network.normalized:
+            raise ValueError(
+                "the filter's drift is a constant Jacobian, which only normalised neurons can "
+                "represent: build the network with normalized=True."
+            )
+        # A drift alike in all neurons, independent between the six components.
+        K = len(network.centers)
+        walk = torch.block_diag(*[network.centers.new_ones(K, K)] * 6)
+        self.register_buffer("walk", self.config.drift**2 * walk, persistent=False)
+
+    def resumed(self, state: RecursiveState, pause: float) -> RecursiveState:
+        """No key frame, and the drift of the pause."""
+        state = super().resumed(state, pause)
+        return replace(state, covariance=state.covariance + pause * self.walk)
+
+    def update(self, state: RecursiveState, measurement: Measurement) -> RecursiveState:
+        """Drift for dt, then one pair if there is a new one."""
+        theta = self.network.basis(measurement.pose)
+        key, pair = self.advance(state.key, measurement, theta, self.config)
+        weight, covariance = condition(
+            state.weight,
+            state.covariance + measurement.dt * self.walk,
+            pair,
+            self.scale,
+            self.config.pair_noise,
+        )
+        return RecursiveState(weight=self.projected(weight), covariance=covariance, key=key)

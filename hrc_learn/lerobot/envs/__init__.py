@@ -1,3 +1,3 @@
 """Placing and grasping as environments for lerobot-eval."""
 
-from .config_panda_env import PandaEnvConfig as PandaEnvConfig
+from hrc_learn.lerobot.envs.config_panda_env import PandaEnvConfig as PandaEnvConfig

@@ -9,11 +9,11 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
-from ..panda_names import ActionSpace, action_names
-from ..robots import MujocoPanda, MujocoPandaConfig
-from ..robots.config_mujoco_panda import ImagesConfig
-from ..robots.mujoco_panda import CAMERA
-from ..scenarios import make_scenario
+from hrc_learn.lerobot.panda_features import ActionSpace, action_names
+from hrc_learn.lerobot.robots import MujocoPanda, MujocoPandaConfig
+from hrc_learn.lerobot.robots.config_mujoco_panda import ImagesConfig
+from hrc_learn.lerobot.robots.mujoco_panda import CAMERA
+from hrc_learn.teleoperation.scenarios import make_scenario
 
 if TYPE_CHECKING:
     import gymnasium as gym
@@ -98,7 +98,7 @@ class PandaEnvConfig(EnvConfig):
         import gymnasium as gym
         from gymnasium.vector import AutoresetMode
 
-        from .panda_env import PandaEnv
+        from hrc_learn.lerobot.envs.panda_env import PandaEnv
 
         make = partial(PandaEnv, **self.gym_kwargs)
         if use_async_envs and n_envs > 1:

@@ -8,10 +8,10 @@ import gymnasium as gym
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from ...tasks.scenario_run import ScenarioView
-from ..panda_names import action_names
-from ..robots import MujocoPanda, MujocoPandaConfig
-from ..robots.mujoco_panda import CAMERA
+from hrc_learn.lerobot.panda_features import action_names
+from hrc_learn.lerobot.robots import MujocoPanda, MujocoPandaConfig
+from hrc_learn.lerobot.robots.mujoco_panda import CAMERA
+from hrc_learn.teleoperation.scenarios import ScenarioView
 
 _PICTURE = (240, 180)
 """Size of the pictures of `render` [px]."""

@@ -1,3 +1,3 @@
 """Movement primitives as a LeRobot policy, `dmp`."""
 
-from .configuration_dmp import DMPConfig as DMPConfig
+from hrc_learn.lerobot.policy.configuration_dmp import DMPConfig as DMPConfig

@@ -1,15 +1,24 @@
-"""A policy's first primitives, by regression instead of gradients."""
+"""A policy's first primitives, by regression instead of gradients, from whole
+demonstrations.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from ...dmp import JointDMP, Response, RidgeFit, fit_ridge
-from .motion import ContextualMotion
+from hrc_learn.demos.format.dataset_folder import open_folder
+from hrc_learn.demos.read.episodes import choose_episodes
+from hrc_learn.demos.read.frames import read_frames
+from hrc_learn.dmp import JointDMP, Response, RidgeFit, fit_ridge
+from hrc_learn.lerobot.policy.primitive_head import ContextualMotion
+
+# A policy's first primitives, by regression instead of gradients.
 
 REGULARIZATIONS = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
 """Of the regression, chosen from by the error on demonstrations left out."""
@@ -118,3 +127,34 @@ def _error(motion: ContextualMotion, difference: Float[Tensor, "n K"]) -> float:
     position, _, _ = motion.response.matrices(s, torch.float64)
     square = (per_coordinate @ position).square().mean() + difference[:, -1].square().mean()
     return float(square.sqrt())
+
+
+# Whole demonstrations of a dataset's folder, in the columns and units a policy trains on.
+
+MOST = 256
+"""Demonstrations that say enough of a motion to start from; more are spread evenly."""
+
+
+def read_episodes(
+    root: str | Path, keys: Sequence[str], episodes: Sequence[int] | None = None
+) -> list[dict[str, Tensor]]:
+    """Columns of whole episodes, (frames, components) each, just as they are on disk.
+
+    Args:
+        root: Folder of a LeRobot dataset.
+        keys: Columns wanted.
+        episodes: Indices; None: all. Of more than 256, that many are read.
+
+    Raises:
+        DatasetError: A `ValueError` that says what of the dataset cannot be read.
+    """
+    folder = open_folder(root)
+    chosen = choose_episodes(folder, episodes)
+    if len(chosen) > MOST:
+        spread = np.linspace(0, len(chosen) - 1, MOST).round().astype(int)
+        chosen = tuple(chosen[i] for i in spread)
+    entries = sorted(chosen, key=lambda entry: (entry.file, entry.start))
+    return [
+        {key: torch.from_numpy(np.array(frames[key])) for key in keys}
+        for _, frames in read_frames(folder, entries, keys)
+    ]

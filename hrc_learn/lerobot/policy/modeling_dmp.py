@@ -13,14 +13,17 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
 
-from ...dmp import GaussianBasis, SpringDamper, response_of
-from .chart import ActionChart
-from .columns import matched_columns, rotation_triples
-from .configuration_dmp import DMPConfig
-from .encoder import ObservationEncoder
-from .episodes import read_episodes
-from .motion import ContextualMotion
-from .planner import MotionPlanner, Opening, Start
+from hrc_learn.dmp import GaussianBasis, SpringDamper, response_of
+from hrc_learn.lerobot.policy.action_encoding import (
+    ActionChart,
+    matched_columns,
+    rotation_triples,
+)
+from hrc_learn.lerobot.policy.chunk_planner import MotionPlanner, Opening, Start
+from hrc_learn.lerobot.policy.closed_form import read_episodes
+from hrc_learn.lerobot.policy.configuration_dmp import DMPConfig
+from hrc_learn.lerobot.policy.observation_encoder import ObservationEncoder
+from hrc_learn.lerobot.policy.primitive_head import ContextualMotion
 
 logger = logging.getLogger(__name__)
 

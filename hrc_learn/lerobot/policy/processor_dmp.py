@@ -9,7 +9,7 @@ from lerobot.processor import (
 )
 from torch import Tensor
 
-from .configuration_dmp import DMPConfig
+from hrc_learn.lerobot.policy.configuration_dmp import DMPConfig
 
 
 def make_dmp_pre_post_processors(

@@ -1,4 +1,6 @@
-"""The steps: one that watches where the robot is, one that smooths what it is sent."""
+"""Steps of LeRobot's processors: one watches where the robot is, one smooths what it is
+sent.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +9,8 @@ import math
 import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, ClassVar
+from weakref import WeakValueDictionary
 
 import torch
 from jaxtyping import Bool, Float
@@ -17,12 +20,57 @@ from lerobot.processor import ProcessorStep, ProcessorStepRegistry
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
-from ...controller import ChunkSmoother, SmoothReport, SmoothState
-from ...kinematics import MotionLimits
-from .changes import Changes
+from hrc_learn.controller import BROKEN, ChunkSmoother, SmoothReport, SmoothState
+from hrc_learn.kinematics import MotionLimits
 
-_MEASURED: dict[str, Tensor] = {}
-"""Newest state of the robot, by the name of the pair of steps."""
+# What smoothing has changed, added up.
+
+_SAME = 1e-6
+"""Changes below this are rounding."""
+
+
+class Changes:
+    """Counts and the largest changes, over many actions.
+
+    Attributes:
+        steps: Actions handed out.
+        changed: Of them, those that differ from what was asked for.
+        broken: Of them, those asked for that would have broken each of `BROKEN`.
+        largest: Largest change of each value, in its unit.
+    """
+
+    def __init__(self, names: list[str]):
+        self.names = tuple(names)
+        self.clear()
+
+    def clear(self) -> None:
+        """Start over."""
+        self.steps = self.changed = 0
+        self.broken = dict.fromkeys(BROKEN, 0)
+        self.largest = dict.fromkeys(self.names, 0.0)
+
+    def add(self, report: SmoothReport) -> None:
+        """Count what was done to a chunk."""
+        change = report.change.abs().reshape(-1, len(self.names))
+        self.steps += len(change)
+        self.changed += int((change > _SAME).any(-1).sum())
+        for kind, count in zip(
+            BROKEN, report.broken.flatten(0, -2).sum(0).tolist(), strict=True
+        ):
+            self.broken[kind] += int(count)
+        for name, most in zip(self.names, torch.amax(change, 0).tolist(), strict=True):
+            self.largest[name] = max(self.largest[name], most)
+
+    def __str__(self) -> str:
+        broken = ", ".join(f"{kind} {count}" for kind, count in self.broken.items())
+        name = max(self.largest, key=self.largest.__getitem__)
+        return (
+            f"{self.changed} of {self.steps} actions changed, by at most "
+            f"{self.largest[name]:.4g} ({name}); asked for beyond limits of {broken}"
+        )
+
+
+# The steps: one that watches where the robot is, one that smooths what it is sent.
 
 _JUMP = 5.0
 """A robot that moves this many times faster than its limit was put there: an episode began."""
@@ -40,16 +88,30 @@ class WatchStateStep(ProcessorStep):
 
     pair: str = "smooth"
     """Name that both steps of a policy share."""
+    state: Tensor | None = field(default=None, init=False, repr=False)
+    """Newest state of the robot, (batch, values); None before the first observation."""
+
+    # LeRobot builds both steps of a policy from files, each without the other: the one that
+    # smooths finds the one that watches by name, for as long as somebody holds it.
+    _alive: ClassVar[WeakValueDictionary[str, WatchStateStep]] = WeakValueDictionary()
+
+    def __post_init__(self) -> None:
+        self._alive[self.pair] = self
+
+    @classmethod
+    def named(cls, pair: str) -> WatchStateStep | None:
+        """The newest step of that name that is still in use."""
+        return cls._alive.get(pair)
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
         observation = transition.get(TransitionKey.OBSERVATION) or {}
         state = observation.get(OBS_STATE)
         if state is not None:
-            _MEASURED[self.pair] = torch.atleast_2d(state).detach().cpu()
+            self.state = torch.atleast_2d(state).detach().cpu()
         return transition
 
     def reset(self) -> None:
-        _MEASURED.pop(self.pair, None)
+        self.state = None
 
     def get_config(self) -> dict[str, Any]:
         return {"pair": self.pair}
@@ -171,7 +233,8 @@ class SmoothActionsStep(ProcessorStep):
     def _measured(self, chunk: Tensor) -> Float[Tensor, "batch values"]:
         """Where the robot is; values that are not measured are where they are sent."""
         here = chunk[..., 0, :].to(torch.float64)
-        state = _MEASURED.get(self.pair)
+        watch = WatchStateStep.named(self.pair)
+        state = None if watch is None else watch.state
         if state is None or state.shape[0] != here.shape[0]:
             return here
         if int(self._columns.max()) >= state.shape[-1]:

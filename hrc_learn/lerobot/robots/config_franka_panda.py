@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from lerobot.cameras import CameraConfig
 from lerobot.robots import RobotConfig
 
-from ..panda_names import ActionSpace
+from hrc_learn.lerobot.panda_features import ActionSpace
 
 
 @RobotConfig.register_subclass("franka_panda")

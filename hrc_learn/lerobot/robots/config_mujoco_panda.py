@@ -5,8 +5,8 @@ from typing import Literal
 
 from lerobot.robots import RobotConfig
 
-from ..panda_names import ActionSpace
-from ..scenarios import check_scenario
+from hrc_learn.lerobot.panda_features import ActionSpace
+from hrc_learn.teleoperation.scenarios import check_scenario
 
 
 @dataclass

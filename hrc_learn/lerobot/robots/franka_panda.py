@@ -9,16 +9,16 @@ import torch
 from jaxtyping import Float
 from lerobot.cameras import make_cameras_from_configs
 
-from ...controller import SafetyConfig, Watchdog
-from ...geometry import Pose
-from ...kinematics import panda
-from ...protocols import Arm
-from .config_franka_panda import FrankaPandaConfig
-from .franky_arm import FrankyArm
-from .panda_robot import PandaRobot
+from hrc_learn.controller import SafetyConfig, Watchdog
+from hrc_learn.geometry import Pose
+from hrc_learn.hardware.franky_arm import FrankyArm
+from hrc_learn.kinematics import panda
+from hrc_learn.lerobot.robots.config_franka_panda import FrankaPandaConfig
+from hrc_learn.lerobot.robots.panda_robot import PandaRobot
+from hrc_learn.protocols import Arm
 
 if TYPE_CHECKING:
-    from ...tasks.position_servo import PositionServo
+    from hrc_learn.skills.position_servo import PositionServo
 
 
 class FrankaPanda(PandaRobot):
@@ -60,7 +60,7 @@ class FrankaPanda(PandaRobot):
         return self._arm
 
     def _open(self) -> None:
-        from ...tasks.position_servo import PositionServo, PositionServoConfig
+        from hrc_learn.skills.position_servo import PositionServo, PositionServoConfig
 
         config = self.config
         self._arm = FrankyArm(

@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
-from ...geometry import Pose
-from ...protocols import Arm
-from ..panda_names import DOWN, PIXELS
-from ..scenarios import make_scenario
-from .config_mujoco_panda import MujocoPandaConfig
-from .panda_robot import PandaRobot
+from hrc_learn.geometry import Pose
+from hrc_learn.lerobot.panda_features import DOWN, PIXELS
+from hrc_learn.lerobot.robots.config_mujoco_panda import MujocoPandaConfig
+from hrc_learn.lerobot.robots.panda_robot import PandaRobot
+from hrc_learn.protocols import Arm
+from hrc_learn.teleoperation.scenarios import make_scenario
 
 if TYPE_CHECKING:
-    from ...tasks.scenario_run import ScenarioRun
+    from hrc_learn.teleoperation.scenarios import ScenarioRun
 
 CAMERA = "front"
 
@@ -58,7 +58,7 @@ class MujocoPanda(PandaRobot):
         return self.run.world.arm
 
     def _open(self) -> None:
-        from ...tasks.scenario_run import ScenarioRun, ScenarioView
+        from hrc_learn.teleoperation.scenarios import ScenarioRun, ScenarioView
 
         config, images = self.config, self.config.images
         scenario = make_scenario(config.scenario, config.shelf)

@@ -9,11 +9,9 @@ import numpy as np
 from jaxtyping import Float
 from lerobot.robots import Robot, RobotConfig
 
-from ...geometry import Pose
-from ...protocols import Arm, ArmState
-from ..connected import CONNECTED
-from ..device import Device
-from ..panda_names import (
+from hrc_learn.geometry import Pose
+from hrc_learn.lerobot.panda_device import CONNECTED, Device
+from hrc_learn.lerobot.panda_features import (
     DOWN,
     GRIPPER,
     HAND,
@@ -25,6 +23,7 @@ from ..panda_names import (
     observed,
     target_of,
 )
+from hrc_learn.protocols import Arm, ArmState
 
 
 class PandaRobot(Device, Robot):

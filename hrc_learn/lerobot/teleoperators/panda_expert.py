@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from ..robots.mujoco_panda import MujocoPanda
-from .config_panda_expert import PandaExpertConfig
-from .leading import PandaTeleoperator
+from hrc_learn.lerobot.robots import MujocoPanda
+from hrc_learn.lerobot.teleoperators.config_panda_expert import PandaExpertConfig
+from hrc_learn.lerobot.teleoperators.panda_teleoperator import PandaTeleoperator
 
 
 class PandaExpert(PandaTeleoperator):

@@ -5,14 +5,14 @@ from __future__ import annotations
 from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
-from ..robots.mujoco_panda import MujocoPanda
-from ..robots.panda_robot import PandaRobot
-from .config_panda_page import PandaPageConfig
-from .leading import PandaTeleoperator
+from hrc_learn.lerobot.robots import MujocoPanda
+from hrc_learn.lerobot.robots.panda_robot import PandaRobot
+from hrc_learn.lerobot.teleoperators.config_panda_page import PandaPageConfig
+from hrc_learn.lerobot.teleoperators.panda_teleoperator import PandaTeleoperator
 
 if TYPE_CHECKING:
-    from ...human.page import Page
-    from ...sim import MovingBodies, World
+    from hrc_learn.sim import MovingBodies, World
+    from hrc_learn.teleoperation.page import Page
 
 _NOTE = "LeRobot records: its own keys begin and end episodes"
 
@@ -40,9 +40,9 @@ class PandaPage(PandaTeleoperator):
         self._served = ExitStack()
 
     def _open(self) -> None:
-        from ...human.page import Page, PageConfig, PageStatus
-        from ...kinematics import panda
-        from ...sim import MovingBodies, World
+        from hrc_learn.kinematics import panda
+        from hrc_learn.sim import MovingBodies, World
+        from hrc_learn.teleoperation.page import Page, PageConfig, PageStatus
 
         self._ghost = self._shown = World()
         self._bodies = MovingBodies(self._ghost)
@@ -67,7 +67,7 @@ class PandaPage(PandaTeleoperator):
 
     def _show(self, robot: PandaRobot) -> None:
         """Show where the arm is, and in simulation everything else as well."""
-        from ...sim import MovingBodies
+        from hrc_learn.sim import MovingBodies
 
         world = robot.run.world if isinstance(robot, MujocoPanda) else self._ghost
         if world is self._ghost:

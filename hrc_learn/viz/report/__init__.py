@@ -5,14 +5,14 @@ A program fills a `Report` and hands it to `write_report`, which leaves `report.
 them up again, and `reports_page` puts several on one page.
 """
 
-from .content import Measurement as Measurement
-from .content import Picture as Picture
-from .content import Report as Report
-from .content import Section as Section
-from .content import flatten as flatten
-from .folder import REPORT as REPORT
-from .folder import read_report as read_report
-from .folder import write_report as write_report
-from .page import reports_page as reports_page
-from .terminal import show_measurements as show_measurements
-from .versions import software_versions as software_versions
+from hrc_learn.viz.report.content import Measurement as Measurement
+from hrc_learn.viz.report.content import Picture as Picture
+from hrc_learn.viz.report.content import Report as Report
+from hrc_learn.viz.report.content import Section as Section
+from hrc_learn.viz.report.content import flatten as flatten
+from hrc_learn.viz.report.content import show_measurements as show_measurements
+from hrc_learn.viz.report.content import software_versions as software_versions
+from hrc_learn.viz.report.folder import REPORT as REPORT
+from hrc_learn.viz.report.folder import read_report as read_report
+from hrc_learn.viz.report.folder import write_report as write_report
+from hrc_learn.viz.report.html import reports_page as reports_page

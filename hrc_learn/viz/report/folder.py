@@ -8,9 +8,9 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from ...output import new_file
-from .content import Measurement, Picture, Report, Section, flatten
-from .page import reports_page
+from hrc_learn.store import new_file
+from hrc_learn.viz.report.content import Measurement, Picture, Report, Section, flatten
+from hrc_learn.viz.report.html import reports_page
 
 REPORT = "report.json"
 """File that tells the folder of a run that has a report."""

@@ -1,0 +1,251 @@
+"""Smooth chunks: what a policy asks for, followed as nearly as limits of the motion allow."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import final
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from hrc_learn.controller.motion_barriers import LimitBarrier
+from hrc_learn.kinematics import MotionLimits
+from hrc_learn.pytree import pytree
+
+BROKEN = ("position", "velocity", "acceleration", "jerk")
+"""Limits that a chunk may break, in the order of the last axis of a report's flags."""
+
+_SHARE = 0.8
+"""Of the limits, what a correction counts on; the motion that is followed needs the rest."""
+_POSITION_RATE, _VELOCITY_RATE = 0.35, 0.7
+"""Fastest decay of errors, in shares of the sampling rate: of those tried, the fastest with
+which steps of 0.03 to 1 rad settle without overshoot at 20 and 50 samples a second."""
+_ROUNDING = 1 + 1e-6
+_ABSURD = 1e50
+"""Squares of much larger numbers overflow."""
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
+class SmoothState:
+    """Where the motion is, carried from one chunk to the next."""
+
+    position: Float[Tensor, "*batch D"]
+    """Last one handed out."""
+    velocity: Float[Tensor, "*batch D"]
+    """By which it was reached [1/s]."""
+    acceleration: Float[Tensor, "*batch D"]
+    """By which that came about [1/s^2]."""
+    asked: Float[Tensor, "*batch D"]
+    """Last position asked for."""
+    asked_velocity: Float[Tensor, "*batch D"]
+    """With which it moved [1/s]."""
+    asked_acceleration: Float[Tensor, "*batch D"]
+    """By which that came about [1/s^2]."""
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
+class SmoothReport:
+    """What was wrong with a chunk, and what was changed."""
+
+    broken: Bool[Tensor, "*batch T 4"]
+    """Whether to go there from the state, to the letter, would have broken each of `BROKEN`."""
+    change: Float[Tensor, "*batch T D"]
+    """Position handed out less the one asked for."""
+
+
+@final
+class ChunkSmoother(nn.Module):
+    """Follows chunks of positions within limits of position, velocity, acceleration and jerk.
+
+    A chunk that keeps the limits and goes on where the last one ended comes out as it went in.
+    Otherwise the motion leaves it and comes back: with e the distance to the chunk, e' its
+    rate and a_r the chunk's acceleration,
+
+        a = a_r - h'(e; A, lambda) e' - h(e' + h(e; A, lambda); j, mu)
+        h(x; b, k) = sign(x) (sqrt((b/k)^2 + 2 b |x|) - b/k)
+
+    so that e' follows -h(e), along which e brakes with A while it is large and decays at the
+    rate lambda once it is small. The step from one chunk to the next counts as error, not as
+    motion, so position, velocity and acceleration go on without a jump.
+
+    The limits hold for *any* chunks, by `LimitBarrier`, as they are for differences of what is
+    handed out: v_k = (p_k - p_{k-1})/dt, a_k = (v_k - v_{k-1})/dt, j_k = (a_k - a_{k-1})/dt.
+    It takes a start within the barrier's set: at rest, A^3/(8 j^2) + A^2 dt/(2 j) away from the
+    limits of position. A is lowered where that would be more than a tenth of their range.
+    Each coordinate is followed by itself, in the unit of its limits.
+    """
+
+    braking: Tensor
+    """A."""
+    fading: Tensor
+    """j."""
+    position_rate: Tensor
+    """lambda [1/s]."""
+
+    def __init__(self, limits: MotionLimits, dt: float):
+        """Prepare for chunks of one sampling rate.
+
+        Args:
+            limits: Of every coordinate; those of position may be infinite.
+            dt: Time from one sample of a chunk to the next [s].
+
+        Raises:
+            ValueError: dt or a limit is not positive and finite, or an upper limit of position
+                is not above the lower one.
+        """
+        super().__init__()
+        _check(limits, dt)
+        self.dt = dt
+        limits = replace(limits, acceleration=_that_leaves_room(limits, dt))
+        self.barrier = LimitBarrier(limits, margin=0.0, rate=1 / dt, jerk_limited=True)
+        A, j = _SHARE * limits.acceleration, _SHARE * limits.jerk
+        self.register_buffer("braking", A)
+        self.register_buffer("fading", j)
+        self.register_buffer("position_rate", (j / A).clamp(max=_POSITION_RATE / dt))
+        self.velocity_rate = _VELOCITY_RATE / dt
+
+    def initial_state(
+        self,
+        position: Float[Tensor, "*batch D"],
+        velocity: Float[Tensor, "*batch D"] | None = None,
+    ) -> SmoothState:
+        """State of a motion at rest, or in steady motion, in the limits' precision."""
+        position = position.to(self.braking)
+        still = torch.zeros_like(position)
+        velocity = still if velocity is None else still + velocity
+        return SmoothState(
+            position=position,
+            velocity=velocity,
+            acceleration=still,
+            asked=position,
+            asked_velocity=velocity,
+            asked_acceleration=still,
+        )
+
+    def forward(
+        self, chunk: Float[Tensor, "*batch T D"], state: SmoothState
+    ) -> tuple[Tensor, SmoothState, SmoothReport]:
+        """Follow one chunk, of one sample or many.
+
+        Args:
+            chunk: Positions asked for, dt apart, the first dt after the state's. What is no
+                number, or beyond all bounds, is taken for the value before it.
+            state: After the chunk before.
+
+        Returns:
+            Positions (*batch, T, D) to go to instead, in the chunk's precision; the state
+            after the last; what was changed.
+        """
+        asked = _filled(chunk.to(self.braking), state.asked)
+        broken = self._broken(asked, state)
+        positions = []
+        for k in range(asked.shape[-2]):
+            state = self._step(state, asked[..., k, :])
+            positions.append(state.position)
+        smooth = torch.stack(positions, dim=-2)
+        report = SmoothReport(broken=broken, change=smooth - asked)
+        return smooth.to(chunk), state, report
+
+    def _step(self, state: SmoothState, asked: Tensor) -> SmoothState:
+        """Go towards one sample."""
+        dt = self.dt
+        velocity, acceleration = self._followed(state, asked)
+        error = state.position - (asked - velocity * dt)
+        rate = state.velocity - (velocity - acceleration * dt)
+        approach, slope = _braked(error, self.braking, self.position_rate)
+        fade, _ = _braked(rate + approach, self.fading, self.velocity_rate)
+        a = self._allowed(state, acceleration - slope * rate - fade)
+        v = state.velocity + a * dt
+        return SmoothState(
+            position=state.position + v * dt,
+            velocity=v,
+            acceleration=a,
+            asked=asked,
+            asked_velocity=velocity,
+            asked_acceleration=(velocity - state.asked_velocity) / dt,
+        )
+
+    def _followed(self, state: SmoothState, asked: Tensor) -> tuple[Tensor, Tensor]:
+        """Velocity and acceleration of the samples, as far as they are a motion.
+
+        Both are those of the samples where these keep the limits. Where they do not, the
+        velocity goes after theirs with the limit of acceleration, which passes steps by and
+        still learns a new slope, and there is no acceleration to be followed.
+        """
+        barrier, dt = self.barrier, self.dt
+        change = ((asked - state.asked) / dt - state.asked_velocity) / dt
+        limited = change.clamp(-barrier.acceleration, barrier.acceleration)
+        jerk = (limited - state.asked_acceleration) / dt
+        motion = (jerk.abs() <= barrier.jerk * _ROUNDING) & (limited == change)
+        return state.asked_velocity + limited * dt, limited.masked_fill(~motion, 0)
+
+    def _allowed(self, state: SmoothState, acceleration: Tensor) -> Tensor:
+        """The acceleration with which the limits are kept, now and later."""
+        barrier, last, most = self.barrier, state.acceleration, self.barrier.jerk * self.dt
+        bounds = barrier.velocity_bounds(state.position)
+        lower, upper = barrier.acceleration_bounds(state.velocity, bounds, self.dt)
+        acceleration = acceleration.clamp(lower, upper)
+        # Last what no start can exceed: outside its set the barrier may ask for more.
+        return acceleration.clamp(
+            torch.maximum(last - most, -barrier.acceleration),
+            torch.minimum(last + most, barrier.acceleration),
+        )
+
+    def _broken(self, asked: Tensor, state: SmoothState) -> Tensor:
+        """Flags of a report."""
+        barrier, dt = self.barrier, self.dt
+        upper_wall, lower_wall = barrier.walls[1], -barrier.walls[0]
+        outside = (asked > upper_wall) | (asked < lower_wall)
+        flags, values = [outside.any(-1)], asked
+        for start, limit in (
+            (state.position, barrier.velocity),
+            (state.velocity, barrier.acceleration),
+            (state.acceleration, barrier.jerk),
+        ):
+            values = torch.cat([start.unsqueeze(-2), values], dim=-2).diff(dim=-2) / dt
+            flags.append((values.abs() > limit * _ROUNDING).any(-1))
+        return torch.stack(flags, dim=-1)
+
+
+def _braked(x: Tensor, strength: Tensor, rate: Tensor | float) -> tuple[Tensor, Tensor]:
+    """The function h and its slope: how fast x may change if it is to come to rest at zero."""
+    knee = strength / rate
+    root = torch.sqrt(knee**2 + 2 * strength * x.abs())
+    return torch.sign(x) * (root - knee), strength / root
+
+
+def _filled(chunk: Tensor, before: Tensor) -> Tensor:
+    """The chunk with what cannot be meant replaced by what came before it."""
+    if (chunk.abs() < _ABSURD).all():
+        return chunk
+    rows = []
+    for row in chunk.unbind(-2):
+        before = torch.where(row.abs() < _ABSURD, row, before)
+        rows.append(before)
+    return torch.stack(rows, dim=-2)
+
+
+def _that_leaves_room(limits: MotionLimits, dt: float) -> Tensor:
+    """Acceleration that can be ended well before a limit of position."""
+    room, j = 0.05 * (limits.upper - limits.lower), limits.jerk
+    ramped = torch.minimum((8 * j**2 * room) ** (1 / 3), (2 * j * room / dt).sqrt())
+    return torch.minimum(limits.acceleration, ramped)
+
+
+def _check(limits: MotionLimits, dt: float) -> None:
+    if not 0 < dt < float("inf"):
+        raise ValueError(f"dt must be positive and finite, but is {dt}")
+    for name in ("velocity", "acceleration", "jerk"):
+        limit = getattr(limits, name)
+        if not ((limit > 0) & limit.isfinite()).all():
+            raise ValueError(
+                f"limits of {name} must be positive and finite, got {limit.tolist()}"
+            )
+    if not (limits.lower < limits.upper).all():
+        raise ValueError(
+            f"lower limits must be below the upper ones, got {limits.lower.tolist()} and "
+            f"{limits.upper.tolist()}"
+        )

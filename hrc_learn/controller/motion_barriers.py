@@ -1,0 +1,169 @@
+"""Bounds on motion: how fast a joint may move so that its limits can be kept, and the
+tool near a person.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import final
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from hrc_learn.kinematics import MotionLimits
+
+# How fast a joint may move, and how hard accelerate, so that its limits can still be kept.
+
+# Of v_max: sums of rounded numbers must not exceed a limit in the last digit.
+_ROUNDING = 1e-12
+
+
+@final
+class LimitBarrier(nn.Module):
+    """The set of joint states from which the limits can be kept, and the bounds it implies.
+
+    With delta the distance to a limit less its margin, v the speed towards it, A and j the
+    limits of acceleration and jerk, and v_hat = v + (a + A)^2/(2 j):
+
+        v_hat <= min(h(delta), v_max + A^2/(2 j)),   h(delta) = sqrt(c^2 + 2 A delta) - c,
+        c = A / rate     <=>     Q(v_hat) = v_hat^2/(2 A) + v_hat/rate <= delta
+
+    v_hat is the speed from which braking with A *at once* would end where ramping the
+    acceleration down to -A ends, so one curve h serves. Without a jerk limit v_hat = v.
+
+    The set is invariant in discrete time. Let v_hat_k hold at step k, the joint move by
+    v_k dt, and the next acceleration be max(a_k - j dt, -A). Then v_hat_{k+1} <= v_hat_k -
+    A dt, and for every dt <= 1/rate
+
+        Q(v_hat - A dt) = Q(v_hat) - v_hat dt - A dt (1/rate - dt/2) <= delta - v_k dt,
+
+    while below A dt the joint gets no further than v_hat dt <= rate dt delta <= delta. So a
+    step that keeps all limits always exists. It takes equal steps, in which the joint moves
+    by v dt, and a start inside the set. At rest v_hat = A^2/(2 j), so that is
+
+        delta >= A^3/(8 j^2) + A^2/(2 j rate),
+
+    3 mrad for a Panda at 5 1/s, which the margin covers; the first term, the way on which
+    the acceleration ramps down, counts where A/j is long, as for slow axes. From rest nearer
+    to a limit, or past it, a joint moves inwards only.
+    """
+
+    velocity: Tensor
+    """v_max [rad/s]."""
+    acceleration: Tensor
+    """A [rad/s^2]."""
+    jerk: Tensor
+    """j [rad/s^3]."""
+    walls: Tensor
+    """Lower and upper limits, less the margin, with the signs of `sides` [rad]."""
+    sides: Tensor
+    knee: Tensor
+    """c [rad/s]."""
+    knee_square: Tensor
+    twice_acceleration: Tensor
+    reserve: Tensor
+    """A^2/(2 j), what it takes to start braking [rad/s]; zero without a jerk limit."""
+
+    def __init__(self, limits: MotionLimits, *, margin: float, rate: float, jerk_limited: bool):
+        """Prepare the constants.
+
+        Args:
+            limits: Of the joints.
+            margin: Distance kept from every position limit [rad].
+            rate: Fastest decay of the remaining distance [1/s].
+            jerk_limited: Whether the acceleration changes by at most j dt in a step.
+        """
+        super().__init__()
+        self.jerk_limited = jerk_limited
+        A, j = limits.acceleration, limits.jerk
+        walls = torch.stack([-limits.lower - margin, limits.upper - margin])
+        constants = {
+            "velocity": limits.velocity * (1 - _ROUNDING),
+            "acceleration": A.clone(),
+            "jerk": j.clone(),
+            "walls": walls,
+            "sides": torch.tensor([[1.0], [-1.0]]).to(walls),
+            "knee": A / rate,
+            "knee_square": (A / rate) ** 2,
+            "twice_acceleration": 2 * A,
+            "reserve": A**2 / (2 * j) if jerk_limited else torch.zeros_like(A),
+        }
+        for name, value in constants.items():
+            self.register_buffer(name, value)
+
+    def velocity_bounds(
+        self, joint_position: Float[Tensor, "*batch n"]
+    ) -> tuple[Tensor, Tensor]:
+        """Lowest and highest velocity [rad/s] of a steady motion (a = 0) inside the set."""
+        room = torch.addcmul(self.walls, self.sides, joint_position.unsqueeze(-2))
+        square = torch.addcmul(self.knee_square, self.twice_acceleration, room.abs())
+        speed = torch.copysign(square.sqrt() - self.knee, room)
+        if self.jerk_limited:
+            speed = speed - self.reserve
+        bounds = speed.clamp(-self.velocity, self.velocity) * -self.sides
+        lower, upper = bounds.unbind(-2)
+        return lower, upper
+
+    def acceleration_bounds(
+        self,
+        velocity: Float[Tensor, "*batch n"],
+        bounds: tuple[Tensor, Tensor],
+        dt: float | Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        """Lowest and highest acceleration [rad/s^2] that stay inside the set.
+
+        The roots a of v + a dt + (a + A)^2/(2 j) = bound + A^2/(2 j), for both limits.
+
+        Args:
+            velocity: Of the last step [rad/s].
+            bounds: `velocity_bounds` now.
+            dt: Step [s].
+        """
+        lower, upper = bounds
+        slack = torch.stack([velocity - lower, upper - velocity], dim=-2)
+        offset = self.acceleration + self.jerk * dt
+        square = torch.addcmul(offset * offset, self.jerk, slack, value=2)
+        down, up = (square.clamp(min=0).sqrt() - offset).unbind(-2)
+        return -down, up
+
+
+# Speed and separation monitoring: how fast the tool may move when a person is near.
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeparationConfig:
+    """The terms of the protective separation distance (ISO/TS 15066:2016, 5.5.4.2.3)."""
+
+    human_speed: float = 1.6
+    """v_h, at which the person may come closer [m/s]; 1.6 where it is not measured."""
+    reaction_time: float = 0.1
+    """T_r, from the person's motion to the arm's response [s]: sensing, transport, and some
+    20 ms for a control step and the ramp of the acceleration."""
+    deceleration: float = 2.0
+    """Of the tool while the arm stops [m/s^2]: T_s = v/a and S_s = v^2/(2 a)."""
+    clearance: float = 0.2
+    """C + Z_d + Z_r, intrusion and the uncertainty of both positions [m]: the distance that is
+    left when everything has come to rest."""
+
+    def __post_init__(self):
+        for name in ("human_speed", "reaction_time", "clearance"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} must not be negative, but is {getattr(self, name)}")
+        if not self.deceleration > 0:
+            raise ValueError(f"deceleration must be positive, but is {self.deceleration}")
+
+    def highest_speed(self, distance: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """Tool speed that keeps the protective separation distance [m/s].
+
+        The root v of  d = v_h (T_r + v/a) + v T_r + v^2/(2 a) + C + Z_d + Z_r,  zero where the
+        person is too close for any motion. A distance of NaN is not known and counts as zero.
+
+        Args:
+            distance: Between the person and the arm [m]; infinite: nobody is there.
+        """
+        a = self.deceleration
+        spare = distance - self.human_speed * self.reaction_time - self.clearance
+        spare = torch.where(spare > 0, spare, 0.0)  # NaN too
+        delay = self.reaction_time + self.human_speed / a
+        return a * (torch.sqrt(delay**2 + (2 / a) * spare) - delay)

@@ -1,0 +1,321 @@
+"""Safety filter: the last word on every joint velocity that is sent to the arm.
+
+It needs no model but the joint limits, and works for any source of commands: the adaptive
+controller, the playback of a learned motion, a person's joystick.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import final
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from hrc_learn.controller.motion_barriers import LimitBarrier, SeparationConfig
+from hrc_learn.kinematics import JointLimits
+from hrc_learn.pytree import pytree
+
+INTERVENTIONS = (
+    "velocity",
+    "position",
+    "acceleration",
+    "jerk",
+    "tcp_speed",
+    "separation",
+    "invalid",
+    "stopped",
+)
+"""Kinds of interventions, in the order of the last axis of their flags and counts."""
+
+# Share of a limit, or joint velocity [rad/s], beyond which an intervention is reported. Below
+# is rounding, in float32 too: a command led along a limit would be flagged by chance.
+_NOTICED = 1e-6
+
+
+@dataclass(frozen=True, kw_only=True)
+class SafetyConfig:
+    margin: float = 0.02
+    """Distance kept from every joint position limit [rad]."""
+    velocity_margin: float = 0.02
+    """Share of every joint velocity limit that is not used. The arm's own servo overshoots
+    what it is told by up to 1.2 % of the limit (in MuJoCo)."""
+    rate: float = 5.0
+    """Fastest decay of the remaining distance to a limit [1/s]; at most 1/dt."""
+    jerk_limited: bool = True
+    """Whether the jerk of each joint is limited, which starts to matter below 4 ms a step."""
+    tcp_speed: float = 1.0
+    """Cap on the speed of the tool centre point [m/s]; acts where a Jacobian is given."""
+    separation: SeparationConfig = field(default_factory=SeparationConfig)
+    """Lowers that cap where the distance to a person is given."""
+
+    def __post_init__(self):
+        for name in ("rate", "tcp_speed"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive, but is {getattr(self, name)}")
+        if self.margin < 0:
+            raise ValueError(f"margin must not be negative, but is {self.margin}")
+        if not 0 <= self.velocity_margin < 1:
+            raise ValueError(
+                f"velocity_margin must be in [0, 1), but is {self.velocity_margin}"
+            )
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
+class SafetyState:
+    """What the filter remembers from one step to the next."""
+
+    velocity: Float[Tensor, "*batch n"]
+    """Velocity of the last step [rad/s]."""
+    acceleration: Float[Tensor, "*batch n"]
+    """By which it came about [rad/s^2]; zero where jerk is not limited."""
+    position: Float[Tensor, "*batch n"]
+    """Where the joints should be now [rad]: used while their measurement is invalid."""
+    counts: Int[Tensor, "*batch kinds"]
+    """Steps in which each of `INTERVENTIONS` was needed."""
+
+    def count(self, kind: str) -> Int[Tensor, "*batch"]:
+        """Steps in which one kind of intervention was needed."""
+        return self.counts[..., _index(kind)]
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
+class SafetyReport:
+    """What the filter did in this step."""
+
+    flags: Bool[Tensor, "*batch kinds"]
+    """Whether each of `INTERVENTIONS` was needed, by more than rounding."""
+
+    def acted(self, kind: str) -> Bool[Tensor, "*batch"]:
+        """Whether one kind of intervention was needed."""
+        return self.flags[..., _index(kind)]
+
+
+def _index(kind: str) -> int:
+    if kind not in INTERVENTIONS:
+        raise ValueError(f"no intervention {kind!r}; there are {', '.join(INTERVENTIONS)}")
+    return INTERVENTIONS.index(kind)
+
+
+@final
+class SafetyFilter(nn.Module):
+    """Joint velocities that keep the limits of position, velocity, acceleration and jerk.
+
+    They hold for *any* sequence of commands, by a control barrier (`LimitBarrier`), as long as
+    the arm moves as it is told, or errs by less than the margins. Where it does not, the
+    limits of acceleration and jerk hold, and the others as soon as those let them. Within its
+    margin a joint is driven back.
+
+    Velocity, tool speed, acceleration and jerk are limited by scaling the whole vector, which
+    keeps its direction; only the barrier cuts single joints. The acceleration fades in time
+    for the velocity to arrive without overshoot, so stops and resumes are smooth.
+    """
+
+    def __init__(self, limits: JointLimits, config: SafetyConfig | None = None):
+        super().__init__()
+        self.config = config = config or SafetyConfig()
+        self.barrier = LimitBarrier(
+            replace(limits, velocity=(1 - config.velocity_margin) * limits.velocity),
+            margin=config.margin,
+            rate=config.rate,
+            jerk_limited=config.jerk_limited,
+        )
+
+    def initial_state(
+        self,
+        joint_position: Float[Tensor, "*batch n"],
+        joint_velocity: Float[Tensor, "*batch n"] | None = None,
+    ) -> SafetyState:
+        """State of an arm at rest, or moving steadily with `joint_velocity` [rad/s]."""
+        counts = joint_position.new_zeros(
+            *joint_position.shape[:-1], len(INTERVENTIONS), dtype=torch.int64
+        )
+        still = torch.zeros_like(joint_position)
+        return SafetyState(
+            velocity=still.clone() if joint_velocity is None else still + joint_velocity,
+            acceleration=still,
+            position=joint_position,
+            counts=counts,
+        )
+
+    def velocity_bounds(
+        self, joint_position: Float[Tensor, "*batch n"]
+    ) -> tuple[Tensor, Tensor]:
+        """Lowest and highest velocity [rad/s] that position and velocity limits allow."""
+        return self.barrier.velocity_bounds(joint_position)
+
+    def step(
+        self,
+        state: SafetyState,
+        joint_position: Float[Tensor, "*batch n"],
+        joint_velocity_command: Float[Tensor, "*batch n"],
+        dt: float | Float[Tensor, ""],
+        *,
+        jacobian: Float[Tensor, "*batch rows n"] | None = None,
+        human_distance: Float[Tensor, "*batch"] | None = None,
+        stop: Bool[Tensor, "*batch"] | None = None,
+        stale: Bool[Tensor, "*batch"] | None = None,
+        bounds: tuple[Tensor, Tensor] | None = None,
+    ) -> tuple[Tensor, SafetyState, SafetyReport]:
+        """Velocity to send for the next `dt` seconds.
+
+        Args:
+            state: Of the step before.
+            joint_position: Measured [rad]. Not finite: brake to rest.
+            joint_velocity_command: Wanted [rad/s]. Not finite: brake to rest.
+            dt: Time until the next step [s].
+            jacobian: Of the tool centre point, linear rows first: enables its speed cap.
+            human_distance: Of the nearest person [m], who slows the tool down and stops it;
+                NaN, not known: stop. None: nobody is watched for.
+            stop: Brake to rest for another reason.
+            stale: The joint position is too old to be used: brake to rest.
+            bounds: `velocity_bounds` of a trusted joint position, where they are known.
+
+        Returns:
+            The velocity (*batch, n) [rad/s], the next state, and what was done.
+
+        Raises:
+            ValueError: dt is not in (0, 1/rate], or a distance comes without a Jacobian.
+        """
+        self._check_step(dt)
+        q, u, invalid, stopped = self._trusted(
+            state, joint_position, joint_velocity_command, stop, stale
+        )
+        bounds = bounds or self.velocity_bounds(q)
+
+        excess = _excess(u, self.barrier.velocity)
+        u = u / excess.clamp(min=1)
+        inside = u.clamp(*bounds)
+        cut = torch.linalg.vector_norm(inside - u, math.inf, dim=-1, keepdim=True) > _NOTICED
+        target, speeding, near = self._cap_tcp_speed(inside, jacobian, human_distance)
+        follow = self._follow_smoothly if self.config.jerk_limited else self._follow
+        v, acceleration, steep, sharp = follow(state, target, bounds, dt)
+
+        steep, sharp = _acts(steep), _acts(sharp)
+        flags = [_acts(excess), cut, steep, sharp, speeding, near, invalid, stopped]
+        flags = torch.cat(flags, dim=-1)
+        return (
+            v,
+            SafetyState(
+                velocity=v,
+                acceleration=acceleration,
+                position=q + v * dt,
+                counts=state.counts + flags,
+            ),
+            SafetyReport(flags=flags),
+        )
+
+    def _check_step(self, dt: float | Tensor) -> None:
+        if not isinstance(dt, Tensor) and not 0 < dt <= 1 / self.config.rate:
+            raise ValueError(
+                f"the safety filter needs a step dt in (0, {1 / self.config.rate:g}] s to "
+                f"guarantee the limits, but got {dt:g} s; step faster or lower its rate"
+            )
+
+    def _trusted(
+        self,
+        state: SafetyState,
+        q: Tensor,
+        u: Tensor,
+        stop: Tensor | None,
+        stale: Tensor | None,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Position and command to work with, and the flags `invalid` and `stopped`."""
+        invalid = ~torch.cat([q, u], dim=-1).isfinite().all(-1, keepdim=True)
+        if stale is not None:
+            invalid = invalid | stale.unsqueeze(-1)
+        stopped = torch.zeros_like(invalid) if stop is None else stop.unsqueeze(-1)
+        q = torch.where(invalid, state.position, q)
+        u = u.masked_fill(invalid | stopped, 0)
+        return q, u, invalid, stopped
+
+    def _cap_tcp_speed(
+        self, u: Tensor, jacobian: Tensor | None, human_distance: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """The command slowed down, and the flags `tcp_speed` and `separation`."""
+        never = torch.zeros_like(u[..., :1], dtype=torch.bool)
+        if jacobian is None:
+            if human_distance is not None:
+                raise ValueError(
+                    "human_distance limits the speed of the tool, which needs its Jacobian: "
+                    "pass jacobian as well"
+                )
+            return u, never, never
+        linear = torch.linalg.vecdot(jacobian[..., :3, :], u.unsqueeze(-2))
+        speed = torch.linalg.vector_norm(linear, dim=-1, keepdim=True)
+        excess = speed / self.config.tcp_speed
+        speeding = _acts(excess)
+        if human_distance is None:
+            return u / excess.clamp(min=1), speeding, never
+        safe = self.config.separation.highest_speed(human_distance).unsqueeze(-1)
+        cap = safe.clamp(max=self.config.tcp_speed)
+        # At a cap of zero everything rests, also what does not move the tool.
+        factor = cap / torch.maximum(speed, cap).clamp(min=torch.finfo(u.dtype).tiny)
+        return factor * u, speeding, (speed > (1 + _NOTICED) * safe) | (safe == 0)
+
+    def _follow(
+        self,
+        state: SafetyState,
+        target: Tensor,
+        bounds: tuple[Tensor, Tensor],
+        dt: float | Tensor,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Velocity as near to the target as the acceleration limit lets it come.
+
+        Returns:
+            Velocity, acceleration, and by how much acceleration and jerk were too large.
+        """
+        reach = self.barrier.acceleration * dt
+        change = target - state.velocity
+        steep = _excess(change, reach)
+        v = torch.addcdiv(state.velocity, change, steep.clamp(min=1))
+        # Last the bounds that no scaling may loosen. Should both exclude each other, the arm
+        # could not brake harder anyway.
+        v = v.clamp(*bounds).clamp(state.velocity - reach, state.velocity + reach)
+        return v, state.acceleration, steep, torch.zeros_like(steep)
+
+    def _follow_smoothly(
+        self,
+        state: SafetyState,
+        target: Tensor,
+        bounds: tuple[Tensor, Tensor],
+        dt: float | Tensor,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """The same under a jerk limit.
+
+        The acceleration wanted is the largest share of change/dt, alike for all joints, with
+        which they keep their acceleration limits and can still fade it out in time:
+        a dt + a^2/(2 j) <= change.
+        """
+        barrier = self.barrier
+        most = barrier.jerk * dt
+        change = (target - state.velocity) / dt
+        steep = _excess(change, barrier.acceleration)
+        fading = 1 + torch.sqrt(1 + 2 * _excess(change, most))
+        wanted = change / torch.maximum(steep, fading / 2)
+        jerk = wanted - state.acceleration
+        excess = _excess(jerk, most)
+        acceleration = torch.addcdiv(state.acceleration, jerk, excess.clamp(min=1))
+        # As above, and here too what comes last is what the arm cannot exceed.
+        acceleration = acceleration.clamp(
+            *barrier.acceleration_bounds(state.velocity, bounds, dt)
+        )
+        acceleration = acceleration.clamp(
+            torch.maximum(state.acceleration - most, -barrier.acceleration),
+            torch.minimum(state.acceleration + most, barrier.acceleration),
+        )
+        return state.velocity + acceleration * dt, acceleration, steep, excess
+
+
+def _excess(vector: Tensor, limit: Tensor) -> Tensor:
+    """Largest ratio of a component to its limit; at most 1 where all keep them."""
+    return (vector / limit).abs().amax(-1, keepdim=True)
+
+
+def _acts(excess: Tensor) -> Bool[Tensor, "..."]:
+    """Whether what is divided by a ratio of at least 1 changes by more than rounding."""
+    return excess > 1 + _NOTICED

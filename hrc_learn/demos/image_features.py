@@ -1,0 +1,305 @@
+"""Image features found in a dataset's videos, kept in files beside it, and put into
+demonstrations.
+"""
+
+import json
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from jaxtyping import Bool, Float64, UInt8
+
+from hrc_learn.demos.demonstration import Demonstration, DemonstrationSet
+from hrc_learn.demos.format.dataset_folder import EpisodeEntry, open_folder
+from hrc_learn.demos.format.parquet import open_parquet, read_table, to_numpy
+from hrc_learn.demos.format.video_segments import VideoSegment, read_segments, video_keys
+from hrc_learn.demos.issue import DatasetError
+from hrc_learn.demos.write.video_encoder import image_key
+from hrc_learn.store import new_file
+
+# Images of one episode, decoded from its video.
+
+
+def decode(
+    segment: VideoSegment, fps: float
+) -> Iterator[tuple[int, UInt8[np.ndarray, "height width 3"]]]:
+    """Images (RGB) with the frames of the episode they belong to, in order.
+
+    Args:
+        segment: Where they lie.
+        fps: Frame rate of the dataset [1/s].
+
+    Raises:
+        DatasetError: The file is no video that can be decoded.
+    """
+    import av
+
+    half_period = 0.5 / fps
+    try:
+        with av.open(str(segment.file)) as container:
+            stream = container.streams.video[0]
+            stream.thread_type = "AUTO"
+            if segment.start > 0 and stream.time_base is not None:
+                # To the key frame before; what lies between is decoded and left out.
+                container.seek(int(segment.start / stream.time_base), stream=stream)
+            for image in container.decode(stream):
+                time = float(image.time or 0.0)
+                if time > segment.stop - half_period:
+                    return
+                if time > segment.start - half_period:
+                    yield round((time - segment.start) * fps), image.to_ndarray(format="rgb24")
+    except (av.FFmpegError, IndexError) as error:
+        raise DatasetError(
+            f"cannot be decoded ({error}): the recording was broken off, or the copy is "
+            f"incomplete",
+            file=segment.file,
+        ) from error
+
+
+# Image features of a dataset in a folder beside it: one file an episode.
+#
+#     NAME.features/CAMERA.FEATURE/episode_000000.parquet    u, v, visible: one row a frame
+#
+# The dataset itself is never touched. Each file is whole or not there, and says of which video
+# it was made, so that an extraction goes on where it was broken off and notices new recordings.
+
+_SOURCE = b"hrc_learn.video"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FeatureTrack:
+    """An image feature along one episode."""
+
+    pixels: Float64[np.ndarray, "_frames 2"]
+    """(u right, v down) [px], 0 where it was not seen."""
+    visible: Bool[np.ndarray, " _frames"]
+
+
+def features_folder(root: Path) -> Path:
+    """Where the features found in the videos of the dataset `root` are kept."""
+    return root.with_name(root.name + ".features")
+
+
+def feature_names(root: Path) -> list[str]:
+    """Features that were extracted, whole or in part."""
+    # Hidden ones hold what is not finished.
+    return sorted(path.name for path in features_folder(root).glob("[!.]*") if path.is_dir())
+
+
+class FeatureCache:
+    """The files of one feature of one dataset."""
+
+    def __init__(self, root: Path, name: str):
+        self.name = name
+        self._folder = features_folder(root) / name
+
+    def path(self, episode: int) -> Path:
+        return self._folder / f"episode_{episode:06d}.parquet"
+
+    def is_current(self, episode: int, segment: VideoSegment) -> bool:
+        """Whether the episode's file is there and was made of this very video."""
+        path = self.path(episode)
+        if not path.is_file():
+            return False
+        metadata = pq.read_schema(path).metadata or {}
+        return metadata.get(_SOURCE) == _fingerprint(segment)
+
+    def write(self, episode: int, segment: VideoSegment, track: FeatureTrack) -> None:
+        """Keep what was found in an episode; its file is whole or not there."""
+        path = self.path(episode)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        table = pa.table(
+            {
+                "u": pa.array(track.pixels[:, 0]),
+                "v": pa.array(track.pixels[:, 1]),
+                "visible": pa.array(track.visible),
+            }
+        )
+        with new_file(path) as part:
+            pq.write_table(
+                table.replace_schema_metadata({_SOURCE: _fingerprint(segment)}), part
+            )
+
+    def read(self, episode: int, frames: int) -> FeatureTrack:
+        """What was found in an episode.
+
+        Raises:
+            DatasetError: It was not extracted, or is of another recording.
+        """
+        file = str(self.path(episode))
+        if not self.path(episode).is_file():
+            raise DatasetError(
+                f"{self.name} was not extracted from this episode: run extract_features.py, "
+                f"which goes on where it was broken off",
+                file=file,
+                episode=episode,
+            )
+        table = read_table(open_parquet(Path(), file, episode), file)
+        u, v, visible = (to_numpy(table.column(name))[:, 0] for name in ("u", "v", "visible"))
+        if len(u) != frames:
+            raise DatasetError(
+                f"{self.name} has {len(u)} frames, the episode {frames}: run "
+                f"extract_features.py again",
+                file=file,
+                episode=episode,
+            )
+        return FeatureTrack(pixels=np.stack([u, v], axis=1), visible=visible.astype(bool))
+
+
+def _fingerprint(segment: VideoSegment) -> bytes:
+    state = segment.file.stat()
+    content = [segment.file.name, state.st_size, state.st_mtime_ns, segment.start, segment.stop]
+    return json.dumps(content).encode()
+
+
+# Looking for a feature in all videos of a camera.
+
+Detector = Callable[[UInt8[np.ndarray, "_height _width 3"]], Float64[np.ndarray, "2"] | None]
+"""Pixel (u right, v down) of the feature in an RGB image, or None where it is not seen."""
+
+Progress = Callable[[Sequence[EpisodeEntry]], Iterable[EpisodeEntry]]
+
+
+@dataclass(kw_only=True)
+class Extraction:
+    """What was done."""
+
+    name: str
+    """Name of the feature beside the dataset."""
+    episodes: int = 0
+    """Episodes looked at now."""
+    known: int = 0
+    """Episodes that had been looked at before."""
+    frames: int = 0
+    """Frames looked at now."""
+    seen: int = 0
+    """Those of them in which the feature was seen."""
+    without_image: int = 0
+    """Frames for which the video holds no image."""
+
+
+def extract_features(
+    path: str | Path,
+    name: str,
+    detector: Callable[[], Detector],
+    *,
+    camera: str | None = None,
+    progress: Progress | None = None,
+) -> Extraction:
+    """Find a feature in every image of a camera and keep it beside the dataset.
+
+    Episodes that were looked at before, in the same videos, are skipped: run it again after
+    it was broken off, or after more was recorded.
+
+    Args:
+        path: The dataset.
+        name: What is looked for, such as "marker_3".
+        detector: Makes the detector for one episode, so that one which follows the feature
+            from image to image starts anew.
+        camera: Name of the camera ("front") or of its feature; None: the only one.
+        progress: Called with the episodes to look at, and gives them back: a hook for a
+            progress bar.
+
+    Raises:
+        DatasetError: There is no such camera, or a video is missing or damaged.
+    """
+    folder = open_folder(path)
+    key = _camera_key(video_keys(folder), camera)
+    cache = FeatureCache(folder.root, f"{key.rpartition('.')[2]}.{name}")
+    segments = {
+        entry.index: _require(found.get(key), entry, key)
+        for entry, found in zip(folder.episodes, read_segments(folder).values(), strict=True)
+    }
+    waiting = [e for e in folder.episodes if not cache.is_current(e.index, segments[e.index])]
+    done = Extraction(name=cache.name, known=len(folder.episodes) - len(waiting))
+    for entry in progress(waiting) if progress else waiting:
+        segment = segments[entry.index]
+        track, images = _look(segment, entry.length, folder.fps, detector())
+        cache.write(entry.index, segment, track)
+        done.episodes += 1
+        done.frames += entry.length
+        done.seen += int(track.visible.sum())
+        done.without_image += entry.length - images
+    return done
+
+
+def _look(
+    segment: VideoSegment, frames: int, fps: float, detect: Detector
+) -> tuple[FeatureTrack, int]:
+    """The feature along one episode, and how many of its frames have an image."""
+    pixels, visible = np.zeros((frames, 2)), np.zeros(frames, dtype=bool)
+    seen = set()
+    for frame, image in decode(segment, fps):
+        if frame >= frames:
+            break
+        seen.add(frame)
+        pixel = detect(image)
+        if pixel is not None:
+            pixels[frame], visible[frame] = pixel, True
+    return FeatureTrack(pixels=pixels, visible=visible), len(seen)
+
+
+def _camera_key(keys: Sequence[str], camera: str | None) -> str:
+    wanted = [key for key in keys if camera is None or key in (camera, image_key(camera))]
+    if len(wanted) == 1:
+        return wanted[0]
+    what = "say which camera" if camera is None and keys else f"there is no camera {camera!r}"
+    raise DatasetError(f"{what}; the videos are of {', '.join(keys) or 'none'}")
+
+
+def _require(segment: VideoSegment | None, entry: EpisodeEntry, key: str) -> VideoSegment:
+    if segment is None:
+        raise DatasetError(
+            "its video is not here; copy it, or load the dataset without image features",
+            episode=entry.index,
+            key=key,
+        )
+    return segment
+
+
+# Features that were extracted from videos, put into demonstrations.
+
+
+def attach_features(demos: DemonstrationSet, name: str | None = None) -> DemonstrationSet:
+    """Demonstrations with a feature that `extract_features` found in their videos.
+
+    `load_demos` and `open_demos` do so by themselves where a dataset has no image feature of
+    its own and exactly one was extracted.
+
+    Args:
+        demos: Read from a dataset.
+        name: Name of the feature, such as "front.marker_3"; None: the only one.
+
+    Raises:
+        DatasetError: There is no such feature, or it was not extracted from all episodes.
+    """
+    root = Path(demos.source)
+    known = feature_names(root) if demos.source else []
+    chosen = [feature for feature in known if name in (None, feature)]
+    if len(chosen) != 1:
+        raise DatasetError(
+            f"{'say which feature' if name is None else f'there is no feature {name!r}'}; "
+            f"extracted are {', '.join(known) or 'none'}",
+            file=demos.source,
+        )
+    cache = FeatureCache(root, chosen[0])
+    return demos.map(lambda demo: with_feature(demo, cache))
+
+
+def only_feature(root: Path) -> FeatureCache | None:
+    """The feature that was extracted from a dataset; None where that is not exactly one."""
+    names = feature_names(root)
+    return FeatureCache(root, names[0]) if len(names) == 1 else None
+
+
+def with_feature(demo: Demonstration, cache: FeatureCache) -> Demonstration:
+    """The demonstration with the feature of its episode.
+
+    Raises:
+        DatasetError: It was not extracted from this episode.
+    """
+    track = cache.read(demo.episode, len(demo))
+    return replace(demo, feature=track.pixels, feature_visible=track.visible)

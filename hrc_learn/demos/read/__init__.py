@@ -1,0 +1,1 @@
+"""From a dataset's columns to demonstrations in SI units."""

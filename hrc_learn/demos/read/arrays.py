@@ -1,0 +1,300 @@
+"""Demonstrations made of plain arrays: in memory, or in .npz, .npy and .csv files."""
+
+import csv
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from hrc_learn.demos.demonstration import Demonstration
+from hrc_learn.demos.issue import DatasetError
+from hrc_learn.demos.read.component_names import meaning_of_component
+from hrc_learn.demos.read.value_encodings import to_quaternion, unit_factor
+
+# Arrays read from .npz, .npy and .csv files.
+
+Table = dict[str, Float64[np.ndarray, "_demos _frames _components"]]
+"""Array or column name -> its values, demonstration by demonstration."""
+
+UNNAMED = "array"
+"""Name of an array whose columns have none."""
+
+
+def read_table(path: Path, columns: Sequence[str] = ()) -> Table:
+    """Read the arrays of a file.
+
+    Arrays of one axis are columns, of two axes (frames, components), of three (demonstrations,
+    frames, components).
+
+    Args:
+        path: A .npz, .npy or .csv file.
+        columns: Names for the columns of a .npy file, or of a .csv file without a header.
+
+    Raises:
+        DatasetError: The file is missing, of another kind, or holds no such arrays.
+    """
+    if not path.is_file():
+        raise DatasetError("not found", file=path)
+    match path.suffix.lower():
+        case ".npz":
+            with _load(path) as file:
+                return {name: _three_axes(file[name], path, name) for name in _numeric(file)}
+        case ".npy":
+            return _split(_three_axes(_load(path), path, UNNAMED), columns, path)
+        case ".csv" | ".txt":
+            names, values = _read_csv(path)
+            return _split(values[None], columns or names, path)
+    raise DatasetError("is neither .npz, .npy nor .csv", file=path)
+
+
+def _load(path: Path):
+    try:
+        return np.load(path, allow_pickle=False)
+    except (ValueError, OSError, EOFError) as error:
+        raise DatasetError(f"cannot be read as numpy arrays: {error}", file=path) from error
+
+
+def _numeric(file) -> list[str]:
+    """Names of the arrays that can be tables of numbers."""
+    return [
+        name
+        for name in file.files
+        if file[name].dtype.kind in "fiu" and 1 <= file[name].ndim <= 3
+    ]
+
+
+def _three_axes(array: np.ndarray, path: Path, name: str) -> np.ndarray:
+    if array.dtype.kind not in "fiu" or not 1 <= array.ndim <= 3 or 0 in array.shape:
+        raise DatasetError(
+            f"an array of shape {array.shape} and type {array.dtype} holds no frames of "
+            f"numbers",
+            file=path,
+            key=name,
+        )
+    array = array.astype(np.float64)
+    if array.ndim == 1:
+        array = array[:, None]
+    return array if array.ndim == 3 else array[None]
+
+
+def _split(array: np.ndarray, columns: Sequence[str], path: Path) -> Table:
+    if not columns:
+        return {UNNAMED: array}
+    if len(columns) != array.shape[-1]:
+        raise DatasetError(
+            f"{len(columns)} column names for {array.shape[-1]} columns", file=path
+        )
+    return {name: array[..., i : i + 1] for i, name in enumerate(columns)}
+
+
+def _read_csv(path: Path) -> tuple[list[str], np.ndarray]:
+    """Header, [] where there is none, and numbers of a file with commas or semicolons."""
+    lines = path.read_text(encoding="utf-8").splitlines()
+    if not lines:
+        raise DatasetError("is empty", file=path)
+    delimiter = max(",;\t ", key=lines[0].count)
+    rows = [
+        [field.strip() for field in row if field.strip()]
+        for row in csv.reader(lines, delimiter=delimiter, skipinitialspace=True)
+        if row
+    ]
+    header = [] if _are_numbers(rows[0]) else rows[0]
+    numbers = rows[1:] if header else rows
+    for line, row in enumerate(numbers, start=2 if header else 1):
+        if len(row) != len(rows[0]) or not _are_numbers(row):
+            raise DatasetError(
+                f"line {line} does not hold {len(rows[0])} numbers separated by {delimiter!r}",
+                file=path,
+            )
+    if not numbers:
+        raise DatasetError("holds a header and no numbers", file=path)
+    return header, np.array(numbers, dtype=np.float64)
+
+
+def _are_numbers(fields: Sequence[str]) -> bool:
+    try:
+        [float(field) for field in fields]
+    except ValueError:
+        return False
+    return True
+
+
+# Demonstrations made of plain arrays.
+
+_TIME_NAMES = ("t", "time", "timestamp", "stamp")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArraySources:
+    """Which arrays hold what: a name, or several joined by commas. None: by their names."""
+
+    joints: str | None = None
+    """Joint positions."""
+    position: str | None = None
+    """Position of the end effector."""
+    orientation: str | None = None
+    """Its orientation: 4 columns are a quaternion, 3 a rotation vector."""
+    time: str | None = None
+    """Stamps."""
+
+
+def demonstrations_from_table(
+    table: Table,
+    sources: ArraySources,
+    *,
+    path: Path,
+    units: Mapping[str, str] | None = None,
+    quaternion_order: str = "wxyz",
+    joint_names: Sequence[str] = (),
+    duration: float | int | None = None,
+    fps: float | int | None = None,
+    task: str = "",
+) -> list[Demonstration]:
+    """Make demonstrations of arrays.
+
+    Args:
+        table: Arrays by name.
+        sources: Which of them hold what.
+        path: Where they come from, for errors.
+        units: Units by role ("joint_position", "position", "time"); SI where not given.
+        quaternion_order: "wxyz" or "xyzw".
+        joint_names: Names of the joints; joint1, joint2, ... where not given.
+        duration: Length of each demonstration [s] where there are no stamps.
+        fps: Frame rate [1/s] where there are no stamps; with them, it is only recorded.
+        task: What the demonstrations show.
+
+    Raises:
+        DatasetError: An array is missing, has a wrong shape, or holds values no
+            demonstration can have; says which, and at which frame.
+    """
+    found = _find(table, sources, path)
+    if not {"joints", "position"} & found.keys():
+        raise DatasetError(
+            f"say which arrays are joints or poses (joints, position, orientation); it holds "
+            f"{', '.join(table)}",
+            file=path,
+        )
+    demos = max(len(values) for values in found.values())
+    made = []
+    for index in range(demos):
+        episode = {
+            name: _scaled(name, values[index if len(values) > 1 else 0], units or {})
+            for name, values in found.items()
+        }
+        try:
+            made.append(
+                _demonstration(episode, quaternion_order, joint_names, duration, fps, task)
+            )
+        except ValueError as error:
+            raise DatasetError(str(error), file=path, episode=index) from error
+    return made
+
+
+def _find(table: Table, sources: ArraySources, path: Path) -> Table:
+    """The arrays that hold joints, position, orientation and time."""
+    chosen = {name: text.split(",") for name, text in vars(sources).items() if text}
+    by_name = {name: ns for name, ns in _by_name(table).items() if name not in chosen}
+    if chosen.keys() & {"joints", "position", "orientation"}:
+        by_name = {name: ns for name, ns in by_name.items() if name == "time"}
+    found = {}
+    for name, arrays in (by_name | chosen).items():
+        missing = [array for array in arrays if array not in table]
+        if missing:
+            raise DatasetError(
+                f"there is no array {missing[0]!r} for {name}; it holds {', '.join(table)}",
+                file=path,
+                key=name,
+            )
+        found[name] = np.concatenate([table[array] for array in arrays], axis=-1)
+    shapes = {name: values.shape[:2] for name, values in found.items()}
+    frames = {shape[1] for shape in shapes.values()}
+    counts = {shape[0] for shape in shapes.values()} - {1}
+    if len(frames) > 1 or len(counts) > 1:
+        raise DatasetError(
+            f"arrays differ in their numbers of demonstrations and frames: {shapes}", file=path
+        )
+    return found
+
+
+def _by_name(table: Table) -> dict[str, list[str]]:
+    """What columns are by their names alone; joints, where nothing else fits."""
+    found: dict[str, list[str]] = {}
+    for name, values in table.items():
+        meaning = meaning_of_component(name)
+        if name.lower() in _TIME_NAMES:
+            found["time"] = [name]
+        elif meaning is not None and meaning.role == "position":
+            found.setdefault("position", []).append(name)
+        elif meaning is not None and meaning.role in ("quaternion_wxyz", "rotation_vector"):
+            found.setdefault("orientation", []).append(name)
+        elif values.shape[-1] == 1 or name == UNNAMED:
+            found.setdefault("joints", []).append(name)
+    return found
+
+
+def _scaled(name: str, values: np.ndarray, units: Mapping[str, str]) -> np.ndarray:
+    role = {"joints": "joint_position"}.get(name, name)
+    return values * unit_factor(role, units[role]) if role in units else values
+
+
+def _demonstration(
+    episode: Mapping[str, np.ndarray],
+    quaternion_order: str,
+    joint_names: Sequence[str],
+    duration: float | int | None,
+    fps: float | int | None,
+    task: str,
+) -> Demonstration:
+    for name, values in episode.items():
+        bad = np.argwhere(~np.isfinite(values))
+        if len(bad):
+            raise ValueError(f"{name} is {values[*bad[0]]} at frame {bad[0][0]}")
+    frames = len(next(iter(episode.values())))
+    time = _stamps(episode.get("time"), frames, duration, fps)
+    joints = episode.get("joints")
+    width = 0 if joints is None else joints.shape[1]
+    names = tuple(joint_names) or tuple(f"joint{i + 1}" for i in range(width))
+    if joints is not None and len(names) != width:
+        raise ValueError(f"{len(names)} joint names for {width} columns of joints")
+    return Demonstration(
+        time=time - time[0],
+        start_time=float(time[0]),
+        joint_position=joints,
+        joint_names=names if joints is not None else (),
+        position=episode.get("position"),
+        orientation=_orientation(episode.get("orientation"), quaternion_order),
+        task=task,
+        fps=fps or _nominal_rate(time),
+    )
+
+
+def _orientation(values: np.ndarray | None, quaternion_order: str) -> np.ndarray | None:
+    if values is None:
+        return None
+    if values.shape[1] not in (3, 4):
+        raise ValueError(f"orientation takes 3 or 4 columns, not {values.shape[1]}")
+    role = "rotation_vector" if values.shape[1] == 3 else f"quaternion_{quaternion_order}"
+    return to_quaternion(role, np.ascontiguousarray(values))
+
+
+def _stamps(
+    given: np.ndarray | None, frames: int, duration: float | int | None, fps: float | int | None
+) -> np.ndarray:
+    if given is not None:
+        return given[:, 0]
+    if frames < 2:
+        raise ValueError("a demonstration needs at least two frames")
+    if duration is not None:
+        return np.linspace(0.0, duration, frames)
+    if fps is not None:
+        return np.arange(frames) / fps
+    raise ValueError(
+        "there are no stamps: say which array holds them (time), or give duration or fps"
+    )
+
+
+def _nominal_rate(time: np.ndarray) -> float:
+    """LeRobot counts frames at a whole rate; the stamps themselves are kept beside it."""
+    return float(max(1, round(1 / float(np.median(np.diff(time))))))

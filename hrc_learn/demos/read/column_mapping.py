@@ -1,0 +1,381 @@
+"""Which columns of a dataset hold which quantity: found by convention, or named by the
+caller.
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from hrc_learn.demos.demonstration import JOINT_FIELDS
+from hrc_learn.demos.format.features import INFO_PATH, Feature, Sidecar
+from hrc_learn.demos.issue import DatasetError
+from hrc_learn.demos.read.component_names import (
+    INDEX_KEYS,
+    ORIENTATION_ROLES,
+    ROLES,
+    Meaning,
+    meaning_of_component,
+    role_of_key,
+    says_joint_quantity,
+)
+
+# Columns that the caller names, instead of having them found by convention.
+
+MappingSpec = Mapping[str, str | Sequence[str] | None]
+"""Role -> columns: a feature ("observation.qpos"), a range of one ("observation.state[0:7]"),
+or component names (["j1.pos", "observation.state/j2.pos"]); None leaves the role out."""
+
+_RANGE = re.compile(r"(.+)\[(\d*):?(\d*)\]")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Selection:
+    """Columns that hold one quantity."""
+
+    role: str
+    columns: tuple[tuple[str, int], ...]
+    """Feature key and index of the component within it."""
+    labels: tuple[str, ...]
+    """Joint names for quantities that go by joints, names of components for others."""
+    numbered: bool = False
+    """Whether the dataset gave no names, so that the labels only count."""
+
+    def only(self, labels: Sequence[str]) -> "Selection":
+        """The columns of these labels, in this order."""
+        place = dict(zip(self.labels, self.columns, strict=True))
+        return Selection(
+            role=self.role,
+            columns=tuple(place[label] for label in labels),
+            labels=tuple(labels),
+            numbered=self.numbered,
+        )
+
+
+def parse_mapping(
+    mapping: MappingSpec, features: Mapping[str, Feature]
+) -> dict[str, Selection]:
+    """The columns a mapping asks for.
+
+    Raises:
+        DatasetError: A role or a column does not exist, or a role gets too many or too few.
+    """
+    selections = {}
+    for role, columns in mapping.items():
+        if role not in ROLES:
+            raise DatasetError(
+                f"mapping names the unknown quantity {role!r}; known are {', '.join(ROLES)}"
+            )
+        if columns is None:
+            continue
+        selections[role] = _selection(role, columns, features)
+    return selections
+
+
+def _selection(
+    role: str, columns: str | Sequence[str], features: Mapping[str, Feature]
+) -> Selection:
+    if isinstance(columns, str):
+        places = _feature_range(role, columns, features)
+    else:
+        places = [_component(role, name, features) for name in columns]
+    width = ROLES[role].width
+    if width is not None and len(places) != width:
+        raise DatasetError(f"mapping gives {role} {len(places)} columns, it takes {width}")
+    names = [features[key].names for key, _ in places]
+    labels = tuple(
+        f"joint_{n + 1}" if known is None else _label(known[index], role)
+        for n, (known, (_, index)) in enumerate(zip(names, places, strict=True))
+    )
+    return Selection(
+        role=role, columns=tuple(places), labels=labels, numbered=any(n is None for n in names)
+    )
+
+
+def _label(name: str, role: str) -> str:
+    stem = role in JOINT_FIELDS and says_joint_quantity(name)
+    return name.rpartition(".")[0] if stem else name
+
+
+def _feature_range(
+    role: str, text: str, features: Mapping[str, Feature]
+) -> list[tuple[str, int]]:
+    match = _RANGE.fullmatch(text)
+    key = match[1] if match else text
+    if key not in features:
+        raise DatasetError(
+            f"mapping takes {role} from a feature that does not exist; numeric features are "
+            f"{', '.join(features)}",
+            file=INFO_PATH,
+            key=key,
+        )
+    indices = range(features[key].width)
+    if match and ":" in text:
+        indices = indices[int(match[2] or 0) : int(match[3]) if match[3] else None]
+    elif match:
+        indices = indices[int(match[2]) : int(match[2]) + 1]
+    return [(key, index) for index in indices]
+
+
+def _component(role: str, name: str, features: Mapping[str, Feature]) -> tuple[str, int]:
+    key, slash, component = name.partition("/")
+    places = [
+        (feature.key, index)
+        for feature in features.values()
+        for index, known in enumerate(feature.names or ())
+        if (feature.key, known) == (key, component) or (not slash and known == name)
+    ]
+    if not places:
+        known = ", ".join(n for feature in features.values() for n in feature.names or ())
+        raise DatasetError(
+            f"mapping takes {role} from a component that does not exist; named components "
+            f"are {known or 'none'}",
+            file=INFO_PATH,
+            key=name,
+        )
+    if len(places) > 1:
+        options = ", ".join(f"{key}/{name}" for key, _ in places)
+        raise DatasetError(f"mapping for {role} is ambiguous: write one of {options}", key=name)
+    return places[0]
+
+
+# Which columns of a dataset hold which quantity.
+#
+# Columns are found by name, in this order: the caller's mapping, the sidecar that our writer
+# leaves, the conventions of `naming`. Nothing is taken for a quantity by position alone.
+
+_STATE_KEYS = ("observation.state", "observation.states", "state", "states")
+_ACTION_KEYS = ("action", "actions")
+_COMMANDS = {"joint_position": "command_position", "joint_velocity": "command_velocity"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Matching:
+    """What the columns of a dataset mean."""
+
+    selections: dict[str, Selection]
+    """By role."""
+    joint_names: tuple[str, ...]
+    extra: tuple[str, ...]
+    """Numeric features with components that no role took."""
+    notes: tuple[str, ...]
+    """What had to be guessed or left out."""
+    unmatched: dict[str, tuple[str, ...]]
+    """Quantities of other joints than `joint_names`: role -> their joints."""
+
+
+def match_columns(
+    features: Mapping[str, Feature], sidecar: Sidecar, mapping: MappingSpec | None = None
+) -> Matching:
+    """Find the quantities among the features.
+
+    Args:
+        features: As declared by the dataset.
+        sidecar: What our own writer declared; its columns spare all guessing.
+        mapping: Role -> columns, as in `load_demos`; a role given None is left out.
+
+    Raises:
+        DatasetError: The mapping names a role or column that does not exist.
+    """
+    usable = {
+        key: feature
+        for key, feature in features.items()
+        if feature.numeric and key not in INDEX_KEYS
+    }
+    notes: list[str] = []
+    if sidecar.columns:
+        declared = {
+            role: [f"{column['key']}/{name}" for name in column["names"]]
+            for role, column in sidecar.columns.items()
+        }
+        found = parse_mapping(declared, usable)
+    else:
+        found = _by_convention(usable, notes)
+    found = _override(found, mapping or {}, usable)
+    names, found, unmatched = _align_joints(found)
+    notes.extend(
+        f"{role} is of other joints ({', '.join(others)}) than the rest ({', '.join(names)}); "
+        f"left among the extra columns"
+        for role, others in unmatched.items()
+    )
+    taken = {column for selection in found.values() for column in selection.columns}
+    extra = [
+        key
+        for key, feature in usable.items()
+        if any((key, index) not in taken for index in range(feature.width))
+    ]
+    return Matching(
+        selections=found,
+        joint_names=names,
+        extra=tuple(extra),
+        notes=tuple(notes),
+        unmatched=unmatched,
+    )
+
+
+def _override(
+    found: dict[str, Selection], mapping: MappingSpec, features: Mapping[str, Feature]
+) -> dict[str, Selection]:
+    explicit = parse_mapping(mapping, features)
+    dropped = set(mapping)
+    if dropped & set(ORIENTATION_ROLES):
+        dropped |= set(ORIENTATION_ROLES)
+    return {role: s for role, s in found.items() if role not in dropped} | explicit
+
+
+def _by_convention(features: Mapping[str, Feature], notes: list[str]) -> dict[str, Selection]:
+    whole: dict[str, Selection] = {}
+    by_component: dict[str, Selection] = {}
+    for feature in features.values():
+        selections = _of_whole_feature(feature, notes)
+        known = whole if selections else by_component
+        for selection in selections or _of_components(feature, notes):
+            known.setdefault(selection.role, selection)
+    return by_component | whole
+
+
+def _of_whole_feature(feature: Feature, notes: list[str]) -> list[Selection]:
+    """Selections of a feature whose key says what it is, [] for all others."""
+    role = role_of_key(feature.key)
+    if role is None or (_is_command(feature) and role not in _COMMANDS):
+        return []
+    named = [meaning_of_component(name) for name in feature.names or ()]
+    if any(meaning and meaning.role in ORIENTATION_ROLES for meaning in named):
+        return _grouped(feature, named, notes)
+    indices = range(feature.width)
+    if role == "cartesian":
+        return _cartesian(feature, notes)
+    if role == "feature":
+        visible = [_select("feature_visible", feature, [2])] if feature.width == 3 else []
+        return [_select("feature", feature, indices[:2]), *visible]
+    if role == "quaternion_xyzw" and feature.width == 4:
+        notes.append(f"{feature.key}: assumed to be a quaternion in the order x, y, z, w")
+    width = ROLES[role].width
+    if width is not None and width != feature.width:
+        return []
+    if _is_command(feature):
+        role = _COMMANDS[role]
+    return [_select(role, feature, indices)]
+
+
+def _cartesian(feature: Feature, notes: list[str]) -> list[Selection]:
+    """A pose in one feature without telling names: told apart by its width."""
+    indices = range(feature.width)
+    position = _select("position", feature, indices[:3])
+    match feature.width:
+        case 3:
+            return [position]
+        case 6:
+            notes.append(f"{feature.key}: assumed to be x, y, z, roll, pitch, yaw")
+            return [position, _select("euler_xyz", feature, indices[3:])]
+        case 7:
+            notes.append(f"{feature.key}: assumed to be x, y, z, qx, qy, qz, qw")
+            return [position, _select("quaternion_xyzw", feature, indices[3:])]
+        case 9:
+            notes.append(f"{feature.key}: assumed to be x, y, z and two columns of a matrix")
+            return [position, _select("rotation_6d", feature, indices[3:])]
+        case 16:
+            return [_select("pose_matrix", feature, indices)]
+    return []
+
+
+def _of_components(feature: Feature, notes: list[str]) -> list[Selection]:
+    """Selections of a feature of mixed content, such as `observation.state`."""
+    mixed = feature.key in (*_STATE_KEYS, *_ACTION_KEYS)
+    names = feature.names
+    if names is None:
+        if not mixed:
+            return []
+        names = tuple(f"joint_{i + 1}" for i in range(feature.width))
+        notes.append(f"{feature.key} names no components: taken for {feature.width} joints")
+    meanings = [meaning_of_component(name) for name in names]
+    if not mixed:
+        # Elsewhere x, y, z may be of an object: only names that say more count.
+        meanings = [
+            meaning if says_joint_quantity(name) or name.lower().startswith("ee") else None
+            for name, meaning in zip(names, meanings, strict=True)
+        ]
+    elif not any(map(says_joint_quantity, names)):
+        meanings = [
+            meaning or Meaning("joint_position", name)
+            for name, meaning in zip(names, meanings, strict=True)
+        ]
+    return _grouped(feature, meanings, notes)
+
+
+def _grouped(
+    feature: Feature, meanings: Sequence[Meaning | None], notes: list[str]
+) -> list[Selection]:
+    groups: dict[str, dict[str | int, int]] = {}
+    for index, meaning in enumerate(meanings):
+        if meaning is not None:
+            groups.setdefault(meaning.role, {})[meaning.slot] = index
+    selections = []
+    for role, slots in groups.items():
+        if _is_command(feature):
+            if role not in _COMMANDS:
+                continue
+            role = _COMMANDS[role]
+        width = ROLES[role].width
+        if width is not None and len(slots) != width:
+            notes.append(
+                f"{feature.key}: {len(slots)} components look like {role}, which takes "
+                f"{width}; left among the extra columns"
+            )
+            continue
+        order = sorted(slots) if role in _POSES else list(slots)
+        labels = tuple(map(str, order))
+        columns = tuple((feature.key, slots[slot]) for slot in order)
+        selections.append(
+            Selection(role=role, columns=columns, labels=labels, numbered=feature.names is None)
+        )
+    return selections
+
+
+_POSES = ("position", *ORIENTATION_ROLES)
+
+
+def _select(role: str, feature: Feature, indices: Sequence[int]) -> Selection:
+    names = feature.names or tuple(f"joint_{i + 1}" for i in range(feature.width))
+    labels = tuple(
+        names[i].rpartition(".")[0] if says_joint_quantity(names[i]) else names[i]
+        for i in indices
+    )
+    columns = tuple((feature.key, index) for index in indices)
+    return Selection(role=role, columns=columns, labels=labels, numbered=feature.names is None)
+
+
+def _is_command(feature: Feature) -> bool:
+    return feature.key.startswith(("action.", "action/")) or feature.key in _ACTION_KEYS
+
+
+def _align_joints(
+    found: dict[str, Selection],
+) -> tuple[tuple[str, ...], dict[str, Selection], dict[str, tuple[str, ...]]]:
+    """Bring every quantity that goes by joints into the order of the first such one.
+
+    Returns:
+        The joints, the quantities in their order, and the joints of those that have others.
+    """
+    first = next((found[role] for role in JOINT_FIELDS if role in found), None)
+    if first is None:
+        return (), found, {}
+    aligned, unmatched = {}, {}
+    for role, selection in found.items():
+        if role not in JOINT_FIELDS or selection.labels == first.labels:
+            aligned[role] = selection
+        elif set(selection.labels) >= set(first.labels):
+            aligned[role] = selection.only(first.labels)
+        elif len(selection.labels) == len(first.labels) and (
+            selection.numbered or first.numbered
+        ):
+            aligned[role] = replace(selection, labels=first.labels)
+        else:
+            unmatched[role] = selection.labels
+    return _joint_names(first, aligned), aligned, unmatched
+
+
+def _joint_names(first: Selection, aligned: Mapping[str, Selection]) -> tuple[str, ...]:
+    if not first.numbered:
+        return first.labels
+    named = [s for role, s in aligned.items() if role in JOINT_FIELDS and not s.numbered]
+    return named[0].labels if named else first.labels

@@ -1,0 +1,287 @@
+"""Episodes of a dataset whose columns are known: which are chosen, and their quantities
+in the units on disk.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float64
+
+from hrc_learn.demos.format.dataset_folder import (
+    DatasetFolder,
+    EpisodeEntry,
+    count_faults,
+    open_folder,
+)
+from hrc_learn.demos.format.features import Sidecar, read_sidecar
+from hrc_learn.demos.image_features import FeatureCache, only_feature
+from hrc_learn.demos.issue import DatasetError
+from hrc_learn.demos.read.column_mapping import MappingSpec, Matching, Selection, match_columns
+from hrc_learn.demos.read.frames import RawFrames, read_frames
+from hrc_learn.demos.read.value_encodings import (
+    UnitDecision,
+    decide_units,
+    guessed_from_values,
+    unit_factor,
+)
+
+# Quantities picked out of raw columns, still in the units they have on disk.
+
+Quantities = dict[str, Float64[np.ndarray, "_frames _components"]]
+"""Role -> values during one episode."""
+
+
+def select_quantities(frames: RawFrames, selections: Mapping[str, Selection]) -> Quantities:
+    """Values of every role, as float64."""
+    return {role: _columns(frames, selection.columns) for role, selection in selections.items()}
+
+
+def frame_step(time: Float64[np.ndarray, "frames 1"] | None, fps: float) -> float:
+    """Usual step of true stamps as a multiple of the nominal period; 1 without stamps."""
+    if time is None or len(time) < 2:
+        return 1.0
+    return float(np.median(np.diff(time[:, 0]))) * fps
+
+
+def _columns(
+    frames: RawFrames, columns: Sequence[tuple[str, int]]
+) -> Float64[np.ndarray, "frames components"]:
+    keys = {key for key, _ in columns}
+    if len(keys) > 1:
+        return np.stack([frames[key][:, index] for key, index in columns], axis=1).astype(float)
+    values, indices = frames[keys.pop()], [index for _, index in columns]
+    if indices == list(range(indices[0], indices[-1] + 1)):  # a view: converted in one go
+        return values[:, indices[0] : indices[-1] + 1].astype(float)
+    return values[:, indices].astype(float)
+
+
+# Which episodes of which dataset are meant.
+
+EpisodeFilter = Callable[[EpisodeEntry], bool]
+"""Says of an episode, by its `index`, `length` and `tasks`, whether it is wanted."""
+
+
+@runtime_checkable
+class OpenDataset(Protocol):
+    """An open `LeRobotDataset`, as far as it is needed: its folder and its chosen episodes."""
+
+    root: Path
+    episodes: list[int] | None
+
+
+def locate(
+    dataset: str | Path | OpenDataset, episodes: Sequence[int] | None
+) -> tuple[Path, Sequence[int] | None]:
+    """Folder of a dataset, and the episodes wanted of it.
+
+    Args:
+        dataset: A folder, or an open `LeRobotDataset`.
+        episodes: Episodes wanted; None: all, or all that the open dataset was opened with.
+    """
+    if isinstance(dataset, str | Path):
+        return Path(dataset), episodes
+    return Path(dataset.root), dataset.episodes if episodes is None else episodes
+
+
+def choose_episodes(
+    folder: DatasetFolder,
+    episodes: Sequence[int] | None = None,
+    tasks: str | Sequence[str] | None = None,
+    where: EpisodeFilter | None = None,
+) -> tuple[EpisodeEntry, ...]:
+    """The episodes wanted, in the order wanted.
+
+    Args:
+        folder: The dataset.
+        episodes: Their indices; None: all, as they come.
+        tasks: Only those that show one of these tasks.
+        where: Only those of which this is true.
+
+    Raises:
+        DatasetError: One does not exist, or none is left.
+    """
+    chosen = _by_index(folder, episodes)
+    if tasks is not None:
+        wanted = {tasks} if isinstance(tasks, str) else set(tasks)
+        _refuse_unknown_tasks(folder, wanted)
+        chosen = [entry for entry in chosen if wanted & set(entry.tasks)]
+    if where is not None:
+        chosen = [entry for entry in chosen if where(entry)]
+    if not chosen:
+        raise DatasetError("no episode is left by the filters given", file=folder.root)
+    return tuple(chosen)
+
+
+def _by_index(folder: DatasetFolder, wanted: Sequence[int] | None) -> list[EpisodeEntry]:
+    by_index = {entry.index: entry for entry in folder.episodes}
+    if not by_index:
+        raise DatasetError("the dataset holds no episodes", file=folder.root)
+    if wanted is not None and not len(wanted):
+        raise DatasetError("no episode was asked for; None reads all", file=folder.root)
+    missing = [index for index in wanted or () if index not in by_index]
+    if missing:
+        raise DatasetError(
+            f"there is no such episode; the dataset has {min(by_index)} to {max(by_index)}",
+            file=folder.root,
+            episode=missing[0],
+        )
+    return list(by_index.values() if wanted is None else (by_index[i] for i in wanted))
+
+
+def _refuse_unknown_tasks(folder: DatasetFolder, wanted: set[str]) -> None:
+    known = {task for entry in folder.episodes for task in entry.tasks}
+    unknown = sorted(wanted - known)
+    if unknown:
+        raise DatasetError(
+            f"no episode shows the task {unknown[0]!r}; the list of episodes has "
+            f"{', '.join(map(repr, sorted(known))) or 'none'}",
+            file=folder.root,
+        )
+
+
+# Episodes of a dataset whose columns are known for what they mean.
+
+
+@dataclass(frozen=True, kw_only=True)
+class RawEpisode:
+    """One episode in the units on disk."""
+
+    entry: EpisodeEntry
+    frames: RawFrames
+    quantities: Quantities
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeReader:
+    """The chosen episodes of a dataset, and how to read them."""
+
+    folder: DatasetFolder
+    sidecar: Sidecar
+    matching: Matching
+    entries: tuple[EpisodeEntry, ...]
+    extracted: FeatureCache | None = None
+    """Image feature kept beside the dataset, where it has none itself."""
+
+    def read(
+        self, entries: Sequence[EpisodeEntry], roles: Iterable[str] | None = None
+    ) -> Iterator[RawEpisode]:
+        """Read episodes one after another, in the order they lie on disk.
+
+        Args:
+            entries: Episodes wanted, in any order, once each.
+            roles: Quantities wanted; None: all, and what else is recorded.
+
+        Raises:
+            DatasetError: They cannot be read, or hold values that are not finite.
+        """
+        selections, extra = self.matching.selections, self.matching.extra
+        if roles is not None:
+            selections, extra = {role: selections[role] for role in roles}, ()
+        keys = {key for s in selections.values() for key, _ in s.columns} | {*extra}
+        for entry, frames in read_frames(
+            self.folder, sorted(entries, key=_place), sorted(keys)
+        ):
+            if not entry.length:
+                raise DatasetError("has no frames", file=entry.file, episode=entry.index)
+            quantities = select_quantities(frames, selections)
+            _refuse_non_finite(entry, quantities, self.matching)
+            yield RawEpisode(entry=entry, frames=frames, quantities=quantities)
+
+    @property
+    def notes(self) -> list[str]:
+        """What had to be guessed, or comes from elsewhere."""
+        if self.extracted is None:
+            return [*self.matching.notes]
+        beside = f"feature: {self.extracted.name}, as it was extracted from the videos"
+        return [*self.matching.notes, beside]
+
+    def decide_units(
+        self, episodes: Iterable[RawEpisode], given: Mapping[str, str]
+    ) -> dict[str, UnitDecision]:
+        """The unit of every quantity, from the values of these episodes where not declared.
+
+        Raises:
+            DatasetError: A unit is unknown, or does not fit its quantity.
+        """
+        largest = dict.fromkeys(self.matching.selections, 0.0)
+        steps = []
+        for episode in episodes:
+            for role, values in episode.quantities.items():
+                largest[role] = max(largest[role], float(np.abs(values).max()))
+            if not steps:
+                steps.append(frame_step(episode.quantities.get("time"), self.folder.fps))
+        return decide_units(largest, self.sidecar.units, given, *steps)
+
+    def survey(self, given: Mapping[str, str]) -> dict[str, UnitDecision]:
+        """The same from a pass of its own over those columns whose unit must be guessed.
+
+        Raises:
+            DatasetError: As in `read` and `decide_units`.
+        """
+        for role, unit in given.items():  # before anything long is read
+            unit_factor(role, unit)
+        stated = {*self.sidecar.units, *given}
+        roles = {*guessed_from_values(self.matching.selections, stated)}
+        entries = self.entries if roles else self.entries[:1]
+        if "time" in self.matching.selections and "time" not in stated:
+            roles.add("time")
+        episodes = self.read(tuple(dict.fromkeys(entries)), roles) if roles else ()
+        return self.decide_units(episodes, given)
+
+
+def open_reader(
+    dataset: str | Path | OpenDataset,
+    episodes: Sequence[int] | None,
+    mapping: MappingSpec | None,
+    tasks: str | Sequence[str] | None,
+    where: EpisodeFilter | None,
+) -> EpisodeReader:
+    """Read the metadata and find the quantities; arguments as in `load_demos`.
+
+    Raises:
+        DatasetError: The metadata are missing or damaged, or no such episode exists.
+    """
+    root, episodes = locate(dataset, episodes)
+    folder = open_folder(root)
+    for fault in count_faults(folder):
+        raise fault
+    sidecar = read_sidecar(folder.root)
+    matching = match_columns(folder.features, sidecar, mapping)
+    has_own = "feature" in matching.selections or "feature" in (mapping or {})
+    return EpisodeReader(
+        folder=folder,
+        sidecar=sidecar,
+        matching=matching,
+        extracted=None if has_own else only_feature(folder.root),
+        entries=choose_episodes(folder, episodes, tasks, where),
+    )
+
+
+def _place(entry: EpisodeEntry) -> tuple[str, int]:
+    return entry.file, entry.start
+
+
+def _refuse_non_finite(entry: EpisodeEntry, quantities: Quantities, matching: Matching) -> None:
+    seen = quantities.get("feature_visible")
+    for role, values in quantities.items():
+        # The sum is finite unless a value is not: far cheaper than a mask.
+        if np.isfinite(values.sum()):
+            continue
+        bad = ~np.isfinite(values)
+        if role == "feature" and seen is not None:
+            values[bad & (seen == 0)] = 0.0
+            bad &= seen != 0
+        if bad.any():
+            frame, component = (int(i) for i in np.argwhere(bad)[0])
+            selection = matching.selections[role]
+            raise DatasetError(
+                f"{role} is {values[frame, component]} there; leave the episode out "
+                f"(episodes=[...]) or repair the recording",
+                file=entry.file,
+                episode=entry.index,
+                frame=frame,
+                key=f"{selection.columns[component][0]} ({selection.labels[component]})",
+            )

@@ -1,0 +1,206 @@
+"""Frames of episodes as raw arrays, just as they are on disk, and when each was taken."""
+
+from collections.abc import Iterator, Sequence
+from itertools import groupby
+
+import numpy as np
+import pyarrow.parquet as pq
+from jaxtyping import Float64, Shaped
+
+from hrc_learn.demos.format.dataset_folder import DatasetFolder, EpisodeEntry
+from hrc_learn.demos.format.parquet import (
+    BadRowError,
+    open_parquet,
+    read_table,
+    row_group_starts,
+    to_numpy,
+)
+from hrc_learn.demos.issue import DatasetError
+
+# Frames of episodes as raw arrays, just as they are on disk.
+
+RawFrames = dict[str, Shaped[np.ndarray, "_frames _components"]]
+"""Column -> its values during one episode, in the type and unit they have on disk."""
+
+_BATCH_ROWS = 2**16
+"""Frames read at a time: enough for the speed of the disk, few enough for any memory."""
+
+
+def read_frames(
+    folder: DatasetFolder, entries: Sequence[EpisodeEntry], keys: Sequence[str]
+) -> Iterator[tuple[EpisodeEntry, RawFrames]]:
+    """Read columns of episodes, in the order of `entries`.
+
+    No more than some 65,000 frames are held at a time, or one row group where that is larger;
+    no row group is read twice.
+
+    Args:
+        folder: The dataset.
+        entries: Episodes wanted, in the order they lie on disk.
+        keys: Columns wanted; LeRobot's own index columns come along where they exist.
+
+    Raises:
+        DatasetError: A file or column is missing or damaged, a column is not as wide as
+            declared, or the rows are not those the metadata promise.
+    """
+    for file, group in groupby(entries, key=lambda entry: entry.file):
+        yield from _read_file(folder, file, list(group), keys)
+
+
+def slice_frames(columns: RawFrames, start: int, length: int) -> RawFrames:
+    """The columns of one episode as views into those of its file."""
+    return {key: values[start : start + length] for key, values in columns.items()}
+
+
+def _read_file(
+    folder: DatasetFolder, file: str, entries: list[EpisodeEntry], keys: Sequence[str]
+) -> Iterator[tuple[EpisodeEntry, RawFrames]]:
+    parquet = open_parquet(folder.root, file, entries[0].index)
+    require_rows(file, entries, parquet.metadata.num_rows, folder.promised_rows[file])
+    existing = parquet.schema_arrow.names
+    for key in keys:
+        if key not in existing:
+            raise DatasetError(
+                "the column is declared in meta/info.json, but missing", file=file, key=key
+            )
+    indices = [k for k in ("timestamp", "episode_index", "task_index") if k in existing]
+    wanted = [*dict.fromkeys([*keys, *indices])]
+    for batch in _batches(entries, row_group_starts(parquet.metadata)):
+        yield from _read_batch(folder, file, parquet, batch, wanted)
+
+
+def _batches(
+    entries: Sequence[EpisodeEntry], group_starts: Sequence[int]
+) -> Iterator[list[EpisodeEntry]]:
+    """Split episodes, in the order of their rows, where no row group spans the cut."""
+    batch: list[EpisodeEntry] = []
+    rows, last_group = 0, -1
+    for entry in entries:
+        ends = [entry.start, entry.start + max(entry.length, 1) - 1]
+        first, last = np.searchsorted(group_starts, ends, side="right") - 1
+        skips = first > last_group + 1
+        if batch and (skips or (rows >= _BATCH_ROWS and first > last_group)):
+            yield batch
+            batch, rows = [], 0
+        batch.append(entry)
+        rows += entry.length
+        last_group = last
+    if batch:
+        yield batch
+
+
+def _read_batch(
+    folder: DatasetFolder,
+    file: str,
+    parquet: pq.ParquetFile,
+    entries: list[EpisodeEntry],
+    keys: Sequence[str],
+) -> Iterator[tuple[EpisodeEntry, RawFrames]]:
+    rows = slice(
+        min(entry.start for entry in entries),
+        max(entry.start + entry.length for entry in entries),
+    )
+    table = read_table(parquet, file, keys, rows)
+    columns = {}
+    for key in table.column_names:
+        try:
+            columns[key] = to_numpy(table.column(key))
+        except BadRowError as error:
+            entry = _entry_at(entries, error.row + rows.start)
+            frame = error.row + rows.start - entry.start
+            raise DatasetError(
+                str(error), file=file, episode=entry.index, frame=frame, key=key
+            ) from error
+        _require_width(folder, file, key, columns[key])
+    for entry in entries:
+        frames = slice_frames(columns, entry.start - rows.start, entry.length)
+        _require_episode(file, entry, frames)
+        yield entry, frames
+
+
+def require_rows(file: str, entries: Sequence[EpisodeEntry], rows: int, promised: int) -> None:
+    """Refuse a file that holds more or fewer frames than the list of episodes promises.
+
+    Raises:
+        DatasetError: It does.
+    """
+    if rows != promised:
+        raise DatasetError(
+            f"holds {rows} frames, but the list of episodes promises {promised}: frames were "
+            f"lost or repeated, or the metadata belong to another copy",
+            file=file,
+            episode=entries[0].index if len(entries) == 1 else None,
+        )
+
+
+def _require_width(folder: DatasetFolder, file: str, key: str, values: np.ndarray) -> None:
+    feature = folder.features.get(key)
+    if feature is not None and len(values) and values.shape[1] != feature.width:
+        raise DatasetError(
+            f"has {values.shape[1]} components, but meta/info.json declares the shape "
+            f"{list(feature.shape)}",
+            file=file,
+            key=key,
+        )
+
+
+def _require_episode(file: str, entry: EpisodeEntry, frames: RawFrames) -> None:
+    if "episode_index" not in frames:
+        return
+    wrong = np.flatnonzero(frames["episode_index"] != entry.index)
+    if len(wrong):
+        raise DatasetError(
+            f"the frame belongs to episode {int(frames['episode_index'][wrong[0], 0])} by its "
+            f"episode_index: the offsets in the list of episodes are wrong",
+            file=file,
+            episode=entry.index,
+            frame=int(wrong[0]),
+            key="episode_index",
+        )
+
+
+def _entry_at(entries: Sequence[EpisodeEntry], row: int) -> EpisodeEntry:
+    return next(entry for entry in entries if entry.start <= row < entry.start + entry.length)
+
+
+# When each frame was taken.
+
+
+def stamps(
+    folder: DatasetFolder,
+    entry: EpisodeEntry,
+    frames: RawFrames,
+    true_stamps: Float64[np.ndarray, "frames 1"] | None,
+) -> Float64[np.ndarray, " frames"]:
+    """Stamps of one episode [s].
+
+    A column of true stamps is preferred. LeRobot's own `timestamp` is frame / fps by
+    definition, and where it is so to the resolution of float32, that is computed anew.
+
+    Raises:
+        DatasetError: The stamps do not increase.
+    """
+    nominal = np.arange(entry.length) / folder.fps
+    if true_stamps is not None:
+        time, key = true_stamps[:, 0], "time"
+    elif "timestamp" in frames:
+        time, key = frames["timestamp"][:, 0].astype(float), "timestamp"
+    else:
+        return nominal
+    stalled = np.flatnonzero(~(np.diff(time) > 0))
+    if len(stalled):
+        k = int(stalled[0])
+        raise DatasetError(
+            f"stamps must increase, but go from {time[k]:.6f} s to {time[k + 1]:.6f} s; "
+            f"drop the repeated frames, or have frames taken 1/fps apart "
+            f"(mapping={{'time': None}} where the column is one of true stamps)",
+            file=entry.file,
+            episode=entry.index,
+            frame=k + 1,
+            key=key,
+        )
+    resolution = 2 * np.finfo(np.float32).eps * max(1.0, float(np.abs(time).max()))
+    regular = time[0] + nominal
+    if key == "timestamp" and (np.abs(time - regular) <= resolution).all():
+        return regular
+    return time

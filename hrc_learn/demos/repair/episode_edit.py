@@ -1,0 +1,398 @@
+"""Edits of one episode: frames dropped, angles unwrapped, signs made continuous, frames
+put on a regular grid.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64, Int64
+
+from hrc_learn.demos.demonstration import Demonstration
+from hrc_learn.demos.format.dataset_folder import EpisodeEntry
+from hrc_learn.demos.issue import DatasetError
+from hrc_learn.demos.preprocessing import resample, trim_rest
+from hrc_learn.demos.preprocessing.resampling import nearest_frames
+from hrc_learn.demos.read.column_mapping import Matching
+from hrc_learn.demos.read.episodes import Quantities, select_quantities
+from hrc_learn.demos.read.frames import RawFrames
+from hrc_learn.demos.read.value_encodings import UnitDecision, to_quaternion
+from hrc_learn.demos.validation.data_checks import repeated_frames
+from hrc_learn.geometry import quaternion
+
+# One episode on its way from the old dataset to the new.
+
+
+@dataclass(frozen=True, kw_only=True)
+class Meaning:
+    """What the columns of the dataset mean, and in which units."""
+
+    matching: Matching
+    units: dict[str, UnitDecision]
+
+    def whole_turn(self, role: str) -> float:
+        """A turn in the unit that the quantity has on disk."""
+        return 2 * np.pi / self.units[role].factor
+
+
+@dataclass(frozen=True, kw_only=True)
+class Draft:
+    """One episode as far as it has been repaired."""
+
+    entry: EpisodeEntry
+    """Its place in the old dataset."""
+    frames: RawFrames
+    """Columns that will be written, LeRobot's own but for `task_index` left out."""
+    time: Float64[np.ndarray, " _frames"]
+    """True stamps [s] where there are any, LeRobot's otherwise."""
+    kept: Int64[np.ndarray, " _frames"] | None
+    """Frames of the old episode that are left; None once it was resampled."""
+    changes: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def quantities(self, meaning: Meaning) -> Quantities:
+        """Quantities in the units on disk."""
+        return select_quantities(self.frames, meaning.matching.selections)
+
+    def only(self, wanted: Bool[np.ndarray, " _frames"], change: str) -> "Draft":
+        """The wanted frames alone.
+
+        Raises:
+            DatasetError: Less than two would be left.
+        """
+        if wanted.all():
+            return self
+        if wanted.sum() < 2:
+            raise self.bad(f"{change}: no two frames are left")
+        return replace(
+            self,
+            frames={key: values[wanted] for key, values in self.frames.items()},
+            time=self.time[wanted],
+            kept=None if self.kept is None else self.kept[wanted],
+            changes=(*self.changes, change),
+        )
+
+    def with_columns(self, columns: RawFrames, change: str) -> "Draft":
+        """Some columns replaced."""
+        return replace(self, frames=self.frames | columns, changes=(*self.changes, change))
+
+    def bad(
+        self, message: str, frame: int | None = None, key: str | None = None
+    ) -> DatasetError:
+        """An error that names the episode."""
+        original = None if frame is None or self.kept is None else int(self.kept[frame])
+        return DatasetError(
+            message,
+            file=self.entry.file,
+            episode=self.entry.index,
+            frame=original,
+            key=key,
+        )
+
+
+# Turns taken out of angles, and signs out of quaternions.
+
+_ANGLES = ("joint_position", "command_position", "euler_xyz", "euler_intrinsic_xyz")
+_TOLERANCE = 0.3 / (2 * np.pi)
+"""How far a jump may be from whole turns and still be one, in turns: what moves in a frame."""
+
+
+def unwrap(draft: Draft, meaning: Meaning) -> Draft:
+    """Joints, Euler angles and rotation vectors without jumps by whole turns."""
+    for role, values in draft.quantities(meaning).items():
+        turn = meaning.whole_turn(role) if role in (*_ANGLES, "rotation_vector") else None
+        if turn is None:
+            continue
+        if role == "rotation_vector":
+            scaled = torch.from_numpy(values * 2 * np.pi / turn)
+            smooth = quaternion.unwrap_log(scaled).numpy() * turn / (2 * np.pi)
+        else:
+            smooth = values - turn * _turns(values / turn)
+        # Beyond rounding: a rotation vector is changed in its last digit by scaling.
+        changed = np.abs(smooth - values).max(0) > 1e-6 * turn
+        if changed.any():
+            labels = meaning.matching.selections[role].labels
+            names = ", ".join(labels[int(i)] for i in np.flatnonzero(changed))
+            draft = _with_quantity(draft, meaning, role, smooth, f"unwrapped {role} ({names})")
+    return draft
+
+
+def fix_signs(draft: Draft, meaning: Meaning) -> Draft:
+    """Quaternions whose sign does not jump."""
+    for role, values in draft.quantities(meaning).items():
+        if not role.startswith("quaternion"):
+            continue
+        flips = (values[1:] * values[:-1]).sum(1) < 0
+        if flips.any():
+            sign = np.concatenate([[1.0], np.cumprod(np.where(flips, -1.0, 1.0))])
+            change = f"fixed {flips.sum()} jumps of the sign of {role}"
+            draft = _with_quantity(draft, meaning, role, values * sign[:, None], change)
+    return draft
+
+
+def _turns(
+    values: Float64[np.ndarray, "frames columns"],
+) -> Float64[np.ndarray, "frames columns"]:
+    """Whole turns by which each value has jumped since the first frame."""
+    steps = np.diff(values, axis=0)
+    whole = np.rint(steps)
+    jumps = np.where(np.abs(steps - whole) < _TOLERANCE, whole, 0.0)
+    return np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(jumps, axis=0)])
+
+
+def _with_quantity(
+    draft: Draft,
+    meaning: Meaning,
+    role: str,
+    values: Float64[np.ndarray, "frames columns"],
+    change: str,
+) -> Draft:
+    columns: RawFrames = {}
+    for number, (key, index) in enumerate(meaning.matching.selections[role].columns):
+        column = columns.setdefault(key, draft.frames[key].copy())
+        column[:, index] = values[:, number]
+    return draft.with_columns(columns, change)
+
+
+# An episode at the frames of a regular grid.
+
+_SMOOTH = ("joint_position", "joint_velocity", "position")
+
+
+def regrid(draft: Draft, meaning: Meaning, fps: float | int) -> Draft:
+    """Resample every column, as `preparation.resample` does.
+
+    Rotation vectors and Euler angles are interpolated as they are: unwrap them first.
+
+    Raises:
+        DatasetError: The stamps do not increase, or the episode is shorter than a period, or
+            holds transforms, which cannot be interpolated by their entries.
+    """
+    quantities = draft.quantities(meaning)
+    if "pose_matrix" in quantities:
+        raise draft.bad(
+            "holds poses as matrices, which are not resampled; map them away "
+            "(mapping={'pose_matrix': None}) or leave the frames as they are (no fps)",
+            key="pose_matrix",
+        )
+    fields: dict[str, Any] = {role: quantities[role] for role in _SMOOTH if role in quantities}
+    role = next((role for role in quantities if role.startswith("quaternion")), "")
+    try:
+        if role:
+            fields["orientation"] = to_quaternion(role, quantities[role])
+        demo = Demonstration(
+            time=draft.time - draft.time[0],
+            joint_names=meaning.matching.joint_names,
+            fps=fps,
+            extra={key: values.astype(float) for key, values in draft.frames.items()},
+            **fields,
+        )
+        moved = resample(demo, fps)
+    except ValueError as error:
+        raise draft.bad(str(error)) from error
+    columns: RawFrames = dict(moved.extra)
+    for name in fields:
+        values = getattr(moved, name)
+        if name == "orientation" and role == "quaternion_xyzw":
+            values = np.roll(values, -1, axis=1)
+        taken = meaning.matching.selections[role if name == "orientation" else name].columns
+        for number, (key, index) in enumerate(taken):
+            columns[key][:, index] = values[:, number]
+    nearest = nearest_frames(demo.time, np.minimum(moved.time, demo.time[-1]))
+    for key, values in draft.frames.items():
+        if values.dtype.kind not in "f":
+            columns[key] = values[nearest]
+    return replace(
+        draft,
+        frames=columns,
+        time=moved.time + draft.time[0],
+        kept=None,
+        changes=(
+            *draft.changes,
+            f"resampled {len(draft)} frames to {len(moved)} at {fps:g} Hz",
+        ),
+    )
+
+
+# Frames that a dataset is better without.
+
+_PAUSE = 0.1
+"""Longest time between two reports of a robot that moves [s]."""
+
+
+def drop_bad_frames(draft: Draft, meaning: Meaning, allowed: bool) -> Draft:
+    """Without the frames that hold values that are not finite.
+
+    Raises:
+        DatasetError: There are some, and dropping them is not allowed; or too few are left.
+    """
+    bad = ~_finite(draft, meaning)
+    if bad.any() and not allowed:
+        raise draft.bad(
+            f"holds values that are not finite in {bad.sum()} frames; drop those "
+            f"(drop_bad_frames), or the episode (drop_bad_episodes)",
+            frame=int(bad.argmax()),
+        )
+    return draft.only(~bad, f"dropped {bad.sum()} frames with values that are not finite")
+
+
+def drop_late(draft: Draft) -> Draft:
+    """Without the frames whose stamp is not later than all before.
+
+    Raises:
+        DatasetError: No two frames are left.
+    """
+    highest = np.maximum.accumulate(draft.time)
+    later = np.concatenate([[True], draft.time[1:] > highest[:-1]])
+    return draft.only(later, f"dropped {(~later).sum()} frames whose stamp does not increase")
+
+
+def drop_repeats(draft: Draft) -> Draft:
+    """Without the frames that repeat the one before, because the robot reports more slowly.
+
+    A frame repeated for longer than `_PAUSE` shows an arm that stands still; it stays.
+
+    Raises:
+        DatasetError: No two frames are left.
+    """
+    repeated = repeated_frames(draft.frames)
+    begin = np.maximum.accumulate(np.where(repeated, 0, np.arange(len(draft))))
+    end = np.append(np.flatnonzero(~repeated)[1:], len(draft))[np.cumsum(~repeated) - 1] - 1
+    repeated &= draft.time[end] - draft.time[begin] <= _PAUSE
+    return draft.only(~repeated, f"dropped {repeated.sum()} repeated frames")
+
+
+def trim(draft: Draft, meaning: Meaning, keep: float | int) -> Draft:
+    """Without standing still before and after the motion.
+
+    Raises:
+        DatasetError: The arm stands still all the time, or stamps do not increase.
+    """
+    quantities, units = draft.quantities(meaning), meaning.units
+    role = next((r for r in ("joint_position", "position") if r in quantities), None)
+    if role is None:
+        return draft
+    moving: dict[str, Any] = {role: quantities[role] * units[role].factor}
+    names = meaning.matching.joint_names if role == "joint_position" else ()
+    try:
+        demo = Demonstration(
+            time=draft.time - draft.time[0],
+            joint_names=names,
+            fps=1.0,
+            episode=draft.entry.index,
+            extra={"frame": np.arange(len(draft), dtype=float)[:, None]},
+            **moving,
+        )
+        left = trim_rest(demo, keep=keep).extra["frame"][:, 0].astype(int)
+    except ValueError as error:
+        raise draft.bad(str(error)) from error
+    wanted = np.zeros(len(draft), dtype=bool)
+    wanted[left] = True
+    lead = demo.time[left[0]]
+    tail = demo.time[-1] - demo.time[left[-1]]
+    return draft.only(wanted, f"trimmed {lead:.2f} s at the beginning, {tail:.2f} s at the end")
+
+
+def _finite(draft: Draft, meaning: Meaning) -> Bool[np.ndarray, " _frames"]:
+    """Frames whose values all are; a feature that was not seen need not be."""
+    finite = np.isfinite(draft.time)
+    unseen = _unseen_columns(draft, meaning)
+    for key, values in draft.frames.items():
+        sound = np.isfinite(values.astype(float))
+        for index, lost in unseen.get(key, ()):
+            sound[lost, index] = True
+        finite &= sound.all(1)
+    return finite
+
+
+def _unseen_columns(
+    draft: Draft, meaning: Meaning
+) -> dict[str, list[tuple[int, Bool[np.ndarray, " frames"]]]]:
+    selections = meaning.matching.selections
+    if not {"feature", "feature_visible"} <= selections.keys():
+        return {}
+    ((key, index),) = selections["feature_visible"].columns
+    lost = ~(draft.frames[key][:, index] > 0)
+    columns: dict[str, list] = {}
+    for key, index in selections["feature"].columns:
+        columns.setdefault(key, []).append((index, lost))
+    return columns
+
+
+# What a repair may change.
+
+
+@dataclass(frozen=True, kw_only=True)
+class RepairOptions:
+    """What a repair may change. All of it happens in a copy."""
+
+    trim: bool = True
+    """Cut off standing still before and after the motion."""
+    keep_rest: float | int = 0.1
+    """Standing still that is left at either end [s]."""
+    drop_repeats: bool = True
+    """Drop frames that repeat the one before for up to 0.1 s, and those stamped no later."""
+    unwrap: bool = True
+    """Take whole turns out of joints and angles that jump by one."""
+    fix_signs: bool = True
+    """Choose the signs of quaternions so that they do not jump."""
+    drop_bad_frames: bool = False
+    """Drop frames with values that are not finite."""
+    drop_bad_episodes: bool = False
+    """Leave out episodes that cannot be read or repaired."""
+    fps: float | int | None = None
+    """Resample to a regular grid of this rate [1/s]; None leaves the frames as they are."""
+    videos: bool = True
+    """Keep the videos. Frames dropped in the middle and resampling would need new ones."""
+
+    def __post_init__(self) -> None:
+        if self.fps is not None and not self.fps > 0:
+            raise ValueError(f"fps must be positive, got {self.fps}")
+        if self.keep_rest < 0:
+            raise ValueError(f"keep_rest must not be negative, got {self.keep_rest}")
+
+
+# What a repair changed.
+
+
+@dataclass(kw_only=True)
+class RepairReport:
+    """What became of each episode."""
+
+    path: Path
+    """The new dataset."""
+    changes: dict[int, tuple[str, ...]] = field(default_factory=dict)
+    """Index of an episode that was kept, in the old dataset -> what was changed."""
+    left_out: dict[int, str] = field(default_factory=dict)
+    """Index of an episode that was left out -> why."""
+    notes: list[str] = field(default_factory=list)
+    """What was changed in all."""
+    frames_before: int = 0
+    frames: int = 0
+    """Frames of the new dataset."""
+
+    @property
+    def changed(self) -> int:
+        """Episodes of which something was changed."""
+        return sum(map(bool, self.changes.values()))
+
+    def lines(self) -> Iterator[str]:
+        yield from self.notes
+        for new, (old, changes) in enumerate(self.changes.items()):
+            name = f"episode {old}" if new == old else f"episode {old} (now {new})"
+            yield f"{name}: {'; '.join(changes) or 'as it was'}"
+        for old, reason in self.left_out.items():
+            yield f"episode {old}: left out: {reason}"
+        yield (
+            f"{self.path}: {len(self.changes)} episodes, {self.frames} of "
+            f"{self.frames_before} frames, {self.changed} episodes changed, "
+            f"{len(self.left_out)} left out"
+        )
+
+    def __str__(self) -> str:
+        return "\n".join(self.lines())

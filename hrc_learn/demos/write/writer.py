@@ -1,0 +1,351 @@
+"""Recording demonstrations as a LeRobot dataset of version 3.0."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal
+
+import numpy as np
+
+from hrc_learn.demos.demonstration import Demonstration
+from hrc_learn.demos.format.dataset_folder import DatasetFolder, open_folder
+from hrc_learn.demos.format.features import read_sidecar, sidecar_content
+from hrc_learn.demos.format.lerobot_v3 import INDEX_FEATURES, episode_statistics
+from hrc_learn.demos.issue import DatasetError
+from hrc_learn.demos.write.recovery import begin, claim_recording, discard, finish
+from hrc_learn.demos.write.schema import (
+    TIME_KEY,
+    Column,
+    Episode,
+    EpisodeBuffer,
+    columns_for,
+    complete,
+    describe_difference,
+    encode,
+    examine,
+    lerobot_features,
+)
+from hrc_learn.demos.write.staging import (
+    RecordingHeader,
+    StagedEpisode,
+    episode_path,
+    staging_folder,
+    to_table,
+    write_episode,
+)
+from hrc_learn.demos.write.video_encoder import CameraRecorder, Image, video_features
+from hrc_learn.store import DATASET
+
+
+class DatasetWriter:
+    """Records episodes frame by frame and leaves a LeRobot dataset behind.
+
+        with DatasetWriter(root, fps=50, robot_type="panda", joint_names=names) as writer:
+            writer.start_episode("put the bottle on the shelf")
+            writer.add_frame(time=t, joint_position=q, position=p, orientation=quaternion)
+            ...
+            writer.save_episode()
+
+    Saved episodes wait in `ROOT.recording/`; `finalize`, which leaving the `with` block
+    calls, turns them into the dataset in one step. If the recording breaks off, by an
+    exception or a kill, the episodes saved until then stay there and `recover_dataset`
+    makes the dataset of them, or adds them to the one they were appended to.
+    """
+
+    def __init__(
+        self,
+        root: str | Path,
+        fps: float | int,
+        robot_type: str,
+        joint_names: Sequence[str] = (),
+        features: Mapping[str, Sequence[str]] | None = None,
+        *,
+        cameras: Mapping[str, tuple[int, int]] | None = None,
+        dtype: Literal["float32", "float64"] = "float32",
+        frames: Mapping[str, str] | None = None,
+        details: Mapping[str, object] | None = None,
+        append: bool = False,
+    ):
+        """Claim the folder; nothing is written into `root` before `finalize`.
+
+        Args:
+            root: Folder of the dataset, which must not exist, unless it is appended to.
+            fps: Frame rate [1/s]. True stamps are kept beside it where frames give `time`.
+            robot_type: Name of the robot, as LeRobot's metadata keep it.
+            joint_names: Joints, in the order of the values of `joint_position` and the like.
+            features: Further features: key, such as "observation.shelf", and the names of
+                its components.
+            cameras: Cameras whose images are kept as videos: name -> height, width [px].
+            dtype: Type on disk. Policies that train on the dataset expect float32.
+            frames: Names of the frames poses are given in, such as
+                {"base": "panda_link0", "ee": "panda_hand_tcp"}.
+            details: Anything else worth keeping, as JSON values.
+            append: Add episodes to the dataset `root`, which a `DatasetWriter` wrote with the
+                same settings. It stays as it is, and readable, until `finalize` puts the
+                longer one in its place.
+
+        Raises:
+            BusyError: Another process is recording this dataset.
+            FileExistsError: `root`, or an interrupted recording of it, is already there.
+            ValueError: An argument makes no sense, or is not that of the dataset appended to.
+            DatasetError: The dataset to append to cannot be read.
+        """
+        self.root = Path(root)
+        if not fps > 0:
+            raise ValueError(f"fps must be positive, got {fps}")
+        if len(set(joint_names)) != len(joint_names):
+            raise ValueError(f"joint names must differ, got {', '.join(joint_names)}")
+        _check_feature_keys(features or {})
+        self.fps = float(fps)
+        self.robot_type = robot_type
+        self.joint_names = tuple(joint_names)
+        self.features = {key: tuple(names) for key, names in (features or {}).items()}
+        self._dtype = dtype
+        self._frames_of_poses = dict(frames or {})
+        self._details = dict(details or {})
+        self._columns: list[Column] = []
+        self._task: str | None = None
+        self._buffer = EpisodeBuffer(self.joint_names, self.features)
+        self._tasks: dict[str, int] = {}
+        self._saved_frames = 0
+        self.episodes = 0
+        self._video_features = video_features(cameras or {}, self.fps)
+        self._staging = staging_folder(self.root)
+        self._images = CameraRecorder(cameras or {}, self.fps, self._staging)
+        self._claim = claim_recording(self.root)
+        try:
+            self._earlier = self._continue() if append else None
+            if append:
+                self._claim.require_replaceable(DATASET, True, foreign=True, adopt=True)
+            begin(self.root, self.episodes if append else None)
+        except BaseException:
+            self._claim.release()
+            raise
+
+    def __enter__(self) -> "DatasetWriter":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if error is None:
+            with self._claim:
+                self.finalize()
+            return
+        with self._claim:
+            self.discard_episode()
+            if not self._new_episodes:
+                discard(self._staging)
+        if self._new_episodes:
+            error.add_note(
+                f"The {self._new_episodes} episodes saved before this are kept in "
+                f"{self._staging}; hrc_learn.demos.recover_dataset({str(self.root)!r}) makes "
+                f"a dataset of them."
+            )
+
+    def start_episode(self, task: str) -> None:
+        """Begin an episode; `task` says what is shown, in words.
+
+        Raises:
+            RuntimeError: The episode before has neither been saved nor discarded.
+        """
+        if self._task is not None:
+            raise RuntimeError(
+                f"the episode before still holds {len(self._buffer)} unsaved frames: call "
+                f"save_episode() or discard_episode() first"
+            )
+        self._task = task
+
+    def add_frame(self, *, images: Mapping[str, Image] | None = None, **values: Any) -> None:
+        """Add one frame to the open episode.
+
+        The first episode saved fixes which quantities are recorded; all later ones
+        give the same.
+
+        Args:
+            images: RGB image (height, width, 3) uint8 of every camera, by its name.
+            values: Fields of `Demonstration` by name, one row each (`time` [s],
+                `joint_position` [rad], `orientation` as (w, x, y, z), `feature` [px], ...),
+                and the features declared at the start by their key. Without `time`, frames
+                are taken to be 1/fps apart. Arrays are copied.
+
+        Raises:
+            RuntimeError: No episode is open.
+            ValueError: A quantity is unknown, missing, new, or of the wrong length.
+        """
+        self._open_task()
+        self._images.examine(images or {})
+        self._buffer.append(values)
+        self._images.append(images or {})
+
+    def save_episode(self) -> int:
+        """Keep the open episode, safe from whatever happens later.
+
+        Returns:
+            Its index in the dataset.
+
+        Raises:
+            RuntimeError: No episode is open.
+            ValueError: It is empty, holds values that are not finite, or its time does not
+                increase. The episode is discarded then.
+        """
+        task, episode = self._open_task(), self._buffer.arrays()
+        try:
+            return self._save(episode, task)
+        finally:
+            self.discard_episode()
+
+    def add_episode(self, demonstration: Demonstration) -> int:
+        """Save a whole demonstration as one episode.
+
+        Of its `extra`, the features declared at the start are written.
+
+        Returns:
+            Its index in the dataset.
+
+        Raises:
+            RuntimeError: An episode is open.
+            ValueError: Its joints are not the dataset's, or as in `save_episode`.
+        """
+        if self._task is not None:
+            raise RuntimeError("save or discard the open episode before adding another")
+        if self._video_features:
+            raise ValueError("a demonstration holds no images: add its frames one by one")
+        if demonstration.joint_names != self.joint_names:
+            raise ValueError(
+                f"the demonstration's joints {demonstration.joint_names} are not the "
+                f"dataset's {self.joint_names}: select_joints(names) brings them in order"
+            )
+        episode = {name: getattr(demonstration, name) for name in demonstration.recorded}
+        episode["time"] = demonstration.time + demonstration.start_time
+        episode |= {key: demonstration.extra[key] for key in self.features}
+        return self._save(episode, demonstration.task)
+
+    def discard_episode(self) -> None:
+        """Forget the open episode, if any."""
+        self._task, self._buffer = None, EpisodeBuffer(self.joint_names, self.features)
+        self._images.discard()
+
+    def finalize(self) -> Path:
+        """Turn the saved episodes into the dataset.
+
+        Returns:
+            The dataset's folder.
+
+        Raises:
+            RuntimeError: An episode is open.
+            DatasetError: No episode was saved.
+        """
+        if self._task is not None:
+            raise RuntimeError(
+                f"the last episode holds {len(self._buffer)} unsaved frames: call "
+                f"save_episode() or discard_episode() before the recording ends"
+            )
+        with self._claim:
+            if not self._new_episodes:
+                discard(self._staging)
+                raise DatasetError(
+                    "no episode was saved, so there is no dataset", file=self.root
+                )
+            finish(self.root, self._claim)
+        return self.root
+
+    @property
+    def _new_episodes(self) -> int:
+        return self.episodes - (len(self._earlier.episodes) if self._earlier else 0)
+
+    def _continue(self) -> DatasetFolder:
+        """Go on counting where the dataset ends that is appended to."""
+        folder, sidecar = open_folder(self.root), read_sidecar(self.root)
+        for name, theirs, ours in (
+            ("frame rate", folder.fps, self.fps),
+            ("robot", folder.robot_type, self.robot_type),
+            ("joints", sidecar.joint_names, self.joint_names),
+        ):
+            if theirs != ours:
+                raise ValueError(
+                    f"cannot append to {self.root}: its {name} is {theirs!r}, not {ours!r}"
+                )
+        self._tasks = {text: index for index, text in folder.tasks.items()}
+        self._saved_frames = sum(entry.length for entry in folder.episodes)
+        self.episodes = len(folder.episodes)
+        return folder
+
+    def _open_task(self) -> str:
+        if self._task is None:
+            raise RuntimeError("no episode is open: call start_episode(task) first")
+        return self._task
+
+    def _save(self, episode: Episode, task: str) -> int:
+        if not episode:
+            raise ValueError(f"episode {self.episodes} has no frames")
+        episode = complete(episode, self.fps)
+        columns = columns_for(episode.keys(), self.joint_names, self.features)
+        try:
+            if self._columns and columns != self._columns:
+                first = [column.given for column in self._columns]
+                raise ValueError(describe_difference(episode.keys(), first))
+            examine(episode)
+        except ValueError as error:
+            raise ValueError(f"episode {self.episodes} was not saved: {error}") from error
+        self._columns = columns
+        values = self._with_indices(encode(columns, episode), task)
+        header = self._header()
+        if self._earlier is not None:
+            _require_same_columns(self._earlier, header)
+        staged = StagedEpisode(
+            header=header,
+            tasks=[task],
+            statistics=episode_statistics(values) | self._images.finish(self.episodes),
+            table=to_table(values, header.features),
+        )
+        write_episode(episode_path(self._staging, self.episodes), staged)
+        self._saved_frames += len(staged.table)
+        self.episodes += 1
+        return self.episodes - 1
+
+    def _with_indices(self, values: dict[str, np.ndarray], task: str) -> dict[str, np.ndarray]:
+        frame = np.arange(len(values[TIME_KEY]))
+        return values | {
+            "timestamp": frame / self.fps,
+            "frame_index": frame,
+            "episode_index": np.full_like(frame, self.episodes),
+            "index": frame + self._saved_frames,
+            "task_index": np.full_like(frame, self._tasks.setdefault(task, len(self._tasks))),
+        }
+
+    def _header(self) -> RecordingHeader:
+        return RecordingHeader(
+            fps=self.fps,
+            robot_type=self.robot_type,
+            features={
+                **lerobot_features(self._columns, self._dtype),
+                **self._video_features,
+                **INDEX_FEATURES,
+            },
+            sidecar=sidecar_content(
+                self._columns, self.joint_names, self._frames_of_poses, self._details
+            ),
+        )
+
+
+def _require_same_columns(folder: DatasetFolder, header: RecordingHeader) -> None:
+    theirs, ours = folder.info["features"], header.features
+    differing = [key for key in theirs | ours if theirs.get(key) != ours.get(key)]
+    if differing:
+        raise ValueError(
+            f"cannot append to {folder.root}: {differing[0]} there is "
+            f"{theirs.get(differing[0])}, here {ours.get(differing[0])}; record the same "
+            f"quantities with the same settings, or a dataset of its own"
+        )
+
+
+def _check_feature_keys(features: Mapping[str, Sequence[str]]) -> None:
+    for key in features:
+        if not key.startswith(("observation.", "action.")):
+            raise ValueError(
+                f"feature {key!r} needs a key that LeRobot understands: 'observation.{key}'"
+            )

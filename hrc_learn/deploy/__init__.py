@@ -1,0 +1,9 @@
+"""The control step for real-time loops: compiled ahead of time, NumPy in and out."""
+
+from hrc_learn.deploy.export import NoCompilerError as NoCompilerError
+from hrc_learn.deploy.export import export_step as export_step
+from hrc_learn.deploy.rate import Metronome as Metronome
+from hrc_learn.deploy.runner import EagerRunner as EagerRunner
+from hrc_learn.deploy.runner import PackageRunner as PackageRunner
+from hrc_learn.deploy.runner import StepRunner as StepRunner
+from hrc_learn.deploy.runner import open_step as open_step

@@ -1,0 +1,181 @@
+"""Runs a control step in a loop, NumPy in and out."""
+
+from __future__ import annotations
+
+import warnings
+from abc import ABC, abstractmethod
+from pathlib import Path
+from typing import final
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch.utils import _pytree
+
+from hrc_learn.controller import AdaptiveController, Observation
+from hrc_learn.deploy.export import NoCompilerError, export_step
+from hrc_learn.deploy.io_layout import FlatStep, Layouts, Vectors, tensors_of
+from hrc_learn.deploy.package import load
+
+_POSITIONS = ("safety.position", "hold.joint_position")
+"""Fields of the state that remember where the joints were."""
+
+
+class StepRunner(ABC):
+    """A control step with its state, driven by writing into arrays.
+
+        runner.observation["joint_position"][:] = q
+        velocity = runner.step()
+
+    Attributes:
+        observation: Arrays to write each observation into, by field, as in "joint_position" or
+            "goals.vision.target"; flags are 0 or 1. They are what the step reads.
+        joint_velocity: What the last step commands [rad/s]; overwritten by the next.
+    """
+
+    def __init__(self, layouts: Layouts):
+        self._layouts = layouts
+        self._vectors = Vectors(*(layout.empty() for layout in layouts))
+        self.observation = layouts.observation.arrays(self._vectors.observation)
+        self._command = layouts.command.arrays(self._vectors.command)
+        self.joint_velocity: Float[np.ndarray, "*batch n"] = self._command["joint_velocity"]
+
+    @abstractmethod
+    def start(self, joint_position: Float[np.ndarray, "*batch n"]) -> None:
+        """Forget everything: the arm is at rest in a joint position [rad]."""
+
+    @abstractmethod
+    def step(self) -> Float[np.ndarray, "*batch n"]:
+        """Take one step on what stands in `observation`.
+
+        Returns:
+            `joint_velocity`.
+        """
+
+    def observe(self, observation: Observation) -> None:
+        """Write all fields of an observation at once."""
+        vector = self._layouts.observation.pack(tensors_of(observation))
+        self._vectors.observation.copy_(vector)
+
+    def command(self, field: str) -> np.ndarray:
+        """One field of the last command, as in "xi_x" or "safety.flags".
+
+        Raises:
+            ValueError: There is no such field.
+        """
+        return _named(field, self._command)
+
+    def state(self, field: str) -> np.ndarray:
+        """One field of the state, as in "safety.counts".
+
+        Raises:
+            ValueError: There is no such field.
+        """
+        return _named(field, self._layouts.state.arrays(self._state_vector()))
+
+    @abstractmethod
+    def _state_vector(self) -> torch.Tensor:
+        """The state after the last step."""
+
+
+@final
+class PackageRunner(StepRunner):
+    """A step compiled ahead of time; it allocates nothing.
+
+    Numbers of the observation are NaN and its flags unset until they are written.
+    """
+
+    def __init__(self, package: Path):
+        """Load what `export_step` wrote, in milliseconds.
+
+        Raises:
+            FileNotFoundError: There is no such file.
+            ValueError: It is not a package of ours, or was built for another machine.
+        """
+        loaded = load(package)
+        super().__init__(loaded.layouts)
+        self._run = loaded.run
+        self._arguments = list(self._vectors)
+        self._first_state = loaded.first_state
+        self._vectors.state.copy_(loaded.first_state)
+
+    def start(self, joint_position: Float[np.ndarray, "*batch n"]) -> None:
+        self._vectors.state.copy_(self._first_state)
+        for field in _POSITIONS:
+            self.state(field)[...] = joint_position
+
+    def step(self) -> Float[np.ndarray, "*batch n"]:
+        self._run(self._arguments)
+        return self.joint_velocity
+
+    def _state_vector(self) -> torch.Tensor:
+        return self._vectors.state
+
+
+@final
+class EagerRunner(StepRunner):
+    """The same step uncompiled."""
+
+    def __init__(self, controller: AdaptiveController, observation: Observation):
+        """Take a step as it is; later observations have the fields of this one."""
+        super().__init__(FlatStep(controller, observation).layouts)
+        self._controller, self._said = controller, None
+        self._leaves, self._structure = _pytree.tree_flatten(observation)
+        views = iter(self._layouts.observation.views(self._vectors.observation))
+        self._views = [
+            (k, next(views), x.dtype)
+            for k, x in enumerate(self._leaves)
+            if isinstance(x, torch.Tensor)
+        ]
+        self.observe(observation)
+        self.start(self.observation["joint_position"])
+
+    def start(self, joint_position: Float[np.ndarray, "*batch n"]) -> None:
+        dtype = self._layouts.observation.fields[0].dtype
+        q = torch.tensor(joint_position, dtype=dtype)
+        self._state = self._controller.initial_state(q)
+
+    @torch.inference_mode()
+    def step(self) -> Float[np.ndarray, "*batch n"]:
+        for k, view, dtype in self._views:
+            # A state that shared memory with an observation would change with the next.
+            self._leaves[k] = view.to(dtype, copy=True)
+        observation = _pytree.tree_unflatten(self._leaves, self._structure)
+        self._said, self._state = self._controller.step(self._state, observation)
+        self.joint_velocity[...] = self._said.joint_velocity.numpy()
+        return self.joint_velocity
+
+    def command(self, field: str) -> np.ndarray:
+        if self._said is not None:
+            vector = self._layouts.command.pack(tensors_of(self._said))
+            self._vectors.command.copy_(vector)
+        return super().command(field)
+
+    def _state_vector(self) -> torch.Tensor:
+        return self._layouts.state.pack(tensors_of(self._state))
+
+
+def _named(field: str, arrays: dict[str, np.ndarray]) -> np.ndarray:
+    if field not in arrays:
+        raise ValueError(f"no field {field!r}; there are {', '.join(arrays)}")
+    return arrays[field]
+
+
+def open_step(
+    controller: AdaptiveController, observation: Observation, folder: Path | None = None
+) -> StepRunner:
+    """The fastest runner there is: compiled, or eager with a warning without a C++ compiler.
+
+    Args:
+        controller: Whose step.
+        observation: The first, with exactly the fields that later ones will have.
+        folder: Where packages are kept; default: the user's cache.
+    """
+    try:
+        runner = PackageRunner(export_step(controller, observation, folder))
+    except NoCompilerError as error:
+        warnings.warn(f"control steps run uncompiled and slower: {error}", stacklevel=2)
+        return EagerRunner(controller, observation)
+    runner.observe(observation)
+    runner.start(runner.observation["joint_position"])
+    return runner

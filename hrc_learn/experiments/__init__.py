@@ -1,0 +1,3 @@
+"""The paper's experiments and studies of the controller: scenario, metrics, report,
+recording.
+"""

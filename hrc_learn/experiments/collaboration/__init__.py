@@ -1,0 +1,1 @@
+"""Experiment 3 of the paper: the whole job beside a person."""

@@ -1,0 +1,1 @@
+"""The controller in batches of closed loops: grasps, a person's effort, stress."""

@@ -1,0 +1,333 @@
+"""Grasp trials: many random starts, cameras and targets as one batch of closed loops."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from hrc_learn.controller import (
+    GRIPPER_DOWN,
+    INITIAL_IMAGE_JACOBIAN,
+    AdaptiveController,
+    Command,
+    ControllerConfig,
+    ControllerState,
+    Goals,
+    Observation,
+    table1_config,
+    table1_goals,
+    table1_joint_region,
+)
+from hrc_learn.controller.interface import HALF_SIZE
+from hrc_learn.controller.monitors import LimitWatch
+from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.jacobian import ImageJacobianEstimator, RBFImageJacobian, paper_grid
+from hrc_learn.kinematics import (
+    JointLimits,
+    clear_posture,
+    comfortable_postures,
+    panda,
+    panda_capsules,
+)
+from hrc_learn.regions import JointRegion
+from hrc_learn.sim.closed_loop import Imperfections, PinholeCamera, VirtualCamera, rehearse
+
+# How far the arm is from itself and from what stands in the workplace of the trials.
+
+TABLE = ((0.26, 0.54, -0.02), (0.42, 0.34, 0.02))
+"""Centre and half edges of the table [m], as simulated."""
+PEDESTAL = ((-0.03, 0.0, -0.36), (0.12, 0.12, 0.36))
+"""The same of what the arm stands on [m]."""
+
+
+def clearance(q: Float[Tensor, "*batch 7"]) -> Float[Tensor, "*batch"]:
+    """Distance of the Panda from itself, the table and the pedestal [m]; negative in contact.
+
+    Args:
+        q: Joint position [rad].
+    """
+    distance = panda_capsules.self_distance(q)
+    for box in (TABLE, PEDESTAL):
+        centre, half_size = q.new_tensor(box)
+        distance = torch.minimum(distance, panda_capsules.box_distance(q, centre, half_size))
+    return distance
+
+
+# Grasp trials: many random starts, cameras and targets as one batch of closed loops.
+
+ROLL_CLASSES = ((0, 30), (30, 60), (60, 90), (90, 135), (135, 180))
+"""Camera roll from the paper's camera [deg], one class for each fifth of the trials."""
+
+CENTRE = (0.2, 0.5, 0.3)
+"""Of the box: the middle of the paper's neurons in x and y [m]."""
+
+_HALF_SIDE = 0.024
+CORNERS = tuple(
+    (x * _HALF_SIDE, y * _HALF_SIDE, 0.0) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))
+)
+"""Of the marker, from its centre in the tool's frame [m]."""
+
+_SECONDS_BETWEEN_CONTACT_CHECKS = 0.024
+_START_CLEARANCE = 0.01
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrialConfig:
+    """How trials are drawn. Lengths [m], angles [rad]."""
+
+    count: int = 1000
+    seed: int = 0
+    starts: Literal["near", "global"] = "near"
+    """Ready posture with 0.4 rad of noise on each joint, or anywhere within the limits."""
+    tilt: tuple[float, float] = (0.0, 0.35)
+    """Of the camera's axis from the vertical."""
+    imperfections: Imperfections = field(
+        default_factory=lambda: Imperfections(frame_steps=4, latency_frames=1, noise=0.5)
+    )
+    duration: float = 12.0
+    """[s]"""
+    dt: float = 0.008
+    """Control step [s]."""
+    feature: Literal["centre", "corners"] = "centre"
+    """Of the marker: the paper's single point, or the four corners."""
+    law: Literal["recommended", "printed"] = "recommended"
+    """The paper's law as printed has Table I's gains and no joint-space approach."""
+    initial_jacobian: Callable[[Tensor], Tensor] = lambda J: J
+    """What to make of the paper's initial image Jacobian."""
+    contacts: bool = False
+    """Look for contacts of the arm with itself, the table and the pedestal, at a third more
+    time. Starts are free of them in any case."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrialResult:
+    """What came out; one entry a trial."""
+
+    roll_class: Int[Tensor, "trials"]
+    success: Bool[Tensor, "trials"]
+    """Final pixel error below 5 px with the tool in the box, no limit broken. Of corners it is
+    the mean that counts: the law turns the tool into its orientation cone, not further."""
+    time: Float[Tensor, "trials"]
+    """Until the pixel error stayed below 5 px [s]; infinite if it did not."""
+    vision_time: Float[Tensor, "trials"]
+    """Of that, since the camera took over [s]."""
+    violations: Int[Tensor, "trials"]
+    """Steps that broke a limit of position, velocity, acceleration or jerk."""
+    touched: Bool[Tensor, "trials"]
+    """Whether the arm met itself, the table or the pedestal; False where not looked for."""
+    peak_speed: Float[Tensor, "trials"]
+    """Largest joint velocity over its limit."""
+    hand_overs: Int[Tensor, "trials"]
+    """How often the camera took over or let go."""
+
+    @staticmethod
+    def join(parts: Sequence[TrialResult]) -> TrialResult:
+        """The trials of several results."""
+        names = [field.name for field in fields(TrialResult)]
+        return TrialResult(
+            **{name: torch.cat([getattr(part, name) for part in parts]) for name in names}
+        )
+
+    def summary(self) -> dict[str, float]:
+        """Shares, medians and totals, by name."""
+        figures = {
+            "success": _share(self.success),
+            "free_success": _share(self.success & ~self.touched),
+            "touched": _share(self.touched),
+            "t50": self.time.quantile(0.5, interpolation="higher").item(),
+            "t95": self.time.quantile(0.95, interpolation="higher").item(),
+            "vision_phase": _median(self.vision_time),
+            "violations": float(self.violations.sum()),
+            "peak_speed": self.peak_speed.max().item(),
+            "hand_overs": self.hand_overs.double().mean().item(),
+        }
+        for k, (low, high) in enumerate(ROLL_CLASSES):
+            members = self.roll_class == k
+            figures[f"success_roll_{low}_{high}"] = _share(self.success[members])
+            figures[f"vision_phase_roll_{low}_{high}"] = _median(self.vision_time[members])
+        return figures
+
+
+def _share(flags: Tensor) -> float:
+    return flags.double().mean().item()
+
+
+def _median(times: Tensor) -> float:
+    """Median where infinity, for never, is a value like any other."""
+    times = torch.where(times.isnan(), math.inf, times)  # never taken over: inf - inf
+    return times.quantile(0.5, interpolation="higher").item()
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Scene:
+    """What is drawn at random."""
+
+    camera: PinholeCamera
+    target: Tensor
+    start: Tensor
+    roll_class: Tensor
+
+
+def run_trials(
+    make_estimator: Callable[[RBFImageJacobian], ImageJacobianEstimator], config: TrialConfig
+) -> TrialResult:
+    """Run all trials of a configuration.
+
+    Args:
+        make_estimator: From the network that starts at the paper's initial Jacobian.
+        config: What to draw and how long to run.
+    """
+    rng = torch.Generator().manual_seed(config.seed)
+    scene = _draw(config, rng)
+    controller = _controller(make_estimator, config, scene)
+    judge = _Judge(scene, controller, config)
+    with torch.inference_mode():
+        rehearse(
+            controller,
+            VirtualCamera(
+                camera=scene.camera, imperfections=config.imperfections, generator=rng
+            ),
+            scene.start,
+            steps=round(config.duration / config.dt),
+            dt=config.dt,
+            watch=judge,
+        )
+    return judge.result()
+
+
+def _draw(config: TrialConfig, rng: torch.Generator) -> _Scene:
+    def uniform(low: float, high: float, *shape: int) -> Tensor:
+        unit = torch.rand(config.count, *shape, generator=rng, dtype=torch.float64)
+        return low + (high - low) * unit
+
+    roll_class = torch.arange(config.count) % len(ROLL_CLASSES)
+    low, high = torch.deg2rad(torch.tensor(ROLL_CLASSES, dtype=torch.float64))[roll_class].mT
+    side = torch.where(uniform(0.0, 1.0) < 0.5, -1.0, 1.0)
+    centre = torch.tensor(CENTRE, dtype=torch.float64)
+    camera = PinholeCamera.above(
+        centre + uniform(-0.05, 0.05, 3),
+        height=uniform(0.9, 1.2),
+        roll=side * (low + (high - low) * uniform(0.0, 1.0)),
+        tilt=uniform(*config.tilt),
+        bearing=uniform(0.0, 2 * math.pi),
+        marker=centre.new_tensor((0.05, 0.0, -0.08)),
+        corners=centre.new_tensor(CORNERS) if config.feature == "corners" else None,
+    )
+    spread = centre.new_tensor((0.08, 0.08, 0.05))
+    down = quaternion.normalize(centre.new_tensor(GRIPPER_DOWN))
+    tool = Pose(centre + spread * uniform(-1.0, 1.0, 3), down.expand(config.count, 4))
+    return _Scene(
+        camera=camera,
+        target=camera.project(tool)[0],
+        start=_starts(config, panda.limits, rng),
+        roll_class=roll_class,
+    )
+
+
+def _starts(config: TrialConfig, limits: JointLimits, rng: torch.Generator) -> Tensor:
+    lower, upper = limits.lower + 0.03, limits.upper - 0.03
+    shape = (config.count, len(lower))
+    free: list[Tensor] = []
+    while sum(map(len, free)) < config.count:
+        if config.starts == "near":
+            noise = torch.randn(shape, generator=rng, dtype=torch.float64)
+            q = (panda.ready + 0.4 * noise).clamp(lower, upper)
+        else:
+            unit = torch.rand(shape, generator=rng, dtype=torch.float64)
+            q = lower + unit * (upper - lower)
+        free.append(q[clearance(q) > _START_CLEARANCE])
+    return torch.cat(free)[: config.count]
+
+
+def _controller(
+    make_estimator: Callable[[RBFImageJacobian], ImageJacobianEstimator],
+    config: TrialConfig,
+    scene: _Scene,
+) -> AdaptiveController:
+    J = config.initial_jacobian(torch.tensor(INITIAL_IMAGE_JACOBIAN, dtype=torch.float64))
+    J = J.repeat(scene.target.shape[-1] // 2, 1)
+    network = RBFImageJacobian.from_jacobian(J, paper_grid(), 0.1)
+    centre = torch.tensor(CENTRE, dtype=torch.float64)
+    half_size = centre.new_tensor(HALF_SIZE)
+    if config.law == "printed":
+        goals = table1_goals(centre, half_size, scene.target)
+        settings, region = table1_config(), table1_joint_region(panda.limits)
+    else:
+        down = quaternion.normalize(centre.new_tensor(GRIPPER_DOWN))
+        postures = comfortable_postures(panda, Pose(centre, down))
+        posture = clear_posture(postures, scene.start, clearance)
+        goals = Goals.at(centre, down, scene.target).approached_by(posture)
+        settings = ControllerConfig()
+        region = JointRegion.from_limits(panda.limits.lower, panda.limits.upper)
+    return AdaptiveController(
+        panda, make_estimator(network), goals, config=settings, joint_region=region
+    )
+
+
+class _Judge:
+    """Watches a rehearsal and keeps what the result needs."""
+
+    def __init__(self, scene: _Scene, controller: AdaptiveController, config: TrialConfig):
+        self.scene, self.controller, self.dt = scene, controller, config.dt
+        self.contact_steps = 0
+        if config.contacts:
+            self.contact_steps = max(1, round(_SECONDS_BETWEEN_CONTACT_CHECKS / config.dt))
+        count = len(scene.start)
+        self.taken_over = torch.full((count,), math.inf, dtype=torch.float64)
+        self.entered = torch.full((count,), math.inf, dtype=torch.float64)
+        self.violations = torch.zeros(count, dtype=torch.int64)
+        self.hand_overs = torch.zeros(count, dtype=torch.int64)
+        self.peak_speed = torch.zeros(count, dtype=torch.float64)
+        still = torch.zeros_like(scene.start)
+        self.watch = LimitWatch(panda.limits, still, config.dt)
+        self.touched = torch.zeros(count, dtype=torch.bool)
+        self.active = torch.zeros(count, dtype=torch.bool)
+        self.in_box = torch.zeros(count, dtype=torch.bool)
+
+    def __call__(
+        self,
+        step: int,
+        q: Tensor,
+        observation: Observation,
+        command: Command,
+        state: ControllerState,
+    ) -> None:
+        now = torch.tensor(step * self.dt, dtype=torch.float64)
+        tool = panda.forward(q)
+        error = self.scene.camera.project(tool)[0] - self.scene.target
+        centre = error.unflatten(-1, (-1, 2)).mean(-2)
+        close = torch.linalg.vector_norm(centre, dim=-1) < 5
+        self.entered = torch.where(close, torch.minimum(self.entered, now), math.inf)
+        active = state.activation.active
+        self.taken_over = torch.where(
+            active, torch.minimum(self.taken_over, now), self.taken_over
+        )
+        self.hand_overs += active != self.active
+        self.active = active
+        box = self.controller.goals.position
+        # 5 % beyond the wall count as in the box: a potential ends at the wall, not inside.
+        self.in_box = ((tool.position - box.centre).abs() <= 1.05 * box.half_size).all(-1)
+        v = command.joint_velocity
+        self.violations += self.watch.beyond(q, v).any(-1) | ~v.isfinite().all(-1)
+        speed = (v.abs() / panda.limits.velocity).amax(-1)
+        self.peak_speed = torch.maximum(self.peak_speed, speed)
+        if self.contact_steps and step % self.contact_steps == 0:
+            self.touched |= clearance(q) < 0
+
+    def result(self) -> TrialResult:
+        return TrialResult(
+            roll_class=self.scene.roll_class,
+            success=self.entered.isfinite() & self.in_box & (self.violations == 0),
+            time=self.entered,
+            vision_time=self.entered - self.taken_over,
+            violations=self.violations,
+            touched=self.touched,
+            peak_speed=self.peak_speed,
+            hand_overs=self.hand_overs,
+        )

@@ -1,0 +1,315 @@
+"""What a learned image Jacobian is worth as a start: closed loops from it and from
+guesses, and its error against the true one.
+"""
+
+import itertools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from hrc_learn.controller import AdaptiveController, ControllerConfig, Goals
+from hrc_learn.controller.interface import IMAGE_SIZE
+from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.jacobian import (
+    FixedEstimator,
+    ImageJacobianEstimator,
+    KalmanEstimator,
+    RBFImageJacobian,
+)
+from hrc_learn.kinematics import gripper_down, panda
+from hrc_learn.sim.closed_loop import Imperfections, VirtualCamera, rehearse
+from hrc_learn.sim.workplace import nearest_configuration
+from hrc_learn.skills.visual_servoing import guessed_network
+from hrc_learn.vision import CameraModel
+
+# Many short closed loops in one batch: the hand's marker to its target, seen by the scene's
+# camera.
+#
+# The arm's kinematics against the camera, lens and all, which the controller cannot see. So
+# that no guess is right by luck, the camera is turned about its axis by another angle in each
+# of
+# the starts.
+
+
+@dataclass(frozen=True, kw_only=True)
+class StartsConfig:
+    """How starts are drawn. Lengths [m], angles [rad]."""
+
+    count: int = 200
+    """Of starts."""
+    largest_roll: float = math.pi
+    """Of the camera about its axis, either way; 0: as the demonstrations saw it."""
+    tilt: float = 0.1
+    """Of the hand at the start, either way about each axis."""
+    reached: float = 5.0
+    """Pixel error that counts as converged once it is kept [px]."""
+    duration: float = 4.0
+    """[s]"""
+    dt: float = 0.008
+    """Control step [s]."""
+    seed: int = 0
+    """Of starts, targets, cameras and noise."""
+    imperfections: Imperfections = field(
+        default_factory=lambda: Imperfections(frame_steps=4, latency_frames=1, noise=0.5)
+    )
+    """Of the measurement."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TurnedCamera:
+    """The scene's camera, its image turned by an angle for each of the starts.
+
+    About what it sees in the middle of the workspace, which is moved to the middle of the
+    image: a camera that is turned about its axis, and its sensor shifted.
+    """
+
+    model: CameraModel
+    offset: Float[Tensor, "3"]
+    """Of the marker in the frame of the tool centre point [m]."""
+    middle: Pose
+    """Of the tool in the middle of the workspace."""
+    roll: Float[Tensor, " starts"]
+    """[rad]"""
+
+    def project(self, tool: Pose) -> tuple[Float[Tensor, "starts 2"], Bool[Tensor, " starts"]]:
+        """Marker in the image [px], and whether it is inside the image."""
+        about = self._pixel(tool) - self._pixel(self.middle)
+        half = about.new_tensor(IMAGE_SIZE) / 2
+        turned = (turn_rows(self.roll) @ about[..., None])[..., 0]
+        return turned + half, (turned.abs() < half).all(dim=-1)
+
+    def _pixel(self, tool: Pose) -> Tensor:
+        return torch.from_numpy(self.model.project(tool.apply(self.offset).numpy()))
+
+
+def turn_rows(roll: Float[Tensor, " starts"]) -> Float[Tensor, "starts 2 2"]:
+    """What a turn of the camera about its axis does to pixels about its centre."""
+    c, s = roll.cos(), roll.sin()
+    return torch.stack([torch.stack([c, s], -1), torch.stack([-s, c], -1)], -2)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ClosedLoops:
+    """Starts, targets and cameras, the same for whatever is compared on them."""
+
+    camera: TurnedCamera
+    start: Float[Tensor, "starts joints"]
+    """[rad]"""
+    goals: Goals
+    config: StartsConfig
+
+    @classmethod
+    def draw(
+        cls,
+        camera: CameraModel,
+        offset: Float[np.ndarray, "3"],
+        workspace: Float[Tensor, "2 3"],
+        near: Float[Tensor, "joints"],
+        config: StartsConfig,
+    ) -> "ClosedLoops":
+        """Draw them at random.
+
+        Args:
+            camera: The true one.
+            offset: Of the marker in the frame of the tool centre point [m].
+            workspace: Lower and upper corner of the box of starts and targets [m].
+            near: Joints with the hand in it, near which starts are chosen [rad].
+            config: How.
+        """
+        rng, n = torch.Generator().manual_seed(config.seed), config.count
+
+        def uniform(*shape: int) -> Tensor:
+            return 2 * torch.rand(n, *shape, generator=rng, dtype=torch.float64) - 1
+
+        middle, half = workspace.mean(dim=0), (workspace[1] - workspace[0]) / 2
+        down = gripper_down().expand(n, 4)
+        turned = TurnedCamera(
+            model=camera,
+            offset=torch.from_numpy(offset),
+            middle=Pose(middle, down[0]),
+            roll=config.largest_roll * uniform(),
+        )
+        target = turned.project(Pose(middle + half * uniform(3), down))[0]
+        tilted = quaternion.multiply(quaternion.exp(config.tilt * uniform(3)), down)
+        return cls(
+            camera=turned,
+            start=_postures(Pose(middle + half * uniform(3), tilted), near),
+            goals=Goals.at(middle, down[0], target),
+            config=config,
+        )
+
+    def times(
+        self, estimator: ImageJacobianEstimator, control: ControllerConfig | None = None
+    ) -> Float[Tensor, " starts"]:
+        """Time until the marker stays at its target [s]; infinite where it does not."""
+        config, target = self.config, self.goals.vision.target
+        controller = AdaptiveController(panda, estimator, self.goals, config=control)
+        reached = torch.full((len(self.start),), math.inf, dtype=torch.float64)
+
+        def watch(step: int, q: Tensor, *_: object) -> None:
+            error = self.camera.project(panda.forward(q))[0] - target
+            near = torch.linalg.vector_norm(error, dim=-1) < config.reached
+            # The first step of the last spell inside.
+            reached.copy_(torch.where(near, reached.clamp(max=step * config.dt), math.inf))
+
+        noise = torch.Generator().manual_seed(config.seed + 1)
+        camera = VirtualCamera(
+            camera=self.camera, imperfections=config.imperfections, generator=noise
+        )
+        with torch.inference_mode():
+            rehearse(
+                controller,
+                camera,
+                self.start,
+                steps=round(config.duration / config.dt),
+                dt=config.dt,
+                watch=watch,
+            )
+        return reached
+
+
+def _postures(hand: Pose, near: Float[Tensor, "joints"]) -> Float[Tensor, "starts joints"]:
+    """Joint positions with the hand at each of the poses [rad]."""
+    return torch.stack(
+        [nearest_configuration(hand[i], near, samples=9) for i in range(len(hand.position))]
+    )
+
+
+# What a learned image Jacobian is worth: closed loops that start from it, and from a guess.
+
+
+class _Turned(KalmanEstimator):
+    """Starts from a learned Jacobian, as seen by cameras that are turned.
+
+    A learned Jacobian turns along exactly, as would one learned from the turned camera.
+    """
+
+    def __init__(self, network: RBFImageJacobian, roll: Float[Tensor, " starts"]):
+        super().__init__(network)
+        self._turn = turn_rows(roll)
+
+    def initial_weight(self, *batch: int) -> Float[Tensor, "*batch 12 K"]:
+        rows = super().initial_weight(*batch).unflatten(-2, (2, 6))
+        return torch.einsum("nij,njck->nick", self._turn, rows).flatten(1, 2)
+
+
+def compare_starts(
+    network: RBFImageJacobian,
+    loops: ClosedLoops,
+    control: ControllerConfig | None = None,
+    on_run: Callable[[str], None] = lambda name: None,
+) -> dict[str, float]:
+    """Time to bring the marker to its target [s], from what was learned and from a guess.
+
+    Args:
+        network: Learned from demonstrations of the camera.
+        loops: What is run.
+        control: Gains, the same for all.
+        on_run: Told the name of each run as it begins.
+
+    Returns:
+        For `learned`, `guessed` (the paper's initial Jacobian, adapted alike) and `fixed`
+        (the same, not adapted): median and 95th percentile of the time, and the share that
+        got there. `speed_up_over_guessed` and `speed_up_over_fixed` are medians of the other
+        time over that of the learned one, start by start; infinite where most of the others
+        never get there.
+    """
+    guessed = guessed_network()
+    estimators: dict[str, ImageJacobianEstimator] = {
+        "learned": _Turned(network.double(), loops.camera.roll),
+        "guessed": KalmanEstimator(guessed),
+        "fixed": FixedEstimator(guessed),
+    }
+    times, figures = {}, {}
+    for name, estimator in estimators.items():
+        on_run(name)
+        times[name] = loops.times(estimator, control)
+        figures |= {f"{name}_{k}": v for k, v in summary(times[name]).items()}
+    for name in ("guessed", "fixed"):
+        # Where neither gets there, neither is faster.
+        ratio = (times[name] / times["learned"]).nan_to_num(nan=1.0, posinf=math.inf)
+        figures[f"speed_up_over_{name}"] = float(ratio.quantile(0.5, interpolation="lower"))
+    return figures
+
+
+def summary(times: Float[Tensor, " starts"]) -> dict[str, float]:
+    """Quantiles where infinity, for never, is a time like any other."""
+    return {
+        "t50": float(times.quantile(0.5, interpolation="higher")),
+        "t95": float(times.quantile(0.95, interpolation="higher")),
+        "converged": float(times.isfinite().double().mean()),
+    }
+
+
+# A learned image Jacobian against the true one, where the simulator knows it.
+
+ROTATION_SCALE = 0.15
+"""Metres that a radian counts for in the size of a Jacobian [m/rad]: a typical lever arm."""
+REACH = 0.02
+"""A point this close to where the hand was shown is inside the demonstrated workspace [m]."""
+
+
+def held_out_grid(
+    shown: Float[Tensor, "frames 3"], points: int = 9, tilt: float = 0.0, seed: int = 0
+) -> Pose:
+    """Poses inside the demonstrated workspace, on a grid that no demonstration follows.
+
+    Args:
+        shown: Where the hand was [m].
+        points: Along each axis, over the range that was shown.
+        tilt: Of the hand from pointing down, at most, about each axis [rad].
+        seed: Of the tilts.
+    """
+    low, high = shown.amin(dim=0), shown.amax(dim=0)
+    axes = [
+        torch.linspace(float(a), float(b), points, dtype=torch.float64)
+        for a, b in zip(low, high, strict=True)
+    ]
+    grid = torch.tensor(list(itertools.product(*axes)), dtype=torch.float64)
+    inside = torch.cdist(grid, shown).amin(dim=1) < REACH
+    grid = grid[inside]
+    rng = torch.Generator().manual_seed(seed)
+    turn = tilt * (2 * torch.rand(len(grid), 3, generator=rng, dtype=torch.float64) - 1)
+    down = gripper_down().expand(len(grid), 4)
+    return Pose(grid, quaternion.multiply(quaternion.exp(turn), down))
+
+
+def compare_with_truth(
+    network: RBFImageJacobian,
+    poses: Pose,
+    camera: CameraModel,
+    offset: Float[np.ndarray, "3"],
+) -> dict[str, float]:
+    """Errors of the estimate over its size, and whether its uncertainty is honest.
+
+    Args:
+        network: Learned, with its covariance.
+        poses: Of the tool, (n,).
+        camera: The true one.
+        offset: Of the marker in the frame of the tool centre point [m].
+
+    Returns:
+        `relative_error_median` and `_p95`: |estimate - truth| / |truth|, Frobenius norms with
+        rotation counted in metres. `within_1_sigma` and `within_2_sigma`: shares of the
+        entries that close to the truth; 0.68 and 0.95 of a Gaussian.
+    """
+    scale = torch.tensor([1.0] * 3 + [1 / ROTATION_SCALE] * 3, dtype=torch.float64)
+    marker = poses.apply(torch.from_numpy(offset)).numpy()
+    truth = torch.from_numpy(camera.image_jacobian(marker, poses.position.numpy()))
+    with torch.no_grad():
+        error = network(poses) - truth
+        sigmas = error.abs() / network.uncertainty(poses)[..., None, :]
+    relative = (error * scale).flatten(-2).norm(dim=-1) / (truth * scale).flatten(-2).norm(
+        dim=-1
+    )
+    return {
+        "relative_error_median": float(relative.median()),
+        "relative_error_p95": float(relative.quantile(0.95)),
+        "within_1_sigma": float((sigmas < 1).double().mean()),
+        "within_2_sigma": float((sigmas < 2).double().mean()),
+    }

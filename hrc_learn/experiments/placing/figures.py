@@ -1,0 +1,252 @@
+"""Figures of placing on several shelves: paths, joints, ways in, smoothness, repetitions.
+
+Shelves have one colour each throughout, demonstrations are grey.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import matplotlib
+import numpy as np
+from jaxtyping import Float, UInt8
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator, NullFormatter, StrMethodFormatter
+
+from hrc_learn.geometry import Box
+from hrc_learn.viz import JointLimits, palette
+from hrc_learn.viz.figure_parts import (
+    STYLE,
+    WIDTH,
+    draw_box,
+    draw_limits,
+    frame_space,
+    legend_in_free_cell,
+    near,
+    space,
+)
+
+_SHELF_COLOURS = (palette.ORANGE, palette.BLUE, palette.PURPLE, palette.GREEN)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Motion:
+    """A motion of the arm."""
+
+    time: Float[np.ndarray, " samples"]
+    """[s]"""
+    joint_position: Float[np.ndarray, "samples joints"]
+    """[rad]"""
+    path: Float[np.ndarray, "samples 3"]
+    """Of the tool centre point [m]."""
+
+
+def shelf_colours(shelves: Sequence[str]) -> dict[str, str]:
+    """One for each, in order."""
+    return dict(zip(shelves, _SHELF_COLOURS, strict=False))
+
+
+def shelf_paths_figure(
+    demonstration: Motion,
+    motions: Mapping[str, Mapping[str, Motion]],
+    boxes: tuple[Box, ...],
+) -> Figure:
+    """Paths of the hand in space, one panel for each way of planning.
+
+    Args:
+        demonstration: What was shown.
+        motions: By way of planning and shelf.
+        boxes: What stands around.
+    """
+    everything = [m.path for by_shelf in motions.values() for m in by_shelf.values()]
+    points = np.concatenate([demonstration.path, *everything])
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(WIDTH, 4.5))
+        for i, (way, by_shelf) in enumerate(motions.items()):
+            axes = space(figure, position=(1, len(motions), 1 + i))
+            for box in near(boxes, points):
+                draw_box(axes, box, "#8D8F94", alpha=0.08)
+            axes.plot(*demonstration.path.T, color=palette.DEMO, lw=5, label="demonstration")
+            for shelf, colour in shelf_colours(list(by_shelf)).items():
+                path = by_shelf[shelf].path
+                axes.plot(*path.T, color=colour, lw=1.8, label=f"{shelf} shelf")
+                axes.plot(*path[-1], "s", color=colour, ms=4)
+            axes.set_title(way.capitalize(), loc="left")
+            frame_space(axes, points, zoom=1.0)
+            axes.xaxis.set_major_locator(MaxNLocator(3))
+            axes.view_init(elev=16, azim=62)
+        _legend_above(figure)
+    return figure
+
+
+def shelf_joints_figure(
+    names: Sequence[str],
+    demonstration: Motion,
+    motions: Mapping[str, Motion],
+    limits: JointLimits,
+) -> Figure:
+    """Every joint over time: the demonstration, and the motion to each shelf.
+
+    Args:
+        names: Of the joints.
+        demonstration: What was shown.
+        motions: By shelf.
+        limits: Of the joints.
+    """
+    rows = -(-len(names) // 2)
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(WIDTH, 1.45 * rows + 0.5))
+        grid = figure.subplots(rows, 2, sharex=True, squeeze=False).ravel()
+        for i, (axes, name) in enumerate(zip(grid, names, strict=False)):
+            shown = demonstration.joint_position[:, i]
+            axes.plot(demonstration.time, shown, color=palette.DEMO, lw=3.5, label="demo")
+            values = [shown]
+            for shelf, colour in shelf_colours(list(motions)).items():
+                motion = motions[shelf]
+                values.append(motion.joint_position[:, i])
+                axes.plot(motion.time, values[-1], color=colour, label=f"{shelf} shelf")
+            axes.set(title=name, ylabel="rad")
+            axes.margins(x=0)
+            _keep_limits_in_sight(axes, np.concatenate(values), limits, i)
+        legend_in_free_cell(figure, grid, len(names))
+    return figure
+
+
+def _keep_limits_in_sight(
+    axes: Axes, values: Float[np.ndarray, " samples"], limits: JointLimits, i: int
+) -> None:
+    """Draw a joint's limits, but let its motion fill the picture where they are far away."""
+    draw_limits(axes, float(limits.lower[i]), float(limits.upper[i]))
+    low, high = float(values.min()), float(values.max())
+    margin = max(0.25, 0.15 * (high - low))
+    bottom, top = axes.get_ylim()
+    axes.set_ylim(max(bottom, low - margin), min(top, high + margin))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class WayIn:
+    """How far a way into a shelf is from the demonstrated one."""
+
+    left: Float[np.ndarray, " samples"]
+    """Of the way [m]."""
+    aside: Float[np.ndarray, " samples"]
+    """Distance there [m]."""
+
+
+def bend_figure(ways: Mapping[str, Mapping[str, WayIn]], bound: float) -> Figure:
+    """How far the ways into the shelves are bent, one panel for each way of planning.
+
+    Args:
+        ways: By way of planning and shelf.
+        bound: Of what is good enough [m].
+    """
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(WIDTH, 2.9))
+        panels = figure.subplots(1, len(ways), sharey=True, squeeze=False)[0]
+        for axes, (title, by_shelf) in zip(panels, ways.items(), strict=True):
+            for shelf, colour in shelf_colours(list(by_shelf)).items():
+                left, aside = 1e3 * by_shelf[shelf].left, 1e3 * by_shelf[shelf].aside
+                axes.plot(left, aside, color=colour, label=f"{shelf} shelf")
+            axes.axhline(1e3 * bound, color=palette.LIMIT, lw=1, ls="--", label="bound")
+            axes.set(title=title.capitalize(), xlabel="way left to the goal [mm]")
+            axes.set_yscale("log")
+            axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+            axes.set_ylim(0.1, 400)
+            longest = max(way.left.max(initial=1e-3) for way in by_shelf.values())
+            axes.set_xlim(1e3 * longest, 0)
+        panels[0].set_ylabel("off the demonstrated way [mm]")
+        _legend_above(figure)
+    return figure
+
+
+def smoothness_figure(demonstration: Motion, reproduction: Motion) -> Figure:
+    """Speed and jerk of the hand over the share of the motion, demonstrated and reproduced.
+
+    Both are scaled by duration and length of the path, so that neither a faster nor a longer
+    motion counts as less smooth.
+    """
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(WIDTH, 2.9))
+        speed, jerk = figure.subplots(1, 2)
+        for label, motion, colour, width in (
+            ("demonstration", demonstration, palette.DEMO, 1.2),
+            ("reproduction", reproduction, palette.RUN, 1.6),
+        ):
+            share, first, third = _scaled_derivatives(motion)
+            speed.plot(share, first, color=colour, lw=width, label=label)
+            jerk.plot(share, third, color=colour, lw=width, label=label)
+        speed.set(title="Speed of the hand", ylabel="[path lengths / duration]", ylim=(0, None))
+        jerk.set(title="Jerk of the hand", ylabel="[path lengths / duration³]")
+        jerk.set_yscale("log")
+        jerk.set_ylim(10, None)
+        for axes in (speed, jerk):
+            axes.set_xlabel("share of the motion")
+            axes.margins(x=0)
+        _legend_above(figure)
+    return figure
+
+
+def _legend_above(figure: Figure) -> None:
+    """One legend for all panels, which show the same things."""
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=len(labels))
+
+
+def _scaled_derivatives(motion: Motion) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Share of the duration, and size of the first and third derivative by it."""
+    share = (motion.time - motion.time[0]) / (motion.time[-1] - motion.time[0])
+    path = motion.path / np.linalg.norm(np.diff(motion.path, axis=0), axis=1).sum()
+    sizes, values = [], path
+    for _ in range(3):
+        values = np.gradient(values, share, axis=0)
+        sizes.append(np.linalg.norm(values, axis=1))
+    return share, sizes[0], sizes[2]
+
+
+def snapshots_figure(
+    pictures: Sequence[tuple[str, UInt8[np.ndarray, "height width 3"]]], columns: int = 2
+) -> Figure:
+    """Pictures side by side, each with its title above."""
+    rows = -(-len(pictures) // columns)
+    height, width = pictures[0][1].shape[:2]
+    with matplotlib.rc_context(STYLE):
+        each = WIDTH / columns
+        figure = Figure(figsize=(WIDTH, rows * (each * height / width + 0.28)))
+        grid = figure.subplots(rows, columns, squeeze=False).ravel()
+        for axes in grid:
+            axes.set_axis_off()
+        for axes, (title, picture) in zip(grid, pictures, strict=False):
+            axes.imshow(picture, interpolation="lanczos")
+            axes.set_title(title, fontsize=9)
+    return figure
+
+
+def repetition_figure(
+    values: Mapping[str, Mapping[str, Float[np.ndarray, " trials"]]],
+    bounds: Mapping[str, float],
+) -> Figure:
+    """Every trial as a dot, by shelf, one panel for each measure.
+
+    Args:
+        values: By measure (with its unit) and shelf.
+        bounds: Of what is good enough, by measure.
+    """
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(WIDTH, 2.9))
+        panels = figure.subplots(1, len(values), squeeze=False)[0]
+        for axes, (measure, by_shelf) in zip(panels, values.items(), strict=True):
+            for x, (shelf, colour) in enumerate(shelf_colours(list(by_shelf)).items()):
+                dots = by_shelf[shelf]
+                # Spread evenly, in no order: dots that hide each other cannot be counted.
+                aside = 0.3 * (np.modf(np.arange(len(dots)) * 0.618)[0] - 0.5)
+                axes.plot(x + aside, dots, ".", color=colour, ms=4, alpha=0.7)
+            axes.axhline(bounds[measure], color=palette.LIMIT, lw=1, ls="--")
+            axes.set(title=measure, xticks=range(len(by_shelf)), xticklabels=list(by_shelf))
+            axes.set_xlim(-0.6, len(by_shelf) - 0.4)
+            axes.set_yscale("log")
+            known = np.concatenate([d[np.isfinite(d)] for d in by_shelf.values()])
+            decade = 10.0 ** np.floor(np.log10(max(known.min(initial=1.0), 1e-6)))
+            axes.set_ylim(decade, 3 * max(bounds[measure], known.max(initial=0.0)))
+            axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+            axes.yaxis.set_minor_formatter(NullFormatter())
+    return figure

@@ -1,0 +1,230 @@
+"""Learning where the neurons stand, how wide they are, and how much to trust the camera.
+
+For given neurons the weights have a closed form, and so has the probability of the
+demonstrated image motion with the weights integrated out (type-II maximum likelihood; MacKay
+1992, "Bayesian interpolation"). Its gradient by everything else is what is followed here. The
+error on demonstrations held out says when to stop.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from hrc_learn import distributed
+from hrc_learn.jacobian.fitting import ImageJacobianFitConfig, prior_precision, solve
+from hrc_learn.jacobian.radial_basis import weight_covariance
+from hrc_learn.jacobian.rbf_centers import Neurons
+from hrc_learn.jacobian.samples import KeyMotion, PairStatistics, Watched
+
+
+@dataclass(frozen=True, kw_only=True)
+class LearningConfig:
+    """How long to learn, and what."""
+
+    rounds: int = 15
+    """Rounds of L-BFGS at most."""
+    iterations: int = 5
+    """Iterations of a round."""
+    patience: int = 3
+    """Rounds without a better held-out error after which to stop."""
+    least_gain: float = 1e-3
+    """Share by which the held-out error has to fall to count as better."""
+    hold_out: int = 4
+    """Every n-th demonstration is held out to decide when to stop."""
+    most_pairs: int = 20_000
+    """Pairs that each process learns from, evenly chosen among its own."""
+    learn_centers: bool = True
+    """Whether the centres move; widths, noise and prior are always learned."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Round:
+    """State of learning after a round."""
+
+    evidence: float
+    """Negative logarithm of the probability of the image motion, per pair."""
+    held_out_error: float
+    """Root mean square over the pairs of demonstrations held out [px]."""
+    neurons: Neurons
+    """As they were then."""
+    config: ImageJacobianFitConfig
+    """With noise and prior as they were then."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Learned:
+    """All rounds, of which the best is the result."""
+
+    rounds: tuple[Round, ...]
+    """The first before anything was learned."""
+    best: int
+    """Which round the result is of."""
+
+    @property
+    def neurons(self) -> Neurons:
+        """As learned."""
+        return self.rounds[self.best].neurons
+
+    @property
+    def config(self) -> ImageJacobianFitConfig:
+        """With noise and prior as learned."""
+        return self.rounds[self.best].config
+
+
+def learn(
+    demonstrations: Sequence[Watched],
+    neurons: Neurons,
+    config: ImageJacobianFitConfig | None = None,
+    learning: LearningConfig | None = None,
+    on_round: Callable[[int, Round], None] = lambda number, state: None,
+) -> Learned:
+    """Improve neurons, noise and prior for the fit that follows.
+
+    Of several processes each learns from its share of the demonstrations; all end with the
+    same result.
+
+    Args:
+        demonstrations: At least as many as `hold_out`; read one by one.
+        neurons: To start from.
+        config: To start from.
+        learning: How long.
+        on_round: Told of every round.
+
+    Raises:
+        ValueError: Too few demonstrations, or no pair of key frames in one of the two sets.
+    """
+    config, learning = config or ImageJacobianFitConfig(), learning or LearningConfig()
+    training, held_out = _motions(demonstrations, config, learning)
+    model = Evidence(neurons, config, learning.learn_centers)
+    parallel = distributed.data_parallel(model)
+    optimiser = torch.optim.LBFGS(
+        parallel.parameters(), max_iter=learning.iterations, line_search_fn="strong_wolfe"
+    )
+
+    def loss() -> Tensor:
+        optimiser.zero_grad()
+        value = parallel(training)
+        value.backward()
+        return value
+
+    rounds = [model.judge(training, held_out)]
+    on_round(0, rounds[0])
+    best = 0
+    while len(rounds) <= learning.rounds and len(rounds) - 1 - best < learning.patience:
+        try:
+            optimiser.step(loss)
+        except torch.linalg.LinAlgError:
+            break  # a step so long that nothing could be solved: the best so far is kept
+        rounds.append(model.judge(training, held_out))
+        on_round(len(rounds) - 1, rounds[-1])
+        limit = (1 - learning.least_gain) * rounds[best].held_out_error
+        if rounds[-1].held_out_error < limit:
+            best = len(rounds) - 1
+    return Learned(rounds=tuple(rounds), best=best)
+
+
+class Evidence(nn.Module):
+    """Negative log probability of image motion, per pair, weights integrated out.
+
+    Parameters are logarithms where no optimiser step may make a number negative.
+    """
+
+    def __init__(self, neurons: Neurons, config: ImageJacobianFitConfig, learn_centers: bool):
+        super().__init__()
+        self._neurons, self._config = neurons, config
+
+        def logarithm(value: float) -> nn.Parameter:
+            return nn.Parameter(torch.tensor(math.log(value), dtype=torch.float64))
+
+        self.centers = nn.Parameter(neurons.centers.detach().double(), learn_centers)
+        self.log_width = logarithm(float(neurons.width))
+        self.log_noise = logarithm(config.pixel_noise)
+        self.log_bias = logarithm(config.bias_std)
+        self.log_weight = logarithm(config.weight_std)
+
+    def forward(self, motion: KeyMotion) -> Float[Tensor, ""]:
+        """Of the pairs of all processes, each given its own."""
+        total = self.statistics(motion)
+        noise = 2 * (2 * self.log_noise).exp()
+        # In weights that the prior makes independent and of size one, all is well scaled.
+        root = torch.block_diag(*[torch.linalg.cholesky(self._prior())] * 6)
+        cross = root.mT @ total.cross / noise
+        eye = torch.eye(len(root), dtype=root.dtype)
+        factor = torch.linalg.cholesky(root.mT @ total.gram @ root / noise + eye)
+        mean = torch.cholesky_solve(cross, factor)
+        misfit = (total.energy / noise - (cross * mean).sum()) / 2
+        # Two image rows: each has one determinant, and each pair two coordinates.
+        volume = 2 * factor.diagonal().log().sum() + total.count * (2 * math.pi * noise).log()
+        return (misfit + volume) / total.count
+
+    def statistics(self, motion: KeyMotion) -> PairStatistics:
+        """Sums over the pairs of all processes, for the neurons as they are."""
+        phi = motion.regressors(self.neurons(attached=True).basis())
+        return PairStatistics.of(phi, motion.dx).over_processes()
+
+    def neurons(self, *, attached: bool = False) -> Neurons:
+        """As they are; attached: so that gradients reach them."""
+        centers, width = self.centers, self.log_width.exp()
+        if not attached:
+            centers, width = centers.detach().clone(), float(width.detach())
+        return replace(self._neurons, centers=centers, width=width)
+
+    def fit_config(self) -> ImageJacobianFitConfig:
+        """Noise and prior as they are, with the choice of key frames."""
+        return replace(
+            self._config,
+            pixel_noise=float(self.log_noise.detach().exp()),
+            bias_std=float(self.log_bias.detach().exp()),
+            weight_std=float(self.log_weight.detach().exp()),
+        )
+
+    @torch.no_grad()
+    def judge(self, training: KeyMotion, held_out: KeyMotion) -> Round:
+        """Evidence of the training pairs, and the error on pairs held out."""
+        config = self.fit_config()
+        precision = prior_precision(self.centers, config)
+        noise = 2 * config.pixel_noise**2
+        weights = solve(self.statistics(training), precision, noise).mean
+        unseen = self.statistics(held_out)
+        error = (unseen.squared_error(weights) / unseen.count) ** 0.5
+        return Round(
+            evidence=float(self(training)),
+            held_out_error=error,
+            neurons=self.neurons(),
+            config=config,
+        )
+
+    def _prior(self) -> Float[Tensor, "K K"]:
+        return weight_covariance(self.centers, self.log_bias.exp(), self.log_weight.exp())
+
+
+def _motions(
+    demonstrations: Sequence[Watched], config: ImageJacobianFitConfig, learning: LearningConfig
+) -> tuple[KeyMotion, KeyMotion]:
+    """Pairs of this process to learn from, and those held out."""
+    if len(demonstrations) < learning.hold_out:
+        raise ValueError(
+            f"learning holds out every {learning.hold_out}th demonstration, but there are only "
+            f"{len(demonstrations)}: record more, or fit with the neurons as they are."
+        )
+    sets: tuple[list[KeyMotion], list[KeyMotion]] = ([], [])
+    for i, demonstration in distributed.share(demonstrations):
+        is_held_out = (i + 1) % learning.hold_out == 0
+        sets[is_held_out].append(demonstration.motion(config))
+    for motions in sets:
+        pairs = torch.tensor(sum(len(motion.dx) for motion in motions))
+        if not distributed.sum_over_processes(pairs):
+            raise ValueError(
+                "no two visible key frames are within reach of each other in "
+                f"{'every ' if motions is sets[1] else 'those but every '}"
+                f"{learning.hold_out}th demonstration: there is nothing to "
+                f"{'judge' if motions is sets[1] else 'learn'} from."
+            )
+    training, held_out = (KeyMotion.joined(motions) for motions in sets)
+    return training.thinned(learning.most_pairs), held_out.thinned(learning.most_pairs)

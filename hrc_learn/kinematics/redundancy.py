@@ -1,0 +1,173 @@
+"""The redundancy of a seven-joint arm: its arm angle, and which of the postures for a
+tool pose to take.
+"""
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hrc_learn.geometry import Pose
+from hrc_learn.kinematics.chain import SerialChain
+from hrc_learn.kinematics.franka import FrankaArm
+from hrc_learn.kinematics.inverse import UnreachableError
+from hrc_learn.kinematics.pseudo_inverse import null_space_projector
+
+# Arm angle: one number for the body shape of a seven-joint arm with its hand held still.
+#
+# The angle by which the plane of shoulder, elbow and wrist is turned out of the vertical about
+# the line from shoulder to wrist (Kreutz-Delgado et al. 1992). Unlike the position of joint 7
+# it
+# changes steadily as the elbow circles, and keeps its meaning when the hand goes elsewhere.
+
+_SHOULDER, _ELBOW, _WRIST = 1, 3, 5  # frames of joints 2, 4 and 6
+_STEP = 1e-5  # rad; of the central difference
+
+
+def arm_angle(chain: SerialChain, q: Float[Tensor, "*batch 7"]) -> Float[Tensor, "*batch"]:
+    """Angle of the elbow about the line from shoulder to wrist [rad], in (-pi, pi].
+
+    Zero with the elbow straight above that line, positive turning right-handed about it. Not
+    defined where the wrist is straight above the shoulder, or the arm is stretched.
+
+    Args:
+        chain: A seven-joint arm with shoulder, elbow and wrist at joints 2, 4 and 6.
+        q: Joint positions [rad].
+    """
+    points = chain.joint_origins(q)
+    axis = points[..., _WRIST, :] - points[..., _SHOULDER, :]
+    axis = torch.nn.functional.normalize(axis, dim=-1)
+    upper_arm = points[..., _ELBOW, :] - points[..., _SHOULDER, :]
+    up = torch.zeros_like(axis)
+    up[..., 2] = 1.0
+    side = torch.linalg.cross(axis, up)
+    above = torch.linalg.cross(side, axis)
+    return torch.atan2((upper_arm * side).sum(-1), (upper_arm * above).sum(-1))
+
+
+def arm_angle_and_motion(
+    chain: SerialChain,
+    q: Float[Tensor, "*batch 7"],
+    jacobian: Float[Tensor, "*batch 6 7"],
+) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 7"]]:
+    """`arm_angle`, and the joint motion that turns it at 1 rad/s and leaves the hand alone.
+
+    Args:
+        chain: The arm.
+        q: Joint positions [rad].
+        jacobian: Of the hand, at q.
+
+    Returns:
+        The angle [rad], and joint velocities [rad/s]; these are bounded near configurations
+        in which the null space does not move the elbow.
+    """
+    N = null_space_projector(jacobian)
+    # The projector has rank one: its longest column spans the null space.
+    longest = N.norm(dim=-2).argmax(dim=-1)
+    column = N.gather(-1, longest[..., None, None].expand(*N.shape[:-1], 1)).squeeze(-1)
+    direction = torch.nn.functional.normalize(column, dim=-1)
+    step = _STEP * direction
+    angle, after, before = arm_angle(chain, torch.stack([q, q + step, q - step]))
+    difference = torch.remainder(after - before + torch.pi, 2 * torch.pi) - torch.pi
+    rate = (difference / (2 * _STEP)).unsqueeze(-1)
+    return angle, direction * rate / (rate * rate + 1e-2)
+
+
+# Which of the many postures for a tool pose to approach.
+
+# Beyond these a posture is as good as any [1], [rad].
+_GOOD_SINGULAR_VALUE = 0.2
+_GOOD_DISTANCE = 0.5
+# Postures nearer to each other lead along the same path [rad].
+_ALIKE = 0.5
+
+
+def comfortable_posture(
+    chain: FrankaArm, pose: Pose, *, candidates: int = 29
+) -> Float[Tensor, "n"]:
+    """Inverse-kinematics solution furthest from singularities and joint limits.
+
+    An arm that servoes round a pose keeps its posture but for small motions, so the posture
+    it arrives in decides whether it meets a limit there.
+
+    Args:
+        chain: The arm.
+        pose: Of the tool, without batch dimensions.
+        candidates: Values tried for the last joint, the redundant parameter.
+
+    Returns:
+        Joint position [rad].
+
+    Raises:
+        UnreachableError: No candidate reaches the pose within the limits.
+    """
+    return comfortable_postures(chain, pose, candidates=candidates)[0]
+
+
+def comfortable_postures(
+    chain: FrankaArm, pose: Pose, *, candidates: int = 29
+) -> Float[Tensor, "postures n"]:
+    """Inverse-kinematics solutions that differ, the most comfortable one first.
+
+    Arguments and errors are those of `comfortable_posture`.
+    """
+    lower, upper = chain.limits.lower, chain.limits.upper
+    q7 = torch.linspace(float(lower[-1]), float(upper[-1]), candidates, dtype=torch.float64)
+    many = Pose(
+        pose.position.double().expand(candidates, 3),
+        pose.orientation.double().expand(candidates, 4),
+    )
+    solutions = chain.inverse_all(many, q7).flatten(0, 1)
+    solutions = solutions[solutions.isfinite().all(-1)]
+    if len(solutions) == 0:
+        raise UnreachableError(
+            f"no posture within the joint limits brings the tool to {pose.position.tolist()} m "
+            f"with orientation {pose.orientation.tolist()}; move the goal towards the arm"
+        )
+    distance = torch.minimum(solutions - lower, upper - solutions).amin(-1)
+    smallest = torch.linalg.svdvals(chain.jacobian(solutions))[:, -1]
+    score = (distance / _GOOD_DISTANCE).clamp(max=1) + (smallest / _GOOD_SINGULAR_VALUE).clamp(
+        max=1
+    )
+    chosen: list[Tensor] = []
+    for posture in solutions[score.argsort(descending=True, stable=True)]:
+        if all(torch.linalg.vector_norm(posture - other) > _ALIKE for other in chosen):
+            chosen.append(posture)
+    return torch.stack(chosen).to(pose.position)
+
+
+def clear_posture(
+    postures: Float[Tensor, "postures n"],
+    start: Float[Tensor, "*batch n"],
+    clearance: Callable[[Tensor], Tensor],
+    *,
+    least: float = 0.03,
+    samples: int = 25,
+) -> Float[Tensor, "*batch n"]:
+    """The first posture whose straight path in joint space keeps clear of contacts.
+
+    A joint-space approach follows that path. Where none is clear, the posture whose path comes
+    least near to a contact.
+
+    Args:
+        postures: To choose from, the best first.
+        start: Where the arm is [rad].
+        clearance: Distance from all contacts [m] at joint positions (*points, n).
+        least: Distance to keep [m]; nearer to the start what the start has is enough.
+        samples: Points looked at along the path.
+    """
+    flat = start.reshape(-1, start.shape[-1])
+    best = postures[:1].expand_as(flat).clone()
+    found = torch.full_like(flat[:, 0], -torch.inf)
+    wanted = torch.minimum(clearance(flat), found.new_tensor(least))
+    share = torch.linspace(0, 1, samples, dtype=flat.dtype, device=flat.device)[1:, None]
+    for posture in postures:
+        open_ = (found < wanted).nonzero().flatten()
+        if len(open_) == 0:
+            break
+        path = torch.lerp(flat[open_, None], posture, share)
+        distance = clearance(path).amin(-1)
+        better = distance > found[open_]
+        best[open_[better]], found[open_[better]] = posture, distance[better]
+    return best.reshape(start.shape)

@@ -1,0 +1,158 @@
+"""Tool orientations: turned as the tool moves sideways, and along the tangent of
+demonstrated approaches.
+"""
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.store import new_file
+
+# The paper's rule that turns the gripper as the hand moves sideways (eq. coarse_orientation).
+#
+# A three-axis haptic device moves the end effector but cannot turn it. So the tilt follows from
+# the sideways position: straight down in front of the robot, level at the end of its reach.
+
+
+def gripper_down() -> Float[Tensor, "4"]:
+    """Orientation of a gripper that points down and closes along the base's x axis (wxyz)."""
+    return torch.tensor([0.0, math.sqrt(0.5), math.sqrt(0.5), 0.0], dtype=torch.float64)
+
+
+def coarse_orientation(
+    position: Float[Tensor, "*batch 3"], reach: float = 0.6, tilt: float = math.pi / 2
+) -> Float[Tensor, "*batch 4"]:
+    """Orientation of the end effector that goes with its position.
+
+    The paper gives r_5 = beta_0 r_2 / Y_0, limited to +-beta_0, without saying about which
+    axis. We tilt the gripper-down frame by that angle about the base's x axis: a hand that
+    moves to the right (-y) points to the right.
+
+    Args:
+        position: Of the end effector [m].
+        reach: Y_0 [m].
+        tilt: beta_0 [rad].
+
+    Returns:
+        Unit quaternions (wxyz).
+    """
+    angle = tilt * (position[..., 1] / reach).clamp(-1.0, 1.0)
+    zero = torch.zeros_like(angle)
+    turn = quaternion.exp(torch.stack([angle, zero, zero], dim=-1))
+    return quaternion.multiply(turn, gripper_down().to(position))
+
+
+# From which side an object is approached, by the tangents of demonstrated paths near it.
+#
+# The paper takes the orientation for grasping from the tangent of each trajectory near the
+# object
+# (section Collaboration Task): the hand points where it was going.
+
+NEAR = 0.05
+"""Length of the last stretch of a path, whose direction is its tangent there [m]."""
+WIDEST = math.radians(30)
+"""Tangents that differ by more, from one another or from where the hand points, tell nothing:
+the hand came to the object from the side, as over a table, and not the way it grasps."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Approach:
+    """How the hand is turned where it stands before an object."""
+
+    orientation: Float[Tensor, "4"]
+    """Of the hand (wxyz); its z axis is the direction in which it goes on to the object."""
+    spread: float
+    """Angle of the demonstrations' tangents to their mean, root mean square [rad]."""
+    turned: float
+    """Angle from the mean demonstrated orientation [rad]; 0 where tangents told nothing."""
+
+    @property
+    def direction(self) -> Float[Tensor, "3"]:
+        """In which the hand goes on to the object, base frame; of unit length."""
+        return quaternion.to_matrix(self.orientation)[:, 2]
+
+    @classmethod
+    def fit(cls, paths: Sequence[Pose]) -> "Approach":
+        """Turn the demonstrated orientation as little as makes the hand point along the path.
+
+        Args:
+            paths: Poses of the hand in each demonstration, which ends before the object:
+                position (time, 3) [m], orientation (time, 4).
+
+        Raises:
+            ValueError: If there is no path.
+        """
+        if not paths:
+            raise ValueError("an approach is learned from one demonstration or more: got none.")
+        shown = _mean([path.orientation[-1] for path in paths])
+        tangents = torch.stack([tangent(path.position) for path in paths])
+        mean = tangents.mean(dim=0)
+        mean = mean / mean.norm().clamp(min=1e-12)
+        spread = float(_angle(tangents, mean).square().mean().sqrt())
+        points = quaternion.to_matrix(shown)[:, 2]
+        turned = float(_angle(points, mean))
+        if not max(spread, turned) < WIDEST:
+            return cls(orientation=shown, spread=spread, turned=0.0)
+        axis = torch.linalg.cross(points, mean)
+        turn = quaternion.exp(turned * axis / axis.norm().clamp(min=1e-12))
+        return cls(orientation=quaternion.multiply(turn, shown), spread=spread, turned=turned)
+
+    def save(self, path: Path) -> None:
+        """Write to a JSON file, whole or not at all."""
+        content = {
+            "version": 1,
+            "orientation_wxyz": self.orientation.tolist(),
+            "spread_rad": self.spread,
+            "turned_rad": self.turned,
+        }
+        with new_file(path) as part:
+            part.write_text(json.dumps(content, indent=2), encoding="utf-8")
+
+    @classmethod
+    def load(cls, path: Path) -> "Approach":
+        """Read what `save` wrote.
+
+        Raises:
+            FileNotFoundError: If there is no such file.
+            ValueError: If it is not one of ours.
+        """
+        content = json.loads(path.read_text(encoding="utf-8"))
+        if content.get("version") != 1 or "orientation_wxyz" not in content:
+            raise ValueError(f"{path} is not an approach of a known version: fit it again.")
+        return cls(
+            orientation=torch.tensor(content["orientation_wxyz"], dtype=torch.float64),
+            spread=content["spread_rad"],
+            turned=content["turned_rad"],
+        )
+
+
+def tangent(position: Float[Tensor, "time 3"], near: float = NEAR) -> Float[Tensor, "3"]:
+    """Direction of the last stretch of a path, of unit length; 0 where it does not move.
+
+    Args:
+        position: Along the path [m].
+        near: Length of the stretch [m].
+    """
+    way = position[-1] - position
+    before = (way.norm(dim=-1) > near).nonzero()[:, 0]
+    chord = way[int(before[-1])] if len(before) else way[0]
+    return chord / chord.norm().clamp(min=1e-12)
+
+
+def _mean(orientations: Sequence[Tensor]) -> Float[Tensor, "4"]:
+    """Of unit quaternions, whatever their signs (Markley et al. 2007)."""
+    q = torch.stack(list(orientations)).double()
+    return torch.linalg.eigh(q.T @ q).eigenvectors[:, -1]
+
+
+def _angle(a: Float[Tensor, "*batch 3"], b: Float[Tensor, "3"]) -> Float[Tensor, "*batch"]:
+    """Between unit vectors [rad]; exact also where they are nearly parallel."""
+    a, b = torch.broadcast_tensors(a, b)
+    return torch.atan2(torch.linalg.cross(a, b).norm(dim=-1), (a * b).sum(dim=-1))

@@ -1,0 +1,1 @@
+"""From datasets to models: movement primitives, image Jacobians, metrics, tuning."""

@@ -1,0 +1,348 @@
+"""From demonstrations to movement primitives: one for each channel, functions of a
+context, or streamed from disk.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, cast, overload
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hrc_learn.demos import (
+    Demonstration,
+    DemonstrationSet,
+    DemonstrationSource,
+    PaddedDemonstrations,
+)
+from hrc_learn.dmp import (
+    BasisSelection,
+    ContextualDMP,
+    DMPDistribution,
+    JointDMP,
+    PoseDMP,
+    SharedFit,
+    fit_shared,
+    mean_primitive,
+    select_basis_count,
+)
+from hrc_learn.kinematics import panda
+from hrc_learn.learning.channels import KINDS, Motions, Primitive, kinds_wanted
+from hrc_learn.learning.reproduction_error import reproduction_error
+from hrc_learn.viz import FitRecording, JointLimits
+
+# From demonstrations to movement primitives, and what is to be said about them.
+
+EACH = "each"
+"""Folder of the primitives of single demonstrations, where they are kept."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FittedPrimitives:
+    """Primitives of one motion, one for each demonstration and what they have in common."""
+
+    motions: Motions
+    each: Mapping[str, Primitive]
+    """By kind: one for each demonstration, as a batch."""
+    common: Mapping[str, Primitive]
+    """By kind: their mean, without batch dimensions."""
+    n_basis: int
+    selection: BasisSelection | None = None
+    """How the number of basis functions was chosen, if it was."""
+    options: Mapping[str, Any] = field(default_factory=dict)
+    """Of the fit."""
+
+    @property
+    def demonstrations(self) -> PaddedDemonstrations:
+        """What they were fitted to."""
+        return self.motions.demos
+
+    @property
+    def joint(self) -> JointDMP | None:
+        """One for each demonstration; None if joints were not learned."""
+        return cast(JointDMP | None, self.each.get("joint"))
+
+    @property
+    def pose(self) -> PoseDMP | None:
+        """The same for the hand, the arm angle as its body shape if the arm is a Panda."""
+        return cast(PoseDMP | None, self.each.get("pose"))
+
+    def save(self, folder: Path, each: bool = False) -> None:
+        """Write the common primitives into `folder/KIND`.
+
+        Args:
+            folder: Where.
+            each: Keep those of single demonstrations too, in `folder/each/KIND`: what a
+                `DMPDistribution` is made of.
+        """
+        for kind, primitive in self.common.items():
+            primitive.save(folder / kind)
+        for kind, primitives in self.each.items() if each else ():
+            primitives.save(folder / EACH / kind)
+
+    def distribution(self, kind: str) -> DMPDistribution:
+        """Gaussian over the primitives of one kind.
+
+        Raises:
+            ValueError: Of fewer than two demonstrations, or scaled primitives.
+        """
+        return DMPDistribution.fit(self.each[kind])
+
+    def metrics(self) -> dict[str, float]:
+        """How close the primitives come to their demonstrations.
+
+        `mean_` is the common primitive, given start, goal and duration of each.
+        """
+        values = {"demonstrations": float(len(self.demonstrations.length))}
+        values["basis_functions"] = float(self.n_basis)
+        for kind in self.each:
+            own = self.motions.own(self.each[kind])
+            adapted = self.motions.adapted(kind, self.common[kind])
+            values |= reproduction_error(kind, self.motions, own).summary(kind)
+            values |= reproduction_error(kind, self.motions, adapted).summary(f"mean_{kind}")
+        return values
+
+
+def fit_primitives(
+    demos: DemonstrationSet,
+    n_basis: int | None = 60,
+    method: str = "trajectory",
+    *,
+    kinds: Sequence[str] = (),
+    candidates: Sequence[int] = (10, 15, 20, 30, 40, 60, 80, 100),
+    **options: Any,
+) -> FittedPrimitives:
+    """Fit one primitive to each demonstration, and their mean.
+
+    Joints are learned from any robot. The pose of the hand is learned where it was recorded,
+    or where the joints are those of a Panda, whose arm angle is then learned along.
+
+    Args:
+        demos: Demonstrations of one motion.
+        n_basis: Number of basis functions; None: the smallest of the candidates that
+            predicts samples held out as well as the best (see `select_basis_count`).
+        method: See `JointDMP.fit`.
+        kinds: To learn; none: joints and pose, or what there is of them.
+        candidates: Numbers of basis functions to choose from.
+        options: Further options of the fit, such as `robust` or `scaling`.
+
+    Raises:
+        ValueError: If the demonstrations hold no motion, or not what a kind needs.
+    """
+    motions = Motions.of(demos)
+    kinds = kinds_wanted(motions, kinds)
+    options = {"method": method, **options}
+    selection = None
+    if n_basis is None:
+        selection = _select(motions, kinds[0], candidates, options)
+        n_basis = selection.count
+    each = {kind: motions.fit(kind, n_basis, **options) for kind in kinds}
+    return FittedPrimitives(
+        motions=motions,
+        each=each,
+        common={kind: mean_primitive(cast(Any, each[kind])) for kind in kinds},
+        n_basis=n_basis,
+        selection=selection,
+        options=options,
+    )
+
+
+def _select(
+    motions: Motions, kind: str, candidates: Sequence[int], options: Mapping[str, Any]
+) -> BasisSelection:
+    """By the linear coordinates of a kind; orientations alone give none to choose by."""
+    if kind == "orientation":
+        raise ValueError(
+            "the number of basis functions is chosen by joints or positions: name it for "
+            "orientations alone."
+        )
+    shortest = int(motions.demos.length.min())
+    possible = [count for count in candidates if 2 * count <= shortest]
+    if not possible:
+        raise ValueError(
+            f"the shortest demonstration has {shortest} samples, too few to choose the number "
+            f"of basis functions from {', '.join(map(str, candidates))}: name it."
+        )
+    return select_basis_count(
+        motions.demos.time, motions.position(kind), possible, mask=motions.demos.mask, **options
+    )
+
+
+def fit_recording(fitted: FittedPrimitives, title: str) -> FitRecording:
+    """Demonstrations beside their reproductions, to be looked at.
+
+    Of the joints, or else of the position.
+
+    Raises:
+        ValueError: If neither was learned.
+    """
+    kind = next((k for k in ("joint", "position", "pose") if k in fitted.each), None)
+    if kind is None:
+        raise ValueError("orientations alone have no figure: learn the pose, or positions.")
+    motions, lengths = fitted.motions, fitted.demonstrations.length.tolist()
+    shown, made = motions.position(kind), motions.own(fitted.each[kind]).position
+    assert made is not None
+
+    def cut(padded: Tensor) -> tuple[np.ndarray, ...]:
+        return tuple(
+            values[:n].double().numpy() for values, n in zip(padded, lengths, strict=True)
+        )
+
+    limits, paths, reproduced = None, (), ()
+    if kind != "joint":
+        paths, reproduced = cut(shown), cut(made)
+    elif motions.joint_names == panda.joint_names:
+        limits = JointLimits(lower=panda.limits.lower.numpy(), upper=panda.limits.upper.numpy())
+        paths = cut(panda.forward(shown.double()).position)
+        reproduced = cut(panda.forward(made.double()).position)
+    residual = {}
+    if (selection := fitted.selection) is not None:
+        residual = dict(zip(selection.candidates, selection.error.tolist(), strict=True))
+    return FitRecording(
+        title=title,
+        joint_names=motions.joint_names if kind == "joint" else ("x", "y", "z"),
+        time=cut(motions.demos.time),
+        demos=cut(shown),
+        reproductions=cut(made),
+        joint_limits=limits,
+        n_basis=fitted.n_basis,
+        demo_paths=paths,
+        reproduction_paths=reproduced,
+        residual=residual,
+        unit="rad" if kind == "joint" else "m",
+    )
+
+
+# What several demonstrations teach beyond their mean: a function of a context, or one
+# primitive from more of them than memory holds.
+
+CONTEXTUAL = "contextual"
+"""Folder of the primitives that are functions of a context."""
+
+
+def contexts(
+    demos: DemonstrationSet, columns: Sequence[str], fitted: FittedPrimitives, kind: str
+) -> Float[Tensor, "demos C"]:
+    """What each demonstration was about.
+
+    Args:
+        demos: The demonstrations.
+        columns: Whose first row it is; none: start and goal of the motion.
+        fitted: To them.
+        kind: Whose start and goal.
+
+    Raises:
+        ValueError: A demonstration lacks a column.
+    """
+    if not columns:
+        motions = fitted.motions
+        position = motions.position(kind)
+        last = (motions.demos.length - 1)[:, None, None]
+        goal = position.take_along_dim(last, dim=1)[:, 0]
+        return torch.cat([position[:, 0], goal], dim=-1)
+    rows = []
+    for demo in demos:
+        missing = [name for name in columns if name not in demo.extra]
+        if missing:
+            raise ValueError(
+                f"{demos.source}, episode {demo.episode}: no column {missing[0]!r} to take a "
+                f"context from; there are {', '.join(demo.extra) or 'none'}."
+            )
+        rows.append(np.concatenate([np.atleast_1d(demo.extra[name][0]) for name in columns]))
+    return torch.from_numpy(np.stack(rows)).double()
+
+
+def fit_contextual(
+    fitted: FittedPrimitives, demos: DemonstrationSet, columns: Sequence[str], folder: Path
+) -> dict[str, float]:
+    """Fit a primitive for every context, of joints and of positions; save into the folder.
+
+    Returns:
+        Error of each demonstration predicted from the others: median and largest.
+
+    Raises:
+        ValueError: Fewer than two demonstrations, no such kind, or a context that is missing.
+    """
+    linear = [kind for kind in ("joint", "position") if kind in fitted.each]
+    if not linear:
+        raise ValueError("a function of a context is learned of joints or of positions.")
+    metrics = {}
+    for kind in linear:
+        motions = fitted.motions
+        model = ContextualDMP.fit(
+            motions.demos.time,
+            motions.position(kind),
+            contexts(demos, columns, fitted, kind),
+            fitted.n_basis,
+            mask=motions.demos.mask,
+            **motions.naming(kind),
+            **fitted.options,
+        )
+        model.save(folder / CONTEXTUAL / kind)
+        error = model.held_out.nrmse
+        metrics[f"contextual_{kind}_held_out_nrmse_median"] = float(error.median())
+        metrics[f"contextual_{kind}_held_out_nrmse_max"] = float(error.max())
+    return metrics
+
+
+class _Columns(Sequence[tuple[np.ndarray, np.ndarray]]):
+    """Stamps and one column of demonstrations, read when asked for."""
+
+    def __init__(self, demos: Sequence[Demonstration], name: str, source: str):
+        self._demos, self._name, self._source = demos, name, source
+
+    @overload
+    def __getitem__(self, index: int) -> tuple[np.ndarray, np.ndarray]: ...
+    @overload
+    def __getitem__(self, index: slice) -> "_Columns": ...
+    def __getitem__(self, index):
+        if isinstance(index, slice):
+            return _Columns(self._demos[index], self._name, self._source)
+        return self._column(self._demos[index])
+
+    def __len__(self) -> int:
+        return len(self._demos)
+
+    def __iter__(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        return map(self._column, self._demos)
+
+    def _column(self, demo: Demonstration) -> tuple[np.ndarray, np.ndarray]:
+        values = getattr(demo, self._name)
+        if values is None:
+            raise ValueError(f"{self._source}, episode {demo.episode}: no {self._name}.")
+        return demo.time, values
+
+
+def fit_streamed(
+    demos: DemonstrationSource, n_basis: int, *, kinds: Sequence[str] = ()
+) -> tuple[dict[str, SharedFit], dict[str, float]]:
+    """Fit one primitive to all demonstrations, one of them in memory at a time.
+
+    Args:
+        demos: On disk.
+        n_basis: Number of basis functions.
+        kinds: Joint, position, or both; none: joint.
+
+    Returns:
+        The fits by kind, and what is to be said about them.
+
+    Raises:
+        ValueError: Another kind, whose coordinates depend on where demonstrations end.
+    """
+    fits, metrics = {}, {"demonstrations": float(len(demos)), "frames": float(demos.frames)}
+    for kind in kinds or ("joint",):
+        if kind not in ("joint", "position"):
+            raise ValueError(f"kind {kind!r} is not streamed: joint and position are.")
+        names = demos.joint_names if kind == "joint" else ("x", "y", "z")
+        fit = fit_shared(
+            _Columns(demos, KINDS[kind][0], demos.source),
+            n_basis,
+            joint_names=names,
+            units="rad" if kind == "joint" else "m",
+        )
+        fits[kind] = fit
+        metrics[f"mean_{kind}_rmse"] = float(fit.rmse.square().mean().sqrt())
+    return fits, metrics

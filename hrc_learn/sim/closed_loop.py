@@ -1,0 +1,245 @@
+"""Rehearsal: the closed loop in plain torch, against a camera the controller cannot see.
+
+Kinematics alone (the arm moves as it is told), so thousands of runs fit into one batch and
+gradients pass through. For contacts, images and marker detection use the simulator.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from hrc_learn.controller import (
+    AdaptiveController,
+    Command,
+    ControllerState,
+    Goals,
+    Observation,
+)
+from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.pytree import pytree, static
+
+OVERHEAD = (0.0, 0.0, 1.0, 0.0)
+"""Orientation of the paper's camera: it looks down, image right is -x and image down is +y."""
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
+class PinholeCamera:
+    """Fixed camera that sees a marker on the hand."""
+
+    pose: Pose
+    """Of the camera in the base frame: it looks along its z axis, x right, y down."""
+    marker: Float[Tensor, "*#batch 3"]
+    """Marker in the frame of the tool centre point [m]."""
+    corners: Float[Tensor, "points 3"] | None = None
+    """Points of a feature that has several, from the marker in the tool's frame [m]; None: the
+    marker's centre is the feature."""
+    focal_length: float = static(1600.0)
+    """[px]"""
+    image_size: tuple[int, int] = static((1440, 1080))
+    """Width and height [px]."""
+
+    @classmethod
+    def above(
+        cls,
+        point: Float[Tensor, "*batch 3"],
+        *,
+        height: Float[Tensor, "*#batch"],
+        roll: Float[Tensor, "*#batch"],
+        tilt: Float[Tensor, "*#batch"],
+        bearing: Float[Tensor, "*#batch"],
+        marker: Float[Tensor, "*#batch 3"],
+        **options,
+    ) -> PinholeCamera:
+        """Camera that looks at a point from a distance.
+
+        Args:
+            point: In the middle of the image [m].
+            height: Distance of the camera from it [m].
+            roll: Turn about the optical axis, from the paper's camera [rad].
+            tilt: Angle of the optical axis with the vertical [rad].
+            bearing: Horizontal direction in which the camera leans, from base x [rad].
+            marker: In the frame of the tool centre point [m].
+            options: The remaining fields.
+        """
+        zero = torch.zeros_like(roll + tilt + bearing)
+        lean = torch.stack([-torch.sin(bearing) + zero, torch.cos(bearing) + zero, zero], -1)
+        turn = torch.stack([zero, zero, roll + zero], dim=-1)
+        overhead = point.new_tensor(OVERHEAD)
+        orientation = quaternion.multiply(
+            quaternion.exp(tilt.unsqueeze(-1) * lean),
+            quaternion.multiply(overhead, quaternion.exp(turn)),
+        )
+        axis = quaternion.rotate(orientation, point.new_tensor((0.0, 0.0, 1.0)))
+        position = point - height.unsqueeze(-1) * axis
+        return cls(pose=Pose(position, orientation), marker=marker, **options)
+
+    def project(
+        self, tool: Pose
+    ) -> tuple[Float[Tensor, "*batch rows"], Bool[Tensor, "*batch"]]:
+        """Feature in the image [px], and whether all of it is inside the image."""
+        ray, _ = self._rays(tool)
+        pixel = self.focal_length * ray[..., :2] / ray[..., 2:] + self._centre(ray)
+        inside = (pixel >= 0) & (pixel <= 2 * self._centre(ray))
+        seen = inside.all(-1) & (ray[..., 2] > 0)
+        return pixel.flatten(-2), seen.all(-1)
+
+    def image_jacobian(self, tool: Pose) -> Float[Tensor, "*batch rows 6"]:
+        """True J_s: pixel velocity for a twist of the tool [px/m, px/rad]."""
+        ray, arm = self._rays(tool)
+        x, y, z = ray.unbind(-1)
+        zero = torch.zeros_like(z)
+        rows = [torch.stack([z, zero, -x], -1), torch.stack([zero, z, -y], -1)]
+        over_ray = self.focal_length * torch.stack(rows, -2) / (z * z)[..., None, None]
+        rotation = quaternion.to_matrix(quaternion.conjugate(self.pose.orientation))
+        over_point = over_ray @ rotation.unsqueeze(-3)
+        # Turning by w moves a point by w x arm: a row g of d(pixel)/d(point) gives arm x g.
+        arm, over_point = torch.broadcast_tensors(arm.unsqueeze(-2), over_point)
+        over_turn = torch.linalg.cross(arm, over_point)
+        return torch.cat([over_point, over_turn], dim=-1).flatten(-3, -2)
+
+    def _rays(self, tool: Pose) -> tuple[Tensor, Tensor]:
+        """Points in the camera frame, and their arms on the tool in the base frame [m].
+
+        Both have an axis of points before the last.
+        """
+        points = self.marker.unsqueeze(-2)
+        if self.corners is not None:
+            points = points + self.corners
+        arm = quaternion.rotate(tool.orientation.unsqueeze(-2), points)
+        offset = arm + (tool.position - self.pose.position).unsqueeze(-2)
+        turn = quaternion.conjugate(self.pose.orientation).unsqueeze(-2)
+        return quaternion.rotate(turn, offset), arm
+
+    def _centre(self, like: Tensor) -> Tensor:
+        return (like.new_tensor(self.image_size) - 1) / 2
+
+
+@runtime_checkable
+class Projects(Protocol):
+    """Whatever says where a camera sees the marker on the hand."""
+
+    def project(
+        self, tool: Pose
+    ) -> tuple[Float[Tensor, "*batch rows"], Bool[Tensor, "*batch"]]:
+        """Marker in the image [px], and whether it is inside the image."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class Imperfections:
+    """What a real camera does to the measurement."""
+
+    frame_steps: int = 1
+    """Control steps from one image to the next."""
+    latency_frames: int = 0
+    """Images by which a measurement is late."""
+    noise: float = 0.0
+    """Standard deviation of each pixel coordinate [px]."""
+    nan_share: float = 0.0
+    """Share of images whose measurement is NaN though it claims to be visible."""
+    loss_rate: float = 0.0
+    """How often the marker gets covered [1/s]."""
+    loss_time: float = 3.0
+    """Longest time it stays covered [s]; the mean is half of it."""
+
+
+@dataclass(kw_only=True)
+class VirtualCamera:
+    """Turns tool poses into measurements, with the imperfections of a camera."""
+
+    camera: Projects
+    imperfections: Imperfections
+    generator: torch.Generator
+    _steps: int = 0
+    _images: list[tuple[Tensor, Tensor, Tensor]] = field(default_factory=list)
+    _covered: Tensor | None = None
+
+    def observe(self, tool: Pose, joint_position: Tensor, dt: float) -> dict[str, Tensor]:
+        """Fields of an observation that come from the camera."""
+        new = self._steps % self.imperfections.frame_steps == 0
+        if new:
+            self._take_image(tool, joint_position, dt * self.imperfections.frame_steps)
+        self._steps += 1
+        feature, visible, q = self._images[0]
+        return {
+            "feature": feature,
+            "feature_visible": visible,
+            "feature_new": torch.full_like(visible, new),
+            "image_joint_position": q,
+        }
+
+    def _take_image(self, tool: Pose, joint_position: Tensor, frame_time: float) -> None:
+        imperfections = self.imperfections
+        feature, visible = self.camera.project(tool)
+        feature = feature + imperfections.noise * self._normal(feature)
+        broken = self._uniform(visible) < imperfections.nan_share
+        feature = torch.where(broken.unsqueeze(-1), torch.nan, feature)
+        visible = visible & ~self._cover(visible, frame_time)
+        self._images.append((feature, visible, joint_position))
+        del self._images[: -1 - imperfections.latency_frames]
+
+    def _cover(self, visible: Tensor, frame_time: float) -> Tensor:
+        """Whether something stands between marker and camera."""
+        remaining = torch.zeros_like(visible, dtype=torch.float64)
+        if self._covered is not None:
+            remaining = self._covered - frame_time
+        starts = self._uniform(visible) < self.imperfections.loss_rate * frame_time
+        spell = self.imperfections.loss_time * self._uniform(visible)
+        self._covered = torch.where(starts & (remaining <= 0), spell, remaining)
+        return self._covered > 0
+
+    def _uniform(self, like: Tensor) -> Tensor:
+        return torch.rand(like.shape, generator=self.generator, dtype=torch.float64)
+
+    def _normal(self, like: Tensor) -> Tensor:
+        return torch.randn(like.shape, generator=self.generator, dtype=like.dtype)
+
+
+def rehearse(
+    controller: AdaptiveController,
+    camera: VirtualCamera,
+    joint_position: Float[Tensor, "*batch n"],
+    *,
+    steps: int,
+    dt: float,
+    effort: Callable[[int, Tensor], Tensor] | None = None,
+    goals: Callable[[int], Goals] | None = None,
+    watch: Callable[[int, Tensor, Observation, Command, ControllerState], None] | None = None,
+) -> Float[Tensor, "*batch n"]:
+    """Run the closed loop.
+
+    Args:
+        controller: With its goals.
+        camera: What it sees.
+        joint_position: Start [rad].
+        steps: Number of control steps.
+        dt: Their length [s].
+        effort: Human effort from step number and joint position.
+        goals: Goals from the step number; default: those of the controller.
+        watch: Called after each step with its number, the joint position it started from,
+            observation, command and new state.
+
+    Returns:
+        Joint position at the end [rad].
+    """
+    q, state = joint_position, controller.initial_state(joint_position)
+    for k in range(steps):
+        observation = Observation(
+            **camera.observe(controller.chain.forward(q), q, dt),
+            joint_position=q,
+            dt=dt,
+            human_effort=None if effort is None else effort(k, q),
+            goals=None if goals is None else goals(k),
+        )
+        command, state = controller.step(state, observation)
+        if watch is not None:
+            watch(k, q, observation, command, state)
+        q = q + command.joint_velocity * dt
+    return q

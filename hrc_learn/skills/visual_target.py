@@ -1,0 +1,188 @@
+"""Where in the image the hand's marker should be, to stand right above an object.
+
+The hand's marker and the object's are at different heights and places, so aiming is not
+bringing one upon the other. With an uncalibrated camera the offset has to be learned: each
+demonstration ends with the hand right above an object, and tells one pair of pixels.
+
+For a camera that stands as it did then, a map from pixel to pixel is all it takes. One that has
+been moved since shows the same offset in space from another side: the image Jacobian, which
+adapts to it, tells how it looks from there.
+"""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from hrc_learn.store import new_file
+
+OBJECT_FEATURE = "observation.object_feature"
+"""Column of a dataset with the object's marker in the image."""
+OBJECT_FEATURE_NAMES = ("u", "v", "visible")
+UP = np.array([0.0, 0.0, 1.0])
+LONGEST_OFFSET = 0.3
+"""Of the hand's marker from the object's [m]. From few demonstrations along a flat box the
+image Jacobian knows little about height; only an offset of metres would explain the rest."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class VisualTarget:
+    """Affine map from the pixel of an object's marker to that of the hand's marker above it.
+
+    Affine is exact for a camera that looks straight down through a perfect lens, and good to a
+    few pixels for one that does not; `error` tells.
+    """
+
+    matrix: Float[np.ndarray, "2 3"]
+    """Maps (u, v, 1) of the object's marker to (u, v) of the hand's [px]."""
+    error: float
+    """Leave-one-out error, root mean square [px]; NaN from fewer than five demonstrations."""
+    offset: Float[np.ndarray, "3"] | None = None
+    """From the object's marker to the hand's, base frame [m], as the image Jacobian at the
+    hand's has it: shorter than it is by perspective, which shrinks what is further away. None
+    where no image Jacobian was at hand."""
+    offset_error: float = float("nan")
+    """As `error`, of targets by the offset [px]."""
+
+    @classmethod
+    def fit(
+        cls,
+        objects: Float[np.ndarray, "demos 2"],
+        hands: Float[np.ndarray, "demos 2"],
+        jacobians: Float[np.ndarray, "demos 2 6"] | None = None,
+    ) -> "VisualTarget":
+        """Fit to the ends of demonstrations.
+
+        Args:
+            objects: Pixels of the object's marker [px].
+            hands: Pixels of the hand's marker when the hand stood right above it [px].
+            jacobians: Image Jacobians of the hand's marker there [px/m, px/rad].
+
+        Raises:
+            ValueError: If there are fewer than three demonstrations, or they lie on a line.
+        """
+        design = np.column_stack([objects, np.ones(len(objects))])
+        if np.linalg.matrix_rank(design - design.mean(axis=0)) < 2:
+            raise ValueError(
+                f"{len(objects)} demonstrations do not determine where to aim: at least three "
+                "are needed, with objects that do not lie on one line in the image."
+            )
+        matrix, error = _solved(np.kron(design, np.eye(2)), hands)
+        offset, offset_error = None, float("nan")
+        if jacobians is not None:
+            directions = jacobians[..., :3].reshape(-1, 3)
+            offset, offset_error = _solved(directions, hands - objects, LONGEST_OFFSET)
+        return cls(
+            matrix=matrix.reshape(3, 2).T,
+            error=error,
+            offset=offset,
+            offset_error=offset_error,
+        )
+
+    def __call__(self, pixel: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
+        """Where the hand's marker should be for an object's marker at `pixel` [px]."""
+        return self.matrix @ np.append(pixel, 1.0)
+
+    def seen_by(
+        self, pixel: Float[np.ndarray, "2"], jacobian: Float[np.ndarray, "2 6"]
+    ) -> Float[np.ndarray, "2"]:
+        """The same for a camera that may have been moved since the demonstrations.
+
+        Args:
+            pixel: Of the object's marker [px].
+            jacobian: Estimate of the image Jacobian of the hand's marker [px/m, px/rad].
+        """
+        return self(pixel) if self.offset is None else pixel + jacobian[:, :3] @ self.offset
+
+    def line(self) -> Float[np.ndarray, "3"]:
+        """Direction from the object's marker to the hand's above it, base frame.
+
+        Straight up where demonstrations told no offset, or one that leads aside.
+        """
+        if self.offset is None or self.offset[2] < 0.5 * np.linalg.norm(self.offset):
+            return UP
+        return self.offset / np.linalg.norm(self.offset)
+
+    def save(self, path: Path) -> None:
+        """Write to a JSON file, whole or not at all."""
+        content = {
+            "version": 1,
+            "matrix": self.matrix.tolist(),
+            "error_px": _or_none(self.error),
+            "offset_m": None if self.offset is None else self.offset.tolist(),
+            "offset_error_px": _or_none(self.offset_error),
+        }
+        with new_file(path) as part:
+            part.write_text(json.dumps(content, indent=2), encoding="utf-8")
+
+    @classmethod
+    def load(cls, path: Path) -> "VisualTarget":
+        """Read what `save` wrote.
+
+        Raises:
+            FileNotFoundError: If there is no such file.
+            ValueError: If it is not one of ours.
+        """
+        content = json.loads(path.read_text(encoding="utf-8"))
+        if content.get("version") != 1 or "matrix" not in content:
+            raise ValueError(f"{path} is not a visual target of a known version: fit it again.")
+        offset = content.get("offset_m")
+        return cls(
+            matrix=np.array(content["matrix"]),
+            error=_or_nan(content["error_px"]),
+            offset=None if offset is None else np.array(offset),
+            offset_error=_or_nan(content.get("offset_error_px")),
+        )
+
+
+def _solved(
+    design: Float[np.ndarray, "equations unknowns"],
+    pixels: Float[np.ndarray, "demos 2"],
+    longest: float = np.inf,
+) -> tuple[Float[np.ndarray, " unknowns"], float]:
+    """Least squares on pixels, two equations a demonstration, and their leave-one-out error.
+
+    A solution longer than `longest` is shortened by the ridge penalty that takes.
+    """
+    inverse = _ridge_inverse(design, pixels.ravel(), longest)
+    solution = inverse @ pixels.ravel()
+    if len(pixels) < 5:
+        return solution, float("nan")
+    residuals = pixels - (design @ solution).reshape(-1, 2)
+    # From the blocks of the hat matrix, of both equations that go at once (Allen 1974, PRESS).
+    hat = (design @ inverse).reshape(len(pixels), 2, len(pixels), 2)
+    own = hat[np.arange(len(pixels)), :, np.arange(len(pixels))]
+    press = np.linalg.solve(np.eye(2) - own, residuals[..., None])
+    return solution, float(np.sqrt((press**2).sum(axis=(1, 2)).mean()))
+
+
+def _ridge_inverse(
+    design: Float[np.ndarray, "equations unknowns"],
+    values: Float[np.ndarray, " equations"],
+    longest: float,
+) -> Float[np.ndarray, "unknowns equations"]:
+    """Pseudo-inverse, damped just enough to keep the solution as short as asked for."""
+    u, s, vt = np.linalg.svd(design, full_matrices=False)
+    s = np.maximum(s, 1e-12 * s[0])
+    along = u.T @ values
+
+    def length(penalty: float) -> float:
+        return float(np.linalg.norm(s * along / (s**2 + penalty)))
+
+    low, high = 0.0, 0.0
+    if length(0.0) > longest:
+        high = float(s[0] * np.linalg.norm(along)) / longest
+        while high - low > 1e-6 * high:
+            middle = (low + high) / 2
+            low, high = (middle, high) if length(middle) > longest else (low, middle)
+    return (vt.T * (s / (s**2 + high))) @ u.T
+
+
+def _or_none(error: float) -> float | None:
+    return None if np.isnan(error) else error
+
+
+def _or_nan(error: float | None) -> float:
+    return float("nan") if error is None else float(error)

@@ -1,0 +1,225 @@
+"""The page in a browser from which a person leads the arm: a stand-in for an AR headset."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Sequence
+from threading import Event, Thread
+from types import TracebackType
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from hrc_learn.geometry import Body, Box, Pose
+from hrc_learn.kinematics import SerialChain, coarse_orientation
+from hrc_learn.protocols import ArmState, HumanInput
+from hrc_learn.teleoperation.interaction_force import DragConfig, hand_twist
+from hrc_learn.teleoperation.page.gizmos import Grips, Handles
+from hrc_learn.teleoperation.page.page_config import PageConfig, PageStatus
+from hrc_learn.teleoperation.page.page_operator import Asked, PageHuman, ask
+from hrc_learn.teleoperation.page.page_scene import Stage
+from hrc_learn.teleoperation.page.panel import Panel
+
+_PANEL_EVERY = 5  # refreshes of the scene for one of the panel
+
+
+class Page:
+    """Serves the page and keeps it up to date, in threads of its own.
+
+        with Page(panda, bodies, boxes) as page:
+            while running:
+                asked = page.human.read(arm.read())
+                ...
+                page.place(positions, orientations)
+                page.show(status)
+
+    The control loop pays for `human.read`, `place` and `show`, which exchange references.
+
+    Attributes:
+        human: The person at the page.
+        url: Where the page is.
+    """
+
+    def __init__(
+        self,
+        chain: SerialChain,
+        bodies: Sequence[Body],
+        boxes: Sequence[Box] = (),
+        config: PageConfig | None = None,
+        *,
+        task: str = "",
+        leads: bool = True,
+    ):
+        """Serve the page; it follows the arm within the `with` block.
+
+        Args:
+            chain: The arm.
+            bodies: What moves, with its shapes and first poses. "link1", "link2", ... can be
+                held, and "hand", "finger_left", "finger_right", which lead the hand.
+            boxes: What stands.
+            config: Of the page.
+            task: What is to be shown, in words.
+            leads: Whether the person leads the hand, draws regions and records. Beside an arm
+                that works by itself, people pull at the body, and nothing else is offered.
+        """
+        import viser
+
+        self._config = config = config or PageConfig()
+        self._chain = chain
+        self.human = PageHuman(len(chain.joint_names))
+        self._server = viser.ViserServer(config.host, config.port, verbose=False)
+        self.url = f"http://{config.host}:{self._server.get_port()}"
+        self._grips = Grips(config.patience)
+        self._stage = Stage(self._server, bodies, boxes, config.twin)
+        self._handles = Handles(
+            self._server, self._stage, self._grips, self._links, leads=leads
+        )
+        self._panel = Panel(
+            self._server,
+            boxes,
+            config,
+            self.human.request,
+            self._stage.show_twin,
+            self._handles.let_turn,
+            task,
+            leads=leads,
+        )
+        first = [np.stack([getattr(b, name)[0] for b in bodies]) for name in _POSE]
+        self._poses: tuple[np.ndarray, np.ndarray] = (first[0], first[1])
+        self._status = PageStatus()
+        self._placed, self._counted = 0, (0, time.monotonic())
+        self._closing = Event()
+        self._error: BaseException | None = None
+        self._threads = [
+            Thread(target=self._guarded, args=(work,), name=f"page {name}", daemon=True)
+            for name, work in (("refresh", self._refresh), ("listen", self._listen))
+        ]
+
+    def __enter__(self) -> Page:
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._closing.set()
+        for thread in self._threads:
+            thread.join()
+        self._server.stop()
+        if self._error is not None and error is None:
+            raise self._error
+
+    @property
+    def task(self) -> str:
+        """What is shown, in words, as the person has put it."""
+        return self._panel.task
+
+    @property
+    def alive(self) -> bool:
+        """Whether the page still follows the arm; leaving the block raises why it does not."""
+        return self._error is None
+
+    def place(
+        self,
+        positions: Float[np.ndarray, "bodies 3"],
+        orientations: Float[np.ndarray, "bodies 4"],
+    ) -> None:
+        """Tell after each step where the bodies are: positions [m], unit quaternions (wxyz)."""
+        self._poses = (positions, orientations)
+        self._placed += 1
+
+    def show(self, status: PageStatus) -> None:
+        """Tell how the session stands."""
+        self._status = status
+
+    def _guarded(self, work: Callable[[], None]) -> None:
+        try:
+            work()
+        except Exception as error:  # handed over to the thread that closes
+            self._error = error
+
+    def _links(self) -> Pose | None:
+        state = self.human.state
+        return None if state is None else self._chain.link_poses(_joints(state))
+
+    def _refresh(self) -> None:
+        """Follow the arm, and renew what is asked of it."""
+        period, ticks = 1 / self._config.refresh, 0
+        while not self._closing.wait(period):
+            state = self.human.state
+            if state is None:
+                continue
+            asked = self._ask(state)
+            links = self._chain.link_poses(_joints(state))
+            with self._server.atomic():
+                self._stage.move(*self._poses, links.position.numpy())
+                self._stage.point(asked.arrows)
+                self._handles.follow(links[-1])
+                if ticks % _PANEL_EVERY == 0:
+                    people = len(self._server.get_clients())
+                    self._panel.refresh(self._status, asked.effort, self._rate(), people)
+            ticks += 1
+
+    def _rate(self) -> float:
+        """Steps that the loop has taken since the last time this was asked [1/s]."""
+        placed, began = self._counted
+        self._counted = self._placed, time.monotonic()
+        return (self._counted[0] - placed) / max(self._counted[1] - began, 1e-9)
+
+    def _ask(self, state: ArmState) -> Asked:
+        panel, drag = self._panel, self._panel.drag
+        grips = self._grips.held().values()
+        asked = ask(self._chain, state.joint_position, grips, drag, coarse=panel.coarse)
+        twist = asked.twist
+        if not twist.any():
+            twist = self._keyed(state, drag)
+        self.human.post(
+            HumanInput(
+                effort=asked.effort,
+                twist=twist,
+                gripper=panel.gripper,
+                region=panel.region,
+                target=panel.target,
+            )
+        )
+        return asked
+
+    def _keyed(self, state: ArmState, drag: DragConfig) -> Float[np.ndarray, "6"]:
+        """Motion of the hand that the keys ask for."""
+        direction = self._panel.direction()
+        if not direction.any():
+            return np.zeros(6)
+        hand = self._chain.forward(_joints(state))
+        orientation = coarse_orientation(hand.position) if self._panel.coarse else None
+        return hand_twist(hand, drag.speed * direction, orientation, drag)
+
+    def _listen(self) -> None:
+        """Ask the browsers of those who hold something whether they are still there.
+
+        A browser that is told nothing for a while may be gone, its network cable pulled: the
+        server learns of that much later. A pointer at rest sends nothing either.
+        """
+        while not self._closing.wait(self._config.patience / 4):
+            for holder in self._grips.holders:
+                client = self._server.get_clients().get(holder)
+                if client is None:
+                    self._grips.release_all(holder)
+                    continue
+                with contextlib.suppress(TimeoutError, RuntimeError):
+                    asked = time.monotonic()
+                    client.local_storage.get_item("alive", timeout=self._config.patience)
+                    if time.monotonic() - asked < self._config.patience:
+                        self._grips.hear(holder)
+
+
+_POSE = ("position", "orientation")
+
+
+def _joints(state: ArmState) -> Float[torch.Tensor, " joints"]:
+    return torch.from_numpy(state.joint_position)

@@ -1,0 +1,251 @@
+"""What stands and moves in the page's scene: the arm, its virtual twin, the furniture;
+and the meshes it is drawn with.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from hrc_learn.geometry import Body, Box, Capsule
+from hrc_learn.teleoperation.page.viser_names import (
+    Holdable,
+    IcosphereHandle,
+    MeshHandle,
+    ViserServer,
+)
+from hrc_learn.viz.palette import PERSON, SKY, rgba
+
+# Meshes of the capsules and boxes that bodies are drawn with.
+
+
+class Mesh(NamedTuple):
+    """Triangles in the frame of a body."""
+
+    vertices: Float[np.ndarray, "vertices 3"]
+    """[m]"""
+    faces: Int[np.ndarray, "faces 3"]
+    """Corners of each triangle, counter-clockwise as seen from outside."""
+
+
+def capsule_mesh(capsule: Capsule, segments: int = 20) -> Mesh:
+    """A cylinder with round ends.
+
+    Args:
+        capsule: Its ends and radius.
+        segments: Around the axis; half as many from pole to pole.
+    """
+    start, end = np.array(capsule.start), np.array(capsule.end)
+    axis = end - start
+    length = float(np.linalg.norm(axis))
+    w = axis / length if length > 0 else np.array([0.0, 0.0, 1.0])
+    u = np.cross(w, np.eye(3)[np.abs(w).argmin()])
+    u /= np.linalg.norm(u)
+    v = np.cross(w, u)
+    # Rings from pole to pole; the equator is there twice, once at each end of the cylinder.
+    quarter = np.linspace(0, np.pi / 2, segments // 4 + 1)
+    latitude = np.concatenate([quarter - np.pi / 2, quarter])
+    origin = np.where(np.arange(len(latitude))[:, None] < len(quarter), start, end)
+    longitude = np.linspace(0, 2 * np.pi, segments, endpoint=False)
+    around = np.cos(longitude)[:, None] * u + np.sin(longitude)[:, None] * v
+    offset = np.cos(latitude)[:, None, None] * around + np.sin(latitude)[:, None, None] * w
+    vertices = origin[:, None] + capsule.radius * offset
+    return Mesh(vertices.reshape(-1, 3), _grid_faces(len(latitude), segments))
+
+
+def _grid_faces(rings: int, segments: int) -> Int[np.ndarray, "faces 3"]:
+    """Two triangles for each cell of a grid that closes around its second axis."""
+    ring, k = np.meshgrid(np.arange(rings - 1), np.arange(segments), indexing="ij")
+    here, right = ring * segments + k, ring * segments + (k + 1) % segments
+    above, above_right = here + segments, right + segments
+    faces = np.stack([here, right, above_right, here, above_right, above], axis=-1)
+    return faces.reshape(-1, 3)
+
+
+def box_mesh(box: Box) -> Mesh:
+    """A box along the axes of its body."""
+    corner = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    # Every side has corners of its own, so that shading keeps the edges sharp.
+    vertices = np.concatenate([corner[list(side)] for side in sides])
+    first = 4 * np.arange(6)[:, None]
+    faces = np.concatenate([first + np.array(half) for half in ((0, 1, 2), (0, 2, 3))])
+    return Mesh(np.array(box.centre) + vertices * box.half_size, faces)
+
+
+def body_mesh(body: Body) -> Mesh:
+    """All capsules and boxes of a body as one mesh."""
+    meshes = [*map(capsule_mesh, body.capsules), *map(box_mesh, body.boxes)]
+    first = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
+    return Mesh(
+        np.concatenate([mesh.vertices for mesh in meshes]),
+        np.concatenate([mesh.faces + start for mesh, start in zip(meshes, first, strict=True)]),
+    )
+
+
+# What stands and moves in the page's scene: the arm, its virtual twin, the furniture.
+
+_KNOBS = (2, 4, 6)
+"""Joints marked by a knob: shoulder, elbow, wrist. Between them the links are held."""
+_HAND_PARTS = ("link7", "hand", "finger_left", "finger_right")
+"""What moves with the hand, the last link too: whoever pulls at it leads the hand."""
+_PERSON = rgba(PERSON)[:3]
+
+
+class Stage:
+    """Draws bodies where they are, once as the arm itself and once as its twin."""
+
+    def __init__(
+        self,
+        server: ViserServer,
+        bodies: Sequence[Body],
+        boxes: Sequence[Box],
+        twin: tuple[float, float, float],
+    ):
+        """Set the stage.
+
+        Args:
+            server: Of the page.
+            bodies: What moves, with its shapes.
+            boxes: What stands.
+            twin: Where the virtual twin stands, from the arm [m].
+        """
+        self._scene = server.scene
+        self.twin = np.array(twin)
+        self._scene.add_frame("/twin", position=twin, show_axes=False)
+        self._bodies = tuple(bodies)
+        self._own = [self._draw("", body) for body in bodies]
+        # Things that are carried have no twin: what matters is what can be held.
+        self._copies = [
+            self._draw("/twin", body) if _is_part_of_arm(body) else None for body in bodies
+        ]
+        self._knobs = {joint: self._draw_knob("", joint) for joint in _KNOBS}
+        self._twin_knobs = {joint: self._draw_knob("/twin", joint) for joint in _KNOBS}
+        for box in boxes:
+            self._draw_box(box)
+        self._surroundings(server)
+        self._arrows = None
+
+    def handles(self) -> Iterator[tuple[Holdable, int | None, np.ndarray]]:
+        """All that can be held: node, joint (None: the hand), and how far off the arm [m]."""
+        here = np.zeros(3)
+        for body, own, copy in zip(self._bodies, self._own, self._copies, strict=True):
+            is_hand = body.name in _HAND_PARTS
+            joint = None if is_hand else _joint_of(body)
+            if is_hand or joint is not None:
+                yield own, joint, here
+                if copy is not None:
+                    yield copy, joint, self.twin
+        for joint in _KNOBS:
+            yield self._knobs[joint], joint, here
+            yield self._twin_knobs[joint], joint, self.twin
+
+    def move(
+        self,
+        positions: Float[np.ndarray, "bodies 3"],
+        orientations: Float[np.ndarray, "bodies 4"],
+        joints: Float[np.ndarray, "links 3"],
+    ) -> None:
+        """Put everything where it is.
+
+        Args:
+            positions: Of the bodies [m].
+            orientations: Of the bodies (wxyz).
+            joints: Origins of the arm's frames, for the knobs [m].
+        """
+        nodes = zip(self._own, self._copies, positions, orientations, strict=True)
+        for own, copy, position, orientation in nodes:
+            for node in (own, copy):
+                if node is not None:
+                    node.position, node.wxyz = position, orientation
+        for knobs in (self._knobs, self._twin_knobs):
+            for joint, knob in knobs.items():
+                knob.position = joints[joint - 1]
+
+    def show_twin(self, visible: bool) -> None:
+        """Show or hide the twin."""
+        for node in (*self._copies, *self._twin_knobs.values()):
+            if node is not None:
+                node.visible = visible
+
+    def point(self, arrows: Float[np.ndarray, "arrows 2 3"]) -> None:
+        """Show where from and where to the arm is pulled."""
+        if self._arrows is not None:
+            self._arrows.remove()
+            self._arrows = None
+        if len(arrows):
+            self._arrows = self._scene.add_arrows(
+                "/pull",
+                arrows,
+                _PERSON,
+                shaft_radius=0.008,
+                head_radius=0.022,
+                head_length=0.05,
+            )
+
+    def _draw(self, parent: str, body: Body) -> MeshHandle:
+        mesh = body_mesh(body)
+        red, green, blue, _ = (*body.capsules, *body.boxes)[0].colour
+        own = round(255 * red), round(255 * green), round(255 * blue)
+        return self._scene.add_mesh_simple(
+            f"{parent}/arm/{body.name}",
+            mesh.vertices,
+            mesh.faces,
+            color=rgba(SKY)[:3] if parent else own,
+            opacity=0.45 if parent else None,
+            flat_shading=False,
+            position=body.position[0],
+            wxyz=body.orientation[0],
+            cast_shadow=not parent,
+        )
+
+    def _draw_knob(self, parent: str, joint: int) -> IcosphereHandle:
+        return self._scene.add_icosphere(
+            f"{parent}/knobs/joint{joint}",
+            radius=0.078,
+            color=_PERSON,
+            opacity=0.9,
+            cast_shadow=False,
+        )
+
+    def _draw_box(self, box: Box) -> None:
+        r, g, b, opacity = box.colour
+        self._scene.add_box(
+            f"/furniture/{box.name}",
+            color=(round(255 * r), round(255 * g), round(255 * b)),
+            dimensions=2 * np.array(box.half_size),
+            position=box.centre,
+            opacity=opacity if opacity < 1 else None,
+        )
+
+    def _surroundings(self, server: ViserServer) -> None:
+        self._scene.world_axes.visible = False
+        # Shadows cost a machine without a GPU half its frames.
+        self._scene.configure_default_lights(cast_shadow=False)
+        self._scene.configure_environment_map("city", environment_intensity=0.5)
+        self._scene.add_grid(
+            "/floor", width=6.0, height=6.0, cell_size=0.25, position=(0.0, 0.5, -0.72)
+        )
+        self._scene.add_box(
+            "/furniture/pedestal",
+            color=(77, 77, 82),
+            dimensions=(0.24, 0.24, 0.72),
+            position=(-0.03, 0.0, -0.36),
+        )
+        server.initial_camera.position = (2.65, 1.05, 1.15)
+        server.initial_camera.look_at = (0.1, 0.47, 0.12)
+        server.initial_camera.fov = 0.9
+
+
+def _joint_of(body: Body) -> int | None:
+    """Joint that moves a link, by its name; None for what is no link that moves."""
+    match = re.fullmatch(r"link([1-9]\d*)", body.name)
+    return int(match[1]) if match else None
+
+
+def _is_part_of_arm(body: Body) -> bool:
+    return body.name.startswith("link") or body.name in _HAND_PARTS

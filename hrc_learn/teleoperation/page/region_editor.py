@@ -1,0 +1,307 @@
+"""Drawing, moving and sizing the Cartesian region with the mouse, and marking the target."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from hrc_learn.geometry import Box, quaternion
+from hrc_learn.protocols import DrawnRegion
+from hrc_learn.teleoperation.page.page_config import FIRST_REGION
+from hrc_learn.teleoperation.page.viser_names import (
+    SceneClickEvent,
+    SceneRectSelectEvent,
+    ViserServer,
+)
+from hrc_learn.viz.palette import GREEN, VERMILION, rgba
+
+# Pointing into the scene: from a place on the screen to a point or a box in the workplace.
+
+
+def view_ray(
+    screen: tuple[float, float],
+    orientation: Float[np.ndarray, "4"],
+    field_of_view: float,
+    aspect: float,
+) -> Float[np.ndarray, "3"]:
+    """Direction in which a camera sees a place on its screen, as a unit vector.
+
+    Args:
+        screen: Place, from (0, 0) at the upper left to (1, 1) at the lower right.
+        orientation: Of the camera (wxyz): x right, y down, z into the scene.
+        field_of_view: From the lower to the upper edge [rad].
+        aspect: Width over height of the screen.
+    """
+    half = math.tan(field_of_view / 2)
+    x, y = (2 * screen[0] - 1) * half * aspect, (2 * screen[1] - 1) * half
+    ray = torch.tensor([x, y, 1.0], dtype=torch.float64)
+    turned = quaternion.rotate(torch.as_tensor(orientation, dtype=torch.float64), ray)
+    return (turned / turned.norm()).numpy()
+
+
+def meet_plane(
+    origin: Float[np.ndarray, "3"], direction: Float[np.ndarray, "3"], axis: int, value: float
+) -> Float[np.ndarray, "3"] | None:
+    """Where a ray meets a plane on which one coordinate is the same everywhere.
+
+    Args:
+        origin: Of the ray [m].
+        direction: Unit vector.
+        axis: Which coordinate: 2 for a horizontal plane.
+        value: Of the coordinate on the plane [m].
+
+    Returns:
+        The point [m]; None if the ray leads away from the plane or along it.
+    """
+    if abs(direction[axis]) < 1e-9:
+        return None
+    distance = (value - origin[axis]) / direction[axis]
+    return origin + distance * direction if distance > 0 else None
+
+
+def meet_box(
+    origin: Float[np.ndarray, "3"],
+    direction: Float[np.ndarray, "3"],
+    centre: Float[np.ndarray, "3"],
+    half_size: Float[np.ndarray, "3"],
+) -> float:
+    """Distance at which a ray enters a box along the base axes, infinity if it does not [m].
+
+    The slabs of Kay and Kajiya (1986).
+
+    Args:
+        origin: Of the ray [m], outside the box.
+        direction: Unit vector.
+        centre: Of the box [m].
+        half_size: Of the box [m].
+    """
+    # A component of zero leaves its slab never or always: both infinities say so.
+    safe = np.where(np.abs(direction) < 1e-12, 1e-12, direction)
+    near = (centre - half_size - origin) / safe
+    far = (centre + half_size - origin) / safe
+    enter = float(np.minimum(near, far).max())
+    leave = float(np.maximum(near, far).min())
+    return enter if 0 < enter <= leave else math.inf
+
+
+def region_over(
+    points: Float[np.ndarray, "points 3"],
+    bottom: float,
+    height: float,
+    smallest: float = 0.02,
+) -> DrawnRegion:
+    """The upright box over the rectangle that holds some points, along the base axes.
+
+    Args:
+        points: Seen from above [m]; their heights do not matter.
+        bottom: Height of the box's lower face [m].
+        height: Of the box [m].
+        smallest: Half size that no edge falls below [m].
+    """
+    low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
+    x, y = ((low + high) / 2).tolist()
+    a, b = np.maximum((high - low) / 2, smallest).tolist()
+    c = max(height / 2, smallest)
+    return DrawnRegion(centre=(x, y, bottom + c), half_size=(a, b, c))
+
+
+# Drawing, moving and sizing the Cartesian region, and marking the target.
+
+_COLOUR = rgba(GREEN)[:3]
+_DRAW: Any = "cube-plus"
+_MARK: Any = "target"
+_LARGEST = 0.5  # half size that a slider goes up to [m]
+_SMALLEST = 0.02
+_LIFTED = 0.08  # height of a target above what was clicked on [m]
+
+
+class RegionEditor:
+    """The box in the scene, its controls in the panel, and the target's mark."""
+
+    def __init__(self, server: ViserServer, boxes: Sequence[Box]):
+        """Draw the first region, not in force.
+
+        Args:
+            server: Of the page; controls go into the folder that is open.
+            boxes: Furniture that targets may be marked on.
+        """
+        self._server, self._scene, self._boxes = server, server.scene, tuple(boxes)
+        self._region = FIRST_REGION
+        self._target: tuple[float, float, float] | None = None
+        self._add_controls()
+        self._add_nodes()
+        self._update()
+
+    @property
+    def region(self) -> DrawnRegion | None:
+        """The region, where it is in force."""
+        return self._region if self._in_force.value else None
+
+    @property
+    def target(self) -> tuple[float, float, float] | None:
+        """The point marked, where there is one [m]."""
+        return self._target
+
+    def reshape(self, region: DrawnRegion) -> None:
+        """Take another region, and let scene and panel follow."""
+        self._region = region
+        self._update()
+
+    def mark(self, point: Float[np.ndarray, "3"] | None) -> None:
+        """Mark the target somewhere [m], or nowhere."""
+        self._mark.visible = point is not None
+        self._target = None
+        if point is not None:
+            x, y, z = point.tolist()
+            self._target = (x, y, z)
+            self._mark.position = point
+
+    def _add_controls(self) -> None:
+        gui = self._server.gui
+        self._draw = gui.add_button("Draw on the table", icon=_DRAW)
+        self._draw.on_click(lambda _: self._draw_next())
+        self._in_force = gui.add_checkbox(
+            "In force", False, hint="The hand is drawn into the region."
+        )
+        self._in_force.on_update(lambda _: self._update())
+        self._sizes = [
+            gui.add_slider(f"Size {axis}", 2 * _SMALLEST, 2 * _LARGEST, 0.01, 0.1)
+            for axis in "xyz"
+        ]
+        for slider in self._sizes:
+            slider.on_update(self._resized)
+        self._mark_next_button = gui.add_button("Mark the target", icon=_MARK)
+        self._mark_next_button.on_click(lambda _: self._mark_next())
+        gui.add_button("Clear the target", color="gray").on_click(lambda _: self.mark(None))
+
+    def _add_nodes(self) -> None:
+        scene, region = self._scene, self._region
+        self._gizmo = scene.add_transform_controls(
+            "/region", scale=0.16, disable_rotations=True, position=region.centre
+        )
+        self._gizmo.on_update(self._moved)
+        self._box = scene.add_box(
+            "/region/box",
+            color=_COLOUR,
+            dimensions=_doubled(region.half_size),
+            opacity=0.12,
+            side="double",
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+        self._edges = scene.add_line_segments(
+            "/region/edges", _edges(region.half_size), _COLOUR, thickness=0.004
+        )
+        self._corner = scene.add_icosphere(
+            "/region/corner", radius=0.022, color=_COLOUR, position=region.half_size
+        )
+        self._corner.on_drag(self._corner_dragged)
+        self._mark = scene.add_icosphere(
+            "/target", radius=0.02, color=rgba(VERMILION)[:3], visible=False
+        )
+        self._mark.on_drag(self._mark_dragged)
+
+    async def _moved(self, event: Any) -> None:
+        x, y, z = event.target.position.tolist()
+        self._region = DrawnRegion(centre=(x, y, z), half_size=self._region.half_size)
+
+    async def _corner_dragged(self, event: Any) -> None:
+        # Two sizes follow the pointer; the third, along the view, could only be guessed.
+        corner = np.array(self._region.centre) + self._region.half_size
+        eye = event.client.camera.position
+        view = np.array(event.end_position) - eye
+        axis = int(np.abs(view).argmax())
+        place = meet_plane(eye, view / np.linalg.norm(view), axis, corner[axis])
+        if place is None:
+            return
+        half_size = np.clip(place - self._region.centre, _SMALLEST, _LARGEST)
+        a, b, c = half_size.tolist()
+        self.reshape(DrawnRegion(centre=self._region.centre, half_size=(a, b, c)))
+
+    async def _mark_dragged(self, event: Any) -> None:
+        self.mark(np.array(event.end_position))
+
+    def _resized(self, event: Any) -> None:
+        if event.client is None:  # we have moved the slider ourselves
+            return
+        a, b, c = (slider.value / 2 for slider in self._sizes)
+        self.reshape(DrawnRegion(centre=self._region.centre, half_size=(a, b, c)))
+
+    def _update(self) -> None:
+        region = self._region
+        self._gizmo.position = region.centre
+        self._box.dimensions = _doubled(region.half_size)
+        self._box.opacity = 0.3 if self._in_force.value else 0.12
+        self._edges.points = _edges(region.half_size)
+        self._corner.position = region.half_size
+        for slider, half in zip(self._sizes, region.half_size, strict=True):
+            slider.value = round(2 * half, 3)
+
+    def _draw_next(self) -> None:
+        """Make the next rectangle drawn on the screen the region's footprint."""
+        self._draw.disabled = True
+
+        @self._scene.on_rect_select()
+        def drawn(event: SceneRectSelectEvent) -> None:
+            self._scene.remove_rect_select_callback(drawn)
+            self._draw.disabled = False
+            footprint = self._footprint(event)
+            if footprint is not None:
+                bottom = self._region.centre[2] - self._region.half_size[2]
+                height = 2 * self._region.half_size[2]
+                self.reshape(region_over(footprint, bottom, height))
+
+    def _footprint(self, event: SceneRectSelectEvent) -> Float[np.ndarray, "4 3"] | None:
+        """Where the middles of a rectangle's edges lie on the table."""
+        (left, top), (right, bottom) = event.screen_min, event.screen_max
+        x, y = (left + right) / 2, (top + bottom) / 2
+        camera = event.client.camera
+        points = []
+        for screen in ((left, y), (right, y), (x, top), (x, bottom)):
+            ray = view_ray(screen, camera.wxyz, camera.fov, camera.aspect)
+            points.append(meet_plane(camera.position, ray, 2, 0.0))
+        return None if any(p is None for p in points) else np.array(points)
+
+    def _mark_next(self) -> None:
+        """Mark the target above the next point clicked."""
+        self._mark_next_button.disabled = True
+
+        @self._scene.on_click()
+        def clicked(event: SceneClickEvent) -> None:
+            self._scene.remove_click_callback(clicked)
+            self._mark_next_button.disabled = False
+            point = self._surface(np.array(event.ray_origin), np.array(event.ray_direction))
+            if point is not None:
+                self.mark(point + np.array([0.0, 0.0, _LIFTED]))
+
+    def _surface(
+        self, origin: Float[np.ndarray, "3"], direction: Float[np.ndarray, "3"]
+    ) -> Float[np.ndarray, "3"] | None:
+        """Nearest point of the furniture on a ray, else that at the height of the table."""
+        distances = [
+            meet_box(origin, direction, np.array(box.centre), np.array(box.half_size))
+            for box in self._boxes
+        ]
+        nearest = min(distances, default=np.inf)
+        if np.isfinite(nearest):
+            return origin + nearest * direction
+        return meet_plane(origin, direction, 2, 0.0)
+
+
+def _doubled(half_size: tuple[float, float, float]) -> tuple[float, float, float]:
+    x, y, z = half_size
+    return 2 * x, 2 * y, 2 * z
+
+
+def _edges(half_size: tuple[float, float, float]) -> Float[np.ndarray, "12 2 3"]:
+    """Both ends of each edge of a box about the origin."""
+    corners = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+    # An edge goes up along one axis, from -1 to 1.
+    pairs = [(a, b) for a in corners for b in corners if sorted(b - a) == [0, 0, 2]]
+    return np.array(pairs) * np.array(half_size)

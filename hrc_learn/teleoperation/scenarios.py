@@ -1,0 +1,346 @@
+"""Jobs to be learned in the simulated workplace: how they begin, are shown, run and are
+judged.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+
+from hrc_learn.kinematics import gripper_down, panda
+from hrc_learn.protocols import ArmState, Human, HumanInput
+from hrc_learn.sim import CameraKind, World, open_camera
+from hrc_learn.sim.workplace import Workplace, nearest_configuration
+from hrc_learn.skills.marker_sensor import Eye
+from hrc_learn.skills.position_servo import PositionServo, PositionServoConfig
+from hrc_learn.teleoperation.scripted_demonstrations import PlacingLesson, placing_expert
+from hrc_learn.teleoperation.scripted_expert import GuidedPath, ScriptedExpert, Tremor
+from hrc_learn.vision import CameraModel, ImageNoise, SyntheticCamera
+
+# Jobs to be learned in the simulated workplace: how they begin, are shown, and are done.
+#
+# Success is read from MuJoCo's contacts and poses, whoever did the job.
+
+OPEN, CLOSED = 0.08, 0.0
+"""Openings that the gripper is sent to [m]; closed, it squeezes what is between the fingers."""
+
+
+class Scenario(ABC):
+    """A job, the same for the person who shows it and the policy that has learned it."""
+
+    workplace: Workplace
+
+    @property
+    @abstractmethod
+    def task(self) -> str:
+        """What is to be done, in words."""
+
+    @property
+    @abstractmethod
+    def duration(self) -> float:
+        """Of a demonstration [s]."""
+
+    @abstractmethod
+    def begin(self, world: World, rng: np.random.Generator) -> Human:
+        """Put everything in place, and return who can show the job from there.
+
+        Args:
+            world: Of the workplace; its clock begins at zero.
+            rng: Source of where things are, and of the person's unsteadiness.
+        """
+
+    @abstractmethod
+    def succeeded(self, world: World) -> bool:
+        """Whether the job is done."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Placing(Scenario):
+    """Put the thing in the hand on a shelf, and let go."""
+
+    workplace: Workplace = field(default_factory=Workplace)
+    shelf: str = "middle"
+    lesson: PlacingLesson = field(default_factory=PlacingLesson)
+    release: float = 1.5
+    """Time for the fingers to open [s]."""
+
+    @property
+    def task(self) -> str:
+        return f"place the box on the {self.shelf} shelf"
+
+    @property
+    def duration(self) -> float:
+        return self._let_go + self.release
+
+    @property
+    def _let_go(self) -> float:
+        return self.lesson.duration + self.lesson.settle
+
+    def begin(self, world: World, rng: np.random.Generator) -> Human:
+        expert = placing_expert(self.workplace, self.shelf, self.lesson, rng)
+        offset = torch.from_numpy(expert.path.position(0.0)) - self.workplace.home().position
+        joints = self.workplace.home_joints(offset).numpy()
+        world.hold(self.workplace.scene.objects[0].name, joints)
+        return InTurn([(0.0, expert, CLOSED), (self._let_go, expert, OPEN)])
+
+    def succeeded(self, world: World) -> bool:
+        return world.rests_on(self.workplace.scene.objects[0].name, f"board_{self.shelf}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Grasping(Scenario):
+    """Take a thing that lies at random on the table, and lift it."""
+
+    workplace: Workplace = field(default_factory=Workplace)
+    reach: tuple[float, float, float] = (0.10, 0.08, 0.0)
+    """How far from the middle of the table it lies [m]."""
+    approach: float = 4.0
+    """From above the middle of the table down to the thing [s]."""
+    grip: float = 0.7
+    """Time for the fingers to close [s]."""
+    lift: float = 2.0
+    """Time to lift it [s]."""
+    height: float = 0.15
+    """How far it is lifted [m]."""
+    settle: float = 0.5
+    """Rest at the end [s]."""
+    tremor: float = 2e-4
+    """Amplitude of the hand's tremor [m]."""
+
+    @property
+    def task(self) -> str:
+        return "grasp the box and lift it"
+
+    @property
+    def duration(self) -> float:
+        return self.approach + self.grip + self.lift + self.settle
+
+    def begin(self, world: World, rng: np.random.Generator) -> Human:
+        item = self.workplace.scene.objects[0]
+        pose = self.workplace.random_object_pose(self.reach, rng)
+        hover = self.workplace.hover()
+        joints = nearest_configuration(hover, near=self.workplace.hover_joints())
+        world.reset(joints.numpy(), {item.name: pose})
+        grasp = pose[:3, 3]
+        above, lifted = (grasp + np.array([0.0, 0.0, h]) for h in (0.08, self.height))
+        closing = self.approach + self.grip
+        down = self._lead([hover.position.numpy(), above, grasp], self.approach, 0.0, rng)
+        up = self._lead([grasp, lifted], self.lift, closing, rng)
+        return InTurn([(0.0, down, OPEN), (self.approach, down, CLOSED), (closing, up, CLOSED)])
+
+    def _lead(
+        self, points: list[np.ndarray], duration: float, start: float, rng: np.random.Generator
+    ) -> ScriptedExpert:
+        return ScriptedExpert(
+            panda,
+            GuidedPath(np.vstack(points), duration, start),
+            tremor=Tremor(self.tremor, rng),
+            orientation=lambda _position, _time: gripper_down(),
+        )
+
+    def succeeded(self, world: World) -> bool:
+        item = self.workplace.scene.objects[0]
+        bottom = world.object_pose(item.name)[2, 3] - max(item.half_size)
+        return world.holds(item.name) and bool(bottom > 0.5 * self.height)
+
+
+class InTurn:
+    """People who lead the arm one after the other, each with the gripper's opening."""
+
+    def __init__(self, turns: list[tuple[float, Human, float]]):
+        """Fix the turns.
+
+        Args:
+            turns: When each begins [s], who leads, and how far the gripper opens [m].
+        """
+        self._turns = turns
+
+    def read(self, state: ArmState) -> HumanInput:
+        """What the one asks for whose turn it is."""
+        begun = [turn for turn in self._turns if turn[0] <= state.time]
+        _, human, width = begun[-1] if begun else self._turns[0]
+        return replace(human.read(state), gripper=width)
+
+
+# A scenario under way in simulation: begun by seed, moved by targets, looked at.
+
+
+class ScenarioRun:
+    """A world in which a scenario is done over and over, each time from a seed.
+
+    Time passes by commands only, so that the same seed and commands lead to the same end.
+
+    Attributes:
+        scenario: What is to be done.
+        world: Where.
+        dt: Time that passes with each command [s].
+        expert: Who can show it from where it began.
+        servo: Leads the arm by positions.
+        seed: Of the present beginning.
+        commands: Given since then.
+    """
+
+    expert: Human
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        fps: float,
+        *,
+        seed: int = 0,
+        servo: PositionServoConfig | None = None,
+    ):
+        """Begin.
+
+        Args:
+            scenario: What is to be done.
+            fps: Commands a second of the world's time.
+            seed: Of the first beginning.
+            servo: How positions are followed.
+        """
+        self.scenario, self.dt = scenario, 1.0 / fps
+        self.world = World(scenario.workplace.scene)
+        self.servo = PositionServo(panda, self.world.arm, self.dt, servo)
+        self._noise = np.random.default_rng(0)
+        self.begin(seed)
+
+    def begin(self, seed: int) -> None:
+        """Put everything in place as a seed has it."""
+        self.seed, self.commands = seed, 0
+        self.expert = self.scenario.begin(self.world, np.random.default_rng(seed))
+        self.servo.restart()
+        self._pixel: np.ndarray | None = None
+
+    def command(self, joints: Float[np.ndarray, "7"], width: float) -> np.ndarray:
+        """Send the joints and the gripper on their way, and let time pass.
+
+        Args:
+            joints: Positions to be reached when the next command is due [rad].
+            width: Opening of the gripper [m].
+
+        Returns:
+            Where the joints were sent instead, within their limits [rad].
+        """
+        with torch.inference_mode():
+            _, sent = self.servo.follow(joints)
+        if np.isfinite(width):
+            self.world.arm.move(width)
+        self.world.advance(self.dt)
+        self.commands += 1
+        return sent
+
+    def object_pixel(self) -> Float[np.ndarray, "2"]:
+        """Where the fixed camera saw the object's marker (u, v) [px].
+
+        It looked before the arm came between both, as a person would let it.
+
+        Raises:
+            ValueError: The object was not in its view.
+        """
+        marker = self.scenario.workplace.scene.objects[0].marker.id
+        if self._pixel is None:
+            eye = self._eye  # whose background takes random numbers when it is first made
+            noise = np.random.default_rng([self.seed, 1])
+            self._noise.bit_generator.state = noise.bit_generator.state
+            self._pixel = eye.look().get(marker)
+        if self._pixel is None:
+            raise ValueError(
+                f"the fixed camera does not see marker {marker} at the beginning: leave out "
+                "the pixels of the object."
+            )
+        return self._pixel
+
+    @cached_property
+    def _eye(self) -> Eye:
+        """Of the fixed camera, before which nothing but the object is ever seen."""
+        scene = self.scenario.workplace.scene
+        marker = scene.objects[0].marker
+
+        def poses() -> dict[int, np.ndarray]:
+            return {marker.id: self.world.marker_poses()[marker.id]}
+
+        camera = SyntheticCamera(scene.camera, [marker], poses, rng=self._noise)
+        return Eye.on(camera, scene)
+
+    def succeeded(self) -> bool:
+        """Whether the job is done, by MuJoCo's contacts."""
+        return self.scenario.succeeded(self.world)
+
+
+class ScenarioView:
+    """Images of a run, small enough to learn from."""
+
+    def __init__(self, run: ScenarioRun, width: int, height: int, kind: CameraKind = "auto"):
+        """Set up a camera that sees table, arm and cabinet.
+
+        Args:
+            run: What to look at.
+            width: Of the images [px].
+            height: Of the images [px].
+            kind: "egl" renders everything; "synthetic" draws the markers on the table only.
+
+        Raises:
+            RenderingUnavailableError: `kind` is "egl" and this machine cannot render.
+        """
+        rng, noise = np.random.default_rng(0), ImageNoise()
+        model = overview(width, height)
+        if kind == "synthetic":
+            model = _scaled(run.scenario.workplace.scene.camera, width, height)
+        self._camera = open_camera(run.world, kind, model, rng=rng, noise=noise)
+
+    def read(self) -> UInt8[np.ndarray, "height width 3"]:
+        """The image now, RGB."""
+        return self._camera.read()
+
+
+def overview(width: int, height: int) -> CameraModel:
+    """A camera in front of the arm that has table, hand and shelves in view."""
+    focal = 0.9 * min(width / 4 * 3, height)
+    middle = ((width - 1) / 2, (height - 1) / 2)
+    model = CameraModel(width=width, height=height, focal=(focal, focal), principal=middle)
+    return model.look_at(np.array([1.9, 0.35, 1.15]), np.array([0.25, -0.02, 0.25]))
+
+
+def _scaled(model: CameraModel, width: int, height: int) -> CameraModel:
+    """The same camera with coarser pixels."""
+    fx, fy = width / model.width, height / model.height
+    return replace(
+        model,
+        width=width,
+        height=height,
+        focal=(model.focal[0] * fx, model.focal[1] * fy),
+        principal=(
+            (model.principal[0] + 0.5) * fx - 0.5,
+            (model.principal[1] + 0.5) * fy - 0.5,
+        ),
+    )
+
+
+# The scenarios by the names that command lines give them.
+
+SCENARIOS = ("placing", "grasping")
+SHELVES = ("lower", "middle", "upper")
+
+
+def check_scenario(name: str, shelf: str, pixels: bool) -> None:
+    """Refuse what there is not, before anything heavy is imported.
+
+    Raises:
+        ValueError: There is no such scenario or shelf, or its object has no pixel.
+    """
+    if name not in SCENARIOS:
+        raise ValueError(f"no scenario {name!r}: there are {', '.join(SCENARIOS)}.")
+    if shelf not in SHELVES:
+        raise ValueError(f"no shelf {shelf!r}: there are {', '.join(SHELVES)}.")
+    if pixels and name == "placing":
+        raise ValueError("placing begins with the object in the hand, so it has no pixels.")
+
+
+def make_scenario(name: str, shelf: str) -> Scenario:
+    """A scenario in the default workplace."""
+    return Placing(shelf=shelf) if name == "placing" else Grasping()

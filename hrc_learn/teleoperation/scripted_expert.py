@@ -1,0 +1,138 @@
+"""The scripted expert: leads the hand along way points while pulling the body into shape."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.interpolate import PchipInterpolator
+
+from hrc_learn.geometry import Pose, minimum_jerk
+from hrc_learn.kinematics import SerialChain, coarse_orientation
+from hrc_learn.protocols import ArmState, HumanInput
+from hrc_learn.teleoperation.interaction_force import PullSpell, ScriptedPuller
+
+
+class GuidedPath:
+    """A smooth path through way points, run through once from rest to rest."""
+
+    def __init__(
+        self, waypoints: Float[np.ndarray, "points 3"], duration: float, start: float = 0.0
+    ):
+        """Fix the path.
+
+        Args:
+            waypoints: Positions to pass [m].
+            duration: From the first to the last [s].
+            start: Time at the first [s].
+
+        Raises:
+            ValueError: If way points repeat or the duration is not positive.
+        """
+        chords = np.linalg.norm(np.diff(waypoints, axis=0), axis=1)
+        if len(chords) < 1 or chords.min() < 1e-6 or duration <= 0:
+            raise ValueError(
+                "a guided path needs at least two different way points, no two the same in a "
+                f"row, and a positive duration; got {len(waypoints)} in {duration} s."
+            )
+        length = np.concatenate([[0.0], np.cumsum(chords)])
+        # Monotone between way points: a hand that overshoots would hit the boards.
+        self._curve = PchipInterpolator(length / length[-1], waypoints)
+        self._slope = self._curve.derivative()
+        self._start, self.duration = start, duration
+
+    @property
+    def end(self) -> float:
+        """Time at the last way point [s]."""
+        return self._start + self.duration
+
+    def position(self, time: float) -> Float[np.ndarray, "3"]:
+        """[m]"""
+        s, _ = self._progress(time)
+        return self._curve(s)
+
+    def velocity(self, time: float) -> Float[np.ndarray, "3"]:
+        """[m/s]"""
+        s, rate = self._progress(time)
+        return self._slope(s) * rate
+
+    def _progress(self, time: float) -> tuple[float, float]:
+        """Share of the path covered, and its rate [1/s]."""
+        s, slope = minimum_jerk((time - self._start) / self.duration)
+        return s, slope / self.duration
+
+
+class Tremor:
+    """The shaking of a hand: a slow random drift and an 8 Hz tremor, in velocity [m/s]."""
+
+    def __init__(self, amplitude: float, rng: np.random.Generator, frequency: float = 8.0):
+        """Draw the phases.
+
+        Args:
+            amplitude: Of the tremor's displacement [m]; the drift's is three times as large.
+            rng: Source of the phases.
+            frequency: Of the tremor [Hz] (Elble and Koller 1990: 8 to 12 Hz).
+        """
+        self._omega = 2 * np.pi * np.array([frequency, 0.9 * frequency, 0.35, 0.22])
+        self._amplitude = amplitude * np.array([1.0, 0.7, 3.0, 3.0])
+        self._phase = rng.uniform(0, 2 * np.pi, size=(3, 4))
+
+    def velocity(self, time: float) -> Float[np.ndarray, "3"]:
+        """[m/s]"""
+        return (self._amplitude * self._omega * np.cos(self._omega * time + self._phase)).sum(
+            axis=1
+        )
+
+
+Orientation = Callable[[Float[torch.Tensor, "3"], float], Float[torch.Tensor, "4"]]
+"""Orientation (wxyz) the hand should have at a position [m] and time [s]."""
+
+
+def _by_the_rule(position: Float[torch.Tensor, "3"], _time: float) -> Float[torch.Tensor, "4"]:
+    return coarse_orientation(position)
+
+
+class ScriptedExpert:
+    """Teaches a motion in task space and body shape at once, with an unsteady hand.
+
+    Position follows a guided path, corrected by eye; orientation follows a rule; meanwhile the
+    other hand pulls joints in the null space.
+    """
+
+    def __init__(
+        self,
+        chain: SerialChain,
+        path: GuidedPath,
+        spells: Sequence[PullSpell] = (),
+        tremor: Tremor | None = None,
+        orientation: Orientation = _by_the_rule,
+        gain: float = 4.0,
+    ):
+        """Prepare the script.
+
+        Args:
+            chain: The arm.
+            path: Where the hand goes.
+            spells: When and how the body is pulled.
+            tremor: Unsteadiness of the hand.
+            orientation: Rule for the hand's orientation; the paper's coarse one by default.
+            gain: How fast an error of pose is corrected [1/s].
+        """
+        self.path = path
+        self.orientation = orientation
+        self._chain = chain
+        self._puller = ScriptedPuller(chain, spells)
+        self._tremor = tremor
+        self._gain = gain
+
+    def read(self, state: ArmState) -> HumanInput:
+        """Motion of the hand and pull at the body at the state's time."""
+        pose = self._chain.forward(torch.from_numpy(state.joint_position))
+        wanted = torch.from_numpy(self.path.position(state.time))
+        # The rule turns the hand where it is, not where it should be.
+        goal = Pose(wanted, self.orientation(pose.position, state.time))
+        twist = self._gain * pose.twist_to(goal).numpy()
+        twist[:3] += self.path.velocity(state.time)
+        if self._tremor is not None and state.time < self.path.end:
+            twist[:3] += self._tremor.velocity(state.time)
+        return HumanInput(effort=self._puller.read(state).effort, twist=twist)

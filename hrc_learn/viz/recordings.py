@@ -1,0 +1,378 @@
+"""What runs, fits, sweeps and demonstrations hand over to be shown: plain arrays, no
+robot model, no library.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from hrc_learn.geometry import Body, Box
+from hrc_learn.vision import CameraModel
+from hrc_learn.viz.step_log import Event
+
+# What a run and a fit hand over to be shown: plain arrays, no robot model, no library.
+#
+# Whatever is None or empty drops its panel or figure. Times are seconds from the run's start.
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class JointLimits:
+    """Ranges to draw beside joint positions."""
+
+    lower: Float[np.ndarray, " joints"]
+    """[rad]"""
+    upper: Float[np.ndarray, " joints"]
+    """[rad]"""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CameraRecording:
+    """What a camera saw, and what was made of it."""
+
+    model: CameraModel
+    """The true camera: drawn as a frustum; simulation only knows it."""
+    feature: Float[np.ndarray, "time 2"]
+    """Measured feature [px]; NaN while it was not seen."""
+    target: Float[np.ndarray, "time 2"]
+    """Where the feature was wanted [px]; NaN while nothing was wanted."""
+    image_time: Float[np.ndarray, " images"] = field(default_factory=lambda: np.empty(0))
+    """[s]"""
+    images: tuple[UInt8[np.ndarray, "h w 3"], ...] = ()
+    """RGB, a few a second."""
+
+    def __post_init__(self) -> None:
+        if len(self.image_time) != len(self.images):
+            raise ValueError(
+                f"image_time has {len(self.image_time)} entries for {len(self.images)} images."
+            )
+
+    @property
+    def error(self) -> Float[np.ndarray, " time"]:
+        """Distance from feature to target [px]."""
+        return np.linalg.norm(self.feature - self.target, axis=-1)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RunRecording:
+    """One run of a task, sampled at every control step.
+
+    Raises:
+        ValueError: If a field has another number of samples than `time`.
+    """
+
+    title: str
+    time: Float[np.ndarray, " time"]
+    """[s], increasing."""
+
+    joint_names: tuple[str, ...]
+    joint_position: Float[np.ndarray, "time joints"]
+    """[rad]"""
+    joint_limits: JointLimits | None = None
+    demo_joint_position: Float[np.ndarray, "time joints"] | None = None
+    """Demonstration at the matching phase of the run, NaN elsewhere [rad]."""
+
+    position: Float[np.ndarray, "time 3"]
+    """Tool centre point in the base frame [m]."""
+    demo_path: Float[np.ndarray, "samples 3"] | None = None
+    """Tool centre point of the demonstration [m]."""
+    plan_path: Float[np.ndarray, "samples 3"] | None = None
+    """Path that the learned motion asked for [m]."""
+
+    bodies: tuple[Body, ...] = ()
+    """The arm's links, the gripper, carried objects."""
+    boxes: tuple[Box, ...] = ()
+    """Everything that stands still, in the base frame."""
+    region: Box | None = None
+    """The Cartesian region in which the camera takes over."""
+
+    camera: CameraRecording | None = None
+    image_jacobian: Float[np.ndarray, "time 2 6"] | None = None
+    """Estimate by the learned model [px/m, px/rad]; NaN where the run made none."""
+    true_image_jacobian: Float[np.ndarray, "time 2 6"] | None = None
+    """Of the true camera, simulation only [px/m, px/rad]."""
+    weight_norm: Float[np.ndarray, " time"] | None = None
+    """Frobenius norm of the image Jacobian's weights."""
+    potentials: Mapping[str, Float[np.ndarray, " time"]] = field(default_factory=dict)
+    """Potential of each region, or a Lyapunov function, by name."""
+
+    potential_rate: Float[np.ndarray, " time"] | None = None
+    """Rate of the sum of the potentials that the estimated image Jacobian predicts [1/s]."""
+
+    human_effort: Float[np.ndarray, "time joints"] | None = None
+    """Null-space effort d of the person, on each joint."""
+    elbow_motion: Float[np.ndarray, " time"] | None = None
+    """How far the elbow is from where it would be undisturbed [m]."""
+    position_deviation: Float[np.ndarray, " time"] | None = None
+    """How far the end effector is from where it would be undisturbed [m]."""
+    rotation_deviation: Float[np.ndarray, " time"] | None = None
+    """The same for its orientation [rad]."""
+
+    safety: Mapping[str, Float[np.ndarray, " time"] | Bool[np.ndarray, " time"]] = field(
+        default_factory=dict
+    )
+    """Whether, or how strongly, each guard of the safety filter acted, by name."""
+    phases: tuple[Event, ...] = ()
+    """When the task entered each of its phases."""
+
+    def __post_init__(self) -> None:
+        steps = len(self.time)
+        series: dict[str, np.ndarray | None] = {name: getattr(self, name) for name in _SERIES}
+        series |= {f"potentials[{name!r}]": value for name, value in self.potentials.items()}
+        series |= {f"safety[{name!r}]": value for name, value in self.safety.items()}
+        for body in self.bodies:
+            series[f"bodies: {body.name}.position"] = body.position
+            series[f"bodies: {body.name}.orientation"] = body.orientation
+        if self.camera is not None:
+            series |= {
+                "camera.feature": self.camera.feature,
+                "camera.target": self.camera.target,
+            }
+        wrong = {
+            name: len(value)
+            for name, value in series.items()
+            if value is not None and len(value) != steps
+        }
+        if wrong:
+            raise ValueError(
+                f"time has {steps} samples, but "
+                + ", ".join(f"{name} has {n}" for name, n in wrong.items())
+                + ". Log every field at every control step, with NaN where it has no value."
+            )
+
+
+_SERIES = (
+    "joint_position",
+    "demo_joint_position",
+    "position",
+    "image_jacobian",
+    "true_image_jacobian",
+    "weight_norm",
+    "potential_rate",
+    "human_effort",
+    "elbow_motion",
+    "position_deviation",
+    "rotation_deviation",
+)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FitRecording:
+    """Demonstrations beside what the fitted primitives make of them, on the same grids.
+
+    Raises:
+        ValueError: If the numbers of demonstrations or of their samples disagree.
+    """
+
+    title: str
+    joint_names: tuple[str, ...]
+    time: tuple[Float[np.ndarray, "_"], ...]
+    """Time grid of each demonstration [s]."""
+    demos: tuple[Float[np.ndarray, "_ joints"], ...]
+    """Demonstrated joint positions [rad]."""
+    reproductions: tuple[Float[np.ndarray, "_ joints"], ...]
+    """Reproduced joint positions [rad]."""
+    demo_paths: tuple[Float[np.ndarray, "_ 3"], ...] = ()
+    """Tool centre point of each demonstration [m]."""
+    reproduction_paths: tuple[Float[np.ndarray, "_ 3"], ...] = ()
+    """Tool centre point of each reproduction [m]."""
+    joint_limits: JointLimits | None = None
+    boxes: tuple[Box, ...] = ()
+    residual: Mapping[int, float] = field(default_factory=dict)
+    """Normalised RMS error of the fit for each number of basis functions tried."""
+    n_basis: int | None = None
+    """The number of basis functions used."""
+    unit: str = "rad"
+    """Of the joints, or "m" where they are positions."""
+
+    def __post_init__(self) -> None:
+        if not len(self.time) == len(self.demos) == len(self.reproductions) > 0:
+            raise ValueError(
+                "time, demos and reproductions must hold one array a demonstration, but hold "
+                f"{len(self.time)}, {len(self.demos)} and {len(self.reproductions)}."
+            )
+        for i, (t, demo, reproduction) in enumerate(
+            zip(self.time, self.demos, self.reproductions, strict=True)
+        ):
+            if not len(t) == len(demo) == len(reproduction):
+                raise ValueError(
+                    f"demonstration {i} has {len(t)} times, {len(demo)} demonstrated and "
+                    f"{len(reproduction)} reproduced samples; they must agree."
+                )
+
+
+# What a set of demonstrations hands over to be shown.
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ShownDemonstration:
+    """One demonstration; whatever was not recorded is None.
+
+    Raises:
+        ValueError: If a field has another number of samples than `time`.
+    """
+
+    episode: int
+    task: str
+    time: Float[np.ndarray, " time"]
+    """[s]"""
+    joint_position: Float[np.ndarray, "time joints"] | None = None
+    """[rad], or [m] of sliding joints."""
+    position: Float[np.ndarray, "time 3"] | None = None
+    """Tool centre point [m]."""
+    feature: Float[np.ndarray, "time 2"] | None = None
+    """In the image [px]; NaN while it was not seen."""
+    human_effort: Float[np.ndarray, "time joints"] | None = None
+    gripper: Float[np.ndarray, " time"] | None = None
+    """Opening [m]."""
+    bodies: tuple[Body, ...] = ()
+    """The arm along the demonstration."""
+
+    def __post_init__(self) -> None:
+        for name in ("joint_position", "position", "feature", "human_effort", "gripper"):
+            value = getattr(self, name)
+            if value is not None and len(value) != len(self.time):
+                raise ValueError(
+                    f"episode {self.episode}: {name} has {len(value)} samples, but time has "
+                    f"{len(self.time)}."
+                )
+
+    @property
+    def duration(self) -> float:
+        """[s]"""
+        return float(self.time[-1] - self.time[0])
+
+    @property
+    def length(self) -> float | None:
+        """Of the path of the tool centre point [m]."""
+        if self.position is None:
+            return None
+        return float(np.linalg.norm(np.diff(self.position, axis=0), axis=1).sum())
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class DemonstrationsRecording:
+    """Demonstrations of one task by one robot.
+
+    Raises:
+        ValueError: If there is none.
+    """
+
+    title: str
+    joint_names: tuple[str, ...]
+    demonstrations: tuple[ShownDemonstration, ...]
+    joint_limits: JointLimits | None = None
+    notes: tuple[str, ...] = ()
+    """What was guessed or odd when they were read."""
+
+    def __post_init__(self) -> None:
+        if not self.demonstrations:
+            raise ValueError("there is no demonstration to show.")
+
+
+# What a fit in rounds hands over to be shown: how it converged, and where it errs.
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ErrorMap:
+    """Shares over cells of the horizontal plane."""
+
+    x: Float[np.ndarray, " nx_and_1"]
+    """Edges of the cells [m]."""
+    y: Float[np.ndarray, " ny_and_1"]
+    """Edges of the cells [m]."""
+    z: float
+    """Height at which they are drawn [m]."""
+    share: Float[np.ndarray, "nx ny"]
+    """Error over size of what was predicted; NaN in an empty cell."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LearningRecording:
+    """Rounds of learning, the first before anything was learned.
+
+    Raises:
+        ValueError: If curves or centres do not have a value for each round, or the best round
+            is none of them.
+    """
+
+    title: str
+    measured: Mapping[str, float] = field(default_factory=dict)
+    """Values of the result, by name."""
+    curves: Mapping[str, Float[np.ndarray, "_"]] = field(default_factory=dict)
+    """Of the rounds, by name with unit; none where nothing was learned in rounds."""
+    best: int = 0
+    """The round that was kept."""
+    centers: Float[np.ndarray, "rounds neurons 3"] = field(
+        default_factory=lambda: np.zeros((1, 0, 3))
+    )
+    """Where the neurons stood in each [m]."""
+    paths: tuple[Float[np.ndarray, "_ 3"], ...] = ()
+    """Of the hand in demonstrations [m]."""
+    errors: ErrorMap | None = None
+    """On demonstrations held out."""
+
+    def __post_init__(self) -> None:
+        rounds = len(self.centers)
+        for name, values in self.curves.items():
+            if len(values) != rounds:
+                raise ValueError(
+                    f"{name!r} has {len(values)} values, but there are centers of {rounds} "
+                    "rounds; they must agree."
+                )
+        if not 0 <= self.best < rounds:
+            raise ValueError(f"best must be one of the {rounds} rounds, but is {self.best}.")
+
+
+# What a sweep hands over to be shown: how often and how fast its trials succeeded.
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SweptTrials:
+    """The trials of one experiment."""
+
+    success: Bool[np.ndarray, " trials"]
+    arrival: Float[np.ndarray, " trials"]
+    """When each was on target for good [s]; infinite if it never was."""
+    group: Int[np.ndarray, " trials"]
+    """Class of each trial, counted from 0."""
+
+    def share(self, time: Float[np.ndarray, " time"]) -> Float[np.ndarray, " time"]:
+        """Share of the trials that are on target."""
+        return np.searchsorted(np.sort(self.arrival), time, side="right") / len(self.arrival)
+
+    def of(self, group: int) -> "SweptTrials":
+        """The trials of a class."""
+        chosen = self.group == group
+        return SweptTrials(
+            success=self.success[chosen],
+            arrival=self.arrival[chosen],
+            group=self.group[chosen],
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SweepRecording:
+    """Experiments of one kind, their trials in classes.
+
+    Raises:
+        ValueError: If there is no experiment, or one has a class without a name or no trials.
+    """
+
+    title: str
+    groups: tuple[str, ...]
+    """Names of the classes, with their unit."""
+    experiments: Mapping[str, SweptTrials]
+
+    def __post_init__(self) -> None:
+        if not self.experiments:
+            raise ValueError("a sweep needs at least one experiment.")
+        for name, trials in self.experiments.items():
+            if not len(trials.group):
+                raise ValueError(f"experiment {name!r} has no trials.")
+            if trials.group.max() >= len(self.groups):
+                raise ValueError(
+                    f"experiment {name!r} has a trial of class {trials.group.max()}, but there "
+                    f"are {len(self.groups)} classes, counted from 0."
+                )

@@ -1,0 +1,239 @@
+"""Writing one .rrd file: all or nothing, columns instead of single values."""
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from jaxtyping import Float, Int
+
+from hrc_learn.geometry import Body, Box, Capsule, MeshFile
+from hrc_learn.store import new_file
+from hrc_learn.viz.panels import Curves, Plot, Tab
+
+TIMELINE = "time"
+"""All that is recorded lies on this timeline [s]: the viewer shows one at a time."""
+
+_PATH_POINTS = 400
+
+
+@contextmanager
+def rrd_file(
+    path: str | os.PathLike[str], title: str, blueprint: rrb.Blueprint | None = None
+) -> Iterator[rr.RecordingStream]:
+    """A recording stream into a file that appears only when it is complete.
+
+    Args:
+        path: The file.
+        title: What it shows.
+        blueprint: Its layout; None: what writes the stream sends it.
+    """
+    stream = rr.RecordingStream("hrc_learn")
+    with new_file(Path(path)) as part:
+        try:
+            stream.save(part, default_blueprint=blueprint)
+            begin(stream, title)
+            yield stream
+            stream.flush()
+        finally:
+            stream.disconnect()
+
+
+def begin(stream: rr.RecordingStream, title: str) -> None:
+    """Name a recording, and say which way is up."""
+    stream.send_recording_name(title)
+    stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+
+
+Logged = rr.AsComponents | tuple[rr.AsComponents, ...]
+
+
+class StillThings:
+    """Sends what has no time, once, and again only if it changed."""
+
+    def __init__(self, stream: rr.RecordingStream):
+        self._stream = stream
+        self._sent: dict[str, object] = {}
+
+    def send(self, path: str, value: object, make: Callable[[], Logged]) -> None:
+        """Send to an entity what has changed.
+
+        Args:
+            path: The entity.
+            value: By which a change is told.
+            make: Of the value what is to be sent.
+        """
+        if path in self._sent and self._sent[path] == value:
+            return
+        self._sent[path] = value
+        made = make()
+        self._stream.log(path, *(made if isinstance(made, tuple) else (made,)), static=True)
+
+
+def seconds(time: Float[np.ndarray, " time"]) -> list[rr.TimeColumn]:
+    """The index of columns sampled at these times."""
+    return [rr.TimeColumn(TIMELINE, duration=np.rint(1e9 * time).astype("timedelta64[ns]"))]
+
+
+def send_curves(
+    stream: rr.RecordingStream, time: Float[np.ndarray, " time"], curves: Curves
+) -> None:
+    """Send curves with their names and colours; they break off where they are NaN."""
+    stream.log(curves.path, style(curves), static=True)
+    send_values(stream, time, curves)
+
+
+def style(curves: Curves) -> rr.SeriesLines:
+    """Names, colours and widths of curves."""
+    return rr.SeriesLines(
+        names=curves.names,
+        colors=curves.colours,
+        widths=[curves.width] * len(curves.names),
+    )
+
+
+def send_values(
+    stream: rr.RecordingStream, time: Float[np.ndarray, " time"], curves: Curves
+) -> None:
+    """Send the samples of curves."""
+    send_rows(stream, seconds(time), curves)
+
+
+def send_rows(stream: rr.RecordingStream, index: list[rr.TimeColumn], curves: Curves) -> None:
+    """Send the samples of curves on a timeline of any kind."""
+    values = np.asarray(curves.values, dtype=np.float64)
+    columns = rr.Scalars.columns(scalars=values.ravel())
+    stream.send_columns(curves.path, index, columns.partition([values.shape[1]] * len(values)))
+
+
+def body_path(body: Body) -> str:
+    """Entity of a body."""
+    return f"world/bodies/{body.name}"
+
+
+def send_shapes(still: StillThings, body: Body) -> None:
+    """Send what a body looks like."""
+    path, mesh, plain = body_path(body), body.mesh, body.boxes
+    if mesh is not None:
+        still.send(f"{path}/mesh", mesh, lambda: _asset(mesh))
+        plain = tuple(box for box in body.boxes if box.name)
+    elif body.capsules:
+        still.send(f"{path}/capsules", body.capsules, lambda: capsules(body.capsules))
+    if plain:
+        still.send(f"{path}/boxes", plain, lambda: boxes(plain))
+
+
+def _asset(mesh: MeshFile) -> tuple[rr.Asset3D, rr.Transform3D]:
+    """A mesh where it is on its body."""
+    # Rerun tells most kinds of files by their contents, but takes COLLADA for any XML.
+    kind = "model/vnd.collada+xml" if mesh.path.suffix == ".dae" else None
+    turn = rr.RotationAxisAngle(axis=(0, 0, 1), radians=mesh.turn)
+    place = rr.Transform3D(translation=mesh.offset, rotation=turn)
+    return rr.Asset3D(path=mesh.path, media_type=kind), place
+
+
+def send_poses(
+    stream: rr.RecordingStream,
+    time: Float[np.ndarray, " time"],
+    body: Body,
+    at: Int[np.ndarray, " chosen"],
+) -> None:
+    """Send the pose of a body at the chosen samples."""
+    stream.send_columns(
+        body_path(body),
+        seconds(time[at]),
+        rr.Transform3D.columns(
+            translation=body.position[at],
+            quaternion=np.roll(body.orientation[at], -1, axis=-1),  # rerun: x, y, z, w
+        ),
+    )
+
+
+def boxes(shapes: tuple[Box, ...]) -> rr.Boxes3D:
+    """Solid boxes."""
+    return rr.Boxes3D(
+        centers=[s.centre for s in shapes],
+        half_sizes=[s.half_size for s in shapes],
+        colors=[s.colour for s in shapes],
+        labels=[s.name for s in shapes],
+        show_labels=False,
+        fill_mode=rr.components.FillMode.Solid,
+    )
+
+
+def capsules(shapes: tuple[Capsule, ...]) -> rr.Capsules3D:
+    """Solid capsules; rerun's start at the origin and point along z."""
+    start, end = (np.array([getattr(s, at) for s in shapes]) for at in ("start", "end"))
+    axis = end - start
+    length = np.linalg.norm(axis, axis=1)
+    direction = np.where(
+        length[:, None] > 0, axis / np.maximum(length, 1e-12)[:, None], [0, 0, 1]
+    )
+    # Half way between z and the axis lies the normal of the turn by pi that swaps them; its
+    # quaternion is (0, normal). Where both are opposite, any normal across z will do.
+    half = direction + np.array([0.0, 0.0, 1.0])
+    norm = np.linalg.norm(half, axis=1, keepdims=True)
+    normal = np.where(norm > 1e-9, half / np.maximum(norm, 1e-12), [1.0, 0.0, 0.0])
+    return rr.Capsules3D(
+        lengths=length,
+        radii=[s.radius for s in shapes],
+        translations=start,
+        quaternions=np.concatenate([normal, np.zeros((len(shapes), 1))], axis=1),
+        colors=[s.colour for s in shapes],
+        fill_mode=rr.components.FillMode.Solid,
+    )
+
+
+def tab_view(tab: Tab) -> rrb.Grid:
+    """Layout of one tab."""
+    return rrb.Grid(
+        contents=[plot_view(plot) for plot in tab.plots],
+        grid_columns=tab.columns,
+        row_shares=[plot.share for plot in tab.plots[:: tab.columns]],
+        name=tab.title,
+    )
+
+
+def plot_view(plot: Plot) -> rrb.TimeSeriesView:
+    """Layout of one plot."""
+    return rrb.TimeSeriesView(
+        origin="/",
+        contents=[f"/{curves.path}" for curves in plot.curves],
+        name=plot.title,
+        axis_y=None if plot.range is None else rrb.ScalarAxis(range=plot.range),
+        # Most curves that need a legend begin low or at zero.
+        plot_legend=rrb.PlotLegend("LeftTop", visible=plot.legend),
+    )
+
+
+def look_at_all(path: Float[np.ndarray, "n 3"], *, base: bool = True) -> rrb.EyeControls3D:
+    """An eye in front of the robot, to its left, that sees the whole path.
+
+    Args:
+        path: Points to see [m].
+        base: Whether to see the robot's base as well.
+    """
+    points = np.concatenate([path, np.zeros((1, 3))]) if base else path
+    low, high = points.min(axis=0), points.max(axis=0)
+    middle, reach = (low + high) / 2, max(float(np.linalg.norm(high - low)), 0.5)
+    return rrb.EyeControls3D(
+        position=middle + reach * np.array([1.05, 0.65, 0.6]),
+        look_target=middle,
+        eye_up=(0.0, 0.0, 1.0),
+    )
+
+
+def samples(time: Float[np.ndarray, " time"], rate: float) -> Int[np.ndarray, " chosen"]:
+    """Indices of about `rate` samples a second, the first and the last among them."""
+    wanted = np.arange(time[0], time[-1], 1.0 / rate)
+    return np.unique(np.append(np.searchsorted(time, wanted), len(time) - 1))
+
+
+def thin(path: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "m d"]:
+    """A path of at most a few hundred of its points, ends kept."""
+    if len(path) <= _PATH_POINTS:
+        return path
+    return path[np.linspace(0, len(path) - 1, _PATH_POINTS).astype(int)]

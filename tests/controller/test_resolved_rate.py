@@ -1,0 +1,120 @@
+import pytest
+import sampling
+import torch
+
+from hrc_learn.controller.resolved_rate import excess_speed, fit_null_space, resolve
+from hrc_learn.kinematics import null_space_projector, panda, pseudo_inverse
+
+
+def random(*shape: int, rng: torch.Generator) -> torch.Tensor:
+    return torch.randn(*shape, generator=rng, dtype=torch.float64)
+
+
+def regular_jacobians(count: int, rng: torch.Generator) -> torch.Tensor:
+    q = sampling.within(panda.limits.lower, panda.limits.upper, count, rng=rng)
+    J = panda.jacobian(q)
+    return J[torch.linalg.svdvals(J)[:, -1] > 0.1]
+
+
+def test_equals_pseudo_inverse_and_projector():
+    rng = sampling.generator()
+    J = regular_jacobians(300, rng)
+    twist, wish = random(len(J), 6, rng=rng), random(len(J), 7, rng=rng)
+    task, null = resolve(J, twist, wish)
+    torch.testing.assert_close(
+        task, (pseudo_inverse(J) @ twist[..., None])[..., 0], rtol=0, atol=1e-11
+    )
+    torch.testing.assert_close(
+        null, (null_space_projector(J) @ wish[..., None])[..., 0], rtol=0, atol=1e-11
+    )
+
+
+def test_the_null_space_does_not_move_the_tool():
+    """J N = 0, N J^+ = 0, N N = N to 1e-12."""
+    rng = sampling.generator(1)
+    J = regular_jacobians(300, rng)
+    zero = torch.zeros(len(J), 6, dtype=torch.float64)
+    twist, wish = random(len(J), 6, rng=rng), random(len(J), 7, rng=rng)
+    task, null = resolve(J, twist, wish)
+    assert (J @ null[..., None]).abs().max() < 1e-12
+    assert ((J @ task[..., None])[..., 0] - twist).abs().max() < 1e-12
+    assert resolve(J, zero, task)[1].abs().max() < 1e-12
+    assert (resolve(J, zero, null)[1] - null).abs().max() < 1e-12
+
+
+def test_damping_is_zero_away_from_singularities_and_bounds_the_gain_at_them():
+    rng = sampling.generator(2)
+    U, V = torch.linalg.qr(random(6, 6, rng=rng))[0], torch.linalg.qr(random(7, 7, rng=rng))[0]
+    gains = {}
+    for smallest in (0.2, 0.09, 0.03, 0.01, 1e-4, 0.0):
+        sigma = torch.tensor([2.0, 1.5, 1.2, 1.0, 0.8, smallest], dtype=torch.float64)
+        J = U @ torch.diag(sigma) @ V[:, :6].mT
+        task, _ = resolve(J, U[:, 5], torch.zeros(7, dtype=torch.float64))
+        gains[smallest] = task.norm().item()
+    # Exact inverse where J is regular ...
+    assert gains[0.2] == pytest.approx(1 / 0.2, rel=1e-10)
+    assert gains[0.09] == pytest.approx(1 / 0.09, rel=1e-10)
+    # ... and never a gain above 1 / (2 x 0.05), less towards the singularity itself.
+    assert all(gain <= 1.3 / 0.1 for gain in gains.values())
+    assert gains[1e-4] < gains[0.01] < gains[0.03]
+    assert gains[0.0] < 1e-6
+
+
+def test_everything_stays_finite_at_a_singularity_of_the_arm():
+    q = torch.zeros(7, dtype=torch.float64)  # stretched out: rank 5
+    J = panda.jacobian(q)
+    task, null = resolve(J, torch.ones(6, dtype=torch.float64), torch.ones_like(q))
+    assert task.isfinite().all()
+    assert null.isfinite().all()
+    assert task.norm() < 50
+
+
+@pytest.mark.parametrize("batch", [(), (1,), (3, 1, 2)])
+def test_a_capped_twist_keeps_its_direction(batch):
+    twist = random(*batch, 6, rng=sampling.generator(3))
+    caps = torch.tensor([0.25, 1.0], dtype=torch.float64)
+    capped = twist / excess_speed(twist, caps)
+    linear, angular = capped[..., :3].norm(dim=-1), capped[..., 3:].norm(dim=-1)
+    torch.testing.assert_close(
+        torch.maximum(linear / 0.25, angular), torch.ones(batch, dtype=torch.float64)
+    )
+    along = (capped * twist).sum(-1) / (capped.norm(dim=-1) * twist.norm(dim=-1))
+    torch.testing.assert_close(along, torch.ones(batch, dtype=torch.float64))
+    assert (excess_speed(0.01 * twist, caps) == 1).all()
+
+
+class TestFitNullSpace:
+    lower = torch.full((3,), -1.0, dtype=torch.float64)
+    upper = torch.full((3,), 1.0, dtype=torch.float64)
+
+    def fit(self, task, null):
+        task, null = (torch.tensor(v, dtype=torch.float64) for v in (task, null))
+        return fit_null_space(task, null, self.lower, self.upper).tolist()
+
+    def test_what_fits_is_left_alone(self):
+        assert self.fit([0.5, 0.0, -0.5], [0.4, 0.2, -0.4]) == [0.4, 0.2, -0.4]
+
+    def test_it_is_scaled_as_a_whole(self):
+        assert self.fit([0.5, 0.0, 0.0], [1.0, 0.4, -0.2]) == [0.5, 0.2, -0.1]
+
+    def test_it_stops_where_it_would_make_things_worse(self):
+        # The task alone is beyond the limit of joint 1.
+        assert self.fit([1.2, 0.0, 0.0], [0.1, 0.2, 0.0]) == [0.0, 0.0, 0.0]
+
+    def test_it_helps_the_task_as_far_as_it_was_wanted(self):
+        assert self.fit([1.2, 0.0, 0.0], [-0.4, 0.2, 0.0]) == [-0.4, 0.2, 0.0]
+
+    def test_where_nothing_fits_it_moves_least(self):
+        # Joint 1 needs the factor <= -2, joint 2 a factor >= 3: zero is between them.
+        assert self.fit([1.2, -1.3, 0.0], [0.1, 0.1, 0.0]) == [0.0, 0.0, 0.0]
+
+    def test_no_null_motion_stays_none(self):
+        assert self.fit([0.5, 1.0, 2.0], [0.0, 0.0, 0.0]) == [0.0, 0.0, 0.0]
+
+    def test_a_batch_is_a_loop(self):
+        rng = sampling.generator(4)
+        task, null = random(50, 3, rng=rng), random(50, 3, rng=rng)
+        whole = fit_null_space(task, null, self.lower, self.upper)
+        for k in range(50):
+            one = fit_null_space(task[k], null[k], self.lower, self.upper)
+            assert (one == whole[k]).all()

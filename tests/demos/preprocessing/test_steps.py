@@ -1,0 +1,356 @@
+"""Steps that make demonstrations ready for learning, on motions known in closed form."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.interpolate import CubicSpline
+from scipy.signal import butter, freqz
+from scipy.spatial.transform import Rotation, Slerp
+
+from hrc_learn.demos import Demonstration, DemonstrationSet
+from hrc_learn.demos.preprocessing import (
+    RestCriterion,
+    align,
+    at_times,
+    butterworth,
+    compensate_delay,
+    cut,
+    equalise_durations,
+    estimate_joint_velocity,
+    estimate_twist,
+    resample,
+    resting,
+    savitzky_golay,
+    set_duration,
+    split_at_rest,
+    trim_rest,
+)
+
+AXIS = np.array([0.6, 0.0, 0.8])
+
+
+def turn(time, rate=2.0):
+    """Quaternions (w, x, y, z) of a turn about one axis, of continuous sign."""
+    half = rate * time[:, None] / 2
+    return np.hstack([np.cos(half), np.sin(half) * AXIS])
+
+
+def swing(time, **fields):
+    """Two joints and a pose that swing; the velocity is exact."""
+    q = np.stack([np.sin(2 * time), np.cos(time)], axis=1)
+    q_dot = np.stack([2 * np.cos(2 * time), -np.sin(time)], axis=1)
+    return Demonstration(
+        **{
+            "time": time - time[0],
+            "joint_position": q,
+            "joint_velocity": q_dot,
+            "position": np.stack([time, time**2, np.sin(time)], axis=1),
+            "orientation": turn(time),
+            "joint_names": ("a", "b"),
+            "fps": 50,
+            **fields,
+        }
+    )
+
+
+def jittered(frames=200, seed=0):
+    steps = np.random.default_rng(seed).uniform(0.012, 0.028, frames)
+    return np.cumsum(steps) - steps[0]
+
+
+def angle(p, q):
+    """Angle between orientations, whichever their signs."""
+    return (
+        Rotation.from_quat(p, scalar_first=True).inv()
+        * Rotation.from_quat(q, scalar_first=True)
+    ).magnitude()
+
+
+def test_a_cut_begins_at_zero_and_remembers_when_it_was():
+    time = jittered()
+    demo = swing(time, start_time=7.0, extra={"shelf": np.arange(200.0)[:, None]})
+    part = cut(demo, 50, 80)
+    np.testing.assert_allclose(part.time, time[50:80] - time[50])
+    assert part.start_time == pytest.approx(7.0 + time[50])
+    np.testing.assert_array_equal(part.joint_position, demo.joint_position[50:80])
+    np.testing.assert_array_equal(part.extra["shelf"][:, 0], np.arange(50, 80))
+    with pytest.raises(ValueError, match="no part of a demonstration of 200 frames"):
+        cut(demo, 80, 201)
+
+
+def test_resampling_finds_the_motion_between_jittered_frames():
+    demo = resample(swing(jittered()), fps=100)
+    truth = swing(demo.time)
+    np.testing.assert_allclose(np.diff(demo.time), 0.01)
+    # A spline of fourth order at steps of 20 ms; less at the ends, where it knows no slope.
+    np.testing.assert_allclose(demo.joint_position[5:-5], truth.joint_position[5:-5], atol=2e-6)
+    np.testing.assert_allclose(demo.joint_velocity[5:-5], truth.joint_velocity[5:-5], atol=2e-6)
+    assert angle(demo.orientation, truth.orientation)[5:-5].max() < 2e-6
+    np.testing.assert_allclose(np.linalg.norm(demo.orientation, axis=1), 1)
+    assert demo.fps == 100
+
+
+def test_a_regular_demonstration_resampled_to_its_own_rate_is_itself():
+    demo = swing(np.arange(120) / 50)
+    again = resample(demo, 50)
+    assert len(again) == 120
+    for name in demo.recorded:
+        np.testing.assert_allclose(getattr(again, name), getattr(demo, name), atol=1e-12)
+
+
+def test_straight_lines_and_turns_at_constant_rate_are_scipys():
+    demo = swing(jittered(40))
+    times = np.sort(np.random.default_rng(1).uniform(0, demo.duration, 90))
+    moved = at_times(demo, times, "linear")
+    for k in range(2):
+        expected = np.interp(times, demo.time, demo.joint_position[:, k])
+        np.testing.assert_allclose(moved.joint_position[:, k], expected, atol=1e-12)
+    slerp = Slerp(demo.time, Rotation.from_quat(demo.orientation, scalar_first=True))(times)
+    assert angle(moved.orientation, slerp.as_quat(scalar_first=True)).max() < 1e-7
+
+
+def test_orientations_at_rest_stay_finite():
+    time = np.arange(10) / 50
+    demo = swing(time, orientation=np.tile([1.0, 0, 0, 0], (10, 1)))
+    np.testing.assert_allclose(at_times(demo, time[:-1] + 0.01, "linear").orientation[:, 0], 1)
+
+
+def test_what_is_counted_or_seen_is_not_averaged():
+    time = np.arange(6) / 10
+    visible = np.array([True, True, False, True, True, True])
+    demo = swing(
+        time,
+        feature=np.full((6, 2), 5.0),
+        feature_visible=visible,
+        extra={"mixed": np.stack([np.arange(6.0), np.arange(6) / 4], axis=1)},
+    )
+    moved = at_times(demo, np.array([0.0, 0.04, 0.16, 0.24, 0.38, 0.5]))
+    assert moved.feature_visible.tolist() == [True, True, False, False, True, True]
+    np.testing.assert_allclose(moved.extra["mixed"][:, 0], [0, 0, 2, 2, 4, 5])
+    np.testing.assert_allclose(moved.extra["mixed"][:, 1], [0, 0.1, 0.4, 0.6, 0.95, 1.25])
+    with pytest.raises(ValueError, match=r"leave the demonstration, which lasts 0\.5 s"):
+        at_times(demo, np.array([0.0, 0.6]))
+
+
+def test_velocities_at_jittered_stamps_are_those_of_the_motion():
+    time = jittered()
+    demo = swing(time, joint_velocity=None)
+    estimated = estimate_joint_velocity(demo, window=0.1)
+    np.testing.assert_allclose(
+        estimated.joint_velocity[5:-5], swing(time).joint_velocity[5:-5], atol=2e-4
+    )
+    twist = estimate_twist(demo, window=0.1)
+    linear = np.stack([np.ones_like(time), 2 * time, np.cos(time)], axis=1)
+    np.testing.assert_allclose(twist[5:-5, :3], linear[5:-5], atol=2e-4)
+    np.testing.assert_allclose(twist[5:-5, 3:], np.tile(2 * AXIS, (190, 1)), atol=2e-4)
+    with pytest.raises(ValueError, match="none are recorded"):
+        estimate_joint_velocity(replace(demo, joint_position=None))
+
+
+def test_smoothing_of_orientations_does_not_depend_on_the_frame():
+    time = jittered()
+    noise = 0.02 * np.random.default_rng(2).normal(size=(200, 3))
+    noisy = Rotation.from_quat(turn(time), scalar_first=True) * Rotation.from_rotvec(noise)
+    elsewhere = Rotation.from_rotvec([1.0, -2.0, 0.5]) * noisy
+    one, other = (
+        savitzky_golay(
+            swing(time, orientation=_continuous(r.as_quat(scalar_first=True))), window=0.3
+        ).orientation
+        for r in (noisy, elsewhere)
+    )
+    moved = Rotation.from_rotvec([1.0, -2.0, 0.5]) * Rotation.from_quat(one, scalar_first=True)
+    assert angle(other, moved.as_quat(scalar_first=True)).max() < 1e-7
+    assert (
+        angle(one, turn(time)).mean()
+        < angle(noisy.as_quat(scalar_first=True), turn(time)).mean() / 1.5
+    )
+
+
+def _continuous(q):
+    signs = np.sign((q[1:] * q[:-1]).sum(1))
+    return q * np.concatenate([[1], np.cumprod(signs)])[:, None]
+
+
+@pytest.mark.parametrize("order", [1, 2, 4])
+def test_the_low_pass_halves_the_power_at_its_cutoff_without_lag(order):
+    time = np.arange(2000) / 200
+    wave = np.sin(2 * np.pi * 5 * time)
+    demo = swing(time, joint_position=np.stack([wave, np.ones_like(wave)], axis=1))
+    filtered = butterworth(demo, cutoff=5, order=order).joint_position
+    middle = slice(600, 1400)
+    np.testing.assert_allclose(filtered[middle, 0], wave[middle] / np.sqrt(2), atol=1e-6)
+    np.testing.assert_allclose(filtered[:, 1], 1, atol=1e-9)
+
+
+def test_the_low_pass_is_scipys_run_twice():
+    time = np.arange(4000) / 200
+    slow, fast = np.sin(2 * np.pi * 1 * time), np.sin(2 * np.pi * 12 * time)
+    demo = swing(time, joint_position=np.stack([slow, fast], axis=1))
+    filtered = butterworth(demo, cutoff=6).joint_position
+    raised = np.arctan(np.tan(np.pi * 6 / 200) / (np.sqrt(2) - 1) ** 0.25) * 200 / np.pi
+    _, gain = freqz(*butter(2, raised, fs=200), worN=[1, 12], fs=200)
+    middle = slice(1500, 2500)
+    for k, wave in enumerate((slow, fast)):
+        np.testing.assert_allclose(
+            filtered[middle, k], np.abs(gain[k]) ** 2 * wave[middle], atol=1e-6
+        )
+
+
+def test_filters_say_what_they_need():
+    with pytest.raises(ValueError, match="needs even stamps"):
+        butterworth(swing(jittered()), cutoff=5)
+    even = swing(np.arange(100) / 50)
+    with pytest.raises(ValueError, match="between 0 and 25 Hz"):
+        butterworth(even, cutoff=30)
+    with pytest.raises(ValueError, match="8 frames are too few"):
+        butterworth(cut(even, 0, 8), cutoff=5)
+    lost = replace(even, feature=np.zeros((100, 2)), feature_visible=np.arange(100) != 7)
+    with pytest.raises(ValueError, match="lost at frame 7"):
+        savitzky_golay(lost, 0.1, fields=["feature"])
+    with pytest.raises(ValueError, match="nothing to be smoothed"):
+        savitzky_golay(lost, 0.1, fields=["time"])
+
+
+def with_rests(fps=100):
+    """Rest 1 s, minimum-jerk motion 2 s, rest 1 s, motion 1 s, rest 0.5 s, with noise."""
+
+    def s(frames):
+        u = np.linspace(0, 1, frames)
+        return 10 * u**3 - 15 * u**4 + 6 * u**5
+
+    path = np.concatenate(
+        [np.zeros(100), s(200), np.ones(100), 1 - s(100) / 2, np.full(50, 0.5)]
+    )
+    noise = 1e-4 * np.random.default_rng(3).normal(size=(len(path), 2))
+    return swing(
+        np.arange(len(path)) / fps,
+        joint_position=np.stack([path, -path], axis=1) + noise,
+        joint_velocity=None,
+        position=None,
+        orientation=None,
+    )
+
+
+def test_rest_is_told_from_motion():
+    still = resting(with_rests())
+    assert still[:100].all()
+    assert still[310:390].all()
+    assert not still[120:280].any()
+    assert not still[415:485].any()
+
+
+def test_a_speed_between_the_bounds_changes_nothing():
+    # The speed falls to 0.02 rad/s, below the upper bound and above the lower one.
+    time = np.arange(400) / 100
+    speed = np.where((time > 1) & (time < 2), 0.02, 0.5)
+    q = np.cumsum(speed)[:, None] * 0.01
+    demo = swing(time, joint_position=np.hstack([q, q]), joint_velocity=None)
+    assert not resting(demo).any()
+    assert resting(demo, RestCriterion(joint_speed=(0.03, 0.04))).sum() == pytest.approx(
+        100, abs=20
+    )
+
+
+def test_rest_is_trimmed_and_demonstrations_are_split_at_it():
+    demo = with_rests()
+    trimmed = trim_rest(demo, keep=0.1)
+    assert trimmed.start_time == pytest.approx(0.95, abs=0.12)
+    assert trimmed.duration == pytest.approx(4.1, abs=0.2)
+    parts = split_at_rest(demo)
+    assert [round(part.duration, 1) for part in parts] == [
+        pytest.approx(2.1, abs=0.2),
+        pytest.approx(1.1, abs=0.2),
+    ]
+    np.testing.assert_allclose(parts[0].joint_position[-1], [1, -1], atol=5e-3)
+    still = swing(np.arange(50) / 50, joint_position=np.ones((50, 2)))
+    with pytest.raises(ValueError, match="rests all the time"):
+        trim_rest(still)
+    assert split_at_rest(still) == []
+
+
+def test_rest_of_poses_is_told_by_the_speed_of_the_hand():
+    demo = with_rests()
+    pose = replace(
+        demo,
+        joint_position=None,
+        joint_names=(),
+        position=0.2 * np.hstack([demo.joint_position, demo.joint_position[:, :1]]),
+    )
+    assert resting(pose)[:90].all()
+    assert not resting(pose)[150:250].any()
+
+
+def test_durations_are_made_equal_and_velocities_with_them():
+    demos = DemonstrationSet([swing(np.arange(n) / 50) for n in (101, 151, 251)])
+    equal = equalise_durations(demos)
+    assert [demo.duration for demo in equal] == pytest.approx([3, 3, 3])
+    for demo in equal:
+        spline = CubicSpline(demo.time, demo.joint_position)
+        np.testing.assert_allclose(
+            demo.joint_velocity[5:-5], spline(demo.time, 1)[5:-5], atol=1e-3
+        )
+        assert 1 / np.median(np.diff(demo.time)) == pytest.approx(demo.fps)
+    with pytest.raises(ValueError, match="cannot be made to last 0 s"):
+        set_duration(demos[0], 0)
+
+
+def test_a_late_stream_is_moved_to_when_it_was_measured():
+    time = np.arange(200) / 50
+    late = np.maximum(time - 0.06, 0)
+
+    def uv(t):
+        return np.stack([t**2, np.sin(t)], axis=1)
+
+    demo = swing(time, feature=uv(late), feature_visible=np.ones(200, bool))
+    moved = compensate_delay(demo, {"feature": 0.06})
+    assert moved.duration == pytest.approx(demo.duration - 0.06, abs=0.021)
+    np.testing.assert_allclose(moved.feature, uv(moved.time), atol=2e-4)
+    np.testing.assert_allclose(
+        moved.joint_position, swing(moved.time).joint_position, atol=1e-9
+    )
+    with pytest.raises(ValueError, match="gripper is not recorded"):
+        compensate_delay(demo, {"gripper": 0.1})
+
+
+def warped(time, strength):
+    """The swing gone through at a changing pace."""
+    s = time / time[-1]
+    return time[-1] * (s + strength * np.sin(np.pi * s) ** 2)
+
+
+def test_demonstrations_are_brought_to_the_timing_of_one():
+    time = np.arange(300) / 50
+    paces = [warped(time, strength) for strength in (0.0, 0.12, -0.1)]
+    demos = DemonstrationSet([replace(swing(pace), time=time) for pace in paces])
+    aligned = align(demos, reference=0)
+    before = np.abs(demos[1].joint_position - demos[0].joint_position).max()
+    for demo in aligned:
+        np.testing.assert_array_equal(demo.time, time)
+        difference = np.abs(demo.joint_position - demos[0].joint_position)
+        assert difference.max() < 0.06 < before / 4
+        assert difference.mean() < 0.01
+    # Its velocities are those of the leader's timing now.
+    np.testing.assert_allclose(aligned[1].joint_velocity, demos[0].joint_velocity, atol=0.5)
+
+
+def test_poses_are_aligned_too_and_the_median_leads():
+    time = np.arange(200) / 50
+    demos = DemonstrationSet(
+        [
+            replace(
+                swing(warped(time, strength)),
+                joint_position=None,
+                joint_velocity=None,
+                joint_names=(),
+                time=time * stretch,
+            )
+            for strength, stretch in ((0.1, 1.4), (0.0, 1.0), (-0.1, 0.7))
+        ]
+    )
+    aligned = align(demos, band=None)
+    for demo in aligned:
+        np.testing.assert_array_equal(demo.time, demos[1].time)
+        assert angle(demo.orientation, demos[1].orientation).mean() < 0.03
+    with pytest.raises(ValueError, match="empty set"):
+        align(DemonstrationSet([]))

@@ -1,0 +1,97 @@
+"""A package must be built anew when anything changes that the step depends on."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+
+from hrc_learn.controller import (
+    GRIPPER_DOWN,
+    INITIAL_IMAGE_JACOBIAN,
+    AdaptiveController,
+    ControllerConfig,
+    Goals,
+    Observation,
+)
+from hrc_learn.deploy.export import _structure
+from hrc_learn.deploy.package import UnknownCodeError, fingerprint
+from hrc_learn.geometry import quaternion
+from hrc_learn.jacobian import (
+    FixedEstimator,
+    ImageJacobianEstimator,
+    KalmanEstimator,
+    RBFImageJacobian,
+    paper_grid,
+)
+from hrc_learn.kinematics import panda
+
+DOUBLE = torch.float64
+
+
+def controller(
+    scale: float = 1.0,
+    half_size: float = 0.1,
+    kind: Callable[[RBFImageJacobian], ImageJacobianEstimator] = KalmanEstimator,
+    **config: float,
+) -> AdaptiveController:
+    J = scale * torch.tensor(INITIAL_IMAGE_JACOBIAN, dtype=DOUBLE)
+    estimator = kind(RBFImageJacobian.from_jacobian(J, paper_grid(), 0.1))
+    down = quaternion.normalize(torch.tensor(GRIPPER_DOWN, dtype=DOUBLE))
+    centre = torch.tensor((0.4, 0.1, 0.4), dtype=DOUBLE)
+    goals = Goals.at(centre, down, half_size=(half_size,) * 3)
+    return AdaptiveController(panda, estimator, goals, config=ControllerConfig(**config))
+
+
+def test_equal_controllers_have_equal_fingerprints():
+    assert fingerprint(controller()) == fingerprint(controller())
+
+
+def test_use_leaves_no_trace():
+    one = controller()
+    before = fingerprint(one)
+    one.float().initial_state(panda.ready.float())
+    one.double()
+    assert fingerprint(controller()) == before
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"scale": 1 + 1e-15},
+        {"half_size": 0.11},
+        {"kind": FixedEstimator},
+        {"hold_rate": 0.0},
+        {"vision_rate": 5.0},
+    ],
+    ids=lambda change: next(iter(change)),
+)
+def test_every_weight_goal_part_and_setting_counts(change):
+    assert fingerprint(controller(**change)) != fingerprint(controller())
+
+
+def test_of_an_observation_the_structure_counts_not_the_values():
+    one = Observation(
+        joint_position=panda.ready,
+        feature=torch.zeros(2, dtype=DOUBLE),
+        feature_visible=torch.tensor(True),
+        dt=0.001,
+    )
+    seen = fingerprint(_structure(one))
+    assert fingerprint(_structure(replace(one, joint_position=panda.ready + 1))) == seen
+    for other in (
+        replace(one, dt=0.002),
+        replace(one, human_effort=panda.ready),
+        replace(one, joint_position=panda.ready.float()),
+    ):
+        assert fingerprint(_structure(other)) != seen
+
+
+def test_code_it_cannot_know_is_refused():
+    class Own(FixedEstimator):
+        """Somebody's own."""
+
+    with pytest.raises(UnknownCodeError, match=r"cannot tell what a .*Own does"):
+        fingerprint(controller(kind=Own))
+    with pytest.raises(UnknownCodeError, match="function"):
+        fingerprint([lambda x: x])

@@ -1,0 +1,337 @@
+"""The whole job in simulation, from demonstrations on disk to objects on shelves.
+
+One run is shared by most tests; what may go wrong is provoked in MuJoCo.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from taught_skills import WORKPLACE, taught_aiming, taught_placing
+from unchecked import shapes_unchecked
+
+from hrc_learn.experiments.collaboration.experiment import (
+    Disturbances,
+    simulate_collaboration,
+    with_objects,
+)
+from hrc_learn.experiments.collaboration.metrics import evaluate, measured, verdict
+from hrc_learn.experiments.pose_randomization import THREE_OBJECTS
+from hrc_learn.experiments.run_recording import Deviation, record, span, true_image_jacobian
+from hrc_learn.geometry import Box
+from hrc_learn.sim import NOWHERE, CameraChange, Occlusion
+from hrc_learn.skills.grasping import GraspingConfig
+from hrc_learn.skills.pick_and_place import CollaborationConfig
+from hrc_learn.skills.visual_servoing import AimingConfig
+from hrc_learn.skills.work_cell import StationConfig
+from hrc_learn.teleoperation import PullSpell
+
+PULL = (PullSpell(start=0.3, duration=2.0, towards=(0.4, 0.0, 0.5), strongest=60.0),)
+BRIEF = CollaborationConfig(interaction=0.0)
+HASTY = replace(
+    BRIEF,
+    grasping=GraspingConfig(aiming=AimingConfig(unseen_patience=2.5), patience=0.1, attempts=1),
+)
+"""Gives up as soon as the arm has come to where it should see its marker."""
+SHELVES = ("lower", "middle", "upper")
+
+
+@pytest.fixture(scope="module")
+def placing(tmp_path_factory):
+    return taught_placing(tmp_path_factory.mktemp("placing"))
+
+
+@pytest.fixture(scope="module")
+def aiming(tmp_path_factory):
+    return taught_aiming(tmp_path_factory.mktemp("aiming"))
+
+
+@pytest.fixture(scope="module")
+@shapes_unchecked()
+def job(aiming, placing):
+    return simulate_collaboration(
+        aiming,
+        placing[0],
+        ("upper",),
+        camera="synthetic",
+        pulls=PULL,
+        disturbances=Disturbances(occlusions=(Occlusion(start=0.0, duration=3.0),)),
+        config=CollaborationConfig(interaction=2.5),
+        seed=3,
+    )
+
+
+def test_the_object_ends_on_the_shelf_and_every_target_is_met(job, placing):
+    assert job.failure == ""
+    missed = [str(m) for m in evaluate(job, placing[1]) if m.ok is False]
+    assert missed == []
+    assert job.world.rests_on("box", "board_upper")
+
+
+def test_the_phases_come_in_order(job):
+    phases = [event.text for event in job.station.log.events]
+    assert phases == [
+        "look",
+        "aim",
+        "interact",
+        "grasp",
+        "lift",
+        "home",
+        "transfer",
+        "release",
+        "retreat",
+        "done",
+    ]
+
+
+def test_the_estimated_image_jacobian_is_close_to_the_true_one(job):
+    estimate = job.station.log["image_jacobian"]
+    true = true_image_jacobian(job.station.log, job.world, job.cameras)
+    start, end = span(job.station.log, "interact")
+    time = job.station.log["time"]
+    rows = (time >= start) & (time < end)
+    difference = (estimate - true)[rows, :, :2]
+    assert np.abs(difference).max() < 0.1 * np.abs(true[rows]).max()
+
+
+def test_deviations_count_from_the_first_pull(job):
+    deviation = Deviation.of(job.station.log)
+    start, end = span(job.station.log, "interact")
+    time = job.station.log["time"]
+    outside = (time < start) | (time >= end)
+    assert np.isnan(deviation.position[outside]).all()
+    first = int(np.flatnonzero(np.isfinite(deviation.position))[0])
+    assert deviation.position[first] == 0.0
+    assert time[first] == pytest.approx(start + PULL[0].start, abs=0.05)
+    assert deviation.elbow_most_moved > 0.1
+    assert deviation.most_moved < 1e-3
+
+
+def test_the_recording_holds_what_the_run_did(job):
+    plans = [errand.plan for errand in job.errands]
+    run = record("test", job.station, job.world, job.motion, plans=plans, cameras=job.cameras)
+    assert len(run.bodies) == len({body.name for body in run.bodies})
+    hand = next(body for body in run.bodies if body.name == "hand")
+    tool = hand.position + 0.1034 * _axis_z(hand.orientation)
+    np.testing.assert_allclose(tool, run.position, atol=1e-6)
+    assert {box.name for box in run.boxes} >= {"table", "board_upper", "cabinet_door"}
+    assert run.camera is not None
+    assert len(run.camera.images) > 10
+
+
+def _axis_z(orientation):
+    from hrc_learn.geometry import quaternion
+
+    return quaternion.to_matrix(torch.from_numpy(orientation))[..., :, 2].numpy()
+
+
+@pytest.mark.slow
+def test_a_person_who_keeps_away_changes_nothing(aiming, placing):
+    config = CollaborationConfig(interaction=0.5)
+    job = simulate_collaboration(
+        aiming, placing[0], ("middle",), camera="synthetic", pulls=(), config=config, seed=5
+    )
+    assert job.failure == ""
+    assert Deviation.of(job.station.log).elbow_most_moved == 0.0
+    assert job.world.rests_on("box", "board_middle")
+
+
+def moved_camera(dx, dy):
+    scene = WORKPLACE.scene
+    pose = scene.camera.pose.copy()
+    pose[:2, 3] += [dx, dy]
+    return replace(WORKPLACE, scene=replace(scene, camera=replace(scene.camera, pose=pose)))
+
+
+@pytest.mark.parametrize(
+    ("shift", "reason"),
+    [((1.5, 0.0), "does not see marker 11"), ((-0.46, 0.0), "nearer to the middle")],
+)
+def test_what_the_camera_cannot_see_is_reported(aiming, placing, shift, reason):
+    job = provoked(aiming, placing, moved_camera(*shift), HASTY)
+    assert reason in job.failure
+    with pytest.raises(ValueError, match="nothing to measure"):
+        evaluate(job, placing[1])
+
+
+def test_an_unknown_shelf_is_refused_before_anything_moves(aiming, placing):
+    with pytest.raises(ValueError, match="attic"):
+        simulate_collaboration(aiming, placing[0], ("attic",), camera="synthetic")
+
+
+def test_a_hidden_marker_is_waited_for_and_the_wait_noted(job):
+    (note,) = [note for errand in job.errands for note in errand.recoveries]
+    assert note.mishap == "marker out of sight"
+    feature = job.station.log["feature"][:, 0]
+    assert np.isnan(feature[job.station.log["time"] < 3.0]).all()
+    assert verdict(job) == ""
+    assert measured(job)["recovered_marker_out_of_sight"] == 1
+
+
+def provoked(aiming, placing, workplace=WORKPLACE, config=BRIEF, **options):
+    """A job without a person, disturbed in its course."""
+    return simulate_collaboration(
+        aiming,
+        placing[0],
+        ("middle",),
+        workplace=workplace,
+        camera="synthetic",
+        pulls=(),
+        config=config,
+        station_config=StationConfig(keep_every=0),
+        **options,
+    )
+
+
+class Meddler:
+    """Somebody who does something to the world once, so long after a phase has begun."""
+
+    def __init__(self, phase, deed, after=0.0):
+        self._phase, self._deed, self._after = phase, deed, after
+        self._begun, self._done = None, False
+
+    def start(self, world, station):
+        self._world, send = world, station._send
+
+        def meddled(*command, **columns):
+            due = self._begun is not None and world.time >= self._begun + self._after
+            if due and not self._done:
+                self._done = True
+                self._deed(world)
+            send(*command, **columns)
+
+        station._send = meddled
+
+    def phase(self, name, time):
+        if name == self._phase and self._begun is None:
+            self._begun = time
+
+
+def shifted(dx, dy, dz=0.0):
+    def shift(world):
+        world.data.joint("box").qpos[:3] += [dx, dy, dz]
+
+    return shift
+
+
+def mishaps(job):
+    return [note.mishap for errand in job.errands for note in errand.recoveries]
+
+
+@pytest.mark.slow
+def test_an_object_moved_away_under_the_hand_is_grasped_at_the_second_attempt(aiming, placing):
+    meddler = Meddler("grasp", shifted(0.0, 0.09))
+    job = provoked(aiming, placing, on_start=meddler.start, on_phase=meddler.phase, seed=5)
+    assert mishaps(job) == ["missed grasp"]
+    assert job.errands[0].attempts == 2
+    assert verdict(job) == ""
+
+
+@pytest.mark.slow
+def test_an_object_lost_on_the_way_up_is_looked_for_again(aiming, placing):
+    meddler = Meddler("lift", shifted(0.0, 0.08, 0.0), after=0.4)
+    job = provoked(aiming, placing, on_start=meddler.start, on_phase=meddler.phase, seed=5)
+    assert mishaps(job)[0] == "dropped object"
+    assert verdict(job) == ""
+
+
+@pytest.mark.slow
+def test_an_object_lost_for_good_is_given_up_and_the_arm_goes_home(aiming, placing):
+    """Half-way to the shelf it falls where the camera does not see it."""
+    meddler = Meddler("transfer", shifted(0.0, 0.0, -0.3), after=3.0)
+    job = provoked(aiming, placing, on_start=meddler.start, on_phase=meddler.phase, seed=5)
+    assert mishaps(job) == ["dropped object"]
+    assert "does not see marker 11" in job.failure
+    home = torch.from_numpy(job.station.state.joint_position)
+    assert float((home - WORKPLACE.home_joints()).abs().max()) < 0.02
+    assert not job.world.cabinet_contacts.touches
+
+
+def with_obstacle(centre, half_size):
+    box = Box(name="crate", centre=centre, half_size=half_size)
+    return replace(WORKPLACE, scene=replace(WORKPLACE.scene, obstacles=(box,)))
+
+
+@pytest.mark.slow
+def test_a_blocked_way_is_gone_round(aiming, placing):
+    workplace = with_obstacle((0.55, -0.10, 0.305), (0.05, 0.02, 0.04))
+    job = provoked(aiming, placing, workplace, seed=5)
+    assert set(mishaps(job)) == {"blocked way"}
+    assert verdict(job) == ""
+
+
+@pytest.mark.slow
+def test_what_blocks_every_way_is_waited_for(aiming, placing):
+    workplace = with_obstacle((0.40, -0.40, 0.40), (0.15, 0.03, 0.15))
+    meddler = Meddler(
+        "transfer", lambda world: world.move_obstacle("crate", NOWHERE), after=1.0
+    )
+    job = provoked(
+        aiming, placing, workplace, on_start=meddler.start, on_phase=meddler.phase, seed=5
+    )
+    assert mishaps(job) == ["blocked way"]
+    assert verdict(job) == ""
+
+
+@pytest.mark.slow
+def test_where_no_way_gets_free_the_object_is_put_back(aiming, placing):
+    workplace = with_obstacle((0.40, -0.40, 0.40), (0.15, 0.03, 0.15))
+    config = replace(BRIEF, waits=1, wait=0.5)
+    job = provoked(aiming, placing, workplace, config, seed=5)
+    assert mishaps(job) == ["blocked way", "blocked way"]
+    assert "stayed blocked" in job.failure
+    assert job.world.rests_on("box", "table")
+    place = job.world.object_pose("box")[:2, 3]
+    np.testing.assert_allclose(place, job.errands[0].picked_up.position[:2], atol=0.01)
+    assert not job.world.cabinet_contacts.touches
+    home = torch.from_numpy(job.station.state.joint_position)
+    assert float((home - WORKPLACE.home_joints()).abs().max()) < 0.02
+
+
+@pytest.mark.slow
+def test_a_marker_that_stays_hidden_ends_the_attempts_cleanly(aiming, placing):
+    config = replace(BRIEF, grasping=replace(HASTY.grasping, attempts=2))
+    hidden = Disturbances(occlusions=(Occlusion(start=0.0, duration=1e3),))
+    job = provoked(aiming, placing, config=config, disturbances=hidden, seed=5)
+    assert mishaps(job) == ["marker out of sight", "marker out of sight"]
+    assert "marker" in job.failure
+    assert job.world.rests_on("box", "table")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "change", [CameraChange(), CameraChange(distance=0.0, angle=0.0, focus=1.06)]
+)
+def test_three_objects_are_placed_though_the_camera_is_changed_between_them(
+    aiming, placing, change
+):
+    workplace = with_objects(WORKPLACE, THREE_OBJECTS)
+    job = simulate_collaboration(
+        aiming,
+        placing[0],
+        SHELVES,
+        workplace=workplace,
+        camera="synthetic",
+        pulls=PULL,
+        disturbances=Disturbances(
+            occlusions=(
+                Occlusion(start=0.0, duration=3.0),
+                Occlusion(start=50.0, duration=3.0),
+            ),
+            camera_change=change,
+        ),
+        config=CollaborationConfig(interaction=2.5),
+        station_config=StationConfig(keep_every=0),
+        seed=1,
+    )
+    assert verdict(job) == ""
+    assert len(job.cameras) == 3
+    assert measured(job)["standing"] == 3
+
+
+def test_every_object_needs_a_shelf_of_its_own(aiming, placing):
+    workplace = with_objects(WORKPLACE, THREE_OBJECTS[:2])
+    for shelves in (("lower",), ("lower", "lower")):
+        with pytest.raises(ValueError, match="a shelf of its own"):
+            simulate_collaboration(aiming, placing[0], shelves, workplace=workplace)

@@ -1,0 +1,77 @@
+from dataclasses import replace
+from io import BytesIO
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from sample_runs import sample_run
+
+from hrc_learn.experiments.collaboration import figures as collaboration_figures
+from hrc_learn.experiments.collaboration.figures import (
+    hand_figure,
+    marker_figure,
+    timeline_figure,
+    trajectories_figure,
+)
+from hrc_learn.geometry import quaternion
+from hrc_learn.kinematics import gripper_down
+from hrc_learn.viz import Event
+
+OBJECTS = {"box": (0.0, 2.0), "tin": (2.0, 4.0)}
+PHASES = ("look", "aim", "transfer", "release")
+
+
+@pytest.fixture(scope="module")
+def run():
+    times = np.concatenate([start + np.array([0.0, 0.4, 1.0, 1.7]) for start in (0.0, 2.0)])
+    events = tuple(Event(float(t), text) for t, text in zip(times, PHASES * 2, strict=True))
+    return sample_run(phases=events)
+
+
+@pytest.mark.parametrize(
+    "draw",
+    [trajectories_figure, marker_figure, timeline_figure, lambda run, _: hand_figure(run)],
+)
+def test_figures_are_drawn(run, draw):
+    buffer = BytesIO()
+    draw(run, OBJECTS).savefig(buffer, format="png", dpi=60)
+    assert np.asarray(Image.open(buffer).convert("L")).std() > 10
+
+
+def test_each_object_is_carried_along_its_own_path(run):
+    axes = trajectories_figure(run, OBJECTS).axes[0]
+    lines = {line.get_label(): line for line in axes.get_lines()}
+    assert {"demonstration", "carried: box", "carried: tin"} <= lines.keys()
+    x, _, _ = lines["carried: tin"].get_data_3d()
+    carried = (run.time >= 3.0) & (run.time < run.time[-1])  # the last phase ends there
+    np.testing.assert_array_equal(x, run.position[carried, 0])
+
+
+def test_the_marker_is_shaded_where_it_is_wanted_and_not_seen(run):
+    _, error = marker_figure(run, OBJECTS).axes
+    (spell,) = [patch for patch in error.patches if patch.get_alpha() == 0.25]
+    low, high = spell.get_extents().transformed(error.transData.inverted()).intervalx
+    assert (low, high) == pytest.approx((run.time[50], run.time[59]))
+
+
+def test_the_timeline_has_a_row_for_each_phase_and_for_people(run):
+    axes = timeline_figure(run, OBJECTS).axes[0]
+    labels = [label.get_text() for label in axes.get_yticklabels()]
+    assert labels == [*PHASES, "person pulls", "marker unseen"]
+
+
+def test_angles_count_from_the_hand_pointing_down(run):
+    turns = np.deg2rad([[0.0, 0.0, 0.0], [-90.0, 0.0, 0.0], [0.0, 0.0, 20.0], [0.0, 15.0, 0.0]])
+    down = gripper_down()
+    q = quaternion.multiply(quaternion.exp(torch.from_numpy(turns)), down).numpy()
+    steps = len(run.time) // len(turns)
+    hand = replace(run.bodies[0], orientation=np.repeat(q, steps, axis=0), name="hand")
+    axes = hand_figure(replace(run, bodies=(hand,))).axes[1]
+    drawn = np.stack([line.get_ydata() for line in axes.get_lines()], axis=-1)[::steps]
+    np.testing.assert_allclose(drawn, np.rad2deg(turns), atol=1e-9)
+
+
+def test_runs_without_a_camera_are_refused_where_it_is_needed(run):
+    with pytest.raises(ValueError, match="needs camera"):
+        collaboration_figures.marker_figure(replace(run, camera=None), OBJECTS)

@@ -1,0 +1,71 @@
+import math
+
+import pytest
+import torch
+from unchecked import shapes_unchecked
+
+from hrc_learn.experiments.controller.stress_trials import StressConfig, run_stress_trials
+from hrc_learn.experiments.controller.sweep import CRITERIA, EXPERIMENTS, chunks, compared
+
+
+def test_every_bound_is_on_a_figure_that_its_experiment_reports():
+    """Experiments of one or two steps, and what is made of two of them."""
+    assert {c.experiment for c in CRITERIA} <= EXPERIMENTS.keys()
+    figures = dict.fromkeys(
+        ("near_vision_phase_roll_0_30", "fixed_vision_phase_roll_0_30"), 1.0
+    )
+    assert compared(figures) == {"near_speed_up_roll_0_30": 1.0}
+    for name in ("noise", "stress"):
+        summary = run_chunk_of_two_steps(name).summary()
+        wanted = {c.figure for c in CRITERIA if c.experiment == name}
+        assert wanted
+        assert wanted <= summary.keys()
+
+
+def run_chunk_of_two_steps(name: str):
+    experiment = EXPERIMENTS[name]
+    config = type(experiment.config)(count=5, duration=2 * experiment.config.dt)
+    return experiment.run(config)
+
+
+def test_a_bound_is_met_on_its_own_side():
+    success = next(c for c in CRITERIA if c.key == "near_success")
+    assert [success.met(x) for x in (1.0, 0.99, 0.98, math.nan)] == [True, True, False, False]
+    assert success.bound == ">= 0.99"
+    latest = next(c for c in CRITERIA if c.key == "near_t95")
+    assert [latest.met(x) for x in (7.0, 8.0, math.inf)] == [True, True, False]
+    assert latest.bound == "<= 8"
+
+
+def test_never_arriving_without_adaptation_is_infinitely_slower():
+    gains = compared(
+        {"near_vision_phase_roll_60_90": 1.0, "fixed_vision_phase_roll_60_90": math.inf}
+    )
+    assert gains == {"near_speed_up_roll_60_90": math.inf}
+
+
+def test_chunks_make_up_the_trials_with_a_seed_each():
+    jobs = chunks("near", 600, 2, 250)
+    assert [count for _, count, _ in jobs] == [250, 250, 100]
+    assert len({seed for *_, seed in jobs}) == 3
+    assert not {seed for *_, seed in jobs} & {seed for *_, seed in chunks("near", 600, 0, 250)}
+    assert chunks("effort", 600, 2, 250) == [("effort", 600, 2)]
+
+
+def test_joined_results_are_those_of_the_chunks():
+    parts = [run_chunk_of_two_steps("stress"), run_chunk_of_two_steps("stress")]
+    joined = EXPERIMENTS["stress"].join(parts)
+    assert joined.summary()["rollouts"] == 10
+    assert torch.equal(joined.interventions[:5], parts[0].interventions)
+
+
+@pytest.mark.parametrize("fault", ["none", "nan", "late", "lost"])
+def test_no_limit_is_broken_under_stress(fault: str):
+    config = StressConfig(count=40, seed=3, duration=2.5, fault=fault)
+    with shapes_unchecked():  # for speed
+        result = run_stress_trials(config)
+    assert not result.beyond.any()
+    assert not result.unknown.any()
+    acted = result.interventions.sum(0)
+    assert acted[1] > 0  # position limits were in the way
+    assert (acted[6] > 0) == (fault in ("nan", "late"))

@@ -1,0 +1,141 @@
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from unchecked import shapes_unchecked
+
+from hrc_learn.controller import GRIPPER_DOWN
+from hrc_learn.experiments.controller.effort_trials import EffortConfig, run_effort_trials
+from hrc_learn.experiments.controller.grasp_trials import (
+    CENTRE,
+    TrialConfig,
+    TrialResult,
+    _draw,
+    clearance,
+    run_trials,
+)
+from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.jacobian import FixedEstimator, KalmanEstimator
+from hrc_learn.kinematics import (
+    UnreachableError,
+    clear_posture,
+    comfortable_posture,
+    comfortable_postures,
+    panda,
+)
+from hrc_learn.sim.closed_loop import Imperfections
+
+QUICK = TrialConfig(
+    count=20, duration=6.0, dt=0.02, imperfections=Imperfections(frame_steps=2, noise=0.5)
+)
+
+
+@shapes_unchecked()  # for speed
+def test_adaptation_succeeds_where_the_fixed_jacobian_cannot():
+    adaptive = run_trials(KalmanEstimator, QUICK)
+    fixed = run_trials(FixedEstimator, replace(QUICK, duration=4.0))
+    assert adaptive.success.double().mean() >= 0.9
+    assert not fixed.success[fixed.roll_class == 4].any()
+    for result in (adaptive, fixed):
+        assert not result.violations.any()
+        assert result.peak_speed.max() <= 1
+    assert (adaptive.vision_time[adaptive.success] <= adaptive.time[adaptive.success]).all()
+
+
+def test_the_same_seed_draws_the_same_trials():
+    short = replace(QUICK, duration=0.2)
+    one, same = run_trials(KalmanEstimator, short), run_trials(KalmanEstimator, short)
+    other = run_trials(KalmanEstimator, replace(short, seed=1))
+    assert (one.peak_speed == same.peak_speed).all()
+    assert (one.peak_speed != other.peak_speed).any()
+
+
+def test_a_run_that_left_the_target_again_is_no_success():
+    """The summary counts what held to the end."""
+    result = TrialResult(
+        roll_class=torch.tensor([0, 1, 2, 3, 4]),
+        success=torch.tensor([True, True, False, True, True]),
+        time=torch.tensor([1.0, 2.0, math.inf, 3.0, 4.0], dtype=torch.float64),
+        vision_time=torch.tensor([0.5, 0.5, math.nan, 1.0, 1.0], dtype=torch.float64),
+        violations=torch.tensor([0, 0, 2, 0, 0]),
+        touched=torch.tensor([False, True, False, False, False]),
+        peak_speed=torch.full((5,), 0.7, dtype=torch.float64),
+        hand_overs=torch.ones(5, dtype=torch.int64),
+    )
+    summary = result.summary()
+    assert summary["success"] == 0.8
+    assert summary["free_success"] == 0.6
+    assert summary["touched"] == 0.2
+    assert summary["t50"] == 3.0
+    assert summary["t95"] == math.inf
+    assert summary["violations"] == 2
+    assert summary["vision_phase"] == 1.0
+    assert summary["vision_phase_roll_60_90"] == math.inf
+    assert summary["success_roll_60_90"] == 0
+    assert summary["success_roll_0_30"] == 1
+
+
+def test_a_comfortable_posture_reaches_the_pose_far_from_trouble():
+    pose = Pose(
+        torch.tensor([0.3, 0.4, 0.3], dtype=torch.float64),
+        quaternion.normalize(torch.tensor([0.0, 1.0, 0.2, 0.0], dtype=torch.float64)),
+    )
+    q = comfortable_posture(panda, pose)
+    reached = panda.forward(q)
+    assert (reached.position - pose.position).norm() < 1e-9
+    assert quaternion.angle(reached.orientation, pose.orientation) < 1e-9
+    distance = torch.minimum(q - panda.limits.lower, panda.limits.upper - q)
+    assert distance.min() > 0.3
+    assert torch.linalg.svdvals(panda.jacobian(q))[-1] > 0.1
+
+
+def test_a_clear_posture_is_the_first_with_a_free_path():
+    """In a plane with a wall at 1 that has a door between 2 and 3."""
+
+    def clearance(q: torch.Tensor) -> torch.Tensor:
+        wall = (q[..., 0] - 1).abs()
+        return torch.where((q[..., 1] - 2.5).abs() < 0.5, 1.0, wall) - 0.1
+
+    postures = torch.tensor([[2.0, 0.0], [2.0, 5.0], [0.0, 9.0]], dtype=torch.float64)
+    start = torch.tensor([[1.5, 0.0], [0.5, 1.5], [0.5, 0.0]], dtype=torch.float64)
+    chosen = clear_posture(postures, start, clearance)
+    assert chosen.tolist() == postures.tolist()
+    # Through the wall whichever it is: what comes least near.
+    walled = clear_posture(postures[:1], start[2], clearance)
+    assert walled.tolist() == [2.0, 0.0]
+
+
+def test_a_path_that_would_touch_is_not_taken():
+    """A start from which the straight way to the most comfortable posture meets the arm."""
+    rng = torch.Generator().manual_seed(0)
+    config = TrialConfig(count=250, starts="global")
+    starts = _draw(config, rng).start
+    assert (clearance(starts) > 0).all()
+    down = quaternion.normalize(torch.tensor(GRIPPER_DOWN, dtype=torch.float64))
+    pose = Pose(torch.tensor(CENTRE, dtype=torch.float64), down)
+    postures = comfortable_postures(panda, pose)
+    share = torch.linspace(0, 1, 50, dtype=torch.float64)[:, None]
+    blind = clearance(torch.lerp(starts[:, None], postures[0], share)).amin(-1)
+    q = starts[blind < 0]
+    assert len(q) >= 3
+    seeing = clear_posture(postures, q, clearance)
+    assert (clearance(torch.lerp(q[:, None], seeing[:, None], share)) > 0).all()
+
+
+def test_a_pose_out_of_reach_is_refused():
+    far = Pose(
+        torch.tensor([2.0, 0.0, 0.3], dtype=torch.float64),
+        torch.tensor([0.0, 1.0, 0.0, 0.0], dtype=torch.float64),
+    )
+    with pytest.raises(UnreachableError, match="move the goal"):
+        comfortable_posture(panda, far)
+
+
+@shapes_unchecked()  # for speed
+def test_a_pull_moves_the_elbow_far_and_the_tool_hardly():
+    config = EffortConfig(count=6, force=12.0, dt=0.01, away=1.5, back=0.5)
+    summary = run_effort_trials(config).summary()
+    assert summary["elbow_mm"] > 100
+    assert summary["deviation_p95_mm"] < 0.2
+    assert summary["turn_p95_deg"] < 0.05

@@ -1,0 +1,157 @@
+import math
+
+import pytest
+import torch
+from pinhole import Pinhole, wander
+from sampling import generator
+from torch.testing import assert_close
+
+from hrc_learn.jacobian import (
+    ImageJacobianFitConfig,
+    LearningConfig,
+    Neurons,
+    RBFImageJacobian,
+    held_out_pairs,
+    learn,
+    paper_grid,
+    watched,
+)
+from hrc_learn.jacobian.evidence import Evidence
+from hrc_learn.jacobian.radial_basis import weight_covariance
+from hrc_learn.jacobian.samples import KeyMotion, PairConfig
+
+CAMERA = Pinhole.overhead(roll=0.7)
+
+
+WORKSPACE = {"spread": 0.06, "turn": 0.08}
+
+
+def record(demos=4, *, frames=200, noise=0.1, seed=0):
+    rng = generator(seed)
+    poses = wander(frames, demos, rng=rng, **WORKSPACE)
+    x = CAMERA.project(poses)
+    x = x + noise * torch.randn(x.shape, generator=rng, dtype=x.dtype)
+    return watched([poses[i] for i in range(demos)], list(x))
+
+
+def relative_error(network):
+    test = wander(200, rng=generator(99), **WORKSPACE)
+    truth = CAMERA.jacobian(test)
+    return float((network(test).detach() - truth).norm() / truth.norm())
+
+
+def test_evidence_is_the_density_of_the_image_motion():
+    """Against the Gaussian density of all pairs at once, from its covariance."""
+    demonstrations = record(1, frames=40)
+    config = ImageJacobianFitConfig(pixel_noise=0.3, bias_std=900.0, weight_std=300.0)
+    motion = demonstrations[0].motion(config)
+    neurons = Neurons.paper()
+    model = Evidence(neurons, config, learn_centers=False)
+    phi = motion.regressors(neurons.basis())
+    prior = torch.block_diag(*[weight_covariance(paper_grid(), 900.0, 300.0)] * 6)
+    noise = 2 * 0.3**2 * torch.eye(len(phi), dtype=torch.float64)
+    density = torch.distributions.MultivariateNormal(
+        torch.zeros(len(phi), dtype=torch.float64), phi @ prior @ phi.mT + noise
+    )
+    expected = -density.log_prob(motion.dx.mT).sum() / len(phi)
+    assert_close(model(motion), expected.detach(), rtol=1e-9, atol=0)
+
+
+def test_gradients_of_the_evidence():
+    demonstrations = record(2, frames=40)
+    motion = KeyMotion.joined([one.motion(PairConfig()) for one in demonstrations])
+    model = Evidence(Neurons.around(demonstrations), ImageJacobianFitConfig(), True)
+    value = model(motion)
+    value.backward()
+    step = 1e-5
+    for name in ("log_width", "log_noise", "log_bias", "log_weight"):
+        parameter = getattr(model, name)
+        with torch.no_grad():
+            parameter += step
+            above = float(model(motion))
+            parameter -= 2 * step
+            below = float(model(motion))
+            parameter += step
+        numeric = (above - below) / (2 * step)
+        assert float(parameter.grad) == pytest.approx(numeric, rel=1e-4, abs=1e-6)
+    assert float(model.centers.grad.norm()) > 0
+
+
+def test_learning_improves_on_ridge_and_finds_the_noise():
+    demonstrations = record()
+    neurons = Neurons.around(demonstrations)
+    config = ImageJacobianFitConfig()
+    learned = learn(
+        demonstrations, neurons, config, LearningConfig(rounds=3, learn_centers=False)
+    )
+    # Noise alone, four coordinates of it in each pair, leaves an error of 0.2 px.
+    excess = [state.held_out_error - 0.2 for state in learned.rounds]
+    assert excess[learned.best] < 0.9 * excess[0]
+    assert learned.config.pixel_noise == pytest.approx(0.1, rel=0.1)
+    ridge = RBFImageJacobian.fit_watched(demonstrations, neurons, config)
+    better = RBFImageJacobian.fit_watched(demonstrations, learned.neurons, learned.config)
+    assert relative_error(better) < relative_error(ridge)
+
+
+def test_learning_keeps_what_was_best_on_demonstrations_held_out():
+    learned = learn(record(), Neurons.paper(), learning=LearningConfig(rounds=3, patience=2))
+    errors = [state.held_out_error for state in learned.rounds]
+    assert errors[learned.best] <= 1.001 * min(errors)
+    if learned.best == 0:
+        assert len(errors) == 3  # patience of two rounds
+        assert_close(learned.neurons.centers, paper_grid())
+
+
+def test_too_few_demonstrations_are_refused():
+    with pytest.raises(ValueError, match="holds out every 4th"):
+        learn(record(3), Neurons.paper())
+
+
+def test_neurons_around_stand_where_the_tool_was():
+    demonstrations = record()
+    neurons = Neurons.around(demonstrations)
+    assert neurons.centers.shape == (13, 6)
+    position = torch.cat([one.pose.position for one in demonstrations])
+    low, high = neurons.centers[:, :3].amin(dim=0), neurons.centers[:, :3].amax(dim=0)
+    assert_close((low + high) / 2, (position.amin(dim=0) + position.amax(dim=0)) / 2)
+    # In z hardly anything was shown: neurons keep their least distance there.
+    assert_close((high - low)[:2], (position.amax(dim=0) - position.amin(dim=0))[:2])
+    reference = neurons.reference
+    assert reference is not None
+    down = torch.tensor([0.0, 1.0, 0.0, 0.0], dtype=torch.float64)
+    assert float((reference @ down).abs()) > math.cos(0.5 * 0.1)
+
+
+def test_a_reference_survives_saving_and_half_turns(tmp_path):
+    """Poses and their vectors agree though the hand points down, at a half turn."""
+    demonstrations = record(2)
+    network = RBFImageJacobian.fit_watched(demonstrations, Neurons.around(demonstrations))
+    network.save(tmp_path / "model")
+    loaded = RBFImageJacobian.load(tmp_path / "model")
+    pose = demonstrations[0].pose[:5]
+    assert_close(loaded(pose), network(pose))
+    assert_close(network(pose.vector()), network(pose), rtol=1e-9, atol=1e-6)
+    flipped = type(pose)(pose.position, -pose.orientation)
+    assert_close(network(flipped), network(pose))
+
+
+def test_held_out_errors_by_place_add_up():
+    demonstrations = record()
+    config = ImageJacobianFitConfig(pixel_noise=0.1)
+    network = RBFImageJacobian.fit_watched(
+        demonstrations, Neurons.around(demonstrations), config
+    )
+    report = network.report
+    assert report is not None
+    pairs = held_out_pairs(demonstrations, network, config)
+    assert len(pairs.error) == report.pairs
+    rms = float(pairs.error.square().sum(-1).mean().sqrt())
+    # The report's came before the noise was raised to the error it found.
+    assert rms == pytest.approx(report.held_out_error, rel=0.02)
+    cells = pairs.by_cell(3)
+    assert int(cells.pairs.sum()) == report.pairs
+    assert bool((cells.relative.isfinite() == (cells.pairs > 0)).all())
+    loaded = RBFImageJacobian(paper_grid(), 0.1)
+    with pytest.raises(ValueError, match="just fitted"):
+        held_out_pairs(demonstrations, loaded, config)
+    assert math.isfinite(float(cells.uncertainty.nanmean()))

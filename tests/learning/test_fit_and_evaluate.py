@@ -1,0 +1,164 @@
+"""Fits, evaluations and searches, on data small enough to know the answer."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from hrc_learn.controller import ControllerConfig
+from hrc_learn.demos import Demonstration, DemonstrationSet
+from hrc_learn.dmp import ContextualDMP, JointDMP, OrientationDMP, PoseDMP
+from hrc_learn.geometry import quaternion
+from hrc_learn.learning.channels import Motions, Reproduction, load_primitive
+from hrc_learn.learning.fit_primitives import EACH, contexts, fit_contextual, fit_primitives
+from hrc_learn.learning.reproduction_error import dimensionless_jerk, reproduction_error
+from hrc_learn.learning.tuning import Search, with_gains
+
+
+def demonstration(episode, frames=120):
+    """A hand that moves and turns, further in each episode."""
+    s = np.linspace(0, 1, frames)
+    way = s**3 * (10 - 15 * s + 6 * s**2)
+    reach = 0.2 + 0.1 * episode
+    turn = torch.from_numpy(np.outer(way, [0.0, 0.3, 0.5 + 0.1 * episode]))
+    return Demonstration(
+        episode=episode,
+        fps=60,
+        time=2 * s,
+        joint_names=(),
+        position=np.outer(way, [reach, 0.1, -0.2]) + np.array([0.3, 0.0, 0.4]),
+        orientation=quaternion.exp(turn).numpy(),
+        extra={"observation.size": np.full((frames, 1), 1.5 + episode)},
+    )
+
+
+@pytest.fixture(scope="module")
+def demos():
+    # Of two lengths, so that there is something to mask.
+    return DemonstrationSet([demonstration(0), demonstration(1, 100), demonstration(2)])
+
+
+def test_every_kind_is_fitted_saved_and_read_back(demos, tmp_path):
+    fitted = fit_primitives(demos, 25, kinds=("position", "orientation", "pose"))
+    fitted.save(tmp_path, each=True)
+    classes = {"position": JointDMP, "orientation": OrientationDMP, "pose": PoseDMP}
+    for kind, cls in classes.items():
+        assert isinstance(load_primitive(tmp_path / kind, kind), cls)
+        assert load_primitive(tmp_path / EACH / kind, kind).duration.shape == (3,)
+    metrics = fitted.metrics()
+    assert metrics["position_nrmse_max"] < 1e-3
+    assert metrics["pose_turn_rmse_max"] < 0.05
+    assert metrics["mean_pose_goal_error_max"] < 1e-3
+    assert metrics["mean_orientation_turn_at_goal_max"] < 0.2
+
+
+def test_a_kind_that_was_not_recorded_is_refused(demos):
+    with pytest.raises(
+        ValueError, match="no joint_position, which a primitive of kind 'joint'"
+    ):
+        fit_primitives(demos, 10, kinds=("joint",))
+
+
+def test_the_number_of_basis_functions_is_chosen_by_samples_held_out(demos):
+    fitted = fit_primitives(demos, None, kinds=("position",), candidates=(5, 12, 20))
+    assert fitted.selection is not None
+    assert fitted.n_basis == fitted.selection.count
+    best = fitted.selection.error.min()
+    chosen = fitted.selection.candidates.index(fitted.n_basis)
+    assert fitted.selection.error[chosen] <= 1.05 * best
+
+
+def test_contexts_are_ends_or_columns(demos, tmp_path):
+    fitted = fit_primitives(demos, 15, kinds=("position",))
+    ends = contexts(demos, (), fitted, "position")
+    assert ends.shape == (3, 6)
+    np.testing.assert_allclose(ends[1, 3:], demos[1].position[-1])
+    size = contexts(demos, ("observation.size",), fitted, "position")
+    assert size[:, 0].tolist() == [1.5, 2.5, 3.5]
+    metrics = fit_contextual(fitted, demos, ("observation.size",), tmp_path)
+    # The reach is a linear function of the size, so two demonstrations tell of the third.
+    assert metrics["contextual_position_held_out_nrmse_max"] < 1e-2
+    model = ContextualDMP.load(tmp_path / "contextual" / "position")
+    middle = model.at([2.0])
+    assert middle.goal[0].item() == pytest.approx(0.3 + 0.25, abs=1e-4)
+    with pytest.raises(ValueError, match=r"episode 0: no column 'observation.mass'"):
+        contexts(demos, ("observation.mass",), fitted, "position")
+
+
+def test_errors_of_a_known_offset(demos):
+    motions = Motions.of(demos)
+    mask = motions.demos.mask[..., None]
+    shown, turn = motions.column("position"), motions.column("orientation")
+    # What stands behind the end of a demonstration must not count.
+    offset = torch.tensor([0.0, 0.03, 0.0], dtype=torch.float64)
+    made = torch.where(mask, shown + offset, 1e6)
+    tilt = quaternion.exp(torch.tensor([math.radians(2.0), 0.0, 0.0], dtype=torch.float64))
+    turned = quaternion.multiply(tilt, turn)
+    error = reproduction_error("pose", motions, Reproduction(made, turned))
+    columns = error.columns()
+    span = torch.tensor([0.2, 0.3, 0.4], dtype=torch.float64)
+    expected = 0.03 / 3**0.5 / span
+    torch.testing.assert_close(columns["nrmse"], expected, rtol=1e-9, atol=0)
+    torch.testing.assert_close(columns["goal_error"], torch.full((3,), 0.03).double())
+    torch.testing.assert_close(columns["turn_rmse"], torch.full((3,), 2.0).double())
+    torch.testing.assert_close(columns["jerk"], torch.ones(3).double(), rtol=1e-6, atol=0)
+
+
+def test_dimensionless_jerk_of_a_minimum_jerk_motion():
+    """720 for any length and duration: the integral of (60 - 360 s + 360 s^2)^2."""
+    for reach, duration in ((1.0, 1.0), (0.2, 7.0)):
+        s = torch.linspace(0, 1, 4000, dtype=torch.float64)
+        way = reach * s**3 * (10 - 15 * s + 6 * s**2)
+        jerk = dimensionless_jerk(duration * s, way[:, None])
+        # Differences are of first order at both ends, where the jerk is largest.
+        assert float(jerk) == pytest.approx(720, rel=0.01)
+
+
+def bowl(numbers):
+    """Least, 0.1, at (3, 0.5)."""
+    a, b = math.log(numbers["a"] / 3), math.log(numbers["b"] / 0.5)
+    return 0.1 + a**2 + 3 * (a + b) ** 2
+
+
+def test_a_search_finds_the_bottom_of_a_bowl():
+    search = Search.around({"a": 1.0, "b": 1.0}, seed=3)
+    for _ in range(40):
+        tried = search.ask(10)
+        search = search.tell(tried, [bowl(one) for one in tried])
+    best = dict(zip(search.names, search.best, strict=True))
+    assert search.best_cost == pytest.approx(0.1, abs=1e-3)
+    assert best["a"] == pytest.approx(3, rel=0.05)
+
+
+def test_an_interrupted_search_goes_on_as_if_it_had_not_been():
+    def run(search, generations):
+        for _ in range(generations):
+            tried = search.ask(6)
+            search = search.tell(tried, [bowl(one) for one in tried])
+        return search
+
+    start = Search.around({"a": 1.0, "b": 1.0})
+    saved = json.loads(json.dumps(run(start, 2).to_json()))
+    assert run(Search.from_json(saved), 3) == run(start, 5)
+
+
+def test_bad_starts_and_states_of_a_search_are_refused():
+    with pytest.raises(ValueError, match="b must be positive"):
+        Search.around({"a": 1.0, "b": math.inf})
+    with pytest.raises(ValueError, match="not the state of a search"):
+        Search.from_json({"names": []})
+
+
+def test_gains_of_a_file_take_the_place_of_defaults(tmp_path):
+    path = tmp_path / "gains.json"
+    path.write_text('{"vision_rate": 5.5}')
+    config = ControllerConfig()
+    assert with_gains(config, path) == replace(config, vision_rate=5.5)
+    assert with_gains(config, None) is config
+    for content in ('{"speed": 1}', '{"vision_rate": "fast"}', "[]", "{"):
+        path.write_text(content)
+        with pytest.raises(ValueError, match=r"gains\.json"):
+            with_gains(config, path)

@@ -1,0 +1,58 @@
+import numpy as np
+import pytest
+import torch
+
+from hrc_learn.demos import Demonstration, DemonstrationSet
+from hrc_learn.kinematics import panda, panda_capsules
+from hrc_learn.learning.fit_recordings import demonstrations_recording
+from hrc_learn.viz.arm_bodies import panda_bodies
+
+
+@pytest.fixture
+def joints():
+    rng = np.random.default_rng(0)
+    return panda.ready.numpy() + 0.3 * rng.normal(size=(6, 7))
+
+
+def demonstration(joints, **changes) -> Demonstration:
+    values = {"joint_names": panda.joint_names, "fps": 50, "time": np.arange(6) / 50}
+    return Demonstration(**(values | {"joint_position": joints} | changes))
+
+
+def test_the_arm_is_drawn_where_planning_takes_it_to_be(joints):
+    bodies = panda_bodies(joints)
+    drawn = [
+        body.position + rotated(body.orientation, np.array(end))
+        for body in bodies
+        for capsule in body.capsules
+        for end in (capsule.start, capsule.end)
+    ]
+    expected = panda_capsules.segments(torch.from_numpy(joints)).flatten(1, 2).numpy()
+    np.testing.assert_allclose(np.stack(drawn, axis=1), expected, atol=1e-12)
+
+
+def rotated(orientation, point):
+    w, v = orientation[:, :1], orientation[:, 1:]
+    turned = np.cross(v, point)
+    return point + 2 * (w * turned + np.cross(v, turned))
+
+
+def test_a_pandas_path_is_found_from_its_joints(joints):
+    shown = demonstrations_recording(DemonstrationSet([demonstration(joints)]), "Demos")
+    (demo,) = shown.demonstrations
+    expected = panda.forward(torch.from_numpy(joints)).position.numpy()
+    np.testing.assert_allclose(demo.position, expected, atol=1e-12)
+    assert shown.joint_limits is not None
+    assert demo.bodies
+
+
+def test_what_was_not_seen_and_other_robots_are_left_out(joints):
+    visible = np.array([True, False, True, True, False, True])
+    names = tuple(f"arm_{i}" for i in range(7))
+    feature = np.ones((6, 2))
+    demo = demonstration(joints, joint_names=names, feature=feature, feature_visible=visible)
+    shown = demonstrations_recording(DemonstrationSet([demo]), "Demos")
+    np.testing.assert_array_equal(np.isfinite(shown.demonstrations[0].feature[:, 0]), visible)
+    assert shown.joint_limits is None
+    assert shown.demonstrations[0].bodies == ()
+    assert shown.demonstrations[0].position is None

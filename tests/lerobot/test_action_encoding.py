@@ -1,0 +1,52 @@
+import pytest
+import torch
+
+from hrc_learn.geometry import quaternion
+from hrc_learn.lerobot.policy.action_encoding import ActionChart
+
+
+def poses(tilt: float) -> torch.Tensor:
+    """Positions, and orientations about a hand that points down, (30, 6), float64."""
+    rng = torch.Generator().manual_seed(0)
+    noise = torch.randn(30, 6, generator=rng, dtype=torch.float64).cumsum(0) / 5
+    noise = noise - noise.mean(0)
+    down = quaternion.exp(torch.tensor([torch.pi, 0, 0], dtype=torch.float64))
+    q = quaternion.multiply(quaternion.exp(tilt * noise[:, 3:]), down)
+    return torch.cat([noise[:, :3], quaternion.log(q)], dim=-1)
+
+
+def test_there_and_back_is_the_same_pose():
+    shown = poses(0.3)
+    chart = ActionChart(6, [[3, 4, 5]]).double()
+    chart.learn([shown])
+    back = chart.to_actions(chart.to_coordinates(shown))
+    torch.testing.assert_close(back[:, :3], shown[:, :3], rtol=0, atol=1e-9)
+    p, q = (quaternion.exp(x[:, 3:]) for x in (back, shown))
+    assert quaternion.angle(p, q).max() < 1e-7
+
+
+def test_coordinates_are_white_and_turn_smoothly_where_vectors_jump():
+    shown = poses(0.3)
+    # The shortest vectors jump from one side to the other.
+    assert shown[:, 3:].diff(dim=0).norm(dim=-1).max() > 5
+    chart = ActionChart(6, [[3, 4, 5]]).double()
+    chart.learn([shown[:10], shown[10:]])
+    coordinates = chart.to_coordinates(shown)
+    torch.testing.assert_close(coordinates.std(0), torch.ones(6).double())
+    assert coordinates.mean(0).abs().max() < 1e-9
+    assert coordinates.diff(dim=0).abs().max() < 2
+    assert chart.to_actions(coordinates)[:, 3:].diff(dim=0).norm(dim=-1).max() < 0.5
+
+
+def test_what_never_moves_is_not_blown_up():
+    chart = ActionChart(2, []).double()
+    shown = torch.tensor([[1.0, 5.0], [2.0, 5.0]], dtype=torch.float64)
+    chart.learn([shown])
+    assert chart.to_coordinates(shown + 1e-3)[:, 1].abs().max() <= 1 + 1e-9
+
+
+def test_more_than_half_a_turn_is_refused():
+    angle = torch.linspace(-4, 4, 50, dtype=torch.float64)[:, None]
+    turning = angle * torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    with pytest.raises(ValueError, match="demonstration 0 turns the hand by more than half"):
+        ActionChart(3, [[0, 1, 2]]).double().learn([turning])

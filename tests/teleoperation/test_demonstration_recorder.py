@@ -1,0 +1,160 @@
+"""Recording at a person's word, without a person."""
+
+import numpy as np
+import pytest
+
+from hrc_learn.demos import DatasetWriter, load_demos
+from hrc_learn.kinematics import panda
+from hrc_learn.teleoperation.demonstration_recorder import DemonstrationRecorder, without_rest
+
+FPS = 50.0
+
+
+def frame(k):
+    q = np.linspace(0.1, 0.7, 7) + 0.01 * k
+    return {"time": k / FPS, "joint_position": q, "human_effort": np.full(7, 0.1 * k)}
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return tmp_path / "demos"
+
+
+def open_recorder(folder):
+    writer = DatasetWriter(folder, FPS, "panda", panda.joint_names)
+    return DemonstrationRecorder(writer, lambda: "show it")
+
+
+def record(recorder, start, count):
+    for k in range(start, start + count):
+        recorder.add(frame(k))
+
+
+def test_what_is_saved_is_in_the_dataset_and_nothing_else(folder):
+    with open_recorder(folder) as recorder:
+        record(recorder, 0, 5)  # before the start
+        recorder.handle("start")
+        record(recorder, 5, 20)
+        assert recorder.status.state == "recording"
+        assert recorder.status.seconds == pytest.approx(19 / FPS)
+        recorder.handle("stop")
+        record(recorder, 25, 5)  # after the stop
+        recorder.handle("save")
+        recorder.handle("start")
+        record(recorder, 40, 10)
+        recorder.handle("discard")
+        recorder.handle("start")
+        record(recorder, 60, 8)
+        recorder.handle("save")  # saving stops
+    assert recorder.status.saved == 2
+    first, second = load_demos(folder)
+    assert (len(first), len(second)) == (20, 8)
+    assert first.task == "show it"
+    np.testing.assert_allclose(first.joint_position[0], frame(5)["joint_position"], atol=1e-6)
+    np.testing.assert_allclose(second.human_effort[-1], 6.7, atol=1e-5)
+    assert first.start_time == pytest.approx(5 / FPS)
+
+
+def test_starting_over_forgets_what_was_shown(folder):
+    with open_recorder(folder) as recorder:
+        recorder.handle("start")
+        record(recorder, 0, 10)
+        recorder.handle("stop")
+        recorder.handle("start")
+        record(recorder, 10, 6)
+        recorder.handle("save")
+    (demo,) = load_demos(folder)
+    assert len(demo) == 6
+
+
+@pytest.mark.parametrize("request_", ["stop", "save", "discard"])
+def test_what_makes_no_sense_is_said_and_not_done(folder, request_):
+    with open_recorder(folder) as recorder:
+        recorder.handle(request_)
+        assert f"nothing to {request_}" in recorder.status.note
+        assert recorder.status.state == "ready"
+
+
+def test_nothing_saved_leaves_no_dataset_and_nothing_else(folder):
+    with open_recorder(folder) as recorder:
+        recorder.handle("start")
+        record(recorder, 0, 3)
+    assert not list(folder.parent.iterdir())
+
+
+def test_an_empty_demonstration_is_not_saved(folder):
+    with open_recorder(folder) as recorder:
+        recorder.handle("start")
+        recorder.handle("save")
+        assert "no frames" in recorder.status.note
+
+
+def test_frames_that_cannot_be_written_are_reported_and_the_next_are_saved(folder):
+    with open_recorder(folder) as recorder:
+        recorder.handle("start")
+        recorder.add({"time": 0.0, "joint_position": np.zeros(6)})
+        recorder.handle("save")
+        recorder._writing[0].exception()  # wait for the thread
+        assert recorder.status.note.startswith("not saved: frame 0: joint_position needs 7")
+        recorder.handle("start")
+        record(recorder, 0, 4)
+        recorder.handle("save")
+    assert recorder.status.saved == 1
+    assert len(load_demos(folder)[0]) == 4
+
+
+def test_what_was_saved_before_a_failure_is_not_lost(folder):
+    def fail():
+        with open_recorder(folder) as recorder:
+            recorder.handle("start")
+            record(recorder, 0, 4)
+            recorder.handle("save")
+            raise RuntimeError("the cable came off")
+
+    with pytest.raises(RuntimeError, match="cable") as caught:
+        fail()
+    assert "recover_dataset" in caught.value.__notes__[0]
+
+
+def resting_frames(moves):
+    """Two seconds of rest, a second in which something moves, two of rest."""
+    return [
+        {
+            "time": 10.0 + k / FPS,
+            "joint_position": np.zeros(7),
+            "gripper": 0.08,
+            **moves(np.clip(k / FPS - 2.0, 0.0, 1.0)),
+        }
+        for k in range(251)
+    ]
+
+
+@pytest.mark.parametrize(
+    "moves",
+    [
+        lambda share: {"joint_position": np.array([0, 0, 0, 0.5 * share, 0, 0, 0])},
+        lambda share: {"gripper": 0.08 - 0.05 * share},
+        # There and back: the ends alone would tell of no motion.
+        lambda share: {"joint_position": np.full(7, np.sin(np.pi * share))},
+    ],
+)
+def test_rest_before_and_after_the_motion_is_left_out(moves):
+    kept = without_rest(resting_frames(moves))
+    assert kept[0]["time"] == pytest.approx(11.7, abs=0.12)
+    assert kept[-1]["time"] == pytest.approx(13.7, abs=0.12)
+    assert kept[0]["time"] <= 12.0
+    assert kept[-1]["time"] >= 13.0
+
+
+def test_an_arm_that_never_moves_keeps_what_was_recorded():
+    frames = resting_frames(lambda share: {})
+    assert without_rest(frames) == frames
+    assert without_rest(frames[:1]) == frames[:1]
+
+
+def test_a_motion_that_is_cut_off_is_kept_to_its_end():
+    moves = resting_frames(lambda share: {"joint_position": np.full(7, share)})
+    frames = moves[:130]
+    kept = without_rest(frames)
+    assert kept[-1] is frames[-1]
+    assert kept[0]["time"] == pytest.approx(11.7, abs=0.12)
