@@ -25,7 +25,7 @@ from timing import Timing, time_calls
 
 from hrc_learn import cli
 from hrc_learn.dmp import JointDMP, PoseDMP, Stepper
-from hrc_learn.dmp.export import resting_inputs, state_tensors
+from hrc_learn.dmp.exported_dmp import resting_inputs, state_tensors
 from hrc_learn.geometry import quaternion
 
 JOINTS, SAMPLES, BASIS = 7, 1000, 50

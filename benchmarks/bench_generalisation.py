@@ -20,8 +20,14 @@ from rich.progress import track
 from rich.table import Table
 
 from hrc_learn import cli
-from hrc_learn.dmp import DMPDistribution, PoseDMP, PoseTrajectory, through, with_ends
-from hrc_learn.dmp.fitting.mean import mean_primitive
+from hrc_learn.dmp import (
+    PoseDMP,
+    PoseTrajectory,
+    ProbabilisticDMP,
+    mean_primitive,
+    through,
+    with_ends,
+)
 from hrc_learn.geometry import Pose, quaternion
 
 DURATION = 5.0
@@ -160,7 +166,7 @@ def conditioned(task: Task, slack: float, times: list[float]) -> PoseDMP:
         torch.cat([pose.position for pose in where]),
         torch.cat([pose.orientation for pose in where]),
     )
-    distribution = DMPDistribution.fit(task.others, slack=slack)
+    distribution = ProbabilisticDMP.fit(task.others, slack=slack)
     return distribution.condition(times, via, noise=NOISE).mean_primitive()
 
 
@@ -172,7 +178,7 @@ METHODS: dict[str, Callable[[Task], PoseDMP]] = {
     "via: mean, through": lambda task: through(mean(task), [HALF], task.via),
     "via: mean, approach, through": lambda task: through(gentle_mean(task), [HALF], task.via),
     "via: mean, around": lambda task: (
-        DMPDistribution.around(mean(task)).condition([HALF], task.via).mean_primitive()
+        ProbabilisticDMP.around(mean(task)).condition([HALF], task.via).mean_primitive()
     ),
     "via: distribution 0": lambda task: conditioned(task, 0.0, [0.0, HALF, DURATION]),
     "via: distribution 0.1": lambda task: conditioned(task, 0.1, [0.0, HALF, DURATION]),

@@ -155,8 +155,8 @@ class DMPContract:
     def test_slowing_down_stays_on_the_path(self, dmp):
         state = dmp.initial_state()
         for k in range(20):
-            slowdown = 3.0 if k % 2 else None
-            state = dmp.step(state, 0.03 * dmp.duration, slowdown=slowdown)
+            waiting = 3.0 if k % 2 else None
+            state = dmp.step(state, 0.03 * dmp.duration, phase_stopping=waiting)
         s = torch.tensor([10 * 0.03 * (1 + 1 / 4)], dtype=torch.float64)
         there = self.outputs(dmp.rollout(time=s * dmp.duration))
         for name, value in self.state_outputs(state).items():

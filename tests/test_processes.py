@@ -20,7 +20,7 @@ import torch
 from safetensors.torch import save_file
 
 from hrc_learn import distributed
-from hrc_learn.dmp.fitting.shared import fit_shared
+from hrc_learn.dmp import fit_shared
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import LearningConfig, Neurons, RBFImageJacobian, learn, watched
 

@@ -42,7 +42,7 @@ class Args:
     """What to learn; joint and pose, or what there is of them, when empty."""
     several: Literal["mean", "distribution", "contextual", "streamed"] = "mean"
     """What to keep of several demonstrations: their mean; all of them as well, which a
-    DMPDistribution is made of; a primitive for every context; or one fitted to all in one
+    ProbabilisticDMP is made of; a primitive for every context; or one fitted to all in one
     pass, one demonstration in memory at a time, and under torchrun in several processes."""
     context: tuple[str, ...] = ()
     """Columns whose first row is the context; start and goal when empty."""

@@ -6,10 +6,10 @@ from matplotlib.figure import Figure
 
 from hrc_learn.dmp import (
     ContextualDMP,
-    DMPDistribution,
     JointDMP,
     MovingGoal,
     PolynomialFeatures,
+    ProbabilisticDMP,
     fit_rhythmic,
     through,
 )
@@ -93,14 +93,14 @@ def rhythm(figure: Figure) -> None:
     with torch.no_grad():
         for k in range(1800):
             now = k * dt
-            amplitude = 1.6 if now > 3 else 1.0
-            state = dmp.step(state, dt * (2 if now > 6 else 1), amplitude=amplitude)
+            gain = 1.6 if now > 3 else 1.0
+            state = dmp.step(state, dt * (2 if now > 6 else 1), forcing_gain=gain)
             path.append((now, state.position[0].item()))
     axes = figure.subplots()
     axes.plot(t, wave, **DEMO)
     axes.plot(*np.array(path).T, color=palette.RUN)
     top = axes.get_ylim()[1] + 0.14
-    for begin, text in ((0, "as shown"), (3, "amplitude=1.6"), (6, "twice as fast")):
+    for begin, text in ((0, "as shown"), (3, "forcing_gain=1.6"), (6, "twice as fast")):
         axes.axvline(begin, color=palette.GREY, lw=0.8, ls=":")
         axes.text(begin + 0.08, top - 0.1, text)
     axes.set(xlabel="time [s]", ylabel="joint [rad]", ylim=(None, top), xlim=(0, 9))
@@ -117,7 +117,7 @@ def distribution(figure: Figure) -> None:
 
     demos = demonstrations.rise(s) + random(0.12) * torch.sin(torch.pi * s)
     demos = demos + random(0.06) * torch.sin(2 * torch.pi * s) + random(0.05) * s
-    known = DMPDistribution.fit(JointDMP.fit(time.expand(12, -1), demos[..., None], 20))
+    known = ProbabilisticDMP.fit(JointDMP.fit(time.expand(12, -1), demos[..., None], 20))
     via = (1.0, 0.85)
     given = known.condition([via[0]], [[via[1]]], noise=0.005)
     for axes, belief, colour, title in zip(

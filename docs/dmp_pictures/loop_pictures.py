@@ -8,8 +8,15 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from hrc_learn.dmp import JointDMP
-from hrc_learn.dmp.coupling import nearest_on_sphere, phase_stopping, repulsion, steering
-from hrc_learn.dmp.force import learn, offset_error, velocity_coupling
+from hrc_learn.dmp.coupling import (
+    learn,
+    nearest_on_sphere,
+    offset_error,
+    phase_stopping,
+    repulsion,
+    steering,
+    velocity_coupling,
+)
 from hrc_learn.viz import palette
 from hrc_learn.viz.figure_parts import shade
 
@@ -72,7 +79,7 @@ def stopping(figure: Figure) -> None:
                 measured = measured + 100 * DT * (state.position - measured)
             robot.append(measured)
             followed.append(measured.item())
-            return {"slowdown": phase_stopping(state.position, measured, gain)}
+            return {"phase_stopping": phase_stopping(state.position, measured, gain)}
 
         path = run(dmp, 3.0, change)[:, 0]
         t = DT * np.arange(1, len(path) + 1)

@@ -4,7 +4,7 @@ import torch
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from hrc_learn.dmp import GaussianBasis, JointDMP, PlacedBasis, SplineBasis
+from hrc_learn.dmp import GaussianBasis, JointDMP, LearnedGaussianBasis, SplineBasis
 from hrc_learn.dmp.training import (
     Clearance,
     DescentConfig,
@@ -26,7 +26,8 @@ def bases(figure: Figure) -> None:
     s = torch.linspace(0, 1.25, 700, dtype=torch.float64)
     uneven = torch.tensor([0.0, 0.2, 0.4, 0.5, 0.55, 0.6, 0.65, 0.75, 0.87, 1.0])
     gaps = uneven.diff(append=torch.tensor([1.13]))
-    placed = PlacedBasis(centres=tuple(uneven.tolist()), widths=tuple((0.6 * gaps).tolist()))
+    centres, widths = tuple(uneven.tolist()), tuple((0.6 * gaps).tolist())
+    placed = LearnedGaussianBasis(centres=centres, widths=widths)
     for axes, basis in zip(
         panels(figure, 3, sharey=True),
         (GaussianBasis(count=10), SplineBasis(count=10), placed),

@@ -24,10 +24,11 @@ from hrc_learn.dmp import (
     DMPDistribution,
     JointDMP,
     PoseDMP,
+    SharedFit,
+    fit_shared,
+    mean_primitive,
     select_basis_count,
 )
-from hrc_learn.dmp.fitting.mean import mean_primitive
-from hrc_learn.dmp.fitting.shared import SharedFit, fit_shared
 from hrc_learn.kinematics import panda
 from hrc_learn.learning.channels import KINDS, Motions, Primitive, kinds_wanted
 from hrc_learn.learning.reproduction_error import reproduction_error

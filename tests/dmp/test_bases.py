@@ -14,15 +14,15 @@ from hrc_learn.dmp import (
     ExponentialPhase,
     GaussianBasis,
     JointDMP,
-    PlacedBasis,
+    LearnedGaussianBasis,
+    Response,
     SigmoidPhase,
     SplineBasis,
     SpringDamper,
     Stepper,
 )
-from hrc_learn.dmp.system.response import Response
 
-UNEVEN = PlacedBasis(
+UNEVEN = LearnedGaussianBasis(
     centres=(0.0, 0.1, 0.3, 0.33, 0.36, 0.6, 1.0), widths=(0.1, 0.1, 0.01, 0.02, 0.02, 0.2, 0.1)
 )
 
@@ -48,7 +48,7 @@ BASES = {
     "spline, few": SplineBasis(count=3),
     "spline, sigmoid": SplineBasis(count=20, phase=SigmoidPhase(steepness=200.0)),
     "placed": UNEVEN,
-    "placed, sigmoid": PlacedBasis(
+    "placed, sigmoid": LearnedGaussianBasis(
         centres=UNEVEN.centres, widths=UNEVEN.widths, phase=SigmoidPhase()
     ),
 }
@@ -76,7 +76,7 @@ def shares(basis, s):
     N = basis.count
     if isinstance(basis, SplineBasis):
         return np.nan_to_num(splines(N)(s))
-    if isinstance(basis, PlacedBasis):
+    if isinstance(basis, LearnedGaussianBasis):
         c, sigma = np.array(basis.centres), np.array(basis.widths)
         c = np.append(c, c[-1] + max(c[-1] - c[-2], sigma.max()))
         sigma = np.append(sigma, sigma.max())
@@ -135,7 +135,7 @@ def test_splines_add_up_to_one_until_they_fade():
 
 def test_alike_and_equally_placed_gaussians_are_the_usual_ones():
     usual = GaussianBasis(count=9)
-    placed = PlacedBasis(centres=tuple(k / 8 for k in range(9)), widths=(0.6 / 8,) * 9)
+    placed = LearnedGaussianBasis(centres=tuple(k / 8 for k in range(9)), widths=(0.6 / 8,) * 9)
     s = torch.linspace(0, 1.5, 100, dtype=torch.float64)
     torch.testing.assert_close(placed.forcing(s), usual.forcing(s))
 
@@ -181,11 +181,23 @@ def test_files_without_a_type_of_phase_are_read(tmp_path):
     ("make", "complaint"),
     [
         (lambda: SplineBasis(count=1), "at least 2"),
-        (lambda: PlacedBasis(centres=(0.0,), widths=(0.1,)), "at least 2"),
-        (lambda: PlacedBasis(centres=(0.0, 0.5), widths=(0.1,)), "1 widths for 2 centres"),
-        (lambda: PlacedBasis(centres=(0.5, 0.5), widths=(0.1, 0.1)), "must increase.*place 1"),
-        (lambda: PlacedBasis(centres=(0.0, 0.5), widths=(0.1, 0.0)), "width must be positive"),
-        (lambda: PlacedBasis(centres=(0.0, float("inf")), widths=(0.1, 0.1)), "finite"),
+        (lambda: LearnedGaussianBasis(centres=(0.0,), widths=(0.1,)), "at least 2"),
+        (
+            lambda: LearnedGaussianBasis(centres=(0.0, 0.5), widths=(0.1,)),
+            "1 widths for 2 centres",
+        ),
+        (
+            lambda: LearnedGaussianBasis(centres=(0.5, 0.5), widths=(0.1, 0.1)),
+            "must increase.*place 1",
+        ),
+        (
+            lambda: LearnedGaussianBasis(centres=(0.0, 0.5), widths=(0.1, 0.0)),
+            "width must be positive",
+        ),
+        (
+            lambda: LearnedGaussianBasis(centres=(0.0, float("inf")), widths=(0.1, 0.1)),
+            "finite",
+        ),
         (lambda: SigmoidPhase(steepness=0.0), "steepness must be positive"),
         (lambda: SigmoidPhase(middle=-1.0), "middle must be positive"),
     ],

@@ -6,8 +6,7 @@ import torch
 from demo_motions import minimum_jerk
 from torch.autograd import gradcheck
 
-from hrc_learn.dmp import ContextualDMP, JointDMP, PolynomialFeatures
-from hrc_learn.dmp.fitting.ridge import fit_ridge
+from hrc_learn.dmp import ContextualDMP, JointDMP, PolynomialFeatures, fit_ridge
 
 S = torch.linspace(0, 1, 200, dtype=torch.float64)
 CONTEXTS = torch.tensor([[0.0, 0.2], [0.5, 1.0], [1.0, 0.1], [0.3, 0.7], [0.8, 0.6]]).double()

@@ -1,9 +1,7 @@
 import pytest
 import torch
 
-from hrc_learn.dmp import GaussianBasis, JointDMP, SpringDamper
-from hrc_learn.dmp.continuation import continue_motion
-from hrc_learn.dmp.system.response import response_of
+from hrc_learn.dmp import GaussianBasis, JointDMP, SpringDamper, continue_motion, response_of
 
 RESPONSE = response_of(SpringDamper(), GaussianBasis(count=12))
 
@@ -22,7 +20,7 @@ def primitive(batch: tuple[int, ...], seed: int = 0) -> JointDMP:
         start_velocity=draw(3),
         duration=1 + draw().abs(),
         amplitude=torch.ones(*batch, 3, dtype=torch.float64),
-        stamps=torch.linspace(0, 1, 5, dtype=torch.float64),
+        timestamps=torch.linspace(0, 1, 5, dtype=torch.float64),
         basis=RESPONSE.basis,
         spring=RESPONSE.spring,
     )
@@ -122,5 +120,5 @@ def test_an_approach_cannot_be_continued():
             dmp.start_velocity,
             duration=dmp.duration,
             elapsed=dmp.duration,
-            time=dmp.stamps,
+            time=dmp.timestamps,
         )

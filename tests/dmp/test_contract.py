@@ -7,7 +7,7 @@ from dmp_contract import DMPContract
 from unchecked import shapes_unchecked
 
 from hrc_learn.dmp import JointDMP, OrientationDMP, PoseDMP, SplineBasis
-from hrc_learn.dmp.rotation import ude
+from hrc_learn.dmp import ude_formulation as ude
 from hrc_learn.geometry import Pose, quaternion
 
 
@@ -193,8 +193,8 @@ class TestOrientationOfUde(TestOrientation):
         state = dmp.initial_state()
         with torch.no_grad(), shapes_unchecked():
             for k in range(200):
-                slowdown = 3.0 if k % 2 else None
-                state = dmp.step(state, 0.003 * dmp.duration, slowdown=slowdown)
+                waiting = 3.0 if k % 2 else None
+                state = dmp.step(state, 0.003 * dmp.duration, phase_stopping=waiting)
         s = torch.tensor([100 * 0.003 * (1 + 1 / 4)], dtype=torch.float64)
         there = self.outputs(dmp.rollout(time=s * dmp.duration))
         for name, value in self.state_outputs(state).items():

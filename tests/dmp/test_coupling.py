@@ -114,8 +114,8 @@ def test_a_held_robot_is_waited_for():
     state, robot = dmp.initial_state(), dmp.start
     with torch.no_grad():
         for k in range(1500):
-            slowdown = phase_stopping(state.position, robot, gain=1e4)
-            state = dmp.step(state, 0.01, slowdown=slowdown)
+            waiting = phase_stopping(state.position, robot, gain=1e4)
+            state = dmp.step(state, 0.01, phase_stopping=waiting)
             if k >= 500:
                 robot = state.position
             if k == 499:

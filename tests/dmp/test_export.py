@@ -8,16 +8,14 @@ import torch
 from demo_motions import arm_motion, turning_motion
 from unchecked import shapes_unchecked
 
-from hrc_learn.dmp import JointDMP, OrientationDMP, PoseDMP
-from hrc_learn.dmp.export import (
+from hrc_learn.dmp import JointDMP, OrientationDMP, OrientationStepper, PoseDMP, PoseStepper
+from hrc_learn.dmp.exported_dmp import (
     StepModule,
     export_dmp,
     load_stepper,
     resting_inputs,
     state_tensors,
 )
-from hrc_learn.dmp.orientation_stepper import OrientationStepper
-from hrc_learn.dmp.pose_stepper import PoseStepper
 from hrc_learn.geometry import Pose, quaternion
 
 
@@ -53,7 +51,7 @@ def test_an_orientation_stepper_does_what_the_primitive_does(approach):
     state, numpy_state = dmp.initial_state(**ends), stepper.initial_state(**ends)
     for k in range(18):
         dt = 10 ** rng.uniform(-1.2, -0.2)
-        change = {"slowdown": 1.0} if k % 3 == 0 else {}
+        change = {"phase_stopping": 1.0} if k % 3 == 0 else {}
         change |= {"goal": 1.01 * random_orientation(rng)} if k % 7 == 0 else {}
         state = dmp.step(state, dt, **change)
         numpy_state = stepper.step(numpy_state, dt, **change)
@@ -78,8 +76,8 @@ def test_a_pose_stepper_does_what_the_primitive_does():
             change["goal_body"] = numpy_change["body"] = rng.standard_normal(2)
         if k % 4 == 0:
             change["coupling"] = numpy_change["coupling"] = rng.standard_normal(3)
-        state = dmp.step(state, dt, **change, slowdown=0.5)
-        numpy_state = stepper.step(numpy_state, dt, **numpy_change, slowdown=0.5)
+        state = dmp.step(state, dt, **change, phase_stopping=0.5)
+        numpy_state = stepper.step(numpy_state, dt, **numpy_change, phase_stopping=0.5)
         same(numpy_state.position, state.pose.position)
         same(numpy_state.orientation, state.pose.orientation)
         same(numpy_state.body, state.body)
@@ -195,7 +193,8 @@ def test_what_cannot_be_stepped_is_refused(tmp_path):
 
 def test_the_closed_form_is_the_derivative():
     """Angular velocity of NumPy against that of tensors, from tiny to many turns."""
-    from hrc_learn.dmp.rotation import arrays, error
+    from hrc_learn.dmp import numpy_orientation as arrays
+    from hrc_learn.dmp import orientation_error as error
 
     rng = np.random.default_rng(3)
     for size in (0.0, 1e-9, 1e-4, 0.019, 0.021, 1.0, 3.1, 6.0, 2 * np.pi, 14.0):

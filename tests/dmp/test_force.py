@@ -8,7 +8,7 @@ from torch.autograd import gradcheck
 from torch.autograd.functional import jvp
 
 from hrc_learn.dmp import JointDMP
-from hrc_learn.dmp.force import distance_error, learn, offset_error, velocity_coupling
+from hrc_learn.dmp.coupling import distance_error, learn, offset_error, velocity_coupling
 
 TAU = 2.0
 S = torch.linspace(0, 1, 400, dtype=torch.float64)

@@ -3,6 +3,7 @@ import pytest
 import torch
 from demo_motions import arm_motion, minimum_jerk
 from torch.autograd import gradcheck
+from unchecked import shapes_unchecked
 
 from hrc_learn.dmp import JointDMP
 
@@ -130,7 +131,7 @@ def test_lists_keep_their_precision():
     time = [0.1 * k for k in range(30)]
     plain = JointDMP.fit(torch.tensor(time, dtype=torch.float64), torch.tensor(time).double())
     listed = JointDMP.fit(time, torch.tensor(time).double())
-    torch.testing.assert_close(listed.stamps, plain.stamps, rtol=0, atol=0)
+    torch.testing.assert_close(listed.timestamps, plain.timestamps, rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("batch", [(2,), (3, 1, 2)])
@@ -299,7 +300,7 @@ def broken(values, index, value):
     ],
 )
 def test_bad_demonstrations_are_refused(time, position, kwargs, complaint):
-    with pytest.raises(ValueError, match=complaint):
+    with shapes_unchecked(), pytest.raises(ValueError, match=complaint):
         JointDMP.fit(time, position, **kwargs)
 
 
@@ -320,6 +321,7 @@ def test_errors_say_which_demonstration():
     ],
 )
 def test_bad_rollouts_are_refused(kwargs, complaint):
+    # Also what the types forbid already: nobody checks those outside of the tests.
     dmp = JointDMP.fit(TIME, POSITION)
-    with pytest.raises(ValueError, match=complaint):
+    with shapes_unchecked(), pytest.raises(ValueError, match=complaint):
         dmp.rollout(**kwargs)

@@ -34,7 +34,7 @@ def test_the_same_coordinates_give_the_same_primitive(dmp):
 
 def test_coordinates_are_what_the_response_maps_to_the_motion(dmp):
     plain = JointDMP.fit(*arm_motion(n_samples=60, n_joints=3, moving_start=True), n_basis=7)
-    H = plain.response.evaluate(plain.stamps)[:, 0]
+    H = plain.response.evaluate(plain.timestamps)[:, 0]
     torch.testing.assert_close(H @ plain.coordinates().mT, plain.rollout().position)
 
 

@@ -13,11 +13,11 @@ def fitted(seed=0):
 
 def rebuilt(dmp):
     """The motion of the same numbers, by the definition: no matrices, no caches."""
-    rows = dmp.response.evaluate(dmp.stamps.double())
+    rows = dmp.response.evaluate(dmp.timestamps.double())
     return (rows[:, 0] @ dmp.coordinates().double().mT).detach()
 
 
-@pytest.mark.parametrize("name", ["weights", "start", "goal", "start_velocity", "stamps"])
+@pytest.mark.parametrize("name", ["weights", "start", "goal", "start_velocity", "timestamps"])
 @pytest.mark.parametrize("how", ["in place", "data", "load"])
 def test_a_change_shows_in_the_next_rollout(name, how):
     dmp = fitted()
@@ -64,11 +64,11 @@ def test_grids_and_primitives_take_turns():
 def test_no_matrix_holds_numbers_that_make_products_slow():
     """Subnormal ones, which the fading basis functions leave in single precision."""
     dmp = JointDMP.fit(*(column.float() for column in arm_motion(n_joints=2)), 50)
-    for matrix in dmp.response.matrices(dmp.stamps, torch.float32):
+    for matrix in dmp.response.matrices(dmp.timestamps, torch.float32):
         size = matrix.abs()
         assert not ((size > 0) & (size < torch.finfo(torch.float32).tiny)).any()
-    exact = dmp.response.evaluate(dmp.stamps.double())[:, 0]
-    position = dmp.response.matrices(dmp.stamps, torch.float32)[0].mT.double()
+    exact = dmp.response.evaluate(dmp.timestamps.double())[:, 0]
+    position = dmp.response.matrices(dmp.timestamps, torch.float32)[0].mT.double()
     torch.testing.assert_close(position, exact, rtol=0, atol=1e-7)
 
 

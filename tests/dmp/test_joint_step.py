@@ -64,7 +64,7 @@ def test_slowing_down_stays_on_the_path():
     dmp = JointDMP.fit(time, position)
     state = dmp.initial_state()
     for k in range(20):
-        state = dmp.step(state, 0.1, slowdown=3.0 if k % 2 else None)
+        state = dmp.step(state, 0.1, phase_stopping=3.0 if k % 2 else None)
     on_path = dmp.rollout(time=3.0 * state.s[None])
     torch.testing.assert_close(state.position, on_path.position[0], rtol=0, atol=1e-9)
     torch.testing.assert_close(4 * state.velocity, on_path.velocity[0], rtol=0, atol=1e-9)

@@ -1,8 +1,7 @@
 import pytest
 import torch
 
-from hrc_learn.dmp import JointDMP, OrientationDMP, PoseDMP
-from hrc_learn.dmp.fitting.mean import mean_primitive
+from hrc_learn.dmp import JointDMP, OrientationDMP, PoseDMP, mean_primitive
 from hrc_learn.geometry import quaternion
 
 

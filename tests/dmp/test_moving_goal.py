@@ -70,7 +70,7 @@ def test_slowing_down_stays_on_the_path():
     moving = MovingGoal(primitive())
     state = moving.initial_state(END, START, GOAL, 2.0)
     for _ in range(10):
-        state = moving.step(state, 0.1, slowdown=1.0)
+        state = moving.step(state, 0.1, phase_stopping=1.0)
     there = moving.rollout(END, [0.5], START, GOAL, 2.0)
     torch.testing.assert_close(state.position, there.position[0])
     torch.testing.assert_close(2 * state.velocity, there.velocity[0])

@@ -5,7 +5,7 @@ from demo_motions import minimum_jerk, turning_motion
 from unchecked import shapes_unchecked
 
 from hrc_learn.dmp import OrientationDMP, PoseDMP
-from hrc_learn.dmp.rotation.error import (
+from hrc_learn.dmp.orientation_error import (
     angular_acceleration,
     angular_velocity,
     error_rate,

@@ -6,7 +6,7 @@ import torch
 from demo_motions import minimum_jerk
 
 from hrc_learn.dmp import OrientationDMP
-from hrc_learn.dmp.rotation.error import angular_acceleration
+from hrc_learn.dmp.orientation_error import angular_acceleration
 from hrc_learn.geometry import quaternion
 
 S = torch.linspace(0, 1, 1000, dtype=torch.float64)

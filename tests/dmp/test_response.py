@@ -5,8 +5,7 @@ import pytest
 import torch
 from dmp_oracle import forcing, gaussians, solve
 
-from hrc_learn.dmp import ExponentialPhase, GaussianBasis, SpringDamper
-from hrc_learn.dmp.system.response import Response
+from hrc_learn.dmp import ExponentialPhase, GaussianBasis, Response, SpringDamper
 
 SPRINGS = {
     "critical": SpringDamper(),

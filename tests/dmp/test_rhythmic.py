@@ -5,8 +5,7 @@ from demo_motions import PERIOD, rhythm
 from dmp_contract import DMPContract
 from scipy.integrate import solve_ivp
 
-from hrc_learn.dmp import PeriodicBasis, SpringDamper, Stepper, fit_rhythmic
-from hrc_learn.dmp.system.response import Response
+from hrc_learn.dmp import PeriodicBasis, Response, SpringDamper, Stepper, fit_rhythmic
 
 
 class TestRhythmic(DMPContract):
@@ -73,7 +72,7 @@ def test_frequency_and_amplitude_are_modulated():
     plain = dmp.rollout(time=t).position
     torch.testing.assert_close(dmp.rollout(time=t / 2, speed=2.0).position, plain)
     late = 4 * PERIOD + t
-    wide = dmp.rollout(time=late, amplitude=2.0).position - dmp.goal
+    wide = dmp.rollout(time=late, forcing_gain=2.0).position - dmp.goal
     torch.testing.assert_close(wide, 2 * (dmp.rollout(time=late).position - dmp.goal))
 
 
@@ -81,11 +80,11 @@ def test_steps_change_amplitude_without_a_jump():
     time, y = rhythm()
     dmp = fit_rhythmic(time, y, period=PERIOD)
     state = dmp.step(dmp.initial_state(), 3.0)
-    louder = dmp.step(state, 0.0, amplitude=2.0)
+    louder = dmp.step(state, 0.0, forcing_gain=2.0)
     torch.testing.assert_close(louder.position, state.position)
     torch.testing.assert_close(louder.velocity, state.velocity)
-    louder = dmp.step(louder, 20 * PERIOD, amplitude=2.0)
-    cycle = dmp.rollout(time=louder.s[None] * PERIOD, amplitude=2.0)
+    louder = dmp.step(louder, 20 * PERIOD, forcing_gain=2.0)
+    cycle = dmp.rollout(time=louder.s[None] * PERIOD, forcing_gain=2.0)
     torch.testing.assert_close(louder.position, cycle.position[0], rtol=0, atol=1e-9)
 
 

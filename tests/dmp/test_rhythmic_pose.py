@@ -3,9 +3,13 @@ import torch
 from demo_motions import PERIOD, rhythm, turning_motion
 from dmp_contract import DMPContract
 
-from hrc_learn.dmp import OrientationDMP, PoseDMP, fit_rhythmic_orientation, fit_rhythmic_pose
-from hrc_learn.dmp.rotation.error import to_error
-from hrc_learn.dmp.rotation.mean import intrinsic_mean
+from hrc_learn.dmp import (
+    OrientationDMP,
+    PoseDMP,
+    fit_rhythmic_orientation,
+    fit_rhythmic_pose,
+)
+from hrc_learn.dmp.orientation_error import intrinsic_mean, to_error
 from hrc_learn.geometry import quaternion
 
 CENTRE = quaternion.exp(torch.tensor([1.5, -2.0, 0.4], dtype=torch.float64))
@@ -88,7 +92,7 @@ def test_frequency_and_amplitude_are_modulated():
     fast = dmp.rollout(time=LATE / 2, speed=2.0)
     torch.testing.assert_close(fast.orientation, plain.orientation)
     torch.testing.assert_close(fast.angular_velocity, 2 * plain.angular_velocity)
-    wide = dmp.rollout(time=LATE, amplitude=0.5)
+    wide = dmp.rollout(time=LATE, forcing_gain=0.5)
     errors = (to_error(x.orientation, dmp.reference) for x in (plain, wide))
     one, other = (error - dmp.motion.goal for error in errors)
     torch.testing.assert_close(other, one / 2, rtol=0, atol=1e-6)
@@ -97,11 +101,11 @@ def test_frequency_and_amplitude_are_modulated():
 def test_a_step_changes_the_amplitude_without_a_jump():
     dmp = fit_rhythmic_orientation(*waving(), period=PERIOD)
     state = dmp.step(dmp.initial_state(), 3.0)
-    louder = dmp.step(state, 0.0, amplitude=1.5)
+    louder = dmp.step(state, 0.0, forcing_gain=1.5)
     torch.testing.assert_close(louder.orientation, state.orientation)
     torch.testing.assert_close(louder.angular_velocity, state.angular_velocity)
-    louder = dmp.step(louder, 20 * PERIOD, amplitude=1.5)
-    cycle = dmp.rollout(time=louder.motion.s[None] * PERIOD, amplitude=1.5)
+    louder = dmp.step(louder, 20 * PERIOD, forcing_gain=1.5)
+    cycle = dmp.rollout(time=louder.motion.s[None] * PERIOD, forcing_gain=1.5)
     assert quaternion.angle(louder.orientation, cycle.orientation[0]) < 1e-7
 
 
@@ -130,8 +134,8 @@ def test_a_rhythm_of_a_pose_shares_its_period_and_is_saved(tmp_path):
     torch.testing.assert_close(motion.position, position, rtol=0, atol=0.01)
     assert quaternion.angle(motion.orientation, q).max() < 0.01
     dmp.save(tmp_path / "pose")
-    loaded = PoseDMP.load(tmp_path / "pose").rollout(time=LATE, amplitude=1.2)
-    expected = dmp.rollout(time=LATE, amplitude=1.2)
+    loaded = PoseDMP.load(tmp_path / "pose").rollout(time=LATE, forcing_gain=1.2)
+    expected = dmp.rollout(time=LATE, forcing_gain=1.2)
     torch.testing.assert_close(loaded.pose.vector(), expected.pose.vector())
 
 

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from hrc_learn.dmp.rotation.error import nearest_turn, to_error, to_orientation
+from hrc_learn.dmp.orientation_error import nearest_turn, to_error, to_orientation
 from hrc_learn.geometry import quaternion
 
 # The coordinates in which actions move linearly.

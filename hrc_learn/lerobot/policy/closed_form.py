@@ -15,9 +15,7 @@ from torch.nn.utils.rnn import pad_sequence
 from hrc_learn.demos.format.dataset_folder import open_folder
 from hrc_learn.demos.read.episodes import select_episodes
 from hrc_learn.demos.read.frames import read_frames
-from hrc_learn.dmp import JointDMP
-from hrc_learn.dmp.fitting.ridge import RidgeFit, fit_ridge
-from hrc_learn.dmp.system.response import Response
+from hrc_learn.dmp import JointDMP, Response, RidgeFit, fit_ridge
 from hrc_learn.lerobot.policy.primitive_head import ContextualMotion
 
 # A policy's first primitives, by regression instead of gradients.

@@ -13,8 +13,7 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
 
-from hrc_learn.dmp import GaussianBasis, SpringDamper
-from hrc_learn.dmp.system.response import response_of
+from hrc_learn.dmp import GaussianBasis, SpringDamper, response_of
 from hrc_learn.lerobot.policy.action_encoding import (
     ActionEncoding,
     matched_columns,

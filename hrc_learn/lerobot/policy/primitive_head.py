@@ -7,8 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from hrc_learn.dmp.continuation import continue_motion
-from hrc_learn.dmp.system.response import Response
+from hrc_learn.dmp import Response, continue_motion
 
 HARMONICS = 4
 """Sines and cosines of the phase that the network sees."""

@@ -4,10 +4,9 @@ import pytest
 import torch
 from demo_motions import arm_motion
 
-from hrc_learn.dmp import ExponentialPhase, JointDMP, SigmoidPhase, SpringDamper
-from hrc_learn.dmp.system.response import Response
+from hrc_learn.dmp import ExponentialPhase, JointDMP, Response, SigmoidPhase, SpringDamper
 from hrc_learn.dmp.training import DescentConfig, learn_basis
-from hrc_learn.dmp.training.placement import Demo, Placement, projection_error
+from hrc_learn.dmp.training.basis_training import Demo, Placement, projection_error
 
 STAMPS = torch.linspace(0, 1, 120, dtype=torch.float64) ** 1.2
 

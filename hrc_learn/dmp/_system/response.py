@@ -1,0 +1,265 @@
+"""The motion of a primitive as a linear map of its coordinates, and the trajectory it gives."""
+
+import math
+from collections import OrderedDict
+from functools import cached_property, lru_cache
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hrc_learn.dmp._system.bases import Basis
+from hrc_learn.dmp._system.forced_response import (
+    PiecewisePolynomial,
+    accumulate,
+    chebyshev_points,
+    impulse,
+)
+from hrc_learn.dmp._system.quintic_curves import approach_state, minimum_jerk
+from hrc_learn.dmp._system.spring import SpringDamper
+
+GRIDS_KEPT = 16
+
+
+class Response:
+    """Response of y'' = alpha (beta (g - y) - y') + sum_i phi_i(s) w_i, solved exactly.
+
+    y(s) = H(s) [w_1 ... w_N, y_0', y_0, g]: the columns of H are the motions that a unit of
+    each coordinate causes alone. What the weights cause is integrated once by Gauss-Legendre
+    quadrature and the transition matrix of the spring, and kept as polynomials in s; the
+    rest is closed form. Nothing depends on the step length of a grid. Everything is float64
+    until it is handed out.
+    """
+
+    def __init__(self, spring: SpringDamper, basis: Basis, approach: float = 0.0):
+        """Solve the equation for all coordinates.
+
+        Args:
+            spring: Gains.
+            basis: Of the forcing term.
+            approach: Share of the motion over which start and goal act along a minimum-jerk
+                curve, see `approach.py`; 0: they act through the spring alone, as printed.
+        """
+        if not 0 <= approach <= 1 or (approach and basis.periodic):
+            raise ValueError(
+                f"approach must be a share, 0 to 1, and 0 for rhythms, got {approach}"
+            )
+        self.spring = spring
+        self.basis = basis
+        self.approach = approach
+        self.size = basis.count + 3
+        """Number of coordinates: N weights, start velocity, start, goal."""
+        # Tensors made in inference mode cannot take part in a backward pass later.
+        with torch.inference_mode(False):
+            self.forced = self._integrate()
+        """(y, y') that unit weights alone cause, (2, N): from rest at the goal at s = 0, or,
+        of a periodic basis, the limit cycle."""
+        self._matrices: OrderedDict[tuple, tuple[Tensor, Tensor, Tensor]] = OrderedDict()
+        self._latest: tuple[Tensor, tuple[Tensor, Tensor, Tensor]] | None = None
+
+    def matrices(
+        self, s: Float[Tensor, "T"], dtype: torch.dtype
+    ) -> tuple[Float[Tensor, "M T"], Float[Tensor, "M T"], Float[Tensor, "M T"]]:
+        """H, H', H'' over one time grid, transposed for a product from the right; cached.
+
+        Args:
+            s: Normalised times, all >= 0.
+            dtype: Of the result.
+        """
+        if self._latest is not None:
+            grid, matrices = self._latest
+            alike = matrices[0].dtype == dtype and grid.device == s.device
+            # By content: a grid that was changed in place is another one.
+            if alike and grid.dtype == s.dtype and torch.equal(grid, s):
+                return matrices
+        key = (s.detach().cpu().numpy().tobytes(), s.dtype, s.device, dtype)
+        if key not in self._matrices:
+            self._matrices[key] = self._transposed(s, dtype)
+            if len(self._matrices) > GRIDS_KEPT:
+                self._matrices.popitem(last=False)
+        self._matrices.move_to_end(key)
+        self._latest = s.detach().clone(), self._matrices[key]
+        return self._matrices[key]
+
+    @torch.inference_mode(False)
+    def _transposed(self, s: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
+        """`matrices`, for all calls to come."""
+        H = self.evaluate(s.detach().clone().double()).to(dtype)
+        position, velocity, acceleration = _without_subnormals(H).permute(1, 2, 0).contiguous()
+        return position, velocity, acceleration
+
+    def evaluate(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 3 M"]:
+        """Rows H(s), H'(s), H''(s); differentiable any number of times in `s`."""
+        state = _StateAt.apply(s, self)
+        return torch.cat([state, self._acceleration(s, state)], dim=-2)
+
+    def coasting(self, s: Float[Tensor, "*batch"] | float) -> Float[Tensor, "*batch"] | float:
+        """How long the spring alone has moved on what the forcing caused until it ended."""
+        if self.basis.periodic:
+            return 0 * s
+        past = s - self.forced.end
+        return past.clamp(min=0) if isinstance(past, Tensor) else max(past, 0.0)
+
+    def state(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 2 M"]:
+        """Rows H(s), H'(s)."""
+        E = self.spring.propagator(s)
+        start, velocity = E[..., :, :1], E[..., :, 1:]
+        at_rest = torch.tensor([[1.0], [0.0]], dtype=s.dtype, device=s.device)
+        table = self.forced.to(s.device)
+        forced = self.spring.propagator(self.coasting(s)) @ table(s)
+        if self.basis.periodic:
+            # From rest: what it takes to be off the limit cycle at first dies out.
+            forced = forced - E @ table(torch.zeros_like(s))
+        if self.approach:
+            start = -approach_state(s, self.approach)[..., None]
+        return torch.cat([forced, velocity, start, at_rest - start], dim=-1)
+
+    def approach_force(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """Forcing per unit of goal - start that makes the motion between them m(s)."""
+        m, slope, curvature = minimum_jerk(s, self.approach)
+        return curvature - self.spring.acceleration(m - 1, slope)
+
+    def _acceleration(self, s: Tensor, state: Tensor) -> Tensor:
+        goal = torch.zeros(self.size, dtype=s.dtype, device=s.device)
+        goal[-1] = 1.0
+        forcing = torch.nn.functional.pad(self.basis.forcing(s), (0, 3))
+        if self.approach:
+            force = self.approach_force(s)[..., None]
+            forcing = torch.cat([forcing[..., :-2], -force, force], dim=-1)
+        free = self.spring.acceleration(state[..., 0, :] - goal, state[..., 1, :])
+        return (free + forcing)[..., None, :]
+
+    def _integrate(self) -> PiecewisePolynomial:
+        """Solve for all basis functions at once, to where the forcing ends or starts over."""
+        propagate, forcing = self.spring.propagator, self.basis.forcing
+        interval = min(self.basis.smooth_interval, self.spring.smooth_interval)
+        if self.basis.knot_spacing is not None:
+            interval = self.basis.knot_spacing / math.ceil(self.basis.knot_spacing / interval)
+        # Rounding must not add a piece past the last knot.
+        n_pieces = math.ceil(self.basis.horizon / interval - 1e-9)
+        knots = interval * torch.arange(n_pieces + 1, dtype=torch.float64)
+        points = interval * chebyshev_points()
+        share = torch.stack(
+            [impulse(propagate, forcing, knots[:-1], point) for point in points], dim=1
+        )
+        state = accumulate(propagate, knots, share[:, -1])
+        if self.basis.periodic:
+            # The start that a period leads back to: x = E x + (what is there from rest).
+            E = propagate(knots[-1])
+            cycle = torch.linalg.solve(torch.eye(2, dtype=torch.float64) - E, state[-1])
+            state = state + propagate(knots) @ cycle
+        values = propagate(points) @ state[:-1, None] + share
+        return PiecewisePolynomial.interpolate(values, interval, self.basis.periodic)
+
+
+class _StateAt(torch.autograd.Function):
+    """State of the response at s, whose derivative is the differential equation itself."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(s, response):
+        return response.state(s)
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        s, ctx.response = inputs
+        ctx.save_for_backward(s)
+
+    @staticmethod
+    def backward(ctx, grad):
+        (s,) = ctx.saved_tensors
+        rate = ctx.response.evaluate(s)[..., 1:, :]
+        return (grad * rate).sum((-2, -1)), None
+
+
+def _without_subnormals(values: Tensor) -> Tensor:
+    """Zeros for what is lost beside one, but makes every product take several times as long."""
+    limits = torch.finfo(values.dtype)
+    return torch.where(values.abs() < limits.tiny / limits.eps, 0.0, values)
+
+
+@lru_cache(maxsize=64)
+def response_of(spring: SpringDamper, basis: Basis, approach: float = 0.0) -> Response:
+    """The one `Response` of these parts: primitives alike share tables and matrices."""
+    return Response(spring, basis, approach)
+
+
+class Trajectory:
+    """A motion over time, each output computed when first asked for.
+
+    Position, velocity and acceleration are one matrix product each; a caller that needs the
+    position alone pays for nothing else.
+    """
+
+    def __init__(
+        self,
+        *,
+        coordinates: Float[Tensor, "*#batch D M"],
+        s: Float[Tensor, "*#batch T"],
+        duration: Float[Tensor, "*#batch"],
+        response: Response,
+    ):
+        """Describe the motion.
+
+        Args:
+            coordinates: What `response` maps to motions.
+            s: Normalised times.
+            duration: [s].
+            response: Of the primitive.
+        """
+        self._coordinates = coordinates
+        self.s = s
+        """Normalised times."""
+        self.duration = duration
+        """[s]."""
+        self._response = response
+
+    @cached_property
+    def time(self) -> Float[Tensor, "*batch T"]:
+        """Since the start of the motion [s]."""
+        time = self.s * self.duration[..., None]
+        return time.to(self._coordinates.dtype).expand(*self._batch, -1)
+
+    @cached_property
+    def position(self) -> Float[Tensor, "*batch T D"]:
+        """In the units of the demonstration, [rad] or [m]."""
+        return self._output(0)
+
+    @cached_property
+    def velocity(self) -> Float[Tensor, "*batch T D"]:
+        """The same per second."""
+        return self._output(1)
+
+    @cached_property
+    def acceleration(self) -> Float[Tensor, "*batch T D"]:
+        """The same per second squared."""
+        return self._output(2)
+
+    def _output(self, order: int) -> Float[Tensor, "*batch T D"]:
+        X = self._coordinates
+        if order:
+            X = X / self.duration[..., None, None] ** order
+        if self.s.ndim == 1 and not self.s.requires_grad:
+            # One flat product: batched ones against a shared matrix are ten times slower.
+            H = self._response.matrices(self.s, X.dtype)[order]
+            y = X @ H if X.ndim == 2 else (X.flatten(0, -2) @ H).view(*X.shape[:-1], -1)
+        else:
+            y = X @ self._rows[..., order, :].to(X.dtype).mT
+        return y.mT if y.shape[:-2] == self._batch else y.mT.expand(*self._batch, -1, -1)
+
+    @cached_property
+    def _batch(self) -> torch.Size | tuple[int, ...]:
+        return broadcast_shapes(
+            self._coordinates.shape[:-2], self.s.shape[:-1], self.duration.shape
+        )
+
+    @cached_property
+    def _rows(self) -> Float[Tensor, "*#batch T 3 M"]:
+        return self._response.evaluate(self.s.double())
+
+
+def broadcast_shapes(*shapes: tuple[int, ...]) -> tuple[int, ...]:
+    """As `torch.broadcast_shapes`, which takes longer than a rollout of shapes all alike."""
+    first = shapes[0]
+    return first if all(shape == first for shape in shapes) else torch.broadcast_shapes(*shapes)

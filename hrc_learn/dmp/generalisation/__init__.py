@@ -1,1 +1,0 @@
-"""Primitives from several demonstrations: distributions and contexts."""

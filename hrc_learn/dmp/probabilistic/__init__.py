@@ -1,0 +1,1 @@
+"""Primitives from several demonstrations: distributions, via points and contexts."""

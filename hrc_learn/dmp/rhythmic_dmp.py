@@ -1,0 +1,235 @@
+"""Rhythmic movement primitives: motions of joints, orientations and poses that repeat."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hrc_learn.dmp._system.bases import PeriodicBasis
+from hrc_learn.dmp._system.response import Response, response_of
+from hrc_learn.dmp._system.spring import SpringDamper
+from hrc_learn.dmp._types import Mask, Points, Quaternions, Times
+from hrc_learn.dmp.fitting.motion_samples import check_samples
+from hrc_learn.dmp.joint_dmp import JointDMP
+from hrc_learn.dmp.orientation_dmp import OrientationDMP
+from hrc_learn.dmp.orientation_error import centred_error, to_orientation
+from hrc_learn.dmp.pose_dmp import ERROR, PoseDMP, demonstrated_columns
+
+SEARCH = 0.1
+"""How far from the autocorrelation's estimate a period is looked for, as a share of it."""
+ALIKE = 0.9
+"""Share of the highest peak of the autocorrelation that counts as high."""
+GOLDEN = (5**0.5 - 1) / 2
+
+
+def fit_rhythmic(
+    time: Times,
+    position: Points,
+    n_basis: int = 25,
+    period: float | None = None,
+    mask: Mask | None = None,
+    *,
+    joint_names: Sequence[str] | None = None,
+    units: str = "rad",
+    spring: SpringDamper | None = None,
+    regularization: float = 1e-7,
+) -> JointDMP:
+    """Learn a rhythm from each demonstration of one cycle or more.
+
+    The result is a `JointDMP` on a `PeriodicBasis`: its duration is the period, its goal the
+    centre of the oscillation. From any start its motion goes over to the limit cycle, as the
+    demonstration's does; `duration` (or `speed`) and `forcing_gain` modulate the rhythm.
+
+    Args:
+        time: Timestamps [s], (T,) or (*B, T).
+        position: (T, D) or (*B, T, D).
+        n_basis: Basis functions a period.
+        period: [s]; found from the positions unless given.
+        mask: (*B, T), false where a sample does not count.
+        joint_names: D names, kept with the primitive.
+        units: Of the coordinates.
+        spring: Gains; alpha = 25 per period, critically damped, unless given.
+        regularization: Ridge, relative to the largest singular value.
+
+    Raises:
+        ValueError: Bad samples (says which), or less than one period of them.
+    """
+    samples = check_samples(time, position, mask=mask)
+    spring, basis = spring or SpringDamper(), PeriodicBasis(count=n_basis)
+    response = response_of(spring, basis)
+    parts = []
+    for s, duration, y, valid in zip(
+        samples.s, samples.duration, samples.position.double(), samples.mask, strict=True
+    ):
+        elapsed, y = (s * duration)[valid], y[:, valid].mT
+        tau = elapsed.new_tensor(period) if period else find_period(elapsed, y, response)
+        if not 0 < tau <= duration:
+            raise ValueError(
+                f"a rhythm needs a whole period of {tau:.3f} s, got {duration.item():.3f} s"
+            )
+        parts.append((tau, *_solve(response, elapsed / tau, y, regularization)))
+    tau, weights, rate, start, centre = (torch.stack(part) for part in zip(*parts, strict=True))
+
+    def batched(tensor: Tensor) -> Tensor:
+        return tensor.to(samples.position.dtype).reshape(samples.batch + tensor.shape[1:])
+
+    dmp = JointDMP(
+        weights=batched(weights),
+        start=batched(start),
+        goal=batched(centre),
+        start_velocity=batched(rate / tau[:, None]),
+        duration=batched(tau),
+        amplitude=batched(torch.where(samples.span > 0, samples.span, 1.0)),
+        timestamps=(samples.s * (samples.duration / tau)[:, None]).reshape(*samples.batch, -1),
+        basis=basis,
+        spring=spring,
+        joint_names=joint_names,
+        units=units,
+    )
+    with torch.no_grad():
+        reproduction = dmp.rollout().position.mT.reshape(samples.position.shape)
+    dmp.fit_report = samples.compare(reproduction)
+    return dmp
+
+
+def find_period(
+    elapsed: Float[Tensor, "T"], y: Float[Tensor, "T D"], response: Response
+) -> Float[Tensor, ""]:
+    """Period [s] of an oscillation: the highest peak of the autocorrelation, refined.
+
+    The refinement is the period whose rhythm fits the samples best, by golden sections.
+    """
+    span = elapsed[-1]
+    rough = _autocorrelation_peak(elapsed, y)
+    low, high = rough * (1 - SEARCH), torch.minimum(rough * (1 + SEARCH), span)
+
+    def misfit(tau: Tensor) -> Tensor:
+        s = elapsed / tau
+        weights, rate, start, centre = _solve(response, s, y, 1e-6)
+        x = torch.cat([weights, torch.stack([rate, start, centre], dim=-1)], dim=-1)
+        return (response.state(s)[:, 0] @ x.mT - y).square().sum()
+
+    left, right = high - GOLDEN * (high - low), low + GOLDEN * (high - low)
+    at_left, at_right = misfit(left), misfit(right)
+    while high - low > 1e-6 * rough:
+        if at_left < at_right:
+            high, right, at_right = right, left, at_left
+            left = high - GOLDEN * (high - low)
+            at_left = misfit(left)
+        else:
+            low, left, at_left = left, right, at_right
+            right = low + GOLDEN * (high - low)
+            at_right = misfit(right)
+    return (low + high) / 2
+
+
+def _autocorrelation_peak(elapsed: Tensor, y: Tensor) -> Tensor:
+    """First lag [s] at which the motion is as like itself as ever, after a zero crossing."""
+    T = len(elapsed)
+    even = torch.linspace(0, 1, T, dtype=elapsed.dtype, device=elapsed.device) * elapsed[-1]
+    after = torch.searchsorted(elapsed, even).clamp(1, T - 1)
+    share = (even - elapsed[after - 1]) / (elapsed[after] - elapsed[after - 1])
+    even_y = y[after - 1] + share[:, None] * (y[after] - y[after - 1])
+    power = torch.fft.rfft(even_y - even_y.mean(0), n=2 * T, dim=0).abs().square()
+    similar = torch.fft.irfft(power, n=2 * T, dim=0)[:T].sum(-1)
+    # Late lags overlap little, and their sums are small for that: compare means, of enough.
+    similar = similar[: T * 3 // 4] / torch.arange(T, T - T * 3 // 4, -1).to(y)
+    crossed = (similar < 0).cummax(0).values
+    peak = (similar[1:-1] >= similar[:-2]) & (similar[1:-1] >= similar[2:]) & crossed[1:-1]
+    if not peak.any():
+        raise ValueError("found no period in these positions: give one, or record more cycles")
+    # Every multiple of the period peaks alike: the first of the high ones is it.
+    high = peak & (similar[1:-1] >= ALIKE * similar[1:-1][peak].max())
+    return even[1 + high.long().argmax()]
+
+
+def _solve(
+    response: Response, s: Tensor, y: Float[Tensor, "T D"], regularization: float
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Weights (D, N), start velocity by s, start and centre (D,) of the closest rhythm."""
+    centre = _mean_of_last_cycles(s, y)
+    H = response.state(s)[:, 0]
+    # Units in which the ridge weighs all columns alike.
+    A = H[:, :-1]
+    size = A.norm(dim=0)
+    U, sigma, Vh = torch.linalg.svd(A / size, full_matrices=False)
+    inverse = sigma / (sigma**2 + (regularization * sigma[0]) ** 2)
+    residual = y - H[:, -1:] * centre
+    x = (Vh.mT * inverse) @ (U.mT @ residual) / size[:, None]
+    return x[:-2].mT, x[-2], x[-1], centre
+
+
+def _mean_of_last_cycles(s: Tensor, y: Tensor) -> Tensor:
+    """Average over as many whole cycles as there are, the last ones."""
+    whole = s[-1] - s[-1].floor().clamp(min=1)
+    inside = s >= whole
+    return torch.trapezoid(y[inside].mT, s[inside]) / (s[-1] - s[inside][0])
+
+
+def fit_rhythmic_orientation(
+    time: Times,
+    orientation: Quaternions,
+    n_basis: int = 25,
+    period: float | None = None,
+    mask: Mask | None = None,
+    *,
+    spring: SpringDamper | None = None,
+    regularization: float = 1e-7,
+) -> OrientationDMP:
+    """Learn a rhythm of an orientation from each demonstration of one cycle or more.
+
+    The error to the mean orientation swings as a `fit_rhythmic` primitive; the goal of the
+    result is the centre of that. `duration` (or `speed`) and `forcing_gain` modulate it.
+
+    Args:
+        time: Timestamps [s], (T,) or (*B, T).
+        orientation: Unit quaternions (w, x, y, z), (*B, T, 4), within half a turn of their
+            mean; signs may flip.
+        n_basis: Basis functions a period.
+        period: [s]; found from the motion unless given.
+        mask: (*B, T), false where a sample does not count.
+        spring: Gains; alpha = 25 per period, critically damped, unless given.
+        regularization: Ridge, relative to the largest singular value.
+
+    Raises:
+        ValueError: Bad samples (says which), less than one period of them, or a motion that
+            passes half a turn from its mean.
+    """
+    error, reference = centred_error(time, orientation, mask)
+    motion = fit_rhythmic(
+        time, error, n_basis, period, mask, spring=spring, regularization=regularization
+    )
+    return OrientationDMP(motion, to_orientation(motion.goal, reference))
+
+
+def fit_rhythmic_pose(
+    time: Times,
+    position: Points,
+    orientation: Quaternions,
+    n_basis: int = 25,
+    body: Points | None = None,
+    period: float | None = None,
+    mask: Mask | None = None,
+    *,
+    spring: SpringDamper | None = None,
+    regularization: float = 1e-7,
+) -> PoseDMP:
+    """Learn a rhythm of a pose; arguments as for `PoseDMP.fit` and `fit_rhythmic`.
+
+    All coordinates share one period, found from all of them unless it is given.
+    """
+    error, reference = centred_error(time, orientation, mask)
+    columns = demonstrated_columns(time, position, error, body, mask)
+    motion = fit_rhythmic(
+        time,
+        columns,
+        n_basis,
+        period,
+        mask,
+        units="m, rad, body",
+        spring=spring,
+        regularization=regularization,
+    )
+    goal = to_orientation(motion.goal[..., ERROR], reference.to(columns))
+    return PoseDMP(motion, goal)

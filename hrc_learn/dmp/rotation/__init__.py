@@ -1,1 +1,0 @@
-"""Orientations as a linear system: errors to the goal and their formulations."""

@@ -1,0 +1,180 @@
+"""Training the weights of a primitive by gradients of any loss of its motion."""
+
+import copy
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Protocol
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from hrc_learn.dmp.joint_dmp import JointDMP
+from hrc_learn.dmp.training.gradient_descent import (
+    DescentConfig,
+    Progress,
+    TrainingResult,
+    descend,
+)
+from hrc_learn.dmp.training.trajectory_losses import Loss
+
+LEARNABLE = ("weights", "goal")
+SAMPLES_PER_FUNCTION = 4
+NEGLIGIBLE = 1e-6
+"""Directions that accelerate the motion by less than this, relative to the strongest, do not
+count."""
+
+type Arguments = Mapping[str, Any]
+"""Of `rollout`."""
+type Condition = Arguments | Callable[[torch.Generator], Arguments]
+"""Fixed arguments of `rollout`, or new ones for every step."""
+
+
+class Primitive(Protocol):
+    """A primitive that rolls out, or is one of a linear `motion` that does."""
+
+    def rollout(self, **arguments: Any) -> Any:
+        """The motion."""
+        ...
+
+
+def train[P: nn.Module](
+    dmp: P,
+    loss: Loss | Callable[[Any], Tensor],
+    config: DescentConfig | None = None,
+    *,
+    learn: Sequence[str] = ("weights",),
+    condition: Condition | None = None,
+    held_out: Sequence[Arguments] = (),
+    hold_end: bool = True,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> TrainingResult[P]:
+    """Change the weights of a primitive until its motions have a small loss.
+
+    The steps are taken in directions of equal mean squared acceleration (the metric of CHOMP,
+    Zucker et al. 2013), relative to that of the demonstration: the path gives way as a whole
+    and stays smooth. Start and start velocity stay as they are.
+
+    Args:
+        dmp: Joint, orientation or pose primitive, or a batch; left as it is.
+        loss: Of a trajectory, one number per motion; see `losses.py`.
+        config: How far and how long.
+        learn: `"weights"`, and `"goal"` of a joint primitive.
+        condition: Arguments of `rollout` to train for, or what makes new ones of a generator
+            for every step; None: the demonstrated motion.
+        held_out: Conditions whose mean loss decides what is best and when to stop; without
+            any, the training loss does.
+        hold_end: Keep position and velocity at the end of the duration, exactly.
+        seed: Of the generator.
+        progress: Called after each step with its number and the best criterion.
+
+    Raises:
+        ValueError: Unknown names, nothing to learn, or a loss that is not finite.
+    """
+    config = config or DescentConfig()
+    parts = _parts(dmp, learn, hold_end)
+    rng = torch.Generator().manual_seed(seed)
+    rolled = _Rollout(dmp)
+
+    def mean_loss(arguments: Arguments) -> Tensor:
+        tensors = {name: part() for name, part in parts.items()}
+        motion = torch.func.functional_call(rolled, tensors, (), dict(arguments))
+        return torch.as_tensor(loss(motion)).mean()
+
+    def objective() -> tuple[Tensor, Tensor]:
+        arguments = condition(rng) if callable(condition) else condition or {}
+        value = mean_loss(arguments)
+        if not held_out:
+            return value, value
+        with torch.no_grad():
+            return value, torch.stack([mean_loss(x) for x in held_out]).mean()
+
+    history = descend([part.shift for part in parts.values()], objective, config, progress)
+    trained = _copy(dmp)
+    tensors = dict(trained.named_parameters()) | dict(trained.named_buffers())
+    with torch.no_grad():
+        for name, part in parts.items():
+            tensors[name.removeprefix("dmp.")].copy_(part())
+    return TrainingResult(dmp=trained, history=history)
+
+
+class _Rollout(nn.Module):
+    """Makes `rollout` what `torch.func.functional_call` calls."""
+
+    def __init__(self, dmp: nn.Module):
+        super().__init__()
+        self.dmp = dmp
+
+    def forward(self, **arguments: Any) -> Any:
+        return self.dmp.rollout(**arguments)  # pyright: ignore[reportCallIssue]
+
+
+class _Shifted(nn.Module):
+    """A tensor as it was, plus a shift along some directions."""
+
+    def __init__(self, value: Float[Tensor, "*batch n"], directions: Float[Tensor, "k n"]):
+        super().__init__()
+        self.value, self.directions = value.detach(), directions.to(value)
+        self.shift = nn.Parameter(self.value.new_zeros(*value.shape[:-1], len(directions)))
+
+    def forward(self) -> Float[Tensor, "*batch n"]:
+        return self.value + self.shift @ self.directions
+
+
+def _parts(dmp: nn.Module, learn: Sequence[str], hold_end: bool) -> dict[str, _Shifted]:
+    """What is learned, by its name in `_Rollout`."""
+    unknown = set(learn) - {*LEARNABLE}
+    if unknown or not learn:
+        raise ValueError(
+            f"learn must name some of {', '.join(LEARNABLE)}, got {', '.join(learn) or 'none'}"
+        )
+    joint = isinstance(dmp, JointDMP)
+    motion = dmp if joint else getattr(dmp, "motion", None)
+    if not isinstance(motion, JointDMP):
+        raise ValueError(f"{type(dmp).__name__} has no weights that could be trained")
+    parts = {}
+    if "weights" in learn:
+        directions = weight_directions(motion, hold_end)
+        parts["dmp.weights" if joint else "dmp.motion.weights"] = _Shifted(
+            motion.weights, directions
+        )
+    if "goal" in learn:
+        if not joint:
+            raise ValueError("a goal can be learned of joint primitives only: it must add up")
+        unit = motion.amplitude.amax() * torch.eye(motion.goal.shape[-1])
+        parts["dmp.goal"] = _Shifted(motion.goal, unit)
+    return parts
+
+
+def weight_directions(motion: JointDMP, hold_end: bool) -> Float[Tensor, "K N"]:
+    """Changes of the weights of a coordinate that accelerate it alike, independently.
+
+    Each changes y'' by as much, in the mean square, as the demonstrated motion has most.
+
+    Args:
+        motion: Whose weights they are for.
+        hold_end: Only those that leave y(1) and y'(1) as they are.
+    """
+    N, response = motion.basis.count, motion.response
+    s = torch.linspace(0, 1, SAMPLES_PER_FUNCTION * N, dtype=torch.float64)
+    H = response.evaluate(s)
+    free = torch.eye(N, dtype=torch.float64)
+    # Weights act through what fades them: late ones are the larger.
+    unit = 1 / H[:, 2, :N].norm(dim=0)
+    if hold_end:
+        ends = H[-1, :2, :N] * unit
+        free = torch.linalg.svd(ends).Vh[2:].mT
+    _, sigma, Vh = torch.linalg.svd(H[:, 2, :N] * unit @ free, full_matrices=False)
+    kept = sigma > NEGLIGIBLE * sigma[0]
+    directions = (Vh[kept] / sigma[kept, None]) @ free.mT * unit * len(s) ** 0.5
+    with torch.no_grad():
+        acceleration = motion.rollout(s, duration=1.0).acceleration.double()
+    strongest = acceleration.square().mean(-2).amax().sqrt()
+    # A motion that rests sets no measure: one that moves on would accelerate by about 6.
+    return directions * torch.where(strongest > 0, strongest, 6.0).item()
+
+
+def _copy[P: nn.Module](dmp: P) -> P:
+    """A primitive of its own, but for the response, which all alike share."""
+    shared = {id(m.response): m.response for m in dmp.modules() if isinstance(m, JointDMP)}
+    return copy.deepcopy(dmp, shared)

@@ -1,0 +1,146 @@
+import numpy as np
+import pytest
+import torch
+from demo_motions import arm_motion, minimum_jerk
+from scipy.stats import multivariate_normal
+
+from hrc_learn.dmp import JointDMP, ProbabilisticDMP
+
+S = torch.linspace(0, 1, 200, dtype=torch.float64)
+
+
+def family(n=12, seed=0):
+    """Motions of 2 s of two joints that differ in goal, bump and start velocity."""
+    rng = torch.Generator().manual_seed(seed)
+    goal, bump, lean = torch.randn(3, n, 1, 2, generator=rng, dtype=torch.float64)
+    s = S[:, None]
+    wave = 0.3 * bump * torch.sin(torch.pi * s) ** 2 + 0.1 * lean * torch.sin(4 * s)
+    return 2 * S, minimum_jerk(s) * (1 + 0.2 * goal) + wave
+
+
+def dense(rows):
+    """Rows of H, for both joints at all times."""
+    joints = torch.eye(2, dtype=torch.float64)
+    return torch.stack([torch.kron(joint, row) for row in rows for joint in joints])
+
+
+@pytest.fixture(scope="module")
+def distribution():
+    time, motions = family()
+    return ProbabilisticDMP.fit(JointDMP.fit(time, motions, n_basis=15))
+
+
+def test_moments_are_those_of_the_demonstrations(distribution):
+    time, motions = family()
+    mean, deviation = distribution.position(time)
+    torch.testing.assert_close(mean, motions.mean(0), rtol=0, atol=1e-3)
+    torch.testing.assert_close(deviation, motions.std(0), rtol=0, atol=1e-3)
+    torch.testing.assert_close(
+        distribution.mean_primitive().rollout(time=time).position, mean, rtol=0, atol=1e-9
+    )
+
+
+def test_samples_vary_like_the_demonstrations(distribution):
+    time, _ = family()
+    samples = distribution.sample(4000, torch.Generator().manual_seed(0))
+    positions = samples.rollout(time=time).position
+    mean, deviation = distribution.position(time)
+    torch.testing.assert_close(positions.mean(0), mean, rtol=0, atol=0.02)
+    torch.testing.assert_close(positions.std(0), deviation, rtol=0.05, atol=0.005)
+
+
+def test_conditioning_agrees_with_the_textbook(distribution):
+    """Bishop 2006, eqs. 2.116 and 2.117, on dense matrices."""
+    value = torch.tensor([[0.3, 0.9], [0.8, 1.2]], dtype=torch.float64)
+    given = distribution.condition([0.7, 1.5], value, noise=0.05)
+    x, spread = distribution.mean.flatten(), distribution.spread
+    H = distribution.primitive.response.evaluate(
+        torch.tensor([0.35, 0.75], dtype=torch.float64)
+    )[:, 0]
+    observe = dense(H)
+    cov = spread @ spread.mT
+    noise = 0.05**2 * torch.eye(4, dtype=torch.float64)
+    gain = cov @ observe.mT @ torch.linalg.inv(observe @ cov @ observe.mT + noise)
+    expected = x + gain @ (value.flatten() - observe @ x)
+    torch.testing.assert_close(given.mean.flatten(), expected)
+    left = cov - gain @ observe @ cov
+    torch.testing.assert_close(given.spread @ given.spread.mT, left, rtol=1e-6, atol=1e-9)
+
+
+def test_via_points_and_via_velocities_are_passed(distribution):
+    via = torch.tensor([[0.6, 0.2]], dtype=torch.float64)
+    given = distribution.condition([1.0], via)
+    torch.testing.assert_close(given.mean_primitive().rollout(time=[1.0]).position, via)
+    assert given.position([1.0])[1].max() < 1e-5
+    slow = given.condition([1.0], velocity=[[0.0, 0.0]])
+    there = slow.mean_primitive().rollout(time=[1.0])
+    torch.testing.assert_close(there.position, via, rtol=0, atol=1e-5)
+    assert there.velocity.abs().max() < 1e-4
+
+
+def test_one_primitive_bends_through_via_points_and_keeps_its_ends():
+    time, position = arm_motion(n_joints=2)
+    dmp = JointDMP.fit(time, position)
+    via = torch.tensor([[0.4, torch.nan]], dtype=torch.float64)
+    bent = ProbabilisticDMP.around(dmp).condition([1.5], via).mean_primitive()
+    plain, moved = dmp.rollout().position, bent.rollout().position
+    assert bent.rollout(time=[1.5]).position[0, 0].item() == pytest.approx(0.4, abs=1e-6)
+    torch.testing.assert_close(moved[:, 1], plain[:, 1])
+    torch.testing.assert_close(moved[0], plain[0])
+    # The bend is local: it has died out at the end, and is smooth in between.
+    torch.testing.assert_close(moved[-1], plain[-1], rtol=0, atol=0.02)
+    torch.testing.assert_close(bent.goal, dmp.goal)
+    kink = (moved - plain).diff(n=2, dim=0).abs().max()
+    assert kink < 1e-3
+
+
+def test_slack_reaches_what_no_mixture_passes():
+    time, motions = family(n=3)
+    primitives = JointDMP.fit(time, motions, n_basis=15)
+    via = torch.tensor([[2.0, -1.0], [-0.5, 1.5], [2.0, 0.0]], dtype=torch.float64)
+    times = [0.5, 1.0, 1.6]
+
+    def miss(slack):
+        given = ProbabilisticDMP.fit(primitives, slack=slack).condition(times, via)
+        return (given.mean_primitive().rollout(time=times).position - via).abs().max()
+
+    assert miss(0.0) > 0.1
+    assert miss(0.3) < 1e-5
+
+
+def test_log_prob_is_that_of_the_gaussian(distribution):
+    time, motions = family(seed=1)
+    some = slice(None, None, 40)
+    got = distribution.log_prob(time[some], motions[0, some], noise=0.1)
+    rows = distribution.primitive.response.evaluate(S[some])[:, 0]
+    cov = distribution.spread @ distribution.spread.mT
+    observe = torch.stack(
+        [torch.kron(torch.eye(2).double()[d], h) for h in rows for d in (0, 1)]
+    )
+    mean = (observe @ distribution.mean.flatten()).numpy()
+    full = (observe @ cov @ observe.mT).numpy() + 0.01 * np.eye(len(mean))
+    expected = multivariate_normal(mean, full).logpdf(motions[0, some].flatten().numpy())
+    assert got.item() == pytest.approx(expected, rel=1e-6)
+
+
+def test_conditioning_is_differentiable(distribution):
+    def passed(value):
+        return distribution.condition([0.7, 1.5], value, noise=0.05).mean
+
+    value = torch.zeros(2, 2, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(passed, (value,))
+
+
+def test_what_cannot_be_is_refused(distribution):
+    time, position = arm_motion()
+    with pytest.raises(ValueError, match="at least 2"):
+        ProbabilisticDMP.fit(JointDMP.fit(time, position))
+    both = torch.stack([position, position])
+    with pytest.raises(ValueError, match=r"needs one primitive, got a batch \(2,\)"):
+        ProbabilisticDMP.around(JointDMP.fit(time, both))
+    with pytest.raises(ValueError, match="not linear"):
+        ProbabilisticDMP.fit(JointDMP.fit(time, both, scaling="amplitude"))
+    with pytest.raises(ValueError, match=r"value must have shape \(1, 2\)"):
+        distribution.condition([0.5], [0.0, 0.0, 0.0])
+    with pytest.raises(ValueError, match="none negative"):
+        distribution.position([-1.0])
