@@ -185,9 +185,8 @@ def _run(words: Sequence[str]) -> int:
         return 0
     if rest and rest[0] not in ("-h", "--help", "--help-all"):
         known = ", ".join(dict.fromkeys(_next_words(name)))
-        raise ValueError(
-            f"no command {rest[0]!r} of hrc {name}".rstrip() + f"; there are {known}"
-        )
+        group = f"hrc {name}".rstrip()
+        raise ValueError(f"no command {rest[0]!r} of {group}; there are {known}")
     print("\n".join(_overview(name)))
     # Asked for help, that was it; a command that is missing is bad input.
     return 0 if rest else 2

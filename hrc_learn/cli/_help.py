@@ -80,7 +80,7 @@ def _values(hint: Any) -> str:
         return "NAME VALUE ..."
     if hint is bool:
         return ""
-    return "PATH" if hint is Path else {str: "TEXT"}.get(hint, hint.__name__.upper())
+    return {Path: "PATH", str: "TEXT"}.get(hint) or hint.__name__.upper()
 
 
 def _default(field: dataclasses.Field) -> str:

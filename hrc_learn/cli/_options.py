@@ -1,8 +1,8 @@
 """Command lines as dataclasses that cost nothing to import.
 
 Each field is an option, its docstring the help. `More[...]` marks what only `--help-all` shows.
-A field with a `Detail` for default stands for the configuration of a package that is slow to import:
-its options, such as --config.speed, are known as soon as one of them is given.
+A field with a `Detail` for default stands for the configuration of a package that is slow to
+import: its options, such as --config.speed, are known as soon as one of them is given.
 """
 
 import ast

@@ -112,10 +112,12 @@ def parse[Args](
 def _complaint(box: str) -> str:
     """What tyro says in a box of many lines, in one."""
     plain = re.sub(r"\x1b\[[0-9;]*m", "", box)  # colours
-    # Frame and a blank at either side, title and lower edge around; rules between sections.
-    lines = [line[2:-1].rstrip() for line in plain.splitlines()[1:-1]]
-    sections = re.split(r"^[─-]{3,}$", "\n".join(lines), flags=re.MULTILINE)
-    said, *others = [section.strip("\n") for section in sections]
+    # A frame, of blanks on a terminal without its characters; first the title, then sections
+    # with rules between them.
+    rows = [re.sub("[│╭╮╰╯]", " ", row).rstrip() for row in plain.splitlines()]
+    _, *rows = [row[2:] for row in rows if row.strip()]
+    sections = re.split(r"^ *[─-]{3,}$", "\n".join(rows), flags=re.MULTILINE)
+    said, *others = [section for section in sections if section.strip()]
     for part in (said, *others):
         if "Unrecognized options:" in part:
             names = " ".join(part.split("Unrecognized options:")[1].replace(",", " ").split())
@@ -124,7 +126,8 @@ def _complaint(box: str) -> str:
             return f"unknown options: {names}" + (f"; perhaps {similar}" if similar else "")
     if missing := re.findall(r"^ {4}(\S+)", said, re.MULTILINE):
         return f"missing: {', '.join(missing)}"
-    return " ".join(said.split()).rstrip(".")
+    # Why each of several types did not fit is for programmers.
+    return " ".join(said.split(" Got errors")[0].split()).rstrip(".")
 
 
 def _warning_line(message: Warning | str, *_place: object, **_line: object) -> str:
