@@ -1,87 +1,9 @@
 """Record demonstrations of placing a thing on a shelf, hand and body shape at once.
 
-The scripted expert leads the simulated arm from home into the cabinet while pulling its elbow
-past the open door. Demonstrations that touch the cabinet are thrown away and shown again.
-Writes a LeRobot dataset of version 3.0.
+The same as `hrc record placing`.
 """
 
-import sys
-from collections.abc import Iterator
-from dataclasses import dataclass, field
-from pathlib import Path
-
-import numpy as np
-from rich.progress import track
-
 from hrc_learn import cli
-from hrc_learn.sim import World
-from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.work_cell import TaskFailedError
-from hrc_learn.teleoperation.hand_guiding import Frame
-from hrc_learn.teleoperation.paired_demonstrations import write_lessons
-from hrc_learn.teleoperation.scripted_demonstrations import PlacingLesson, teach_placing_cleanly
-
-
-@dataclass(frozen=True, kw_only=True)
-class Args:
-    """What to record."""
-
-    out: Path
-    """Folder of the new dataset."""
-    episodes: int = 3
-    """Demonstrations to record."""
-    shelf: str = "middle"
-    """Shelf to place on: lower, middle or upper."""
-    lesson: PlacingLesson = field(default_factory=PlacingLesson)
-    """How the expert teaches."""
-    seed: int = 0
-    """Seed of the hand's unsteadiness and of where demonstrations start."""
-    overwrite: bool = False
-    """Replace an older dataset in that folder."""
-    json: Path | None = None
-    """File for the measured values."""
-
-
-def main(args: Args) -> int:
-    if args.episodes < 1:
-        raise ValueError(f"--episodes must be at least 1, but is {args.episodes}.")
-    workplace = Workplace()
-    goal = workplace.shelf(args.shelf).position.numpy()
-    world = World(workplace.scene)
-    rng = np.random.default_rng(args.seed)
-    thrown_away, errors = [], []
-
-    def lessons() -> Iterator[list[Frame]]:
-        for _ in track(range(args.episodes), description="Placing demonstrations"):
-            frames, thrown = teach_placing_cleanly(
-                world, workplace, args.shelf, args.lesson, rng
-            )
-            thrown_away.append(thrown)
-            errors.append(float(np.linalg.norm(frames[-1]["position"] - goal)))
-            yield frames
-
-    try:
-        write_lessons(
-            args.out,
-            lessons(),
-            f"place the box on the {args.shelf} shelf",
-            args.lesson.fps,
-            details={"shelf": args.shelf, "scene": "hrc_learn workplace"},
-            overwrite=args.overwrite,
-        )
-    except TaskFailedError as error:
-        print(f"failed: {error}", file=sys.stderr)
-        return 1
-    print(f"{args.episodes} demonstrations in {args.out} ({sum(thrown_away)} thrown away)")
-    if args.json is not None:
-        values = {
-            "episodes": args.episodes,
-            "thrown_away": sum(thrown_away),
-            "final_error_mm_max": 1e3 * max(errors),
-        }
-        cli.write_json(args.json, values)
-    return 0
-
 
 if __name__ == "__main__":
-    cli.run(main, Args)
+    cli.main("record", "placing")

@@ -66,9 +66,9 @@ LAYERS = (
     | {
         "experiments": {*CORE, *EDGES, *WORK},
         "lerobot": {*CORE, *EDGES, *WORK},
-        "cli": {"store"},
     }
 )
+LAYERS |= {"cli": {*LAYERS}}
 
 LIBRARIES: dict[str, set[str]] = {
     **{package: {"torch", "jaxtyping", "numpy", "safetensors"} for package in CORE},

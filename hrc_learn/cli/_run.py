@@ -1,0 +1,141 @@
+"""A command run: its command line parsed, its errors told in a line, its exit status.
+
+Exit status: 0 done, 1 the work failed, 2 bad input. Bad input ends in one line on stderr.
+"""
+
+import io
+import re
+import sys
+import warnings
+from collections.abc import Callable, Sequence
+from contextlib import redirect_stderr
+from pathlib import Path
+from typing import NoReturn
+
+from hrc_learn.cli._help import short_help
+from hrc_learn.cli._options import complete, mentions_details
+from hrc_learn.cli._values import one_line
+
+EXTRAS = {
+    "tyro": "programs",
+    "rich": "programs",
+    "mujoco": "sim",
+    "cv2": "sim",
+    "pyarrow": "demos",
+    "av": "demos",
+    "scipy": "demos",
+    "rerun": "viz",
+    "matplotlib": "viz",
+    "viser": "ui",
+    "pygame": "gamepad",
+    "lerobot": "lerobot",
+    "gymnasium": "lerobot",
+    "franky": "franky",
+    "example_robot_data": "meshes",
+    "ray": "sweep",
+}
+"""Extra of the package that brings a library."""
+
+
+def run[Args](main: Callable[[Args], int | None], args: type[Args]) -> NoReturn:
+    """Parse the command line into the dataclass `args`, call `main` with it, and exit.
+
+    `main` returns the exit status, None for 0. A ValueError or a missing or existing file is
+    the user's doing and ends with status 2 and one line; a library that is not installed ends
+    with status 1 and the extra that brings it; anything else is ours and shows its traceback
+    with status 1.
+    """
+    words, program = sys.argv[1:], Path(sys.argv[0]).name
+    description = _summary(main)
+    sys.exit(status_of(lambda: main(parse(args, words, program, description)) or 0))
+
+
+def status_of(work: Callable[[], int]) -> int:
+    """Do the work; its exit status, what went wrong told in one line on stderr."""
+    warnings.formatwarning = _warning_line
+    try:
+        return work()
+    except (ValueError, FileNotFoundError, FileExistsError, NotADirectoryError) as error:
+        print(f"error: {one_line(error)}", file=sys.stderr)
+        return 2
+    except ModuleNotFoundError as error:
+        library = (error.name or "").split(".")[0]
+        if library not in EXTRAS:
+            raise
+        extra = f"pip install 'hrc-learn[{EXTRAS[library]}]'"
+        print(f"error: {library} is not installed, which this needs: {extra}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 1
+
+
+def parse[Args](
+    arguments: type[Args], words: Sequence[str], program: str, description: str | None = None
+) -> Args:
+    """The command line as an instance of its dataclass.
+
+    Args:
+        arguments: The dataclass.
+        words: What was typed after the command.
+        program: The command.
+        description: What it does; the docstring of the dataclass when None.
+
+    Raises:
+        SystemExit: After help, with status 0; of bad input, told in one line, with status 2.
+    """
+    if description is None and ("-h" in words or "--help" in words):
+        print(short_help(program, arguments))
+        sys.exit(0)
+
+    import tyro  # a tenth of a second, which the short help does not need
+
+    everything = "--help-all" in words
+    words = ["--help" if word == "--help-all" else word for word in words]
+    said = io.StringIO()
+    try:
+        with redirect_stderr(said):
+            return tyro.cli(
+                complete(arguments)
+                if everything or mentions_details(arguments, words)
+                else arguments,
+                args=words,
+                prog=program,
+                description=description or (arguments.__doc__ or "").strip(),
+            )
+    except SystemExit:
+        if text := said.getvalue():
+            print(f"error: {_complaint(text)} (see {program} --help)", file=sys.stderr)
+        raise
+
+
+def _complaint(box: str) -> str:
+    """What tyro says in a box of many lines, in one."""
+    plain = re.sub(r"\x1b\[[0-9;]*m", "", box)  # colours
+    # A frame, of blanks on a terminal without its characters; first the title, then sections
+    # with rules between them.
+    rows = [re.sub("[│╭╮╰╯]", " ", row).rstrip() for row in plain.splitlines()]
+    _, *rows = [row[2:] for row in rows if row.strip()]
+    sections = re.split(r"^ *[─-]{3,}$", "\n".join(rows), flags=re.MULTILINE)
+    said, *others = [section for section in sections if section.strip()]
+    for part in (said, *others):
+        if "Unrecognized options:" in part:
+            names = " ".join(part.split("Unrecognized options:")[1].replace(",", " ").split())
+            meant = next((other for other in others if "Perhaps" in other), "")
+            similar = " or ".join(re.findall(r"^ {4}(--[\w.-]+)", meant, re.MULTILINE))
+            return f"unknown options: {names}" + (f"; perhaps {similar}" if similar else "")
+    if missing := re.findall(r"^ {4}(\S+)", said, re.MULTILINE):
+        return f"missing: {', '.join(missing)}"
+    # Why each of several types did not fit is for programmers.
+    return " ".join(said.split(" Got errors")[0].split()).rstrip(".")
+
+
+def _warning_line(message: Warning | str, *_place: object, **_line: object) -> str:
+    """A warning as a user reads it: without the place in our code that gave it."""
+    return f"warning: {message}\n"
+
+
+def _summary(main: Callable) -> str | None:
+    """The program's own docstring."""
+    text = sys.modules[main.__module__].__doc__ or main.__doc__
+    return text and text.strip()

@@ -1,0 +1,186 @@
+"""Command lines of the commands that read and write datasets."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from tyro.conf import Positional
+
+from hrc_learn.cli._options import More
+
+
+@dataclass(frozen=True, kw_only=True)
+class Check:
+    """Check a LeRobot dataset: what is broken, what is odd enough to look at before training.
+
+    Every finding names the file, episode, frame and column as closely as is known. Exit status:
+    0 no errors, 1 errors in the data, 2 no dataset there.
+    """
+
+    dataset: Path
+    """Folder of the dataset, version 2.0, 2.1 or 3.0."""
+    out: Path | None = None
+    """Folder for findings.json and metrics.json; none are kept without."""
+    units: dict[str, str] = field(default_factory=dict)
+    """Units on disk by quantity, such as: joint_position deg position mm."""
+    speed_limits: dict[str, float] = field(default_factory=dict)
+    """Fastest each joint can turn [rad/s], such as: joint1 2.1 joint2 2.1."""
+    strict: bool = False
+    """Count warnings as errors in the exit status."""
+    findings: Path | None = None
+    """Receives every finding: a JSON list of kind, message, file, episode, frame, key."""
+    overwrite: bool = False
+    """Replace an older folder of findings."""
+    json: Path | None = None
+    """Receives the counts as one flat object."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Repair:
+    """Repair a LeRobot dataset into a new copy, and say what was changed in which episode.
+
+    Standing still is trimmed, repeated frames are dropped, angles unwrapped and signs of
+    quaternions fixed; more on request. Any version is read, version 3.0 is written; the old
+    dataset is left as it is. Check the copy with `hrc check`.
+
+        hrc repair --dataset broken --out repaired
+        hrc repair --dataset broken --out repaired --fps 50 --drop-bad-episodes --no-videos
+    """
+
+    dataset: Path
+    """Folder of the dataset to repair, version 2.0, 2.1 or 3.0."""
+    out: Path | None = None
+    """Folder of the new one; must not exist. DATASET_repaired when not given."""
+    trim: bool = True
+    """Cut off standing still before and after the motion."""
+    keep_rest: More[float] = 0.1
+    """Standing still that is left at either end [s]."""
+    drop_repeats: bool = True
+    """Drop frames that repeat the one before for up to 0.1 s, and those stamped no later."""
+    unwrap: bool = True
+    """Take whole turns out of joints and angles that jump by one."""
+    fix_signs: bool = True
+    """Choose the signs of quaternions so that they do not jump."""
+    drop_bad_frames: bool = False
+    """Drop frames with values that are not finite."""
+    drop_bad_episodes: bool = False
+    """Leave out episodes that cannot be read or repaired."""
+    fps: float | None = None
+    """Resample to a regular grid of this rate [1/s]; None leaves the frames as they are."""
+    videos: bool = True
+    """Keep the videos. Frames dropped in the middle and resampling would need new ones."""
+    units: dict[str, str] = field(default_factory=dict)
+    """Units on disk by quantity, such as: joint_position deg position mm."""
+    json: Path | None = None
+    """Receives the counts as one flat object."""
+
+    @property
+    def folder(self) -> Path:
+        """Where the copy is written."""
+        return self.out or self.dataset.with_name(f"{self.dataset.name}_repaired")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportArrays:
+    """Turn recordings kept as plain arrays (.npz, .npy, .csv) into a LeRobot dataset.
+
+    Each file is one demonstration; an array of three axes (demonstrations, frames, components)
+    is as many as it holds. The stamps are kept as they are in `observation.time`, whatever the
+    frame rate LeRobot counts by.
+
+        hrc import pour.npz --out pour --joints q --time t
+        hrc import shelf.npy --out shelf --columns px,py,pz,qw,qx,qy,qz --duration 5
+        hrc import run1.csv run2.csv --out runs --joints j1,j2,j3,j4,j5,j6 --time stamp
+    """
+
+    files: Positional[tuple[Path, ...]]
+    """Recordings to import."""
+    out: Path
+    """Folder of the dataset to write; must not exist."""
+    joints: str | None = None
+    """Array with the joint positions, or columns joined by commas."""
+    position: str | None = None
+    """Array with the end effector's position, or columns joined by commas."""
+    orientation: str | None = None
+    """Array with its orientation (quaternion or rotation vector), or columns."""
+    time: str | None = None
+    """Array or column with the stamps."""
+    columns: str = ""
+    """Names of the columns of a .npy file, or of a .csv without a header, joined by commas.
+    px,py,pz and qw,qx,qy,qz are poses, t is time, others are joints."""
+    joint_names: tuple[str, ...] = ()
+    """Names of the joints; joint1, joint2, ... where not given."""
+    duration: float | None = None
+    """Length of each demonstration [s] where there are no stamps."""
+    fps: float | None = None
+    """Frame rate [1/s] where there are no stamps."""
+    joint_unit: Literal["rad", "deg"] = "rad"
+    """Unit of the joint positions."""
+    position_unit: Literal["m", "cm", "mm"] = "m"
+    """Unit of the positions."""
+    time_unit: More[Literal["s", "ms", "us", "ns"]] = "s"
+    """Unit of the stamps."""
+    quaternion_order: More[Literal["wxyz", "xyzw"]] = "wxyz"
+    """Order of a quaternion's components."""
+    robot_type: More[str] = "unknown"
+    """Name of the robot, kept in the dataset."""
+    task: str | None = None
+    """What was shown, in words; the file's name where not given."""
+    dtype: More[Literal["float32", "float64"]] = "float32"
+    """Type on disk; LeRobot's policies want float32."""
+    json: Path | None = None
+    """Receives the counts as one flat object."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Show:
+    """Look at the demonstrations of a LeRobot dataset: a Rerun recording of all of them.
+
+    Paths of the hand in 3D with the arm (a Panda; of other robots the paths alone), every joint
+    of all demonstrations over one another, and for each what else was recorded: image feature,
+    the person's effort, gripper.
+    """
+
+    dataset: Path
+    """Folder of the dataset, version 2.0, 2.1 or 3.0."""
+    out: Path
+    """Recording to write, as .rrd; replaces an older one."""
+    episodes: tuple[int, ...] = ()
+    """Episodes to show; all when empty."""
+    units: dict[str, str] = field(default_factory=dict)
+    """Units on disk by quantity, such as: joint_position deg position mm."""
+    json: Path | None = None
+    """File for the counts."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Extract:
+    """Find a marker in the videos of a LeRobot dataset and keep its pixels beside the dataset.
+
+    The result lies in NAME.features, where `load_demos` finds it; the dataset is not touched.
+    What was broken off goes on where it was.
+
+        hrc extract --dataset grasping --marker 3 --camera front
+    """
+
+    dataset: Path
+    """Folder of the dataset, with its videos."""
+    marker: int
+    """Number of the marker, of OpenCV's ArUco dictionary 4x4_50."""
+    camera: str | None = None
+    """Name of the camera; may be left out where there is only one."""
+    json: Path | None = None
+    """Receives the counts as one flat object."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recover:
+    """Recover what a process that was killed left behind: a dataset of its saved episodes.
+
+    Nothing that was acknowledged as saved is lost; what was not yet saved is left out.
+    """
+
+    path: Path
+    """Folder that was to be written."""
+    json: Path | None = None
+    """Receives the counts as one flat object."""

@@ -1,0 +1,101 @@
+"""Command lines of `hrc record`."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from tyro.conf import Suppress
+
+from hrc_learn.cli._options import Detail, More
+from hrc_learn.cli.arguments.choices import Camera, Shelf
+
+
+def _placing_lesson() -> Any:
+    from hrc_learn.teleoperation.scripted_demonstrations import PlacingLesson
+
+    return PlacingLesson()
+
+
+def _aiming_lesson() -> Any:
+    from hrc_learn.teleoperation.scripted_demonstrations import AimingLesson
+
+    return AimingLesson()
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordPlacing:
+    """Record demonstrations of placing a thing on a shelf, hand and body shape at once.
+
+    The scripted expert leads the simulated arm from home into the cabinet while pulling its
+    elbow past the open door. Demonstrations that touch the cabinet are thrown away and shown
+    again. Writes a LeRobot dataset of version 3.0.
+    """
+
+    out: Path
+    """Folder of the new dataset."""
+    episodes: int = 3
+    """Demonstrations to record."""
+    shelf: Shelf = "middle"
+    """Shelf to place on."""
+    lesson: Annotated[Any, Suppress] = field(default=Detail(_placing_lesson))
+    """How the expert teaches."""
+    seed: int = 0
+    """Seed of the hand's unsteadiness and of where demonstrations start."""
+    overwrite: bool = False
+    """Replace an older dataset in that folder."""
+    json: Path | None = None
+    """File for the measured values."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordServoing:
+    """Record demonstrations of aiming at an object in the image of an uncalibrated camera.
+
+    The scripted expert moves the marked hand about over the table and ends right above an
+    object. The camera's pose and lens are in none of the columns. Writes a LeRobot dataset of
+    version 3.0.
+    """
+
+    out: Path
+    """Folder of the new dataset."""
+    episodes: int = 8
+    """Demonstrations to record."""
+    camera: Camera = "synthetic"
+    """Camera: rendered by "egl", or "synthetic", which draws the markers only but is fast."""
+    lesson: Annotated[Any, Suppress] = field(default=Detail(_aiming_lesson))
+    """How the expert teaches."""
+    seed: int = 1
+    """Seed of objects, paths and image noise."""
+    overwrite: bool = False
+    """Replace an older dataset in that folder."""
+    json: Path | None = None
+    """File for the measured values."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordExpert:
+    """Record the scripted expert on LeRobot's simulated Panda, in simulated time.
+
+    Writes what lerobot-record would write with --robot.type=mujoco_panda and
+    --teleop.type=panda_expert, but waits for no clock: every episode is shown to its end, as
+    fast as the machine can. Demonstrations that fail are shown again.
+    """
+
+    out: Path
+    """Folder of the new dataset; must not exist."""
+    scenario: Literal["placing", "grasping"] = "placing"
+    """What is shown."""
+    shelf: Shelf = "middle"
+    """Where to place."""
+    episodes: int = 10
+    """Demonstrations to write."""
+    fps: int = 20
+    """Frames a second."""
+    action_space: Literal["joint", "ee"] = "joint"
+    """What actions give: positions of the joints, or of the hand."""
+    pixels: More[bool] = True
+    """Whether the pixel of the object to grasp is observed."""
+    seed: int = 0
+    """Of the first beginning; each one after has the next."""
+    json: Path | None = None
+    """File for the measured values."""

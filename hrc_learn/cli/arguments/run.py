@@ -1,0 +1,337 @@
+"""Command lines of the commands that move the arm, and of what is made from their runs."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from tyro.conf import Positional, Suppress
+
+from hrc_learn.cli._options import Detail, More
+from hrc_learn.cli.arguments.choices import Camera, Experiment, Robot, Shelf, Variant
+
+
+def _camera_change() -> Any:
+    from hrc_learn.sim import CameraChange
+
+    return CameraChange()
+
+
+def _serving() -> Any:
+    from hrc_learn.experiments.run_recording import ServeConfig
+
+    return ServeConfig()
+
+
+def _collaboration() -> Any:
+    from hrc_learn.skills.pick_and_place import CollaborationConfig
+
+    return CollaborationConfig()
+
+
+def _grasping() -> Any:
+    from hrc_learn.skills.grasping import GraspingConfig
+
+    return GraspingConfig()
+
+
+def _page() -> Any:
+    from hrc_learn.teleoperation.page import PageConfig
+
+    return PageConfig()
+
+
+def _session() -> Any:
+    from hrc_learn.teleoperation.page_session import PageSessionConfig
+
+    return PageSessionConfig()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Demo:
+    """Do the whole main job in simulation: demonstrate, learn, grasp, place.
+
+    Records demonstrations of placing and of aiming, fits a movement primitive and an image
+    Jacobian to them, then grasps a box with an uncalibrated camera while a scripted person
+    draws the elbow aside, carries it to the cabinet along the learned motion, and puts it on a
+    shelf. Results of an older demo in the folder are replaced. Exit status 1 if the job failed
+    or a target was missed.
+    """
+
+    out: Path = Path("outputs/demo")
+    """Folder for demonstrations, models and the run."""
+    robot: Robot = "panda"
+    """Arm that does it."""
+    shelf: Shelf = "middle"
+    """Where to put the object; the middle shelf is the demonstrated one."""
+    seed: int = 0
+    """Seed of where the object lies and of image noise."""
+    json: Path | None = None
+    """File for the measured values."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunPlacing:
+    """Place a thing on three shelves by a motion that was shown for one of them.
+
+    In simulation, with the thing held between the fingers: the demonstrated motion once more
+    and faster, then the other shelves, as the paper does it (joint space, shifted goal) and in
+    task space with the learned body shape; the demonstration with and without that shape; on
+    request from many random starts. Writes Rerun recordings, a report and the measured values.
+    Exit status 1 if a target was missed.
+    """
+
+    placing: Path | None = None
+    """Folder of `hrc fit`, from demonstrations of placing. Those of `hrc demo` when not given,
+    made first where they are missing."""
+    out: Path = Path("outputs/placing")
+    """Folder for recordings, report and measured values."""
+    demonstrations: Path | None = None
+    """Dataset the motion was learned from; the one named in that folder when None."""
+    speed: float = 1.5
+    """How many times faster than demonstrated."""
+    trials: int = 0
+    """Random starts from which to place on each shelf besides."""
+    noise: float = 0.1
+    """Standard deviation of each joint at these starts, about home [rad]."""
+    lessons: int = 0
+    """Further demonstrations with and without the body's shape."""
+    processes: int = 1
+    """Of the repetitions, at once."""
+    seed: int = 0
+    """First seed of starts and demonstrations."""
+    robot: Robot = "panda"
+    """Arm that does it."""
+    serve: bool = False
+    """Serve the dashboard of the reproduction in the browser while it goes on."""
+    serving: Annotated[Any, Suppress] = field(default=Detail(_serving))
+    """Where, with --serve."""
+    pictures: bool = True
+    """Whether to render pictures of the arm, where this machine can."""
+    overwrite: bool = False
+    """Replace an older run in that folder."""
+    json: Path | None = None
+    """File for the measured values."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunGrasping:
+    """Grasp an object from afar with a camera that nobody calibrated.
+
+    In simulation: the arm starts anywhere within its joint limits, the camera was turned or
+    moved since the image Jacobian was learned, and the controller is not told. The learned
+    Jacobian with a Kalman filter has to do it; the paper's law, no adaptation and other
+    estimators are run on the same setting for comparison. Writes Rerun recordings, a report and
+    the measured values. Exit status 1 if the default failed or a target was missed.
+    """
+
+    aiming: Path | None = None
+    """Folder of `hrc fit image-jacobian`. That of `hrc demo` when not given, made first where
+    it is missing."""
+    out: Path = Path("outputs/grasping")
+    """Folder for recordings, report and measured values."""
+    camera_roll: float = 60.0
+    """By how much the camera was turned about its axis since the demonstrations [deg]."""
+    random_camera: bool = False
+    """Draw where the camera stands, how it is tilted and turned, instead."""
+    variants: tuple[Variant, ...] = ("learned", "kalman", "composite", "paper", "fixed")
+    """What to compare. A Kalman filter from the learned Jacobian and from the paper's guess;
+    from that guess also the composite law, the paper's law and no adaptation; "unadapted", the
+    learned Jacobian as it is. "none" for nothing."""
+    camera: Camera = "auto"
+    """Camera: rendered by "egl", or "synthetic", which needs no OpenGL; "auto" renders where
+    it can."""
+    serve: bool = False
+    """Serve the dashboard of the grasp in the browser while it goes on."""
+    serving: Annotated[Any, Suppress] = field(default=Detail(_serving))
+    """Where, with --serve."""
+    config: Annotated[Any, Suppress] = field(default=Detail(_grasping))
+    """How objects are grasped."""
+    gains: More[Path | None] = None
+    """gains.json of `hrc tune`, in place of those of the controller."""
+    seed: int = 0
+    """Seed of camera, start, object and image noise; the first one of many."""
+    trials: int = 0
+    """Grasps besides, each with a random camera, start and object, by the default alone."""
+    processes: int = 1
+    """Of these grasps, at once. They are seen by the synthetic camera."""
+    robot: Robot = "panda"
+    """Arm that does it."""
+    overwrite: bool = False
+    """Replace an older run in that folder."""
+    json: Path | None = None
+    """File for the measured values."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunCollaboration:
+    """Grasp objects beside a person, carry them to the cabinet and put them on shelves.
+
+    In simulation: the learned skills run on MuJoCo's arm, an uncalibrated camera watches, and a
+    scripted person pulls the elbow aside while the arm aims. The camera may be moved between
+    two objects, the marker may be hidden, images may be late or lost. Writes a Rerun recording,
+    a report and the measured values. Exit status 1 if the job failed or a target was missed.
+
+    The paper's third experiment: --shelves lower middle upper --occlusion 0 4.
+    """
+
+    placing: Path | None = None
+    """Folder of `hrc fit`, from demonstrations of placing. Those of `hrc demo` when not given,
+    made first where they are missing."""
+    aiming: Path | None = None
+    """Folder of `hrc fit image-jacobian`. That of `hrc demo` when not given, likewise."""
+    out: Path = Path("outputs/collaboration")
+    """Folder for recording, report and measured values."""
+    shelf: Shelf = "middle"
+    """Where to put the object."""
+    shelves: tuple[Shelf, ...] = ()
+    """Where to put each of two or three objects, in place of --shelf."""
+    shelf_x: More[float] = 0.40
+    """Where along the board [m], in the robot's base frame."""
+    shelf_depth: More[float] = 0.10
+    """How far behind the board's front edge [m]."""
+    occlusion: More[tuple[tuple[float, float], ...]] = ()
+    """Spells in which a board hides the hand's marker: start and duration [s]."""
+    camera_moved: bool = False
+    """Move and turn the camera between two objects."""
+    camera_change: Annotated[Any, Suppress] = field(default=Detail(_camera_change))
+    """How far, with --camera-moved."""
+    latency: More[float] = 0.0
+    """From an image being taken until its markers are known [s]."""
+    drop: More[float] = 0.0
+    """Share of the images that are lost."""
+    camera: Camera = "auto"
+    """Camera: rendered by "egl", or "synthetic", which needs no OpenGL; "auto" renders where
+    it can."""
+    person: bool = True
+    """Whether the scripted person pulls the elbow."""
+    page: bool = False
+    """Serve a page in the browser, from which people watch and pull at the body too. The run
+    takes as long as it would on a real arm then."""
+    port: int = 8080
+    """Port of that page."""
+    serve: bool = False
+    """Serve the dashboard in the browser while the run goes on."""
+    serving: Annotated[Any, Suppress] = field(default=Detail(_serving))
+    """Where, with --serve."""
+    config: Annotated[Any, Suppress] = field(default=Detail(_collaboration))
+    """How the job is done."""
+    gains: More[Path | None] = None
+    """gains.json of `hrc tune`, in place of those of the controller."""
+    seed: int = 0
+    """Seed of where the objects lie and of image noise."""
+    trials: int = 0
+    """Do the job so many times more, with this seed and those after it, and sum up."""
+    processes: int = 1
+    """Of the repetitions, at once."""
+    robot: Robot = "panda"
+    """Arm that does it."""
+    overwrite: bool = False
+    """Replace an older run in that folder."""
+    json: Path | None = None
+    """File for the measured values."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """Make one page from the folders of one or several runs.
+
+    The page holds their figures, what they measured beside its targets and the paper's claims,
+    their configuration and versions, and the commands that run them again. It needs no network:
+    mail it, print it, keep it.
+    """
+
+    runs: Positional[tuple[Path, ...]]
+    """Folders of runs, in the order of the page; each holds a report.json."""
+    out: Path
+    """HTML file to write; replaces an older one."""
+    title: str = "Runs"
+    """Heading above several runs."""
+    json: Path | None = None
+    """File for the measured values of all runs, each behind the name of its folder."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sweep:
+    """Thousands of simulated grasps as batches: how often, how fast and how safely.
+
+    Random starts, targets and uncalibrated cameras, turned by up to 180 degrees from what the
+    controller believes, against the kinematics of the arm. Prints what was measured beside its
+    target, for all acceptance figures about grasping and human effort with --suite acceptance.
+    Exit status 1 if a target was missed.
+    """
+
+    suite: Literal["acceptance", "estimators", "stress", "all"] = "acceptance"
+    """Which experiments: those of the acceptance figures; rival estimators; random runs that
+    look for broken limits alone."""
+    only: More[tuple[Experiment, ...]] = ()
+    """Names of single experiments, instead of a suite."""
+    trials: int = 1000
+    """Trials of the experiments near, global, fixed and of each stress test."""
+    variants: int = 400
+    """Trials of each of the others."""
+    seed: int = 0
+    """Seed of starts, targets, cameras and noise, the same for all experiments."""
+    ray: bool = False
+    """Spread the trials over processes or machines with Ray; the figures stay the same."""
+    out: Path | None = None
+    """Folder for the figures, the picture and the recording, all at once."""
+    overwrite: bool = False
+    """Replace an older sweep in that folder."""
+    json: Path | None = None
+    """Receives all figures as one flat object."""
+    figure: Path | None = None
+    """Receives a picture of the times to the target by experiment, as .png or .svg."""
+    recording: Path | None = None
+    """Receives a Rerun recording: success by class of camera, and arrival over time."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Serve:
+    """Run the controller at a fixed rate on the simulated arm, and report how fast it answers.
+
+    The arm servoes on a marker that an uncalibrated camera sees at 31 Hz. Step latency is the
+    time from reading the joints to the command, wake-up latency how late the loop is woken for
+    its tick, both in wall-clock time. A tick is missed when the loop, physics included, was
+    still busy a whole period after it.
+    """
+
+    duration: float = 8.0
+    """How long to run [s]."""
+    rate: float = 500.0
+    """Control steps a second; the physics takes steps of the same length."""
+    step: Literal["fastest", "eager"] = "fastest"
+    """Whether to compile the step ahead of time, where there is a C++ compiler."""
+    packages: Path | None = None
+    """Folder in which compiled steps are kept; default: the user's cache. The first start
+    compiles, in a minute or two; later ones, at any rate, take a tenth of a second."""
+    json: Path | None = None
+    """File for the measured values."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ServePage:
+    """Lead the simulated arm in a browser, and record demonstrations of your own.
+
+    Open the address that is printed. Drag a link or a knob of the arm, or of its virtual twin,
+    to shape the body; drag the hand's handle to lead the hand, such as to a green field on a
+    shelf. Start, stop, save. Ends with "Finish", with Ctrl-C, or after --duration, and leaves a
+    LeRobot dataset if anything was saved.
+    """
+
+    out: Path
+    """Folder of the dataset to record; must not exist."""
+    port: int | None = None
+    """Port of the page; that of --page.port, 8080, when not given."""
+    task: str = "put the thing on the middle shelf"
+    """What is to be shown, in words; it can be changed on the page."""
+    beside: Literal["nothing", "gamepad", "keyboard"] = "nothing"
+    """A device for the other hand, which leads the end effector: a gamepad (extra `gamepad`),
+    or the keys of the terminal this runs in."""
+    duration: float | None = None
+    """End after this time [s]; None: when the person finishes."""
+    page: Annotated[Any, Suppress] = field(default=Detail(_page))
+    """The page."""
+    session: Annotated[Any, Suppress] = field(default=Detail(_session))
+    """The session."""
+    json: Path | None = None
+    """File for the measured values."""

@@ -1,0 +1,160 @@
+"""`hrc serve`: the controller in a paced loop, and its latency."""
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from rich.console import Console
+
+from hrc_learn.cli._values import write_json
+from hrc_learn.cli.arguments.run import Serve as Args
+from hrc_learn.controller import (
+    GRIPPER_DOWN,
+    INITIAL_IMAGE_JACOBIAN,
+    INTERVENTIONS,
+    AdaptiveController,
+    Goals,
+    Observation,
+    SafetyConfig,
+)
+from hrc_learn.deploy import EagerRunner, Metronome, StepRunner, open_step
+from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.jacobian import KalmanEstimator, RBFImageJacobian, paper_grid
+from hrc_learn.kinematics import panda
+from hrc_learn.protocols import Arm
+from hrc_learn.sim import SceneConfig, World
+from hrc_learn.sim.closed_loop import PinholeCamera
+
+FRAME_TIME = 0.032
+"""From one image to the next [s]."""
+CENTRE = (0.35, 0.35, 0.35)
+"""Of the box [m]."""
+PERCENTILES = (50.0, 90.0, 99.0, 99.9, 100.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Latencies:
+    """One entry a step [s]."""
+
+    step: np.ndarray
+    wake_up: np.ndarray
+    missed: int
+    """Ticks that were skipped."""
+
+
+def run(args: Args) -> None:
+    if not (args.duration > 0 and args.rate > 0):
+        raise ValueError("duration and rate must be positive")
+    if args.rate < (slowest := SafetyConfig().rate):
+        raise ValueError(f"rate must be at least {slowest:g}, as the safety filter asks")
+    torch.set_num_threads(1)
+    dt = 1 / args.rate
+    camera = _camera()
+    controller, observation = _controller(camera, dt)
+    began = time.perf_counter()
+    if args.step == "eager":
+        runner = EagerRunner(controller, observation)
+    else:
+        runner = open_step(controller, observation, args.packages)
+    opened = time.perf_counter() - began
+    world = World(SceneConfig(timestep=dt))
+    latencies, error = _serve(runner, world, camera, dt, round(args.duration * args.rate))
+    figures = {"open_s": opened} | _figures(latencies) | {"pixel_error": error}
+    counts = runner.state("safety.counts")
+    figures |= {f"safety_{k}": int(n) for k, n in zip(INTERVENTIONS, counts, strict=True)}
+    for name, value in figures.items():
+        Console().print(f"{name:22} {value:.4g}", highlight=False)
+    if args.json is not None:
+        write_json(args.json, figures)
+
+
+def _figures(latencies: Latencies) -> dict[str, float]:
+    figures: dict[str, float] = {
+        "steps": len(latencies.step),
+        "missed_ticks": latencies.missed,
+    }
+    for name, seconds in (("step", latencies.step), ("wake_up", latencies.wake_up)):
+        values = 1e6 * np.percentile(seconds, PERCENTILES)
+        for percentile, value in zip(PERCENTILES, values, strict=True):
+            figures[f"{name}_p{percentile:g}_us"] = float(value)
+    return figures
+
+
+def _camera() -> PinholeCamera:
+    centre = torch.tensor(CENTRE, dtype=torch.float64)
+    return PinholeCamera.above(
+        centre,
+        height=centre.new_tensor(1.1),
+        roll=centre.new_tensor(0.5),
+        tilt=centre.new_tensor(0.2),
+        bearing=centre.new_tensor(1.0),
+        marker=centre.new_tensor((0.05, 0.0, -0.08)),
+    )
+
+
+def _controller(camera: PinholeCamera, dt: float) -> tuple[AdaptiveController, Observation]:
+    """The controller, and an observation with all that the loop will tell it."""
+    centre = torch.tensor(CENTRE, dtype=torch.float64)
+    down = quaternion.normalize(centre.new_tensor(GRIPPER_DOWN))
+    target, _ = camera.project(Pose(centre + centre.new_tensor((0.03, -0.02, 0.0)), down))
+    J = torch.tensor(INITIAL_IMAGE_JACOBIAN, dtype=torch.float64)
+    network = RBFImageJacobian.from_jacobian(J, paper_grid(), 0.1)
+    controller = AdaptiveController(
+        panda, KalmanEstimator(network), Goals.at(centre, down, target)
+    )
+    q = panda.ready
+    observation = Observation(
+        joint_position=q,
+        feature=target,
+        feature_visible=torch.tensor(False),
+        feature_new=torch.tensor(False),
+        image_joint_position=q,
+        human_effort=torch.zeros_like(q),
+        # A tensor, so that one package serves all rates.
+        dt=torch.tensor(dt, dtype=torch.float64),
+    )
+    return controller, observation
+
+
+def _serve(
+    runner: StepRunner, world: World, camera: PinholeCamera, dt: float, steps: int
+) -> tuple[Latencies, float]:
+    """Run the loop; returns latencies and the last pixel error [px]."""
+    world.reset(panda.ready.numpy())
+    target = runner.observation["feature"].copy()
+    frame_steps = max(1, round(FRAME_TIME / dt))
+    took, late = np.empty(steps), np.empty(steps)
+    _answer(runner, world.arm)  # the first call is slower than any other
+    runner.start(panda.ready.numpy())
+    metronome = Metronome(dt)
+    for k in range(steps):
+        began = time.perf_counter()
+        _answer(runner, world.arm)
+        took[k] = time.perf_counter() - began
+        world.advance(dt)
+        runner.observation["feature_new"][...] = k % frame_steps == 0
+        if k % frame_steps == 0:
+            _look(runner.observation, camera, world.arm)
+        late[k] = metronome.wait()
+    error = float(np.linalg.norm(runner.observation["feature"] - target))
+    return Latencies(step=took, wake_up=late, missed=metronome.missed), error
+
+
+def _answer(runner: StepRunner, arm: Arm) -> None:
+    """All that lies between a measurement and a command."""
+    runner.observation["joint_position"][:] = arm.read().joint_position
+    arm.command(runner.step())
+
+
+def _look(arrays: dict[str, np.ndarray], camera: PinholeCamera, arm: Arm) -> None:
+    """Image of the marker, with the joints when it was taken."""
+    q = arm.read().joint_position
+    feature, visible = camera.project(panda.forward(torch.from_numpy(q)))
+    arrays["feature"][:] = feature.numpy()
+    arrays["feature_visible"][...] = bool(visible)
+    arrays["image_joint_position"][:] = q

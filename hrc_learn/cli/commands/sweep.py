@@ -1,0 +1,190 @@
+"""`hrc sweep`: thousands of simulated grasps as batches."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from hrc_learn.cli._values import configuration, refuse_existing, write_json
+from hrc_learn.cli.arguments.run import Sweep as Args
+from hrc_learn.experiments.controller.grasp_trials import ROLL_CLASSES
+from hrc_learn.experiments.controller.sweep import (
+    CRITERIA,
+    EXPERIMENTS,
+    Criterion,
+    chunks,
+    compared,
+    run_chunk,
+)
+from hrc_learn.store import new_folder
+
+CHUNK = 250
+"""Trials in one batch: their tensors stay in the cache."""
+# Of the tables: a log file has no width of its own.
+_WIDTH = 100
+
+
+def run(args: Args) -> int:
+    """Run the experiments, print their figures beside the targets, write the figures."""
+    if args.out is not None:
+        refuse_existing(args.out, args.overwrite)
+    names = _chosen(args)
+    torch.set_num_threads(1)
+    jobs = [
+        job
+        for name in names
+        for job in chunks(
+            name, args.trials if EXPERIMENTS[name].main else args.variants, args.seed, CHUNK
+        )
+    ]
+    results = _run(jobs, _with_ray if args.ray else _in_turn)
+    figures: dict[str, float] = {}
+    for name, result in results.items():
+        figures |= {f"{name}_{key}": value for key, value in result.summary().items()}
+    figures |= compared(figures)
+    missed = _show(names, figures)
+    if args.out is not None:
+        with new_folder(args.out, configuration(args), args.overwrite) as folder:
+            write_json(folder / "metrics.json", figures)
+            _draw(folder / "times.png", results)
+            _record(folder / "sweep.rrd", results)
+    if args.json is not None:
+        write_json(args.json, figures)
+    if args.figure is not None:
+        _draw(args.figure, results)
+    if args.recording is not None:
+        _record(args.recording, results)
+    return 1 if missed else 0
+
+
+def _draw(path: Path, results: dict[str, Any]) -> None:
+    from hrc_learn.viz.figures import arrival_figure  # matplotlib takes a second
+
+    times = {name: r.time.numpy() for name, r in results.items() if hasattr(r, "time")}
+    arrival_figure(times).savefig(path, dpi=150)
+
+
+def _record(path: Path, results: dict[str, Any]) -> None:
+    from hrc_learn.viz import SweepRecording, SweptTrials
+    from hrc_learn.viz.sweep_dashboard import record_sweep  # rerun takes a second
+
+    trials = {
+        name: SweptTrials(
+            success=r.success.numpy(), arrival=r.time.numpy(), group=r.roll_class.numpy()
+        )
+        for name, r in results.items()
+        if hasattr(r, "roll_class")
+    }
+    groups = tuple(f"{low}-{high} deg" for low, high in ROLL_CLASSES)
+    title = "Grasping, by how far the camera is turned from what the controller believes"
+    record_sweep(path, SweepRecording(title=title, groups=groups, experiments=trials))
+
+
+def _chosen(args: Args) -> list[str]:
+    for name in ("trials", "variants"):
+        if getattr(args, name) < 1:
+            raise ValueError(f"--{name} must be at least 1, but is {getattr(args, name)}")
+    return list(args.only) or [
+        name
+        for name, experiment in EXPERIMENTS.items()
+        if args.suite in (experiment.suite, "all")
+    ]
+
+
+Job = tuple[str, int, int]
+
+
+def _run(jobs: list[Job], spread: Callable[[list[Job]], Iterator[Any]]) -> dict[str, Any]:
+    """Joined results by experiment."""
+    parts: dict[str, list[Any]] = {}
+    with Progress(transient=True) as progress:
+        task = progress.add_task("trials", total=len(jobs))
+        for (name, *_), part in zip(jobs, spread(jobs), strict=True):
+            parts.setdefault(name, []).append(part)
+            progress.update(task, advance=1, description=name)
+    return {name: EXPERIMENTS[name].join(results) for name, results in parts.items()}
+
+
+def _in_turn(jobs: list[Job]) -> Iterator[Any]:
+    return (run_chunk(*job) for job in jobs)
+
+
+def _with_ray(jobs: list[Job]) -> Iterator[Any]:
+    try:
+        import ray
+    except ImportError as error:
+        raise ValueError("--ray needs Ray: pip install ray") from error
+
+    @ray.remote
+    def run(name: str, count: int, seed: int) -> Any:
+        torch.set_num_threads(1)
+        return run_chunk(name, count, seed)
+
+    ray.init(log_to_driver=False)
+    waiting = [run.remote(*job) for job in jobs]
+    return (ray.get(result) for result in waiting)
+
+
+def _show(names: list[str], figures: dict[str, float]) -> list[Criterion]:
+    """Print tables; returns what was missed."""
+    console = Console()
+    console = Console(width=max(console.width, _WIDTH))
+    grasps = [name for name in names if f"{name}_success" in figures]
+    if grasps:
+        console.print(_grasp_table(grasps, figures))
+    criteria = [c for c in CRITERIA if c.experiment in names and c.key in figures]
+    table = Table(title="Measured and wanted")
+    for column in ("figure", "experiment", "what", "measured", "target", ""):
+        right = column in ("measured", "target")
+        table.add_column(column, no_wrap=True, justify="right" if right else "left")
+    for criterion in criteria:
+        value = figures[criterion.key]
+        table.add_row(
+            criterion.number,
+            criterion.experiment,
+            criterion.figure.replace("_", " "),
+            f"{value:.4g}",
+            criterion.bound,
+            "met" if criterion.met(value) else "missed",
+        )
+    if criteria:
+        console.print(table)
+    if any(c.number == "1" for c in criteria):
+        console.print(
+            "Figures 6 and 8 need the simulator: hrc run placing --trials 40 and "
+            "hrc run collaboration --trials 50"
+        )
+    return [c for c in criteria if not c.met(figures[c.key])]
+
+
+def _grasp_table(names: list[str], figures: dict[str, float]) -> Table:
+    rolls = ", ".join(f"{low}-{high}" for low, high in ROLL_CLASSES)
+    table = Table(title=f"Grasping; success [%] by camera roll of {rolls} degrees")
+    table.add_column("experiment", no_wrap=True)
+    columns = (
+        "by roll",
+        "all",
+        "contact [%]",
+        "t50 [s]",
+        "t95 [s]",
+        "vision [s]",
+        "violations",
+    )
+    for column in columns:
+        table.add_column(column, no_wrap=True, justify="right")
+    for name in names:
+        share = [figures[f"{name}_success_roll_{low}_{high}"] for low, high in ROLL_CLASSES]
+        looked = EXPERIMENTS[name].config.contacts
+        table.add_row(
+            name,
+            " ".join(f"{100 * part:.0f}" for part in share),
+            f"{100 * figures[f'{name}_success']:.1f}",
+            f"{100 * figures[f'{name}_touched']:.1f}" if looked else "",
+            *(f"{figures[f'{name}_{key}']:.2f}" for key in ("t50", "t95", "vision_phase")),
+            f"{figures[f'{name}_violations']:.0f}",
+        )
+    return table

@@ -1,0 +1,108 @@
+"""`hrc tune`: gains, searched over simulated closed loops."""
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import torch
+from rich.console import Console
+from rich.progress import Progress
+
+from hrc_learn.cli._options import resolved
+from hrc_learn.cli._values import show_values, write_json, write_text
+from hrc_learn.cli.arguments.learn import Tune as Args
+from hrc_learn.controller import ControllerConfig
+from hrc_learn.experiments.initialization_study import ClosedLoops, StartsConfig, summary
+from hrc_learn.jacobian import KalmanEstimator
+from hrc_learn.learning.tuning import TUNED, Search
+from hrc_learn.sim import World
+from hrc_learn.sim.workplace import Workplace
+from hrc_learn.skills.visual_servoing import guessed_network
+from hrc_learn.store import new_folder
+from hrc_learn.viz.figures import learning_figure
+
+
+def run(args: Args) -> None:
+    args = resolved(args)
+    if args.generations < 1 or args.population < 3:
+        raise ValueError("a search needs --generations of 1 and --population of 3, or more")
+    torch.set_num_threads(1)
+    console, default = Console(), ControllerConfig()
+    place = args.out.with_name(f"{args.out.name}.search.json")
+    search, history = _begin(args, place, default)
+    with new_folder(args.out, asdict(args), args.overwrite) as folder:
+        cost = _cost(_loops(args.starts), default)
+        with Progress(console=console) as progress:
+            task = progress.add_task("Searching", total=args.generations)
+            progress.advance(task, search.generation)
+            while search.generation < args.generations:
+                tried = search.ask(args.population)
+                search = search.tell(tried, [cost(gains) for gains in tried])
+                history.append(search.best_cost)
+                state = {"search": search.to_json(), "costs": history}
+                write_text(place, json.dumps(state))
+                best = f"Searching, mean time {search.best_cost:.3f} s"
+                progress.update(task, advance=1, description=best)
+        gains = dict(zip(search.names, search.best, strict=True))
+        figures = _figures(args, default, gains)
+        write_json(folder / "gains.json", gains)
+        write_json(folder / "metrics.json", figures)
+        learning_figure(history, len(history) - 1, "s").savefig(folder / "search.png", dpi=120)
+    place.unlink(missing_ok=True)
+    show_values("Gains, on closed loops not searched", figures)
+    console.print(f"Gains in {args.out / 'gains.json'}")
+    if args.json is not None:
+        write_json(args.json, figures)
+
+
+def _begin(args: Args, place: Path, default: ControllerConfig) -> tuple[Search, list[float]]:
+    """A new search, or the one that was interrupted."""
+    if args.resume:
+        state = json.loads(place.read_text(encoding="utf-8"))
+        return Search.from_json(state["search"]), [float(cost) for cost in state["costs"]]
+    start = {name: getattr(default, name) for name in TUNED}
+    return Search.around(start, seed=args.starts.seed), []
+
+
+def _loops(config: StartsConfig) -> ClosedLoops:
+    """Above the table of the workplace."""
+    workplace = Workplace()
+    world = World(workplace.scene)
+    world.reset(workplace.home_joints().numpy(), {})
+    middle = workplace.hover().position
+    reach = torch.tensor([0.09, 0.07, 0.03], dtype=torch.float64)
+    return ClosedLoops.draw(
+        workplace.scene.camera,
+        world.hand_marker_offset(),
+        torch.stack([middle - reach, middle + reach]),
+        workplace.hover_joints(),
+        config,
+    )
+
+
+def _cost(loops: ClosedLoops, default: ControllerConfig) -> Callable[[dict[str, float]], float]:
+    """Mean time [s]; a start that does not get there counts twice the time it was given."""
+    estimator, never = KalmanEstimator(guessed_network()), 2 * loops.config.duration
+
+    def cost(gains: dict[str, float]) -> float:
+        times = loops.times(estimator, replace(default, **gains))
+        return float(times.nan_to_num(posinf=never).mean())
+
+    return cost
+
+
+def _figures(
+    args: Args, default: ControllerConfig, gains: dict[str, float]
+) -> dict[str, float]:
+    """The gains, and times with and without them on closed loops that were not searched."""
+    loops = _loops(replace(args.starts, seed=args.held_out_seed))
+    estimator = KalmanEstimator(guessed_network())
+    figures = dict(gains)
+    for name, config in (("default", default), ("tuned", replace(default, **gains))):
+        times = loops.times(estimator, config)
+        figures |= {f"{name}_{key}": value for key, value in summary(times).items()}
+        reached = times[times.isfinite()]
+        figures[f"{name}_mean"] = float(reached.mean()) if len(reached) else math.inf
+    return figures
