@@ -58,13 +58,14 @@ LAYERS = (
     | {
         "experiments": {*CORE, *EDGES, *WORK},
         "lerobot": {*CORE, *EDGES, *WORK},
-        "cli": {"output"},
+        "cli": {*CORE, *EDGES, *WORK, "experiments", "lerobot"},
     }
 )
 
 LIBRARIES: dict[str, set[str]] = {
     **{package: {"torch", "jaxtyping", "numpy", "safetensors"} for package in CORE},
-    "cli": set(),
+    # Of its modules for commands, each imported when its command runs.
+    "cli": {"torch", "jaxtyping", "numpy", "tyro", "rich"},
     "output": set(),
     "demos": {"torch", "jaxtyping", "numpy", "pyarrow"},
     "vision": {"jaxtyping", "numpy"},
@@ -90,7 +91,7 @@ LIBRARIES: dict[str, set[str]] = {
 
 LAZY_LIBRARIES: dict[str, set[str]] = {
     "kinematics": {"pytorch_kinematics", "frankik"},
-    "cli": {"tyro", "rich"},
+    "cli": {"ray"},
     "demos": {"av", "scipy"},
     "vision": {"cv2"},
     "viz": {"rich"},
