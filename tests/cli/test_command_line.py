@@ -3,6 +3,7 @@ options checked before any work, errors of one line.
 """
 
 import dataclasses
+import json
 import subprocess
 import sys
 import typing
@@ -257,7 +258,7 @@ def test_our_own_mistakes_are_not_taken_for_the_users(monkeypatch):
 def test_measured_values_are_written_whole_or_not_at_all(tmp_path):
     path = tmp_path / "new" / "values.json"
     cli.write_json(path, {"a": 1, "b": np.float32(0.5), "c": float("nan"), "d": np.int64(3)})
-    assert path.read_text().split() == [
+    assert json.loads(path.read_text()) == {"a": 1, "b": 0.5, "c": None, "d": 3}
         "{",
         '"a":',
         "1,",
