@@ -14,11 +14,7 @@ help:
 	@echo "make format  format the code        make check  lint, type-check, build the site"
 
 demo: .venv/.installed
-	$(PYTHON) datasets/record_placing.py --out $(OUT)/placing_demos --overwrite
-	$(PYTHON) datasets/record_servoing.py --out $(OUT)/aiming_demos --overwrite
-	$(PYTHON) training/fit_dmp.py --dataset $(OUT)/placing_demos --out $(OUT)/placing --overwrite
-	$(PYTHON) training/fit_image_jacobian.py --dataset $(OUT)/aiming_demos --out $(OUT)/aiming --overwrite
-	$(PYTHON) control/run_collaboration.py --placing $(OUT)/placing --aiming $(OUT)/aiming --shelf $(SHELF) --out $(OUT)/run --overwrite
+	$(PYTHON) -m hrc_learn.cli demo --out $(OUT) --shelf $(SHELF)
 
 test: .venv/.installed
 	$(PYTHON) -m pytest -n auto --dist loadfile

@@ -29,11 +29,11 @@ class Args:
     """Which runs to show."""
 
     placing: Path | None = None
-    """Folder of control/run_placing.py; what the page shows of it stays as it is without."""
+    """Folder of `hrc run placing`; what the page shows of it stays as it is without."""
     grasping: Path | None = None
-    """Folder of control/run_grasping.py, likewise."""
+    """Folder of `hrc run grasping`, likewise."""
     collaboration: Path | None = None
-    """Folder of control/run_collaboration.py, likewise."""
+    """Folder of `hrc run collaboration`, likewise."""
     page: Path = PAGE
     """The page; its pictures are in images/ beside it."""
 

@@ -66,14 +66,15 @@ LAYERS = (
     | {
         "experiments": {*CORE, *EDGES, *WORK},
         "lerobot": {*CORE, *EDGES, *WORK},
+        "cli": {*CORE, *EDGES, *WORK, "experiments", "lerobot"},
     }
 )
-LAYERS |= {"cli": {*LAYERS}}
 
 LIBRARIES: dict[str, set[str]] = {
     **{package: {"torch", "jaxtyping", "numpy", "safetensors"} for package in CORE},
+    # Of its modules for commands, each imported when its command runs.
+    "cli": {"torch", "jaxtyping", "numpy", "tyro", "rich"},
     "store": set(),
-    "cli": set(),
     "demos": {"torch", "jaxtyping", "numpy", "pyarrow"},
     "vision": {"jaxtyping", "numpy"},
     "viz": {
@@ -98,7 +99,7 @@ LIBRARIES: dict[str, set[str]] = {
 
 LAZY_LIBRARIES: dict[str, set[str]] = {
     "kinematics": {"pytorch_kinematics", "frankik"},
-    "cli": {"tyro", "rich"},
+    "cli": {"ray"},
     "demos": {"av", "scipy"},
     "vision": {"cv2"},
     "viz": {"rich"},
@@ -467,4 +468,5 @@ def test_the_wheel_holds_the_package_alone(tmp_path):
     assert roots == {"hrc_learn", information}
     packed = {name for name in names if name.startswith("hrc_learn/")}
     data = (ROOT / "hrc_learn").rglob("*.css")
-    assert packed == {str(path.relative_to(ROOT)) for path in (*SOURCES, *data)}
+    typed = ROOT / "hrc_learn/py.typed"
+    assert packed == {str(path.relative_to(ROOT)) for path in (*SOURCES, *data, typed)}

@@ -5,7 +5,7 @@ import shutil
 import textwrap
 import types
 import typing
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, Literal
 
@@ -31,7 +31,7 @@ def short_help(program: str, arguments: type) -> str:
     return "\n".join(lines)
 
 
-def table(rows: typing.Iterable[tuple[str, str]], width: int | None = None) -> list[str]:
+def table(rows: Iterable[tuple[str, str]], width: int | None = None) -> list[str]:
     """Names, and beside each what it is."""
     width = width or min(shutil.get_terminal_size().columns, _WIDEST)
     return [line for name, text in rows for line in _row(name, text, width)]

@@ -127,7 +127,7 @@ def _complaint(box: str) -> str:
     if missing := re.findall(r"^ {4}(\S+)", said, re.MULTILINE):
         return f"missing: {', '.join(missing)}"
     # Why each of several types did not fit is for programmers.
-    return " ".join(said.split(" Got errors")[0].split()).rstrip(".")
+    return " ".join(said.split()).split(" Got errors")[0].rstrip(".")
 
 
 def _warning_line(message: Warning | str, *_place: object, **_line: object) -> str:

@@ -105,7 +105,7 @@ class Motions:
             raise ValueError(
                 f"{self.source}: the demonstrations hold no {' and no '.join(missing)}, which "
                 f"a primitive of kind {kind!r} is learned from. Look with "
-                f"datasets/check_dataset.py."
+                f"hrc check."
             )
 
     def adapted(self, kind: str, primitive: Primitive) -> "Reproduction":
@@ -188,7 +188,7 @@ def kinds_wanted(motions: Motions, wanted: Sequence[str]) -> tuple[str, ...]:
         raise ValueError(
             f"{motions.source}: the demonstrations hold neither joint positions nor "
             "end-effector poses, so there is no motion to learn. Look with "
-            "datasets/check_dataset.py."
+            "hrc check."
         )
     whole = [kind for kind in ("joint", "pose") if kind in available]
     parts = [kind for kind in ("position", "orientation") if kind in available]

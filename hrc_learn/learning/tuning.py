@@ -133,7 +133,7 @@ def with_gains(config: ControllerConfig, path: Path | None) -> ControllerConfig:
 
     Args:
         config: The settings.
-        path: Of training/tune_controller.py; None: as they are.
+        path: Of hrc tune; None: as they are.
 
     Raises:
         FileNotFoundError: There is no such file.

@@ -71,7 +71,7 @@ class PlacingSkill:
 
     @classmethod
     def load(cls, folder: Path) -> "PlacingSkill":
-        """Read what `training/fit_dmp.py` wrote.
+        """Read what `hrc fit` wrote.
 
         Raises:
             FileNotFoundError: If the folder holds no primitives.

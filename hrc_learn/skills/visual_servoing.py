@@ -339,7 +339,7 @@ class AimingSkill:
 
     @classmethod
     def load(cls, folder: Path) -> "AimingSkill":
-        """Read what `training/fit_image_jacobian.py` wrote.
+        """Read what `hrc fit image-jacobian` wrote.
 
         Raises:
             FileNotFoundError: If there is no such folder or file.

@@ -1,34 +1,41 @@
-"""What every program promises on the command line: help that reads well, one-line errors."""
+"""Programs of the repository: help of benchmarks, and that others are commands of `hrc`."""
 
 import ast
 import dataclasses
 import importlib.util
-import inspect
 import re
 import sys
-import textwrap
-import typing
-from collections.abc import Iterator
 from functools import cache
-from itertools import pairwise
 from pathlib import Path
 
 import pytest
-import tyro
+
+from hrc_learn.cli._commands import COMMANDS
+from hrc_learn.cli._options import docstrings
 
 ROOT = Path(__file__).parents[2]
+BENCHMARKS = sorted(
+    path for path in (ROOT / "benchmarks").glob("*.py") if "cli.run(" in path.read_text()
+)
 PROGRAMS = sorted(
     path
-    for folder in ("datasets", "training", "control", "benchmarks")
-    for path in (ROOT / folder).glob("*.py")
-    if "cli.run(" in path.read_text()
+    for folder in ("datasets", "training", "control")
+    for path in (ROOT / folder).glob("*")
+    if path.suffix == ".py"
 )
-every_program = pytest.mark.parametrize("program", PROGRAMS, ids=lambda path: path.stem)
+every_benchmark = pytest.mark.parametrize("program", BENCHMARKS, ids=lambda path: path.stem)
+
+
+def command_of(program: Path) -> str:
+    """What a program passes to `cli.main`."""
+    words = re.search(r"cli\.main\((.*)\)", program.read_text())
+    assert words is not None
+    return " ".join(ast.literal_eval(f"({words[1]},)"))
 
 
 @cache
 def arguments_of(program: Path) -> type:
-    """The dataclass that is a program's command line."""
+    """The dataclass that is a benchmark's command line."""
     name = f"{program.parent.name}_{program.stem}"
     spec = importlib.util.spec_from_file_location(name, program)
     assert spec is not None
@@ -43,101 +50,60 @@ def arguments_of(program: Path) -> type:
     return module.Args
 
 
-def options(config: type, prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Each option as it is typed and its docstring, nested configurations included.
-
-    Of a positional argument, which has no name on the command line, the docstring alone.
-    """
-    texts = docstrings(config)
-    hints = typing.get_type_hints(config, include_extras=True)
-    for field in dataclasses.fields(config):
-        hint, name = hints[field.name], f"{prefix}{field.name.replace('_', '-')}"
-        markers = getattr(hint, "__metadata__", ())
-        kind = getattr(hint, "__origin__", hint) if markers else hint
-        if isinstance(kind, type) and dataclasses.is_dataclass(kind):
-            unnamed = any(getattr(marker, "name", None) == "" for marker in markers)
-            yield from options(kind, prefix if unnamed else f"{name}.")
-        else:
-            positional = tyro.conf.Positional in markers
-            yield "" if positional else f"--{name}", texts.get(field.name, "")
-
-
-def docstrings(config: type) -> dict[str, str]:
-    """Strings that follow the fields of a dataclass and of what it inherits from."""
-    texts: dict[str, str] = {}
-    for cls in reversed(config.__mro__):
-        if not dataclasses.is_dataclass(cls):
-            continue
-        (definition,) = ast.parse(textwrap.dedent(inspect.getsource(cls))).body
-        assert isinstance(definition, ast.ClassDef)
-        for field, after in pairwise(definition.body):
-            if isinstance(field, ast.AnnAssign) and isinstance(after, ast.Expr):
-                texts[ast.unparse(field.target)] = ast.literal_eval(after.value)
-    return texts
-
-
 def words(text: str) -> str:
     """Text without the frames and line breaks of a terminal."""
     return " ".join(re.sub(r"[│╭╮╰╯─]", " ", text).split())
 
 
-@every_program
+@pytest.mark.parametrize("program", PROGRAMS, ids=lambda path: path.stem)
+def test_a_program_is_a_command(program, run_here):
+    """The same help, to its name, from a few lines."""
+    command = COMMANDS[command_of(program)]
+    status, output, error = run_here(program, "--help")
+    assert (status, error) == (0, "")
+    assert output.startswith(f"usage: hrc {command_of(program)}")
+    summary = ast.get_docstring(ast.parse(program.read_text()))
+    about = command.arguments_type().__doc__
+    assert summary is not None
+    assert about is not None
+    assert f"`hrc {command_of(program)}`" in summary
+    assert len(program.read_text().splitlines()) < 15
+
+
+def test_every_command_but_those_of_the_package_alone_is_a_program():
+    assert COMMANDS.keys() - {command_of(program) for program in PROGRAMS} == {
+        "demo",
+        "recover",
+    }
+
+
+@every_benchmark
 def test_help_explains_every_option(program, run_here):
     status, output, error = run_here(program, "--help")
     assert status == 0
     assert error == ""
-    shown = words(output)
+    shown, arguments = words(output), arguments_of(program)
     summary = ast.get_docstring(ast.parse(program.read_text()))
     assert summary is not None
     assert words(summary.splitlines()[0]) in shown
+    texts = docstrings(arguments)
     unexplained = [
-        option or text
-        for option, text in options(arguments_of(program))
-        if not (text and words(text) in shown and re.search(rf"{option}[ ,]", shown))
+        field.name
+        for field in dataclasses.fields(arguments)
+        if not (text := texts.get(field.name)) or words(text) not in shown
     ]
     assert not unexplained
 
 
-@every_program
-def test_every_program_writes_its_figures_as_json(program):
+@every_benchmark
+def test_every_benchmark_writes_its_figures_as_json(program):
     assert "json" in {field.name for field in dataclasses.fields(arguments_of(program))}
 
 
-@pytest.mark.parametrize(
-    ("program", "arguments", "message"),
-    [
-        ("datasets/check_dataset.py", ["none"], "no dataset at none"),
-        ("datasets/import_arrays.py", ["none.npz", "--out", "new"], "none.npz"),
-        (
-            "datasets/record_placing.py",
-            ["--shelf", "attic", "--out", "new", "--episodes", "1"],
-            "no shelf named 'attic': this cabinet has lower, middle, upper",
-        ),
-        ("training/fit_dmp.py", ["--dataset", "none", "--out", "new"], "none"),
-        ("training/fit_image_jacobian.py", ["--dataset", "none", "--out", "new"], "none"),
-        ("training/evaluate.py", ["none", "none"], "none"),
-        ("training/evaluate_image_jacobian.py", ["none", "none"], "none"),
-        ("training/tune_controller.py", ["--out", "new", "--resume"], "new.search.json"),
-        (
-            "control/run_collaboration.py",
-            ["--placing", "none", "--aiming", "none", "--out", "new"],
-            "none",
-        ),
-        ("benchmarks/bench_dmp.py", ["--compare", "none.json"], "none.json"),
-    ],
-)
-def test_bad_input_is_one_line_and_leaves_nothing(
-    run_here, tmp_path, program, arguments, message
-):
-    status, _, error = run_here(program, *arguments)
+def test_bad_input_of_a_benchmark_is_one_line(run_here, tmp_path):
+    status, _, error = run_here("benchmarks/bench_dmp.py", "--compare", "none.json")
     assert status == 2
-    assert message in error
+    assert "none.json" in error
     assert error.startswith("error: ")
     assert error.count("\n") == 1
     assert not list(tmp_path.iterdir())
-
-
-def test_an_unknown_option_is_told_apart_from_the_work_failing(run_here):
-    status, _, error = run_here("training/fit_dmp.py", "--datset", "demos", "--out", "new")
-    assert status == 2
-    assert "--datset" in error

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import done
 from PIL import Image
 
-from hrc_learn import cli
 from hrc_learn.viz.report import Measurement, Picture, Report, Section, write_report
 
 ROOT = Path(__file__).parents[2]
@@ -47,8 +47,7 @@ def runs(tmp_path):
 
 def test_one_page_is_made_from_several_runs(runs, tmp_path):
     out, figures = tmp_path / "new" / "page.html", tmp_path / "figures.json"
-    program = load(ROOT / "control" / "report.py")
-    program.main(program.Args(runs=tuple(runs), out=out, title="Both", json=figures))
+    done("report", *runs, "--out", out, "--title", "Both", "--json", figures)
     html = out.read_text(encoding="utf-8")
     for part in ("<h1>Both</h1>", "Run number 1", "Run number 2", "Side by side"):
         assert part in html
@@ -62,22 +61,14 @@ def test_one_page_is_made_from_several_runs(runs, tmp_path):
 
 
 def test_a_single_run_has_its_own_page(runs, tmp_path):
-    program = load(ROOT / "control" / "report.py")
-    program.main(program.Args(runs=(runs[0],), out=tmp_path / "page.html"))
+    done("report", runs[0], "--out", tmp_path / "page.html")
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert page == (runs[0] / "report.html").read_text(encoding="utf-8")
 
 
-def test_what_is_no_run_is_bad_input(runs, tmp_path, monkeypatch, capsys):
+def test_what_is_no_run_is_bad_input(runs, tmp_path):
     out = tmp_path / "page.html"
-    program = load(ROOT / "control" / "report.py")
-    monkeypatch.setattr(
-        sys, "argv", ["report.py", *map(str, [runs[0], tmp_path, "--out", out])]
-    )
-    with pytest.raises(SystemExit) as ended:
-        cli.run(program.main, program.Args)
-    assert ended.value.code == 2
-    (line,) = capsys.readouterr().err.splitlines()
+    (line,) = done("report", runs[0], tmp_path, "--out", out, status=2).error.splitlines()
     assert f"{tmp_path} holds no report.json" in line
     assert not out.exists()
 

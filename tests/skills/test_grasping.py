@@ -174,7 +174,7 @@ def test_the_program_grasps_and_compares(skill, tmp_path):
     skill.save(tmp_path / "aiming")
     command = [sys.executable, "control/run_grasping.py", "--camera", "synthetic"]
     command += ["--aiming", tmp_path / "aiming", "--out", tmp_path / "run"]
-    command += ["--camera-roll", "100", "--variants", "learned", "fixed", "--seeds", "1"]
+    command += ["--camera-roll", "100", "--variants", "learned", "fixed", "--trials", "1"]
     done = subprocess.run(
         [str(c) for c in command], capture_output=True, text=True, check=False
     )

@@ -13,7 +13,7 @@ from hrc_learn.cli._options import resolved
 from hrc_learn.cli._values import command_line, refuse_existing, write_json
 from hrc_learn.cli.arguments.run import RunGrasping as Args
 from hrc_learn.cli.commands._common_figures import Figure, common_figures, median, p95, total
-from hrc_learn.cli.commands.demo import model
+from hrc_learn.cli.commands._demo_models import model
 from hrc_learn.experiments.grasping.experiment import (
     VARIANTS,
     GraspingExperiment,

@@ -11,12 +11,14 @@ from hrc_learn.cli.arguments.learn import Smooth as Args
 
 
 def run(args: Args) -> None:
+
+    if not args.checkpoint.is_dir():
+        raise FileNotFoundError(f"there is no folder {args.checkpoint}")
+    # LeRobot takes seconds to import.
     from hrc_learn.lerobot.processor import add_smoothing
     from hrc_learn.lerobot.processor.action_limits import demonstrated_limits
     from hrc_learn.lerobot.processor.checkpoint_steps import remove_smoothing
 
-    if not args.checkpoint.is_dir():
-        raise FileNotFoundError(f"there is no folder {args.checkpoint}")
     if args.remove:
         remove_smoothing(args.checkpoint)
         print(f"{args.checkpoint} is as it was trained")

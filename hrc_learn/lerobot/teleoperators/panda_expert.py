@@ -10,7 +10,7 @@ from hrc_learn.lerobot.teleoperators.panda_teleoperator import PandaTeleoperator
 class PandaExpert(PandaTeleoperator):
     """Shows a `mujoco_panda` its scenario, from each of its beginnings, then keeps still.
 
-    The same demonstrations as `datasets/record_placing.py` records, with the release of the
+    The same demonstrations as `hrc record placing` records, with the release of the
     object, and grasping.
     """
 

@@ -1,46 +1,18 @@
-"""The dataset programs as a user runs them: results, messages, exit status."""
+"""The commands for datasets as a user runs them: results, messages, exit status."""
 
-import importlib.util
 import json
 import subprocess
 import sys
-import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import hrc
 from lerobot_folders import joint_path, write_folder
 
-from hrc_learn import cli
 from hrc_learn.demos import DatasetWriter, load_demos
 
-PROGRAMS = Path(__file__).parents[2] / "datasets"
-
-
-def run(monkeypatch, capsys, program, *arguments):
-    """Run a program in this process; its exit status, stdout and stderr."""
-    spec = importlib.util.spec_from_file_location(program, PROGRAMS / f"{program}.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, program, module)
-    spec.loader.exec_module(module)
-    monkeypatch.setattr(sys, "argv", [f"{program}.py", *map(str, arguments)])
-    with pytest.raises(SystemExit) as ended:
-        cli.run(module.main, module.Args)
-    captured = capsys.readouterr()
-    return ended.value.code, captured.out, captured.err
-
-
-@pytest.fixture(autouse=True)
-def _warnings_as_before(monkeypatch):
-    """Programs change how warnings look; that must not outlive the test."""
-    monkeypatch.setattr(warnings, "formatwarning", warnings.formatwarning)
-
-
-@pytest.fixture
-def program(monkeypatch, capsys):
-    return lambda *arguments: run(monkeypatch, capsys, *arguments)
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture
@@ -50,10 +22,10 @@ def recording(tmp_path):
     return path
 
 
-def test_arrays_are_imported_checked_and_read(program, recording, tmp_path):
+def test_arrays_are_imported_checked_and_read(recording, tmp_path):
     out = tmp_path / "set"
-    status, text, _ = program(
-        *("import_arrays", recording, recording, "--out", out, "--joints", "q", "--time", "t"),
+    status, text, _ = hrc(
+        *("import", recording, recording, "--out", out, "--joints", "q", "--time", "t"),
         *("--json", tmp_path / "values.json", "--robot-type", "iiwa14"),
     )
     assert status == 0
@@ -65,23 +37,23 @@ def test_arrays_are_imported_checked_and_read(program, recording, tmp_path):
     assert demos[1].start_time == 3.0
     np.testing.assert_allclose(demos[1].time, 0.003 * np.arange(200), atol=1e-9)
     np.testing.assert_allclose(demos[1].joint_position, joint_path(200, 7), atol=1e-6)
-    status, text, _ = program("check_dataset", out, "--json", tmp_path / "check.json")
+    status, text, _ = hrc("check", out, "--json", tmp_path / "check.json")
     assert status == 0
     checked = json.loads((tmp_path / "check.json").read_text())
     assert (checked["errors"], checked["episodes"], checked["frames"]) == (0, 2, 400)
     assert checked["warnings"] >= 1  # the same episode twice
     assert "same motion as episode 0" in text
-    assert program("check_dataset", out, "--strict")[0] == 1
+    assert hrc("check", out, "--strict")[0] == 1
 
 
-def test_poses_are_imported_in_centimetres(program, tmp_path):
+def test_poses_are_imported_in_centimetres(tmp_path):
     angle = np.linspace(0, 1, 50)
     pose = np.column_stack(
         [100 * joint_path(50), np.cos(angle), np.sin(angle), 0 * angle, 0 * angle]
     )
     np.save(tmp_path / "poses.npy", np.stack([pose, pose + 1e-9]))
-    status, *_ = program(
-        *("import_arrays", tmp_path / "poses.npy", "--out", tmp_path / "set"),
+    status, *_ = hrc(
+        *("import", tmp_path / "poses.npy", "--out", tmp_path / "set"),
         *("--columns", "px,py,pz,qw,qx,qy,qz", "--position-unit", "cm", "--duration", "5"),
     )
     assert status == 0
@@ -100,12 +72,8 @@ def test_poses_are_imported_in_centimetres(program, tmp_path):
         (["--position", "q", "--time", "t"], "position has shape (200, 7)"),
     ],
 )
-def test_bad_input_is_one_line_and_leaves_nothing(
-    program, recording, tmp_path, arguments, message
-):
-    status, _, error = program(
-        "import_arrays", recording, "--out", tmp_path / "set", *arguments
-    )
+def test_bad_input_is_one_line_and_leaves_nothing(recording, tmp_path, arguments, message):
+    status, _, error = hrc("import", recording, "--out", tmp_path / "set", *arguments)
     if message is None:  # the array of stamps is found by its name
         assert status == 0
         return
@@ -116,46 +84,46 @@ def test_bad_input_is_one_line_and_leaves_nothing(
     assert sorted(p.name for p in tmp_path.iterdir()) == ["pour.npz"]
 
 
-def test_an_existing_dataset_is_not_touched(program, recording, tmp_path):
+def test_an_existing_dataset_is_not_touched(recording, tmp_path):
     (tmp_path / "set").mkdir()
-    arguments = ("import_arrays", recording, "--out", tmp_path / "set", "--joints", "q")
-    status, _, error = program(*arguments)
+    arguments = ("import", recording, "--out", tmp_path / "set", "--joints", "q")
+    status, _, error = hrc(*arguments)
     assert status == 2
     assert "already exists" in error
 
 
-def test_recordings_of_different_robots_do_not_mix(program, recording, tmp_path):
+def test_recordings_of_different_robots_do_not_mix(recording, tmp_path):
     np.savez(tmp_path / "other.npz", t=0.003 * np.arange(200), q=joint_path(200, 6))
-    status, _, error = program(
-        *("import_arrays", recording, tmp_path / "other.npz"),
+    status, _, error = hrc(
+        *("import", recording, tmp_path / "other.npz"),
         *("--out", tmp_path / "set", "--joints", "q", "--time", "t"),
     )
     assert status == 2
     assert "do not fit into one dataset" in error
 
 
-def test_check_names_the_place_of_an_error(program, tmp_path):
+def test_check_names_the_place_of_an_error(tmp_path):
     q = joint_path()
     q[7, 1] = np.nan
     root = write_folder(
         tmp_path / "set", [{"observation.state": q}], {"observation.state": ["a", "b", "c"]}
     )
-    status, text, _ = program("check_dataset", root)
+    status, text, _ = hrc("check", root)
     assert status == 1
     place = "data/chunk-000/file-000.parquet, episode 0, frame 7, observation.state: b is nan"
     assert place in text
 
 
-def test_check_of_nothing(program, tmp_path):
-    status, _, error = program("check_dataset", tmp_path / "none")
+def test_check_of_nothing(tmp_path):
+    status, _, error = hrc("check", tmp_path / "none")
     assert (status, error.count("\n")) == (2, 1)
     assert "there is no dataset" in error
 
 
-def test_findings_are_written_for_other_programs(program, recording, tmp_path):
-    program("import_arrays", recording, "--out", tmp_path / "set", "--joints", "q")
+def test_findings_are_written_for_other_programs(recording, tmp_path):
+    hrc("import", recording, "--out", tmp_path / "set", "--joints", "q")
     (tmp_path / "set/meta/stats.json").unlink()
-    program("check_dataset", tmp_path / "set", "--findings", tmp_path / "findings.json")
+    hrc("check", tmp_path / "set", "--findings", tmp_path / "findings.json")
     (finding,) = json.loads((tmp_path / "findings.json").read_text())
     assert finding["kind"] == "warning"
     assert "no statistics" in finding["message"]
@@ -163,24 +131,24 @@ def test_findings_are_written_for_other_programs(program, recording, tmp_path):
     assert finding["episode"] is None
 
 
-def test_a_broken_dataset_is_repaired_checked_and_read(program, tmp_path):
+def test_a_broken_dataset_is_repaired_checked_and_read(tmp_path):
     q = joint_path(100)
     stuck = np.concatenate([np.repeat(q[:1], 80, axis=0), q])
     stuck[130, 1] = np.nan
     names = {"observation.state": ["a", "b", "c"]}
     root = write_folder(tmp_path / "old", [{"observation.state": stuck}], names, version="v2.0")
-    assert program("check_dataset", root)[0] == 1
-    status, _, error = program("repair_dataset", root, tmp_path / "new")
+    assert hrc("check", root)[0] == 1
+    status, _, error = hrc("repair", root, tmp_path / "new")
     assert (status, error.count("\n")) == (2, 1)
     assert "drop_bad_frames" in error
-    status, text, _ = program(
-        *("repair_dataset", root, tmp_path / "new", "--drop-bad-frames", "--fps", 40),
+    status, text, _ = hrc(
+        *("repair", root, tmp_path / "new", "--drop-bad-frames", "--fps", 40),
         *("--units", "joint_position", "rad", "--json", tmp_path / "values.json"),
     )
     assert status == 0
     assert "trimmed" in text
     assert "resampled" in text
-    assert program("check_dataset", tmp_path / "new", "--strict")[0] == 0
+    assert hrc("check", tmp_path / "new", "--strict")[0] == 0
     values = json.loads((tmp_path / "values.json").read_text())
     assert values["episodes_changed"] == values["episodes"] == 1
     (demo,) = load_demos(tmp_path / "new")
@@ -188,7 +156,7 @@ def test_a_broken_dataset_is_repaired_checked_and_read(program, tmp_path):
     assert demo.fps == 40
 
 
-def test_markers_are_found_in_the_videos_of_a_dataset(program, tmp_path):
+def test_markers_are_found_in_the_videos_of_a_dataset(tmp_path):
     cv2 = pytest.importorskip("cv2")
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
     marker = cv2.aruco.generateImageMarker(dictionary, 7, 60)
@@ -200,8 +168,8 @@ def test_markers_are_found_in_the_videos_of_a_dataset(program, tmp_path):
             image[40:100, 50 + 4 * k : 110 + 4 * k] = marker[..., None]
             writer.add_frame(joint_position=[0.01 * k], images={"front": image})
         writer.save_episode()
-    arguments = ("extract_features", root, "--marker", 7, "--json", tmp_path / "values.json")
-    status, text, _ = program(*arguments)
+    arguments = ("extract", root, "--marker", 7, "--json", tmp_path / "values.json")
+    status, text, _ = hrc(*arguments)
     assert status == 0
     assert "front.marker_7: 1 episodes looked at" in text
     assert json.loads((tmp_path / "values.json").read_text())["seen_share"] == 1
@@ -209,22 +177,12 @@ def test_markers_are_found_in_the_videos_of_a_dataset(program, tmp_path):
     # A square of pixels 50 to 109 has its middle at 79.5.
     truth = np.stack([79.5 + 4 * np.arange(10), np.full(10, 69.5)], axis=1)
     np.testing.assert_allclose(demo.feature, truth, atol=0.5)
-    assert "1 known before" in program(*arguments)[1]
-    assert program("extract_features", root, "--marker", 70)[0] == 2
-
-
-@pytest.mark.parametrize("name", ["import_arrays", "check_dataset", "repair_dataset"])
-def test_help_tells_what_the_program_is_for(name):
-    done = subprocess.run(
-        [sys.executable, PROGRAMS / f"{name}.py", "--help"], capture_output=True, text=True
-    )
-    assert done.returncode == 0
-    assert "LeRobot dataset" in done.stdout
-    assert "--json" in done.stdout
+    assert "1 known before" in hrc(*arguments)[1]
+    assert hrc("extract", root, "--marker", 70)[0] == 2
 
 
 def test_the_benchmark_writes_its_figures(tmp_path):
-    program = PROGRAMS.parent / "benchmarks/bench_demos.py"
+    program = ROOT / "benchmarks/bench_demos.py"
     sizes = ["--episodes", "2", "--frames", "50", "--repeats", "1"]
     subprocess.run(
         [sys.executable, program, *sizes, "--json", tmp_path / "figures.json"], check=True
@@ -235,46 +193,4 @@ def test_the_benchmark_writes_its_figures(tmp_path):
 
 
 def test_no_package_shadows_hugging_faces_datasets():
-    assert not list(PROGRAMS.glob("__init__.py"))
-
-
-def test_measured_values_are_written_whole_or_not_at_all(tmp_path):
-    path = tmp_path / "new" / "values.json"
-    cli.write_json(path, {"a": 1, "b": np.float32(0.5), "c": float("nan"), "d": np.int64(3)})
-    assert json.loads(path.read_text()) == {"a": 1, "b": 0.5, "c": None, "d": 3}
-    with pytest.raises(TypeError):
-        cli.write_json(path, {"a": object()})  # pyright: ignore[reportArgumentType]
-    assert json.loads(path.read_text())["a"] == 1
-    assert [p.name for p in path.parent.iterdir()] == ["values.json"]
-
-
-@pytest.mark.parametrize(
-    ("error", "status", "line"),
-    [
-        (ValueError("two\nlines"), 2, "error: two lines\n"),
-        (FileNotFoundError(2, "No such file or directory", "/x"), 2, "error: /x: No such file"),
-        (KeyboardInterrupt(), 1, "interrupted\n"),
-    ],
-)
-def test_the_users_mistakes_end_in_one_line(monkeypatch, capsys, error, status, line):
-    from dataclasses import make_dataclass
-
-    def main(_):
-        raise error
-
-    monkeypatch.setattr(sys, "argv", ["program"])
-    with pytest.raises(SystemExit) as ended:
-        cli.run(main, make_dataclass("Args", []))
-    assert ended.value.code == status
-    assert capsys.readouterr().err.startswith(line)
-
-
-def test_our_own_mistakes_are_not_taken_for_the_users(monkeypatch):
-    from dataclasses import make_dataclass
-
-    def main(_):
-        raise KeyError("ours")
-
-    monkeypatch.setattr(sys, "argv", ["program"])
-    with pytest.raises(KeyError):
-        cli.run(main, make_dataclass("Args", []))
+    assert not list((ROOT / "datasets").glob("__init__.py"))

@@ -1,0 +1,87 @@
+"""Each command of the main job once, small."""
+
+import json
+
+import pytest
+from commands import done, hrc
+
+
+@pytest.fixture(scope="module")
+def work(tmp_path_factory):
+    """Demonstrations and models of a small main job."""
+    work = tmp_path_factory.mktemp("job")
+    done("record", "placing", "--out", work / "placing_demos", "--episodes", 1)
+    done(
+        *("record", "servoing", "--out", work / "aiming_demos", "--episodes", 4),
+        *("--lesson.duration", 5, "--json", work / "aiming.json"),
+    )
+    done("fit", "--dataset", work / "placing_demos", "--out", work / "placing")
+    done(
+        *("fit", "image-jacobian", "--dataset", work / "aiming_demos"),
+        *("--out", work / "aiming"),
+    )
+    return work
+
+
+def test_the_job_is_done_and_every_target_met(work):
+    out = work / "run"
+    outcome = done(
+        *("run", "collaboration", "--placing", work / "placing"),
+        *("--aiming", work / "aiming", "--out", out, "--shelf", "lower"),
+        *("--camera", "synthetic", "--seed", 3, "--json", work / "measured.json"),
+        *("--config.interaction", 5, "--occlusion", 0, 3, "--latency", 0.04, "--drop", 0.1),
+    )
+    assert "missed" not in outcome.output
+    measured = json.loads((work / "measured.json").read_text())
+    assert measured["objects_that_stand_on_their_shelf"] == 1
+    assert measured["recovered_from_marker_out_of_sight"] == 1
+    assert measured["collisions_with_the_cabinet"] == 0
+    assert {path.name for path in out.iterdir()} == {
+        "figures",
+        "log.npz",
+        "made_by.json",
+        "measured.json",
+        "report.html",
+        "report.json",
+        "run.rrd",
+    }
+
+
+def test_an_unknown_shelf_and_a_missing_model_are_bad_input(work):
+    models = ("--placing", work / "placing", "--aiming", work / "aiming")
+    for arguments, reason in (
+        ((*models, "--shelf", "attic"), "'lower', 'middle', 'upper'"),
+        ((*models, "--shelves", "lower", "lower"), "a shelf of its own"),
+        (("--placing", work / "nowhere", "--aiming", work / "aiming"), "nowhere"),
+    ):
+        out = work / "refused"
+        outcome = hrc("run", "collaboration", *arguments, "--out", out)
+        assert outcome.status == 2
+        assert reason in outcome.error
+        assert len(outcome.error.strip().splitlines()) == 1
+        assert not out.exists()
+
+
+def test_nothing_is_overwritten_unasked(work):
+    arguments = ("--dataset", work / "placing_demos", "--out", work / "placing")
+    before = (work / "placing" / "made_by.json").read_text()
+    outcome = hrc("fit", *arguments)
+    assert outcome.status == 2
+    assert "exists" in outcome.error
+    assert (work / "placing" / "made_by.json").read_text() == before
+    assert hrc("fit", *arguments, "--overwrite").status == 0
+
+
+def test_a_missing_dataset_and_unknown_joints_are_bad_input(work):
+    out = work / "none"
+    outcome = hrc("fit", "--dataset", work / "absent", "--out", out)
+    assert outcome.status == 2
+    assert "absent" in outcome.error
+    outcome = hrc(
+        *("fit", "--dataset", work / "placing_demos", "--out", out),
+        *("--joint-names", "elbow"),
+    )
+    assert outcome.status == 2
+    assert "elbow" in outcome.error
+    assert "panda_joint1" in outcome.error
+    assert not out.exists()
