@@ -11,7 +11,6 @@ import typing
 import numpy as np
 import pytest
 from commands import hrc
-from hrc_learn.dmp.scaling import SCALINGS
 
 from hrc_learn import cli
 from hrc_learn.cli import _options
@@ -20,6 +19,7 @@ from hrc_learn.cli._help import short_help
 from hrc_learn.cli.arguments import choices
 from hrc_learn.cli.arguments.dataset import Repair
 from hrc_learn.demos.repair import RepairOptions
+from hrc_learn.dmp.forcing_scale import SCALINGS
 from hrc_learn.experiments.controller.sweep import EXPERIMENTS
 from hrc_learn.experiments.grasping.experiment import VARIANTS
 from hrc_learn.learning.channels import KINDS

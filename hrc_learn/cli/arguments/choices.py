@@ -9,7 +9,7 @@ Camera = Literal["auto", "egl", "synthetic"]
 Kind = Literal["joint", "position", "orientation", "pose"]
 """Keys of `hrc_learn.learning.channels.KINDS`."""
 Scaling = Literal["none", "paper", "amplitude", "rotation"]
-"""Keys of `hrc_learn.dmp.scaling.SCALINGS`."""
+"""Keys of `hrc_learn.dmp.forcing_scale.SCALINGS`."""
 Robot = Literal["panda"]
 """Arms that the simulated work cell has."""
 Variant = Literal["learned", "unadapted", "kalman", "composite", "paper", "fixed", "none"]
