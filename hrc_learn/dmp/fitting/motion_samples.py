@@ -44,6 +44,7 @@ class FitReport:
 
 
 MINIMUM_SAMPLES = 3
+"""Start, goal and one on the way: with two, nothing is left to fit."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
