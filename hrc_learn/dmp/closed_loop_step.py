@@ -111,7 +111,7 @@ def advance(
     push: Float[Tensor, "*#batch D"] | None,
     pace: Float[Tensor, "*batch"],
 ) -> DMPState:
-    """Advance by `ds`, all influences as given for the whole step.
+    """Advance by `ds`, all coupling terms as given for the whole step.
 
     Args:
         state: Where the primitive is.

@@ -159,7 +159,7 @@ def _trajectory_operator(
 
 
 def _key(s: Float[Tensor, "T"]) -> bytes:
-    """Stamps as something to look an operator up by."""
+    """Timestamps as something to look an operator up by."""
     return s.cpu().numpy().tobytes()
 
 
