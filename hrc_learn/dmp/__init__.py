@@ -13,6 +13,7 @@ from hrc_learn.dmp._system.response import response_of as response_of
 from hrc_learn.dmp._system.spring import SpringDamper as SpringDamper
 from hrc_learn.dmp.closed_loop_step import DMPState as DMPState
 from hrc_learn.dmp.closed_loop_step import continue_motion as continue_motion
+from hrc_learn.dmp.coordinate_adapter import CoordinateAdapter as CoordinateAdapter
 from hrc_learn.dmp.dual_arm_dmp import DualArmDMP as DualArmDMP
 from hrc_learn.dmp.dual_arm_dmp import DualArmState as DualArmState
 from hrc_learn.dmp.exported_dmp import ExportedDMP as ExportedDMP
@@ -28,6 +29,8 @@ from hrc_learn.dmp.limited_dmp import LimitedDMP as LimitedDMP
 from hrc_learn.dmp.limited_dmp import LimitedState as LimitedState
 from hrc_learn.dmp.limited_dmp import LimitedTrajectory as LimitedTrajectory
 from hrc_learn.dmp.limited_dmp import SoftLimits as SoftLimits
+from hrc_learn.dmp.linear_primitive import LinearPrimitive as LinearPrimitive
+from hrc_learn.dmp.motion_primitive import AdaptedPrimitive as AdaptedPrimitive
 from hrc_learn.dmp.motion_primitive import MotionPrimitive as MotionPrimitive
 from hrc_learn.dmp.moving_goal_dmp import MovingGoalDMP as MovingGoalDMP
 from hrc_learn.dmp.moving_goal_dmp import MovingGoalState as MovingGoalState

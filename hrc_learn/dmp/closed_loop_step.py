@@ -56,7 +56,8 @@ torch.export.register_dataclass(DMPState, serialized_type_name="hrc_learn.dmp.DM
 
 
 RESONANCE = 1e-3
-"""How close to a mode of the spring a goal filter may come, relative to the stiffness."""
+"""How close to a mode of the spring a goal filter may come, relative to the stiffness: the
+particular motion grows as its inverse, and digits are lost by as much."""
 
 
 def begin(
@@ -110,7 +111,7 @@ def advance(
     push: Float[Tensor, "*#batch D"] | None,
     pace: Float[Tensor, "*batch"],
 ) -> DMPState:
-    """Advance by `ds`, all influences as given for the whole step.
+    """Advance by `ds`, all coupling terms as given for the whole step.
 
     Args:
         state: Where the primitive is.

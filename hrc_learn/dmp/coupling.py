@@ -113,6 +113,7 @@ def nearest_on_sphere(
     offset = position - centre
     distance = offset.norm(dim=-1, keepdim=True)
     limit = radius[..., None] if isinstance(radius, Tensor) else radius
+    # The centre itself has no direction: it stays where it is, inside.
     inwards = (limit / distance.clamp_min(torch.finfo(distance.dtype).tiny)).clamp_max(1)
     return centre + offset * inwards
 

@@ -365,6 +365,7 @@ def relation(pose: Pose, twist: Tensor) -> tuple[Pose, Float[Tensor, "*batch 2 6
     other, other_twist = _flipped(pose), twist.flip(-2)
     offset = pose.position - other.position
     linear, angular = (twist - other_twist).split(3, dim=-1)
+    # A frame that turns sees what rests move backwards: minus omega x offset.
     linear = linear - torch.linalg.cross(other_twist[..., 3:], offset)
     inverse = quaternion.conjugate(other.orientation)
     seen = [quaternion.rotate(inverse, part) for part in (linear, angular)]

@@ -40,7 +40,7 @@ STATE = tuple(field.name for field in fields(DMPState))
 TRACED_BATCH = 3
 """Any but 0 and 1, which a tracer would take for constants."""
 SAME = 8
-"""Angles of fewer roundings than this are none."""
+"""Angles of fewer roundings than this are none: a product of quaternions takes seven."""
 TRACED_STEP = 1e-3
 """Step [s] that a program is traced with; any other will do as well when it runs."""
 

@@ -22,11 +22,13 @@ from torch import Tensor
 from hrc_learn.dmp.fitting.motion_samples import demo_label
 
 MINIMUM_WAY = 1e-3
-"""Smallest |g - y_0|, as a share of the range covered, that can be divided by."""
+"""Smallest |g - y_0|, as a share of the range covered, that can be divided by: weights would be
+a thousand times the forces they stand for."""
 HALF_TURN = 1e-3
 """How close to half a turn [rad] the way may turn before it is taken for one."""
 NO_WAY = 1e-24
-"""Square of the share of the demonstrated way below which a way has no direction."""
+"""Square of the share of the demonstrated way below which a way has no direction: 1e-12 of it,
+where start and goal agree to rounding."""
 
 
 @dataclass(frozen=True, eq=False)

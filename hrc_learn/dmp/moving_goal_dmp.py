@@ -113,6 +113,7 @@ class MovingGoalCoordinates(CoordinateAdapter[Vectors, MovingTrajectory, MovingG
         still = motion.roll(ColumnEnds(start, goal, rate), duration, end).velocity[..., 0, :]
         # Per unit of v the start is seen shifted by v, its rate by -v.
         at_end = motion.response.evaluate(torch.ones((), dtype=torch.float64))[1]
+        # Columns -2 and -3 of the response are the start and its rate; the goal's own is one.
         gain = 1 + at_end[-2] - at_end[-3]
         v = (given(end_velocity, still) - still) / gain.to(still)
         return ColumnEnds(start + v * end, goal, rate - v), v

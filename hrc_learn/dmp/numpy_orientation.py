@@ -9,7 +9,8 @@ Quaternion = Float64[np.ndarray, "4"]
 SMALL = 1e-3
 """Angles [rad] below which the next term of a series is lost in rounding."""
 SINGULAR = 1e-3
-"""Share of an angular velocity that still counts as rate of the error."""
+"""Share of an angular velocity that still counts as rate of the error: below it, one whole turn
+away, the inverse would blow the rest up a thousand times."""
 NO_AXIS = 1e-9
 """Rotation vectors shorter than this [rad] have no direction of their own."""
 
@@ -70,6 +71,7 @@ def velocity_map(error: Vector) -> Float64[np.ndarray, "3 3"]:
     """
     square = float(error @ error)
     angle = square**0.5
+    # Two terms of each series: the next is below 1e-13 at this angle.
     if angle < 20 * SMALL:
         first = 0.5 - square / 24 + square**2 / 720
         second = 1 / 6 - square / 120 + square**2 / 5040
@@ -96,6 +98,7 @@ def error_rate(error: Vector, velocity: Vector) -> Vector:
     sinc = np.sin(half) / half if half > SMALL else 1.0
     if abs(sinc) < SINGULAR:
         return -(error @ velocity) / square * error
+    # The closed form cancels below: two terms of its series are exact to 1e-11 there.
     near = half < 10 * SMALL
     share = 1 / 12 + square / 720 if near else (1 - np.cos(half) / sinc) / square
     cross = skew(error)

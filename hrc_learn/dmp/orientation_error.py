@@ -142,6 +142,7 @@ def unit_quaternion(value: Quaternions, like: Tensor) -> Float[Tensor, "*batch 4
     q = to_tensor(value, dtype=like.dtype, device=like.device)
     shaped = q.ndim > 0 and q.shape[-1] == 4
     # A tracer cannot look at values.
+    # Not a tolerance on units: it tells a quaternion from zeros and from three Euler angles.
     if not (shaped and (torch.compiler.is_compiling() or (q.norm(dim=-1) > 0.5).all())):
         raise ValueError(f"an orientation must be unit quaternions (w, x, y, z), got {value}")
     return quaternion.normalize(q)
@@ -264,6 +265,7 @@ def centred_error(
     centre = mean_along(q, mask)
     error = to_error(q, centre[..., None, :])
     # Past half a turn the logarithm jumps to the other side, which unwrapping undoes.
+    # A jump is 2 pi long: any threshold well between rounding and that will do.
     far = (quaternion.unwrap_log(error) - error).norm(dim=-1) > 1
     if far.any():
         i, k = far.reshape(-1, far.shape[-1]).nonzero()[0].tolist()

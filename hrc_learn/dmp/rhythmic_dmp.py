@@ -21,6 +21,11 @@ SEARCH = 0.1
 ALIKE = 0.9
 """Share of the highest peak of the autocorrelation that counts as high."""
 GOLDEN = (5**0.5 - 1) / 2
+"""Share of an interval that a golden section keeps: one of its two points serves again."""
+SEARCH_RIDGE = 1e-6
+"""Ridge while a period is searched: stronger than the fit's, for a smooth misfit."""
+PERIOD_ERROR = 1e-6
+"""Relative error at which the search ends: far below what the samples tell of a period."""
 
 
 def fit_rhythmic(
@@ -106,13 +111,13 @@ def find_period(
 
     def misfit(tau: Tensor) -> Tensor:
         s = elapsed / tau
-        weights, rate, start, centre = _solve(response, s, y, 1e-6)
+        weights, rate, start, centre = _solve(response, s, y, SEARCH_RIDGE)
         x = torch.cat([weights, torch.stack([rate, start, centre], dim=-1)], dim=-1)
         return (response.state(s)[:, 0] @ x.mT - y).square().sum()
 
     left, right = high - GOLDEN * (high - low), low + GOLDEN * (high - low)
     at_left, at_right = misfit(left), misfit(right)
-    while high - low > 1e-6 * rough:
+    while high - low > PERIOD_ERROR * rough:
         if at_left < at_right:
             high, right, at_right = right, left, at_left
             left = high - GOLDEN * (high - low)

@@ -86,11 +86,8 @@ def linear_arguments(saved: SavedModel) -> dict[str, Any]:
     Raises:
         ValueError: Names the file and the field that is wrong.
     """
-    # Older files call the timestamps "stamps".
-    names = {
-        n: "stamps" if n == "timestamps" and n not in saved.tensors else n for n in TENSORS
-    }
-    tensors = {name: saved.tensor(stored) for name, stored in names.items()}
+    older = {"timestamps": "stamps"} if "stamps" in saved.tensors else {}
+    tensors = {name: saved.tensor(older.get(name, name)) for name in TENSORS}
     _check_shapes(saved, tensors)
     arguments = {
         **tensors,

@@ -192,9 +192,9 @@ def test_nearest_turn_is_the_same_rotation_closest_to_the_reference():
     ],
 )
 def test_bad_orientations_are_refused(orientation, complaint):
-    with pytest.raises(ValueError, match=complaint):
+    with shapes_unchecked(), pytest.raises(ValueError, match=complaint):
         OrientationDMP.fit(S, orientation)
-    with pytest.raises(ValueError, match=complaint):
+    with shapes_unchecked(), pytest.raises(ValueError, match=complaint):
         PoseDMP.fit(S, torch.zeros(1000, 3), orientation)
 
 

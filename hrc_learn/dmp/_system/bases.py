@@ -110,6 +110,7 @@ class GaussianBasis:
         Neighbours hand over along a logistic function of scale width^2 times the spacing,
         which is analytic within pi times that.
         """
+        # 1.4 width^2 is 0.45 of where the logistic function's nearest pole lies, pi width^2.
         handover = min(0.5, 1.4 * self.width**2) / (self.count - 1)
         return min(handover, self.phase.smooth_interval)
 
@@ -193,6 +194,7 @@ class PeriodicBasis:
         return torch.softmax(self._exponents(s), dim=-1)
 
     def _exponents(self, s: Tensor) -> Tensor:
+        # cos(x) - 1 is -x^2 / 2 near the centre: a Gaussian of variance 1 / h, in radians.
         sharpness = (self.count / (2 * math.pi * self.width)) ** 2
         angle = 2 * math.pi * (s[..., None] - self.centre_times().to(s))
         return sharpness * (torch.cos(angle) - 1)
@@ -205,6 +207,7 @@ def check_count(count: int) -> None:
 
 
 DEGREE = 3
+"""Cubic: the lowest whose forcing has a continuous second derivative."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -342,6 +345,7 @@ class LearnedGaussianBasis:
         slope = -(s - c) / sigma**2
         mean = (share * slope).sum(-1, keepdim=True)
         spread = (share * (slope - mean) ** 2).sum(-1).amax().sqrt().item()
+        # 0.7 / m is 1.4 times the scale 1 / 2 m, as between equally spaced Gaussians.
         return min(0.7 / spread, *self.widths, self.phase.smooth_interval)
 
     def centre_times(self) -> Float[Tensor, "N"]:

@@ -67,6 +67,7 @@ def accumulate(
 
 
 DEGREE = 12
+"""Of the polynomial on a piece, whose error is then rounding: pieces are chosen that short."""
 
 
 def chebyshev_points() -> Float[Tensor, "P"]:

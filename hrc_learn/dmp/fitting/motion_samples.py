@@ -44,6 +44,7 @@ class FitReport:
 
 
 MINIMUM_SAMPLES = 3
+"""Start, goal and one on the way: with two, nothing is left to fit."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -75,7 +76,7 @@ class Samples:
         """Whether all demonstrations are sampled alike, so that one solve serves all."""
         if len(self.s) == 1 or not self.complete:
             return self.complete
-        # 1e-12 of the motion: stamps that differ by the rounding of a start time are alike.
+        # 1e-12 of the motion: timestamps that differ by the rounding of a start time are alike.
         return bool(((self.s - self.s[:1]).abs() < 1e-12).all())
 
     @cached_property
@@ -239,7 +240,7 @@ def _normalised(time: Tensor, mask: Tensor, batch: Sequence[int]) -> tuple[Tenso
     first = time.masked_fill(~mask, torch.inf).amin(-1, keepdim=True)
     last = time.masked_fill(~mask, -torch.inf).amax(-1, keepdim=True)
     elapsed = (time - first).masked_fill(~mask, 0)
-    # Samples that do not count repeat the stamp before them, so that stamps never fall.
+    # Samples that do not count repeat the time before them, so that times never fall.
     latest = torch.cat([torch.full_like(first, -1.0), elapsed.cummax(-1).values], dim=-1)
     stalled = mask & (elapsed <= latest[..., :-1])
     # The first sample that counts has zero elapsed time, as have the filled ones before it.

@@ -26,6 +26,7 @@ SPREAD_OF_MEDIAN = 1.4826
 LEAST_SPREAD = 1e-12
 """Of residuals, as a share of the range covered: below, they are rounding."""
 ROUNDS = 50
+"""At most: trust may swing to and fro between samples and never settle."""
 SETTLED = 1e-3
 """Change of trust at which the iteration ends."""
 
@@ -112,6 +113,7 @@ def _fit(
     """The closest motion and the trust in each sample."""
     trust, spread = torch.ones_like(y), torch.zeros_like(y[:, :1])
     fitted = reach.closest(y, trust)
+    # The smallest number as well: a coordinate that never moves covers no range.
     least = LEAST_SPREAD * (y.amax(-1) - y.amin(-1))[:, None] + torch.finfo(y.dtype).tiny
     for name in dict.fromkeys(("huber", loss)):
         for _ in range(ROUNDS):

@@ -107,6 +107,7 @@ def differentiate(
     """dy/ds of second order on any spacing, ends included (exact for parabolas)."""
     slope = y.diff() / s.diff()
     h = s.diff()
+    # The parabola through three samples: each slope counts by the step on the other side.
     inner = (h[1:] * slope[..., :-1] + h[:-1] * slope[..., 1:]) / (h[1:] + h[:-1])
     first = 2 * slope[..., :1] - inner[..., :1]
     last = 2 * slope[..., -1:] - inner[..., -1:]
@@ -131,6 +132,7 @@ def _trajectory(
     return unknown - start_rate[..., None] * to_weights, start_rate
 
 
+# Sampled alike, demonstrations share one: 16 of them are as many datasets.
 @lru_cache(maxsize=16)
 def _trajectory_operator(
     response: Response,
@@ -157,7 +159,7 @@ def _trajectory_operator(
 
 
 def _key(s: Float[Tensor, "T"]) -> bytes:
-    """Stamps as something to look an operator up by."""
+    """Timestamps as something to look an operator up by."""
     return s.cpu().numpy().tobytes()
 
 
@@ -262,6 +264,7 @@ def fit_motion(
     approach: float | int = 0.0,
     basis: Basis | None = None,
     spring: SpringDamper | None = None,
+    # Far above rounding, far below what a sensor can tell.
     regularization: float = 1e-7,
 ) -> MotionFit:
     """Fit weights and start velocity; arguments as in `FitOptions`.

@@ -149,6 +149,7 @@ def fit_shared(
     )
     totals = _gather(demonstrations, response)
     problem, mean = totals.problem, totals.sums / len(demonstrations)
+    # One more unknown than weights: the start velocity.
     unit = balanced_units(response.basis, problem.design, others=1)
     X = problem.solve(regularization, unit)
     start, goal, amplitude, duration = mean[0], mean[1], mean[2], mean[3, 0]

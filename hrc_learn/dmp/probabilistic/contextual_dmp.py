@@ -43,7 +43,8 @@ class PolynomialFeatures:
 
 
 CONSTANT = 1e-12
-"""Features that vary by less than this share of their size do not vary."""
+"""Features that vary by less than this share of their size do not vary: it is rounding of the
+mean that was taken off."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -142,6 +142,7 @@ class ProbabilisticDMP[P: AdaptedPrimitive]:
         # a unit one beforehand.
         root = root[given] / deviation[:, None]
         residual = (wanted[given] - mean[given]) / deviation
+        # The unit covariance keeps it positive definite, however many via points agree.
         precision = root.mT @ root + torch.eye(root.shape[1]).to(root)
         factor = torch.linalg.cholesky(precision)
         z = torch.cholesky_solve((root.mT @ residual)[:, None], factor)[:, 0]

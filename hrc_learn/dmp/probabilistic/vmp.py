@@ -21,9 +21,11 @@ from hrc_learn.dmp.forcing_scale import Demonstrated
 from hrc_learn.dmp.linear_primitive import ColumnEnds, LinearPrimitive
 
 PER_FUNCTION = 8
-"""Times per basis function at which curve and motion are compared."""
+"""Times per basis function at which curve and motion are compared: what moves within an eighth
+of their distance no basis function can follow."""
 LOCAL = 1e-9
-"""Share of its height that a basis function may reach outside of a window."""
+"""Share of its height that a basis function may reach outside of a window: of Gaussians, it
+leaves out the few that stand nearest to its ends."""
 RIDGE = 1e-7
 """Keeps weights that cause the same motion small, relative to the largest."""
 SAME = 1e-12
@@ -162,6 +164,7 @@ class _Follower:
         return (curve * self.units[:, None]).flatten(-3, -2).mT @ self.Q
 
 
+# A decomposition of 8 N x 3 rows each; a task has few windows.
 @lru_cache(maxsize=16)
 def _follower(response: Response, window: tuple[float, float]) -> _Follower:
     N, (first, last) = response.basis.count, window

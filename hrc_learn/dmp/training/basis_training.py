@@ -39,6 +39,7 @@ SMALLEST_GAP = 0.1
 GAIN_RANGE = 4.0
 """Factor by which alpha may grow or fall."""
 USUAL_WIDTH = 0.6
+"""Where widths begin: that of a `GaussianBasis`."""
 
 
 def learn_basis(

@@ -19,6 +19,7 @@ from hrc_learn.dmp.training.trajectory_losses import Loss
 
 LEARNABLE = ("weights", "goal")
 SAMPLES_PER_FUNCTION = 4
+"""Times at which acceleration is measured: two at least between neighbouring centres."""
 NEGLIGIBLE = 1e-6
 """Directions that accelerate the motion by less than this, relative to the strongest, do not
 count."""
