@@ -1,5 +1,6 @@
 """Files and folders of results: whole or not there at all, whatever happens to their writer."""
 
+import errno
 import json
 import os
 import subprocess
@@ -159,16 +160,22 @@ def test_what_is_not_ours_is_never_overwritten(tmp_path, kind):
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
-@pytest.mark.parametrize("with_manifest", [True, False])
-@pytest.mark.parametrize("name", ["thesis.tex", "layers/own", "own/empty folder/"])
+@pytest.mark.parametrize(
+    ("with_manifest", "name"),
+    [
+        (True, "thesis.tex"),
+        (True, "layers/own"),
+        (True, "own/empty folder/"),
+        (False, "thesis.tex"),
+        (False, "own/empty folder/"),
+    ],
+)
 def test_a_folder_that_holds_files_of_the_users_own_is_not_replaced(
     tmp_path, with_manifest, name
 ):
     out = tmp_path / "out"
     fill(out, "old")
     if not with_manifest:
-        if name == "layers/own":
-            pytest.skip("without a manifest its name makes it ours")
         (out / MANIFEST).unlink()
     precious = out / name
     precious.parent.mkdir(exist_ok=True)
@@ -359,6 +366,23 @@ def test_the_lock_of_a_dead_process_does_not_block(tmp_path, other_writer):
         part.write_text("ours")
     assert contents(tmp_path) == {"file": "ours"}
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_without_locks_a_file_names_its_writer(tmp_path, monkeypatch):
+    """Some network file systems have none; then only who is alive keeps others out."""
+    fcntl = pytest.importorskip("fcntl")
+
+    def refuse(*_):
+        raise OSError(errno.ENOLCK, "no locks")
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    with Claim(tmp_path / "out"), pytest.raises(BusyError):
+        Claim(tmp_path / "out")
+    (tmp_path / ".out.writing").mkdir()
+    (tmp_path / ".out.writing" / "lock").write_text(f"{DEAD} elsewhere\n")
+    with Claim(tmp_path / "out"):
+        pass
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_second_claim_in_the_same_process_is_refused(tmp_path):

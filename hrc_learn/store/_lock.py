@@ -7,8 +7,12 @@ import socket
 from pathlib import Path
 from typing import TextIO
 
-# Of file systems that have no locks, such as some network ones.
-_NO_LOCKS = {errno.ENOTSUP, errno.ENOSYS, errno.ENOLCK, errno.EINVAL}
+# Of file systems that have no locks, such as some network ones. Not every system has each.
+_NO_LOCKS = {
+    getattr(errno, name)
+    for name in ("ENOTSUP", "EOPNOTSUPP", "ENOSYS", "ENOLCK", "EINVAL")
+    if hasattr(errno, name)
+}
 
 
 def try_lock(file: TextIO) -> bool:

@@ -39,6 +39,7 @@ def test_the_job_is_done_and_every_target_met(work):
     assert {path.name for path in out.iterdir()} == {
         "figures",
         "log.npz",
+        ".manifest.json",
         "made_by.json",
         "measured.json",
         "report.html",

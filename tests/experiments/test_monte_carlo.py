@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from power_cuts import cut_off
 from scipy.stats import binomtest
 from trial_runs import Breaks
 
@@ -163,3 +164,25 @@ def test_the_table_tells_who_failed_and_why():
     assert "1 of 2 succeeded" in text
     assert "goal error mm" in text
     assert "seed 8: a [b]" in text
+
+
+def test_two_runs_do_not_write_one_file(tmp_path):
+    """They would both try the same seeds, and each end with half of the trials."""
+    file = tmp_path / "t.jsonl"
+
+    def again(seed):
+        repeat(square, [seed], file, made_by=MADE_BY)
+        return {}
+
+    with pytest.raises(FileExistsError, match="is being written by process"):
+        repeat(again, [0], file, made_by=MADE_BY)
+    assert list(tmp_path.iterdir()) == [file]
+
+
+def test_trials_cut_off_at_any_step_go_on_where_they_ended(tmp_path):
+    file = tmp_path / "t.jsonl"
+    for _ in cut_off(lambda: repeat(square, [0, 1], file, made_by=MADE_BY)):
+        trials = repeat(square, [0, 1, 2], file, made_by=MADE_BY)
+        assert [trial.seed for trial in trials] == [0, 1, 2]
+        assert list(tmp_path.iterdir()) == [file]
+        file.unlink()
