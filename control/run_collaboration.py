@@ -35,7 +35,6 @@ from hrc_learn.experiments.monte_carlo import Summary, Trial, repeat
 from hrc_learn.experiments.run_recording import ServeConfig, record, serving, unwatched
 from hrc_learn.geometry import Box
 from hrc_learn.learning.tuning import with_gains
-from hrc_learn.output import MADE_BY, new_folder
 from hrc_learn.sim import CameraChange, CameraKind, Occlusion
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.marker_sensor import TransportConfig
@@ -43,6 +42,7 @@ from hrc_learn.skills.pick_and_place import CollaborationConfig
 from hrc_learn.skills.placing import PlacingSkill
 from hrc_learn.skills.visual_servoing import AimingSkill
 from hrc_learn.skills.work_cell import StationConfig
+from hrc_learn.store import new_folder, read_made_by
 from hrc_learn.teleoperation.page import PageConfig
 from hrc_learn.viz.report import Measurement, show_measurements, write_report
 from hrc_learn.viz.run_dashboard import record_run
@@ -109,7 +109,7 @@ class Args:
 def main(args: Args) -> int:
     console = Console()
     trials = _trials(args)
-    fit = json.loads((args.placing / "metrics.json").read_text())
+    fit = json.loads((args.placing / "metrics.json").read_text(encoding="utf-8"))
     with new_folder(args.out, asdict(args), args.overwrite) as folder:
         console.print(f"Placing on the {_shelves(args)}:")
         job = _run(args, trials, console)
@@ -253,7 +253,7 @@ def _region(workplace: Workplace, half_size: tuple[float, float, float]) -> Box:
 
 def _demonstration(placing: Path) -> Demonstration | None:
     """The first demonstration the placing motion was learned from, if it is still there."""
-    dataset = Path(json.loads((placing / MADE_BY).read_text())["dataset"])
+    dataset = Path(read_made_by(placing)["dataset"])
     return load_demos(dataset, episodes=[0])[0] if dataset.is_dir() else None
 
 

@@ -7,7 +7,6 @@ from many random starts. Writes Rerun recordings, a report and the measured valu
 1 if a target was missed.
 """
 
-import json
 import shlex
 import shutil
 import sys
@@ -36,10 +35,10 @@ from hrc_learn.experiments.placing.metrics import (
 )
 from hrc_learn.experiments.placing.report import record_placing
 from hrc_learn.experiments.run_recording import ServeConfig, serving, unwatched
-from hrc_learn.output import MADE_BY, new_folder
 from hrc_learn.sim import RenderingUnavailableError
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.placing import PlacingSkill
+from hrc_learn.store import new_folder, read_made_by
 from hrc_learn.viz.report import Measurement, show_measurements, write_report
 from hrc_learn.viz.run_dashboard import record_run
 
@@ -142,7 +141,7 @@ def _check(args: Args) -> None:
 
 def _dataset(args: Args) -> Path:
     """The dataset that the motion was learned from."""
-    path = Path(json.loads((args.placing / MADE_BY).read_text())["dataset"])
+    path = Path(read_made_by(args.placing)["dataset"])
     if not path.is_dir():
         raise FileNotFoundError(
             f"{path}, which {args.placing} was learned from, is not there any more: name the "

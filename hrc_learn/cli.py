@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NoReturn, SupportsFloat
 
-from hrc_learn.output import new_file
+from hrc_learn.store import new_file
 
 
 def run[Args](main: Callable[[Args], int | None], args: type[Args]) -> NoReturn:
@@ -61,7 +61,7 @@ def write_text(path: str | Path, text: str) -> None:
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with new_file(path) as part:
-        part.write_text(text)
+        part.write_text(text, encoding="utf-8")
 
 
 def _warning_line(message: Warning | str, *_place: object, **_line: object) -> str:

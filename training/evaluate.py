@@ -5,7 +5,6 @@ goal and duration. Prints error, goal error, smoothness and orientation error of
 demonstration, and writes figures of them. Exit status 1 if --most-nrmse was missed.
 """
 
-import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
@@ -19,7 +18,7 @@ from hrc_learn import cli
 from hrc_learn.demos import DemonstrationSet, load_demos, open_demos
 from hrc_learn.learning.channels import KINDS, Motions, load_primitive
 from hrc_learn.learning.reproduction_error import ReproductionError, reproduction_error
-from hrc_learn.output import MADE_BY, new_folder
+from hrc_learn.store import new_folder, read_made_by
 from hrc_learn.viz.figures import measures_figure
 
 UNITS = {
@@ -84,7 +83,7 @@ def main(args: Args) -> int:
 
 def _demonstrations(args: Args, console: Console) -> DemonstrationSet:
     """Those asked for, with the joints that were learned."""
-    made_by = json.loads((args.model / MADE_BY).read_text())
+    made_by = read_made_by(args.model)
     learned = [int(i) for i in made_by.get("episodes") or ()]
     episodes = list(args.episodes)
     same = Path(made_by["dataset"]).resolve() == args.dataset.resolve()
