@@ -20,7 +20,7 @@ from rich.console import Console
 
 from hrc_learn import cli
 from hrc_learn.demos import DatasetWriter
-from hrc_learn.deploy import Metronome
+from hrc_learn.deploy import Rate
 from hrc_learn.kinematics import panda
 from hrc_learn.protocols import Human
 from hrc_learn.sim import MovingBodies, World
@@ -104,7 +104,7 @@ def _serve(
     session: PageSession, page: Page, dt: float, duration: float | None
 ) -> dict[str, float]:
     """Run the loop in the arm's own time; what was measured of it."""
-    metronome, steps, latest = Metronome(dt), 0, 0.0
+    metronome, steps, latest = Rate(dt), 0, 0.0
     try:
         while page.alive and not session.finished:
             session.step()

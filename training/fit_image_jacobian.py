@@ -16,7 +16,13 @@ from rich.console import Console
 
 from hrc_learn import cli, distributed
 from hrc_learn.demos import DemonstrationSource, open_demos
-from hrc_learn.jacobian import CellErrors, ImageJacobianFitConfig, LearningConfig, Neurons, grid
+from hrc_learn.jacobian import (
+    CellErrors,
+    EvidenceConfig,
+    ImageJacobianFitConfig,
+    RBFCenters,
+    grid,
+)
 from hrc_learn.learning.fit_recordings import learning_recording
 from hrc_learn.learning.fit_visual_servo import fit_aiming
 from hrc_learn.skills.visual_servoing import AimingSkill
@@ -47,7 +53,7 @@ class Args:
     learn: bool = True
     """Whether neurons, noise and prior are learned. Needs --learning.hold-out demonstrations,
     fewer are fitted without."""
-    learning: LearningConfig = field(default_factory=LearningConfig)
+    learning: EvidenceConfig = field(default_factory=EvidenceConfig)
     """How they are learned."""
     fit: ImageJacobianFitConfig = field(default_factory=ImageJacobianFitConfig)
     """What is compared, and what is believed before; where learning starts."""
@@ -82,8 +88,8 @@ def main(args: Args) -> None:
             _write(args, skill, demos, console)
 
 
-def _grid(args: Args) -> Neurons:
-    return Neurons(centers=grid(args.x, args.y), width=args.width)
+def _grid(args: Args) -> RBFCenters:
+    return RBFCenters(centers=grid(args.x, args.y), width=args.width)
 
 
 def _write(

@@ -17,8 +17,8 @@ from torch.utils import _pytree
 from torch.utils._pytree import tree_map_only
 
 from hrc_learn.controller import AdaptiveController, Observation
-from hrc_learn.deploy.io_layout import FlatStep
-from hrc_learn.deploy.package import UnknownCodeError, describe, fingerprint, machine
+from hrc_learn.deploy.io_layout import PackedStep
+from hrc_learn.deploy.package import UnknownCodeError, content_hash, describe, machine
 from hrc_learn.store import Claim, new_file
 
 # Has inductor keep the batch last in memory, whatever comes first in a tensor.
@@ -158,10 +158,10 @@ def export_step(
         ValueError: dt is not in (0, 1/rate] of the safety filter.
     """
     folder = folder or _default_folder()
-    step = FlatStep(controller, observation)
+    step = PackedStep(controller, observation)
     program = None
     try:
-        key = fingerprint(machine(), controller, _structure(observation))
+        key = content_hash(machine(), controller, _structure(observation))
     except UnknownCodeError:
         program = trace(step, observation)
         key = _digest(step, program)
@@ -182,7 +182,7 @@ def export_step(
     return package
 
 
-def trace(step: FlatStep, observation: Observation) -> torch.export.ExportedProgram:
+def trace(step: PackedStep, observation: Observation) -> torch.export.ExportedProgram:
     """One graph of a step, as AOTInductor takes it."""
     with torch.no_grad():
         program = torch.export.export(step, tuple(step.example(observation)), strict=False)
@@ -221,7 +221,7 @@ def _structure(observation: Observation) -> list[tuple[str, str]]:
     ]
 
 
-def _digest(step: FlatStep, program: torch.export.ExportedProgram) -> str:
+def _digest(step: PackedStep, program: torch.export.ExportedProgram) -> str:
     """Hash of all that decides what a package computes and where it runs."""
     digest = hashlib.sha256()
     fields = [field for layout in step.layouts for field in layout.fields]

@@ -33,7 +33,7 @@ class Field:
 
 
 @final
-class Layout:
+class IOLayout:
     """Where the tensors of a dataclass stand in a vector (rows, *batch).
 
     The batch comes last in memory: a row is one quantity of all its elements, which is what
@@ -55,8 +55,8 @@ class Layout:
         """Of each field."""
 
     @staticmethod
-    def of(tree: Any, batch: Sequence[int], dtype: torch.dtype = torch.float64) -> Layout:
-        """Layout of the tensors in a pytree; what else it holds is left out."""
+    def of(tree: Any, batch: Sequence[int], dtype: torch.dtype = torch.float64) -> IOLayout:
+        """IOLayout of the tensors in a pytree; what else it holds is left out."""
         batch, fields = tuple(batch), []
         for path, x in _pytree.tree_flatten_with_path(tree)[0]:
             if isinstance(x, Tensor):
@@ -64,7 +64,7 @@ class Layout:
                 shape = tuple(x.shape[len(batch) :] if batched else x.shape)
                 name = _pytree.keystr(path).removeprefix(".")
                 fields.append(Field(name, x.dtype, batched, shape))
-        return Layout(fields, batch, dtype)
+        return IOLayout(fields, batch, dtype)
 
     def empty(self) -> Float[Tensor, "rows *batch"]:
         """A vector in which nothing is known: every number is NaN, no flag is set."""
@@ -127,16 +127,16 @@ class Vectors(NamedTuple):
     command: Tensor
 
 
-class Layouts(NamedTuple):
+class StepLayouts(NamedTuple):
     """Where everything stands in them."""
 
-    state: Layout
-    observation: Layout
-    command: Layout
+    state: IOLayout
+    observation: IOLayout
+    command: IOLayout
 
 
 @final
-class FlatStep(nn.Module):
+class PackedStep(nn.Module):
     """`AdaptiveController.step` on vectors, in place.
 
     It reads the vectors of state and observation, and writes those of the command and of the
@@ -160,7 +160,9 @@ class FlatStep(nn.Module):
         leaves, self._structure = _pytree.tree_flatten((state, observation))
         self._constants = [None if isinstance(x, Tensor) else x for x in leaves]
         trees = (state, observation, command)
-        self.layouts = Layouts(*(Layout.of(tree, q.shape[:-1], q.dtype) for tree in trees))
+        self.layouts = StepLayouts(
+            *(IOLayout.of(tree, q.shape[:-1], q.dtype) for tree in trees)
+        )
         self.first_state = self.layouts.state.pack(tensors_of(state))
 
     def example(self, observation: Observation) -> Vectors:

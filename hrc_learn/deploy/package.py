@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from hrc_learn.controller import Observation
-from hrc_learn.deploy.io_layout import Field, FlatStep, Layout, Layouts
+from hrc_learn.deploy.io_layout import Field, IOLayout, PackedStep, StepLayouts
 
 # The file of a compiled step: code, and what to know to call it.
 
@@ -33,14 +33,14 @@ class Package:
 
     run: Callable[[list[Tensor]], object]
     """Takes the three vectors and updates state and command in place."""
-    layouts: Layouts
+    layouts: StepLayouts
     first_state: Tensor
     """Vector of an arm at rest in its ready posture."""
     example: Tensor
     """Vector of the observation that it was exported with."""
 
 
-def describe(step: FlatStep, observation: Observation) -> dict[str, str]:
+def describe(step: PackedStep, observation: Observation) -> dict[str, str]:
     """What a package says about a step, as text that any language can read.
 
     The layout has a line for each field: which vector, field, dtype, 1 if it is batched, and
@@ -85,14 +85,14 @@ def load(path: Path) -> Package:
         )
     batch = [int(n) for n in says[_BATCH].split()]
     dtype: torch.dtype = getattr(torch, says[_DTYPE])
-    fields: dict[str, list[Field]] = {vector: [] for vector in Layouts._fields}
+    fields: dict[str, list[Field]] = {vector: [] for vector in StepLayouts._fields}
     for line in says[_LAYOUT].splitlines():
         vector, name, kind, batched, *shape = line.split()
         field = Field(name, getattr(torch, kind), batched == "1", tuple(map(int, shape)))
         fields[vector].append(field)
     return Package(
         run=run,
-        layouts=Layouts(*(Layout(part, batch, dtype) for part in fields.values())),
+        layouts=StepLayouts(*(IOLayout(part, batch, dtype) for part in fields.values())),
         first_state=_vector(says[_STATE], batch, dtype),
         example=_vector(says[_OBSERVATION], batch, dtype),
     )
@@ -162,7 +162,7 @@ class UnknownCodeError(TypeError):
     """An object is of a class, or holds a function, whose code is not ours to know."""
 
 
-def fingerprint(*objects: Any) -> str:
+def content_hash(*objects: Any) -> str:
     """Hash of all values within some objects, and of the source of this library.
 
     Args:

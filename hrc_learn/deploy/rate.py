@@ -11,7 +11,7 @@ _SPIN = 0.0002
 
 
 @final
-class Metronome:
+class Rate:
     """Ticks at a fixed rate, and counts the ticks that a loop was too slow for.
 
     Attributes:

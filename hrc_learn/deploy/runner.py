@@ -14,10 +14,10 @@ from torch.utils import _pytree
 
 from hrc_learn.controller import AdaptiveController, Observation
 from hrc_learn.deploy.export import NoCompilerError, export_step
-from hrc_learn.deploy.io_layout import FlatStep, Layouts, Vectors, tensors_of
+from hrc_learn.deploy.io_layout import PackedStep, StepLayouts, Vectors, tensors_of
 from hrc_learn.deploy.package import load
 
-_POSITIONS = ("safety.position", "hold.joint_position")
+_POSITIONS = ("safety.position", "pose_drift.joint_position")
 """Fields of the state that remember where the joints were."""
 
 
@@ -33,7 +33,7 @@ class StepRunner(ABC):
         joint_velocity: What the last step commands [rad/s]; overwritten by the next.
     """
 
-    def __init__(self, layouts: Layouts):
+    def __init__(self, layouts: StepLayouts):
         self._layouts = layouts
         self._vectors = Vectors(*(layout.empty() for layout in layouts))
         self.observation = layouts.observation.arrays(self._vectors.observation)
@@ -118,7 +118,7 @@ class EagerRunner(StepRunner):
 
     def __init__(self, controller: AdaptiveController, observation: Observation):
         """Take a step as it is; later observations have the fields of this one."""
-        super().__init__(FlatStep(controller, observation).layouts)
+        super().__init__(PackedStep(controller, observation).layouts)
         self._controller, self._said = controller, None
         self._leaves, self._structure = _pytree.tree_flatten(observation)
         views = iter(self._layouts.observation.views(self._vectors.observation))

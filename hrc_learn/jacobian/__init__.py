@@ -12,18 +12,18 @@ from hrc_learn.jacobian.estimators.recursive import KalmanEstimator as KalmanEst
 from hrc_learn.jacobian.estimators.recursive import (
     RecursiveLeastSquaresEstimator as RecursiveLeastSquaresEstimator,
 )
-from hrc_learn.jacobian.evidence import Learned as Learned
-from hrc_learn.jacobian.evidence import LearningConfig as LearningConfig
-from hrc_learn.jacobian.evidence import learn as learn
+from hrc_learn.jacobian.evidence import EvidenceConfig as EvidenceConfig
+from hrc_learn.jacobian.evidence import EvidenceResult as EvidenceResult
+from hrc_learn.jacobian.evidence import maximize_evidence as maximize_evidence
 from hrc_learn.jacobian.fitting import ImageJacobianFitConfig as ImageJacobianFitConfig
 from hrc_learn.jacobian.fitting import ImageJacobianFitReport as ImageJacobianFitReport
 from hrc_learn.jacobian.held_out_error import CellErrors as CellErrors
-from hrc_learn.jacobian.held_out_error import held_out_pairs as held_out_pairs
+from hrc_learn.jacobian.held_out_error import cross_validate as cross_validate
 from hrc_learn.jacobian.network import RBFImageJacobian as RBFImageJacobian
 from hrc_learn.jacobian.network import nominal_network as nominal_network
-from hrc_learn.jacobian.network import stacked as stacked
-from hrc_learn.jacobian.radial_basis import grid as grid
-from hrc_learn.jacobian.radial_basis import paper_grid as paper_grid
-from hrc_learn.jacobian.rbf_centers import Neurons as Neurons
-from hrc_learn.jacobian.samples import Watched as Watched
-from hrc_learn.jacobian.samples import watched as watched
+from hrc_learn.jacobian.network import stack_networks as stack_networks
+from hrc_learn.jacobian.rbf_centers import RBFCenters as RBFCenters
+from hrc_learn.jacobian.rbf_centers import grid as grid
+from hrc_learn.jacobian.rbf_centers import paper_grid as paper_grid
+from hrc_learn.jacobian.samples import ImageDemonstration as ImageDemonstration
+from hrc_learn.jacobian.samples import image_demonstrations as image_demonstrations

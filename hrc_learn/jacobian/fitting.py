@@ -16,12 +16,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.jacobian.radial_basis import weight_covariance
-from hrc_learn.jacobian.samples import PairConfig, PairStatistics
+from hrc_learn.jacobian.samples import KeyFrameConfig, RegressionStatistics
 
 
 @dataclass(frozen=True, kw_only=True)
-class ImageJacobianFitConfig(PairConfig):
+class ImageJacobianFitConfig(KeyFrameConfig):
     """Which frames are compared, and what is believed before they are."""
 
     pixel_noise: float = 0.5
@@ -67,6 +66,27 @@ class Posterior:
     """Of either image row [(px/m)^2]."""
 
 
+def weight_covariance(
+    centers: Float[Tensor, "K _"],
+    bias_std: float | Float[Tensor, ""],
+    weight_std: float | Float[Tensor, ""],
+) -> Float[Tensor, "K K"]:
+    """Prior covariance between neurons, for each entry of the Jacobian alone.
+
+    The entry is a bias, common to all neurons, plus a departure of each. With normalised
+    neurons, which sum to one, that is a constant Jacobian plus a network: what is learned in
+    one place holds everywhere until a place says otherwise.
+
+    Args:
+        centers: Of the neurons; gives their number, dtype and device.
+        bias_std: Standard deviation of the bias [px/m].
+        weight_std: Standard deviation of the departures [px/m].
+    """
+    K = len(centers)
+    eye = torch.eye(K, dtype=centers.dtype, device=centers.device)
+    return bias_std**2 * torch.ones_like(eye) + weight_std**2 * eye
+
+
 def prior_precision(
     centers: Float[Tensor, "K _"], config: ImageJacobianFitConfig
 ) -> Float[Tensor, "P P"]:
@@ -76,7 +96,7 @@ def prior_precision(
 
 
 def fit_weights(
-    parts: Sequence[PairStatistics],
+    parts: Sequence[RegressionStatistics],
     precision: Float[Tensor, "P P"],
     config: ImageJacobianFitConfig,
 ) -> tuple[Posterior, ImageJacobianFitReport]:
@@ -112,7 +132,7 @@ def fit_weights(
 
 
 def solve(
-    statistics: PairStatistics, precision: Float[Tensor, "P P"], noise: float
+    statistics: RegressionStatistics, precision: Float[Tensor, "P P"], noise: float
 ) -> Posterior:
     """Posterior of the weights for a zero-mean prior.
 
@@ -126,7 +146,9 @@ def solve(
     return Posterior(mean=mean, covariance=torch.cholesky_inverse(factor))
 
 
-def _held_out_square(parts: Sequence[PairStatistics], precision: Tensor, noise: float) -> float:
+def _held_out_square(
+    parts: Sequence[RegressionStatistics], precision: Tensor, noise: float
+) -> float:
     """Mean squared error over all pairs, each predicted without its own part."""
     if len(parts) == 1:
         return float("nan")

@@ -14,12 +14,16 @@ from torch import Tensor
 from hrc_learn.geometry import Pose
 from hrc_learn.jacobian.fitting import ImageJacobianFitConfig, prior_precision, solve
 from hrc_learn.jacobian.network import RBFImageJacobian
-from hrc_learn.jacobian.radial_basis import component_scale
-from hrc_learn.jacobian.samples import Watched, motion_by_part, statistics_by_part
+from hrc_learn.jacobian.samples import (
+    ImageDemonstration,
+    component_scale,
+    samples_by_fold,
+    statistics_by_fold,
+)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class HeldOutPairs:
+class HeldOutSamples:
     """Pairs of key frames, each predicted without its part of the data."""
 
     position: Float[Tensor, "pairs 3"]
@@ -71,11 +75,11 @@ class CellErrors:
     """Mean of the posterior deviation over the Jacobian's size; NaN in an empty cell."""
 
 
-def held_out_pairs(
-    demonstrations: Sequence[Watched],
+def cross_validate(
+    demonstrations: Sequence[ImageDemonstration],
     network: RBFImageJacobian,
     config: ImageJacobianFitConfig,
-) -> HeldOutPairs:
+) -> HeldOutSamples:
     """Predict every pair with the weights fitted to the other parts of the data.
 
     Of several processes, each predicts the pairs of its share.
@@ -93,7 +97,7 @@ def held_out_pairs(
         raise ValueError("only a network just fitted knows what it was fitted with.")
     network = network.double()
     K = len(network.centers)
-    parts = statistics_by_part(network.basis, K, demonstrations, config)
+    parts = statistics_by_fold(network.basis, K, demonstrations, config)
     if sum(part.count > 0 for part in parts) < 2:
         raise ValueError("held-out errors need pairs in at least two parts of the data.")
     precision = prior_precision(network.centers, config)
@@ -101,19 +105,19 @@ def held_out_pairs(
         solve(reduce(add, [*parts[:i], *parts[i + 1 :]]), precision, report.noise**2).mean
         for i in range(len(parts))
     ]
-    pairs: list[HeldOutPairs] = []
+    pairs: list[HeldOutSamples] = []
     with torch.no_grad():
-        for part, motion in motion_by_part(demonstrations, config):
+        for part, motion in samples_by_fold(demonstrations, config):
             pairs.append(
-                HeldOutPairs(
+                HeldOutSamples(
                     position=(motion.before.position + motion.after.position) / 2,
                     motion=motion.dx,
                     error=motion.dx - motion.regressors(network.basis) @ without[part],
                     uncertainty=relative_uncertainty(network, motion.before, config),
                 )
             )
-    names = [field.name for field in fields(HeldOutPairs)]
-    return HeldOutPairs(
+    names = [field.name for field in fields(HeldOutSamples)]
+    return HeldOutSamples(
         **{name: torch.cat([getattr(one, name) for one in pairs]) for name in names}
     )
 

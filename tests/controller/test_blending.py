@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from hrc_learn.controller import Activation, ActivationConfig, HandOver
+from hrc_learn.controller import BlendingConfig, BlendingState, VisionBlending
 
 CENTRE = (719.5, 539.5)
 
@@ -13,60 +13,60 @@ def pixel(u: float, v: float) -> Tensor:
     return torch.tensor([u, v], dtype=torch.float64)
 
 
-def follow(hand_over: HandOver, features, *, dt=0.01, state=None, age=None, visible=True):
+def follow(blending: VisionBlending, features, *, dt=0.01, state=None, age=None, visible=True):
     """State after each of some measurements."""
-    state = state or hand_over.initial_state(torch.zeros(7, dtype=torch.float64))
+    state = state or blending.initial_state(torch.zeros(7, dtype=torch.float64))
     states = []
     for feature in features:
         usable = torch.tensor(visible)
-        state, _, _ = hand_over.step(state, pixel(*feature), usable, dt, age=age)
+        state, _, _ = blending.step(state, pixel(*feature), usable, dt, age=age)
         states.append(state)
     return states
 
 
 def test_a_feature_must_come_well_inside_to_be_used_and_may_go_to_the_edge():
     states = follow(
-        HandOver(), [(30, 500), (41, 500), (30, 500), (1, 500), (-1, 500), (30, 500)]
+        VisionBlending(), [(30, 500), (41, 500), (30, 500), (1, 500), (-1, 500), (30, 500)]
     )
     assert [s.active.item() for s in states] == [False, True, True, True, False, False]
 
 
 def test_vision_fades_in_and_out_over_the_blend_time():
-    states = follow(HandOver(), [CENTRE] * 40, dt=0.01)
+    states = follow(VisionBlending(), [CENTRE] * 40, dt=0.01)
     levels = torch.stack([s.level for s in states])
     torch.testing.assert_close(levels[:30], torch.linspace(1, 30, 30, dtype=torch.float64) / 30)
     assert (levels[30:] == 1).all()
-    gone = follow(HandOver(), [CENTRE] * 15, state=states[-1], visible=False)
+    gone = follow(VisionBlending(), [CENTRE] * 15, state=states[-1], visible=False)
     assert gone[-1].level.item() == pytest.approx(0.5)
 
 
 def test_without_blend_time_it_switches():
-    hand_over = HandOver(ActivationConfig(blend_time=0.0))
-    assert follow(hand_over, [CENTRE])[0].level == 1
+    blending = VisionBlending(BlendingConfig(blend_time=0.0))
+    assert follow(blending, [CENTRE])[0].level == 1
 
 
 @pytest.mark.parametrize("lost", [(math.nan, 5.0), (2000.0, 500.0), (math.inf, 500.0)])
 def test_what_cannot_be_used_leaves_the_last_good_feature(lost):
-    *_, last = follow(HandOver(), [(600, 500)] * 40 + [lost] * 3)
+    *_, last = follow(VisionBlending(), [(600, 500)] * 40 + [lost] * 3)
     assert last.feature.tolist() == [600, 500]
     assert not last.active
     assert last.level.item() == pytest.approx(0.9)
 
 
 def test_a_silent_camera_stops_the_arm_that_follows_it_and_no_other():
-    hand_over = HandOver()
+    blending = VisionBlending()
     old = torch.tensor(0.3, dtype=torch.float64)
-    approaching = hand_over.initial_state(torch.zeros(7, dtype=torch.float64))
-    following = follow(hand_over, [CENTRE] * 40)[-1]
+    approaching = blending.initial_state(torch.zeros(7, dtype=torch.float64))
+    following = follow(blending, [CENTRE] * 40)[-1]
     for state, stops in ((approaching, False), (following, True)):
-        after, seen, stop = hand_over.step(
+        after, seen, stop = blending.step(
             state, pixel(*CENTRE), torch.tensor(True), 0.01, age=old
         )
         assert not seen
         assert stop.item() is stops
         assert after.level == state.level
     # It carries on where it was when the camera comes back.
-    after, seen, stop = hand_over.step(
+    after, seen, stop = blending.step(
         after, pixel(*CENTRE), torch.tensor(True), 0.01, age=torch.zeros_like(old)
     )
     assert seen
@@ -75,11 +75,11 @@ def test_a_silent_camera_stops_the_arm_that_follows_it_and_no_other():
 
 
 def test_the_members_of_a_batch_are_handled_apart():
-    hand_over = HandOver()
-    state = hand_over.initial_state(torch.zeros(3, 7, dtype=torch.float64))
+    blending = VisionBlending()
+    state = blending.initial_state(torch.zeros(3, 7, dtype=torch.float64))
     feature = torch.tensor([[700.0, 500], [10, 500], [math.nan, 0]], dtype=torch.float64)
-    state, seen, _ = hand_over.step(state, feature, torch.tensor([True, True, True]), 0.03)
+    state, seen, _ = blending.step(state, feature, torch.tensor([True, True, True]), 0.03)
     assert seen.tolist() == [True, True, False]
     assert state.active.tolist() == [True, False, False]
     assert state.level.tolist() == pytest.approx([0.1, 0, 0])
-    assert isinstance(state, Activation)
+    assert isinstance(state, BlendingState)

@@ -67,7 +67,7 @@ class TestBatch:
             runner.start(q)
             runner.observation["feature"][:] += 100 * q[:, :2]
             runner.observation["feature_visible"][:] = np.arange(ARMS) % 4 != 0
-            runner.observation["human_effort"][:] = 0.1 * q
+            runner.observation["nullspace_input"][:] = 0.1 * q
         steps = 200
         for _ in range(steps):
             eager, exported = (runner.step() for runner in runners)

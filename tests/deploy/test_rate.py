@@ -2,7 +2,7 @@
 
 import pytest
 
-from hrc_learn.deploy import Metronome
+from hrc_learn.deploy import Rate
 
 
 class Clock:
@@ -23,8 +23,8 @@ def clock() -> Clock:
 
 
 @pytest.fixture
-def metronome(clock) -> Metronome:
-    return Metronome(0.01, clock=clock, sleep=clock.sleep)
+def metronome(clock) -> Rate:
+    return Rate(0.01, clock=clock, sleep=clock.sleep)
 
 
 def test_it_keeps_the_rate_however_long_the_work_takes(clock, metronome):
@@ -53,4 +53,4 @@ def test_ticks_a_loop_slept_through_are_counted_not_made_up_for(clock, metronome
 
 def test_a_period_of_nothing_is_refused():
     with pytest.raises(ValueError, match="period must be positive, but is 0"):
-        Metronome(0.0)
+        Rate(0.0)

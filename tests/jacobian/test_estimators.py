@@ -29,7 +29,7 @@ from hrc_learn.jacobian.estimators import (
     KalmanConfig,
     LeastSquaresConfig,
 )
-from hrc_learn.jacobian.estimators.key_frames import Pair
+from hrc_learn.jacobian.estimators.key_frames import MotionSample
 from hrc_learn.jacobian.estimators.recursive import condition
 
 ALL = [
@@ -374,7 +374,7 @@ def test_forgetting_weighs_old_pairs_less():
     prior = np.kron(np.eye(6), 1500.0**2 * np.ones((9, 9)) + 500.0**2 * np.eye(9))
     weight, covariance = network.weight.detach(), torch.from_numpy(prior)
     for _, dx, dr, theta in pairs:
-        pair = Pair(
+        pair = MotionSample(
             twist=torch.from_numpy(dr / SCALE),
             dr=torch.from_numpy(dr),
             dx=torch.from_numpy(dx),

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 from hrc_learn.jacobian.estimators.estimator import Measurement
 from hrc_learn.jacobian.estimators.gradient import CompositeState
-from hrc_learn.jacobian.estimators.key_frames import KeyFrame, PairEstimator
+from hrc_learn.jacobian.estimators.key_frames import KeyFrame, KeyFrameEstimator
 from hrc_learn.jacobian.network import RBFImageJacobian
-from hrc_learn.jacobian.samples import PairConfig
+from hrc_learn.jacobian.samples import KeyFrameConfig
 
 
 @dataclass(frozen=True, kw_only=True)
-class BroydenConfig(PairConfig):
+class BroydenConfig(KeyFrameConfig):
     """Step of Broyden's update."""
 
     min_step: float = 2e-3
@@ -23,7 +23,7 @@ class BroydenConfig(PairConfig):
     """Largest entry of the weights [px/m], rotation counted with `rotation_scale`."""
 
 
-class BroydenEstimator(PairEstimator):
+class BroydenEstimator(KeyFrameEstimator):
     """J_s <- J_s + gain (dx - J_s dr) dr^T / |dr|^2 (Jägersand 1997), everywhere at once.
 
     The same change of every neuron changes a network of normalised neurons by a constant.

@@ -17,9 +17,9 @@ from hrc_learn.jacobian.estimators.estimator import (
     WeightState,
     evaluate,
 )
-from hrc_learn.jacobian.estimators.key_frames import KeyFrame, Pair, PairEstimator
+from hrc_learn.jacobian.estimators.key_frames import KeyFrame, KeyFrameEstimator, MotionSample
 from hrc_learn.jacobian.network import RBFImageJacobian
-from hrc_learn.jacobian.samples import PairConfig
+from hrc_learn.jacobian.samples import KeyFrameConfig
 from hrc_learn.pytree import pytree
 
 # The adaptation law as the paper prints it.
@@ -37,7 +37,7 @@ class PaperEstimator(ImageJacobianEstimator):
         """Set up the law.
 
         Args:
-            network: Neurons and initial weights.
+            network: RBFCenters and initial weights.
             gain: Diagonal of L.
         """
         super().__init__(network)
@@ -76,7 +76,7 @@ def paper_rate(
 
 
 @dataclass(frozen=True, kw_only=True)
-class CompositeConfig(PairConfig):
+class CompositeConfig(KeyFrameConfig):
     """Gains of the composite law."""
 
     task_gain: float = 0.25
@@ -100,7 +100,7 @@ class CompositeState:
     """Last key frame."""
 
 
-class CompositeEstimator(PairEstimator):
+class CompositeEstimator(KeyFrameEstimator):
     """Composite adaptation: task error and prediction error (Slotine and Li 1989).
 
     Between key frames the prediction error is e = dx - J_s_hat dr. Each pair moves the
@@ -131,7 +131,7 @@ class CompositeEstimator(PairEstimator):
         weight = state.weight + change
         return CompositeState(weight=self.projected(weight), key=key)
 
-    def _correction(self, weight: Tensor, pair: Pair) -> Tensor:
+    def _correction(self, weight: Tensor, pair: MotionSample) -> Tensor:
         """Normalised gradient step on the prediction error; zero without a pair."""
         config = self.config
         motion = pair.dr.square().sum(-1) + config.noise_floor**2

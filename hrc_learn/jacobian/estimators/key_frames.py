@@ -17,8 +17,7 @@ from hrc_learn.jacobian.estimators.estimator import (
     evaluate,
 )
 from hrc_learn.jacobian.network import RBFImageJacobian
-from hrc_learn.jacobian.radial_basis import component_scale
-from hrc_learn.jacobian.samples import PairConfig
+from hrc_learn.jacobian.samples import KeyFrameConfig, component_scale
 from hrc_learn.pytree import pytree
 
 
@@ -51,7 +50,7 @@ class KeyFrame:
 
 @pytree
 @dataclass(frozen=True, kw_only=True)
-class Pair:
+class MotionSample:
     """Motion from the key frame to now; zero where there is none to learn from."""
 
     twist: Float[Tensor, "*batch 6"]
@@ -61,7 +60,7 @@ class Pair:
     dx: Float[Tensor, "*batch rows"]
     """Motion of the feature [px]."""
     theta: Float[Tensor, "*batch K"]
-    """Neurons half-way: the mean of both ends."""
+    """RBFCenters half-way: the mean of both ends."""
     valid: Bool[Tensor, "*batch"]
     """Whether there is a pair."""
 
@@ -71,7 +70,7 @@ class Pair:
         return self.dx - matmul(J, self.twist.unsqueeze(-1)).squeeze(-1)
 
 
-class PairEstimator(ImageJacobianEstimator):
+class KeyFrameEstimator(ImageJacobianEstimator):
     """An estimator that learns from pairs of key frames."""
 
     scale: Tensor
@@ -80,11 +79,11 @@ class PairEstimator(ImageJacobianEstimator):
     bound: Tensor
     """Largest absolute value of each entry of the weights, (entries, 1)."""
 
-    def __init__(self, network: RBFImageJacobian, config: PairConfig, weight_bound: float):
+    def __init__(self, network: RBFImageJacobian, config: KeyFrameConfig, weight_bound: float):
         """Prepare the scales.
 
         Args:
-            network: Neurons and initial weights.
+            network: RBFCenters and initial weights.
             config: Choice of key frames.
             weight_bound: Largest entry of the weights [px/m].
         """
@@ -113,8 +112,8 @@ class PairEstimator(ImageJacobianEstimator):
         key: KeyFrame,
         measurement: Measurement,
         theta: Float[Tensor, "*batch K"],
-        config: PairConfig,
-    ) -> tuple[KeyFrame, Pair]:
+        config: KeyFrameConfig,
+    ) -> tuple[KeyFrame, MotionSample]:
         """Compare with the key frame; move it here once the tool is `min_step` away.
 
         Where the tool has meanwhile moved further than `max_step`, as after a loss of the
@@ -132,7 +131,7 @@ class PairEstimator(ImageJacobianEstimator):
         valid = moved & (distance <= config.max_step)
         use = valid.unsqueeze(-1)
         twist = torch.where(use, twist, 0.0)
-        pair = Pair(
+        pair = MotionSample(
             twist=twist,
             dr=twist * self.scale,
             dx=torch.where(use, measurement.feature - key.feature, 0.0),
