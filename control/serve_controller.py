@@ -153,7 +153,7 @@ def _serve(
     took, late = np.empty(steps), np.empty(steps)
     _answer(runner, world.arm)  # the first call is slower than any other
     runner.start(panda.ready.numpy())
-    metronome = Rate(dt)
+    rate = Rate(dt)
     for k in range(steps):
         began = time.perf_counter()
         _answer(runner, world.arm)
@@ -162,9 +162,9 @@ def _serve(
         runner.observation["feature_new"][...] = k % frame_steps == 0
         if k % frame_steps == 0:
             _look(runner.observation, camera, world.arm)
-        late[k] = metronome.wait()
+        late[k] = rate.wait()
     error = float(np.linalg.norm(runner.observation["feature"] - target))
-    return Latencies(step=took, wake_up=late, missed=metronome.missed), error
+    return Latencies(step=took, wake_up=late, missed=rate.missed), error
 
 
 def _answer(runner: StepRunner, arm: Arm) -> None:

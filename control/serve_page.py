@@ -104,17 +104,17 @@ def _serve(
     session: PageSession, page: Page, dt: float, duration: float | None
 ) -> dict[str, float]:
     """Run the loop in the arm's own time; what was measured of it."""
-    metronome, steps, latest = Rate(dt), 0, 0.0
+    rate, steps, latest = Rate(dt), 0, 0.0
     try:
         while page.alive and not session.finished:
             session.step()
             steps += 1
             if duration is not None and steps * dt >= duration:
                 break
-            latest = max(latest, metronome.wait())
+            latest = max(latest, rate.wait())
     except KeyboardInterrupt:
         print()
-    return {"steps": steps, "missed_ticks": metronome.missed, "latest_s": latest}
+    return {"steps": steps, "missed_ticks": rate.missed, "latest_s": latest}
 
 
 if __name__ == "__main__":

@@ -1,4 +1,8 @@
-"""The control step as a function of vectors: named tensors side by side, and the flat step."""
+"""The control step as a function of vectors, and the layout of its named tensors in them.
+
+Code compiled for real time takes and returns a few vectors of numbers, not dataclasses: any
+language can fill them, and nothing is allocated in a step.
+"""
 
 from __future__ import annotations
 
@@ -15,8 +19,6 @@ from torch import Tensor, nn
 from torch.utils import _pytree
 
 from hrc_learn.controller import AdaptiveController, Observation
-
-# Named tensors of any shape and dtype, side by side in one vector of numbers.
 
 
 @dataclass(frozen=True)
@@ -86,7 +88,7 @@ class IOLayout:
         return torch.cat(parts)
 
     def unpack(self, vector: Float[Tensor, "rows *batch"]) -> list[Tensor]:
-        """The tensors in a vector: views of it, but for those of another dtype."""
+        """The tensors in a vector: views of it, except those of another dtype."""
         views = zip(self.views(vector), self.fields, strict=True)
         return [view.to(field.dtype) for view, field in views]
 
@@ -103,6 +105,7 @@ class IOLayout:
         part = vector[self.rows[field.name]].reshape((*field.shape, *self.batch))
         if field.batched:
             return part.movedim(self._last, self._first)
+        # One value for the whole batch stands there once for each element: read the first.
         return part[(..., *(0 for _ in self.batch))]
 
     @property
@@ -114,9 +117,6 @@ class IOLayout:
     def _last(self) -> list[int]:
         """Where it stands in a vector."""
         return list(range(-len(self.batch), 0))
-
-
-# The control step as a function of three vectors of numbers.
 
 
 class Vectors(NamedTuple):
@@ -183,9 +183,10 @@ class PackedStep(nn.Module):
         layouts = self.layouts
         read = iter(layouts.state.unpack(state) + layouts.observation.unpack(observation))
         leaves = [next(read) if x is None else x for x in self._constants]
-        said, following = self.controller.step(*_pytree.tree_unflatten(leaves, self._structure))
+        before, seen = _pytree.tree_unflatten(leaves, self._structure)
+        said, after = self.controller.step(before, seen)
         command.copy_(layouts.command.pack(tensors_of(said)))
-        state.copy_(layouts.state.pack(tensors_of(following)))
+        state.copy_(layouts.state.pack(tensors_of(after)))
 
 
 def tensors_of(tree: object) -> list[Tensor]:

@@ -119,7 +119,7 @@ class EagerRunner(StepRunner):
     def __init__(self, controller: AdaptiveController, observation: Observation):
         """Take a step as it is; later observations have the fields of this one."""
         super().__init__(PackedStep(controller, observation).layouts)
-        self._controller, self._said = controller, None
+        self._controller, self._last_command = controller, None
         self._leaves, self._structure = _pytree.tree_flatten(observation)
         views = iter(self._layouts.observation.views(self._vectors.observation))
         self._views = [
@@ -141,13 +141,13 @@ class EagerRunner(StepRunner):
             # A state that shared memory with an observation would change with the next.
             self._leaves[k] = view.to(dtype, copy=True)
         observation = _pytree.tree_unflatten(self._leaves, self._structure)
-        self._said, self._state = self._controller.step(self._state, observation)
-        self.joint_velocity[...] = self._said.joint_velocity.numpy()
+        self._last_command, self._state = self._controller.step(self._state, observation)
+        self.joint_velocity[...] = self._last_command.joint_velocity.numpy()
         return self.joint_velocity
 
     def command(self, field: str) -> np.ndarray:
-        if self._said is not None:
-            vector = self._layouts.command.pack(tensors_of(self._said))
+        if self._last_command is not None:
+            vector = self._layouts.command.pack(tensors_of(self._last_command))
             self._vectors.command.copy_(vector)
         return super().command(field)
 

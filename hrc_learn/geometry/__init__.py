@@ -1,4 +1,4 @@
-"""Rotations and poses; every delicate numeric of the package is in `numerics`."""
+"""Rotations, poses and shapes; every delicate numeric of the package is in `numerics`."""
 
 from hrc_learn.geometry import quaternion as quaternion
 from hrc_learn.geometry.minimum_jerk import minimum_jerk as minimum_jerk

@@ -5,6 +5,9 @@ import torch
 from torch import Tensor
 
 from hrc_learn.controller import BlendingConfig, BlendingState, VisionBlending
+from hrc_learn.controller.blending import approach_velocity, fade, next_task_level
+from hrc_learn.kinematics import panda
+from hrc_learn.regions import PostureRegion
 
 CENTRE = (719.5, 539.5)
 
@@ -83,3 +86,71 @@ def test_the_members_of_a_batch_are_handled_apart():
     assert state.active.tolist() == [True, False, False]
     assert state.level.tolist() == pytest.approx([0.1, 0, 0])
     assert isinstance(state, BlendingState)
+
+
+GOAL = torch.zeros(7, dtype=torch.float64)
+POSTURE = PostureRegion(goal=GOAL, tolerance=0.5)
+
+
+def away(distance: float) -> Tensor:
+    """A joint position so far from the posture [rad]."""
+    return GOAL + distance * torch.nn.functional.normalize(torch.ones_like(GOAL), dim=0)
+
+
+def level_after(
+    before: float, distance: float, *, vision_active: bool = False, dt: float = 0.03
+) -> float:
+    level = next_task_level(
+        torch.tensor(before, dtype=torch.float64),
+        POSTURE,
+        away(distance),
+        torch.tensor(vision_active),
+        dt,
+        0.3,
+    )
+    return level.item()
+
+
+@pytest.mark.parametrize(
+    ("before", "distance", "vision_active", "after"),
+    [
+        (0.0, 0.51, False, 0.0),  # still on its way
+        (0.0, 0.49, False, 0.1),  # inside the region: task-space feedback takes over
+        (0.0, 1.0, True, 0.0),  # the camera alone takes nothing over
+        (0.5, 1.49, False, 0.6),  # and keeps the lead outside the region,
+        (0.5, 1.51, False, 0.4),  # unless the posture lies far away,
+        (0.5, 1.51, True, 0.6),  # but never while the camera leads
+    ],
+)
+def test_task_space_feedback_takes_over_inside_the_posture_region(
+    before, distance, vision_active, after
+):
+    assert level_after(before, distance, vision_active=vision_active) == pytest.approx(after)
+
+
+def test_without_a_posture_there_is_no_approach_to_take_over_from():
+    before = torch.ones(3, dtype=torch.float64)
+    after = next_task_level(
+        before, None, away(0.0).expand(3, 7), torch.ones(3, dtype=torch.bool), 0.1, 0.3
+    )
+    assert after.tolist() == [0, 0, 0]
+
+
+def test_a_level_stays_between_zero_and_one():
+    level, rising = torch.tensor([0.95, 0.05, 0.5]), torch.tensor([True, False, True])
+    torch.testing.assert_close(fade(level, rising, 0.1, 1.0), torch.tensor([1.0, 0.0, 0.6]))
+
+
+def test_an_approach_is_as_slow_as_the_caps_of_the_tool_ask():
+    q = panda.ready
+    posture = PostureRegion(goal=q + 0.5)
+    J = panda.jacobian(q)
+    for caps in ([0.05, 10.0], [10.0, 0.1], [0.05, 0.1]):
+        v = approach_velocity(posture, q, J, torch.tensor(caps, dtype=torch.float64))
+        twist = J @ v
+        used = torch.stack([twist[:3].norm() / caps[0], twist[3:].norm() / caps[1]])
+        assert used.max().item() == pytest.approx(1.0)
+        # Straight towards the posture.
+        assert torch.nn.functional.cosine_similarity(v, posture.goal - q, dim=0) > 1 - 1e-12
+    free = approach_velocity(posture, q, J, torch.full((2,), 100.0, dtype=torch.float64))
+    torch.testing.assert_close(free, -posture.gradient(q))

@@ -1,5 +1,6 @@
 """A package must be built anew when anything changes that the step depends on."""
 
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -14,6 +15,7 @@ from hrc_learn.controller import (
     Goals,
     Observation,
 )
+from hrc_learn.deploy import package
 from hrc_learn.deploy.export import _structure
 from hrc_learn.deploy.package import UnknownCodeError, content_hash
 from hrc_learn.geometry import quaternion
@@ -43,7 +45,7 @@ def controller(
     return AdaptiveController(panda, estimator, goals, config=ControllerConfig(**config))
 
 
-def test_equal_controllers_have_equal_fingerprints():
+def test_equal_controllers_have_equal_hashes():
     assert content_hash(controller()) == content_hash(controller())
 
 
@@ -95,3 +97,30 @@ def test_code_it_cannot_know_is_refused():
         content_hash(controller(kind=Own))
     with pytest.raises(UnknownCodeError, match="function"):
         content_hash([lambda x: x])
+
+
+def test_a_change_of_any_source_that_a_step_is_made_from_changes_the_hash(
+    tmp_path, monkeypatch
+):
+    for name in package._SOURCES:
+        source = package._ROOT / name
+        assert source.exists(), f"{name} has moved: its changes would go unnoticed"
+        copy = shutil.copytree if source.is_dir() else shutil.copy
+        copy(source, tmp_path / name)
+    monkeypatch.setattr(package, "_ROOT", tmp_path)
+    whole = fresh_hash()
+    for name in ("controller/safety_filter.py", "kinematics/franka.py", "deploy/io_layout.py"):
+        file = tmp_path / name
+        text = file.read_text(encoding="utf-8")
+        file.write_text(text + "# changed\n", encoding="utf-8")
+        assert fresh_hash() != whole
+        file.write_text(text, encoding="utf-8")
+        assert fresh_hash() == whole
+
+
+def fresh_hash() -> str:
+    package._source_hash.cache_clear()
+    try:
+        return content_hash()
+    finally:
+        package._source_hash.cache_clear()
