@@ -71,3 +71,13 @@ def polynomial(x: Tensor, coefficients: tuple[float, ...]) -> Tensor:
     for coefficient in reversed(rest):
         value = value * x + coefficient
     return value
+
+
+def minimum_jerk(x: float) -> tuple[float, float]:
+    """Progress 0 to 1 of a minimum-jerk motion and its slope (Flash and Hogan 1985).
+
+    Args:
+        x: Fraction of the duration. Outside 0 to 1 the motion rests at the start or the end.
+    """
+    x = min(max(x, 0.0), 1.0)
+    return x**3 * (10 - 15 * x + 6 * x**2), 30 * x**2 * (1 - x) ** 2

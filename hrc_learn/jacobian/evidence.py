@@ -1,9 +1,9 @@
-"""Learning where the neurons stand, how wide they are, and how much to trust the camera.
+"""Evidence maximisation: where the neurons stand, how wide they are, how noisy the camera is.
 
 For given neurons the weights have a closed form, and so has the probability of the
 demonstrated image motion with the weights integrated out (type-II maximum likelihood; MacKay
-1992, "Bayesian interpolation"). Its gradient by everything else is what is followed here. The
-error on demonstrations held out says when to stop.
+1992, "Bayesian interpolation"). L-BFGS maximises it over everything else. The error on
+demonstrations held out says when to stop.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from hrc_learn.jacobian.samples import ImageDemonstration, MotionSamples, Regres
 
 @dataclass(frozen=True, kw_only=True)
 class EvidenceConfig:
-    """How long to learn, and what."""
+    """How long to maximise the evidence, and over what."""
 
     rounds: int = 15
     """Rounds of L-BFGS at most."""
@@ -38,7 +38,7 @@ class EvidenceConfig:
     patience: int = 3
     """Rounds without a better held-out error after which to stop."""
     min_improvement: float = 1e-3
-    """Share by which the held-out error has to fall to count as better."""
+    """Fraction by which the held-out error has to fall to count as better."""
     hold_out: int = 4
     """Every n-th demonstration is held out to decide when to stop."""
     max_samples: int = 20_000
@@ -49,7 +49,7 @@ class EvidenceConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class EvidenceRound:
-    """State of learning after a round."""
+    """Neurons, noise and prior after a round, and how good they are."""
 
     evidence: float
     """Negative logarithm of the probability of the image motion, per pair."""
@@ -157,6 +157,7 @@ class NegativeLogEvidence(nn.Module):
     def forward(self, motion: MotionSamples) -> Float[Tensor, ""]:
         """Of the pairs of all processes, each given its own."""
         total = self.statistics(motion)
+        # Variance of a difference of two measurements, each with this deviation.
         noise = 2 * (2 * self.log_noise).exp()
         # In weights that the prior makes independent and of size one, all is well scaled.
         root = torch.block_diag(*[torch.linalg.cholesky(self._prior())] * 6)
@@ -197,6 +198,7 @@ class NegativeLogEvidence(nn.Module):
         precision = prior_precision(self.centers, config)
         noise = 2 * config.pixel_noise**2
         weights = solve(self.statistics(training), precision, noise).mean
+        # Weights of the training pairs alone predict the others.
         unseen = self.statistics(held_out)
         error = (unseen.squared_error(weights) / unseen.count) ** 0.5
         return EvidenceRound(
@@ -223,6 +225,7 @@ def _motions(
         )
     sets: tuple[list[MotionSamples], list[MotionSamples]] = ([], [])
     for i, demonstration in distributed.share(demonstrations):
+        # By the number among all demonstrations, the same however many processes there are.
         is_held_out = (i + 1) % learning.hold_out == 0
         sets[is_held_out].append(demonstration.motion(config))
     for motions in sets:

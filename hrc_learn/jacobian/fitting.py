@@ -96,30 +96,32 @@ def prior_precision(
 
 
 def fit_weights(
-    parts: Sequence[RegressionStatistics],
+    folds: Sequence[RegressionStatistics],
     precision: Float[Tensor, "P P"],
     config: ImageJacobianFitConfig,
 ) -> tuple[Posterior, ImageJacobianFitReport]:
-    """Fit to all parts; each part in turn is held out to measure the error on unseen data.
+    """Fit to all folds; each in turn is held out to measure the error on unseen data.
 
     Args:
-        parts: Statistics of parts of the data that were recorded apart.
+        folds: Statistics of parts of the data that were recorded apart.
         precision: Of the prior (see `prior_precision`).
         config: Noise of the feature.
 
     Raises:
         ValueError: There is no pair at all.
     """
-    parts = [part for part in parts if part.count]
-    if not parts:
+    folds = [fold for fold in folds if fold.count]
+    if not folds:
         raise ValueError(
             "no two visible key frames are within reach of each other: the feature was not "
             "seen, or the tool moved less than min_step or more than max_step at a time."
         )
-    total = reduce(add, parts)
-    noise = 2 * config.pixel_noise**2
-    held_out = _held_out_square(parts, precision, noise)
-    noise = max(noise, held_out / 2)  # two coordinates
+    total = reduce(add, folds)
+    noise = 2 * config.pixel_noise**2  # of a difference of two measurements
+    held_out = _held_out_square(folds, precision, noise)
+    # The network may be too coarse for the data: then its error is noise to the weights. Half
+    # of it, as the square sums two coordinates. (NaN, with one fold, leaves the noise.)
+    noise = max(noise, held_out / 2)
     posterior = solve(total, precision, noise)
     report = ImageJacobianFitReport(
         pairs=total.count,
@@ -147,13 +149,13 @@ def solve(
 
 
 def _held_out_square(
-    parts: Sequence[RegressionStatistics], precision: Tensor, noise: float
+    folds: Sequence[RegressionStatistics], precision: Tensor, noise: float
 ) -> float:
-    """Mean squared error over all pairs, each predicted without its own part."""
-    if len(parts) == 1:
+    """Mean squared error over all pairs, each predicted without its own fold."""
+    if len(folds) == 1:
         return float("nan")
     error = 0.0
-    for i, held_out in enumerate(parts):
-        rest = reduce(add, [*parts[:i], *parts[i + 1 :]])
+    for i, held_out in enumerate(folds):
+        rest = reduce(add, [*folds[:i], *folds[i + 1 :]])
         error += held_out.squared_error(solve(rest, precision, noise).mean)
-    return error / sum(part.count for part in parts)
+    return error / sum(fold.count for fold in folds)

@@ -26,8 +26,6 @@ from hrc_learn.jacobian.samples import (
 )
 from hrc_learn.storage import SavedModel, write_model
 
-# The image Jacobian as a network of radial basis functions of the tool's pose.
-
 _KIND = "RBFImageJacobian"
 _UNITS = {"position": "m", "rotation": "rad", "jacobian": "px/m, px/rad", "pixels": "u, v"}
 
@@ -320,9 +318,6 @@ def _checked_indices(indices: Sequence[int], centers: Tensor) -> tuple[int, ...]
     return tuple(indices)
 
 
-# One network for a feature of several points.
-
-
 def stack_networks(networks: Sequence[RBFImageJacobian]) -> RBFImageJacobian:
     """One network for all points of a feature, from one for each of them.
 
@@ -361,9 +356,6 @@ def _same_neurons(a: RBFImageJacobian, b: RBFImageJacobian) -> bool:
         and (a.input_indices, a.normalized) == (b.input_indices, b.normalized)
         and (not references or (len(references) == 2 and torch.equal(*references)))
     )
-
-
-# Prior that knows depth and rotation: a network that starts as the model of a rough camera.
 
 
 def nominal_network(

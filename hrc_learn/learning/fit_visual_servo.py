@@ -13,6 +13,7 @@ from hrc_learn.demos import Demonstration, DemonstrationSet, DemonstrationSource
 from hrc_learn.geometry import Pose
 from hrc_learn.jacobian import (
     EvidenceConfig,
+    EvidenceRound,
     ImageDemonstration,
     ImageJacobianFitConfig,
     RBFCenters,
@@ -20,7 +21,6 @@ from hrc_learn.jacobian import (
     cross_validate,
     maximize_evidence,
 )
-from hrc_learn.jacobian.evidence import EvidenceRound
 from hrc_learn.kinematics import panda
 from hrc_learn.kinematics.tool_orientation import Approach
 from hrc_learn.skills.visual_servoing import AimingSkill

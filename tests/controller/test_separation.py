@@ -55,7 +55,7 @@ def test_the_tool_is_as_fast_as_the_distance_allows():
 
 @pytest.mark.parametrize(("distance", "acts"), [(0.1, True), (math.nan, True), (9.0, False)])
 def test_a_person_too_close_ends_motion_in_the_null_space_too(distance, acts):
-    """The tool is at rest anyway; that the arm must be, too, is an intervention all the same."""
+    """The tool is at rest anyway; that all joints must be is an intervention all the same."""
     safety, J = SafetyFilter(panda.limits), panda.jacobian(READY)
     u = null_space_projector(J) @ torch.ones(7, dtype=torch.float64)
     assert u.norm() > 0.1

@@ -13,24 +13,22 @@ from unchecked import shapes_unchecked
 
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import (
+    BroydenConfig,
     BroydenEstimator,
+    CompositeConfig,
     CompositeEstimator,
     FixedEstimator,
+    KalmanConfig,
     KalmanEstimator,
+    LeastSquaresConfig,
     Measurement,
     PaperEstimator,
     RBFImageJacobian,
     RecursiveLeastSquaresEstimator,
     paper_grid,
 )
-from hrc_learn.jacobian.estimators import (
-    BroydenConfig,
-    CompositeConfig,
-    KalmanConfig,
-    LeastSquaresConfig,
-)
-from hrc_learn.jacobian.estimators.key_frames import MotionSample
-from hrc_learn.jacobian.estimators.recursive import condition
+from hrc_learn.jacobian.estimator import MotionSample
+from hrc_learn.jacobian.recursive_estimators import condition
 
 ALL = [
     FixedEstimator,

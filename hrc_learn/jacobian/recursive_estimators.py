@@ -1,4 +1,7 @@
-"""Recursive estimation of the weights: least squares with forgetting, and a Kalman filter."""
+"""Recursive estimation of the weights: least squares with forgetting, and a Kalman filter.
+
+Both keep one Gaussian for both image rows, which see the same regressors.
+"""
 
 from __future__ import annotations
 
@@ -9,14 +12,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.geometry.small_matrices import matmul
-from hrc_learn.jacobian.estimators.estimator import Measurement
-from hrc_learn.jacobian.estimators.key_frames import KeyFrame, KeyFrameEstimator, MotionSample
+from hrc_learn.jacobian.estimator import KeyFrame, KeyFrameEstimator, Measurement, MotionSample
 from hrc_learn.jacobian.fitting import weight_covariance
 from hrc_learn.jacobian.network import RBFImageJacobian
 from hrc_learn.jacobian.samples import KeyFrameConfig
 from hrc_learn.pytree import pytree
-
-# Recursive Bayesian estimation of the weights: one Gaussian for both image rows.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,9 +106,6 @@ def condition(
     return weight + change.flatten(-3, -2), covariance - root.mT * root
 
 
-# Recursive least squares with exponential forgetting.
-
-
 @dataclass(frozen=True, kw_only=True)
 class LeastSquaresConfig(RecursiveConfig):
     """Prior, noise and forgetting."""
@@ -150,9 +147,6 @@ class RecursiveLeastSquaresEstimator(RecursiveEstimator):
         return RecursiveState(
             weight=self.projected(weight), covariance=covariance * shrink, key=key
         )
-
-
-# Kalman filter on the weights.
 
 
 @dataclass(frozen=True, kw_only=True)
