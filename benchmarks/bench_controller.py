@@ -35,7 +35,7 @@ from hrc_learn.controller import (
     Observation,
     SafetyFilter,
 )
-from hrc_learn.controller.resolved_rate import resolve
+from hrc_learn.controller.resolved_rate import resolved_rate
 from hrc_learn.deploy import EagerRunner, StepRunner, open_step
 from hrc_learn.geometry import quaternion
 from hrc_learn.jacobian import (
@@ -127,7 +127,7 @@ def _single_calls(args: Args, console: Console) -> dict[str, Callable[[], object
 
     def floor() -> object:
         _, J = panda.forward_and_jacobian(q)
-        return resolve(J, twist, effort)
+        return resolved_rate(J, twist, effort)
 
     safety = SafetyFilter(panda.limits)
     safe = safety.initial_state(q)
@@ -136,7 +136,7 @@ def _single_calls(args: Args, console: Console) -> dict[str, Callable[[], object
         observation,
         feature_new=torch.tensor(True),
         image_joint_position=q.clone(),
-        human_effort=effort,
+        nullspace_input=effort,
     )
     calls: dict[str, Callable[[], object]] = {
         "kinematics": lambda: panda.transform_and_jacobian(q),

@@ -18,7 +18,7 @@ import torch
 from hrc_learn import cli
 from hrc_learn.demos import DatasetWriter, Demonstration, open_demos
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.jacobian import ImageJacobianFitConfig, Neurons, RBFImageJacobian
+from hrc_learn.jacobian import ImageJacobianFitConfig, RBFCenters, RBFImageJacobian
 from hrc_learn.learning.fit_primitives import fit_streamed
 from hrc_learn.learning.fit_visual_servo import Watching
 
@@ -58,7 +58,9 @@ def main(args: Args) -> None:
         camera = Watching(demos)
         config = ImageJacobianFitConfig(pixel_noise=0.1)
         took, network = _timed(
-            lambda: RBFImageJacobian.fit_watched(camera, Neurons.around(camera), config)
+            lambda: RBFImageJacobian.fit_demonstrations(
+                camera, RBFCenters.around(camera), config
+            )
         )
         figures["jacobian_fit_s"] = took
         figures["peak_growth_mb"] = _peak_memory() - before

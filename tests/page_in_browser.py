@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from hrc_learn.demos import DatasetWriter
-from hrc_learn.deploy import Metronome
+from hrc_learn.deploy import Rate
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import MovingBodies, World
 from hrc_learn.sim.workplace import Workplace
@@ -59,7 +59,7 @@ class Session:
         self._thread = threading.Thread(target=self._run)
 
     def _run(self):
-        metronome = Metronome(0.01)
+        metronome = Rate(0.01)
         while not self._closing.is_set():
             self.instant = self.session.step()
             metronome.wait()

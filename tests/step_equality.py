@@ -13,7 +13,7 @@ from hrc_learn.controller import (
     Goals,
     Observation,
 )
-from hrc_learn.deploy.io_layout import FlatStep, Layouts, Vectors
+from hrc_learn.deploy.io_layout import PackedStep, StepLayouts, Vectors
 from hrc_learn.geometry import quaternion
 from hrc_learn.jacobian import KalmanEstimator, RBFImageJacobian, paper_grid
 from hrc_learn.kinematics import panda
@@ -53,7 +53,7 @@ def controller_and_observation(
         feature_new=torch.ones(batch, dtype=torch.bool),
         feature_age=torch.zeros(batch, dtype=q.dtype),
         image_joint_position=q,
-        human_effort=torch.zeros_like(q),
+        nullspace_input=torch.zeros_like(q),
         goals=goals,
         dt=0.002,
     )
@@ -67,11 +67,11 @@ def assert_equal_steps(
     steps: int,
 ) -> None:
     """Compares single steps from states that the eager step has reached."""
-    step = FlatStep(controller, observation)
+    step = PackedStep(controller, observation)
     expected = step.example(observation)
     first = expected.state.clone()
     arms = _of_each_arm(step.layouts.observation.arrays(expected.observation))
-    active = step.layouts.state.arrays(expected.state)["activation.active"]
+    active = step.layouts.state.arrays(expected.state)["blending.active"]
     rng, followed = np.random.default_rng(0), 0.0
     for k in range(steps):
         for arm in arms:
@@ -87,7 +87,7 @@ def assert_equal_steps(
     assert 0.1 * steps < followed < 0.9 * steps
 
 
-def _assert_equal(layouts: Layouts, expected: Vectors, actual: Vectors, step: int) -> None:
+def _assert_equal(layouts: StepLayouts, expected: Vectors, actual: Vectors, step: int) -> None:
     for layout, e, a in zip(layouts, expected, actual, strict=True):
         for field, x, y in zip(layout.fields, layout.views(e), layout.views(a), strict=True):
             exact = not field.dtype.is_floating_point
@@ -126,9 +126,9 @@ def _observe_at_random(arrays: Arrays, rng: np.random.Generator) -> None:
     arrays["feature_visible"][...] = rng.random() < 0.8
     arrays["feature_new"][...] = rng.random() < 0.5
     arrays["feature_age"][...] = rng.uniform(0, 0.3)
-    arrays["human_effort"][:] = 2 * rng.standard_normal(7) * (rng.random() < 0.5)
+    arrays["nullspace_input"][:] = 2 * rng.standard_normal(7) * (rng.random() < 0.5)
     arrays["goals.vision.target"][:] = rng.uniform(200, 900, 2)
     arrays["goals.vision_enabled"][...] = rng.random() < 0.9
-    for name, share in (("feature", 0.1), ("joint_position", 0.02), ("human_effort", 0.01)):
+    for name, share in (("feature", 0.1), ("joint_position", 0.02), ("nullspace_input", 0.01)):
         if rng.random() < share:
             arrays[name].flat[0] = np.nan

@@ -22,7 +22,13 @@ from safetensors.torch import save_file
 from hrc_learn import distributed
 from hrc_learn.dmp import fit_shared
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.jacobian import LearningConfig, Neurons, RBFImageJacobian, learn, watched
+from hrc_learn.jacobian import (
+    EvidenceConfig,
+    RBFCenters,
+    RBFImageJacobian,
+    image_demonstrations,
+    maximize_evidence,
+)
 
 rng = torch.Generator().manual_seed(0)
 
@@ -50,11 +56,14 @@ motions = [motion(100 + 7 * i) for i in range(5)]
 views = [view(80 + 3 * i) for i in range(5)]
 with distributed.processes() as rank:
     shared = fit_shared(motions, 20)
-    demonstrations = watched([pose for pose, _ in views], [pixel for _, pixel in views])
-    around = Neurons.around(demonstrations)
-    few = LearningConfig(rounds=2, iterations=3)
-    learned = learn(demonstrations, around, learning=few)
-    network = RBFImageJacobian.fit_watched(demonstrations, learned.neurons, learned.config)
+    poses, features = [pose for pose, _ in views], [pixel for _, pixel in views]
+    demonstrations = image_demonstrations(poses, features)
+    around = RBFCenters.around(demonstrations)
+    few = EvidenceConfig(rounds=2, iterations=3)
+    learned = maximize_evidence(demonstrations, around, learning=few)
+    network = RBFImageJacobian.fit_demonstrations(
+        demonstrations, learned.neurons, learned.config
+    )
     result = {
         "processes": torch.tensor(distributed.count()),
         "primitive": shared.primitive.rollout().position,

@@ -1,4 +1,6 @@
-"""Smooth chunks: what a policy asks for, followed as nearly as limits of the motion allow."""
+"""A jerk-limited filter of action chunks: what a policy asks for, followed as nearly as the
+limits of position, velocity, acceleration and jerk allow.
+"""
 
 from __future__ import annotations
 
@@ -13,51 +15,52 @@ from hrc_learn.controller.motion_barriers import LimitBarrier
 from hrc_learn.kinematics import MotionLimits
 from hrc_learn.pytree import pytree
 
-BROKEN = ("position", "velocity", "acceleration", "jerk")
+LIMIT_KINDS = ("position", "velocity", "acceleration", "jerk")
 """Limits that a chunk may break, in the order of the last axis of a report's flags."""
 
-_SHARE = 0.8
-"""Of the limits, what a correction counts on; the motion that is followed needs the rest."""
+# Fraction of the limits that a correction counts on; the motion followed needs the rest.
+_USABLE = 0.8
+# Fastest decay of errors, as fractions of the sampling rate: of those tried, the fastest with
+# which steps of 0.03 to 1 rad settle without overshoot at 20 and 50 samples a second.
 _POSITION_RATE, _VELOCITY_RATE = 0.35, 0.7
-"""Fastest decay of errors, in shares of the sampling rate: of those tried, the fastest with
-which steps of 0.03 to 1 rad settle without overshoot at 20 and 50 samples a second."""
+# Differences of rounded numbers, float32 too, may exceed a limit in the last digits.
 _ROUNDING = 1 + 1e-6
-_ABSURD = 1e50
-"""Squares of much larger numbers overflow."""
+# Larger numbers are taken for invalid: squares of much larger ones overflow.
+_LARGEST_VALID = 1e50
 
 
 @pytree
 @dataclass(frozen=True, kw_only=True)
-class SmoothState:
+class ActionChunkState:
     """Where the motion is, carried from one chunk to the next."""
 
     position: Float[Tensor, "*batch D"]
-    """Last one handed out."""
+    """Of the last sample of the output."""
     velocity: Float[Tensor, "*batch D"]
-    """By which it was reached [1/s]."""
+    """Difference quotient that led to it [1/s]."""
     acceleration: Float[Tensor, "*batch D"]
-    """By which that came about [1/s^2]."""
-    asked: Float[Tensor, "*batch D"]
+    """Difference quotient that led to the velocity [1/s^2]."""
+    reference: Float[Tensor, "*batch D"]
     """Last position asked for."""
-    asked_velocity: Float[Tensor, "*batch D"]
-    """With which it moved [1/s]."""
-    asked_acceleration: Float[Tensor, "*batch D"]
-    """By which that came about [1/s^2]."""
+    reference_velocity: Float[Tensor, "*batch D"]
+    """With which it moved, as far as it was a motion [1/s]."""
+    reference_acceleration: Float[Tensor, "*batch D"]
+    """Likewise [1/s^2]."""
 
 
 @pytree
 @dataclass(frozen=True, kw_only=True)
-class SmoothReport:
+class ActionChunkReport:
     """What was wrong with a chunk, and what was changed."""
 
     broken: Bool[Tensor, "*batch T 4"]
-    """Whether to go there from the state, to the letter, would have broken each of `BROKEN`."""
+    """Whether each of `LIMIT_KINDS` would be broken by going there exactly, from the state."""
     change: Float[Tensor, "*batch T D"]
     """Position handed out less the one asked for."""
 
 
 @final
-class ChunkSmoother(nn.Module):
+class ActionChunkFilter(nn.Module):
     """Follows chunks of positions within limits of position, velocity, acceleration and jerk.
 
     A chunk that keeps the limits and goes on where the last one ended comes out as it went in.
@@ -78,10 +81,10 @@ class ChunkSmoother(nn.Module):
     Each coordinate is followed by itself, in the unit of its limits.
     """
 
-    braking: Tensor
-    """A."""
-    fading: Tensor
-    """j."""
+    braking_acceleration: Tensor
+    """A of the corrections [1/s^2]."""
+    braking_jerk: Tensor
+    """j of the corrections [1/s^3]."""
     position_rate: Tensor
     """lambda [1/s]."""
 
@@ -99,11 +102,11 @@ class ChunkSmoother(nn.Module):
         super().__init__()
         _check(limits, dt)
         self.dt = dt
-        limits = replace(limits, acceleration=_that_leaves_room(limits, dt))
+        limits = replace(limits, acceleration=_reduced_acceleration(limits, dt))
         self.barrier = LimitBarrier(limits, margin=0.0, rate=1 / dt, jerk_limited=True)
-        A, j = _SHARE * limits.acceleration, _SHARE * limits.jerk
-        self.register_buffer("braking", A)
-        self.register_buffer("fading", j)
+        A, j = _USABLE * limits.acceleration, _USABLE * limits.jerk
+        self.register_buffer("braking_acceleration", A)
+        self.register_buffer("braking_jerk", j)
         self.register_buffer("position_rate", (j / A).clamp(max=_POSITION_RATE / dt))
         self.velocity_rate = _VELOCITY_RATE / dt
 
@@ -111,23 +114,23 @@ class ChunkSmoother(nn.Module):
         self,
         position: Float[Tensor, "*batch D"],
         velocity: Float[Tensor, "*batch D"] | None = None,
-    ) -> SmoothState:
+    ) -> ActionChunkState:
         """State of a motion at rest, or in steady motion, in the limits' precision."""
-        position = position.to(self.braking)
+        position = position.to(self.braking_acceleration)
         still = torch.zeros_like(position)
         velocity = still if velocity is None else still + velocity
-        return SmoothState(
+        return ActionChunkState(
             position=position,
             velocity=velocity,
             acceleration=still,
-            asked=position,
-            asked_velocity=velocity,
-            asked_acceleration=still,
+            reference=position,
+            reference_velocity=velocity,
+            reference_acceleration=still,
         )
 
     def forward(
-        self, chunk: Float[Tensor, "*batch T D"], state: SmoothState
-    ) -> tuple[Tensor, SmoothState, SmoothReport]:
+        self, chunk: Float[Tensor, "*batch T D"], state: ActionChunkState
+    ) -> tuple[Tensor, ActionChunkState, ActionChunkReport]:
         """Follow one chunk, of one sample or many.
 
         Args:
@@ -139,36 +142,38 @@ class ChunkSmoother(nn.Module):
             Positions (*batch, T, D) to go to instead, in the chunk's precision; the state
             after the last; what was changed.
         """
-        asked = _filled(chunk.to(self.braking), state.asked)
-        broken = self._broken(asked, state)
+        asked = _replace_invalid(chunk.to(self.braking_acceleration), state.reference)
+        broken = self._broken_limits(asked, state)
         positions = []
         for k in range(asked.shape[-2]):
             state = self._step(state, asked[..., k, :])
             positions.append(state.position)
         smooth = torch.stack(positions, dim=-2)
-        report = SmoothReport(broken=broken, change=smooth - asked)
+        report = ActionChunkReport(broken=broken, change=smooth - asked)
         return smooth.to(chunk), state, report
 
-    def _step(self, state: SmoothState, asked: Tensor) -> SmoothState:
+    def _step(self, state: ActionChunkState, asked: Tensor) -> ActionChunkState:
         """Go towards one sample."""
         dt = self.dt
-        velocity, acceleration = self._followed(state, asked)
+        velocity, acceleration = self._reference_motion(state, asked)
         error = state.position - (asked - velocity * dt)
         rate = state.velocity - (velocity - acceleration * dt)
-        approach, slope = _braked(error, self.braking, self.position_rate)
-        fade, _ = _braked(rate + approach, self.fading, self.velocity_rate)
-        a = self._allowed(state, acceleration - slope * rate - fade)
+        approach, slope = _braking_rate(error, self.braking_acceleration, self.position_rate)
+        fade, _ = _braking_rate(rate + approach, self.braking_jerk, self.velocity_rate)
+        a = self._clamped(state, acceleration - slope * rate - fade)
         v = state.velocity + a * dt
-        return SmoothState(
+        return ActionChunkState(
             position=state.position + v * dt,
             velocity=v,
             acceleration=a,
-            asked=asked,
-            asked_velocity=velocity,
-            asked_acceleration=(velocity - state.asked_velocity) / dt,
+            reference=asked,
+            reference_velocity=velocity,
+            reference_acceleration=(velocity - state.reference_velocity) / dt,
         )
 
-    def _followed(self, state: SmoothState, asked: Tensor) -> tuple[Tensor, Tensor]:
+    def _reference_motion(
+        self, state: ActionChunkState, asked: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Velocity and acceleration of the samples, as far as they are a motion.
 
         Both are those of the samples where these keep the limits. Where they do not, the
@@ -176,25 +181,25 @@ class ChunkSmoother(nn.Module):
         still learns a new slope, and there is no acceleration to be followed.
         """
         barrier, dt = self.barrier, self.dt
-        change = ((asked - state.asked) / dt - state.asked_velocity) / dt
+        change = ((asked - state.reference) / dt - state.reference_velocity) / dt
         limited = change.clamp(-barrier.acceleration, barrier.acceleration)
-        jerk = (limited - state.asked_acceleration) / dt
+        jerk = (limited - state.reference_acceleration) / dt
         motion = (jerk.abs() <= barrier.jerk * _ROUNDING) & (limited == change)
-        return state.asked_velocity + limited * dt, limited.masked_fill(~motion, 0)
+        return state.reference_velocity + limited * dt, limited.masked_fill(~motion, 0)
 
-    def _allowed(self, state: SmoothState, acceleration: Tensor) -> Tensor:
-        """The acceleration with which the limits are kept, now and later."""
-        barrier, last, most = self.barrier, state.acceleration, self.barrier.jerk * self.dt
+    def _clamped(self, state: ActionChunkState, acceleration: Tensor) -> Tensor:
+        """The nearest acceleration with which the limits are kept, now and later."""
+        barrier, last, reach = self.barrier, state.acceleration, self.barrier.jerk * self.dt
         bounds = barrier.velocity_bounds(state.position)
         lower, upper = barrier.acceleration_bounds(state.velocity, bounds, self.dt)
         acceleration = acceleration.clamp(lower, upper)
         # Last what no start can exceed: outside its set the barrier may ask for more.
         return acceleration.clamp(
-            torch.maximum(last - most, -barrier.acceleration),
-            torch.minimum(last + most, barrier.acceleration),
+            torch.maximum(last - reach, -barrier.acceleration),
+            torch.minimum(last + reach, barrier.acceleration),
         )
 
-    def _broken(self, asked: Tensor, state: SmoothState) -> Tensor:
+    def _broken_limits(self, asked: Tensor, state: ActionChunkState) -> Tensor:
         """Flags of a report."""
         barrier, dt = self.barrier, self.dt
         upper_wall, lower_wall = barrier.walls[1], -barrier.walls[0]
@@ -210,26 +215,33 @@ class ChunkSmoother(nn.Module):
         return torch.stack(flags, dim=-1)
 
 
-def _braked(x: Tensor, strength: Tensor, rate: Tensor | float) -> tuple[Tensor, Tensor]:
-    """The function h and its slope: how fast x may change if it is to come to rest at zero."""
+def _braking_rate(x: Tensor, strength: Tensor, rate: Tensor | float) -> tuple[Tensor, Tensor]:
+    """The function h and its slope: how fast x may change if it is to come to rest at zero.
+
+    Square root far from zero (constant deceleration), a line of slope `rate` close to it.
+    """
     knee = strength / rate
     root = torch.sqrt(knee**2 + 2 * strength * x.abs())
     return torch.sign(x) * (root - knee), strength / root
 
 
-def _filled(chunk: Tensor, before: Tensor) -> Tensor:
-    """The chunk with what cannot be meant replaced by what came before it."""
-    if (chunk.abs() < _ABSURD).all():
+def _replace_invalid(chunk: Tensor, before: Tensor) -> Tensor:
+    """The chunk with what is no number, or absurdly large, replaced by the value before it."""
+    if (chunk.abs() < _LARGEST_VALID).all():
         return chunk
     rows = []
     for row in chunk.unbind(-2):
-        before = torch.where(row.abs() < _ABSURD, row, before)
+        before = torch.where(row.abs() < _LARGEST_VALID, row, before)
         rows.append(before)
     return torch.stack(rows, dim=-2)
 
 
-def _that_leaves_room(limits: MotionLimits, dt: float) -> Tensor:
-    """Acceleration that can be ended well before a limit of position."""
+def _reduced_acceleration(limits: MotionLimits, dt: float) -> Tensor:
+    """Acceleration that can be ended within a twentieth of the range before a limit.
+
+    The larger of both terms of the way that `LimitBarrier` needs at rest stays below the room,
+    so that together they take at most a tenth of the range.
+    """
     room, j = 0.05 * (limits.upper - limits.lower), limits.jerk
     ramped = torch.minimum((8 * j**2 * room) ** (1 / 3), (2 * j * room / dt).sqrt())
     return torch.minimum(limits.acceleration, ramped)

@@ -1,5 +1,6 @@
-"""Settings of the controller that stay the same through a task, and those of the paper's
-Table I.
+"""Settings of the controller that stay the same through a task, and the paper's parameters.
+
+The paper's are those of its grasping experiment (Table I), as printed.
 """
 
 from __future__ import annotations
@@ -12,19 +13,26 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.controller.blending import ActivationConfig
+from hrc_learn.controller.blending import BlendingConfig
 from hrc_learn.controller.interface import Goals
 from hrc_learn.controller.safety_filter import SafetyConfig
 from hrc_learn.geometry import quaternion
 from hrc_learn.kinematics import JointLimits
 from hrc_learn.regions import JointRegion, OrientationRegion, PositionRegion, VisionRegion
 
-# Settings of the controller that stay the same through a task.
+GRIPPER_DOWN = (-0.28, 0.63, 0.66, 0.28)
+"""p_g as printed; its norm is 0.995, and scalar first it points the gripper down."""
+
+INITIAL_IMAGE_JACOBIAN = (
+    (-1500.0, 0.0, 0.0, 0.0, -200.0, 60.0),
+    (0.0, 2400.0, 170.0, -200.0, 0.0, 180.0),
+)
+"""J_s_hat at t = 0 [px/m, px/rad] (eq_js0): a camera above whose image right is -x."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ControllerConfig:
-    """The defaults are those that were measured to work best."""
+    """Settings of the law; the defaults are those that were measured to work best."""
 
     linear_speed: float = 0.25
     """Cap on the linear part of the twist [m/s]; the direction of the twist is kept."""
@@ -42,12 +50,12 @@ class ControllerConfig:
     """By which gradients become motions of the tool: the analytic one counts rotation by the
     rotation vector, whose rates differ from angular velocity the more the tool is turned."""
     null_damping: float = 3.0
-    """c_d: effort divided by it is velocity."""
+    """c_d: null-space input divided by it is velocity."""
     null_space_yields: bool = True
     """Scale null-space motion as a whole where a limit would cut single joints."""
-    hold_rate: float = 2.0
+    drift_compensation_rate: float = 2.0
     """Rate at which the tool returns to its place while a person acts [1/s]; 0: it does not."""
-    activation: ActivationConfig = field(default_factory=ActivationConfig)
+    blending: BlendingConfig = field(default_factory=BlendingConfig)
     safety: SafetyConfig = field(default_factory=SafetyConfig)
 
     def __post_init__(self):
@@ -65,8 +73,11 @@ class ControllerConfig:
             raise ValueError(
                 f"jacobian must be 'geometric' or 'analytic', but is {self.jacobian!r}"
             )
-        if self.hold_rate < 0:
-            raise ValueError(f"hold_rate must not be negative, but is {self.hold_rate}")
+        if self.drift_compensation_rate < 0:
+            raise ValueError(
+                "drift_compensation_rate must not be negative, but is "
+                f"{self.drift_compensation_rate}"
+            )
 
     @classmethod
     def paper(cls) -> ControllerConfig:
@@ -76,39 +87,22 @@ class ControllerConfig:
             angular_speed=math.inf,
             vision_rate=math.inf,
             null_space_yields=False,
-            hold_rate=0.0,
-            activation=ActivationConfig(hysteresis=0.0, blend_time=0.0),
+            drift_compensation_rate=0.0,
+            blending=BlendingConfig(hysteresis=0.0, blend_time=0.0),
         )
 
 
-# Table I of the paper: the settings of its grasping experiment, as printed.
-
-GRIPPER_DOWN = (-0.28, 0.63, 0.66, 0.28)
-"""p_g as printed; its norm is 0.995, and scalar first it points the gripper down."""
-
-INITIAL_IMAGE_JACOBIAN = (
-    (-1500.0, 0.0, 0.0, 0.0, -200.0, 60.0),
-    (0.0, 2400.0, 170.0, -200.0, 0.0, 180.0),
-)
-"""J_s_hat at t = 0 [px/m, px/rad] (eq_js0): a camera above whose image right is -x."""
-
-
-def table1_config() -> ControllerConfig:
-    """The law as printed; only the safety filter stands between it and the arm."""
-    return ControllerConfig.paper()
-
-
-def table1_joint_region(limits: JointLimits) -> JointRegion:
-    """Joint-space region with its printed, symmetric form; the gains are the default."""
+def paper_joint_region(limits: JointLimits) -> JointRegion:
+    """The paper's joint-space region in its printed, symmetric form; default gains."""
     return JointRegion.from_limits(limits.lower, limits.upper, formulation="paper")
 
 
-def table1_goals(
+def paper_goals(
     centre: Float[Tensor, "*#batch 3"],
     half_size: Float[Tensor, "*#batch 3"],
     target: Float[Tensor, "*#batch 2"],
 ) -> Goals:
-    """Regions with their printed gains and gradients.
+    """The paper's regions with their printed gains and gradients.
 
     Args:
         centre: Of the box, which the paper leaves to the expert [m].

@@ -11,25 +11,29 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.utils import _pytree
 
-from hrc_learn.controller.blending import Activation, HandOver, approach_velocity, next_arrival
+from hrc_learn.controller.blending import (
+    BlendingState,
+    VisionBlending,
+    approach_velocity,
+    next_task_level,
+)
 from hrc_learn.controller.config import ControllerConfig
 from hrc_learn.controller.feedback import (
     Feedback,
     analytic_descent,
     effective_goals,
-    either,
     regional_feedback,
-    trusted_position,
+    validated_position,
 )
 from hrc_learn.controller.interface import Command, ControllerState, Goals, Observation
 from hrc_learn.controller.monitors import potential_rate
 from hrc_learn.controller.resolved_rate import (
-    Hold,
+    PoseDrift,
     excess_speed,
-    fit_null_space,
     measure_drift,
     planned_motion,
-    resolve,
+    resolved_rate,
+    scale_null_space,
 )
 from hrc_learn.controller.safety_filter import SafetyFilter
 from hrc_learn.geometry import Pose
@@ -44,9 +48,13 @@ class _Motion(NamedTuple):
     joint_velocity: Tensor
     null_velocity: Tensor
     twist: Tensor
+    """Of the tool: the task's, and the correction of the pose drift."""
     task_twist: Tensor
     xi_q: Tensor
     bounds: tuple[Tensor, Tensor]
+    """Velocities that limits of position and velocity allow."""
+    pose_drift: PoseDrift | None
+    """None: not compensated in this step."""
 
 
 @final
@@ -88,7 +96,7 @@ class AdaptiveController(nn.Module):
         self.config = config = config or ControllerConfig()
         limits = chain.limits
         self.joint_region = joint_region or JointRegion.from_limits(limits.lower, limits.upper)
-        self.hand_over = HandOver(config.activation)
+        self.blending = VisionBlending(config.blending)
         self.safety = SafetyFilter(limits, config.safety)
         caps = [
             [config.linear_speed, config.angular_speed],
@@ -115,11 +123,11 @@ class AdaptiveController(nn.Module):
         J = self.chain.jacobian(joint_position)
         still = torch.zeros_like(J[..., 0])
         return ControllerState(
-            activation=self.hand_over.initial_state(
+            blending=self.blending.initial_state(
                 joint_position, self.estimator.network.rows // 2
             ),
-            arrival=torch.zeros_like(joint_position[..., 0]),
-            hold=Hold(
+            task_level=torch.zeros_like(joint_position[..., 0]),
+            pose_drift=PoseDrift(
                 drift=still,
                 joint_position=joint_position,
                 jacobian=J,
@@ -146,30 +154,33 @@ class AdaptiveController(nn.Module):
             ValueError: dt is not in (0, 1/rate] of the safety filter.
         """
         goals, known = effective_goals(observation, self.goals)
-        q, stale = trusted_position(observation, state.safety.position)
+        q, stale = validated_position(observation, state.safety.position)
         pose, J = self.chain.forward_and_jacobian(q)
-        arrival = next_arrival(
-            state.arrival,
+        task_level = next_task_level(
+            state.task_level,
             goals.posture,
             q,
-            state.activation.active,
+            state.blending.active,
             observation.dt,
-            self.config.activation.blend_time,
+            self.config.blending.blend_time,
         )
         usable = observation.feature_visible & goals.vision_enabled & known
-        activation, seen, stop = self.hand_over.step(
-            state.activation,
+        # During a joint-space approach the camera does not take part.
+        blending, seen, stop = self.blending.step(
+            state.blending,
             observation.feature,
-            usable if goals.posture is None else usable & (arrival > 0),
+            usable if goals.posture is None else usable & (task_level > 0),
             observation.dt,
             age=observation.feature_age,
         )
         J_s = self.estimator.jacobian(state.estimator, pose)
-        feedback = regional_feedback(goals, pose, activation, J_s, self.config.vision_rate)
+        feedback = regional_feedback(goals, pose, blending, J_s, self.config.vision_rate)
         descent = feedback.s
         if self.config.jacobian == "analytic":
             descent = analytic_descent(descent, pose.orientation)
-        motion, hold = self._motion(state, observation, goals, q, J, arrival, descent)
+        motion = self._motion(state, observation, goals, q, J, task_level, descent)
+        if observation.stop is not None:
+            stop = observation.stop if stop is None else stop | observation.stop
         v, safety, report = self.safety.step(
             state.safety,
             q,
@@ -177,15 +188,18 @@ class AdaptiveController(nn.Module):
             observation.dt,
             jacobian=J,
             human_distance=observation.human_distance,
-            stop=either(stop, observation.stop),
+            stop=stop,
             stale=stale,
             bounds=motion.bounds,
         )
-        if hold is None:
-            hold = replace(state.hold, active=torch.zeros_like(state.hold.active))
+        # What the filter left of the task's motion is what the tool ought to do until the next
+        # step: whatever else it does is drift.
+        if motion.pose_drift is None:
+            off = torch.zeros_like(state.pose_drift.active)
+            pose_drift = replace(state.pose_drift, active=off)
         else:
             planned = planned_motion(motion.task_twist, J, v, observation.dt)
-            hold = replace(hold, planned=planned)
+            pose_drift = replace(motion.pose_drift, planned=planned)
         command = Command(
             joint_velocity=v,
             twist=motion.twist,
@@ -196,16 +210,16 @@ class AdaptiveController(nn.Module):
             s=feedback.s,
             image_jacobian=J_s,
             weight_norm=torch.linalg.vector_norm(state.estimator.weight, dim=(-2, -1)),
-            vision_activation=activation.level,
+            vision_level=blending.level,
             potential=feedback.potential,
             potential_rate=potential_rate(feedback.s, J, v),
             safety=report,
         )
-        estimator = self._adapted(state, observation, pose, seen & ~stale, activation, feedback)
+        estimator = self._adapted(state, observation, pose, seen & ~stale, blending, feedback)
         return command, ControllerState(
-            activation=activation,
-            arrival=arrival,
-            hold=hold,
+            blending=blending,
+            task_level=task_level,
+            pose_drift=pose_drift,
             safety=safety,
             estimator=estimator,
         )
@@ -217,30 +231,30 @@ class AdaptiveController(nn.Module):
         goals: Goals,
         q: Tensor,
         J: Tensor,
-        arrival: Tensor,
+        task_level: Tensor,
         descent: Tensor,
-    ) -> tuple[_Motion, Hold | None]:
-        """Joint velocity of the law, and the pose hold where one is asked for."""
-        d = observation.human_effort
+    ) -> _Motion:
+        """Joint velocity of the law, with the pose drift compensated while a person acts."""
+        d, rate = observation.nullspace_input, self.config.drift_compensation_rate
         xi_q = self.joint_region.gradient(q)
-        wish = (-xi_q if d is None else d - xi_q) / self.config.null_damping
+        null = (-xi_q if d is None else d - xi_q) / self.config.null_damping
 
         twist = task_twist = -descent / excess_speed(descent, self.caps[0])
-        hold = None
-        if d is not None and self.config.hold_rate > 0:
-            # A joint-space approach has planned no path of the tool that could be held.
-            holds = (d != 0).any(-1) & ((arrival == 1) | (goals.posture is None))
-            hold = measure_drift(state.hold, q, J, holds)
-            twist = torch.add(task_twist, hold.drift, alpha=self.config.hold_rate)
+        pose_drift = None
+        if d is not None and rate > 0:
+            # A joint-space approach plans no path of the tool from which it could drift.
+            active = (d != 0).any(-1) & ((task_level == 1) | (goals.posture is None))
+            pose_drift = measure_drift(state.pose_drift, q, J, active)
+            twist = torch.add(task_twist, pose_drift.drift, alpha=rate)
 
-        task, null = resolve(J, twist, wish)
+        task, null = resolved_rate(J, twist, null)
         if goals.posture is not None:
             approach = approach_velocity(goals.posture, q, J, self.caps[1])
-            task = torch.lerp(approach, task, arrival.unsqueeze(-1))
+            task = torch.lerp(approach, task, task_level.unsqueeze(-1))
         bounds = self.safety.velocity_bounds(q)
         if self.config.null_space_yields:
-            null = fit_null_space(task, null, *bounds)
-        return _Motion(task + null, null, twist, task_twist, xi_q, bounds), hold
+            null = scale_null_space(task, null, *bounds)
+        return _Motion(task + null, null, twist, task_twist, xi_q, bounds, pose_drift)
 
     def _adapted(
         self,
@@ -248,7 +262,7 @@ class AdaptiveController(nn.Module):
         observation: Observation,
         pose: Pose,
         seen: Tensor,
-        activation: Activation,
+        blending: BlendingState,
         feedback: Feedback,
     ) -> Any:
         """State of the estimator after what the camera saw."""
@@ -264,7 +278,7 @@ class AdaptiveController(nn.Module):
             seen = seen & observation.feature_new
         measurement = Measurement(
             pose=pose,
-            feature=activation.feature,
+            feature=blending.feature,
             valid=seen,
             dt=observation.dt,
             xi_x=feedback.xi_x,

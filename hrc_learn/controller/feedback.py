@@ -1,5 +1,5 @@
 """Regional feedback in image and Cartesian space, and the validation of the measurements
-behind it.
+behind it: what cannot be trusted is replaced before any feedback is computed.
 """
 
 from __future__ import annotations
@@ -11,22 +11,20 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from hrc_learn.controller.blending import Activation
+from hrc_learn.controller.blending import BlendingState
 from hrc_learn.controller.interface import Goals, Observation
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.geometry.rotation_rates import left_jacobian, left_jacobian_transposed
 
-# Regional feedback in image and Cartesian space.
-
-# Keeps the cap on the pixel rate finite at the target.
-_ONE_PIXEL_PER_SECOND = 1.0
+# Pixel rate that is always allowed [px/s]: keeps the cap above zero at the target itself.
+_LEAST_PIXEL_RATE = 1.0
 
 
 class Feedback(NamedTuple):
     """Feedback vectors of the regions and their combination."""
 
     xi_x: Float[Tensor, "*batch rows"]
-    """Of the vision region, faded by the activation."""
+    """Of the vision region, faded by the blending."""
     xi_r: Float[Tensor, "*batch 6"]
     """Of the Cartesian regions, position then orientation."""
     s: Float[Tensor, "*batch 6"]
@@ -38,7 +36,7 @@ class Feedback(NamedTuple):
 def regional_feedback(
     goals: Goals,
     pose: Pose,
-    activation: Activation,
+    blending: BlendingState,
     image_jacobian: Float[Tensor, "*batch rows 6"],
     vision_rate: float,
 ) -> Feedback:
@@ -47,36 +45,34 @@ def regional_feedback(
     Args:
         goals: The regions.
         pose: Of the tool.
-        activation: How much of vision feedback takes part, and where the feature is.
+        blending: How much of vision feedback takes part, and where the feature is.
         image_jacobian: J_s_hat at the pose [px/m, px/rad].
         vision_rate: Fastest decay of the pixel error to ask for [1/s].
     """
     P_t, xi_position = goals.position.feedback(pose.position)
     P_o, xi_orientation = goals.orientation.feedback(pose.orientation)
-    P_v, xi_x = goals.vision.feedback(activation.feature)
+    P_v, xi_x = goals.vision.feedback(blending.feature)
     xi_r = torch.cat([xi_position, xi_orientation], dim=-1)
-    error = activation.feature - goals.vision.target
-    share = activation.level.unsqueeze(-1)
+    error = blending.feature - goals.vision.target
+    gain = blending.level.unsqueeze(-1)
     if vision_rate < math.inf:
-        share = share / _excess_rate(image_jacobian, xi_x, error, vision_rate)
-    xi_x = share * xi_x
+        gain = gain / _excess_rate(image_jacobian, xi_x, error, vision_rate)
+    xi_x = gain * xi_x
     s = torch.linalg.vecdot(image_jacobian, xi_x.unsqueeze(-1), dim=-2) + xi_r
-    return Feedback(xi_x, xi_r, s, P_t + P_o + activation.level * P_v)
+    return Feedback(xi_x, xi_r, s, P_t + P_o + blending.level * P_v)
 
 
 def _excess_rate(
     J_s: Tensor, xi_x: Tensor, error: Tensor, vision_rate: float
 ) -> Float[Tensor, "*batch 1"]:
     """What to divide vision feedback by to keep the rate of the pixel error; at least 1."""
-    push = torch.linalg.vecdot(J_s, xi_x.unsqueeze(-1), dim=-2)
-    speed = torch.linalg.vecdot(J_s, push.unsqueeze(-2))
+    # The feature moves with J_s J_s^T xi_x, as far as the estimate is right.
+    descent = torch.linalg.vecdot(J_s, xi_x.unsqueeze(-1), dim=-2)
+    speed = torch.linalg.vecdot(J_s, descent.unsqueeze(-2))
     speed = torch.linalg.vector_norm(speed, dim=-1, keepdim=True)
     distance = torch.linalg.vector_norm(error, dim=-1, keepdim=True)
-    allowed = vision_rate * distance + _ONE_PIXEL_PER_SECOND
+    allowed = vision_rate * distance + _LEAST_PIXEL_RATE
     return (speed / allowed).clamp(min=1)
-
-
-# The law with the analytic Jacobian, whose orientation rows are those of a rotation vector.
 
 
 def analytic_descent(
@@ -98,10 +94,7 @@ def analytic_descent(
     return torch.cat([s[..., :3], turn], dim=-1)
 
 
-# What of an observation can be trusted, and what stands in for the rest.
-
-
-def trusted_position(
+def validated_position(
     observation: Observation, expected: Float[Tensor, "*batch n"]
 ) -> tuple[Float[Tensor, "*batch n"], Bool[Tensor, "*batch"]]:
     """Joint position [rad]: measured, or the expected one where that is NaN or stale.
@@ -127,12 +120,3 @@ def effective_goals(
     known = target.isfinite().all(-1)
     target = torch.where(known.unsqueeze(-1), target, goals.vision.target)
     return goals.aimed_at(target), known
-
-
-def either(
-    a: Bool[Tensor, "*batch"] | None, b: Bool[Tensor, "*batch"] | None
-) -> Bool[Tensor, "*batch"] | None:
-    """Whether one of two optional conditions holds."""
-    if a is None or b is None:
-        return b if a is None else a
-    return a | b

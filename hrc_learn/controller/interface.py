@@ -1,5 +1,5 @@
 """What goes into a control step and what comes out of it: goals, observation, state,
-command.
+command. All are pytrees of tensors, so a step compiles, exports and maps over batches.
 """
 
 from __future__ import annotations
@@ -12,13 +12,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from hrc_learn.controller.blending import Activation
-from hrc_learn.controller.resolved_rate import Hold
+from hrc_learn.controller.blending import BlendingState
+from hrc_learn.controller.resolved_rate import PoseDrift
 from hrc_learn.controller.safety_filter import SafetyReport, SafetyState
 from hrc_learn.pytree import pytree
 from hrc_learn.regions import OrientationRegion, PositionRegion, PostureRegion, VisionRegion
-
-# Where the arm is to go: the regions that a task or a person may move at any step.
 
 HALF_SIZE = (0.12, 0.12, 0.08)
 """Half edges of the box that proved large enough to find the marker in view [m]."""
@@ -110,9 +108,6 @@ class Goals:
         return replace(self, vision_enabled=torch.full_like(self.vision_enabled, enabled))
 
 
-# What goes into a control step and what comes out of it.
-
-
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class Observation:
@@ -130,8 +125,9 @@ class Observation:
     target: Float[Tensor, "*#batch rows"] | None = None
     """Target in the image [px]; None: that of the goals. NaN: not known, so the camera does
     not take part."""
-    human_effort: Float[Tensor, "*batch n"] | None = None
-    """Effort d of the person on each joint; None: nobody acts."""
+    nullspace_input: Float[Tensor, "*batch n"] | None = None
+    """The operator's input d: effort of a person on each joint, which moves the arm in its
+    null space [N m]; None: nobody acts."""
     goals: Goals | None = None
     """Regions to go to; None: those the controller was built with."""
     feature_new: Bool[Tensor, "*batch"] | None = None
@@ -155,12 +151,12 @@ class Observation:
 class ControllerState:
     """All that the controller remembers from one step to the next."""
 
-    activation: Activation
-    """Hand-over between Cartesian and vision feedback."""
-    arrival: Float[Tensor, "*batch"]
-    """Hand-over from a joint-space approach to them, 0 to 1."""
-    hold: Hold
-    """Drift of the tool while a person acts."""
+    blending: BlendingState
+    """Between Cartesian and vision feedback."""
+    task_level: Float[Tensor, "*batch"]
+    """Fraction to which both have taken over from a joint-space approach, 0 to 1."""
+    pose_drift: PoseDrift
+    """Of the tool while a person acts."""
     safety: SafetyState
     """Of the safety filter, with its counts of interventions."""
     estimator: Any
@@ -179,7 +175,7 @@ class Command:
     null_velocity: Float[Tensor, "*batch n"]
     """Joint velocity in the null space [rad/s]."""
     xi_x: Float[Tensor, "*batch rows"]
-    """Vision feedback, faded by the activation."""
+    """Vision feedback, faded by the blending."""
     xi_r: Float[Tensor, "*batch 6"]
     """Cartesian feedback, position then orientation."""
     xi_q: Float[Tensor, "*batch n"]
@@ -190,8 +186,8 @@ class Command:
     """Estimate J_s_hat [px/m, px/rad]."""
     weight_norm: Float[Tensor, "*batch"]
     """Frobenius norm of the estimator's weights."""
-    vision_activation: Float[Tensor, "*batch"]
-    """Share of vision feedback, 0 to 1."""
+    vision_level: Float[Tensor, "*batch"]
+    """Fraction of vision feedback, 0 to 1."""
     potential: Float[Tensor, "*batch"]
     """Sum of the task-space potentials P_v + P_t + P_o: the part of the Lyapunov function
     that needs no true weights."""

@@ -1,5 +1,9 @@
-"""Monitors that judge a run from outside: the Lyapunov function and its rate, and motion
-limits.
+"""Monitors that judge a run from outside: the Lyapunov function and its rate, motion limits.
+
+V = P_v(x) + P_c(r) + 1/2 tr(W~ L^-1 W~^T),  W~ = W - W_hat                          (vt)
+
+`docs/controller.md` states under which assumptions V_dot = -|s|^2. `Command.potential` and
+`Command.potential_rate` hold the part that needs no true weights, at every step.
 """
 
 from typing import final
@@ -10,12 +14,8 @@ from torch import Tensor
 
 from hrc_learn.kinematics import JointLimits
 
-# The function that the law makes smaller, and how fast.
-#
-# V = P_v(x) + P_c(r) + 1/2 tr(W~ L^-1 W~^T),  W~ = W - W_hat                          (vt)
-#
-# `docs/controller.md` states under which assumptions V_dot = -|s|^2. `Command.potential` and
-# `Command.potential_rate` hold the part that needs no true weights, at every step.
+# Differences of rounded numbers may exceed a limit in the last digits.
+_ROUNDING = 1 + 1e-9
 
 
 def lyapunov_function(
@@ -52,15 +52,12 @@ def potential_rate(
     return torch.linalg.vecdot(s, twist)
 
 
-# Looks whether a motion keeps the limits, without help from the filter that ought to.
-
-# Differences of rounded numbers may exceed a limit in the last digits.
-_ROUNDING = 1 + 1e-9
-
-
 @final
-class LimitWatch:
-    """Follows joint velocities from step to step."""
+class LimitMonitor:
+    """Checks the motion limits of commanded joint velocities, from step to step.
+
+    Independent of the safety filter that ought to keep them.
+    """
 
     def __init__(self, limits: JointLimits, velocity: Float[Tensor, "*batch n"], dt: float):
         """Begin.
@@ -73,7 +70,7 @@ class LimitWatch:
         self._limits, self._velocity, self._dt = limits, velocity, dt
         self._acceleration = torch.zeros_like(velocity)
 
-    def beyond(
+    def violations(
         self, q: Float[Tensor, "*batch n"], velocity: Float[Tensor, "*batch n"]
     ) -> Bool[Tensor, "*batch 4"]:
         """Whether limits of position, velocity, acceleration and jerk are broken in a step.

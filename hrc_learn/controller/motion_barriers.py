@@ -1,5 +1,7 @@
-"""Bounds on motion: how fast a joint may move so that its limits can be kept, and the
-tool near a person.
+"""Bounds on motion from control barriers.
+
+`LimitBarrier`: how fast a joint may move, and how hard accelerate, so that its limits can still
+be kept. `SeparationConfig`: how fast the tool may move when a person is near.
 """
 
 from __future__ import annotations
@@ -13,9 +15,7 @@ from torch import Tensor, nn
 
 from hrc_learn.kinematics import MotionLimits
 
-# How fast a joint may move, and how hard accelerate, so that its limits can still be kept.
-
-# Of v_max: sums of rounded numbers must not exceed a limit in the last digit.
+# Fraction of v_max left unused: sums of rounded numbers must not exceed it in the last digit.
 _ROUNDING = 1e-12
 
 
@@ -97,10 +97,12 @@ class LimitBarrier(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Lowest and highest velocity [rad/s] of a steady motion (a = 0) inside the set."""
         room = torch.addcmul(self.walls, self.sides, joint_position.unsqueeze(-2))
+        # h(|delta|) with the sign of delta: past a limit less its margin the joint is driven
+        # back as fast as from the same distance inside it, and the root stays real.
         square = torch.addcmul(self.knee_square, self.twice_acceleration, room.abs())
         speed = torch.copysign(square.sqrt() - self.knee, room)
         if self.jerk_limited:
-            speed = speed - self.reserve
+            speed = speed - self.reserve  # v_hat = v + A^2/(2 j) at a = 0
         bounds = speed.clamp(-self.velocity, self.velocity) * -self.sides
         lower, upper = bounds.unbind(-2)
         return lower, upper
@@ -123,17 +125,18 @@ class LimitBarrier(nn.Module):
         lower, upper = bounds
         slack = torch.stack([velocity - lower, upper - velocity], dim=-2)
         offset = self.acceleration + self.jerk * dt
+        # Negative far outside the set, where no acceleration is enough: the clamp brakes hard.
         square = torch.addcmul(offset * offset, self.jerk, slack, value=2)
         down, up = (square.clamp(min=0).sqrt() - offset).unbind(-2)
         return -down, up
 
 
-# Speed and separation monitoring: how fast the tool may move when a person is near.
-
-
 @dataclass(frozen=True, kw_only=True)
 class SeparationConfig:
-    """The terms of the protective separation distance (ISO/TS 15066:2016, 5.5.4.2.3)."""
+    """Speed and separation monitoring: how fast the tool may move when a person is near.
+
+    The terms of the protective separation distance (ISO/TS 15066:2016, 5.5.4.2.3).
+    """
 
     human_speed: float = 1.6
     """v_h, at which the person may come closer [m/s]; 1.6 where it is not measured."""
@@ -164,6 +167,6 @@ class SeparationConfig:
         """
         a = self.deceleration
         spare = distance - self.human_speed * self.reaction_time - self.clearance
-        spare = torch.where(spare > 0, spare, 0.0)  # NaN too
+        spare = torch.where(spare > 0, spare, 0.0)  # NaN compares false: too close
         delay = self.reaction_time + self.human_speed / a
         return a * (torch.sqrt(delay**2 + (2 / a) * spare) - delay)

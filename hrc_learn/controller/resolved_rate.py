@@ -1,5 +1,7 @@
-"""Resolved rate: from a tool twist and a joint-space wish to one joint velocity, and the
-compensation of pose drift.
+"""Resolved-rate control: one joint velocity from a tool twist and a null-space velocity.
+
+The second half compensates the pose drift that null-space motion causes: the projector is
+right to first order of a step only, so what it lets through is measured and given back.
 """
 
 from __future__ import annotations
@@ -12,13 +14,8 @@ from torch import Tensor
 
 from hrc_learn.geometry.constants import Constant
 from hrc_learn.geometry.small_matrices import inverse_norm, matmul, solve_positive
+from hrc_learn.kinematics.pseudo_inverse import SINGULAR_BELOW
 from hrc_learn.pytree import pytree
-
-# From a tool twist and a joint-space wish to one joint velocity.
-
-SINGULAR_BELOW = 0.05
-"""Smallest singular value of the Jacobian below which its inverse is damped, and the damping
-at the singularity itself, as in `hrc_learn.kinematics.singularity_damping`."""
 
 # Lets the Cholesky factorisation go through at a singularity; used there only to see how
 # near it is, never in a solution.
@@ -39,12 +36,12 @@ def excess_speed(
     return (speeds / caps).amax(-1, keepdim=True).clamp(min=1)
 
 
-def resolve(
+def resolved_rate(
     J: Float[Tensor, "*batch 6 n"],
     twist: Float[Tensor, "*batch 6"],
-    wish: Float[Tensor, "*batch n"],
+    null_velocity: Float[Tensor, "*batch n"],
 ) -> tuple[Float[Tensor, "*batch n"], Float[Tensor, "*batch n"]]:
-    """J^+ twist and N wish from one symmetric 6 x 6 solve.
+    """J^+ twist and N w, for a null-space velocity w, from one symmetric 6 x 6 solve.
 
         J^+ v = J^T A^-1 v,   N w = w - J^T A^-1 J w,   A = J J^T + lambda^2 I
 
@@ -54,7 +51,8 @@ def resolve(
     Args:
         J: Geometric Jacobian.
         twist: Wanted motion of the tool (linear [m/s], angular [rad/s]).
-        wish: Wanted joint velocity in the null space [rad/s].
+        null_velocity: Wanted joint velocity w, of which N keeps what leaves the tool at rest
+            [rad/s].
 
     Returns:
         Joint velocity of the task, and that of the null space [rad/s].
@@ -62,15 +60,16 @@ def resolve(
     gram = matmul(J, J.mT)
     eye = _EYE.like(J)
     sigma_square = 1 / inverse_norm(torch.add(gram, eye, alpha=_FLOOR))
-    damping = (SINGULAR_BELOW**2 - sigma_square).clamp(min=0)
-    damped = torch.addcmul(gram, eye, damping[..., None, None])
-    wish = wish.unsqueeze(-1)
-    wrench = solve_positive(damped, torch.cat([twist.unsqueeze(-1), matmul(J, wish)], dim=-1))
-    task, leak = matmul(J.mT, wrench).unbind(-1)
-    return task, wish.squeeze(-1) - leak
+    damping_square = (SINGULAR_BELOW**2 - sigma_square).clamp(min=0)
+    damped = torch.addcmul(gram, eye, damping_square[..., None, None])
+    # Both right-hand sides in one solve: the task's twist, and the one that w would cause.
+    caused = matmul(J, null_velocity.unsqueeze(-1))
+    solution = solve_positive(damped, torch.cat([twist.unsqueeze(-1), caused], dim=-1))
+    task, compensation = matmul(J.mT, solution).unbind(-1)
+    return task, null_velocity - compensation
 
 
-def fit_null_space(
+def scale_null_space(
     task: Float[Tensor, "*batch n"],
     null: Float[Tensor, "*batch n"],
     lower: Float[Tensor, "*#batch n"],
@@ -93,6 +92,8 @@ def fit_null_space(
     Returns:
         The scaled null-space velocity [rad/s].
     """
+    # A joint that does not move bounds no factor: divided by the smallest number the bounds
+    # are infinite, or of the wrong sign where the task alone is too fast.
     null_or_tiny = torch.where(null == 0, torch.finfo(null.dtype).tiny, null)
     at_lower, at_upper = (lower - task) / null_or_tiny, (upper - task) / null_or_tiny
     least = torch.minimum(at_lower, at_upper).amax(-1, keepdim=True)
@@ -103,16 +104,14 @@ def fit_null_space(
     return factor * null
 
 
-# Pose hold: undoes what null-space motion leaks into the tool pose.
-
-_FARTHEST = 0.005
-"""Bound on each component of the remembered drift [m, rad]: a person who blocks the arm
-must not wind it up."""
+# Bound on each component of the remembered drift [m, rad]: a person who blocks the arm must
+# not wind it up.
+_MAX_DRIFT = 0.005
 
 
 @pytree
 @dataclass(frozen=True, kw_only=True)
-class Hold:
+class PoseDrift:
     """How far the tool has drifted from where the task sent it, and what that needs."""
 
     drift: Float[Tensor, "*batch 6"]
@@ -124,34 +123,34 @@ class Hold:
     planned: Float[Tensor, "*batch 6"]
     """Motion the task had planned for the last step (linear [m], angular [rad])."""
     active: Bool[Tensor, "*batch"]
-    """Whether the last step held; where not, the rest may be old."""
+    """Whether drift was measured in the last step; where not, the rest may be old."""
 
 
 def measure_drift(
-    hold: Hold,
+    before: PoseDrift,
     joint_position: Float[Tensor, "*batch n"],
     jacobian: Float[Tensor, "*batch 6 n"],
-    holds: Bool[Tensor, "*batch"],
-) -> Hold:
+    active: Bool[Tensor, "*batch"],
+) -> PoseDrift:
     """Add the drift of the last step: what was planned, less what the tool did.
 
     The motion of the tool is (J_0 + J_1)/2 dq, right to the third order of the step, where
     the J_0 dq by which it was planned is right to the second: the difference is the drift.
 
     Args:
-        hold: Of the step before.
+        before: After the last step.
         joint_position: Now [rad].
         jacobian: Now.
-        holds: Where to hold. Elsewhere, and in the first step of it, the drift is zero, so that
-            every effort starts afresh.
+        active: Where to compensate. Elsewhere, and in the first step of it, the drift is zero,
+            so that every null-space input starts afresh.
     """
-    step = (joint_position - hold.joint_position).unsqueeze(-2)
-    moved = torch.linalg.vecdot(hold.jacobian + jacobian, step)
-    drift = torch.add(hold.drift + hold.planned, moved, alpha=-0.5)
-    drift = drift.clamp(-_FARTHEST, _FARTHEST)
-    drift = torch.where((holds & hold.active).unsqueeze(-1), drift, 0.0)
+    step = (joint_position - before.joint_position).unsqueeze(-2)
+    moved = torch.linalg.vecdot(before.jacobian + jacobian, step)  # twice the motion
+    drift = torch.add(before.drift + before.planned, moved, alpha=-0.5)
+    drift = drift.clamp(-_MAX_DRIFT, _MAX_DRIFT)
+    drift = torch.where((active & before.active).unsqueeze(-1), drift, 0.0)
     return replace(
-        hold, drift=drift, joint_position=joint_position, jacobian=jacobian, active=holds
+        before, drift=drift, joint_position=joint_position, jacobian=jacobian, active=active
     )
 
 
@@ -163,11 +162,11 @@ def planned_motion(
 ) -> Float[Tensor, "*batch 6"]:
     """The part of the step to come that the task has planned.
 
-    Limits may slow the task down. That is no drift, so only the share of the twist that the
+    Limits may slow the task down. That is no drift, so only the fraction of the twist that the
     filtered joint velocity carries out counts as planned.
     """
     done = torch.linalg.vecdot(jacobian, joint_velocity.unsqueeze(-2))
     along = torch.linalg.vecdot(done, twist)
     square = torch.linalg.vecdot(twist, twist).clamp(min=torch.finfo(twist.dtype).tiny)
-    share = (along / square).clamp(0, 1)
-    return (share * dt).unsqueeze(-1) * twist
+    fraction = (along / square).clamp(0, 1)
+    return (fraction * dt).unsqueeze(-1) * twist

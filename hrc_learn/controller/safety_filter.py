@@ -30,17 +30,19 @@ INTERVENTIONS = (
 )
 """Kinds of interventions, in the order of the last axis of their flags and counts."""
 
-# Share of a limit, or joint velocity [rad/s], beyond which an intervention is reported. Below
-# is rounding, in float32 too: a command led along a limit would be flagged by chance.
-_NOTICED = 1e-6
+# Fraction of a limit, or joint velocity [rad/s], beyond which an intervention is reported.
+# Below is rounding, in float32 too: a command led along a limit would be flagged by chance.
+_REPORTED = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True)
 class SafetyConfig:
+    """Margins and caps besides the joint limits themselves."""
+
     margin: float = 0.02
     """Distance kept from every joint position limit [rad]."""
     velocity_margin: float = 0.02
-    """Share of every joint velocity limit that is not used. The arm's own servo overshoots
+    """Fraction of every joint velocity limit that is not used. The arm's own servo overshoots
     what it is told by up to 1.2 % of the limit (in MuJoCo)."""
     rate: float = 5.0
     """Fastest decay of the remaining distance to a limit [1/s]; at most 1/dt."""
@@ -182,7 +184,7 @@ class SafetyFilter(nn.Module):
             ValueError: dt is not in (0, 1/rate], or a distance comes without a Jacobian.
         """
         self._check_step(dt)
-        q, u, invalid, stopped = self._trusted(
+        q, u, invalid, stopped = self._validated(
             state, joint_position, joint_velocity_command, stop, stale
         )
         bounds = bounds or self.velocity_bounds(q)
@@ -190,13 +192,13 @@ class SafetyFilter(nn.Module):
         excess = _excess(u, self.barrier.velocity)
         u = u / excess.clamp(min=1)
         inside = u.clamp(*bounds)
-        cut = torch.linalg.vector_norm(inside - u, math.inf, dim=-1, keepdim=True) > _NOTICED
+        cut = torch.linalg.vector_norm(inside - u, math.inf, dim=-1, keepdim=True) > _REPORTED
         target, speeding, near = self._cap_tcp_speed(inside, jacobian, human_distance)
-        follow = self._follow_smoothly if self.config.jerk_limited else self._follow
-        v, acceleration, steep, sharp = follow(state, target, bounds, dt)
+        limit = self._limit_jerk if self.config.jerk_limited else self._limit_acceleration
+        v, acceleration, excess_a, excess_j = limit(state, target, bounds, dt)
 
-        steep, sharp = _acts(steep), _acts(sharp)
-        flags = [_acts(excess), cut, steep, sharp, speeding, near, invalid, stopped]
+        a_acts, j_acts = _acts(excess_a), _acts(excess_j)
+        flags = [_acts(excess), cut, a_acts, j_acts, speeding, near, invalid, stopped]
         flags = torch.cat(flags, dim=-1)
         return (
             v,
@@ -216,7 +218,7 @@ class SafetyFilter(nn.Module):
                 f"guarantee the limits, but got {dt:g} s; step faster or lower its rate"
             )
 
-    def _trusted(
+    def _validated(
         self,
         state: SafetyState,
         q: Tensor,
@@ -255,9 +257,9 @@ class SafetyFilter(nn.Module):
         cap = safe.clamp(max=self.config.tcp_speed)
         # At a cap of zero everything rests, also what does not move the tool.
         factor = cap / torch.maximum(speed, cap).clamp(min=torch.finfo(u.dtype).tiny)
-        return factor * u, speeding, (speed > (1 + _NOTICED) * safe) | (safe == 0)
+        return factor * u, speeding, (speed > (1 + _REPORTED) * safe) | (safe == 0)
 
-    def _follow(
+    def _limit_acceleration(
         self,
         state: SafetyState,
         target: Tensor,
@@ -271,14 +273,14 @@ class SafetyFilter(nn.Module):
         """
         reach = self.barrier.acceleration * dt
         change = target - state.velocity
-        steep = _excess(change, reach)
-        v = torch.addcdiv(state.velocity, change, steep.clamp(min=1))
+        excess_a = _excess(change, reach)
+        v = torch.addcdiv(state.velocity, change, excess_a.clamp(min=1))
         # Last the bounds that no scaling may loosen. Should both exclude each other, the arm
         # could not brake harder anyway.
         v = v.clamp(*bounds).clamp(state.velocity - reach, state.velocity + reach)
-        return v, state.acceleration, steep, torch.zeros_like(steep)
+        return v, state.acceleration, excess_a, torch.zeros_like(excess_a)
 
-    def _follow_smoothly(
+    def _limit_jerk(
         self,
         state: SafetyState,
         target: Tensor,
@@ -287,28 +289,29 @@ class SafetyFilter(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """The same under a jerk limit.
 
-        The acceleration wanted is the largest share of change/dt, alike for all joints, with
+        The acceleration wanted is the largest fraction of change/dt, alike for all joints, with
         which they keep their acceleration limits and can still fade it out in time:
         a dt + a^2/(2 j) <= change.
         """
         barrier = self.barrier
-        most = barrier.jerk * dt
+        reach = barrier.jerk * dt  # largest change of the acceleration in this step
         change = (target - state.velocity) / dt
-        steep = _excess(change, barrier.acceleration)
-        fading = 1 + torch.sqrt(1 + 2 * _excess(change, most))
-        wanted = change / torch.maximum(steep, fading / 2)
-        jerk = wanted - state.acceleration
-        excess = _excess(jerk, most)
-        acceleration = torch.addcdiv(state.acceleration, jerk, excess.clamp(min=1))
+        excess_a = _excess(change, barrier.acceleration)
+        # a = change/s with the root s of a dt + a^2/(2 j) = change dt, which fades out in time.
+        fading = (1 + torch.sqrt(1 + 2 * _excess(change, reach))) / 2
+        wanted = change / torch.maximum(excess_a, fading)
+        step = wanted - state.acceleration
+        excess_j = _excess(step, reach)
+        acceleration = torch.addcdiv(state.acceleration, step, excess_j.clamp(min=1))
         # As above, and here too what comes last is what the arm cannot exceed.
         acceleration = acceleration.clamp(
             *barrier.acceleration_bounds(state.velocity, bounds, dt)
         )
         acceleration = acceleration.clamp(
-            torch.maximum(state.acceleration - most, -barrier.acceleration),
-            torch.minimum(state.acceleration + most, barrier.acceleration),
+            torch.maximum(state.acceleration - reach, -barrier.acceleration),
+            torch.minimum(state.acceleration + reach, barrier.acceleration),
         )
-        return state.velocity + acceleration * dt, acceleration, steep, excess
+        return state.velocity + acceleration * dt, acceleration, excess_a, excess_j
 
 
 def _excess(vector: Tensor, limit: Tensor) -> Tensor:
@@ -318,4 +321,4 @@ def _excess(vector: Tensor, limit: Tensor) -> Tensor:
 
 def _acts(excess: Tensor) -> Bool[Tensor, "..."]:
     """Whether what is divided by a ratio of at least 1 changes by more than rounding."""
-    return excess > 1 + _NOTICED
+    return excess > 1 + _REPORTED

@@ -1,4 +1,8 @@
-"""The control step as a function of vectors: named tensors side by side, and the flat step."""
+"""The control step as a function of vectors, and the layout of its named tensors in them.
+
+Code compiled for real time takes and returns a few vectors of numbers, not dataclasses: any
+language can fill them, and nothing is allocated in a step.
+"""
 
 from __future__ import annotations
 
@@ -16,8 +20,6 @@ from torch.utils import _pytree
 
 from hrc_learn.controller import AdaptiveController, Observation
 
-# Named tensors of any shape and dtype, side by side in one vector of numbers.
-
 
 @dataclass(frozen=True)
 class Field:
@@ -33,7 +35,7 @@ class Field:
 
 
 @final
-class Layout:
+class IOLayout:
     """Where the tensors of a dataclass stand in a vector (rows, *batch).
 
     The batch comes last in memory: a row is one quantity of all its elements, which is what
@@ -55,8 +57,8 @@ class Layout:
         """Of each field."""
 
     @staticmethod
-    def of(tree: Any, batch: Sequence[int], dtype: torch.dtype = torch.float64) -> Layout:
-        """Layout of the tensors in a pytree; what else it holds is left out."""
+    def of(tree: Any, batch: Sequence[int], dtype: torch.dtype = torch.float64) -> IOLayout:
+        """IOLayout of the tensors in a pytree; what else it holds is left out."""
         batch, fields = tuple(batch), []
         for path, x in _pytree.tree_flatten_with_path(tree)[0]:
             if isinstance(x, Tensor):
@@ -64,7 +66,7 @@ class Layout:
                 shape = tuple(x.shape[len(batch) :] if batched else x.shape)
                 name = _pytree.keystr(path).removeprefix(".")
                 fields.append(Field(name, x.dtype, batched, shape))
-        return Layout(fields, batch, dtype)
+        return IOLayout(fields, batch, dtype)
 
     def empty(self) -> Float[Tensor, "rows *batch"]:
         """A vector in which nothing is known: every number is NaN, no flag is set."""
@@ -86,7 +88,7 @@ class Layout:
         return torch.cat(parts)
 
     def unpack(self, vector: Float[Tensor, "rows *batch"]) -> list[Tensor]:
-        """The tensors in a vector: views of it, but for those of another dtype."""
+        """The tensors in a vector: views of it, except those of another dtype."""
         views = zip(self.views(vector), self.fields, strict=True)
         return [view.to(field.dtype) for view, field in views]
 
@@ -103,6 +105,7 @@ class Layout:
         part = vector[self.rows[field.name]].reshape((*field.shape, *self.batch))
         if field.batched:
             return part.movedim(self._last, self._first)
+        # One value for the whole batch stands there once for each element: read the first.
         return part[(..., *(0 for _ in self.batch))]
 
     @property
@@ -116,9 +119,6 @@ class Layout:
         return list(range(-len(self.batch), 0))
 
 
-# The control step as a function of three vectors of numbers.
-
-
 class Vectors(NamedTuple):
     """What a step takes, in this order."""
 
@@ -127,16 +127,16 @@ class Vectors(NamedTuple):
     command: Tensor
 
 
-class Layouts(NamedTuple):
+class StepLayouts(NamedTuple):
     """Where everything stands in them."""
 
-    state: Layout
-    observation: Layout
-    command: Layout
+    state: IOLayout
+    observation: IOLayout
+    command: IOLayout
 
 
 @final
-class FlatStep(nn.Module):
+class PackedStep(nn.Module):
     """`AdaptiveController.step` on vectors, in place.
 
     It reads the vectors of state and observation, and writes those of the command and of the
@@ -160,7 +160,9 @@ class FlatStep(nn.Module):
         leaves, self._structure = _pytree.tree_flatten((state, observation))
         self._constants = [None if isinstance(x, Tensor) else x for x in leaves]
         trees = (state, observation, command)
-        self.layouts = Layouts(*(Layout.of(tree, q.shape[:-1], q.dtype) for tree in trees))
+        self.layouts = StepLayouts(
+            *(IOLayout.of(tree, q.shape[:-1], q.dtype) for tree in trees)
+        )
         self.first_state = self.layouts.state.pack(tensors_of(state))
 
     def example(self, observation: Observation) -> Vectors:
@@ -181,9 +183,10 @@ class FlatStep(nn.Module):
         layouts = self.layouts
         read = iter(layouts.state.unpack(state) + layouts.observation.unpack(observation))
         leaves = [next(read) if x is None else x for x in self._constants]
-        said, following = self.controller.step(*_pytree.tree_unflatten(leaves, self._structure))
+        before, seen = _pytree.tree_unflatten(leaves, self._structure)
+        said, after = self.controller.step(before, seen)
         command.copy_(layouts.command.pack(tensors_of(said)))
-        state.copy_(layouts.state.pack(tensors_of(following)))
+        state.copy_(layouts.state.pack(tensors_of(after)))
 
 
 def tensors_of(tree: object) -> list[Tensor]:

@@ -1,5 +1,7 @@
-"""The file of a compiled step: code, what to know to call it, and the hash that tells
-whether it is current.
+"""The file of a compiled step: code, what to know to call it, and its hash.
+
+The hash names the file. It covers all values within a controller and the source of this
+library, so an equal hash means that the compiled code would do the same.
 """
 
 from __future__ import annotations
@@ -7,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import platform
 import warnings
-from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -18,10 +19,9 @@ import torch
 from torch import Tensor
 
 from hrc_learn.controller import Observation
-from hrc_learn.deploy.io_layout import Field, FlatStep, Layout, Layouts
+from hrc_learn.deploy.io_layout import Field, IOLayout, PackedStep, StepLayouts
 
-# The file of a compiled step: code, and what to know to call it.
-
+# Keys of the package's metadata, which later versions must be able to read.
 _LAYOUT, _BATCH, _DTYPE = "hrc_learn.layout", "hrc_learn.batch", "hrc_learn.dtype"
 _STATE, _OBSERVATION = "hrc_learn.state", "hrc_learn.observation"
 _BUILT_FOR = "hrc_learn.built_for"
@@ -33,15 +33,15 @@ class Package:
 
     run: Callable[[list[Tensor]], object]
     """Takes the three vectors and updates state and command in place."""
-    layouts: Layouts
+    layouts: StepLayouts
     first_state: Tensor
     """Vector of an arm at rest in its ready posture."""
     example: Tensor
     """Vector of the observation that it was exported with."""
 
 
-def describe(step: FlatStep, observation: Observation) -> dict[str, str]:
-    """What a package says about a step, as text that any language can read.
+def describe(step: PackedStep, observation: Observation) -> dict[str, str]:
+    """Metadata of a package: what to know of its step, as text that any language can read.
 
     The layout has a line for each field: which vector, field, dtype, 1 if it is batched, and
     its shape. Rows follow each other in the order of the lines.
@@ -73,28 +73,28 @@ def load(path: Path) -> Package:
     if not path.is_file():
         raise FileNotFoundError(f"no package {path}")
     try:
-        run, says = _open(path)
+        run, metadata = _open(path)
     except RuntimeError as error:
         raise ValueError(f"{path} was not written by export_step: {error}") from error
-    if _LAYOUT not in says:
+    if _LAYOUT not in metadata:
         raise ValueError(f"{path} was not written by export_step: it has no layout")
-    if says[_BUILT_FOR] != machine():
+    if metadata[_BUILT_FOR] != machine():
         raise ValueError(
-            f"{path} was built for {says[_BUILT_FOR]}, but this is {machine()}: export the "
+            f"{path} was built for {metadata[_BUILT_FOR]}, but this is {machine()}: export the "
             "step on this machine"
         )
-    batch = [int(n) for n in says[_BATCH].split()]
-    dtype: torch.dtype = getattr(torch, says[_DTYPE])
-    fields: dict[str, list[Field]] = {vector: [] for vector in Layouts._fields}
-    for line in says[_LAYOUT].splitlines():
+    batch = [int(n) for n in metadata[_BATCH].split()]
+    dtype: torch.dtype = getattr(torch, metadata[_DTYPE])
+    fields: dict[str, list[Field]] = {vector: [] for vector in StepLayouts._fields}
+    for line in metadata[_LAYOUT].splitlines():
         vector, name, kind, batched, *shape = line.split()
         field = Field(name, getattr(torch, kind), batched == "1", tuple(map(int, shape)))
         fields[vector].append(field)
     return Package(
         run=run,
-        layouts=Layouts(*(Layout(part, batch, dtype) for part in fields.values())),
-        first_state=_vector(says[_STATE], batch, dtype),
-        example=_vector(says[_OBSERVATION], batch, dtype),
+        layouts=StepLayouts(*(IOLayout(part, batch, dtype) for part in fields.values())),
+        first_state=_vector(metadata[_STATE], batch, dtype),
+        example=_vector(metadata[_OBSERVATION], batch, dtype),
     )
 
 
@@ -150,19 +150,26 @@ def _fast_loader() -> Any:
     return torch._C._aoti.AOTIModelPackageLoader  # pyright: ignore
 
 
-# Tells whether two objects of ours would do the same, without running them.
-
-_ROOT = Path(__file__).parents[2]
-_SOURCES = ("pytree.py", "geometry", "kinematics", "regions", "jacobian", "controller")
+# What a compiled step is made from: the package itself, and those it imports.
+_ROOT = Path(__file__).parents[1]
+_SOURCES = (
+    "pytree.py",
+    "geometry",
+    "kinematics",
+    "regions",
+    "jacobian",
+    "controller",
+    "deploy",
+)
+# Values whose `repr` says all of them.
 _PLAIN = (type(None), bool, int, float, str, bytes, torch.dtype, torch.device)
-_CONTAINERS = (list, tuple, dict, set, OrderedDict)
 
 
 class UnknownCodeError(TypeError):
     """An object is of a class, or holds a function, whose code is not ours to know."""
 
 
-def fingerprint(*objects: Any) -> str:
+def content_hash(*objects: Any) -> str:
     """Hash of all values within some objects, and of the source of this library.
 
     Args:
@@ -171,16 +178,16 @@ def fingerprint(*objects: Any) -> str:
     Raises:
         UnknownCodeError: They hold something whose code is not of this library or torch's.
     """
-    walk = _Walk()
+    hasher = _ObjectHasher()
     for x in objects:
-        walk.add(x)
-    walk.digest.update(_source_hash())
-    return walk.digest.hexdigest()
+        hasher.add(x)
+    hasher.digest.update(_source_hash())
+    return hasher.digest.hexdigest()
 
 
 @final
-class _Walk:
-    """Visits values in a fixed order; each object once."""
+class _ObjectHasher:
+    """Hashes values in a fixed order; each object once, later visits by its number."""
 
     def __init__(self):
         self.digest = hashlib.sha256()

@@ -1,4 +1,4 @@
-"""Keeps a loop at its pace."""
+"""A fixed rate for a loop, without drift."""
 
 from __future__ import annotations
 
@@ -6,16 +6,21 @@ import time
 from collections.abc import Callable
 from typing import final
 
+# Rest of a wait that is spent awake [s]: a sleeping process wakes up late by about as much.
 _SPIN = 0.0002
-"""Rest of a wait that is spent awake [s]: a sleeping process wakes up late by about as much."""
 
 
 @final
-class Metronome:
-    """Ticks at a fixed rate, and counts the ticks that a loop was too slow for.
+class Rate:
+    """Keeps a loop at a fixed rate, and counts the periods that it was too slow for.
+
+        rate = Rate(0.004)
+        while running():
+            step()
+            rate.wait()
 
     Attributes:
-        missed: Ticks skipped because the loop was still busy, or woken too late.
+        missed: Periods skipped because the loop was still busy, or woken too late.
     """
 
     def __init__(
@@ -25,10 +30,10 @@ class Metronome:
         clock: Callable[[], float] = time.perf_counter,
         sleep: Callable[[float], None] = time.sleep,
     ):
-        """The first tick is one period from now.
+        """The first period starts now.
 
         Args:
-            period: Time between two ticks [s].
+            period: Time between two returns of `wait` [s]: one over the rate.
             clock: Tells the time [s].
             sleep: Lets at least a given time pass [s].
 
@@ -42,11 +47,12 @@ class Metronome:
         self._next = clock() + period
 
     def wait(self) -> float:
-        """Wait for the next tick; one that has passed by a whole period is skipped.
+        """Wait for the end of the period; one that ended a whole period ago is skipped.
 
         Returns:
             How late the loop goes on [s].
         """
+        # Ends are counted from the start, not from the last return: delays do not add up.
         rest = self._next - self._clock()
         if rest > _SPIN:
             self._sleep(rest - _SPIN)

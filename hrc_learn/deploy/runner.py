@@ -14,10 +14,10 @@ from torch.utils import _pytree
 
 from hrc_learn.controller import AdaptiveController, Observation
 from hrc_learn.deploy.export import NoCompilerError, export_step
-from hrc_learn.deploy.io_layout import FlatStep, Layouts, Vectors, tensors_of
+from hrc_learn.deploy.io_layout import PackedStep, StepLayouts, Vectors, tensors_of
 from hrc_learn.deploy.package import load
 
-_POSITIONS = ("safety.position", "hold.joint_position")
+_POSITIONS = ("safety.position", "pose_drift.joint_position")
 """Fields of the state that remember where the joints were."""
 
 
@@ -33,7 +33,7 @@ class StepRunner(ABC):
         joint_velocity: What the last step commands [rad/s]; overwritten by the next.
     """
 
-    def __init__(self, layouts: Layouts):
+    def __init__(self, layouts: StepLayouts):
         self._layouts = layouts
         self._vectors = Vectors(*(layout.empty() for layout in layouts))
         self.observation = layouts.observation.arrays(self._vectors.observation)
@@ -118,8 +118,8 @@ class EagerRunner(StepRunner):
 
     def __init__(self, controller: AdaptiveController, observation: Observation):
         """Take a step as it is; later observations have the fields of this one."""
-        super().__init__(FlatStep(controller, observation).layouts)
-        self._controller, self._said = controller, None
+        super().__init__(PackedStep(controller, observation).layouts)
+        self._controller, self._last_command = controller, None
         self._leaves, self._structure = _pytree.tree_flatten(observation)
         views = iter(self._layouts.observation.views(self._vectors.observation))
         self._views = [
@@ -141,13 +141,13 @@ class EagerRunner(StepRunner):
             # A state that shared memory with an observation would change with the next.
             self._leaves[k] = view.to(dtype, copy=True)
         observation = _pytree.tree_unflatten(self._leaves, self._structure)
-        self._said, self._state = self._controller.step(self._state, observation)
-        self.joint_velocity[...] = self._said.joint_velocity.numpy()
+        self._last_command, self._state = self._controller.step(self._state, observation)
+        self.joint_velocity[...] = self._last_command.joint_velocity.numpy()
         return self.joint_velocity
 
     def command(self, field: str) -> np.ndarray:
-        if self._said is not None:
-            vector = self._layouts.command.pack(tensors_of(self._said))
+        if self._last_command is not None:
+            vector = self._layouts.command.pack(tensors_of(self._last_command))
             self._vectors.command.copy_(vector)
         return super().command(field)
 

@@ -22,7 +22,7 @@ from hrc_learn.jacobian import (
     RBFImageJacobian,
 )
 from hrc_learn.kinematics import gripper_down, panda
-from hrc_learn.sim.closed_loop import Imperfections, VirtualCamera, rehearse
+from hrc_learn.sim.closed_loop import Imperfections, VirtualCamera, simulate_closed_loop
 from hrc_learn.sim.workplace import nearest_configuration
 from hrc_learn.skills.visual_servoing import guessed_network
 from hrc_learn.vision import CameraModel
@@ -162,13 +162,13 @@ class ClosedLoops:
             camera=self.camera, imperfections=config.imperfections, generator=noise
         )
         with torch.inference_mode():
-            rehearse(
+            simulate_closed_loop(
                 controller,
                 camera,
                 self.start,
                 steps=round(config.duration / config.dt),
                 dt=config.dt,
-                watch=watch,
+                on_step=watch,
             )
         return reached
 

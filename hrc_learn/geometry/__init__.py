@@ -1,7 +1,7 @@
-"""Rotations and poses; every delicate numeric of the package is in `numerics`."""
+"""Rotations, poses and shapes; every delicate numeric of the package is in `numerics`."""
 
 from hrc_learn.geometry import quaternion as quaternion
-from hrc_learn.geometry.minimum_jerk import minimum_jerk as minimum_jerk
+from hrc_learn.geometry.numerics import minimum_jerk as minimum_jerk
 from hrc_learn.geometry.pose import Pose as Pose
 from hrc_learn.geometry.shapes import Body as Body
 from hrc_learn.geometry.shapes import Box as Box

@@ -28,8 +28,8 @@ def cos_and_sinc(square: Float[Tensor, "*batch"]) -> tuple[Tensor, Tensor]:
     small = square < _SINC_THRESHOLD
     x = torch.sqrt(torch.where(small, 1.0, square))
     near = square.clamp_max(_SINC_THRESHOLD)
-    cos_series = _horner(near, (1.0, -1 / 2, 1 / 24, -1 / 720, 1 / 40320))
-    sinc_series = _horner(near, (1.0, -1 / 6, 1 / 120, -1 / 5040, 1 / 362880))
+    cos_series = polynomial(near, (1.0, -1 / 2, 1 / 24, -1 / 720, 1 / 40320))
+    sinc_series = polynomial(near, (1.0, -1 / 6, 1 / 120, -1 / 5040, 1 / 362880))
     return torch.where(small, cos_series, torch.cos(x)), torch.where(
         small, sinc_series, torch.sin(x) / x
     )
@@ -53,7 +53,7 @@ def arctan_ratio(
     s = torch.sqrt(torch.where(small, 1.0, sine_square))
     c = torch.where(small, cosine, 1.0)
     tangent_square = sine_square / (c * c)  # where not small it only has to be finite
-    series = _horner(tangent_square, (1.0, -1 / 3, 1 / 5, -1 / 7, 1 / 9)) / c
+    series = polynomial(tangent_square, (1.0, -1 / 3, 1 / 5, -1 / 7, 1 / 9)) / c
     return torch.where(small, series, torch.atan2(s, cosine) / s)
 
 
@@ -64,10 +64,20 @@ def safe_norm(vector: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
     return torch.where(zero, 0.0, torch.sqrt(torch.where(zero, 1.0, square)))
 
 
-def _horner(x: Tensor, coefficients: tuple[float, ...]) -> Tensor:
-    """Polynomial with the constant term first."""
+def polynomial(x: Tensor, coefficients: tuple[float, ...]) -> Tensor:
+    """Value of a polynomial, the constant term first, by Horner's rule."""
     *rest, last_but_one, last = coefficients
     value = x * last + last_but_one
     for coefficient in reversed(rest):
         value = value * x + coefficient
     return value
+
+
+def minimum_jerk(x: float) -> tuple[float, float]:
+    """Progress 0 to 1 of a minimum-jerk motion and its slope (Flash and Hogan 1985).
+
+    Args:
+        x: Fraction of the duration. Outside 0 to 1 the motion rests at the start or the end.
+    """
+    x = min(max(x, 0.0), 1.0)
+    return x**3 * (10 - 15 * x + 6 * x**2), 30 * x**2 * (1 - x) ** 2

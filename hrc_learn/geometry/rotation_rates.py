@@ -16,13 +16,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.geometry.numerics import cos_and_sinc
+from hrc_learn.geometry.numerics import cos_and_sinc, polynomial
 
+# Below this angle squared the series are exact to rounding and the closed forms are not.
 _SMALL = 0.1
-"""Below this angle squared the series are exact to rounding and the closed forms are not."""
-
+# Fraction of v across e that must be seen in e' for e' to be told from v.
 _SINGULAR = 1e-3
-"""Share of v across e that must be seen in e' for e' to be told from v."""
 
 
 def axis_drift(
@@ -38,7 +37,7 @@ def axis_drift(
     # How much shorter v is across e, seen in e' the other way round.
     singular = sinc.abs() < _SINGULAR
     cosecant = torch.where(singular, 0.0, 1 / torch.where(singular, 1.0, sinc))
-    series = _polynomial(
+    series = polynomial(
         square.clamp_max(_SMALL), (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160)
     )
     c = torch.where(square < _SMALL, series, (1 - cosine * cosecant) / far)
@@ -66,8 +65,8 @@ def drift_free_slope(
     # h' = dh/da a' with a a' = e e'; likewise k'. Differences of near equals where a is small.
     far, near = square.clamp_min(_SMALL), square.clamp_max(_SMALL)
     _, sinc = cos_and_sinc(far)
-    h_series = _polynomial(near, (-1 / 12, 1 / 180, -1 / 6720, 1 / 453600, -1 / 47900160))
-    k_series = _polynomial(near, (-1 / 60, 1 / 1260, -1 / 60480, 1 / 4989600, -1 / 622702080))
+    h_series = polynomial(near, (-1 / 12, 1 / 180, -1 / 6720, 1 / 453600, -1 / 47900160))
+    k_series = polynomial(near, (-1 / 60, 1 / 1260, -1 / 60480, 1 / 4989600, -1 / 622702080))
     small, along = square < _SMALL, (e * rate).sum(-1, keepdim=True)
     h_rate = along * torch.where(small, h_series, (sinc - 2 * h) / far)
     k_rate = along * torch.where(small, k_series, (h - 3 * k) / far)
@@ -100,15 +99,7 @@ def _k(square: Tensor) -> Tensor:
     """(1 - sin a / a) / a^2 from a squared."""
     far = square.clamp_min(_SMALL)
     _, sinc = cos_and_sinc(far)
-    series = _polynomial(
+    series = polynomial(
         square.clamp_max(_SMALL), (1 / 6, -1 / 120, 1 / 5040, -1 / 362880, 1 / 39916800)
     )
     return torch.where(square < _SMALL, series, (1 - sinc) / far)
-
-
-def _polynomial(x: Tensor, coefficients: tuple[float, ...]) -> Tensor:
-    """The constant term first."""
-    value = torch.zeros_like(x)
-    for coefficient in reversed(coefficients):
-        value = value * x + coefficient
-    return value

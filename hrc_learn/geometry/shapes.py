@@ -1,5 +1,6 @@
-"""Shapes to draw and to keep clear of: boxes, capsules, mesh files, and the bodies that
-carry them.
+"""Shapes to draw and to keep clear of, and the rigid bodies that carry them.
+
+A body is a trajectory of poses with boxes, capsules or a mesh file attached to it.
 """
 
 from dataclasses import dataclass

@@ -1,9 +1,9 @@
-"""Learning where the neurons stand, how wide they are, and how much to trust the camera.
+"""Evidence maximisation: where the neurons stand, how wide they are, how noisy the camera is.
 
 For given neurons the weights have a closed form, and so has the probability of the
 demonstrated image motion with the weights integrated out (type-II maximum likelihood; MacKay
-1992, "Bayesian interpolation"). Its gradient by everything else is what is followed here. The
-error on demonstrations held out says when to stop.
+1992, "Bayesian interpolation"). L-BFGS maximises it over everything else. The error on
+demonstrations held out says when to stop.
 """
 
 from __future__ import annotations
@@ -17,15 +17,19 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from hrc_learn import distributed
-from hrc_learn.jacobian.fitting import ImageJacobianFitConfig, prior_precision, solve
-from hrc_learn.jacobian.radial_basis import weight_covariance
-from hrc_learn.jacobian.rbf_centers import Neurons
-from hrc_learn.jacobian.samples import KeyMotion, PairStatistics, Watched
+from hrc_learn.jacobian.fitting import (
+    ImageJacobianFitConfig,
+    prior_precision,
+    solve,
+    weight_covariance,
+)
+from hrc_learn.jacobian.rbf_centers import RBFCenters
+from hrc_learn.jacobian.samples import ImageDemonstration, MotionSamples, RegressionStatistics
 
 
 @dataclass(frozen=True, kw_only=True)
-class LearningConfig:
-    """How long to learn, and what."""
+class EvidenceConfig:
+    """How long to maximise the evidence, and over what."""
 
     rounds: int = 15
     """Rounds of L-BFGS at most."""
@@ -33,41 +37,41 @@ class LearningConfig:
     """Iterations of a round."""
     patience: int = 3
     """Rounds without a better held-out error after which to stop."""
-    least_gain: float = 1e-3
-    """Share by which the held-out error has to fall to count as better."""
+    min_improvement: float = 1e-3
+    """Fraction by which the held-out error has to fall to count as better."""
     hold_out: int = 4
     """Every n-th demonstration is held out to decide when to stop."""
-    most_pairs: int = 20_000
+    max_samples: int = 20_000
     """Pairs that each process learns from, evenly chosen among its own."""
     learn_centers: bool = True
     """Whether the centres move; widths, noise and prior are always learned."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Round:
-    """State of learning after a round."""
+class EvidenceRound:
+    """Neurons, noise and prior after a round, and how good they are."""
 
     evidence: float
     """Negative logarithm of the probability of the image motion, per pair."""
     held_out_error: float
     """Root mean square over the pairs of demonstrations held out [px]."""
-    neurons: Neurons
+    neurons: RBFCenters
     """As they were then."""
     config: ImageJacobianFitConfig
     """With noise and prior as they were then."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Learned:
+class EvidenceResult:
     """All rounds, of which the best is the result."""
 
-    rounds: tuple[Round, ...]
+    rounds: tuple[EvidenceRound, ...]
     """The first before anything was learned."""
     best: int
     """Which round the result is of."""
 
     @property
-    def neurons(self) -> Neurons:
+    def neurons(self) -> RBFCenters:
         """As learned."""
         return self.rounds[self.best].neurons
 
@@ -77,13 +81,13 @@ class Learned:
         return self.rounds[self.best].config
 
 
-def learn(
-    demonstrations: Sequence[Watched],
-    neurons: Neurons,
+def maximize_evidence(
+    demonstrations: Sequence[ImageDemonstration],
+    neurons: RBFCenters,
     config: ImageJacobianFitConfig | None = None,
-    learning: LearningConfig | None = None,
-    on_round: Callable[[int, Round], None] = lambda number, state: None,
-) -> Learned:
+    learning: EvidenceConfig | None = None,
+    on_round: Callable[[int, EvidenceRound], None] = lambda number, state: None,
+) -> EvidenceResult:
     """Improve neurons, noise and prior for the fit that follows.
 
     Of several processes each learns from its share of the demonstrations; all end with the
@@ -99,9 +103,9 @@ def learn(
     Raises:
         ValueError: Too few demonstrations, or no pair of key frames in one of the two sets.
     """
-    config, learning = config or ImageJacobianFitConfig(), learning or LearningConfig()
+    config, learning = config or ImageJacobianFitConfig(), learning or EvidenceConfig()
     training, held_out = _motions(demonstrations, config, learning)
-    model = Evidence(neurons, config, learning.learn_centers)
+    model = NegativeLogEvidence(neurons, config, learning.learn_centers)
     parallel = distributed.data_parallel(model)
     optimiser = torch.optim.LBFGS(
         parallel.parameters(), max_iter=learning.iterations, line_search_fn="strong_wolfe"
@@ -113,7 +117,7 @@ def learn(
         value.backward()
         return value
 
-    rounds = [model.judge(training, held_out)]
+    rounds = [model.evaluate(training, held_out)]
     on_round(0, rounds[0])
     best = 0
     while len(rounds) <= learning.rounds and len(rounds) - 1 - best < learning.patience:
@@ -121,21 +125,23 @@ def learn(
             optimiser.step(loss)
         except torch.linalg.LinAlgError:
             break  # a step so long that nothing could be solved: the best so far is kept
-        rounds.append(model.judge(training, held_out))
+        rounds.append(model.evaluate(training, held_out))
         on_round(len(rounds) - 1, rounds[-1])
-        limit = (1 - learning.least_gain) * rounds[best].held_out_error
+        limit = (1 - learning.min_improvement) * rounds[best].held_out_error
         if rounds[-1].held_out_error < limit:
             best = len(rounds) - 1
-    return Learned(rounds=tuple(rounds), best=best)
+    return EvidenceResult(rounds=tuple(rounds), best=best)
 
 
-class Evidence(nn.Module):
+class NegativeLogEvidence(nn.Module):
     """Negative log probability of image motion, per pair, weights integrated out.
 
     Parameters are logarithms where no optimiser step may make a number negative.
     """
 
-    def __init__(self, neurons: Neurons, config: ImageJacobianFitConfig, learn_centers: bool):
+    def __init__(
+        self, neurons: RBFCenters, config: ImageJacobianFitConfig, learn_centers: bool
+    ):
         super().__init__()
         self._neurons, self._config = neurons, config
 
@@ -148,9 +154,10 @@ class Evidence(nn.Module):
         self.log_bias = logarithm(config.bias_std)
         self.log_weight = logarithm(config.weight_std)
 
-    def forward(self, motion: KeyMotion) -> Float[Tensor, ""]:
+    def forward(self, motion: MotionSamples) -> Float[Tensor, ""]:
         """Of the pairs of all processes, each given its own."""
         total = self.statistics(motion)
+        # Variance of a difference of two measurements, each with this deviation.
         noise = 2 * (2 * self.log_noise).exp()
         # In weights that the prior makes independent and of size one, all is well scaled.
         root = torch.block_diag(*[torch.linalg.cholesky(self._prior())] * 6)
@@ -163,12 +170,12 @@ class Evidence(nn.Module):
         volume = 2 * factor.diagonal().log().sum() + total.count * (2 * math.pi * noise).log()
         return (misfit + volume) / total.count
 
-    def statistics(self, motion: KeyMotion) -> PairStatistics:
+    def statistics(self, motion: MotionSamples) -> RegressionStatistics:
         """Sums over the pairs of all processes, for the neurons as they are."""
         phi = motion.regressors(self.neurons(attached=True).basis())
-        return PairStatistics.of(phi, motion.dx).over_processes()
+        return RegressionStatistics.of(phi, motion.dx).over_processes()
 
-    def neurons(self, *, attached: bool = False) -> Neurons:
+    def neurons(self, *, attached: bool = False) -> RBFCenters:
         """As they are; attached: so that gradients reach them."""
         centers, width = self.centers, self.log_width.exp()
         if not attached:
@@ -185,15 +192,16 @@ class Evidence(nn.Module):
         )
 
     @torch.no_grad()
-    def judge(self, training: KeyMotion, held_out: KeyMotion) -> Round:
+    def evaluate(self, training: MotionSamples, held_out: MotionSamples) -> EvidenceRound:
         """Evidence of the training pairs, and the error on pairs held out."""
         config = self.fit_config()
         precision = prior_precision(self.centers, config)
         noise = 2 * config.pixel_noise**2
         weights = solve(self.statistics(training), precision, noise).mean
+        # Weights of the training pairs alone predict the others.
         unseen = self.statistics(held_out)
         error = (unseen.squared_error(weights) / unseen.count) ** 0.5
-        return Round(
+        return EvidenceRound(
             evidence=float(self(training)),
             held_out_error=error,
             neurons=self.neurons(),
@@ -205,16 +213,19 @@ class Evidence(nn.Module):
 
 
 def _motions(
-    demonstrations: Sequence[Watched], config: ImageJacobianFitConfig, learning: LearningConfig
-) -> tuple[KeyMotion, KeyMotion]:
+    demonstrations: Sequence[ImageDemonstration],
+    config: ImageJacobianFitConfig,
+    learning: EvidenceConfig,
+) -> tuple[MotionSamples, MotionSamples]:
     """Pairs of this process to learn from, and those held out."""
     if len(demonstrations) < learning.hold_out:
         raise ValueError(
             f"learning holds out every {learning.hold_out}th demonstration, but there are only "
             f"{len(demonstrations)}: record more, or fit with the neurons as they are."
         )
-    sets: tuple[list[KeyMotion], list[KeyMotion]] = ([], [])
+    sets: tuple[list[MotionSamples], list[MotionSamples]] = ([], [])
     for i, demonstration in distributed.share(demonstrations):
+        # By the number among all demonstrations, the same however many processes there are.
         is_held_out = (i + 1) % learning.hold_out == 0
         sets[is_held_out].append(demonstration.motion(config))
     for motions in sets:
@@ -226,5 +237,5 @@ def _motions(
                 f"{learning.hold_out}th demonstration: there is nothing to "
                 f"{'judge' if motions is sets[1] else 'learn'} from."
             )
-    training, held_out = (KeyMotion.joined(motions) for motions in sets)
-    return training.thinned(learning.most_pairs), held_out.thinned(learning.most_pairs)
+    training, held_out = (MotionSamples.joined(motions) for motions in sets)
+    return training.thinned(learning.max_samples), held_out.thinned(learning.max_samples)

@@ -16,12 +16,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.jacobian.radial_basis import weight_covariance
-from hrc_learn.jacobian.samples import PairConfig, PairStatistics
+from hrc_learn.jacobian.samples import KeyFrameConfig, RegressionStatistics
 
 
 @dataclass(frozen=True, kw_only=True)
-class ImageJacobianFitConfig(PairConfig):
+class ImageJacobianFitConfig(KeyFrameConfig):
     """Which frames are compared, and what is believed before they are."""
 
     pixel_noise: float = 0.5
@@ -67,6 +66,27 @@ class Posterior:
     """Of either image row [(px/m)^2]."""
 
 
+def weight_covariance(
+    centers: Float[Tensor, "K _"],
+    bias_std: float | Float[Tensor, ""],
+    weight_std: float | Float[Tensor, ""],
+) -> Float[Tensor, "K K"]:
+    """Prior covariance between neurons, for each entry of the Jacobian alone.
+
+    The entry is a bias, common to all neurons, plus a departure of each. With normalised
+    neurons, which sum to one, that is a constant Jacobian plus a network: what is learned in
+    one place holds everywhere until a place says otherwise.
+
+    Args:
+        centers: Of the neurons; gives their number, dtype and device.
+        bias_std: Standard deviation of the bias [px/m].
+        weight_std: Standard deviation of the departures [px/m].
+    """
+    K = len(centers)
+    eye = torch.eye(K, dtype=centers.dtype, device=centers.device)
+    return bias_std**2 * torch.ones_like(eye) + weight_std**2 * eye
+
+
 def prior_precision(
     centers: Float[Tensor, "K _"], config: ImageJacobianFitConfig
 ) -> Float[Tensor, "P P"]:
@@ -76,30 +96,32 @@ def prior_precision(
 
 
 def fit_weights(
-    parts: Sequence[PairStatistics],
+    folds: Sequence[RegressionStatistics],
     precision: Float[Tensor, "P P"],
     config: ImageJacobianFitConfig,
 ) -> tuple[Posterior, ImageJacobianFitReport]:
-    """Fit to all parts; each part in turn is held out to measure the error on unseen data.
+    """Fit to all folds; each in turn is held out to measure the error on unseen data.
 
     Args:
-        parts: Statistics of parts of the data that were recorded apart.
+        folds: Statistics of parts of the data that were recorded apart.
         precision: Of the prior (see `prior_precision`).
         config: Noise of the feature.
 
     Raises:
         ValueError: There is no pair at all.
     """
-    parts = [part for part in parts if part.count]
-    if not parts:
+    folds = [fold for fold in folds if fold.count]
+    if not folds:
         raise ValueError(
             "no two visible key frames are within reach of each other: the feature was not "
             "seen, or the tool moved less than min_step or more than max_step at a time."
         )
-    total = reduce(add, parts)
-    noise = 2 * config.pixel_noise**2
-    held_out = _held_out_square(parts, precision, noise)
-    noise = max(noise, held_out / 2)  # two coordinates
+    total = reduce(add, folds)
+    noise = 2 * config.pixel_noise**2  # of a difference of two measurements
+    held_out = _held_out_square(folds, precision, noise)
+    # The network may be too coarse for the data: then its error is noise to the weights. Half
+    # of it, as the square sums two coordinates. (NaN, with one fold, leaves the noise.)
+    noise = max(noise, held_out / 2)
     posterior = solve(total, precision, noise)
     report = ImageJacobianFitReport(
         pairs=total.count,
@@ -112,7 +134,7 @@ def fit_weights(
 
 
 def solve(
-    statistics: PairStatistics, precision: Float[Tensor, "P P"], noise: float
+    statistics: RegressionStatistics, precision: Float[Tensor, "P P"], noise: float
 ) -> Posterior:
     """Posterior of the weights for a zero-mean prior.
 
@@ -126,12 +148,14 @@ def solve(
     return Posterior(mean=mean, covariance=torch.cholesky_inverse(factor))
 
 
-def _held_out_square(parts: Sequence[PairStatistics], precision: Tensor, noise: float) -> float:
-    """Mean squared error over all pairs, each predicted without its own part."""
-    if len(parts) == 1:
+def _held_out_square(
+    folds: Sequence[RegressionStatistics], precision: Tensor, noise: float
+) -> float:
+    """Mean squared error over all pairs, each predicted without its own fold."""
+    if len(folds) == 1:
         return float("nan")
     error = 0.0
-    for i, held_out in enumerate(parts):
-        rest = reduce(add, [*parts[:i], *parts[i + 1 :]])
+    for i, held_out in enumerate(folds):
+        rest = reduce(add, [*folds[:i], *folds[i + 1 :]])
         error += held_out.squared_error(solve(rest, precision, noise).mean)
-    return error / sum(part.count for part in parts)
+    return error / sum(fold.count for fold in folds)

@@ -14,13 +14,17 @@ from torch import Tensor
 from hrc_learn.geometry import Pose
 from hrc_learn.jacobian.fitting import ImageJacobianFitConfig, prior_precision, solve
 from hrc_learn.jacobian.network import RBFImageJacobian
-from hrc_learn.jacobian.radial_basis import component_scale
-from hrc_learn.jacobian.samples import Watched, motion_by_part, statistics_by_part
+from hrc_learn.jacobian.samples import (
+    ImageDemonstration,
+    component_scale,
+    samples_by_fold,
+    statistics_by_fold,
+)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class HeldOutPairs:
-    """Pairs of key frames, each predicted without its part of the data."""
+class HeldOutSamples:
+    """Pairs of key frames, each predicted without its fold of the data."""
 
     position: Float[Tensor, "pairs 3"]
     """Of the tool half-way [m]."""
@@ -41,6 +45,7 @@ class HeldOutPairs:
         low, high = place.amin(dim=0), place.amax(dim=0)
         edges = torch.stack([torch.linspace(0, 1, cells + 1).double()] * 2, dim=1)
         edges = low + (high - low) * edges
+        # Points on the upper edge, and all where nothing moves along an axis, stay inside.
         cell = ((place - low) / (high - low).clamp_min(1e-9) * cells).long().clamp(0, cells - 1)
         flat = cell[:, 0] * cells + cell[:, 1]
 
@@ -71,12 +76,12 @@ class CellErrors:
     """Mean of the posterior deviation over the Jacobian's size; NaN in an empty cell."""
 
 
-def held_out_pairs(
-    demonstrations: Sequence[Watched],
+def cross_validate(
+    demonstrations: Sequence[ImageDemonstration],
     network: RBFImageJacobian,
     config: ImageJacobianFitConfig,
-) -> HeldOutPairs:
-    """Predict every pair with the weights fitted to the other parts of the data.
+) -> HeldOutSamples:
+    """Predict every pair with the weights fitted to the other folds of the data.
 
     Of several processes, each predicts the pairs of its share.
 
@@ -86,34 +91,34 @@ def held_out_pairs(
         config: Of that fit.
 
     Raises:
-        ValueError: The network was loaded, or there is one part only.
+        ValueError: The network was loaded, or there is one fold only.
     """
     report = network.report
     if report is None:
         raise ValueError("only a network just fitted knows what it was fitted with.")
     network = network.double()
     K = len(network.centers)
-    parts = statistics_by_part(network.basis, K, demonstrations, config)
-    if sum(part.count > 0 for part in parts) < 2:
-        raise ValueError("held-out errors need pairs in at least two parts of the data.")
+    folds = statistics_by_fold(network.basis, K, demonstrations, config)
+    if sum(fold.count > 0 for fold in folds) < 2:
+        raise ValueError("held-out errors need pairs in at least two folds of the data.")
     precision = prior_precision(network.centers, config)
     without = [
-        solve(reduce(add, [*parts[:i], *parts[i + 1 :]]), precision, report.noise**2).mean
-        for i in range(len(parts))
+        solve(reduce(add, [*folds[:i], *folds[i + 1 :]]), precision, report.noise**2).mean
+        for i in range(len(folds))
     ]
-    pairs: list[HeldOutPairs] = []
+    pairs: list[HeldOutSamples] = []
     with torch.no_grad():
-        for part, motion in motion_by_part(demonstrations, config):
+        for fold, motion in samples_by_fold(demonstrations, config):
             pairs.append(
-                HeldOutPairs(
+                HeldOutSamples(
                     position=(motion.before.position + motion.after.position) / 2,
                     motion=motion.dx,
-                    error=motion.dx - motion.regressors(network.basis) @ without[part],
+                    error=motion.dx - motion.regressors(network.basis) @ without[fold],
                     uncertainty=relative_uncertainty(network, motion.before, config),
                 )
             )
-    names = [field.name for field in fields(HeldOutPairs)]
-    return HeldOutPairs(
+    names = [field.name for field in fields(HeldOutSamples)]
+    return HeldOutSamples(
         **{name: torch.cat([getattr(one, name) for one in pairs]) for name in names}
     )
 
@@ -124,6 +129,6 @@ def relative_uncertainty(
     """Posterior deviation of the Jacobian over its size, rotation counted in metres."""
     scale = component_scale(pose.position, config.rotation_scale)
     size = (network(pose) / scale).flatten(-2).norm(dim=-1)
-    # Both image rows have the same deviation.
+    # Both image rows have the same deviation, which makes the norm over both sqrt(2) times it.
     deviation = network.uncertainty(pose, config.rotation_scale) / scale
     return 2**0.5 * deviation.norm(dim=-1) / size

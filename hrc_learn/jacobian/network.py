@@ -17,12 +17,14 @@ from hrc_learn.jacobian.fitting import (
     fit_weights,
     prior_precision,
 )
-from hrc_learn.jacobian.radial_basis import component_scale, radial_basis
-from hrc_learn.jacobian.rbf_centers import Neurons, pose_inputs
-from hrc_learn.jacobian.samples import Watched, statistics_by_part, watched
+from hrc_learn.jacobian.rbf_centers import RBFCenters, pose_inputs, radial_basis
+from hrc_learn.jacobian.samples import (
+    ImageDemonstration,
+    component_scale,
+    image_demonstrations,
+    statistics_by_fold,
+)
 from hrc_learn.storage import SavedModel, write_model
-
-# The image Jacobian as a network of radial basis functions of the tool's pose.
 
 _KIND = "RBFImageJacobian"
 _UNITS = {"position": "m", "rotation": "rad", "jacobian": "px/m, px/rad", "pixels": "u, v"}
@@ -165,14 +167,16 @@ class RBFImageJacobian(nn.Module):
         Raises:
             ValueError: Lengths differ, or no pair of key frames is left.
         """
-        neurons = Neurons(centers=centers, width=width, input_indices=tuple(input_indices))
-        return cls.fit_watched(watched(poses, features, visible), neurons, config)
+        neurons = RBFCenters(centers=centers, width=width, input_indices=tuple(input_indices))
+        return cls.fit_demonstrations(
+            image_demonstrations(poses, features, visible), neurons, config
+        )
 
     @classmethod
-    def fit_watched(
+    def fit_demonstrations(
         cls,
-        demonstrations: Sequence[Watched],
-        neurons: Neurons,
+        demonstrations: Sequence[ImageDemonstration],
+        neurons: RBFCenters,
         config: ImageJacobianFitConfig | None = None,
     ) -> RBFImageJacobian:
         """Fit to demonstrations read one by one; of several processes, each reads its share.
@@ -196,7 +200,7 @@ class RBFImageJacobian(nn.Module):
             reference=neurons.reference,
         )
         K = len(network.centers)
-        parts = statistics_by_part(network.basis, K, demonstrations, config)
+        parts = statistics_by_fold(network.basis, K, demonstrations, config)
         precision = prior_precision(network.centers, config)
         posterior, report = fit_weights(parts, precision, config)
         rows = posterior.mean.mT.unflatten(-1, (6, -1))  # (2, 6, K)
@@ -314,10 +318,7 @@ def _checked_indices(indices: Sequence[int], centers: Tensor) -> tuple[int, ...]
     return tuple(indices)
 
 
-# One network for a feature of several points.
-
-
-def stacked(networks: Sequence[RBFImageJacobian]) -> RBFImageJacobian:
+def stack_networks(networks: Sequence[RBFImageJacobian]) -> RBFImageJacobian:
     """One network for all points of a feature, from one for each of them.
 
     Points fitted to the same demonstrations have the same regressors, so their image rows share
@@ -355,9 +356,6 @@ def _same_neurons(a: RBFImageJacobian, b: RBFImageJacobian) -> bool:
         and (a.input_indices, a.normalized) == (b.input_indices, b.normalized)
         and (not references or (len(references) == 2 and torch.equal(*references)))
     )
-
-
-# Prior that knows depth and rotation: a network that starts as the model of a rough camera.
 
 
 def nominal_network(

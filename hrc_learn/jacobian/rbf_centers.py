@@ -1,4 +1,7 @@
-"""Where the neurons of an image Jacobian stand, and what of the tool's pose they see."""
+"""Radial basis functions: where their centres stand, and what of the tool's pose they see.
+
+The paper calls each of them a neuron, and so do we.
+"""
 
 from __future__ import annotations
 
@@ -11,18 +14,55 @@ from torch import Tensor
 
 from hrc_learn import distributed
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.jacobian.radial_basis import paper_grid, radial_basis
-from hrc_learn.jacobian.samples import Watched
+from hrc_learn.jacobian.samples import ImageDemonstration
 
-LEAST_REACH = 0.05
-"""Distance of neurons from the middle at least [m, rad], where hardly any motion was shown."""
-WIDTH_OVER_REACH = 1.5
-"""Width of the neurons over the largest distance from the middle: wide enough to blend from
-one end of the workspace to the other, narrow enough to tell them apart."""
+# Least distance of outer neurons from the middle [m, rad]: where hardly any motion was
+# demonstrated along a component, closer ones could not be told apart.
+_LEAST_REACH = 0.05
+# Width of the neurons over the largest distance from the middle: wide enough to blend from one
+# end of the workspace to the other, narrow enough to tell them apart.
+_WIDTH_OVER_REACH = 1.5
+
+
+def radial_basis(
+    inputs: Float[Tensor, "*batch n"],
+    centers: Float[Tensor, "K n"],
+    width: Float[Tensor, ""],
+    *,
+    normalized: bool,
+) -> Float[Tensor, "*batch K"]:
+    """Gaussian neurons theta_k = exp(-|x - c_k|^2 / (2 width^2)), the paper's (eq_rbf).
+
+    Args:
+        inputs: Where to evaluate.
+        centers: One row a neuron.
+        width: Standard deviation of the Gaussians, in the unit of `inputs`.
+        normalized: Divide by the sum over neurons. The neurons then sum to one everywhere: a
+            weight that is the same for all of them is reproduced everywhere, and far from all
+            centres the nearest neuron speaks instead of none.
+    """
+    square = (inputs.unsqueeze(-2) - centers).square().sum(-1)
+    exponent = -square / (2 * width.square())
+    return torch.softmax(exponent, dim=-1) if normalized else torch.exp(exponent)
+
+
+def grid(*axes: tuple[float, float, int]) -> Float[Tensor, "K n"]:
+    """Centres on a regular grid.
+
+    Args:
+        axes: First value, last value and number of centres along each input.
+    """
+    lines = [torch.linspace(*axis, dtype=torch.float64) for axis in axes]
+    return torch.cartesian_prod(*lines).reshape(-1, len(axes))
+
+
+def paper_grid() -> Float[Tensor, "9 2"]:
+    """Table I: (0.05, 0.35) + (0.15 i, 0.15 j) for i, j = 0, 1, 2, in x and y [m]."""
+    return grid((0.05, 0.35, 3), (0.35, 0.65, 3))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Neurons:
+class RBFCenters:
     """Normalised Gaussians of some components of the tool's pose."""
 
     centers: Float[Tensor, "K n"]
@@ -35,13 +75,13 @@ class Neurons:
     """Orientation that the rotation vector starts from; None: that of the base."""
 
     @staticmethod
-    def paper() -> Neurons:
+    def paper() -> RBFCenters:
         """Nine over the paper's table, which see x and y (Table I)."""
-        return Neurons(centers=paper_grid(), width=0.1)
+        return RBFCenters(centers=paper_grid(), width=0.1)
 
     @staticmethod
-    def around(demonstrations: Sequence[Watched]) -> Neurons:
-        """Thirteen about the poses that were shown: the middle, and both ways along all six.
+    def around(demonstrations: Sequence[ImageDemonstration]) -> RBFCenters:
+        """Thirteen about the demonstrated poses: the middle, and both ways along all six.
 
         The image Jacobian of a small workspace is nearly linear in position and rotation,
         which takes these; a grid over six inputs would take hundreds.
@@ -51,16 +91,19 @@ class Neurons:
         """
         reference = _mean_orientation(demonstrations)
         low, high = _range(demonstrations, reference)
-        middle, reach = (low + high) / 2, ((high - low) / 2).clamp_min(LEAST_REACH)
-        return Neurons(
+        middle, reach = (low + high) / 2, ((high - low) / 2).clamp_min(_LEAST_REACH)
+        return RBFCenters(
             centers=torch.cat([middle[None], middle + reach.diag(), middle - reach.diag()]),
-            width=WIDTH_OVER_REACH * float(reach.max()),
+            width=_WIDTH_OVER_REACH * float(reach.max()),
             input_indices=tuple(range(6)),
             reference=reference,
         )
 
     def basis(self) -> Callable[[Pose], Tensor]:
-        """Activation (time, K) of the neurons at poses (time,); gradients reach the neurons."""
+        """Activation (time, K) of the neurons at poses (time,).
+
+        Gradients reach centres and width.
+        """
 
         def activation(pose: Pose) -> Tensor:
             inputs = pose_inputs(pose, self.reference)[..., self.input_indices]
@@ -83,7 +126,7 @@ def pose_inputs(pose: Pose, reference: Float[Tensor, "4"] | None) -> Float[Tenso
     return torch.cat([pose.position, turn], dim=-1)
 
 
-def _mean_orientation(demonstrations: Sequence[Watched]) -> Float[Tensor, "4"]:
+def _mean_orientation(demonstrations: Sequence[ImageDemonstration]) -> Float[Tensor, "4"]:
     """Largest eigenvector of the summed outer products (Markley et al. 2007); either sign."""
     total = torch.zeros(4, 4, dtype=torch.float64)
     for _, demonstration in distributed.share(demonstrations):
@@ -93,7 +136,7 @@ def _mean_orientation(demonstrations: Sequence[Watched]) -> Float[Tensor, "4"]:
 
 
 def _range(
-    demonstrations: Sequence[Watched], reference: Float[Tensor, "4"]
+    demonstrations: Sequence[ImageDemonstration], reference: Float[Tensor, "4"]
 ) -> tuple[Float[Tensor, "6"], Float[Tensor, "6"]]:
     """Smallest and largest value of every input."""
     low = torch.full((6,), torch.inf, dtype=torch.float64)

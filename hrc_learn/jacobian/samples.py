@@ -1,5 +1,6 @@
-"""Samples of image motion: pairs of key frames of demonstrations, and the sums a fit
-needs of them.
+"""Samples of image motion: pairs of key frames of demonstrations, and the sums a fit needs.
+
+Sums add up over demonstrations and processes, so one demonstration is in memory at a time.
 """
 
 from __future__ import annotations
@@ -15,14 +16,14 @@ from torch import Tensor
 
 from hrc_learn import distributed
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.jacobian.radial_basis import component_scale
 
-# Pairs of key frames of a demonstration, and the sums a fit needs of them.
+# Parts of the data, each of which is held out in turn to measure the error on unseen data.
+FOLDS = 5
 
 
 @dataclass(frozen=True, kw_only=True)
-class PairConfig:
-    """Which frames of a demonstration are compared."""
+class KeyFrameConfig:
+    """Which frames of a demonstration, or of a run, are compared."""
 
     min_step: float = 2e-4
     """Least motion between key frames [m], rotation counted with `rotation_scale`."""
@@ -33,8 +34,8 @@ class PairConfig:
 
 
 @dataclass(frozen=True, eq=False)
-class PairStatistics:
-    """Sums over pairs: all a linear fit needs to know, in any order and from any machine."""
+class RegressionStatistics:
+    """Sums over samples: all a linear fit needs to know, in any order and from any machine."""
 
     gram: Float[Tensor, "P P"]
     """Sum of phi phi^T [m^2]."""
@@ -46,27 +47,27 @@ class PairStatistics:
     """Number of pairs."""
 
     @staticmethod
-    def of(phi: Float[Tensor, "pairs P"], dx: Float[Tensor, "pairs 2"]) -> PairStatistics:
-        """Statistics of some pairs, from their regressors (see `KeyMotion`)."""
-        return PairStatistics(phi.mT @ phi, phi.mT @ dx, dx.square().sum(), len(dx))
+    def of(phi: Float[Tensor, "pairs P"], dx: Float[Tensor, "pairs 2"]) -> RegressionStatistics:
+        """Statistics of some pairs, from their regressors (see `MotionSamples`)."""
+        return RegressionStatistics(phi.mT @ phi, phi.mT @ dx, dx.square().sum(), len(dx))
 
     @staticmethod
-    def empty(regressors: int) -> PairStatistics:
+    def empty(regressors: int) -> RegressionStatistics:
         """Statistics of no pairs."""
         zeros = torch.zeros(regressors, regressors + 2, dtype=torch.float64)
-        return PairStatistics(zeros[:, 2:], zeros[:, :2], zeros.new_zeros(()), 0)
+        return RegressionStatistics(zeros[:, 2:], zeros[:, :2], zeros.new_zeros(()), 0)
 
-    def over_processes(self) -> PairStatistics:
+    def over_processes(self) -> RegressionStatistics:
         """Statistics of the pairs of all processes."""
         total = distributed.differentiable_sum
         pairs = torch.tensor(float(self.count), dtype=torch.float64)
-        return PairStatistics(
+        return RegressionStatistics(
             total(self.gram), total(self.cross), total(self.energy), int(total(pairs))
         )
 
-    def __add__(self, other: PairStatistics) -> PairStatistics:
+    def __add__(self, other: RegressionStatistics) -> RegressionStatistics:
         """Statistics of both sets of pairs together."""
-        return PairStatistics(
+        return RegressionStatistics(
             self.gram + other.gram,
             self.cross + other.cross,
             self.energy + other.energy,
@@ -76,11 +77,12 @@ class PairStatistics:
     def squared_error(self, weights: Float[Tensor, "P 2"]) -> float:
         """Sum over the pairs of |dx - weights^T phi|^2 [px^2]."""
         change = (weights * (self.gram @ weights - 2 * self.cross)).sum()
+        # Not below zero, where rounding may take the sum of a perfect fit.
         return max(float(self.energy + change), 0.0)
 
 
 @dataclass(frozen=True, eq=False)
-class KeyMotion:
+class MotionSamples:
     """Motion from each key frame of a demonstration to the next one within reach."""
 
     before: Pose
@@ -99,8 +101,8 @@ class KeyMotion:
         pose: Pose,
         feature: Float[Tensor, "time 2"],
         visible: Bool[Tensor, " time"],
-        config: PairConfig,
-    ) -> KeyMotion:
+        config: KeyFrameConfig,
+    ) -> MotionSamples:
         """Motion along one demonstration.
 
         Args:
@@ -113,7 +115,7 @@ class KeyMotion:
         before, after = pose[keys[:-1]], pose[keys[1:]]
         dr = before.twist_to(after) * component_scale(pose.position, config.rotation_scale)
         near = torch.linalg.vector_norm(dr, dim=-1) <= config.max_step
-        return KeyMotion(
+        return MotionSamples(
             before=before[near],
             after=after[near],
             dr=dr[near],
@@ -122,18 +124,18 @@ class KeyMotion:
         )
 
     @staticmethod
-    def empty() -> KeyMotion:
+    def empty() -> MotionSamples:
         """No pairs."""
         none = torch.zeros(0, 6, dtype=torch.float64)
         pose = Pose(none[:, :3], none[:, :4])
-        return KeyMotion(pose, pose, none, none[:, :2], none[:, :2].long())
+        return MotionSamples(pose, pose, none, none[:, :2], none[:, :2].long())
 
     @staticmethod
-    def joined(motions: Sequence[KeyMotion]) -> KeyMotion:
+    def joined(motions: Sequence[MotionSamples]) -> MotionSamples:
         """The pairs of several demonstrations as one."""
 
         def join(name: str) -> Any:
-            parts = [getattr(motion, name) for motion in (KeyMotion.empty(), *motions)]
+            parts = [getattr(motion, name) for motion in (MotionSamples.empty(), *motions)]
             if isinstance(parts[0], Tensor):
                 return torch.cat(parts)
             return Pose(
@@ -141,20 +143,20 @@ class KeyMotion:
                 torch.cat([part.orientation for part in parts]),
             )
 
-        return KeyMotion(*(join(field.name) for field in fields(KeyMotion)))
+        return MotionSamples(*(join(field.name) for field in fields(MotionSamples)))
 
-    def split(self, parts: int) -> list[KeyMotion]:
+    def split(self, parts: int) -> list[MotionSamples]:
         """The pairs in order, in parts of nearly the same number."""
         return [self[piece] for piece in torch.arange(len(self.dx)).tensor_split(parts)]
 
-    def thinned(self, most: int) -> KeyMotion:
+    def thinned(self, most: int) -> MotionSamples:
         """So many of the pairs at most, evenly chosen."""
         pairs = len(self.dx)
         return self if pairs <= most else self[torch.linspace(0, pairs - 1, most).long()]
 
-    def __getitem__(self, index: Tensor) -> KeyMotion:
+    def __getitem__(self, index: Tensor) -> MotionSamples:
         """Some of the pairs."""
-        return KeyMotion(*(getattr(self, field.name)[index] for field in fields(self)))
+        return MotionSamples(*(getattr(self, field.name)[index] for field in fields(self)))
 
     def regressors(self, basis: Callable[[Pose], Tensor]) -> Float[Tensor, "pairs P"]:
         """Columns phi = dr (x) theta, 6 K of them columns in (component, neuron) order [m].
@@ -167,7 +169,15 @@ class KeyMotion:
         return (self.dr[:, :, None] * theta[:, None, :]).flatten(-2)
 
 
-def key_frames(pose: Pose, visible: Bool[Tensor, " time"], config: PairConfig) -> Tensor:
+def component_scale(like: Tensor, rotation_scale: float) -> Float[Tensor, "6"]:
+    """Metres that each component of a twist counts for: 1 a metre, `rotation_scale` a radian.
+
+    dr times the scale is in metres throughout; a Jacobian divided by it is in px/m throughout.
+    """
+    return like.new_tensor([1.0] * 3 + [rotation_scale] * 3)
+
+
+def key_frames(pose: Pose, visible: Bool[Tensor, " time"], config: KeyFrameConfig) -> Tensor:
     """Indices of visible frames, each at least `min_step` away from the one before."""
     # For close orientations the distance in R^4 is half the angle between them.
     turn = 2 * config.rotation_scale * quaternion.continuous(pose.orientation)
@@ -179,15 +189,9 @@ def key_frames(pose: Pose, visible: Bool[Tensor, " time"], config: PairConfig) -
     return torch.tensor(keys, dtype=torch.long, device=visible.device)
 
 
-# Statistics of whole sets of demonstrations, one demonstration in memory at a time.
-
-PARTS = 5
-"""In which the data are held out in turn."""
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Watched:
-    """One demonstration in which the camera watched the tool."""
+class ImageDemonstration:
+    """One demonstration during which the camera saw the tool."""
 
     pose: Pose
     """Of the tool, (time,)."""
@@ -196,17 +200,17 @@ class Watched:
     visible: Bool[Tensor, " time"]
     """Where the feature was found."""
 
-    def motion(self, config: PairConfig) -> KeyMotion:
+    def motion(self, config: KeyFrameConfig) -> MotionSamples:
         """Between its key frames, in float64."""
         pose = Pose(self.pose.position.double(), self.pose.orientation.double())
-        return KeyMotion.of(pose, self.feature.double(), self.visible, config)
+        return MotionSamples.of(pose, self.feature.double(), self.visible, config)
 
 
-def watched(
+def image_demonstrations(
     poses: Sequence[Pose],
     features: Sequence[Float[Tensor, "_ 2"]],
     visible: Sequence[Bool[Tensor, "_"]] | None = None,
-) -> list[Watched]:
+) -> list[ImageDemonstration]:
     """Demonstrations from their columns.
 
     Args:
@@ -221,18 +225,18 @@ def watched(
         visible = [~feature.isnan().any(-1) for feature in features]
     _check_lengths(poses, features, visible)
     return [
-        Watched(pose=pose, feature=feature, visible=seen)
+        ImageDemonstration(pose=pose, feature=feature, visible=seen)
         for pose, feature, seen in zip(poses, features, visible, strict=True)
     ]
 
 
-def statistics_by_part(
+def statistics_by_fold(
     basis: Callable[[Pose], Tensor],
     neurons: int,
-    demonstrations: Sequence[Watched],
-    config: PairConfig,
-) -> list[PairStatistics]:
-    """Sums over five parts of the data, so that each can be held out in turn.
+    demonstrations: Sequence[ImageDemonstration],
+    config: KeyFrameConfig,
+) -> list[RegressionStatistics]:
+    """Sums over the folds of the data, so that each can be held out in turn.
 
     Each of several processes reads its share of the demonstrations; all get all the sums.
 
@@ -243,25 +247,25 @@ def statistics_by_part(
         config: Choice of key frames.
 
     Returns:
-        Parts made of whole demonstrations, or fifths of a single one; some may be empty.
+        Folds made of whole demonstrations, or fifths of a single one; some may be empty.
     """
-    parts = [PairStatistics.empty(6 * neurons) for _ in range(PARTS)]
+    folds = [RegressionStatistics.empty(6 * neurons) for _ in range(FOLDS)]
     with torch.no_grad():
-        for part, motion in motion_by_part(demonstrations, config):
-            parts[part] += PairStatistics.of(motion.regressors(basis), motion.dx)
-    return [part.over_processes() for part in parts]
+        for fold, motion in samples_by_fold(demonstrations, config):
+            folds[fold] += RegressionStatistics.of(motion.regressors(basis), motion.dx)
+    return [fold.over_processes() for fold in folds]
 
 
-def motion_by_part(
-    demonstrations: Sequence[Watched], config: PairConfig
-) -> Iterator[tuple[int, KeyMotion]]:
-    """Motion between key frames of this process's share, with the part it belongs to."""
+def samples_by_fold(
+    demonstrations: Sequence[ImageDemonstration], config: KeyFrameConfig
+) -> Iterator[tuple[int, MotionSamples]]:
+    """Motion between key frames of this process's share, with the fold it belongs to."""
     for i, demonstration in distributed.share(demonstrations):
         motion = demonstration.motion(config)
         if len(demonstrations) == 1:
-            yield from enumerate(motion.split(PARTS))
+            yield from enumerate(motion.split(FOLDS))
         else:
-            yield i % PARTS, motion
+            yield i % FOLDS, motion
 
 
 def _check_lengths(

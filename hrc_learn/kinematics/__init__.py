@@ -1,8 +1,8 @@
 """Serial arms: forward kinematics, Jacobians and their inverses; the Panda."""
 
 from hrc_learn.kinematics.chain import SerialChain as SerialChain
-from hrc_learn.kinematics.collision import Capsule as Capsule
 from hrc_learn.kinematics.collision import CapsuleArm as CapsuleArm
+from hrc_learn.kinematics.collision import LinkCapsule as LinkCapsule
 from hrc_learn.kinematics.franka import LINK_CAPSULES as LINK_CAPSULES
 from hrc_learn.kinematics.franka import FrankaArm as FrankaArm
 from hrc_learn.kinematics.franka import panda as panda

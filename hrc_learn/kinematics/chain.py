@@ -1,4 +1,10 @@
-"""Forward kinematics and geometric Jacobians of a serial arm, in plain matrix form."""
+"""Forward kinematics and geometric Jacobians of a serial arm.
+
+Twice: as matrix products, which is fast when run eagerly, and for compilers written out number
+by number. There, products with the zeros and ones of which an arm's description mostly
+consists are left out, and each number is a tensor over the batch alone, so that a compiler
+makes one loop over the batch of it. Run eagerly, those thousand operations take far longer.
+"""
 
 from __future__ import annotations
 
@@ -12,13 +18,6 @@ from hrc_learn.geometry import Pose
 from hrc_learn.geometry.constants import Constant
 from hrc_learn.kinematics.limits import JointLimits
 
-# Forward kinematics and Jacobian written out number by number, for compilers.
-#
-# Products with the zeros and ones of which an arm's description mostly consists are left out,
-# and
-# each number is a tensor over the batch alone, so that a compiler makes one loop over the batch
-# of it. Run eagerly, its thousand small operations take far longer than matrix products.
-
 type _Row = list[Tensor]
 
 
@@ -27,7 +26,7 @@ def transform_and_jacobian(
     mounts: Sequence[Sequence[Sequence[float]]],
     tip: Sequence[Sequence[float]],
 ) -> tuple[Float[Tensor, "*batch 3 4"], Float[Tensor, "*batch 6 joints"]]:
-    """Transform (R | p) of the tool centre point and its geometric Jacobian.
+    """Transform (R | p) of the tool centre point and its geometric Jacobian, written out.
 
     Args:
         q: Joint positions [rad].
@@ -63,6 +62,7 @@ def _product(frame: list[_Row], constant: Sequence[Sequence[float]]) -> list[_Ro
 
 
 def _combination(factors: Sequence[float], terms: _Row) -> Tensor:
+    """Sum of factor times term, without those that are zero or one."""
     products = [
         term if factor == 1 else factor * term
         for factor, term in zip(factors, terms, strict=True)
@@ -95,9 +95,6 @@ def _matrix(rows: list[_Row]) -> Tensor:
     batch = list(range(-rows[0][0].ndim, 0))
     flat = torch.stack([entry for row in rows for entry in row])
     return flat.unflatten(0, (len(rows), -1)).movedim(batch, list(range(len(batch))))
-
-
-# Forward kinematics and geometric Jacobians of a serial arm, in plain matrix form.
 
 
 class SerialChain:

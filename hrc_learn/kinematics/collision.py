@@ -18,7 +18,7 @@ _HALVINGS = 20
 
 
 @dataclass(frozen=True, kw_only=True)
-class Capsule:
+class LinkCapsule:
     """All points within a radius of a segment."""
 
     link: int
@@ -42,7 +42,7 @@ class CapsuleArm:
     def __init__(
         self,
         chain: SerialChain,
-        capsules: Sequence[Capsule],
+        capsules: Sequence[LinkCapsule],
         overlapping: Sequence[tuple[int, int]] = (),
     ):
         """Put the capsules on the links.
@@ -118,10 +118,12 @@ def segment_distance(
     start, along = first[..., 0, :], first[..., 1, :] - first[..., 0, :]
     other, across = second[..., 0, :], second[..., 1, :] - second[..., 0, :]
     offset = start - other
-    tiny = torch.finfo(first.dtype).tiny
+    tiny = torch.finfo(first.dtype).tiny  # segments of length zero are points
     a, e = ((v * v).sum(-1).clamp(min=tiny) for v in (along, across))
     b, c, f = (along * across).sum(-1), (along * offset).sum(-1), (across * offset).sum(-1)
     determinant = (a * e - b * b).clamp(min=0)
+    # Of nearly parallel segments any point of the first may be the nearest; a smaller
+    # determinant is rounding.
     parallel = determinant <= 1e-12 * a * e
     s = torch.where(parallel, 0.0, (b * f - c * e) / torch.where(parallel, 1.0, determinant))
     t = ((b * s.clamp(0, 1) + f) / e).clamp(0, 1)

@@ -1,5 +1,5 @@
-"""The Franka Emika Panda: published geometry and limits, and the capsules that stand for
-its links.
+"""The Franka Emika Panda: published geometry and limits in one table, and the capsules that
+stand for its links, to about a centimetre of their published shapes.
 """
 
 from math import cos, pi, sin
@@ -11,11 +11,9 @@ from torch import Tensor
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import inverse
 from hrc_learn.kinematics.chain import SerialChain
-from hrc_learn.kinematics.collision import Capsule, CapsuleArm
+from hrc_learn.kinematics.collision import CapsuleArm, LinkCapsule
 from hrc_learn.kinematics.interchange import to_urdf
 from hrc_learn.kinematics.limits import JointLimits
-
-# The Franka Emika Panda, from one table of published numbers.
 
 # Craig's modified Denavit-Hartenberg parameters and joint limits, as published in
 # frankaemika's "Robot and interface specifications" for the Panda (FER).
@@ -117,14 +115,12 @@ def _panda() -> FrankaArm:
 panda = _panda()
 """The Panda with its hand; a Cartesian limit of 1.7 m/s and 2.5 rad/s is the controller's."""
 
-# The Panda as capsules, to about a centimetre of the published link shapes.
-
+# Number of the tool centre point's frame, on which the hand is mounted.
 _TCP = 9
-"""Number of the tool centre point's frame, on which the hand is mounted."""
 
 # (link, start [m], end [m], radius [m]) in the frame of the link.
 LINK_CAPSULES = tuple(
-    Capsule(link=link, start=start, end=end, radius=radius)
+    LinkCapsule(link=link, start=start, end=end, radius=radius)
     for link, start, end, radius in (
         (0, (-0.06, 0.0, 0.05), (0.0, 0.0, 0.07), 0.07),
         (1, (0.0, 0.0, -0.19), (0.0, 0.0, -0.02), 0.06),
@@ -146,12 +142,12 @@ LINK_CAPSULES = tuple(
 
 # The hand is a box of 60 x 200 x 66 mm, which this contains, and so are the open fingers.
 _HAND_CAPSULES = (
-    Capsule(link=_TCP, start=(0.0, -0.08, -0.0704), end=(0.0, 0.08, -0.0704), radius=0.05),
-    Capsule(link=_TCP, start=(0.0, -0.035, -0.01), end=(0.0, 0.035, -0.01), radius=0.028),
+    LinkCapsule(link=_TCP, start=(0.0, -0.08, -0.0704), end=(0.0, 0.08, -0.0704), radius=0.05),
+    LinkCapsule(link=_TCP, start=(0.0, -0.035, -0.01), end=(0.0, 0.035, -0.01), radius=0.028),
 )
 # Links whose capsules overlap by design although they are no neighbours. The flange (8) has
 # none, so the hand follows link 7.
-OVERLAPPING = ((0, 2), (1, 3), (3, 5), (5, 7), (6, _TCP), (7, _TCP))
+_OVERLAPPING = ((0, 2), (1, 3), (3, 5), (5, 7), (6, _TCP), (7, _TCP))
 
-panda_capsules = CapsuleArm(panda, LINK_CAPSULES + _HAND_CAPSULES, OVERLAPPING)
+panda_capsules = CapsuleArm(panda, LINK_CAPSULES + _HAND_CAPSULES, _OVERLAPPING)
 """The Panda with its hand."""

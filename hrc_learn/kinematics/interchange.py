@@ -1,4 +1,8 @@
-"""To and from other kinematics libraries: chains of pytorch-kinematics, and URDF text."""
+"""Serial chains as URDF text, and to and from chains of the library pytorch-kinematics.
+
+URDF serves viewers, simulators and other kinematics libraries. pytorch-kinematics is imported
+only when it is asked for.
+"""
 
 from __future__ import annotations
 
@@ -15,8 +19,6 @@ from hrc_learn.kinematics.limits import JointLimits
 
 if TYPE_CHECKING:
     import pytorch_kinematics
-
-# URDF text of a serial chain: for viewers, simulators and other kinematics libraries.
 
 
 def to_urdf(chain: SerialChain, name: str = "arm") -> str:
@@ -74,13 +76,10 @@ def _roll_pitch_yaw(R: Float[Tensor, "3 3"]) -> list[float]:
     """Angles about fixed x, y, z [rad]; at pitch +-pi/2, where two coincide, yaw is zero."""
     horizontal = torch.hypot(R[0, 0], R[1, 0])
     pitch = torch.atan2(-R[2, 0], horizontal)
-    if horizontal < 1e-12:
+    if horizontal < 1e-12:  # beyond rounding of entries of size 1: roll and yaw coincide
         return [torch.atan2(-R[1, 2], R[1, 1]).item(), pitch.item(), 0.0]
     roll, yaw = torch.atan2(R[2, 1], R[2, 2]), torch.atan2(R[1, 0], R[0, 0])
     return [roll.item(), pitch.item(), yaw.item()]
-
-
-# To and from chains of the library pytorch-kinematics (imported only when called).
 
 
 def to_pytorch_kinematics(

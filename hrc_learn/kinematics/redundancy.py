@@ -1,5 +1,9 @@
-"""The redundancy of a seven-joint arm: its arm angle, and which of the postures for a
-tool pose to take.
+"""The redundancy of a seven-joint arm: its arm angle, and the choice of posture for a pose.
+
+The arm angle is one number for the posture of the arm with its end effector at rest: the
+angle by which the plane of shoulder, elbow and wrist is turned out of the vertical about the
+line from shoulder to wrist (Kreutz-Delgado et al. 1992). Unlike the position of joint 7 it
+changes steadily as the elbow circles, and keeps its meaning when the end effector moves on.
 """
 
 from collections.abc import Callable
@@ -14,15 +18,17 @@ from hrc_learn.kinematics.franka import FrankaArm
 from hrc_learn.kinematics.inverse import UnreachableError
 from hrc_learn.kinematics.pseudo_inverse import null_space_projector
 
-# Arm angle: one number for the body shape of a seven-joint arm with its hand held still.
-#
-# The angle by which the plane of shoulder, elbow and wrist is turned out of the vertical about
-# the line from shoulder to wrist (Kreutz-Delgado et al. 1992). Unlike the position of joint 7
-# it
-# changes steadily as the elbow circles, and keeps its meaning when the hand goes elsewhere.
-
 _SHOULDER, _ELBOW, _WRIST = 1, 3, 5  # frames of joints 2, 4 and 6
-_STEP = 1e-5  # rad; of the central difference
+# Step of the central difference [rad]: rounding and truncation are both near 1e-10 then.
+_STEP = 1e-5
+# Square of the rate [1] below which the motion that turns the arm angle is damped: near
+# configurations in which the null space does not move the elbow it would have no bound.
+_DAMPING = 1e-2
+# Singular value [1] and distance to a limit [rad] beyond which a posture is as good as any.
+_GOOD_SINGULAR_VALUE = 0.2
+_GOOD_DISTANCE = 0.5
+# Postures nearer to each other lead along the same path [rad].
+_ALIKE = 0.5
 
 
 def arm_angle(chain: SerialChain, q: Float[Tensor, "*batch 7"]) -> Float[Tensor, "*batch"]:
@@ -51,12 +57,12 @@ def arm_angle_and_motion(
     q: Float[Tensor, "*batch 7"],
     jacobian: Float[Tensor, "*batch 6 7"],
 ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 7"]]:
-    """`arm_angle`, and the joint motion that turns it at 1 rad/s and leaves the hand alone.
+    """`arm_angle`, and the joint motion that turns it at 1 rad/s with the tool at rest.
 
     Args:
         chain: The arm.
         q: Joint positions [rad].
-        jacobian: Of the hand, at q.
+        jacobian: Of the tool, at q.
 
     Returns:
         The angle [rad], and joint velocities [rad/s]; these are bounded near configurations
@@ -69,18 +75,10 @@ def arm_angle_and_motion(
     direction = torch.nn.functional.normalize(column, dim=-1)
     step = _STEP * direction
     angle, after, before = arm_angle(chain, torch.stack([q, q + step, q - step]))
+    # Where the angle wraps around between both ends, the short way counts.
     difference = torch.remainder(after - before + torch.pi, 2 * torch.pi) - torch.pi
     rate = (difference / (2 * _STEP)).unsqueeze(-1)
-    return angle, direction * rate / (rate * rate + 1e-2)
-
-
-# Which of the many postures for a tool pose to approach.
-
-# Beyond these a posture is as good as any [1], [rad].
-_GOOD_SINGULAR_VALUE = 0.2
-_GOOD_DISTANCE = 0.5
-# Postures nearer to each other lead along the same path [rad].
-_ALIKE = 0.5
+    return angle, direction * rate / (rate * rate + _DAMPING)
 
 
 def comfortable_posture(
@@ -127,9 +125,8 @@ def comfortable_postures(
         )
     distance = torch.minimum(solutions - lower, upper - solutions).amin(-1)
     smallest = torch.linalg.svdvals(chain.jacobian(solutions))[:, -1]
-    score = (distance / _GOOD_DISTANCE).clamp(max=1) + (smallest / _GOOD_SINGULAR_VALUE).clamp(
-        max=1
-    )
+    room = (distance / _GOOD_DISTANCE).clamp(max=1)
+    score = room + (smallest / _GOOD_SINGULAR_VALUE).clamp(max=1)
     chosen: list[Tensor] = []
     for posture in solutions[score.argsort(descending=True, stable=True)]:
         if all(torch.linalg.vector_norm(posture - other) > _ALIKE for other in chosen):
@@ -161,13 +158,14 @@ def clear_posture(
     best = postures[:1].expand_as(flat).clone()
     found = torch.full_like(flat[:, 0], -torch.inf)
     wanted = torch.minimum(clearance(flat), found.new_tensor(least))
-    share = torch.linspace(0, 1, samples, dtype=flat.dtype, device=flat.device)[1:, None]
+    # Without the start itself, where the arm is anyway.
+    fraction = torch.linspace(0, 1, samples, dtype=flat.dtype, device=flat.device)[1:, None]
     for posture in postures:
-        open_ = (found < wanted).nonzero().flatten()
-        if len(open_) == 0:
+        missing = (found < wanted).nonzero().flatten()
+        if len(missing) == 0:
             break
-        path = torch.lerp(flat[open_, None], posture, share)
+        path = torch.lerp(flat[missing, None], posture, fraction)
         distance = clearance(path).amin(-1)
-        better = distance > found[open_]
-        best[open_[better]], found[open_[better]] = posture, distance[better]
+        better = distance > found[missing]
+        best[missing[better]], found[missing[better]] = posture, distance[better]
     return best.reshape(start.shape)

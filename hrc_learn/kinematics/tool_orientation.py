@@ -1,5 +1,10 @@
-"""Tool orientations: turned as the tool moves sideways, and along the tangent of
-demonstrated approaches.
+"""Tool orientations: the paper's rule for three-axis devices, and the tangent of approaches.
+
+`coarse_orientation` (eq. coarse_orientation): a three-axis haptic device moves the end effector
+but cannot turn it, so the tilt follows from the sideways position: straight down in front of
+the robot, level at the end of its reach. `Approach` (section Collaboration Task): the
+orientation for grasping is along the tangent of each demonstration near the object, where the
+end effector was going.
 """
 
 import json
@@ -15,10 +20,14 @@ from torch import Tensor
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.store import new_file
 
-# The paper's rule that turns the gripper as the hand moves sideways (eq. coarse_orientation).
-#
-# A three-axis haptic device moves the end effector but cannot turn it. So the tilt follows from
-# the sideways position: straight down in front of the robot, level at the end of its reach.
+NEAR = 0.05
+"""Length of the last stretch of a path, whose direction is its tangent there [m]."""
+
+# Tangents that differ by more [rad], from one another or from where the end effector points,
+# tell nothing: it came to the object from the side, as over a table, and not as it grasps.
+MAX_SPREAD = math.radians(30)
+# Shorter vectors are rounding noise and have no direction.
+_SHORTEST = 1e-12
 
 
 def gripper_down() -> Float[Tensor, "4"]:
@@ -49,25 +58,12 @@ def coarse_orientation(
     return quaternion.multiply(turn, gripper_down().to(position))
 
 
-# From which side an object is approached, by the tangents of demonstrated paths near it.
-#
-# The paper takes the orientation for grasping from the tangent of each trajectory near the
-# object
-# (section Collaboration Task): the hand points where it was going.
-
-NEAR = 0.05
-"""Length of the last stretch of a path, whose direction is its tangent there [m]."""
-WIDEST = math.radians(30)
-"""Tangents that differ by more, from one another or from where the hand points, tell nothing:
-the hand came to the object from the side, as over a table, and not the way it grasps."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class Approach:
-    """How the hand is turned where it stands before an object."""
+    """Orientation of the end effector in front of an object, from demonstrated approaches."""
 
     orientation: Float[Tensor, "4"]
-    """Of the hand (wxyz); its z axis is the direction in which it goes on to the object."""
+    """(wxyz); its z axis is the direction in which it goes on to the object."""
     spread: float
     """Angle of the demonstrations' tangents to their mean, root mean square [rad]."""
     turned: float
@@ -75,34 +71,36 @@ class Approach:
 
     @property
     def direction(self) -> Float[Tensor, "3"]:
-        """In which the hand goes on to the object, base frame; of unit length."""
+        """In which the end effector goes on to the object, base frame; of unit length."""
         return quaternion.to_matrix(self.orientation)[:, 2]
 
     @classmethod
     def fit(cls, paths: Sequence[Pose]) -> "Approach":
-        """Turn the demonstrated orientation as little as makes the hand point along the path.
+        """Turn the mean demonstrated orientation, as little as needed, along the path.
 
         Args:
-            paths: Poses of the hand in each demonstration, which ends before the object:
-                position (time, 3) [m], orientation (time, 4).
+            paths: Poses of the end effector in each demonstration, which ends in front of the
+                object: position (time, 3) [m], orientation (time, 4).
 
         Raises:
             ValueError: If there is no path.
         """
         if not paths:
             raise ValueError("an approach is learned from one demonstration or more: got none.")
-        shown = _mean([path.orientation[-1] for path in paths])
+        demonstrated = _mean([path.orientation[-1] for path in paths])
         tangents = torch.stack([tangent(path.position) for path in paths])
         mean = tangents.mean(dim=0)
-        mean = mean / mean.norm().clamp(min=1e-12)
+        mean = mean / mean.norm().clamp(min=_SHORTEST)
         spread = float(_angle(tangents, mean).square().mean().sqrt())
-        points = quaternion.to_matrix(shown)[:, 2]
+        points = quaternion.to_matrix(demonstrated)[:, 2]
         turned = float(_angle(points, mean))
-        if not max(spread, turned) < WIDEST:
-            return cls(orientation=shown, spread=spread, turned=0.0)
+        if not max(spread, turned) < MAX_SPREAD:
+            return cls(orientation=demonstrated, spread=spread, turned=0.0)
         axis = torch.linalg.cross(points, mean)
-        turn = quaternion.exp(turned * axis / axis.norm().clamp(min=1e-12))
-        return cls(orientation=quaternion.multiply(turn, shown), spread=spread, turned=turned)
+        turn = quaternion.exp(turned * axis / axis.norm().clamp(min=_SHORTEST))
+        return cls(
+            orientation=quaternion.multiply(turn, demonstrated), spread=spread, turned=turned
+        )
 
     def save(self, path: Path) -> None:
         """Write to a JSON file, whole or not at all."""
@@ -143,7 +141,7 @@ def tangent(position: Float[Tensor, "time 3"], near: float = NEAR) -> Float[Tens
     way = position[-1] - position
     before = (way.norm(dim=-1) > near).nonzero()[:, 0]
     chord = way[int(before[-1])] if len(before) else way[0]
-    return chord / chord.norm().clamp(min=1e-12)
+    return chord / chord.norm().clamp(min=_SHORTEST)
 
 
 def _mean(orientations: Sequence[Tensor]) -> Float[Tensor, "4"]:

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from hrc_learn.demos import Demonstration, DemonstrationSet
-from hrc_learn.jacobian import Learned, Neurons
+from hrc_learn.jacobian import EvidenceResult, RBFCenters
 from hrc_learn.kinematics import panda
 from hrc_learn.learning.fit_visual_servo import Demonstrations, Watching
 from hrc_learn.skills.visual_servoing import AimingSkill
@@ -62,7 +62,7 @@ def learning_recording(
     )
 
 
-def _curves(learned: Learned) -> dict[str, np.ndarray]:
+def _curves(learned: EvidenceResult) -> dict[str, np.ndarray]:
     rounds, configs = learned.rounds, [state.config for state in learned.rounds]
     return {
         "Error on demonstrations held out [px]": np.array([s.held_out_error for s in rounds]),
@@ -74,13 +74,13 @@ def _curves(learned: Learned) -> dict[str, np.ndarray]:
     }
 
 
-def _centers(learned: Learned | None, height: float) -> np.ndarray:
+def _centers(learned: EvidenceResult | None, height: float) -> np.ndarray:
     if learned is None:
         return np.zeros((1, 0, 3))
     return np.stack([_places(state.neurons, height) for state in learned.rounds])
 
 
-def _places(neurons: Neurons, height: float) -> np.ndarray:
+def _places(neurons: RBFCenters, height: float) -> np.ndarray:
     """Where neurons stand [m]; those that do not see a coordinate, in the middle of it."""
     centers, places = neurons.centers.numpy(), np.zeros((len(neurons.centers), 3))
     places[:, 2] = height

@@ -12,15 +12,15 @@ from torch import Tensor
 from hrc_learn.demos import Demonstration, DemonstrationSet, DemonstrationSource
 from hrc_learn.geometry import Pose
 from hrc_learn.jacobian import (
+    EvidenceConfig,
+    EvidenceRound,
+    ImageDemonstration,
     ImageJacobianFitConfig,
-    LearningConfig,
-    Neurons,
+    RBFCenters,
     RBFImageJacobian,
-    Watched,
-    held_out_pairs,
-    learn,
+    cross_validate,
+    maximize_evidence,
 )
-from hrc_learn.jacobian.evidence import Round
 from hrc_learn.kinematics import panda
 from hrc_learn.kinematics.tool_orientation import Approach
 from hrc_learn.skills.visual_servoing import AimingSkill
@@ -35,10 +35,10 @@ _REST = 0.3
 
 def fit_aiming(
     demos: Demonstrations,
-    neurons: Neurons | None = None,
+    neurons: RBFCenters | None = None,
     config: ImageJacobianFitConfig | None = None,
-    learning: LearningConfig | None = None,
-    on_round: Callable[[int, Round], None] = lambda number, state: None,
+    learning: EvidenceConfig | None = None,
+    on_round: Callable[[int, EvidenceRound], None] = lambda number, state: None,
 ) -> AimingSkill:
     """Fit image Jacobian and, where an object was watched, visual target and approach.
 
@@ -55,13 +55,13 @@ def fit_aiming(
     """
     camera = Watching(demos)
     config = config or ImageJacobianFitConfig()
-    neurons = neurons or Neurons.around(camera)
+    neurons = neurons or RBFCenters.around(camera)
     learned = None
     if learning is not None and len(demos) >= learning.hold_out:
-        learned = learn(camera, neurons, config, learning, on_round)
+        learned = maximize_evidence(camera, neurons, config, learning, on_round)
         neurons, config = learned.neurons, learned.config
-    network = RBFImageJacobian.fit_watched(camera, neurons, config)
-    cells = held_out_pairs(camera, network, config).by_cell()
+    network = RBFImageJacobian.fit_demonstrations(camera, neurons, config)
+    cells = cross_validate(camera, network, config).by_cell()
     ends = _ends(demos, network)
     return AimingSkill(
         jacobian=network,
@@ -72,7 +72,7 @@ def fit_aiming(
     )
 
 
-class Watching(Sequence[Watched]):
+class Watching(Sequence[ImageDemonstration]):
     """Demonstrations as the fit of an image Jacobian takes them, read when asked for."""
 
     def __init__(self, demos: Sequence[Demonstration], source: str | None = None):
@@ -80,7 +80,7 @@ class Watching(Sequence[Watched]):
         self._source = getattr(demos, "source", "") if source is None else source
 
     @overload
-    def __getitem__(self, index: int) -> Watched: ...
+    def __getitem__(self, index: int) -> ImageDemonstration: ...
     @overload
     def __getitem__(self, index: slice) -> "Watching": ...
     def __getitem__(self, index):
@@ -91,11 +91,11 @@ class Watching(Sequence[Watched]):
     def __len__(self) -> int:
         return len(self._demos)
 
-    def __iter__(self) -> Iterator[Watched]:
+    def __iter__(self) -> Iterator[ImageDemonstration]:
         return (_watched(demo, self._source) for demo in self._demos)
 
 
-def _watched(demo: Demonstration, source: str) -> Watched:
+def _watched(demo: Demonstration, source: str) -> ImageDemonstration:
     missing = [name for name in ("feature", "feature_visible") if getattr(demo, name) is None]
     pose = _pose(demo)
     missing += ["position, orientation"] if pose is None else []
@@ -104,7 +104,7 @@ def _watched(demo: Demonstration, source: str) -> Watched:
             f"{source}, episode {demo.episode}: no {', '.join(missing)}. An image Jacobian "
             "needs the hand's pose and its marker's pixel in every frame."
         )
-    return Watched(
+    return ImageDemonstration(
         pose=pose,
         feature=torch.from_numpy(demo.feature).double(),
         visible=torch.from_numpy(demo.feature_visible),

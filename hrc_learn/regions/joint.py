@@ -12,8 +12,6 @@ from torch import Tensor
 from hrc_learn.pytree import pytree, static
 from hrc_learn.regions.region import Region
 
-# Joint-space region: a potential that repels from the joint limits.
-
 
 @pytree
 @dataclass(frozen=True, kw_only=True)
@@ -61,26 +59,24 @@ class JointRegion(Region):
         f, f_reference = (depth.clamp(max=0) for depth in self._depths(distance))
         pull, pull_reference = self.stiffness * f, self.reference_stiffness * f_reference
         P = 0.5 * (pull * f + pull_reference * f_reference).sum(-1)
-        slope = pull + pull_reference
+        slope = pull + pull_reference  # dP/d delta, at most zero
         if self.formulation == "paper":
             slope = slope * (2 * distance)
+        # The distance to the nearer limit falls on either side of the centre.
         return P, -torch.sign(offset) * slope
 
     def _depths(self, distance: Tensor) -> tuple[Tensor, Tensor]:
-        """F and f_r from the distance to the limit."""
+        """Region functions f and f_r from the distance to the limit."""
         if self.formulation == "paper":
             square = distance * distance
             return square - self.margin**2, square - self.reference_margin**2
         return distance - self.margin, distance - self.reference_margin
 
 
-# Posture region: a ball in joint space that attracts, for large approaches.
-
-
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class PostureRegion(Region):
-    """Attracts the joints to a posture, at a speed that does not grow with the distance.
+    """Ball that attracts the joints to a posture, at a speed that levels off with the distance.
 
     f = |q - q_g| / tolerance - 1
     P = k s^2 (sqrt(1 + |q - q_g|^2/s^2) - 1)
@@ -99,7 +95,7 @@ class PostureRegion(Region):
     """s, the distance from which on the pull hardly grows [rad]; its limit is k s [rad/s]."""
 
     def value(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*both"]:
-        """F at the joint position x [rad]."""
+        """Region function f at the joint position x [rad]."""
         return torch.linalg.vector_norm(x - self.goal, dim=-1) / self.tolerance - 1
 
     def feedback(self, x: Float[Tensor, "*batch n"]) -> tuple[Tensor, Tensor]:

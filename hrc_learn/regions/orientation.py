@@ -1,5 +1,8 @@
-"""Cartesian orientation region: a cone round a goal orientation; also with the derivative
-that the paper prints.
+"""Cartesian orientation region: a cone round a goal orientation.
+
+Also with the derivative that the paper prints. (PartialV2Quat) divides by the components of
+both quaternions and counts the constraint of unit length twice: along unit quaternions it is
+twice the true derivative, for which `OrientationRegion` has a form without divisions.
 """
 
 from __future__ import annotations
@@ -17,13 +20,9 @@ from hrc_learn.geometry.rotation_rates import left_jacobian_transposed
 from hrc_learn.pytree import pytree, static
 from hrc_learn.regions.region import Region
 
-# The paper's derivative of the orientation error over a rotation vector, as printed.
-#
-# (PartialV2Quat) divides by the components of both quaternions and counts the constraint of
-# unit
-# length twice: along unit quaternions it is twice the true derivative, for which
-# `OrientationRegion` has a form without divisions.
-
+# Shorter axes are rounding noise. They occur at the goal, deep inside the cone, where the
+# gradient is zero whatever the axis.
+_SHORTEST_AXIS = 1e-12
 # Smaller components are not divided by: the printed form has poles there.
 _LEAST_COMPONENT = 1e-9
 # Below this angle squared the closed form of the last term loses digits, its series none.
@@ -66,13 +65,6 @@ def _over_rotation_vector(over_p: Tensor, r: Tensor) -> Tensor:
     return sinc / 2 * over_p[..., 1:] + (along - sinc / 4 * over_p[..., :1]) * r
 
 
-# Cartesian orientation region: a cone round a goal orientation.
-
-# Shorter axes are rounding noise. They occur at the goal, deep inside the cone, where the
-# gradient is zero whatever the axis.
-_SHORTEST_AXIS = 1e-12
-
-
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class OrientationRegion(Region):
@@ -110,7 +102,7 @@ class OrientationRegion(Region):
         return 2 / self.sharpness
 
     def value(self, x: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*both"]:
-        """F at the orientation x (a unit quaternion)."""
+        """Region function f at the orientation x (a unit quaternion)."""
         error = self._error(x)
         half_angle = torch.atan2(
             torch.linalg.vector_norm(error[..., 1:], dim=-1), error[..., 0]
@@ -124,6 +116,7 @@ class OrientationRegion(Region):
         half_angle = torch.atan2(sine, error[..., :1])
         f = (self.sharpness * half_angle - 1).clamp(min=0)
         P = (0.5 * self.stiffness) * (f * f).squeeze(-1)
+        # Over the sine, as the vector part of the error is sin(phi/2) n.
         slope = (0.5 * self.stiffness * self.sharpness) * f / sine.clamp(min=_SHORTEST_AXIS)
         if self.coordinates == "rotation_vector":
             return P, self._over_rotation_vector(x, error, slope)
@@ -138,5 +131,5 @@ class OrientationRegion(Region):
         return left_jacobian_transposed(quaternion.log(x).expand_as(gradient), gradient)
 
     def _error(self, x: Tensor) -> Tensor:
-        """P * p_g^-1 with the sign of the shortest rotation."""
+        """Error p * p_g^-1 with the sign of the shortest rotation."""
         return quaternion.canonical(quaternion.multiply(x, quaternion.conjugate(self.goal)))

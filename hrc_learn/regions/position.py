@@ -35,7 +35,7 @@ class PositionRegion(Region):
     excess near a wall of 0.12 m decays in 9 s, which leaves the tool outside for long."""
 
     def value(self, x: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*both 3"]:
-        """F of each pair of walls at the position x [m]."""
+        """Region function f of each pair of walls at the position x [m]."""
         scaled = self._in_box(x) / self.half_size
         return scaled * scaled - 1
 
@@ -43,7 +43,9 @@ class PositionRegion(Region):
         """Potential and its gradient over the position, in the base frame."""
         scaled = self._in_box(x) / self.half_size
         f = (scaled * scaled - 1).clamp(min=0)
-        pull = self._stiffness(like=f) * f
+        k_c = self.stiffness
+        # One for each axis of the box, or one for all.
+        pull = (f.new_tensor(k_c) if isinstance(k_c, tuple) else k_c) * f
         P = 0.5 * (pull * f).sum(-1)
         gradient = 2 * pull * scaled / self.half_size
         if self.rotation is not None:
@@ -56,8 +58,3 @@ class PositionRegion(Region):
         if self.rotation is None:
             return offset
         return quaternion.rotate(quaternion.conjugate(self.rotation), offset)
-
-    def _stiffness(self, like: Tensor) -> Tensor | float:
-        if isinstance(self.stiffness, tuple):
-            return like.new_tensor(self.stiffness)
-        return self.stiffness

@@ -1,4 +1,4 @@
-"""What every region is."""
+"""The interface of regions: a region function, a potential and its gradient."""
 
 from abc import ABC, abstractmethod
 from typing import final

@@ -61,6 +61,7 @@ class VisionRegion(Region):
         Raises:
             ValueError: The target is not inside the image by more than the border.
         """
+        # Pixels count from 0, so the last one is at the size less one.
         far_edge = target.new_tensor(image_size).repeat(target.shape[-1] // 2) - 1
         half_size = torch.minimum(target, far_edge - target) - border
         if not bool((half_size > 0).all()):
@@ -72,7 +73,7 @@ class VisionRegion(Region):
         return cls(target=target, half_size=half_size, **options)
 
     def value(self, x: Float[Tensor, "*batch rows"]) -> Float[Tensor, "*both"]:
-        """F at the feature position x [px]; of the point furthest out where it has several."""
+        """Region function f at the feature position x [px]; of several points, the largest."""
         scaled = (x - self.target) / self.half_size
         square = scaled * scaled
         if square.shape[-1] > 2:

@@ -1,4 +1,5 @@
-"""Rehearsal: the closed loop in plain torch, against a camera the controller cannot see.
+"""Batched simulation of the closed loop in plain torch, against a camera of which the
+controller knows nothing.
 
 Kinematics alone (the arm moves as it is told), so thousands of runs fit into one batch and
 gradients pass through. For contacts, images and marker detection use the simulator.
@@ -31,7 +32,7 @@ OVERHEAD = (0.0, 0.0, 1.0, 0.0)
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class PinholeCamera:
-    """Fixed camera that sees a marker on the hand."""
+    """Fixed camera that sees a marker on the end effector."""
 
     pose: Pose
     """Of the camera in the base frame: it looks along its z axis, x right, y down."""
@@ -99,7 +100,8 @@ class PinholeCamera:
         over_ray = self.focal_length * torch.stack(rows, -2) / (z * z)[..., None, None]
         rotation = quaternion.to_matrix(quaternion.conjugate(self.pose.orientation))
         over_point = over_ray @ rotation.unsqueeze(-3)
-        # Turning by w moves a point by w x arm: a row g of d(pixel)/d(point) gives arm x g.
+        # Turning by w moves a point by w x arm, so a row g of d(pixel)/d(point) contributes
+        # g . (w x arm) = (arm x g) . w.
         arm, over_point = torch.broadcast_tensors(arm.unsqueeze(-2), over_point)
         over_turn = torch.linalg.cross(arm, over_point)
         return torch.cat([over_point, over_turn], dim=-1).flatten(-3, -2)
@@ -122,8 +124,8 @@ class PinholeCamera:
 
 
 @runtime_checkable
-class Projects(Protocol):
-    """Whatever says where a camera sees the marker on the hand."""
+class ProjectiveCamera(Protocol):
+    """Whatever says where a camera sees the marker on the end effector."""
 
     def project(
         self, tool: Pose
@@ -142,8 +144,8 @@ class Imperfections:
     """Images by which a measurement is late."""
     noise: float = 0.0
     """Standard deviation of each pixel coordinate [px]."""
-    nan_share: float = 0.0
-    """Share of images whose measurement is NaN though it claims to be visible."""
+    nan_fraction: float = 0.0
+    """Fraction of images whose measurement is NaN though it claims to be visible."""
     loss_rate: float = 0.0
     """How often the marker gets covered [1/s]."""
     loss_time: float = 3.0
@@ -152,9 +154,12 @@ class Imperfections:
 
 @dataclass(kw_only=True)
 class VirtualCamera:
-    """Turns tool poses into measurements, with the imperfections of a camera."""
+    """Turns tool poses into measurements, with the imperfections of a camera.
 
-    camera: Projects
+    It remembers the last images, for their latency, and how long the marker stays covered.
+    """
+
+    camera: ProjectiveCamera
     imperfections: Imperfections
     generator: torch.Generator
     _steps: int = 0
@@ -179,7 +184,7 @@ class VirtualCamera:
         imperfections = self.imperfections
         feature, visible = self.camera.project(tool)
         feature = feature + imperfections.noise * self._normal(feature)
-        broken = self._uniform(visible) < imperfections.nan_share
+        broken = self._uniform(visible) < imperfections.nan_fraction
         feature = torch.where(broken.unsqueeze(-1), torch.nan, feature)
         visible = visible & ~self._cover(visible, frame_time)
         self._images.append((feature, visible, joint_position))
@@ -191,8 +196,9 @@ class VirtualCamera:
         if self._covered is not None:
             remaining = self._covered - frame_time
         starts = self._uniform(visible) < self.imperfections.loss_rate * frame_time
-        spell = self.imperfections.loss_time * self._uniform(visible)
-        self._covered = torch.where(starts & (remaining <= 0), spell, remaining)
+        # Uniform up to the longest interval, which makes the mean half of it.
+        interval = self.imperfections.loss_time * self._uniform(visible)
+        self._covered = torch.where(starts & (remaining <= 0), interval, remaining)
         return self._covered > 0
 
     def _uniform(self, like: Tensor) -> Tensor:
@@ -202,16 +208,16 @@ class VirtualCamera:
         return torch.randn(like.shape, generator=self.generator, dtype=like.dtype)
 
 
-def rehearse(
+def simulate_closed_loop(
     controller: AdaptiveController,
     camera: VirtualCamera,
     joint_position: Float[Tensor, "*batch n"],
     *,
     steps: int,
     dt: float,
-    effort: Callable[[int, Tensor], Tensor] | None = None,
+    nullspace_input: Callable[[int, Tensor], Tensor] | None = None,
     goals: Callable[[int], Goals] | None = None,
-    watch: Callable[[int, Tensor, Observation, Command, ControllerState], None] | None = None,
+    on_step: Callable[[int, Tensor, Observation, Command, ControllerState], None] | None = None,
 ) -> Float[Tensor, "*batch n"]:
     """Run the closed loop.
 
@@ -221,9 +227,9 @@ def rehearse(
         joint_position: Start [rad].
         steps: Number of control steps.
         dt: Their length [s].
-        effort: Human effort from step number and joint position.
+        nullspace_input: Of the operator, from step number and joint position.
         goals: Goals from the step number; default: those of the controller.
-        watch: Called after each step with its number, the joint position it started from,
+        on_step: Called after each step with its number, the joint position it started from,
             observation, command and new state.
 
     Returns:
@@ -235,11 +241,11 @@ def rehearse(
             **camera.observe(controller.chain.forward(q), q, dt),
             joint_position=q,
             dt=dt,
-            human_effort=None if effort is None else effort(k, q),
+            nullspace_input=None if nullspace_input is None else nullspace_input(k, q),
             goals=None if goals is None else goals(k),
         )
         command, state = controller.step(state, observation)
-        if watch is not None:
-            watch(k, q, observation, command, state)
+        if on_step is not None:
+            on_step(k, q, observation, command, state)
         q = q + command.joint_velocity * dt
     return q

@@ -54,7 +54,7 @@ class GraspingConfig:
 
     aiming: AimingConfig = field(default_factory=AimingConfig)
     controller: ControllerConfig = field(
-        default_factory=lambda: ControllerConfig(hold_rate=10.0)
+        default_factory=lambda: ControllerConfig(drift_compensation_rate=10.0)
     )
     """Settings of the adaptive controller; it holds the hand firmly against the drift that
     steps of 10 ms leave."""

@@ -7,11 +7,11 @@ import torch
 from jaxtyping import Float
 
 from hrc_learn.controller import (
-    ChunkSmoother,
+    ActionChunkFilter,
+    ActionChunkState,
     SafetyConfig,
     SafetyFilter,
     SafetyState,
-    SmoothState,
 )
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import MotionLimits, SerialChain
@@ -41,7 +41,7 @@ class PositionServo:
     """Follows joint positions, or poses of the hand, by velocities within the arm's limits.
 
     Positions that keep the limits are reached when the next one is due. The others are
-    followed as `ChunkSmoother` does, so a target that jumps makes no jump of the arm.
+    followed as `ActionChunkFilter` does, so a target that jumps makes no jump of the arm.
 
     Attributes:
         safety: State of the safety filter, with its counts of interventions.
@@ -73,9 +73,9 @@ class PositionServo:
                 f"targets must come within {1 / config.safety.rate:g} s of each other, but dt "
                 f"is {dt:g} s: raise the rate of frames."
             )
-        self._smoother = ChunkSmoother(_inner(chain, 1.5 * config.safety.margin), dt)
+        self._smoother = ActionChunkFilter(_inner(chain, 1.5 * config.safety.margin), dt)
         self.safety: SafetyState
-        self._motion: SmoothState
+        self._motion: ActionChunkState
         self.restart()
 
     def restart(self) -> None:

@@ -22,8 +22,8 @@ from hrc_learn.controller.interface import IMAGE_SIZE
 from hrc_learn.geometry import Pose
 from hrc_learn.jacobian import (
     CellErrors,
+    EvidenceResult,
     KalmanEstimator,
-    Learned,
     RBFImageJacobian,
     paper_grid,
 )
@@ -268,12 +268,12 @@ class Aimer:
                 feature_new=new,
                 feature_age=_scalar(self._station.time - sight.time),
                 image_joint_position=sight.joints,
-                human_effort=torch.from_numpy(self._station.asked.effort),
+                nullspace_input=torch.from_numpy(self._station.asked.effort),
                 goals=goals,
                 dt=self._station.config.dt,
             ),
         )
-        approach = 0.0 if aim.posture is None else 1.0 - float(self.state.arrival)
+        approach = 0.0 if aim.posture is None else 1.0 - float(self.state.task_level)
         target = goals.vision.target.numpy()
         self._station.obey(command, target, feature.numpy(), approach)
 
@@ -324,7 +324,7 @@ class AimingSkill:
     """None where no object was watched."""
     approach: Approach | None = None
     """None where no object was watched."""
-    learned: Learned | None = None
+    learned: EvidenceResult | None = None
     """How neurons, noise and prior were learned; None where they were given."""
     cells: CellErrors | None = None
     """Held-out errors by place; None of a skill that was loaded."""

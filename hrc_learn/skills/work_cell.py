@@ -178,7 +178,7 @@ class Station:
             weight_norm=float(command.weight_norm),
             potential=float(command.potential),
             potential_rate=float(command.potential_rate),
-            vision_activation=float(command.vision_activation),
+            vision_activation=float(command.vision_level),
             approach=approach,
         )
 

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 
 from hrc_learn.controller import INTERVENTIONS
-from hrc_learn.deploy import Metronome
+from hrc_learn.deploy import Rate
 from hrc_learn.geometry import Box
 from hrc_learn.kinematics import panda
 from hrc_learn.protocols import Human, HumanInput, Request
@@ -237,7 +237,7 @@ class PageBeside:
         """
         self.human = page.human
         self._world, self._page, self._bodies = world, page, MovingBodies(world)
-        self._metronome, self._ticks = Metronome(dt), 0
+        self._rate, self._ticks = Rate(dt), 0
         self._station: Station | None = None
 
     def follow(self, station: Station) -> None:
@@ -266,7 +266,7 @@ class PageBeside:
         if self._ticks % _SHOW_EVERY == 0 and self._station is not None:
             self._page.show(self.status(self._station))
         self._ticks += 1
-        self._metronome.wait()
+        self._rate.wait()
 
     def status(self, station: Station) -> PageStatus:
         """What the page says of a task that runs on a station."""

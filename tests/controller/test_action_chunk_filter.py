@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from unchecked import shapes_unchecked
 
-from hrc_learn.controller import BROKEN, ChunkSmoother
+from hrc_learn.controller import LIMIT_KINDS, ActionChunkFilter
 from hrc_learn.kinematics import MotionLimits, panda
 
 DT = 0.02
@@ -74,7 +74,7 @@ def test_limits_hold_for_any_chunks(chunks, velocity, brake_time, ramp_time, dt)
     given_limits = limits(-1.0, 1.0, velocity, acceleration, acceleration / ramp_time)
     start = torch.zeros(1, dtype=torch.float64)
     hostile = [torch.tensor(c, dtype=torch.float64)[:, None] for c in chunks]
-    positions, _, _ = follow(ChunkSmoother(given_limits, dt), hostile, start)
+    positions, _, _ = follow(ActionChunkFilter(given_limits, dt), hostile, start)
     assert positions.isfinite().all()
     assert positions.abs().max() <= 1 + 1e-9
     assert max(worst(positions, start, given_limits, dt)) <= 1 + 1e-6
@@ -84,7 +84,7 @@ def test_limits_hold_for_any_chunks(chunks, velocity, brake_time, ramp_time, dt)
 def test_a_motion_that_keeps_the_limits_comes_out_as_it_went_in(size):
     motion = wave(120)
     start = torch.zeros(1, dtype=torch.float64)
-    positions, _, reports = follow(ChunkSmoother(limits(), DT), motion.split(size), start)
+    positions, _, reports = follow(ActionChunkFilter(limits(), DT), motion.split(size), start)
     torch.testing.assert_close(positions, motion, rtol=0, atol=1e-12)
     assert not any(report.broken.any() for report in reports)
 
@@ -98,11 +98,11 @@ def test_a_step_between_chunks_is_blended_without_overshoot(step, slope, size):
     second = second + step + slope * seam.clamp(max=1.0)
     chunks = [*first.split(size), *second.split(size)]
     start = torch.zeros(1, dtype=torch.float64)
-    positions, _, reports = follow(ChunkSmoother(limits(), DT), chunks, start)
+    positions, _, reports = follow(ActionChunkFilter(limits(), DT), chunks, start)
     asked = torch.cat(chunks)
     assert max(worst(positions, start, limits(), DT)) <= 1 + 1e-6
     assert max(worst(asked, start, limits(), DT)) > 100
-    assert any(report.broken[..., BROKEN.index("jerk")].any() for report in reports)
+    assert any(report.broken[..., LIMIT_KINDS.index("jerk")].any() for report in reports)
     left = (positions - asked)[60:110] * -torch.sign(torch.tensor(step))
     assert left.min() > -2e-3  # does not pass the chunk by
     torch.testing.assert_close(positions[-50:], asked[-50:], rtol=0, atol=2e-4)
@@ -111,7 +111,7 @@ def test_a_step_between_chunks_is_blended_without_overshoot(step, slope, size):
 def test_a_step_settles_nearly_as_fast_as_can_be():
     """Against the shortest time from rest to rest at any speed, 2 sqrt(d/A) + A/j."""
     given_limits = limits(velocity=10.0, acceleration=3.0, jerk=60.0)
-    smoother = ChunkSmoother(given_limits, DT)
+    smoother = ActionChunkFilter(given_limits, DT)
     for distance in (0.3, 0.8):
         chunk = torch.full((150, 1), distance, dtype=torch.float64)
         positions, _, _ = smoother(chunk, smoother.initial_state(torch.zeros(1)))
@@ -126,7 +126,7 @@ def test_noise_is_followed_as_far_as_the_limits_let_it():
     motion = wave(250)
     noise = 3e-4 * torch.randn(250, 1, generator=rng, dtype=torch.float64)
     start = torch.zeros(1, dtype=torch.float64)
-    positions, _, _ = follow(ChunkSmoother(limits(), DT), (motion + noise).split(50), start)
+    positions, _, _ = follow(ActionChunkFilter(limits(), DT), (motion + noise).split(50), start)
     assert max(worst(positions, start, limits(), DT)) <= 1 + 1e-6
     assert (positions - motion).abs().max() < 5e-3
 
@@ -134,7 +134,7 @@ def test_noise_is_followed_as_far_as_the_limits_let_it():
 @pytest.mark.parametrize("batch", [(), (1,), (2, 3)])
 def test_batches_and_joints_are_followed_one_by_one(batch):
     rng = torch.Generator().manual_seed(1)
-    smoother = ChunkSmoother(panda.limits, DT)
+    smoother = ActionChunkFilter(panda.limits, DT)
     start = panda.ready.expand(*batch, 7).clone()
     chunks = start.unsqueeze(-2) + torch.randn(
         *batch, 12, 7, generator=rng, dtype=torch.float64
@@ -148,14 +148,14 @@ def test_batches_and_joints_are_followed_one_by_one(batch):
                 name: getattr(panda.limits, name)[j : j + 1]
                 for name in ("lower", "upper", "velocity", "acceleration", "jerk")
             }
-            alone = ChunkSmoother(MotionLimits(**own), DT)
+            alone = ActionChunkFilter(MotionLimits(**own), DT)
             state = alone.initial_state(start[index][j : j + 1])
             positions, _, _ = alone(chunks[index][:, j : j + 1], state)
             torch.testing.assert_close(together[index][:, j], positions[:, 0])
 
 
 def test_what_is_not_finite_is_taken_for_what_came_before():
-    smoother, start = ChunkSmoother(limits(), DT), torch.zeros(1, dtype=torch.float64)
+    smoother, start = ActionChunkFilter(limits(), DT), torch.zeros(1, dtype=torch.float64)
     chunk = wave(10)
     broken, mended = chunk.clone(), chunk.clone()
     broken[3:5], mended[3:5] = torch.tensor([[float("nan")], [float("inf")]]), chunk[2]
@@ -165,7 +165,7 @@ def test_what_is_not_finite_is_taken_for_what_came_before():
 
 
 def test_single_precision_goes_in_and_out():
-    smoother = ChunkSmoother(limits(), DT)
+    smoother = ActionChunkFilter(limits(), DT)
     chunk = wave(5).float()
     smooth, state, _ = smoother(chunk, smoother.initial_state(torch.zeros(1)))
     assert smooth.dtype == torch.float32
@@ -182,9 +182,9 @@ def test_single_precision_goes_in_and_out():
 )
 def test_limits_that_make_no_sense_are_refused(change, message):
     with pytest.raises(ValueError, match=message):
-        ChunkSmoother(replace(limits(), **change), DT)
+        ActionChunkFilter(replace(limits(), **change), DT)
 
 
 def test_dt_must_be_positive():
     with pytest.raises(ValueError, match="dt must be positive"):
-        ChunkSmoother(limits(), 0.0)
+        ActionChunkFilter(limits(), 0.0)

@@ -46,7 +46,7 @@ class TestTheLaw:
 
     def test_printed_law(self):
         feature = torch.tensor([640.0, 500.0], dtype=DOUBLE)
-        observation = observe(self.q, feature=feature, human_effort=self.d)
+        observation = observe(self.q, feature=feature, nullspace_input=self.d)
         command, _ = self.controller.step(self.state, observation)
 
         goals, pose = self.controller.goals, panda.forward(self.q)
@@ -77,7 +77,7 @@ class TestTheLaw:
         controller, _ = grasping(rng=sampling.generator(2))
         state = controller.initial_state(panda.ready)
         command, state = controller.step(state, observe(panda.ready, dt=0.03))
-        assert command.vision_activation.item() == pytest.approx(0.1)
+        assert command.vision_level.item() == pytest.approx(0.1)
         speed = torch.maximum(command.twist[:3].norm() / 0.25, command.twist[3:].norm())
         assert speed.item() == pytest.approx(1.0)
 
@@ -94,9 +94,9 @@ class TestTheLaw:
             )
             q = POSTURE
             state = controller.initial_state(q)
-            active = replace(state.activation, level=torch.ones_like(state.activation.level))
+            active = replace(state.blending, level=torch.ones_like(state.blending.level))
             command, _ = controller.step(
-                replace(state, activation=active), observe(q, feature=feature)
+                replace(state, blending=active), observe(q, feature=feature)
             )
             rate = (J @ J.mT @ command.xi_x).norm() / (10**2 + 30**2) ** 0.5
             assert rate <= 4.1
@@ -107,7 +107,7 @@ class TestTheLaw:
         expected = elsewhere.position.gradient(panda.forward(self.q).position)
         torch.testing.assert_close(command.xi_r[:3], expected)
         assert (command.xi_x == 0).all()
-        assert command.vision_activation == 0
+        assert command.vision_level == 0
         target = torch.tensor([900.0, 300.0], dtype=DOUBLE)
         command, _ = self.controller.step(self.state, observe(self.q, target=target))
         assert (command.xi_x * (700 - target) > 0).all()
@@ -115,7 +115,7 @@ class TestTheLaw:
     def test_the_module_is_not_changed_by_a_step(self):
         before = [p.clone() for p in self.controller.state_dict().values()]
         leaves = [leaf.clone() for leaf in _pytree.tree_leaves(self.state)]
-        self.controller.step(self.state, observe(self.q, human_effort=self.d))
+        self.controller.step(self.state, observe(self.q, nullspace_input=self.d))
         for old, new in zip(before, self.controller.state_dict().values(), strict=True):
             assert (old == new).all()
         for old, new in zip(leaves, _pytree.tree_leaves(self.state), strict=True):
@@ -149,7 +149,7 @@ def test_a_batch_is_a_loop(kind: int):
             feature_new=torch.full(visible.shape, k % 2 == 0),
             image_joint_position=q,
             joint_state_stale=torch.full(visible.shape, k % 11 == 10),
-            human_effort=effort,
+            nullspace_input=effort,
             goals=goals,
             dt=0.01,
         )
@@ -211,8 +211,8 @@ def test_follows_its_dtype():
 def test_bad_settings_are_refused():
     with pytest.raises(ValueError, match="null_damping must be positive"):
         ControllerConfig(null_damping=0.0)
-    with pytest.raises(ValueError, match="hold_rate must not be negative"):
-        ControllerConfig(hold_rate=-1.0)
+    with pytest.raises(ValueError, match="drift_compensation_rate must not be negative"):
+        ControllerConfig(drift_compensation_rate=-1.0)
 
 
 def test_the_analytic_law_is_that_of_the_analytic_jacobian():

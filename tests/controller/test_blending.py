@@ -4,7 +4,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from hrc_learn.controller import Activation, ActivationConfig, HandOver
+from hrc_learn.controller import BlendingConfig, BlendingState, VisionBlending
+from hrc_learn.controller.blending import approach_velocity, fade, next_task_level
+from hrc_learn.kinematics import panda
+from hrc_learn.regions import PostureRegion
 
 CENTRE = (719.5, 539.5)
 
@@ -13,60 +16,60 @@ def pixel(u: float, v: float) -> Tensor:
     return torch.tensor([u, v], dtype=torch.float64)
 
 
-def follow(hand_over: HandOver, features, *, dt=0.01, state=None, age=None, visible=True):
+def follow(blending: VisionBlending, features, *, dt=0.01, state=None, age=None, visible=True):
     """State after each of some measurements."""
-    state = state or hand_over.initial_state(torch.zeros(7, dtype=torch.float64))
+    state = state or blending.initial_state(torch.zeros(7, dtype=torch.float64))
     states = []
     for feature in features:
         usable = torch.tensor(visible)
-        state, _, _ = hand_over.step(state, pixel(*feature), usable, dt, age=age)
+        state, _, _ = blending.step(state, pixel(*feature), usable, dt, age=age)
         states.append(state)
     return states
 
 
 def test_a_feature_must_come_well_inside_to_be_used_and_may_go_to_the_edge():
     states = follow(
-        HandOver(), [(30, 500), (41, 500), (30, 500), (1, 500), (-1, 500), (30, 500)]
+        VisionBlending(), [(30, 500), (41, 500), (30, 500), (1, 500), (-1, 500), (30, 500)]
     )
     assert [s.active.item() for s in states] == [False, True, True, True, False, False]
 
 
 def test_vision_fades_in_and_out_over_the_blend_time():
-    states = follow(HandOver(), [CENTRE] * 40, dt=0.01)
+    states = follow(VisionBlending(), [CENTRE] * 40, dt=0.01)
     levels = torch.stack([s.level for s in states])
     torch.testing.assert_close(levels[:30], torch.linspace(1, 30, 30, dtype=torch.float64) / 30)
     assert (levels[30:] == 1).all()
-    gone = follow(HandOver(), [CENTRE] * 15, state=states[-1], visible=False)
+    gone = follow(VisionBlending(), [CENTRE] * 15, state=states[-1], visible=False)
     assert gone[-1].level.item() == pytest.approx(0.5)
 
 
 def test_without_blend_time_it_switches():
-    hand_over = HandOver(ActivationConfig(blend_time=0.0))
-    assert follow(hand_over, [CENTRE])[0].level == 1
+    blending = VisionBlending(BlendingConfig(blend_time=0.0))
+    assert follow(blending, [CENTRE])[0].level == 1
 
 
 @pytest.mark.parametrize("lost", [(math.nan, 5.0), (2000.0, 500.0), (math.inf, 500.0)])
 def test_what_cannot_be_used_leaves_the_last_good_feature(lost):
-    *_, last = follow(HandOver(), [(600, 500)] * 40 + [lost] * 3)
+    *_, last = follow(VisionBlending(), [(600, 500)] * 40 + [lost] * 3)
     assert last.feature.tolist() == [600, 500]
     assert not last.active
     assert last.level.item() == pytest.approx(0.9)
 
 
 def test_a_silent_camera_stops_the_arm_that_follows_it_and_no_other():
-    hand_over = HandOver()
+    blending = VisionBlending()
     old = torch.tensor(0.3, dtype=torch.float64)
-    approaching = hand_over.initial_state(torch.zeros(7, dtype=torch.float64))
-    following = follow(hand_over, [CENTRE] * 40)[-1]
+    approaching = blending.initial_state(torch.zeros(7, dtype=torch.float64))
+    following = follow(blending, [CENTRE] * 40)[-1]
     for state, stops in ((approaching, False), (following, True)):
-        after, seen, stop = hand_over.step(
+        after, seen, stop = blending.step(
             state, pixel(*CENTRE), torch.tensor(True), 0.01, age=old
         )
         assert not seen
         assert stop.item() is stops
         assert after.level == state.level
     # It carries on where it was when the camera comes back.
-    after, seen, stop = hand_over.step(
+    after, seen, stop = blending.step(
         after, pixel(*CENTRE), torch.tensor(True), 0.01, age=torch.zeros_like(old)
     )
     assert seen
@@ -75,11 +78,79 @@ def test_a_silent_camera_stops_the_arm_that_follows_it_and_no_other():
 
 
 def test_the_members_of_a_batch_are_handled_apart():
-    hand_over = HandOver()
-    state = hand_over.initial_state(torch.zeros(3, 7, dtype=torch.float64))
+    blending = VisionBlending()
+    state = blending.initial_state(torch.zeros(3, 7, dtype=torch.float64))
     feature = torch.tensor([[700.0, 500], [10, 500], [math.nan, 0]], dtype=torch.float64)
-    state, seen, _ = hand_over.step(state, feature, torch.tensor([True, True, True]), 0.03)
+    state, seen, _ = blending.step(state, feature, torch.tensor([True, True, True]), 0.03)
     assert seen.tolist() == [True, True, False]
     assert state.active.tolist() == [True, False, False]
     assert state.level.tolist() == pytest.approx([0.1, 0, 0])
-    assert isinstance(state, Activation)
+    assert isinstance(state, BlendingState)
+
+
+GOAL = torch.zeros(7, dtype=torch.float64)
+POSTURE = PostureRegion(goal=GOAL, tolerance=0.5)
+
+
+def away(distance: float) -> Tensor:
+    """A joint position so far from the posture [rad]."""
+    return GOAL + distance * torch.nn.functional.normalize(torch.ones_like(GOAL), dim=0)
+
+
+def level_after(
+    before: float, distance: float, *, vision_active: bool = False, dt: float = 0.03
+) -> float:
+    level = next_task_level(
+        torch.tensor(before, dtype=torch.float64),
+        POSTURE,
+        away(distance),
+        torch.tensor(vision_active),
+        dt,
+        0.3,
+    )
+    return level.item()
+
+
+@pytest.mark.parametrize(
+    ("before", "distance", "vision_active", "after"),
+    [
+        (0.0, 0.51, False, 0.0),  # still on its way
+        (0.0, 0.49, False, 0.1),  # inside the region: task-space feedback takes over
+        (0.0, 1.0, True, 0.0),  # the camera alone takes nothing over
+        (0.5, 1.49, False, 0.6),  # and keeps the lead outside the region,
+        (0.5, 1.51, False, 0.4),  # unless the posture lies far away,
+        (0.5, 1.51, True, 0.6),  # but never while the camera leads
+    ],
+)
+def test_task_space_feedback_takes_over_inside_the_posture_region(
+    before, distance, vision_active, after
+):
+    assert level_after(before, distance, vision_active=vision_active) == pytest.approx(after)
+
+
+def test_without_a_posture_there_is_no_approach_to_take_over_from():
+    before = torch.ones(3, dtype=torch.float64)
+    after = next_task_level(
+        before, None, away(0.0).expand(3, 7), torch.ones(3, dtype=torch.bool), 0.1, 0.3
+    )
+    assert after.tolist() == [0, 0, 0]
+
+
+def test_a_level_stays_between_zero_and_one():
+    level, rising = torch.tensor([0.95, 0.05, 0.5]), torch.tensor([True, False, True])
+    torch.testing.assert_close(fade(level, rising, 0.1, 1.0), torch.tensor([1.0, 0.0, 0.6]))
+
+
+def test_an_approach_is_as_slow_as_the_caps_of_the_tool_ask():
+    q = panda.ready
+    posture = PostureRegion(goal=q + 0.5)
+    J = panda.jacobian(q)
+    for caps in ([0.05, 10.0], [10.0, 0.1], [0.05, 0.1]):
+        v = approach_velocity(posture, q, J, torch.tensor(caps, dtype=torch.float64))
+        twist = J @ v
+        used = torch.stack([twist[:3].norm() / caps[0], twist[3:].norm() / caps[1]])
+        assert used.max().item() == pytest.approx(1.0)
+        # Straight towards the posture.
+        assert torch.nn.functional.cosine_similarity(v, posture.goal - q, dim=0) > 1 - 1e-12
+    free = approach_velocity(posture, q, J, torch.full((2,), 100.0, dtype=torch.float64))
+    torch.testing.assert_close(free, -posture.gradient(q))

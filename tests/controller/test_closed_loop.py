@@ -25,11 +25,11 @@ from unchecked import shapes_unchecked
 from hrc_learn.controller import (
     INITIAL_IMAGE_JACOBIAN,
     AdaptiveController,
+    ControllerConfig,
     ControllerState,
     Goals,
-    table1_config,
-    table1_goals,
-    table1_joint_region,
+    paper_goals,
+    paper_joint_region,
 )
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import (
@@ -39,7 +39,7 @@ from hrc_learn.jacobian import (
     PaperEstimator,
 )
 from hrc_learn.kinematics import panda, pseudo_inverse
-from hrc_learn.sim.closed_loop import Imperfections, VirtualCamera, rehearse
+from hrc_learn.sim.closed_loop import Imperfections, VirtualCamera, simulate_closed_loop
 
 
 @pytest.fixture(autouse=True)
@@ -53,7 +53,7 @@ def test_converges_from_near_starts_with_a_good_jacobian():
     rng = sampling.generator(5)
     controller, camera = grasping(100, rng=rng)
     goals = controller.goals.approached_by(POSTURE)
-    q = rehearse(
+    q = simulate_closed_loop(
         controller,
         VirtualCamera(camera=camera, imperfections=Imperfections(), generator=rng),
         near_starts(100, rng=rng),
@@ -78,7 +78,7 @@ def test_adaptation_finds_a_camera_turned_upside_down():
     success = {}
     for kind in (FixedEstimator, KalmanEstimator):
         controller = AdaptiveController(panda, kind(network(J)), goals)
-        q = rehearse(
+        q = simulate_closed_loop(
             controller,
             VirtualCamera(
                 camera=camera,
@@ -122,14 +122,14 @@ def test_a_person_moves_the_elbow_and_not_the_tool(dt: float):
             deviation.append((links.position[:, -1] - tool.position).norm(dim=-1))
             turned.append(quaternion.angle(links.orientation[:, -1], tool.orientation))
 
-    rehearse(
+    simulate_closed_loop(
         controller,
         VirtualCamera(camera=camera, imperfections=Imperfections(), generator=rng),
         q,
         steps=2 * half,
         dt=dt,
-        effort=pull,
-        watch=watch,
+        nullspace_input=pull,
+        on_step=watch,
     )
     assert torch.stack(moved).amax(0).median() >= 0.1
     worst = torch.stack(deviation).amax(0)
@@ -184,7 +184,7 @@ def test_phases_share_one_module_and_one_state():
             command, state = controller.step(state, observation)
             q = q + 0.02 * command.joint_velocity
     assert isinstance(state, ControllerState)
-    assert command.vision_activation == 0
+    assert command.vision_level == 0
     offset = (panda.forward(q).position - lower.position.centre).abs()
     assert (offset <= 1.2 * lower.position.half_size).all()
 
@@ -203,7 +203,7 @@ def test_a_lost_marker_does_not_send_the_arm_back_to_its_approach():
         command, state = controller.step(state, observation)
         q = q + 0.02 * command.joint_velocity
         path.append(panda.forward(q).position)
-    assert command.vision_activation == 0
+    assert command.vision_level == 0
     assert (path[-1] - path[150]).norm() < 2e-3
 
 
@@ -217,7 +217,7 @@ def test_a_posture_far_away_begins_a_new_approach():
         command, state = controller.step(
             state, observe(q, goals=there, feature_visible=hidden, dt=0.01)
         )
-    assert state.arrival == 1
+    assert state.task_level == 1
     elsewhere = controller.goals.approached_by(panda.ready)
     led_by_posture = False
     for _ in range(600):
@@ -225,8 +225,8 @@ def test_a_posture_far_away_begins_a_new_approach():
             state, observe(q, goals=elsewhere, feature_visible=hidden, dt=0.01)
         )
         q = q + 0.01 * command.joint_velocity
-        led_by_posture |= bool(state.arrival == 0)
-        if led_by_posture and state.arrival > 0:
+        led_by_posture |= bool(state.task_level == 0)
+        if led_by_posture and state.task_level > 0:
             break
     assert 0.3 < (q - panda.ready).norm() <= 0.52
 
@@ -249,9 +249,9 @@ def test_table_one_runs_only_because_of_the_safety_filter():
     controller = AdaptiveController(
         panda,
         PaperEstimator(network(J)),
-        table1_goals(CENTRE, half_size, target),
-        config=table1_config(),
-        joint_region=table1_joint_region(LIMITS),
+        paper_goals(CENTRE, half_size, target),
+        config=ControllerConfig.paper(),
+        joint_region=paper_joint_region(LIMITS),
     )
     state = controller.initial_state(q)
     hidden = torch.zeros(50, dtype=torch.bool)

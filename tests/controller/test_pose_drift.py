@@ -3,13 +3,13 @@ from dataclasses import replace
 import sampling
 import torch
 
-from hrc_learn.controller.resolved_rate import Hold, measure_drift, planned_motion
+from hrc_learn.controller.resolved_rate import PoseDrift, measure_drift, planned_motion
 from hrc_learn.kinematics import panda
 
 
-def start(q: torch.Tensor) -> Hold:
+def start(q: torch.Tensor) -> PoseDrift:
     zero = torch.zeros(*q.shape[:-1], 6, dtype=q.dtype)
-    return Hold(
+    return PoseDrift(
         drift=zero,
         joint_position=q,
         jacobian=panda.jacobian(q),
@@ -23,22 +23,22 @@ def test_the_drift_is_what_the_tool_did_beyond_the_plan():
     rng = sampling.generator()
     q = panda.ready + 0.2 * torch.randn(50, 7, generator=rng, dtype=torch.float64)
     moved = q + 0.0005 * torch.randn(50, 7, generator=rng, dtype=torch.float64)
-    holds = torch.ones(50, dtype=torch.bool)
-    hold = measure_drift(start(q), moved, panda.jacobian(moved), holds)
+    active = torch.ones(50, dtype=torch.bool)
+    drift = measure_drift(start(q), moved, panda.jacobian(moved), active)
     true = panda.forward(q).twist_to(panda.forward(moved))
     # The trapezoidal rule errs by the third power of the step, here about 1e-3 rad.
-    torch.testing.assert_close(hold.drift, -true, rtol=0, atol=1e-9)
+    torch.testing.assert_close(drift.drift, -true, rtol=0, atol=1e-9)
 
 
 def test_a_motion_that_was_planned_is_no_drift():
     q = panda.ready
     v = torch.tensor([0.1, -0.2, 0.1, 0.3, 0.0, 0.1, -0.1], dtype=torch.float64)
     J = panda.jacobian(q)
-    hold = start(q)
-    hold = replace(hold, planned=planned_motion(J @ v, J, v, 1e-4))
+    drift = start(q)
+    drift = replace(drift, planned=planned_motion(J @ v, J, v, 1e-4))
     moved = q + 1e-4 * v
-    hold = measure_drift(hold, moved, panda.jacobian(moved), torch.tensor(True))
-    assert hold.drift.norm() < 1e-8
+    drift = measure_drift(drift, moved, panda.jacobian(moved), torch.tensor(True))
+    assert drift.drift.norm() < 1e-8
 
 
 def test_limits_that_slow_the_task_leave_no_drift():
@@ -54,16 +54,16 @@ def test_limits_that_slow_the_task_leave_no_drift():
 def test_it_forgets_where_it_does_not_hold_and_cannot_wind_up():
     q = panda.ready.expand(2, 7)
     moved = q + 0.1
-    hold = measure_drift(start(q), moved, panda.jacobian(moved), torch.tensor([True, False]))
-    assert hold.drift[0].abs().max() == 0.005
-    assert (hold.drift[1] == 0).all()
+    drift = measure_drift(start(q), moved, panda.jacobian(moved), torch.tensor([True, False]))
+    assert drift.drift[0].abs().max() == 0.005
+    assert (drift.drift[1] == 0).all()
 
 
 def test_the_first_step_of_an_effort_forgets_what_is_old():
     q = panda.ready
     old = replace(start(q - 0.5), active=torch.tensor(False))
-    hold = measure_drift(old, q, panda.jacobian(q), torch.tensor(True))
-    assert (hold.drift == 0).all()
-    assert hold.active
-    hold = measure_drift(hold, q + 1e-3, panda.jacobian(q + 1e-3), torch.tensor(True))
-    assert hold.drift.norm() > 1e-4
+    drift = measure_drift(old, q, panda.jacobian(q), torch.tensor(True))
+    assert (drift.drift == 0).all()
+    assert drift.active
+    drift = measure_drift(drift, q + 1e-3, panda.jacobian(q + 1e-3), torch.tensor(True))
+    assert drift.drift.norm() > 1e-4

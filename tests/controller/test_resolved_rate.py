@@ -2,7 +2,7 @@ import pytest
 import sampling
 import torch
 
-from hrc_learn.controller.resolved_rate import excess_speed, fit_null_space, resolve
+from hrc_learn.controller.resolved_rate import excess_speed, resolved_rate, scale_null_space
 from hrc_learn.kinematics import null_space_projector, panda, pseudo_inverse
 
 
@@ -20,7 +20,7 @@ def test_equals_pseudo_inverse_and_projector():
     rng = sampling.generator()
     J = regular_jacobians(300, rng)
     twist, wish = random(len(J), 6, rng=rng), random(len(J), 7, rng=rng)
-    task, null = resolve(J, twist, wish)
+    task, null = resolved_rate(J, twist, wish)
     torch.testing.assert_close(
         task, (pseudo_inverse(J) @ twist[..., None])[..., 0], rtol=0, atol=1e-11
     )
@@ -35,11 +35,11 @@ def test_the_null_space_does_not_move_the_tool():
     J = regular_jacobians(300, rng)
     zero = torch.zeros(len(J), 6, dtype=torch.float64)
     twist, wish = random(len(J), 6, rng=rng), random(len(J), 7, rng=rng)
-    task, null = resolve(J, twist, wish)
+    task, null = resolved_rate(J, twist, wish)
     assert (J @ null[..., None]).abs().max() < 1e-12
     assert ((J @ task[..., None])[..., 0] - twist).abs().max() < 1e-12
-    assert resolve(J, zero, task)[1].abs().max() < 1e-12
-    assert (resolve(J, zero, null)[1] - null).abs().max() < 1e-12
+    assert resolved_rate(J, zero, task)[1].abs().max() < 1e-12
+    assert (resolved_rate(J, zero, null)[1] - null).abs().max() < 1e-12
 
 
 def test_damping_is_zero_away_from_singularities_and_bounds_the_gain_at_them():
@@ -49,7 +49,7 @@ def test_damping_is_zero_away_from_singularities_and_bounds_the_gain_at_them():
     for smallest in (0.2, 0.09, 0.03, 0.01, 1e-4, 0.0):
         sigma = torch.tensor([2.0, 1.5, 1.2, 1.0, 0.8, smallest], dtype=torch.float64)
         J = U @ torch.diag(sigma) @ V[:, :6].mT
-        task, _ = resolve(J, U[:, 5], torch.zeros(7, dtype=torch.float64))
+        task, _ = resolved_rate(J, U[:, 5], torch.zeros(7, dtype=torch.float64))
         gains[smallest] = task.norm().item()
     # Exact inverse where J is regular ...
     assert gains[0.2] == pytest.approx(1 / 0.2, rel=1e-10)
@@ -63,7 +63,7 @@ def test_damping_is_zero_away_from_singularities_and_bounds_the_gain_at_them():
 def test_everything_stays_finite_at_a_singularity_of_the_arm():
     q = torch.zeros(7, dtype=torch.float64)  # stretched out: rank 5
     J = panda.jacobian(q)
-    task, null = resolve(J, torch.ones(6, dtype=torch.float64), torch.ones_like(q))
+    task, null = resolved_rate(J, torch.ones(6, dtype=torch.float64), torch.ones_like(q))
     assert task.isfinite().all()
     assert null.isfinite().all()
     assert task.norm() < 50
@@ -89,7 +89,7 @@ class TestFitNullSpace:
 
     def fit(self, task, null):
         task, null = (torch.tensor(v, dtype=torch.float64) for v in (task, null))
-        return fit_null_space(task, null, self.lower, self.upper).tolist()
+        return scale_null_space(task, null, self.lower, self.upper).tolist()
 
     def test_what_fits_is_left_alone(self):
         assert self.fit([0.5, 0.0, -0.5], [0.4, 0.2, -0.4]) == [0.4, 0.2, -0.4]
@@ -114,7 +114,7 @@ class TestFitNullSpace:
     def test_a_batch_is_a_loop(self):
         rng = sampling.generator(4)
         task, null = random(50, 3, rng=rng), random(50, 3, rng=rng)
-        whole = fit_null_space(task, null, self.lower, self.upper)
+        whole = scale_null_space(task, null, self.lower, self.upper)
         for k in range(50):
-            one = fit_null_space(task[k], null[k], self.lower, self.upper)
+            one = scale_null_space(task[k], null[k], self.lower, self.upper)
             assert (one == whole[k]).all()

@@ -106,6 +106,33 @@ def test_without_a_jerk_limit_the_others_hold():
     assert (state.acceleration == 0).all()
 
 
+@pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.parametrize("jerk_limited", [True, False])
+@shapes_unchecked()  # for speed
+def test_beyond_a_limit_it_brakes_as_hard_as_the_arm_can_and_no_harder(jerk_limited, side):
+    """Pushed across its limits at full speed, no admissible motion keeps them: those of
+    acceleration and jerk hold all the same, and the joints come back."""
+    dt, config = 0.001, SafetyConfig(jerk_limited=jerk_limited)
+    safety = SafetyFilter(LIMITS, config)
+    wall = LIMITS.upper if side > 0 else LIMITS.lower
+    q = wall + side * 0.05
+    state = safety.initial_state(q, side * 0.9 * LIMITS.velocity)
+    hardest = torch.zeros(7, dtype=torch.float64)
+    for _ in range(1500):
+        before = state
+        v, state, _ = safety.step(state, q, side * LIMITS.velocity, dt)
+        q = q + v * dt
+        a = (v - before.velocity) / dt
+        hardest = torch.maximum(hardest, -side * a)
+        assert (a.abs() <= LIMITS.acceleration * (1 + 1e-9)).all()
+        if jerk_limited:
+            change = (a - before.acceleration).abs()
+            assert (change <= LIMITS.jerk * dt * (1 + 1e-9)).all()
+    torch.testing.assert_close(hardest, LIMITS.acceleration)
+    assert LIMITS.contain(q)
+    assert ((wall - q).abs() < 1.5 * config.margin + 0.01).all()
+
+
 @pytest.mark.parametrize("dt", [0.0005, 0.001, 0.002])
 @shapes_unchecked()  # for speed
 def test_a_stop_and_a_resume_are_smooth(dt: float):

@@ -8,7 +8,7 @@ import torch
 from unchecked import shapes_unchecked
 
 from hrc_learn.controller import SafetyConfig, SafetyFilter, SeparationConfig
-from hrc_learn.kinematics import panda
+from hrc_learn.kinematics import null_space_projector, panda
 
 READY = panda.ready
 ACROSS = torch.tensor([1.4, 0.9, 0.3, 0.8, 0.3, -0.4, 0.8], dtype=torch.float64)
@@ -51,6 +51,39 @@ def test_the_tool_is_as_fast_as_the_distance_allows():
     assert v[2].norm() == 0
     assert report.acted("separation").tolist() == [False, True, True]
     assert state.count("separation").tolist() == [0, 200, 200]
+
+
+@pytest.mark.parametrize(("distance", "acts"), [(0.1, True), (math.nan, True), (9.0, False)])
+def test_a_person_too_close_ends_motion_in_the_null_space_too(distance, acts):
+    """The tool is at rest anyway; that all joints must be is an intervention all the same."""
+    safety, J = SafetyFilter(panda.limits), panda.jacobian(READY)
+    u = null_space_projector(J) @ torch.ones(7, dtype=torch.float64)
+    assert u.norm() > 0.1
+    assert (J @ u).norm() < 1e-12
+    state = safety.initial_state(READY, u)
+    for _ in range(100):
+        v, state, report = safety.step(
+            state, READY, u, 0.004, jacobian=J, human_distance=tensor(distance)[0]
+        )
+    assert report.acted("separation").item() is acts
+    assert not report.acted("tcp_speed")
+    torch.testing.assert_close(v, 0 * u if acts else u)
+
+
+def test_at_the_speed_that_the_distance_allows_nothing_is_reported():
+    safety, J = SafetyFilter(panda.limits), panda.jacobian(READY)
+    allowed = SeparationConfig().highest_speed(tensor(0.6))[0]
+    u = ACROSS * allowed / (J @ ACROSS)[:3].norm()
+    for factor, acts in ((1 - 1e-3, False), (1 + 1e-3, True)):
+        _, _, report = safety.step(
+            safety.initial_state(READY, u),
+            READY,
+            factor * u,
+            0.004,
+            jacobian=J,
+            human_distance=tensor(0.6)[0],
+        )
+        assert report.acted("separation").item() is acts
 
 
 def test_the_arm_rests_before_a_person_who_comes_running():

@@ -8,7 +8,7 @@ import torch
 from torch.utils import _pytree
 from unchecked import shapes_unchecked
 
-from hrc_learn.controller import HandOver
+from hrc_learn.controller import VisionBlending
 from hrc_learn.experiments.controller.grasp_trials import CORNERS, TrialConfig, run_trials
 from hrc_learn.geometry import Pose
 from hrc_learn.jacobian import (
@@ -20,7 +20,7 @@ from hrc_learn.jacobian import (
     RBFImageJacobian,
     RecursiveLeastSquaresEstimator,
     paper_grid,
-    stacked,
+    stack_networks,
 )
 from hrc_learn.kinematics import panda
 from hrc_learn.sim.closed_loop import Imperfections, PinholeCamera
@@ -107,10 +107,10 @@ def test_an_estimator_of_several_points_is_one_for_each(Estimator):
 
 
 def test_a_feature_is_seen_where_all_of_its_points_are():
-    hand_over = HandOver()
-    state = hand_over.initial_state(torch.zeros(2, 7, dtype=DOUBLE), points=2)
+    blending = VisionBlending()
+    state = blending.initial_state(torch.zeros(2, 7, dtype=DOUBLE), points=2)
     feature = torch.tensor([[700.0, 500, 710, 510], [700, 500, 1500, 510]], dtype=DOUBLE)
-    state, seen, _ = hand_over.step(state, feature, torch.tensor([True, True]), 0.01)
+    state, seen, _ = blending.step(state, feature, torch.tensor([True, True]), 0.01)
     assert seen.tolist() == [True, False]
     assert state.feature[0].tolist() == feature[0].tolist()
     assert state.feature[1].tolist() == [719.5, 539.5] * 2
@@ -135,11 +135,11 @@ def test_networks_of_single_points_are_stacked():
     rng = sampling.generator(7)
     guesses = [J0 + 100 * torch.randn(2, 6, generator=rng, dtype=DOUBLE) for _ in range(4)]
     networks = [RBFImageJacobian.from_jacobian(J, paper_grid(), 0.1) for J in guesses]
-    stack = stacked(networks)
+    stack = stack_networks(networks)
     tool = tools(3)
     assert stack.rows == 8
     torch.testing.assert_close(stack(tool), torch.cat(guesses).expand(3, 8, 6))
     other = RBFImageJacobian.from_jacobian(J0, paper_grid(), 0.2)
     with pytest.raises(ValueError, match="network 1 has other neurons"):
-        stacked([networks[0], other])
+        stack_networks([networks[0], other])
     assert len(_pytree.tree_leaves(camera())) == 4

@@ -44,3 +44,22 @@ def test_its_thread_notices_a_loop_that_hangs():
 def test_a_timeout_must_be_positive():
     with pytest.raises(ValueError, match="timeout must be positive"):
         Watchdog(0.0, lambda: None)
+
+
+def test_its_thread_looks_often_enough():
+    """A silence is noticed at most a quarter of the timeout late."""
+    clock, stops = Clock(), []
+
+    class Waiting:
+        """Lets time pass as fast as the thread waits."""
+
+        def wait(self, duration: float) -> bool:
+            clock.now += duration
+            return clock.now > 2.0
+
+    dog = Watchdog(0.1, lambda: stops.append(clock.now), clock=clock)
+    dog.feed()
+    dog._done = Waiting()
+    dog._watch()
+    assert len(stops) == 1
+    assert 0.1 < stops[0] <= 0.125 + 1e-9

@@ -12,7 +12,7 @@ from torch.fx.experimental.proxy_tensor import make_fx
 from unchecked import shapes_unchecked
 
 from hrc_learn.deploy import EagerRunner, PackageRunner, export_step
-from hrc_learn.deploy.export import joining_batch_last
+from hrc_learn.deploy._inductor import cat_batch_last
 from hrc_learn.deploy.package import load
 from hrc_learn.kinematics import panda
 
@@ -39,7 +39,7 @@ def test_what_is_joined_has_the_batch_last():
     rng = sampling.generator()
     a, b = torch.randn(5, 4, 3, generator=rng), torch.randn(5, 2, 3, generator=rng)
     module = make_fx(join, tracing_mode="fake")(a, b)
-    joining_batch_last([5])(module.graph)
+    cat_batch_last([5])(module.graph)
     module.recompile()
     for ours, theirs in zip(module(a, b), join(a, b), strict=True):
         assert torch.equal(ours, theirs)
@@ -67,7 +67,7 @@ class TestBatch:
             runner.start(q)
             runner.observation["feature"][:] += 100 * q[:, :2]
             runner.observation["feature_visible"][:] = np.arange(ARMS) % 4 != 0
-            runner.observation["human_effort"][:] = 0.1 * q
+            runner.observation["nullspace_input"][:] = 0.1 * q
         steps = 200
         for _ in range(steps):
             eager, exported = (runner.step() for runner in runners)

@@ -23,7 +23,7 @@ from hrc_learn.deploy import EagerRunner, NoCompilerError, PackageRunner, export
 from hrc_learn.deploy import export as export_module
 from hrc_learn.deploy import package as package_module
 from hrc_learn.deploy.export import trace
-from hrc_learn.deploy.io_layout import FlatStep, tensors_of
+from hrc_learn.deploy.io_layout import PackedStep, tensors_of
 from hrc_learn.deploy.package import load
 from hrc_learn.kinematics import panda
 
@@ -40,7 +40,7 @@ def _no_shape_checks() -> Iterator[None]:
 
 def test_the_traced_step_equals_the_eager_one_and_is_written_out():
     controller, observation = controller_and_observation()
-    traced = trace(FlatStep(controller, observation), observation)
+    traced = trace(PackedStep(controller, observation), observation)
     assert not library_calls(traced)
     program = traced.module()
     assert_equal_steps(controller, observation, lambda vectors: program(*vectors), 100)
@@ -174,7 +174,7 @@ def test_a_package_tells_all_it_takes_to_call_it(monkeypatch, tmp_path, dtype, b
         feature_visible=torch.ones(batch, dtype=torch.bool),
         dt=0.002,
     )
-    step = FlatStep(controller.to(dtype), observation)
+    step = PackedStep(controller.to(dtype), observation)
     (path := tmp_path / "step.pt2").touch()
     says = package_module.describe(step, observation)
     monkeypatch.setattr(package_module, "_open", lambda path: (step, says))
@@ -254,7 +254,7 @@ class TestPackage:
         )
 
     def test_it_remembers_its_layout_and_first_state(self, package):
-        step = FlatStep(*controller_and_observation())
+        step = PackedStep(*controller_and_observation())
         kept = load(package)
         for ours, theirs in zip(step.layouts, kept.layouts, strict=True):
             assert (theirs.fields, theirs.batch) == (ours.fields, ours.batch)
@@ -273,7 +273,7 @@ class TestPackage:
         with pytest.warns(UserWarning, match="lacks the fast loader of packages"):
             slow = load(package)
         controller, observation = controller_and_observation()
-        step = FlatStep(controller, observation)
+        step = PackedStep(controller, observation)
         expected, actual = step.example(observation), step.example(observation)
         with torch.no_grad():
             step(*expected)

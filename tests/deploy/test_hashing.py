@@ -1,5 +1,6 @@
 """A package must be built anew when anything changes that the step depends on."""
 
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -14,8 +15,9 @@ from hrc_learn.controller import (
     Goals,
     Observation,
 )
+from hrc_learn.deploy import package
 from hrc_learn.deploy.export import _structure
-from hrc_learn.deploy.package import UnknownCodeError, fingerprint
+from hrc_learn.deploy.package import UnknownCodeError, content_hash
 from hrc_learn.geometry import quaternion
 from hrc_learn.jacobian import (
     FixedEstimator,
@@ -43,16 +45,16 @@ def controller(
     return AdaptiveController(panda, estimator, goals, config=ControllerConfig(**config))
 
 
-def test_equal_controllers_have_equal_fingerprints():
-    assert fingerprint(controller()) == fingerprint(controller())
+def test_equal_controllers_have_equal_hashes():
+    assert content_hash(controller()) == content_hash(controller())
 
 
 def test_use_leaves_no_trace():
     one = controller()
-    before = fingerprint(one)
+    before = content_hash(one)
     one.float().initial_state(panda.ready.float())
     one.double()
-    assert fingerprint(controller()) == before
+    assert content_hash(controller()) == before
 
 
 @pytest.mark.parametrize(
@@ -61,13 +63,13 @@ def test_use_leaves_no_trace():
         {"scale": 1 + 1e-15},
         {"half_size": 0.11},
         {"kind": FixedEstimator},
-        {"hold_rate": 0.0},
+        {"drift_compensation_rate": 0.0},
         {"vision_rate": 5.0},
     ],
     ids=lambda change: next(iter(change)),
 )
 def test_every_weight_goal_part_and_setting_counts(change):
-    assert fingerprint(controller(**change)) != fingerprint(controller())
+    assert content_hash(controller(**change)) != content_hash(controller())
 
 
 def test_of_an_observation_the_structure_counts_not_the_values():
@@ -77,14 +79,14 @@ def test_of_an_observation_the_structure_counts_not_the_values():
         feature_visible=torch.tensor(True),
         dt=0.001,
     )
-    seen = fingerprint(_structure(one))
-    assert fingerprint(_structure(replace(one, joint_position=panda.ready + 1))) == seen
+    seen = content_hash(_structure(one))
+    assert content_hash(_structure(replace(one, joint_position=panda.ready + 1))) == seen
     for other in (
         replace(one, dt=0.002),
-        replace(one, human_effort=panda.ready),
+        replace(one, nullspace_input=panda.ready),
         replace(one, joint_position=panda.ready.float()),
     ):
-        assert fingerprint(_structure(other)) != seen
+        assert content_hash(_structure(other)) != seen
 
 
 def test_code_it_cannot_know_is_refused():
@@ -92,6 +94,33 @@ def test_code_it_cannot_know_is_refused():
         """Somebody's own."""
 
     with pytest.raises(UnknownCodeError, match=r"cannot tell what a .*Own does"):
-        fingerprint(controller(kind=Own))
+        content_hash(controller(kind=Own))
     with pytest.raises(UnknownCodeError, match="function"):
-        fingerprint([lambda x: x])
+        content_hash([lambda x: x])
+
+
+def test_a_change_of_any_source_that_a_step_is_made_from_changes_the_hash(
+    tmp_path, monkeypatch
+):
+    for name in package._SOURCES:
+        source = package._ROOT / name
+        assert source.exists(), f"{name} has moved: its changes would go unnoticed"
+        copy = shutil.copytree if source.is_dir() else shutil.copy
+        copy(source, tmp_path / name)
+    monkeypatch.setattr(package, "_ROOT", tmp_path)
+    whole = fresh_hash()
+    for name in ("controller/safety_filter.py", "kinematics/franka.py", "deploy/io_layout.py"):
+        file = tmp_path / name
+        text = file.read_text(encoding="utf-8")
+        file.write_text(text + "# changed\n", encoding="utf-8")
+        assert fresh_hash() != whole
+        file.write_text(text, encoding="utf-8")
+        assert fresh_hash() == whole
+
+
+def fresh_hash() -> str:
+    package._source_hash.cache_clear()
+    try:
+        return content_hash()
+    finally:
+        package._source_hash.cache_clear()

@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from hrc_learn.deploy.io_layout import Layout
+from hrc_learn.deploy.io_layout import IOLayout
 from hrc_learn.pytree import pytree
 
 DOUBLE = torch.float64
@@ -45,7 +45,7 @@ def tensors(value: Reading) -> list[Tensor]:
 @pytest.mark.parametrize("batch", [(), (1,), (5,), (4, 2)])
 def test_what_is_packed_comes_back(batch):
     value = reading(*batch)
-    layout = Layout.of(value, batch)
+    layout = IOLayout.of(value, batch)
     vector = layout.pack(tensors(value))
     assert vector.shape == (7 + 6 + 1 + 1 + 3, *batch)
     assert list(layout.rows) == ["angles", "matrix", "seen", "count", "gain"]
@@ -56,7 +56,7 @@ def test_what_is_packed_comes_back(batch):
 
 def test_a_row_is_one_quantity_of_the_whole_batch():
     value = reading(5)
-    layout = Layout.of(value, (5,))
+    layout = IOLayout.of(value, (5,))
     vector = layout.pack(tensors(value))
     assert torch.equal(vector[layout.rows["angles"]][3], value.angles[:, 3])
     assert torch.equal(vector[layout.rows["matrix"]][4], value.matrix[:, 1, 1])
@@ -64,7 +64,7 @@ def test_a_row_is_one_quantity_of_the_whole_batch():
 
 @pytest.mark.parametrize("batch", [(), (5,)])
 def test_arrays_are_views_by_name(batch):
-    layout = Layout.of(reading(*batch), batch)
+    layout = IOLayout.of(reading(*batch), batch)
     vector = layout.empty()
     arrays = layout.arrays(vector)
     assert np.isnan(arrays["angles"]).all()

@@ -13,24 +13,22 @@ from unchecked import shapes_unchecked
 
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import (
+    BroydenConfig,
     BroydenEstimator,
+    CompositeConfig,
     CompositeEstimator,
     FixedEstimator,
+    KalmanConfig,
     KalmanEstimator,
+    LeastSquaresConfig,
     Measurement,
     PaperEstimator,
     RBFImageJacobian,
     RecursiveLeastSquaresEstimator,
     paper_grid,
 )
-from hrc_learn.jacobian.estimators import (
-    BroydenConfig,
-    CompositeConfig,
-    KalmanConfig,
-    LeastSquaresConfig,
-)
-from hrc_learn.jacobian.estimators.key_frames import Pair
-from hrc_learn.jacobian.estimators.recursive import condition
+from hrc_learn.jacobian.estimator import MotionSample
+from hrc_learn.jacobian.recursive_estimators import condition
 
 ALL = [
     FixedEstimator,
@@ -374,7 +372,7 @@ def test_forgetting_weighs_old_pairs_less():
     prior = np.kron(np.eye(6), 1500.0**2 * np.ones((9, 9)) + 500.0**2 * np.eye(9))
     weight, covariance = network.weight.detach(), torch.from_numpy(prior)
     for _, dx, dr, theta in pairs:
-        pair = Pair(
+        pair = MotionSample(
             twist=torch.from_numpy(dr / SCALE),
             dr=torch.from_numpy(dr),
             dx=torch.from_numpy(dx),

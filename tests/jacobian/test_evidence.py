@@ -7,18 +7,18 @@ from sampling import generator
 from torch.testing import assert_close
 
 from hrc_learn.jacobian import (
+    EvidenceConfig,
     ImageJacobianFitConfig,
-    LearningConfig,
-    Neurons,
+    RBFCenters,
     RBFImageJacobian,
-    held_out_pairs,
-    learn,
+    cross_validate,
+    image_demonstrations,
+    maximize_evidence,
     paper_grid,
-    watched,
 )
-from hrc_learn.jacobian.evidence import Evidence
-from hrc_learn.jacobian.radial_basis import weight_covariance
-from hrc_learn.jacobian.samples import KeyMotion, PairConfig
+from hrc_learn.jacobian.evidence import NegativeLogEvidence
+from hrc_learn.jacobian.fitting import weight_covariance
+from hrc_learn.jacobian.samples import KeyFrameConfig, MotionSamples
 
 CAMERA = Pinhole.overhead(roll=0.7)
 
@@ -31,7 +31,7 @@ def record(demos=4, *, frames=200, noise=0.1, seed=0):
     poses = wander(frames, demos, rng=rng, **WORKSPACE)
     x = CAMERA.project(poses)
     x = x + noise * torch.randn(x.shape, generator=rng, dtype=x.dtype)
-    return watched([poses[i] for i in range(demos)], list(x))
+    return image_demonstrations([poses[i] for i in range(demos)], list(x))
 
 
 def relative_error(network):
@@ -45,8 +45,8 @@ def test_evidence_is_the_density_of_the_image_motion():
     demonstrations = record(1, frames=40)
     config = ImageJacobianFitConfig(pixel_noise=0.3, bias_std=900.0, weight_std=300.0)
     motion = demonstrations[0].motion(config)
-    neurons = Neurons.paper()
-    model = Evidence(neurons, config, learn_centers=False)
+    neurons = RBFCenters.paper()
+    model = NegativeLogEvidence(neurons, config, learn_centers=False)
     phi = motion.regressors(neurons.basis())
     prior = torch.block_diag(*[weight_covariance(paper_grid(), 900.0, 300.0)] * 6)
     noise = 2 * 0.3**2 * torch.eye(len(phi), dtype=torch.float64)
@@ -59,8 +59,10 @@ def test_evidence_is_the_density_of_the_image_motion():
 
 def test_gradients_of_the_evidence():
     demonstrations = record(2, frames=40)
-    motion = KeyMotion.joined([one.motion(PairConfig()) for one in demonstrations])
-    model = Evidence(Neurons.around(demonstrations), ImageJacobianFitConfig(), True)
+    motion = MotionSamples.joined([one.motion(KeyFrameConfig()) for one in demonstrations])
+    model = NegativeLogEvidence(
+        RBFCenters.around(demonstrations), ImageJacobianFitConfig(), True
+    )
     value = model(motion)
     value.backward()
     step = 1e-5
@@ -79,22 +81,26 @@ def test_gradients_of_the_evidence():
 
 def test_learning_improves_on_ridge_and_finds_the_noise():
     demonstrations = record()
-    neurons = Neurons.around(demonstrations)
+    neurons = RBFCenters.around(demonstrations)
     config = ImageJacobianFitConfig()
-    learned = learn(
-        demonstrations, neurons, config, LearningConfig(rounds=3, learn_centers=False)
+    learned = maximize_evidence(
+        demonstrations, neurons, config, EvidenceConfig(rounds=3, learn_centers=False)
     )
     # Noise alone, four coordinates of it in each pair, leaves an error of 0.2 px.
     excess = [state.held_out_error - 0.2 for state in learned.rounds]
     assert excess[learned.best] < 0.9 * excess[0]
     assert learned.config.pixel_noise == pytest.approx(0.1, rel=0.1)
-    ridge = RBFImageJacobian.fit_watched(demonstrations, neurons, config)
-    better = RBFImageJacobian.fit_watched(demonstrations, learned.neurons, learned.config)
+    ridge = RBFImageJacobian.fit_demonstrations(demonstrations, neurons, config)
+    better = RBFImageJacobian.fit_demonstrations(
+        demonstrations, learned.neurons, learned.config
+    )
     assert relative_error(better) < relative_error(ridge)
 
 
 def test_learning_keeps_what_was_best_on_demonstrations_held_out():
-    learned = learn(record(), Neurons.paper(), learning=LearningConfig(rounds=3, patience=2))
+    learned = maximize_evidence(
+        record(), RBFCenters.paper(), learning=EvidenceConfig(rounds=3, patience=2)
+    )
     errors = [state.held_out_error for state in learned.rounds]
     assert errors[learned.best] <= 1.001 * min(errors)
     if learned.best == 0:
@@ -104,12 +110,12 @@ def test_learning_keeps_what_was_best_on_demonstrations_held_out():
 
 def test_too_few_demonstrations_are_refused():
     with pytest.raises(ValueError, match="holds out every 4th"):
-        learn(record(3), Neurons.paper())
+        maximize_evidence(record(3), RBFCenters.paper())
 
 
 def test_neurons_around_stand_where_the_tool_was():
     demonstrations = record()
-    neurons = Neurons.around(demonstrations)
+    neurons = RBFCenters.around(demonstrations)
     assert neurons.centers.shape == (13, 6)
     position = torch.cat([one.pose.position for one in demonstrations])
     low, high = neurons.centers[:, :3].amin(dim=0), neurons.centers[:, :3].amax(dim=0)
@@ -125,7 +131,9 @@ def test_neurons_around_stand_where_the_tool_was():
 def test_a_reference_survives_saving_and_half_turns(tmp_path):
     """Poses and their vectors agree though the hand points down, at a half turn."""
     demonstrations = record(2)
-    network = RBFImageJacobian.fit_watched(demonstrations, Neurons.around(demonstrations))
+    network = RBFImageJacobian.fit_demonstrations(
+        demonstrations, RBFCenters.around(demonstrations)
+    )
     network.save(tmp_path / "model")
     loaded = RBFImageJacobian.load(tmp_path / "model")
     pose = demonstrations[0].pose[:5]
@@ -138,12 +146,12 @@ def test_a_reference_survives_saving_and_half_turns(tmp_path):
 def test_held_out_errors_by_place_add_up():
     demonstrations = record()
     config = ImageJacobianFitConfig(pixel_noise=0.1)
-    network = RBFImageJacobian.fit_watched(
-        demonstrations, Neurons.around(demonstrations), config
+    network = RBFImageJacobian.fit_demonstrations(
+        demonstrations, RBFCenters.around(demonstrations), config
     )
     report = network.report
     assert report is not None
-    pairs = held_out_pairs(demonstrations, network, config)
+    pairs = cross_validate(demonstrations, network, config)
     assert len(pairs.error) == report.pairs
     rms = float(pairs.error.square().sum(-1).mean().sqrt())
     # The report's came before the noise was raised to the error it found.
@@ -153,5 +161,5 @@ def test_held_out_errors_by_place_add_up():
     assert bool((cells.relative.isfinite() == (cells.pairs > 0)).all())
     loaded = RBFImageJacobian(paper_grid(), 0.1)
     with pytest.raises(ValueError, match="just fitted"):
-        held_out_pairs(demonstrations, loaded, config)
+        cross_validate(demonstrations, loaded, config)
     assert math.isfinite(float(cells.uncertainty.nanmean()))

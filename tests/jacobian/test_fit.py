@@ -9,10 +9,15 @@ from hrc_learn.jacobian import (
     ImageJacobianFitConfig,
     RBFImageJacobian,
     grid,
+    image_demonstrations,
     paper_grid,
-    watched,
 )
-from hrc_learn.jacobian.samples import KeyMotion, PairConfig, key_frames, statistics_by_part
+from hrc_learn.jacobian.samples import (
+    KeyFrameConfig,
+    MotionSamples,
+    key_frames,
+    statistics_by_fold,
+)
 
 CAMERA = Pinhole.overhead(roll=0.7)
 
@@ -101,13 +106,13 @@ def test_uncertainty_is_the_spread_of_the_posterior():
 
 
 def test_fit_is_ridge_regression():
-    """Against a plain least-squares solve of the stacked rows, prior rows included."""
+    """Against a plain least-squares solve of the stack_networks rows, prior rows included."""
     poses, features = record(2, frames=80, noise=0.5)
     config = ImageJacobianFitConfig()
     network = fit(poses, features)
     rows, targets = [], []
     for pose, x in zip(poses, features, strict=True):
-        motion = KeyMotion.of(pose, x, torch.ones(80).bool(), config)
+        motion = MotionSamples.of(pose, x, torch.ones(80).bool(), config)
         rows.append(motion.regressors(network.basis).detach())
         targets.append(motion.dx)
     covariance = 1500.0**2 * torch.ones(9, 9) + 500.0**2 * torch.eye(9)
@@ -123,12 +128,14 @@ def test_fit_is_ridge_regression():
 
 def test_statistics_add_up_in_any_order():
     poses, features = record(7)
-    config = PairConfig()
+    config = KeyFrameConfig()
     network = RBFImageJacobian(paper_grid(), 0.1)
 
     def total(order):
-        demonstrations = watched([poses[i] for i in order], [features[i] for i in order])
-        parts = statistics_by_part(network.basis, 9, demonstrations, config)
+        demonstrations = image_demonstrations(
+            [poses[i] for i in order], [features[i] for i in order]
+        )
+        parts = statistics_by_fold(network.basis, 9, demonstrations, config)
         return sum(parts[1:], parts[0])
 
     one, other = total(range(7)), total([3, 6, 0, 2, 5, 1, 4])
@@ -144,7 +151,7 @@ def test_key_frames_are_apart_and_visible():
     )
     visible = torch.ones(1200, dtype=torch.bool)
     visible[300:600] = False
-    config = PairConfig(min_step=0.004)
+    config = KeyFrameConfig(min_step=0.004)
     keys = key_frames(still, visible, config)
     assert bool(visible[keys].all())
     step = still[keys][:-1].twist_to(still[keys][1:])

@@ -7,7 +7,7 @@ import torch
 
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import gripper_down
-from hrc_learn.kinematics.tool_orientation import NEAR, WIDEST, Approach, tangent
+from hrc_learn.kinematics.tool_orientation import MAX_SPREAD, NEAR, Approach, tangent
 
 DOWN = gripper_down()
 
@@ -59,7 +59,7 @@ def test_it_is_the_mean_of_demonstrations_whatever_their_signs():
     assert approach.spread == pytest.approx(0.1)
 
 
-@pytest.mark.parametrize("angles", [(WIDEST + 0.01,), (0.6, -0.6), (math.pi / 2,)])
+@pytest.mark.parametrize("angles", [(MAX_SPREAD + 0.01,), (0.6, -0.6), (math.pi / 2,)])
 def test_where_the_hand_came_from_the_side_it_keeps_its_orientation(angles):
     approach = Approach.fit([path_along(tilted(angle)) for angle in angles])
     assert float(quaternion.angle(approach.orientation, DOWN)) < 1e-7

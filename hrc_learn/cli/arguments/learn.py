@@ -11,9 +11,9 @@ from hrc_learn.cli.arguments.choices import Kind, Scaling
 
 
 def _learning() -> Any:
-    from hrc_learn.jacobian import LearningConfig
+    from hrc_learn.jacobian import EvidenceConfig
 
-    return LearningConfig()
+    return EvidenceConfig()
 
 
 def _jacobian_fit() -> Any:

@@ -10,7 +10,7 @@ from hrc_learn.cli._options import resolved
 from hrc_learn.cli._values import show_values, write_json
 from hrc_learn.cli.arguments.learn import FitImageJacobian as Args
 from hrc_learn.demos import DemonstrationSource, open_demos
-from hrc_learn.jacobian import CellErrors, Neurons, grid
+from hrc_learn.jacobian import CellErrors, RBFCenters, grid
 from hrc_learn.learning.fit_recordings import learning_recording
 from hrc_learn.learning.fit_visual_servo import fit_aiming
 from hrc_learn.skills.visual_servoing import AimingSkill
@@ -45,8 +45,8 @@ def run(args: Args) -> None:
             _write(args, skill, demos, console)
 
 
-def _grid(args: Args) -> Neurons:
-    return Neurons(centers=grid(args.x, args.y), width=args.width)
+def _grid(args: Args) -> RBFCenters:
+    return RBFCenters(centers=grid(args.x, args.y), width=args.width)
 
 
 def _write(

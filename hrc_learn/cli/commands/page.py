@@ -14,7 +14,7 @@ from hrc_learn.cli._options import resolved
 from hrc_learn.cli._values import configuration, write_json
 from hrc_learn.cli.arguments.run import ServePage as Args
 from hrc_learn.demos import DatasetWriter
-from hrc_learn.deploy import Metronome
+from hrc_learn.deploy import Rate
 from hrc_learn.kinematics import panda
 from hrc_learn.protocols import Human
 from hrc_learn.sim import MovingBodies, World
@@ -79,14 +79,14 @@ def _serve(
     session: PageSession, page: Page, dt: float, duration: float | None
 ) -> dict[str, float]:
     """Run the loop in the arm's own time; what was measured of it."""
-    metronome, steps, latest = Metronome(dt), 0, 0.0
+    rate, steps, latest = Rate(dt), 0, 0.0
     try:
         while page.alive and not session.finished:
             session.step()
             steps += 1
             if duration is not None and steps * dt >= duration:
                 break
-            latest = max(latest, metronome.wait())
+            latest = max(latest, rate.wait())
     except KeyboardInterrupt:
         print()
-    return {"steps": steps, "missed_ticks": metronome.missed, "latest_s": latest}
+    return {"steps": steps, "missed_ticks": rate.missed, "latest_s": latest}

@@ -22,7 +22,7 @@ from hrc_learn.controller import (
     Observation,
     SafetyConfig,
 )
-from hrc_learn.deploy import EagerRunner, Metronome, StepRunner, open_step
+from hrc_learn.deploy import EagerRunner, Rate, StepRunner, open_step
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import KalmanEstimator, RBFImageJacobian, paper_grid
 from hrc_learn.kinematics import panda
@@ -114,7 +114,7 @@ def _controller(camera: PinholeCamera, dt: float) -> tuple[AdaptiveController, O
         feature_visible=torch.tensor(False),
         feature_new=torch.tensor(False),
         image_joint_position=q,
-        human_effort=torch.zeros_like(q),
+        nullspace_input=torch.zeros_like(q),
         # A tensor, so that one package serves all rates.
         dt=torch.tensor(dt, dtype=torch.float64),
     )
@@ -131,7 +131,7 @@ def _serve(
     took, late = np.empty(steps), np.empty(steps)
     _answer(runner, world.arm)  # the first call is slower than any other
     runner.start(panda.ready.numpy())
-    metronome = Metronome(dt)
+    rate = Rate(dt)
     for k in range(steps):
         began = time.perf_counter()
         _answer(runner, world.arm)
@@ -140,9 +140,9 @@ def _serve(
         runner.observation["feature_new"][...] = k % frame_steps == 0
         if k % frame_steps == 0:
             _look(runner.observation, camera, world.arm)
-        late[k] = metronome.wait()
+        late[k] = rate.wait()
     error = float(np.linalg.norm(runner.observation["feature"] - target))
-    return Latencies(step=took, wake_up=late, missed=metronome.missed), error
+    return Latencies(step=took, wake_up=late, missed=rate.missed), error
 
 
 def _answer(runner: StepRunner, arm: Arm) -> None:

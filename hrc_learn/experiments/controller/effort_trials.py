@@ -13,7 +13,12 @@ from hrc_learn.controller import AdaptiveController, ControllerConfig, Goals
 from hrc_learn.geometry import quaternion
 from hrc_learn.jacobian import FixedEstimator, RBFImageJacobian, paper_grid
 from hrc_learn.kinematics import panda
-from hrc_learn.sim.closed_loop import Imperfections, PinholeCamera, VirtualCamera, rehearse
+from hrc_learn.sim.closed_loop import (
+    Imperfections,
+    PinholeCamera,
+    VirtualCamera,
+    simulate_closed_loop,
+)
 
 ELBOW = 4
 """Joint that is pulled."""
@@ -108,7 +113,7 @@ def run_effort_trials(config: EffortConfig) -> EffortResult:
         torch.maximum(largest, values, out=largest)
 
     with torch.inference_mode():
-        rehearse(
+        simulate_closed_loop(
             controller,
             VirtualCamera(
                 camera=camera,
@@ -118,8 +123,8 @@ def run_effort_trials(config: EffortConfig) -> EffortResult:
             q,
             steps=round((config.away + config.back) / config.dt),
             dt=config.dt,
-            effort=pull,
-            watch=watch,
+            nullspace_input=pull,
+            on_step=watch,
         )
     return EffortResult(elbow=largest[0], deviation=largest[1], turn=largest[2])
 

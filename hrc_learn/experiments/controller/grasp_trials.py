@@ -20,12 +20,11 @@ from hrc_learn.controller import (
     ControllerState,
     Goals,
     Observation,
-    table1_config,
-    table1_goals,
-    table1_joint_region,
+    paper_goals,
+    paper_joint_region,
 )
 from hrc_learn.controller.interface import HALF_SIZE
-from hrc_learn.controller.monitors import LimitWatch
+from hrc_learn.controller.monitors import LimitMonitor
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import ImageJacobianEstimator, RBFImageJacobian, paper_grid
 from hrc_learn.kinematics import (
@@ -36,7 +35,12 @@ from hrc_learn.kinematics import (
     panda_capsules,
 )
 from hrc_learn.regions import JointRegion
-from hrc_learn.sim.closed_loop import Imperfections, PinholeCamera, VirtualCamera, rehearse
+from hrc_learn.sim.closed_loop import (
+    Imperfections,
+    PinholeCamera,
+    VirtualCamera,
+    simulate_closed_loop,
+)
 
 # How far the arm is from itself and from what stands in the workplace of the trials.
 
@@ -188,7 +192,7 @@ def run_trials(
     controller = _controller(make_estimator, config, scene)
     judge = _Judge(scene, controller, config)
     with torch.inference_mode():
-        rehearse(
+        simulate_closed_loop(
             controller,
             VirtualCamera(
                 camera=scene.camera, imperfections=config.imperfections, generator=rng
@@ -196,7 +200,7 @@ def run_trials(
             scene.start,
             steps=round(config.duration / config.dt),
             dt=config.dt,
-            watch=judge,
+            on_step=judge,
         )
     return judge.result()
 
@@ -256,8 +260,8 @@ def _controller(
     centre = torch.tensor(CENTRE, dtype=torch.float64)
     half_size = centre.new_tensor(HALF_SIZE)
     if config.law == "printed":
-        goals = table1_goals(centre, half_size, scene.target)
-        settings, region = table1_config(), table1_joint_region(panda.limits)
+        goals = paper_goals(centre, half_size, scene.target)
+        settings, region = ControllerConfig.paper(), paper_joint_region(panda.limits)
     else:
         down = quaternion.normalize(centre.new_tensor(GRIPPER_DOWN))
         postures = comfortable_postures(panda, Pose(centre, down))
@@ -285,7 +289,7 @@ class _Judge:
         self.hand_overs = torch.zeros(count, dtype=torch.int64)
         self.peak_speed = torch.zeros(count, dtype=torch.float64)
         still = torch.zeros_like(scene.start)
-        self.watch = LimitWatch(panda.limits, still, config.dt)
+        self.watch = LimitMonitor(panda.limits, still, config.dt)
         self.touched = torch.zeros(count, dtype=torch.bool)
         self.active = torch.zeros(count, dtype=torch.bool)
         self.in_box = torch.zeros(count, dtype=torch.bool)
@@ -304,7 +308,7 @@ class _Judge:
         centre = error.unflatten(-1, (-1, 2)).mean(-2)
         close = torch.linalg.vector_norm(centre, dim=-1) < 5
         self.entered = torch.where(close, torch.minimum(self.entered, now), math.inf)
-        active = state.activation.active
+        active = state.blending.active
         self.taken_over = torch.where(
             active, torch.minimum(self.taken_over, now), self.taken_over
         )
@@ -314,7 +318,7 @@ class _Judge:
         # 5 % beyond the wall count as in the box: a potential ends at the wall, not inside.
         self.in_box = ((tool.position - box.centre).abs() <= 1.05 * box.half_size).all(-1)
         v = command.joint_velocity
-        self.violations += self.watch.beyond(q, v).any(-1) | ~v.isfinite().all(-1)
+        self.violations += self.watch.violations(q, v).any(-1) | ~v.isfinite().all(-1)
         speed = (v.abs() / panda.limits.velocity).amax(-1)
         self.peak_speed = torch.maximum(self.peak_speed, speed)
         if self.contact_steps and step % self.contact_steps == 0:

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.utils import _pytree
 
 from hrc_learn.controller import INITIAL_IMAGE_JACOBIAN, AdaptiveController, Goals, Observation
-from hrc_learn.controller.monitors import LimitWatch
+from hrc_learn.controller.monitors import LimitMonitor
 from hrc_learn.geometry import quaternion
 from hrc_learn.jacobian import CompositeEstimator, RBFImageJacobian, paper_grid
 from hrc_learn.kinematics import panda
@@ -46,7 +46,7 @@ class StressConfig:
         return Imperfections(
             frame_steps=frame_steps,
             noise=0.5,
-            nan_share=0.01 if self.fault == "nan" else 0.0,
+            nan_fraction=0.01 if self.fault == "nan" else 0.0,
             latency_frames=round(_LATE / (frame_steps * self.dt)) if late else 0,
             loss_rate=0.5 if self.fault == "lost" else 0.0,
         )
@@ -91,7 +91,7 @@ def run_stress_trials(config: StressConfig) -> StressResult:
     controller, camera = _controller(count, rng)
     virtual = VirtualCamera(camera=camera, imperfections=config.imperfections(), generator=rng)
     state = controller.initial_state(q)
-    watch = LimitWatch(limits, state.safety.velocity, config.dt)
+    watch = LimitMonitor(limits, state.safety.velocity, config.dt)
     beyond = torch.zeros(count, 4, dtype=torch.int64)
     unknown = torch.zeros(count, dtype=torch.int64)
     joints = _JointReadings(config, rng)
@@ -105,12 +105,12 @@ def run_stress_trials(config: StressConfig) -> StressResult:
                 **image,
                 joint_position=measured,
                 joint_state_stale=stale,
-                human_effort=effort,
+                nullspace_input=effort,
                 dt=config.dt,
             )
             command, state = controller.step(state, observation)
             q = q + config.dt * command.joint_velocity
-            beyond += watch.beyond(q, command.joint_velocity)
+            beyond += watch.violations(q, command.joint_velocity)
             unknown += _unknown((q, command, state))
     return StressResult(beyond=beyond, unknown=unknown, interventions=state.safety.counts)
 

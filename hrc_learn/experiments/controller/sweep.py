@@ -136,7 +136,7 @@ EXPERIMENTS: Mapping[str, Experiment] = {
     "effort": _effort("a person pulls the elbow away for 7 s and back for 4 s, at 1 kHz"),
     "effort_noise": _effort("the same with 0.5 px of noise", noise=0.5),
     "faulty_images": _grasp(
-        "1 % of measurements NaN", suite="estimators", **_imperfect(nan_share=0.01)
+        "1 % of measurements NaN", suite="estimators", **_imperfect(nan_fraction=0.01)
     ),
     "composite": _grasp("composite adaptation", CompositeEstimator, suite="estimators"),
     "least_squares": _grasp(

@@ -20,7 +20,12 @@ from lerobot.processor import ProcessorStep, ProcessorStepRegistry
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
-from hrc_learn.controller import BROKEN, ChunkSmoother, SmoothReport, SmoothState
+from hrc_learn.controller import (
+    LIMIT_KINDS,
+    ActionChunkFilter,
+    ActionChunkReport,
+    ActionChunkState,
+)
 from hrc_learn.kinematics import MotionLimits
 
 # What smoothing has changed, added up.
@@ -35,7 +40,7 @@ class Changes:
     Attributes:
         steps: Actions handed out.
         changed: Of them, those that differ from what was asked for.
-        broken: Of them, those asked for that would have broken each of `BROKEN`.
+        broken: Of them, those asked for that would have broken each of `LIMIT_KINDS`.
         largest: Largest change of each value, in its unit.
     """
 
@@ -46,16 +51,16 @@ class Changes:
     def clear(self) -> None:
         """Start over."""
         self.steps = self.changed = 0
-        self.broken = dict.fromkeys(BROKEN, 0)
+        self.broken = dict.fromkeys(LIMIT_KINDS, 0)
         self.largest = dict.fromkeys(self.names, 0.0)
 
-    def add(self, report: SmoothReport) -> None:
+    def add(self, report: ActionChunkReport) -> None:
         """Count what was done to a chunk."""
         change = report.change.abs().reshape(-1, len(self.names))
         self.steps += len(change)
         self.changed += int((change > _SAME).any(-1).sum())
         for kind, count in zip(
-            BROKEN, report.broken.flatten(0, -2).sum(0).tolist(), strict=True
+            LIMIT_KINDS, report.broken.flatten(0, -2).sum(0).tolist(), strict=True
         ):
             self.broken[kind] += int(count)
         for name, most in zip(self.names, torch.amax(change, 0).tolist(), strict=True):
@@ -129,7 +134,7 @@ class SmoothActionsStep(ProcessorStep):
     Belongs at the end of the postprocessor, where actions have their units. Takes one action at
     a time, (batch, values), as lerobot-rollout and lerobot-eval hand them on, or whole chunks
     (batch, steps, values). A motion begins where the robot is, and anew where it is put; a
-    chunk begins where the robot is on the one before. See `ChunkSmoother`.
+    chunk begins where the robot is on the one before. See `ActionChunkFilter`.
     """
 
     fps: float
@@ -160,9 +165,9 @@ class SmoothActionsStep(ProcessorStep):
                     f"smooth actions: {name} must have one entry for each of "
                     f"{', '.join(self.names)}, but has {len(getattr(self, name))}."
                 )
-        self._smoother = ChunkSmoother(self._limits(), 1.0 / self.fps)
+        self._smoother = ActionChunkFilter(self._limits(), 1.0 / self.fps)
         self._columns = torch.tensor(self.state_columns)
-        self._state: SmoothState | None = None
+        self._state: ActionChunkState | None = None
         self._chunk: Tensor | None = None
         self._before: Tensor | None = None
         self.changes = Changes(self.names)
@@ -217,7 +222,7 @@ class SmoothActionsStep(ProcessorStep):
             jerk=_tensor(self.jerk),
         )
 
-    def _start(self, chunk: Tensor, whole: bool) -> SmoothState:
+    def _start(self, chunk: Tensor, whole: bool) -> ActionChunkState:
         """Where the motion goes on from."""
         measured = self._measured(chunk)
         fresh = self._smoother.initial_state(measured)
@@ -253,7 +258,7 @@ class SmoothActionsStep(ProcessorStep):
         moved = (measured - self._before).abs() > farthest
         return (moved & (self._columns >= 0)).any(-1)
 
-    def _reached(self, measured: Tensor, chunk: Tensor) -> SmoothState:
+    def _reached(self, measured: Tensor, chunk: Tensor) -> ActionChunkState:
         """State on the chunk before, where it is nearest to the robot."""
         scaled = (chunk - measured.unsqueeze(-2)) / self._smoother.barrier.velocity
         seen = torch.where(self._columns >= 0, scaled, 0.0)
@@ -265,7 +270,7 @@ class SmoothActionsStep(ProcessorStep):
         acceleration = (velocity - (middle - first) * self.fps) * self.fps
         return replace(state, acceleration=acceleration)
 
-    def _keep(self, smooth: Tensor, report: SmoothReport, whole: bool) -> None:
+    def _keep(self, smooth: Tensor, report: ActionChunkReport, whole: bool) -> None:
         self.changes.add(report)
         self._chunk = smooth.to(torch.float64) if whole and smooth.shape[-2] > 2 else None
 
@@ -274,7 +279,9 @@ def _tensor(values: Sequence[float | None], missing: float = math.nan) -> Float[
     return torch.tensor([missing if v is None else v for v in values], dtype=torch.float64)
 
 
-def _where(rows: Bool[Tensor, " batch"], yes: SmoothState, no: SmoothState) -> SmoothState:
+def _where(
+    rows: Bool[Tensor, " batch"], yes: ActionChunkState, no: ActionChunkState
+) -> ActionChunkState:
     values = {
         name: torch.where(rows.unsqueeze(-1), getattr(yes, name), getattr(no, name))
         for name in vars(no)

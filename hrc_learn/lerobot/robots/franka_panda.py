@@ -25,8 +25,8 @@ class FrankaPanda(PandaRobot):
     """A Franka Panda led by positions, through its velocity interface.
 
     NOT RUN ON HARDWARE. Between an action and the arm stand, in this order: the limits of the
-    joints' motion (`ChunkSmoother`), the safety filter with a cap on the speed of the tool, a
-    watchdog that stops the arm when the loop falls silent, and the driver, which ends every
+    joints' motion (`ActionChunkFilter`), the safety filter with a cap on the speed of the tool,
+    a watchdog that stops the arm when the loop falls silent, and the driver, which ends every
     velocity by itself. Keep the stop button in hand.
 
     Attributes:

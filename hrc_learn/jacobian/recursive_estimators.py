@@ -1,4 +1,7 @@
-"""Recursive estimation of the weights: least squares with forgetting, and a Kalman filter."""
+"""Recursive estimation of the weights: least squares with forgetting, and a Kalman filter.
+
+Both keep one Gaussian for both image rows, which see the same regressors.
+"""
 
 from __future__ import annotations
 
@@ -9,18 +12,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.geometry.small_matrices import matmul
-from hrc_learn.jacobian.estimators.estimator import Measurement
-from hrc_learn.jacobian.estimators.key_frames import KeyFrame, Pair, PairEstimator
+from hrc_learn.jacobian.estimator import KeyFrame, KeyFrameEstimator, Measurement, MotionSample
+from hrc_learn.jacobian.fitting import weight_covariance
 from hrc_learn.jacobian.network import RBFImageJacobian
-from hrc_learn.jacobian.radial_basis import weight_covariance
-from hrc_learn.jacobian.samples import PairConfig
+from hrc_learn.jacobian.samples import KeyFrameConfig
 from hrc_learn.pytree import pytree
-
-# Recursive Bayesian estimation of the weights: one Gaussian for both image rows.
 
 
 @dataclass(frozen=True, kw_only=True)
-class RecursiveConfig(PairConfig):
+class RecursiveConfig(KeyFrameConfig):
     """What is believed before the first image."""
 
     pixel_noise: float = 0.5
@@ -51,7 +51,7 @@ class RecursiveState:
     """Last key frame."""
 
 
-class RecursiveEstimator(PairEstimator):
+class RecursiveEstimator(KeyFrameEstimator):
     """An estimator that keeps a covariance of the weights."""
 
     first_covariance: Tensor
@@ -80,7 +80,7 @@ class RecursiveEstimator(PairEstimator):
 def condition(
     weight: Float[Tensor, "*batch entries K"],
     covariance: Float[Tensor, "*batch P P"],
-    pair: Pair,
+    pair: MotionSample,
     scale: Float[Tensor, "6"],
     noise: float,
 ) -> tuple[Float[Tensor, "*batch entries K"], Float[Tensor, "*batch P P"]]:
@@ -104,9 +104,6 @@ def condition(
     # and P_phi is not, and forgetting amplifies the difference until the covariance is none.
     root = P_phi / spread.sqrt()
     return weight + change.flatten(-3, -2), covariance - root.mT * root
-
-
-# Recursive least squares with exponential forgetting.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,9 +149,6 @@ class RecursiveLeastSquaresEstimator(RecursiveEstimator):
         )
 
 
-# Kalman filter on the weights.
-
-
 @dataclass(frozen=True, kw_only=True)
 class KalmanConfig(RecursiveConfig):
     """Prior, noise and drift."""
@@ -177,7 +171,7 @@ class KalmanEstimator(RecursiveEstimator):
         """Set up the filter.
 
         Args:
-            network: Neurons and initial weights. If fitted offline, its covariance is where
+            network: RBFCenters and initial weights. If fitted offline, its covariance is where
                 the filter starts.
             config: Prior, noise and drift.
 

@@ -1,5 +1,7 @@
-"""Gradient laws for the image Jacobian: the paper's, and the composite law with the
-prediction error.
+"""Gradient laws for the image Jacobian.
+
+The paper's; the composite law with the prediction error, which the paper's lacks; and
+Broyden's update of one Jacobian for the whole workspace.
 """
 
 from __future__ import annotations
@@ -11,18 +13,18 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.geometry.small_matrices import matmul
-from hrc_learn.jacobian.estimators.estimator import (
+from hrc_learn.jacobian.estimator import (
     ImageJacobianEstimator,
+    KeyFrame,
+    KeyFrameEstimator,
     Measurement,
+    MotionSample,
     WeightState,
     evaluate,
 )
-from hrc_learn.jacobian.estimators.key_frames import KeyFrame, Pair, PairEstimator
 from hrc_learn.jacobian.network import RBFImageJacobian
-from hrc_learn.jacobian.samples import PairConfig
+from hrc_learn.jacobian.samples import KeyFrameConfig
 from hrc_learn.pytree import pytree
-
-# The adaptation law as the paper prints it.
 
 
 class PaperEstimator(ImageJacobianEstimator):
@@ -37,7 +39,7 @@ class PaperEstimator(ImageJacobianEstimator):
         """Set up the law.
 
         Args:
-            network: Neurons and initial weights.
+            network: RBFCenters and initial weights.
             gain: Diagonal of L.
         """
         super().__init__(network)
@@ -72,11 +74,8 @@ def paper_rate(
     return -gain * push.unsqueeze(-1) * theta.unsqueeze(-2)
 
 
-# The paper's law with what it lacks: the error of the predicted image motion.
-
-
 @dataclass(frozen=True, kw_only=True)
-class CompositeConfig(PairConfig):
+class CompositeConfig(KeyFrameConfig):
     """Gains of the composite law."""
 
     task_gain: float = 0.25
@@ -100,7 +99,7 @@ class CompositeState:
     """Last key frame."""
 
 
-class CompositeEstimator(PairEstimator):
+class CompositeEstimator(KeyFrameEstimator):
     """Composite adaptation: task error and prediction error (Slotine and Li 1989).
 
     Between key frames the prediction error is e = dx - J_s_hat dr. Each pair moves the
@@ -131,7 +130,7 @@ class CompositeEstimator(PairEstimator):
         weight = state.weight + change
         return CompositeState(weight=self.projected(weight), key=key)
 
-    def _correction(self, weight: Tensor, pair: Pair) -> Tensor:
+    def _correction(self, weight: Tensor, pair: MotionSample) -> Tensor:
         """Normalised gradient step on the prediction error; zero without a pair."""
         config = self.config
         motion = pair.dr.square().sum(-1) + config.noise_floor**2
@@ -143,3 +142,52 @@ class CompositeEstimator(PairEstimator):
         step = config.prediction_gain * pair.error(weight) / size.unsqueeze(-1)
         entries = step.unsqueeze(-1) * (pair.dr * self.scale).unsqueeze(-2)
         return entries.flatten(-2).unsqueeze(-1) * pair.theta.unsqueeze(-2)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BroydenConfig(KeyFrameConfig):
+    """Step of Broyden's update."""
+
+    min_step: float = 2e-3
+    """Least motion between key frames [m]: without a noise model it must be large."""
+    gain: float = 0.5
+    """Share of the prediction error that one pair removes, above 0 to 1."""
+    weight_bound: float = 2e4
+    """Largest entry of the weights [px/m], rotation counted with `rotation_scale`."""
+
+
+class BroydenEstimator(KeyFrameEstimator):
+    """J_s <- J_s + gain (dx - J_s dr) dr^T / |dr|^2 (Jägersand 1997), everywhere at once.
+
+    The same change of every neuron changes a network of normalised neurons by a constant.
+    """
+
+    def __init__(self, network: RBFImageJacobian, config: BroydenConfig | None = None):
+        """Set up the update.
+
+        Raises:
+            ValueError: The network's neurons are not normalised.
+        """
+        self.config = config or BroydenConfig()
+        super().__init__(network, self.config, self.config.weight_bound)
+        if not network.normalized:
+            raise ValueError(
+                "Broyden's update adds a constant Jacobian, which only normalised neurons can "
+                "represent: build the network with normalized=True."
+            )
+
+    def initial_state(self, *batch: int) -> CompositeState:
+        """The network's weights and no key frame."""
+        weight, key = self.initial_weight(*batch), KeyFrame.absent(self.network, *batch)
+        return CompositeState(weight=weight, key=key)
+
+    def update(self, state: CompositeState, measurement: Measurement) -> CompositeState:
+        """One pair if there is a new one."""
+        theta = self.network.basis(measurement.pose)
+        key, pair = self.advance(state.key, measurement, theta, self.config)
+        # dr is zero without a pair: then the floor keeps 0 / 0 away.
+        size = pair.dr.square().sum(-1).clamp_min((self.config.min_step / 2) ** 2)
+        step = self.config.gain * pair.error(state.weight) / size.unsqueeze(-1)
+        change = step.unsqueeze(-1) * (pair.dr * self.scale).unsqueeze(-2)
+        weight = state.weight + change.flatten(-2).unsqueeze(-1)
+        return CompositeState(weight=self.projected(weight), key=key)

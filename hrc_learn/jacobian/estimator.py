@@ -1,25 +1,124 @@
-"""Pairs of poses and images far enough apart to tell motion from noise, found online."""
+"""The interface of online estimators of the image Jacobian, and what most of them share.
+
+`FixedEstimator` never changes it. Those that learn compare key frames: pairs of poses and
+images far enough apart to tell motion from noise, which `KeyFrameEstimator` finds online.
+"""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from hrc_learn.geometry import Pose
 from hrc_learn.geometry.small_matrices import matmul
-from hrc_learn.jacobian.estimators.estimator import (
-    ImageJacobianEstimator,
-    Measurement,
-    evaluate,
-)
 from hrc_learn.jacobian.network import RBFImageJacobian
-from hrc_learn.jacobian.radial_basis import component_scale
-from hrc_learn.jacobian.samples import PairConfig
+from hrc_learn.jacobian.samples import KeyFrameConfig, component_scale
 from hrc_learn.pytree import pytree
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
+class Measurement:
+    """One control step as an estimator sees it."""
+
+    pose: Pose
+    """Of the tool when the image was taken."""
+    feature: Float[Tensor, "*batch rows"]
+    """Image feature [px], u and v of one point or of several in turn; anything, also NaN,
+    where not `valid`."""
+    valid: Bool[Tensor, "*batch"]
+    """Whether the feature is visible and stems from an image not used before."""
+    dt: float | Float[Tensor, ""]
+    """Time since the step before [s]."""
+    xi_x: Float[Tensor, "*batch rows"]
+    """Vision feedback of the controller."""
+    xi_r: Float[Tensor, "*batch 6"]
+    """Cartesian feedback of the controller."""
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
+class WeightState:
+    """State of an estimator that remembers nothing but the weights."""
+
+    weight: Float[Tensor, "*batch entries K"]
+    """W [px/m, px/rad], one matrix for each element of the batch."""
+
+
+class ImageJacobianEstimator(nn.Module, ABC):
+    """Adapts the weights of a network while the robot moves.
+
+    Pure: `update` takes a state and returns a new one, so that thousands of robots adapt in
+    one batch. The network supplies the neurons and the weights to start from; it is not
+    changed.
+    """
+
+    def __init__(self, network: RBFImageJacobian):
+        super().__init__()
+        self.network = network
+
+    @abstractmethod
+    def initial_state(self, *batch: int) -> Any:
+        """State before the first step, for a batch of robots.
+
+        Its tensors are of the dtype and device of the network.
+        """
+
+    @abstractmethod
+    def update(self, state: Any, measurement: Measurement) -> Any:
+        """State after one control step."""
+
+    def resumed(self, state: Any, pause: float) -> Any:
+        """State after a pause in which nobody watched.
+
+        What was seen before it must not be compared with what is seen after it: meanwhile the
+        camera may have been moved.
+
+        Args:
+            state: At the end of the watching before.
+            pause: [s]
+        """
+        return state
+
+    def jacobian(
+        self, state: Any, r: Pose | Float[Tensor, "*batch 6"]
+    ) -> Float[Tensor, "*batch rows 6"]:
+        """J_s_hat at a pose with the weights of a state.
+
+        Args:
+            state: Of this estimator.
+            r: Position [m] and rotation vector [rad], or a pose.
+        """
+        return evaluate(state.weight, self.network.basis(r))
+
+    def initial_weight(self, *batch: int) -> Float[Tensor, "*batch entries K"]:
+        """The network's weights, once for each element of a batch."""
+        weight = self.network.weight.detach()
+        return weight.expand(*batch, *weight.shape).clone()
+
+
+def evaluate(
+    weight: Float[Tensor, "*batch entries K"], theta: Float[Tensor, "*batch K"]
+) -> Float[Tensor, "*batch rows 6"]:
+    """J_s_hat from vec(J_s_hat^T) = W theta."""
+    return matmul(weight, theta.unsqueeze(-1)).squeeze(-1).unflatten(-1, (-1, 6))
+
+
+class FixedEstimator(ImageJacobianEstimator):
+    """Keeps the network's weights: what every other estimator is measured against."""
+
+    def initial_state(self, *batch: int) -> WeightState:
+        """The network's weights."""
+        return WeightState(weight=self.initial_weight(*batch))
+
+    def update(self, state: WeightState, measurement: Measurement) -> WeightState:
+        """The same state."""
+        return state
 
 
 @pytree
@@ -51,7 +150,7 @@ class KeyFrame:
 
 @pytree
 @dataclass(frozen=True, kw_only=True)
-class Pair:
+class MotionSample:
     """Motion from the key frame to now; zero where there is none to learn from."""
 
     twist: Float[Tensor, "*batch 6"]
@@ -61,7 +160,7 @@ class Pair:
     dx: Float[Tensor, "*batch rows"]
     """Motion of the feature [px]."""
     theta: Float[Tensor, "*batch K"]
-    """Neurons half-way: the mean of both ends."""
+    """RBFCenters half-way: the mean of both ends."""
     valid: Bool[Tensor, "*batch"]
     """Whether there is a pair."""
 
@@ -71,7 +170,7 @@ class Pair:
         return self.dx - matmul(J, self.twist.unsqueeze(-1)).squeeze(-1)
 
 
-class PairEstimator(ImageJacobianEstimator):
+class KeyFrameEstimator(ImageJacobianEstimator):
     """An estimator that learns from pairs of key frames."""
 
     scale: Tensor
@@ -80,11 +179,11 @@ class PairEstimator(ImageJacobianEstimator):
     bound: Tensor
     """Largest absolute value of each entry of the weights, (entries, 1)."""
 
-    def __init__(self, network: RBFImageJacobian, config: PairConfig, weight_bound: float):
+    def __init__(self, network: RBFImageJacobian, config: KeyFrameConfig, weight_bound: float):
         """Prepare the scales.
 
         Args:
-            network: Neurons and initial weights.
+            network: RBFCenters and initial weights.
             config: Choice of key frames.
             weight_bound: Largest entry of the weights [px/m].
         """
@@ -113,8 +212,8 @@ class PairEstimator(ImageJacobianEstimator):
         key: KeyFrame,
         measurement: Measurement,
         theta: Float[Tensor, "*batch K"],
-        config: PairConfig,
-    ) -> tuple[KeyFrame, Pair]:
+        config: KeyFrameConfig,
+    ) -> tuple[KeyFrame, MotionSample]:
         """Compare with the key frame; move it here once the tool is `min_step` away.
 
         Where the tool has meanwhile moved further than `max_step`, as after a loss of the
@@ -130,15 +229,17 @@ class PairEstimator(ImageJacobianEstimator):
         distance = torch.linalg.vector_norm(twist * self.scale, dim=-1)
         moved = measurement.valid & key.present & (distance >= config.min_step)
         valid = moved & (distance <= config.max_step)
+        # What is not valid may be NaN: zero instead, which leaves every weight as it is.
         use = valid.unsqueeze(-1)
         twist = torch.where(use, twist, 0.0)
-        pair = Pair(
+        pair = MotionSample(
             twist=twist,
             dr=twist * self.scale,
             dx=torch.where(use, measurement.feature - key.feature, 0.0),
             theta=(key.theta + theta) / 2,
             valid=valid,
         )
+        # The first frame seen becomes a key frame, and so does the end of every pair.
         take = (moved | (measurement.valid & ~key.present)).unsqueeze(-1)
         here = KeyFrame(
             pose=Pose(
