@@ -116,9 +116,7 @@ def test_all_options_are_shown_on_request(name):
 def test_the_same_thing_is_called_the_same(name):
     hints = typing.get_type_hints(COMMANDS[name].arguments_type())
     assert "json" in hints
-    assert (
-        not hints.keys() & {"path", "seeds", "output", "data"} - {"path"} or name == "recover"
-    )
+    assert not hints.keys() & {"seeds", "output", "data"}
     for option, kind in SAME_EVERYWHERE.items():
         if option in hints:
             assert kind in str(hints[option])
@@ -259,17 +257,6 @@ def test_measured_values_are_written_whole_or_not_at_all(tmp_path):
     path = tmp_path / "new" / "values.json"
     cli.write_json(path, {"a": 1, "b": np.float32(0.5), "c": float("nan"), "d": np.int64(3)})
     assert json.loads(path.read_text()) == {"a": 1, "b": 0.5, "c": None, "d": 3}
-        "{",
-        '"a":',
-        "1,",
-        '"b":',
-        "0.5,",
-        '"c":',
-        "null,",
-        '"d":',
-        "3",
-        "}",
-    ]
     before = path.read_bytes()
     with pytest.raises(TypeError):
         cli.write_json(path, {"a": object()})  # pyright: ignore[reportArgumentType]
