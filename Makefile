@@ -1,4 +1,4 @@
-.PHONY: demo test test-slow format check bench clean
+.PHONY: demo test test-slow docs format check bench clean
 .DEFAULT_GOAL := help
 
 PYTHON := .venv/bin/python
@@ -10,7 +10,8 @@ help:
 	@echo "             make demo SHELF=upper places on another shelf (lower, middle, upper)"
 	@echo "make test    run the tests"
 	@echo "make bench   measure the speed against floors and peers"
-	@echo "make format  format the code        make check  lint and type-check"
+	@echo "make docs    build the documentation site; writes outputs/docs"
+	@echo "make format  format the code        make check  lint, type-check, build the site"
 
 demo: .venv/.installed
 	$(PYTHON) -m hrc_learn.cli demo --out $(OUT) --shelf $(SHELF)
@@ -21,6 +22,9 @@ test: .venv/.installed
 test-slow: .venv/.installed
 	$(PYTHON) -m pytest -m slow
 
+docs: .venv/.installed
+	$(PYTHON) tools/build_docs.py
+
 format: .venv/.installed
 	$(PYTHON) -m ruff check --fix-only --quiet .
 	$(PYTHON) -m ruff format .
@@ -29,6 +33,7 @@ check: .venv/.installed
 	$(PYTHON) -m ruff check .
 	$(PYTHON) -m ruff format --check .
 	$(PYTHON) -m pyright
+	$(PYTHON) tools/build_docs.py
 
 bench: .venv/.installed
 	for program in benchmarks/bench_*.py; do $(PYTHON) $$program || exit 1; done

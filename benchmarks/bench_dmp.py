@@ -208,7 +208,7 @@ def repeats_for(batch: int, repeats: int) -> int:
 def read_figures(path: Path) -> dict[str, float]:
     """Figures of an earlier run."""
     try:
-        figures = json.loads(path.read_text())
+        figures = json.loads(path.read_text(encoding="utf-8"))
     except json.JSONDecodeError as error:
         raise ValueError(f"{path} holds no saved figures: {error}") from None
     return figures

@@ -1,19 +1,18 @@
 """Learned models on disk: a folder with `config.json` and `model.safetensors`.
 
-Everything is written to a temporary folder beside the target and renamed at the end, so an
-interrupted save leaves the old file or none, never half of one.
+They are written through `hrc_learn.store`, so an interrupted save leaves the old model or none,
+never half of one.
 """
 
 import json
-import os
-import shutil
-import tempfile
 from pathlib import Path
 from typing import Any
 
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
+
+from hrc_learn import store
 
 FORMAT = "hrc_learn"
 VERSION = 1
@@ -32,33 +31,18 @@ def write_model(
         tensors: By name.
 
     Raises:
-        ValueError: `folder` exists and holds anything else; it is left alone.
+        InTheWayError: A ValueError: `folder` exists and holds anything else; it is left alone.
+        BusyError: Another process is writing there.
     """
-    folder = Path(folder)
-    if folder.exists() and not {p.name for p in folder.iterdir()} <= {CONFIG, MODEL}:
-        raise ValueError(f"{folder} holds more than a saved model: choose another folder")
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-    try:
-        header = {"format": FORMAT, "version": VERSION, "kind": kind}
-        (temporary / CONFIG).write_text(json.dumps(header | config, indent=2) + "\n")
-        # Clones, as buffers may share memory, which safetensors refuses to write.
-        tensors = {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}
-        save_file(tensors, temporary / MODEL)
-        temporary.chmod(0o777 & ~_umask())  # mkdtemp makes it private
-        if folder.exists():
-            old = temporary / "old"
-            os.rename(folder, old)
-            try:
-                os.rename(temporary, folder)
-            except OSError:
-                os.rename(old, folder)
-                raise
-            shutil.rmtree(folder / "old")
-        else:
-            os.rename(temporary, folder)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+    # Clones, as buffers may share memory, which safetensors refuses to write.
+    tensors = {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}
+    header = {"format": FORMAT, "version": VERSION, "kind": kind}
+    with store.replacing(folder, store.MODEL, overwrite=True) as new:
+        new.mkdir()
+        (new / CONFIG).write_text(
+            json.dumps(header | config, indent=2) + "\n", encoding="utf-8"
+        )
+        save_file(tensors, new / MODEL)
 
 
 class SavedModel:
@@ -134,18 +118,13 @@ def saved_kind(folder: str | Path) -> str:
 
 def _read_config(folder: Path) -> dict[str, Any]:
     path = folder / CONFIG
+    store.settle(folder)
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist: no model was saved here")
     try:
-        config = json.loads(path.read_text())
+        config = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
         raise ValueError(f"{path}: not valid JSON ({error})") from None
     if not isinstance(config, dict):
         raise ValueError(f"{path}: must hold one JSON object")
     return config
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask

@@ -21,17 +21,25 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 CORE: dict[str, set[str]] = {
     "pytree": set(),
-    "storage": set(),
-    "output": set(),
+    "store": set(),
+    "storage": {"store"},
     "distributed": set(),
     "protocols": set(),
     "geometry": set(),
-    "kinematics": {"output", "geometry"},
-    "dmp": {"storage", "distributed", "geometry"},
+    "kinematics": {"store", "geometry"},
+    "dmp": {"store", "storage", "distributed", "geometry"},
     "regions": {"pytree", "geometry"},
     "jacobian": {"pytree", "storage", "distributed", "geometry"},
     "controller": {"pytree", "geometry", "kinematics", "regions", "jacobian"},
-    "deploy": {"pytree", "geometry", "kinematics", "regions", "jacobian", "controller"},
+    "deploy": {
+        "pytree",
+        "store",
+        "geometry",
+        "kinematics",
+        "regions",
+        "jacobian",
+        "controller",
+    },
 }
 """Core packages in the order they build on each other, with what each may import."""
 
@@ -66,7 +74,7 @@ LIBRARIES: dict[str, set[str]] = {
     **{package: {"torch", "jaxtyping", "numpy", "safetensors"} for package in CORE},
     # Of its modules for commands, each imported when its command runs.
     "cli": {"torch", "jaxtyping", "numpy", "tyro", "rich"},
-    "output": set(),
+    "store": set(),
     "demos": {"torch", "jaxtyping", "numpy", "pyarrow"},
     "vision": {"jaxtyping", "numpy"},
     "viz": {
@@ -141,7 +149,7 @@ class Import(NamedTuple):
 
 @cache
 def parse(source: Path) -> ast.Module:
-    return ast.parse(source.read_text(), filename=str(source))
+    return ast.parse(source.read_text(encoding="utf-8"), filename=str(source))
 
 
 def imports_of(source: Path) -> Iterator[Import]:
@@ -304,6 +312,71 @@ def test_pickles_are_recognised(code, unsafe):
     call = ast.parse(code, mode="eval").body
     assert isinstance(call, ast.Call)
     assert pickles(call) == unsafe
+
+
+PROGRAMS = [
+    p
+    for folder in ("tools", *set(FOLDERS_OF_PROGRAMS) - {"tests"})
+    for p in (ROOT / folder).glob("*.py")
+]
+
+
+def test_text_files_are_opened_with_an_encoding():
+    """Without one they are read and written as the machine's settings say, and differ."""
+    found = [
+        f"{path.relative_to(ROOT)}:{call.lineno}"
+        for path in (*SOURCES, *PROGRAMS)
+        for call in ast.walk(parse(path))
+        if isinstance(call, ast.Call) and lacks_encoding(call)
+    ]
+    assert not found
+
+
+def lacks_encoding(call: ast.Call) -> bool:
+    """Whether a call opens a file as text without saying how it is encoded."""
+    f = call.func
+    name = f.attr if isinstance(f, ast.Attribute) else getattr(f, "id", "")
+    if any(keyword.arg in ("encoding", None) for keyword in call.keywords):
+        return False
+    arguments = call.args[1:] if isinstance(f, ast.Name) else call.args
+    if name in ("read_text", "write_text"):
+        # A function of that name, such as cli.write_text, takes a path and the text.
+        return isinstance(f, ast.Attribute) and len(arguments) < (2 if "w" in name else 1)
+    mode = next((k.value for k in call.keywords if k.arg == "mode"), None)
+    mode = arguments[0] if arguments and mode is None else mode
+    if name != "open" or (mode is None and isinstance(f, ast.Attribute) and call.keywords):
+        return False
+    if mode is None:
+        return True
+    text = mode.value if isinstance(mode, ast.Constant) else None
+    return isinstance(text, str) and set(text) <= set("rwax+t")
+
+
+@pytest.mark.parametrize(
+    ("code", "lacks"),
+    [
+        ("path.read_text()", True),
+        ("path.read_text('utf-8')", False),
+        ("path.read_text(encoding='utf-8')", False),
+        ("path.write_text(text)", True),
+        ("path.write_text(text, 'utf-8')", False),
+        ("cli.write_text(path, text)", False),
+        ("open(path)", True),
+        ("open(path, 'w')", True),
+        ("open(path, 'rb')", False),
+        ("open(path, 'a', encoding='utf-8')", False),
+        ("path.open()", True),
+        ("path.open('a')", True),
+        ("path.open(mode='a')", True),
+        ("path.open('rb')", False),
+        ("av.open(path)", False),
+        ("Gamepad.open(chain)", False),
+    ],
+)
+def test_a_missing_encoding_is_recognised(code, lacks):
+    call = ast.parse(code, mode="eval").body
+    assert isinstance(call, ast.Call)
+    assert lacks_encoding(call) == lacks
 
 
 def test_no_large_file_is_tracked():

@@ -9,7 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, SupportsFloat
 
-from hrc_learn.output import new_file
+from hrc_learn.store import new_file
 
 
 def write_json(path: str | Path, values: Mapping[str, SupportsFloat]) -> None:

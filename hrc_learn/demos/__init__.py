@@ -15,5 +15,6 @@ from hrc_learn.demos.read.reader import DemonstrationSource as DemonstrationSour
 from hrc_learn.demos.read.reader import load_demos as load_demos
 from hrc_learn.demos.read.reader import open_demos as open_demos
 from hrc_learn.demos.validation.check import check_dataset as check_dataset
+from hrc_learn.demos.write.recovery import recover_all as recover_all
 from hrc_learn.demos.write.recovery import recover_dataset as recover_dataset
 from hrc_learn.demos.write.writer import DatasetWriter as DatasetWriter

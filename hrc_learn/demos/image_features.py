@@ -3,7 +3,6 @@ demonstrations.
 """
 
 import json
-import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,6 +18,7 @@ from hrc_learn.demos.format.parquet import open_parquet, read_table, to_numpy
 from hrc_learn.demos.format.video_segments import VideoSegment, read_segments, video_keys
 from hrc_learn.demos.issue import DatasetError
 from hrc_learn.demos.write.video_encoder import image_key
+from hrc_learn.store import new_file
 
 # Images of one episode, decoded from its video.
 
@@ -85,7 +85,8 @@ def features_folder(root: Path) -> Path:
 
 def feature_names(root: Path) -> list[str]:
     """Features that were extracted, whole or in part."""
-    return sorted(path.name for path in features_folder(root).glob("*") if path.is_dir())
+    # Hidden ones hold what is not finished.
+    return sorted(path.name for path in features_folder(root).glob("[!.]*") if path.is_dir())
 
 
 class FeatureCache:
@@ -117,11 +118,10 @@ class FeatureCache:
                 "visible": pa.array(track.visible),
             }
         )
-        unfinished = path.with_suffix(f".unfinished.{os.getpid()}")
-        pq.write_table(
-            table.replace_schema_metadata({_SOURCE: _fingerprint(segment)}), unfinished
-        )
-        unfinished.replace(path)
+        with new_file(path) as part:
+            pq.write_table(
+                table.replace_schema_metadata({_SOURCE: _fingerprint(segment)}), part
+            )
 
     def read(self, episode: int, frames: int) -> FeatureTrack:
         """What was found in an episode.

@@ -19,6 +19,7 @@ from torch.utils._pytree import tree_map_only
 from hrc_learn.controller import AdaptiveController, Observation
 from hrc_learn.deploy.io_layout import FlatStep
 from hrc_learn.deploy.package import UnknownCodeError, describe, fingerprint, machine
+from hrc_learn.store import Claim, new_file
 
 # Has inductor keep the batch last in memory, whatever comes first in a tensor.
 
@@ -169,15 +170,15 @@ def export_step(
         return package
     _require_compiler()
     folder.mkdir(parents=True, exist_ok=True)
-    unfinished = folder / f".{package.stem}.{os.getpid()}.pt2"
-    try:
-        program = program or trace(step, observation)
-        with batch_last(step.layouts.state.batch) as options:
-            says = {"aot_inductor.metadata": describe(step, observation)}
-            _compile(program, unfinished, options | says)
-        unfinished.replace(package)
-    finally:
-        unfinished.unlink(missing_ok=True)
+    # Who else compiles the same step is waited for: that is quicker than to compile it too.
+    with Claim(package, wait=True) as claim:
+        if package.is_file():
+            return package
+        with new_file(claim) as part:
+            program = program or trace(step, observation)
+            with batch_last(step.layouts.state.batch) as options:
+                says = {"aot_inductor.metadata": describe(step, observation)}
+                _compile(program, part, options | says)
     return package
 
 

@@ -111,7 +111,7 @@ def machine() -> str:
 def _instructions() -> str:
     """Short hash of the extensions of the processor, all of which a compiler may use."""
     try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:
         return "unknown"
     flags = next((line for line in lines if line.startswith(("flags", "Features"))), "")

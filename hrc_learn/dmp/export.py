@@ -7,7 +7,6 @@ without this package:
     state = program(state, dt, inputs)
 """
 
-import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -18,6 +17,7 @@ from torch import Tensor, nn
 from torch.export import Dim, ExportedProgram
 from torch.utils._pytree import tree_map
 
+from hrc_learn import store
 from hrc_learn.dmp.joint import JointDMP
 from hrc_learn.dmp.orientation import OrientationDMP
 from hrc_learn.dmp.orientation_motion import OrientationState
@@ -63,21 +63,13 @@ class ExportedDMP:
         """Write the primitive and `step.pt2` into `folder`, replacing an older export.
 
         Raises:
-            ValueError: `folder` holds anything else; it is left alone.
+            InTheWayError: A ValueError: `folder` holds anything else; it is left alone.
+            BusyError: Another process is writing there.
         """
-        folder = Path(folder)
-        if folder.exists() and not {p.name for p in folder.iterdir()} <= {PRIMITIVE, PROGRAM}:
-            raise ValueError(f"{folder} holds more than an export: choose another folder")
-        temporary = folder.with_name(f".{folder.name}.new")
-        shutil.rmtree(temporary, ignore_errors=True)
-        try:
-            self.dmp.save(temporary / PRIMITIVE)
-            torch.export.save(self.program, temporary / PROGRAM)
-            if folder.exists():
-                shutil.rmtree(folder)
-            temporary.rename(folder)
-        finally:
-            shutil.rmtree(temporary, ignore_errors=True)
+        with store.replacing(folder, store.EXPORT, overwrite=True) as new:
+            new.mkdir()
+            self.dmp.save(new / PRIMITIVE)
+            torch.export.save(self.program, new / PROGRAM)
 
 
 def export_dmp(dmp: Exportable, *, goal_filter: float | None = None) -> ExportedDMP:
@@ -104,6 +96,7 @@ def load_stepper(folder: str | Path) -> Stepper | OrientationStepper | PoseStepp
         ValueError: Names the file and the field that is wrong.
     """
     folder = Path(folder)
+    store.settle(folder)
     folder = folder / PRIMITIVE if (folder / PRIMITIVE).is_dir() else folder
     kinds: dict[str, type[Exportable]] = {
         kind.__name__: kind for kind in (JointDMP, OrientationDMP, PoseDMP)

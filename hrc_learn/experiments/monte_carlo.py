@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from hrc_learn.skills.work_cell import TaskFailedError
+from hrc_learn.store import Claim, new_file, sync_file
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -69,7 +70,7 @@ class Trial:
 
 
 class TrialFile:
-    """Trials of one thing, in a file that grows.
+    """Trials of one thing, in a file that grows, for one process at a time.
 
     Attributes:
         trials: Those in the file, by seed.
@@ -83,25 +84,42 @@ class TrialFile:
             made_by: What is tried; whatever is no JSON is kept as text.
 
         Raises:
+            BusyError: Another process is adding trials to it.
             ValueError: If the file holds trials of something else, or no trials.
         """
         self._path = path
         self.trials: dict[int, Trial] = {}
         made_by = json.loads(json.dumps(made_by, default=str))
-        if path.exists():
-            self._resume(made_by)
-        else:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(json.dumps({_MADE_BY: made_by}) + "\n")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._claim = Claim(path)
+        try:
+            if path.exists():
+                self._resume(made_by)
+            else:
+                self._write(json.dumps({_MADE_BY: made_by}) + "\n")
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> "TrialFile":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Let others add trials."""
+        self._claim.release()
 
     def append(self, trial: Trial) -> None:
         """Add a trial; it is on disk when this returns."""
-        with self._path.open("a") as file:
+        with self._path.open("a", encoding="utf-8") as file:
             file.write(trial.line())
+        sync_file(self._path)
         self.trials[trial.seed] = trial
 
     def _resume(self, made_by: Mapping[str, Any]) -> None:
-        text = self._path.read_text()
+        text = self._path.read_text(encoding="utf-8")
         whole = text[: text.rfind("\n") + 1]
         lines = whole.splitlines()
         try:
@@ -117,8 +135,12 @@ class TrialFile:
                 " remove it to begin anew, or choose another place."
             )
         if whole != text:  # stopped in the middle of a line
-            self._path.write_text(whole)
+            self._write(whole)
         self.trials = {trial.seed: trial for trial in found}
+
+    def _write(self, text: str) -> None:
+        with new_file(self._claim) as part:
+            part.write_text(text, encoding="utf-8")
 
 
 def _difference(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
@@ -171,6 +193,7 @@ def repeat(
         One trial for each seed, in the order of the seeds.
 
     Raises:
+        BusyError: Another process is adding trials to the file.
         ValueError: Without seeds or processes, or if the file is of something else.
     """
     seeds = list(dict.fromkeys(seeds))
@@ -179,13 +202,13 @@ def repeat(
             f"there must be a seed and a process at least, but there are {len(seeds)} and "
             f"{processes}."
         )
-    done = TrialFile(file, made_by)
-    waiting = [seed for seed in seeds if seed not in done.trials]
-    known = [done.trials[seed] for seed in seeds if seed in done.trials]
-    with _progress(title, len(seeds), known) as tell:
-        for trial in _trials(run, waiting, min(processes, len(waiting))):
-            done.append(trial)
-            tell(trial)
+    with TrialFile(file, made_by) as done:
+        waiting = [seed for seed in seeds if seed not in done.trials]
+        known = [done.trials[seed] for seed in seeds if seed in done.trials]
+        with _progress(title, len(seeds), known) as tell:
+            for trial in _trials(run, waiting, min(processes, len(waiting))):
+                done.append(trial)
+                tell(trial)
     return [done.trials[seed] for seed in seeds]
 
 

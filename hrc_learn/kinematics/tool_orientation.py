@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.output import new_file
+from hrc_learn.store import new_file
 
 # The paper's rule that turns the gripper as the hand moves sideways (eq. coarse_orientation).
 #
@@ -113,7 +113,7 @@ class Approach:
             "turned_rad": self.turned,
         }
         with new_file(path) as part:
-            part.write_text(json.dumps(content, indent=2))
+            part.write_text(json.dumps(content, indent=2), encoding="utf-8")
 
     @classmethod
     def load(cls, path: Path) -> "Approach":
@@ -123,7 +123,7 @@ class Approach:
             FileNotFoundError: If there is no such file.
             ValueError: If it is not one of ours.
         """
-        content = json.loads(path.read_text())
+        content = json.loads(path.read_text(encoding="utf-8"))
         if content.get("version") != 1 or "orientation_wxyz" not in content:
             raise ValueError(f"{path} is not an approach of a known version: fit it again.")
         return cls(

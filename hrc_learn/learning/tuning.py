@@ -142,7 +142,7 @@ def with_gains(config: ControllerConfig, path: Path | None) -> ControllerConfig:
     if path is None:
         return config
     try:
-        gains = json.loads(path.read_text())
+        gains = json.loads(path.read_text(encoding="utf-8"))
     except json.JSONDecodeError as error:
         raise ValueError(f"{path}: not valid JSON ({error})") from None
     known = {field.name for field in fields(ControllerConfig)}

@@ -11,6 +11,7 @@ from lerobot.utils.feature_utils import build_dataset_frame, hw_to_dataset_featu
 
 from hrc_learn.lerobot.robots import MujocoPanda, MujocoPandaConfig
 from hrc_learn.lerobot.teleoperators import PandaExpert, PandaExpertConfig
+from hrc_learn.store import DATASET, replacing
 
 
 def record_expert(
@@ -30,6 +31,7 @@ def record_expert(
         After each demonstration: how many are written, and whether it succeeded.
 
     Raises:
+        BusyError: Another process is recording there.
         FileExistsError: There is something at `folder`.
         RuntimeError: More demonstrations fail than succeed.
     """
@@ -37,35 +39,36 @@ def record_expert(
     features = hw_to_dataset_features(robot.action_features, ACTION) | hw_to_dataset_features(
         robot.observation_features, OBS_STR
     )
-    dataset = LeRobotDataset.create(
-        f"local/{folder.name}",
-        round(config.fps),
-        root=folder,
-        robot_type=robot.name,
-        features=features,
-        video_backend="pyav",
-    )
-    robot.connect()
-    expert.connect()
-    try:
-        written = failed = 0
-        while written < episodes:
-            if written + failed:
-                robot.begin(robot.run.seed + 1)
-            succeeded = _show(robot, expert, dataset)
-            if succeeded:
-                dataset.save_episode()
-                written += 1
-            else:
-                dataset.clear_episode_buffer()
-                failed += 1
-            yield written, succeeded
-            if failed > max(3, written):
-                raise RuntimeError(f"{failed} of {failed + written} demonstrations failed.")
-    finally:
-        dataset.finalize()
-        expert.disconnect()
-        robot.disconnect()
+    with replacing(folder, DATASET) as new:
+        dataset = LeRobotDataset.create(
+            f"local/{folder.name}",
+            round(config.fps),
+            root=new,
+            robot_type=robot.name,
+            features=features,
+            video_backend="pyav",
+        )
+        robot.connect()
+        expert.connect()
+        try:
+            written = failed = 0
+            while written < episodes:
+                if written + failed:
+                    robot.begin(robot.run.seed + 1)
+                succeeded = _show(robot, expert, dataset)
+                if succeeded:
+                    dataset.save_episode()
+                    written += 1
+                else:
+                    dataset.clear_episode_buffer()
+                    failed += 1
+                yield written, succeeded
+                if failed > max(3, written):
+                    raise RuntimeError(f"{failed} of {failed + written} demonstrations failed.")
+        finally:
+            dataset.finalize()
+            expert.disconnect()
+            robot.disconnect()
 
 
 def _show(robot: MujocoPanda, expert: PandaExpert, dataset: LeRobotDataset) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float
@@ -48,7 +48,7 @@ class VisionRegion(Region):
         target: Float[Tensor, "*batch rows"],
         image_size: tuple[int, int],
         border: float = 0.0,
-        **options,
+        **options: Any,
     ) -> VisionRegion:
         """Largest ellipse round the target that stays inside the image.
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from hrc_learn.output import new_file
+from hrc_learn.store import new_file
 
 OBJECT_FEATURE = "observation.object_feature"
 """Column of a dataset with the object's marker in the image."""
@@ -115,7 +115,7 @@ class VisualTarget:
             "offset_error_px": _or_none(self.offset_error),
         }
         with new_file(path) as part:
-            part.write_text(json.dumps(content, indent=2))
+            part.write_text(json.dumps(content, indent=2), encoding="utf-8")
 
     @classmethod
     def load(cls, path: Path) -> "VisualTarget":
@@ -125,7 +125,7 @@ class VisualTarget:
             FileNotFoundError: If there is no such file.
             ValueError: If it is not one of ours.
         """
-        content = json.loads(path.read_text())
+        content = json.loads(path.read_text(encoding="utf-8"))
         if content.get("version") != 1 or "matrix" not in content:
             raise ValueError(f"{path} is not a visual target of a known version: fit it again.")
         offset = content.get("offset_m")

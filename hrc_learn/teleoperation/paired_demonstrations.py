@@ -8,9 +8,9 @@ from pathlib import Path
 
 from hrc_learn.demos import DatasetWriter
 from hrc_learn.kinematics import panda
-from hrc_learn.output import replacing
 from hrc_learn.protocols import Human
 from hrc_learn.sim import World
+from hrc_learn.store import DATASET, replacing
 from hrc_learn.teleoperation.hand_guiding import Frame, LedArm, LedArmConfig
 
 # Demonstrations of the Panda as a LeRobot dataset.
@@ -41,7 +41,7 @@ def write_lessons(
         FileExistsError: If there is something at `path` that may not be replaced.
     """
     with (
-        replacing(path, "meta/info.json", overwrite) as folder,
+        replacing(path, DATASET, overwrite) as folder,
         DatasetWriter(
             folder,
             fps=fps,

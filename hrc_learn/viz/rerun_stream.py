@@ -11,7 +11,7 @@ import rerun.blueprint as rrb
 from jaxtyping import Float, Int
 
 from hrc_learn.geometry import Body, Box, Capsule, MeshFile
-from hrc_learn.output import new_file
+from hrc_learn.store import new_file
 from hrc_learn.viz.panels import Curves, Plot, Tab
 
 TIMELINE = "time"

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hrc_learn.output import new_file
+from hrc_learn.store import new_file
 
 # What was logged: columns of equal length, one row a step, and what happened when.
 

@@ -232,5 +232,5 @@ def test_saved_episodes_are_recovered(tmp_path):
     del writer  # as a kill leaves it
     outcome = hrc("recover", tmp_path / "set", "--json", tmp_path / "figures.json")
     assert outcome.status == 0, outcome.error
-    assert json.loads((tmp_path / "figures.json").read_text()) == {"episodes": 2, "frames": 20}
+    assert json.loads((tmp_path / "figures.json").read_text()) == {"mended": 1}
     assert len(load_demos(tmp_path / "set")) == 2

@@ -1,30 +1,34 @@
 """Episodes added to a dataset that is there already."""
 
-from pathlib import Path
+import shutil
 
 import numpy as np
 import pytest
 from lerobot_folders import joint_path, read_info
+from power_cuts import cut_off
 
 from hrc_learn.demos import (
     DatasetError,
     DatasetWriter,
     check_dataset,
     load_demos,
+    recover_all,
     recover_dataset,
 )
 
 JOINTS = ("a", "b", "c")
 
 
-def record(root, seeds, tasks, *, append=False, then=None, **settings):
+def record(root, seeds, tasks, *, append=False, then=None, saved=None, **settings):
     settings = {"fps": 50, "robot_type": "any", "joint_names": JOINTS, **settings}
     with DatasetWriter(root, append=append, **settings) as writer:
         for seed, task in zip(seeds, tasks, strict=True):
             writer.start_episode(task)
             for k, q in enumerate(joint_path(40 + seed, seed=seed)):
                 writer.add_frame(time=0.02 * k, joint_position=q, command_position=q + 0.1)
-            writer.save_episode()
+            episode = writer.save_episode()
+            if saved is not None:
+                saved.append(episode)
         if then is not None:
             raise then
     return root
@@ -101,26 +105,67 @@ def test_a_broken_recording_leaves_the_dataset_whole_and_its_episodes_safe(tmp_p
     assert list(tmp_path.iterdir()) == [root]
 
 
-@pytest.mark.parametrize("survives", range(5))
-def test_finalizing_may_be_broken_off_at_any_step(tmp_path, monkeypatch, survives):
-    """Whichever folder is renamed last, `recover_dataset` gets everything."""
+@pytest.mark.parametrize("append", [pytest.param(False, marks=pytest.mark.slow), True])
+def test_a_recording_cut_off_at_any_step_keeps_what_it_had_saved(tmp_path, append):
+    """And leaves nothing else, nor loses anything of the dataset that it is appended to."""
+    before, root, finished = tmp_path / "before", tmp_path / "here" / "set", 0
+    record(before, [0], ["reach"])
+    (before / "README.md").write_text("mine")
+    root.parent.mkdir()
+    saved = []
+
+    def begin():
+        shutil.rmtree(root, ignore_errors=True)
+        saved.clear()
+        if append:
+            shutil.copytree(before, root)
+
+    begin()
+    lengths = [len(joint_path(40 + seed)) for seed in ((0, 1) if append else (1,))]
+    for _ in cut_off(lambda: record(root, [1], ["place"], append=append, saved=saved)):
+        recover_all(root)
+        found = [len(demo) for demo in load_demos(root)] if root.exists() else []
+        # What is saved but not yet acknowledged may be there as well.
+        assert found == lengths or (found == lengths[:-1] and not saved)
+        assert not append or (root / "README.md").read_text() == "mine"
+        assert list(root.parent.iterdir()) == [root] * root.exists()
+        finished += found == lengths
+        begin()
+    assert finished > 5  # cut off after the episode was saved, too
+
+
+def test_a_file_of_the_users_own_stays_in_the_dataset(tmp_path):
     root = record(tmp_path / "set", [0], ["reach"])
-    renamed, rename = [], Path.rename
+    (root / "README.md").write_text("mine")
+    (root / "meta" / "notes.txt").write_text("mine")
+    for seed in (1, 2):
+        record(root, [seed], ["place"], append=True)
+    assert_holds(root, [0, 1, 2], ["reach", "place", "place"])
+    assert (root / "README.md").read_text() == (root / "meta/notes.txt").read_text() == "mine"
 
-    def die(path, target):
-        if path.is_dir() and len(renamed) >= survives:
-            raise KeyboardInterrupt
-        renamed.append(path)
-        return rename(path, target)
 
-    monkeypatch.setattr(Path, "rename", die)
-    try:
-        record(root, [1], ["place"], append=True)
-    except KeyboardInterrupt:
-        assert survives < 3
-    monkeypatch.setattr(Path, "rename", rename)
-    if survives < 3:
-        recover_dataset(root)
+def test_a_dataset_behind_a_link_grows_there(tmp_path):
+    (tmp_path / "disk").mkdir()
+    link = tmp_path / "set"
+    link.symlink_to(tmp_path / "disk" / "set")
+    record(link, [0], ["reach"])
+    record(link, [1], ["place"], append=True)
+    assert link.is_symlink()
+    assert_holds(tmp_path / "disk" / "set", [0, 1], ["reach", "place"])
+    assert sorted(tmp_path.rglob("set")) == [tmp_path / "disk" / "set", link]
+
+
+def test_what_an_older_version_left_is_recovered(tmp_path):
+    """It kept the dataset in the recording's folder while the longer one took its place."""
+    root = record(tmp_path / "set", [0], ["reach"])
+    with pytest.raises(KeyboardInterrupt):
+        record(root, [1], ["place"], append=True, then=KeyboardInterrupt())
+    staging = tmp_path / "set.recording"
+    (staging / "recording.json").unlink()
+    (staging / "appended_to.json").write_text('{"episodes": 1}')
+    (root / ".manifest.json").unlink()
+    root.rename(staging / "earlier")
+    recover_dataset(root)
     assert_holds(root, [0, 1], ["reach", "place"])
     assert list(tmp_path.iterdir()) == [root]
 

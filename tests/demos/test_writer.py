@@ -324,6 +324,42 @@ def test_a_recovery_that_was_killed_starts_anew(tmp_path):
     assert len(load_demos(recover_dataset(root))) == 1
 
 
+def test_a_recording_killed_before_its_first_episode_is_no_obstacle(tmp_path):
+    root, staging = tmp_path / "set", tmp_path / "set.recording"
+    staging.mkdir()
+    (staging / "front.unfinished.mp4").write_bytes(b"half")
+    record_one(root, [{"gripper": 0.1}])
+    assert list(tmp_path.iterdir()) == [root]
+    staging.mkdir()
+    with pytest.raises(DatasetError, match="no episode was saved"):
+        recover_dataset(tmp_path / "set")
+    assert list(tmp_path.iterdir()) == [root]
+
+
+def test_a_recording_that_goes_on_is_left_alone(tmp_path):
+    root = tmp_path / "set"
+    with writing(root) as writer:
+        with pytest.raises(FileExistsError, match=f"is being written by process {os.getpid()}"):
+            writing(root)
+        with pytest.raises(FileExistsError, match="is being written"):
+            recover_dataset(root)
+        writer.start_episode("")
+        writer.add_frame(gripper=0.1)
+        writer.save_episode()
+    assert len(load_demos(root)) == 1
+
+
+def test_a_users_file_in_the_recording_is_kept(tmp_path):
+    root = tmp_path / "set"
+    with writing(root) as writer:
+        writer.start_episode("")
+        writer.add_frame(gripper=0.1)
+        writer.save_episode()
+        (tmp_path / "set.recording" / "notes.txt").write_text("mine")
+    assert (tmp_path / "set.recording.kept" / "notes.txt").read_text() == "mine"
+    assert len(load_demos(root)) == 1
+
+
 def record_one(root, frames, then=None):
     with writing(root) as writer:
         writer.start_episode("reach")

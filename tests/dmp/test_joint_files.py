@@ -3,6 +3,7 @@ import json
 import pytest
 import torch
 from demo_motions import arm_motion
+from power_cuts import cut_off
 from safetensors.torch import load_file, save_file
 
 from hrc_learn.dmp import JointDMP
@@ -40,10 +41,38 @@ def test_saving_replaces_whole_folders_and_leaves_nothing_else(saved):
     assert [p.name for p in folder.parent.iterdir()] == ["primitive"]
 
 
+def test_saving_replaces_no_model_of_another_program(tmp_path):
+    """Many programs name their files so; only the contents tell whose they are."""
+    (tmp_path / "bert").mkdir()
+    (tmp_path / "bert" / "config.json").write_text('{"architectures": ["BERT"]}')
+    (tmp_path / "bert" / "model.safetensors").write_bytes(b"weeks of training")
+    with pytest.raises(ValueError, match="not ours to overwrite"):
+        JointDMP.fit(TIME, POSITION).save(tmp_path / "bert")
+    assert (tmp_path / "bert" / "model.safetensors").read_bytes() == b"weeks of training"
+
+
+def test_saving_replaces_no_model_with_notes_beside_it(saved):
+    _, folder = saved
+    (folder / "notes.txt").write_text("good with the blue gripper")
+    with pytest.raises(ValueError, match=r"holds more than a saved model, notes\.txt"):
+        JointDMP.fit(TIME, POSITION, n_basis=5).save(folder)
+    assert (folder / "notes.txt").read_text() == "good with the blue gripper"
+
+
+def test_a_save_cut_off_at_any_step_leaves_the_old_model_or_the_new(saved):
+    _, folder = saved
+    older, newer = (JointDMP.fit(TIME, POSITION, n_basis=count) for count in (4, 5))
+    older.save(folder)
+    for _ in cut_off(lambda: newer.save(folder)):
+        assert JointDMP.load(folder).basis.count in (4, 5)
+        older.save(folder)
+        assert [p.name for p in folder.parent.iterdir()] == ["primitive"]
+
+
 def test_saving_does_not_overwrite_what_is_no_primitive(tmp_path):
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "chapter.tex").write_text("years of work")
-    with pytest.raises(ValueError, match="more than a saved model"):
+    with pytest.raises(ValueError, match="not ours to overwrite"):
         JointDMP.fit(TIME, POSITION).save(tmp_path / "thesis")
     assert (tmp_path / "thesis" / "chapter.tex").read_text() == "years of work"
 

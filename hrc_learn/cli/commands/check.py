@@ -5,7 +5,7 @@ import json
 from hrc_learn.cli._values import configuration, write_json, write_text
 from hrc_learn.cli.arguments.dataset import Check as Args
 from hrc_learn.demos import check_dataset
-from hrc_learn.output import new_folder
+from hrc_learn.store import new_folder
 
 
 def run(args: Args) -> int:

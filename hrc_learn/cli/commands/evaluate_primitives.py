@@ -1,6 +1,5 @@
 """`hrc evaluate primitives`: primitives on demonstrations held out."""
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -16,7 +15,7 @@ from hrc_learn.cli.commands import fit_primitives
 from hrc_learn.demos import DemonstrationSet, load_demos, open_demos
 from hrc_learn.learning.channels import KINDS, Motions, load_primitive
 from hrc_learn.learning.reproduction_error import ReproductionError, reproduction_error
-from hrc_learn.output import MADE_BY, new_folder
+from hrc_learn.store import new_folder, read_made_by
 from hrc_learn.viz.figures import measures_figure
 
 UNITS = {
@@ -81,7 +80,7 @@ def _evaluate(args: Args, model: Path) -> int:
 
 def _demonstrations(args: Args, model: Path, console: Console) -> DemonstrationSet:
     """Those asked for, with the joints that were learned."""
-    made_by = json.loads((model / MADE_BY).read_text())
+    made_by = read_made_by(model)
     learned = [int(i) for i in made_by.get("episodes") or ()]
     episodes = list(args.episodes)
     same = Path(made_by["dataset"]).resolve() == args.dataset.resolve()

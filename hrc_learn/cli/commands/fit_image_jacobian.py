@@ -13,8 +13,8 @@ from hrc_learn.demos import DemonstrationSource, open_demos
 from hrc_learn.jacobian import CellErrors, Neurons, grid
 from hrc_learn.learning.fit_recordings import learning_recording
 from hrc_learn.learning.fit_visual_servo import fit_aiming
-from hrc_learn.output import new_folder
 from hrc_learn.skills.visual_servoing import AimingSkill
+from hrc_learn.store import new_folder
 from hrc_learn.viz.figures import learning_figure, workspace_figure
 from hrc_learn.viz.fit_dashboard import record_learning
 

@@ -19,7 +19,7 @@ from hrc_learn.learning.fit_primitives import (
     fit_recording,
     fit_streamed,
 )
-from hrc_learn.output import new_folder
+from hrc_learn.store import new_folder
 from hrc_learn.viz.figures import fit_joints_figure, residual_figure
 from hrc_learn.viz.fit_dashboard import record_fit
 

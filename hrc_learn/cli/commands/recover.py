@@ -2,15 +2,16 @@
 
 from hrc_learn.cli._values import write_json
 from hrc_learn.cli.arguments.dataset import Recover as Args
-from hrc_learn.demos import load_demos, recover_dataset
+from hrc_learn.demos import recover_all
 
 
 def run(args: Args) -> None:
-    # Datasets are what can be recovered so far; whatever else is written transactionally
-    # belongs here too.
-    root = recover_dataset(args.path)
-    demos = load_demos(root)
-    print(f"{root}: {len(demos)} demonstrations recovered")
+    done = recover_all(args.path)
+    if not done and not args.path.exists():
+        raise FileNotFoundError(f"there is nothing at {args.path}, nor was it being written")
+    for mended in done:
+        print(mended)
+    if not done:
+        print(f"{args.path}: nothing to recover")
     if args.json is not None:
-        frames = sum(len(demo) for demo in demos)
-        write_json(args.json, {"episodes": len(demos), "frames": frames})
+        write_json(args.json, {"mended": len(done)})

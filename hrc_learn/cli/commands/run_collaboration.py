@@ -32,13 +32,13 @@ from hrc_learn.experiments.monte_carlo import Summary, Trial, repeat
 from hrc_learn.experiments.run_recording import record, serving, unwatched
 from hrc_learn.geometry import Box
 from hrc_learn.learning.tuning import with_gains
-from hrc_learn.output import MADE_BY, new_folder
 from hrc_learn.sim import Occlusion
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.marker_sensor import TransportConfig
 from hrc_learn.skills.placing import PlacingSkill
 from hrc_learn.skills.visual_servoing import AimingSkill
 from hrc_learn.skills.work_cell import StationConfig
+from hrc_learn.store import new_folder, read_made_by
 from hrc_learn.teleoperation.page import PageConfig
 from hrc_learn.viz.report import Measurement, show_measurements, write_report
 from hrc_learn.viz.run_dashboard import record_run
@@ -214,5 +214,5 @@ def _region(workplace: Workplace, half_size: tuple[float, float, float]) -> Box:
 
 def _demonstration(placing: Path) -> Demonstration | None:
     """The first demonstration the placing motion was learned from, if it is still there."""
-    dataset = Path(json.loads((placing / MADE_BY).read_text())["dataset"])
+    dataset = Path(read_made_by(placing)["dataset"])
     return load_demos(dataset, episodes=[0])[0] if dataset.is_dir() else None

@@ -25,7 +25,7 @@ from hrc_learn.experiments.grasping.trial import GraspingSettingConfig
 from hrc_learn.experiments.monte_carlo import Summary, Trial, repeat
 from hrc_learn.experiments.run_recording import serving, unwatched
 from hrc_learn.learning.tuning import with_gains
-from hrc_learn.output import new_folder
+from hrc_learn.store import new_folder
 from hrc_learn.viz.report import Measurement, show_measurements, write_report
 from hrc_learn.viz.run_dashboard import record_run
 

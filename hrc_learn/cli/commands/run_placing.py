@@ -1,6 +1,5 @@
 """`hrc run placing`: the paper's first experiment, a motion repeated for other shelves."""
 
-import json
 import shutil
 import sys
 from collections.abc import Mapping, Sequence
@@ -32,10 +31,10 @@ from hrc_learn.experiments.placing.metrics import (
 )
 from hrc_learn.experiments.placing.report import record_placing
 from hrc_learn.experiments.run_recording import serving, unwatched
-from hrc_learn.output import MADE_BY, new_folder
 from hrc_learn.sim import RenderingUnavailableError
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.placing import PlacingSkill
+from hrc_learn.store import new_folder, read_made_by
 from hrc_learn.viz.report import Measurement, show_measurements, write_report
 from hrc_learn.viz.run_dashboard import record_run
 
@@ -131,7 +130,7 @@ def _check(args: Args) -> None:
 
 def _dataset(placing: Path) -> Path:
     """The dataset that the motion was learned from."""
-    path = Path(json.loads((placing / MADE_BY).read_text())["dataset"])
+    path = Path(read_made_by(placing)["dataset"])
     if not path.is_dir():
         raise FileNotFoundError(
             f"{path}, which {placing} was learned from, is not there any more: name the "

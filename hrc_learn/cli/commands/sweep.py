@@ -20,7 +20,7 @@ from hrc_learn.experiments.controller.sweep import (
     compared,
     run_chunk,
 )
-from hrc_learn.output import new_folder
+from hrc_learn.store import new_folder
 
 CHUNK = 250
 """Trials in one batch: their tensors stay in the cache."""

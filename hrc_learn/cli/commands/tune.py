@@ -17,10 +17,10 @@ from hrc_learn.controller import ControllerConfig
 from hrc_learn.experiments.initialization_study import ClosedLoops, StartsConfig, summary
 from hrc_learn.jacobian import KalmanEstimator
 from hrc_learn.learning.tuning import TUNED, Search
-from hrc_learn.output import new_folder
 from hrc_learn.sim import World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.visual_servoing import guessed_network
+from hrc_learn.store import new_folder
 from hrc_learn.viz.figures import learning_figure
 
 
@@ -60,7 +60,7 @@ def run(args: Args) -> None:
 def _begin(args: Args, place: Path, default: ControllerConfig) -> tuple[Search, list[float]]:
     """A new search, or the one that was interrupted."""
     if args.resume:
-        state = json.loads(place.read_text())
+        state = json.loads(place.read_text(encoding="utf-8"))
         return Search.from_json(state["search"]), [float(cost) for cost in state["costs"]]
     start = {name: getattr(default, name) for name in TUNED}
     return Search.around(start, seed=args.starts.seed), []

@@ -13,6 +13,7 @@ from hrc_learn.demos.format.features import INFO_PATH, Feature, read_features
 from hrc_learn.demos.format.parquet import read_rows
 from hrc_learn.demos.issue import DatasetError
 from hrc_learn.demos.write.staging import staging_folder
+from hrc_learn.store import settle
 
 # Where the parts of a LeRobot dataset lie, for its versions 2.0, 2.1 and 3.0.
 #
@@ -93,6 +94,7 @@ def read_info(root: Path) -> dict:
         DatasetError: It is missing, damaged, or unusable.
     """
     path = root / INFO_PATH
+    settle(root)
     if not path.is_file():
         raise DatasetError(_why_no_info(root), file=path)
     info = read_json(path)
@@ -149,7 +151,7 @@ def read_json(path: Path) -> dict:
         DatasetError: The file holds none.
     """
     try:
-        content = json.loads(path.read_text())
+        content = json.loads(path.read_text(encoding="utf-8"))
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise DatasetError(f"is no valid JSON: {error}", file=path) from error
     if not isinstance(content, dict):
@@ -241,7 +243,7 @@ def _read_json_lines(root: Path, file: str, required: tuple[str, ...]) -> list[d
     if not path.is_file():
         raise DatasetError("not found: the copy is incomplete", file=file)
     rows = []
-    for number, line in enumerate(path.read_text().splitlines(), start=1):
+    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
         if not line.strip():
             continue
         try:

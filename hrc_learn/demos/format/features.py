@@ -144,7 +144,7 @@ def read_sidecar(root: Path) -> Sidecar:
     if not path.exists():
         return Sidecar()
     try:
-        content = json.loads(path.read_text())
+        content = json.loads(path.read_text(encoding="utf-8"))
         if content["format"] != _FORMAT:
             raise DatasetError(
                 f"format {content['format']} is not known here (only {_FORMAT}); a newer "

@@ -108,7 +108,8 @@ def info(
 
 
 def write_json(path: Path, content: Mapping) -> None:
-    path.write_text(json.dumps(content, indent=4, ensure_ascii=False) + "\n")
+    text = json.dumps(content, indent=4, ensure_ascii=False) + "\n"
+    path.write_text(text, encoding="utf-8")
 
 
 # Statistics of features, as LeRobot keeps them for every episode and for the whole.

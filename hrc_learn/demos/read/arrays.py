@@ -91,7 +91,7 @@ def _split(array: np.ndarray, columns: Sequence[str], path: Path) -> Table:
 
 def _read_csv(path: Path) -> tuple[list[str], np.ndarray]:
     """Header, [] where there is none, and numbers of a file with commas or semicolons."""
-    lines = path.read_text().splitlines()
+    lines = path.read_text(encoding="utf-8").splitlines()
     if not lines:
         raise DatasetError("is empty", file=path)
     delimiter = max(",;\t ", key=lines[0].count)

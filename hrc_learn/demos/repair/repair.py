@@ -31,7 +31,7 @@ from hrc_learn.demos.repair.episode_edit import (
 from hrc_learn.demos.repair.rewrite import Recast, cut_segments
 from hrc_learn.demos.write.assembly import assemble
 from hrc_learn.demos.write.staging import episode_path
-from hrc_learn.output import replacing
+from hrc_learn.store import DATASET, replacing
 
 Progress = Callable[[Sequence[EpisodeEntry]], Iterable[EpisodeEntry]]
 
@@ -72,7 +72,7 @@ def repair_dataset(
     segments = read_segments(folder) if options.videos else {}
     recast = Recast(folder, sidecar, meaning, options, units, segments)
     report = RepairReport(path=Path(out), notes=recast.notes)
-    with replacing(Path(out), mark="meta/info.json") as target:
+    with replacing(out, DATASET) as target:
         staging = target / "episodes"
         staging.mkdir(parents=True)
         videos: list[Segments] = []

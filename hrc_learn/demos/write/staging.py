@@ -6,7 +6,6 @@ open episode and nothing else, and what it leaves is never taken for a dataset.
 """
 
 import json
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +15,7 @@ import pyarrow.parquet as pq
 
 from hrc_learn.demos.format.lerobot_v3 import Statistics
 from hrc_learn.demos.issue import DatasetError
+from hrc_learn.store import new_file, resolved
 
 _METADATA_KEY = b"hrc_learn"
 
@@ -45,6 +45,7 @@ class StagedEpisode:
 
 def staging_folder(root: Path) -> Path:
     """Where the recording of the dataset `root` is kept until it is whole."""
+    root = resolved(root)
     return root.with_name(root.name + ".recording")
 
 
@@ -60,12 +61,8 @@ def write_episode(path: Path, episode: StagedEpisode) -> None:
         "statistics": episode.statistics,
     }
     table = episode.table.replace_schema_metadata({_METADATA_KEY: json.dumps(metadata)})
-    unfinished = path.with_suffix(".unfinished")
-    with unfinished.open("wb") as file:
-        pq.write_table(table, file)
-        file.flush()
-        os.fsync(file.fileno())
-    unfinished.replace(path)
+    with new_file(path) as part:
+        pq.write_table(table, part)
 
 
 def read_episode(path: Path) -> StagedEpisode:

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Shaped, UInt8
 
 from hrc_learn.demos.format.lerobot_v3 import Statistics, image_statistics
+from hrc_learn.store import sync_file
 
 Image = UInt8[np.ndarray, "_height _width 3"]
 
@@ -157,6 +158,7 @@ class _Video:
     def finish(self, path: Path) -> dict[str, list]:
         self._container.mux(self._stream.encode())
         self._container.close()
+        sync_file(self._path)
         self._path.replace(path)
         return image_statistics(np.stack(self._samples))
 

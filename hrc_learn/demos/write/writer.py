@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from hrc_learn.demos.format.dataset_folder import DatasetFolder, open_folder
 from hrc_learn.demos.format.features import read_sidecar, sidecar_content
 from hrc_learn.demos.format.lerobot_v3 import INDEX_FEATURES, episode_statistics
 from hrc_learn.demos.issue import DatasetError
-from hrc_learn.demos.write.recovery import begin, discard, recover_dataset
+from hrc_learn.demos.write.recovery import begin, claim_recording, discard, finish
 from hrc_learn.demos.write.schema import (
     TIME_KEY,
     Column,
@@ -34,6 +34,7 @@ from hrc_learn.demos.write.staging import (
     write_episode,
 )
 from hrc_learn.demos.write.video_encoder import CameraRecorder, Image, video_features
+from hrc_learn.store import DATASET
 
 
 class DatasetWriter:
@@ -84,6 +85,7 @@ class DatasetWriter:
                 longer one in its place.
 
         Raises:
+            BusyError: Another process is recording this dataset.
             FileExistsError: `root`, or an interrupted recording of it, is already there.
             ValueError: An argument makes no sense, or is not that of the dataset appended to.
             DatasetError: The dataset to append to cannot be read.
@@ -107,11 +109,18 @@ class DatasetWriter:
         self._tasks: dict[str, int] = {}
         self._saved_frames = 0
         self.episodes = 0
-        self._earlier = self._continue() if append else None
         self._video_features = video_features(cameras or {}, self.fps)
-        staging = staging_folder(self.root)
-        self._images = CameraRecorder(cameras or {}, self.fps, staging)
-        self._staging = begin(self.root, self.episodes if append else None)
+        self._staging = staging_folder(self.root)
+        self._images = CameraRecorder(cameras or {}, self.fps, self._staging)
+        self._claim = claim_recording(self.root)
+        try:
+            self._earlier = self._continue() if append else None
+            if append:
+                self._claim.require_replaceable(DATASET, True, foreign=True, adopt=True)
+            begin(self.root, self.episodes if append else None)
+        except BaseException:
+            self._claim.release()
+            raise
 
     def __enter__(self) -> "DatasetWriter":
         return self
@@ -123,12 +132,14 @@ class DatasetWriter:
         trace: TracebackType | None,
     ) -> None:
         if error is None:
-            self.finalize()
+            with self._claim:
+                self.finalize()
             return
-        self.discard_episode()
-        if not self._new_episodes:
-            discard(self._staging)
-        else:
+        with self._claim:
+            self.discard_episode()
+            if not self._new_episodes:
+                discard(self._staging)
+        if self._new_episodes:
             error.add_note(
                 f"The {self._new_episodes} episodes saved before this are kept in "
                 f"{self._staging}; hrc_learn.demos.recover_dataset({str(self.root)!r}) makes "
@@ -148,7 +159,7 @@ class DatasetWriter:
             )
         self._task = task
 
-    def add_frame(self, *, images: Mapping[str, Image] | None = None, **values) -> None:
+    def add_frame(self, *, images: Mapping[str, Image] | None = None, **values: Any) -> None:
         """Add one frame to the open episode.
 
         The first episode saved fixes which quantities are recorded; all later ones
@@ -233,10 +244,14 @@ class DatasetWriter:
                 f"the last episode holds {len(self._buffer)} unsaved frames: call "
                 f"save_episode() or discard_episode() before the recording ends"
             )
-        if not self._new_episodes:
-            discard(self._staging)
-            raise DatasetError("no episode was saved, so there is no dataset", file=self.root)
-        return recover_dataset(self.root)
+        with self._claim:
+            if not self._new_episodes:
+                discard(self._staging)
+                raise DatasetError(
+                    "no episode was saved, so there is no dataset", file=self.root
+                )
+            finish(self.root, self._claim)
+        return self.root
 
     @property
     def _new_episodes(self) -> int:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from hrc_learn.lerobot.processor.action_limits import ActionLimits
-from hrc_learn.output import new_file
+from hrc_learn.store import new_file
 
 PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor.json", "policy_postprocessor.json"
 WATCH, SMOOTH = "hrc_learn_watch_state", "hrc_learn_smooth_actions"
@@ -48,7 +48,7 @@ def _read(path: Path) -> dict[str, Any]:
             f"there is no {path}: give the folder `pretrained_model` of a LeRobot checkpoint."
         )
     try:
-        content = json.loads(path.read_text())
+        content = json.loads(path.read_text(encoding="utf-8"))
         steps = content["steps"]
     except (json.JSONDecodeError, KeyError, TypeError) as error:
         raise ValueError(f"{path} is not a processor of LeRobot: {error}") from None
@@ -58,4 +58,4 @@ def _read(path: Path) -> dict[str, Any]:
 
 def _write(path: Path, content: dict[str, Any]) -> None:
     with new_file(path) as new:
-        new.write_text(json.dumps(content, indent=2))
+        new.write_text(json.dumps(content, indent=2), encoding="utf-8")

@@ -9,7 +9,8 @@ import math
 import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, ClassVar
+from weakref import WeakValueDictionary
 
 import torch
 from jaxtyping import Bool, Float
@@ -71,9 +72,6 @@ class Changes:
 
 # The steps: one that watches where the robot is, one that smooths what it is sent.
 
-_MEASURED: dict[str, Tensor] = {}
-"""Newest state of the robot, by the name of the pair of steps."""
-
 _JUMP = 5.0
 """A robot that moves this many times faster than its limit was put there: an episode began."""
 
@@ -90,16 +88,30 @@ class WatchStateStep(ProcessorStep):
 
     pair: str = "smooth"
     """Name that both steps of a policy share."""
+    state: Tensor | None = field(default=None, init=False, repr=False)
+    """Newest state of the robot, (batch, values); None before the first observation."""
+
+    # LeRobot builds both steps of a policy from files, each without the other: the one that
+    # smooths finds the one that watches by name, for as long as somebody holds it.
+    _alive: ClassVar[WeakValueDictionary[str, WatchStateStep]] = WeakValueDictionary()
+
+    def __post_init__(self) -> None:
+        self._alive[self.pair] = self
+
+    @classmethod
+    def named(cls, pair: str) -> WatchStateStep | None:
+        """The newest step of that name that is still in use."""
+        return cls._alive.get(pair)
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
         observation = transition.get(TransitionKey.OBSERVATION) or {}
         state = observation.get(OBS_STATE)
         if state is not None:
-            _MEASURED[self.pair] = torch.atleast_2d(state).detach().cpu()
+            self.state = torch.atleast_2d(state).detach().cpu()
         return transition
 
     def reset(self) -> None:
-        _MEASURED.pop(self.pair, None)
+        self.state = None
 
     def get_config(self) -> dict[str, Any]:
         return {"pair": self.pair}
@@ -221,7 +233,8 @@ class SmoothActionsStep(ProcessorStep):
     def _measured(self, chunk: Tensor) -> Float[Tensor, "batch values"]:
         """Where the robot is; values that are not measured are where they are sent."""
         here = chunk[..., 0, :].to(torch.float64)
-        state = _MEASURED.get(self.pair)
+        watch = WatchStateStep.named(self.pair)
+        state = None if watch is None else watch.state
         if state is None or state.shape[0] != here.shape[0]:
             return here
         if int(self._columns.max()) >= state.shape[-1]:

@@ -8,7 +8,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from hrc_learn.output import new_file
+from hrc_learn.store import new_file
 from hrc_learn.viz.report.content import Measurement, Picture, Report, Section, flatten
 from hrc_learn.viz.report.html import reports_page
 

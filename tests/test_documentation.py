@@ -1,0 +1,97 @@
+"""The documentation site: what becomes a page, and what makes the build fail."""
+
+import importlib.util
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+SPEC = importlib.util.spec_from_file_location("build_docs", ROOT / "tools" / "build_docs.py")
+assert SPEC is not None
+assert SPEC.loader is not None
+build_docs = importlib.util.module_from_spec(SPEC)
+SPEC.loader.exec_module(build_docs)
+
+builder = pytest.mark.skipif(
+    not all(importlib.util.find_spec(name) for name in ("zensical", "mkdocstrings")),
+    reason="the extra `docs` is not installed: `make docs` installs it",
+)
+
+CHECKOUT = {
+    "README.md": "# Robots\n\n[A guide](docs/guide.md), [its end](docs/guide.md#end).\n",
+    "CHANGELOG.md": "# Changes\n",
+    "CONTRIBUTING.md": "# Contributing\n\nSee [the code](hrc_learn/arm/_moving.py).\n",
+    "docs/guide.md": "# Guide\n\n[Back](../README.md), [move][hrc_learn.arm.move]\n\n## End\n",
+    "docs/notation.md": "# Notation\n",
+    "hrc_learn/__init__.py": '"""Robots."""\n\nfrom .arm import move as move\n',
+    "hrc_learn/arm/__init__.py": '"""Arms."""\n\nfrom ._moving import move as move\n',
+    "hrc_learn/arm/_moving.py": (
+        "def move(speed: float) -> None:\n"
+        '    """Move the arm.\n\n    Args:\n        speed: Of the hand [m/s].\n    """\n'
+    ),
+    "hrc_learn/_private/__init__.py": '"""Ours."""\n\nfrom .gear import gear as gear\n',
+}
+"""A checkout in small: one public function, described in a private module."""
+
+
+def checkout(folder: Path, **changed: str) -> Path:
+    for name, text in {**CHECKOUT, **changed}.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+    return folder
+
+
+def test_a_page_for_each_public_face_and_no_other(tmp_path):
+    assert set(build_docs.reference(checkout(tmp_path))) == {"hrc_learn", "hrc_learn.arm"}
+
+
+def test_an_object_is_described_once_and_linked_elsewhere(tmp_path):
+    pages = build_docs.reference(checkout(tmp_path))
+    assert "::: hrc_learn.arm.move" in pages["hrc_learn.arm"]
+    assert ":::" not in pages["hrc_learn"]
+    assert "[`move`][hrc_learn.arm.move]" in pages["hrc_learn"]
+
+
+def test_a_function_in_a_module_of_its_name_is_meant_not_the_module(tmp_path):
+    face = {"hrc_learn/arm/__init__.py": '"""Arms."""\n\nfrom .move import move as move\n'}
+    root = checkout(tmp_path, **face, **{"hrc_learn/arm/move.py": "def move(): ...\n"})
+    assert "::: hrc_learn.arm.move.move\n" in build_docs.reference(root)["hrc_learn.arm"]
+
+
+def test_every_name_of_our_faces_is_described_or_linked():
+    pages = build_docs.reference(ROOT)
+    for face in build_docs.faces(ROOT):
+        for export in face.exports:
+            assert export.path in pages or f".{export.name}" in pages[face.name], export.path
+
+
+@builder
+def test_the_site_opens_without_a_network(tmp_path):
+    out = tmp_path / "site"
+    assert build_docs.build(checkout(tmp_path / "checkout"), out) == []
+    page = (out / "api" / "hrc_learn.arm.html").read_text()
+    assert "Of the hand [m/s]." in page
+    assert 'id="hrc_learn.arm.move"' in page
+    guide = (out / "guide.html").read_text()
+    assert 'href="api/hrc_learn.arm.html#hrc_learn.arm.move"' in guide
+    for html in out.rglob("*.html"):
+        assert not build_docs.REMOTE.search(html.read_text()), html
+    assert not list(out.rglob("_*"))
+
+
+@builder
+@pytest.mark.parametrize(
+    ("name", "old", "new", "complaint"),
+    [
+        ("README.md", "docs/guide.md)", "docs/gide.md)", "gide.md"),
+        ("README.md", "#end", "#ends", "ends"),
+        ("docs/guide.md", "arm.move", "arm.moved", "hrc_learn.arm.moved"),
+        ("hrc_learn/arm/_moving.py", "speed: Of", "sped: Of", "'sped'"),
+    ],
+    ids=["page", "anchor", "reference", "argument"],
+)
+def test_what_is_wrong_is_said_and_leaves_no_site(tmp_path, name, old, new, complaint):
+    root = checkout(tmp_path / "checkout", **{name: CHECKOUT[name].replace(old, new)})
+    wrong = build_docs.build(root, tmp_path / "site")
+    assert complaint in "\n".join(wrong)
+    assert not (tmp_path / "site").exists()

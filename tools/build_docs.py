@@ -1,0 +1,293 @@
+"""Build the documentation site: README, docs/ and a reference made from the docstrings.
+
+Everything is read from this checkout and nothing from the network; `hrc_learn` is parsed, not
+imported. Whatever the builder warns of (a broken link or anchor, a docstring that describes
+arguments there are not) makes it fail.
+"""
+
+import argparse
+import ast
+import importlib.util
+import json
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+SITE = ROOT / "docs" / "site.yml"
+PACKAGE = "hrc_learn"
+# Modules of their own beside the packages that users implement or call.
+PUBLIC_MODULES = ("protocols",)
+SOURCE_LINK = re.compile(r"\[([^\]]+)\]\((?!\w+:)([^)\s#]+)((?:#[^)\s]*)?)\)")
+DOCSTRING_WARNING = re.compile(r"(griffe|mkdocstrings\w*|mkdocs_autorefs):")
+REMOTE_SHIM = re.compile(r'src="https://unpkg\.com/iframe-worker/[^"]*"')
+REMOTE = re.compile(r"""<(?:script|img|iframe)\b[^>]*?\bsrc=["']?(https?:[^"'>\s]+)""")
+WORKER_FROM_BLOB = """\
+if (location.protocol === "file:") {
+  const Native = window.Worker
+  const source = new Blob([SOURCE], { type: "text/javascript" })
+  window.Worker = function () { return new Native(URL.createObjectURL(source)) }
+}
+"""
+COLOUR = re.compile(r"\x1b\[[\d;]*m")
+FENCE = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
+
+
+@dataclass(frozen=True)
+class Export:
+    """A name that a package's face lists."""
+
+    path: str
+    """The name as users import it, such as `hrc_learn.dmp.JointDMP`."""
+    origin: str
+    """Module that the face imports it from."""
+
+    @property
+    def name(self) -> str:
+        return self.path.rpartition(".")[2]
+
+    @property
+    def source(self) -> str:
+        return f"{self.origin}.{self.name}"
+
+
+@dataclass(frozen=True)
+class Face:
+    """What a package's `__init__` re-exports by `from .x import Y as Y`."""
+
+    name: str
+    docstring: str
+    exports: tuple[Export, ...]
+
+
+def faces(root: Path) -> list[Face]:
+    """The faces of all public packages below a folder that holds the package."""
+    found = []
+    for file in sorted((root / PACKAGE).rglob("__init__.py")):
+        parts = file.parent.relative_to(root).parts
+        if not any(part.startswith("_") for part in parts):
+            found.append(read_face(root, ".".join(parts)))
+    return [face for face in found if face.exports]
+
+
+def read_face(root: Path, package: str) -> Face:
+    tree = ast.parse((root / package.replace(".", "/") / "__init__.py").read_text("utf-8"))
+    exports = []
+    for node in tree.body:
+        if not isinstance(node, ast.ImportFrom):
+            continue
+        origin = absolute(package, node)
+        for alias in node.names:
+            if alias.asname != alias.name or alias.name.startswith("_"):
+                continue
+            exports.append(Export(f"{package}.{alias.name}", origin))
+    docstring = ast.get_docstring(tree) or ""
+    if not docstring and exports:
+        raise SystemExit(f"{package}/__init__.py has no docstring to head its page with")
+    return Face(package, docstring, tuple(exports))
+
+
+def absolute(package: str, node: ast.ImportFrom) -> str:
+    """The module that a package's `from` statement names."""
+    if not node.level:
+        return node.module or ""
+    above = package.split(".")[: len(package.split(".")) - node.level + 1]
+    return ".".join([*above, *([node.module] if node.module else [])])
+
+
+def exists(root: Path, module: str) -> bool:
+    path = root / module.replace(".", "/")
+    return path.with_suffix(".py").exists() or (path / "__init__.py").exists()
+
+
+def reference(root: Path) -> dict[str, str]:
+    """The reference's pages as Markdown, by the dotted name of what they describe.
+
+    An object has its description on one page only. A face that takes it over from another
+    public package links there.
+    """
+    listed = faces(root)
+    home = {export.path: face.name for face in listed for export in face.exports}
+    packages = {face.name for face in listed}
+    pages = {}
+    for face in listed:
+        inner = [name for name in sorted(packages) if name.rpartition(".")[0] == face.name]
+        own, taken_over = [], []
+        for export in face.exports:
+            if export.path in packages:
+                continue
+            if export.source != export.path and export.source in home:
+                link = f"[`{export.name}`][{export.source}] of `{home[export.source]}`"
+                taken_over.append(f"- {link}")
+            elif export.origin == export.path:
+                # A function in a module of its name: the path of both means the module.
+                own += ["", f"::: {export.source}"]
+            else:
+                own += ["", f"::: {export.path}"]
+        lines = [f"# {face.name}", "", face.docstring, ""]
+        if inner:
+            lines += ["## Packages", "", *(f"- [`{name}`]({name}.md)" for name in inner), ""]
+        if taken_over:
+            lines += ["## Names", "", *taken_over, ""]
+        pages[face.name] = "\n".join([*lines, *own]) + "\n"
+    for module in PUBLIC_MODULES:
+        if exists(root, f"{PACKAGE}.{module}"):
+            name = f"{PACKAGE}.{module}"
+            pages[name] = f"::: {name}\n    options:\n      heading_level: 1\n"
+    return pages
+
+
+def guides(root: Path) -> list[str]:
+    """Pages of docs/ in the order in which the README names them, then the others."""
+    readme = (root / "README.md").read_text("utf-8")
+    pages = sorted((root / "docs").glob("*.md"))
+    named = {page.name: readme.find(f"docs/{page.name}") for page in pages}
+    return sorted(named, key=lambda name: (named[name] < 0, named[name]))
+
+
+def for_site(text: str, page: Path, pages: dict[Path, str], root: Path) -> str:
+    """A page's text with links to files of the checkout turned into links of the site.
+
+    The site has no sources: what links to one keeps its words and loses its link. A link that
+    leads nowhere stays as it is, for the builder to complain of.
+    """
+
+    def relink(match: re.Match[str]) -> str:
+        words, target, anchor = match.groups()
+        file = (page.parent / target).resolve()
+        if file in pages:
+            return f"[{words}]({pages[file]}{anchor})"
+        if (root / "docs" / "images") in file.parents:
+            return f"[{words}](images/{file.name})"
+        if file.exists() and root in file.parents:
+            return words
+        return match[0]
+
+    pieces, start = [], 0
+    for fence in FENCE.finditer(text):
+        pieces += [SOURCE_LINK.sub(relink, text[start : fence.start()]), fence[0]]
+        start = fence.end()
+    return "".join([*pieces, SOURCE_LINK.sub(relink, text[start:])])
+
+
+def stage(root: Path, folder: Path) -> list:
+    """Put the site's pages into an empty folder.
+
+    Returns:
+        The site's navigation, as the builder takes it.
+    """
+    (folder / "api").mkdir(parents=True)
+    guide_names = guides(root)
+    pages = {root / "docs" / name: name for name in guide_names}
+    pages |= {
+        root / "README.md": "index.md",
+        root / "CHANGELOG.md": "changelog.md",
+        root / "CONTRIBUTING.md": "contributing.md",
+    }
+    for page, name in pages.items():
+        text = for_site(page.read_text("utf-8"), page, pages, root)
+        (folder / name).write_text(text, "utf-8")
+    if (root / "docs" / "images").exists():
+        shutil.copytree(root / "docs" / "images", folder / "images")
+    api = reference(root)
+    for name, text in api.items():
+        (folder / "api" / f"{name}.md").write_text(text, "utf-8")
+    return [
+        {"Get started": "index.md"},
+        {"Guides": [name for name in guide_names if name != "notation.md"]},
+        {
+            "API reference": [
+                {name.removeprefix(f"{PACKAGE}."): f"api/{name}.md"} for name in sorted(api)
+            ]
+        },
+        {"Notation": "notation.md"},
+        {"Changelog": "changelog.md"},
+        {"Contributing": "contributing.md"},
+    ]
+
+
+def search_from_disk(site: Path) -> None:
+    """Let the search work in pages opened from the disk, without a script from the network.
+
+    A browser starts no worker from a `file:` address. The builder's remedy is loaded from
+    elsewhere at each view; ours gives the worker's source to the browser as a Blob.
+    """
+    (worker,) = (site / "assets" / "javascripts" / "workers").glob("search*.js")
+    source = json.dumps(worker.read_text("utf-8"))
+    script = WORKER_FROM_BLOB.replace("SOURCE", source)
+    (site / "assets" / "javascripts" / "worker_from_blob.js").write_text(script, "utf-8")
+    for page in site.rglob("*.html"):
+        up = "../" * (len(page.relative_to(site).parts) - 1)
+        ours = f'src="{up}assets/javascripts/worker_from_blob.js"'
+        html = REMOTE_SHIM.sub(ours, page.read_text("utf-8"))
+        if remote := REMOTE.search(html):
+            raise SystemExit(f"{page.name} would load {remote[1]} from the network")
+        page.write_text(html, "utf-8")
+
+
+def build(root: Path, out: Path) -> list[str]:
+    """Build the site of a checkout; a site that is complete replaces what `out` was.
+
+    Returns:
+        What is wrong, as the builder says it; empty if `out` is there.
+    """
+    root = root.resolve()
+    with tempfile.TemporaryDirectory(prefix="hrc_learn_docs_") as name:
+        # The builder asks for pages and site to lie in one folder with its configuration.
+        work = Path(name)
+        config = {
+            "INHERIT": str(SITE),
+            "docs_dir": "pages",
+            "site_dir": "site",
+            "nav": stage(root, work / "pages"),
+            "plugins": {"mkdocstrings": {"handlers": {"python": {"paths": [str(root)]}}}},
+        }
+        # JSON is YAML, and needs no library to write.
+        (work / "mkdocs.yml").write_text(json.dumps(config), "utf-8")
+        done = subprocess.run(
+            [sys.executable, "-m", "zensical", "build", "--strict"],
+            cwd=work,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            encoding="utf-8",
+            check=False,
+        )
+        complaints, _, _ = COLOUR.sub("", done.stdout).partition("Traceback")
+        lines = complaints.splitlines()
+        # `--strict` is about links; what the reader of docstrings warns of fails here.
+        if done.returncode or any(DOCSTRING_WARNING.match(line) for line in lines):
+            return lines
+        search_from_disk(work / "site")
+        if out.exists():
+            shutil.rmtree(out)
+        out.parent.mkdir(parents=True, exist_ok=True)
+        shutil.move(work / "site", out)
+    return []
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description="Build the documentation site.")
+    parser.add_argument(
+        "--out", type=Path, default=ROOT / "outputs" / "docs", help="folder of the site"
+    )
+    out = parser.parse_args().out.resolve()
+    # A site lists what it describes in objects.inv; anything else is not ours to replace.
+    if out.exists() and any(out.iterdir()) and not (out / "objects.inv").exists():
+        print(f"{out} is no documentation site; name another --out", file=sys.stderr)
+        return 2
+    if importlib.util.find_spec("zensical") is None:
+        print("Missing: the extra `docs` (pip install -e '.[docs]').", file=sys.stderr)
+        return 2
+    if wrong := build(ROOT, out):
+        print("\n".join(wrong), file=sys.stderr)
+        return 1
+    print(out / "index.html")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

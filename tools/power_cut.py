@@ -1,0 +1,349 @@
+"""Kill writing programs at random moments, and see that nothing is lost or left behind.
+
+Writers of this package are killed while they write one thing after another, and say of each
+when it is safe. A command of your own is killed instead with --command, in which {out} stands
+for what it writes:
+
+    tools/power_cut.py --command "python training/fit_dmp.py --dataset demos --out {out}
+        --overwrite" --check "python training/evaluate.py --dataset demos --model {out}"
+
+What a kill leaves is mended in turns by `recover_all` and by the next start. Exit status 1 if
+anything that had been acknowledged is lost, a result is broken, or something is left over.
+"""
+
+import itertools
+import os
+import random
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from rich.console import Console
+from rich.table import Table
+
+from hrc_learn import cli
+
+# How long a writer goes on after the first thing it wrote, at most [s]: many times over what
+# one thing takes, so that the kill comes at any of its steps.
+WINDOW = 0.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args:
+    kills: int = 50
+    """Kills of each writer, or of the command."""
+    writers: tuple[str, ...] = ()
+    """Writers to kill: file, model, results, recording, append, trials; all when none."""
+    command: str = ""
+    """Command to kill instead; {out} stands for the path that it writes."""
+    check: str = ""
+    """Command that must succeed whenever {out} is there."""
+    seed: int = 0
+    """Of the moments."""
+    json: Path | None = None
+    """File for the counts."""
+    write: str = ""
+    """Be this writer, which is what the kills are for."""
+    out: Path | None = None
+    """What it writes."""
+
+
+@dataclass
+class Count:
+    """What came of the kills."""
+
+    kills: int = 0
+    interrupted: int = 0
+    """Those that left something to mend."""
+    lost: int = 0
+    """Acknowledged, and not there afterwards."""
+    broken: int = 0
+    """There, but not whole."""
+    orphans: int = 0
+    """Files that belong to nothing."""
+    stuck: int = 0
+    """Starts that failed because of what the kill had left."""
+
+    @property
+    def failures(self) -> int:
+        return self.lost + self.broken + self.orphans + self.stuck
+
+
+def main(args: Args) -> int:
+    if args.write:
+        assert args.out is not None
+        WRITERS[args.write].write(args.out)
+        return 0
+    unknown = [name for name in args.writers if name not in WRITERS]
+    if unknown or args.kills < 1:
+        raise ValueError(f"there are --writers {', '.join(WRITERS)}, and --kills of 1 or more")
+    rng = random.Random(args.seed)
+    with tempfile.TemporaryDirectory() as folder:
+        if args.command:
+            counts = {"command": kill_command(args, Path(folder), rng)}
+        else:
+            counts = {
+                name: kill_writer(name, args.kills, Path(folder) / name, rng)
+                for name in args.writers or WRITERS
+            }
+    show(counts)
+    if args.json is not None:
+        figures = {
+            f"{n}_{k}": v for n, count in counts.items() for k, v in asdict(count).items()
+        }
+        cli.write_json(args.json, figures)
+    return int(any(count.failures for count in counts.values()))
+
+
+def kill_writer(name: str, kills: int, folder: Path, rng: random.Random) -> Count:
+    """Kill one writer of this package again and again."""
+    count, writer, out = Count(), WRITERS[name], folder / "out"
+    folder.mkdir()
+    for number in range(kills):
+        if not writer.goes_on:
+            shutil.rmtree(folder)
+            folder.mkdir()
+        process = subprocess.Popen(
+            [sys.executable, __file__, "--write", name, "--out", str(out)],
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        assert process.stdout is not None
+        lines = [process.stdout.readline()]
+        time.sleep(rng.uniform(0, WINDOW))
+        process.kill()
+        lines += process.stdout.readlines()
+        process.wait()
+        count.kills += 1
+        count.interrupted += [path.name for path in folder.iterdir()] != ["out"]
+        if not lines[0]:
+            count.stuck += 1
+            continue
+        if number % 2 and writer.goes_on:
+            continue  # the next start mends it
+        recover(folder)
+        try:
+            found = writer.read(out)
+        except Exception as error:  # of whatever kind
+            print(f"{name}: {error}", file=sys.stderr)
+            count.broken += 1
+            continue
+        acknowledged = int([line for line in lines if line.endswith("\n")][-1])
+        count.lost += found < acknowledged
+        # One more may have been written and not yet said.
+        count.broken += found > acknowledged + 1
+        count.orphans += [path.name for path in folder.iterdir()] != ["out"]
+    return count
+
+
+def kill_command(args: Args, folder: Path, rng: random.Random) -> Count:
+    """Kill a command again and again."""
+    count, out = Count(), folder / "here" / "out"
+    out.parent.mkdir()
+    replaces = "--overwrite" in args.command
+    start = time.perf_counter()
+    if not run(args.command, out):
+        raise ValueError("the command fails without being killed, too")
+    duration, whole = time.perf_counter() - start, names(out)
+    beside = names(out.parent) - {f"out/{name}" for name in whole}
+    for number in range(args.kills):
+        # In turns with an older result to replace, and without.
+        older = replaces and number % 4 < 2 and out.exists()
+        if not older:
+            shutil.rmtree(out.parent)
+            out.parent.mkdir()
+        done = run(args.command, out, rng.uniform(0, duration))
+        count.kills += 1
+        count.interrupted += names(out.parent) != {f"out/{n}" for n in whole} | beside
+        if number % 2:
+            recover(out.parent)
+            # What the next start goes on with, such as trials, is no orphan.
+            rest = {n for n in names(out.parent) - beside if not n.startswith("out")}
+            count.orphans += bool(rest)
+            count.lost += (done or older) and not out.exists()
+        else:
+            if out.exists() and not replaces:
+                shutil.rmtree(out)
+            count.stuck += not run(args.command, out)
+            count.orphans += names(out.parent) != {f"out/{n}" for n in whole} | beside
+        if out.exists():
+            sound = names(out) == whole and (not args.check or run(args.check, out))
+            count.broken += not sound
+    return count
+
+
+def run(command: str, out: Path, seconds: float | None = None) -> bool:
+    """Run a command, and kill it after some time with all that it has started."""
+    process = subprocess.Popen(
+        shlex.split(command.format(out=shlex.quote(str(out)))),
+        stdout=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+    try:
+        return process.wait(seconds) == 0
+    except subprocess.TimeoutExpired:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+        return False
+
+
+def names(path: Path) -> set[str]:
+    """All files below a path."""
+    return {str(file.relative_to(path)) for file in path.rglob("*") if not file.is_dir()}
+
+
+def recover(folder: Path) -> None:
+    from hrc_learn.demos import recover_all
+
+    recover_all(folder)
+
+
+class Writer(NamedTuple):
+    """Writes one thing after another, and says the number of each when it is safe."""
+
+    write: Callable[[Path], None]
+    read: Callable[[Path], int]
+    """Number of the last thing written."""
+    goes_on: bool = True
+    """Whether its next start goes on with what is there."""
+
+
+def write_files(out: Path) -> None:
+    from hrc_learn.store import new_file
+
+    for number in numbers(out, read_file):
+        with new_file(out) as part:
+            part.write_text(f"{number}\n", encoding="utf-8")
+
+
+def read_file(out: Path) -> int:
+    return int(out.read_text(encoding="utf-8"))
+
+
+def write_models(out: Path) -> None:
+    import torch
+
+    from hrc_learn.storage import write_model
+
+    for number in numbers(out, read_model):
+        write_model(out, "Number", {"number": number}, {"number": torch.tensor([number])})
+
+
+def read_model(out: Path) -> int:
+    from hrc_learn.storage import SavedModel
+
+    model = SavedModel(out, "Number")
+    number = model.get("number", int)
+    if int(model.tensor("number")) != number:
+        raise ValueError(f"{out} is half of one model and half of another")
+    return number
+
+
+def write_results(out: Path) -> None:
+    from hrc_learn.store import new_folder
+
+    for number in numbers(out, read_results):
+        with new_folder(out, {"number": number}, overwrite=True) as folder:
+            (folder / "figures").mkdir()
+            for name in range(5):
+                text = str(number)
+                (folder / "figures" / str(name)).write_text(text, encoding="utf-8")
+
+
+def read_results(out: Path) -> int:
+    from hrc_learn.store import read_made_by
+
+    number = read_made_by(out)["number"]
+    found = [read_file(out / "figures" / str(name)) for name in range(5)]
+    if found != [number] * 5:
+        raise ValueError(f"{out} is of {number} and {found}")
+    return number
+
+
+def write_recording(out: Path) -> None:
+    from hrc_learn.demos import DatasetWriter
+
+    with DatasetWriter(out, 50, "any", ["a", "b"]) as writer:
+        for number in itertools.count(1):
+            record(writer)
+            print(number, flush=True)
+
+
+def write_longer_datasets(out: Path) -> None:
+    from hrc_learn.demos import DatasetWriter
+
+    recover(out.parent)  # else the episodes of the recording would stand in the way
+    for _ in numbers(out, read_dataset):
+        with DatasetWriter(out, 50, "any", ["a", "b"], append=out.exists()) as writer:
+            record(writer)
+
+
+def record(writer) -> None:
+    writer.start_episode("reach")
+    for k in range(5):
+        writer.add_frame(joint_position=[writer.episodes, k])
+    writer.save_episode()
+
+
+def read_dataset(out: Path) -> int:
+    from hrc_learn.demos import check_dataset, load_demos
+
+    report = check_dataset(out)
+    if not report.ok:
+        raise ValueError(str(report))
+    return len(load_demos(out))
+
+
+def write_trials(out: Path) -> None:
+    from hrc_learn.experiments.monte_carlo import Trial, TrialFile
+
+    with TrialFile(out, {"tried": "nothing"}) as file:
+        for number in itertools.count(len(file.trials) + 1):
+            file.append(Trial(seed=number, values={}))
+            print(number, flush=True)
+
+
+def read_trials(out: Path) -> int:
+    from hrc_learn.experiments.monte_carlo import TrialFile
+
+    with TrialFile(out, {"tried": "nothing"}) as file:
+        return len(file.trials)
+
+
+def numbers(out: Path, read: Callable[[Path], int]):
+    """Numbers from the one after the last written; each is said when the next is asked for."""
+    from hrc_learn.store import settle
+
+    settle(out)
+    for number in itertools.count(read(out) + 1 if out.exists() else 1):
+        yield number
+        print(number, flush=True)
+
+
+WRITERS = {
+    "file": Writer(write_files, read_file),
+    "model": Writer(write_models, read_model),
+    "results": Writer(write_results, read_results),
+    "recording": Writer(write_recording, read_dataset, goes_on=False),
+    "append": Writer(write_longer_datasets, read_dataset),
+    "trials": Writer(write_trials, read_trials),
+}
+
+
+def show(counts: dict[str, Count]) -> None:
+    table = Table("killed", *Count.__annotations__, title="Power cuts")
+    for name, count in counts.items():
+        table.add_row(name, *map(str, asdict(count).values()))
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    cli.run(main, Args)
