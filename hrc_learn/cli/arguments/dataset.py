@@ -178,7 +178,7 @@ class Recover:
     """Recover what processes that were killed left behind, of a path and of anything below it.
 
     Interrupted recordings become datasets of their saved episodes, interrupted replacements are
-    finished, and what was left unfinished is removed. What is still being written is left alone.
+    finished, and what was left unfinished is removed. What is being written is left alone.
     """
 
     path: Path
