@@ -400,5 +400,5 @@ def test_the_wheel_holds_the_package_alone(tmp_path):
     information = f"hrc_learn-{PROJECT['version']}.dist-info"
     assert roots == {"hrc_learn", information}
     packed = {name for name in names if name.startswith("hrc_learn/")}
-    data = (ROOT / "hrc_learn").rglob("*.css")
+    data = [*(ROOT / "hrc_learn").rglob("*.css"), *(ROOT / "hrc_learn").rglob("py.typed")]
     assert packed == {str(path.relative_to(ROOT)) for path in (*SOURCES, *data)}
