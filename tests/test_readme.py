@@ -1,6 +1,7 @@
 """What the documentation says can be done as it says."""
 
 import ast
+import dataclasses
 import os
 import re
 import subprocess
@@ -8,6 +9,8 @@ import sys
 from pathlib import Path
 
 import pytest
+
+from hrc_learn.cli._commands import COMMANDS, find
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
@@ -31,6 +34,7 @@ LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s#]+)[^)]*\)|<img[^>]*src=\"([^\"]+)\"")
 PROGRAM_PATH = re.compile(rf"(?<![\w/.])(?:{'|'.join(FOLDERS)})/[\w./-]*\w")
 MAKE_TARGET = re.compile(r"\bmake ([a-z][\w-]*)")
 COMMAND = re.compile(r"\b((?:datasets|training|control|benchmarks)/\w+\.py)([^\n|;&]*)")
+HRC = re.compile(r"\bhrc ([a-z-][^\n|;&`]*)")
 OPTION = re.compile(r"(?<!\S)--([a-z][\w-]*)")
 
 by_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
@@ -83,14 +87,42 @@ def test_make_knows_its_targets(page):
 
 
 @by_page
-def test_programs_know_their_options(page):
-    unknown = [
-        f"{program} --{option}"
-        for program, arguments in COMMAND.findall(code(page))
-        for option in OPTION.findall(arguments)
-        if option.split(".")[0] not in options(ROOT / program)
-    ]
+def test_commands_are_known_with_their_options(page):
+    """Of `hrc`, and of programs, which are commands or benchmarks."""
+    text, unknown = code(page), []
+    typed = [(("hrc", line), line.split()) for line in HRC.findall(text)]
+    for program, rest in COMMAND.findall(text):
+        if not program.startswith("benchmarks"):
+            typed.append(
+                ((program, rest), [*command_of(ROOT / program).split(), *rest.split()])
+            )
+        elif set(OPTION.findall(rest)) - options(ROOT / program):
+            unknown.append((program, rest))
+    for said, words in typed:
+        name, rest = find(words)
+        known = command_options(name) if name in COMMANDS else HELP
+        given = {option.split(".")[0] for option in OPTION.findall(" ".join(rest))}
+        # A word of several commands stands for all of them; any other has to be one.
+        if not name or given - known:
+            unknown.append(said)
     assert not unknown
+
+
+HELP = {"help", "help-all", "version"}
+
+
+def command_of(program: Path) -> str:
+    """What a program passes to `cli.main`."""
+    words = re.search(r"cli\.main\((.*)\)", program.read_text())
+    assert words is not None
+    return " ".join(ast.literal_eval(f"({words[1]},)"))
+
+
+def command_options(name: str) -> set[str]:
+    """Names that a command takes."""
+    fields = dataclasses.fields(COMMANDS[name].arguments_type())
+    names = [field.name.replace("_", "-") for field in fields]
+    return {*HELP, *names, *(f"no-{name}" for name in names)}
 
 
 def options(program: Path) -> set[str]:

@@ -77,7 +77,7 @@ class RunRecording:
     """Tool centre point in the base frame [m]."""
     demo_path: Float[np.ndarray, "samples 3"] | None = None
     """Tool centre point of the demonstration [m]."""
-    plan_path: Float[np.ndarray, "samples 3"] | None = None
+    plan_path: Float[np.ndarray, "plan_samples 3"] | None = None
     """Path that the learned motion asked for [m]."""
 
     bodies: tuple[Body, ...] = ()

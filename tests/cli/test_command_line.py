@@ -116,9 +116,7 @@ def test_all_options_are_shown_on_request(name):
 def test_the_same_thing_is_called_the_same(name):
     hints = typing.get_type_hints(COMMANDS[name].arguments_type())
     assert "json" in hints
-    assert (
-        not hints.keys() & {"path", "seeds", "output", "data"} - {"path"} or name == "recover"
-    )
+    assert not hints.keys() & {"seeds", "output", "data"}
     for option, kind in SAME_EVERYWHERE.items():
         if option in hints:
             assert kind in str(hints[option])

@@ -194,3 +194,43 @@ def test_the_benchmark_writes_its_figures(tmp_path):
 
 def test_no_package_shadows_hugging_faces_datasets():
     assert not list((ROOT / "datasets").glob("__init__.py"))
+
+
+def test_findings_and_counts_are_kept_in_a_folder(recording, tmp_path):
+    hrc("import", recording, "--out", tmp_path / "set", "--joints", "q")
+    out = tmp_path / "found"
+    assert hrc("check", "--dataset", tmp_path / "set", "--out", out).status == 0
+    counts = json.loads((out / "metrics.json").read_text())
+    findings = json.loads((out / "findings.json").read_text())
+    assert len(findings) == counts["errors"] + counts["warnings"]
+    assert json.loads((out / "made_by.json").read_text())["dataset"] == str(tmp_path / "set")
+    assert hrc("check", "--dataset", tmp_path / "set", "--out", out).status == 2
+
+
+def test_a_copy_is_repaired_beside_the_dataset_unless_told_where(recording, tmp_path):
+    hrc("import", recording, "--out", tmp_path / "set", "--joints", "q")
+    assert hrc("repair", "--dataset", tmp_path / "set").status == 0
+    assert len(load_demos(tmp_path / "set_repaired")) == 1
+
+
+def test_demonstrations_are_shown_in_a_recording(recording, tmp_path):
+    hrc("import", recording, "--out", tmp_path / "set", "--joints", "q", "--time", "t")
+    out, figures = tmp_path / "new" / "demos.rrd", tmp_path / "figures.json"
+    assert hrc("show", tmp_path / "set", "--out", out, "--json", figures).status == 0
+    assert out.stat().st_size > 1000
+    assert json.loads(figures.read_text()) == {"episodes": 1, "seconds": pytest.approx(0.597)}
+
+
+def test_saved_episodes_are_recovered(tmp_path):
+    writer = DatasetWriter(tmp_path / "set", 50, "any", ["a"])
+    for _ in range(2):
+        writer.start_episode("move")
+        for k in range(10):
+            writer.add_frame(joint_position=[0.01 * k])
+        writer.save_episode()
+    writer.start_episode("move")
+    del writer  # as a kill leaves it
+    outcome = hrc("recover", tmp_path / "set", "--json", tmp_path / "figures.json")
+    assert outcome.status == 0, outcome.error
+    assert json.loads((tmp_path / "figures.json").read_text()) == {"mended": 1}
+    assert len(load_demos(tmp_path / "set")) == 2

@@ -63,3 +63,11 @@ def test_a_search_for_gains_is_taken_up_again(tmp_path):
     assert set(gains) == {"vision_rate", "linear_speed", "angular_speed"}
     assert not place.exists()
     done("tune", "--out", out, "--resume", *few, status=2)
+
+
+def test_an_evaluation_without_a_model_holds_demonstrations_out(poses, tmp_path):
+    outcome = done("evaluate", "--dataset", poses, "--json", tmp_path / "figures.json")
+    assert "1 episodes that were not learned from" in outcome.output
+    assert json.loads((tmp_path / "figures.json").read_text())["demonstrations"] == 1
+    # The model was for this once.
+    assert [path.name for path in tmp_path.iterdir()] == ["figures.json"]

@@ -3,7 +3,16 @@
 import json
 from pathlib import Path
 
+import pytest
 from commands import hrc
+from unchecked import shapes_unchecked
+
+
+@pytest.fixture(autouse=True)
+def _unchecked():
+    """Batches of control steps take many times as long with every shape checked."""
+    with shapes_unchecked():
+        yield
 
 
 def test_it_writes_one_flat_object_of_figures(tmp_path: Path):

@@ -175,12 +175,13 @@ class Extract:
 
 @dataclass(frozen=True, kw_only=True)
 class Recover:
-    """Recover what a process that was killed left behind: a dataset of its saved episodes.
+    """Recover what processes that were killed left behind, of a path and of anything below it.
 
-    Nothing that was acknowledged as saved is lost; what was not yet saved is left out.
+    Interrupted recordings become datasets of their saved episodes, interrupted replacements are
+    finished, and what was left unfinished is removed. What is being written is left alone.
     """
 
     path: Path
-    """Folder that was to be written."""
+    """A dataset, model or folder of results, or a folder of such things."""
     json: Path | None = None
     """Receives the counts as one flat object."""

@@ -77,7 +77,7 @@ def _beside(device: str) -> tuple[Human, ...]:
 
 def _serve(
     session: PageSession, page: Page, dt: float, duration: float | None
-) -> dict[str, float]:
+) -> dict[str, float | int]:
     """Run the loop in the arm's own time; what was measured of it."""
     rate, steps, latest = Rate(dt), 0, 0.0
     try:

@@ -73,8 +73,8 @@ def run(args: Args) -> None:
         write_json(args.json, figures)
 
 
-def _figures(latencies: Latencies) -> dict[str, float]:
-    figures: dict[str, float] = {
+def _figures(latencies: Latencies) -> dict[str, float | int]:
+    figures: dict[str, float | int] = {
         "steps": len(latencies.step),
         "missed_ticks": latencies.missed,
     }

@@ -115,7 +115,7 @@ def _in_turn(jobs: list[Job]) -> Iterator[Any]:
 
 def _with_ray(jobs: list[Job]) -> Iterator[Any]:
     try:
-        import ray
+        import ray  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise ValueError("--ray needs Ray: pip install ray") from error
 
