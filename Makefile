@@ -1,9 +1,10 @@
-.PHONY: demo test test-slow docs format check bench clean
+.PHONY: demo test test-slow test-wheel docs format check bench clean
 .DEFAULT_GOAL := help
 
 PYTHON := .venv/bin/python
 OUT ?= outputs/demo
 SHELF ?= middle
+PYTHONS ?= 3.12
 
 help:
 	@echo "make demo    demonstrate, learn, grasp, place in simulation; writes $(OUT)"
@@ -21,6 +22,10 @@ test: .venv/.installed
 
 test-slow: .venv/.installed
 	$(PYTHON) -m pytest -m slow
+
+# PYTHONS="3.12 3.13" tests with both; uv fetches a Python that is missing.
+test-wheel: .venv/.installed
+	$(PYTHON) tools/test_wheel.py --python $(PYTHONS)
 
 docs: .venv/.installed
 	$(PYTHON) tools/build_docs.py

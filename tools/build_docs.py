@@ -24,7 +24,7 @@ PACKAGE = "hrc_learn"
 PUBLIC_MODULES = ("protocols",)
 SOURCE_LINK = re.compile(r"\[([^\]]+)\]\((?!\w+:)([^)\s#]+)((?:#[^)\s]*)?)\)")
 DOCSTRING_WARNING = re.compile(r"(griffe|mkdocstrings\w*|mkdocs_autorefs):")
-REMOTE_SHIM = re.compile(r'src="https://unpkg\.com/iframe-worker/[^"]*"')
+REMOTE_SHIM = re.compile(r'src="https://[^"]*/iframe-worker/[^"]*"')
 REMOTE = re.compile(r"""<(?:script|img|iframe)\b[^>]*?\bsrc=["']?(https?:[^"'>\s]+)""")
 WORKER_FROM_BLOB = """\
 if (location.protocol === "file:") {
