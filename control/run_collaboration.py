@@ -38,11 +38,11 @@ from hrc_learn.learning.tuning import with_gains
 from hrc_learn.output import MADE_BY, new_folder
 from hrc_learn.sim import CameraChange, CameraKind, Occlusion
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.marker_sensor import TransportConfig
-from hrc_learn.skills.pick_and_place import CollaborationConfig
+from hrc_learn.skills.marker_sensor import LatencyConfig
+from hrc_learn.skills.pick_and_place import PickAndPlaceConfig
 from hrc_learn.skills.placing import PlacingSkill
-from hrc_learn.skills.visual_servoing import AimingSkill
-from hrc_learn.skills.work_cell import StationConfig
+from hrc_learn.skills.visual_servoing import VisualServoSkill
+from hrc_learn.skills.work_cell import WorkCellConfig
 from hrc_learn.teleoperation.page import PageConfig
 from hrc_learn.viz.report import Measurement, show_measurements, write_report
 from hrc_learn.viz.run_dashboard import record_run
@@ -90,7 +90,7 @@ class Args:
     """Serve the dashboard in the browser while the run goes on."""
     serving: ServeConfig = field(default_factory=ServeConfig)
     """Where, with --serve."""
-    config: CollaborationConfig = field(default_factory=CollaborationConfig)
+    config: PickAndPlaceConfig = field(default_factory=PickAndPlaceConfig)
     """How the job is done."""
     gains: Path | None = None
     """gains.json of training/tune_controller.py, in place of those of the controller."""
@@ -113,7 +113,7 @@ def main(args: Args) -> int:
     with new_folder(args.out, asdict(args), args.overwrite) as folder:
         console.print(f"Placing on the {_shelves(args)}:")
         job = _run(args, trials, console)
-        delivered = any(errand.release is not None for errand in job.errands)
+        delivered = any(pick.release is not None for pick in job.picks)
         table = evaluate(job, fit) if delivered else []
         repeated = _repeat(args, trials)
         with console.status("Writing recording and report"):
@@ -138,7 +138,7 @@ def _trials(args: Args) -> CollaborationTrials:
     """The job as it is to be done, once or many times."""
     controller = with_gains(args.config.grasping.controller, args.gains)
     grasping = replace(args.config.grasping, controller=controller)
-    transport = TransportConfig(latency=args.latency, dropped=args.drop)
+    latency = LatencyConfig(delay=args.latency, frame_loss=args.drop)
     return CollaborationTrials(
         aiming=args.aiming.resolve(),
         placing=args.placing.resolve(),
@@ -150,7 +150,7 @@ def _trials(args: Args) -> CollaborationTrials:
             occlusions=tuple(Occlusion(start=s, duration=d) for s, d in args.occlusion),
             camera_change=args.camera_change if args.camera_moved else None,
         ),
-        station=StationConfig(keep_every=0, transport=transport),
+        cell=WorkCellConfig(keep_image_every=0, latency=latency),
         config=replace(args.config, grasping=grasping),
     )
 
@@ -162,9 +162,9 @@ def _run(args: Args, trials: CollaborationTrials, console: Console) -> Simulated
         console.print(f"Dashboard at [bold]{address}[/]")
 
     # As many images whatever the number of objects: a gigabyte of memory holds 200.
-    keep_every = StationConfig().keep_every * len(trials.shelves)
+    keep_image_every = WorkCellConfig().keep_image_every * len(trials.shelves)
     return simulate_collaboration(
-        AimingSkill.load(args.aiming),
+        VisualServoSkill.load(args.aiming),
         PlacingSkill.load(args.placing),
         trials.shelves,
         workplace=workplace_for(trials.shelves, args.shelf_x, args.shelf_depth),
@@ -172,7 +172,7 @@ def _run(args: Args, trials: CollaborationTrials, console: Console) -> Simulated
         pulls=PULLS if args.person else (),
         disturbances=trials.disturbances,
         config=trials.config,
-        station_config=replace(trials.station, keep_every=keep_every),
+        cell_config=replace(trials.cell, keep_image_every=keep_image_every),
         seed=args.seed,
         page=PageConfig(port=args.port) if args.page else None,
         watch=serving(_title(args), args.serving, opened) if args.serve else unwatched,
@@ -210,12 +210,12 @@ def _write(
 ) -> None:
     run = record(
         _title(args),
-        job.station,
+        job.cell,
         job.world,
         job.motion,
-        plans=[errand.plan for errand in job.errands if errand.plan is not None],
+        plans=[pick.plan for pick in job.picks if pick.plan is not None],
         cameras=job.cameras,
-        region=_region(job.workplace, args.config.grasping.aiming.half_size),
+        region=_region(job.workplace, args.config.grasping.servo.half_size),
         demonstration=_demonstration(args.placing),
     )
     record_run(folder / "run.rrd", run)
@@ -223,7 +223,7 @@ def _write(
         command = shlex.join(["python", *sys.argv])
         report = collaboration_report(run, job, table, asdict(args), command, repeated)
         write_report(folder, report)
-    job.station.log.save(folder / "log.npz")
+    job.cell.log.save(folder / "log.npz")
     if (trials := _trial_file(args)).exists():
         shutil.copy(trials, folder / "trials.jsonl")
 

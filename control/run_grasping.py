@@ -170,7 +170,7 @@ def _write(
         for name, run in experiment.compared.items()
     }
     for name, (title, run) in runs.items():
-        recording = record_grasp(run, experiment.trials.config.aiming, title)
+        recording = record_grasp(run, experiment.trials.config.servo, title)
         record_run(folder / f"{name}.rrd", recording)
     report = grasping_report(
         experiment,
@@ -180,7 +180,7 @@ def _write(
         command=shlex.join(["python", *sys.argv]),
     )
     write_report(folder, report)
-    experiment.grasp.station.log.save(folder / "log.npz")
+    experiment.grasp.cell.log.save(folder / "log.npz")
     if many:
         shutil.copy(_trial_file(args), folder / "grasps.jsonl")
 

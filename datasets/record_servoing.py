@@ -14,7 +14,7 @@ from rich.progress import track
 from hrc_learn import cli
 from hrc_learn.sim import CameraKind, World, open_camera
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.marker_sensor import Eye
+from hrc_learn.skills.marker_sensor import MarkerSensor
 from hrc_learn.skills.visual_target import OBJECT_FEATURE, OBJECT_FEATURE_NAMES
 from hrc_learn.teleoperation.hand_guiding import Frame
 from hrc_learn.teleoperation.paired_demonstrations import write_lessons
@@ -47,12 +47,12 @@ def main(args: Args) -> None:
     workplace = Workplace()
     world = World(workplace.scene)
     rng = np.random.default_rng(args.seed)
-    eye = Eye.on(open_camera(world, args.camera, rng=rng), workplace.scene)
+    sensor = MarkerSensor(open_camera(world, args.camera, rng=rng), workplace.scene.marker_ids)
     seen = []
 
     def lessons() -> Iterator[list[Frame]]:
         for _ in track(range(args.episodes), description="Aiming demonstrations"):
-            frames = teach_aiming(world, workplace, eye, args.lesson, rng)
+            frames = teach_aiming(world, workplace, sensor, args.lesson, rng)
             seen.append(float(np.mean([bool(frame["feature_visible"]) for frame in frames])))
             yield frames
 

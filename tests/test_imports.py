@@ -69,6 +69,6 @@ def test_learning_from_a_dataset_needs_no_simulator():
 import sys
 for name in ("mujoco", "cv2", "lerobot"):
     sys.modules[name] = None
-import hrc_learn.tasks.fit_primitives, hrc_learn.tasks.fit_aiming, hrc_learn.demos
+import hrc_learn.tasks.fit_primitives, hrc_learn.tasks.fit_visual_servo, hrc_learn.demos
 """
     subprocess.run([sys.executable, "-c", program], check=True, timeout=120)

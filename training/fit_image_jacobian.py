@@ -18,9 +18,9 @@ from hrc_learn import cli, distributed
 from hrc_learn.demos import DemonstrationSource, open_demos
 from hrc_learn.jacobian import CellErrors, ImageJacobianFitConfig, LearningConfig, Neurons, grid
 from hrc_learn.learning.fit_recordings import learning_recording
-from hrc_learn.learning.fit_visual_servo import fit_aiming
+from hrc_learn.learning.fit_visual_servo import fit_visual_servo
 from hrc_learn.output import new_folder
-from hrc_learn.skills.visual_servoing import AimingSkill
+from hrc_learn.skills.visual_servoing import VisualServoSkill
 from hrc_learn.viz.figures import learning_figure, workspace_figure
 from hrc_learn.viz.fit_dashboard import record_learning
 
@@ -69,7 +69,7 @@ def main(args: Args) -> None:
                 f"fitted as they are (--learning.hold-out {args.learning.hold_out})"
             )
         with console.status(f"Fitting {len(demos)} demonstrations") as status:
-            skill = fit_aiming(
+            skill = fit_visual_servo(
                 demos,
                 None if args.neurons == "around" else _grid(args),
                 args.fit,
@@ -87,7 +87,7 @@ def _grid(args: Args) -> Neurons:
 
 
 def _write(
-    args: Args, skill: AimingSkill, demos: DemonstrationSource, console: Console
+    args: Args, skill: VisualServoSkill, demos: DemonstrationSource, console: Console
 ) -> None:
     metrics = skill.metrics()
     with new_folder(args.out, asdict(args), args.overwrite) as folder:

@@ -9,7 +9,7 @@ from hrc_learn.demos import Demonstration, DemonstrationSet
 from hrc_learn.jacobian import Learned, Neurons
 from hrc_learn.kinematics import panda
 from hrc_learn.learning.fit_visual_servo import Demonstrations, Watching
-from hrc_learn.skills.visual_servoing import AimingSkill
+from hrc_learn.skills.visual_servoing import VisualServoSkill
 from hrc_learn.viz import (
     DemonstrationsRecording,
     ErrorMap,
@@ -26,7 +26,7 @@ _BELOW = 0.03  # distance of the error map under the lowest path [m]
 
 
 def learning_recording(
-    skill: AimingSkill, demos: Demonstrations, title: str
+    skill: VisualServoSkill, demos: Demonstrations, title: str
 ) -> LearningRecording:
     """What is to be shown of a skill just fitted.
 

@@ -23,7 +23,7 @@ from hrc_learn.jacobian import (
 from hrc_learn.jacobian.evidence import Round
 from hrc_learn.kinematics import panda
 from hrc_learn.kinematics.tool_orientation import Approach
-from hrc_learn.skills.visual_servoing import AimingSkill
+from hrc_learn.skills.visual_servoing import VisualServoSkill
 from hrc_learn.skills.visual_target import OBJECT_FEATURE, VisualTarget
 
 type Demonstrations = DemonstrationSet | DemonstrationSource
@@ -33,13 +33,13 @@ _REST = 0.3
 """Time at the end of a demonstration in which the hand stands above the object [s]."""
 
 
-def fit_aiming(
+def fit_visual_servo(
     demos: Demonstrations,
     neurons: Neurons | None = None,
     config: ImageJacobianFitConfig | None = None,
     learning: LearningConfig | None = None,
     on_round: Callable[[int, Round], None] = lambda number, state: None,
-) -> AimingSkill:
+) -> VisualServoSkill:
     """Fit image Jacobian and, where an object was watched, visual target and approach.
 
     Args:
@@ -63,7 +63,7 @@ def fit_aiming(
     network = RBFImageJacobian.fit_watched(camera, neurons, config)
     cells = held_out_pairs(camera, network, config).by_cell()
     ends = _ends(demos, network)
-    return AimingSkill(
+    return VisualServoSkill(
         jacobian=network,
         target=_visual_target(ends) if ends else None,
         approach=Approach.fit([end.path for end in ends]) if ends else None,

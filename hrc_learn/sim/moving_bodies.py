@@ -95,7 +95,7 @@ def _triple(vector: np.ndarray) -> tuple[float, float, float]:
 
 
 class MotionLog:
-    """Remembers where everything that moves was after each step of the station."""
+    """Remembers where everything that moves was after each step of the work cell."""
 
     def __init__(self, world: World):
         self._world = world

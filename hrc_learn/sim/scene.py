@@ -160,6 +160,11 @@ class SceneConfig:
     timestep: float = 0.002
     """Physics step [s]."""
 
+    @property
+    def marker_ids(self) -> tuple[int, ...]:
+        """ArUco numbers of the markers on the end effector and on the objects."""
+        return HAND_MARKER, *(item.marker.id for item in self.objects)
+
     def boxes(self) -> list[Box]:
         """The fixed furniture, for drawing and for collision checks."""
         return [self.table, *self.cabinet.boxes()]

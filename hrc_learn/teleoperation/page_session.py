@@ -18,7 +18,7 @@ from hrc_learn.protocols import Human, HumanInput, Request
 from hrc_learn.sim import MovingBodies, World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.pick_and_place import INTERACT
-from hrc_learn.skills.work_cell import SAFETY_COLUMNS, Station
+from hrc_learn.skills.work_cell import SAFETY_COLUMNS, WorkCell
 from hrc_learn.teleoperation.combined_input import BothHands, Eased, EasingConfig
 from hrc_learn.teleoperation.demonstration_recorder import DemonstrationRecorder
 from hrc_learn.teleoperation.hand_guiding import Frame, Instant, LedArm, LedArmConfig
@@ -238,11 +238,11 @@ class PageBeside:
         self.human = page.human
         self._world, self._page, self._bodies = world, page, MovingBodies(world)
         self._metronome, self._ticks = Metronome(dt), 0
-        self._station: Station | None = None
+        self._cell: WorkCell | None = None
 
-    def follow(self, station: Station) -> None:
-        """Tell from the log of a station what the task is doing."""
-        self._station = station
+    def follow(self, cell: WorkCell) -> None:
+        """Tell from the log of a work cell what the task is doing."""
+        self._cell = cell
 
     def joined(
         self, person: Human, advance: Callable[[float], None]
@@ -263,20 +263,20 @@ class PageBeside:
     def tick(self) -> None:
         """After each control step: show where everything is, and let real time pass."""
         self._page.place(*self._bodies.poses())
-        if self._ticks % _SHOW_EVERY == 0 and self._station is not None:
-            self._page.show(self.status(self._station))
+        if self._ticks % _SHOW_EVERY == 0 and self._cell is not None:
+            self._page.show(self.status(self._cell))
         self._ticks += 1
         self._metronome.wait()
 
-    def status(self, station: Station) -> PageStatus:
-        """What the page says of a task that runs on a station."""
-        world, log = self._world, station.log
+    def status(self, cell: WorkCell) -> PageStatus:
+        """What the page says of a task that runs on a work cell."""
+        world, log = self._world, cell.log
         phase = log.events[-1].text if log.events else "getting ready"
         acted = log["safety"].sum(axis=0) if len(log) else [0] * len(SAFETY_COLUMNS)
         return PageStatus(
             title="Collaboration",
             doing=phase,
-            seconds=station.time,
+            seconds=cell.time,
             note=_INVITED if phase == INTERACT else "",
             interventions=dict(zip(SAFETY_COLUMNS, map(int, acted), strict=True)),
             contacts=len(world.cabinet_contacts.touches) + len(world.table_contacts.touches),

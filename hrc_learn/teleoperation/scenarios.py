@@ -15,8 +15,9 @@ from jaxtyping import Float, UInt8
 from hrc_learn.kinematics import gripper_down, panda
 from hrc_learn.protocols import ArmState, Human, HumanInput
 from hrc_learn.sim import CameraKind, World, open_camera
-from hrc_learn.sim.workplace import Workplace, nearest_configuration
-from hrc_learn.skills.marker_sensor import Eye
+from hrc_learn.sim.workplace import Workplace
+from hrc_learn.skills.cartesian_motion import nearest_configuration
+from hrc_learn.skills.marker_sensor import MarkerSensor
 from hrc_learn.skills.position_servo import PositionServo, PositionServoConfig
 from hrc_learn.teleoperation.scripted_demonstrations import PlacingLesson, placing_expert
 from hrc_learn.teleoperation.scripted_expert import GuidedPath, ScriptedExpert, Tremor
@@ -244,10 +245,10 @@ class ScenarioRun:
         """
         marker = self.scenario.workplace.scene.objects[0].marker.id
         if self._pixel is None:
-            eye = self._eye  # whose background takes random numbers when it is first made
+            sensor = self._sensor  # whose background takes random numbers when it is first made
             noise = np.random.default_rng([self.seed, 1])
             self._noise.bit_generator.state = noise.bit_generator.state
-            self._pixel = eye.look().get(marker)
+            self._pixel = sensor.detect().get(marker)
         if self._pixel is None:
             raise ValueError(
                 f"the fixed camera does not see marker {marker} at the beginning: leave out "
@@ -256,7 +257,7 @@ class ScenarioRun:
         return self._pixel
 
     @cached_property
-    def _eye(self) -> Eye:
+    def _sensor(self) -> MarkerSensor:
         """Of the fixed camera, before which nothing but the object is ever seen."""
         scene = self.scenario.workplace.scene
         marker = scene.objects[0].marker
@@ -265,7 +266,7 @@ class ScenarioRun:
             return {marker.id: self.world.marker_poses()[marker.id]}
 
         camera = SyntheticCamera(scene.camera, [marker], poses, rng=self._noise)
-        return Eye.on(camera, scene)
+        return MarkerSensor(camera, scene.marker_ids)
 
     def succeeded(self) -> bool:
         """Whether the job is done, by MuJoCo's contacts."""

@@ -11,8 +11,9 @@ from jaxtyping import Float
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import gripper_down, panda
 from hrc_learn.sim import HAND_MARKER, Touch, World
-from hrc_learn.sim.workplace import Workplace, nearest_configuration
-from hrc_learn.skills.marker_sensor import Eye
+from hrc_learn.sim.workplace import Workplace
+from hrc_learn.skills.cartesian_motion import nearest_configuration
+from hrc_learn.skills.marker_sensor import MarkerSensor
 from hrc_learn.skills.visual_target import OBJECT_FEATURE
 from hrc_learn.skills.work_cell import TaskFailedError
 from hrc_learn.teleoperation.hand_guiding import Frame
@@ -70,7 +71,11 @@ def aiming_expert(
 
 
 def teach_aiming(
-    world: World, workplace: Workplace, eye: Eye, lesson: AimingLesson, rng: np.random.Generator
+    world: World,
+    workplace: Workplace,
+    sensor: MarkerSensor,
+    lesson: AimingLesson,
+    rng: np.random.Generator,
 ) -> list[Frame]:
     """Demonstrate one motion that ends above an object.
 
@@ -83,7 +88,7 @@ def teach_aiming(
     item = workplace.scene.objects[0]
     pose = workplace.random_object_pose(lesson.reach, rng)
     world.reset(workplace.home_joints().numpy(), {item.name: pose})
-    target = eye.look().get(item.marker.id)
+    target = sensor.detect().get(item.marker.id)
     if target is None:
         raise ValueError(
             f"the camera does not see marker {item.marker.id} on the table: move the camera or "
@@ -99,7 +104,7 @@ def teach_aiming(
 
     def observe() -> Frame:
         nonlocal last
-        feature = eye.look().get(HAND_MARKER)
+        feature = sensor.detect().get(HAND_MARKER)
         last = last if feature is None else feature
         return {
             "feature": last,
@@ -144,12 +149,12 @@ def placing_expert(
         lesson: How.
         rng: Source of the hand's unsteadiness and of where it starts.
     """
-    goal, mouth = workplace.shelf(shelf).position, workplace.mouth(shelf).position
+    goal, front = workplace.shelf(shelf).position, workplace.shelf_front(shelf).position
     # The hand is not quite level yet at the edge: what it carries hangs a little lower.
     lifted = torch.tensor([0.0, 0.0, lesson.lift], dtype=torch.float64)
-    inside = goal + 0.3 * (mouth - goal)
+    inside = goal + 0.3 * (front - goal)
     start = workplace.home().position + lesson.spread * torch.from_numpy(rng.standard_normal(3))
-    waypoints = torch.stack([start, mouth + lifted, inside + lifted, goal]).numpy()
+    waypoints = torch.stack([start, front + lifted, inside + lifted, goal]).numpy()
     return ScriptedExpert(
         panda,
         GuidedPath(waypoints, lesson.duration),

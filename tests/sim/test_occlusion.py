@@ -6,7 +6,7 @@ import pytest
 from hrc_learn.sim import HAND_MARKER, NOWHERE, Occluder, Occlusion, World, open_camera
 from hrc_learn.sim.camera_disturbances import covers_in
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.marker_sensor import Eye
+from hrc_learn.skills.marker_sensor import MarkerSensor
 
 WORKPLACE = Workplace()
 
@@ -16,21 +16,23 @@ def world():
     return World(WORKPLACE.scene)
 
 
-def eye_on(world, kind):
-    return Eye.on(open_camera(world, kind, rng=np.random.default_rng(0)), WORKPLACE.scene)
+def sensor_for(world, kind):
+    return MarkerSensor(
+        open_camera(world, kind, rng=np.random.default_rng(0)), WORKPLACE.scene.marker_ids
+    )
 
 
 @pytest.mark.parametrize("kind", ["synthetic", pytest.param("egl", marks=pytest.mark.egl)])
 def test_a_marker_is_hidden_for_a_spell_and_seen_again(world, kind):
     world.reset(WORKPLACE.hover_joints().numpy())
-    eye = eye_on(world, kind)
+    sensor = sensor_for(world, kind)
     occluder = Occluder(world, [Occlusion(start=0.1, duration=0.2)])
     seen = []
     for _ in range(4):
         occluder.update()
-        image = eye.read()
+        image = sensor.read()
         seen.append(
-            (round(world.time, 3), HAND_MARKER in eye.look(), image.mean(axis=-1).std())
+            (round(world.time, 3), HAND_MARKER in sensor.detect(), image.mean(axis=-1).std())
         )
         world.advance(0.1)
     assert [found for _, found, _ in seen] == [True, False, False, True]

@@ -15,7 +15,7 @@ from hrc_learn.kinematics import UnreachableError, panda
 from hrc_learn.learning.fit_primitives import fit_primitives
 from hrc_learn.sim import World
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.placing import PlacingSkill, check_plan, ways_to
+from hrc_learn.skills.placing import PlacingSkill, check_plan, plan_candidates
 from hrc_learn.skills.work_cell import BlockedPathError
 from hrc_learn.teleoperation.scripted_demonstrations import PlacingLesson, teach_placing
 
@@ -90,7 +90,7 @@ def test_plans_in_pose_space_reach_every_shelf_without_touching(skill, world, sh
     goal = WORKPLACE.shelf(shelf)
     plan = skill.plan(HOME, goal, space="pose", dt=0.02, speed=speed)
     check_plan(plan, world, carried="box")
-    miss = plan.hand[-1].twist_to(goal)
+    miss = plan.tool_pose[-1].twist_to(goal)
     assert float(miss[:3].norm()) < 1e-3
     assert float(miss[3:].norm()) < 1e-3
     np.testing.assert_allclose(plan.path[0], HOME.numpy())
@@ -100,7 +100,7 @@ def test_plans_in_pose_space_reach_every_shelf_without_touching(skill, world, sh
 def test_the_papers_plan_in_joint_space_bends_the_way_into_other_shelves(skill):
     def sideways(space, shelf):
         goal = WORKPLACE.shelf(shelf)
-        hand = skill.plan(HOME, goal, space=space, dt=0.02).hand.position
+        hand = skill.plan(HOME, goal, space=space, dt=0.02).tool_pose.position
         inside = hand[hand[:, 1] < WORKPLACE.scene.cabinet.front + 0.1]
         return float((inside[:, 0] - goal.position[0]).abs().max())
 
@@ -141,7 +141,7 @@ def test_a_placing_carried_out_ends_on_the_shelf_as_it_was_shown(skill, demos):
     # Measured by the simulator, so not exactly what was planned.
     assert 0 < figures.goal_distance < 5e-4
     np.testing.assert_allclose(run.path[-1], run.plan.goal.position.numpy(), atol=1e-3)
-    assert [event.text for event in run.station.log.events] == [
+    assert [event.text for event in run.cell.log.events] == [
         "transfer",
         "release",
         "retreat",
@@ -204,7 +204,7 @@ def test_a_thing_that_sits_low_in_the_hand_is_put_down_higher(skill, low, name):
             return False
         return True
 
-    ways = ways_to(goal, HOME, skill, WORKPLACE, space="pose", dt=0.01, speed=1.5)
+    ways = plan_candidates(goal, HOME, skill, WORKPLACE, space="pose", dt=0.01, speed=1.5)
     way = next(filter(free, ways))
     assert way.name == name
     assert 0 <= float(way.plan.goal.position[2] - goal.position[2]) < 0.01

@@ -10,7 +10,7 @@ from hrc_learn.kinematics import panda
 from hrc_learn.protocols import HumanInput
 from hrc_learn.sim import World
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.work_cell import Station
+from hrc_learn.skills.work_cell import WorkCell
 from hrc_learn.teleoperation import ScriptedPuller
 from hrc_learn.teleoperation.page import PageConfig
 from hrc_learn.teleoperation.page_session import page_beside
@@ -70,19 +70,17 @@ def test_time_passes_for_the_world_as_it_does_for_the_person(world, beside):
 
 def test_the_page_tells_what_the_task_and_its_safety_filter_do(world, beside):
     human, advance = beside.joined(ScriptedPuller(panda, ()), world.advance)
-    station = Station(
-        chain=panda, arm=world.arm, gripper=world.arm, human=human, advance=advance
-    )
-    beside.follow(station)
-    assert beside.status(station).doing == "getting ready"
-    station.enter("interact")
+    cell = WorkCell(chain=panda, arm=world.arm, gripper=world.arm, human=human, advance=advance)
+    beside.follow(cell)
+    assert beside.status(cell).doing == "getting ready"
+    cell.begin_phase("interact")
     for _ in range(5):
-        station.step(torch.full((7,), 50.0, dtype=torch.float64))  # far beyond the limits
-    status = beside.status(station)
+        cell.step(torch.full((7,), 50.0, dtype=torch.float64))  # far beyond the limits
+    status = beside.status(cell)
     assert status.doing == "interact"
     assert "Pull" in status.note
     assert status.seconds == pytest.approx(0.05)
     assert status.interventions["velocity"] == 5
     assert status.interventions["invalid"] == 0
-    station.enter("grasp")
-    assert beside.status(station).note == ""
+    cell.begin_phase("grasp")
+    assert beside.status(cell).note == ""
