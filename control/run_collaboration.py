@@ -36,7 +36,7 @@ from hrc_learn.experiments.run_recording import ServeConfig, record, serving, un
 from hrc_learn.geometry import Box
 from hrc_learn.learning.tuning import with_gains
 from hrc_learn.output import MADE_BY, new_folder
-from hrc_learn.sim import CameraChange, CameraKind, Occlusion
+from hrc_learn.sim import CameraChange, CameraKind, OcclusionInterval
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.marker_sensor import LatencyConfig
 from hrc_learn.skills.pick_and_place import PickAndPlaceConfig
@@ -147,7 +147,7 @@ def _trials(args: Args) -> CollaborationTrials:
         shelf_depth=args.shelf_depth,
         person=args.person,
         disturbances=Disturbances(
-            occlusions=tuple(Occlusion(start=s, duration=d) for s, d in args.occlusion),
+            occlusions=tuple(OcclusionInterval(start=s, duration=d) for s, d in args.occlusion),
             camera_change=args.camera_change if args.camera_moved else None,
         ),
         cell=WorkCellConfig(keep_image_every=0, latency=latency),

@@ -1,7 +1,7 @@
-"""Record demonstrations of placing a thing on a shelf, hand and body shape at once.
+"""Record demonstrations of placing an object on a shelf, with the null-space posture.
 
-The scripted expert leads the simulated arm from home into the cabinet while pulling its elbow
-past the open door. Demonstrations that touch the cabinet are thrown away and shown again.
+The scripted expert guides the simulated arm from home into the cabinet while pulling its elbow
+past the open door. Demonstrations that touch the cabinet are discarded and repeated.
 Writes a LeRobot dataset of version 3.0.
 """
 
@@ -18,8 +18,11 @@ from hrc_learn.sim import World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.work_cell import TaskFailedError
 from hrc_learn.teleoperation.hand_guiding import Frame
-from hrc_learn.teleoperation.paired_demonstrations import write_lessons
-from hrc_learn.teleoperation.scripted_demonstrations import PlacingLesson, teach_placing_cleanly
+from hrc_learn.teleoperation.scripted_demonstrations import (
+    PlacingDemonstrationConfig,
+    demonstrate_placing_without_contact,
+    write_demonstrations,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,10 +35,12 @@ class Args:
     """Demonstrations to record."""
     shelf: str = "middle"
     """Shelf to place on: lower, middle or upper."""
-    lesson: PlacingLesson = field(default_factory=PlacingLesson)
-    """How the expert teaches."""
+    demonstration: PlacingDemonstrationConfig = field(
+        default_factory=PlacingDemonstrationConfig
+    )
+    """How the expert demonstrates."""
     seed: int = 0
-    """Seed of the hand's unsteadiness and of where demonstrations start."""
+    """Seed of the tremor and of initial positions."""
     overwrite: bool = False
     """Replace an older dataset in that folder."""
     json: Path | None = None
@@ -51,28 +56,28 @@ def main(args: Args) -> int:
     rng = np.random.default_rng(args.seed)
     thrown_away, errors = [], []
 
-    def lessons() -> Iterator[list[Frame]]:
+    def demonstrations() -> Iterator[list[Frame]]:
         for _ in track(range(args.episodes), description="Placing demonstrations"):
-            frames, thrown = teach_placing_cleanly(
-                world, workplace, args.shelf, args.lesson, rng
+            frames, thrown = demonstrate_placing_without_contact(
+                world, workplace, args.shelf, args.demonstration, rng
             )
             thrown_away.append(thrown)
             errors.append(float(np.linalg.norm(frames[-1]["position"] - goal)))
             yield frames
 
     try:
-        write_lessons(
+        write_demonstrations(
             args.out,
-            lessons(),
+            demonstrations(),
             f"place the box on the {args.shelf} shelf",
-            args.lesson.fps,
+            args.demonstration.fps,
             details={"shelf": args.shelf, "scene": "hrc_learn workplace"},
             overwrite=args.overwrite,
         )
     except TaskFailedError as error:
         print(f"failed: {error}", file=sys.stderr)
         return 1
-    print(f"{args.episodes} demonstrations in {args.out} ({sum(thrown_away)} thrown away)")
+    print(f"{args.episodes} demonstrations in {args.out} ({sum(thrown_away)} discarded)")
     if args.json is not None:
         values = {
             "episodes": args.episodes,

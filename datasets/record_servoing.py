@@ -1,6 +1,6 @@
-"""Record demonstrations of aiming at an object in the image of an uncalibrated camera.
+"""Record demonstrations of visual servoing to an object in the image of an uncalibrated camera.
 
-The scripted expert moves the marked hand about over the table and ends right above an object.
+The scripted expert moves the marked end effector over the table and ends right above an object.
 The camera's pose and lens are in none of the columns. Writes a LeRobot dataset of version 3.0.
 """
 
@@ -17,8 +17,11 @@ from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.marker_sensor import MarkerSensor
 from hrc_learn.skills.visual_target import OBJECT_FEATURE, OBJECT_FEATURE_NAMES
 from hrc_learn.teleoperation.hand_guiding import Frame
-from hrc_learn.teleoperation.paired_demonstrations import write_lessons
-from hrc_learn.teleoperation.scripted_demonstrations import AimingLesson, teach_aiming
+from hrc_learn.teleoperation.scripted_demonstrations import (
+    ServoDemonstrationConfig,
+    demonstrate_servoing,
+    write_demonstrations,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,8 +34,8 @@ class Args:
     """Demonstrations to record."""
     camera: CameraKind = "synthetic"
     """Camera: rendered by "egl", or "synthetic", which draws the markers only but is fast."""
-    lesson: AimingLesson = field(default_factory=AimingLesson)
-    """How the expert teaches."""
+    demonstration: ServoDemonstrationConfig = field(default_factory=ServoDemonstrationConfig)
+    """How the expert demonstrates."""
     seed: int = 1
     """Seed of objects, paths and image noise."""
     overwrite: bool = False
@@ -50,17 +53,17 @@ def main(args: Args) -> None:
     sensor = MarkerSensor(open_camera(world, args.camera, rng=rng), workplace.scene.marker_ids)
     seen = []
 
-    def lessons() -> Iterator[list[Frame]]:
-        for _ in track(range(args.episodes), description="Aiming demonstrations"):
-            frames = teach_aiming(world, workplace, sensor, args.lesson, rng)
+    def demonstrations() -> Iterator[list[Frame]]:
+        for _ in track(range(args.episodes), description="Servoing demonstrations"):
+            frames = demonstrate_servoing(world, workplace, sensor, args.demonstration, rng)
             seen.append(float(np.mean([bool(frame["feature_visible"]) for frame in frames])))
             yield frames
 
-    write_lessons(
+    write_demonstrations(
         args.out,
-        lessons(),
-        "aim at the box",
-        args.lesson.fps,
+        demonstrations(),
+        "servo to the box",
+        args.demonstration.fps,
         features={OBJECT_FEATURE: OBJECT_FEATURE_NAMES},
         details={"scene": "hrc_learn workplace"},
         overwrite=args.overwrite,

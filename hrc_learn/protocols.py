@@ -58,7 +58,7 @@ class Camera(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class DrawnRegion:
-    """A box that a person has drawn for the hand, along the axes of the base frame."""
+    """A box that a person has drawn for the end effector, along the axes of the base frame."""
 
     centre: tuple[float, float, float]
     """[m]"""
@@ -79,16 +79,16 @@ where it started) and of the session."""
 class HumanInput:
     """What a person asks for at one instant."""
 
-    effort: Float[np.ndarray, " joints"] = field(default_factory=lambda: np.zeros(7))
+    nullspace_input: Float[np.ndarray, " joints"] = field(default_factory=lambda: np.zeros(7))
     """Null-space effort d on the joints (paper, eq. globalControl)."""
     twist: Float[np.ndarray, " 6"] = field(default_factory=lambda: np.zeros(6))
     """End-effector motion, linear [m/s] and angular [rad/s], in the base frame."""
     gripper: float | None = None
     """Opening the gripper should have [m]; None: nothing is asked."""
     region: DrawnRegion | None = None
-    """Where the hand should be; None: anywhere."""
+    """Where the end effector should be; None: anywhere."""
     target: tuple[float, float, float] | None = None
-    """Point marked for the hand, in the base frame [m]; None: none is."""
+    """Point marked for the end effector, in the base frame [m]; None: none is."""
     requests: tuple[Request, ...] = ()
     """Asked for since the last reading, in this order."""
 

@@ -48,7 +48,7 @@ print(tuple(panda.forward_and_jacobian(torch.zeros(7, dtype=torch.float64))[1].s
 def test_the_person_needs_no_screen_until_a_page_is_opened():
     code = """
 import sys
-import hrc_learn.human.page, hrc_learn.human.devices
+import hrc_learn.teleoperation.page, hrc_learn.teleoperation.devices
 print([name for name in ("viser", "pygame", "rerun", "mujoco") if name in sys.modules])
 """
     assert run(code) == "[]"
@@ -69,6 +69,6 @@ def test_learning_from_a_dataset_needs_no_simulator():
 import sys
 for name in ("mujoco", "cv2", "lerobot"):
     sys.modules[name] = None
-import hrc_learn.tasks.fit_primitives, hrc_learn.tasks.fit_visual_servo, hrc_learn.demos
+import hrc_learn.learning.primitive_fitting, hrc_learn.learning.visual_servo_fitting, hrc_learn.demos
 """
     subprocess.run([sys.executable, "-c", program], check=True, timeout=120)

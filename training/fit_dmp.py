@@ -17,8 +17,8 @@ from rich.console import Console
 
 from hrc_learn import cli, distributed
 from hrc_learn.demos import load_demos, open_demos
-from hrc_learn.learning.channels import Kind
-from hrc_learn.learning.fit_primitives import (
+from hrc_learn.learning.channels import Channel
+from hrc_learn.learning.primitive_fitting import (
     FittedPrimitives,
     fit_contextual,
     fit_primitives,
@@ -38,7 +38,7 @@ class Args:
     """LeRobot dataset with the demonstrations."""
     out: Path
     """Folder for the model."""
-    kinds: tuple[Kind, ...] = ()
+    channels: tuple[Channel, ...] = ()
     """What to learn; joint and pose, or what there is of them, when empty."""
     several: Literal["mean", "distribution", "contextual", "streamed"] = "mean"
     """What to keep of several demonstrations: their mean; all of them as well, which a
@@ -86,13 +86,13 @@ def main(args: Args) -> None:
         console.print(f"note: {note}")
     with new_folder(args.out, _made_by(args), args.overwrite) as folder:
         with console.status(f"Fitting {len(demos)} demonstrations"):
-            # Not every kind takes a scaling.
+            # Not every channel takes a scaling.
             scaled: dict[str, Any] = {} if args.scaling == "none" else {"scaling": args.scaling}
             fitted = fit_primitives(
                 demos,
                 args.n_basis,
                 args.method,
-                kinds=args.kinds,
+                channels=args.channels,
                 robust=args.robust,
                 **scaled,
             )
@@ -111,12 +111,12 @@ def _fit_streamed(args: Args) -> None:
         demos = open_demos(
             args.dataset, episodes=args.episodes or None, joint_names=args.joint_names or None
         )
-        fits, metrics = fit_streamed(demos, args.n_basis or 60, kinds=args.kinds)
+        fits, metrics = fit_streamed(demos, args.n_basis or 60, channels=args.channels)
         if rank:
             return
         with new_folder(args.out, _made_by(args), args.overwrite) as folder:
-            for kind, fit in fits.items():
-                fit.primitive.save(folder / kind)
+            for channel, fit in fits.items():
+                fit.primitive.save(folder / channel)
             _finish(args, metrics, folder)
 
 
@@ -124,7 +124,7 @@ def _fit_policy(args: Args, console: Console) -> None:
     # LeRobot takes ten seconds to import.
     from hrc_learn.lerobot.policy.closed_form_checkpoint import write_closed_form_policy
 
-    given = (args.kinds, args.context, args.joint_names, args.robust)
+    given = (args.channels, args.context, args.joint_names, args.robust)
     if any(given) or (args.several, args.method, args.scaling) != (
         "mean",
         "trajectory",
@@ -148,9 +148,9 @@ def _made_by(args: Args) -> dict:
     return asdict(args) | {"dataset": args.dataset.resolve()}
 
 
-def _spread(fitted: FittedPrimitives, kind: str) -> float:
+def _spread(fitted: FittedPrimitives, channel: str) -> float:
     """Standard deviation of the motion over demonstrations, root mean square [rad or m]."""
-    distribution = fitted.distribution(kind)
+    distribution = fitted.distribution(channel)
     durations = fitted.demonstrations.time.amax(dim=1)
     time = torch.linspace(0, float(durations.mean()), 100, dtype=torch.float64)
     return float(np.sqrt(np.square(distribution.position(time)[1].numpy()).mean()))

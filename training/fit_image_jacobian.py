@@ -18,7 +18,7 @@ from hrc_learn import cli, distributed
 from hrc_learn.demos import DemonstrationSource, open_demos
 from hrc_learn.jacobian import CellErrors, ImageJacobianFitConfig, LearningConfig, Neurons, grid
 from hrc_learn.learning.fit_recordings import learning_recording
-from hrc_learn.learning.fit_visual_servo import fit_visual_servo
+from hrc_learn.learning.visual_servo_fitting import fit_visual_servo
 from hrc_learn.output import new_folder
 from hrc_learn.skills.visual_servoing import VisualServoSkill
 from hrc_learn.viz.figures import learning_figure, workspace_figure

@@ -22,7 +22,7 @@ from hrc_learn import cli
 from hrc_learn.controller import ControllerConfig
 from hrc_learn.experiments.initialization_study import ClosedLoops, StartsConfig, summary
 from hrc_learn.jacobian import KalmanEstimator
-from hrc_learn.learning.tuning import TUNED, Search
+from hrc_learn.learning.tuning import TUNED, TuningState
 from hrc_learn.output import new_folder
 from hrc_learn.sim import World
 from hrc_learn.sim.workplace import Workplace
@@ -84,13 +84,15 @@ def main(args: Args) -> None:
         cli.write_json(args.json, figures)
 
 
-def _begin(args: Args, place: Path, default: ControllerConfig) -> tuple[Search, list[float]]:
+def _begin(
+    args: Args, place: Path, default: ControllerConfig
+) -> tuple[TuningState, list[float]]:
     """A new search, or the one that was interrupted."""
     if args.resume:
         state = json.loads(place.read_text())
-        return Search.from_json(state["search"]), [float(cost) for cost in state["costs"]]
+        return TuningState.from_json(state["search"]), [float(cost) for cost in state["costs"]]
     start = {name: getattr(default, name) for name in TUNED}
-    return Search.around(start, seed=args.starts.seed), []
+    return TuningState.around(start, seed=args.starts.seed), []
 
 
 def _loops(config: StartsConfig) -> ClosedLoops:

@@ -207,7 +207,7 @@ def _largest(values: Float[np.ndarray, " time"]) -> float:
     return float(np.nanmax(values)) if np.isfinite(values).any() else 0.0
 
 
-# Watching a run from the side while it goes on.
+# FeatureTrajectories a run from the side while it goes on.
 
 Watch = Callable[[WorkCell, World, MotionLog], AbstractContextManager[None]]
 """Entered once a work cell is ready to start, and left when the run is over."""

@@ -8,7 +8,7 @@ import torch
 from hrc_learn.demos import Demonstration, DemonstrationSet
 from hrc_learn.jacobian import Learned, Neurons
 from hrc_learn.kinematics import panda
-from hrc_learn.learning.fit_visual_servo import Demonstrations, Watching
+from hrc_learn.learning.visual_servo_fitting import Demonstrations, FeatureTrajectories
 from hrc_learn.skills.visual_servoing import VisualServoSkill
 from hrc_learn.viz import (
     DemonstrationsRecording,
@@ -41,7 +41,8 @@ def learning_recording(
     measured, cells = skill.metrics(), skill.cells
     assert cells is not None  # or there would be no metrics
     paths = tuple(
-        watched.pose.position.numpy() for watched in islice(Watching(demos), _MOST_PATHS)
+        watched.pose.position.numpy()
+        for watched in islice(FeatureTrajectories(demos), _MOST_PATHS)
     )
     height = float(np.mean([path[:, 2].mean() for path in paths]))
     x, y = cells.edges.mT.numpy()

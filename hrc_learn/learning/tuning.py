@@ -15,7 +15,7 @@ import torch
 
 from hrc_learn.controller import ControllerConfig
 
-# Search for the best of a few positive numbers, when a gradient says little.
+# TuningState for the best of a few positive numbers, when a gradient says little.
 #
 # An evolution strategy with a step size for each of them (sep-CMA-ES without its evolution
 # paths; Ros and Hansen 2008, "A simple modification in CMA-ES achieving linear time and space
@@ -23,7 +23,7 @@ from hrc_learn.controller import ControllerConfig
 
 
 @dataclass(frozen=True, kw_only=True)
-class Search:
+class TuningState:
     """Where a search stands. Plain numbers: as JSON it can be resumed elsewhere."""
 
     names: tuple[str, ...]
@@ -38,7 +38,9 @@ class Search:
     best_cost: float = math.inf
 
     @classmethod
-    def around(cls, start: Mapping[str, float], spread: float = 0.4, seed: int = 0) -> Search:
+    def around(
+        cls, start: Mapping[str, float], spread: float = 0.4, seed: int = 0
+    ) -> TuningState:
         """Begin.
 
         Args:
@@ -70,7 +72,7 @@ class Search:
         values = torch.tensor(self.middle, dtype=torch.float64) * steps.exp()
         return [dict(zip(self.names, row, strict=True)) for row in values.tolist()]
 
-    def tell(self, tried: Sequence[Mapping[str, float]], costs: Sequence[float]) -> Search:
+    def tell(self, tried: Sequence[Mapping[str, float]], costs: Sequence[float]) -> TuningState:
         """Learn from what was tried: towards the better half, as wide as it is.
 
         Args:
@@ -104,7 +106,7 @@ class Search:
         return asdict(self) | {"best_cost": self.best_cost if self.best else None}
 
     @classmethod
-    def from_json(cls, values: Mapping[str, Any]) -> Search:
+    def from_json(cls, values: Mapping[str, Any]) -> TuningState:
         """What `to_json` gave.
 
         Raises:

@@ -275,7 +275,7 @@ class VisualServo:
                 feature_new=new,
                 feature_age=age,
                 image_joint_position=observation.joints,
-                human_effort=torch.from_numpy(self._cell.human_input.effort),
+                human_effort=torch.from_numpy(self._cell.human_input.nullspace_input),
                 goals=goals,
                 dt=self._cell.config.dt,
             ),

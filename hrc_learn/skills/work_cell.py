@@ -217,7 +217,7 @@ class WorkCell:
         """One step of tracking a moving pose; the null space yields to the person."""
         pose, J = self.chain.forward_and_jacobian(self.joints)
         correction = self.config.pose_gain * pose.twist_to(goal)
-        null_velocity = torch.from_numpy(self.human_input.effort) / self.config.damping
+        null_velocity = torch.from_numpy(self.human_input.nullspace_input) / self.config.damping
         self.step(resolved_rate(J, twist + correction, null_velocity))
 
     def hold_pose(self, duration: float) -> None:
@@ -272,7 +272,7 @@ class WorkCell:
             joint_position=self.state.joint_position,
             joint_velocity=self.state.joint_velocity,
             command_velocity=velocity.numpy(),
-            human_effort=self.human_input.effort,
+            human_effort=self.human_input.nullspace_input,
             gripper=self.state.gripper_width,
             **columns,
         )

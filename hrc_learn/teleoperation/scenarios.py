@@ -19,7 +19,10 @@ from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.cartesian_motion import nearest_configuration
 from hrc_learn.skills.marker_sensor import MarkerSensor
 from hrc_learn.skills.position_servo import PositionServo, PositionServoConfig
-from hrc_learn.teleoperation.scripted_demonstrations import PlacingLesson, placing_expert
+from hrc_learn.teleoperation.scripted_demonstrations import (
+    PlacingDemonstrationConfig,
+    placing_expert,
+)
 from hrc_learn.teleoperation.scripted_expert import GuidedPath, ScriptedExpert, Tremor
 from hrc_learn.vision import CameraModel, ImageNoise, SyntheticCamera
 
@@ -52,7 +55,7 @@ class Scenario(ABC):
 
         Args:
             world: Of the workplace; its clock begins at zero.
-            rng: Source of where things are, and of the person's unsteadiness.
+            rng: Source of where objects are, and of the person's unsteadiness.
         """
 
     @abstractmethod
@@ -62,11 +65,13 @@ class Scenario(ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class Placing(Scenario):
-    """Put the thing in the hand on a shelf, and let go."""
+    """Put the object in the end effector on a shelf, and let go."""
 
     workplace: Workplace = field(default_factory=Workplace)
     shelf: str = "middle"
-    lesson: PlacingLesson = field(default_factory=PlacingLesson)
+    demonstration: PlacingDemonstrationConfig = field(
+        default_factory=PlacingDemonstrationConfig
+    )
     release: float = 1.5
     """Time for the fingers to open [s]."""
 
@@ -80,14 +85,14 @@ class Placing(Scenario):
 
     @property
     def _let_go(self) -> float:
-        return self.lesson.duration + self.lesson.settle
+        return self.demonstration.duration + self.demonstration.settle
 
     def begin(self, world: World, rng: np.random.Generator) -> Human:
-        expert = placing_expert(self.workplace, self.shelf, self.lesson, rng)
+        expert = placing_expert(self.workplace, self.shelf, self.demonstration, rng)
         offset = torch.from_numpy(expert.path.position(0.0)) - self.workplace.home().position
         joints = self.workplace.home_joints(offset).numpy()
         world.hold(self.workplace.scene.objects[0].name, joints)
-        return InTurn([(0.0, expert, CLOSED), (self._let_go, expert, OPEN)])
+        return SequencedInput([(0.0, expert, CLOSED), (self._let_go, expert, OPEN)])
 
     def succeeded(self, world: World) -> bool:
         return world.rests_on(self.workplace.scene.objects[0].name, f"board_{self.shelf}")
@@ -95,13 +100,13 @@ class Placing(Scenario):
 
 @dataclass(frozen=True, kw_only=True)
 class Grasping(Scenario):
-    """Take a thing that lies at random on the table, and lift it."""
+    """Take an object that lies at random on the table, and lift it."""
 
     workplace: Workplace = field(default_factory=Workplace)
     reach: tuple[float, float, float] = (0.10, 0.08, 0.0)
     """How far from the middle of the table it lies [m]."""
     approach: float = 4.0
-    """From above the middle of the table down to the thing [s]."""
+    """From above the middle of the table down to the object [s]."""
     grip: float = 0.7
     """Time for the fingers to close [s]."""
     lift: float = 2.0
@@ -111,7 +116,7 @@ class Grasping(Scenario):
     settle: float = 0.5
     """Rest at the end [s]."""
     tremor: float = 2e-4
-    """Amplitude of the hand's tremor [m]."""
+    """Amplitude of the end effector's tremor [m]."""
 
     @property
     def task(self) -> str:
@@ -132,7 +137,9 @@ class Grasping(Scenario):
         closing = self.approach + self.grip
         down = self._lead([hover.position.numpy(), above, grasp], self.approach, 0.0, rng)
         up = self._lead([grasp, lifted], self.lift, closing, rng)
-        return InTurn([(0.0, down, OPEN), (self.approach, down, CLOSED), (closing, up, CLOSED)])
+        return SequencedInput(
+            [(0.0, down, OPEN), (self.approach, down, CLOSED), (closing, up, CLOSED)]
+        )
 
     def _lead(
         self, points: list[np.ndarray], duration: float, start: float, rng: np.random.Generator
@@ -150,7 +157,7 @@ class Grasping(Scenario):
         return world.holds(item.name) and bool(bottom > 0.5 * self.height)
 
 
-class InTurn:
+class SequencedInput:
     """People who lead the arm one after the other, each with the gripper's opening."""
 
     def __init__(self, turns: list[tuple[float, Human, float]]):
@@ -339,7 +346,9 @@ def check_scenario(name: str, shelf: str, pixels: bool) -> None:
     if shelf not in SHELVES:
         raise ValueError(f"no shelf {shelf!r}: there are {', '.join(SHELVES)}.")
     if pixels and name == "placing":
-        raise ValueError("placing begins with the object in the hand, so it has no pixels.")
+        raise ValueError(
+            "placing begins with the object in the end effector, so it has no pixels."
+        )
 
 
 def make_scenario(name: str, shelf: str) -> Scenario:

@@ -20,14 +20,14 @@ from hrc_learn.experiments.collaboration.metrics import evaluate, measured, verd
 from hrc_learn.experiments.pose_randomization import THREE_OBJECTS
 from hrc_learn.experiments.run_recording import Deviation, record, span, true_image_jacobian
 from hrc_learn.geometry import Box
-from hrc_learn.sim import NOWHERE, CameraChange, Occlusion
+from hrc_learn.sim import NOWHERE, CameraChange, OcclusionInterval
 from hrc_learn.skills.grasping import GraspingConfig
 from hrc_learn.skills.pick_and_place import PickAndPlaceConfig
 from hrc_learn.skills.visual_servoing import VisualServoConfig
 from hrc_learn.skills.work_cell import WorkCellConfig
-from hrc_learn.teleoperation import PullSpell
+from hrc_learn.teleoperation import ScriptedForce
 
-PULL = (PullSpell(start=0.3, duration=2.0, towards=(0.4, 0.0, 0.5), strongest=60.0),)
+PULL = (ScriptedForce(start=0.3, duration=2.0, towards=(0.4, 0.0, 0.5), max_force=60.0),)
 BRIEF = PickAndPlaceConfig(interaction=0.0)
 HASTY = replace(
     BRIEF,
@@ -58,7 +58,7 @@ def job(aiming, placing):
         ("upper",),
         camera="synthetic",
         pulls=PULL,
-        disturbances=Disturbances(occlusions=(Occlusion(start=0.0, duration=3.0),)),
+        disturbances=Disturbances(occlusions=(OcclusionInterval(start=0.0, duration=3.0),)),
         config=PickAndPlaceConfig(interaction=2.5),
         seed=3,
     )
@@ -294,7 +294,7 @@ def test_where_no_way_gets_free_the_object_is_put_back(aiming, placing):
 @pytest.mark.slow
 def test_a_marker_that_stays_hidden_ends_the_attempts_cleanly(aiming, placing):
     config = replace(BRIEF, grasping=replace(HASTY.grasping, attempts=2))
-    hidden = Disturbances(occlusions=(Occlusion(start=0.0, duration=1e3),))
+    hidden = Disturbances(occlusions=(OcclusionInterval(start=0.0, duration=1e3),))
     job = provoked(aiming, placing, config=config, disturbances=hidden, seed=5)
     assert mishaps(job) == ["marker occluded", "marker occluded"]
     assert "marker" in job.failure
@@ -318,8 +318,8 @@ def test_three_objects_are_placed_though_the_camera_is_changed_between_them(
         pulls=PULL,
         disturbances=Disturbances(
             occlusions=(
-                Occlusion(start=0.0, duration=3.0),
-                Occlusion(start=50.0, duration=3.0),
+                OcclusionInterval(start=0.0, duration=3.0),
+                OcclusionInterval(start=50.0, duration=3.0),
             ),
             camera_change=change,
         ),

@@ -12,7 +12,7 @@ from hrc_learn.kinematics import panda
 from hrc_learn.sim import MotionLog, World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.work_cell import WorkCell
-from hrc_learn.teleoperation import ScriptedPuller
+from hrc_learn.teleoperation import ScriptedPerturbation
 from hrc_learn.viz import live_dashboard as servers
 
 
@@ -33,7 +33,7 @@ def test_a_station_is_shown_while_it_works(tmp_path, monkeypatch):
         chain=panda,
         arm=world.arm,
         gripper=world.arm,
-        human=ScriptedPuller(panda, ()),
+        human=ScriptedPerturbation(panda, ()),
         advance=motion.advance,
     )
     config = ServeConfig(port=1, data_port=2, period=0.01)

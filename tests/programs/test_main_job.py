@@ -33,7 +33,7 @@ def work(tmp_path_factory):
     run("datasets/record_placing.py", "--out", work / "placing_demos", "--episodes", 1)
     run(
         *("datasets/record_servoing.py", "--out", work / "aiming_demos", "--episodes", 4),
-        *("--lesson.duration", 5, "--json", work / "aiming.json"),
+        *("--demonstration.duration", 5, "--json", work / "aiming.json"),
     )
     run("training/fit_dmp.py", "--dataset", work / "placing_demos", "--out", work / "placing")
     run(

@@ -12,12 +12,15 @@ from hrc_learn.demos import DatasetWriter, load_demos
 from hrc_learn.experiments.placing.trial import place, placing_figures
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import UnreachableError, panda
-from hrc_learn.learning.fit_primitives import fit_primitives
+from hrc_learn.learning.primitive_fitting import fit_primitives
 from hrc_learn.sim import World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.placing import PlacingSkill, check_plan, plan_candidates
 from hrc_learn.skills.work_cell import BlockedPathError
-from hrc_learn.teleoperation.scripted_demonstrations import PlacingLesson, teach_placing
+from hrc_learn.teleoperation.scripted_demonstrations import (
+    PlacingDemonstrationConfig,
+    demonstrate_placing,
+)
 
 WORKPLACE = Workplace()
 HOME = WORKPLACE.home_joints()
@@ -28,11 +31,11 @@ HOME = WORKPLACE.home_joints()
 def demos(tmp_path_factory):
     """Two demonstrations, recorded to disk and read back."""
     folder = tmp_path_factory.mktemp("demos") / "placing"
-    lesson, rng = PlacingLesson(), np.random.default_rng(0)
+    config, rng = PlacingDemonstrationConfig(), np.random.default_rng(0)
     world = World(WORKPLACE.scene)
-    with DatasetWriter(folder, lesson.fps, "panda", panda.joint_names) as writer:
+    with DatasetWriter(folder, config.fps, "panda", panda.joint_names) as writer:
         for _ in range(2):
-            frames, touches = teach_placing(world, WORKPLACE, "middle", lesson, rng)
+            frames, touches = demonstrate_placing(world, WORKPLACE, "middle", config, rng)
             assert touches == []
             writer.start_episode("place")
             for frame in frames:
@@ -71,8 +74,10 @@ def test_the_expert_ends_at_the_shelf_and_pulls_the_body_on_the_way(demos):
 @shapes_unchecked()
 def test_without_the_body_shape_the_arm_hits_the_open_door():
     world = World(WORKPLACE.scene)
-    lesson = PlacingLesson(shape_body=False)
-    _, touches = teach_placing(world, WORKPLACE, "middle", lesson, np.random.default_rng(0))
+    config = PlacingDemonstrationConfig(pull_elbow=False)
+    _, touches = demonstrate_placing(
+        world, WORKPLACE, "middle", config, np.random.default_rng(0)
+    )
     assert "cabinet_door" in {touch.second for touch in touches}
 
 

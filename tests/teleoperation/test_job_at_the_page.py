@@ -11,7 +11,7 @@ from taught_skills import taught_aiming, taught_placing
 from hrc_learn.experiments.collaboration.experiment import simulate_collaboration
 from hrc_learn.experiments.run_recording import ELBOW, Deviation, link_poses, span
 from hrc_learn.skills.pick_and_place import PickAndPlaceConfig
-from hrc_learn.teleoperation import page_session as page_beside
+from hrc_learn.teleoperation import page_session as task_page
 from hrc_learn.teleoperation.page import Page, PageConfig
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
@@ -34,7 +34,7 @@ class Job:
             pulls=(),
             config=PickAndPlaceConfig(interaction=15.0),
             seed=3,
-            page=PageConfig(port=8600, patience=PATIENCE),
+            page=PageConfig(port=8600, timeout=PATIENCE),
             watch=self._watch,
         )
 
@@ -67,15 +67,15 @@ def test_the_elbow_yields_to_the_mouse_while_the_hand_aims(tmp_path, monkeypatch
     aiming, (placing, _) = taught_aiming(tmp_path / "aim"), taught_placing(tmp_path / "place")
     job = Job(aiming, placing)
     monkeypatch.setattr(
-        page_beside, "Page", lambda *given, **named: job.open(Page(*given, **named))
+        task_page, "Page", lambda *given, **named: job.open(Page(*given, **named))
     )
     # The browser, which takes most of the machine, is closed before the job goes on.
     with job, chromium(tmp_path / "chromium") as tab:
         wait_until(lambda: job.cell, "a page", timeout=180)
-        browser = Browser(tab, job.pages[0], leads=False)
+        browser = Browser(tab, job.pages[0], guides=False)
         job.begin.set()
         wait_until(lambda: job.phase() == "interact", "time for the person", timeout=300)
-        tab.get_by_text("the hand goes on aiming").wait_for()
+        tab.get_by_text("the end effector keeps servoing").wait_for()
         assert not tab.get_by_role("button", name="Start", exact=True).count()
         elbow = job.link(ELBOW)
         with browser.dragging(elbow, by=(70, -10)):

@@ -17,8 +17,8 @@ from hrc_learn.sim import (
     ChangingCamera,
     MotionLog,
     ObjectConfig,
-    Occluder,
-    Occlusion,
+    OcclusionInterval,
+    ScriptedOcclusion,
     World,
     open_camera,
 )
@@ -33,14 +33,14 @@ from hrc_learn.skills.pick_and_place import (
 from hrc_learn.skills.placing import PlacingSkill, Plan, check_plan
 from hrc_learn.skills.visual_servoing import VisualServoSkill
 from hrc_learn.skills.work_cell import WorkCell, WorkCellConfig
-from hrc_learn.teleoperation import PullSpell, ScriptedPuller
+from hrc_learn.teleoperation import ScriptedForce, ScriptedPerturbation
 from hrc_learn.teleoperation.page import PageConfig
-from hrc_learn.teleoperation.page_session import page_beside
+from hrc_learn.teleoperation.page_session import task_page
 from hrc_learn.vision import CameraModel
 
 PULLS = (
-    PullSpell(start=0.5, duration=4.5, towards=(0.40, 0.00, 0.50), strongest=60.0),
-    PullSpell(start=5.5, duration=4.5, towards=(-0.10, 0.25, 0.60), strongest=60.0),
+    ScriptedForce(start=0.5, duration=4.5, towards=(0.40, 0.00, 0.50), max_force=60.0),
+    ScriptedForce(start=5.5, duration=4.5, towards=(-0.10, 0.25, 0.60), max_force=60.0),
 )
 """A worker reaches under the arm: the elbow is drawn aside, and let back."""
 
@@ -54,7 +54,7 @@ OBJECTS_REACH = (0.12, 0.10)
 class Disturbances:
     """What happens to camera and images beside the job."""
 
-    occlusions: tuple[Occlusion, ...] = ()
+    occlusions: tuple[OcclusionInterval, ...] = ()
     """Spells in which the hand's marker is hidden."""
     camera_change: CameraChange | None = None
     """How the camera is changed between two objects; None: it stays."""
@@ -91,7 +91,7 @@ def simulate_collaboration(
     *,
     workplace: Workplace | None = None,
     camera: CameraKind = "auto",
-    pulls: Sequence[PullSpell] = PULLS,
+    pulls: Sequence[ScriptedForce] = PULLS,
     disturbances: Disturbances | None = None,
     config: PickAndPlaceConfig | None = None,
     cell_config: WorkCellConfig | None = None,
@@ -134,8 +134,8 @@ def simulate_collaboration(
     _check_shelves(workplace, shelves)
     world = World(workplace.scene)
     world.reset(workplace.home_joints().numpy(), _places(workplace, rng))
-    person, motion = ScriptedPuller(panda, pulls, begin=None), MotionLog(world)
-    occluder = Occluder(world, disturbances.occlusions)
+    person, motion = ScriptedPerturbation(panda, pulls, begin=None), MotionLog(world)
+    occluder = ScriptedOcclusion(world, disturbances.occlusions)
     eyes = ChangingCamera(
         workplace.scene.camera, lambda model: open_camera(world, camera, model, rng=rng)
     )
@@ -162,7 +162,7 @@ def simulate_collaboration(
     with torch.inference_mode(), ExitStack() as stack:
         human, passing, beside = person, advance, None
         if page is not None:
-            opened = page_beside(world, cell_config.dt, page, on_page)
+            opened = task_page(world, cell_config.dt, page, on_page)
             beside = stack.enter_context(opened)
             human, passing = beside.joined(person, advance)
         cell = WorkCell(

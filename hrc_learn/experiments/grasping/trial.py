@@ -22,7 +22,7 @@ from hrc_learn.skills.marker_sensor import MarkerSensor
 from hrc_learn.skills.placing import Plan, check_plan
 from hrc_learn.skills.visual_servoing import VisualServoSkill
 from hrc_learn.skills.work_cell import TaskFailedError, WorkCell
-from hrc_learn.teleoperation import ScriptedPuller
+from hrc_learn.teleoperation import ScriptedPerturbation
 from hrc_learn.vision import CameraModel
 
 # Where a grasp begins: a camera nobody calibrated, an arm far off, an object at random.
@@ -221,7 +221,7 @@ def simulate_grasp(
             sensor=MarkerSensor(
                 open_camera(world, camera, rng=rng), workplace.scene.marker_ids
             ),
-            human=ScriptedPuller(panda, (), begin=None),
+            human=ScriptedPerturbation(panda, (), begin=None),
             advance=motion.advance,
             on_phase=on_phase,
         )

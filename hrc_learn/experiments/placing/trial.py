@@ -12,13 +12,13 @@ from hrc_learn.experiments.collaboration.metrics import limit_violations
 from hrc_learn.experiments.run_recording import Watch, unwatched
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import panda
-from hrc_learn.learning.reproduction_error import dimensionless_jerk
+from hrc_learn.learning.reproduction_metrics import dimensionless_jerk
 from hrc_learn.sim import MotionLog, Touch, World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.grasping import OPEN
 from hrc_learn.skills.placing import PlacingSkill, Plan, PlanningSpace
 from hrc_learn.skills.work_cell import WorkCell
-from hrc_learn.teleoperation import ScriptedPuller
+from hrc_learn.teleoperation import ScriptedPerturbation
 
 # One thing placed on a shelf in MuJoCo, from a start of one's own, and what came of it.
 #
@@ -107,7 +107,7 @@ def place(
         chain=panda,
         arm=world.arm,
         gripper=world.arm,
-        human=ScriptedPuller(panda, ()),
+        human=ScriptedPerturbation(panda, ()),
         advance=motion.advance,
     )
     with torch.inference_mode(), watch(cell, world, motion):

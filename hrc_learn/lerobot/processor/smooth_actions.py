@@ -9,6 +9,7 @@ import math
 import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import Any
 
 import torch
@@ -71,8 +72,16 @@ class Changes:
 
 # The steps: one that watches where the robot is, one that smooths what it is sent.
 
-_MEASURED: dict[str, Tensor] = {}
-"""Newest state of the robot, by the name of the pair of steps."""
+
+@cache
+def _measured_states() -> dict[str, Tensor]:
+    """Newest state of the robot, by the name of the pair of steps that share it.
+
+    LeRobot builds preprocessor and postprocessor apart, from their own configurations: a name
+    is all that the two steps can have in common.
+    """
+    return {}
+
 
 _JUMP = 5.0
 """A robot that moves this many times faster than its limit was put there: an episode began."""
@@ -95,11 +104,11 @@ class WatchStateStep(ProcessorStep):
         observation = transition.get(TransitionKey.OBSERVATION) or {}
         state = observation.get(OBS_STATE)
         if state is not None:
-            _MEASURED[self.pair] = torch.atleast_2d(state).detach().cpu()
+            _measured_states()[self.pair] = torch.atleast_2d(state).detach().cpu()
         return transition
 
     def reset(self) -> None:
-        _MEASURED.pop(self.pair, None)
+        _measured_states().pop(self.pair, None)
 
     def get_config(self) -> dict[str, Any]:
         return {"pair": self.pair}
@@ -221,7 +230,7 @@ class SmoothActionsStep(ProcessorStep):
     def _measured(self, chunk: Tensor) -> Float[Tensor, "batch values"]:
         """Where the robot is; values that are not measured are where they are sent."""
         here = chunk[..., 0, :].to(torch.float64)
-        state = _MEASURED.get(self.pair)
+        state = _measured_states().get(self.pair)
         if state is None or state.shape[0] != here.shape[0]:
             return here
         if int(self._columns.max()) >= state.shape[-1]:

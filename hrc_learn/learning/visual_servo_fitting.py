@@ -1,4 +1,4 @@
-"""From demonstrations of aiming: the image Jacobian, where to aim, and how to hold the hand."""
+"""From demonstrations of visual servoing: image Jacobian, visual target, approach direction."""
 
 import copy
 from collections.abc import Callable, Iterator, Sequence
@@ -30,7 +30,7 @@ type Demonstrations = DemonstrationSet | DemonstrationSource
 """In memory, or read one by one."""
 
 _REST = 0.3
-"""Time at the end of a demonstration in which the hand stands above the object [s]."""
+"""Time at the end of a demonstration in which the end effector rests above the object [s]."""
 
 
 def fit_visual_servo(
@@ -53,7 +53,7 @@ def fit_visual_servo(
     Raises:
         ValueError: If a demonstration lacks a column; names it and the episode.
     """
-    camera = Watching(demos)
+    camera = FeatureTrajectories(demos)
     config = config or ImageJacobianFitConfig()
     neurons = neurons or Neurons.around(camera)
     learned = None
@@ -72,7 +72,7 @@ def fit_visual_servo(
     )
 
 
-class Watching(Sequence[Watched]):
+class FeatureTrajectories(Sequence[Watched]):
     """Demonstrations as the fit of an image Jacobian takes them, read when asked for."""
 
     def __init__(self, demos: Sequence[Demonstration], source: str | None = None):
@@ -82,10 +82,10 @@ class Watching(Sequence[Watched]):
     @overload
     def __getitem__(self, index: int) -> Watched: ...
     @overload
-    def __getitem__(self, index: slice) -> "Watching": ...
+    def __getitem__(self, index: slice) -> "FeatureTrajectories": ...
     def __getitem__(self, index):
         if isinstance(index, slice):
-            return Watching(self._demos[index], self._source)
+            return FeatureTrajectories(self._demos[index], self._source)
         return _watched(self._demos[index], self._source)
 
     def __len__(self) -> int:
@@ -102,7 +102,7 @@ def _watched(demo: Demonstration, source: str) -> Watched:
     if missing or pose is None or demo.feature is None or demo.feature_visible is None:
         raise ValueError(
             f"{source}, episode {demo.episode}: no {', '.join(missing)}. An image Jacobian "
-            "needs the hand's pose and its marker's pixel in every frame."
+            "needs the end effector's pose and its marker's pixel in every frame."
         )
     return Watched(
         pose=pose,
@@ -112,7 +112,7 @@ def _watched(demo: Demonstration, source: str) -> Watched:
 
 
 def _pose(demo: Demonstration) -> Pose | None:
-    """Of the hand, as recorded or from the joints of a known arm."""
+    """Of the end effector, as recorded or from the joints of a known arm."""
     if demo.position is not None and demo.orientation is not None:
         return Pose(_double(demo.position), _double(demo.orientation))
     if demo.joint_position is not None and demo.joint_names == panda.joint_names:
@@ -156,8 +156,8 @@ def _end(demo: Demonstration, source: str, network: RBFImageJacobian) -> _End:
     last = (watched.visible & at_rest).nonzero()[:, 0]
     if not len(last):
         raise ValueError(
-            f"{source}, episode {demo.episode}: the hand's marker is not seen in the last "
-            f"{_REST} s, where the hand stands above the object. Leave this episode out."
+            f"{source}, episode {demo.episode}: the end effector's marker is not seen in "
+            f"the last {_REST} s, where it is above the object. Leave this episode out."
         )
     with torch.no_grad():
         jacobian = network(watched.pose[last]).mean(dim=0)
