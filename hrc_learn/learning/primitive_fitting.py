@@ -64,7 +64,7 @@ class FittedPrimitives:
 
     @property
     def pose(self) -> PoseDMP | None:
-        """The same for the end effector; of a Panda with the arm angle as null-space posture."""
+        """The same for the end effector; of a Panda with the arm angle."""
         return cast(PoseDMP | None, self.each.get("pose"))
 
     def save(self, folder: Path, each: bool = False) -> None:

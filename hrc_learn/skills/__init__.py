@@ -1,4 +1,4 @@
-"""Skills: visual servoing, grasping, placing, pick and place. They know protocols, not devices."""
+"""Visual servoing, grasping, placing, pick and place. Skills know protocols, not devices."""
 
 from hrc_learn.skills.cartesian_motion import joint_line as joint_line
 from hrc_learn.skills.cartesian_motion import nearest_configuration as nearest_configuration
