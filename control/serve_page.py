@@ -1,7 +1,7 @@
-"""Lead the simulated arm in a browser, and record demonstrations of your own.
+"""Hand-guide the simulated arm in a browser, and record demonstrations of your own.
 
 Open the address that is printed. Drag a link or a knob of the arm, or of its virtual twin, to
-shape the body; drag the hand's handle to lead the hand, such as to a green field on a shelf.
+move it in its null space; drag the end effector's gizmo, such as to a green field on a shelf.
 Start, stop, save. Ends with "Finish", with Ctrl-C, or after --duration, and leaves a LeRobot
 dataset if anything was saved.
 """
@@ -41,14 +41,14 @@ SWITCH_INTERVAL = 0.0005
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
-    """What to lead, and where to keep it."""
+    """What to record, and where to keep it."""
 
     out: Path
     """Folder of the dataset to record; must not exist."""
-    task: str = "put the thing on the middle shelf"
+    task: str = "put the object on the middle shelf"
     """What is to be shown, in words; it can be changed on the page."""
     beside: Literal["nothing", "gamepad", "keyboard"] = "nothing"
-    """A device for the other hand, which leads the end effector: a gamepad (extra `gamepad`),
+    """A device for the other hand, which moves the end effector: a gamepad (extra `gamepad`),
     or the keys of the terminal this runs in."""
     duration: float | None = None
     """End after this time [s]; None: when the person finishes."""

@@ -19,10 +19,10 @@ from hrc_learn.viz import (
 )
 from hrc_learn.viz.arm_bodies import panda_bodies
 
-# A learned image Jacobian, to be looked at: convergence, neurons, held-out errors.
-
+# Paths drawn at most: more hide each other.
 _MOST_PATHS = 30
-_BELOW = 0.03  # distance of the error map under the lowest path [m]
+# Distance of the error map under the lowest path, so that both can be seen [m].
+_BELOW = 0.03
 
 
 def learning_recording(
@@ -89,9 +89,6 @@ def _places(neurons: Neurons, height: float) -> np.ndarray:
         if component < 3:
             places[:, component] = centers[:, column]
     return places
-
-
-# From demonstrations as they were read to a recording to look at.
 
 
 def demonstrations_recording(demos: DemonstrationSet, title: str) -> DemonstrationsRecording:

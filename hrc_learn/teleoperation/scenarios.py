@@ -1,5 +1,6 @@
-"""Jobs to be learned in the simulated workplace: how they begin, are shown, run and are
-judged.
+"""Scenarios to learn in the simulated workplace: reset, demonstration, execution, success.
+
+Success is read from MuJoCo's contacts and poses, whoever did the job.
 """
 
 from __future__ import annotations
@@ -25,10 +26,6 @@ from hrc_learn.teleoperation.scripted_demonstrations import (
 )
 from hrc_learn.teleoperation.scripted_expert import GuidedPath, ScriptedExpert, Tremor
 from hrc_learn.vision import CameraModel, ImageNoise, SyntheticCamera
-
-# Jobs to be learned in the simulated workplace: how they begin, are shown, and are done.
-#
-# Success is read from MuJoCo's contacts and poses, whoever did the job.
 
 OPEN, CLOSED = 0.08, 0.0
 """Openings that the gripper is sent to [m]; closed, it squeezes what is between the fingers."""
@@ -173,9 +170,6 @@ class SequencedInput:
         begun = [turn for turn in self._turns if turn[0] <= state.time]
         _, human, width = begun[-1] if begun else self._turns[0]
         return replace(human.read(state), gripper=width)
-
-
-# A scenario under way in simulation: begun by seed, moved by targets, looked at.
 
 
 class ScenarioRun:
@@ -328,8 +322,6 @@ def _scaled(model: CameraModel, width: int, height: int) -> CameraModel:
         ),
     )
 
-
-# The scenarios by the names that command lines give them.
 
 SCENARIOS = ("placing", "grasping")
 SHELVES = ("lower", "middle", "upper")
