@@ -79,8 +79,8 @@ where it started) and of the session."""
 class HumanInput:
     """What a person asks for at one instant."""
 
-    effort: Float[np.ndarray, " joints"] = field(default_factory=lambda: np.zeros(7))
-    """Null-space input d: effort on each joint [N m] (paper, eq. globalControl)."""
+    nullspace_input: Float[np.ndarray, " joints"] = field(default_factory=lambda: np.zeros(7))
+    """Null-space effort d on the joints (paper, eq. globalControl)."""
     twist: Float[np.ndarray, " 6"] = field(default_factory=lambda: np.zeros(6))
     """End-effector motion, linear [m/s] and angular [rad/s], in the base frame."""
     gripper: float | None = None

@@ -17,7 +17,7 @@ from hrc_learn.deploy import Rate
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import MovingBodies, World
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.teleoperation import DragConfig
+from hrc_learn.teleoperation import InteractionForceConfig
 from hrc_learn.teleoperation.demonstration_recorder import DemonstrationRecorder
 from hrc_learn.teleoperation.page import Page, PageConfig
 from hrc_learn.teleoperation.page_session import FEATURES, PageSession, PageSessionConfig
@@ -50,18 +50,20 @@ class Session:
         bodies = MovingBodies(world)
         drawn = bodies.drawn(*(poses[None] for poses in bodies.poses()))
         self.writer = DatasetWriter(out, config.fps, "panda", panda.joint_names, FEATURES)
-        page = PageConfig(port=8300, patience=PATIENCE, drag=DragConfig(mapping=mapping))
+        page = PageConfig(
+            port=8300, timeout=PATIENCE, forces=InteractionForceConfig(mapping=mapping)
+        )
         self.page = Page(panda, drawn, workplace.scene.boxes(), page, task="show it")
         self.recorder = DemonstrationRecorder(self.writer, lambda: self.page.task)
         self.session = PageSession(workplace, self.page, self.recorder, world)
-        self.instant = self.session.step()
+        self.step = self.session.step()
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run)
 
     def _run(self):
         metronome = Rate(0.01)
         while not self._closing.is_set():
-            self.instant = self.session.step()
+            self.step = self.session.step()
             metronome.wait()
 
     def __enter__(self):
@@ -78,22 +80,22 @@ class Session:
 
     @property
     def asked(self):
-        return self.instant.asked
+        return self.step.human_input
 
     def frame(self, joint: int) -> np.ndarray:
         """Where a joint's frame is now; -1: the tool centre point."""
-        q = torch.from_numpy(self.instant.state.joint_position)
+        q = torch.from_numpy(self.step.state.joint_position)
         return panda.link_poses(q)[joint - 1 if joint > 0 else -1].position.numpy()
 
 
 class Browser:
     """A page shown in Chromium, and its mouse."""
 
-    def __init__(self, tab, page: Page, timeout: float = 180.0, *, leads: bool = True):
+    def __init__(self, tab, page: Page, timeout: float = 180.0, *, guides: bool = True):
         self.tab = tab
         tab.set_default_timeout(1e3 * timeout)
         tab.goto(page.url)
-        (self.button("Start") if leads else tab.get_by_text("Safety filter")).wait_for()
+        (self.button("Start") if guides else tab.get_by_text("Safety filter")).wait_for()
         wait_until(page._server.get_clients, "a client", timeout)
         clients = page._server.get_clients()
         self._client = clients[max(clients)]

@@ -7,28 +7,28 @@ from unchecked import shapes_unchecked
 
 from hrc_learn.demos import DatasetWriter, DemonstrationSet, load_demos
 from hrc_learn.kinematics import panda
-from hrc_learn.learning.fit_primitives import fit_primitives
-from hrc_learn.learning.fit_visual_servo import fit_aiming
+from hrc_learn.learning.primitive_fitting import fit_primitives
+from hrc_learn.learning.visual_servo_fitting import fit_visual_servo
 from hrc_learn.sim import World, open_camera
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.marker_sensor import Eye
+from hrc_learn.skills.marker_sensor import MarkerSensor
 from hrc_learn.skills.placing import PlacingSkill
-from hrc_learn.skills.visual_servoing import AimingSkill
+from hrc_learn.skills.visual_servoing import VisualServoSkill
 from hrc_learn.skills.visual_target import OBJECT_FEATURE, OBJECT_FEATURE_NAMES
 from hrc_learn.teleoperation.scripted_demonstrations import (
-    AimingLesson,
-    PlacingLesson,
-    teach_aiming,
-    teach_placing,
+    PlacingDemonstrationConfig,
+    ServoDemonstrationConfig,
+    demonstrate_placing,
+    demonstrate_servoing,
 )
 
 WORKPLACE = Workplace()
 
 
-def recorded(folder: Path, lesson, features, demonstrations) -> DemonstrationSet:
+def recorded(folder: Path, config, features, demonstrations) -> DemonstrationSet:
     """Lessons, written to disk and read again."""
     with DatasetWriter(
-        folder, lesson.fps, "panda", panda.joint_names, features=features
+        folder, config.fps, "panda", panda.joint_names, features=features
     ) as writer:
         for frames in demonstrations:
             writer.start_episode("show")
@@ -41,22 +41,28 @@ def recorded(folder: Path, lesson, features, demonstrations) -> DemonstrationSet
 @shapes_unchecked()
 def taught_placing(folder: Path) -> tuple[PlacingSkill, dict[str, float]]:
     """Placing, from one demonstration, and the errors of the fit."""
-    lesson, world = PlacingLesson(), World(WORKPLACE.scene)
-    frames, _ = teach_placing(world, WORKPLACE, "middle", lesson, np.random.default_rng(0))
-    fitted = fit_primitives(recorded(folder / "demos", lesson, {}, [frames]))
+    config, world = PlacingDemonstrationConfig(), World(WORKPLACE.scene)
+    frames, _ = demonstrate_placing(
+        world, WORKPLACE, "middle", config, np.random.default_rng(0)
+    )
+    fitted = fit_primitives(recorded(folder / "demos", config, {}, [frames]))
     fitted.save(folder / "model")
     return PlacingSkill.load(folder / "model"), fitted.metrics()
 
 
 @shapes_unchecked()
-def taught_aiming(folder: Path) -> AimingSkill:
+def taught_aiming(folder: Path) -> VisualServoSkill:
     """Aiming, from five demonstrations."""
-    lesson, rng, world = AimingLesson(duration=5.0), np.random.default_rng(1), World()
-    eye = Eye.on(open_camera(world, "synthetic", rng=rng), WORKPLACE.scene)
-    shown = [teach_aiming(world, WORKPLACE, eye, lesson, rng) for _ in range(5)]
+    config, rng, world = (
+        ServoDemonstrationConfig(duration=5.0),
+        np.random.default_rng(1),
+        World(),
+    )
+    sensor = MarkerSensor(open_camera(world, "synthetic", rng=rng), WORKPLACE.scene.marker_ids)
+    shown = [demonstrate_servoing(world, WORKPLACE, sensor, config, rng) for _ in range(5)]
     features = {OBJECT_FEATURE: OBJECT_FEATURE_NAMES}
-    skill = fit_aiming(recorded(folder / "demos", lesson, features, shown))
+    skill = fit_visual_servo(recorded(folder / "demos", config, features, shown))
     (folder / "model").mkdir()
     skill.save(folder / "model")
     assert skill.metrics()["held_out_relative"] < 0.15
-    return AimingSkill.load(folder / "model")
+    return VisualServoSkill.load(folder / "model")

@@ -52,7 +52,7 @@ EDGES: dict[str, set[str]] = {
 """Edges likewise: where the package meets files, screens and simulators."""
 
 WORK: dict[str, set[str]] = {
-    "skills": {*CORE, *EDGES},
+    "skills": {*CORE, *EDGES} - {"sim"},
     "learning": {*CORE, *EDGES, "skills"},
     "hardware": {*CORE, *EDGES},
     "teleoperation": {*CORE, *EDGES, "skills"},

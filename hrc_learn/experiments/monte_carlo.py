@@ -242,7 +242,7 @@ def _trial(run: Run, seed: int) -> Trial:
         error.add_note(f"in the trial with seed {seed}")
         raise
     finally:
-        # Its world, station and log know each other, and the simulator's memory is not counted
+        # World, work cell and log know each other, and the simulator's memory is not counted
         # by what collects such rings: fifty trials would keep two gigabytes.
         gc.collect()
 

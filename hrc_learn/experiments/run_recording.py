@@ -15,11 +15,11 @@ from hrc_learn.kinematics import panda
 from hrc_learn.sim import MotionLog, World
 from hrc_learn.skills.pick_and_place import INTERACT, TRANSFER
 from hrc_learn.skills.placing import Plan
-from hrc_learn.skills.work_cell import SAFETY_COLUMNS, Station
+from hrc_learn.skills.work_cell import SAFETY_COLUMNS, WorkCell
 from hrc_learn.vision import CameraModel
 from hrc_learn.viz import CameraRecording, JointLimits, LoggedSteps, RunRecording
 
-# From what a station logged, and what the simulator knows, to a recording to look at.
+# From what a work cell logged, and what the simulator knows, to a recording to look at.
 
 ELBOW, TOOL = 3, 8
 """Frames of the elbow and of the tool among the links."""
@@ -27,7 +27,7 @@ ELBOW, TOOL = 3, 8
 
 def record(
     title: str,
-    station: Station,
+    cell: WorkCell,
     world: World,
     motion: MotionLog,
     *,
@@ -40,7 +40,7 @@ def record(
 
     Args:
         title: What it was.
-        station: That ran it.
+        cell: That ran it.
         world: That it ran in; tells what only a simulator knows.
         motion: Where everything was.
         plans: The ways to the shelves, in turn, as far as it came to that.
@@ -49,9 +49,9 @@ def record(
         demonstration: One that the way was learned from.
     """
     # Another thread may ask while the loop goes on: both logs as far as both have come.
-    log = station.log.snapshot(len(motion))
+    log = cell.log.snapshot(len(motion))
     time, safety = log["time"], log["safety"]
-    images = tuple(station.images)
+    images = tuple(cell.images)
     deviation = Deviation.of(log)
     cameras = cameras or ((-math.inf, world.config.camera),)
     limits = panda.limits
@@ -106,7 +106,7 @@ def span(log: LoggedSteps, phase: str) -> tuple[float, float]:
 
 def _there_and_back(plans: Sequence[Plan]) -> Float[np.ndarray, "samples 3"] | None:
     """Path of the hand along all plans; it backs out of a shelf the way it went in."""
-    paths = [plan.hand.position.numpy() for plan in plans]
+    paths = [plan.tool_pose.position.numpy() for plan in plans]
     return np.concatenate([np.vstack([path, path[::-1]]) for path in paths]) if paths else None
 
 
@@ -207,15 +207,13 @@ def _largest(values: Float[np.ndarray, " time"]) -> float:
     return float(np.nanmax(values)) if np.isfinite(values).any() else 0.0
 
 
-# Watching a run from the side while it goes on.
+# FeatureTrajectories a run from the side while it goes on.
 
-Watch = Callable[[Station, World, MotionLog], AbstractContextManager[None]]
-"""Entered once a station is ready to start, and left when the run is over."""
+Watch = Callable[[WorkCell, World, MotionLog], AbstractContextManager[None]]
+"""Entered once a work cell is ready to start, and left when the run is over."""
 
 
-def unwatched(
-    station: Station, world: World, motion: MotionLog
-) -> AbstractContextManager[None]:
+def unwatched(cell: WorkCell, world: World, motion: MotionLog) -> AbstractContextManager[None]:
     """Nobody watches."""
     return nullcontext()
 
@@ -245,14 +243,14 @@ def serving(title: str, config: ServeConfig, on_open: Callable[[str], None]) -> 
     """
 
     @contextmanager
-    def watch(station: Station, world: World, motion: MotionLog) -> Iterator[None]:
+    def watch(cell: WorkCell, world: World, motion: MotionLog) -> Iterator[None]:
         from hrc_learn.viz.live_dashboard import (
             live_dashboard,  # rerun takes a second
             serve_stream,
         )
 
         def snapshot():
-            return record(title, station, world, motion) if len(motion) else None
+            return record(title, cell, world, motion) if len(motion) else None
 
         with serve_stream(config.port, config.data_port) as server:
             on_open(server.viewer)

@@ -39,7 +39,7 @@ class FrankyArm:
 
         Args:
             ip: Address of the control box.
-            dynamics: Share of the driver's own limits.
+            dynamics: Fraction of the driver's own limits.
             timeout: How long a velocity holds [s].
             grip_force: With which the gripper squeezes [N].
             grip_speed: Of the fingers [m/s].

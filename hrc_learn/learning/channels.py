@@ -1,4 +1,4 @@
-"""What a demonstration can teach: the motion of the joints, of the hand, or of its parts."""
+"""Channels of a demonstration to learn: joints, position, orientation, or pose."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,16 +15,16 @@ from hrc_learn.dmp import JointDMP, OrientationDMP, PoseDMP
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import arm_angle, panda
 
-type Kind = Literal["joint", "position", "orientation", "pose"]
+type Channel = Literal["joint", "position", "orientation", "pose"]
 type Primitive = JointDMP | OrientationDMP | PoseDMP
 
-KINDS: dict[str, tuple[str, ...]] = {
+CHANNELS: dict[str, tuple[str, ...]] = {
     "joint": ("joint_position",),
     "position": ("position",),
     "orientation": ("orientation",),
     "pose": ("position", "orientation"),
 }
-"""Every kind, with the columns that it is learned from."""
+"""Every channel, with the columns that it is learned from."""
 CLASSES = {
     "joint": JointDMP,
     "position": JointDMP,
@@ -35,7 +35,7 @@ CLASSES = {
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Motions:
-    """Demonstrations of one motion, ready for any kind of primitive."""
+    """Demonstrations of one motion, ready for a primitive of any channel."""
 
     demos: PaddedDemonstrations
     joint_names: tuple[str, ...]
@@ -43,7 +43,7 @@ class Motions:
 
     @classmethod
     def of(cls, demos: DemonstrationSet) -> "Motions":
-        """Pad them; of a Panda, the pose of the hand follows from the joints."""
+        """Pad them; of a Panda, the pose of the end effector follows from the joints."""
         padded = demos.padded()
         joints = padded.joint_position if demos.joint_names == panda.joint_names else None
         if joints is not None and (padded.position is None or padded.orientation is None):
@@ -55,8 +55,8 @@ class Motions:
     def available(self) -> tuple[str, ...]:
         """Kinds that can be learned."""
         return tuple(
-            kind
-            for kind, columns in KINDS.items()
+            channel
+            for channel, columns in CHANNELS.items()
             if all(getattr(self.demos, column) is not None for column in columns)
         )
 
@@ -66,49 +66,51 @@ class Motions:
         assert values is not None, name
         return values
 
-    def position(self, kind: str) -> Float[Tensor, "demos frames D"]:
-        """What a kind of primitive with linear coordinates is fitted to."""
-        return self.column(KINDS[kind][0])
+    def position(self, channel: str) -> Float[Tensor, "demos frames D"]:
+        """What a primitive of a channel with linear coordinates is fitted to."""
+        return self.column(CHANNELS[channel][0])
 
-    def naming(self, kind: str) -> dict[str, Any]:
-        """Names and unit of the coordinates of such a kind."""
-        if kind == "joint":
+    def naming(self, channel: str) -> dict[str, Any]:
+        """Names and unit of the coordinates of a linear channel."""
+        if channel == "joint":
             return {"joint_names": self.joint_names or None, "units": "rad"}
         return {"joint_names": ("x", "y", "z"), "units": "m"}
 
-    def fit(self, kind: str, n_basis: int, **options: Any) -> Primitive:
+    def fit(self, channel: str, n_basis: int, **options: Any) -> Primitive:
         """One primitive for each demonstration.
 
         Args:
-            kind: One of `available()`.
+            channel: One of `available()`.
             n_basis: Number of basis functions.
             options: See `FitOptions`.
 
         Raises:
-            ValueError: The demonstrations lack what the kind needs.
+            ValueError: The demonstrations lack what the channel needs.
         """
-        self.require(kind)
+        self.require(channel)
         time, mask = self.demos.time, self.demos.mask
-        if kind == "orientation":
+        if channel == "orientation":
             turn = self.column("orientation")
             return OrientationDMP.fit(time, turn, n_basis, mask=mask, **options)
-        position = self.position(kind)
-        if kind == "pose":
+        position = self.position(channel)
+        if channel == "pose":
             turn, body = self.column("orientation"), self._body_shape()
             return PoseDMP.fit(time, position, turn, n_basis, body=body, mask=mask, **options)
-        return JointDMP.fit(time, position, n_basis, mask=mask, **self.naming(kind), **options)
+        return JointDMP.fit(
+            time, position, n_basis, mask=mask, **self.naming(channel), **options
+        )
 
-    def require(self, kind: str) -> None:
-        """Raise ValueError unless a kind can be learned."""
-        missing = [name for name in KINDS[kind] if getattr(self.demos, name) is None]
+    def require(self, channel: str) -> None:
+        """Raise ValueError unless a channel can be learned."""
+        missing = [name for name in CHANNELS[channel] if getattr(self.demos, name) is None]
         if missing:
             raise ValueError(
                 f"{self.source}: the demonstrations hold no {' and no '.join(missing)}, which "
-                f"a primitive of kind {kind!r} is learned from. Look with "
-                f"hrc check."
+                f"a primitive of channel {channel!r} is learned from. Look with "
+                f"datasets/check_dataset.py."
             )
 
-    def adapted(self, kind: str, primitive: Primitive) -> "Reproduction":
+    def adapted(self, channel: str, primitive: Primitive) -> "Reproduction":
         """A primitive with the start, goal and duration of each demonstration."""
         last = (self.demos.length - 1)[:, None, None]
 
@@ -119,7 +121,7 @@ class Motions:
         time, duration = self.demos.time, self.demos.time.take_along_dim(last[..., 0], dim=1)
         timing = {"duration": duration[:, 0]}
         if isinstance(primitive, JointDMP):
-            start, goal = ends(KINDS[kind][0])
+            start, goal = ends(CHANNELS[channel][0])
             return Reproduction(primitive.rollout(time, start, goal, **timing).position)
         turn_start, turn_goal = ends("orientation")
         if isinstance(primitive, OrientationDMP):
@@ -151,7 +153,7 @@ class Motions:
 
 @dataclass(frozen=True, eq=False)
 class Reproduction:
-    """Motions at the stamps of demonstrations; None where a kind says nothing about it."""
+    """Motions at the stamps of demonstrations; None where a channel says nothing about it."""
 
     position: Float[Tensor, "demos frames D"] | None = None
     """Joints [rad] or position [m]."""
@@ -163,24 +165,24 @@ class Reproduction:
                 object.__setattr__(self, name, values.detach())
 
 
-def load_primitive(folder: Path, kind: str) -> Primitive:
-    """A saved primitive of that kind.
+def load_primitive(folder: Path, channel: str) -> Primitive:
+    """A saved primitive of that channel.
 
     Raises:
         FileNotFoundError: No saved primitive there.
-        ValueError: It is another kind of model.
+        ValueError: It is a model of another channel.
     """
-    return CLASSES[kind].load(folder)
+    return CLASSES[channel].load(folder)
 
 
-def kinds_wanted(motions: Motions, wanted: Sequence[str]) -> tuple[str, ...]:
+def select_channels(motions: Motions, wanted: Sequence[str]) -> tuple[str, ...]:
     """Kinds to learn: those wanted, or, if none is named, joints and pose or what there is.
 
     Raises:
-        ValueError: The demonstrations lack what a kind needs, or hold no motion at all.
+        ValueError: The demonstrations lack what a channel needs, or hold no motion at all.
     """
-    for kind in wanted:
-        motions.require(kind)
+    for channel in wanted:
+        motions.require(channel)
     if wanted:
         return tuple(wanted)
     available = motions.available()
@@ -190,6 +192,6 @@ def kinds_wanted(motions: Motions, wanted: Sequence[str]) -> tuple[str, ...]:
             "end-effector poses, so there is no motion to learn. Look with "
             "hrc check."
         )
-    whole = [kind for kind in ("joint", "pose") if kind in available]
-    parts = [kind for kind in ("position", "orientation") if kind in available]
+    whole = [channel for channel in ("joint", "pose") if channel in available]
+    parts = [channel for channel in ("position", "orientation") if channel in available]
     return tuple(whole if "pose" in whole else whole + parts)

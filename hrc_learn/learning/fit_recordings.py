@@ -8,8 +8,8 @@ import torch
 from hrc_learn.demos import Demonstration, DemonstrationSet
 from hrc_learn.jacobian import EvidenceResult, RBFCenters
 from hrc_learn.kinematics import panda
-from hrc_learn.learning.fit_visual_servo import Demonstrations, Watching
-from hrc_learn.skills.visual_servoing import AimingSkill
+from hrc_learn.learning.visual_servo_fitting import Demonstrations, FeatureTrajectories
+from hrc_learn.skills.visual_servoing import VisualServoSkill
 from hrc_learn.viz import (
     DemonstrationsRecording,
     DemonstrationTrace,
@@ -19,14 +19,14 @@ from hrc_learn.viz import (
 )
 from hrc_learn.viz.arm_bodies import panda_bodies
 
-# A learned image Jacobian, to be looked at: convergence, neurons, held-out errors.
-
+# Paths drawn at most: more hide each other.
 _MOST_PATHS = 30
-_BELOW = 0.03  # distance of the error map under the lowest path [m]
+# Distance of the error map under the lowest path, so that both can be seen [m].
+_BELOW = 0.03
 
 
 def learning_recording(
-    skill: AimingSkill, demos: Demonstrations, title: str
+    skill: VisualServoSkill, demos: Demonstrations, title: str
 ) -> LearningRecording:
     """What is to be shown of a skill just fitted.
 
@@ -41,7 +41,8 @@ def learning_recording(
     measured, cells = skill.metrics(), skill.cells
     assert cells is not None  # or there would be no metrics
     paths = tuple(
-        watched.pose.position.numpy() for watched in islice(Watching(demos), _MOST_PATHS)
+        image_demonstrations.pose.position.numpy()
+        for image_demonstrations in islice(FeatureTrajectories(demos), _MOST_PATHS)
     )
     height = float(np.mean([path[:, 2].mean() for path in paths]))
     x, y = cells.edges.mT.numpy()
@@ -88,9 +89,6 @@ def _places(neurons: RBFCenters, height: float) -> np.ndarray:
         if component < 3:
             places[:, component] = centers[:, column]
     return places
-
-
-# From demonstrations as they were read to a recording to look at.
 
 
 def demonstrations_recording(demos: DemonstrationSet, title: str) -> DemonstrationsRecording:

@@ -1,6 +1,4 @@
-"""Tuning of positive numbers such as gains, when a gradient says little, and the file
-that keeps them.
-"""
+"""Tuning of positive parameters such as gains without gradients, and their file."""
 
 from __future__ import annotations
 
@@ -15,16 +13,15 @@ import torch
 
 from hrc_learn.controller import ControllerConfig
 
-# Search for the best of a few positive numbers, when a gradient says little.
-#
-# An evolution strategy with a step size for each of them (sep-CMA-ES without its evolution
-# paths; Ros and Hansen 2008, "A simple modification in CMA-ES achieving linear time and space
-# complexity"), on logarithms, so that factors count.
-
 
 @dataclass(frozen=True, kw_only=True)
-class Search:
-    """Where a search stands. Plain numbers: as JSON it can be resumed elsewhere."""
+class TuningState:
+    """State of a tuning run. Plain numbers: as JSON it can be resumed elsewhere.
+
+    An evolution strategy with a step size for each parameter (sep-CMA-ES without its evolution
+    paths; Ros and Hansen 2008, "A simple modification in CMA-ES achieving linear time and space
+    complexity"), on logarithms, so that factors count.
+    """
 
     names: tuple[str, ...]
     middle: tuple[float, ...]
@@ -38,7 +35,9 @@ class Search:
     best_cost: float = math.inf
 
     @classmethod
-    def around(cls, start: Mapping[str, float], spread: float = 0.4, seed: int = 0) -> Search:
+    def around(
+        cls, start: Mapping[str, float], spread: float = 0.4, seed: int = 0
+    ) -> TuningState:
         """Begin.
 
         Args:
@@ -63,6 +62,7 @@ class Search:
 
     def ask(self, count: int) -> list[dict[str, float]]:
         """Numbers to try next: the middle, then draws about it in mirrored pairs."""
+        # A prime keeps the streams of two seeds apart for the first million generations.
         rng = torch.Generator().manual_seed(1_000_003 * self.seed + self.generation)
         half = torch.randn(count // 2, len(self.names), generator=rng, dtype=torch.float64)
         z = torch.cat([torch.zeros(1, len(self.names)), half, -half])[:count]
@@ -70,7 +70,7 @@ class Search:
         values = torch.tensor(self.middle, dtype=torch.float64) * steps.exp()
         return [dict(zip(self.names, row, strict=True)) for row in values.tolist()]
 
-    def tell(self, tried: Sequence[Mapping[str, float]], costs: Sequence[float]) -> Search:
+    def tell(self, tried: Sequence[Mapping[str, float]], costs: Sequence[float]) -> TuningState:
         """Learn from what was tried: towards the better half, as wide as it is.
 
         Args:
@@ -80,6 +80,7 @@ class Search:
         costs = [math.inf if math.isnan(cost) else cost for cost in costs]
         order = sorted(range(len(costs)), key=costs.__getitem__)
         elite = [tried[i] for i in order[: max(len(order) // 2, 1)]]
+        # Weights of rank k fall as log(mu + 1/2) - log k (Hansen 2016, eq. 49).
         share = [math.log(len(elite) + 0.5) - math.log(k + 1) for k in range(len(elite))]
         weights = torch.tensor(share, dtype=torch.float64) / sum(share)
         rows = torch.tensor([[one[name] for name in self.names] for one in elite])
@@ -88,6 +89,7 @@ class Search:
         middle = weights @ rows
         moved = weights @ (rows - before).square()
         old = torch.tensor(self.spread, dtype=torch.float64)
+        # Half of the old variance is kept: a generation of ten tells the new one badly.
         spread = (0.5 * old.square() + 0.5 * moved).sqrt()
         found = costs[order[0]] < self.best_cost
         return replace(
@@ -104,7 +106,7 @@ class Search:
         return asdict(self) | {"best_cost": self.best_cost if self.best else None}
 
     @classmethod
-    def from_json(cls, values: Mapping[str, Any]) -> Search:
+    def from_json(cls, values: Mapping[str, Any]) -> TuningState:
         """What `to_json` gave.
 
         Raises:
@@ -121,8 +123,6 @@ class Search:
         except (KeyError, TypeError, AttributeError) as error:
             raise ValueError(f"not the state of a search: {error}") from None
 
-
-# Gains of the controller in a file: written by tuning, taken by the programs that run it.
 
 TUNED = ("vision_rate", "linear_speed", "angular_speed")
 """Fields of `ControllerConfig` that tuning searches."""

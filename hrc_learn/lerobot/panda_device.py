@@ -1,18 +1,16 @@
-"""What LeRobot asks of robots and teleoperators alike, and which of our robots are
-connected.
-"""
+"""What LeRobot asks of robots and teleoperators alike, and how they find each other."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Iterator
+from functools import cache
 from typing import TYPE_CHECKING
 
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 
 if TYPE_CHECKING:
     from hrc_learn.lerobot.robots.panda_robot import PandaRobot
-
-# What LeRobot asks of robots and teleoperators alike.
 
 
 class Device:
@@ -68,27 +66,46 @@ class Device:
         """Let it go."""
 
 
-# Which of our robots are connected in this process.
-#
-# LeRobot tells a teleoperator nothing of the robot it leads. One that leads the hand, rather
-# than copying joints of its own, needs to know where the arm is.
+class RobotRegistry:
+    """The connected robots among which a teleoperator finds the one that it guides.
 
-CONNECTED: list[PandaRobot] = []
-"""In the order they were connected in."""
-
-
-def connected_robot(id: str | None) -> PandaRobot:
-    """The robot that is connected under a name, or the only one.
-
-    Raises:
-        DeviceNotConnectedError: There is none, or several and no name is given.
+    LeRobot gives a teleoperator no reference to the robot. One that guides the end effector,
+    rather than copying joints of its own, needs to know where the arm is.
     """
-    found = [robot for robot in CONNECTED if id in (None, robot.id)]
-    if len(found) == 1:
-        return found[0]
-    names = ", ".join(repr(robot.id) for robot in CONNECTED) or "none"
-    wanted = "a robot of hrc_learn" if id is None else f"one robot with id {id!r}"
-    raise DeviceNotConnectedError(
-        f"this teleoperator leads {wanted} (mujoco_panda or franka_panda); connected: {names}. "
-        "Give --teleop.robot_id where there are several."
-    )
+
+    def __init__(self) -> None:
+        self._robots: list[PandaRobot] = []
+
+    def __iter__(self) -> Iterator[PandaRobot]:
+        """In the order in which they were connected."""
+        return iter(tuple(self._robots))
+
+    def add(self, robot: PandaRobot) -> None:
+        """Note a robot that has been connected."""
+        self._robots.append(robot)
+
+    def remove(self, robot: PandaRobot) -> None:
+        """Forget a robot that has been disconnected."""
+        self._robots.remove(robot)
+
+    def find(self, id: str | None) -> PandaRobot:
+        """The robot with a name, or the only one.
+
+        Raises:
+            DeviceNotConnectedError: There is none, or several and no name is given.
+        """
+        found = [robot for robot in self._robots if id in (None, robot.id)]
+        if len(found) == 1:
+            return found[0]
+        names = ", ".join(repr(robot.id) for robot in self._robots) or "none"
+        wanted = "a robot of hrc_learn" if id is None else f"one robot with id {id!r}"
+        raise DeviceNotConnectedError(
+            f"this teleoperator guides {wanted} (mujoco_panda or franka_panda); connected: "
+            f"{names}. Give --teleop.robot_id where there are several."
+        )
+
+
+@cache
+def robot_registry() -> RobotRegistry:
+    """The registry of this process, which robots and teleoperators share."""
+    return RobotRegistry()

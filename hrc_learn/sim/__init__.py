@@ -2,8 +2,8 @@
 
 from hrc_learn.sim.camera_disturbances import CameraChange as CameraChange
 from hrc_learn.sim.camera_disturbances import ChangingCamera as ChangingCamera
-from hrc_learn.sim.camera_disturbances import Occluder as Occluder
-from hrc_learn.sim.camera_disturbances import Occlusion as Occlusion
+from hrc_learn.sim.camera_disturbances import OcclusionInterval as OcclusionInterval
+from hrc_learn.sim.camera_disturbances import ScriptedOcclusion as ScriptedOcclusion
 from hrc_learn.sim.contacts import ContactMonitor as ContactMonitor
 from hrc_learn.sim.contacts import Touch as Touch
 from hrc_learn.sim.marker_plates import Plate as Plate

@@ -1,6 +1,4 @@
-"""What happens to a camera while it is needed: it is moved, refocused, or its sight is
-occluded.
-"""
+"""Disturbances of a camera in use: it is moved, refocused, or a marker is occluded."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -9,11 +7,21 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from hrc_learn.protocols import Camera
-from hrc_learn.sim.scene import COVER, COVER_COLOUR, COVER_HALF_SIZE, HAND_MARKER, NOWHERE
+from hrc_learn.sim.scene import (
+    HAND_MARKER,
+    NOWHERE,
+    OCCLUDER,
+    OCCLUDER_COLOUR,
+    OCCLUDER_HALF_SIZE,
+)
 from hrc_learn.sim.world import World
-from hrc_learn.vision import CameraModel, Cover
+from hrc_learn.vision import CameraModel, OccludingBoard
 
-# A camera that somebody bumps into, moves or refocuses now and then.
+# pyright: reportAttributeAccessIssue=false
+# MuJoCo ships no type stubs; its names come from a compiled module.
+
+# How far above the marker the board is held, towards the camera: clear of the gripper [m].
+_BOARD_HEIGHT = 0.10
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,19 +123,9 @@ def _rotation(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     return np.eye(3) + np.sin(angle) * K + (1.0 - np.cos(angle)) * K @ K
 
 
-# Somebody holds a board before the camera, so that it does not see a marker for a while.
-
-# pyright: reportAttributeAccessIssue=false
-# MuJoCo ships no type stubs; its names come from a compiled module.
-
-
-_HEIGHT = 0.10
-"""How far above the marker the board is held, towards the camera [m]."""
-
-
 @dataclass(frozen=True, kw_only=True)
-class Occlusion:
-    """A spell in which a marker is hidden."""
+class OcclusionInterval:
+    """An interval in which a marker is occluded."""
 
     start: float
     """[s]"""
@@ -144,34 +142,34 @@ class Occlusion:
             )
 
 
-class Occluder:
-    """Holds the board between the camera and a marker, wherever that moves."""
+class ScriptedOcclusion:
+    """Holds a board between the camera and a marker, wherever that moves."""
 
-    def __init__(self, world: World, spells: Sequence[Occlusion]):
-        self._world, self._spells, self._held = world, tuple(spells), False
+    def __init__(self, world: World, intervals: Sequence[OcclusionInterval]):
+        self._world, self._intervals, self._held = world, tuple(intervals), False
 
     def update(self) -> None:
-        """Move the board to where it is wanted now."""
+        """Move the board to where it belongs now."""
         now = self._world.time
-        for spell in self._spells:
-            if spell.start <= now < spell.start + spell.duration:
-                marker = self._world.marker_poses()[spell.marker][:3, 3]
+        for interval in self._intervals:
+            if interval.start <= now < interval.start + interval.duration:
+                marker = self._world.marker_poses()[interval.marker][:3, 3]
                 towards = self._world.config.camera.pose[:3, 3] - marker
-                offset = _HEIGHT * towards / np.linalg.norm(towards)
-                self._world.move_obstacle(COVER, marker + offset)
+                offset = _BOARD_HEIGHT * towards / np.linalg.norm(towards)
+                self._world.move_obstacle(OCCLUDER, marker + offset)
                 self._held = True
                 return
         if self._held:
-            self._world.move_obstacle(COVER, NOWHERE)
+            self._world.move_obstacle(OCCLUDER, NOWHERE)
             self._held = False
 
 
-def covers_in(world: World, model: CameraModel) -> list[Cover]:
+def occluding_boards(world: World, model: CameraModel) -> list[OccludingBoard]:
     """The board as a camera without OpenGL is to draw it, if it is in the scene."""
-    centre = world.data.body(COVER).xpos
-    x, y, z = COVER_HALF_SIZE
+    centre = world.data.body(OCCLUDER).xpos
+    x, y, z = OCCLUDER_HALF_SIZE
     corners = centre + np.array([[-x, -y, z], [x, -y, z], [x, y, z], [-x, y, z]])
     # Taken away it lies under the floor, which hides it from every camera.
     if np.array_equal(centre, NOWHERE) or not model.in_view(corners).any():
         return []
-    return [Cover(corners=corners, colour=COVER_COLOUR[:3])]
+    return [OccludingBoard(corners=corners, colour=OCCLUDER_COLOUR[:3])]

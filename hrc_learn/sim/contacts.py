@@ -12,7 +12,7 @@ import numpy as np
 
 @dataclass(frozen=True, kw_only=True)
 class Touch:
-    """Two things in contact, from `start` until `end`."""
+    """Two objects in contact, from `start` until `end`."""
 
     first: str
     """Geom of the moving side (arm, hand or carried object)."""

@@ -30,7 +30,7 @@ class Plate:
     orientation: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
     """Orientation of the plate's frame (wxyz): x along the marker's top edge, y up its side."""
     solid: bool = True
-    """Whether the plate touches things. A sticker on a box does not."""
+    """Whether the plate touches objects. A sticker on a box does not."""
 
 
 def add_plate(spec: mujoco.MjSpec, body, name: str, plate: Plate) -> None:

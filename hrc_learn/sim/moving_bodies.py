@@ -6,11 +6,9 @@ from jaxtyping import Float
 
 from hrc_learn.geometry import Body, Box, Capsule
 from hrc_learn.sim.contacts import body_geoms
-from hrc_learn.sim.scene import COVER
+from hrc_learn.sim.scene import OCCLUDER
 from hrc_learn.sim.world import World
 from hrc_learn.viz.arm_bodies import panda_mesh
-
-# Everything that moves in a world, to be drawn: its shapes, and where it is.
 
 # pyright: reportAttributeAccessIssue=false
 # MuJoCo ships no type stubs; its names come from a compiled module.
@@ -24,7 +22,7 @@ class MovingBodies:
         model = world.model
         obstacles = (box.name for box in world.config.obstacles)
         objects = (item.name for item in world.config.objects)
-        movers = ["link0", *objects, *obstacles, COVER]
+        movers = ["link0", *objects, *obstacles, OCCLUDER]
         geoms = body_geoms(model, movers)
         self._indices = sorted({int(b) for b in model.geom_bodyid[geoms]})
         self.names = tuple(model.body(b).name for b in self._indices)
@@ -91,11 +89,8 @@ def _triple(vector: np.ndarray) -> tuple[float, float, float]:
     return x, y, z
 
 
-# Where everything that moves has been, to be drawn afterwards.
-
-
 class MotionLog:
-    """Remembers where everything that moves was after each step of the station."""
+    """Remembers where everything that moves was after each step."""
 
     def __init__(self, world: World):
         self._world = world

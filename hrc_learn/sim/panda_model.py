@@ -39,9 +39,9 @@ class PandaModelConfig:
     damping: tuple[float, ...] = (600.0, 600.0, 450.0, 450.0, 150.0, 150.0, 80.0)
     """Velocity gain of the joint servos [N m s/rad]."""
     grip_force: float = 40.0
-    """Largest force of a finger [N] (the hand's continuous rating is 70 N)."""
+    """Largest force of a finger [N] (the end effector's continuous rating is 70 N)."""
     marker: Plate | None = None
-    """ArUco plate on the hand, in the hand's frame."""
+    """ArUco plate on the end effector, in the end effector's frame."""
 
 
 # Masses of links 1 to 7 [kg], from franka_description.
@@ -75,7 +75,7 @@ def add_panda(spec: mujoco.MjSpec, config: PandaModelConfig) -> None:
         parent_frame = frames[i]
         _add_joint(spec, body, name, i, config)
         _add_capsules(body, i + 1, mass=_MASSES[i])
-    # The hand's frame: at the flange, turned as the tool.
+    # The end effector's frame: at the flange, turned as the tool.
     flange, tool = frames[7], frames[8]
     hand_frame = np.linalg.inv(parent_frame) @ tool
     hand_frame[:3, 3] = (np.linalg.inv(parent_frame) @ flange)[:3, 3]

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from hrc_learn.protocols import Camera
-from hrc_learn.sim.camera_disturbances import covers_in
+from hrc_learn.sim.camera_disturbances import occluding_boards
 from hrc_learn.sim.world import World
 from hrc_learn.vision import CameraModel, ImageNoise, Lens, Marker, SyntheticCamera
 
@@ -61,7 +61,7 @@ class OffscreenRenderer:
             self._scene,
         )
         for view in self._scene.camera:
-            _aim(view, camera)
+            _set_view(view, camera)
         viewport = mujoco.MjrRect(0, 0, width, height)
         mujoco.mjr_render(viewport, self._scene, self._context)
         image = np.empty((height, width, 3), dtype=np.uint8)
@@ -97,7 +97,7 @@ def _open_context(width: int, height: int):
     return context
 
 
-def _aim(view: mujoco.MjvGLCamera, camera: CameraModel) -> None:
+def _set_view(view: mujoco.MjvGLCamera, camera: CameraModel) -> None:
     """Give OpenGL's camera the pose and the frustum of a pinhole."""
     R = camera.pose[:3, :3]
     view.pos = camera.pose[:3, 3]
@@ -146,12 +146,12 @@ class EGLCamera:
         self._renderer.close()
 
 
-class MarkerSight:
-    """Which markers something stands in front of, by casting rays from the camera."""
+class MarkerVisibility:
+    """Which markers are occluded, by casting rays from the camera."""
 
     def __init__(self, world: World, model: CameraModel, markers: list[Marker]):
         self._world = world
-        self._eye = model.pose[:3, 3].copy()
+        self._centre = model.pose[:3, 3].copy()
         self._markers = {marker.id: marker for marker in markers}
 
     def hidden(self) -> Set[int]:
@@ -168,12 +168,12 @@ class MarkerSight:
         geom = np.zeros(1, dtype=np.int32)
         normal = np.zeros(3)
         for point in points:
-            ray = point - self._eye
+            ray = point - self._centre
             length = np.linalg.norm(ray)
             hit = mujoco.mj_ray(
                 self._world.model,
                 self._world.data,
-                self._eye,
+                self._centre,
                 ray / length,
                 None,
                 1,
@@ -181,6 +181,7 @@ class MarkerSight:
                 geom,
                 normal,
             )
+            # The marker's own plate is hit at its full distance, give or take its thickness.
             if 0 <= hit < length - 5e-3:
                 return True
         return False
@@ -217,13 +218,13 @@ def open_camera(
     markers = [item.marker for item in world.config.objects]
     if world.config.arm.marker is not None:
         markers.append(world.config.arm.marker.marker)
-    sight = MarkerSight(world, model, markers)
+    visibility = MarkerVisibility(world, model, markers)
     return SyntheticCamera(
         model,
         markers,
         world.marker_poses,
         rng=rng,
         noise=noise,
-        hidden=sight.hidden,
-        covers=lambda: covers_in(world, model),
+        hidden=visibility.hidden,
+        occluders=lambda: occluding_boards(world, model),
     )

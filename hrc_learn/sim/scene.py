@@ -23,15 +23,15 @@ from hrc_learn.vision import CameraModel, Marker
 _BOX = mujoco.mjtGeom.mjGEOM_BOX
 
 HAND_MARKER = 7
-"""ArUco number of the plate on the hand."""
+"""ArUco number of the plate on the end effector."""
 
-COVER = "cover"
-"""Name of the board that hides markers from the camera."""
-COVER_HALF_SIZE = (0.07, 0.09, 0.004)
+OCCLUDER = "occluder"
+"""Name of the board that occludes markers."""
+OCCLUDER_HALF_SIZE = (0.07, 0.09, 0.004)
 """[m]"""
-COVER_COLOUR = (0.55, 0.36, 0.30, 1.0)
+OCCLUDER_COLOUR = (0.55, 0.36, 0.30, 1.0)
 NOWHERE = (0.0, 0.0, -5.0)
-"""Where things are that are not in the scene: far below the floor [m]."""
+"""Where objects are that are not in the scene: far below the floor [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,9 +156,14 @@ class SceneConfig:
     objects: tuple[ObjectConfig, ...] = (ObjectConfig(),)
     camera: CameraModel = field(default_factory=overhead_camera)
     obstacles: tuple[Box, ...] = ()
-    """Things that people put in the way and take away again (`World.move_obstacle`)."""
+    """Obstacles that people put in the way and take away again (`World.move_obstacle`)."""
     timestep: float = 0.002
     """Physics step [s]."""
+
+    @property
+    def marker_ids(self) -> tuple[int, ...]:
+        """ArUco numbers of the markers on the end effector and on the objects."""
+        return HAND_MARKER, *(item.marker.id for item in self.objects)
 
     def boxes(self) -> list[Box]:
         """The fixed furniture, for drawing and for collision checks."""
@@ -178,7 +183,7 @@ def build_scene(config: SceneConfig) -> mujoco.MjSpec:
         _add_box(spec, obstacle).mocap = True
     for item in config.objects:
         _add_object(spec, item)
-    _add_cover(spec)
+    _add_occluder(spec)
     return spec
 
 
@@ -235,14 +240,14 @@ def _add_box(spec: mujoco.MjSpec, box: Box):
     return body
 
 
-def _add_cover(spec: mujoco.MjSpec) -> None:
-    """A board that somebody may hold before the camera; nothing can touch it."""
-    body = spec.worldbody.add_body(name=COVER, pos=NOWHERE, mocap=True)
+def _add_occluder(spec: mujoco.MjSpec) -> None:
+    """A board that may be held in front of the camera; nothing can touch it."""
+    body = spec.worldbody.add_body(name=OCCLUDER, pos=NOWHERE, mocap=True)
     body.add_geom(
-        name=COVER,
+        name=OCCLUDER,
         type=_BOX,
-        size=COVER_HALF_SIZE,
-        rgba=COVER_COLOUR,
+        size=OCCLUDER_HALF_SIZE,
+        rgba=OCCLUDER_COLOUR,
         contype=0,
         conaffinity=0,
     )

@@ -101,7 +101,7 @@ class World:
         width = 2 * self._object(name).half_size[0]
         self.reset(joint_position, gripper_width=width + 0.002)
         tcp = self.arm.tcp_pose()
-        # The object's x lies along the fingers' line of closing, its top towards the hand.
+        # The object's x lies along the fingers' line of closing, its top towards the gripper.
         in_hand = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
         self.reset(joint_position, {name: tcp @ in_hand}, gripper_width=width + 0.002)
         self.arm.move(0.0)
@@ -162,10 +162,10 @@ class World:
         return poses
 
     def hand_marker_offset(self) -> Float[np.ndarray, "3"]:
-        """Centre of the hand's marker in the frame of the tool centre point [m].
+        """Centre of the end effector's marker in the frame of the tool centre point [m].
 
         Raises:
-            ValueError: If the hand carries no marker.
+            ValueError: If the end effector carries no marker.
         """
         if self.config.arm.marker is None:
             raise ValueError("this scene's hand carries no marker: give its arm a Plate.")
@@ -183,7 +183,7 @@ class World:
 
         Args:
             path: Joint positions [rad].
-            carried: An object to carry along, at its present pose in the hand.
+            carried: An object to carry along, at its present pose in the end effector.
         """
         data = mujoco.MjData(self.model)
         data.qpos[:] = self.data.qpos

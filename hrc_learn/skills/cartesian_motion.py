@@ -1,4 +1,4 @@
-"""Moving the hand along given motions: resolved rates, straight lines, planned joint paths."""
+"""Cartesian and joint motions: resolved rates, straight lines, inverse kinematics of a goal."""
 
 import math
 from collections.abc import Iterator
@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.geometry import Pose, minimum_jerk, quaternion
-from hrc_learn.kinematics import pseudo_inverse, singularity_damping
+from hrc_learn.kinematics import UnreachableError, panda, pseudo_inverse, singularity_damping
 
 
 def resolved_rate(
@@ -17,14 +17,14 @@ def resolved_rate(
     twist: Float[Tensor, "*batch 6"],
     null_velocity: Float[Tensor, "*batch joints"],
 ) -> Float[Tensor, "*batch joints"]:
-    """Joint velocities with a given hand motion, as close as can be to a wanted joint motion.
+    """Joint velocities for a given twist, as close as possible to given joint velocities.
 
     u = J^+ twist + N null_velocity, with N = I - J^+ J.
 
     Args:
-        jacobian: Geometric Jacobian of the hand.
-        twist: Linear [m/s] and angular [rad/s] velocity of the hand.
-        null_velocity: Wanted joint velocities; only their null-space part acts [rad/s].
+        jacobian: Geometric Jacobian of the end effector.
+        twist: Linear [m/s] and angular [rad/s] velocity of the end effector.
+        null_velocity: Desired joint velocities; only their null-space part acts [rad/s].
     """
     J_pinv = pseudo_inverse(jacobian, singularity_damping(jacobian))
     remaining = twist - (jacobian @ null_velocity.unsqueeze(-1)).squeeze(-1)
@@ -39,7 +39,7 @@ def straight_line(
     Args:
         start: First pose.
         goal: Last pose.
-        speed: Mean speed of the hand [m/s].
+        speed: Mean speed of the end effector [m/s].
         dt: Time between samples [s].
         angular_speed: Mean turning speed [rad/s]; the slower of both sets the duration.
 
@@ -48,7 +48,7 @@ def straight_line(
     """
     twist = start.twist_to(goal)
     distance, turn = float(twist[:3].norm()), float(twist[3:].norm())
-    # A minimum jerk motion peaks at 1.875 times its mean speed.
+    # Not below 0.3 s: a short motion would need accelerations beyond the safety filter's.
     duration = max(distance / speed, turn / angular_speed, 0.3)
     for k in range(1, math.ceil(duration / dt) + 1):
         s, slope = minimum_jerk(k * dt / duration)
@@ -79,8 +79,45 @@ def joint_line(
 def path_velocity(
     path: Float[np.ndarray, "steps joints"], k: int, dt: float
 ) -> Float[np.ndarray, " joints"]:
-    """Velocity of a sampled path at sample k, central where it can be [rad/s]."""
+    """Velocity of a sampled path at sample k, by central differences inside [rad/s]."""
     low, high = max(k - 1, 0), min(k + 1, len(path) - 1)
     return (
         (path[high] - path[low]) / ((high - low) * dt) if high > low else np.zeros_like(path[k])
     )
+
+
+def nearest_configuration(
+    goal: Pose, near: Float[Tensor, "7"], samples: int = 57
+) -> Float[Tensor, "7"]:
+    """Joint positions that reach a pose, as near as can be to given ones.
+
+    Scans joint 7, the redundant one, and keeps the best of the analytic solutions.
+
+    Args:
+        goal: Pose of the tool centre point.
+        near: Joint positions [rad].
+        samples: Values of joint 7 tried between its limits.
+
+    Raises:
+        UnreachableError: If no value of joint 7 reaches the pose within the limits.
+    """
+    lower, upper = float(panda.limits.lower[6]), float(panda.limits.upper[6])
+    # A little inside the limits, where the arm can still be corrected.
+    candidates = torch.linspace(lower + 0.02, upper - 0.02, samples, dtype=torch.float64)
+    candidates = torch.cat([near[6:7], candidates])
+    best, distance = None, math.inf
+    for q7 in candidates:
+        try:
+            q = panda.inverse(goal, q7, near=near)
+        except UnreachableError:
+            continue
+        if (d := float((q - near).norm())) < distance:
+            best, distance = q, d
+    if best is None:
+        x, y, z = goal.position.tolist()
+        w = [round(v, 3) for v in quaternion.normalize(goal.orientation).tolist()]
+        raise UnreachableError(
+            f"no joint positions within the limits reach position ({x:.3f}, {y:.3f}, {z:.3f}) "
+            f"m with orientation {w} (wxyz): move the goal towards the robot or turn it."
+        )
+    return best

@@ -1,9 +1,9 @@
-"""Grasping an object with an uncalibrated camera, and what to do when that fails.
+"""Grasping an object with an uncalibrated camera, and recovering from failures.
 
-    look -> aim -> grasp -> lift
+    detect -> servo -> grasp -> lift
 
-An object out of sight is waited for. A grasp that missed, or an aim that did not get there,
-is begun anew from home.
+An object that is not detected is waited for. After a missed grasp, or servoing that timed out,
+everything starts again from home.
 """
 
 from collections.abc import Callable
@@ -19,50 +19,62 @@ from hrc_learn.controller import AdaptiveController, ControllerConfig, Goals
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import ImageJacobianEstimator
 from hrc_learn.kinematics import panda_capsules
-from hrc_learn.sim import HAND_MARKER, ObjectConfig
-from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.cartesian_motion import joint_line
 from hrc_learn.skills.placing import Plan
-from hrc_learn.skills.visual_servoing import Aim, Aimer, AimingConfig, AimingSkill, from_learned
+from hrc_learn.skills.visual_servoing import (
+    ServoTarget,
+    VisualServo,
+    VisualServoConfig,
+    VisualServoSkill,
+    from_learned,
+)
 from hrc_learn.skills.visual_target import UP
 from hrc_learn.skills.work_cell import (
     BlockedPathError,
     MissedGraspError,
-    Station,
     TaskFailedError,
+    WorkCell,
 )
+from hrc_learn.skills.workplace import GraspObject, Workplace
 
 OPEN, CLOSED = 0.08, 0.0
-# Least distance of the arm's capsules from where things may lie: the plate with the hand's
-# marker stands out from them [m].
-_CLEAR = 0.06
-# Samples of a way of which one is looked at for that.
-_EVERY = 5
-# Largest distance of a joint from its place at home that counts as there [rad].
+"""Widths the gripper is commanded to [m]: its full stroke; closed, it squeezes the object."""
+JOINT_SPEED = 0.6
+"""Largest joint speed between postures [rad/s]: a quarter of the slowest joint's limit."""
+DESCENT_SPEED = 0.08
+"""Mean speed of the last centimetres down to an object [m/s]."""
+
+# The marker plate stands out from the arm's capsules by up to this [m].
+_PLATE_CLEARANCE = 0.06
+# Clearance is checked at one of so many samples: at JOINT_SPEED the arm moves 3 cm in between.
+_CHECK_EVERY = 5
+# Largest distance of a joint from home that still counts as at home [rad].
 _AT_HOME = 0.05
-"""Widths the gripper is told to take [m]."""
+# Time for the fingers to close and for the grip to settle [s].
+_CLOSING_TIME = 0.7
 
 type TargetLaw = Callable[
     [Float[np.ndarray, "2"], Float[np.ndarray, "2 6"]], Float[np.ndarray, "2"]
 ]
-"""From the object's marker [px] and the image Jacobian to where the hand's should be [px]."""
+"""From the object's marker [px] and the image Jacobian to the target of the end effector's
+marker [px]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class GraspingConfig:
     """How objects are grasped."""
 
-    aiming: AimingConfig = field(default_factory=AimingConfig)
+    servo: VisualServoConfig = field(default_factory=VisualServoConfig)
     controller: ControllerConfig = field(
         default_factory=lambda: ControllerConfig(drift_compensation_rate=10.0)
     )
-    """Settings of the adaptive controller; it holds the hand firmly against the drift that
-    steps of 10 ms leave."""
+    """Settings of the adaptive controller; the high hold rate compensates the drift that steps
+    of 10 ms leave."""
     approach: bool = True
-    """Whether the table is approached in joint space, along a way that was checked; else the
-    Cartesian regions lead from the start, as in the paper."""
-    patience: float = 5.0
-    """How long an object that is not seen is waited for [s]."""
+    """Whether the table is approached in joint space, along a path that was checked; else the
+    Cartesian regions guide from the start, as in the paper."""
+    detection_timeout: float = 5.0
+    """How long to wait for an object that is not detected [s]."""
     lift: float = 0.20
     """How far an object is lifted [m]."""
     attempts: int = 3
@@ -73,10 +85,10 @@ class GraspingConfig:
 class GraspResult:
     """How an object was grasped."""
 
-    aim_time: float
-    """From the start of aiming until the target was reached [s]."""
+    servo_time: float
+    """From the start of visual servoing until the target was reached [s]."""
     pixel_error: float
-    """When the hand went down [px]."""
+    """At the start of the descent [px]."""
     setbacks: tuple[str, ...] = ()
     """Why earlier attempts failed."""
 
@@ -90,70 +102,71 @@ class Grasping:
     """Grasps objects; `grasp` does it all, the other methods are its steps.
 
     Attributes:
-        aimer: Runs the controller; its estimate of the image Jacobian goes on from grasp to
-            grasp.
+        servo: Runs the controller; its estimate of the image Jacobian persists between grasps.
     """
 
     def __init__(
         self,
-        station: Station,
+        cell: WorkCell,
         workplace: Workplace,
-        aiming: AimingSkill,
+        skill: VisualServoSkill,
         config: GraspingConfig | None = None,
         *,
         estimator: ImageJacobianEstimator | None = None,
         target: TargetLaw | None = None,
         check: Callable[[Plan], None] = lambda plan: None,
     ):
-        """Bring station and skill together.
+        """Prepare.
 
         Args:
-            station: Arm, gripper, camera and person.
-            workplace: Where things are, roughly: the region over the table, home. How the hand
-                is turned there it tells; `Workplace.approached` has it turned as was shown.
-            aiming: Learned image Jacobian and visual target.
+            cell: Arm, gripper, camera and person.
+            workplace: The region over the table, and home. Its hover pose has the orientation
+                of the end effector; the simulator's `Workplace.approached` takes the
+                demonstrated one.
+            skill: Learned image Jacobian and visual target.
             config: How objects are grasped.
             estimator: Of the image Jacobian; None: a Kalman filter that starts from the
                 learned one, wherever the camera may have been moved since.
-            target: Where the hand's marker should be; None: as learned.
-            check: Raises if a plan may not be carried out.
+            target: Where the end effector's marker should be; None: as learned.
+            check: Raises if a plan must not be executed.
         """
-        self._station = station
+        self._cell = cell
         self._workplace = workplace
-        self._target = target or aiming.target_of
-        self._offset_line = UP if aiming.target is None else aiming.target.line()
+        self._target = target or skill.target_of
+        self._offset_line = UP if skill.target is None else skill.target.line()
         self._config = config = config or GraspingConfig()
         self._check = check
         controller = AdaptiveController(
-            station.chain,
-            estimator or from_learned(aiming.jacobian),
+            cell.chain,
+            estimator or from_learned(skill.jacobian),
             Goals.at(workplace.hover().position, workplace.hover().orientation),
             config=config.controller,
         )
-        self.aimer = Aimer(station, controller, HAND_MARKER, config.aiming)
+        self.servo = VisualServo(cell, controller, workplace.tool_marker, config.servo)
 
     def grasp(
-        self, item: ObjectConfig, on_aimed: Callable[[Aim], None] = lambda aim: None
+        self,
+        item: GraspObject,
+        on_reached: Callable[[ServoTarget], None] = lambda target: None,
     ) -> GraspResult:
         """Grasp an object and lift it.
 
         Args:
             item: What to grasp.
-            on_aimed: What else is to be done once the hand stands above the object for the
-                first time.
+            on_reached: Called when the end effector is above the object for the first time.
 
         Raises:
-            TaskFailedError: If the object is not found, or all attempts fail.
+            TaskFailedError: If the object is not detected, or all attempts fail.
         """
-        self._station.gripper.move(OPEN)
+        self._cell.gripper.move(OPEN)
         setbacks: list[str] = []
         while True:
-            aim = self.look_for(item)
+            target = self.locate(item)
             try:
-                aim_time = self.aim(aim)
+                servo_time = self.servo_to(target)
                 if not setbacks:
-                    on_aimed(aim)
-                pixel_error = self.aimer.error(aim)
+                    on_reached(target)
+                pixel_error = self.servo.error(target)
                 self.close_on(item)
             except MissedGraspError as error:
                 setbacks.append(str(error))
@@ -161,155 +174,169 @@ class Grasping:
                     raise
                 self.start_over()
             else:
-                self.rise()
+                self.lift()
                 return GraspResult(
-                    aim_time=aim_time, pixel_error=pixel_error, setbacks=tuple(setbacks)
+                    servo_time=servo_time, pixel_error=pixel_error, setbacks=tuple(setbacks)
                 )
 
-    def look_for(self, item: ObjectConfig) -> Aim:
-        """Where to aim, from a look at the table before the arm is over it.
+    def locate(self, item: GraspObject) -> ServoTarget:
+        """Detect an object while the arm is not above the table; where to servo to.
 
-        An arm that stands elsewhere than at home, and so may hide the object, goes there if it
-        is not seen.
+        An arm that is not at home may occlude the object: if it is not detected, the arm goes
+        home first.
 
         Raises:
-            TaskFailedError: If the object's marker stays out of sight.
+            TaskFailedError: If the object's marker stays undetected.
         """
-        pixel = self._find(item)
-        if pixel is None and not self._at_home():
+        pixel = self._detect(item)
+        away = self._cell.joints - self._workplace.home_joints()
+        if pixel is None and float(away.abs().max()) >= _AT_HOME:
             self.go_home()
-            pixel = self._find(item)
+            pixel = self._detect(item)
         if pixel is None:
             raise TaskFailedError(
-                f"look: the camera does not see marker {item.marker.id} of {item.name!r}. "
+                f"detect: the camera does not see marker {item.marker.id} of {item.name!r}. "
                 "Put it into the camera's view, and the arm out of it."
             )
-        return Aim(
-            config=self._config.aiming,
+        return ServoTarget(
+            config=self._config.servo,
             above=self._workplace.hover(),
             posture=self._posture() if self._config.approach else None,
             target=partial(self._target, pixel),
             line=self._offset_line,
         )
 
-    def _find(self, item: ObjectConfig) -> Float[np.ndarray, "2"] | None:
-        """Pixel of an object's marker; None if it stays out of sight."""
-        self._station.enter("look")
-        give_up = self._station.time + self._config.patience
-        while (pixel := self._station.see().pixels.get(item.marker.id)) is None:
-            if self._station.time >= give_up:
+    def _detect(self, item: GraspObject) -> Float[np.ndarray, "2"] | None:
+        """Pixel of an object's marker; None if it stays undetected."""
+        cell = self._cell
+        cell.begin_phase("detect")
+        deadline = cell.time + self._config.detection_timeout
+        while (pixel := cell.wait_for_detection().pixels.get(item.marker.id)) is None:
+            if cell.time >= deadline:
                 return None
-            self._station.stay(self._station.config.look_every * self._station.config.dt)
+            cell.hold_pose(cell.config.detect_every * cell.config.dt)
         return pixel
 
-    def _at_home(self) -> bool:
-        away = self._station.joints - self._workplace.home_joints()
-        return float(away.abs().max()) < _AT_HOME
-
     def _posture(self) -> Float[Tensor, " joints"]:
-        """Joint positions above the table to which, and home from which, the way is free.
+        """Joint positions above the table that can be reached, and home from there.
 
         Where there are none, the arm goes home first. Nobody knows yet where on the table
-        things lie, so the way keeps clear of all places where they may.
+        objects are, so the path keeps clear of the whole region in which they may be.
         """
         postures, home = self._workplace.hover_postures(), self._workplace.home_joints()
         for posture in postures:
-            here = self._station.joints
-            if self._free(here, posture, _CLEAR) and self._free(posture, home):
+            here = self._cell.joints
+            if self._free(here, posture, _PLATE_CLEARANCE) and self._free(posture, home):
                 return posture
         self.go_home()
         return postures[0]
 
-    def aim(self, aim: Aim) -> float:
-        """Bring the hand above the object; the time it took [s].
+    def servo_to(self, target: ServoTarget) -> float:
+        """Bring the end effector above the object; the time it took [s].
 
         Raises:
             MissedGraspError: If it takes too long.
         """
-        self._station.enter("aim")
-        self._station.watching = (HAND_MARKER,)
-        return self.aimer.aim(aim)
+        self._cell.begin_phase("servo")
+        self._cell.tracked_markers = (self._workplace.tool_marker,)
+        return self.servo.servo_to(target)
 
-    def close_on(self, item: ObjectConfig) -> None:
-        """Go down and close the fingers.
+    def close_on(self, item: GraspObject) -> None:
+        """Descend and close the fingers.
 
         Raises:
             MissedGraspError: If there is nothing between them.
         """
-        self._station.enter("grasp")
-        self._station.watching = ()
-        self._station.move_straight(self._before(item), speed=0.08)
-        self._station.gripper.move(CLOSED)
-        self._station.stay(0.7)
-        if self._station.state.gripper_width <= item.half_size[0]:
+        self._cell.begin_phase("grasp")
+        self._cell.tracked_markers = ()
+        self._cell.move_straight(self._grasp_pose(item), speed=DESCENT_SPEED)
+        self._cell.gripper.move(CLOSED)
+        self._cell.hold_pose(_CLOSING_TIME)
+        if not holds(self._cell, item):
             raise MissedGraspError(
                 f"grasp: the fingers closed on nothing. Is {item.name!r} where its marker says?"
             )
 
-    def _before(self, item: ObjectConfig) -> Pose:
-        """Hand with its fingers about the object, on from here the way the hand points."""
-        position, orientation = self._station.pose.position, self._workplace.hover().orientation
+    def _grasp_pose(self, item: GraspObject) -> Pose:
+        """Fingers around the object, from here along the end effector's own direction."""
+        position, orientation = self._cell.pose.position, self._workplace.hover().orientation
         direction = quaternion.to_matrix(orientation)[:, 2]
-        drop = (item.half_size[2] - position[2]) / direction[2]
-        return Pose(position + drop * direction, orientation)
+        way = (item.half_size[2] - position[2]) / direction[2]
+        return Pose(position + way * direction, orientation)
 
-    def rise(self) -> None:
-        """Lift the hand straight up."""
-        self._station.enter("lift")
-        pose = self._station.pose
-        up = torch.tensor([0.0, 0.0, self._config.lift], dtype=torch.float64)
-        self._station.move_straight(Pose(pose.position + up, pose.orientation))
+    def lift(self) -> None:
+        """Lift the end effector straight up."""
+        self._cell.begin_phase("lift")
+        self._cell.move_straight(raised(self._cell.pose, self._config.lift))
 
     def go_home(self) -> None:
-        """Move the joints home, by way of another posture where the straight way is not free.
+        """Move the joints home, via another posture where the straight path is blocked.
 
         Raises:
-            BlockedPathError: If no way is free.
+            BlockedPathError: If all paths are blocked.
         """
-        self._station.enter("home")
-        here, home = self._station.joints, self._workplace.home_joints()
+        self._cell.begin_phase("home")
+        here, home = self._cell.joints, self._workplace.home_joints()
         postures = self._workplace.hover_postures()
-        for clear in (_CLEAR, None):
-            if self._free(here, home, clear):
+        # With clearance if that is possible anywhere, then without.
+        for clearance in (_PLATE_CLEARANCE, None):
+            if self._free(here, home, clearance):
                 break
-            ways = (q for q in postures if self._free(here, q, clear) and self._free(q, home))
-            if (via := next(ways, None)) is not None:
-                self._station.play(self._line(here, via).path)
+            reachable = (
+                q for q in postures if self._free(here, q, clearance) and self._free(q, home)
+            )
+            if (via := next(reachable, None)) is not None:
+                self._cell.follow_path(joint_plan(self._cell, here, via).path)
                 break
-        plan = self._line(self._station.joints, home)
+        plan = joint_plan(self._cell, self._cell.joints, home)
         self._check(plan)
-        self._station.play(plan.path)
+        self._cell.follow_path(plan.path)
 
     def _free(
         self,
         start: Float[Tensor, " joints"],
         goal: Float[Tensor, " joints"],
-        clear: float | None = None,
+        clearance: float | None = None,
     ) -> bool:
-        """Whether the arm may go straight, and, if asked, this far [m] off things anywhere."""
-        plan = self._line(start, goal)
+        """Whether a straight line in joint space is free; with a clearance to objects [m]."""
+        plan = joint_plan(self._cell, start, goal)
         try:
             self._check(plan)
         except BlockedPathError:
             return False
-        if clear is None:
+        if clearance is None:
             return True
-        path = torch.from_numpy(plan.path[::_EVERY])
-        return bool(
-            (panda_capsules.box_distance(path, *self._workplace.things()) > clear).all()
-        )
-
-    def _line(self, start: Float[Tensor, " joints"], goal: Float[Tensor, " joints"]) -> Plan:
-        """A straight line in joint space."""
-        dt = self._station.config.dt
-        path = joint_line(start, goal, speed=0.6, dt=dt)
-        return Plan(goal=self._station.chain.forward(goal), dt=dt, path=path.numpy())
+        path = torch.from_numpy(plan.path[::_CHECK_EVERY])
+        distance = panda_capsules.box_distance(path, *self._workplace.object_region())
+        return bool((distance > clearance).all())
 
     def start_over(self) -> None:
         """Open the fingers and go home, clear of the table and of the camera's view."""
-        self._station.watching = ()
-        self._station.gripper.move(OPEN)
-        self._station.stay(0.3)
-        if self._station.pose.position[2] < self._workplace.hover_height:
-            self.rise()
+        self._cell.tracked_markers = ()
+        self._cell.gripper.move(OPEN)
+        self._cell.hold_pose(0.3)  # time for the fingers to open
+        if self._cell.pose.position[2] < self._workplace.hover_height:
+            self.lift()
         self.go_home()
+
+
+def joint_plan(
+    cell: WorkCell, start: Float[Tensor, " joints"], goal: Float[Tensor, " joints"]
+) -> Plan:
+    """A straight line in joint space as a plan for a work cell."""
+    dt = cell.config.dt
+    path = joint_line(start, goal, speed=JOINT_SPEED, dt=dt)
+    return Plan(goal=cell.chain.forward(goal), dt=dt, path=path.numpy())
+
+
+def holds(cell: WorkCell, item: GraspObject) -> bool:
+    """Whether the fingers are as far apart as an object between them keeps them.
+
+    Half the object's width is the threshold: far from both a held object and closed fingers.
+    """
+    return cell.state.gripper_width > item.half_size[0]
+
+
+def raised(pose: Pose, height: float) -> Pose:
+    """A pose higher up, in the same orientation [m]."""
+    return Pose(pose.position + pose.position.new_tensor([0.0, 0.0, height]), pose.orientation)

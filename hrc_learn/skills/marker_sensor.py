@@ -1,6 +1,4 @@
-"""A camera and a marker detector together: what it saw, how late it arrives, and how long
-a marker was occluded.
-"""
+"""A fixed camera as a sensor of markers: detections, their delay and loss, occlusions."""
 
 from collections import deque
 from collections.abc import Iterable, Mapping
@@ -14,46 +12,41 @@ from torch import Tensor
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import panda
 from hrc_learn.protocols import Camera
-from hrc_learn.sim import HAND_MARKER, SceneConfig
 from hrc_learn.vision import MarkerDetector, centre
 from hrc_learn.viz import StepLog
 
-# A camera and a marker detector together: images in, pixels of markers out.
 
-
-class Eye:
-    """Finds the centres of markers in a camera's images."""
+class MarkerSensor:
+    """Detects the centres of markers in a camera's images."""
 
     def __init__(self, camera: Camera, marker_ids: Iterable[int]):
+        """Set up the detector.
+
+        Args:
+            camera: Source of the images.
+            marker_ids: ArUco numbers to report; others are ignored.
+        """
         self._camera = camera
         self._detector = MarkerDetector(list(marker_ids))
-
-    @classmethod
-    def on(cls, camera: Camera, scene: SceneConfig) -> "Eye":
-        """An eye that looks for the markers of a scene."""
-        return cls(camera, [HAND_MARKER, *(item.marker.id for item in scene.objects)])
 
     def read(self) -> UInt8[np.ndarray, "height width 3"]:
         """Take an image, RGB."""
         return self._camera.read()
 
-    def look(self, ids: Iterable[int] | None = None) -> dict[int, Float[np.ndarray, "2"]]:
+    def detect(self, ids: Iterable[int] | None = None) -> dict[int, Float[np.ndarray, "2"]]:
         """Take an image; return the pixel (u, v) of each marker in it, by number.
 
         Args:
-            ids: Markers that matter now; None: all. Looking for one that is out of sight
-                takes ten times as long as following one that is seen.
+            ids: Markers that matter now; None: all. Searching for one that is out of sight
+                takes ten times as long as tracking one that is seen.
         """
         found = self._detector.detect(self.read(), ids)
         return {id: centre(corners) for id, corners in found.items()}
 
 
-# What a camera saw, and how it gets to the task: late, and not always.
-
-
 @dataclass(frozen=True, kw_only=True)
-class Sight:
-    """Markers found in an image."""
+class MarkerObservation:
+    """Markers detected in an image."""
 
     time: float = -np.inf
     """When the image was taken [s]."""
@@ -64,70 +57,70 @@ class Sight:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TransportConfig:
-    """What happens to images on their way."""
+class LatencyConfig:
+    """Delay and loss of images between the camera and the controller."""
 
-    latency: float = 0.0
+    delay: float = 0.0
     """From an image being taken until its markers are known [s]."""
-    dropped: float = 0.0
-    """Share of the images that never arrive."""
+    frame_loss: float = 0.0
+    """Fraction of the images that never arrive."""
 
     def __post_init__(self) -> None:
-        if self.latency < 0 or not 0 <= self.dropped < 1:
+        if self.delay < 0 or not 0 <= self.frame_loss < 1:
             raise ValueError(
-                "latency must not be negative and dropped must be in [0, 1), but are "
-                f"{self.latency:g} s and {self.dropped:g}."
+                "delay must not be negative and frame_loss must be in [0, 1), but are "
+                f"{self.delay:g} s and {self.frame_loss:g}."
             )
 
 
-class Transport:
-    """Images on their way from camera to task, in the order in which they were taken."""
+class DelayedChannel:
+    """Delivers observations late, in the order in which they were taken, and loses some."""
 
-    def __init__(self, config: TransportConfig, rng: np.random.Generator):
-        """Nothing is under way yet.
+    def __init__(self, config: LatencyConfig, rng: np.random.Generator):
+        """Start with an empty channel.
 
         Args:
             config: How late, and how many are lost.
             rng: Decides which.
         """
         self._config, self._rng = config, rng
-        self._under_way: deque[Sight] = deque()
+        self._pending: deque[MarkerObservation] = deque()
 
-    def send(self, sight: Sight) -> None:
-        """Hand over what was found in an image."""
-        if self._rng.random() >= self._config.dropped:
-            self._under_way.append(sight)
+    def send(self, observation: MarkerObservation) -> None:
+        """Put an observation into the channel."""
+        if self._rng.random() >= self._config.frame_loss:
+            self._pending.append(observation)
 
-    def newest(self, time: float) -> Sight | None:
+    def newest(self, time: float) -> MarkerObservation | None:
         """The newest that has arrived by a time [s] since last asked; None if none has."""
         arrived = None
-        taken_by = time - self._config.latency + 1e-9  # clocks add up steps
-        while self._under_way and self._under_way[0].time <= taken_by:
-            arrived = self._under_way.popleft()
+        # Clocks add up steps of rounded length: a nanosecond early still counts as in time.
+        taken_by = time - self._config.delay + 1e-9
+        while self._pending and self._pending[0].time <= taken_by:
+            arrived = self._pending.popleft()
         return arrived
 
 
-# For how long the hand's marker was out of sight where it should have been seen.
+_OVER_TABLE = 0.22
+"""Distance of the end effector from the middle of the table within which the camera should see
+its marker [m]: the camera's view reaches about 0.25 m to each side."""
 
-_NEAR = 0.22
-"""Distance of the hand from the middle of the table within which it should be seen [m]."""
 
-
-def longest_unseen(log: StepLog, middle: Pose, since: float) -> float:
-    """Longest spell in which the marker was not seen while the hand was over the table [s].
+def longest_occlusion(log: StepLog, middle: Pose, since: float) -> float:
+    """Longest time without a detection while the end effector was over the table [s].
 
     Args:
-        log: Of a station.
-        middle: Of the hand above the middle of the table.
+        log: Of a work cell.
+        middle: Of the end effector above the middle of the table.
         since: Steps from this time on count [s].
     """
     time = log["time"]
     rows = time >= since
-    hand = panda.forward(torch.from_numpy(log["joint_position"][rows])).position
-    over = ((hand - middle.position).norm(dim=-1) < _NEAR).numpy()
-    unseen = over & np.isnan(log["feature"][rows, 0])
-    # Steps of each spell, by where it begins and ends.
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], unseen, [False]]).astype(int)))
+    position = panda.forward(torch.from_numpy(log["joint_position"][rows])).position
+    over_table = ((position - middle.position).norm(dim=-1) < _OVER_TABLE).numpy()
+    occluded = over_table & np.isnan(log["feature"][rows, 0])
+    # Rising and falling edges alternate: their distances are the lengths in steps.
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], occluded, [False]]).astype(int)))
     steps = edges[1::2] - edges[::2]
-    step = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
-    return float(steps.max()) * step if len(steps) else 0.0
+    dt = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+    return float(steps.max()) * dt if len(steps) else 0.0

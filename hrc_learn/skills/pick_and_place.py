@@ -1,42 +1,68 @@
-"""The whole job: grasp beside a person, carry to the cabinet, put on a shelf."""
+"""Pick and place beside a person: grasp, carry to the cabinet, put on a shelf.
+
+    detect -> servo -> interact -> grasp -> home -> transfer -> release -> retreat -> over
+      ^         |                    |       |         |
+      +---------+--- start over -----+-------+---------+-- put back -> over
+
+In the paper's words: detect and servo are the approach and the vision-based control, interact
+is what the person needs, home to release is the placing, retreat the way back. Each phase is a
+method that does its work and names the next one. Failures are recovered from, logged and
+counted:
+
+- the end effector's marker is occluded: the controller holds the end effector and continues
+  when the marker is detected again; after a timeout the arm goes home and starts over;
+- the object is not detected: it is waited for;
+- a missed grasp, an object dropped over the table: again, from home;
+- a blocked path: another height, via point or arm angle, then waiting; at last the object is
+  put back where it was.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Literal
 
-import torch
-
 from hrc_learn.geometry import Pose
-from hrc_learn.sim import ObjectConfig
-from hrc_learn.sim.workplace import Workplace, nearest_configuration
-from hrc_learn.skills.cartesian_motion import joint_line
-from hrc_learn.skills.grasping import OPEN, Grasping, GraspingConfig
-from hrc_learn.skills.marker_sensor import longest_unseen
-from hrc_learn.skills.placing import PlacingSkill, Plan, PlanningSpace, Way, ways_to
-from hrc_learn.skills.visual_servoing import Aim, AimingSkill
+from hrc_learn.skills.cartesian_motion import nearest_configuration
+from hrc_learn.skills.grasping import (
+    DESCENT_SPEED,
+    OPEN,
+    Grasping,
+    GraspingConfig,
+    holds,
+    joint_plan,
+    raised,
+)
+from hrc_learn.skills.marker_sensor import longest_occlusion
+from hrc_learn.skills.placing import (
+    CandidatePlan,
+    PlacingSkill,
+    Plan,
+    PlanningSpace,
+    plan_candidates,
+)
+from hrc_learn.skills.visual_servoing import ServoTarget, VisualServoSkill
 from hrc_learn.skills.work_cell import (
     BlockedPathError,
     MissedGraspError,
-    Station,
     TaskFailedError,
+    WorkCell,
 )
-
-# One object on its way from the table to its shelf.
+from hrc_learn.skills.workplace import GraspObject, Workplace
 
 Mishap = Literal[
-    "object out of sight",
-    "marker out of sight",
+    "object not detected",
+    "marker occluded",
     "missed grasp",
     "dropped object",
-    "blocked way",
+    "blocked path",
 ]
-"""What a task recovers from."""
+"""What a job recovers from."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Recovery:
-    """Something went wrong, and the task went on."""
+    """Something went wrong, and the job went on."""
 
     time: float
     """[s]"""
@@ -46,43 +72,43 @@ class Recovery:
 
 
 @dataclass(kw_only=True)
-class Errand:
-    """What the phases of the task hand on to each other, and in the end its result."""
+class PickPlaceJob:
+    """One object's way from the table to its shelf: what phases hand on, and the result."""
 
-    item: ObjectConfig
+    item: GraspObject
     shelf: str
     goal: Pose
-    """Of the hand where it lets go, if the thing is held in the middle."""
+    """Of the end effector at the release, if the object is held in the middle."""
     time_for_person: float = 0.0
-    """How long to go on aiming while a person reaches under the arm [s]."""
-    aim: Aim | None = None
-    """Where the object was seen last."""
-    aim_time: float = float("nan")
-    """From the start of the last aim until the target was reached [s]."""
+    """How long to keep servoing while a person reaches under the arm [s]."""
+    target: ServoTarget | None = None
+    """Where the object was detected last."""
+    servo_time: float = float("nan")
+    """From the start of the last visual servoing until its target was reached [s]."""
     pixel_error: float = float("nan")
-    """When the hand went down [px]."""
+    """At the start of the descent [px]."""
     picked_up: Pose | None = None
-    """Of the hand when it took hold of the object."""
+    """Of the end effector when it grasped the object."""
     plan: Plan | None = None
-    """The way to the shelf."""
+    """The path to the shelf."""
     release: Pose | None = None
-    """Of the hand when it let go on the shelf."""
+    """Of the end effector when it released the object on the shelf."""
     failure: str = ""
-    """Why the task was given up."""
+    """Why the job was given up."""
     attempts: int = 1
-    """Times it was begun with."""
+    """Times it was started."""
     recoveries: list[Recovery] = field(default_factory=list)
     span: tuple[float, float] = (0.0, 0.0)
-    """When it was begun with and when it was over [s]."""
+    """Start and end [s]."""
 
     @property
     def delivered(self) -> bool:
-        """Whether the hand let go of the object at its shelf, as the robot sees it."""
+        """Whether the object was released at its shelf, as the robot sees it."""
         return self.release is not None and not self.failure
 
     @property
     def goal_error(self) -> tuple[float, float]:
-        """Of the hand when it let go [m, rad].
+        """Of the end effector at the release [m, rad].
 
         Raises:
             ValueError: If it never came to that.
@@ -94,31 +120,11 @@ class Errand:
         return float(twist[:3].norm()), float(twist[3:].norm())
 
 
-# The whole job: grasp beside a person, carry to the cabinet, put on a shelf.
-#
-#     look -> aim -> interact -> grasp -> home -> transfer -> release -> retreat -> over
-#      ^       |                   |       |         |
-#      +-------+--- begin again ---+-------+---------+-- put back -> over
-#
-# In the paper's words: look and aim are the approach and the vision-based control, interact is
-# what the person needs, home to release is the placing, retreat the way back. Each phase is a
-# method that does its work and names the next one. What goes wrong is recovered from, noted and
-# counted:
-#
-# - the hand's marker is out of sight: the controller holds the hand where it is and goes on
-# when
-#   it sees it again; if it stays unseen, the arm goes home and looks anew;
-# - the object is out of sight: it is waited for;
-# - a missed grasp, an object dropped over the table: again, from home;
-# - a blocked way: another height, via point or arm angle, then waiting; at last the object is
-#   put back where it was.
-
-
 class Phase(StrEnum):
-    """What the robot is about; begun phases are events of the log."""
+    """What the robot is doing; the start of a phase is an event of the log."""
 
-    LOOK = "look"
-    AIM = "aim"
+    DETECT = "detect"
+    SERVO = "servo"
     INTERACT = "interact"
     GRASP = "grasp"
     HOME = "home"
@@ -130,69 +136,71 @@ class Phase(StrEnum):
 
 
 INTERACT, TRANSFER, RELEASE = Phase.INTERACT, Phase.TRANSFER, Phase.RELEASE
-"""Phases that others look for in the log."""
+"""Phases that others look up in the log."""
 
-_BLINK = 0.3
-"""Longer than this out of sight is worth a note [s]."""
+# Delays and occlusions up to this are no recovery [s]: a few lost images, or a blink.
+_NEGLIGIBLE = 0.3
+# Time for the fingers to open and for the released object to come to rest [s].
+_RELEASE_TIME = 0.8
 
 
 @dataclass(frozen=True, kw_only=True)
-class CollaborationConfig:
-    """How the job is done."""
+class PickAndPlaceConfig:
+    """How the jobs are done."""
 
     grasping: GraspingConfig = field(default_factory=GraspingConfig)
     """How objects are grasped."""
     interaction: float = 11.0
-    """How long the robot goes on aiming while the person reaches under its arm [s]."""
+    """How long the robot keeps servoing while the person reaches under its arm [s]."""
     interactions: int = 1
     """For how many objects, the first ones, the person is given that time."""
     speed: float = 1.5
     """How many times faster than demonstrated the object is carried to the shelf."""
     planning: PlanningSpace = "pose"
-    """Space in which the way to the shelf is planned; "joint" is the paper's, which bends the
-    way into shelves that were not demonstrated."""
+    """Space in which the path to the shelf is planned; "joint" is the paper's, which bends the
+    path into shelves that were not demonstrated."""
     waits: int = 3
-    """How often to wait for a blocked way to become free."""
+    """How often to wait for a blocked path to become free."""
     wait: float = 2.0
     """How long each time [s]."""
 
 
-class Collaboration:
+class PickAndPlace:
     """Grasps objects and puts them on shelves.
 
     Attributes:
-        errands: What became of each object so far.
+        jobs: One for each object so far.
     """
 
     def __init__(
         self,
-        station: Station,
+        cell: WorkCell,
         workplace: Workplace,
-        aiming: AimingSkill,
+        servoing: VisualServoSkill,
         placing: PlacingSkill,
         check: Callable[[Plan], None] = lambda plan: None,
-        config: CollaborationConfig | None = None,
+        config: PickAndPlaceConfig | None = None,
     ):
-        """Bring station and skills together.
+        """Prepare.
 
         Args:
-            station: Arm, gripper, camera and person.
-            workplace: Where things are, roughly: the region over the table, home, the shelves.
-            aiming: Learned image Jacobian and visual target.
+            cell: Arm, gripper, camera and person.
+            workplace: The region over the table, home, and the shelves.
+            servoing: Learned image Jacobian and visual target.
             placing: Learned placing motion.
-            check: Raises if a plan may not be carried out.
-            config: How the job is done.
+            check: Raises if a plan must not be executed.
+            config: How the jobs are done.
         """
-        self.errands: list[Errand] = []
-        self._station = station
+        self.jobs: list[PickPlaceJob] = []
+        self._cell = cell
         self._workplace = workplace
         self._placing = placing
         self._check = check
-        self._config = config = config or CollaborationConfig()
-        self._grasping = Grasping(station, workplace, aiming, config.grasping, check=check)
-        self._work: dict[Phase, Callable[[Errand], Phase]] = {
-            Phase.LOOK: self._look,
-            Phase.AIM: self._aim,
+        self._config = config = config or PickAndPlaceConfig()
+        self._grasping = Grasping(cell, workplace, servoing, config.grasping, check=check)
+        self._work: dict[Phase, Callable[[PickPlaceJob], Phase]] = {
+            Phase.DETECT: self._detect,
+            Phase.SERVO: self._servo,
             Phase.INTERACT: self._interact,
             Phase.GRASP: self._grasp,
             Phase.HOME: self._home,
@@ -204,198 +212,190 @@ class Collaboration:
 
     def run(
         self,
-        orders: Sequence[tuple[ObjectConfig, str]],
+        orders: Sequence[tuple[GraspObject, str]],
         before: Callable[[int], None] = lambda number: None,
-    ) -> list[Errand]:
-        """Do the whole job, object by object.
+    ) -> list[PickPlaceJob]:
+        """Deliver objects one after the other.
 
-        An object that cannot be delivered is left on the table, and the next one is begun
-        with. Only where the arm cannot go home, the job ends.
+        An object that cannot be delivered is left on the table, and the next one is started.
+        Only where the arm cannot go home, everything ends.
 
         Args:
             orders: What to grasp, and the shelf to put it on.
-            before: Told the number of each object, from 0, before it is begun with.
+            before: Called with the number of each object, from 0, before it is started.
 
         Raises:
             ValueError: If there is no such shelf, or the arm cannot reach it.
         """
-        waiting = [self._errand(*order) for order in orders]  # all, before anything moves
-        for number, errand in enumerate(waiting):
+        # All goals are checked before anything moves.
+        for number, job in enumerate([self._new_job(*order) for order in orders]):
             before(number)
-            self.errands.append(errand)
+            self.jobs.append(job)
             if number < self._config.interactions:
-                errand.time_for_person = self._config.interaction
+                job.time_for_person = self._config.interaction
             try:
-                self._deliver(errand)
+                self._deliver(job)
             except TaskFailedError as error:
-                errand.failure = str(error)
+                job.failure = str(error)
                 break
-        self._station.enter("done")
-        return self.errands
+        self._cell.begin_phase("done")
+        return self.jobs
 
-    def _errand(self, item: ObjectConfig, shelf: str) -> Errand:
-        goal = self._workplace.shelf(shelf, item)
+    def _new_job(self, item: GraspObject, shelf: str) -> PickPlaceJob:
+        goal = self._workplace.shelf(shelf, item.half_size)
         nearest_configuration(goal, near=self._placing.joint.goal)
-        return Errand(item=item, shelf=shelf, goal=goal)
+        return PickPlaceJob(item=item, shelf=shelf, goal=goal)
 
-    def _deliver(self, errand: Errand) -> None:
-        begin = self._station.time
-        self._station.gripper.move(OPEN)
-        phase = Phase.LOOK
+    def _deliver(self, job: PickPlaceJob) -> None:
+        start = self._cell.time
+        self._cell.gripper.move(OPEN)
+        phase = Phase.DETECT
         try:
             while phase is not Phase.OVER:
-                phase = self._work[phase](errand)
+                phase = self._work[phase](job)
         finally:
-            errand.span = begin, self._station.time
+            job.span = start, self._cell.time
 
-    def _look(self, errand: Errand) -> Phase:
-        begin = self._station.time
+    def _detect(self, job: PickPlaceJob) -> Phase:
+        start = self._cell.time
         try:
-            errand.aim = self._grasping.look_for(errand.item)
+            job.target = self._grasping.locate(job.item)
         except TaskFailedError as error:
-            errand.failure = str(error)
+            job.failure = str(error)
             return Phase.OVER
-        waited = self._station.time - begin
-        if waited > _BLINK:
-            self._note(errand, "object out of sight", f"waited {waited:.1f} s for its marker")
-        return Phase.AIM
+        waited = self._cell.time - start
+        if waited > _NEGLIGIBLE:
+            self._note(job, "object not detected", f"waited {waited:.1f} s for its marker")
+        return Phase.SERVO
 
-    def _aim(self, errand: Errand) -> Phase:
-        assert errand.aim is not None
-        begin = self._station.time
+    def _servo(self, job: PickPlaceJob) -> Phase:
+        assert job.target is not None
+        start = self._cell.time
         try:
-            errand.aim_time = self._grasping.aim(errand.aim)
+            job.servo_time = self._grasping.servo_to(job.target)
         except MissedGraspError as error:
-            return self._begin_again(errand, "marker out of sight", str(error))
-        unseen = longest_unseen(self._station.log, self._workplace.hover(), begin)
-        if unseen > _BLINK:
-            self._note(errand, "marker out of sight", f"held the hand for {unseen:.1f} s")
-        return Phase.INTERACT if errand.time_for_person > 0 else Phase.GRASP
+            return self._start_over(job, "marker occluded", str(error))
+        occluded = longest_occlusion(self._cell.log, self._workplace.hover(), start)
+        if occluded > _NEGLIGIBLE:
+            self._note(job, "marker occluded", f"held the end effector for {occluded:.1f} s")
+        return Phase.INTERACT if job.time_for_person > 0 else Phase.GRASP
 
-    def _interact(self, errand: Errand) -> Phase:
-        assert errand.aim is not None
-        self._station.enter(Phase.INTERACT)
-        self._grasping.aimer.hold(errand.aim, errand.time_for_person)
-        errand.time_for_person = 0.0
-        aimed = (
-            self._grasping.aimer.error(errand.aim) < 2 * self._config.grasping.aiming.tolerance
-        )
-        return Phase.GRASP if aimed else Phase.AIM
+    def _interact(self, job: PickPlaceJob) -> Phase:
+        """Keep servoing while the person reaches under the arm."""
+        assert job.target is not None
+        self._cell.begin_phase(Phase.INTERACT)
+        servo = self._grasping.servo
+        servo.hold(job.target, job.time_for_person)
+        job.time_for_person = 0.0
+        # The person's push may leave twice the tolerance; beyond that the target is lost.
+        on_target = servo.error(job.target) < 2 * self._config.grasping.servo.tolerance
+        return Phase.GRASP if on_target else Phase.SERVO
 
-    def _grasp(self, errand: Errand) -> Phase:
-        assert errand.aim is not None
-        errand.pixel_error = self._grasping.aimer.error(errand.aim)
+    def _grasp(self, job: PickPlaceJob) -> Phase:
+        assert job.target is not None
+        job.pixel_error = self._grasping.servo.error(job.target)
         try:
-            self._grasping.close_on(errand.item)
+            self._grasping.close_on(job.item)
         except MissedGraspError as error:
-            return self._begin_again(errand, "missed grasp", str(error))
-        errand.picked_up = self._station.pose
-        self._grasping.rise()
+            return self._start_over(job, "missed grasp", str(error))
+        job.picked_up = self._cell.pose
+        self._grasping.lift()
         return Phase.HOME
 
-    def _home(self, errand: Errand) -> Phase:
-        if self._dropped(errand.item):
-            return self._begin_again(errand, "dropped object", "lost on the way up")
+    def _home(self, job: PickPlaceJob) -> Phase:
+        if not holds(self._cell, job.item):
+            return self._start_over(job, "dropped object", "lost on the way up")
         for _ in range(1 + self._config.waits):
             try:
                 self._grasping.go_home()
             except BlockedPathError as error:
-                self._note(errand, "blocked way", f"waited: {error}")
-                self._station.stay(self._config.wait)
+                self._note(job, "blocked path", f"waited: {error}")
+                self._cell.hold_pose(self._config.wait)
             else:
                 return Phase.TRANSFER
-        errand.failure = "home: the way stayed blocked"
+        job.failure = "home: the path stayed blocked"
         return Phase.PUT_BACK
 
-    def _transfer(self, errand: Errand) -> Phase:
+    def _transfer(self, job: PickPlaceJob) -> Phase:
         """Carry to the shelf along the learned motion."""
-        if self._dropped(errand.item):
-            return self._begin_again(errand, "dropped object", "lost on the way home")
-        self._station.enter(Phase.TRANSFER)
-        way = self._free_way(errand)
-        if way is None:
-            errand.failure = f"transfer: all ways to the {errand.shelf} shelf stayed blocked"
+        if not holds(self._cell, job.item):
+            return self._start_over(job, "dropped object", "lost on the way home")
+        self._cell.begin_phase(Phase.TRANSFER)
+        plan = self._free_plan(job)
+        if plan is None:
+            job.failure = f"transfer: all paths to the {job.shelf} shelf stayed blocked"
             return Phase.PUT_BACK
-        errand.plan = plan = way.plan
-        played = self._station.play(plan.path, until=lambda: self._dropped(errand.item))
-        if played < len(plan.path):
-            self._station.play(plan.path[:played][::-1])
-            return self._begin_again(errand, "dropped object", "lost on the way to the shelf")
-        self._station.move_straight(plan.goal)
+        job.plan = plan
+        tracked = self._cell.follow_path(
+            plan.path, until=lambda: not holds(self._cell, job.item)
+        )
+        if tracked < len(plan.path):
+            self._cell.follow_path(plan.path[:tracked][::-1])
+            return self._start_over(job, "dropped object", "lost on the way to the shelf")
+        self._cell.move_straight(plan.goal)
         return Phase.RELEASE
 
-    def _free_way(self, errand: Errand) -> Way | None:
-        """The first way that is free, now or after a while."""
+    def _free_plan(self, job: PickPlaceJob) -> Plan | None:
+        """The first candidate that is free, now or after a while."""
         for wait in range(1 + self._config.waits):
             if wait:
-                self._station.stay(self._config.wait)
-            for way in self._ways(errand.goal):
+                self._cell.hold_pose(self._config.wait)
+            for candidate in self._candidates(job.goal):
                 try:
-                    self._check(way.plan)
+                    self._check(candidate.plan)
                 except BlockedPathError as error:
-                    if way.name == "as learned":
-                        self._note(errand, "blocked way", str(error))
+                    if candidate.name == "as learned":
+                        self._note(job, "blocked path", str(error))
                 else:
-                    return way
+                    return candidate.plan
         return None
 
-    def _ways(self, goal: Pose) -> Iterator[Way]:
-        return ways_to(
+    def _candidates(self, goal: Pose) -> Iterator[CandidatePlan]:
+        return plan_candidates(
             goal,
-            self._station.joints,
+            self._cell.joints,
             self._placing,
             self._workplace,
             space=self._config.planning,
-            dt=self._station.config.dt,
+            dt=self._cell.config.dt,
             speed=self._config.speed,
         )
 
-    def _release(self, errand: Errand) -> Phase:
-        self._station.enter(Phase.RELEASE)
-        errand.release = self._station.pose
-        self._station.gripper.move(OPEN)
-        self._station.stay(0.8)
+    def _release(self, job: PickPlaceJob) -> Phase:
+        self._cell.begin_phase(Phase.RELEASE)
+        job.release = self._cell.pose
+        self._cell.gripper.move(OPEN)
+        self._cell.hold_pose(_RELEASE_TIME)
         return Phase.RETREAT
 
-    def _retreat(self, errand: Errand) -> Phase:
-        """Back out the way the hand went in: what was free then is free now."""
-        assert errand.plan is not None
-        self._station.enter(Phase.RETREAT)
-        self._station.play(errand.plan.path[::-1])
+    def _retreat(self, job: PickPlaceJob) -> Phase:
+        """Back out along the same path: what was free then is free now."""
+        assert job.plan is not None
+        self._cell.begin_phase(Phase.RETREAT)
+        self._cell.follow_path(job.plan.path[::-1])
         return Phase.OVER
 
-    def _put_back(self, errand: Errand) -> Phase:
+    def _put_back(self, job: PickPlaceJob) -> Phase:
         """Lay the object where it was, and go home."""
-        assert errand.picked_up is not None
-        self._station.enter(Phase.PUT_BACK)
-        joints, above = self._station.joints, self._workplace.hover_joints()
-        path = joint_line(joints, above, speed=0.6, dt=self._station.config.dt)
-        plan = Plan(goal=self._workplace.hover(), dt=self._station.config.dt, path=path.numpy())
+        assert job.picked_up is not None
+        self._cell.begin_phase(Phase.PUT_BACK)
+        plan = joint_plan(self._cell, self._cell.joints, self._workplace.hover_joints())
         self._check(plan)
-        self._station.play(plan.path)
-        self._station.move_straight(_raised(errand.picked_up, self._config.grasping.lift))
-        self._station.move_straight(errand.picked_up, speed=0.08)
+        self._cell.follow_path(plan.path)
+        self._cell.move_straight(raised(job.picked_up, self._config.grasping.lift))
+        self._cell.move_straight(job.picked_up, speed=DESCENT_SPEED)
         self._grasping.start_over()
         return Phase.OVER
 
-    def _begin_again(self, errand: Errand, mishap: Mishap, what: str) -> Phase:
+    def _start_over(self, job: PickPlaceJob, mishap: Mishap, what: str) -> Phase:
         """From home, unless it has been tried often enough."""
-        self._note(errand, mishap, what)
+        self._note(job, mishap, what)
         self._grasping.start_over()
-        if errand.attempts == self._config.grasping.attempts:
-            errand.failure = what
+        if job.attempts == self._config.grasping.attempts:
+            job.failure = what
             return Phase.OVER
-        errand.attempts += 1
-        return Phase.LOOK
+        job.attempts += 1
+        return Phase.DETECT
 
-    def _dropped(self, item: ObjectConfig) -> bool:
-        """Whether the fingers have closed further than the object lets them."""
-        return self._station.state.gripper_width <= item.half_size[0]
-
-    def _note(self, errand: Errand, mishap: Mishap, what: str) -> None:
-        errand.recoveries.append(Recovery(time=self._station.time, mishap=mishap, what=what))
-
-
-def _raised(pose: Pose, height: float) -> Pose:
-    up = torch.tensor([0.0, 0.0, height], dtype=torch.float64)
-    return Pose(pose.position + up, pose.orientation)
+    def _note(self, job: PickPlaceJob, mishap: Mishap, what: str) -> None:
+        job.recoveries.append(Recovery(time=self._cell.time, mishap=mishap, what=what))

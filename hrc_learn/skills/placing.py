@@ -1,5 +1,9 @@
-"""Placing an object on a shelf by a learned motion: candidate plans, checked, then
-carried out.
+"""Placing an object on a shelf by a learned motion: candidate plans, checked before execution.
+
+The motion was demonstrated for one shelf. For another one there are two spaces to plan in: the
+joint-space primitive with a shifted goal, as in the paper, which bends the path into the shelf;
+and the pose primitive with the learned arm angle tracked in the null space, which keeps it
+straight.
 """
 
 from collections.abc import Iterator
@@ -23,17 +27,13 @@ from hrc_learn.kinematics import (
     panda,
 )
 from hrc_learn.regions import JointRegion
-from hrc_learn.sim import World
-from hrc_learn.sim.workplace import Workplace, nearest_configuration
-from hrc_learn.skills.cartesian_motion import joint_line, resolved_rate
+from hrc_learn.skills.cartesian_motion import (
+    joint_line,
+    nearest_configuration,
+    resolved_rate,
+)
 from hrc_learn.skills.work_cell import BlockedPathError
-
-# Placing a thing on a shelf by a learned motion: planned, checked, then carried out.
-#
-# The motion was taught for one shelf. For another one there are two ways: the joint-space
-# primitive with a shifted goal, as in the paper, which bends the way into the shelf; and the
-# pose primitive with the learned body shape followed in the null space, which keeps it
-# straight.
+from hrc_learn.skills.workplace import CollisionChecker, Workplace
 
 PlanningSpace = Literal["joint", "pose"]
 
@@ -43,15 +43,15 @@ class Plan:
     """A motion of the joints, sampled at the control step."""
 
     goal: Pose
-    """Where the hand should end."""
+    """Where the end effector should end."""
     dt: float
     """[s]"""
     path: Float[np.ndarray, "steps 7"]
     """Joint positions [rad]."""
 
     @property
-    def hand(self) -> Pose:
-        """Pose of the hand along the path."""
+    def tool_pose(self) -> Pose:
+        """Pose of the end effector along the path."""
         return panda.forward(torch.from_numpy(self.path))
 
     @property
@@ -62,12 +62,12 @@ class Plan:
 
 @dataclass(frozen=True, kw_only=True)
 class PlacingSkill:
-    """What was learned from demonstrations of placing."""
+    """Primitives learned from demonstrations of placing."""
 
     joint: JointDMP
     """Motion of the joints."""
     pose: PoseDMP
-    """Motion of the hand, with the arm angle as the body shape learned along."""
+    """Motion of the end effector together with the arm angle, its null-space posture."""
 
     @classmethod
     def load(cls, folder: Path) -> "PlacingSkill":
@@ -99,11 +99,11 @@ class PlacingSkill:
         dt: float,
         speed: float = 1.0,
     ) -> Plan:
-        """Plan the motion from the arm's present position to a goal of the hand.
+        """Plan the motion from the arm's present position to a goal of the end effector.
 
         Args:
             start: Joint positions now [rad].
-            goal: Where the hand should let go.
+            goal: Where the end effector should release the object.
             space: Follow the primitive of the joints, or that of the pose.
             dt: Step of the plan [s].
             speed: How many times faster than demonstrated.
@@ -144,27 +144,27 @@ class PlacingSkill:
 def follow_pose(
     chain: SerialChain,
     start: Float[Tensor, "7"],
-    hand: Pose,
+    poses: Pose,
     twist: Float[Tensor, "steps 6"],
     angle: Float[Tensor, " steps"],
     dt: float,
     gain: float = 10.0,
     angle_gain: float = 4.0,
 ) -> Float[Tensor, "steps 7"]:
-    """Joint path that keeps the hand on given poses and the arm angle near given values.
+    """Joint path that tracks poses of the end effector, and arm angles in the null space.
 
     u = J^+ (twist + gain e) + N n (angle' + angle_gain (angle - angle(q))) - N xi_q, where
-    n turns the arm angle at unit rate: the hand's motion is met, the body's as far as the null
-    space and the joint limits allow.
+    n turns the arm angle at unit rate and xi_q is the gradient of the joint-limit region: the
+    poses are met, the arm angle as far as the null space and the joint limits allow.
 
     Args:
         chain: The arm.
         start: Joint positions at the first pose [rad].
-        hand: Wanted poses, (steps,).
-        twist: Wanted motion of the hand (linear [m/s], angular [rad/s]).
-        angle: Wanted arm angles, continuous [rad].
+        poses: Desired poses of the end effector, (steps,).
+        twist: Its desired motion (linear [m/s], angular [rad/s]).
+        angle: Desired arm angles, continuous [rad].
         dt: Time between samples [s].
-        gain: Decay rate of the hand's error [1/s].
+        gain: Decay rate of the pose error [1/s].
         angle_gain: Decay rate of the arm angle's error [1/s].
     """
     limits = JointRegion.from_limits(chain.limits.lower, chain.limits.upper)
@@ -172,22 +172,23 @@ def follow_pose(
     q, path = start, [start]
     for k in range(len(angle) - 1):
         pose, J = chain.forward_and_jacobian(q)
-        wanted = twist[k] + gain * pose.twist_to(hand[k])
-        shown, motion = arm_angle_and_motion(chain, q, J)
-        error = torch.remainder(angle[k] - shown + torch.pi, 2 * torch.pi) - torch.pi
-        shape = motion * (rate[k] + angle_gain * error)
-        q = q + dt * resolved_rate(J, wanted, shape - limits.gradient(q))
+        desired = twist[k] + gain * pose.twist_to(poses[k])
+        measured, motion = arm_angle_and_motion(chain, q, J)
+        # The shorter way around the circle.
+        error = torch.remainder(angle[k] - measured + torch.pi, 2 * torch.pi) - torch.pi
+        null_velocity = motion * (rate[k] + angle_gain * error) - limits.gradient(q)
+        q = q + dt * resolved_rate(J, desired, null_velocity)
         path.append(q)
     return torch.stack(path)
 
 
-def check_plan(plan: Plan, world: World, carried: str | None = None) -> None:
-    """Make sure that a plan keeps the arm's limits and hits nothing.
+def check_plan(plan: Plan, world: CollisionChecker, carried: str | None = None) -> None:
+    """Make sure that a plan keeps the arm's limits and collides with nothing.
 
     Args:
         plan: The plan.
-        world: Where it is to be carried out, in its present state.
-        carried: The thing in the hand.
+        world: Where it is to be executed, in its present state.
+        carried: The object in the gripper.
 
     Raises:
         BlockedPathError: Otherwise; tells what and where.
@@ -208,8 +209,9 @@ def check_plan(plan: Plan, world: World, carried: str | None = None) -> None:
         raise BlockedPathError(
             f"the plan asks {panda.joint_names[joint]} for {float(speed[k, joint]):.2f} rad/s "
             f"after {k * plan.dt:.1f} s, more than its {float(limits.velocity[joint]):.2f} "
-            "rad/s: play it slower."
+            "rad/s: plan it slower."
         )
+    # One sample in 40 ms: at most 2 cm of motion at the speed of a placing motion.
     every = max(1, round(0.04 / plan.dt))
     samples = np.concatenate([plan.path[:-1:every], plan.path[-1:]])
     touches = world.collisions_along(samples, carried)
@@ -221,28 +223,26 @@ def check_plan(plan: Plan, world: World, carried: str | None = None) -> None:
         )
 
 
-# Ways to a shelf: the learned one, and others for when that is blocked.
-
+# Offsets of via points from home [m]: around what may stand in the direct path.
 _VIA_POINTS = {
     "higher": (0.0, 0.0, 0.12),
     "nearer to the robot": (-0.14, 0.0, 0.06),
     "further from the robot": (0.08, 0.0, 0.10),
 }
-"""Offsets from home [m]."""
+# Changes of joint 7 at home, which turn the elbow about the line to the wrist [rad].
 _ARM_ANGLES = {"with the elbow further out": -0.35, "with the elbow further in": 0.35}
-"""Changes of joint 7 at home, which turn the elbow about the line to the wrist [rad]."""
+# How much higher an object that sits low in the gripper is released [m].
 _RAISED = 0.008
-"""How much higher a thing that sits low in the hand is put down [m]."""
 
 
-class Way(NamedTuple):
+class CandidatePlan(NamedTuple):
     """A plan, and how it differs from the learned one."""
 
     name: str
     plan: Plan
 
 
-def ways_to(
+def plan_candidates(
     goal: Pose,
     start: Float[Tensor, "7"],
     skill: PlacingSkill,
@@ -251,47 +251,43 @@ def ways_to(
     space: PlanningSpace,
     dt: float,
     speed: float,
-) -> Iterator[Way]:
-    """Ways from where the arm is to a shelf, the learned one first, planned when asked for.
+) -> Iterator[CandidatePlan]:
+    """Candidate plans to a shelf, the learned one first; each is planned when asked for.
 
-    Another way ends a little higher, as a thing that sits low in the hand needs it, or begins
-    at another via point or arm angle. The primitive brings hand and body back to what was
-    learned as it nears its goal: the way into the shelf stays as it is.
+    The others end a little higher, as an object that sits low in the gripper needs it, or start
+    at another via point or arm angle. The primitive returns to the learned pose and arm angle
+    as it nears its goal: the path into the shelf stays as it is.
 
     Args:
-        goal: Of the hand.
+        goal: Of the end effector.
         start: Joint positions now [rad].
         skill: The learned motion.
-        workplace: Whose home the other ways begin about.
+        workplace: Whose home the other candidates start near.
         space: In which the motion is planned.
         dt: Control step [s].
         speed: How many times faster than demonstrated.
     """
 
-    def learned(begin: Tensor, goal: Pose = goal) -> Plan:
-        return skill.plan(begin, goal, space=space, dt=dt, speed=speed)
+    def learned(start: Tensor, goal: Pose = goal) -> Plan:
+        return skill.plan(start, goal, space=space, dt=dt, speed=speed)
 
-    yield Way("as learned", learned(start))
+    yield CandidatePlan("as learned", learned(start))
     up = goal.position.new_tensor([0.0, 0.0, _RAISED])
     with suppress(UnreachableError):
         raised = Pose(goal.position + up, goal.orientation)
-        yield Way("a little higher", learned(start, raised))
-    for name, via in _vias(workplace):
+        yield CandidatePlan("a little higher", learned(start, raised))
+    for name, via in _via_postures(workplace):
         first = joint_line(start, via, speed=0.6, dt=dt).numpy()
         rest = learned(via)
-        yield Way(name, replace(rest, path=np.concatenate([first, rest.path[1:]])))
+        path = np.concatenate([first, rest.path[1:]])
+        yield CandidatePlan(name, replace(rest, path=path))
 
 
-def _vias(workplace: Workplace) -> Iterator[tuple[str, Float[Tensor, "7"]]]:
-    """Joint positions to begin from that can be reached."""
+def _via_postures(workplace: Workplace) -> Iterator[tuple[str, Float[Tensor, "7"]]]:
+    """Joint positions near home that can be reached."""
     for name, offset in _VIA_POINTS.items():
-        try:
+        with suppress(UnreachableError):
             yield name, workplace.home_joints(torch.tensor(offset, dtype=torch.float64))
-        except UnreachableError:
-            continue
     for name, change in _ARM_ANGLES.items():
-        try:
-            turned = replace(workplace, home_q7=workplace.home_q7 + change)
-            yield name, turned.home_joints()
-        except UnreachableError:
-            continue
+        with suppress(UnreachableError):
+            yield name, workplace.home_joints(q7_offset=change)

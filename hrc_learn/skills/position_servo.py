@@ -1,4 +1,4 @@
-"""An arm that takes velocities, led by positions: how policies and teleoperators command."""
+"""Position control of a velocity-controlled arm: how policies and teleoperators command."""
 
 from dataclasses import dataclass, field
 
@@ -18,15 +18,18 @@ from hrc_learn.kinematics import MotionLimits, SerialChain
 from hrc_learn.protocols import Arm, ArmState
 from hrc_learn.skills.cartesian_motion import resolved_rate
 
+# Of Newton's method, which doubles the digits each time: from 1 cm to below 1e-9 m.
+_ITERATIONS = 4
+
 
 @dataclass(frozen=True, kw_only=True)
 class PositionServoConfig:
-    """How positions are followed."""
+    """How positions are tracked."""
 
     gain: float = 8.0
-    """How fast the arm is brought back to where it should be [1/s]."""
+    """Decay rate of the tracking error [1/s]."""
     lag: float = 0.1
-    """How far a joint may be from there; farther, the motion begins anew where it is [rad]."""
+    """Largest tracking error of a joint; beyond, the motion restarts where the arm is [rad]."""
     safety: SafetyConfig = field(default_factory=SafetyConfig)
     """The safety filter, which has the last word."""
 
@@ -38,10 +41,10 @@ class PositionServoConfig:
 
 
 class PositionServo:
-    """Follows joint positions, or poses of the hand, by velocities within the arm's limits.
+    """Tracks joint positions, or poses of the end effector, by velocities within the limits.
 
     Positions that keep the limits are reached when the next one is due. The others are
-    followed as `ActionChunkFilter` does, so a target that jumps makes no jump of the arm.
+    tracked as `ActionChunkFilter` does, so a target that jumps makes no jump of the arm.
 
     Attributes:
         safety: State of the safety filter, with its counts of interventions.
@@ -54,13 +57,13 @@ class PositionServo:
         dt: float,
         config: PositionServoConfig | None = None,
     ):
-        """Take hold of the arm at rest.
+        """Connect to the arm at rest.
 
         Args:
             chain: Its kinematics.
             arm: Its driver.
             dt: Time between targets [s].
-            config: How they are followed.
+            config: How they are tracked.
 
         Raises:
             ValueError: dt is longer than the safety filter can guarantee its limits for.
@@ -73,13 +76,13 @@ class PositionServo:
                 f"targets must come within {1 / config.safety.rate:g} s of each other, but dt "
                 f"is {dt:g} s: raise the rate of frames."
             )
-        self._smoother = ActionChunkFilter(_inner(chain, 1.5 * config.safety.margin), dt)
+        self._smoother = ActionChunkFilter(_inner_limits(chain, 1.5 * config.safety.margin), dt)
         self.safety: SafetyState
         self._motion: ActionChunkState
         self.restart()
 
     def restart(self) -> None:
-        """Begin anew where the arm is, at rest."""
+        """Restart where the arm is, at rest."""
         q = torch.from_numpy(self._arm.read().joint_position)
         self.safety = self._filter.initial_state(q)
         self._motion = self._smoother.initial_state(q)
@@ -90,10 +93,10 @@ class PositionServo:
         """Command the velocity with which the target is reached, or neared, within dt.
 
         Args:
-            target: Joint positions [rad]. What is no number leaves its joint to its course.
+            target: Joint positions [rad]. NaN leaves a joint to its present motion.
 
         Returns:
-            The reading of the arm it is based on, and where the joints are sent [rad]. The
+            The reading of the arm it is based on, and the commanded positions [rad]. The
             caller lets dt pass.
         """
         state = self._arm.read()
@@ -111,10 +114,10 @@ class PositionServo:
         return state, self._motion.position.numpy()
 
     def joints_at(self, pose: Pose) -> Float[np.ndarray, " joints"]:
-        """Joint positions, near those the arm is sent to, with the hand at a pose [rad].
+        """Joint positions, near the commanded ones, with the end effector at a pose [rad].
 
         Args:
-            pose: Of the hand. Out of reach: positions that come closer.
+            pose: Of the end effector. Out of reach: positions that come closer.
         """
         q = self._motion.position
         still = torch.zeros_like(q)
@@ -124,11 +127,7 @@ class PositionServo:
         return q.numpy()
 
 
-_ITERATIONS = 4
-"""Of Newton's method, which doubles the digits from each to the next."""
-
-
-def _inner(chain: SerialChain, margin: float) -> MotionLimits:
+def _inner_limits(chain: SerialChain, margin: float) -> MotionLimits:
     """Limits of the joints within those of the safety filter, which then has nothing to do."""
     limits = chain.limits
     return MotionLimits(

@@ -1,4 +1,8 @@
-"""Image-based visual servoing to an object with an uncalibrated camera."""
+"""Image-based visual servoing to an object with an uncalibrated camera.
+
+`VisualServo` runs the adaptive controller in a work cell; `VisualServoSkill` is what it needs
+from demonstrations: the image Jacobian, the visual target and the approach direction.
+"""
 
 import copy
 import math
@@ -29,77 +33,73 @@ from hrc_learn.jacobian import (
 )
 from hrc_learn.kinematics.tool_orientation import Approach
 from hrc_learn.skills.visual_target import OBJECT_FEATURE, VisualTarget
-from hrc_learn.skills.work_cell import MissedGraspError, Station
-
-# Aiming at an object with an uncalibrated camera: the adaptive controller at work.
+from hrc_learn.skills.work_cell import MissedGraspError, WorkCell
 
 
 @dataclass(frozen=True, kw_only=True)
-class AimingConfig:
-    """When aiming is done, and when it is given up."""
+class VisualServoConfig:
+    """When the target counts as reached, and when servoing is given up."""
 
     tolerance: float = 2.0
     """Distance of the feature from the target at which it counts as reached [px]."""
     dwell: float = 0.4
     """How long it has to stay there [s]."""
     height_tolerance: float = 0.01
-    """How far above or below the middle of the box the hand may then be [m]."""
-    patience: float = 40.0
-    """After which aiming is given up [s]."""
-    unseen_patience: float = 10.0
-    """How long the hand's marker may stay out of sight [s]."""
+    """How far above or below the middle of the box the end effector may then be [m]."""
+    timeout: float = 40.0
+    """After which servoing is given up [s]."""
+    occlusion_timeout: float = 10.0
+    """How long the end effector's marker may stay undetected [s]."""
     probe: float = 0.03
-    """Height above the box from which the hand comes down into it, along the line from the
-    object's marker to its own [m]. From this motion the controller learns how that line looks
-    to a camera that may have been moved, and so where on it the marker has to be. The longer,
-    the less matters noise, and the more perspective, which makes the line look longer from
-    nearer to the camera. 0: none."""
+    """Height above the box from which the end effector descends into it, along the line from
+    the object's marker to its own [m]. From this motion the controller learns how that line
+    looks to a camera that may have been moved, and so where on it the marker has to be. A
+    longer probe is less sensitive to noise and more to perspective, which makes the line look
+    longer from nearer to the camera. 0: none."""
     probe_speed: float = 0.05
-    """How fast the hand comes down from there: no faster than the camera can lead it along the
-    line [m/s]."""
+    """Speed of that descent [m/s]: no faster than the camera can guide it along the line."""
     probe_tolerance: float = 10.0
-    """Distance of the feature from the target at which the hand comes down [px]."""
+    """Distance of the feature from the target at which the descent begins [px]."""
     probe_reach: float = 0.015
-    """The line looks different elsewhere, and one motion may not tell it well: a hand that has
-    come further off it than this by the time it is down goes up again, and comes down where
-    it then is [m]."""
-    most_probes: int = 3
-    """How often the hand comes down at most."""
+    """Sideways deviation from the line after the descent above which the probe is repeated from
+    the new place [m]: the line looks different there, and one motion may not tell it well."""
+    max_probes: int = 3
+    """Descents at most."""
     border: float = 50.0
     """Distance that the target keeps from the edge of the image [px]."""
     half_size: tuple[float, float, float] = (0.12, 0.12, 0.003)
     """Box in which the camera takes over [m]. Flat: the image tells little about height, and
-    an object has to be met at the height at which aiming was taught."""
-    unseen_half_size: tuple[float, float, float] = (0.03, 0.03, 0.003)
-    """The same until the camera has seen the hand's marker: one that was moved may not see all
-    of the box, but will see its middle [m]."""
+    an object has to be met at the height of the demonstrations."""
+    acquisition_half_size: tuple[float, float, float] = (0.03, 0.03, 0.003)
+    """The same until the marker has been detected: a camera that was moved may not see all of
+    the box, but will see its middle [m]."""
     angle: float = 0.01
-    """Tolerated turn of the hand [rad]. The paper's cone of 7.6 degrees would leave the marker
-    1 cm off the place it was taught to be at."""
+    """Half angle of the tolerated cone of orientations [rad]. The paper's cone of 7.6 degrees
+    would leave the marker 1 cm off its demonstrated place."""
     rate: float = 4.0
-    """How fast the hand returns into the box from above or below, and into the cone [1/s]."""
+    """How fast the end effector returns into the box vertically, and into the cone [1/s]."""
 
     def within(self, pixel: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
         """A pixel, or the nearest one that keeps its distance from the edge of the image."""
         return np.clip(pixel, self.border, np.array(IMAGE_SIZE) - 1 - self.border)
 
     def goals(
-        self, above: Pose, target: Float[np.ndarray, "2"], *, found: bool = True
+        self, above: Pose, target: Float[np.ndarray, "2"], *, detected: bool = True
     ) -> Goals:
-        """Goals of aiming.
+        """Goals of the controller.
 
         Args:
-            above: Middle of the box above the table, and orientation of the hand.
-            target: Where in the image the hand's marker should be [px]. One outside the image
-                is brought to its border: on the way there the image Jacobian is learned, which
-                may have put it outside.
-            found: Whether the camera has seen the hand's marker.
+            above: Middle of the box above the table, and orientation of the end effector.
+            target: Where in the image its marker should be [px]. A target outside the image is
+                moved to the border: on the way there the image Jacobian is learned, whose
+                error may have put it outside.
+            detected: Whether the end effector's marker has been detected yet.
         """
         goals = Goals.at(
             above.position,
             above.orientation,
             torch.from_numpy(self.within(target)),
-            half_size=self.half_size if found else self.unseen_half_size,
+            half_size=self.half_size if detected else self.acquisition_half_size,
         )
         # Near the border of a region its excess decays at 4 k_c / h^2 and k_o (alpha_o / 2)^2.
         upright = self.rate / 4 * self.half_size[2] ** 2
@@ -116,218 +116,214 @@ class AimingConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Aim:
-    """What to aim at. Where that is in the image depends on what is known of the camera."""
+class ServoTarget:
+    """What to servo to. Where that is in the image depends on what is known of the camera."""
 
-    config: AimingConfig
+    config: VisualServoConfig
     above: Pose
-    """Middle of the box above the table, and orientation of the hand."""
+    """Middle of the box above the table, and orientation of the end effector."""
     posture: Float[Tensor, " joints"] | None
-    """Joint positions with the hand there, by which it is approached [rad]; None: it is
-    approached by the Cartesian regions."""
+    """Joint positions there, approached in joint space [rad]; None: approached by the
+    Cartesian regions."""
     target: Callable[[Float[np.ndarray, "2 6"]], Float[np.ndarray, "2"]]
-    """Where the hand's marker should be [px], given the image Jacobian there."""
+    """Where the end effector's marker should be [px], given the image Jacobian there."""
     line: Float[np.ndarray, "3"]
-    """Direction from the object's marker to the hand's, base frame; it leads up."""
+    """Direction from the object's marker to the end effector's, base frame; it leads up."""
     raised: float = 0.0
-    """Height above there at which to stay for now, further away along the line [m]."""
+    """Height above the box to servo at for now, further along the line [m]."""
 
     def goals(
-        self, image_jacobian: Float[np.ndarray, "2 6"], hand: Pose, *, found: bool = True
+        self, image_jacobian: Float[np.ndarray, "2 6"], pose: Pose, *, detected: bool = True
     ) -> Goals:
-        """Goals by an estimate of the image Jacobian, with the hand where it is."""
-        away = torch.from_numpy(self._away(self.raised))
-        above = Pose(self.above.position + away, self.above.orientation)
-        goals = self.config.goals(above, self.pixel(image_jacobian, hand), found=found)
+        """Goals by an estimate of the image Jacobian, at a pose of the end effector."""
+        offset = torch.from_numpy(self._offset(self.raised))
+        above = Pose(self.above.position + offset, self.above.orientation)
+        goals = self.config.goals(above, self.pixel(image_jacobian, pose), detected=detected)
         return goals.approached_by(self.posture)
 
     def pixel(
-        self, image_jacobian: Float[np.ndarray, "2 6"], hand: Pose
+        self, image_jacobian: Float[np.ndarray, "2 6"], pose: Pose
     ) -> Float[np.ndarray, "2"]:
-        """Where the marker should be for the hand to be on the line, at the height it has."""
-        height = float(hand.position[2] - self.above.position[2])
-        away = self._away(min(max(height, 0.0), self.config.probe))
-        pixel = self.target(image_jacobian) + image_jacobian[:, :3] @ away
+        """Where the marker should be for the end effector to be on the line at its height."""
+        height = float(pose.position[2] - self.above.position[2])
+        offset = self._offset(min(max(height, 0.0), self.config.probe))
+        pixel = self.target(image_jacobian) + image_jacobian[:, :3] @ offset
         return self.config.within(pixel) if self.raised else pixel
 
-    def aside(self, hand: Pose, before: Pose) -> float:
-        """How far a hand has left the line that it was on before, sideways [m]."""
-        moved = (hand.position - before.position).numpy()
-        return float(np.linalg.norm((moved - self._away(moved[2]))[:2]))
+    def deviation(self, pose: Pose, before: Pose) -> float:
+        """Sideways distance of a pose from the line through an earlier one [m]."""
+        moved = (pose.position - before.position).numpy()
+        return float(np.linalg.norm((moved - self._offset(moved[2]))[:2]))
 
-    def _away(self, height: float) -> Float[np.ndarray, "3"]:
+    def _offset(self, height: float) -> Float[np.ndarray, "3"]:
+        """Way along the line to a height above its beginning [m]."""
         return height / self.line[2] * self.line
 
 
-class Aimer:
-    """Runs the controller on a station until the hand's marker is at its target.
+class VisualServo:
+    """Runs the controller in a work cell until the marker is at its target.
 
     Attributes:
-        state: Of the controller; the estimate of the image Jacobian goes on from aim to aim.
+        state: Of the controller; its estimate of the image Jacobian persists between targets.
     """
 
     def __init__(
         self,
-        station: Station,
+        cell: WorkCell,
         controller: AdaptiveController,
         marker: int,
-        config: AimingConfig | None = None,
+        config: VisualServoConfig | None = None,
     ):
         """Prepare.
 
         Args:
-            station: Where.
+            cell: Where.
             controller: The adaptive controller.
-            marker: ArUco number of the hand's marker.
-            config: When aiming is done.
+            marker: ArUco number of the end effector's marker.
+            config: When the target counts as reached.
         """
-        self._station = station
+        self._cell = cell
         self._controller = controller
         self._marker = marker
-        self._config = config or AimingConfig()
-        self._last_image = self._last_seen = -np.inf
-        self._known = (np.nan, np.zeros((2, 6)))  # when, and the image Jacobian then
-        self._found = False
-        self.state: ControllerState = controller.initial_state(station.joints)
+        self._config = config or VisualServoConfig()
+        self._last_image = self._last_detection = -np.inf
+        self._cached = (np.nan, np.zeros((2, 6)))  # time of an image, and the Jacobian at it
+        self._detected = False
+        self.state: ControllerState = controller.initial_state(cell.joints)
 
-    def aim(self, aim: Aim) -> float:
-        """Bring the hand's marker to the target, first from higher up, along a line.
+    def servo_to(self, target: ServoTarget) -> float:
+        """Bring the marker to the target, first from higher up, along a line.
 
         Returns:
             Time it took [s].
 
         Raises:
-            MissedGraspError: If it takes too long, or the marker stays out of sight.
+            MissedGraspError: If it takes too long, or the marker stays undetected.
         """
-        begin, config = self._station.time, self._config
-        self._found = False
+        start, config = self._cell.time, self._config
+        self._detected = False
         self._resume()
-        reached, above = begin, self._station.pose
-        for _ in range(config.most_probes if config.probe > 0 else 1):
+        reached, above = start, self._cell.pose
+        for _ in range(config.max_probes if config.probe > 0 else 1):
             if config.probe > 0:
-                self._reach(replace(aim, raised=config.probe), config.probe_tolerance, begin)
-                above = self._station.pose
-                self._come_down(aim)
-            reached = self._reach(aim, config.tolerance, begin)
-            if config.probe == 0 or aim.aside(self._station.pose, above) < config.probe_reach:
+                raised = replace(target, raised=config.probe)
+                self._converge(raised, config.probe_tolerance, start)
+                above = self._cell.pose
+                self._descend(target)
+            reached = self._converge(target, config.tolerance, start)
+            if config.probe == 0:
                 break
-        return reached - begin
+            if target.deviation(self._cell.pose, above) < config.probe_reach:
+                break
+        return reached - start
 
     def _resume(self) -> None:
-        """Tell the estimate how long nobody has watched: the camera may have been moved."""
-        pause = self._station.time - self._last_image
+        """Tell the estimator how long no image was taken: the camera may have been moved."""
+        pause = self._cell.time - self._last_image
         if 0 < pause < np.inf:
             estimator = self._controller.estimator
             resumed = estimator.resumed(self.state.estimator, pause)
             self.state = replace(self.state, estimator=resumed)
 
-    def _reach(self, aim: Aim, tolerance: float, begin: float) -> float:
-        """Steps until marker and height have stayed at the target; when they came there [s]."""
-        reached = self._last_seen = self._station.time
-        while self._station.time - reached < self._config.dwell:
-            self.step(aim)
-            if not (self.error(aim) < tolerance and self._at_height(aim)):
-                reached = self._station.time
-            self._check(aim, self._station.time - begin)
+    def _converge(self, target: ServoTarget, tolerance: float, start: float) -> float:
+        """Step until marker and height have stayed at the target; when they got there [s]."""
+        reached = self._last_detection = self._cell.time
+        while self._cell.time - reached < self._config.dwell:
+            self.step(target)
+            height = float(self._cell.pose.position[2] - target.above.position[2])
+            at_height = abs(height - target.raised) < self._config.height_tolerance
+            if not (self.error(target) < tolerance and at_height):
+                reached = self._cell.time
+            self._check_timeouts(target, self._cell.time - start)
         return reached
 
-    def _come_down(self, aim: Aim) -> None:
+    def _descend(self, target: ServoTarget) -> None:
         """Along the line, from as high up as a probe begins."""
         config = self._config
-        drop = config.probe_speed * self._station.config.dt
-        for height in np.arange(config.probe, 0.0, -drop):
-            self.step(replace(aim, raised=float(height)))
+        step = config.probe_speed * self._cell.config.dt
+        for height in np.arange(config.probe, 0.0, -step):
+            self.step(replace(target, raised=float(height)))
 
-    def hold(self, aim: Aim, duration: float) -> None:
-        """Keep aiming for a while [s], whatever the person does to the body."""
-        end = self._station.time + duration
-        while self._station.time < end:
-            self.step(aim)
+    def hold(self, target: ServoTarget, duration: float) -> None:
+        """Keep servoing for a while [s], whatever the person does to the null space."""
+        end = self._cell.time + duration
+        while self._cell.time < end:
+            self.step(target)
 
-    def error(self, aim: Aim) -> float:
-        """Distance of the feature from its target [px]; NaN if it is not seen."""
-        target = aim.pixel(self._image_jacobian(), self._station.pose)
-        return float(np.linalg.norm(self._feature() - target))
+    def error(self, target: ServoTarget) -> float:
+        """Distance of the feature from its target [px]; NaN if it is not detected."""
+        pixel = target.pixel(self._image_jacobian(), self._cell.pose)
+        return float(np.linalg.norm(self._feature() - pixel))
 
-    def step(self, aim: Aim) -> None:
+    def step(self, target: ServoTarget) -> None:
         """One step of the controller."""
-        sight = self._station.sight
+        observation = self._cell.observation
         feature = torch.from_numpy(self._feature())
-        seen = torch.tensor(bool(torch.isfinite(feature).all()))
-        new = torch.tensor(sight.time > self._last_image)
-        self._last_image = sight.time
-        if seen:
-            self._last_seen, self._found = sight.time, True
-        goals = aim.goals(self._image_jacobian(), self._station.pose, found=self._found)
+        visible = torch.tensor(bool(torch.isfinite(feature).all()))
+        new = torch.tensor(observation.time > self._last_image)
+        self._last_image = observation.time
+        if visible:
+            self._last_detection, self._detected = observation.time, True
+        goals = target.goals(self._image_jacobian(), self._cell.pose, detected=self._detected)
+        age = torch.tensor(self._cell.time - observation.time, dtype=torch.float64)
         command, self.state = self._controller.step(
             self.state,
             Observation(
-                joint_position=self._station.joints,
+                joint_position=self._cell.joints,
                 feature=feature,
-                feature_visible=seen,
+                feature_visible=visible,
                 feature_new=new,
-                feature_age=_scalar(self._station.time - sight.time),
-                image_joint_position=sight.joints,
-                nullspace_input=torch.from_numpy(self._station.asked.effort),
+                feature_age=age,
+                image_joint_position=observation.joints,
+                nullspace_input=torch.from_numpy(self._cell.human_input.nullspace_input),
                 goals=goals,
-                dt=self._station.config.dt,
+                dt=self._cell.config.dt,
             ),
         )
-        approach = 0.0 if aim.posture is None else 1.0 - float(self.state.task_level)
-        target = goals.vision.target.numpy()
-        self._station.obey(command, target, feature.numpy(), approach)
+        approach = 0.0 if target.posture is None else 1.0 - float(self.state.task_level)
+        pixel = goals.vision.target.numpy()
+        self._cell.execute(command, pixel, feature.numpy(), approach)
 
     def _image_jacobian(self) -> Float[np.ndarray, "2 6"]:
-        """Estimate where the hand was in the newest image [px/m, px/rad]."""
-        sight = self._station.sight
-        if sight.time != self._known[0]:
-            joints = self._station.joints if sight.joints is None else sight.joints
-            pose = self._station.chain.forward(joints)
+        """Estimate at the pose of the newest image [px/m, px/rad], computed once an image."""
+        observation = self._cell.observation
+        if observation.time != self._cached[0]:
+            joints = self._cell.joints if observation.joints is None else observation.joints
+            pose = self._cell.chain.forward(joints)
             estimate = self._controller.estimator.jacobian(self.state.estimator, pose)
-            self._known = sight.time, estimate.numpy()
-        return self._known[1]
+            self._cached = observation.time, estimate.numpy()
+        return self._cached[1]
 
-    def _at_height(self, aim: Aim) -> bool:
-        wrong = self._station.pose.position[2] - aim.above.position[2] - aim.raised
-        return abs(float(wrong)) < self._config.height_tolerance
-
-    def _check(self, aim: Aim, spent: float) -> None:
-        if self._station.time - self._last_seen > self._config.unseen_patience:
+    def _check_timeouts(self, target: ServoTarget, spent: float) -> None:
+        if self._cell.time - self._last_detection > self._config.occlusion_timeout:
             raise MissedGraspError(
-                f"aiming: for {self._config.unseen_patience:.0f} s the camera has not seen the "
-                f"hand's marker {self._marker}. If nothing covers it, put the object nearer to "
-                "the middle of the image."
+                f"visual servoing: the end effector's marker {self._marker} was not detected "
+                f"for {self._config.occlusion_timeout:.0f} s. If nothing occludes it, put the "
+                "object nearer to the middle of the image."
             )
-        if spent > self._config.patience:
+        if spent > self._config.timeout:
             raise MissedGraspError(
-                f"aiming: after {spent:.0f} s the marker is still {self.error(aim):.1f} px "
-                "from its target (NaN: not seen)."
+                f"visual servoing: after {spent:.0f} s the marker is still "
+                f"{self.error(target):.1f} px from its target (NaN: not detected)."
             )
 
     def _feature(self) -> Float[np.ndarray, "2"]:
-        return self._station.sight.pixels.get(self._marker, np.full(2, np.nan))
-
-
-def _scalar(value: float) -> Tensor:
-    return torch.tensor(value, dtype=torch.float64)
-
-
-# A learned visual servo: image Jacobian, visual target and approach direction.
+        return self._cell.observation.pixels.get(self._marker, np.full(2, np.nan))
 
 
 @dataclass(frozen=True, kw_only=True)
-class AimingSkill:
-    """What was learned from demonstrations of aiming."""
+class VisualServoSkill:
+    """What was learned from demonstrations of visual servoing."""
 
     jacobian: RBFImageJacobian
     target: VisualTarget | None
-    """None where no object was watched."""
+    """None where no object was observed."""
     approach: Approach | None = None
-    """None where no object was watched."""
+    """None where no object was observed."""
     learned: EvidenceResult | None = None
-    """How neurons, noise and prior were learned; None where they were given."""
+    """How RBF centres, noise and prior were learned; None where they were given."""
     cells: CellErrors | None = None
-    """Held-out errors by place; None of a skill that was loaded."""
+    """Held-out errors by cell of a grid; None of a skill that was loaded."""
 
     def save(self, folder: Path) -> None:
         """Write `folder/jacobian`, `folder/visual_target.json`, `folder/approach.json`."""
@@ -338,8 +334,8 @@ class AimingSkill:
             self.approach.save(folder / "approach.json")
 
     @classmethod
-    def load(cls, folder: Path) -> "AimingSkill":
-        """Read what `hrc fit image-jacobian` wrote.
+    def load(cls, folder: Path) -> "VisualServoSkill":
+        """Read what `training/fit_image_jacobian.py` wrote.
 
         Raises:
             FileNotFoundError: If there is no such folder or file.
@@ -355,24 +351,24 @@ class AimingSkill:
     def target_of(
         self, pixel: Float[np.ndarray, "2"], jacobian: Float[np.ndarray, "2 6"]
     ) -> Float[np.ndarray, "2"]:
-        """Where the hand's marker should be, to stand above an object seen at a pixel.
+        """Where the marker should be for the end effector to be above an object at a pixel.
 
         Args:
             pixel: Of the object's marker [px].
-            jacobian: Estimate of the image Jacobian of the hand's marker [px/m, px/rad].
+            jacobian: Estimate of the image Jacobian of the end effector's marker
+                [px/m, px/rad].
 
         Raises:
-            ValueError: If no object was watched in the demonstrations.
+            ValueError: If no object was observed in the demonstrations.
         """
         if self.target is None:
             raise ValueError(
-                f"the aiming skill knows no visual target: its demonstrations lack "
-                f"{OBJECT_FEATURE}."
+                f"the skill knows no visual target: its demonstrations lack {OBJECT_FEATURE}."
             )
-        return self.target.seen_by(pixel, jacobian)
+        return self.target.from_view(pixel, jacobian)
 
     def metrics(self) -> dict[str, float]:
-        """How well image motion is predicted, and how well aiming.
+        """How well image motion and visual targets are predicted.
 
         Raises:
             ValueError: If the skill was loaded; its metrics are in metrics.json.
@@ -406,9 +402,6 @@ class AimingSkill:
             values["approach_spread_deg"] = math.degrees(self.approach.spread)
             values["approach_turned_deg"] = math.degrees(self.approach.turned)
         return values
-
-
-# Image Jacobians to start from, learned or guessed.
 
 
 def from_learned(learned: RBFImageJacobian) -> KalmanEstimator:

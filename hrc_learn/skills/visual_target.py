@@ -1,12 +1,12 @@
-"""Where in the image the hand's marker should be, to stand right above an object.
+"""Where in the image the end effector's marker should be, for it to be right above an object.
 
-The hand's marker and the object's are at different heights and places, so aiming is not
-bringing one upon the other. With an uncalibrated camera the offset has to be learned: each
-demonstration ends with the hand right above an object, and tells one pair of pixels.
+The markers of end effector and object are at different heights and places, so the target is not
+the object's pixel. With an uncalibrated camera the offset has to be learned: each demonstration
+ends with the end effector right above an object, and gives one pair of pixels.
 
-For a camera that stands as it did then, a map from pixel to pixel is all it takes. One that has
-been moved since shows the same offset in space from another side: the image Jacobian, which
-adapts to it, tells how it looks from there.
+For a camera at its place in the demonstrations, a map from pixel to pixel is enough. One that
+has been moved since sees the same offset in space from another side: the image Jacobian, which
+adapts, projects it into the image.
 """
 
 import json
@@ -23,26 +23,27 @@ OBJECT_FEATURE = "observation.object_feature"
 OBJECT_FEATURE_NAMES = ("u", "v", "visible")
 UP = np.array([0.0, 0.0, 1.0])
 LONGEST_OFFSET = 0.3
-"""Of the hand's marker from the object's [m]. From few demonstrations along a flat box the
-image Jacobian knows little about height; only an offset of metres would explain the rest."""
+"""Of the end effector's marker from the object's [m]. From few demonstrations along a flat box
+the image Jacobian knows little about height: without this bound the least-squares offset can be
+metres long."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class VisualTarget:
-    """Affine map from the pixel of an object's marker to that of the hand's marker above it.
+    """Affine map from the pixel of an object's marker to that of the end effector's above it.
 
     Affine is exact for a camera that looks straight down through a perfect lens, and good to a
     few pixels for one that does not; `error` tells.
     """
 
     matrix: Float[np.ndarray, "2 3"]
-    """Maps (u, v, 1) of the object's marker to (u, v) of the hand's [px]."""
+    """Maps (u, v, 1) of the object's marker to (u, v) of the end effector's [px]."""
     error: float
     """Leave-one-out error, root mean square [px]; NaN from fewer than five demonstrations."""
     offset: Float[np.ndarray, "3"] | None = None
-    """From the object's marker to the hand's, base frame [m], as the image Jacobian at the
-    hand's has it: shorter than it is by perspective, which shrinks what is further away. None
-    where no image Jacobian was at hand."""
+    """From the object's marker to the end effector's, base frame [m], by the image Jacobian at
+    the latter: shorter than the true one, as perspective shrinks what is further away. None
+    where no image Jacobian was given."""
     offset_error: float = float("nan")
     """As `error`, of targets by the offset [px]."""
 
@@ -50,15 +51,15 @@ class VisualTarget:
     def fit(
         cls,
         objects: Float[np.ndarray, "demos 2"],
-        hands: Float[np.ndarray, "demos 2"],
+        tools: Float[np.ndarray, "demos 2"],
         jacobians: Float[np.ndarray, "demos 2 6"] | None = None,
     ) -> "VisualTarget":
         """Fit to the ends of demonstrations.
 
         Args:
             objects: Pixels of the object's marker [px].
-            hands: Pixels of the hand's marker when the hand stood right above it [px].
-            jacobians: Image Jacobians of the hand's marker there [px/m, px/rad].
+            tools: Pixels of the end effector's marker right above it [px].
+            jacobians: Image Jacobians of that marker there [px/m, px/rad].
 
         Raises:
             ValueError: If there are fewer than three demonstrations, or they lie on a line.
@@ -66,14 +67,14 @@ class VisualTarget:
         design = np.column_stack([objects, np.ones(len(objects))])
         if np.linalg.matrix_rank(design - design.mean(axis=0)) < 2:
             raise ValueError(
-                f"{len(objects)} demonstrations do not determine where to aim: at least three "
-                "are needed, with objects that do not lie on one line in the image."
+                f"{len(objects)} demonstrations do not determine the visual target: at least "
+                "three are needed, with objects that do not lie on one line in the image."
             )
-        matrix, error = _solved(np.kron(design, np.eye(2)), hands)
+        matrix, error = _solved(np.kron(design, np.eye(2)), tools)
         offset, offset_error = None, float("nan")
         if jacobians is not None:
             directions = jacobians[..., :3].reshape(-1, 3)
-            offset, offset_error = _solved(directions, hands - objects, LONGEST_OFFSET)
+            offset, offset_error = _solved(directions, tools - objects, LONGEST_OFFSET)
         return cls(
             matrix=matrix.reshape(3, 2).T,
             error=error,
@@ -82,24 +83,26 @@ class VisualTarget:
         )
 
     def __call__(self, pixel: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
-        """Where the hand's marker should be for an object's marker at `pixel` [px]."""
+        """Where the end effector's marker should be for an object's marker at `pixel` [px]."""
         return self.matrix @ np.append(pixel, 1.0)
 
-    def seen_by(
+    def from_view(
         self, pixel: Float[np.ndarray, "2"], jacobian: Float[np.ndarray, "2 6"]
     ) -> Float[np.ndarray, "2"]:
         """The same for a camera that may have been moved since the demonstrations.
 
         Args:
             pixel: Of the object's marker [px].
-            jacobian: Estimate of the image Jacobian of the hand's marker [px/m, px/rad].
+            jacobian: Estimate of the image Jacobian of the end effector's marker
+                [px/m, px/rad].
         """
         return self(pixel) if self.offset is None else pixel + jacobian[:, :3] @ self.offset
 
     def line(self) -> Float[np.ndarray, "3"]:
-        """Direction from the object's marker to the hand's above it, base frame.
+        """Direction from the object's marker to the end effector's above it, base frame.
 
-        Straight up where demonstrations told no offset, or one that leads aside.
+        Straight up without a learned offset, or with one that is flatter than 30 degrees,
+        which few demonstrations cannot tell from noise.
         """
         if self.offset is None or self.offset[2] < 0.5 * np.linalg.norm(self.offset):
             return UP
@@ -151,7 +154,7 @@ def _solved(
     if len(pixels) < 5:
         return solution, float("nan")
     residuals = pixels - (design @ solution).reshape(-1, 2)
-    # From the blocks of the hat matrix, of both equations that go at once (Allen 1974, PRESS).
+    # By blocks of the hat matrix, one for each demonstration (Allen 1974, PRESS).
     hat = (design @ inverse).reshape(len(pixels), 2, len(pixels), 2)
     own = hat[np.arange(len(pixels)), :, np.arange(len(pixels))]
     press = np.linalg.solve(np.eye(2) - own, residuals[..., None])
@@ -165,6 +168,7 @@ def _ridge_inverse(
 ) -> Float[np.ndarray, "unknowns equations"]:
     """Pseudo-inverse, damped just enough to keep the solution as short as asked for."""
     u, s, vt = np.linalg.svd(design, full_matrices=False)
+    # Rank deficient designs: the factor keeps the divisions below finite.
     s = np.maximum(s, 1e-12 * s[0])
     along = u.T @ values
 
@@ -174,6 +178,7 @@ def _ridge_inverse(
     low, high = 0.0, 0.0
     if length(0.0) > longest:
         high = float(s[0] * np.linalg.norm(along)) / longest
+        # Bisection: the length falls with the penalty.
         while high - low > 1e-6 * high:
             middle = (low + high) / 2
             low, high = (middle, high) if length(middle) > longest else (low, middle)

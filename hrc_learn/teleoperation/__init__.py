@@ -1,17 +1,29 @@
-"""A person at the arm: scripted, at the keys, at a gamepad, or in a browser; and
-demonstrations recorded from them.
+"""Human input: scripted, by keys, gamepad or browser; hand guiding; recorded demonstrations.
+
+Devices are in `teleoperation.devices`, the browser page in `teleoperation.page`; scenarios and
+scripted demonstrations, which need the simulator, in modules of their own.
 """
 
-from hrc_learn.teleoperation.combined_input import BothHands as BothHands
-from hrc_learn.teleoperation.combined_input import Eased as Eased
-from hrc_learn.teleoperation.combined_input import EasingConfig as EasingConfig
-from hrc_learn.teleoperation.interaction_force import DragConfig as DragConfig
-from hrc_learn.teleoperation.interaction_force import PullMapping as PullMapping
-from hrc_learn.teleoperation.interaction_force import PullSpell as PullSpell
-from hrc_learn.teleoperation.interaction_force import ScriptedPuller as ScriptedPuller
-from hrc_learn.teleoperation.interaction_force import drag_effort as drag_effort
-from hrc_learn.teleoperation.interaction_force import hand_twist as hand_twist
-from hrc_learn.teleoperation.interaction_force import pull_effort as pull_effort
+from hrc_learn.teleoperation.combined_input import CombinedInput as CombinedInput
+from hrc_learn.teleoperation.combined_input import InputFilter as InputFilter
+from hrc_learn.teleoperation.combined_input import InputFilterConfig as InputFilterConfig
+from hrc_learn.teleoperation.hand_guiding import HandGuidedArm as HandGuidedArm
+from hrc_learn.teleoperation.hand_guiding import HandGuidingConfig as HandGuidingConfig
+from hrc_learn.teleoperation.interaction_force import ForceMapping as ForceMapping
+from hrc_learn.teleoperation.interaction_force import (
+    InteractionForceConfig as InteractionForceConfig,
+)
+from hrc_learn.teleoperation.interaction_force import ScriptedForce as ScriptedForce
+from hrc_learn.teleoperation.interaction_force import (
+    ScriptedPerturbation as ScriptedPerturbation,
+)
+from hrc_learn.teleoperation.interaction_force import (
+    force_to_nullspace_input as force_to_nullspace_input,
+)
+from hrc_learn.teleoperation.interaction_force import (
+    gizmo_nullspace_input as gizmo_nullspace_input,
+)
+from hrc_learn.teleoperation.interaction_force import guiding_twist as guiding_twist
 from hrc_learn.teleoperation.scripted_expert import GuidedPath as GuidedPath
 from hrc_learn.teleoperation.scripted_expert import ScriptedExpert as ScriptedExpert
 from hrc_learn.teleoperation.scripted_expert import Tremor as Tremor

@@ -1,6 +1,4 @@
-"""Several sources of a person's input at once, and the filter that bounds the
-acceleration of what they ask.
-"""
+"""Several sources of human input at once, and a filter that bounds its acceleration."""
 
 from dataclasses import dataclass, replace
 
@@ -9,14 +7,12 @@ import numpy as np
 from hrc_learn.protocols import ArmState, Human, HumanInput
 from hrc_learn.teleoperation.interaction_force import capped
 
-# Several sources of a person's input at once, as the paper's mixed interface has two.
 
+class CombinedInput:
+    """Joins several sources, as the paper's mixed interface has a haptic device and a headset.
 
-class BothHands:
-    """One hand leads the end effector by a device, the other the body in the browser.
-
-    Efforts and motions add up. Of what is asked for otherwise, the first source that says
-    anything is heard; requests of all are.
+    Null-space inputs and twists add up. Of gripper, region and target the first source that
+    sets them is used; requests of all are passed on.
     """
 
     def __init__(self, *sources: Human):
@@ -26,16 +22,15 @@ class BothHands:
             ValueError: There are none.
         """
         if not sources:
-            raise ValueError("a person needs at least one source of input.")
+            raise ValueError("a combined input needs at least one source.")
         self._sources = sources
 
     def read(self, state: ArmState) -> HumanInput:
         """What all sources ask for together."""
         inputs = [source.read(state) for source in self._sources]
-        first, *others = inputs
         return HumanInput(
-            effort=sum((other.effort for other in others), first.effort),
-            twist=sum((other.twist for other in others), first.twist),
+            nullspace_input=np.sum([i.nullspace_input for i in inputs], axis=0),
+            twist=np.sum([i.twist for i in inputs], axis=0),
             gripper=next((i.gripper for i in inputs if i.gripper is not None), None),
             region=next((i.region for i in inputs if i.region is not None), None),
             target=next((i.target for i in inputs if i.target is not None), None),
@@ -43,15 +38,12 @@ class BothHands:
         )
 
 
-# A hand that is led starts and stops within bounds of its acceleration.
-
-
 @dataclass(frozen=True, kw_only=True)
-class EasingConfig:
-    """How fast the motion of the hand may change."""
+class InputFilterConfig:
+    """Bounds on the acceleration of the end effector."""
 
     linear: float = 1.5
-    """[m/s^2]: from rest to a handle's full speed, and back, in a sixth of a second."""
+    """[m/s^2]: from rest to a gizmo's full speed, and back, in a sixth of a second."""
     angular: float = 5.0
     """[rad/s^2]"""
 
@@ -61,30 +53,31 @@ class EasingConfig:
                 raise ValueError(f"{name} must be positive, but is {value}.")
 
 
-class Eased:
-    """Hands on what a person asks for, with the motion of the hand eased.
+class InputFilter:
+    """Passes human input on with the acceleration of the end effector bounded.
 
-    A key asks for full speed at once, and a handle that is let go for none: an arm that obeyed
-    would jerk, and so would what is learned from it.
+    A key that is pressed asks for full speed at once, and a gizmo that is released for none:
+    unfiltered, the arm would jerk, and so would what is learned from it.
     """
 
-    def __init__(self, human: Human, config: EasingConfig | None = None):
-        """Start with a hand at rest.
+    def __init__(self, human: Human, config: InputFilterConfig | None = None):
+        """Start at rest.
 
         Args:
-            human: The person.
-            config: How fast the motion may change.
+            human: Source of the input.
+            config: Bounds.
         """
-        self._human, self._config = human, config or EasingConfig()
+        self._human, self._config = human, config or InputFilterConfig()
+        # The first reading has no predecessor: an infinite time makes its dt zero below.
         self._twist, self._time = np.zeros(6), np.inf
 
     def read(self, state: ArmState) -> HumanInput:
-        """What the person asks for now."""
-        asked, config = self._human.read(state), self._config
+        """The filtered input now."""
+        human_input, config = self._human.read(state), self._config
         dt = max(state.time - self._time, 0.0)
-        change = asked.twist - self._twist
+        change = human_input.twist - self._twist
         self._time = state.time
         self._twist = self._twist + np.concatenate(
             [capped(change[:3], config.linear * dt), capped(change[3:], config.angular * dt)]
         )
-        return replace(asked, twist=self._twist)
+        return replace(human_input, twist=self._twist)

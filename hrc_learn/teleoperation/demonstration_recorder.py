@@ -50,7 +50,7 @@ class DemonstrationRecorder:
 
         Args:
             writer: Of the dataset, used by nobody else.
-            task: What is shown, in words; asked for when a demonstration is saved.
+            task: What is demonstrated, in words; asked for when a demonstration is saved.
         """
         self._writer, self._task = writer, task
         self._frames: list[Frame] = []

@@ -1,4 +1,4 @@
-"""An arm that a person leads: the hand by its motion, the body by pulls, both by regions."""
+"""Hand guiding: a person moves the end effector, pulls in the null space, and draws regions."""
 
 from dataclasses import dataclass
 
@@ -9,13 +9,13 @@ from jaxtyping import Float
 from hrc_learn.controller import SafetyFilter, SafetyState
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import SerialChain
-from hrc_learn.protocols import Arm, ArmState, DrawnRegion, Human, HumanInput
+from hrc_learn.protocols import Arm, ArmState, Human, HumanInput
 from hrc_learn.regions import PositionRegion
 from hrc_learn.skills.cartesian_motion import resolved_rate
 
 
 @dataclass(frozen=True, kw_only=True)
-class LedArmConfig:
+class HandGuidingConfig:
     """How the arm follows."""
 
     dt: float = 0.01
@@ -23,9 +23,9 @@ class LedArmConfig:
     damping: float = 3.0
     """c_d [N m s/rad]."""
     attraction: float = 0.12
-    """Fastest that a region or a target draws the hand [m/s]."""
+    """Largest speed towards a region or a target [m/s]."""
     approach_rate: float = 1.5
-    """How fast the distance to a target decays [1/s]."""
+    """Decay rate of the distance to a target [1/s]."""
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -34,17 +34,17 @@ class LedArmConfig:
 
 
 Frame = dict[str, np.ndarray | float | bool]
-"""Columns of one recorded instant, as `DatasetWriter.add_frame` takes them."""
+"""Columns of one recorded step, as `DatasetWriter.add_frame` takes them."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Instant:
-    """One step of an arm that is led."""
+class GuidedStep:
+    """One step of a hand-guided arm."""
 
     state: ArmState
-    asked: HumanInput
+    human_input: HumanInput
     pose: Pose
-    """Of the hand."""
+    """Of the end effector."""
     command: Float[np.ndarray, " joints"]
     """Joint velocity sent [rad/s]."""
 
@@ -57,78 +57,79 @@ class Instant:
             "position": self.pose.position.numpy(),
             "orientation": self.pose.orientation.numpy(),
             "gripper": self.state.gripper_width,
-            "human_effort": self.asked.effort,
+            "human_effort": self.human_input.nullspace_input,
             "command_velocity": self.command,
         }
 
 
-class LedArm:
-    """Does at each step what a person asks, as far as the safety filter lets it.
+class HandGuidedArm:
+    """Executes at each step what a person asks, within the safety filter's limits.
 
     u = J^+ (v + attraction) + N c_d^-1 d: the law of the paper (eq. globalControl) with the
-    person's own motion v of the hand in place of the camera's.
+    person's own end-effector motion v in place of the camera's.
 
     Attributes:
         safety: State of the safety filter, with its counts of interventions.
     """
 
     def __init__(
-        self, chain: SerialChain, arm: Arm, human: Human, config: LedArmConfig | None = None
+        self,
+        chain: SerialChain,
+        arm: Arm,
+        human: Human,
+        config: HandGuidingConfig | None = None,
     ):
-        """Take hold of the arm at rest.
+        """Connect to the arm at rest.
 
         Args:
             chain: Its kinematics.
             arm: Its driver.
-            human: Who leads it.
+            human: Who guides it.
             config: How it follows.
         """
-        self.config = config or LedArmConfig()
+        self.config = config or HandGuidingConfig()
         self._chain, self._arm, self._human = chain, arm, human
         self._filter = SafetyFilter(chain.limits)
         self.safety: SafetyState
         self.restart()
 
     def restart(self) -> None:
-        """Begin anew where the arm is, at rest."""
+        """Restart where the arm is, at rest."""
         q = torch.from_numpy(self._arm.read().joint_position)
         self.safety = self._filter.initial_state(q)
 
-    def step(self) -> Instant:
-        """Read, ask, command. The caller lets `dt` pass."""
+    def step(self) -> GuidedStep:
+        """Read the arm and the human input, then command. The caller lets `dt` pass."""
         state = self._arm.read()
-        asked = self._human.read(state)
+        human_input = self._human.read(state)
         q = torch.from_numpy(state.joint_position)
         pose, J = self._chain.forward_and_jacobian(q)
-        twist = torch.from_numpy(asked.twist.copy())
-        # A hand that leads knows better than the region it has drawn.
-        if not asked.twist.any():
-            twist[:3] = self._attraction(asked, pose.position)
-        wish = torch.from_numpy(asked.effort / self.config.damping)
+        twist = torch.from_numpy(human_input.twist.copy())
+        # Direct motion overrides the attraction: the person may leave a region they have drawn.
+        if not human_input.twist.any():
+            twist[:3] = self._attraction(human_input, pose.position)
+        null_velocity = torch.from_numpy(human_input.nullspace_input / self.config.damping)
+        desired = resolved_rate(J, twist, null_velocity)
         velocity, self.safety, _ = self._filter.step(
-            self.safety, q, resolved_rate(J, twist, wish), self.config.dt, jacobian=J
+            self.safety, q, desired, self.config.dt, jacobian=J
         )
         command = velocity.numpy()
         self._arm.command(command)
-        return Instant(state=state, asked=asked, pose=pose, command=command)
+        return GuidedStep(state=state, human_input=human_input, pose=pose, command=command)
 
     def _attraction(
-        self, asked: HumanInput, position: Float[torch.Tensor, "3"]
+        self, human_input: HumanInput, position: Float[torch.Tensor, "3"]
     ) -> Float[torch.Tensor, "3"]:
         """Velocity towards the region and the target that the person has drawn [m/s]."""
-        pull = torch.zeros_like(position)
-        if asked.region is not None:
-            pull = _into(asked.region, position)
-        if asked.target is not None:
-            towards = position.new_tensor(asked.target) - position
-            pull = pull + self.config.approach_rate * towards
-        return pull / max(1.0, float(pull.norm()) / self.config.attraction)
-
-
-def _into(region: DrawnRegion, position: Float[torch.Tensor, "3"]) -> Float[torch.Tensor, "3"]:
-    """Velocity that takes a point into a region; zero inside."""
-    box = PositionRegion(
-        centre=position.new_tensor(region.centre),
-        half_size=position.new_tensor(region.half_size),
-    )
-    return -box.feedback(position)[1]
+        velocity = torch.zeros_like(position)
+        if (region := human_input.region) is not None:
+            box = PositionRegion(
+                centre=position.new_tensor(region.centre),
+                half_size=position.new_tensor(region.half_size),
+            )
+            velocity = -box.feedback(position)[1]  # zero inside
+        if human_input.target is not None:
+            towards = position.new_tensor(human_input.target) - position
+            velocity = velocity + self.config.approach_rate * towards
+        # Shortened as a whole: the direction is kept.
+        return velocity / max(1.0, float(velocity.norm()) / self.config.attraction)

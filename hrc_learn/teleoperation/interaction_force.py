@@ -1,5 +1,8 @@
-"""Forces of a person on the arm: handles that are dragged, links that are pulled, and
-scripted perturbations.
+"""Interaction forces of a person on the arm as null-space input d: gizmos, pulls, scripts.
+
+The paper's mixed interface: the displacement of a joint's gizmo is a velocity in proportion,
+mapped to the joints by the pseudo-inverse of that joint's Jacobian (section VII); that of the
+end effector's gizmo guides the end effector.
 """
 
 from collections.abc import Sequence
@@ -14,20 +17,18 @@ from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.protocols import ArmState, HumanInput
 
-# Pulling a link: what a person does to the arm's body, as effort d on the joints.
-
-PullMapping = Literal["transpose", "pinv"]
+ForceMapping = Literal["transpose", "pinv"]
 
 
-def pull_effort(
+def force_to_nullspace_input(
     chain: SerialChain,
     joint_position: Float[np.ndarray, " joints"],
     joint: int,
     pull: Float[np.ndarray, "3"],
-    mapping: PullMapping = "transpose",
+    mapping: ForceMapping = "transpose",
     point: Float[np.ndarray, "3"] | None = None,
 ) -> Float[np.ndarray, " joints"]:
-    """Effort d on the joints from a pull at one of them, or at the link that it moves.
+    """Null-space input d from a pull at a joint, or at the link that it moves.
 
     With "transpose", d = J_joint^T f: the torques of a force, which never move the joint
     against the pull, not even after the projection into the null space of the task. The
@@ -58,8 +59,8 @@ def pull_effort(
 
 
 @dataclass(frozen=True, kw_only=True)
-class PullSpell:
-    """One pull at a joint towards a point, with soft start and end."""
+class ScriptedForce:
+    """A pull at a joint towards a point during an interval, with soft start and end."""
 
     start: float
     """[s]"""
@@ -68,8 +69,8 @@ class PullSpell:
     towards: tuple[float, float, float]
     """Where the person's hand is, in the base frame [m]."""
     stiffness: float = 100.0
-    """Force for each metre between the joint and the hand [N/m]."""
-    strongest: float = 25.0
+    """Force per distance between the joint and the person's hand [N/m]."""
+    max_force: float = 25.0
     """Largest force [N]."""
     joint: int = 4
     """Which joint is pulled, counted from 1."""
@@ -82,33 +83,34 @@ class PullSpell:
         return self.start + self.duration
 
     def strength(self, time: float) -> float:
-        """Share of full strength at a time, 0 to 1."""
+        """Fraction of full strength at a time, 0 to 1."""
         edge = min(time - self.start, self.end - time) / self.ramp
         s = min(max(edge, 0.0), 1.0)
+        # Smoothstep: the force starts and ends without a jump of its rate.
         return s * s * (3.0 - 2.0 * s)
 
     def force(self, time: float, origin: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
         """Force at a time on a joint whose origin is there now [N]."""
         pull = self.stiffness * (np.array(self.towards) - origin)
         size = float(np.linalg.norm(pull))
-        return pull * self.strength(time) * min(1.0, self.strongest / max(size, 1e-12))
+        return pull * self.strength(time) * min(1.0, self.max_force / max(size, _TINY))
 
 
-class ScriptedPuller:
-    """A person who pulls at the arm's body at given times, and does nothing else."""
+class ScriptedPerturbation:
+    """A person who pulls at the arm at given times, and does nothing else."""
 
     def __init__(
-        self, chain: SerialChain, spells: Sequence[PullSpell], begin: float | None = 0.0
+        self, chain: SerialChain, forces: Sequence[ScriptedForce], begin: float | None = 0.0
     ):
         """Prepare the script.
 
         Args:
             chain: The arm.
-            spells: When and where it is pulled.
-            begin: Time from which the spells' times count [s]; None: not before `begin`.
+            forces: When and where it is pulled.
+            begin: Time from which their intervals count [s]; None: once `begin` is called.
         """
         self._chain = chain
-        self.spells = tuple(spells)
+        self.forces = tuple(forces)
         self._begin = begin
 
     def begin(self, time: float) -> None:
@@ -116,51 +118,46 @@ class ScriptedPuller:
         self._begin = time
 
     def read(self, state: ArmState) -> HumanInput:
-        """The effort of all spells that are on."""
-        effort = np.zeros(len(self._chain.joint_names))
+        """The null-space input of all forces that act now."""
+        d = np.zeros(len(self._chain.joint_names))
         if self._begin is None:
-            return HumanInput(effort=effort, twist=np.zeros(6))
+            return HumanInput(nullspace_input=d, twist=np.zeros(6))
         time = state.time - self._begin
-        active = [spell for spell in self.spells if spell.strength(time) > 0.0]
+        active = [force for force in self.forces if force.strength(time) > 0.0]
         if active:
             q = torch.from_numpy(state.joint_position)
             origins = self._chain.link_poses(q).position.numpy()
-            for spell in active:
-                force = spell.force(time, origins[spell.joint - 1])
-                effort += pull_effort(self._chain, state.joint_position, spell.joint, force)
-        return HumanInput(effort=effort, twist=np.zeros(6))
-
-
-# From a handle that a person has dragged away from the arm to what the arm should do.
-#
-# The paper's mixed interface: the displacement of a joint's handle is a velocity in proportion,
-# brought to the joints by the pseudo-inverse of that joint's Jacobian (section VII); that of
-# the hand's handle leads the end effector.
+            for scripted in active:
+                force = scripted.force(time, origins[scripted.joint - 1])
+                d += force_to_nullspace_input(
+                    self._chain, state.joint_position, scripted.joint, force
+                )
+        return HumanInput(nullspace_input=d, twist=np.zeros(6))
 
 
 @dataclass(frozen=True, kw_only=True)
-class DragConfig:
-    """How strongly a displacement acts, and what bounds it."""
+class InteractionForceConfig:
+    """How strongly the displacement of a gizmo acts, and what bounds it."""
 
-    mapping: PullMapping = "pinv"
-    """How a joint's handle acts: "pinv", the paper's, asks for a velocity; "transpose" is a
-    spring between joint and handle, and never moves the joint against the pull."""
+    mapping: ForceMapping = "pinv"
+    """How a joint's gizmo acts: "pinv", the paper's, asks for a velocity; "transpose" is a
+    spring between joint and gizmo, and never moves the joint against the pull."""
     rate: float = 2.0
-    """Speed for each metre of displacement [1/s]."""
+    """Speed per displacement [1/s]."""
     speed: float = 0.25
-    """Fastest that a handle asks for [m/s]."""
+    """Largest speed that a gizmo asks for [m/s]."""
     stiffness: float = 150.0
-    """Force for each metre of displacement [N/m], where a handle is a spring."""
-    strongest: float = 45.0
+    """Force per displacement [N/m], where a gizmo is a spring."""
+    max_force: float = 45.0
     """Largest force [N]."""
     damping: float = 3.0
-    """c_d: effort divided by it is velocity [N m s/rad]."""
-    largest_effort: float = 20.0
-    """Bound on the effort on each joint; the direction is kept [N m]."""
+    """c_d: null-space input per velocity [N m s/rad]."""
+    max_nullspace_input: float = 20.0
+    """Bound on d of each joint; the direction is kept [N m]."""
     turn_rate: float = 4.0
-    """How fast an error of the hand's orientation is corrected [1/s]."""
+    """Decay rate of the end effector's orientation error [1/s]."""
     turn_speed: float = 0.8
-    """Fastest turn of the hand [rad/s]."""
+    """Largest angular speed of the end effector [rad/s]."""
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -168,25 +165,29 @@ class DragConfig:
                 raise ValueError(f"{name} must be positive, but is {value}.")
 
 
+# The floor only keeps a division by zero out; it is far below any length that matters.
+_TINY = 1e-12
+
+
 def capped(vector: Float[np.ndarray, " n"], most: float) -> Float[np.ndarray, " n"]:
     """The vector, shortened to a length of `most` where it is longer."""
-    return vector * min(1.0, most / max(float(np.linalg.norm(vector)), 1e-12))
+    return vector * min(1.0, most / max(float(np.linalg.norm(vector)), _TINY))
 
 
 def bounded(vector: Float[np.ndarray, " n"], most: float) -> Float[np.ndarray, " n"]:
     """The vector, scaled as a whole so that no component exceeds `most`."""
-    return vector * min(1.0, most / max(float(np.abs(vector).max()), 1e-12))
+    return vector * min(1.0, most / max(float(np.abs(vector).max()), _TINY))
 
 
-def drag_effort(
+def gizmo_nullspace_input(
     chain: SerialChain,
     joint_position: Float[np.ndarray, " joints"],
     joint: int,
     point: Float[np.ndarray, "3"],
     displacement: Float[np.ndarray, "3"],
-    config: DragConfig,
+    config: InteractionForceConfig,
 ) -> Float[np.ndarray, " joints"]:
-    """Null-space effort d from a handle on the body of the arm.
+    """Null-space input d from a gizmo on the arm.
 
         d = c_d J^+ v,  v = rate * displacement      ("pinv", the paper's)
         d = J^T f,      f = stiffness * displacement ("transpose")
@@ -199,7 +200,7 @@ def drag_effort(
         joint_position: Joint positions [rad].
         joint: The joint that moves the link, counted from 1.
         point: Where the link is held, in the base frame [m].
-        displacement: From there to the handle, in the base frame [m].
+        displacement: From there to the gizmo, in the base frame [m].
         config: How strongly it acts.
 
     Raises:
@@ -208,21 +209,21 @@ def drag_effort(
     if config.mapping == "pinv":
         pull = config.damping * capped(config.rate * displacement, config.speed)
     else:
-        pull = capped(config.stiffness * displacement, config.strongest)
-    effort = pull_effort(chain, joint_position, joint, pull, config.mapping, point)
-    return bounded(effort, config.largest_effort)
+        pull = capped(config.stiffness * displacement, config.max_force)
+    d = force_to_nullspace_input(chain, joint_position, joint, pull, config.mapping, point)
+    return bounded(d, config.max_nullspace_input)
 
 
-def hand_twist(
+def guiding_twist(
     pose: Pose,
     velocity: Float[np.ndarray, "3"],
     orientation: Float[torch.Tensor, "4"] | None,
-    config: DragConfig,
+    config: InteractionForceConfig,
 ) -> Float[np.ndarray, "6"]:
-    """Twist of a hand that is led with a velocity and turned towards an orientation.
+    """Twist of a hand-guided end effector with a velocity, turned towards an orientation.
 
     Args:
-        pose: Of the hand.
+        pose: Of the end effector.
         velocity: Asked for [m/s]; capped with its direction kept.
         orientation: To turn to (wxyz), such as the coarse rule's; None: no turn.
         config: Speeds.

@@ -14,26 +14,40 @@ from hrc_learn.controller import INTERVENTIONS
 from hrc_learn.deploy import Rate
 from hrc_learn.geometry import Box
 from hrc_learn.kinematics import panda
-from hrc_learn.protocols import Human, HumanInput, Request
+from hrc_learn.protocols import Human, Request
 from hrc_learn.sim import MovingBodies, World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.pick_and_place import INTERACT
-from hrc_learn.skills.work_cell import SAFETY_COLUMNS, Station
-from hrc_learn.teleoperation.combined_input import BothHands, Eased, EasingConfig
+from hrc_learn.skills.work_cell import SAFETY_COLUMNS, WorkCell
+from hrc_learn.teleoperation.combined_input import CombinedInput, InputFilter, InputFilterConfig
 from hrc_learn.teleoperation.demonstration_recorder import DemonstrationRecorder
-from hrc_learn.teleoperation.hand_guiding import Frame, Instant, LedArm, LedArmConfig
+from hrc_learn.teleoperation.hand_guiding import (
+    Frame,
+    GuidedStep,
+    HandGuidedArm,
+    HandGuidingConfig,
+)
 from hrc_learn.teleoperation.page import Page, PageConfig, PageHuman, PageStatus
 from hrc_learn.viz.palette import GREEN, rgba
 
-# Where on the shelves things go: drawn, and said in words, for a person who shows the way.
+# Of the fields drawn on the boards [m]: thin, but thick enough not to flicker with the board.
+_THICKNESS = 0.002
+# Control steps from one status shown beside a job to the next: ten times a second at 10 ms.
+_SHOW_EVERY = 10
+_INVITATION = "Pull at a link or a knob: the end effector keeps servoing."
 
-_THICKNESS = 0.002  # of what is drawn on a board [m]
+FEATURES = {
+    "observation.human_twist": ("vx", "vy", "vz", "wx", "wy", "wz"),
+    "observation.region": ("x", "y", "z", "half_x", "half_y", "half_z"),
+}
+"""Recorded beside the usual columns: end-effector motion that the person asked for, and the
+active region (zeros where there is none)."""
 
 
-def landing_places(workplace: Workplace) -> list[Box]:
-    """A green field on each board, where the thing stands once the hand has let go of it."""
+def place_targets(workplace: Workplace) -> list[Box]:
+    """A green field on each board, where the object stands once it is released."""
     item, (red, green, blue, _) = workplace.scene.objects[0], rgba(GREEN)
-    # Held from above, a thing lies on its side once the hand points level.
+    # Grasped from above, an object lies on its side once the end effector is level.
     x, y = item.half_size[0], item.half_size[2]
     fields = []
     for name in workplace.shelf_names():
@@ -50,48 +64,35 @@ def landing_places(workplace: Workplace) -> list[Box]:
     return fields
 
 
-def way_left(workplace: Workplace, hand: Float[np.ndarray, "3"]) -> str:
-    """How far the hand is from where it would let go on the nearest shelf, in words.
+def place_target_hint(workplace: Workplace, position: Float[np.ndarray, "3"]) -> str:
+    """How far the end effector is from the place target of the nearest shelf, in words.
 
     Args:
         workplace: With the shelves.
-        hand: Tool centre point [m].
+        position: Of the tool centre point [m].
     """
     names = workplace.shelf_names()
-    offsets = {name: workplace.shelf(name).position.numpy() - hand for name in names}
+    offsets = {name: workplace.shelf(name).position.numpy() - position for name in names}
     nearest = min(names, key=lambda name: float(np.linalg.norm(offsets[name])))
-    away, left, up = 100 * offsets[nearest]
-    steps = (
-        _step(away, "away", "back"),
-        _step(left, "left", "right"),
-        _step(up, "up", "down"),
-    )
-    return f"{nearest} shelf: {', '.join(step for step in steps if step) or 'there'}"
-
-
-def _step(way: float, forward: str, backward: str) -> str:
-    """A way [cm] in a direction or the other; nothing below one."""
-    return "" if abs(way) < 1 else f"{abs(way):.0f} cm {forward if way > 0 else backward}"
-
-
-# A person at the page leads the simulated arm and records demonstrations.
-
-FEATURES = {
-    "observation.human_twist": ("vx", "vy", "vz", "wx", "wy", "wz"),
-    "observation.region": ("x", "y", "z", "half_x", "half_y", "half_z"),
-}
-"""Recorded beside the usual columns: motion of the hand that the person asked for, and the
-region in force (zeros where there is none)."""
+    directions = (("away", "back"), ("left", "right"), ("up", "down"))
+    steps = [
+        f"{abs(distance):.0f} cm {forward if distance > 0 else backward}"
+        for distance, (forward, backward) in zip(
+            100 * offsets[nearest], directions, strict=True
+        )
+        if abs(distance) >= 1  # closer than a centimetre is close enough
+    ]
+    return f"{nearest} shelf: {', '.join(steps) or 'there'}"
 
 
 @dataclass(frozen=True, kw_only=True)
 class PageSessionConfig:
     """How a session runs."""
 
-    led: LedArmConfig = field(default_factory=LedArmConfig)
+    guiding: HandGuidingConfig = field(default_factory=HandGuidingConfig)
     """How the arm follows."""
-    easing: EasingConfig = field(default_factory=EasingConfig)
-    """How fast the motion of a hand that is led may change."""
+    input_filter: InputFilterConfig = field(default_factory=InputFilterConfig)
+    """Bounds on the acceleration of the end effector."""
     record_every: int = 2
     """Control steps from one recorded frame to the next."""
     show_every: int = 10
@@ -103,17 +104,17 @@ class PageSessionConfig:
 
     @property
     def fps(self) -> float:
-        """Recorded frames a second."""
-        return 1.0 / (self.led.dt * self.record_every)
+        """Recorded frames per second."""
+        return 1.0 / (self.guiding.dt * self.record_every)
 
 
 class PageSession:
-    """Steps the simulated arm as the person at the page asks.
+    """Steps the simulated arm as the person at the page asks, and records demonstrations.
 
     Attributes:
         world: That the arm is in.
         finished: Whether the person is done.
-        led: The arm as it is led.
+        arm: The end effector-guided arm.
     """
 
     def __init__(
@@ -126,7 +127,7 @@ class PageSession:
         beside: tuple[Human, ...] = (),
         config: PageSessionConfig | None = None,
     ):
-        """Put a thing into the hand, at home.
+        """Put an object into the gripper, at home.
 
         Args:
             workplace: Where.
@@ -142,53 +143,51 @@ class PageSession:
         self._bodies = MovingBodies(world)
         self._home = workplace.home_joints().numpy()
         self._go_home()
-        human = Eased(BothHands(page.human, *beside), self._config.easing)
-        self.led = LedArm(panda, world.arm, human, self._config.led)
+        human = InputFilter(CombinedInput(page.human, *beside), self._config.input_filter)
+        self.arm = HandGuidedArm(panda, world.arm, human, self._config.guiding)
         self._ticks, self._width = 0, None
 
-    def step(self) -> Instant:
+    def step(self) -> GuidedStep:
         """One control step of the arm, and of the world."""
         with torch.inference_mode():
-            instant = self.led.step()
+            step = self.arm.step()
         if self._ticks % self._config.record_every == 0:
-            self._recorder.add(recorded(instant))
-        self._grip(instant.asked)
-        self.world.advance(self._config.led.dt)
+            self._recorder.add(recorded(step))
+        width = step.human_input.gripper
+        if width is not None and width != self._width:
+            self._width = width
+            self.world.arm.move(width)
+        self.world.advance(self._config.guiding.dt)
         self._page.place(*self._bodies.poses())
-        for request in instant.asked.requests:
+        for request in step.human_input.requests:
             self._handle(request)
         if self._ticks % self._config.show_every == 0:
-            self._page.show(self._status(instant))
+            self._page.show(self._status(step))
         self._ticks += 1
-        return instant
+        return step
 
     def _handle(self, request: Request) -> None:
         if request == "finish":
             self.finished = True
         elif request == "home":
-            # A jump of the arm has no place in a demonstration.
+            # The arm jumps home: a demonstration must not contain that.
             if self._recorder.status.state == "recording":
                 self._recorder.handle("stop")
             self._go_home()
-            self.led.restart()
+            self.arm.restart()
         else:
             self._recorder.handle(request)
 
     def _go_home(self) -> None:
         self.world.hold(self._workplace.scene.objects[0].name, self._home)
 
-    def _grip(self, asked: HumanInput) -> None:
-        if asked.gripper is not None and asked.gripper != self._width:
-            self._width = asked.gripper
-            self.world.arm.move(asked.gripper)
-
-    def _status(self, instant: Instant) -> PageStatus:
+    def _status(self, step: GuidedStep) -> PageStatus:
         status, world = self._recorder.status, self.world
         notes = [status.note]
         if status.state != "ready":
-            notes.insert(0, way_left(self._workplace, instant.pose.position.numpy()))
+            notes.insert(0, place_target_hint(self._workplace, step.pose.position.numpy()))
         monitors = (world.cabinet_contacts, world.table_contacts, world.self_contacts)
-        counts = self.led.safety.counts.tolist()
+        counts = self.arm.safety.counts.tolist()
         return PageStatus(
             title="Simulated Panda",
             recording=status.state,
@@ -200,26 +199,20 @@ class PageSession:
         )
 
 
-def recorded(instant: Instant) -> Frame:
-    """Columns of an instant, with all that the person asked for."""
-    asked, box = instant.asked, np.zeros(6)
-    if asked.region is not None:
-        box = np.array([*asked.region.centre, *asked.region.half_size])
+def recorded(step: GuidedStep) -> Frame:
+    """Columns of a step, with all that the person asked for."""
+    human_input, box = step.human_input, np.zeros(6)
+    if human_input.region is not None:
+        box = np.array([*human_input.region.centre, *human_input.region.half_size])
     return {
-        **instant.frame(),
-        "observation.human_twist": asked.twist,
+        **step.frame(),
+        "observation.human_twist": human_input.twist,
         "observation.region": box,
     }
 
 
-# A page beside a task that runs by itself: people watch it, and pull the arm's body.
-
-_SHOW_EVERY = 10  # control steps from one status to the next
-_INVITED = "Pull at a link or a knob: the hand goes on aiming."
-
-
-class PageBeside:
-    """A page on a world that a task moves.
+class TaskPage:
+    """A page beside a task that runs by itself: people watch it, and pull the arm.
 
     Attributes:
         human: The person at the page.
@@ -228,7 +221,7 @@ class PageBeside:
     human: PageHuman
 
     def __init__(self, world: World, page: Page, dt: float):
-        """Take the page along.
+        """Connect page and world.
 
         Args:
             world: That is shown.
@@ -238,11 +231,11 @@ class PageBeside:
         self.human = page.human
         self._world, self._page, self._bodies = world, page, MovingBodies(world)
         self._rate, self._ticks = Rate(dt), 0
-        self._station: Station | None = None
+        self._cell: WorkCell | None = None
 
-    def follow(self, station: Station) -> None:
-        """Tell from the log of a station what the task is doing."""
-        self._station = station
+    def follow(self, cell: WorkCell) -> None:
+        """Show what a task does in a work cell, by its log."""
+        self._cell = cell
 
     def joined(
         self, person: Human, advance: Callable[[float], None]
@@ -258,35 +251,35 @@ class PageBeside:
             advance(duration)
             self.tick()
 
-        return BothHands(person, self.human), advance_and_show
+        return CombinedInput(person, self.human), advance_and_show
 
     def tick(self) -> None:
         """After each control step: show where everything is, and let real time pass."""
         self._page.place(*self._bodies.poses())
-        if self._ticks % _SHOW_EVERY == 0 and self._station is not None:
-            self._page.show(self.status(self._station))
+        if self._ticks % _SHOW_EVERY == 0 and self._cell is not None:
+            self._page.show(self.status(self._cell))
         self._ticks += 1
         self._rate.wait()
 
-    def status(self, station: Station) -> PageStatus:
-        """What the page says of a task that runs on a station."""
-        world, log = self._world, station.log
+    def status(self, cell: WorkCell) -> PageStatus:
+        """What the page says of a task that runs on a work cell."""
+        world, log = self._world, cell.log
         phase = log.events[-1].text if log.events else "getting ready"
         acted = log["safety"].sum(axis=0) if len(log) else [0] * len(SAFETY_COLUMNS)
         return PageStatus(
-            title="Collaboration",
+            title="Pick and place",
             doing=phase,
-            seconds=station.time,
-            note=_INVITED if phase == INTERACT else "",
+            seconds=cell.time,
+            note=_INVITATION if phase == INTERACT else "",
             interventions=dict(zip(SAFETY_COLUMNS, map(int, acted), strict=True)),
             contacts=len(world.cabinet_contacts.touches) + len(world.table_contacts.touches),
         )
 
 
 @contextmanager
-def page_beside(
+def task_page(
     world: World, dt: float, config: PageConfig, on_open: Callable[[str], None]
-) -> Iterator[PageBeside]:
+) -> Iterator[TaskPage]:
     """Serve a page on a world that a task moves.
 
     Args:
@@ -297,6 +290,6 @@ def page_beside(
     """
     bodies = MovingBodies(world)
     drawn = bodies.drawn(*(poses[None] for poses in bodies.poses()))
-    with Page(panda, drawn, world.config.boxes(), config, leads=False) as page:
+    with Page(panda, drawn, world.config.boxes(), config, guides=False) as page:
         on_open(page.url)
-        yield PageBeside(world, page, dt)
+        yield TaskPage(world, page, dt)

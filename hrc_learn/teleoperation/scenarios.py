@@ -1,5 +1,6 @@
-"""Jobs to be learned in the simulated workplace: how they begin, are shown, run and are
-judged.
+"""Scenarios to learn in the simulated workplace: reset, demonstration, execution, success.
+
+Success is read from MuJoCo's contacts and poses, whoever did the job.
 """
 
 from __future__ import annotations
@@ -15,16 +16,16 @@ from jaxtyping import Float, UInt8
 from hrc_learn.kinematics import gripper_down, panda
 from hrc_learn.protocols import ArmState, Human, HumanInput
 from hrc_learn.sim import CameraKind, World, open_camera
-from hrc_learn.sim.workplace import Workplace, nearest_configuration
-from hrc_learn.skills.marker_sensor import Eye
+from hrc_learn.sim.workplace import Workplace
+from hrc_learn.skills.cartesian_motion import nearest_configuration
+from hrc_learn.skills.marker_sensor import MarkerSensor
 from hrc_learn.skills.position_servo import PositionServo, PositionServoConfig
-from hrc_learn.teleoperation.scripted_demonstrations import PlacingLesson, placing_expert
+from hrc_learn.teleoperation.scripted_demonstrations import (
+    PlacingDemonstrationConfig,
+    placing_expert,
+)
 from hrc_learn.teleoperation.scripted_expert import GuidedPath, ScriptedExpert, Tremor
 from hrc_learn.vision import CameraModel, ImageNoise, SyntheticCamera
-
-# Jobs to be learned in the simulated workplace: how they begin, are shown, and are done.
-#
-# Success is read from MuJoCo's contacts and poses, whoever did the job.
 
 OPEN, CLOSED = 0.08, 0.0
 """Openings that the gripper is sent to [m]; closed, it squeezes what is between the fingers."""
@@ -51,7 +52,7 @@ class Scenario(ABC):
 
         Args:
             world: Of the workplace; its clock begins at zero.
-            rng: Source of where things are, and of the person's unsteadiness.
+            rng: Source of where objects are, and of the person's unsteadiness.
         """
 
     @abstractmethod
@@ -61,11 +62,13 @@ class Scenario(ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class Placing(Scenario):
-    """Put the thing in the hand on a shelf, and let go."""
+    """Put the object in the end effector on a shelf, and let go."""
 
     workplace: Workplace = field(default_factory=Workplace)
     shelf: str = "middle"
-    lesson: PlacingLesson = field(default_factory=PlacingLesson)
+    demonstration: PlacingDemonstrationConfig = field(
+        default_factory=PlacingDemonstrationConfig
+    )
     release: float = 1.5
     """Time for the fingers to open [s]."""
 
@@ -79,14 +82,14 @@ class Placing(Scenario):
 
     @property
     def _let_go(self) -> float:
-        return self.lesson.duration + self.lesson.settle
+        return self.demonstration.duration + self.demonstration.settle
 
     def begin(self, world: World, rng: np.random.Generator) -> Human:
-        expert = placing_expert(self.workplace, self.shelf, self.lesson, rng)
+        expert = placing_expert(self.workplace, self.shelf, self.demonstration, rng)
         offset = torch.from_numpy(expert.path.position(0.0)) - self.workplace.home().position
         joints = self.workplace.home_joints(offset).numpy()
         world.hold(self.workplace.scene.objects[0].name, joints)
-        return InTurn([(0.0, expert, CLOSED), (self._let_go, expert, OPEN)])
+        return SequencedInput([(0.0, expert, CLOSED), (self._let_go, expert, OPEN)])
 
     def succeeded(self, world: World) -> bool:
         return world.rests_on(self.workplace.scene.objects[0].name, f"board_{self.shelf}")
@@ -94,13 +97,13 @@ class Placing(Scenario):
 
 @dataclass(frozen=True, kw_only=True)
 class Grasping(Scenario):
-    """Take a thing that lies at random on the table, and lift it."""
+    """Take an object that lies at random on the table, and lift it."""
 
     workplace: Workplace = field(default_factory=Workplace)
     reach: tuple[float, float, float] = (0.10, 0.08, 0.0)
     """How far from the middle of the table it lies [m]."""
     approach: float = 4.0
-    """From above the middle of the table down to the thing [s]."""
+    """From above the middle of the table down to the object [s]."""
     grip: float = 0.7
     """Time for the fingers to close [s]."""
     lift: float = 2.0
@@ -110,7 +113,7 @@ class Grasping(Scenario):
     settle: float = 0.5
     """Rest at the end [s]."""
     tremor: float = 2e-4
-    """Amplitude of the hand's tremor [m]."""
+    """Amplitude of the end effector's tremor [m]."""
 
     @property
     def task(self) -> str:
@@ -131,7 +134,9 @@ class Grasping(Scenario):
         closing = self.approach + self.grip
         down = self._lead([hover.position.numpy(), above, grasp], self.approach, 0.0, rng)
         up = self._lead([grasp, lifted], self.lift, closing, rng)
-        return InTurn([(0.0, down, OPEN), (self.approach, down, CLOSED), (closing, up, CLOSED)])
+        return SequencedInput(
+            [(0.0, down, OPEN), (self.approach, down, CLOSED), (closing, up, CLOSED)]
+        )
 
     def _lead(
         self, points: list[np.ndarray], duration: float, start: float, rng: np.random.Generator
@@ -149,7 +154,7 @@ class Grasping(Scenario):
         return world.holds(item.name) and bool(bottom > 0.5 * self.height)
 
 
-class InTurn:
+class SequencedInput:
     """People who lead the arm one after the other, each with the gripper's opening."""
 
     def __init__(self, turns: list[tuple[float, Human, float]]):
@@ -165,9 +170,6 @@ class InTurn:
         begun = [turn for turn in self._turns if turn[0] <= state.time]
         _, human, width = begun[-1] if begun else self._turns[0]
         return replace(human.read(state), gripper=width)
-
-
-# A scenario under way in simulation: begun by seed, moved by targets, looked at.
 
 
 class ScenarioRun:
@@ -244,10 +246,10 @@ class ScenarioRun:
         """
         marker = self.scenario.workplace.scene.objects[0].marker.id
         if self._pixel is None:
-            eye = self._eye  # whose background takes random numbers when it is first made
+            sensor = self._sensor  # whose background takes random numbers when it is first made
             noise = np.random.default_rng([self.seed, 1])
             self._noise.bit_generator.state = noise.bit_generator.state
-            self._pixel = eye.look().get(marker)
+            self._pixel = sensor.detect().get(marker)
         if self._pixel is None:
             raise ValueError(
                 f"the fixed camera does not see marker {marker} at the beginning: leave out "
@@ -256,7 +258,7 @@ class ScenarioRun:
         return self._pixel
 
     @cached_property
-    def _eye(self) -> Eye:
+    def _sensor(self) -> MarkerSensor:
         """Of the fixed camera, before which nothing but the object is ever seen."""
         scene = self.scenario.workplace.scene
         marker = scene.objects[0].marker
@@ -265,7 +267,7 @@ class ScenarioRun:
             return {marker.id: self.world.marker_poses()[marker.id]}
 
         camera = SyntheticCamera(scene.camera, [marker], poses, rng=self._noise)
-        return Eye.on(camera, scene)
+        return MarkerSensor(camera, scene.marker_ids)
 
     def succeeded(self) -> bool:
         """Whether the job is done, by MuJoCo's contacts."""
@@ -321,8 +323,6 @@ def _scaled(model: CameraModel, width: int, height: int) -> CameraModel:
     )
 
 
-# The scenarios by the names that command lines give them.
-
 SCENARIOS = ("placing", "grasping")
 SHELVES = ("lower", "middle", "upper")
 
@@ -338,7 +338,9 @@ def check_scenario(name: str, shelf: str, pixels: bool) -> None:
     if shelf not in SHELVES:
         raise ValueError(f"no shelf {shelf!r}: there are {', '.join(SHELVES)}.")
     if pixels and name == "placing":
-        raise ValueError("placing begins with the object in the hand, so it has no pixels.")
+        raise ValueError(
+            "placing begins with the object in the end effector, so it has no pixels."
+        )
 
 
 def make_scenario(name: str, shelf: str) -> Scenario:

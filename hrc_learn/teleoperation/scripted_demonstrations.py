@@ -1,96 +1,204 @@
-"""Demonstrations by the scripted expert: of visual servoing, and of placing with hand and
-body shape at once.
+"""Demonstrations by the scripted expert: of visual servoing, and of placing with the null-space
+posture; and how they are recorded and written as a LeRobot dataset.
 """
 
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Float
 
+from hrc_learn.demos import DatasetWriter
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import gripper_down, panda
+from hrc_learn.protocols import Human
 from hrc_learn.sim import HAND_MARKER, Touch, World
-from hrc_learn.sim.workplace import Workplace, nearest_configuration
-from hrc_learn.skills.marker_sensor import Eye
+from hrc_learn.sim.workplace import Workplace
+from hrc_learn.skills.cartesian_motion import nearest_configuration
+from hrc_learn.skills.marker_sensor import MarkerSensor
 from hrc_learn.skills.visual_target import OBJECT_FEATURE
 from hrc_learn.skills.work_cell import TaskFailedError
-from hrc_learn.teleoperation.hand_guiding import Frame
-from hrc_learn.teleoperation.interaction_force import PullSpell
-from hrc_learn.teleoperation.paired_demonstrations import TeachingConfig, teach
+from hrc_learn.store import DATASET, replacing
+from hrc_learn.teleoperation.hand_guiding import Frame, HandGuidedArm, HandGuidingConfig
+from hrc_learn.teleoperation.interaction_force import ScriptedForce
 from hrc_learn.teleoperation.scripted_expert import GuidedPath, ScriptedExpert, Tremor
-
-# The expert shows the camera's image: moves the marked hand about, and ends above an object.
-#
-# The image Jacobian is learned from the motion, and from the ends where to aim and how the hand
-# is turned to go on to the object.
 
 
 @dataclass(frozen=True, kw_only=True)
-class AimingLesson(TeachingConfig):
-    """How the expert teaches aiming."""
+class DemonstrationConfig:
+    """How an arm is guided and recorded."""
+
+    tremor: float = 4e-4
+    """Amplitude of the tremor of the person's hand [m]."""
+    settle: float = 1.0
+    """Rest at the end of a demonstration [s]."""
+    dt: float = 0.01
+    """Control step [s]."""
+    record_every: int = 2
+    """Control steps from one recorded frame to the next."""
+    damping: float = 3.0
+    """c_d [N m s/rad]."""
+
+    def __post_init__(self) -> None:
+        if not (self.dt > 0 and self.record_every >= 1 and self.damping > 0):
+            raise ValueError(
+                "dt and damping must be positive and record_every at least 1, but are "
+                f"{self.dt}, {self.damping} and {self.record_every}."
+            )
+
+    @property
+    def fps(self) -> float:
+        """Recorded frames per second."""
+        return 1.0 / (self.dt * self.record_every)
+
+
+def guided_frames(
+    world: World,
+    human: Human,
+    duration: float,
+    config: DemonstrationConfig,
+    observe: Callable[[], Frame] = dict,
+) -> Iterator[Frame]:
+    """Let a person guide the arm, and yield what is to be recorded.
+
+    Args:
+        world: The workplace, reset to where the demonstration starts.
+        human: Gives end-effector motion and null-space input.
+        duration: Of the demonstration [s].
+        config: How the arm is guided.
+        observe: Further columns of a frame, called when it is recorded.
+
+    Yields:
+        A frame every `record_every` control steps.
+    """
+    guiding = HandGuidingConfig(dt=config.dt, damping=config.damping)
+    arm = HandGuidedArm(panda, world.arm, human, guiding)
+    for k in range(round(duration / config.dt)):
+        step = arm.step()
+        if k % config.record_every == 0:
+            yield {**step.frame(), **observe()}
+        world.advance(config.dt)
+
+
+def write_demonstrations(
+    path: Path,
+    demonstrations: Iterable[Sequence[Frame]],
+    task: str,
+    fps: float,
+    *,
+    features: Mapping[str, Sequence[str]] | None = None,
+    details: Mapping[str, object] | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Write demonstrations of a Panda as a LeRobot dataset, one episode each, as they come.
+
+    Args:
+        path: Folder of the dataset.
+        demonstrations: Frames of each.
+        task: What is demonstrated, in words.
+        fps: Frames per second.
+        features: Columns beyond the usual ones: key, and names of the components.
+        details: Anything else worth keeping with the dataset.
+        overwrite: Replace an older dataset in that folder.
+
+    Raises:
+        FileExistsError: If there is something at `path` that may not be replaced.
+    """
+    with (
+        replacing(path, DATASET, overwrite) as folder,
+        DatasetWriter(
+            folder,
+            fps=fps,
+            robot_type="panda",
+            joint_names=panda.joint_names,
+            features=features,
+            frames={"base": "panda_link0", "ee": "panda_hand_tcp"},
+            details=details,
+        ) as writer,
+    ):
+        for frames in demonstrations:
+            writer.start_episode(task)
+            for frame in frames:
+                writer.add_frame(images=None, **frame)
+            writer.save_episode()
+
+
+@dataclass(frozen=True, kw_only=True)
+class ServoDemonstrationConfig(DemonstrationConfig):
+    """How the expert demonstrates visual servoing."""
 
     duration: float = 9.0
     """From the first point to above the object [s]."""
     points: int = 4
     """Random points passed before the object."""
     descent: float = 0.06
-    """Height from which the hand at last comes straight down, as onto the object [m]."""
+    """Height from which the end effector finally descends vertically [m]."""
     reach: tuple[float, float, float] = (0.10, 0.08, 0.06)
-    """How far from the middle of the table the points lie, and how far above hovering [m]."""
+    """Largest distances of the points from the middle of the table, and above hovering [m]."""
     wobble: float = 0.12
-    """Amplitude of small turns of the hand on the way, which show how turning acts [rad]."""
+    """Amplitude of small rotations on the way, which show their effect in the image [rad]."""
     record_every: int = 4
     """Control steps from one recorded frame, and image, to the next."""
 
 
-def aiming_expert(
+def servo_expert(
     workplace: Workplace,
     above: Float[np.ndarray, "3"],
-    lesson: AimingLesson,
+    config: ServoDemonstrationConfig,
     rng: np.random.Generator,
 ) -> ScriptedExpert:
-    """The expert who wanders over the table and ends at a given point, hand pointing down."""
+    """The expert who moves about over the table and ends at a given point, gripper down.
+
+    From the motion the image Jacobian is learned; from the ends, where in the image the marker
+    has to be, and in which orientation the object is approached.
+    """
     middle = workplace.hover().position.numpy()
-    spread = rng.uniform(-1, 1, (lesson.points, 3)) * lesson.reach
+    spread = rng.uniform(-1, 1, (config.points, 3)) * config.reach
     spread[:, 2] = np.abs(spread[:, 2])
-    higher = above + np.array([0.0, 0.0, lesson.descent])
-    path = GuidedPath(np.vstack([middle + spread, higher, above]), lesson.duration)
+    higher = above + np.array([0.0, 0.0, config.descent])
+    path = GuidedPath(np.vstack([middle + spread, higher, above]), config.duration)
+    # Three incommensurate rotations, each about once in 5 s, excite all directions.
     rates, phases = rng.uniform(0.8, 1.6, 3), rng.uniform(0, 2 * np.pi, 3)
 
     def orientation(_position: torch.Tensor, time: float) -> torch.Tensor:
-        # The turns die away before the end, where the hand stands still above the object.
+        # They fade out before the end, where the end effector is at rest above the object.
         fading = float(np.clip((0.75 * path.end - time) / 1.0, 0.0, 1.0))
-        turn = lesson.wobble * fading * np.sin(rates * time + phases)
+        turn = config.wobble * fading * np.sin(rates * time + phases)
         return quaternion.multiply(quaternion.exp(torch.from_numpy(turn)), gripper_down())
 
     return ScriptedExpert(
-        panda, path, tremor=Tremor(lesson.tremor, rng), orientation=orientation
+        panda, path, tremor=Tremor(config.tremor, rng), orientation=orientation
     )
 
 
-def teach_aiming(
-    world: World, workplace: Workplace, eye: Eye, lesson: AimingLesson, rng: np.random.Generator
+def demonstrate_servoing(
+    world: World,
+    workplace: Workplace,
+    sensor: MarkerSensor,
+    config: ServoDemonstrationConfig,
+    rng: np.random.Generator,
 ) -> list[Frame]:
     """Demonstrate one motion that ends above an object.
 
-    The object is seen before the arm comes between it and the camera; its pixel is kept in
+    The object is detected before the arm comes between it and the camera; its pixel is kept in
     every frame, as the camera saw it then.
 
     Raises:
         ValueError: If the camera does not see the object.
     """
     item = workplace.scene.objects[0]
-    pose = workplace.random_object_pose(lesson.reach, rng)
+    pose = workplace.random_object_pose(config.reach, rng)
     world.reset(workplace.home_joints().numpy(), {item.name: pose})
-    target = eye.look().get(item.marker.id)
+    target = sensor.detect().get(item.marker.id)
     if target is None:
         raise ValueError(
             f"the camera does not see marker {item.marker.id} on the table: move the camera or "
             "put the object into its view."
         )
     above = np.append(pose[:2, 3], workplace.hover_height)
-    expert = aiming_expert(workplace, above, lesson, rng)
+    expert = servo_expert(workplace, above, config, rng)
     start = torch.from_numpy(expert.path.position(0.0))
     goal = Pose(start, expert.orientation(start, 0.0))
     q = nearest_configuration(goal, near=workplace.hover_joints())
@@ -99,7 +207,7 @@ def teach_aiming(
 
     def observe() -> Frame:
         nonlocal last
-        feature = eye.look().get(HAND_MARKER)
+        feature = sensor.detect().get(HAND_MARKER)
         last = last if feature is None else feature
         return {
             "feature": last,
@@ -107,94 +215,95 @@ def teach_aiming(
             OBJECT_FEATURE: np.array([*target, 1.0]),
         }
 
-    return list(teach(world, expert, lesson.duration + lesson.settle, lesson, observe))
+    return list(guided_frames(world, expert, config.duration + config.settle, config, observe))
 
 
-# The expert shows how a thing is put on a shelf: hand and body shape at once.
-
-# The elbow is led around the open door: first away from the cabinet, then over beside it.
-BODY_SHAPE = (
-    PullSpell(start=0.5, duration=5.0, towards=(0.20, 0.25, 0.58)),
-    PullSpell(start=4.5, duration=11.0, towards=(0.25, -0.10, 0.65)),
+# The elbow is pulled around the open door: first away from the cabinet, then over beside it.
+ELBOW_FORCES = (
+    ScriptedForce(start=0.5, duration=5.0, towards=(0.20, 0.25, 0.58)),
+    ScriptedForce(start=4.5, duration=11.0, towards=(0.25, -0.10, 0.65)),
 )
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlacingLesson(TeachingConfig):
-    """How the expert teaches placing."""
+class PlacingDemonstrationConfig(DemonstrationConfig):
+    """How the expert demonstrates placing."""
 
     duration: float = 14.0
     """From home to the shelf [s]."""
     spread: float = 0.015
-    """Standard deviation of where demonstrations start, around home [m]."""
-    shape_body: bool = True
+    """Standard deviation of the initial positions around home [m]."""
+    pull_elbow: bool = True
     """Whether the expert pulls the elbow past the cabinet's open door."""
     lift: float = 0.03
-    """How far above its last height the hand crosses the board's front edge [m]."""
+    """How far above its last height the end effector crosses the board's front edge [m]."""
 
 
 def placing_expert(
-    workplace: Workplace, shelf: str, lesson: PlacingLesson, rng: np.random.Generator
+    workplace: Workplace,
+    shelf: str,
+    config: PlacingDemonstrationConfig,
+    rng: np.random.Generator,
 ) -> ScriptedExpert:
-    """The expert who puts a thing on a shelf.
+    """The expert who puts an object on a shelf.
 
     Args:
         workplace: Where.
         shelf: Which.
-        lesson: How.
-        rng: Source of the hand's unsteadiness and of where it starts.
+        config: How.
+        rng: Source of the tremor and of the initial position.
     """
-    goal, mouth = workplace.shelf(shelf).position, workplace.mouth(shelf).position
-    # The hand is not quite level yet at the edge: what it carries hangs a little lower.
-    lifted = torch.tensor([0.0, 0.0, lesson.lift], dtype=torch.float64)
-    inside = goal + 0.3 * (mouth - goal)
-    start = workplace.home().position + lesson.spread * torch.from_numpy(rng.standard_normal(3))
-    waypoints = torch.stack([start, mouth + lifted, inside + lifted, goal]).numpy()
+    goal, front = workplace.shelf(shelf).position, workplace.shelf_front(shelf).position
+    # The gripper is not quite level yet at the edge: what it carries hangs a little lower.
+    lifted = torch.tensor([0.0, 0.0, config.lift], dtype=torch.float64)
+    inside = goal + 0.3 * (front - goal)
+    start = workplace.home().position + config.spread * torch.from_numpy(rng.standard_normal(3))
+    waypoints = torch.stack([start, front + lifted, inside + lifted, goal]).numpy()
     return ScriptedExpert(
         panda,
-        GuidedPath(waypoints, lesson.duration),
-        spells=BODY_SHAPE if lesson.shape_body else (),
-        tremor=Tremor(lesson.tremor, rng),
+        GuidedPath(waypoints, config.duration),
+        forces=ELBOW_FORCES if config.pull_elbow else (),
+        tremor=Tremor(config.tremor, rng),
     )
 
 
-def teach_placing_cleanly(
+def demonstrate_placing(
     world: World,
     workplace: Workplace,
     shelf: str,
-    lesson: PlacingLesson,
+    config: PlacingDemonstrationConfig,
+    rng: np.random.Generator,
+) -> tuple[list[Frame], list[Touch]]:
+    """Demonstrate one placing motion, from home to a shelf with the object in the gripper.
+
+    Returns:
+        The recorded frames, and all contacts of arm or object with the cabinet on the way.
+    """
+    expert = placing_expert(workplace, shelf, config, rng)
+    offset = torch.from_numpy(expert.path.position(0.0)) - workplace.home().position
+    world.hold(workplace.scene.objects[0].name, workplace.home_joints(offset).numpy())
+    frames = list(guided_frames(world, expert, config.duration + config.settle, config))
+    return frames, world.cabinet_contacts.touches + world.object_contacts.touches
+
+
+def demonstrate_placing_without_contact(
+    world: World,
+    workplace: Workplace,
+    shelf: str,
+    config: PlacingDemonstrationConfig,
     rng: np.random.Generator,
     attempts: int = 3,
 ) -> tuple[list[Frame], int]:
     """Demonstrate until nothing is touched on the way, as a person would.
 
     Returns:
-        The recorded frames, and how many demonstrations were thrown away.
+        The recorded frames, and how many demonstrations were discarded.
 
     Raises:
         TaskFailedError: If something was touched each time.
     """
     for attempt in range(attempts):
-        frames, touches = teach_placing(world, workplace, shelf, lesson, rng)
+        frames, touches = demonstrate_placing(world, workplace, shelf, config, rng)
         if not touches:
             return frames, attempt
     raise TaskFailedError(f"{attempts} demonstrations in a row hit the cabinet: {touches[0]}")
-
-
-def teach_placing(
-    world: World,
-    workplace: Workplace,
-    shelf: str,
-    lesson: PlacingLesson,
-    rng: np.random.Generator,
-) -> tuple[list[Frame], list[Touch]]:
-    """Demonstrate one placing motion, from home to a shelf with the thing in hand.
-
-    Returns:
-        The recorded frames, and all touches of the cabinet by arm or thing on the way.
-    """
-    expert = placing_expert(workplace, shelf, lesson, rng)
-    offset = torch.from_numpy(expert.path.position(0.0)) - workplace.home().position
-    world.hold(workplace.scene.objects[0].name, workplace.home_joints(offset).numpy())
-    frames = list(teach(world, expert, lesson.duration + lesson.settle, lesson))
-    return frames, world.cabinet_contacts.touches + world.object_contacts.touches

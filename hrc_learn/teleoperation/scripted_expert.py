@@ -1,4 +1,4 @@
-"""The scripted expert: leads the hand along way points while pulling the body into shape."""
+"""The scripted expert: guides the end effector along way points, and pulls at the elbow."""
 
 from collections.abc import Callable, Sequence
 
@@ -10,7 +10,7 @@ from scipy.interpolate import PchipInterpolator
 from hrc_learn.geometry import Pose, minimum_jerk
 from hrc_learn.kinematics import SerialChain, coarse_orientation
 from hrc_learn.protocols import ArmState, HumanInput
-from hrc_learn.teleoperation.interaction_force import PullSpell, ScriptedPuller
+from hrc_learn.teleoperation.interaction_force import ScriptedForce, ScriptedPerturbation
 
 
 class GuidedPath:
@@ -57,7 +57,7 @@ class GuidedPath:
         return self._slope(s) * rate
 
     def _progress(self, time: float) -> tuple[float, float]:
-        """Share of the path covered, and its rate [1/s]."""
+        """Fraction of the path covered, and its rate [1/s]."""
         s, slope = minimum_jerk((time - self._start) / self.duration)
         return s, slope / self.duration
 
@@ -85,7 +85,7 @@ class Tremor:
 
 
 Orientation = Callable[[Float[torch.Tensor, "3"], float], Float[torch.Tensor, "4"]]
-"""Orientation (wxyz) the hand should have at a position [m] and time [s]."""
+"""Orientation (wxyz) the end effector should have at a position [m] and time [s]."""
 
 
 def _by_the_rule(position: Float[torch.Tensor, "3"], _time: float) -> Float[torch.Tensor, "4"]:
@@ -93,7 +93,7 @@ def _by_the_rule(position: Float[torch.Tensor, "3"], _time: float) -> Float[torc
 
 
 class ScriptedExpert:
-    """Teaches a motion in task space and body shape at once, with an unsteady hand.
+    """Teaches a motion in task space and null-space posture at once, with an unsteady hand.
 
     Position follows a guided path, corrected by eye; orientation follows a rule; meanwhile the
     other hand pulls joints in the null space.
@@ -103,7 +103,7 @@ class ScriptedExpert:
         self,
         chain: SerialChain,
         path: GuidedPath,
-        spells: Sequence[PullSpell] = (),
+        forces: Sequence[ScriptedForce] = (),
         tremor: Tremor | None = None,
         orientation: Orientation = _by_the_rule,
         gain: float = 4.0,
@@ -112,27 +112,27 @@ class ScriptedExpert:
 
         Args:
             chain: The arm.
-            path: Where the hand goes.
-            spells: When and how the body is pulled.
-            tremor: Unsteadiness of the hand.
-            orientation: Rule for the hand's orientation; the paper's coarse one by default.
+            path: Where the end effector goes.
+            forces: When and how the body is pulled.
+            tremor: Unsteadiness of the end effector.
+            orientation: Rule for the orientation; the paper's coarse one by default.
             gain: How fast an error of pose is corrected [1/s].
         """
         self.path = path
         self.orientation = orientation
         self._chain = chain
-        self._puller = ScriptedPuller(chain, spells)
+        self._puller = ScriptedPerturbation(chain, forces)
         self._tremor = tremor
         self._gain = gain
 
     def read(self, state: ArmState) -> HumanInput:
-        """Motion of the hand and pull at the body at the state's time."""
+        """Motion of the end effector and pull at the body at the state's time."""
         pose = self._chain.forward(torch.from_numpy(state.joint_position))
         wanted = torch.from_numpy(self.path.position(state.time))
-        # The rule turns the hand where it is, not where it should be.
+        # The rule turns the end effector where it is, not where it should be.
         goal = Pose(wanted, self.orientation(pose.position, state.time))
         twist = self._gain * pose.twist_to(goal).numpy()
         twist[:3] += self.path.velocity(state.time)
         if self._tremor is not None and state.time < self.path.end:
             twist[:3] += self._tremor.velocity(state.time)
-        return HumanInput(effort=self._puller.read(state).effort, twist=twist)
+        return HumanInput(nullspace_input=self._puller.read(state).nullspace_input, twist=twist)

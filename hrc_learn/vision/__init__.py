@@ -7,5 +7,5 @@ from hrc_learn.vision.markers import Marker as Marker
 from hrc_learn.vision.markers import MarkerDetector as MarkerDetector
 from hrc_learn.vision.markers import centre as centre
 from hrc_learn.vision.markers import marker_texture as marker_texture
-from hrc_learn.vision.synthetic_camera import Cover as Cover
+from hrc_learn.vision.synthetic_camera import OccludingBoard as OccludingBoard
 from hrc_learn.vision.synthetic_camera import SyntheticCamera as SyntheticCamera

@@ -1,5 +1,8 @@
-"""A fixed camera: intrinsics, lens distortion (Brown 1966), pose; projection and its
-derivatives.
+"""A fixed camera: intrinsics, lens distortion, pose; projection and its derivatives.
+
+Distortion is that of Brown (1966) in OpenCV's parameter order. Its functions work on normalised
+image points, (x / z, y / z) in the camera frame. The controller never sees a `CameraModel`: it
+belongs to simulation and evaluation.
 """
 
 from dataclasses import dataclass, field, replace
@@ -7,10 +10,6 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float
-
-# Lens distortion of Brown (1966), in the parameter order of OpenCV: k1, k2, p1, p2, k3.
-#
-# Everything here works on *normalised* image points: (x / z, y / z) in the camera frame.
 
 Coefficients = tuple[float, float, float, float, float]
 """(k1, k2, p1, p2, k3): radial k, tangential p."""
@@ -71,6 +70,7 @@ def undistort(
     if coefficients == NONE:
         return distorted.copy()
     points = distorted.copy()
+    # A few rounding errors of the polynomial: Newton's steps cannot get closer.
     tolerance = 16 * np.finfo(points.dtype).eps
     for _ in range(iterations):
         residual = distort(points, coefficients) - distorted
@@ -85,11 +85,6 @@ def undistort(
             J[..., 0, 0] * residual[..., 1] - J[..., 1, 0] * residual[..., 0]
         ) / determinant
     return points
-
-
-# A fixed camera: intrinsics, lens distortion, pose; projection and its derivatives.
-#
-# The controller never sees a `CameraModel`: it belongs to simulation and to evaluation.
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -147,6 +142,7 @@ class CameraModel:
         if distance < 1e-9:
             raise ValueError("eye and target must differ, but both are " + str(eye.tolist()))
         z = z / distance
+        # Within 2.6 degrees of the vertical the base's z axis no longer tells which way is up.
         up = np.array([0.0, 0.0, 1.0]) if abs(z[2]) < 0.999 else np.array([1.0, 0.0, 0.0])
         x = np.cross(z, up)
         x /= np.linalg.norm(x)

@@ -7,8 +7,10 @@ from jaxtyping import Float32, UInt8
 
 from hrc_learn.vision.camera_model import NONE, CameraModel, undistort
 
-_POOL = 1 << 16  # samples of noise drawn for an image
-_BAND = 16  # rows
+# Samples of noise drawn for an image, of which rows are random windows (see `_noise`).
+_POOL = 1 << 16
+# Rows whose rays are computed at a time: 16 of 1440 pixels fit into the processor's cache.
+_BAND = 16
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,4 +1,7 @@
-"""ArUco markers of the 4x4_50 dictionary: their plates, and how they are found in images."""
+"""ArUco markers of the 4x4_50 dictionary: flat plates with a quiet zone, and their detection.
+
+Marker frame: origin in the middle, x right, y up, z out of the plate towards whoever reads it.
+"""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -10,11 +13,6 @@ from jaxtyping import Float, UInt8
 
 if TYPE_CHECKING:
     import cv2
-
-# ArUco markers of the 4x4_50 dictionary, as flat plates with a white quiet zone.
-#
-# Marker frame: origin in the middle, x right, y up, z out of the plate towards whoever reads
-# it.
 
 MODULES = 6
 """Squares along a marker's edge: 4 of code between two of black border."""
@@ -89,8 +87,6 @@ def marker_texture(id: int, pixels: int) -> UInt8[np.ndarray, "pixels pixels"]:
     inner = cv2.aruco.generateImageMarker(dictionary(), id, module * MODULES, borderBits=1)
     return np.pad(inner, module * QUIET_MODULES, constant_values=255)
 
-
-# Finding ArUco markers in images: fast search, corners to a third of a pixel.
 
 _CLOSE_LOOK_EVERY = 5
 """Images from one search at full resolution for a marker that stays unseen to the next."""

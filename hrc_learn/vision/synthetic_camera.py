@@ -19,8 +19,8 @@ MarkerPoses = Callable[[], Mapping[int, Float[np.ndarray, "4 4"]]]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Cover:
-    """A flat board in one colour before everything else."""
+class OccludingBoard:
+    """A flat board in one colour, in front of everything else."""
 
     corners: Float[np.ndarray, "corners 3"]
     """Of a convex outline, in the base frame [m]."""
@@ -28,9 +28,12 @@ class Cover:
     """Red, green, blue, 0 to 1."""
 
 
-_MODULE_PIXELS = (1, 2, 4, 8, 16, 32, 64)  # texture resolutions, one octave apart
-_PAPER, _INK = 235.0, 25.0  # grey levels of a lit print
-_NEAR = 0.02  # m; a plate closer to the camera plane than this is not drawn
+# Texture resolutions, one octave apart: bilinear sampling aliases beyond a factor of two.
+_MODULE_PIXELS = (1, 2, 4, 8, 16, 32, 64)
+# Grey levels of a lit print: white is not 255, black not 0.
+_PAPER, _INK = 235.0, 25.0
+# A plate closer to the camera plane than this is not drawn: its projection diverges [m].
+_NEAR = 0.02
 
 
 class SyntheticCamera:
@@ -49,7 +52,7 @@ class SyntheticCamera:
         rng: np.random.Generator,
         noise: ImageNoise | None = None,
         hidden: Callable[[], Set[int]] = frozenset,
-        covers: Callable[[], Sequence[Cover]] = tuple,
+        occluders: Callable[[], Sequence[OccludingBoard]] = tuple,
         background: UInt8[np.ndarray, "h w 3"] | None = None,
     ):
         """Draw everything that stays the same from frame to frame.
@@ -60,8 +63,8 @@ class SyntheticCamera:
             poses: Called at each frame; ids it leaves out are not drawn.
             rng: Source of the noise.
             noise: Blur and noise of the sensor; the defaults of `ImageNoise` when None.
-            hidden: Called at each frame; ids that something covers now.
-            covers: Called at each frame; boards held before the camera now.
+            hidden: Called at each frame; ids that are occluded now.
+            occluders: Called at each frame; boards held in front of the camera now.
             background: What is seen where no marker is; a plain table top when None.
 
         Raises:
@@ -69,7 +72,7 @@ class SyntheticCamera:
         """
         self.model = model
         self.markers = _by_id(markers)
-        self._poses, self._hidden, self._covers = poses, hidden, covers
+        self._poses, self._hidden, self._occluders = poses, hidden, occluders
         self._rng, self._noise = rng, noise or ImageNoise()
         self._clean = table_top(model.width, model.height) if background is None else background
         if self._clean.shape[:2] != (model.height, model.width):
@@ -87,7 +90,7 @@ class SyntheticCamera:
     def read(self) -> UInt8[np.ndarray, "h w 3"]:
         """The image now, RGB."""
         drawn = [self._draw(marker, pose) for marker, pose in self._visible()]
-        drawn += [self._draw_cover(cover) for cover in self._covers()]
+        drawn += [self._draw_board(board) for board in self._occluders()]
         image = self._background.copy()
         for roi in drawn:
             image[roi] = self._noise.degrade(self._canvas[roi], self._rng)
@@ -128,12 +131,12 @@ class SyntheticCamera:
         self._canvas[roi] = np.rint(grey + (1.0 - alpha) * self._canvas[roi])
         return roi
 
-    def _draw_cover(self, cover: Cover) -> tuple[slice, slice]:
+    def _draw_board(self, board: OccludingBoard) -> tuple[slice, slice]:
         """Paint a board over what has been drawn and return the region it touched."""
         import cv2
 
-        pixels = self.model.project(cover.corners)
-        colour = tuple(255.0 * c for c in cover.colour)
+        pixels = self.model.project(board.corners)
+        colour = tuple(255.0 * c for c in board.colour)
         outline = np.rint(pixels).astype(np.int32)
         cv2.fillConvexPoly(self._canvas, outline, colour, cv2.LINE_AA)
         return self._around(pixels)

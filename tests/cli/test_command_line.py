@@ -267,10 +267,10 @@ def test_measured_values_are_written_whole_or_not_at_all(tmp_path):
 def test_configurations_are_resolved_to_their_defaults_or_to_what_was_given():
     arguments = COMMANDS["run collaboration"].arguments_type()
     from hrc_learn.cli._run import parse
-    from hrc_learn.skills.pick_and_place import CollaborationConfig
+    from hrc_learn.skills.pick_and_place import PickAndPlaceConfig
 
     plain = _options.resolved(parse(arguments, ["--seed", "3"], "hrc"))
-    assert plain.config == CollaborationConfig()
+    assert plain.config == PickAndPlaceConfig()
     typed = ["--config.grasping.attempts", "5", "--seed", "3"]
     given = _options.resolved(parse(arguments, typed, "hrc"))
     assert given.config.grasping.attempts == 5

@@ -26,7 +26,7 @@ def test_fit_and_evaluate_on_demonstrations_held_out(poses, tmp_path):
     model = tmp_path / "model"
     done(
         *("fit", "--dataset", poses, "--out", model, "--n-basis", 20),
-        *("--episodes", 0, 1, 2, "--kinds", "position", "pose", "--several", "contextual"),
+        *("--episodes", 0, 1, 2, "--channels", "position", "pose", "--several", "contextual"),
     )
     assert {"position", "pose", "contextual", "position.png"} <= {
         p.name for p in model.iterdir()
@@ -47,7 +47,7 @@ def test_fit_and_evaluate_on_demonstrations_held_out(poses, tmp_path):
 def test_a_streamed_fit(poses, tmp_path):
     done(
         *("fit", "--dataset", poses, "--out", tmp_path / "model"),
-        *("--several", "streamed", "--kinds", "position", "--n-basis", 15),
+        *("--several", "streamed", "--channels", "position", "--n-basis", 15),
     )
     metrics = json.loads((tmp_path / "model" / "metrics.json").read_text())
     assert metrics["frames"] == 320

@@ -21,7 +21,7 @@ def work(tmp_path_factory):
     done("record", "placing", "--out", work / "placing_demos", "--episodes", 1)
     done(
         *("record", "servoing", "--out", work / "aiming_demos", "--episodes", 4),
-        *("--lesson.duration", 5, "--json", work / "aiming.json"),
+        *("--demonstration.duration", 5, "--json", work / "aiming.json"),
     )
     done("fit", "--dataset", work / "placing_demos", "--out", work / "placing")
     done(

@@ -20,18 +20,20 @@ from hrc_learn.experiments.collaboration.metrics import evaluate, measured, verd
 from hrc_learn.experiments.pose_randomization import THREE_OBJECTS
 from hrc_learn.experiments.run_recording import Deviation, record, span, true_image_jacobian
 from hrc_learn.geometry import Box
-from hrc_learn.sim import NOWHERE, CameraChange, Occlusion
+from hrc_learn.sim import NOWHERE, CameraChange, OcclusionInterval
 from hrc_learn.skills.grasping import GraspingConfig
-from hrc_learn.skills.pick_and_place import CollaborationConfig
-from hrc_learn.skills.visual_servoing import AimingConfig
-from hrc_learn.skills.work_cell import StationConfig
-from hrc_learn.teleoperation import PullSpell
+from hrc_learn.skills.pick_and_place import PickAndPlaceConfig
+from hrc_learn.skills.visual_servoing import VisualServoConfig
+from hrc_learn.skills.work_cell import WorkCellConfig
+from hrc_learn.teleoperation import ScriptedForce
 
-PULL = (PullSpell(start=0.3, duration=2.0, towards=(0.4, 0.0, 0.5), strongest=60.0),)
-BRIEF = CollaborationConfig(interaction=0.0)
+PULL = (ScriptedForce(start=0.3, duration=2.0, towards=(0.4, 0.0, 0.5), max_force=60.0),)
+BRIEF = PickAndPlaceConfig(interaction=0.0)
 HASTY = replace(
     BRIEF,
-    grasping=GraspingConfig(aiming=AimingConfig(unseen_patience=2.5), patience=0.1, attempts=1),
+    grasping=GraspingConfig(
+        servo=VisualServoConfig(occlusion_timeout=2.5), detection_timeout=0.1, attempts=1
+    ),
 )
 """Gives up as soon as the arm has come to where it should see its marker."""
 SHELVES = ("lower", "middle", "upper")
@@ -56,8 +58,8 @@ def job(aiming, placing):
         ("upper",),
         camera="synthetic",
         pulls=PULL,
-        disturbances=Disturbances(occlusions=(Occlusion(start=0.0, duration=3.0),)),
-        config=CollaborationConfig(interaction=2.5),
+        disturbances=Disturbances(occlusions=(OcclusionInterval(start=0.0, duration=3.0),)),
+        config=PickAndPlaceConfig(interaction=2.5),
         seed=3,
     )
 
@@ -70,10 +72,10 @@ def test_the_object_ends_on_the_shelf_and_every_target_is_met(job, placing):
 
 
 def test_the_phases_come_in_order(job):
-    phases = [event.text for event in job.station.log.events]
+    phases = [event.text for event in job.cell.log.events]
     assert phases == [
-        "look",
-        "aim",
+        "detect",
+        "servo",
         "interact",
         "grasp",
         "lift",
@@ -86,19 +88,19 @@ def test_the_phases_come_in_order(job):
 
 
 def test_the_estimated_image_jacobian_is_close_to_the_true_one(job):
-    estimate = job.station.log["image_jacobian"]
-    true = true_image_jacobian(job.station.log, job.world, job.cameras)
-    start, end = span(job.station.log, "interact")
-    time = job.station.log["time"]
+    estimate = job.cell.log["image_jacobian"]
+    true = true_image_jacobian(job.cell.log, job.world, job.cameras)
+    start, end = span(job.cell.log, "interact")
+    time = job.cell.log["time"]
     rows = (time >= start) & (time < end)
     difference = (estimate - true)[rows, :, :2]
     assert np.abs(difference).max() < 0.1 * np.abs(true[rows]).max()
 
 
 def test_deviations_count_from_the_first_pull(job):
-    deviation = Deviation.of(job.station.log)
-    start, end = span(job.station.log, "interact")
-    time = job.station.log["time"]
+    deviation = Deviation.of(job.cell.log)
+    start, end = span(job.cell.log, "interact")
+    time = job.cell.log["time"]
     outside = (time < start) | (time >= end)
     assert np.isnan(deviation.position[outside]).all()
     first = int(np.flatnonzero(np.isfinite(deviation.position))[0])
@@ -109,8 +111,8 @@ def test_deviations_count_from_the_first_pull(job):
 
 
 def test_the_recording_holds_what_the_run_did(job):
-    plans = [errand.plan for errand in job.errands]
-    run = record("test", job.station, job.world, job.motion, plans=plans, cameras=job.cameras)
+    plans = [pick.plan for pick in job.picks]
+    run = record("test", job.cell, job.world, job.motion, plans=plans, cameras=job.cameras)
     assert len(run.bodies) == len({body.name for body in run.bodies})
     hand = next(body for body in run.bodies if body.name == "hand")
     tool = hand.position + 0.1034 * _axis_z(hand.orientation)
@@ -128,12 +130,12 @@ def _axis_z(orientation):
 
 @pytest.mark.slow
 def test_a_person_who_keeps_away_changes_nothing(aiming, placing):
-    config = CollaborationConfig(interaction=0.5)
+    config = PickAndPlaceConfig(interaction=0.5)
     job = simulate_collaboration(
         aiming, placing[0], ("middle",), camera="synthetic", pulls=(), config=config, seed=5
     )
     assert job.failure == ""
-    assert Deviation.of(job.station.log).elbow_most_moved == 0.0
+    assert Deviation.of(job.cell.log).elbow_most_moved == 0.0
     assert job.world.rests_on("box", "board_middle")
 
 
@@ -161,10 +163,10 @@ def test_an_unknown_shelf_is_refused_before_anything_moves(aiming, placing):
 
 
 def test_a_hidden_marker_is_waited_for_and_the_wait_noted(job):
-    (note,) = [note for errand in job.errands for note in errand.recoveries]
-    assert note.mishap == "marker out of sight"
-    feature = job.station.log["feature"][:, 0]
-    assert np.isnan(feature[job.station.log["time"] < 3.0]).all()
+    (note,) = [note for pick in job.picks for note in pick.recoveries]
+    assert note.mishap == "marker occluded"
+    feature = job.cell.log["feature"][:, 0]
+    assert np.isnan(feature[job.cell.log["time"] < 3.0]).all()
     assert verdict(job) == ""
     assert measured(job)["recovered_marker_out_of_sight"] == 1
 
@@ -179,7 +181,7 @@ def provoked(aiming, placing, workplace=WORKPLACE, config=BRIEF, **options):
         camera="synthetic",
         pulls=(),
         config=config,
-        station_config=StationConfig(keep_every=0),
+        cell_config=WorkCellConfig(keep_image_every=0),
         **options,
     )
 
@@ -191,8 +193,8 @@ class Meddler:
         self._phase, self._deed, self._after = phase, deed, after
         self._begun, self._done = None, False
 
-    def start(self, world, station):
-        self._world, send = world, station._send
+    def start(self, world, cell):
+        self._world, send = world, cell._send
 
         def meddled(*command, **columns):
             due = self._begun is not None and world.time >= self._begun + self._after
@@ -201,7 +203,7 @@ class Meddler:
                 self._deed(world)
             send(*command, **columns)
 
-        station._send = meddled
+        cell._send = meddled
 
     def phase(self, name, time):
         if name == self._phase and self._begun is None:
@@ -216,7 +218,7 @@ def shifted(dx, dy, dz=0.0):
 
 
 def mishaps(job):
-    return [note.mishap for errand in job.errands for note in errand.recoveries]
+    return [note.mishap for pick in job.picks for note in pick.recoveries]
 
 
 @pytest.mark.slow
@@ -224,7 +226,7 @@ def test_an_object_moved_away_under_the_hand_is_grasped_at_the_second_attempt(ai
     meddler = Meddler("grasp", shifted(0.0, 0.09))
     job = provoked(aiming, placing, on_start=meddler.start, on_phase=meddler.phase, seed=5)
     assert mishaps(job) == ["missed grasp"]
-    assert job.errands[0].attempts == 2
+    assert job.picks[0].attempts == 2
     assert verdict(job) == ""
 
 
@@ -243,7 +245,7 @@ def test_an_object_lost_for_good_is_given_up_and_the_arm_goes_home(aiming, placi
     job = provoked(aiming, placing, on_start=meddler.start, on_phase=meddler.phase, seed=5)
     assert mishaps(job) == ["dropped object"]
     assert "does not see marker 11" in job.failure
-    home = torch.from_numpy(job.station.state.joint_position)
+    home = torch.from_numpy(job.cell.state.joint_position)
     assert float((home - WORKPLACE.home_joints()).abs().max()) < 0.02
     assert not job.world.cabinet_contacts.touches
 
@@ -257,7 +259,7 @@ def with_obstacle(centre, half_size):
 def test_a_blocked_way_is_gone_round(aiming, placing):
     workplace = with_obstacle((0.55, -0.10, 0.305), (0.05, 0.02, 0.04))
     job = provoked(aiming, placing, workplace, seed=5)
-    assert set(mishaps(job)) == {"blocked way"}
+    assert set(mishaps(job)) == {"blocked path"}
     assert verdict(job) == ""
 
 
@@ -270,7 +272,7 @@ def test_what_blocks_every_way_is_waited_for(aiming, placing):
     job = provoked(
         aiming, placing, workplace, on_start=meddler.start, on_phase=meddler.phase, seed=5
     )
-    assert mishaps(job) == ["blocked way"]
+    assert mishaps(job) == ["blocked path"]
     assert verdict(job) == ""
 
 
@@ -279,22 +281,22 @@ def test_where_no_way_gets_free_the_object_is_put_back(aiming, placing):
     workplace = with_obstacle((0.40, -0.40, 0.40), (0.15, 0.03, 0.15))
     config = replace(BRIEF, waits=1, wait=0.5)
     job = provoked(aiming, placing, workplace, config, seed=5)
-    assert mishaps(job) == ["blocked way", "blocked way"]
+    assert mishaps(job) == ["blocked path", "blocked path"]
     assert "stayed blocked" in job.failure
     assert job.world.rests_on("box", "table")
     place = job.world.object_pose("box")[:2, 3]
-    np.testing.assert_allclose(place, job.errands[0].picked_up.position[:2], atol=0.01)
+    np.testing.assert_allclose(place, job.picks[0].picked_up.position[:2], atol=0.01)
     assert not job.world.cabinet_contacts.touches
-    home = torch.from_numpy(job.station.state.joint_position)
+    home = torch.from_numpy(job.cell.state.joint_position)
     assert float((home - WORKPLACE.home_joints()).abs().max()) < 0.02
 
 
 @pytest.mark.slow
 def test_a_marker_that_stays_hidden_ends_the_attempts_cleanly(aiming, placing):
     config = replace(BRIEF, grasping=replace(HASTY.grasping, attempts=2))
-    hidden = Disturbances(occlusions=(Occlusion(start=0.0, duration=1e3),))
+    hidden = Disturbances(occlusions=(OcclusionInterval(start=0.0, duration=1e3),))
     job = provoked(aiming, placing, config=config, disturbances=hidden, seed=5)
-    assert mishaps(job) == ["marker out of sight", "marker out of sight"]
+    assert mishaps(job) == ["marker occluded", "marker occluded"]
     assert "marker" in job.failure
     assert job.world.rests_on("box", "table")
 
@@ -316,13 +318,13 @@ def test_three_objects_are_placed_though_the_camera_is_changed_between_them(
         pulls=PULL,
         disturbances=Disturbances(
             occlusions=(
-                Occlusion(start=0.0, duration=3.0),
-                Occlusion(start=50.0, duration=3.0),
+                OcclusionInterval(start=0.0, duration=3.0),
+                OcclusionInterval(start=50.0, duration=3.0),
             ),
             camera_change=change,
         ),
-        config=CollaborationConfig(interaction=2.5),
-        station_config=StationConfig(keep_every=0),
+        config=PickAndPlaceConfig(interaction=2.5),
+        cell_config=WorkCellConfig(keep_image_every=0),
         seed=1,
     )
     assert verdict(job) == ""

@@ -19,7 +19,7 @@ from hrc_learn.kinematics import gripper_down
 from hrc_learn.viz import Event
 
 OBJECTS = {"box": (0.0, 2.0), "tin": (2.0, 4.0)}
-PHASES = ("look", "aim", "transfer", "release")
+PHASES = ("detect", "servo", "transfer", "release")
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""A dashboard beside a station: all that is logged arrives, whatever the thread catches."""
+"""A dashboard beside a work cell: all that is logged arrives, whatever the thread catches."""
 
 from contextlib import contextmanager
 
@@ -11,8 +11,8 @@ from hrc_learn.experiments.run_recording import ServeConfig, serving
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import MotionLog, World
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.work_cell import Station
-from hrc_learn.teleoperation import ScriptedPuller
+from hrc_learn.skills.work_cell import WorkCell
+from hrc_learn.teleoperation import ScriptedPerturbation
 from hrc_learn.viz import live_dashboard as servers
 
 
@@ -29,25 +29,23 @@ def test_a_station_is_shown_while_it_works(tmp_path, monkeypatch):
     world = World(workplace.scene)
     world.reset(workplace.home_joints().numpy())
     motion = MotionLog(world)
-    station = Station(
+    cell = WorkCell(
         chain=panda,
         arm=world.arm,
         gripper=world.arm,
-        human=ScriptedPuller(panda, ()),
+        human=ScriptedPerturbation(panda, ()),
         advance=motion.advance,
     )
     config = ServeConfig(port=1, data_port=2, period=0.01)
-    with torch.inference_mode(), serving("Held", config, opened.append)(station, world, motion):
-        station.enter("hold")
-        station.stay(0.3)
+    with torch.inference_mode(), serving("Held", config, opened.append)(cell, world, motion):
+        cell.begin_phase("hold")
+        cell.hold_pose(0.3)
     assert opened == ["http://viewer:1"]
     rrd = Rrd(tmp_path / "live.rrd")
     path = "joints/panda_joint4/position"
     order = np.argsort(rrd.time(path), kind="stable")
-    np.testing.assert_allclose(rrd.time(path)[order], station.log["time"], atol=1e-9)
-    np.testing.assert_array_equal(
-        rrd.scalars(path)[order, 0], station.log["joint_position"][:, 3]
-    )
+    np.testing.assert_allclose(rrd.time(path)[order], cell.log["time"], atol=1e-9)
+    np.testing.assert_array_equal(rrd.scalars(path)[order, 0], cell.log["joint_position"][:, 3])
     assert rrd.column("phases", "TextLog:text") == [["0.0 s: hold"]]
     assert rrd.column("__properties", "RecordingInfo:name", static=True) == [["Held"]]
     assert "world/bodies/link4" in rrd.entities

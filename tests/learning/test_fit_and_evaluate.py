@@ -13,9 +13,9 @@ from hrc_learn.demos import Demonstration, DemonstrationSet
 from hrc_learn.dmp import ContextualDMP, JointDMP, OrientationDMP, PoseDMP
 from hrc_learn.geometry import quaternion
 from hrc_learn.learning.channels import Motions, Reproduction, load_primitive
-from hrc_learn.learning.fit_primitives import EACH, contexts, fit_contextual, fit_primitives
-from hrc_learn.learning.reproduction_error import dimensionless_jerk, reproduction_error
-from hrc_learn.learning.tuning import Search, with_gains
+from hrc_learn.learning.primitive_fitting import EACH, contexts, fit_contextual, fit_primitives
+from hrc_learn.learning.reproduction_metrics import dimensionless_jerk, reproduction_error
+from hrc_learn.learning.tuning import TuningState, with_gains
 
 
 def demonstration(episode, frames=120):
@@ -42,12 +42,12 @@ def demos():
 
 
 def test_every_kind_is_fitted_saved_and_read_back(demos, tmp_path):
-    fitted = fit_primitives(demos, 25, kinds=("position", "orientation", "pose"))
+    fitted = fit_primitives(demos, 25, channels=("position", "orientation", "pose"))
     fitted.save(tmp_path, each=True)
     classes = {"position": JointDMP, "orientation": OrientationDMP, "pose": PoseDMP}
-    for kind, cls in classes.items():
-        assert isinstance(load_primitive(tmp_path / kind, kind), cls)
-        assert load_primitive(tmp_path / EACH / kind, kind).duration.shape == (3,)
+    for channel, cls in classes.items():
+        assert isinstance(load_primitive(tmp_path / channel, channel), cls)
+        assert load_primitive(tmp_path / EACH / channel, channel).duration.shape == (3,)
     metrics = fitted.metrics()
     assert metrics["position_nrmse_max"] < 1e-3
     assert metrics["pose_turn_rmse_max"] < 0.05
@@ -57,13 +57,13 @@ def test_every_kind_is_fitted_saved_and_read_back(demos, tmp_path):
 
 def test_a_kind_that_was_not_recorded_is_refused(demos):
     with pytest.raises(
-        ValueError, match="no joint_position, which a primitive of kind 'joint'"
+        ValueError, match="no joint_position, which a primitive of channel 'joint'"
     ):
-        fit_primitives(demos, 10, kinds=("joint",))
+        fit_primitives(demos, 10, channels=("joint",))
 
 
 def test_the_number_of_basis_functions_is_chosen_by_samples_held_out(demos):
-    fitted = fit_primitives(demos, None, kinds=("position",), candidates=(5, 12, 20))
+    fitted = fit_primitives(demos, None, channels=("position",), candidates=(5, 12, 20))
     assert fitted.selection is not None
     assert fitted.n_basis == fitted.selection.count
     best = fitted.selection.error.min()
@@ -72,7 +72,7 @@ def test_the_number_of_basis_functions_is_chosen_by_samples_held_out(demos):
 
 
 def test_contexts_are_ends_or_columns(demos, tmp_path):
-    fitted = fit_primitives(demos, 15, kinds=("position",))
+    fitted = fit_primitives(demos, 15, channels=("position",))
     ends = contexts(demos, (), fitted, "position")
     assert ends.shape == (3, 6)
     np.testing.assert_allclose(ends[1, 3:], demos[1].position[-1])
@@ -124,7 +124,7 @@ def bowl(numbers):
 
 
 def test_a_search_finds_the_bottom_of_a_bowl():
-    search = Search.around({"a": 1.0, "b": 1.0}, seed=3)
+    search = TuningState.around({"a": 1.0, "b": 1.0}, seed=3)
     for _ in range(40):
         tried = search.ask(10)
         search = search.tell(tried, [bowl(one) for one in tried])
@@ -140,16 +140,16 @@ def test_an_interrupted_search_goes_on_as_if_it_had_not_been():
             search = search.tell(tried, [bowl(one) for one in tried])
         return search
 
-    start = Search.around({"a": 1.0, "b": 1.0})
+    start = TuningState.around({"a": 1.0, "b": 1.0})
     saved = json.loads(json.dumps(run(start, 2).to_json()))
-    assert run(Search.from_json(saved), 3) == run(start, 5)
+    assert run(TuningState.from_json(saved), 3) == run(start, 5)
 
 
 def test_bad_starts_and_states_of_a_search_are_refused():
     with pytest.raises(ValueError, match="b must be positive"):
-        Search.around({"a": 1.0, "b": math.inf})
+        TuningState.around({"a": 1.0, "b": math.inf})
     with pytest.raises(ValueError, match="not the state of a search"):
-        Search.from_json({"names": []})
+        TuningState.from_json({"names": []})
 
 
 def test_gains_of_a_file_take_the_place_of_defaults(tmp_path):

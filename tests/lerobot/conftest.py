@@ -2,14 +2,14 @@
 
 import pytest
 
-from hrc_learn.lerobot.panda_device import CONNECTED
+from hrc_learn.lerobot.panda_device import robot_registry
 from hrc_learn.lerobot.robots import MujocoPanda, MujocoPandaConfig
 
 
 @pytest.fixture(autouse=True)
 def nothing_left_connected():
     yield
-    for robot in list(CONNECTED):
+    for robot in robot_registry():
         robot.disconnect()
 
 

@@ -3,7 +3,8 @@ import torch
 
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import UnreachableError, panda
-from hrc_learn.sim.workplace import Workplace, nearest_configuration
+from hrc_learn.sim.workplace import Workplace
+from hrc_learn.skills.cartesian_motion import nearest_configuration
 
 WORKPLACE = Workplace()
 

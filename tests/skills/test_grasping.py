@@ -29,7 +29,7 @@ from hrc_learn.sim import World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.cartesian_motion import joint_line
 from hrc_learn.skills.grasping import GraspingConfig
-from hrc_learn.skills.visual_servoing import Aim, AimingConfig, AimingSkill
+from hrc_learn.skills.visual_servoing import ServoTarget, VisualServoConfig, VisualServoSkill
 from hrc_learn.skills.visual_target import VisualTarget
 
 WORKPLACE = Workplace()
@@ -52,7 +52,7 @@ def skill():
         torch.from_numpy(jacobians[0]), paper_grid().double(), 0.1
     )
     target = VisualTarget.fit(camera.project(on_top), camera.project(marker), jacobians)
-    return AimingSkill(jacobian=network, target=target)
+    return VisualServoSkill(jacobian=network, target=target)
 
 
 def turned(degrees, seed=0):
@@ -89,8 +89,8 @@ def test_the_object_is_held_though_the_camera_was_turned(grasp):
 
 
 def test_feedback_goes_from_joint_space_to_the_image(grasp):
-    activity = RegionActivity.of(grasp, AimingConfig())
-    aimed = np.isfinite(grasp.station.log["target"]).all(axis=1)
+    activity = RegionActivity.of(grasp, VisualServoConfig())
+    aimed = np.isfinite(grasp.cell.log["target"]).all(axis=1)
     first, last = np.flatnonzero(aimed)[[0, -1]]
     assert (activity.approach[first], activity.vision[first]) == (1.0, 0.0)
     assert (activity.approach[last], activity.vision[last]) == (0.0, 1.0)
@@ -101,7 +101,7 @@ def test_feedback_goes_from_joint_space_to_the_image(grasp):
 
 
 def test_the_recording_tells_how_the_estimate_came_to_the_truth(grasp):
-    run = record_grasp(grasp, AimingConfig(), "test")
+    run = record_grasp(grasp, VisualServoConfig(), "test")
     assert run.camera is not None
     assert run.image_jacobian is not None
     assert run.potential_rate is not None
@@ -151,8 +151,8 @@ def test_a_missed_grasp_is_begun_anew(skill):
     class Astray(VisualTarget):
         """Misses the object by a hand's breadth until it has looked twice."""
 
-        def seen_by(self, pixel, jacobian):
-            seen = super().seen_by(pixel, jacobian)
+        def from_view(self, pixel, jacobian):
+            seen = super().from_view(pixel, jacobian)
             if not tries or np.allclose(pixel, tries[0], atol=1e-12):
                 tries[:] = [pixel]
                 return seen + np.array([0.0, 150.0])
@@ -199,13 +199,13 @@ def test_the_hand_is_turned_as_the_demonstrations_approached(skill):
     outcome = GraspOutcome.of(run)
     assert outcome.failure == ""
     assert outcome.angle_error < 0.02
-    hand = panda.forward(torch.from_numpy(run.station.log["joint_position"]))
-    down = np.flatnonzero(run.station.log["time"] >= phase_time(run, "lift"))[0]
+    hand = panda.forward(torch.from_numpy(run.cell.log["joint_position"]))
+    down = np.flatnonzero(run.cell.log["time"] >= phase_time(run, "lift"))[0]
     assert float(quaternion.angle(hand.orientation[down], shown)) < 0.02
 
 
 def phase_time(run, phase):
-    return next(event.time for event in run.station.log.events if event.text == phase)
+    return next(event.time for event in run.cell.log.events if event.text == phase)
 
 
 SWEPT = 17
@@ -213,6 +213,7 @@ SWEPT = 17
 above the table leads through the object."""
 
 
+@shapes_unchecked()
 def test_the_arm_comes_to_the_table_clear_of_what_lies_there(skill):
     """Nobody told it where that is."""
     config = GraspingSettingConfig(random_camera=True)
@@ -227,7 +228,7 @@ def test_the_arm_comes_to_the_table_clear_of_what_lies_there(skill):
     assert distance(joint_line(start, WORKPLACE.hover_joints(), 0.6, 0.05)) < 0
     with shapes_unchecked():
         run = grasped(skill, setting)
-    log = run.station.log
+    log = run.cell.log
     coming = log["time"] < phase_time(run, "grasp")
     assert distance(torch.from_numpy(log["joint_position"][coming])) > 0.05
     assert GraspOutcome.of(run).failure == ""
@@ -237,8 +238,8 @@ def test_the_arm_comes_to_the_table_clear_of_what_lies_there(skill):
 def test_coming_down_again_finds_the_object_by_any_camera(skill):
     """Cameras moved, tilted and turned by any angle."""
 
-    def outcomes(most_probes):
-        config = GraspingConfig(aiming=AimingConfig(most_probes=most_probes))
+    def outcomes(max_probes):
+        config = GraspingConfig(servo=VisualServoConfig(max_probes=max_probes))
         for seed in (1, 12, 19, 27):
             rng = np.random.default_rng(seed)
             trial = simulate_grasp(
@@ -263,13 +264,15 @@ def test_a_hand_that_comes_down_along_the_line_stays_on_it():
     line = np.array([0.3, -0.2, 1.0])
     line /= np.linalg.norm(line)
     hover = WORKPLACE.hover()
-    aim = Aim(config=AimingConfig(), above=hover, posture=None, target=lambda J: J, line=line)
+    target = ServoTarget(
+        config=VisualServoConfig(), above=hover, posture=None, target=lambda J: J, line=line
+    )
 
     def hand(along, aside=(0.0, 0.0, 0.0)):
         moved = along * line + np.array(aside)
         return Pose(hover.position + torch.from_numpy(moved), hover.orientation)
 
-    assert aim.aside(hand(0.0), hand(0.03)) == pytest.approx(0.0, abs=1e-12)
-    assert aim.aside(hand(0.04), hand(0.01)) == pytest.approx(0.0, abs=1e-12)
+    assert target.deviation(hand(0.0), hand(0.03)) == pytest.approx(0.0, abs=1e-12)
+    assert target.deviation(hand(0.04), hand(0.01)) == pytest.approx(0.0, abs=1e-12)
     there = hand(0.0, (0.012, 0.005, 0.0))
-    assert aim.aside(there, hand(0.03)) == pytest.approx(0.013, abs=1e-12)
+    assert target.deviation(there, hand(0.03)) == pytest.approx(0.013, abs=1e-12)

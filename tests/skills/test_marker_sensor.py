@@ -1,44 +1,44 @@
 import numpy as np
 import pytest
 
-from hrc_learn.skills.marker_sensor import Sight, Transport, TransportConfig
+from hrc_learn.skills.marker_sensor import DelayedChannel, LatencyConfig, MarkerObservation
 
 PERIOD = 0.04
 
 
 def arrivals(config, images=400, step=0.01, seed=0):
     """Times at which images were taken and at which they arrived [s]."""
-    transport = Transport(config, np.random.default_rng(seed))
+    channel = DelayedChannel(config, np.random.default_rng(seed))
     times, every = [], round(PERIOD / step)
     for k in range(images * every):
         if k % every == 0:
-            transport.send(Sight(time=k * step))
-        arrived = transport.newest(k * step)
+            channel.send(MarkerObservation(time=k * step))
+        arrived = channel.newest(k * step)
         if arrived is not None:
             times.append((arrived.time, k * step))
     return np.array(times)
 
 
 def test_images_arrive_at_once_unless_told():
-    taken, arrived = arrivals(TransportConfig()).T
+    taken, arrived = arrivals(LatencyConfig()).T
     np.testing.assert_array_equal(taken, arrived)
     np.testing.assert_allclose(np.diff(taken), PERIOD)
 
 
-@pytest.mark.parametrize("latency", [0.05, 0.1])
-def test_late_images_keep_the_time_at_which_they_were_taken(latency):
-    taken, arrived = arrivals(TransportConfig(latency=latency)).T
-    np.testing.assert_allclose(arrived - taken, latency, atol=1e-9)
+@pytest.mark.parametrize("delay", [0.05, 0.1])
+def test_late_images_keep_the_time_at_which_they_were_taken(delay):
+    taken, arrived = arrivals(LatencyConfig(delay=delay)).T
+    np.testing.assert_allclose(arrived - taken, delay, atol=1e-9)
     np.testing.assert_allclose(np.diff(taken), PERIOD)
 
 
-def test_the_share_asked_for_is_lost():
-    taken, _ = arrivals(TransportConfig(dropped=0.3)).T
+def test_the_fraction_asked_for_is_lost():
+    taken, _ = arrivals(LatencyConfig(frame_loss=0.3)).T
     assert len(taken) == pytest.approx(0.7 * 400, abs=3 * np.sqrt(400 * 0.21))
     assert np.diff(taken).min() > PERIOD / 2
 
 
-@pytest.mark.parametrize("wrong", [{"latency": -0.1}, {"dropped": 1.0}, {"dropped": -0.1}])
+@pytest.mark.parametrize("wrong", [{"delay": -0.1}, {"frame_loss": 1.0}, {"frame_loss": -0.1}])
 def test_what_no_camera_does_is_refused(wrong):
-    with pytest.raises(ValueError, match="latency must not be negative"):
-        TransportConfig(**wrong)
+    with pytest.raises(ValueError, match="delay must not be negative"):
+        LatencyConfig(**wrong)

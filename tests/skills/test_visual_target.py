@@ -30,14 +30,14 @@ def test_the_offset_in_space_is_found_whatever_way_the_camera_is_turned():
     np.testing.assert_allclose(target.offset, offset, atol=1e-9)
     pixel, turned = np.array([500.0, 600.0]), rng.normal(0, 1500, (2, 6))
     expected = pixel + turned[:, :3] @ offset
-    np.testing.assert_allclose(target.seen_by(pixel, turned), expected, atol=1e-6)
+    np.testing.assert_allclose(target.from_view(pixel, turned), expected, atol=1e-6)
 
 
 def test_without_an_image_jacobian_the_camera_is_taken_to_stand_still():
     objects, hands, matrix = demonstrations(5)
     target, pixel = VisualTarget.fit(objects, hands), np.array([500.0, 600.0])
     expected = matrix @ np.append(pixel, 1.0)
-    np.testing.assert_allclose(target.seen_by(pixel, np.ones((2, 6))), expected)
+    np.testing.assert_allclose(target.from_view(pixel, np.ones((2, 6))), expected)
 
 
 def test_the_error_is_what_leaving_each_demonstration_out_gives():
@@ -75,7 +75,7 @@ def test_the_error_of_the_offset_is_what_leaving_each_demonstration_out_gives():
     for i in range(7):
         rest = np.arange(7) != i
         left_out = VisualTarget.fit(objects[rest], hands[rest], jacobians[rest])
-        misses.append(np.sum((left_out.seen_by(objects[i], jacobians[i]) - hands[i]) ** 2))
+        misses.append(np.sum((left_out.from_view(objects[i], jacobians[i]) - hands[i]) ** 2))
     target = VisualTarget.fit(objects, hands, jacobians)
     assert target.offset_error == pytest.approx(np.sqrt(np.mean(misses)))
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from hrc_learn.protocols import ArmState, HumanInput
-from hrc_learn.teleoperation import Eased, EasingConfig
+from hrc_learn.teleoperation import InputFilter, InputFilterConfig
 
-CONFIG = EasingConfig(linear=1.5, angular=5.0)
+CONFIG = InputFilterConfig(linear=1.5, angular=5.0)
 LED = np.array([0.25, 0.0, 0.0, 0.0, 0.4, 0.3])
 
 
@@ -14,7 +14,7 @@ class Person:
     twist = LED
 
     def read(self, state):
-        return HumanInput(effort=np.ones(7), twist=self.twist, gripper=0.05)
+        return HumanInput(nullspace_input=np.ones(7), twist=self.twist, gripper=0.05)
 
 
 def at(time):
@@ -23,7 +23,7 @@ def at(time):
 
 
 def motion(person, times):
-    eased = Eased(person, CONFIG)
+    eased = InputFilter(person, CONFIG)
     return np.stack([eased.read(at(time)).twist for time in times])
 
 
@@ -41,7 +41,7 @@ def test_speed_comes_up_at_the_rate_allowed_and_stays(dt):
 
 def test_a_hand_that_is_let_go_comes_to_rest():
     person = Person()
-    eased = Eased(person, CONFIG)
+    eased = InputFilter(person, CONFIG)
     for time in (0.0, 0.2):
         eased.read(at(time))
     person.twist = np.zeros(6)
@@ -50,14 +50,14 @@ def test_a_hand_that_is_let_go_comes_to_rest():
 
 
 def test_all_else_is_handed_on_as_it_is():
-    asked = Eased(Person()).read(at(3.0))
+    asked = InputFilter(Person()).read(at(3.0))
     assert not asked.twist.any()  # how long it has been asked for is not known yet
-    np.testing.assert_array_equal(asked.effort, np.ones(7))
+    np.testing.assert_array_equal(asked.nullspace_input, np.ones(7))
     assert asked.gripper == 0.05
 
 
 def test_a_clock_that_is_set_back_stops_nothing_and_starts_nothing():
-    eased = Eased(Person(), CONFIG)
+    eased = InputFilter(Person(), CONFIG)
     eased.read(at(5.0))
     before = eased.read(at(5.1)).twist
     np.testing.assert_array_equal(eased.read(at(0.0)).twist, before)
@@ -67,4 +67,4 @@ def test_a_clock_that_is_set_back_stops_nothing_and_starts_nothing():
 @pytest.mark.parametrize("name", ["linear", "angular"])
 def test_an_acceleration_that_is_none_is_refused(name):
     with pytest.raises(ValueError, match=f"{name} must be positive"):
-        EasingConfig(**{name: 0.0})
+        InputFilterConfig(**{name: 0.0})

@@ -6,14 +6,14 @@ import torch
 
 from hrc_learn.kinematics import coarse_orientation, panda
 from hrc_learn.protocols import ArmState, Human
-from hrc_learn.teleoperation import DragConfig
+from hrc_learn.teleoperation import InteractionForceConfig
 from hrc_learn.teleoperation.devices import Gamepad, GamepadConfig, TerminalKeyboard
 from hrc_learn.teleoperation.devices.gamepad import deflection
-from hrc_learn.teleoperation.devices.keyboard import DIRECTIONS, HeldKeys
+from hrc_learn.teleoperation.devices.keyboard import DIRECTIONS, KeyboardState
 
 Q = panda.ready.numpy()
 STATE = ArmState(time=0.0, joint_position=Q, joint_velocity=0 * Q, gripper_width=0.08)
-SPEED = DragConfig().speed
+SPEED = InteractionForceConfig().speed
 
 
 class Clock:
@@ -75,7 +75,7 @@ def test_a_gamepad_that_is_not_there_is_named():
 def test_sticks_lead_where_they_point(axes, way):
     asked = Gamepad(panda, Pad(axes)).read(STATE)
     np.testing.assert_allclose(asked.twist[:3], SPEED * np.array(way), atol=1e-12)
-    assert not asked.effort.any()
+    assert not asked.nullspace_input.any()
 
 
 def test_a_stick_near_its_middle_rests():
@@ -106,7 +106,7 @@ def test_the_hand_turns_by_the_rule_while_it_is_led():
     cosine = abs(float(goal @ hand.orientation))
     assert 2 * np.degrees(np.arccos(cosine)) == pytest.approx(90.0)
     np.testing.assert_allclose(
-        np.abs(asked.twist[3:]), [0, 0, DragConfig().turn_speed], atol=1e-9
+        np.abs(asked.twist[3:]), [0, 0, InteractionForceConfig().turn_speed], atol=1e-9
     )
 
 
@@ -157,7 +157,7 @@ def test_sticks_without_sense_are_refused(wrong):
 
 def test_keys_count_for_a_moment_and_together():
     clock = Clock()
-    keys = HeldKeys(holds_for=0.2, clock=clock)
+    keys = KeyboardState(holds_for=0.2, clock=clock)
     assert keys.press("i")
     assert not keys.press("x")
     assert keys.direction().tolist() == [1.0, 0.0, 0.0]
@@ -171,7 +171,7 @@ def test_keys_count_for_a_moment_and_together():
 
 
 def test_opposite_keys_cancel():
-    keys = HeldKeys(clock=Clock())
+    keys = KeyboardState(clock=Clock())
     keys.press("j")
     keys.press("l")
     assert not keys.direction().any()
@@ -181,7 +181,7 @@ def test_opposite_keys_cancel():
 def test_what_is_typed_leads_grips_and_asks():
     typed = iter(["i", "", "]13", "[q"])
     clock = Clock()
-    keyboard = TerminalKeyboard(panda, lambda: next(typed), HeldKeys(0.3, clock))
+    keyboard = TerminalKeyboard(panda, lambda: next(typed), KeyboardState(0.3, clock))
     assert isinstance(keyboard, Human)
     asked = keyboard.read(STATE)
     np.testing.assert_allclose(asked.twist[:3], [SPEED, 0, 0])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hrc_learn.teleoperation.page.gizmos import Grip, Grips
+from hrc_learn.teleoperation.page.gizmos import HeldGizmo, HeldGizmos
 
 
 class Clock:
@@ -21,11 +21,11 @@ def clock():
 
 @pytest.fixture
 def grips(clock):
-    return Grips(patience=0.5, clock=clock)
+    return HeldGizmos(timeout=0.5, clock=clock)
 
 
 def elbow(x=0.0):
-    return Grip(joint=4, held_at=np.zeros(3), pointer=np.array([x, 0.0, 0.0]))
+    return HeldGizmo(joint=4, held_at=np.zeros(3), pointer=np.array([x, 0.0, 0.0]))
 
 
 def test_a_handle_is_held_until_it_is_let_go(grips):
@@ -80,5 +80,5 @@ def test_people_hold_independently_of_each_other(grips, clock):
 
 
 def test_impatience_without_end_is_refused():
-    with pytest.raises(ValueError, match="patience must be positive"):
-        Grips(patience=0.0)
+    with pytest.raises(ValueError, match="timeout must be positive"):
+        HeldGizmos(timeout=0.0)

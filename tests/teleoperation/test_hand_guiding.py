@@ -7,7 +7,7 @@ import torch
 from hrc_learn.kinematics import panda
 from hrc_learn.protocols import ArmState, DrawnRegion, HumanInput
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.teleoperation.hand_guiding import LedArm, LedArmConfig
+from hrc_learn.teleoperation.hand_guiding import HandGuidedArm, HandGuidingConfig
 
 
 class IdealArm:
@@ -42,7 +42,7 @@ class Wish:
 
 def lead(seconds, dt=0.04, **asked):
     arm = IdealArm()
-    led = LedArm(panda, arm, Wish(**asked), LedArmConfig(dt=dt))
+    led = HandGuidedArm(panda, arm, Wish(**asked), HandGuidingConfig(dt=dt))
     start = arm.hand()
     for _ in range(round(seconds / dt)):
         led.step()
@@ -63,7 +63,7 @@ def test_the_hand_goes_where_it_is_led():
 def test_a_pull_at_the_body_leaves_the_hand_where_it_is():
     q = Workplace().home_joints()
     effort = 3.0 * panda.joint_jacobian(q, 4)[:3].mT.numpy() @ np.array([0.0, 4.0, 0.0])
-    arm, start = lead(0.6, dt=0.01, effort=effort)
+    arm, start = lead(0.6, dt=0.01, nullspace_input=effort)
     assert np.abs(arm.q - q.numpy()).max() > 0.05
     # What is left is the drift of a step of 10 ms.
     assert float(start.twist_to(arm.hand()).norm()) < 3e-3
@@ -73,7 +73,7 @@ def test_a_region_draws_the_hand_in_no_faster_than_it_may():
     region = DrawnRegion(centre=(0.45, 0.25, 0.35), half_size=(0.08, 0.08, 0.08))
     arm, start = lead(1.0, region=region)
     distance = float((arm.hand().position - start.position).norm())
-    assert distance <= LedArmConfig().attraction * 1.0 + 1e-6
+    assert distance <= HandGuidingConfig().attraction * 1.0 + 1e-6
     arm, _ = lead(8.0, region=region)
     offset = np.abs(arm.hand().position.numpy() - region.centre)
     # The last of the way in decays: within a few millimetres of the wall.
@@ -95,7 +95,9 @@ def test_the_hand_that_leads_knows_better_than_the_region():
 
 
 def test_limits_hold_whatever_is_asked():
-    arm, _ = lead(3.0, twist=np.array([0.0, 0.0, 5.0, 0.0, 0.0, 0.0]), effort=np.full(7, 1e3))
+    arm, _ = lead(
+        3.0, twist=np.array([0.0, 0.0, 5.0, 0.0, 0.0, 0.0]), nullspace_input=np.full(7, 1e3)
+    )
     assert (arm.q >= panda.limits.lower.numpy()).all()
     assert (arm.q <= panda.limits.upper.numpy()).all()
 
@@ -103,4 +105,4 @@ def test_limits_hold_whatever_is_asked():
 @pytest.mark.parametrize("name", ["dt", "damping", "attraction", "approach_rate"])
 def test_settings_that_make_no_sense_are_refused(name):
     with pytest.raises(ValueError, match=f"{name} must be positive"):
-        LedArmConfig(**{name: 0.0})
+        HandGuidingConfig(**{name: 0.0})

@@ -22,14 +22,14 @@ def browser(session, tmp_path_factory):
 
 
 def still(session):
-    return not session.asked.effort.any() and not session.asked.twist.any()
+    return not session.asked.nullspace_input.any() and not session.asked.twist.any()
 
 
 def test_a_dragged_elbow_yields_and_the_hand_stays(session, browser):
     elbow, hand = session.frame(4), session.frame(-1)
     with browser.dragging(elbow, by=(70, -10)):
-        wait_until(lambda: session.asked.effort.any(), "effort")
-        effort = session.asked.effort
+        wait_until(lambda: session.asked.nullspace_input.any(), "effort")
+        effort = session.asked.nullspace_input
         wait_until(lambda: np.linalg.norm(session.frame(4) - elbow) > 0.02, "motion")
     assert np.abs(effort).max() <= 20.0
     assert not effort[5:].any()  # later joints do not move the forearm
@@ -59,7 +59,7 @@ def test_a_corner_that_is_dragged_sizes_the_region(session, browser):
 @pytest.mark.slow
 def test_the_twin_is_held_as_the_arm_is(session, browser):
     with browser.dragging(session.frame(4) + session.page._config.twin, by=(-50, 0)):
-        wait_until(lambda: session.asked.effort.any(), "effort")
+        wait_until(lambda: session.asked.nullspace_input.any(), "effort")
     wait_until(lambda: still(session), "rest")
 
 
@@ -76,7 +76,7 @@ def test_the_hands_arrow_leads_along_its_axis(session, browser):
 
 @pytest.mark.slow
 def test_a_region_in_force_draws_the_hand_in(session, browser):
-    browser.tab.get_by_label("In force").check()
+    browser.tab.get_by_label("Active").check()
     wait_until(lambda: session.asked.region is not None, "a region")
     region = session.asked.region
 
@@ -85,7 +85,7 @@ def test_a_region_in_force_draws_the_hand_in(session, browser):
         return (offset < np.array(region.half_size) + 0.01).all()
 
     wait_until(inside, "the hand inside", timeout=300)
-    browser.tab.get_by_label("In force").uncheck()
+    browser.tab.get_by_label("Active").uncheck()
     wait_until(lambda: session.asked.region is None, "no region")
 
 
@@ -116,7 +116,7 @@ def test_a_rectangle_on_the_table_becomes_the_region(session, browser):
 @pytest.mark.slow
 def test_a_browser_that_hangs_lets_go(session, browser):
     with browser.dragging(session.frame(4), by=(60, 0)):
-        wait_until(lambda: session.asked.effort.any(), "effort")
+        wait_until(lambda: session.asked.nullspace_input.any(), "effort")
         hang = "setTimeout(() => { const t = Date.now(); while (Date.now() - t < 40000); }, 0)"
         browser.tab.evaluate(hang)
         wait_until(lambda: still(session), "a hand that is gone lets go", timeout=38)
@@ -129,5 +129,5 @@ def test_a_browser_that_is_closed_lets_go(session, browser):
         tab.mouse.move(*other.pixel(session.frame(4)))
         tab.mouse.down()
         tab.mouse.move(*other.pixel(session.frame(4) + np.array([0.0, 0.2, 0.0])))
-        wait_until(lambda: session.asked.effort.any(), "effort")
+        wait_until(lambda: session.asked.nullspace_input.any(), "effort")
     wait_until(lambda: still(session), "a hand that is gone lets go", timeout=PATIENCE)

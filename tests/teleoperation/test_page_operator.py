@@ -9,10 +9,10 @@ import torch
 from hrc_learn.geometry import quaternion
 from hrc_learn.kinematics import coarse_orientation, panda
 from hrc_learn.protocols import ArmState, DrawnRegion, HumanInput
-from hrc_learn.teleoperation import BothHands, DragConfig, drag_effort
+from hrc_learn.teleoperation import CombinedInput, InteractionForceConfig, gizmo_nullspace_input
 from hrc_learn.teleoperation.page import PageHuman
-from hrc_learn.teleoperation.page.gizmos import Grip
-from hrc_learn.teleoperation.page.page_operator import ask
+from hrc_learn.teleoperation.page.gizmos import HeldGizmo
+from hrc_learn.teleoperation.page.page_operator import gizmo_command
 
 Q = panda.ready.numpy()
 STATE = ArmState(time=0.0, joint_position=Q, joint_velocity=0 * Q, gripper_width=0.08)
@@ -20,7 +20,7 @@ REGION = DrawnRegion(centre=(0.3, 0.2, 0.1), half_size=(0.1, 0.1, 0.1))
 
 
 def pulling(**more):
-    return HumanInput(effort=np.arange(7.0), twist=np.ones(6), **more)
+    return HumanInput(nullspace_input=np.arange(7.0), twist=np.ones(6), **more)
 
 
 class Clock:
@@ -33,13 +33,13 @@ class Clock:
 def test_a_wish_holds_for_a_moment_and_motion_ends_with_it():
     clock = Clock()
     human = PageHuman(7, holds_for=0.25, clock=clock)
-    assert not human.read(STATE).effort.any()
+    assert not human.read(STATE).nullspace_input.any()
     human.post(pulling(region=REGION, target=(0.1, 0.2, 0.3), gripper=0.05))
     clock.time = 0.25
-    assert human.read(STATE).effort.any()
+    assert human.read(STATE).nullspace_input.any()
     clock.time = 0.26
     asked = human.read(STATE)
-    assert not asked.effort.any()
+    assert not asked.nullspace_input.any()
     assert not asked.twist.any()
     # What was drawn has been drawn: it is no motion that a hand must keep up.
     assert asked.region == REGION
@@ -65,7 +65,7 @@ def test_what_is_read_cannot_be_spoiled():
     human = PageHuman(7)
     human.post(pulling())
     with pytest.raises(ValueError, match="read-only"):
-        human.read(STATE).effort[0] = 1.0
+        human.read(STATE).nullspace_input[0] = 1.0
 
 
 def test_effort_and_motion_change_together_under_the_loops_eyes():
@@ -75,7 +75,7 @@ def test_effort_and_motion_change_together_under_the_loops_eyes():
     def post():
         k = 0.0
         while not done.is_set():
-            human.post(HumanInput(effort=np.full(7, k), twist=np.full(6, k)))
+            human.post(HumanInput(nullspace_input=np.full(7, k), twist=np.full(6, k)))
             k += 1.0
 
     thread = threading.Thread(target=post)
@@ -83,7 +83,7 @@ def test_effort_and_motion_change_together_under_the_loops_eyes():
     try:
         for _ in range(2000):
             asked = human.read(STATE)
-            assert asked.effort[0] == asked.twist[0]
+            assert asked.nullspace_input[0] == asked.twist[0]
     finally:
         done.set()
         thread.join()
@@ -92,51 +92,55 @@ def test_effort_and_motion_change_together_under_the_loops_eyes():
 def grip(joint, displacement):
     links = panda.link_poses(torch.from_numpy(Q))
     point = links[joint - 1 if joint else -1].position.numpy()
-    return Grip(joint=joint, held_at=np.zeros(3), pointer=point + displacement)
+    return HeldGizmo(joint=joint, held_at=np.zeros(3), pointer=point + displacement)
 
 
 def test_two_hands_on_the_body_pull_as_their_sum():
-    config = DragConfig(largest_effort=1e9)
+    config = InteractionForceConfig(max_nullspace_input=1e9)
     a, b = grip(4, np.array([0.0, 0.1, 0.0])), grip(6, np.array([0.05, 0.0, 0.02]))
     origins = panda.link_poses(torch.from_numpy(Q)).position.numpy()
-    expected = drag_effort(panda, Q, 4, origins[3], np.array([0.0, 0.1, 0.0]), config)
-    expected += drag_effort(panda, Q, 6, origins[5], np.array([0.05, 0.0, 0.02]), config)
-    asked = ask(panda, Q, [a, b], config)
-    np.testing.assert_allclose(asked.effort, expected, atol=1e-12)
+    expected = gizmo_nullspace_input(panda, Q, 4, origins[3], np.array([0.0, 0.1, 0.0]), config)
+    expected += gizmo_nullspace_input(
+        panda, Q, 6, origins[5], np.array([0.05, 0.0, 0.02]), config
+    )
+    asked = gizmo_command(panda, Q, [a, b], config)
+    np.testing.assert_allclose(asked.nullspace_input, expected, atol=1e-12)
     assert not asked.twist.any()
     np.testing.assert_allclose(
         asked.arrows[:, 1] - asked.arrows[:, 0], [[0, 0.1, 0], [0.05, 0, 0.02]], atol=1e-12
     )
-    small = ask(panda, Q, [a, b], DragConfig(largest_effort=0.1))
-    assert np.abs(small.effort).max() <= 0.1 + 1e-12
+    small = gizmo_command(panda, Q, [a, b], InteractionForceConfig(max_nullspace_input=0.1))
+    assert np.abs(small.nullspace_input).max() <= 0.1 + 1e-12
 
 
 def test_a_point_held_goes_with_its_link():
     held_at = np.array([0.03, -0.02, 0.1])
     frame = panda.link_poses(torch.from_numpy(Q))[2]
     point = frame.apply(torch.from_numpy(held_at)).numpy()
-    asked = ask(panda, Q, [Grip(joint=3, held_at=held_at, pointer=point)], DragConfig())
-    np.testing.assert_allclose(asked.effort, 0.0, atol=1e-9)
+    asked = gizmo_command(
+        panda, Q, [HeldGizmo(joint=3, held_at=held_at, pointer=point)], InteractionForceConfig()
+    )
+    np.testing.assert_allclose(asked.nullspace_input, 0.0, atol=1e-9)
     np.testing.assert_allclose(asked.arrows[0, 0], point, atol=1e-12)
 
 
 def test_a_hand_that_is_led_turns_by_the_rule_or_as_its_handle_is_turned():
-    config, way = DragConfig(turn_speed=100.0), np.array([0.05, 0.0, 0.0])
+    config, way = InteractionForceConfig(turn_speed=100.0), np.array([0.05, 0.0, 0.0])
     hand = panda.forward(torch.from_numpy(Q))
-    asked = ask(panda, Q, [grip(None, way)], config)
+    asked = gizmo_command(panda, Q, [grip(None, way)], config)
     np.testing.assert_allclose(asked.twist[:3], config.rate * way, atol=1e-12)
     step = torch.from_numpy(asked.twist[3:] / config.turn_rate)
     turned = torch.linalg.matrix_exp(torch.tensor(np.cross(np.eye(3), step)))
     R = panda.forward(torch.from_numpy(Q)).matrix()[:3, :3]
     goal = coarse_orientation(hand.position)
     torch.testing.assert_close(turned @ R, quaternion.to_matrix(goal), atol=1e-9, rtol=0)
-    free = ask(panda, Q, [grip(None, way)], config, coarse=False)
+    free = gizmo_command(panda, Q, [grip(None, way)], config, coarse=False)
     assert not free.twist[3:].any()
 
 
 def test_nobody_asks_for_nothing():
-    asked = ask(panda, Q, [], DragConfig())
-    assert not asked.effort.any()
+    asked = gizmo_command(panda, Q, [], InteractionForceConfig())
+    assert not asked.nullspace_input.any()
     assert not asked.twist.any()
     assert asked.arrows.shape == (0, 2, 3)
 
@@ -151,9 +155,11 @@ class Source:
 
 def test_both_hands_act_at_once():
     device = Source(twist=np.ones(6), gripper=0.02, requests=("start",))
-    page = Source(effort=np.arange(7.0), twist=np.ones(6), region=REGION, requests=("stop",))
-    asked = BothHands(device, page).read(STATE)
-    np.testing.assert_array_equal(asked.effort, np.arange(7.0))
+    page = Source(
+        nullspace_input=np.arange(7.0), twist=np.ones(6), region=REGION, requests=("stop",)
+    )
+    asked = CombinedInput(device, page).read(STATE)
+    np.testing.assert_array_equal(asked.nullspace_input, np.arange(7.0))
     np.testing.assert_array_equal(asked.twist, np.full(6, 2.0))
     assert asked.gripper == 0.02
     assert asked.region == REGION
@@ -163,7 +169,7 @@ def test_both_hands_act_at_once():
 
 def test_a_person_without_hands_is_refused():
     with pytest.raises(ValueError, match="at least one source"):
-        BothHands()
+        CombinedInput()
 
 
 def test_a_region_has_a_size():

@@ -5,7 +5,11 @@ import re
 import numpy as np
 
 from hrc_learn.teleoperation.page import PageStatus
-from hrc_learn.teleoperation.page.panel import effort_html, interventions_html, state_html
+from hrc_learn.teleoperation.page.panel import (
+    interventions_html,
+    nullspace_input_html,
+    state_html,
+)
 
 
 def bars(html):
@@ -16,7 +20,7 @@ def bars(html):
 
 
 def test_efforts_are_bars_from_the_middle_to_either_side():
-    html = effort_html(np.array([10.0, -5.0, 0.0, 40.0]), largest=20.0)
+    html = nullspace_input_html(np.array([10.0, -5.0, 0.0, 40.0]), largest=20.0)
     assert bars(html) == [(50.0, 25.0), (37.5, 12.5), (50.0, 0.0), (50.0, 50.0)]
     assert "+10.0" in html
     assert "-5.0" in html

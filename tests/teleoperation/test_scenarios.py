@@ -9,8 +9,14 @@ from hrc_learn.kinematics import panda
 from hrc_learn.protocols import ArmState, HumanInput
 from hrc_learn.sim import World
 from hrc_learn.skills.position_servo import PositionServo, PositionServoConfig
-from hrc_learn.teleoperation.hand_guiding import LedArm, LedArmConfig
-from hrc_learn.teleoperation.scenarios import Grasping, InTurn, Placing, ScenarioRun, overview
+from hrc_learn.teleoperation.hand_guiding import HandGuidedArm, HandGuidingConfig
+from hrc_learn.teleoperation.scenarios import (
+    Grasping,
+    Placing,
+    ScenarioRun,
+    SequencedInput,
+    overview,
+)
 
 DT = 0.05
 
@@ -108,11 +114,11 @@ def show(run):
         def command(self, joint_velocity):
             velocity[:] = joint_velocity
 
-    led = LedArm(panda, Reading(), run.expert, LedArmConfig(dt=run.dt))
+    led = HandGuidedArm(panda, Reading(), run.expert, HandGuidingConfig(dt=run.dt))
     target = arm.read().joint_position
     with shapes_unchecked(), torch.inference_mode():
         for _ in range(round(run.scenario.duration / run.dt)):
-            asked = led.step().asked
+            asked = led.step().human_input
             target = target + run.dt * velocity
             run.command(target, asked.gripper)
 
@@ -171,7 +177,7 @@ def test_turns_follow_each_other():
             return HumanInput()
 
     arm = Joints(READY)
-    turns = InTurn([(0.0, Still(), 0.08), (1.0, Still(), 0.0)])
+    turns = SequencedInput([(0.0, Still(), 0.08), (1.0, Still(), 0.0)])
     widths = []
     for _ in range(30):
         widths.append(turns.read(arm.read()).gripper)

@@ -6,8 +6,8 @@ Shelf = Literal["lower", "middle", "upper"]
 """Of `hrc_learn.sim.workplace.Workplace`."""
 Camera = Literal["auto", "egl", "synthetic"]
 """`hrc_learn.sim.CameraKind`."""
-Kind = Literal["joint", "position", "orientation", "pose"]
-"""Keys of `hrc_learn.learning.channels.KINDS`."""
+Channel = Literal["joint", "position", "orientation", "pose"]
+"""Keys of `hrc_learn.learning.channels.CHANNELS`."""
 Scaling = Literal["none", "paper", "amplitude", "rotation"]
 """Keys of `hrc_learn.dmp.forcing_scale.SCALINGS`."""
 Robot = Literal["panda"]

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Suppress
 
 from hrc_learn.cli._options import Detail, More
-from hrc_learn.cli.arguments.choices import Kind, Scaling
+from hrc_learn.cli.arguments.choices import Channel, Scaling
 
 
 def _learning() -> Any:
@@ -39,7 +39,7 @@ def _few_starts() -> Any:
 class FitPrimitives:
     """Fit movement primitives to the demonstrations of a LeRobot dataset.
 
-    Learns the motion of the joints, of any robot, and that of the hand where its pose is
+    Learns the motion of the joints, of any robot, and that of the end effector where its pose is
     recorded. Several demonstrations give one primitive each and what they have in common: their
     mean, their distribution, a function of a context, or one primitive fitted to all of them in
     one pass. Writes a folder with the primitives, the measured errors, demonstrations beside
@@ -50,7 +50,7 @@ class FitPrimitives:
     """LeRobot dataset with the demonstrations."""
     out: Path | None = None
     """Folder for the model. DATASET_model when not given."""
-    kinds: tuple[Kind, ...] = ()
+    channels: tuple[Channel, ...] = ()
     """What to learn; joint and pose, or what there is of them, when empty."""
     several: Literal["mean", "distribution", "contextual", "streamed"] = "mean"
     """What to keep of several demonstrations. Their mean; all of them as well, which a
@@ -73,7 +73,7 @@ class FitPrimitives:
     """Joints to learn, by name and in this order; all when empty."""
     as_lerobot_policy: bool = False
     """Write the folder of a trained LeRobot policy instead, of type dmp: from observations to
-    the dataset's own actions, joints or the hand, in closed form."""
+    the dataset's own actions, joints or the end effector, in closed form."""
     seed: int = 0
     """Of whatever is drawn at random."""
     overwrite: bool = False
@@ -91,7 +91,7 @@ class FitPrimitives:
 class FitImageJacobian:
     """Fit the image Jacobian of an uncalibrated camera to demonstrations.
 
-    Learns how the image of the hand's marker moves with the hand, as a radial basis function
+    Learns how the image of the marker moves with the end effector, as a radial basis function
     network over the workspace, with its uncertainty; and, where an object was watched, where
     that image should be to stand right above it. Neurons, noise and prior are learned by the
     gradient of the evidence until demonstrations held out say stop. Writes the model, the
@@ -106,7 +106,7 @@ class FitImageJacobian:
     episodes: tuple[int, ...] = ()
     """Episodes to learn from; all when empty."""
     neurons: Literal["around", "grid"] = "around"
-    """Thirteen that see all of the hand's pose, placed about what was shown; or a grid that
+    """Thirteen that see all of the hand's pose, placed about what was demonstrated; or a grid that
     sees x and y, as in the paper."""
     x: More[tuple[float, float, int]] = (0.05, 0.35, 3)
     """Of a grid: first and last centre along x [m], and how many (paper, Table I)."""
@@ -165,7 +165,7 @@ class EvaluateImageJacobian:
 
     For models of `hrc fit image-jacobian` from demonstrations of `hrc record servoing`. Prints
     the error against the true Jacobian on a grid inside the demonstrated workspace, how honest
-    its uncertainty is, and how much sooner the hand's marker reaches its target than from the
+    its uncertainty is, and how much sooner the marker reaches its target than from the
     paper's fixed initial Jacobian, over many starts and with the camera turned by any angle.
     Exit status 1 if a target was missed.
     """
@@ -175,7 +175,7 @@ class EvaluateImageJacobian:
     dataset: Path
     """The demonstrations it was learned from."""
     tilt: float = 0.1
-    """Of the hand, in the second of two grids [rad]; the first has it pointing down."""
+    """Of the end effector, in the second of two grids [rad]; the first has it pointing down."""
     closed_loop: bool = True
     """Whether to run the closed loops, which take a minute or more."""
     starts: Annotated[Any, Suppress] = field(default=Detail(_starts))
@@ -186,7 +186,7 @@ class EvaluateImageJacobian:
 
 @dataclass(frozen=True, kw_only=True)
 class Tune:
-    """Tune gains of the controller: the hand's marker sooner at its target, in simulation.
+    """Tune gains of the controller: the marker sooner at its target, in simulation.
 
     Searches the gains over a batch of closed loops against the workplace's camera, turned by
     any angle: the same starts, targets and noise for all gains that are compared, others for

@@ -10,25 +10,25 @@ from hrc_learn.cli._options import Detail, More
 from hrc_learn.cli.arguments.choices import Camera, Shelf
 
 
-def _placing_lesson() -> Any:
-    from hrc_learn.teleoperation.scripted_demonstrations import PlacingLesson
+def _placing_demonstration() -> Any:
+    from hrc_learn.teleoperation.scripted_demonstrations import PlacingDemonstrationConfig
 
-    return PlacingLesson()
+    return PlacingDemonstrationConfig()
 
 
-def _aiming_lesson() -> Any:
-    from hrc_learn.teleoperation.scripted_demonstrations import AimingLesson
+def _servo_demonstration() -> Any:
+    from hrc_learn.teleoperation.scripted_demonstrations import ServoDemonstrationConfig
 
-    return AimingLesson()
+    return ServoDemonstrationConfig()
 
 
 @dataclass(frozen=True, kw_only=True)
 class RecordPlacing:
-    """Record demonstrations of placing a thing on a shelf, hand and body shape at once.
+    """Record demonstrations of placing an object on a shelf, with the null-space posture.
 
-    The scripted expert leads the simulated arm from home into the cabinet while pulling its
-    elbow past the open door. Demonstrations that touch the cabinet are thrown away and shown
-    again. Writes a LeRobot dataset of version 3.0.
+    The scripted expert guides the simulated arm from home into the cabinet while pulling its
+    elbow past the open door. Demonstrations that touch the cabinet are discarded and
+    repeated. Writes a LeRobot dataset of version 3.0.
     """
 
     out: Path
@@ -37,10 +37,10 @@ class RecordPlacing:
     """Demonstrations to record."""
     shelf: Shelf = "middle"
     """Shelf to place on."""
-    lesson: Annotated[Any, Suppress] = field(default=Detail(_placing_lesson))
-    """How the expert teaches."""
+    demonstration: Annotated[Any, Suppress] = field(default=Detail(_placing_demonstration))
+    """How the expert demonstrates."""
     seed: int = 0
-    """Seed of the hand's unsteadiness and of where demonstrations start."""
+    """Seed of the tremor and of initial positions."""
     overwrite: bool = False
     """Replace an older dataset in that folder."""
     json: Path | None = None
@@ -49,9 +49,9 @@ class RecordPlacing:
 
 @dataclass(frozen=True, kw_only=True)
 class RecordServoing:
-    """Record demonstrations of aiming at an object in the image of an uncalibrated camera.
+    """Record demonstrations of visual servoing to an object in the image of an uncalibrated camera.
 
-    The scripted expert moves the marked hand about over the table and ends right above an
+    The scripted expert moves the marked end effector over the table and ends right above an
     object. The camera's pose and lens are in none of the columns. Writes a LeRobot dataset of
     version 3.0.
     """
@@ -62,8 +62,8 @@ class RecordServoing:
     """Demonstrations to record."""
     camera: Camera = "synthetic"
     """Camera: rendered by "egl", or "synthetic", which draws the markers only but is fast."""
-    lesson: Annotated[Any, Suppress] = field(default=Detail(_aiming_lesson))
-    """How the expert teaches."""
+    demonstration: Annotated[Any, Suppress] = field(default=Detail(_servo_demonstration))
+    """How the expert demonstrates."""
     seed: int = 1
     """Seed of objects, paths and image noise."""
     overwrite: bool = False

@@ -23,9 +23,9 @@ def _serving() -> Any:
 
 
 def _collaboration() -> Any:
-    from hrc_learn.skills.pick_and_place import CollaborationConfig
+    from hrc_learn.skills.pick_and_place import PickAndPlaceConfig
 
-    return CollaborationConfig()
+    return PickAndPlaceConfig()
 
 
 def _grasping() -> Any:
@@ -71,9 +71,9 @@ class Demo:
 
 @dataclass(frozen=True, kw_only=True)
 class RunPlacing:
-    """Place a thing on three shelves by a motion that was shown for one of them.
+    """Place an object on three shelves by a motion that was demonstrated for one of them.
 
-    In simulation, with the thing held between the fingers: the demonstrated motion once more
+    In simulation, with the object held between the fingers: the demonstrated motion once more
     and faster, then the other shelves, as the paper does it (joint space, shifted goal) and in
     task space with the learned body shape; the demonstration with and without that shape; on
     request from many random starts. Writes Rerun recordings, a report and the measured values.
@@ -190,7 +190,7 @@ class RunCollaboration:
     shelf_depth: More[float] = 0.10
     """How far behind the board's front edge [m]."""
     occlusion: More[tuple[tuple[float, float], ...]] = ()
-    """Spells in which a board hides the hand's marker: start and duration [s]."""
+    """Intervals in which a board occludes the marker: start and duration [s]."""
     camera_moved: bool = False
     """Move and turn the camera between two objects."""
     camera_change: Annotated[Any, Suppress] = field(default=Detail(_camera_change))
@@ -313,7 +313,7 @@ class ServePage:
     """Lead the simulated arm in a browser, and record demonstrations of your own.
 
     Open the address that is printed. Drag a link or a knob of the arm, or of its virtual twin,
-    to shape the body; drag the hand's handle to lead the hand, such as to a green field on a
+    to move it in its null space; drag the end effector's gizmo, such as to a green field on a
     shelf. Start, stop, save. Ends with "Finish", with Ctrl-C, or after --duration, and leaves a
     LeRobot dataset if anything was saved.
     """
@@ -322,10 +322,10 @@ class ServePage:
     """Folder of the dataset to record; must not exist."""
     port: int | None = None
     """Port of the page; that of --page.port, 8080, when not given."""
-    task: str = "put the thing on the middle shelf"
+    task: str = "put the object on the middle shelf"
     """What is to be shown, in words; it can be changed on the page."""
     beside: Literal["nothing", "gamepad", "keyboard"] = "nothing"
-    """A device for the other hand, which leads the end effector: a gamepad (extra `gamepad`),
+    """A device for the other hand, which moves the end effector: a gamepad (extra `gamepad`),
     or the keys of the terminal this runs in."""
     duration: float | None = None
     """End after this time [s]; None: when the person finishes."""

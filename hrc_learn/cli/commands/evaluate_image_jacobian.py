@@ -15,7 +15,7 @@ from hrc_learn.experiments.initialization_study import (
 )
 from hrc_learn.sim import World
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.visual_servoing import AimingSkill
+from hrc_learn.skills.visual_servoing import VisualServoSkill
 
 MOST_ERROR = 0.05
 LEAST_SPEED_UP = 1.5
@@ -24,7 +24,7 @@ LEAST_SPEED_UP = 1.5
 def run(args: Args) -> int:
     args = resolved(args)
     torch.set_num_threads(1)
-    network = AimingSkill.load(args.model).jacobian
+    network = VisualServoSkill.load(args.model).jacobian
     demos = load_demos(args.dataset)
     if demos[0].position is None:
         raise ValueError(f"{args.dataset}: no end-effector positions to place a grid by.")

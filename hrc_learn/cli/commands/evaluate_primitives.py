@@ -13,8 +13,8 @@ from hrc_learn.cli.arguments.learn import EvaluatePrimitives as Args
 from hrc_learn.cli.arguments.learn import FitPrimitives
 from hrc_learn.cli.commands import fit_primitives
 from hrc_learn.demos import DemonstrationSet, load_demos, open_demos
-from hrc_learn.learning.channels import KINDS, Motions, load_primitive
-from hrc_learn.learning.reproduction_error import ReproductionError, reproduction_error
+from hrc_learn.learning.channels import CHANNELS, Motions, load_primitive
+from hrc_learn.learning.reproduction_metrics import ReproductionError, reproduction_error
 from hrc_learn.store import new_folder, read_made_by
 from hrc_learn.viz.figures import measures_figure
 
@@ -50,32 +50,34 @@ def _fit_most(args: Args, model: Path) -> None:
 
 def _evaluate(args: Args, model: Path) -> int:
     console = Console()
-    kinds = [kind for kind in KINDS if (model / kind).is_dir()]
-    if not kinds:
+    channels = [channel for channel in CHANNELS if (model / channel).is_dir()]
+    if not channels:
         raise FileNotFoundError(f"{model} holds no model of `hrc fit`")
     demos = _demonstrations(args, model, console)
     motions = Motions.of(demos)
     figures: dict[str, float] = {"demonstrations": float(len(demos))}
     errors: dict[str, ReproductionError] = {}
-    for kind in kinds:
-        motions.require(kind)
-        primitive = load_primitive(model / kind, kind)
-        made = motions.adapted(kind, primitive)
-        errors[kind] = reproduction_error(kind, motions, made)
-        figures |= errors[kind].summary(kind)
-        figures[f"{kind}_duration_ratio_median"] = _duration_ratio(motions, primitive.duration)
-        console.print(_table(kind, demos, errors[kind]))
+    for channel in channels:
+        motions.require(channel)
+        primitive = load_primitive(model / channel, channel)
+        made = motions.adapted(channel, primitive)
+        errors[channel] = reproduction_error(channel, motions, made)
+        figures |= errors[channel].summary(channel)
+        figures[f"{channel}_duration_ratio_median"] = _duration_ratio(
+            motions, primitive.duration
+        )
+        console.print(_table(channel, demos, errors[channel]))
     if args.out is not None:
         with new_folder(args.out, asdict(args), args.overwrite) as folder:
             write_json(folder / "metrics.json", figures)
-            for kind, error in errors.items():
+            for channel, error in errors.items():
                 columns = {name: x.numpy() for name, x in error.columns().items()}
                 figure = measures_figure(columns, [demo.episode for demo in demos], UNITS)
-                figure.savefig(folder / f"{kind}.png", dpi=120)
+                figure.savefig(folder / f"{channel}.png", dpi=120)
     if args.json is not None:
         write_json(args.json, figures)
     limit = torch.inf if args.most_nrmse is None else args.most_nrmse
-    return int(any(figures.get(f"{kind}_nrmse_median", 0.0) > limit for kind in kinds))
+    return int(any(figures.get(f"{channel}_nrmse_median", 0.0) > limit for channel in channels))
 
 
 def _demonstrations(args: Args, model: Path, console: Console) -> DemonstrationSet:
@@ -100,9 +102,9 @@ def _duration_ratio(motions: Motions, duration: torch.Tensor) -> float:
     return float((duration / motions.demos.time.take_along_dim(last, dim=1)[:, 0]).median())
 
 
-def _table(kind: str, demos: DemonstrationSet, error: ReproductionError) -> Table:
+def _table(channel: str, demos: DemonstrationSet, error: ReproductionError) -> Table:
     columns = error.columns()
-    table = Table(title=f"{kind}: predicted from start, goal and duration")
+    table = Table(title=f"{channel}: predicted from start, goal and duration")
     table.add_column("episode", justify="right")
     for name in columns:
         unit = f" [{UNITS[name]}]" if UNITS[name] else ""

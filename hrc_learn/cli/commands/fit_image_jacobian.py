@@ -12,8 +12,8 @@ from hrc_learn.cli.arguments.learn import FitImageJacobian as Args
 from hrc_learn.demos import DemonstrationSource, open_demos
 from hrc_learn.jacobian import CellErrors, RBFCenters, grid
 from hrc_learn.learning.fit_recordings import learning_recording
-from hrc_learn.learning.fit_visual_servo import fit_aiming
-from hrc_learn.skills.visual_servoing import AimingSkill
+from hrc_learn.learning.visual_servo_fitting import fit_visual_servo
+from hrc_learn.skills.visual_servoing import VisualServoSkill
 from hrc_learn.store import new_folder
 from hrc_learn.viz.figures import learning_figure, workspace_figure
 from hrc_learn.viz.fit_dashboard import record_learning
@@ -32,7 +32,7 @@ def run(args: Args) -> None:
                 f"fitted as they are (--learning.hold-out {args.learning.hold_out})"
             )
         with console.status(f"Fitting {len(demos)} demonstrations") as status:
-            skill = fit_aiming(
+            skill = fit_visual_servo(
                 demos,
                 None if args.neurons == "around" else _grid(args),
                 args.fit,
@@ -50,7 +50,7 @@ def _grid(args: Args) -> RBFCenters:
 
 
 def _write(
-    args: Args, skill: AimingSkill, demos: DemonstrationSource, console: Console
+    args: Args, skill: VisualServoSkill, demos: DemonstrationSource, console: Console
 ) -> None:
     metrics = skill.metrics()
     with new_folder(args.folder, asdict(args) | {"out": args.folder}, args.overwrite) as folder:

@@ -12,7 +12,7 @@ from hrc_learn import distributed
 from hrc_learn.cli._values import show_values, write_json
 from hrc_learn.cli.arguments.learn import FitPrimitives as Args
 from hrc_learn.demos import load_demos, open_demos
-from hrc_learn.learning.fit_primitives import (
+from hrc_learn.learning.primitive_fitting import (
     FittedPrimitives,
     fit_contextual,
     fit_primitives,
@@ -40,13 +40,13 @@ def run(args: Args) -> None:
         console.print(f"note: {note}")
     with new_folder(args.folder, _made_by(args), args.overwrite) as folder:
         with console.status(f"Fitting {len(demos)} demonstrations"):
-            # Not every kind takes a scaling.
+            # Not every channel takes a scaling.
             scaled: dict[str, Any] = {} if args.scaling == "none" else {"scaling": args.scaling}
             fitted = fit_primitives(
                 demos,
                 args.n_basis,
                 args.method,
-                kinds=args.kinds,
+                channels=args.channels,
                 robust=args.robust,
                 **scaled,
             )
@@ -65,12 +65,12 @@ def _fit_streamed(args: Args) -> None:
         demos = open_demos(
             args.dataset, episodes=args.episodes or None, joint_names=args.joint_names or None
         )
-        fits, metrics = fit_streamed(demos, args.n_basis or 60, kinds=args.kinds)
+        fits, metrics = fit_streamed(demos, args.n_basis or 60, channels=args.channels)
         if rank:
             return
         with new_folder(args.folder, _made_by(args), args.overwrite) as folder:
-            for kind, fit in fits.items():
-                fit.primitive.save(folder / kind)
+            for channel, fit in fits.items():
+                fit.primitive.save(folder / channel)
             _finish(args, metrics, folder)
 
 
@@ -78,7 +78,7 @@ def _fit_policy(args: Args, console: Console) -> None:
     # LeRobot takes ten seconds to import.
     from hrc_learn.lerobot.policy.closed_form_checkpoint import write_closed_form_policy
 
-    given = (args.kinds, args.context, args.joint_names, args.robust)
+    given = (args.channels, args.context, args.joint_names, args.robust)
     if any(given) or (args.several, args.method, args.scaling) != (
         "mean",
         "trajectory",
@@ -102,9 +102,9 @@ def _made_by(args: Args) -> dict:
     return asdict(args) | {"dataset": args.dataset.resolve(), "out": args.folder}
 
 
-def _spread(fitted: FittedPrimitives, kind: str) -> float:
+def _spread(fitted: FittedPrimitives, channel: str) -> float:
     """Standard deviation of the motion over demonstrations, root mean square [rad or m]."""
-    distribution = fitted.distribution(kind)
+    distribution = fitted.distribution(channel)
     durations = fitted.demonstrations.time.amax(dim=1)
     time = torch.linspace(0, float(durations.mean()), 100, dtype=torch.float64)
     return float(np.sqrt(np.square(distribution.position(time)[1].numpy()).mean()))

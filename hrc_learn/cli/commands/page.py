@@ -25,7 +25,7 @@ from hrc_learn.teleoperation.page import Page
 from hrc_learn.teleoperation.page_session import (
     FEATURES,
     PageSession,
-    landing_places,
+    place_targets,
 )
 
 SWITCH_INTERVAL = 0.0005
@@ -51,14 +51,14 @@ def run(args: Args) -> None:
         details={"taught by": "a person at the page", "recorded with": configuration(args)},
     )
     drawn = bodies.drawn(*(poses[None] for poses in bodies.poses()))
-    stands = [*workplace.scene.boxes(), *landing_places(workplace)]
+    stands = [*workplace.scene.boxes(), *place_targets(workplace)]
     page = Page(panda, drawn, stands, args.page, task=args.task)
     with DemonstrationRecorder(writer, lambda: page.task) as recorder, page:
         session = PageSession(
             workplace, page, recorder, world, beside=_beside(args.beside), config=args.session
         )
         console.print(f"Page at [bold]{page.url}[/]")
-        figures = _serve(session, page, args.session.led.dt, args.duration)
+        figures = _serve(session, page, args.session.guiding.dt, args.duration)
     figures["episodes"] = recorder.status.saved
     console.print(
         f"{args.out}: {recorder.status.saved} demonstrations"

@@ -34,7 +34,7 @@ def run(args: Args) -> int:
     except RuntimeError as error:
         print(f"failed: {error}", file=sys.stderr)
         return 1
-    print(f"{args.episodes} demonstrations in {args.out} ({failed} thrown away)")
+    print(f"{args.episodes} demonstrations in {args.out} ({failed} discarded)")
     if args.json is not None:
         write_json(args.json, {"episodes": args.episodes, "thrown_away": failed})
     return 0

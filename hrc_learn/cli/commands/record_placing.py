@@ -13,8 +13,10 @@ from hrc_learn.sim import World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.work_cell import TaskFailedError
 from hrc_learn.teleoperation.hand_guiding import Frame
-from hrc_learn.teleoperation.paired_demonstrations import write_lessons
-from hrc_learn.teleoperation.scripted_demonstrations import teach_placing_cleanly
+from hrc_learn.teleoperation.scripted_demonstrations import (
+    demonstrate_placing_without_contact,
+    write_demonstrations,
+)
 
 
 def run(args: Args) -> int:
@@ -27,21 +29,21 @@ def run(args: Args) -> int:
     rng = np.random.default_rng(args.seed)
     thrown_away, errors = [], []
 
-    def lessons() -> Iterator[list[Frame]]:
+    def demonstrations() -> Iterator[list[Frame]]:
         for _ in track(range(args.episodes), description="Placing demonstrations"):
-            frames, thrown = teach_placing_cleanly(
-                world, workplace, args.shelf, args.lesson, rng
+            frames, thrown = demonstrate_placing_without_contact(
+                world, workplace, args.shelf, args.demonstration, rng
             )
             thrown_away.append(thrown)
             errors.append(float(np.linalg.norm(frames[-1]["position"] - goal)))
             yield frames
 
     try:
-        write_lessons(
+        write_demonstrations(
             args.out,
-            lessons(),
+            demonstrations(),
             f"place the box on the {args.shelf} shelf",
-            args.lesson.fps,
+            args.demonstration.fps,
             details={
                 "shelf": args.shelf,
                 "scene": "hrc_learn workplace",
@@ -52,7 +54,7 @@ def run(args: Args) -> int:
     except TaskFailedError as error:
         print(f"failed: {error}", file=sys.stderr)
         return 1
-    print(f"{args.episodes} demonstrations in {args.out} ({sum(thrown_away)} thrown away)")
+    print(f"{args.episodes} demonstrations in {args.out} ({sum(thrown_away)} discarded)")
     if args.json is not None:
         values = {
             "episodes": args.episodes,

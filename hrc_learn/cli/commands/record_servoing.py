@@ -1,4 +1,4 @@
-"""`hrc record servoing`: demonstrations of aiming with an uncalibrated camera."""
+"""`hrc record servoing`: demonstrations of visual servoing with an uncalibrated camera."""
 
 from collections.abc import Iterator
 
@@ -10,11 +10,13 @@ from hrc_learn.cli._values import configuration, write_json
 from hrc_learn.cli.arguments.record import RecordServoing as Args
 from hrc_learn.sim import World, open_camera
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.marker_sensor import Eye
+from hrc_learn.skills.marker_sensor import MarkerSensor
 from hrc_learn.skills.visual_target import OBJECT_FEATURE, OBJECT_FEATURE_NAMES
 from hrc_learn.teleoperation.hand_guiding import Frame
-from hrc_learn.teleoperation.paired_demonstrations import write_lessons
-from hrc_learn.teleoperation.scripted_demonstrations import teach_aiming
+from hrc_learn.teleoperation.scripted_demonstrations import (
+    demonstrate_servoing,
+    write_demonstrations,
+)
 
 
 def run(args: Args) -> None:
@@ -24,20 +26,20 @@ def run(args: Args) -> None:
     workplace = Workplace()
     world = World(workplace.scene)
     rng = np.random.default_rng(args.seed)
-    eye = Eye.on(open_camera(world, args.camera, rng=rng), workplace.scene)
+    sensor = MarkerSensor(open_camera(world, args.camera, rng=rng), workplace.scene.marker_ids)
     seen = []
 
-    def lessons() -> Iterator[list[Frame]]:
-        for _ in track(range(args.episodes), description="Aiming demonstrations"):
-            frames = teach_aiming(world, workplace, eye, args.lesson, rng)
+    def demonstrations() -> Iterator[list[Frame]]:
+        for _ in track(range(args.episodes), description="Servoing demonstrations"):
+            frames = demonstrate_servoing(world, workplace, sensor, args.demonstration, rng)
             seen.append(float(np.mean([bool(frame["feature_visible"]) for frame in frames])))
             yield frames
 
-    write_lessons(
+    write_demonstrations(
         args.out,
-        lessons(),
-        "aim at the box",
-        args.lesson.fps,
+        demonstrations(),
+        "servo to the box",
+        args.demonstration.fps,
         features={OBJECT_FEATURE: OBJECT_FEATURE_NAMES},
         details={"scene": "hrc_learn workplace", "recorded with": configuration(args)},
         overwrite=args.overwrite,

@@ -32,12 +32,12 @@ from hrc_learn.experiments.monte_carlo import Summary, Trial, repeat
 from hrc_learn.experiments.run_recording import record, serving, unwatched
 from hrc_learn.geometry import Box
 from hrc_learn.learning.tuning import with_gains
-from hrc_learn.sim import Occlusion
+from hrc_learn.sim import OcclusionInterval
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.marker_sensor import TransportConfig
+from hrc_learn.skills.marker_sensor import LatencyConfig
 from hrc_learn.skills.placing import PlacingSkill
-from hrc_learn.skills.visual_servoing import AimingSkill
-from hrc_learn.skills.work_cell import StationConfig
+from hrc_learn.skills.visual_servoing import VisualServoSkill
+from hrc_learn.skills.work_cell import WorkCellConfig
 from hrc_learn.store import new_folder, read_made_by
 from hrc_learn.teleoperation.page import PageConfig
 from hrc_learn.viz.report import Measurement, show_measurements, write_report
@@ -79,7 +79,7 @@ def run(args: Args) -> int:
         write_json(args.json, values)
     show_measurements(table)
     if repeated:
-        console.print(Summary.of(repeated).table("Collaboration"))
+        console.print(Summary.of(repeated).table("PickAndPlace"))
     if job.failure:
         print(f"failed: {job.failure}", file=sys.stderr)
     console.print(f"Recording  rerun {args.out / 'run.rrd'}")
@@ -92,7 +92,7 @@ def _trials(args: Args, placing: Path, aiming: Path) -> CollaborationTrials:
     """The job as it is to be done, once or many times."""
     controller = with_gains(args.config.grasping.controller, args.gains)
     grasping = replace(args.config.grasping, controller=controller)
-    transport = TransportConfig(latency=args.latency, dropped=args.drop)
+    transport = LatencyConfig(latency=args.latency, dropped=args.drop)
     return CollaborationTrials(
         aiming=aiming.resolve(),
         placing=placing.resolve(),
@@ -101,10 +101,10 @@ def _trials(args: Args, placing: Path, aiming: Path) -> CollaborationTrials:
         shelf_depth=args.shelf_depth,
         person=args.person,
         disturbances=Disturbances(
-            occlusions=tuple(Occlusion(start=s, duration=d) for s, d in args.occlusion),
+            occlusions=tuple(OcclusionInterval(start=s, duration=d) for s, d in args.occlusion),
             camera_change=args.camera_change if args.camera_moved else None,
         ),
-        station=StationConfig(keep_every=0, transport=transport),
+        station=WorkCellConfig(keep_every=0, transport=transport),
         config=replace(args.config, grasping=grasping),
     )
 
@@ -116,9 +116,9 @@ def _run(args: Args, trials: CollaborationTrials, console: Console) -> Simulated
         console.print(f"Dashboard at [bold]{address}[/]")
 
     # As many images whatever the number of objects: a gigabyte of memory holds 200.
-    keep_every = StationConfig().keep_every * len(trials.shelves)
+    keep_every = WorkCellConfig().keep_every * len(trials.shelves)
     return simulate_collaboration(
-        AimingSkill.load(trials.aiming),
+        VisualServoSkill.load(trials.aiming),
         PlacingSkill.load(trials.placing),
         trials.shelves,
         workplace=workplace_for(trials.shelves, args.shelf_x, args.shelf_depth),

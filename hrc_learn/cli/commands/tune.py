@@ -16,7 +16,7 @@ from hrc_learn.cli.arguments.learn import Tune as Args
 from hrc_learn.controller import ControllerConfig
 from hrc_learn.experiments.initialization_study import ClosedLoops, StartsConfig, summary
 from hrc_learn.jacobian import KalmanEstimator
-from hrc_learn.learning.tuning import TUNED, Search
+from hrc_learn.learning.tuning import TUNED, TuningState
 from hrc_learn.sim import World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.visual_servoing import guessed_network
@@ -57,13 +57,15 @@ def run(args: Args) -> None:
         write_json(args.json, figures)
 
 
-def _begin(args: Args, place: Path, default: ControllerConfig) -> tuple[Search, list[float]]:
+def _begin(
+    args: Args, place: Path, default: ControllerConfig
+) -> tuple[TuningState, list[float]]:
     """A new search, or the one that was interrupted."""
     if args.resume:
         state = json.loads(place.read_text(encoding="utf-8"))
-        return Search.from_json(state["search"]), [float(cost) for cost in state["costs"]]
+        return TuningState.from_json(state["search"]), [float(cost) for cost in state["costs"]]
     start = {name: getattr(default, name) for name in TUNED}
-    return Search.around(start, seed=args.starts.seed), []
+    return TuningState.around(start, seed=args.starts.seed), []
 
 
 def _loops(config: StartsConfig) -> ClosedLoops:

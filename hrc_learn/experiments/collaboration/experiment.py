@@ -17,25 +17,30 @@ from hrc_learn.sim import (
     ChangingCamera,
     MotionLog,
     ObjectConfig,
-    Occluder,
-    Occlusion,
+    OcclusionInterval,
+    ScriptedOcclusion,
     World,
     open_camera,
 )
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.marker_sensor import Eye
-from hrc_learn.skills.pick_and_place import INTERACT, Collaboration, CollaborationConfig, Errand
+from hrc_learn.skills.marker_sensor import MarkerSensor
+from hrc_learn.skills.pick_and_place import (
+    INTERACT,
+    PickAndPlace,
+    PickAndPlaceConfig,
+    PickPlaceJob,
+)
 from hrc_learn.skills.placing import PlacingSkill, Plan, check_plan
-from hrc_learn.skills.visual_servoing import AimingSkill
-from hrc_learn.skills.work_cell import Station, StationConfig
-from hrc_learn.teleoperation import PullSpell, ScriptedPuller
+from hrc_learn.skills.visual_servoing import VisualServoSkill
+from hrc_learn.skills.work_cell import WorkCell, WorkCellConfig
+from hrc_learn.teleoperation import ScriptedForce, ScriptedPerturbation
 from hrc_learn.teleoperation.page import PageConfig
-from hrc_learn.teleoperation.page_session import page_beside
+from hrc_learn.teleoperation.page_session import task_page
 from hrc_learn.vision import CameraModel
 
 PULLS = (
-    PullSpell(start=0.5, duration=4.5, towards=(0.40, 0.00, 0.50), strongest=60.0),
-    PullSpell(start=5.5, duration=4.5, towards=(-0.10, 0.25, 0.60), strongest=60.0),
+    ScriptedForce(start=0.5, duration=4.5, towards=(0.40, 0.00, 0.50), max_force=60.0),
+    ScriptedForce(start=5.5, duration=4.5, towards=(-0.10, 0.25, 0.60), max_force=60.0),
 )
 """A worker reaches under the arm: the elbow is drawn aside, and let back."""
 
@@ -49,7 +54,7 @@ OBJECTS_REACH = (0.12, 0.10)
 class Disturbances:
     """What happens to camera and images beside the job."""
 
-    occlusions: tuple[Occlusion, ...] = ()
+    occlusions: tuple[OcclusionInterval, ...] = ()
     """Spells in which the hand's marker is hidden."""
     camera_change: CameraChange | None = None
     """How the camera is changed between two objects; None: it stays."""
@@ -62,9 +67,9 @@ class SimulatedJob:
     workplace: Workplace
     world: World
     """As it was left."""
-    station: Station
+    cell: WorkCell
     motion: MotionLog
-    errands: tuple[Errand, ...]
+    picks: tuple[PickPlaceJob, ...]
     """What became of each object, in turn."""
     cameras: tuple[tuple[float, CameraModel], ...]
     """The true cameras, and from when on each watched [s]."""
@@ -73,27 +78,27 @@ class SimulatedJob:
     @property
     def failure(self) -> str:
         """Why objects were not delivered, as the robot sees it; empty if all were."""
-        failures = [errand.failure for errand in self.errands if errand.failure]
-        if left := len(self.workplace.scene.objects) - len(self.errands):
+        failures = [pick.failure for pick in self.picks if pick.failure]
+        if left := len(self.workplace.scene.objects) - len(self.picks):
             failures.append(f"{left} objects were not begun with")
         return "; ".join(failures)
 
 
 def simulate_collaboration(
-    aiming: AimingSkill,
+    aiming: VisualServoSkill,
     placing: PlacingSkill,
     shelves: Sequence[str],
     *,
     workplace: Workplace | None = None,
     camera: CameraKind = "auto",
-    pulls: Sequence[PullSpell] = PULLS,
+    pulls: Sequence[ScriptedForce] = PULLS,
     disturbances: Disturbances | None = None,
-    config: CollaborationConfig | None = None,
-    station_config: StationConfig | None = None,
+    config: PickAndPlaceConfig | None = None,
+    cell_config: WorkCellConfig | None = None,
     seed: int = 0,
     page: PageConfig | None = None,
     watch: Watch = unwatched,
-    on_start: Callable[[World, Station], None] = lambda world, station: None,
+    on_start: Callable[[World, WorkCell], None] = lambda world, cell: None,
     on_phase: Callable[[str, float], None] = lambda phase, time: None,
     on_page: Callable[[str], None] = lambda address: None,
 ) -> SimulatedJob:
@@ -108,12 +113,12 @@ def simulate_collaboration(
         pulls: At the body, in time since the robot gives the person time.
         disturbances: What happens to camera and images meanwhile.
         config: How the job is done.
-        station_config: How the loop runs; images may be late or lost.
+        cell_config: How the loop runs; images may be late or lost.
         seed: Of where the objects lie, and of image noise.
         page: Serve a page from which people pull at the body too, and let the world go on in
             real time; None: no page.
         watch: Watches from the side, such as `serving` a dashboard.
-        on_start: Shown world and station before the job begins.
+        on_start: Shown world and work cell before the job begins.
         on_phase: Told the name of each phase of the task, and when it begins [s].
         on_page: Told the address of the page.
 
@@ -124,13 +129,13 @@ def simulate_collaboration(
     workplace = (workplace or Workplace()).approached(aiming.approach)
     rng = np.random.default_rng(seed)
     disturbances = disturbances or Disturbances()
-    station_config = station_config or StationConfig()
+    cell_config = cell_config or WorkCellConfig()
     items = workplace.scene.objects
     _check_shelves(workplace, shelves)
     world = World(workplace.scene)
     world.reset(workplace.home_joints().numpy(), _places(workplace, rng))
-    person, motion = ScriptedPuller(panda, pulls, begin=None), MotionLog(world)
-    occluder = Occluder(world, disturbances.occlusions)
+    person, motion = ScriptedPerturbation(panda, pulls, begin=None), MotionLog(world)
+    occluder = ScriptedOcclusion(world, disturbances.occlusions)
     eyes = ChangingCamera(
         workplace.scene.camera, lambda model: open_camera(world, camera, model, rng=rng)
     )
@@ -157,32 +162,32 @@ def simulate_collaboration(
     with torch.inference_mode(), ExitStack() as stack:
         human, passing, beside = person, advance, None
         if page is not None:
-            opened = page_beside(world, station_config.dt, page, on_page)
+            opened = task_page(world, cell_config.dt, page, on_page)
             beside = stack.enter_context(opened)
             human, passing = beside.joined(person, advance)
-        station = Station(
+        cell = WorkCell(
             chain=panda,
             arm=world.arm,
             gripper=world.arm,
-            eye=Eye.on(eyes, workplace.scene),
+            sensor=MarkerSensor(eyes, workplace.scene.marker_ids),
             human=human,
             advance=passing,
-            config=station_config,
+            config=cell_config,
             on_phase=enter,
             rng=rng,
         )
         if beside is not None:
-            beside.follow(station)
-        stack.enter_context(watch(station, world, motion))
-        on_start(world, station)
-        task = Collaboration(station, workplace, aiming, placing, check, config)
-        errands = task.run(list(zip(items, shelves, strict=True)), before)
+            beside.follow(cell)
+        stack.enter_context(watch(cell, world, motion))
+        on_start(world, cell)
+        task = PickAndPlace(cell, workplace, aiming, placing, check, config)
+        picks = task.run(list(zip(items, shelves, strict=True)), before)
     return SimulatedJob(
         workplace=workplace,
         world=world,
-        station=station,
+        cell=cell,
         motion=motion,
-        errands=tuple(errands),
+        picks=tuple(picks),
         cameras=tuple(eyes.history),
         disturbances=disturbances,
     )

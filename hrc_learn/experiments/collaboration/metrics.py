@@ -20,10 +20,10 @@ from hrc_learn.experiments.run_recording import Deviation, spans
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import Touch
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.pick_and_place import RELEASE, CollaborationConfig, Errand
+from hrc_learn.skills.pick_and_place import RELEASE, PickAndPlaceConfig, PickPlaceJob
 from hrc_learn.skills.placing import PlacingSkill
-from hrc_learn.skills.visual_servoing import AimingSkill
-from hrc_learn.skills.work_cell import Station, StationConfig
+from hrc_learn.skills.visual_servoing import VisualServoSkill
+from hrc_learn.skills.work_cell import WorkCell, WorkCellConfig
 from hrc_learn.viz.report import Measurement
 
 # What a run of the collaboration has to reach, measured.
@@ -41,25 +41,25 @@ def evaluate(job: SimulatedJob, fit: Mapping[str, float]) -> list[Measurement]:
     Raises:
         ValueError: If no object was released on a shelf; there is nothing to measure then.
     """
-    released = [errand for errand in job.errands if errand.release is not None]
+    released = [pick for pick in job.picks if pick.release is not None]
     if not released:
         raise ValueError(f"the job failed, so there is nothing to measure: {job.failure}")
     objects = len(job.workplace.scene.objects)
-    distance, angle = np.max([errand.goal_error for errand in released], axis=0)
+    distance, angle = np.max([pick.goal_error for pick in released], axis=0)
     at_most = [
         ("reproduction of the demonstrations, NRMSE", fit["joint_nrmse_median"], "", 1e-3),
-        ("time to aim", max(errand.aim_time for errand in released), "s", None),
+        ("time to aim", max(pick.servo_time for pick in released), "s", None),
         (
             "pixel error when the hand goes down",
-            max(errand.pixel_error for errand in released),
+            max(pick.pixel_error for pick in released),
             "px",
             5.0,
         ),
         ("goal error at the shelf", 1e3 * distance, "mm", 2.0),
         ("goal error at the shelf, angle", _degrees(angle), "deg", 0.5),
-        ("joint limit violations", limit_violations(job.station), "steps", 0),
+        ("joint limit violations", limit_violations(job.cell), "steps", 0),
         *((f"collisions {what}", n, "", 0) for what, n in collisions(job).items()),
-        ("time of the whole job", job.station.time, "s", None),
+        ("time of the whole job", job.cell.time, "s", None),
     ]
     at_most += [
         (f"recovered from: {mishap}", times, "", None)
@@ -67,8 +67,8 @@ def evaluate(job: SimulatedJob, fit: Mapping[str, float]) -> list[Measurement]:
     ]
     stand = float(len(standing(job)))
     at_least = [("objects that stand on their shelf", stand, "", float(objects))]
-    if bool((job.station.log["human_effort"] != 0).any()):
-        deviation = Deviation.of(job.station.log)
+    if bool((job.cell.log["human_effort"] != 0).any()):
+        deviation = Deviation.of(job.cell.log)
         moved, turned = 1e3 * deviation.most_moved, _degrees(deviation.most_turned)
         at_most.append(("end effector moved by the person", moved, "mm", 1.0))
         at_most.append(("end effector turned by the person", turned, "deg", 0.2))
@@ -97,12 +97,10 @@ _CLAIMS = {
 """What the paper says, by name of the measurement."""
 
 
-def standing(job: SimulatedJob) -> list[Errand]:
+def standing(job: SimulatedJob) -> list[PickPlaceJob]:
     """Errands whose object stands on its shelf, touching nothing of the arm."""
     return [
-        errand
-        for errand in job.errands
-        if job.world.rests_on(errand.item.name, f"board_{errand.shelf}")
+        pick for pick in job.picks if job.world.rests_on(pick.item.name, f"board_{pick.shelf}")
     ]
 
 
@@ -118,13 +116,13 @@ def collisions(job: SimulatedJob) -> dict[str, int]:
 
 def recoveries(job: SimulatedJob) -> Counter[str]:
     """How often the task recovered from each kind of mishap."""
-    return Counter(note.mishap for errand in job.errands for note in errand.recoveries)
+    return Counter(note.mishap for pick in job.picks for note in pick.recoveries)
 
 
-def limit_violations(station: Station) -> int:
+def limit_violations(cell: WorkCell) -> int:
     """Steps in which a joint was measured outside its range of position or velocity."""
-    q = torch.from_numpy(station.log["joint_position"])
-    v = torch.from_numpy(station.log["joint_velocity"])
+    q = torch.from_numpy(cell.log["joint_position"])
+    v = torch.from_numpy(cell.log["joint_velocity"])
     limits = panda.limits
     outside = (q < limits.lower) | (q > limits.upper) | (v.abs() > limits.velocity)
     return int(outside.any(dim=-1).sum())
@@ -132,8 +130,8 @@ def limit_violations(station: Station) -> int:
 
 def _carried_touches(job: SimulatedJob) -> list[Touch]:
     """Touches of the cabinet by an object that had not been let go yet."""
-    released = [errand.item.name for errand in job.errands if errand.release is not None]
-    let_go = dict(zip(released, spans(job.station.log, RELEASE), strict=True))
+    released = [pick.item.name for pick in job.picks if pick.release is not None]
+    let_go = dict(zip(released, spans(job.cell.log, RELEASE), strict=True))
     return [
         touch
         for touch in job.world.object_contacts.touches
@@ -165,8 +163,8 @@ class CollaborationTrials:
     person: bool = True
     """Whether the scripted person pulls the elbow."""
     disturbances: Disturbances = field(default_factory=Disturbances)
-    station: StationConfig = field(default_factory=lambda: StationConfig(keep_every=0))
-    config: CollaborationConfig = field(default_factory=CollaborationConfig)
+    cell: WorkCellConfig = field(default_factory=lambda: WorkCellConfig(keep_image_every=0))
+    config: PickAndPlaceConfig = field(default_factory=PickAndPlaceConfig)
 
     def workplace(self) -> Workplace:
         """With as many objects as there are shelves named.
@@ -178,7 +176,7 @@ class CollaborationTrials:
 
     def __call__(self, seed: int) -> dict[str, float | str]:
         job = simulate_collaboration(
-            AimingSkill.load(self.aiming),
+            VisualServoSkill.load(self.aiming),
             PlacingSkill.load(self.placing),
             self.shelves,
             workplace=self.workplace(),
@@ -186,7 +184,7 @@ class CollaborationTrials:
             pulls=PULLS if self.person else (),
             disturbances=self.disturbances,
             config=self.config,
-            station_config=self.station,
+            cell_config=self.cell,
             seed=seed,
         )
         values: dict[str, float | str] = {**measured(job)}
@@ -212,21 +210,21 @@ def workplace_for(shelves: Sequence[str], shelf_x: float, shelf_depth: float) ->
 
 def measured(job: SimulatedJob) -> dict[str, float]:
     """Figures of a run, successful or not."""
-    deviation = Deviation.of(job.station.log)
-    released = [errand for errand in job.errands if errand.release is not None]
+    deviation = Deviation.of(job.cell.log)
+    released = [pick for pick in job.picks if pick.release is not None]
     values = {
         "standing": float(len(standing(job))),
-        "time_s": job.station.time,
-        "limit_violations": float(limit_violations(job.station)),
+        "time_s": job.cell.time,
+        "limit_violations": float(limit_violations(job.cell)),
         "collisions": float(sum(collisions(job).values())),
         "moved_by_person_mm": 1e3 * deviation.most_moved,
         "elbow_moved_mm": 1e3 * deviation.elbow_most_moved,
     }
     if released:
         values |= {
-            "aim_time_s": max(errand.aim_time for errand in released),
-            "pixel_error_px": max(errand.pixel_error for errand in released),
-            "goal_error_mm": 1e3 * max(errand.goal_error[0] for errand in released),
+            "aim_time_s": max(pick.servo_time for pick in released),
+            "pixel_error_px": max(pick.pixel_error for pick in released),
+            "goal_error_mm": 1e3 * max(pick.goal_error[0] for pick in released),
         }
     return values | {
         f"recovered_{mishap.replace(' ', '_')}": float(times)
@@ -237,11 +235,11 @@ def measured(job: SimulatedJob) -> dict[str, float]:
 def verdict(job: SimulatedJob) -> str:
     """Why a run does not count as a success; empty if it does."""
     reasons = [job.failure] if job.failure else []
-    stand = [errand.item.name for errand in standing(job)]
+    stand = [pick.item.name for pick in standing(job)]
     fallen = [item.name for item in job.workplace.scene.objects if item.name not in stand]
     if fallen:
         reasons.append(f"not on their shelf: {', '.join(fallen)}")
     reasons += [f"{n} collisions {what}" for what, n in collisions(job).items() if n]
-    if violations := limit_violations(job.station):
+    if violations := limit_violations(job.cell):
         reasons.append(f"joint limits left in {violations} steps")
     return "; ".join(reasons)

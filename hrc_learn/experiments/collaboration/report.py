@@ -26,7 +26,7 @@ def collaboration_report(
         command: That repeats it.
         trials: The same job with other seeds.
     """
-    objects = {errand.item.name: errand.span for errand in job.errands}
+    objects = {pick.item.name: pick.span for pick in job.picks}
     sections = [
         _overview(run, job, objects),
         _grasping(run, objects),
@@ -57,9 +57,9 @@ def _overview(
     from hrc_learn.experiments.collaboration import figures
 
     notes = [
-        f"{note.time:.1f} s, {errand.item.name}: {note.mishap}: {note.what}."
-        for errand in job.errands
-        for note in errand.recoveries
+        f"{note.time:.1f} s, {pick.item.name}: {note.mishap}: {note.what}."
+        for pick in job.picks
+        for note in pick.recoveries
     ]
     return Section(
         heading="The job",

@@ -32,7 +32,7 @@ from hrc_learn.kinematics import panda
 from hrc_learn.sim import CameraKind
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.grasping import GraspingConfig
-from hrc_learn.skills.visual_servoing import AimingSkill, from_learned, guessed_network
+from hrc_learn.skills.visual_servoing import VisualServoSkill, from_learned, guessed_network
 
 # Image Jacobians that a grasp can start from, learned or guessed, and laws to adapt them.
 
@@ -81,7 +81,7 @@ VARIANTS: Mapping[str, GraspingVariant] = {
 
 # A grasp as one trial of many, each with a setting of its own.
 
-_PATIENCE = 20.0  # with a variant that is only compared [s]
+_TIMEOUT = 20.0  # with a variant that is only compared [s]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,8 +110,8 @@ class GraspingTrials:
 
         It is told the pixel to aim at, goes straight there, and tries but once.
         """
-        aiming = replace(self.config.aiming, probe=0.0, patience=_PATIENCE)
-        config = replace(self.config, aiming=aiming, attempts=1)
+        servo = replace(self.config.servo, probe=0.0, timeout=_TIMEOUT)
+        config = replace(self.config, servo=servo, attempts=1)
         return self._grasp(seed, variant, told_target=True, config=config)
 
     def _grasp(
@@ -123,7 +123,7 @@ class GraspingTrials:
         config: GraspingConfig,
         watch: Watch = unwatched,
     ) -> SimulatedGrasp:
-        skill, rng = AimingSkill.load(self.aiming), np.random.default_rng(seed)
+        skill, rng = VisualServoSkill.load(self.aiming), np.random.default_rng(seed)
         setting = GraspingSetting.draw(Workplace(), self.setting, rng, self.camera)
         return simulate_grasp(
             skill,
@@ -193,7 +193,7 @@ class GraspingExperiment:
 
         Infinite if it never was.
         """
-        log = self.compared[variant].station.log
+        log = self.compared[variant].cell.log
         led = np.flatnonzero(log["vision_activation"] > 0)
         if not len(led):
             return math.inf
@@ -207,7 +207,7 @@ class GraspingExperiment:
 
     def jacobian_error(self) -> tuple[float, float]:
         """Of the linear part, relative, as the camera takes over and as the hand goes down."""
-        world, log = self.grasp.world, self.grasp.station.log
+        world, log = self.grasp.world, self.grasp.cell.log
         rows = np.flatnonzero(log["vision_activation"] > 0)
         if not len(rows):
             return math.nan, math.nan

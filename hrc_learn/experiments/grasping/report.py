@@ -14,7 +14,7 @@ from hrc_learn.experiments.monte_carlo import Summary, Trial
 from hrc_learn.experiments.run_recording import record
 from hrc_learn.geometry import Box
 from hrc_learn.kinematics import panda
-from hrc_learn.skills.visual_servoing import AimingConfig
+from hrc_learn.skills.visual_servoing import VisualServoConfig
 from hrc_learn.viz import RunRecording, figures
 from hrc_learn.viz.report import Measurement, Picture, Report, Section, software_versions
 
@@ -35,9 +35,9 @@ class RegionActivity:
     """Of each region."""
 
     @classmethod
-    def of(cls, run: SimulatedGrasp, config: AimingConfig) -> "RegionActivity":
+    def of(cls, run: SimulatedGrasp, config: VisualServoConfig) -> "RegionActivity":
         """From what was logged."""
-        log, above = run.station.log, run.setting.workplace.hover()
+        log, above = run.cell.log, run.setting.workplace.hover()
         aimed = np.isfinite(log["target"]).all(axis=1)
         seen = aimed & np.isfinite(log["feature"]).all(axis=1)
         hand = panda.forward(torch.from_numpy(log["joint_position"]))
@@ -61,7 +61,7 @@ class RegionActivity:
         )
 
 
-def record_grasp(run: SimulatedGrasp, config: AimingConfig, title: str) -> RunRecording:
+def record_grasp(run: SimulatedGrasp, config: VisualServoConfig, title: str) -> RunRecording:
     """Everything worth looking at in a grasp.
 
     Args:
@@ -71,7 +71,7 @@ def record_grasp(run: SimulatedGrasp, config: AimingConfig, title: str) -> RunRe
     """
     hover = run.setting.workplace.hover().position.tolist()
     region = Box(centre=(hover[0], hover[1], hover[2]), half_size=config.half_size)
-    recording = record(title, run.station, run.world, run.motion, region=region)
+    recording = record(title, run.cell, run.world, run.motion, region=region)
     activity = RegionActivity.of(run, config)
     shares = {
         "share of the joint-space approach": activity.approach,
@@ -102,7 +102,7 @@ def grasping_report(
         configuration: Of the run.
         command: That repeats it.
     """
-    aiming = experiment.trials.config.aiming
+    aiming = experiment.trials.config.servo
     runs = {
         VARIANTS[name].says: record_grasp(run, aiming, name)
         for name, run in experiment.compared.items()

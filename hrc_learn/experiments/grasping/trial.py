@@ -18,11 +18,11 @@ from hrc_learn.sim import CameraKind, MotionLog, ObjectConfig, World, open_camer
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.cartesian_motion import joint_line
 from hrc_learn.skills.grasping import Grasping, GraspingConfig, GraspResult
-from hrc_learn.skills.marker_sensor import Eye
+from hrc_learn.skills.marker_sensor import MarkerSensor
 from hrc_learn.skills.placing import Plan, check_plan
-from hrc_learn.skills.visual_servoing import AimingSkill
-from hrc_learn.skills.work_cell import Station, TaskFailedError
-from hrc_learn.teleoperation import ScriptedPuller
+from hrc_learn.skills.visual_servoing import VisualServoSkill
+from hrc_learn.skills.work_cell import TaskFailedError, WorkCell
+from hrc_learn.teleoperation import ScriptedPerturbation
 from hrc_learn.vision import CameraModel
 
 # Where a grasp begins: a camera nobody calibrated, an arm far off, an object at random.
@@ -102,10 +102,10 @@ class GraspingSetting:
         )
         item = scene.objects[0]
         world = World(workplace.scene)
-        eye = Eye.on(open_camera(world, camera, rng=rng), workplace.scene)
+        sensor = MarkerSensor(open_camera(world, camera, rng=rng), workplace.scene.marker_ids)
         for start in _starts(workplace, config, rng):
             world.reset(start, {item.name: pose})
-            if item.marker.id in eye.look() and _has_a_way(world, workplace, start):
+            if item.marker.id in sensor.detect() and _has_a_way(world, workplace, start):
                 return cls(workplace=workplace, start=start, object_pose=pose)
         raise AssertionError("starts never end")
 
@@ -169,7 +169,7 @@ class SimulatedGrasp:
     setting: GraspingSetting
     world: World
     """As it was left."""
-    station: Station
+    cell: WorkCell
     motion: MotionLog
     item: ObjectConfig
     result: GraspResult | None
@@ -179,7 +179,7 @@ class SimulatedGrasp:
 
 
 def simulate_grasp(
-    aiming: AimingSkill,
+    aiming: VisualServoSkill,
     setting: GraspingSetting,
     *,
     estimator: ImageJacobianEstimator | None = None,
@@ -214,18 +214,20 @@ def simulate_grasp(
 
     result, failure = None, ""
     with torch.inference_mode():
-        station = Station(
+        cell = WorkCell(
             chain=panda,
             arm=world.arm,
             gripper=world.arm,
-            eye=Eye.on(open_camera(world, camera, rng=rng), workplace.scene),
-            human=ScriptedPuller(panda, (), begin=None),
+            sensor=MarkerSensor(
+                open_camera(world, camera, rng=rng), workplace.scene.marker_ids
+            ),
+            human=ScriptedPerturbation(panda, (), begin=None),
             advance=motion.advance,
             on_phase=on_phase,
         )
         target = setting.true_target(world)
         task = Grasping(
-            station,
+            cell,
             workplace,
             aiming,
             config,
@@ -234,7 +236,7 @@ def simulate_grasp(
             check=check,
         )
         try:
-            with watch(station, world, motion):
+            with watch(cell, world, motion):
                 result = task.grasp(item)
                 task.go_home()
         except TaskFailedError as error:
@@ -242,7 +244,7 @@ def simulate_grasp(
     return SimulatedGrasp(
         setting=setting,
         world=world,
-        station=station,
+        cell=cell,
         motion=motion,
         item=item,
         result=result,
@@ -293,7 +295,7 @@ class GraspOutcome:
     @classmethod
     def of(cls, run: SimulatedGrasp) -> "GraspOutcome":
         """Measure."""
-        world, log, result = run.world, run.station.log, run.result
+        world, log, result = run.world, run.cell.log, run.result
         touches = [
             touch
             for monitor in (world.table_contacts, world.cabinet_contacts, world.self_contacts)
@@ -301,7 +303,7 @@ class GraspOutcome:
         ]
         held = world.holds(run.item.name)
         height = float(world.object_pose(run.item.name)[2, 3] - run.setting.object_pose[2, 3])
-        violations = limit_violations(run.station) if len(log) else 0
+        violations = limit_violations(run.cell) if len(log) else 0
         failure = run.failure
         if not failure and not (held and height > LIFTED):
             failure = f"the object is not held {1e3 * LIFTED:.0f} mm above the table"
@@ -315,8 +317,8 @@ class GraspOutcome:
             violations=violations,
             touches=len(touches),
             attempts=0 if result is None else result.attempts,
-            duration=run.station.time,
-            aim_time=math.nan if result is None else result.aim_time,
+            duration=run.cell.time,
+            aim_time=math.nan if result is None else result.servo_time,
             pixel_error=math.nan if result is None else result.pixel_error,
             failure=failure,
             **_at_descent(run),
@@ -329,12 +331,12 @@ class GraspOutcome:
 
 def _at_descent(run: SimulatedGrasp) -> dict[str, float]:
     """What the last descent began with."""
-    log = run.station.log
+    log = run.cell.log
     descents = [event.time for event in log.events if event.text == "grasp"]
     unknown = ("vision_time", "target_error", "place_error", "angle_error")
     if not descents:
         return dict.fromkeys(unknown, math.nan)
-    aiming = span(log, "aim")
+    aiming = span(log, "servo")
     time = log["time"]
     last = int(np.searchsorted(time, descents[-1])) - 1
     hand = panda.forward(torch.from_numpy(log["joint_position"][last]))

@@ -25,7 +25,10 @@ from hrc_learn.sim import Touch, World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.placing import PlacingSkill, Plan, PlanningSpace, check_plan
 from hrc_learn.skills.work_cell import BlockedPathError, TaskFailedError
-from hrc_learn.teleoperation.scripted_demonstrations import PlacingLesson, teach_placing
+from hrc_learn.teleoperation.scripted_demonstrations import (
+    PlacingDemonstrationConfig,
+    demonstrate_placing,
+)
 
 # What it is worth that the expert shows the body's shape along with the hand's motion.
 
@@ -63,9 +66,9 @@ def demonstrate(
         shape_body: Whether the elbow is pulled.
         seed: Of the hand's unsteadiness and of where it starts.
     """
-    lesson = PlacingLesson(shape_body=shape_body)
+    config = PlacingDemonstrationConfig(pull_elbow=shape_body)
     rng = np.random.default_rng(seed)
-    frames, touches = teach_placing(world, workplace, shelf, lesson, rng)
+    frames, touches = demonstrate_placing(world, workplace, shelf, config, rng)
     goal = workplace.shelf(shelf).position.numpy()
     return ShownWay(
         time=np.array([frame["time"] for frame in frames]),

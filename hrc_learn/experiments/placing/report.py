@@ -28,7 +28,7 @@ from hrc_learn.viz.report import Measurement, Picture, Report, Section, software
 
 def record_placing(run: PlacingRun, experiment: PlacingExperiment) -> viz.RunRecording:
     """Everything worth looking at in a run, beside the demonstration."""
-    log, demonstration = run.station.log, experiment.demonstration
+    log, demonstration = run.cell.log, experiment.demonstration
     joints, safety = log["joint_position"], log["safety"]
     shown = np.full_like(joints, np.nan)
     shown[run.transfer] = shown_joints(demonstration, run.time / run.time[-1])
@@ -41,7 +41,7 @@ def record_placing(run: PlacingRun, experiment: PlacingExperiment) -> viz.RunRec
         demo_joint_position=shown,
         position=panda.forward(torch.from_numpy(joints)).position.numpy(),
         demo_path=hand_path(demonstration),
-        plan_path=run.plan.hand.position.numpy(),
+        plan_path=run.plan.tool_pose.position.numpy(),
         bodies=run.motion.bodies(),
         boxes=tuple(experiment.workplace.scene.boxes()),
         safety={name: safety[:, i] for i, name in enumerate(SAFETY_COLUMNS)},

@@ -12,13 +12,13 @@ from hrc_learn.experiments.collaboration.metrics import limit_violations
 from hrc_learn.experiments.run_recording import Watch, unwatched
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import panda
-from hrc_learn.learning.reproduction_error import dimensionless_jerk
+from hrc_learn.learning.reproduction_metrics import dimensionless_jerk
 from hrc_learn.sim import MotionLog, Touch, World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.grasping import OPEN
 from hrc_learn.skills.placing import PlacingSkill, Plan, PlanningSpace
-from hrc_learn.skills.work_cell import Station
-from hrc_learn.teleoperation import ScriptedPuller
+from hrc_learn.skills.work_cell import WorkCell
+from hrc_learn.teleoperation import ScriptedPerturbation
 
 # One thing placed on a shelf in MuJoCo, from a start of one's own, and what came of it.
 #
@@ -41,7 +41,7 @@ class PlacingRun:
     shelf: str
     space: PlanningSpace
     plan: Plan
-    station: Station
+    cell: WorkCell
     motion: MotionLog
     released: Pose
     """True pose of the hand when it let go."""
@@ -58,12 +58,12 @@ class PlacingRun:
     @property
     def joint_position(self) -> Float[np.ndarray, "steps 7"]:
         """Measured on the way to the shelf [rad]."""
-        return self.station.log["joint_position"][self.transfer]
+        return self.cell.log["joint_position"][self.transfer]
 
     @property
     def time(self) -> Float[np.ndarray, " steps"]:
         """From the start of the motion [s]."""
-        time = self.station.log["time"][self.transfer]
+        time = self.cell.log["time"][self.transfer]
         return time - time[0]
 
     @property
@@ -103,29 +103,29 @@ def place(
     world = world or World(workplace.scene)
     world.hold(item.name, start.numpy())
     motion = MotionLog(world)
-    station = Station(
+    cell = WorkCell(
         chain=panda,
         arm=world.arm,
         gripper=world.arm,
-        human=ScriptedPuller(panda, ()),
+        human=ScriptedPerturbation(panda, ()),
         advance=motion.advance,
     )
-    with torch.inference_mode(), watch(station, world, motion):
-        plan = skill.plan(station.joints, goal, space=space, dt=station.config.dt, speed=speed)
-        station.enter(TRANSFER)
-        station.play(plan.path)
-        station.stay(_SETTLE)
-        station.enter(RELEASE)
+    with torch.inference_mode(), watch(cell, world, motion):
+        plan = skill.plan(cell.joints, goal, space=space, dt=cell.config.dt, speed=speed)
+        cell.begin_phase(TRANSFER)
+        cell.follow_path(plan.path)
+        cell.hold_pose(_SETTLE)
+        cell.begin_phase(RELEASE)
         released, release_time = _tool(world), world.time
         world.arm.move(OPEN)
-        station.stay(_LET_GO)
-        station.enter(RETREAT)
-        station.move_straight(_back(released), speed=_RETREAT_SPEED)
+        cell.hold_pose(_LET_GO)
+        cell.begin_phase(RETREAT)
+        cell.move_straight(_back(released), speed=_RETREAT_SPEED)
     return PlacingRun(
         shelf=shelf,
         space=space,
         plan=plan,
-        station=station,
+        cell=cell,
         motion=motion,
         released=released,
         touches=_unwanted(world, release_time),
@@ -269,14 +269,14 @@ def placing_figures(
 ) -> PlacingFigures:
     """Measure a run against a demonstration of any shelf."""
     miss = run.released.twist_to(run.plan.goal)
-    speed = np.abs(run.station.log["joint_velocity"]) / panda.limits.velocity.numpy()
+    speed = np.abs(run.cell.log["joint_velocity"]) / panda.limits.velocity.numpy()
     return PlacingFigures(
         bend=way_in(run.path, run.plan.goal, workplace).bend(
             demonstrated_way_in(demonstration, workplace)
         ),
         goal_distance=float(miss[:3].norm()),
         goal_angle=float(miss[3:].norm()),
-        violations=limit_violations(run.station),
+        violations=limit_violations(run.cell),
         touches=[str(touch) for touch in run.touches],
         peak_speed=float(speed.max()),
         jerk=jerk_left(run, demonstration),

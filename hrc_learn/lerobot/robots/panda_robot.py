@@ -10,7 +10,7 @@ from jaxtyping import Float
 from lerobot.robots import Robot, RobotConfig
 
 from hrc_learn.geometry import Pose
-from hrc_learn.lerobot.panda_device import CONNECTED, Device
+from hrc_learn.lerobot.panda_device import Device, robot_registry
 from hrc_learn.lerobot.panda_features import (
     DOWN,
     GRIPPER,
@@ -65,11 +65,11 @@ class PandaRobot(Device, Robot):
 
     def connect(self, calibrate: bool = True) -> None:
         super().connect(calibrate)
-        CONNECTED.append(self)
+        robot_registry().add(self)
 
     def disconnect(self) -> None:
         self._need_connection()
-        CONNECTED.remove(self)
+        robot_registry().remove(self)
         super().disconnect()
 
     def get_observation(self) -> dict[str, Any]:

@@ -28,4 +28,4 @@ class PandaExpert(PandaTeleoperator):
             raise ValueError(
                 f"panda_expert knows the scenarios of a mujoco_panda only, not of {robot.name}."
             )
-        return self._lead(robot, lambda: robot.run.expert).next()[0]
+        return self._guided_robot(robot, lambda: robot.run.expert).next()[0]

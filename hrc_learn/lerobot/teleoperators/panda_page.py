@@ -59,7 +59,7 @@ class PandaPage(PandaTeleoperator):
     def get_action(self) -> dict[str, float]:
         self._need_connection()
         robot = self._find()
-        action, asked = self._lead(robot, lambda: self.page.human).next()
+        action, asked = self._guided_robot(robot, lambda: self.page.human).next()
         self._show(robot)
         if "home" in asked.requests and isinstance(robot, MujocoPanda):
             robot.begin(robot.run.seed + 1)

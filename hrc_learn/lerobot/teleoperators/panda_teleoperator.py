@@ -1,4 +1,4 @@
-"""Leading an arm by the hand, handed on as positions."""
+"""Hand guiding of an arm, passed on as positions."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from lerobot.teleoperators import Teleoperator, TeleoperatorConfig
 from lerobot.utils.errors import DeviceNotConnectedError
 
 from hrc_learn.kinematics import panda
-from hrc_learn.lerobot.panda_device import Device, connected_robot
+from hrc_learn.lerobot.panda_device import Device, robot_registry
 from hrc_learn.lerobot.panda_features import DOWN, JOINTS, ActionSpace, action_names, action_of
 from hrc_learn.lerobot.robots.panda_robot import PandaRobot
 from hrc_learn.protocols import ArmState, Human, HumanInput
 
 
-class Lead:
+class GuidedRobot:
     """Turns what a person asks for into positions that an arm is sent to, one after another.
 
     Attributes:
@@ -32,11 +32,11 @@ class Lead:
             robot: That is led.
             human: Who leads it.
         """
-        from hrc_learn.teleoperation.hand_guiding import LedArm, LedArmConfig
+        from hrc_learn.teleoperation.hand_guiding import HandGuidedArm, HandGuidingConfig
 
         self.robot, self.beginning = robot, robot.beginnings
         self._velocity = np.zeros(len(JOINTS))
-        self._led = LedArm(panda, self, human, LedArmConfig(dt=robot.dt))
+        self._guided = HandGuidedArm(panda, self, human, HandGuidingConfig(dt=robot.dt))
         state = robot.read_state()
         self._joints, self._width = state.joint_position.copy(), state.gripper_width
         self._rotation = DOWN
@@ -52,17 +52,17 @@ class Lead:
     def next(self) -> tuple[dict[str, float], HumanInput]:
         """The action that comes next, and what was asked for."""
         with torch.inference_mode():
-            instant = self._led.step()
-        here = instant.state.joint_position
+            step = self._guided.step()
+        here = step.state.joint_position
         # A blocked arm is not to be wound up.
         self._joints = here + np.clip(self._joints - here, -_SLACK, _SLACK)
         self._joints = self._joints + self._velocity * self.robot.dt
-        if instant.asked.gripper is not None:
-            self._width = instant.asked.gripper
+        if step.human_input.gripper is not None:
+            self._width = step.human_input.gripper
         action = action_of(self.robot.space, self._joints, self._width, self._rotation)
         if self.robot.space == "ee":
             self._rotation = np.array(list(action.values())[3:6])
-        return action, instant.asked
+        return action, step.human_input
 
 
 _SLACK = 0.05
@@ -75,7 +75,7 @@ class PandaTeleoperator(Device, Teleoperator):
     def __init__(self, config: TeleoperatorConfig, robot_id: str | None):
         super().__init__(config)
         self._robot_id = robot_id
-        self._led: Lead | None = None
+        self._guided: GuidedRobot | None = None
 
     @property
     def action_features(self) -> dict[str, type]:
@@ -96,18 +96,18 @@ class PandaTeleoperator(Device, Teleoperator):
         """Nothing is felt."""
 
     def _open(self) -> None:
-        """Nothing is held beside what is led."""
+        """Nothing is held beside what is guided."""
 
     def _close(self) -> None:
-        self._led = None
+        self._guided = None
 
-    def _lead(self, robot: PandaRobot, human: Callable[[], Human]) -> Lead:
-        """The lead of a robot, anew whenever everything has been put in place."""
-        led = self._led
-        if led is None or led.robot is not robot or led.beginning != robot.beginnings:
-            led = self._led = Lead(robot, human())
-        return led
+    def _guided_robot(self, robot: PandaRobot, human: Callable[[], Human]) -> GuidedRobot:
+        """The guided robot, anew whenever everything has been put in place."""
+        guided = self._guided
+        if guided is None or guided.robot is not robot or guided.beginning != robot.beginnings:
+            guided = self._guided = GuidedRobot(robot, human())
+        return guided
 
     def _find(self) -> PandaRobot:
-        """The robot that is led, which is connected after its teleoperator."""
-        return connected_robot(self._robot_id)
+        """The robot that is guided, which is connected after its teleoperator."""
+        return robot_registry().find(self._robot_id)

@@ -1,4 +1,4 @@
-"""Devices that lead the end effector, as stand-ins for a haptic one."""
+"""Devices that move the end effector, as stand-ins for a haptic one."""
 
 from hrc_learn.teleoperation.devices.gamepad import Gamepad as Gamepad
 from hrc_learn.teleoperation.devices.gamepad import GamepadConfig as GamepadConfig

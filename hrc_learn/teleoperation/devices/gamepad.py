@@ -1,4 +1,4 @@
-"""A gamepad as a stand-in for a haptic device: the sticks lead the hand."""
+"""A gamepad as a stand-in for a haptic device: the sticks move the end effector."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from hrc_learn.kinematics import SerialChain, coarse_orientation
 from hrc_learn.protocols import ArmState, HumanInput, Request
-from hrc_learn.teleoperation.interaction_force import DragConfig, hand_twist
+from hrc_learn.teleoperation.interaction_force import InteractionForceConfig, guiding_twist
 
 # SDL's layout of a game controller, the same for every make (CONTROLLER_AXIS_*, _BUTTON_*).
 _LEFT_X, _LEFT_Y, _RIGHT_Y = 0, 1, 3
@@ -41,11 +41,11 @@ class GamepadConfig:
     """How sticks act."""
 
     dead_zone: float = 0.12
-    """Share of its way that a stick goes without effect: worn sticks do not come back to 0."""
+    """Fraction of its range in which a stick has no effect: worn sticks do not return to 0."""
     curve: float = 2.0
     """Power of the deflection: above 1 it is finer near the middle."""
-    drag: DragConfig = field(default_factory=DragConfig)
-    """Fastest motion of the hand, and how it turns."""
+    forces: InteractionForceConfig = field(default_factory=InteractionForceConfig)
+    """Fastest motion of the end effector, and how it turns."""
     opening: float = 0.08
     """Width of the open gripper [m]."""
 
@@ -67,7 +67,7 @@ def deflection(
 
     Args:
         stick: Its place, each axis -1 to 1.
-        dead_zone: Share of its way without effect.
+        dead_zone: Fraction of its way without effect.
         curve: Power of what remains.
     """
     length = float(np.linalg.norm(stick))
@@ -78,10 +78,10 @@ def deflection(
 
 
 class Gamepad:
-    """Leads the hand by the sticks: left one level, right one up and down.
+    """Moves the end effector by the sticks: left one level, right one up and down.
 
-    Shoulder buttons open and close the gripper, the others ask what `REQUESTS` says. The hand
-    turns by the coarse orientation rule. A gamepad that is unplugged asks for nothing.
+    Shoulder buttons open and close the gripper, the others ask what `REQUESTS` says. The end
+    effector turns by the coarse orientation rule. A gamepad that is unplugged asks for nothing.
     """
 
     def __init__(
@@ -94,7 +94,7 @@ class Gamepad:
         """Take an open controller; `Gamepad.open` finds one.
 
         Args:
-            chain: The arm that is led.
+            chain: The arm that is guided.
             controller: The gamepad.
             update: Lets the library read the device.
             config: How sticks act.
@@ -111,7 +111,7 @@ class Gamepad:
         """Open a gamepad by pygame, which the extra `gamepad` brings.
 
         Args:
-            chain: The arm that is led.
+            chain: The arm that is guided.
             index: Which gamepad, counted from 0.
             config: How sticks act.
 
@@ -138,17 +138,17 @@ class Gamepad:
         return cls(chain, library.Controller(index), pygame.event.pump, config)
 
     def read(self, state: ArmState) -> HumanInput:
-        """Motion of the hand, gripper and requests, as sticks and buttons are now."""
+        """Motion of the end effector, gripper and requests, as sticks and buttons are now."""
         self._update()
         if not self._controller.attached():
             self._held = set()
-            return HumanInput(effort=np.zeros(len(state.joint_position)))
+            return HumanInput(nullspace_input=np.zeros(len(state.joint_position)))
         pressed = self._pressed()
         for button, width in ((_LEFT_SHOULDER, self._config.opening), (_RIGHT_SHOULDER, 0.0)):
             if button in pressed:
                 self._gripper = width
         return HumanInput(
-            effort=np.zeros(len(state.joint_position)),
+            nullspace_input=np.zeros(len(state.joint_position)),
             twist=self._twist(state),
             gripper=self._gripper,
             requests=tuple(REQUESTS[b] for b in sorted(pressed & REQUESTS.keys())),
@@ -164,9 +164,9 @@ class Gamepad:
         way = deflection(stick, config.dead_zone, config.curve)
         if not way.any():
             return np.zeros(6)
-        hand = self._chain.forward(torch.from_numpy(state.joint_position))
-        orientation = coarse_orientation(hand.position)
-        return hand_twist(hand, config.drag.speed * way, orientation, config.drag)
+        tool = self._chain.forward(torch.from_numpy(state.joint_position))
+        orientation = coarse_orientation(tool.position)
+        return guiding_twist(tool, config.forces.speed * way, orientation, config.forces)
 
     def _pressed(self) -> set[int]:
         """Buttons that have gone down since the last reading."""

@@ -15,9 +15,7 @@ from jaxtyping import Float
 
 from hrc_learn.kinematics import SerialChain, coarse_orientation
 from hrc_learn.protocols import ArmState, HumanInput, Request
-from hrc_learn.teleoperation.interaction_force import DragConfig, hand_twist
-
-# Keys that lead the hand: which way, for as long as they are held.
+from hrc_learn.teleoperation.interaction_force import InteractionForceConfig, guiding_twist
 
 DIRECTIONS = MappingProxyType(
     {
@@ -32,12 +30,12 @@ DIRECTIONS = MappingProxyType(
 """Direction of each key in the base frame: i away from the robot, j to its left, u up."""
 
 
-class HeldKeys:
-    """Where the keys held lead.
+class KeyboardState:
+    """Which keys are held, and the direction they ask for.
 
     Terminals and browsers tell presses and repeats, no releases: a press counts for a moment,
     and a key that is held is pressed again before that is over (after a quarter to half a
-    second at first, then every 30 ms). So a keyboard that falls silent leads nowhere.
+    second at first, then every 30 ms). So a keyboard that falls silent asks for no motion.
     """
 
     def __init__(self, holds_for: float = 0.3, clock: Callable[[], float] = time.monotonic):
@@ -56,22 +54,20 @@ class HeldKeys:
         self._until = dict.fromkeys(DIRECTIONS, float("-inf"))
 
     def press(self, key: str) -> bool:
-        """Note a press or repeat; whether the key leads anywhere."""
+        """Note a press or repeat; whether the key has a direction."""
         if key not in self._until:
             return False
         self._until[key] = self._clock() + self._holds_for
         return True
 
     def direction(self) -> Float[np.ndarray, "3"]:
-        """Where the keys lead now: a unit vector, or zero."""
+        """The direction asked for now: a unit vector, or zero."""
         now = self._clock()
         held = [DIRECTIONS[key] for key, until in self._until.items() if now < until]
         total = np.sum(held, axis=0) if held else np.zeros(3)
         length = float(np.linalg.norm(total))
         return total / length if length > 0 else total
 
-
-# The keys of a terminal as a stand-in for a haptic device.
 
 REQUESTS: MappingProxyType[str, Request] = MappingProxyType(
     {"1": "start", "2": "stop", "3": "save", "4": "discard", "0": "home", "q": "finish"}
@@ -82,34 +78,36 @@ _GRIPPER = {"[": 0.08, "]": 0.0}
 
 
 class TerminalKeyboard:
-    """Leads the hand by keys: i k away and back, j l left and right, u o up and down.
+    """Moves the end effector by keys: i k away and back, j l left and right, u o up and down.
 
-    [ opens the gripper, ] closes it; `REQUESTS` has the rest. The hand turns by the coarse
-    orientation rule.
+    [ opens the gripper, ] closes it; `REQUESTS` has the rest. The end effector turns by the
+    coarse orientation rule.
     """
 
     def __init__(
         self,
         chain: SerialChain,
         typed: Callable[[], str],
-        keys: HeldKeys | None = None,
-        config: DragConfig | None = None,
+        keys: KeyboardState | None = None,
+        config: InteractionForceConfig | None = None,
     ):
         """Take a source of characters; `TerminalKeyboard.open` takes the terminal.
 
         Args:
-            chain: The arm that is led.
+            chain: The arm that is guided.
             typed: Characters typed since it was last asked; does not wait.
             keys: How long a press counts.
-            config: Fastest motion of the hand, and how it turns.
+            config: Fastest motion of the end effector, and how it turns.
         """
         self._chain, self._typed = chain, typed
-        self._keys = keys or HeldKeys()
-        self._config = config or DragConfig()
+        self._keys = keys or KeyboardState()
+        self._config = config or InteractionForceConfig()
         self._gripper: float | None = None
 
     @classmethod
-    def open(cls, chain: SerialChain, config: DragConfig | None = None) -> TerminalKeyboard:
+    def open(
+        cls, chain: SerialChain, config: InteractionForceConfig | None = None
+    ) -> TerminalKeyboard:
         """Read the terminal this process runs in, key by key, until the process ends.
 
         Raises:
@@ -121,7 +119,7 @@ class TerminalKeyboard:
         return cls(chain, _typed_in_terminal, config=config)
 
     def read(self, state: ArmState) -> HumanInput:
-        """Motion of the hand, gripper and requests, by the keys typed lately."""
+        """Motion of the end effector, gripper and requests, by the keys typed lately."""
         requests = []
         for key in self._typed():
             if key in REQUESTS:
@@ -132,12 +130,12 @@ class TerminalKeyboard:
                 self._keys.press(key)
         direction, twist = self._keys.direction(), np.zeros(6)
         if direction.any():
-            hand = self._chain.forward(torch.from_numpy(state.joint_position))
+            tool = self._chain.forward(torch.from_numpy(state.joint_position))
             velocity = self._config.speed * direction
-            rule = coarse_orientation(hand.position)
-            twist = hand_twist(hand, velocity, rule, self._config)
+            rule = coarse_orientation(tool.position)
+            twist = guiding_twist(tool, velocity, rule, self._config)
         return HumanInput(
-            effort=np.zeros(len(state.joint_position)),
+            nullspace_input=np.zeros(len(state.joint_position)),
             twist=twist,
             gripper=self._gripper,
             requests=tuple(requests),

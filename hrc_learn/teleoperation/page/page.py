@@ -1,4 +1,4 @@
-"""The page in a browser from which a person leads the arm: a stand-in for an AR headset."""
+"""The page in a browser from which a person guides the arm: a stand-in for an AR headset."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from jaxtyping import Float
 from hrc_learn.geometry import Body, Box, Pose
 from hrc_learn.kinematics import SerialChain, coarse_orientation
 from hrc_learn.protocols import ArmState, HumanInput
-from hrc_learn.teleoperation.interaction_force import DragConfig, hand_twist
-from hrc_learn.teleoperation.page.gizmos import Grips, Handles
+from hrc_learn.teleoperation.interaction_force import InteractionForceConfig, guiding_twist
+from hrc_learn.teleoperation.page.gizmos import Gizmos, HeldGizmos
 from hrc_learn.teleoperation.page.page_config import PageConfig, PageStatus
-from hrc_learn.teleoperation.page.page_operator import Asked, PageHuman, ask
-from hrc_learn.teleoperation.page.page_scene import Stage
+from hrc_learn.teleoperation.page.page_operator import GizmoCommand, PageHuman, gizmo_command
+from hrc_learn.teleoperation.page.page_scene import PageScene
 from hrc_learn.teleoperation.page.panel import Panel
 
-_PANEL_EVERY = 5  # refreshes of the scene for one of the panel
+_PANEL_EVERY = 5  # refreshes of the scene for one of the panel: text need not be as smooth
 
 
 class Page:
@@ -30,7 +30,7 @@ class Page:
 
         with Page(panda, bodies, boxes) as page:
             while running:
-                asked = page.human.read(arm.read())
+                human_input = page.human.read(arm.read())
                 ...
                 page.place(positions, orientations)
                 page.show(status)
@@ -50,19 +50,19 @@ class Page:
         config: PageConfig | None = None,
         *,
         task: str = "",
-        leads: bool = True,
+        guides: bool = True,
     ):
         """Serve the page; it follows the arm within the `with` block.
 
         Args:
             chain: The arm.
             bodies: What moves, with its shapes and first poses. "link1", "link2", ... can be
-                held, and "hand", "finger_left", "finger_right", which lead the hand.
+                held, and "hand", "finger_left", "finger_right", which move the end effector.
             boxes: What stands.
             config: Of the page.
-            task: What is to be shown, in words.
-            leads: Whether the person leads the hand, draws regions and records. Beside an arm
-                that works by itself, people pull at the body, and nothing else is offered.
+            task: What is to be demonstrated, in words.
+            guides: Whether the person guides the end effector, draws regions and records.
+                Beside an arm that works by itself, people pull in the null space only.
         """
         import viser
 
@@ -71,20 +71,20 @@ class Page:
         self.human = PageHuman(len(chain.joint_names))
         self._server = viser.ViserServer(config.host, config.port, verbose=False)
         self.url = f"http://{config.host}:{self._server.get_port()}"
-        self._grips = Grips(config.patience)
-        self._stage = Stage(self._server, bodies, boxes, config.twin)
-        self._handles = Handles(
-            self._server, self._stage, self._grips, self._links, leads=leads
+        self._held_gizmos = HeldGizmos(config.timeout)
+        self._scene = PageScene(self._server, bodies, boxes, config.twin)
+        self._gizmos = Gizmos(
+            self._server, self._scene, self._held_gizmos, self._links, guides=guides
         )
         self._panel = Panel(
             self._server,
             boxes,
             config,
             self.human.request,
-            self._stage.show_twin,
-            self._handles.let_turn,
+            self._scene.show_twin,
+            self._gizmos.let_turn,
             task,
-            leads=leads,
+            guides=guides,
         )
         first = [np.stack([getattr(b, name)[0] for b in bodies]) for name in _POSE]
         self._poses: tuple[np.ndarray, np.ndarray] = (first[0], first[1])
@@ -117,7 +117,7 @@ class Page:
 
     @property
     def task(self) -> str:
-        """What is shown, in words, as the person has put it."""
+        """What is demonstrated, in words, as the person has put it."""
         return self._panel.task
 
     @property
@@ -155,15 +155,17 @@ class Page:
             state = self.human.state
             if state is None:
                 continue
-            asked = self._ask(state)
+            command = self._command(state)
             links = self._chain.link_poses(_joints(state))
             with self._server.atomic():
-                self._stage.move(*self._poses, links.position.numpy())
-                self._stage.point(asked.arrows)
-                self._handles.follow(links[-1])
+                self._scene.move(*self._poses, links.position.numpy())
+                self._scene.point(command.arrows)
+                self._gizmos.follow(links[-1])
                 if ticks % _PANEL_EVERY == 0:
                     people = len(self._server.get_clients())
-                    self._panel.refresh(self._status, asked.effort, self._rate(), people)
+                    self._panel.refresh(
+                        self._status, command.nullspace_input, self._rate(), people
+                    )
             ticks += 1
 
     def _rate(self) -> float:
@@ -172,32 +174,34 @@ class Page:
         self._counted = self._placed, time.monotonic()
         return (self._counted[0] - placed) / max(self._counted[1] - began, 1e-9)
 
-    def _ask(self, state: ArmState) -> Asked:
-        panel, drag = self._panel, self._panel.drag
-        grips = self._grips.held().values()
-        asked = ask(self._chain, state.joint_position, grips, drag, coarse=panel.coarse)
-        twist = asked.twist
+    def _command(self, state: ArmState) -> GizmoCommand:
+        panel, forces = self._panel, self._panel.forces
+        gizmos = self._held_gizmos.held().values()
+        command = gizmo_command(
+            self._chain, state.joint_position, gizmos, forces, coarse=panel.coarse
+        )
+        twist = command.twist
         if not twist.any():
-            twist = self._keyed(state, drag)
+            twist = self._keyed(state, forces)
         self.human.post(
             HumanInput(
-                effort=asked.effort,
+                nullspace_input=command.nullspace_input,
                 twist=twist,
                 gripper=panel.gripper,
                 region=panel.region,
                 target=panel.target,
             )
         )
-        return asked
+        return command
 
-    def _keyed(self, state: ArmState, drag: DragConfig) -> Float[np.ndarray, "6"]:
-        """Motion of the hand that the keys ask for."""
+    def _keyed(self, state: ArmState, forces: InteractionForceConfig) -> Float[np.ndarray, "6"]:
+        """Motion of the end effector that the keys ask for."""
         direction = self._panel.direction()
         if not direction.any():
             return np.zeros(6)
-        hand = self._chain.forward(_joints(state))
-        orientation = coarse_orientation(hand.position) if self._panel.coarse else None
-        return hand_twist(hand, drag.speed * direction, orientation, drag)
+        tool = self._chain.forward(_joints(state))
+        orientation = coarse_orientation(tool.position) if self._panel.coarse else None
+        return guiding_twist(tool, forces.speed * direction, orientation, forces)
 
     def _listen(self) -> None:
         """Ask the browsers of those who hold something whether they are still there.
@@ -205,17 +209,17 @@ class Page:
         A browser that is told nothing for a while may be gone, its network cable pulled: the
         server learns of that much later. A pointer at rest sends nothing either.
         """
-        while not self._closing.wait(self._config.patience / 4):
-            for holder in self._grips.holders:
+        while not self._closing.wait(self._config.timeout / 4):
+            for holder in self._held_gizmos.holders:
                 client = self._server.get_clients().get(holder)
                 if client is None:
-                    self._grips.release_all(holder)
+                    self._held_gizmos.release_all(holder)
                     continue
                 with contextlib.suppress(TimeoutError, RuntimeError):
-                    asked = time.monotonic()
-                    client.local_storage.get_item("alive", timeout=self._config.patience)
-                    if time.monotonic() - asked < self._config.patience:
-                        self._grips.hear(holder)
+                    sent = time.monotonic()
+                    client.local_storage.get_item("alive", timeout=self._config.timeout)
+                    if time.monotonic() - sent < self._config.timeout:
+                        self._held_gizmos.hear(holder)
 
 
 _POSE = ("position", "orientation")

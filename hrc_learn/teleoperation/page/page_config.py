@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from hrc_learn.protocols import DrawnRegion
-from hrc_learn.teleoperation.interaction_force import DragConfig
+from hrc_learn.teleoperation.interaction_force import InteractionForceConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -16,9 +16,9 @@ class PageConfig:
     """Address to serve at. Whoever reaches it can move the arm."""
     port: int = 8080
     """Port to serve at; the next free one is taken if it is in use."""
-    drag: DragConfig = field(default_factory=DragConfig)
-    """How strongly handles act."""
-    patience: float = 0.6
+    forces: InteractionForceConfig = field(default_factory=InteractionForceConfig)
+    """How strongly gizmos act."""
+    timeout: float = 0.6
     """Time without a sign of life from a browser after which its grips are let go [s]."""
     refresh: float = 25.0
     """Times a second that the page follows the arm, and efforts are computed anew [1/s]."""
@@ -26,7 +26,7 @@ class PageConfig:
     """Where the virtual twin stands, from the arm [m]."""
 
     def __post_init__(self) -> None:
-        for name in ("patience", "refresh"):
+        for name in ("timeout", "refresh"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, but is {getattr(self, name)}.")
 
@@ -40,7 +40,7 @@ class PageStatus:
     """What the session lets the page show."""
 
     title: str = ""
-    """What is led here."""
+    """What is guided here."""
     doing: str = ""
     """What an arm that works by itself is doing; empty where a person leads and records."""
     recording: Literal["ready", "recording", "stopped"] = "ready"

@@ -1,6 +1,4 @@
-"""The person at the page, as a control loop meets them: input, and what all who hold the
-arm ask of it together.
-"""
+"""The people at the page as one `Human`: what all who hold a gizmo ask for together."""
 
 import time
 from collections import deque
@@ -15,14 +13,12 @@ from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import SerialChain, coarse_orientation
 from hrc_learn.protocols import ArmState, HumanInput, Request
 from hrc_learn.teleoperation.interaction_force import (
-    DragConfig,
+    InteractionForceConfig,
     bounded,
-    drag_effort,
-    hand_twist,
+    gizmo_nullspace_input,
+    guiding_twist,
 )
-from hrc_learn.teleoperation.page.gizmos import Grip
-
-# The person at the page, as a control loop meets them.
+from hrc_learn.teleoperation.page.gizmos import HeldGizmo
 
 
 class PageHuman:
@@ -53,7 +49,7 @@ class PageHuman:
         if not holds_for > 0:
             raise ValueError(f"holds_for must be positive, but is {holds_for}.")
         self._holds_for, self._clock = holds_for, clock
-        self._idle = _locked(HumanInput(effort=np.zeros(joints)))
+        self._idle = _locked(HumanInput(nullspace_input=np.zeros(joints)))
         # While it holds, afterwards, and until when: changed together, as one reference.
         self._posted = (self._idle, self._idle, float("-inf"))
         self._requests: deque[Request] = deque()
@@ -87,73 +83,70 @@ class PageHuman:
 
 
 def _locked(asked: HumanInput) -> HumanInput:
-    for array in (asked.effort, asked.twist):
+    for array in (asked.nullspace_input, asked.twist):
         array.setflags(write=False)
     return asked
 
 
-# What all who hold the arm ask of it together.
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Asked:
-    """Effort and motion, and the arrows that show where they come from."""
+class GizmoCommand:
+    """Null-space input and motion, and the arrows that show where they come from."""
 
-    effort: Float[np.ndarray, " joints"]
-    """Null-space effort d [N m]."""
+    nullspace_input: Float[np.ndarray, " joints"]
+    """d [N m]."""
     twist: Float[np.ndarray, "6"]
-    """Of the hand, linear [m/s] and angular [rad/s]."""
-    arrows: Float[np.ndarray, "grips 2 3"]
+    """Of the end effector, linear [m/s] and angular [rad/s]."""
+    arrows: Float[np.ndarray, "gizmos 2 3"]
     """From the point held to the handle, in the base frame [m]."""
 
 
-def ask(
+def gizmo_command(
     chain: SerialChain,
     joint_position: Float[np.ndarray, " joints"],
-    grips: Collection[Grip],
-    config: DragConfig,
+    gizmos: Collection[HeldGizmo],
+    config: InteractionForceConfig,
     *,
     coarse: bool = True,
-) -> Asked:
-    """What comes of several grips: their efforts add up, and are bounded as one is.
+) -> GizmoCommand:
+    """The command of several held gizmos: their inputs add up, and are bounded as one is.
 
     Args:
         chain: The arm.
         joint_position: Where it is [rad].
-        grips: Who holds it where.
-        config: How strongly handles act.
-        coarse: Whether a hand that is led turns by the coarse orientation rule; otherwise it
-            turns as its handle is turned, if it is.
+        gizmos: Who holds it where.
+        config: How strongly gizmos act.
+        coarse: Whether a hand-guided end effector turns by the coarse orientation rule;
+            otherwise it turns as its gizmo is turned, if it is.
     """
     links = chain.link_poses(torch.as_tensor(joint_position, dtype=torch.float64))
-    hand = links[-1]
-    effort, velocity = np.zeros(len(chain.joint_names)), np.zeros(3)
-    orientation, led = None, False
-    arrows = np.empty((len(grips), 2, 3))
-    for k, grip in enumerate(grips):
-        point = _point_held(links, grip)
-        displacement = grip.pointer - point
-        arrows[k] = point, grip.pointer
-        if grip.joint is not None:
-            effort += drag_effort(
-                chain, joint_position, grip.joint, point, displacement, config
+    tool = links[-1]
+    d, velocity = np.zeros(len(chain.joint_names)), np.zeros(3)
+    orientation, guided = None, False
+    arrows = np.empty((len(gizmos), 2, 3))
+    for k, gizmo in enumerate(gizmos):
+        point = _point_held(links, gizmo)
+        displacement = gizmo.pointer - point
+        arrows[k] = point, gizmo.pointer
+        if gizmo.joint is not None:
+            d += gizmo_nullspace_input(
+                chain, joint_position, gizmo.joint, point, displacement, config
             )
             continue
-        led = True
+        guided = True
         velocity += config.rate * displacement
-        if grip.orientation is not None:
-            orientation = torch.as_tensor(grip.orientation, dtype=torch.float64)
+        if gizmo.orientation is not None:
+            orientation = torch.as_tensor(gizmo.orientation, dtype=torch.float64)
     if coarse:
-        orientation = coarse_orientation(hand.position)
-    return Asked(
-        effort=bounded(effort, config.largest_effort),
-        twist=hand_twist(hand, velocity, orientation, config) if led else np.zeros(6),
+        orientation = coarse_orientation(tool.position)
+    return GizmoCommand(
+        nullspace_input=bounded(d, config.max_nullspace_input),
+        twist=guiding_twist(tool, velocity, orientation, config) if guided else np.zeros(6),
         arrows=arrows,
     )
 
 
-def _point_held(links: Pose, grip: Grip) -> Float[np.ndarray, "3"]:
+def _point_held(links: Pose, gizmo: HeldGizmo) -> Float[np.ndarray, "3"]:
     """Where the point held is now, in the base frame [m]."""
-    if grip.joint is None:
-        return links[-1].position.numpy() + grip.held_at
-    return links[grip.joint - 1].apply(torch.as_tensor(grip.held_at)).numpy()
+    if gizmo.joint is None:
+        return links[-1].position.numpy() + gizmo.held_at
+    return links[gizmo.joint - 1].apply(torch.as_tensor(gizmo.held_at)).numpy()

@@ -1,6 +1,4 @@
-"""What stands and moves in the page's scene: the arm, its virtual twin, the furniture;
-and the meshes it is drawn with.
-"""
+"""The page's 3D scene: the arm, its virtual twin and the furniture, drawn as meshes."""
 
 from __future__ import annotations
 
@@ -12,15 +10,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from hrc_learn.geometry import Body, Box, Capsule
-from hrc_learn.teleoperation.page.viser_names import (
+from hrc_learn.teleoperation.page._viser import (
     Holdable,
     IcosphereHandle,
     MeshHandle,
     ViserServer,
 )
 from hrc_learn.viz.palette import PERSON, SKY, rgba
-
-# Meshes of the capsules and boxes that bodies are drawn with.
 
 
 class Mesh(NamedTuple):
@@ -87,16 +83,14 @@ def body_mesh(body: Body) -> Mesh:
     )
 
 
-# What stands and moves in the page's scene: the arm, its virtual twin, the furniture.
-
 _KNOBS = (2, 4, 6)
 """Joints marked by a knob: shoulder, elbow, wrist. Between them the links are held."""
-_HAND_PARTS = ("link7", "hand", "finger_left", "finger_right")
-"""What moves with the hand, the last link too: whoever pulls at it leads the hand."""
+_END_EFFECTOR_PARTS = ("link7", "hand", "finger_left", "finger_right")
+"""What moves with the end effector, the last link too: a drag there guides it."""
 _PERSON = rgba(PERSON)[:3]
 
 
-class Stage:
+class PageScene:
     """Draws bodies where they are, once as the arm itself and once as its twin."""
 
     def __init__(
@@ -106,7 +100,7 @@ class Stage:
         boxes: Sequence[Box],
         twin: tuple[float, float, float],
     ):
-        """Set the stage.
+        """Draw everything once.
 
         Args:
             server: Of the page.
@@ -119,7 +113,7 @@ class Stage:
         self._scene.add_frame("/twin", position=twin, show_axes=False)
         self._bodies = tuple(bodies)
         self._own = [self._draw("", body) for body in bodies]
-        # Things that are carried have no twin: what matters is what can be held.
+        # Objects that are carried have no twin: what matters is what can be held.
         self._copies = [
             self._draw("/twin", body) if _is_part_of_arm(body) else None for body in bodies
         ]
@@ -130,11 +124,11 @@ class Stage:
         self._surroundings(server)
         self._arrows = None
 
-    def handles(self) -> Iterator[tuple[Holdable, int | None, np.ndarray]]:
-        """All that can be held: node, joint (None: the hand), and how far off the arm [m]."""
+    def holdables(self) -> Iterator[tuple[Holdable, int | None, np.ndarray]]:
+        """All that can be held: node, joint (None: end effector), offset from the arm [m]."""
         here = np.zeros(3)
         for body, own, copy in zip(self._bodies, self._own, self._copies, strict=True):
-            is_hand = body.name in _HAND_PARTS
+            is_hand = body.name in _END_EFFECTOR_PARTS
             joint = None if is_hand else _joint_of(body)
             if is_hand or joint is not None:
                 yield own, joint, here
@@ -248,4 +242,4 @@ def _joint_of(body: Body) -> int | None:
 
 
 def _is_part_of_arm(body: Body) -> bool:
-    return body.name.startswith("link") or body.name in _HAND_PARTS
+    return body.name.startswith("link") or body.name in _END_EFFECTOR_PARTS

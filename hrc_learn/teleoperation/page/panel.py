@@ -1,4 +1,4 @@
-"""The panel beside the scene: how things stand, buttons, folders of controls and settings."""
+"""The panel beside the scene: status, buttons, folders of controls and settings."""
 
 from __future__ import annotations
 
@@ -12,18 +12,16 @@ from jaxtyping import Float
 
 from hrc_learn.geometry import Box
 from hrc_learn.protocols import DrawnRegion, Request
-from hrc_learn.teleoperation.devices.keyboard import DIRECTIONS, HeldKeys
-from hrc_learn.teleoperation.interaction_force import DragConfig
+from hrc_learn.teleoperation.devices.keyboard import DIRECTIONS, KeyboardState
+from hrc_learn.teleoperation.interaction_force import InteractionForceConfig
+from hrc_learn.teleoperation.page._viser import ViserServer
 from hrc_learn.teleoperation.page.page_config import PageConfig, PageStatus
 from hrc_learn.teleoperation.page.region_editor import RegionEditor
-from hrc_learn.teleoperation.page.viser_names import ViserServer
 from hrc_learn.viz.palette import BLUE, GREEN, GREY, PERSON, VERMILION
-
-# What the panel says, as HTML.
 
 
 def state_html(status: PageStatus, rate: float, people: int) -> str:
-    """What is led here, what it is doing, and who watches.
+    """What is guided here, what it is doing, and who watches.
 
     Args:
         status: Of the session.
@@ -61,17 +59,17 @@ def _badge(colour: str, words: str) -> str:
     )
 
 
-def effort_html(effort: Float[np.ndarray, " joints"], largest: float) -> str:
+def nullspace_input_html(d: Float[np.ndarray, " joints"], largest: float) -> str:
     """A bar to the left or right for each joint.
 
     Args:
-        effort: d [N m].
+        d: Of each joint [N m].
         largest: That fills half the width [N m].
     """
     rows = []
-    for k, d in enumerate(effort):
-        width = 50 * min(abs(d) / largest, 1.0)
-        left = 50 - (width if d < 0 else 0)
+    for k, value in enumerate(d):
+        width = 50 * min(abs(value) / largest, 1.0)
+        left = 50 - (width if value < 0 else 0)
         rows.append(
             f'<div style="display:flex;align-items:center;height:1.15em">'
             f'<span style="width:1.4em;opacity:.7">{k + 1}</span>'
@@ -79,9 +77,9 @@ def effort_html(effort: Float[np.ndarray, " joints"], largest: float) -> str:
             'border-radius:.2em"><div style="position:absolute;height:100%;'
             f"left:{left:.1f}%;width:{width:.1f}%;background:{PERSON};"
             'border-radius:.2em"></div></div>'
-            f'<span style="width:3.4em;text-align:right">{d:+.1f}</span></div>'
+            f'<span style="width:3.4em;text-align:right">{value:+.1f}</span></div>'
         )
-    return _block("Effort d [N m]", "".join(rows))
+    return _block("Null-space input d [N m]", "".join(rows))
 
 
 def interventions_html(status: PageStatus, more: Sequence[str], latest: str) -> str:
@@ -119,8 +117,6 @@ def _block(title: str, content: str) -> str:
     )
 
 
-# Folders of the panel: to record, to lead the hand, to pull at the body.
-
 OPEN = 0.08
 """Width of the open gripper [m]."""
 
@@ -138,7 +134,7 @@ class RecordingControls:
         Args:
             server: Of the page.
             request: Receives what buttons ask for.
-            task: What is to be shown, in words.
+            task: What is to be demonstrated, in words.
         """
         self._server, self._request = server, request
         self._next: Request = "start"
@@ -150,7 +146,7 @@ class RecordingControls:
 
     @property
     def task(self) -> str:
-        """What is shown, in words."""
+        """What is demonstrated, in words."""
         return self._task.value
 
     def refresh(self, recording: bool) -> None:
@@ -165,8 +161,8 @@ class RecordingControls:
         group.on_click(lambda _: self._request(requests[group.value]))
 
 
-class HandControls:
-    """Lead the hand by keys, turn it, open and close it.
+class EndEffectorControls:
+    """Move the end effector by keys, turn it, open and close it.
 
     Attributes:
         gripper: Opening the person wants [m]; None until asked for.
@@ -177,13 +173,13 @@ class HandControls:
 
         Args:
             server: Of the page.
-            let_turn: Whether the hand's handle can be turned.
+            let_turn: Whether the end effector's gizmo can be turned.
         """
         gui = server.gui
         self.gripper: float | None = None
-        self._keys = HeldKeys()
+        self._keys = KeyboardState()
         self._coarse = gui.add_checkbox(
-            "Hand turns by the rule",
+            "Coarse orientation rule",
             True,
             hint="Down in front of the robot, level at the end of its reach.",
         )
@@ -192,21 +188,21 @@ class HandControls:
         gripper.on_click(lambda _: self._move_gripper(gripper.value))
         for key in DIRECTIONS:
             command = gui.add_command(
-                f"Lead the hand {_KEYS[key]}",
+                f"Move the end effector {_KEYS[key]}",
                 hotkey=key.upper(),  # type: ignore
             )
             command.on_trigger(self._presses(key))
         gui.add_markdown(
-            "Keys **I K J L U O** lead the hand away, back, left, right, up, down."
+            "Keys **I K J L U O** move the end effector away, back, left, right, up, down."
         )
 
     @property
     def coarse(self) -> bool:
-        """Whether the hand turns by the coarse orientation rule."""
+        """Whether the end effector turns by the coarse orientation rule."""
         return self._coarse.value
 
     def direction(self) -> Float[np.ndarray, "3"]:
-        """Where the keys lead the hand: a unit vector, or zero."""
+        """Where the keys move the end effector: a unit vector, or zero."""
         return self._keys.direction()
 
     def _presses(self, key: str) -> Callable[[Any], Any]:
@@ -219,17 +215,20 @@ class HandControls:
         self.gripper = OPEN if word == "open" else 0.0
 
 
-class PullControls:
+class ForceControls:
     """How a pull at the body acts, and whether the twin stands by."""
 
     def __init__(
-        self, server: ViserServer, config: DragConfig, show_twin: Callable[[bool], None]
+        self,
+        server: ViserServer,
+        config: InteractionForceConfig,
+        show_twin: Callable[[bool], None],
     ):
         """Add them to the folder that is open.
 
         Args:
             server: Of the page.
-            config: How strongly handles act to begin with.
+            config: How strongly gizmos act to begin with.
             show_twin: Shows or hides the twin.
         """
         gui = server.gui
@@ -241,16 +240,13 @@ class PullControls:
         self._strength = gui.add_slider("Strength [%]", 20, 200, 10, 100)
 
     @property
-    def drag(self) -> DragConfig:
-        """How strongly handles act."""
+    def forces(self) -> InteractionForceConfig:
+        """How strongly gizmos act."""
         mapping: Any = _MAPPINGS[self._mapping.value]
         share, base = self._strength.value / 100, self._config
         return replace(
             base, mapping=mapping, rate=share * base.rate, stiffness=share * base.stiffness
         )
-
-
-# The panel beside the scene: how things stand, buttons and settings.
 
 
 class Panel:
@@ -266,7 +262,7 @@ class Panel:
         let_turn: Callable[[bool], None],
         task: str,
         *,
-        leads: bool = True,
+        guides: bool = True,
     ):
         """Build the panel.
 
@@ -276,12 +272,12 @@ class Panel:
             config: Of the page.
             request: Receives what buttons ask for.
             show_twin: Shows or hides the twin.
-            let_turn: Whether the hand's handle can be turned.
-            task: What is to be shown, in words.
-            leads: Whether the person leads the hand, draws regions and records; otherwise
-                there are no controls but those of pulls.
+            let_turn: Whether the end effector's gizmo can be turned.
+            task: What is to be demonstrated, in words.
+            guides: Whether the person guides the end effector, draws regions and records;
+                otherwise there are no controls but those of forces.
         """
-        self._largest_effort = config.drag.largest_effort
+        self._max_input = config.forces.max_nullspace_input
         gui = server.gui
         gui.configure_theme(
             control_width="medium",
@@ -291,18 +287,18 @@ class Panel:
         )
         gui.main_panel.dock_right()
         self._state = gui.add_html("")
-        self._recording = self._hand = self._region = None
-        if leads:
+        self._recording = self._end_effector = self._region = None
+        if guides:
             with gui.add_folder("Demonstration"):
                 self._recording = RecordingControls(server, request, task)
-        with gui.add_folder("Effort and safety"):
+        with gui.add_folder("Null-space input and safety"):
             self._bars = gui.add_html("")
             self._safety = gui.add_html("")
         with gui.add_folder("Arm"):
-            if leads:
-                self._hand = HandControls(server, let_turn)
-            self._pull = PullControls(server, config.drag, show_twin)
-        if leads:
+            if guides:
+                self._end_effector = EndEffectorControls(server, let_turn)
+            self._forces = ForceControls(server, config.forces, show_twin)
+        if guides:
             with gui.add_folder("Region and target"):
                 self._region = RegionEditor(server, boxes)
         self._seen: Mapping[str, int] = {}
@@ -310,22 +306,22 @@ class Panel:
 
     @property
     def task(self) -> str:
-        """What is shown, in words."""
+        """What is demonstrated, in words."""
         return "" if self._recording is None else self._recording.task
 
     @property
     def coarse(self) -> bool:
-        """Whether the hand turns by the coarse orientation rule."""
-        return self._hand is None or self._hand.coarse
+        """Whether the end effector turns by the coarse orientation rule."""
+        return self._end_effector is None or self._end_effector.coarse
 
     @property
     def gripper(self) -> float | None:
         """Opening the person wants [m]; None until asked for."""
-        return None if self._hand is None else self._hand.gripper
+        return None if self._end_effector is None else self._end_effector.gripper
 
     @property
     def region(self) -> DrawnRegion | None:
-        """The region in force."""
+        """The region active."""
         return None if self._region is None else self._region.region
 
     @property
@@ -334,33 +330,33 @@ class Panel:
         return None if self._region is None else self._region.target
 
     @property
-    def drag(self) -> DragConfig:
-        """How strongly handles act."""
-        return self._pull.drag
+    def forces(self) -> InteractionForceConfig:
+        """How strongly gizmos act."""
+        return self._forces.forces
 
     def direction(self) -> Float[np.ndarray, "3"]:
-        """Where keys lead the hand: a unit vector, or zero."""
-        return np.zeros(3) if self._hand is None else self._hand.direction()
+        """Where keys move the end effector: a unit vector, or zero."""
+        return np.zeros(3) if self._end_effector is None else self._end_effector.direction()
 
     def refresh(
         self,
         status: PageStatus,
-        effort: Float[np.ndarray, " joints"],
+        nullspace_input: Float[np.ndarray, " joints"],
         rate: float,
         people: int,
     ) -> None:
-        """Show how things stand.
+        """Show status.
 
         Args:
             status: Of the session.
-            effort: That is asked for now.
+            nullspace_input: d that is asked for now [N m].
             rate: Steps that the loop takes [1/s].
             people: Browsers that show the page.
         """
         if self._recording is not None:
             self._recording.refresh(status.recording == "recording")
         self._state.content = state_html(status, rate, people)
-        self._bars.content = effort_html(effort, self._largest_effort)
+        self._bars.content = nullspace_input_html(nullspace_input, self._max_input)
         self._safety.content = self._safety_html(status)
 
     def _safety_html(self, status: PageStatus) -> str:

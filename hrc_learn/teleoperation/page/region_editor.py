@@ -13,15 +13,13 @@ from jaxtyping import Float
 
 from hrc_learn.geometry import Box, quaternion
 from hrc_learn.protocols import DrawnRegion
-from hrc_learn.teleoperation.page.page_config import FIRST_REGION
-from hrc_learn.teleoperation.page.viser_names import (
+from hrc_learn.teleoperation.page._viser import (
     SceneClickEvent,
     SceneRectSelectEvent,
     ViserServer,
 )
+from hrc_learn.teleoperation.page.page_config import FIRST_REGION
 from hrc_learn.viz.palette import GREEN, VERMILION, rgba
-
-# Pointing into the scene: from a place on the screen to a point or a box in the workplace.
 
 
 def view_ray(
@@ -111,21 +109,20 @@ def region_over(
     return DrawnRegion(centre=(x, y, bottom + c), half_size=(a, b, c))
 
 
-# Drawing, moving and sizing the Cartesian region, and marking the target.
-
 _COLOUR = rgba(GREEN)[:3]
 _DRAW: Any = "cube-plus"
 _MARK: Any = "target"
-_LARGEST = 0.5  # half size that a slider goes up to [m]
-_SMALLEST = 0.02
-_LIFTED = 0.08  # height of a target above what was clicked on [m]
+# Half sizes of a region: sliders end where the arm does, and a point needs some room [m].
+_LARGEST, _SMALLEST = 0.5, 0.02
+# Height of a target above what was clicked on: an object's height and a little [m].
+_LIFTED = 0.08
 
 
 class RegionEditor:
     """The box in the scene, its controls in the panel, and the target's mark."""
 
     def __init__(self, server: ViserServer, boxes: Sequence[Box]):
-        """Draw the first region, not in force.
+        """Draw the first region, not active.
 
         Args:
             server: Of the page; controls go into the folder that is open.
@@ -140,7 +137,7 @@ class RegionEditor:
 
     @property
     def region(self) -> DrawnRegion | None:
-        """The region, where it is in force."""
+        """The region, where it is active."""
         return self._region if self._in_force.value else None
 
     @property
@@ -167,7 +164,7 @@ class RegionEditor:
         self._draw = gui.add_button("Draw on the table", icon=_DRAW)
         self._draw.on_click(lambda _: self._draw_next())
         self._in_force = gui.add_checkbox(
-            "In force", False, hint="The hand is drawn into the region."
+            "Active", False, hint="The end effector is attracted into the region."
         )
         self._in_force.on_update(lambda _: self._update())
         self._sizes = [

@@ -7,12 +7,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.geometry import quaternion
-from hrc_learn.learning.channels import KINDS, Motions, Reproduction
+from hrc_learn.learning.channels import CHANNELS, Motions, Reproduction
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ReproductionError:
-    """One row a demonstration; None where a kind of motion has no such measure."""
+    """One row a demonstration; None where a channel of motion has no such measure."""
 
     nrmse: Float[Tensor, " demos"] | None = None
     """Root mean square error over the largest range of any coordinate."""
@@ -41,18 +41,18 @@ class ReproductionError:
         return figures
 
 
-def reproduction_error(kind: str, motions: Motions, made: Reproduction) -> ReproductionError:
+def reproduction_error(channel: str, motions: Motions, made: Reproduction) -> ReproductionError:
     """Compare motions with the demonstrations they are of.
 
     Args:
-        kind: What they are motions of.
+        channel: What they are motions of.
         motions: The demonstrations.
         made: At their stamps.
     """
     measures: dict[str, Tensor] = {}
     mask, last = motions.demos.mask, (motions.demos.length - 1)[:, None]
     if made.position is not None:
-        measures |= _linear(motions, motions.column(KINDS[kind][0]), made.position)
+        measures |= _linear(motions, motions.column(CHANNELS[channel][0]), made.position)
     if made.orientation is not None:
         shown = motions.column("orientation")
         angle = quaternion.angle(made.orientation, shown).rad2deg()

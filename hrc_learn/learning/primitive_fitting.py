@@ -30,11 +30,9 @@ from hrc_learn.dmp import (
     select_basis_count,
 )
 from hrc_learn.kinematics import panda
-from hrc_learn.learning.channels import KINDS, Motions, Primitive, kinds_wanted
-from hrc_learn.learning.reproduction_error import reproduction_error
+from hrc_learn.learning.channels import CHANNELS, Motions, Primitive, select_channels
+from hrc_learn.learning.reproduction_metrics import reproduction_error
 from hrc_learn.viz import FitRecording, JointLimits
-
-# From demonstrations to movement primitives, and what is to be said about them.
 
 EACH = "each"
 """Folder of the primitives of single demonstrations, where they are kept."""
@@ -46,9 +44,9 @@ class FittedPrimitives:
 
     motions: Motions
     each: Mapping[str, Primitive]
-    """By kind: one for each demonstration, as a batch."""
+    """By channel: one for each demonstration, as a batch."""
     common: Mapping[str, Primitive]
-    """By kind: their mean, without batch dimensions."""
+    """By channel: their mean, without batch dimensions."""
     n_basis: int
     selection: BasisSelection | None = None
     """How the number of basis functions was chosen, if it was."""
@@ -67,7 +65,7 @@ class FittedPrimitives:
 
     @property
     def pose(self) -> PoseDMP | None:
-        """The same for the hand, the arm angle as its body shape if the arm is a Panda."""
+        """The same for the end effector; of a Panda with the arm angle."""
         return cast(PoseDMP | None, self.each.get("pose"))
 
     def save(self, folder: Path, each: bool = False) -> None:
@@ -78,18 +76,18 @@ class FittedPrimitives:
             each: Keep those of single demonstrations too, in `folder/each/KIND`: what a
                 `DMPDistribution` is made of.
         """
-        for kind, primitive in self.common.items():
-            primitive.save(folder / kind)
-        for kind, primitives in self.each.items() if each else ():
-            primitives.save(folder / EACH / kind)
+        for channel, primitive in self.common.items():
+            primitive.save(folder / channel)
+        for channel, primitives in self.each.items() if each else ():
+            primitives.save(folder / EACH / channel)
 
-    def distribution(self, kind: str) -> DMPDistribution:
-        """Gaussian over the primitives of one kind.
+    def distribution(self, channel: str) -> DMPDistribution:
+        """Gaussian over the primitives of one channel.
 
         Raises:
             ValueError: Of fewer than two demonstrations, or scaled primitives.
         """
-        return DMPDistribution.fit(self.each[kind])
+        return DMPDistribution.fit(self.each[channel])
 
     def metrics(self) -> dict[str, float]:
         """How close the primitives come to their demonstrations.
@@ -98,11 +96,13 @@ class FittedPrimitives:
         """
         values = {"demonstrations": float(len(self.demonstrations.length))}
         values["basis_functions"] = float(self.n_basis)
-        for kind in self.each:
-            own = self.motions.own(self.each[kind])
-            adapted = self.motions.adapted(kind, self.common[kind])
-            values |= reproduction_error(kind, self.motions, own).summary(kind)
-            values |= reproduction_error(kind, self.motions, adapted).summary(f"mean_{kind}")
+        for channel in self.each:
+            own = self.motions.own(self.each[channel])
+            adapted = self.motions.adapted(channel, self.common[channel])
+            values |= reproduction_error(channel, self.motions, own).summary(channel)
+            values |= reproduction_error(channel, self.motions, adapted).summary(
+                f"mean_{channel}"
+            )
         return values
 
 
@@ -111,39 +111,39 @@ def fit_primitives(
     n_basis: int | None = 60,
     method: str = "trajectory",
     *,
-    kinds: Sequence[str] = (),
+    channels: Sequence[str] = (),
     candidates: Sequence[int] = (10, 15, 20, 30, 40, 60, 80, 100),
     **options: Any,
 ) -> FittedPrimitives:
     """Fit one primitive to each demonstration, and their mean.
 
-    Joints are learned from any robot. The pose of the hand is learned where it was recorded,
-    or where the joints are those of a Panda, whose arm angle is then learned along.
+    Joints are learned from any robot. The pose of the end effector is learned where it was
+    recorded, or where the joints are those of a Panda, with its arm angle.
 
     Args:
         demos: Demonstrations of one motion.
         n_basis: Number of basis functions; None: the smallest of the candidates that
             predicts samples held out as well as the best (see `select_basis_count`).
         method: See `JointDMP.fit`.
-        kinds: To learn; none: joints and pose, or what there is of them.
+        channels: To learn; none: joints and pose, or what there is of them.
         candidates: Numbers of basis functions to choose from.
         options: Further options of the fit, such as `robust` or `scaling`.
 
     Raises:
-        ValueError: If the demonstrations hold no motion, or not what a kind needs.
+        ValueError: If the demonstrations hold no motion, or not what a channel needs.
     """
     motions = Motions.of(demos)
-    kinds = kinds_wanted(motions, kinds)
+    channels = select_channels(motions, channels)
     options = {"method": method, **options}
     selection = None
     if n_basis is None:
-        selection = _select(motions, kinds[0], candidates, options)
+        selection = _select(motions, channels[0], candidates, options)
         n_basis = selection.count
-    each = {kind: motions.fit(kind, n_basis, **options) for kind in kinds}
+    each = {channel: motions.fit(channel, n_basis, **options) for channel in channels}
     return FittedPrimitives(
         motions=motions,
         each=each,
-        common={kind: mean_primitive(cast(Any, each[kind])) for kind in kinds},
+        common={channel: mean_primitive(cast(Any, each[channel])) for channel in channels},
         n_basis=n_basis,
         selection=selection,
         options=options,
@@ -151,10 +151,10 @@ def fit_primitives(
 
 
 def _select(
-    motions: Motions, kind: str, candidates: Sequence[int], options: Mapping[str, Any]
+    motions: Motions, channel: str, candidates: Sequence[int], options: Mapping[str, Any]
 ) -> BasisSelection:
-    """By the linear coordinates of a kind; orientations alone give none to choose by."""
-    if kind == "orientation":
+    """By the linear coordinates of a channel; orientations alone give none to choose by."""
+    if channel == "orientation":
         raise ValueError(
             "the number of basis functions is chosen by joints or positions: name it for "
             "orientations alone."
@@ -167,7 +167,11 @@ def _select(
             f"of basis functions from {', '.join(map(str, candidates))}: name it."
         )
     return select_basis_count(
-        motions.demos.time, motions.position(kind), possible, mask=motions.demos.mask, **options
+        motions.demos.time,
+        motions.position(channel),
+        possible,
+        mask=motions.demos.mask,
+        **options,
     )
 
 
@@ -179,11 +183,11 @@ def fit_recording(fitted: FittedPrimitives, title: str) -> FitRecording:
     Raises:
         ValueError: If neither was learned.
     """
-    kind = next((k for k in ("joint", "position", "pose") if k in fitted.each), None)
-    if kind is None:
+    channel = next((k for k in ("joint", "position", "pose") if k in fitted.each), None)
+    if channel is None:
         raise ValueError("orientations alone have no figure: learn the pose, or positions.")
     motions, lengths = fitted.motions, fitted.demonstrations.length.tolist()
-    shown, made = motions.position(kind), motions.own(fitted.each[kind]).position
+    shown, made = motions.position(channel), motions.own(fitted.each[channel]).position
     assert made is not None
 
     def cut(padded: Tensor) -> tuple[np.ndarray, ...]:
@@ -192,7 +196,7 @@ def fit_recording(fitted: FittedPrimitives, title: str) -> FitRecording:
         )
 
     limits, paths, reproduced = None, (), ()
-    if kind != "joint":
+    if channel != "joint":
         paths, reproduced = cut(shown), cut(made)
     elif motions.joint_names == panda.joint_names:
         limits = JointLimits(lower=panda.limits.lower.numpy(), upper=panda.limits.upper.numpy())
@@ -203,7 +207,7 @@ def fit_recording(fitted: FittedPrimitives, title: str) -> FitRecording:
         residual = dict(zip(selection.candidates, selection.error.tolist(), strict=True))
     return FitRecording(
         title=title,
-        joint_names=motions.joint_names if kind == "joint" else ("x", "y", "z"),
+        joint_names=motions.joint_names if channel == "joint" else ("x", "y", "z"),
         time=cut(motions.demos.time),
         demos=cut(shown),
         reproductions=cut(made),
@@ -212,7 +216,7 @@ def fit_recording(fitted: FittedPrimitives, title: str) -> FitRecording:
         demo_paths=paths,
         reproduction_paths=reproduced,
         residual=residual,
-        unit="rad" if kind == "joint" else "m",
+        unit="rad" if channel == "joint" else "m",
     )
 
 
@@ -224,7 +228,7 @@ CONTEXTUAL = "contextual"
 
 
 def contexts(
-    demos: DemonstrationSet, columns: Sequence[str], fitted: FittedPrimitives, kind: str
+    demos: DemonstrationSet, columns: Sequence[str], fitted: FittedPrimitives, channel: str
 ) -> Float[Tensor, "demos C"]:
     """What each demonstration was about.
 
@@ -232,14 +236,14 @@ def contexts(
         demos: The demonstrations.
         columns: Whose first row it is; none: start and goal of the motion.
         fitted: To them.
-        kind: Whose start and goal.
+        channel: Whose start and goal.
 
     Raises:
         ValueError: A demonstration lacks a column.
     """
     if not columns:
         motions = fitted.motions
-        position = motions.position(kind)
+        position = motions.position(channel)
         last = (motions.demos.length - 1)[:, None, None]
         goal = position.take_along_dim(last, dim=1)[:, 0]
         return torch.cat([position[:, 0], goal], dim=-1)
@@ -264,27 +268,27 @@ def fit_contextual(
         Error of each demonstration predicted from the others: median and largest.
 
     Raises:
-        ValueError: Fewer than two demonstrations, no such kind, or a context that is missing.
+        ValueError: Fewer than two demonstrations, no such channel, or a missing context.
     """
-    linear = [kind for kind in ("joint", "position") if kind in fitted.each]
+    linear = [channel for channel in ("joint", "position") if channel in fitted.each]
     if not linear:
         raise ValueError("a function of a context is learned of joints or of positions.")
     metrics = {}
-    for kind in linear:
+    for channel in linear:
         motions = fitted.motions
         model = ContextualDMP.fit(
             motions.demos.time,
-            motions.position(kind),
-            contexts(demos, columns, fitted, kind),
+            motions.position(channel),
+            contexts(demos, columns, fitted, channel),
             fitted.n_basis,
             mask=motions.demos.mask,
-            **motions.naming(kind),
+            **motions.naming(channel),
             **fitted.options,
         )
-        model.save(folder / CONTEXTUAL / kind)
+        model.save(folder / CONTEXTUAL / channel)
         error = model.held_out.nrmse
-        metrics[f"contextual_{kind}_held_out_nrmse_median"] = float(error.median())
-        metrics[f"contextual_{kind}_held_out_nrmse_max"] = float(error.max())
+        metrics[f"contextual_{channel}_held_out_nrmse_median"] = float(error.median())
+        metrics[f"contextual_{channel}_held_out_nrmse_max"] = float(error.max())
     return metrics
 
 
@@ -317,32 +321,32 @@ class _Columns(Sequence[tuple[np.ndarray, np.ndarray]]):
 
 
 def fit_streamed(
-    demos: DemonstrationSource, n_basis: int, *, kinds: Sequence[str] = ()
+    demos: DemonstrationSource, n_basis: int, *, channels: Sequence[str] = ()
 ) -> tuple[dict[str, SharedFit], dict[str, float]]:
     """Fit one primitive to all demonstrations, one of them in memory at a time.
 
     Args:
         demos: On disk.
         n_basis: Number of basis functions.
-        kinds: Joint, position, or both; none: joint.
+        channels: Joint, position, or both; none: joint.
 
     Returns:
-        The fits by kind, and what is to be said about them.
+        The fits by channel, and what is to be said about them.
 
     Raises:
-        ValueError: Another kind, whose coordinates depend on where demonstrations end.
+        ValueError: Another channel, whose coordinates depend on where demonstrations end.
     """
     fits, metrics = {}, {"demonstrations": float(len(demos)), "frames": float(demos.frames)}
-    for kind in kinds or ("joint",):
-        if kind not in ("joint", "position"):
-            raise ValueError(f"kind {kind!r} is not streamed: joint and position are.")
-        names = demos.joint_names if kind == "joint" else ("x", "y", "z")
+    for channel in channels or ("joint",):
+        if channel not in ("joint", "position"):
+            raise ValueError(f"channel {channel!r} is not streamed: joint and position are.")
+        names = demos.joint_names if channel == "joint" else ("x", "y", "z")
         fit = fit_shared(
-            _Columns(demos, KINDS[kind][0], demos.source),
+            _Columns(demos, CHANNELS[channel][0], demos.source),
             n_basis,
             joint_names=names,
-            units="rad" if kind == "joint" else "m",
+            units="rad" if channel == "joint" else "m",
         )
-        fits[kind] = fit
-        metrics[f"mean_{kind}_rmse"] = float(fit.rmse.square().mean().sqrt())
+        fits[channel] = fit
+        metrics[f"mean_{channel}_rmse"] = float(fit.rmse.square().mean().sqrt())
     return fits, metrics

@@ -1,4 +1,4 @@
-"""From demonstrations of aiming: the image Jacobian, where to aim, and how to hold the hand."""
+"""From demonstrations of visual servoing: image Jacobian, visual target, approach direction."""
 
 import copy
 from collections.abc import Callable, Iterator, Sequence
@@ -23,23 +23,23 @@ from hrc_learn.jacobian import (
 )
 from hrc_learn.kinematics import panda
 from hrc_learn.kinematics.tool_orientation import Approach
-from hrc_learn.skills.visual_servoing import AimingSkill
+from hrc_learn.skills.visual_servoing import VisualServoSkill
 from hrc_learn.skills.visual_target import OBJECT_FEATURE, VisualTarget
 
 type Demonstrations = DemonstrationSet | DemonstrationSource
 """In memory, or read one by one."""
 
 _REST = 0.3
-"""Time at the end of a demonstration in which the hand stands above the object [s]."""
+"""Time at the end of a demonstration in which the end effector rests above the object [s]."""
 
 
-def fit_aiming(
+def fit_visual_servo(
     demos: Demonstrations,
     neurons: RBFCenters | None = None,
     config: ImageJacobianFitConfig | None = None,
     learning: EvidenceConfig | None = None,
     on_round: Callable[[int, EvidenceRound], None] = lambda number, state: None,
-) -> AimingSkill:
+) -> VisualServoSkill:
     """Fit image Jacobian and, where an object was watched, visual target and approach.
 
     Args:
@@ -53,7 +53,7 @@ def fit_aiming(
     Raises:
         ValueError: If a demonstration lacks a column; names it and the episode.
     """
-    camera = Watching(demos)
+    camera = FeatureTrajectories(demos)
     config = config or ImageJacobianFitConfig()
     neurons = neurons or RBFCenters.around(camera)
     learned = None
@@ -63,7 +63,7 @@ def fit_aiming(
     network = RBFImageJacobian.fit_demonstrations(camera, neurons, config)
     cells = cross_validate(camera, network, config).by_cell()
     ends = _ends(demos, network)
-    return AimingSkill(
+    return VisualServoSkill(
         jacobian=network,
         target=_visual_target(ends) if ends else None,
         approach=Approach.fit([end.path for end in ends]) if ends else None,
@@ -72,7 +72,7 @@ def fit_aiming(
     )
 
 
-class Watching(Sequence[ImageDemonstration]):
+class FeatureTrajectories(Sequence[ImageDemonstration]):
     """Demonstrations as the fit of an image Jacobian takes them, read when asked for."""
 
     def __init__(self, demos: Sequence[Demonstration], source: str | None = None):
@@ -82,10 +82,10 @@ class Watching(Sequence[ImageDemonstration]):
     @overload
     def __getitem__(self, index: int) -> ImageDemonstration: ...
     @overload
-    def __getitem__(self, index: slice) -> "Watching": ...
+    def __getitem__(self, index: slice) -> "FeatureTrajectories": ...
     def __getitem__(self, index):
         if isinstance(index, slice):
-            return Watching(self._demos[index], self._source)
+            return FeatureTrajectories(self._demos[index], self._source)
         return _watched(self._demos[index], self._source)
 
     def __len__(self) -> int:
@@ -102,7 +102,7 @@ def _watched(demo: Demonstration, source: str) -> ImageDemonstration:
     if missing or pose is None or demo.feature is None or demo.feature_visible is None:
         raise ValueError(
             f"{source}, episode {demo.episode}: no {', '.join(missing)}. An image Jacobian "
-            "needs the hand's pose and its marker's pixel in every frame."
+            "needs the end effector's pose and its marker's pixel in every frame."
         )
     return ImageDemonstration(
         pose=pose,
@@ -112,7 +112,7 @@ def _watched(demo: Demonstration, source: str) -> ImageDemonstration:
 
 
 def _pose(demo: Demonstration) -> Pose | None:
-    """Of the hand, as recorded or from the joints of a known arm."""
+    """Of the end effector, as recorded or from the joints of a known arm."""
     if demo.position is not None and demo.orientation is not None:
         return Pose(_double(demo.position), _double(demo.orientation))
     if demo.joint_position is not None and demo.joint_names == panda.joint_names:
@@ -151,21 +151,21 @@ def _ends(demos: Demonstrations, network: RBFImageJacobian) -> list[_End]:
 
 def _end(demo: Demonstration, source: str, network: RBFImageJacobian) -> _End:
     """Means over the rest at the end."""
-    watched = _watched(demo, source)
+    image_demonstrations = _watched(demo, source)
     at_rest = torch.from_numpy(demo.time > demo.time[-1] - _REST)
-    last = (watched.visible & at_rest).nonzero()[:, 0]
+    last = (image_demonstrations.visible & at_rest).nonzero()[:, 0]
     if not len(last):
         raise ValueError(
-            f"{source}, episode {demo.episode}: the hand's marker is not seen in the last "
-            f"{_REST} s, where the hand stands above the object. Leave this episode out."
+            f"{source}, episode {demo.episode}: the end effector's marker is not seen in "
+            f"the last {_REST} s, where it is above the object. Leave this episode out."
         )
     with torch.no_grad():
-        jacobian = network(watched.pose[last]).mean(dim=0)
+        jacobian = network(image_demonstrations.pose[last]).mean(dim=0)
     return _End(
         object_pixel=demo.extra[OBJECT_FEATURE][last.numpy(), :2].mean(axis=0),
-        hand_pixel=watched.feature[last].mean(dim=0).numpy(),
+        hand_pixel=image_demonstrations.feature[last].mean(dim=0).numpy(),
         jacobian=jacobian.numpy(),
-        path=watched.pose,
+        path=image_demonstrations.pose,
     )
 
 
