@@ -167,7 +167,7 @@ class RegionEditor:
         self._draw = gui.add_button("Draw on the table", icon=_DRAW)
         self._draw.on_click(lambda _: self._draw_next())
         self._in_force = gui.add_checkbox(
-            "In force", False, hint="The hand is drawn into the region."
+            "Active", False, hint="The hand is drawn into the region."
         )
         self._in_force.on_update(lambda _: self._update())
         self._sizes = [
