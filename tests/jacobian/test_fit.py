@@ -107,7 +107,7 @@ def test_uncertainty_is_the_spread_of_the_posterior():
 
 
 def test_fit_is_ridge_regression():
-    """Against a plain least-squares solve of the stack_networks rows, prior rows included."""
+    """Against a plain least-squares solve of the stacked rows, prior rows included."""
     poses, features = record(2, frames=80, noise=0.5)
     config = ImageJacobianFitConfig()
     network = fit(poses, features)
