@@ -71,4 +71,4 @@ for name in ("mujoco", "cv2", "lerobot"):
     sys.modules[name] = None
 import hrc_learn.learning, hrc_learn.demos
 """
-    subprocess.run([sys.executable, "-c", program], check=True, timeout=120)
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=600)

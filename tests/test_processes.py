@@ -93,7 +93,7 @@ def test_two_processes_give_the_answer_of_one(program, tmp_path, monkeypatch):
         env={**os.environ, "OMP_NUM_THREADS": "1"},
         capture_output=True,
         text=True,
-        timeout=300,
+        timeout=600,
         check=False,
     )
     assert done.returncode == 0, done.stderr

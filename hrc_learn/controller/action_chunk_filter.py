@@ -130,7 +130,7 @@ class ActionChunkFilter(nn.Module):
 
     def forward(
         self, chunk: Float[Tensor, "*batch T D"], state: ActionChunkState
-    ) -> tuple[Tensor, ActionChunkState, ActionChunkReport]:
+    ) -> tuple[Float[Tensor, "*batch T D"], ActionChunkState, ActionChunkReport]:
         """Follow one chunk, of one sample or many.
 
         Args:

@@ -94,7 +94,7 @@ class LimitBarrier(nn.Module):
 
     def velocity_bounds(
         self, joint_position: Float[Tensor, "*batch n"]
-    ) -> tuple[Tensor, Tensor]:
+    ) -> tuple[Float[Tensor, "*batch n"], Float[Tensor, "*batch n"]]:
         """Lowest and highest velocity [rad/s] of a steady motion (a = 0) inside the set."""
         room = torch.addcmul(self.walls, self.sides, joint_position.unsqueeze(-2))
         # h(|delta|) with the sign of delta: past a limit less its margin the joint is driven
@@ -111,8 +111,8 @@ class LimitBarrier(nn.Module):
         self,
         velocity: Float[Tensor, "*batch n"],
         bounds: tuple[Tensor, Tensor],
-        dt: float | Tensor,
-    ) -> tuple[Tensor, Tensor]:
+        dt: float | Float[Tensor, ""],
+    ) -> tuple[Float[Tensor, "*batch n"], Float[Tensor, "*batch n"]]:
         """Lowest and highest acceleration [rad/s^2] that stay inside the set.
 
         The roots a of v + a dt + (a + A)^2/(2 j) = bound + A^2/(2 j), for both limits.

@@ -158,7 +158,7 @@ def planned_motion(
     twist: Float[Tensor, "*batch 6"],
     jacobian: Float[Tensor, "*batch 6 n"],
     joint_velocity: Float[Tensor, "*batch n"],
-    dt: float | Tensor,
+    dt: float | Float[Tensor, ""],
 ) -> Float[Tensor, "*batch 6"]:
     """The part of the step to come that the task has planned.
 

@@ -146,7 +146,7 @@ class SafetyFilter(nn.Module):
 
     def velocity_bounds(
         self, joint_position: Float[Tensor, "*batch n"]
-    ) -> tuple[Tensor, Tensor]:
+    ) -> tuple[Float[Tensor, "*batch n"], Float[Tensor, "*batch n"]]:
         """Lowest and highest velocity [rad/s] that position and velocity limits allow."""
         return self.barrier.velocity_bounds(joint_position)
 
@@ -162,7 +162,7 @@ class SafetyFilter(nn.Module):
         stop: Bool[Tensor, "*batch"] | None = None,
         stale: Bool[Tensor, "*batch"] | None = None,
         bounds: tuple[Tensor, Tensor] | None = None,
-    ) -> tuple[Tensor, SafetyState, SafetyReport]:
+    ) -> tuple[Float[Tensor, "*batch n"], SafetyState, SafetyReport]:
         """Velocity to send for the next `dt` seconds.
 
         Args:

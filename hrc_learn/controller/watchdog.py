@@ -35,7 +35,7 @@ class Watchdog:
         """Set up; the time starts with the first `feed`, or on entering the context.
 
         Args:
-            timeout: Longest silence [s].
+            timeout: Longest silence [s]; it is noticed up to a quarter of it late.
             stop: Brings the arm to rest. Called once for every silence.
             clock: Tells the time [s].
 
@@ -68,6 +68,7 @@ class Watchdog:
             if late:
                 self._fed = None  # until fed again there is nothing to stop
                 self.trips += 1
+        # Outside the lock: stopping an arm may take long, and may feed.
         if late:
             self._stop()
         return late
@@ -87,5 +88,6 @@ class Watchdog:
         self._thread.join()
 
     def _watch(self) -> None:
+        # A silence is noticed at most a quarter of the timeout late.
         while not self._done.wait(self._timeout / 4):
             self.check()

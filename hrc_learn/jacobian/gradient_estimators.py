@@ -81,7 +81,7 @@ class CompositeConfig(KeyFrameConfig):
     task_gain: float = 0.25
     """Of the paper's term: diagonal of L."""
     prediction_gain: float = 0.5
-    """Share of the prediction error that one pair removes, 0 to below 2."""
+    """Fraction of the prediction error that one pair removes, 0 to below 2."""
     noise_floor: float = 2e-3
     """Motion [m] at which half of that share is believed: below it noise is."""
     weight_bound: float = 2e4
@@ -151,7 +151,7 @@ class BroydenConfig(KeyFrameConfig):
     min_step: float = 2e-3
     """Least motion between key frames [m]: without a noise model it must be large."""
     gain: float = 0.5
-    """Share of the prediction error that one pair removes, above 0 to 1."""
+    """Fraction of the prediction error that one pair removes, above 0 to 1."""
     weight_bound: float = 2e4
     """Largest entry of the weights [px/m], rotation counted with `rotation_scale`."""
 

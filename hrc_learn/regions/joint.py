@@ -52,7 +52,9 @@ class JointRegion(Region):
         """f_i of every joint at the nearer limit [rad] ("paper": [rad^2])."""
         return self._depths(self.half_range - (x - self.centre).abs())[0]
 
-    def feedback(self, x: Float[Tensor, "*batch n"]) -> tuple[Tensor, Tensor]:
+    def feedback(
+        self, x: Float[Tensor, "*batch n"]
+    ) -> tuple[Float[Tensor, "*both"], Float[Tensor, "*both m"]]:
         """Potential and its gradient over the joint positions."""
         offset = x - self.centre
         distance = self.half_range - offset.abs()
@@ -98,7 +100,9 @@ class PostureRegion(Region):
         """Region function f at the joint position x [rad]."""
         return torch.linalg.vector_norm(x - self.goal, dim=-1) / self.tolerance - 1
 
-    def feedback(self, x: Float[Tensor, "*batch n"]) -> tuple[Tensor, Tensor]:
+    def feedback(
+        self, x: Float[Tensor, "*batch n"]
+    ) -> tuple[Float[Tensor, "*both"], Float[Tensor, "*both m"]]:
         """Potential and its gradient over the joint positions."""
         offset = x - self.goal
         square = torch.linalg.vecdot(offset, offset).unsqueeze(-1)

@@ -109,7 +109,9 @@ class OrientationRegion(Region):
         )
         return self.sharpness * half_angle - 1
 
-    def feedback(self, x: Float[Tensor, "*batch 4"]) -> tuple[Tensor, Tensor]:
+    def feedback(
+        self, x: Float[Tensor, "*batch 4"]
+    ) -> tuple[Float[Tensor, "*both"], Float[Tensor, "*both 3"]]:
         """Potential of shape (*both,) and its gradient (*both, 3) [1/rad]."""
         error = self._error(x)
         sine = torch.linalg.vector_norm(error[..., 1:], dim=-1, keepdim=True)

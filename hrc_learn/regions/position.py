@@ -39,7 +39,9 @@ class PositionRegion(Region):
         scaled = self._in_box(x) / self.half_size
         return scaled * scaled - 1
 
-    def feedback(self, x: Float[Tensor, "*batch 3"]) -> tuple[Tensor, Tensor]:
+    def feedback(
+        self, x: Float[Tensor, "*batch 3"]
+    ) -> tuple[Float[Tensor, "*both"], Float[Tensor, "*both 3"]]:
         """Potential and its gradient over the position, in the base frame."""
         scaled = self._in_box(x) / self.half_size
         f = (scaled * scaled - 1).clamp(min=0)

@@ -20,7 +20,9 @@ class Region(ABC):
         """Region function f, at most zero inside; one number or one for each side."""
 
     @abstractmethod
-    def feedback(self, x: Float[Tensor, "*batch n"]) -> tuple[Tensor, Tensor]:
+    def feedback(
+        self, x: Float[Tensor, "*batch n"]
+    ) -> tuple[Float[Tensor, "*both"], Float[Tensor, "*both m"]]:
         """Potential P of shape (*batch,) and its gradient of shape (*batch, n)."""
 
     @final

@@ -80,7 +80,9 @@ class VisionRegion(Region):
             return square.unflatten(-1, (-1, 2)).sum(-1).amax(-1) - 1
         return square.sum(-1) - 1
 
-    def feedback(self, x: Float[Tensor, "*batch rows"]) -> tuple[Tensor, Tensor]:
+    def feedback(
+        self, x: Float[Tensor, "*batch rows"]
+    ) -> tuple[Float[Tensor, "*both"], Float[Tensor, "*both rows"]]:
         """Potential and its gradient over the feature position [1/px]; means over points."""
         scaled = (x - self.target) / self.half_size
         if scaled.shape[-1] > 2:

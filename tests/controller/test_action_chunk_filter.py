@@ -154,6 +154,42 @@ def test_batches_and_joints_are_followed_one_by_one(batch):
             torch.testing.assert_close(together[index][:, j], positions[:, 0])
 
 
+def test_the_report_says_when_any_joint_would_break_a_limit():
+    """Against plain loops over samples and joints, for limits that a tenth of them break."""
+    rng = torch.Generator().manual_seed(3)
+    joints, steps = 2, 40
+    chunk = 0.1 * torch.randn(steps, joints, generator=rng, dtype=torch.float64)
+    start = torch.zeros(joints, dtype=torch.float64)
+    derivatives = [torch.cat([start.expand(3, joints), chunk])]
+    for _ in range(3):
+        derivatives.append(derivatives[-1].diff(dim=0) / DT)
+    values = [x[-steps:] for x in derivatives]
+    tenth = [x.abs().quantile(0.9, dim=0) for x in values]
+    given_limits = MotionLimits(
+        lower=-tenth[0],
+        upper=0.9 * tenth[0],
+        velocity=tenth[1],
+        acceleration=tenth[2],
+        jerk=tenth[3],
+    )
+    smoother = ActionChunkFilter(given_limits, DT)
+    # The filter may lower its own limit of acceleration, which is not what a chunk breaks.
+    tenth[2] = smoother.barrier.acceleration
+    _, _, report = smoother(chunk, smoother.initial_state(start))
+    for k in range(steps):
+        expected = [False] * 4
+        for j in range(joints):
+            expected[0] |= bool(values[0][k, j] > 0.9 * tenth[0][j])
+            expected[0] |= bool(values[0][k, j] < -tenth[0][j])
+            for kind in (1, 2, 3):
+                expected[kind] |= bool(values[kind][k, j].abs() > tenth[kind][j])
+        assert report.broken[k].tolist() == expected
+    share = report.broken.double().mean(dim=0)
+    assert share[0] < 0.5
+    assert share[1] < 0.5
+    assert (share > 0).all()
+
+
 def test_what_is_not_finite_is_taken_for_what_came_before():
     smoother, start = ActionChunkFilter(limits(), DT), torch.zeros(1, dtype=torch.float64)
     chunk = wave(10)

@@ -70,6 +70,21 @@ def test_a_person_too_close_ends_motion_in_the_null_space_too(distance, acts):
     torch.testing.assert_close(v, 0 * u if acts else u)
 
 
+def test_who_wants_to_rest_before_a_person_rests():
+    """Neither the tool's speed nor the one allowed is other than zero: no 0 / 0."""
+    safety, J, zero = SafetyFilter(panda.limits), panda.jacobian(READY), torch.zeros_like(READY)
+    v, _, report = safety.step(
+        safety.initial_state(READY),
+        READY,
+        zero,
+        0.01,
+        jacobian=J,
+        human_distance=tensor(0.0)[0],
+    )
+    assert (v == 0).all()
+    assert report.acted("separation")
+
+
 def test_at_the_speed_that_the_distance_allows_nothing_is_reported():
     safety, J = SafetyFilter(panda.limits), panda.jacobian(READY)
     allowed = SeparationConfig().highest_speed(tensor(0.6))[0]

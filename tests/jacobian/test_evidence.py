@@ -8,6 +8,7 @@ from torch.testing import assert_close
 
 from hrc_learn.jacobian import (
     EvidenceConfig,
+    HeldOutSamples,
     ImageJacobianFitConfig,
     RBFCenters,
     RBFImageJacobian,
@@ -163,3 +164,31 @@ def test_held_out_errors_by_place_add_up():
     with pytest.raises(ValueError, match="just fitted"):
         cross_validate(demonstrations, loaded, config)
     assert math.isfinite(float(cells.uncertainty.nanmean()))
+
+
+def test_cells_lie_where_their_edges_say():
+    """Each pair counted by a plain loop over the edges; x is the first axis, y the second."""
+    rng = torch.Generator().manual_seed(5)
+    pairs = 60
+    place = torch.rand(pairs, 3, generator=rng, dtype=torch.float64) * torch.tensor(
+        [0.9, 0.3, 1]
+    )
+    place[:, 1] = place[:, 1].square()  # not symmetric in x and y
+    motion, error = torch.randn(2, pairs, 2, generator=rng, dtype=torch.float64)
+    uncertainty = torch.rand(pairs, generator=rng, dtype=torch.float64)
+    cells = HeldOutSamples(
+        position=place, motion=motion, error=error, uncertainty=uncertainty
+    ).by_cell(2)
+    (x0, y0), (x1, y1), (x2, y2) = cells.edges.tolist()
+    for i, (x_low, x_high) in enumerate([(x0, x1), (x1, x2)]):
+        for k, (y_low, y_high) in enumerate([(y0, y1), (y1, y2)]):
+            x, y = place[:, 0], place[:, 1]
+            inside = (x >= x_low) & (y >= y_low)
+            inside &= (x < x_high) if i == 0 else (x <= x_high)
+            inside &= (y < y_high) if k == 0 else (y <= y_high)
+            assert cells.pairs[i, k] == inside.sum()
+            relative = (error[inside].norm() / motion[inside].norm()).item()
+            assert cells.relative[i, k].item() == pytest.approx(relative)
+            mean = uncertainty[inside].mean().item()
+            assert cells.uncertainty[i, k].item() == pytest.approx(mean)
+    assert cells.pairs[0, 1] != cells.pairs[1, 0]

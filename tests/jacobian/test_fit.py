@@ -12,6 +12,7 @@ from hrc_learn.jacobian import (
     image_demonstrations,
     paper_grid,
 )
+from hrc_learn.jacobian.fitting import prior_precision
 from hrc_learn.jacobian.samples import (
     KeyFrameConfig,
     MotionSamples,
@@ -106,7 +107,7 @@ def test_uncertainty_is_the_spread_of_the_posterior():
 
 
 def test_fit_is_ridge_regression():
-    """Against a plain least-squares solve of the stack_networks rows, prior rows included."""
+    """Against a plain least-squares solve of the stacked rows, prior rows included."""
     poses, features = record(2, frames=80, noise=0.5)
     config = ImageJacobianFitConfig()
     network = fit(poses, features)
@@ -124,6 +125,39 @@ def test_fit_is_ridge_regression():
     assert_close(
         network.weight.detach(), (solution * scale).flatten(0, 1), rtol=1e-6, atol=1e-6
     )
+
+
+def test_the_report_states_root_mean_squares_over_all_pairs():
+    """Each demonstration predicted by ridge regression on the others, pair by pair."""
+    poses, features = record(3, frames=60, noise=0.5)
+    config = ImageJacobianFitConfig()
+    network = fit(poses, features)
+    precision = prior_precision(network.centers, config)
+    motions = [demo.motion(config) for demo in image_demonstrations(poses, features)]
+    phi = [motion.regressors(network.basis).detach() for motion in motions]
+
+    def ridge(chosen, noise):
+        rows = torch.cat([phi[i] for i in chosen])
+        dx = torch.cat([motions[i].dx for i in chosen])
+        return torch.linalg.solve(rows.mT @ rows / noise + precision, rows.mT @ dx / noise)
+
+    def rms(squares):
+        return torch.cat(squares).mean().item() ** 0.5
+
+    noise = 2 * config.pixel_noise**2
+    unseen = []
+    for i, motion in enumerate(motions):
+        w = ridge([k for k in range(3) if k != i], noise)
+        unseen.append((motion.dx - phi[i] @ w).square().sum(-1))
+    report = network.report
+    assert report.pairs == sum(len(motion.dx) for motion in motions)
+    assert report.motion == pytest.approx(rms([m.dx.square().sum(-1) for m in motions]))
+    assert report.held_out_error == pytest.approx(rms(unseen), rel=1e-6)
+    # What the network misses counts as noise in both coordinates, where it is more.
+    assert report.noise == pytest.approx(max(noise**0.5, rms(unseen) / 2**0.5), rel=1e-6)
+    w = ridge(range(3), report.noise**2)
+    seen = [(m.dx - phi[i] @ w).square().sum(-1) for i, m in enumerate(motions)]
+    assert report.error == pytest.approx(rms(seen), rel=1e-6)
 
 
 def test_statistics_add_up_in_any_order():

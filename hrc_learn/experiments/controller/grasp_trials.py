@@ -275,7 +275,7 @@ def _controller(
 
 
 class _Judge:
-    """Watches a rehearsal and keeps what the result needs."""
+    """Watches a closed-loop simulation and keeps what the result needs."""
 
     def __init__(self, scene: _Scene, controller: AdaptiveController, config: TrialConfig):
         self.scene, self.controller, self.dt = scene, controller, config.dt
