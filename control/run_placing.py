@@ -1,243 +1,49 @@
-"""Place a thing on three shelves by a motion that was shown for one of them.
+"""Place an object on three shelves by a motion that was demonstrated for one of them.
 
-In simulation, with the thing held between the fingers: the demonstrated motion once more and
-faster, then the other shelves, as the paper does it (joint space, shifted goal) and in task
-space with the learned body shape; the demonstration with and without that shape; on request
+In simulation, with the object held by friction: the demonstrated motion reproduced faster,
+then the other shelves, in task space with the learned null-space posture and as the paper does
+it (joint space, shifted goal); the demonstration with and without that posture; on request
 from many random starts. Writes Rerun recordings, a report and the measured values. Exit status
 1 if a target was missed.
 """
 
-import json
-import shlex
-import shutil
-import sys
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
-
-from rich.console import Console
-from rich.table import Table
 
 from hrc_learn import cli
-from hrc_learn.demos import load_demos
-from hrc_learn.experiments.monte_carlo import Run, Summary, Trial, repeat
-from hrc_learn.experiments.placing.experiment import (
-    SPACES,
-    BodyShapeTrials,
-    PlacingExperiment,
-    PlacingTrials,
-    run_placing_experiment,
-)
-from hrc_learn.experiments.placing.metrics import (
-    evaluate_lessons,
-    evaluate_placing,
-    evaluate_random_starts,
-)
-from hrc_learn.experiments.placing.report import record_placing
-from hrc_learn.experiments.run_recording import ServeConfig, serving, unwatched
-from hrc_learn.output import MADE_BY, new_folder
-from hrc_learn.sim import RenderingUnavailableError
-from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.placing import PlacingSkill
-from hrc_learn.viz.report import Measurement, show_measurements, write_report
-from hrc_learn.viz.run_dashboard import record_run
+from hrc_learn.experiments.frame import RunOptions, conduct
+from hrc_learn.experiments.placing.experiment import ABLATION, PlacingExperiment, dataset_of
 
 
 @dataclass(frozen=True, kw_only=True)
-class Args:
+class Args(RunOptions):
     """What to run."""
 
     placing: Path
     """Folder of training/fit_dmp.py, from demonstrations of placing."""
-    out: Path
-    """Folder for recordings, report and measured values."""
     demonstrations: Path | None = None
     """Dataset the motion was learned from; the one named in that folder when None."""
     speed: float = 1.5
     """How many times faster than demonstrated."""
-    seeds: int = 0
-    """Random starts from which to place on each shelf besides."""
     noise: float = 0.1
-    """Standard deviation of each joint at these starts, about home [rad]."""
-    lessons: int = 0
-    """Further demonstrations with and without the body's shape."""
-    processes: int = 1
-    """Of the repetitions, at once."""
-    seed: int = 0
-    """First seed of starts and demonstrations."""
-    serve: bool = False
-    """Serve the dashboard of the reproduction in the browser while it goes on."""
-    serving: ServeConfig = field(default_factory=ServeConfig)
-    """Where, with --serve."""
+    """Standard deviation of each joint at the random starts of --trials, about home [rad]."""
+    ablation: int = 0
+    """Further demonstrations with and without null-space posture."""
     pictures: bool = True
     """Whether to render pictures of the arm, where this machine can."""
-    overwrite: bool = False
-    """Replace an older run in that folder."""
-    json: Path | None = None
-    """File for the measured values."""
 
 
 def main(args: Args) -> int:
-    _check(args)
-    console = Console()
-    skill, dataset = PlacingSkill.load(args.placing), args.demonstrations or _dataset(args)
-    demonstration = load_demos(dataset, episodes=[0])[0]
-
-    def opened(address: str) -> None:
-        console.print(f"Dashboard at [bold]{address}[/]")
-
-    with new_folder(args.out, asdict(args), args.overwrite) as folder:
-        with console.status("Placing") as status:
-            experiment = run_placing_experiment(
-                skill,
-                demonstration,
-                Workplace(),
-                speed=args.speed,
-                seed=args.seed,
-                on_step=lambda what: status.update(f"Placing: {what}"),
-                watch=serving("Placing", args.serving, opened) if args.serve else unwatched,
-            )
-        table = evaluate_placing(experiment)
-        starts = _repeat(
-            args,
-            "starts",
-            args.seeds,
-            PlacingTrials(
-                placing=args.placing.resolve(),
-                demonstrations=dataset.resolve(),
-                speed=args.speed,
-                noise=args.noise,
-            ),
-        )
-        lessons = _repeat(
-            args, "lessons", args.lessons, BodyShapeTrials(shelf=experiment.shown_shelf)
-        )
-        table += evaluate_random_starts(starts, Workplace().shelf_names()) if starts else []
-        table += evaluate_lessons(lessons) if lessons else []
-        with console.status("Writing recordings and report"):
-            _write(args, folder, experiment, table, starts)
-        values = _values(experiment, table, starts)
-        cli.write_json(folder / "measured.json", values)
-    for name in ("starts", "lessons"):
-        _trial_file(args, name).unlink(missing_ok=True)
-    if args.json is not None:
-        cli.write_json(args.json, values)
-    console.print(_side_by_side(experiment))
-    show_measurements(table)
-    if starts:
-        console.print(Summary.of(starts).table("Placing on all shelves from random starts"))
-    console.print(f"Recordings rerun {args.out / 'run*.rrd'}")
-    console.print(f"Report     {args.out / 'report.html'}")
-    return 1 if any(m.ok is False for m in table) else 0
-
-
-def _check(args: Args) -> None:
-    if args.speed <= 0 or args.noise < 0 or min(args.seeds, args.lessons) < 0:
-        raise ValueError(
-            "--speed must be positive, --noise, --seeds and --lessons not negative, but are "
-            f"{args.speed:g}, {args.noise:g}, {args.seeds} and {args.lessons}."
-        )
-
-
-def _dataset(args: Args) -> Path:
-    """The dataset that the motion was learned from."""
-    path = Path(json.loads((args.placing / MADE_BY).read_text())["dataset"])
-    if not path.is_dir():
-        raise FileNotFoundError(
-            f"{path}, which {args.placing} was learned from, is not there any more: name the "
-            "dataset with --demonstrations."
-        )
-    return path
-
-
-def _trial_file(args: Args, name: str) -> Path:
-    """Beside the folder, which is there only when all is done: a stopped run goes on."""
-    return args.out.with_name(f"{args.out.name}.{name}.jsonl")
-
-
-def _repeat(args: Args, name: str, count: int, run: Run) -> list[Trial]:
-    if not count:
-        return []
-    return repeat(
-        run,
-        range(args.seed, args.seed + count),
-        _trial_file(args, name),
-        made_by=asdict(run),  # pyright: ignore[reportArgumentType]
-        processes=args.processes,
-        title=name.capitalize(),
+    dataset = args.demonstrations or dataset_of(args.placing)
+    experiment = PlacingExperiment(
+        placing=args.placing.resolve(),
+        demonstrations=dataset.resolve(),
+        speed=args.speed,
+        noise=args.noise,
+        snapshots=args.pictures,
     )
-
-
-def _write(
-    args: Args,
-    folder: Path,
-    experiment: PlacingExperiment,
-    table: Sequence[Measurement],
-    starts: Sequence[Trial],
-) -> None:
-    from hrc_learn.experiments.placing.report import placing_report  # matplotlib takes a second
-
-    for (space, shelf), run in experiment.runs.items():
-        if space == "pose":
-            suffix = "" if shelf == experiment.shown_shelf else f"_{shelf}"
-            record_run(folder / f"run{suffix}.rrd", record_placing(run, experiment))
-    report = placing_report(
-        experiment,
-        table,
-        trials=starts,
-        pictures=_pictures(experiment) if args.pictures else None,
-        configuration=asdict(args),
-        command=shlex.join(["python", *sys.argv]),
-    )
-    write_report(folder, report)
-    for name in ("starts", "lessons"):
-        if (file := _trial_file(args, name)).exists():
-            shutil.copy(file, folder / f"{name}.jsonl")
-
-
-def _pictures(experiment: PlacingExperiment) -> Mapping[str, Any] | None:
-    from hrc_learn.experiments.placing.snapshots import take_pictures
-
-    try:
-        return take_pictures(experiment)
-    except RenderingUnavailableError as error:
-        print(f"note: no pictures of the arm, as {error}", file=sys.stderr)
-        return None
-
-
-def _values(
-    experiment: PlacingExperiment, table: Sequence[Measurement], starts: Sequence[Trial]
-) -> dict[str, float | int]:
-    values: dict[str, float | int] = {m.key: m.value for m in table}
-    for (space, shelf), figures in experiment.figures.items():
-        values |= {f"{space}_{shelf}_{name}": v for name, v in figures.row().items()}
-    if starts:
-        summary = Summary.of(starts).figures()
-        values |= {f"random_starts_{name}": value for name, value in summary.items()}
-    return values
-
-
-def _side_by_side(experiment: PlacingExperiment) -> Table:
-    """The two ways to other shelves."""
-    columns = ("bend [mm]", "goal [mm]", "goal [deg]", "contacts", "limits", "speed", "jerk")
-    table = Table("planned in", "shelf", title="Three shelves")
-    for column in columns:
-        table.add_column(column, justify="right")
-    for (space, shelf), f in experiment.figures.items():
-        row = f.row()
-        table.add_row(
-            SPACES[space],
-            shelf,
-            f"{row['bend_mm']:.1f}",
-            f"{row['goal_error_mm']:.2f}",
-            f"{row['goal_error_deg']:.3f}",
-            f"{row['contacts']}",
-            f"{row['limit_violations']}",
-            f"{row['peak_speed_share']:.2f}",
-            f"{row['jerk_share']:.0e}",
-        )
-    return table
+    counts = {ABLATION: args.ablation}
+    return conduct(experiment, args, counts=counts, configuration=asdict(args))
 
 
 if __name__ == "__main__":

@@ -3,15 +3,13 @@
 Exit status: 0 done, 1 the work failed, 2 bad input. Bad input ends in one line on stderr.
 """
 
-import json
-import math
 import sys
 import warnings
 from collections.abc import Callable, Mapping
-from pathlib import Path
-from typing import Any, NoReturn, SupportsFloat
+from typing import NoReturn
 
-from hrc_learn.output import new_file
+from hrc_learn.output import write_json as write_json
+from hrc_learn.output import write_text as write_text
 
 
 def run[Args](main: Callable[[Args], int | None], args: type[Args]) -> NoReturn:
@@ -45,25 +43,6 @@ def one_line(error: BaseException) -> str:
     return " ".join(" ".join([text, *getattr(error, "__notes__", ())]).split())
 
 
-def write_json(path: str | Path, values: Mapping[str, SupportsFloat]) -> None:
-    """Write measured values as one flat object; the file is whole or not there at all.
-
-    Args:
-        path: File to write; its folder is made where missing.
-        values: Name -> number. Numbers that are not finite become null, as JSON has none.
-    """
-    content = {name: _number(value) for name, value in values.items()}
-    write_text(path, json.dumps(content, indent=2) + "\n")
-
-
-def write_text(path: str | Path, text: str) -> None:
-    """Write a file that is whole or not there at all; its folder is made where missing."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with new_file(path) as part:
-        part.write_text(text)
-
-
 def _warning_line(message: Warning | str, *_place: object, **_line: object) -> str:
     """A warning as a user reads it: without the place in our code that gave it."""
     return f"warning: {message}\n"
@@ -78,12 +57,6 @@ def show_values(title: str, values: Mapping[str, float]) -> None:
     for name, value in values.items():
         table.add_row(name.replace("_", " "), f"{value:.3g}")
     Console().print(table)
-
-
-def _number(value: Any) -> float | int | bool | None:
-    # numpy's and torch's scalars come as their plain counterparts.
-    plain = value.item() if hasattr(value, "item") else value
-    return None if isinstance(plain, float) and not math.isfinite(plain) else plain
 
 
 def _summary(main: Callable) -> str | None:

@@ -1,12 +1,13 @@
 """Files and folders of results that are whole or not there at all."""
 
 import json
+import math
 import os
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, SupportsFloat
 
 MADE_BY = "made_by.json"
 """File in each folder of results: what it was made from."""
@@ -97,3 +98,28 @@ def new_folder(
         folder.mkdir()
         yield folder
         (folder / MADE_BY).write_text(json.dumps(made_by, indent=2, default=str) + "\n")
+
+
+def write_json(path: str | Path, values: Mapping[str, SupportsFloat]) -> None:
+    """Write measured values as one flat object; the file is whole or not there at all.
+
+    Args:
+        path: File to write; its folder is made where missing.
+        values: Name -> number. Numbers that are not finite become null, as JSON has none.
+    """
+    content = {name: _number(value) for name, value in values.items()}
+    write_text(path, json.dumps(content, indent=2) + "\n")
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Write a file that is whole or not there at all; its folder is made where missing."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with new_file(path) as part:
+        part.write_text(text, encoding="utf-8")
+
+
+def _number(value: Any) -> float | int | bool | None:
+    # numpy's and torch's scalars come as their plain counterparts.
+    plain = value.item() if hasattr(value, "item") else value
+    return None if isinstance(plain, float) and not math.isfinite(plain) else plain

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -48,15 +47,6 @@ class EffortResult:
     """Displacement of the tool, on target at the start [m]."""
     turn: Float[Tensor, "trials"]
     """Turn of the tool [rad]."""
-
-    @staticmethod
-    def join(parts: Sequence[EffortResult]) -> EffortResult:
-        """The trials of several results."""
-        return EffortResult(
-            elbow=torch.cat([part.elbow for part in parts]),
-            deviation=torch.cat([part.deviation for part in parts]),
-            turn=torch.cat([part.turn for part in parts]),
-        )
 
     def summary(self) -> dict[str, float]:
         """Medians and 95th percentiles in mm and degrees."""

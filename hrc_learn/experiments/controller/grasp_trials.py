@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Literal
 
 import torch
@@ -125,14 +125,6 @@ class TrialResult:
     """Largest joint velocity over its limit."""
     hand_overs: Int[Tensor, "trials"]
     """How often the camera took over or let go."""
-
-    @staticmethod
-    def join(parts: Sequence[TrialResult]) -> TrialResult:
-        """The trials of several results."""
-        names = [field.name for field in fields(TrialResult)]
-        return TrialResult(
-            **{name: torch.cat([getattr(part, name) for part in parts]) for name in names}
-        )
 
     def summary(self) -> dict[str, float]:
         """Shares, medians and totals, by name."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -62,15 +61,6 @@ class StressResult:
     """Steps with a NaN in command or state."""
     interventions: Int[Tensor, "trials kinds"]
     """Steps in which the safety filter acted, by kind."""
-
-    @staticmethod
-    def join(parts: Sequence[StressResult]) -> StressResult:
-        """The trials of several results."""
-        return StressResult(
-            beyond=torch.cat([part.beyond for part in parts]),
-            unknown=torch.cat([part.unknown for part in parts]),
-            interventions=torch.cat([part.interventions for part in parts]),
-        )
 
     def summary(self) -> dict[str, float]:
         """Totals by name."""
