@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, is_dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 from hrc_learn.experiments.live_view import LiveView, LiveViewConfig, live_view, no_live_view
 from hrc_learn.experiments.metric_table import Evaluation, Metric, evaluate
@@ -78,6 +78,7 @@ class Study:
         )
 
 
+@runtime_checkable
 class Experiment[Run](Protocol):
     """What an experiment supplies; `Run` is what one run leaves to be evaluated and drawn."""
 

@@ -7,7 +7,7 @@ import rerun as rr
 import torch
 from rrd_reading import Rrd
 
-from hrc_learn.experiments.run_recording import ServeConfig, serving
+from hrc_learn.experiments.live_view import LiveViewConfig, live_view
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import MotionLog, World
 from hrc_learn.sim.workplace import Workplace
@@ -36,8 +36,11 @@ def test_a_station_is_shown_while_it_works(tmp_path, monkeypatch):
         human=ScriptedPuller(panda, ()),
         advance=motion.advance,
     )
-    config = ServeConfig(port=1, data_port=2, period=0.01)
-    with torch.inference_mode(), serving("Held", config, opened.append)(station, world, motion):
+    config = LiveViewConfig(port=1, data_port=2, period=0.01)
+    with (
+        torch.inference_mode(),
+        live_view("Held", config, opened.append)(station, world, motion),
+    ):
         station.enter("hold")
         station.stay(0.3)
     assert opened == ["http://viewer:1"]

@@ -49,13 +49,25 @@ def test_the_job_is_done_and_every_target_met(work):
         *("control/run_collaboration.py", "--placing", work / "placing"),
         *("--aiming", work / "aiming", "--out", out, "--shelf", "lower"),
         *("--camera", "synthetic", "--seed", 3, "--json", work / "measured.json"),
-        *("--config.interaction", 5, "--occlusion", 0, 3, "--latency", 0.04, "--drop", 0.1),
+        *(
+            "--config.interaction",
+            5,
+            "--occlusion",
+            0,
+            3,
+            "--latency",
+            0.04,
+            "--frame-loss",
+            0.1,
+        ),
     )
     assert "missed" not in done.stdout
     measured = json.loads((work / "measured.json").read_text())
     assert measured["objects_that_stand_on_their_shelf"] == 1
     assert measured["recovered_from_marker_out_of_sight"] == 1
-    assert measured["collisions_with_the_cabinet"] == 0
+    assert measured["contacts_with_the_cabinet"] == 0
+    assert measured["contacts"] == measured["joint_limit_violations"] == 0
+    assert measured["trials"] == measured["success_rate"] == 1
     assert {path.name for path in out.iterdir()} == {
         "figures",
         "log.npz",

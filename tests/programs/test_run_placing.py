@@ -39,22 +39,28 @@ def test_three_shelves_are_reached_free_of_contact_and_everything_is_written(wor
     out = work / "run"
     done = run(
         *("control/run_placing.py", "--placing", work / "placing", "--out", out),
-        *("--seeds", 1, "--json", work / "measured.json"),
+        *("--trials", 1, "--json", work / "measured.json"),
     )
     assert "missed" not in done.stdout
     measured = json.loads((work / "measured.json").read_text())
     for shelf in ("lower", "middle", "upper"):
-        assert measured[f"pose_{shelf}_placed"] == 1
-        assert measured[f"pose_{shelf}_contacts"] == 0
-        assert measured[f"pose_{shelf}_bend_mm"] < 12
-    # The paper's way: bent on the shelves that were not shown.
-    assert measured["joint_lower_bend_mm"] > 60
-    assert measured["joint_upper_bend_mm"] > 60
-    assert measured["random_starts_successes"] == 1
+        assert measured[f"{shelf}_shelf_placed"] == 1
+        assert measured[f"{shelf}_shelf_contacts"] == 0
+        assert measured[f"{shelf}_shelf_approach_path_deviation_mm"] < 12
+    # The paper's way: far off on the shelves that were not demonstrated.
+    assert measured["joint_space_lower_shelf_approach_path_deviation_mm"] > 60
+    assert measured["joint_space_upper_shelf_approach_path_deviation_mm"] > 60
+    assert measured["successes"] == measured["trials"] == 1
+    assert measured["contacts"] == 0
     files = {path.name for path in out.iterdir()}
-    assert {"report.html", "report.json", "starts.jsonl", "run_upper.rrd"} <= files
+    assert {"report.html", "report.json", "trials.jsonl", "run_upper.rrd"} <= files
     pictures = {path.name for path in (out / "figures").iterdir()}
-    assert {"paths.png", "joints_joint_space.png", "bend.png", "random_starts.png"} <= pictures
+    assert {
+        "paths.png",
+        "joints_joint_space.png",
+        "approach.png",
+        "random_starts.png",
+    } <= pictures
     assert not list(work.glob("*.jsonl"))
 
 

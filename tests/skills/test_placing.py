@@ -9,7 +9,9 @@ import torch
 from unchecked import shapes_unchecked
 
 from hrc_learn.demos import DatasetWriter, load_demos
-from hrc_learn.experiments.placing.trial import place, placing_figures
+from hrc_learn.experiments.metric_table import evaluate
+from hrc_learn.experiments.placing.metrics import placing_metrics
+from hrc_learn.experiments.placing.trial import PlacingOutcome, place
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import UnreachableError, panda
 from hrc_learn.learning.fit_primitives import fit_primitives
@@ -134,12 +136,12 @@ def test_check_plan_names_what_would_be_hit(skill, world):
 
 def test_a_placing_carried_out_ends_on_the_shelf_as_it_was_shown(skill, demos):
     run = place(skill, WORKPLACE, "middle", HOME, space="joint", speed=2.5)
-    figures = placing_figures(run, WORKPLACE, demos[0])
-    assert figures.faults == []
-    assert figures.placed
-    assert figures.jerk < 1e-2
+    outcome = PlacingOutcome.of(run, WORKPLACE, demos[0])
+    assert evaluate(placing_metrics(["middle"]), {"middle": outcome}).faults == ()
+    assert outcome.placed
+    assert outcome.jerk < 1e-2
     # Measured by the simulator, so not exactly what was planned.
-    assert 0 < figures.goal_distance < 5e-4
+    assert 0 < outcome.place_error < 5e-4
     np.testing.assert_allclose(run.path[-1], run.plan.goal.position.numpy(), atol=1e-3)
     assert [event.text for event in run.station.log.events] == [
         "transfer",

@@ -8,8 +8,8 @@ import pytest
 from page_in_browser import PATIENCE, Browser, chromium, wait_until
 from taught_skills import taught_aiming, taught_placing
 
-from hrc_learn.experiments.collaboration.experiment import simulate_collaboration
-from hrc_learn.experiments.run_recording import ELBOW, Deviation, link_poses, span
+from hrc_learn.experiments.collaboration.trial import simulate_collaboration
+from hrc_learn.experiments.run_measures import ELBOW, Deviation, link_poses, span
 from hrc_learn.skills.pick_and_place import CollaborationConfig
 from hrc_learn.teleoperation import page_session as page_beside
 from hrc_learn.teleoperation.page import Page, PageConfig
@@ -31,11 +31,11 @@ class Job:
             placing,
             ("middle",),
             camera="synthetic",
-            pulls=(),
+            forces=(),
             config=CollaborationConfig(interaction=15.0),
             seed=3,
             page=PageConfig(port=8600, patience=PATIENCE),
-            watch=self._watch,
+            view=self._watch,
         )
 
     def _watch(self, station, world, motion):
