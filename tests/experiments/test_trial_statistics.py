@@ -1,4 +1,4 @@
-"""Statistics of many trials: success rate, quantiles, totals, and the keys they are written by."""
+"""Statistics of many trials: success rate, quantiles, totals, and their keys."""
 
 import math
 import os

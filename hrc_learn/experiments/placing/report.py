@@ -108,7 +108,7 @@ def placing_sections(run: PlacingRun, snapshots: Snapshots) -> list[Section]:
                     "Speed and jerk of the end effector, scaled by duration and length.",
                 ),
                 *_pictures(
-                    snapshots, "motion", "The demonstration, and the faster reproduction."
+                    snapshots, "snapshots", "The demonstration, and the faster reproduction."
                 ),
             ),
         ),
@@ -203,7 +203,7 @@ def random_start_pictures(trials: Sequence[Trial], shelves: Sequence[str]) -> li
     measures = {
         "place error [mm]": ("place_error_mm", PLACE_ERROR_MM),
         "place tilt [deg]": ("place_tilt_deg", PLACE_TILT_DEG),
-        "approach-path deviation [mm]": ("approach_path_deviation_mm", DEVIATION_MM),
+        "approach deviation [mm]": ("approach_path_deviation_mm", DEVIATION_MM),
     }
     values = {
         label: {shelf: column(trials, f"{shelf}_shelf_{key}") for shelf in shelves}

@@ -84,7 +84,7 @@ def take_snapshots(run: PlacingRun) -> Snapshots:
     camera = Photographer(run.workplace)
     try:
         return {
-            "motion": _motion(run, camera),
+            "snapshots": _motion(run, camera),
             "shelves": [
                 (
                     f"{shelf} shelf",
