@@ -20,9 +20,9 @@ class Metric[Run]:
     """Measures a run. An integer is a count, summed up over trials. None leaves the row out."""
     unit: str = ""
     _: KW_ONLY
-    at_most: float | None = None
+    at_most: float | int | None = None
     """Upper bound; without any bound the value is only reported."""
-    at_least: float | None = None
+    at_least: float | int | None = None
     """Lower bound."""
     claim: str = ""
     """What the paper says about it."""
