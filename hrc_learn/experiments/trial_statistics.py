@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 # Quantile of the normal distribution for a two-sided interval of 95 %.
 _Z = 1.959964
 
-_UNITS = {"s", "m", "mm", "rad", "deg", "px"}
+_UNITS = {"s", "m", "mm", "rad", "deg", "px", "%"}
 """Ends of keys: statistics are named before them, as in `place_error_p95_mm`."""
 
 
@@ -63,7 +63,7 @@ class Summary:
     failed: Mapping[int, str]
     """Reason by seed."""
     spread: Mapping[str, Spread]
-    """By key of the value; failed trials count as far as they measured it."""
+    """By key of the values that are no counts; failed trials as far as they measured them."""
     totals: Mapping[str, int]
     """Sums of the values that are counts, by key."""
 
@@ -77,15 +77,19 @@ class Summary:
         if not trials:
             raise ValueError("there are no trials to sum up.")
         keys = list(dict.fromkeys(key for trial in trials for key in trial.values))
-        known = {key: (c := column(trials, key))[np.isfinite(c)] for key in keys}
+        counts = [
+            key
+            for key in keys
+            if all(isinstance(trial.values.get(key, 0), int) for trial in trials)
+        ]
+        measured = {key: column(trials, key) for key in keys if key not in counts}
+        known = {key: values[np.isfinite(values)] for key, values in measured.items()}
         return cls(
             trials=len(trials),
             failed={trial.seed: trial.failure for trial in trials if trial.failure},
             spread={key: Spread.of(values) for key, values in known.items() if len(values)},
             totals={
-                key: sum(int(trial.values.get(key, 0)) for trial in trials)
-                for key in keys
-                if all(isinstance(trial.values.get(key, 0), int) for trial in trials)
+                key: sum(int(trial.values.get(key, 0)) for trial in trials) for key in counts
             },
         )
 
@@ -143,6 +147,8 @@ class Summary:
         for key, spread in self.spread.items():
             numbers = vars(spread).values()
             table.add_row(key.replace("_", " "), *(f"{number:.4g}" for number in numbers))
+        for key, count in self.totals.items():
+            table.add_row(f"{key.replace('_', ' ')}, in all", f"{count}")
         return table
 
 

@@ -188,23 +188,22 @@ def _criteria(
 ) -> list[Criterion]:
     """One criterion for each figure of an experiment: its name, and its bound."""
 
-    def criterion(figure: str, **bound: float) -> Criterion:
-        # None where the experiment was not run: the row is left out.
-        metric: Metric[Figures] = Metric(
-            figure.replace("_", " "),
-            lambda figures: figures.get(f"{experiment}_{figure}"),
-            **bound,
-        )
+    lower, upper = at_least or {}, at_most or {}
+
+    def criterion(figure: str) -> Criterion:
+        def value(figures: Figures) -> float | None:
+            # None where the experiment was not run: the row is left out.
+            return figures.get(f"{experiment}_{figure}")
+
+        name = figure.replace("_", " ")
+        metric = Metric(name, value, at_least=lower.get(figure), at_most=upper.get(figure))
         return Criterion(number=number, experiment=experiment, metric=metric)
 
-    return [
-        *(criterion(figure, at_least=value) for figure, value in (at_least or {}).items()),
-        *(criterion(figure, at_most=value) for figure, value in (at_most or {}).items()),
-    ]
+    return [criterion(figure) for figure in (*lower, *upper)]
 
 
 _SAFE = {"violations": 0.0}
-_NO_VIOLATION = dict.fromkeys(
+_NO_VIOLATION: dict[str, float] = dict.fromkeys(
     ("beyond_position", "beyond_velocity", "beyond_acceleration", "beyond_jerk", "nan"), 0.0
 )
 _GUESSES = ("jacobian_0.3", "jacobian_3", "row_flipped", "rows_swapped")
