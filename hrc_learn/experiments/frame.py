@@ -18,6 +18,7 @@ from hrc_learn.experiments.monte_carlo import Run as TrialRun
 from hrc_learn.experiments.monte_carlo import Trial, repeat
 from hrc_learn.experiments.trial_statistics import Summary
 from hrc_learn.output import new_folder, write_json
+from hrc_learn.skills.work_cell import TaskFailedError
 from hrc_learn.viz import LoggedSteps, RunRecording
 from hrc_learn.viz.report import (
     Measurement,
@@ -316,6 +317,7 @@ def _repeat(study: Study, name: str, count: int, options: RunOptions) -> list[Tr
         _trial_file(options, name),
         made_by=asdict(study.trial),  # pyright: ignore[reportArgumentType]
         processes=options.processes,
+        failures=(TaskFailedError,),
         title=study.title,
     )
 

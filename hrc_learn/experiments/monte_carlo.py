@@ -13,8 +13,6 @@ from typing import Any
 
 import torch
 
-from hrc_learn.skills.work_cell import TaskFailedError
-
 # Keys of a line of the file: one JSON object a trial. The first line of the file holds what was
 # tried under the last key, so that results of different settings never mix.
 _SEED, _FAILURE, _MADE_BY = "seed", "failure", "made_by"
@@ -140,6 +138,7 @@ def repeat(
     *,
     made_by: Mapping[str, Any],
     processes: int = 1,
+    failures: tuple[type[Exception], ...] = (),
     title: str = "Trials",
 ) -> list[Trial]:
     """Run once for each seed that is not in the file yet.
@@ -148,13 +147,14 @@ def repeat(
 
     Args:
         run: Called with each seed. A trial fails by returning `failure`, the reason, beside
-            what it measured, or by raising `TaskFailedError`; any other exception stops all.
+            what it measured, or by raising one of `failures`; any other exception stops all.
             For several processes it must be picklable: a frozen dataclass of paths and
             settings with `__call__`, say, which loads its models itself.
         seeds: In the order wanted; seeds named twice are run once.
         file: JSON-lines file of the results; those of the same seeds are taken from it.
         made_by: The setting. A file of trials with another one is refused.
         processes: To run at once, each with one thread.
+        failures: Exceptions by which a trial tells that it failed.
         title: Shown beside the progress.
 
     Returns:
@@ -173,23 +173,25 @@ def repeat(
     waiting = [seed for seed in seeds if seed not in done.trials]
     known = [done.trials[seed] for seed in seeds if seed in done.trials]
     with _progress(title, len(seeds), known) as tell:
-        for trial in _trials(run, waiting, min(processes, len(waiting))):
+        for trial in _trials(run, waiting, min(processes, len(waiting)), failures):
             done.append(trial)
             tell(trial)
     return [done.trials[seed] for seed in seeds]
 
 
-def _trials(run: Run, seeds: list[int], processes: int) -> Iterator[Trial]:
+def _trials(
+    run: Run, seeds: list[int], processes: int, failures: tuple[type[Exception], ...]
+) -> Iterator[Trial]:
     """Results in the order in which they are finished."""
     if processes <= 1:
-        yield from (_trial(run, seed) for seed in seeds)
+        yield from (_trial(run, seed, failures) for seed in seeds)
         return
     # A forked process would inherit locks of threads that it does not have.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(
         processes, context, initializer=torch.set_num_threads, initargs=(1,)
     ) as pool:
-        waiting = {pool.submit(_trial, run, seed) for seed in seeds}
+        waiting = {pool.submit(_trial, run, seed, failures) for seed in seeds}
         try:
             while waiting:
                 done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
@@ -200,10 +202,10 @@ def _trials(run: Run, seeds: list[int], processes: int) -> Iterator[Trial]:
             pool.shutdown(cancel_futures=True)
 
 
-def _trial(run: Run, seed: int) -> Trial:
+def _trial(run: Run, seed: int, failures: tuple[type[Exception], ...]) -> Trial:
     try:
         return Trial.of(seed, run(seed))
-    except TaskFailedError as error:
+    except failures as error:
         return Trial(seed=seed, values={}, failure=str(error))
     except Exception as error:
         error.add_note(f"in the trial with seed {seed}")

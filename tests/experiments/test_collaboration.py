@@ -190,6 +190,7 @@ def test_a_hidden_marker_is_waited_for_and_the_wait_noted(job):
     assert evaluated(job).values["recovered_from_marker_out_of_sight"] == 1
 
 
+@shapes_unchecked()
 def provoked(aiming, placing, workplace=WORKPLACE, config=BRIEF, **options):
     """A job without a person, disturbed in its course."""
     return simulate_collaboration(

@@ -32,7 +32,7 @@ def test_the_deviation_is_the_largest_distance_at_equal_depth():
     done = ApproachPath.of(deviating, GOAL, edge=-0.47)
     assert done.deviation(demonstrated) == pytest.approx(0.05, rel=1e-3)
     at = int(done.distance(demonstrated).argmax())
-    assert done.left[at] == pytest.approx(0.065, abs=1e-3)
+    assert done.remaining[at] == pytest.approx(0.065, abs=1e-3)
 
 
 def test_only_what_lies_behind_the_edge_counts():

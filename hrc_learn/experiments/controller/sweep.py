@@ -187,7 +187,6 @@ def _criteria(
     at_most: Mapping[str, float] | None = None,
 ) -> list[Criterion]:
     """One criterion for each figure of an experiment: its name, and its bound."""
-
     lower, upper = at_least or {}, at_most or {}
 
     def criterion(figure: str) -> Criterion:
