@@ -8,7 +8,7 @@ import shlex
 import shutil
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, is_dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
@@ -39,7 +39,7 @@ class Observer:
     view: LiveView = no_live_view
     """A dashboard of the run while it goes on."""
     tell: Callable[[str], None] = lambda text: None
-    """Told what happens next, in a line."""
+    """Shows a line about what happens next."""
 
 
 UNOBSERVED = Observer()
@@ -125,14 +125,15 @@ class RepeatedRun:
 
     def __call__(self, seed: int) -> Mapping[str, Any]:
         """Run once and measure."""
-        return outcome(self.experiment, self.experiment.run(seed))
+        run = self.experiment.run(seed)
+        evaluation = evaluate(self.experiment.metrics(), run)
+        failure = failure_of(self.experiment.failure(run), evaluation)
+        return {**evaluation.values, "failure": failure}
 
 
-def outcome[Run](experiment: Experiment[Run], run: Run) -> dict[str, Any]:
-    """Measured values of a run, and `failure`, empty if it was a success."""
-    evaluation = evaluate(experiment.metrics(), run)
-    reasons = filter(None, (experiment.failure(run), *evaluation.faults))
-    return evaluation.values | {"failure": "; ".join(reasons)}
+def failure_of(given_up: str, evaluation: Evaluation) -> str:
+    """Why a run was no success: the task gave up, or an essential bound was missed."""
+    return "; ".join(filter(None, (given_up, *evaluation.faults)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -160,8 +161,9 @@ class Results:
         Statistics of the study `TRIALS` have no prefix; without it they are those of the run
         itself, so that the same keys are there in any case.
         """
-        total: Evaluation = evaluate(experiment.metrics(), run)
-        single = Trial.of(seed, outcome(experiment, run))
+        total = evaluate(experiment.metrics(), run)
+        failure = failure_of(experiment.failure(run), total)
+        single = Trial(seed=seed, values=total.values, failure=failure)
         values = Summary.of(trials.get(TRIALS) or [single]).figures()
         for name, study in experiment.studies().items():
             if known := trials.get(name):
@@ -173,7 +175,7 @@ class Results:
             table=total.table,
             # Totals over all trials take the place of the counts of the single run.
             values=total.values | values,
-            failure=single.failure,
+            failure=failure,
             trials=trials,
         )
 
@@ -235,7 +237,8 @@ def conduct[Run](
     if negative := [name for name, count in counts.items() if count < 0]:
         raise ValueError(f"--{negative[0]} must not be negative, but is {counts[negative[0]]}.")
     console = Console()
-    configuration = configuration or asdict(options) | _settings(experiment)
+    if configuration is None:
+        configuration = asdict(options) | asdict(experiment)  # pyright: ignore[reportArgumentType]
     with new_folder(options.out, configuration, options.overwrite) as folder:
         run = experiment.run(options.seed, _observer(experiment, options, console.print))
         trials = {
@@ -290,12 +293,6 @@ def report_of(
         versions=software_versions(),
         command=command or shlex.join(["python", *sys.argv]),
     )
-
-
-def _settings(experiment: Experiment[Any]) -> dict[str, Any]:
-    assert is_dataclass(experiment)
-    assert not isinstance(experiment, type)
-    return asdict(experiment)
 
 
 def _observer(

@@ -12,6 +12,7 @@ from taught_skills import WORKPLACE, taught_aiming, taught_placing
 from unchecked import shapes_unchecked
 
 from hrc_learn.experiments.collaboration.metrics import collaboration_metrics
+from hrc_learn.experiments.collaboration.report import collaboration_sections
 from hrc_learn.experiments.collaboration.trial import (
     Disturbances,
     simulate_collaboration,
@@ -59,7 +60,7 @@ def job(aiming, placing):
         camera="synthetic",
         forces=FORCE,
         disturbances=Disturbances(occlusions=(Occlusion(start=0.0, duration=3.0),)),
-        config=CollaborationConfig(interaction=2.5),
+        config=CollaborationConfig(interaction=2.5, speed=2.0),
         seed=3,
     )
 
@@ -174,6 +175,10 @@ def test_what_the_camera_cannot_see_is_reported(aiming, placing, shift, reason):
     (fault,) = evaluation.faults
     assert "objects that stand on their shelf: 0" in fault
     assert "not box" in fault
+    # There is a report of it all the same.
+    recording = record("failed", job.station, job.world, job.motion, cameras=job.cameras)
+    figures = [f for s in collaboration_sections(job, recording) for f in s.figures]
+    assert {"timeline", "marker", "person", "trajectories"} <= {f.name for f in figures}
 
 
 def test_an_unknown_shelf_is_refused_before_anything_moves(aiming, placing):

@@ -14,11 +14,11 @@ from hrc_learn.experiments.frame import (
     TRIALS,
     UNOBSERVED,
     Observer,
+    RepeatedRun,
     Results,
     RunOptions,
     Study,
     conduct,
-    outcome,
 )
 from hrc_learn.experiments.metric_table import Metric, evaluate
 from hrc_learn.experiments.monte_carlo import Trial
@@ -83,19 +83,11 @@ class ThrowExperiment:
         return {
             TRIALS: Study(
                 title="Other throws",
-                trial=ThrowTrial(replace(self, gives_up=False)),
+                trial=RepeatedRun(replace(self, gives_up=False)),
                 metrics=[Metric("throws, error (95 %)", p95("error_mm"), "mm", at_most=1e3)],
             ),
-            "wide": Study(title="Wide throws", trial=ThrowTrial(replace(self, spread=0.5))),
+            "wide": Study(title="Wide throws", trial=RepeatedRun(replace(self, spread=0.5))),
         }
-
-
-@dataclass(frozen=True)
-class ThrowTrial:
-    experiment: ThrowExperiment
-
-    def __call__(self, seed: int):
-        return outcome(self.experiment, self.experiment.run(seed))
 
 
 def errors(count, spread=0.01):

@@ -88,6 +88,7 @@ def test_each_primitive_repeats_its_demonstration_and_their_mean_comes_close(fit
 
 @pytest.mark.parametrize("shelf", WORKPLACE.shelf_names())
 @pytest.mark.parametrize("speed", [1.0, 1.5])
+@shapes_unchecked()  # a thousand steps: checked in the tests below
 def test_plans_in_pose_space_reach_every_shelf_without_touching(skill, world, shelf, speed):
     goal = WORKPLACE.shelf(shelf)
     plan = skill.plan(HOME, goal, space="pose", dt=0.02, speed=speed)
@@ -134,6 +135,7 @@ def test_check_plan_names_what_would_be_hit(skill, world):
         check_plan(replace(plan, path=hasty), world)
 
 
+@shapes_unchecked()
 def test_a_placing_carried_out_ends_on_the_shelf_as_it_was_shown(skill, demos):
     run = place(skill, WORKPLACE, "middle", HOME, space="joint", speed=2.5)
     outcome = PlacingOutcome.of(run, WORKPLACE, demos[0])
@@ -192,6 +194,7 @@ def test_demonstrations_without_motion_are_refused():
 
 
 @pytest.mark.parametrize(("low", "name"), [(0.0, "as learned"), (0.0065, "a little higher")])
+@shapes_unchecked()
 def test_a_thing_that_sits_low_in_the_hand_is_put_down_higher(skill, low, name):
     world, goal = World(WORKPLACE.scene), WORKPLACE.shelf("middle")
     world.hold("box", HOME.numpy())
