@@ -112,7 +112,7 @@ class ClosedLoops:
             camera: The true one.
             offset: Of the marker in the frame of the tool centre point [m].
             workspace: Lower and upper corner of the box of starts and targets [m].
-            near: Joints with the hand in it, near which starts are chosen [rad].
+            near: Joints with the end effector in it, near which starts are chosen [rad].
             config: How.
         """
         rng, n = torch.Generator().manual_seed(config.seed), config.count

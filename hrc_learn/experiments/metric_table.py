@@ -104,6 +104,7 @@ def evaluate[Run](metrics: Iterable[Metric[Run]], run: Run) -> Evaluation:
         values[measured.key] = measured.value
         if metric.listed:
             table.append(measured)
+        # NaN keeps no bound: what could not be measured is no success.
         if metric.essential and measured.ok is False:
             fault = f"{metric.name}: {measured.shown}, but {measured.bound} is wanted"
             detail = metric.detail(run)

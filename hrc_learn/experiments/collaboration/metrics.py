@@ -82,6 +82,7 @@ def collaboration_metrics(
             )
             for met, name in _CONTACTS.items()
         ),
+        # Not listed, as the rows above tell what was met.
         Metric("contacts", lambda run: sum(map(len, contacts(run).values())), listed=False),
         Metric(
             "cycle time",
@@ -122,6 +123,7 @@ def collaboration_metrics(
             "elbow moved",
             lambda run: _pushed(run, lambda d: 1e3 * d.largest_elbow),
             "mm",
+            # Enough to reach under the arm; without it the deviation above would prove nothing.
             at_least=100.0,
             claim="joint 4 dragged forward for 7 s, backward for 4 s",
         ),
@@ -161,6 +163,7 @@ def grasp_offset(run: CollaborationRun) -> float | None:
         descents = [t for t, _ in spans(log, "grasp") if begin <= t < end]
         if errand.release is None or not descents:
             continue
+        # The last attempt: earlier ones missed the object or lost it.
         step = int(np.searchsorted(log["time"], descents[-1]))
         offsets.append(np.linalg.norm((tool[step] - bodies[errand.item.name][step])[:2]))
     return 1e3 * float(max(offsets)) if offsets else None

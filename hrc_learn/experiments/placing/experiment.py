@@ -91,14 +91,14 @@ class PlacingExperiment:
         """
         skill, demonstration = PlacingSkill.load(self.placing), self._demonstration()
         workplace = Workplace()
-        shown_shelf = demonstrated_shelf(demonstrated_path(demonstration)[-1], workplace)
+        goal_shelf = demonstrated_shelf(demonstrated_path(demonstration)[-1], workplace)
         assert demonstration.joint_position is not None
         start = torch.from_numpy(demonstration.joint_position[0])
         placings = {}
         for space, label in SPACES.items():
             for shelf in workplace.shelf_names():
                 observer.tell(f"Placing on the {shelf} shelf, planned in {label}")
-                viewed = (space, shelf) == ("joint", shown_shelf)
+                viewed = (space, shelf) == ("joint", goal_shelf)
                 view = observer.view if viewed else no_live_view
                 placings[space, shelf] = place(
                     skill, workplace, shelf, start, space=space, speed=self.speed, view=view
@@ -107,7 +107,7 @@ class PlacingExperiment:
         return PlacingRun(
             workplace=workplace,
             demonstration=demonstration,
-            demonstrated_shelf=shown_shelf,
+            demonstrated_shelf=goal_shelf,
             placings=placings,
             outcomes={
                 space: {
@@ -116,7 +116,7 @@ class PlacingExperiment:
                 }
                 for space in SPACES
             },
-            ablation=Ablation.run(workplace, shown_shelf, seed),
+            ablation=Ablation.run(workplace, goal_shelf, seed),
             same_joint7=_reached_with_joint7(workplace, demonstration.joint_position[-1]),
         )
 

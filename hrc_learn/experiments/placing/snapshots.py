@@ -23,7 +23,7 @@ _WIDTH, _HEIGHT = 1200, 900
 _EYE, _TOWARDS = (1.30, 0.95, 1.10), (0.24, -0.30, 0.30)
 _TOUCHING = (0.84, 0.37, 0.0, 1.0)  # colour of a link that touches something
 # The object's x lies along the fingers' line of closing, its top towards the palm.
-_IN_HAND = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
+_IN_GRIPPER = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
 
 
 class Photographer:
@@ -53,9 +53,9 @@ class Photographer:
             joints: Joint positions [rad].
             touching: Names of those geoms.
         """
-        hand = panda.forward(torch.from_numpy(joints)).matrix().numpy()
+        tool = panda.forward(torch.from_numpy(joints)).matrix().numpy()
         width = 2 * self._item.half_size[0]
-        self._world.reset(joints, {self._item.name: hand @ _IN_HAND}, gripper_width=width)
+        self._world.reset(joints, {self._item.name: tool @ _IN_GRIPPER}, gripper_width=width)
         with self._coloured(touching):
             return self._renderer.render(self._camera)
 
