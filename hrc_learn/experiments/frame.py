@@ -8,7 +8,7 @@ import shlex
 import shutil
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
@@ -206,6 +206,11 @@ class RunOptions:
     """Replace an older run in that folder."""
     json: Path | None = None
     """File for the measured values."""
+
+    @classmethod
+    def of(cls, args: object) -> "RunOptions":
+        """Those of a command line that has options of the same names."""
+        return cls(**{option.name: getattr(args, option.name) for option in fields(cls)})
 
 
 def conduct[Run](

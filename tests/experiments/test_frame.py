@@ -4,6 +4,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 from typing import ClassVar
 
 import numpy as np
@@ -193,6 +194,11 @@ def test_negative_numbers_of_trials_are_refused_before_anything_runs(tmp_path):
     with pytest.raises(ValueError, match="--wide must not be negative"):
         conduct(ThrowExperiment(), options, counts={"wide": -2})
     assert not list(tmp_path.iterdir())
+
+
+def test_options_are_taken_from_any_command_line_that_has_them(tmp_path):
+    options = RunOptions(out=tmp_path, trials=3, overwrite=True)
+    assert RunOptions.of(SimpleNamespace(**vars(options), speed=1.5)) == options
 
 
 def test_an_older_run_is_replaced_only_on_request(tmp_path, work):
