@@ -80,3 +80,18 @@ def test_angles_count_from_the_hand_pointing_down(run):
 def test_runs_without_a_camera_are_refused_where_it_is_needed(run):
     with pytest.raises(ValueError, match="needs camera"):
         collaboration_figures.marker_figure(replace(run, camera=None), OBJECTS)
+
+
+def test_figures_of_a_job_that_never_saw_its_marker_are_drawn_all_the_same(run):
+    unknown = np.full_like(run.camera.feature, np.nan)
+    blind = replace(
+        run,
+        camera=replace(
+            run.camera, feature=unknown, target=unknown, images=(), image_time=np.empty(0)
+        ),
+        human_effort=np.zeros_like(run.human_effort),
+        demo_path=None,
+    )
+    for draw in (trajectories_figure, marker_figure, timeline_figure):
+        draw(blind, {"box": (0.0, 4.0)})
+    end_effector_figure(blind)

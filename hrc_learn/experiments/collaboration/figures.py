@@ -87,7 +87,8 @@ def marker_figure(run: RunRecording, objects: Spans) -> Figure:
             ylabel="v [px]",
             title="Path of the gripper's marker (dot: first seen, cross: target)",
         )
-        image.legend(loc="upper right", frameon=True, framealpha=0.75, edgecolor="none")
+        if image.get_legend_handles_labels()[0]:  # none where the marker was never seen
+            image.legend(loc="upper right", frameon=True, framealpha=0.75, edgecolor="none")
         hidden = _out_of_sight(run)
         _shade(error, run.time, hidden, _HIDDEN)
         error.set_yscale("log")
