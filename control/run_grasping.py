@@ -1,4 +1,4 @@
-"""Grasp an object from afar with a camera that nobody calibrated.
+"""Grasp an object from afar with an uncalibrated camera.
 
 The same as `hrc run grasping`.
 """

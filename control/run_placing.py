@@ -1,4 +1,4 @@
-"""Place a thing on three shelves by a motion that was shown for one of them.
+"""Place an object on three shelves by a motion that was demonstrated for one of them.
 
 The same as `hrc run placing`.
 """

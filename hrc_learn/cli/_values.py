@@ -1,34 +1,15 @@
 """What commands write and print: measured values, whole files, lines of error."""
 
 import json
-import math
 import shlex
 import sys
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, SupportsFloat
+from typing import Any
 
-from hrc_learn.store import new_file
-
-
-def write_json(path: str | Path, values: Mapping[str, SupportsFloat]) -> None:
-    """Write measured values as one flat object; the file is whole or not there at all.
-
-    Args:
-        path: File to write; its folder is made where missing.
-        values: Name -> number. Numbers that are not finite become null, as JSON has none.
-    """
-    content = {name: _number(value) for name, value in values.items()}
-    write_text(path, json.dumps(content, indent=2) + "\n")
-
-
-def write_text(path: str | Path, text: str) -> None:
-    """Write a file that is whole or not there at all; its folder is made where missing."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with new_file(path) as part:
-        part.write_text(text, encoding="utf-8")
+from hrc_learn.store import write_json as write_json
+from hrc_learn.store import write_text as write_text
 
 
 def show_values(title: str, values: Mapping[str, float]) -> None:
@@ -72,9 +53,3 @@ def command_line() -> str:
     # The installed command is found by its name; a program needs Python before it.
     start = ["python", program] if program.endswith(".py") else [Path(program).name]
     return shlex.join([*start, *arguments])
-
-
-def _number(value: Any) -> float | int | bool | None:
-    # numpy's and torch's scalars come as their plain counterparts.
-    plain = value.item() if hasattr(value, "item") else value
-    return None if isinstance(plain, float) and not math.isfinite(plain) else plain

@@ -1,5 +1,6 @@
-"""What a learned image Jacobian is worth as a start: closed loops from it and from
-guesses, and its error against the true one.
+"""Initialization study: what a learned image Jacobian is worth as initial estimate.
+
+Closed loops that start from it and from guesses, and its error against the true one.
 """
 
 import itertools
@@ -27,33 +28,26 @@ from hrc_learn.skills.cartesian_motion import nearest_configuration
 from hrc_learn.skills.visual_servoing import guessed_network
 from hrc_learn.vision import CameraModel
 
-# Many short closed loops in one batch: the hand's marker to its target, seen by the scene's
-# camera.
-#
-# The arm's kinematics against the camera, lens and all, which the controller cannot see. So
-# that no guess is right by luck, the camera is turned about its axis by another angle in each
-# of
-# the starts.
-
 
 @dataclass(frozen=True, kw_only=True)
 class StartsConfig:
-    """How starts are drawn. Lengths [m], angles [rad]."""
+    """How initial conditions are drawn. Lengths [m], angles [rad]."""
 
     count: int = 200
-    """Of starts."""
+    """Of closed loops."""
     largest_roll: float = math.pi
-    """Of the camera about its axis, either way; 0: as the demonstrations saw it."""
+    """Of the camera about its axis, either way, so that no guess is right by luck; 0: as in
+    the demonstrations."""
     tilt: float = 0.1
-    """Of the hand at the start, either way about each axis."""
+    """Of the end effector at the start, either way about each axis."""
     reached: float = 5.0
-    """Pixel error that counts as converged once it is kept [px]."""
+    """Pixel error below which a loop counts as converged once it stays there [px]."""
     duration: float = 4.0
     """[s]"""
     dt: float = 0.008
     """Control step [s]."""
     seed: int = 0
-    """Of starts, targets, cameras and noise."""
+    """Of initial conditions, targets, cameras and noise."""
     imperfections: Imperfections = field(
         default_factory=lambda: Imperfections(frame_steps=4, latency_frames=1, noise=0.5)
     )
@@ -62,10 +56,10 @@ class StartsConfig:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TurnedCamera:
-    """The scene's camera, its image turned by an angle for each of the starts.
+    """The scene's camera, lens distortion and all, turned by another angle for each loop.
 
-    About what it sees in the middle of the workspace, which is moved to the middle of the
-    image: a camera that is turned about its axis, and its sensor shifted.
+    The image is turned about the middle of the workspace, which is moved to the middle of the
+    image: a camera turned about its axis, with its sensor shifted.
     """
 
     model: CameraModel
@@ -88,14 +82,14 @@ class TurnedCamera:
 
 
 def turn_rows(roll: Float[Tensor, " starts"]) -> Float[Tensor, "starts 2 2"]:
-    """What a turn of the camera about its axis does to pixels about its centre."""
+    """Rotation of pixels about the image centre when the camera turns about its axis."""
     c, s = roll.cos(), roll.sin()
     return torch.stack([torch.stack([c, s], -1), torch.stack([-s, c], -1)], -2)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ClosedLoops:
-    """Starts, targets and cameras, the same for whatever is compared on them."""
+    """Many short visual-servoing loops in one batch, the same for all estimators compared."""
 
     camera: TurnedCamera
     start: Float[Tensor, "starts joints"]
@@ -118,7 +112,7 @@ class ClosedLoops:
             camera: The true one.
             offset: Of the marker in the frame of the tool centre point [m].
             workspace: Lower and upper corner of the box of starts and targets [m].
-            near: Joints with the hand in it, near which starts are chosen [rad].
+            near: Joints with the end effector in it, near which starts are chosen [rad].
             config: How.
         """
         rng, n = torch.Generator().manual_seed(config.seed), config.count
@@ -154,7 +148,7 @@ class ClosedLoops:
         def watch(step: int, q: Tensor, *_: object) -> None:
             error = self.camera.project(panda.forward(q))[0] - target
             near = torch.linalg.vector_norm(error, dim=-1) < config.reached
-            # The first step of the last spell inside.
+            # The first step of the last interval inside.
             reached.copy_(torch.where(near, reached.clamp(max=step * config.dt), math.inf))
 
         noise = torch.Generator().manual_seed(config.seed + 1)
@@ -173,21 +167,15 @@ class ClosedLoops:
         return reached
 
 
-def _postures(hand: Pose, near: Float[Tensor, "joints"]) -> Float[Tensor, "starts joints"]:
-    """Joint positions with the hand at each of the poses [rad]."""
+def _postures(tool: Pose, near: Float[Tensor, "joints"]) -> Float[Tensor, "starts joints"]:
+    """Joint positions with the end effector at each of the poses [rad]."""
     return torch.stack(
-        [nearest_configuration(hand[i], near, samples=9) for i in range(len(hand.position))]
+        [nearest_configuration(tool[i], near, samples=9) for i in range(len(tool.position))]
     )
 
 
-# What a learned image Jacobian is worth: closed loops that start from it, and from a guess.
-
-
 class _Turned(KalmanEstimator):
-    """Starts from a learned Jacobian, as seen by cameras that are turned.
-
-    A learned Jacobian turns along exactly, as would one learned from the turned camera.
-    """
+    """Starts from the learned Jacobian, rotated as the turned camera would have taught it."""
 
     def __init__(self, network: RBFImageJacobian, roll: Float[Tensor, " starts"]):
         super().__init__(network)
@@ -204,7 +192,7 @@ def compare_starts(
     control: ControllerConfig | None = None,
     on_run: Callable[[str], None] = lambda name: None,
 ) -> dict[str, float]:
-    """Time to bring the marker to its target [s], from what was learned and from a guess.
+    """Convergence times [s] from the learned Jacobian and from a guess.
 
     Args:
         network: Learned from demonstrations of the camera.
@@ -214,10 +202,10 @@ def compare_starts(
 
     Returns:
         For `learned`, `guessed` (the paper's initial Jacobian, adapted alike) and `fixed`
-        (the same, not adapted): median and 95th percentile of the time, and the share that
-        got there. `speed_up_over_guessed` and `speed_up_over_fixed` are medians of the other
-        time over that of the learned one, start by start; infinite where most of the others
-        never get there.
+        (the same, not adapted): median and 95th percentile of the time, and the fraction
+        that converged. `speed_up_over_guessed` and `speed_up_over_fixed` are medians of the
+        other time over that of the learned one, loop by loop; infinite where most of the
+        others never converge.
     """
     guessed = guessed_network()
     estimators: dict[str, ImageJacobianEstimator] = {
@@ -231,14 +219,14 @@ def compare_starts(
         times[name] = loops.times(estimator, control)
         figures |= {f"{name}_{k}": v for k, v in summary(times[name]).items()}
     for name in ("guessed", "fixed"):
-        # Where neither gets there, neither is faster.
+        # Where neither converges, neither is faster.
         ratio = (times[name] / times["learned"]).nan_to_num(nan=1.0, posinf=math.inf)
         figures[f"speed_up_over_{name}"] = float(ratio.quantile(0.5, interpolation="lower"))
     return figures
 
 
 def summary(times: Float[Tensor, " starts"]) -> dict[str, float]:
-    """Quantiles where infinity, for never, is a time like any other."""
+    """Quantiles of the times, infinite ones included, and the fraction that converged."""
     return {
         "t50": float(times.quantile(0.5, interpolation="higher")),
         "t95": float(times.quantile(0.95, interpolation="higher")),
@@ -246,32 +234,30 @@ def summary(times: Float[Tensor, " starts"]) -> dict[str, float]:
     }
 
 
-# A learned image Jacobian against the true one, where the simulator knows it.
-
 ROTATION_SCALE = 0.15
-"""Metres that a radian counts for in the size of a Jacobian [m/rad]: a typical lever arm."""
+"""Weight of a radian in the norm of a Jacobian [m/rad]: a typical lever arm."""
 REACH = 0.02
-"""A point this close to where the hand was shown is inside the demonstrated workspace [m]."""
+"""Points this close to a demonstrated one are inside the demonstrated workspace [m]."""
 
 
 def held_out_grid(
-    shown: Float[Tensor, "frames 3"], points: int = 9, tilt: float = 0.0, seed: int = 0
+    demonstrated: Float[Tensor, "frames 3"], points: int = 9, tilt: float = 0.0, seed: int = 0
 ) -> Pose:
     """Poses inside the demonstrated workspace, on a grid that no demonstration follows.
 
     Args:
-        shown: Where the hand was [m].
-        points: Along each axis, over the range that was shown.
-        tilt: Of the hand from pointing down, at most, about each axis [rad].
+        demonstrated: Positions of the end effector [m].
+        points: Along each axis, over the demonstrated range.
+        tilt: Largest tilt of the end effector from pointing down, about each axis [rad].
         seed: Of the tilts.
     """
-    low, high = shown.amin(dim=0), shown.amax(dim=0)
+    low, high = demonstrated.amin(dim=0), demonstrated.amax(dim=0)
     axes = [
         torch.linspace(float(a), float(b), points, dtype=torch.float64)
         for a, b in zip(low, high, strict=True)
     ]
     grid = torch.tensor(list(itertools.product(*axes)), dtype=torch.float64)
-    inside = torch.cdist(grid, shown).amin(dim=1) < REACH
+    inside = torch.cdist(grid, demonstrated).amin(dim=1) < REACH
     grid = grid[inside]
     rng = torch.Generator().manual_seed(seed)
     turn = tilt * (2 * torch.rand(len(grid), 3, generator=rng, dtype=torch.float64) - 1)
@@ -295,8 +281,8 @@ def compare_with_truth(
 
     Returns:
         `relative_error_median` and `_p95`: |estimate - truth| / |truth|, Frobenius norms with
-        rotation counted in metres. `within_1_sigma` and `within_2_sigma`: shares of the
-        entries that close to the truth; 0.68 and 0.95 of a Gaussian.
+        rotation counted in metres. `within_1_sigma` and `within_2_sigma`: fractions of
+        the entries that close to the truth; 0.68 and 0.95 of a Gaussian.
     """
     scale = torch.tensor([1.0] * 3 + [1 / ROTATION_SCALE] * 3, dtype=torch.float64)
     marker = poses.apply(torch.from_numpy(offset)).numpy()

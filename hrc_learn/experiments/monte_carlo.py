@@ -1,37 +1,28 @@
-"""One experiment tried again and again, each time with another seed: kept on disk,
-resumed, summed up.
-"""
+"""Monte Carlo: one experiment repeated with other seeds, kept on disk and resumed."""
 
 import gc
 import json
 import math
 import multiprocessing
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import numpy as np
 import torch
 
-from hrc_learn.skills.work_cell import TaskFailedError
-from hrc_learn.store import Claim, new_file, sync_file
-
-if TYPE_CHECKING:
-    from rich.table import Table
-
-# Trials on disk: one line of JSON each, written as soon as it is known.
-#
-# The first line tells what was tried, so that results of different things never mix.
-
+# Keys of a line of the file: one JSON object a trial. The first line of the file holds what was
+# tried under the last key, so that results of different settings never mix.
 _SEED, _FAILURE, _MADE_BY = "seed", "failure", "made_by"
+
+from hrc_learn.store import Claim, new_file, sync_file
 
 
 @dataclass(frozen=True, kw_only=True)
 class Trial:
-    """What one seed came to."""
+    """The result of one seed."""
 
     seed: int
     values: Mapping[str, float | int | str]
@@ -70,7 +61,9 @@ class Trial:
 
 
 class TrialFile:
-    """Trials of one thing, in a file that grows, for one process at a time.
+    """Trials with one setting, in a file to which each is added as soon as it is known.
+
+    One process at a time may hold it.
 
     Attributes:
         trials: Those in the file, by seed.
@@ -81,11 +74,11 @@ class TrialFile:
 
         Args:
             path: JSON-lines file.
-            made_by: What is tried; whatever is no JSON is kept as text.
+            made_by: The setting; whatever is no JSON is kept as text.
 
         Raises:
             BusyError: Another process is adding trials to it.
-            ValueError: If the file holds trials of something else, or no trials.
+            ValueError: If the file holds trials with another setting, or no trials.
         """
         self._path = path
         self.trials: dict[int, Trial] = {}
@@ -131,8 +124,9 @@ class TrialFile:
             ) from error
         if before != made_by:
             raise ValueError(
-                f"{self._path} holds trials of something else ({_difference(before, made_by)}):"
-                " remove it to begin anew, or choose another place."
+                f"{self._path} holds trials of another setting "
+                f"({_difference(before, made_by)}): remove it to begin anew, or choose another "
+                "place."
             )
         if whole != text:  # stopped in the middle of a line
             self._write(whole)
@@ -158,13 +152,8 @@ def _plain(name: str, value: Any) -> float | int | str:
     return plain
 
 
-# One thing tried again and again, each time with another seed, and what it came to.
-#
-# An hour's work is not lost when it is stopped: every result is in a file at once, and the same
-# call goes on where the last one ended.
-
 Run = Callable[[int], Mapping[str, Any]]
-"""Tries once with a seed; returns what was measured, "failure" with the reason if it failed."""
+"""Runs one trial with a seed; returns what was measured, and "failure", empty or the reason."""
 
 
 def repeat(
@@ -174,27 +163,31 @@ def repeat(
     *,
     made_by: Mapping[str, Any],
     processes: int = 1,
+    failures: tuple[type[Exception], ...] = (),
     title: str = "Trials",
 ) -> list[Trial]:
     """Run once for each seed that is not in the file yet.
 
+    Every result is in the file at once, so a run that was stopped goes on with the same call.
+
     Args:
         run: Called with each seed. A trial fails by returning `failure`, the reason, beside
-            what it measured, or by raising `TaskFailedError`; any other exception stops all.
+            what it measured, or by raising one of `failures`; any other exception stops all.
             For several processes it must be picklable: a frozen dataclass of paths and
             settings with `__call__`, say, which loads its models itself.
         seeds: In the order wanted; seeds named twice are run once.
         file: JSON-lines file of the results; those of the same seeds are taken from it.
-        made_by: What is tried. A file of something else is refused.
+        made_by: The setting. A file of trials with another one is refused.
         processes: To run at once, each with one thread.
+        failures: Exceptions by which a trial tells that it failed.
         title: Shown beside the progress.
 
     Returns:
         One trial for each seed, in the order of the seeds.
 
     Raises:
+        ValueError: Without seeds or processes, or if the file is of another setting.
         BusyError: Another process is adding trials to the file.
-        ValueError: Without seeds or processes, or if the file is of something else.
     """
     seeds = list(dict.fromkeys(seeds))
     if not seeds or processes < 1:
@@ -206,23 +199,25 @@ def repeat(
         waiting = [seed for seed in seeds if seed not in done.trials]
         known = [done.trials[seed] for seed in seeds if seed in done.trials]
         with _progress(title, len(seeds), known) as tell:
-            for trial in _trials(run, waiting, min(processes, len(waiting))):
+            for trial in _trials(run, waiting, min(processes, len(waiting)), failures):
                 done.append(trial)
                 tell(trial)
     return [done.trials[seed] for seed in seeds]
 
 
-def _trials(run: Run, seeds: list[int], processes: int) -> Iterator[Trial]:
-    """As they are finished."""
+def _trials(
+    run: Run, seeds: list[int], processes: int, failures: tuple[type[Exception], ...]
+) -> Iterator[Trial]:
+    """Results in the order in which they are finished."""
     if processes <= 1:
-        yield from (_trial(run, seed) for seed in seeds)
+        yield from (_trial(run, seed, failures) for seed in seeds)
         return
     # A forked process would inherit locks of threads that it does not have.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(
         processes, context, initializer=torch.set_num_threads, initargs=(1,)
     ) as pool:
-        waiting = {pool.submit(_trial, run, seed) for seed in seeds}
+        waiting = {pool.submit(_trial, run, seed, failures) for seed in seeds}
         try:
             while waiting:
                 done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
@@ -233,16 +228,16 @@ def _trials(run: Run, seeds: list[int], processes: int) -> Iterator[Trial]:
             pool.shutdown(cancel_futures=True)
 
 
-def _trial(run: Run, seed: int) -> Trial:
+def _trial(run: Run, seed: int, failures: tuple[type[Exception], ...]) -> Trial:
     try:
         return Trial.of(seed, run(seed))
-    except TaskFailedError as error:
+    except failures as error:
         return Trial(seed=seed, values={}, failure=str(error))
     except Exception as error:
         error.add_note(f"in the trial with seed {seed}")
         raise
     finally:
-        # World, work cell and log know each other, and the simulator's memory is not counted
+        # Its world, cell and log know each other, and the simulator's memory is not counted
         # by what collects such rings: fifty trials would keep two gigabytes.
         gc.collect()
 
@@ -279,124 +274,3 @@ def _progress(
         for trial in done:
             tell(trial)
         yield tell
-
-
-# What many trials come to: how often they succeed, and what they measure.
-
-_Z = 1.959964  # of a two-sided interval of 95 %
-
-
-def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
-    """Interval of 95 % of a share (Wilson 1927); honest for few trials and shares near 0 or 1.
-
-    Args:
-        successes: Of the trials.
-        trials: At least one.
-
-    Raises:
-        ValueError: If there are no trials, or more successes than trials.
-    """
-    if not 0 <= successes <= trials or trials == 0:
-        raise ValueError(f"{successes} successes of {trials} trials make no share.")
-    share, z2 = successes / trials, _Z**2 / trials
-    middle = share + z2 / 2
-    half = _Z * math.sqrt(share * (1 - share) / trials + z2 / (4 * trials))
-    return max(0.0, (middle - half) / (1 + z2)), min(1.0, (middle + half) / (1 + z2))
-
-
-@dataclass(frozen=True, kw_only=True)
-class Spread:
-    """Of one measured value over the trials that know it."""
-
-    median: float
-    p95: float
-    """95 % of the trials are below."""
-    smallest: float
-    largest: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class Summary:
-    """Of a repetition."""
-
-    trials: int
-    failed: Mapping[int, str]
-    """Reason by seed."""
-    spread: Mapping[str, Spread]
-    """By name of the value; over failed trials too, as far as they measured it."""
-
-    @classmethod
-    def of(cls, trials: Sequence[Trial]) -> "Summary":
-        """Count and sort.
-
-        Raises:
-            ValueError: Without trials.
-        """
-        if not trials:
-            raise ValueError("there are no trials to sum up.")
-        names = dict.fromkeys(name for trial in trials for name in trial.values)
-        known = {name: _numbers(trials, name) for name in names}
-        return cls(
-            trials=len(trials),
-            failed={trial.seed: trial.failure for trial in trials if trial.failure},
-            spread={name: _spread(values) for name, values in known.items() if len(values)},
-        )
-
-    @property
-    def successes(self) -> int:
-        """Number of trials that did not fail."""
-        return self.trials - len(self.failed)
-
-    @property
-    def interval(self) -> tuple[float, float]:
-        """Of the share of successes, 95 %."""
-        return wilson_interval(self.successes, self.trials)
-
-    def figures(self) -> dict[str, float | int]:
-        """All of it as one flat object of numbers; seeds and reasons left out."""
-        low, high = self.interval
-        values: dict[str, float | int] = {
-            "trials": self.trials,
-            "successes": self.successes,
-            "success_rate": self.successes / self.trials,
-            "success_rate_low": low,
-            "success_rate_high": high,
-        }
-        for name, spread in self.spread.items():
-            values |= {f"{name}_{kind}": value for kind, value in vars(spread).items()}
-        return values
-
-    def table(self, title: str) -> "Table":
-        """To be printed; the heading tells how many succeeded, the foot why others did not."""
-        from rich.table import Table
-        from rich.text import Text
-
-        low, high = self.interval
-        heading = (
-            f"{title}: {self.successes} of {self.trials} succeeded "
-            f"({100 * low:.1f} to {100 * high:.1f} % with 95 % confidence)"
-        )
-        # As text: brackets in a reason are no markup.
-        reasons = Text(
-            "\n".join(f"seed {seed}: {reason}" for seed, reason in self.failed.items())
-        )
-        table = Table("measured", title=heading, caption=reasons, caption_justify="left")
-        for column in ("median", "p95", "smallest", "largest"):
-            table.add_column(column, justify="right")
-        for name, spread in self.spread.items():
-            numbers = (spread.median, spread.p95, spread.smallest, spread.largest)
-            table.add_row(name.replace("_", " "), *(f"{number:.4g}" for number in numbers))
-        return table
-
-
-def _numbers(trials: Sequence[Trial], name: str) -> np.ndarray:
-    values = [v for t in trials if not isinstance(v := t.values.get(name, math.nan), str)]
-    numbers = np.array(values, dtype=float)
-    return numbers[np.isfinite(numbers)]
-
-
-def _spread(values: np.ndarray) -> Spread:
-    median, p95 = (float(np.quantile(values, share, method="higher")) for share in (0.5, 0.95))
-    return Spread(
-        median=median, p95=p95, smallest=float(values.min()), largest=float(values.max())
-    )

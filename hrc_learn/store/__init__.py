@@ -38,6 +38,8 @@ from hrc_learn.store._ownership import Kind as Kind
 from hrc_learn.store._ownership import source_of as source_of
 from hrc_learn.store._recovery import recover as recover
 from hrc_learn.store._recovery import settle as settle
+from hrc_learn.store._values import write_json as write_json
+from hrc_learn.store._values import write_text as write_text
 from hrc_learn.store._writing import new_file as new_file
 from hrc_learn.store._writing import new_folder as new_folder
 from hrc_learn.store._writing import read_made_by as read_made_by

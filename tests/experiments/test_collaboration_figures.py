@@ -9,7 +9,7 @@ from sample_runs import sample_run
 
 from hrc_learn.experiments.collaboration import figures as collaboration_figures
 from hrc_learn.experiments.collaboration.figures import (
-    hand_figure,
+    end_effector_figure,
     marker_figure,
     timeline_figure,
     trajectories_figure,
@@ -31,7 +31,12 @@ def run():
 
 @pytest.mark.parametrize(
     "draw",
-    [trajectories_figure, marker_figure, timeline_figure, lambda run, _: hand_figure(run)],
+    [
+        trajectories_figure,
+        marker_figure,
+        timeline_figure,
+        lambda run, _: end_effector_figure(run),
+    ],
 )
 def test_figures_are_drawn(run, draw):
     buffer = BytesIO()
@@ -58,7 +63,7 @@ def test_the_marker_is_shaded_where_it_is_wanted_and_not_seen(run):
 def test_the_timeline_has_a_row_for_each_phase_and_for_people(run):
     axes = timeline_figure(run, OBJECTS).axes[0]
     labels = [label.get_text() for label in axes.get_yticklabels()]
-    assert labels == [*PHASES, "person pulls", "marker unseen"]
+    assert labels == [*PHASES, "person pushes", "marker out of sight"]
 
 
 def test_angles_count_from_the_hand_pointing_down(run):
@@ -67,7 +72,7 @@ def test_angles_count_from_the_hand_pointing_down(run):
     q = quaternion.multiply(quaternion.exp(torch.from_numpy(turns)), down).numpy()
     steps = len(run.time) // len(turns)
     hand = replace(run.bodies[0], orientation=np.repeat(q, steps, axis=0), name="hand")
-    axes = hand_figure(replace(run, bodies=(hand,))).axes[1]
+    axes = end_effector_figure(replace(run, bodies=(hand,))).axes[1]
     drawn = np.stack([line.get_ydata() for line in axes.get_lines()], axis=-1)[::steps]
     np.testing.assert_allclose(drawn, np.rad2deg(turns), atol=1e-9)
 
@@ -75,3 +80,18 @@ def test_angles_count_from_the_hand_pointing_down(run):
 def test_runs_without_a_camera_are_refused_where_it_is_needed(run):
     with pytest.raises(ValueError, match="needs camera"):
         collaboration_figures.marker_figure(replace(run, camera=None), OBJECTS)
+
+
+def test_figures_of_a_job_that_never_saw_its_marker_are_drawn_all_the_same(run):
+    unknown = np.full_like(run.camera.feature, np.nan)
+    blind = replace(
+        run,
+        camera=replace(
+            run.camera, feature=unknown, target=unknown, images=(), image_time=np.empty(0)
+        ),
+        human_effort=np.zeros_like(run.human_effort),
+        demo_path=None,
+    )
+    for draw in (trajectories_figure, marker_figure, timeline_figure):
+        draw(blind, {"box": (0.0, 4.0)})
+    end_effector_figure(blind)

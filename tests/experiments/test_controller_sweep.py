@@ -5,7 +5,13 @@ import torch
 from unchecked import shapes_unchecked
 
 from hrc_learn.experiments.controller.stress_trials import StressConfig, run_stress_trials
-from hrc_learn.experiments.controller.sweep import CRITERIA, EXPERIMENTS, chunks, compared
+from hrc_learn.experiments.controller.sweep import (
+    CRITERIA,
+    EXPERIMENTS,
+    chunks,
+    compared,
+    join,
+)
 
 
 def test_every_bound_is_on_a_figure_that_its_experiment_reports():
@@ -17,9 +23,11 @@ def test_every_bound_is_on_a_figure_that_its_experiment_reports():
     assert compared(figures) == {"near_speed_up_roll_0_30": 1.0}
     for name in ("noise", "stress"):
         summary = run_chunk_of_two_steps(name).summary()
-        wanted = {c.figure for c in CRITERIA if c.experiment == name}
+        figures = {f"{name}_{key}": value for key, value in summary.items()}
+        wanted = [c.metric for c in CRITERIA if c.experiment == name]
         assert wanted
-        assert wanted <= summary.keys()
+        assert all(metric.measure(figures) is not None for metric in wanted)
+        assert all(metric.measure({}) is None for metric in wanted)
 
 
 def run_chunk_of_two_steps(name: str):
@@ -29,12 +37,16 @@ def run_chunk_of_two_steps(name: str):
 
 
 def test_a_bound_is_met_on_its_own_side():
-    success = next(c for c in CRITERIA if c.key == "near_success")
-    assert [success.met(x) for x in (1.0, 0.99, 0.98, math.nan)] == [True, True, False, False]
-    assert success.bound == ">= 0.99"
-    latest = next(c for c in CRITERIA if c.key == "near_t95")
-    assert [latest.met(x) for x in (7.0, 8.0, math.inf)] == [True, True, False]
-    assert latest.bound == "<= 8"
+    def measured(figure, value):
+        near = [c.metric for c in CRITERIA if c.experiment == "near"]
+        (metric,) = [m for m in near if m.name == figure]
+        return metric.measure({f"near_{figure}": value})
+
+    success = [measured("success", x).ok for x in (1.0, 0.99, 0.98, math.nan)]
+    assert success == [True, True, False, False]
+    assert measured("success", 1.0).bound == "≥ 0.99"
+    assert [measured("t95", x).ok for x in (7.0, 8.0, math.inf)] == [True, True, False]
+    assert measured("t95", 7.0).bound == "≤ 8"
 
 
 def test_never_arriving_without_adaptation_is_infinitely_slower():
@@ -54,7 +66,7 @@ def test_chunks_make_up_the_trials_with_a_seed_each():
 
 def test_joined_results_are_those_of_the_chunks():
     parts = [run_chunk_of_two_steps("stress"), run_chunk_of_two_steps("stress")]
-    joined = EXPERIMENTS["stress"].join(parts)
+    joined = join(parts)
     assert joined.summary()["rollouts"] == 10
     assert torch.equal(joined.interventions[:5], parts[0].interventions)
 

@@ -1,4 +1,4 @@
-"""A dashboard beside a work cell: all that is logged arrives, whatever the thread catches."""
+"""A dashboard beside a cell: all that is logged arrives, whatever the thread catches."""
 
 from contextlib import contextmanager
 
@@ -7,7 +7,7 @@ import rerun as rr
 import torch
 from rrd_reading import Rrd
 
-from hrc_learn.experiments.run_recording import ServeConfig, serving
+from hrc_learn.experiments.live_view import LiveViewConfig, live_view
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import MotionLog, World
 from hrc_learn.sim.workplace import Workplace
@@ -21,7 +21,7 @@ def test_a_station_is_shown_while_it_works(tmp_path, monkeypatch):
     def into_a_file(port, data_port):
         stream = rr.RecordingStream("test")
         stream.save(tmp_path / "live.rrd")
-        yield servers.DashboardServer(stream, f"http://viewer:{port}", f"data:{data_port}")
+        yield servers.Served(stream, f"http://viewer:{port}", f"data:{data_port}")
         stream.disconnect()
 
     monkeypatch.setattr(servers, "served", into_a_file)
@@ -36,10 +36,13 @@ def test_a_station_is_shown_while_it_works(tmp_path, monkeypatch):
         human=ScriptedPerturbation(panda, ()),
         advance=motion.advance,
     )
-    config = ServeConfig(port=1, data_port=2, period=0.01)
-    with torch.inference_mode(), serving("Held", config, opened.append)(cell, world, motion):
-        cell.begin_phase("hold")
-        cell.hold_pose(0.3)
+    config = LiveViewConfig(port=1, data_port=2, period=0.01)
+    with (
+        torch.inference_mode(),
+        live_view("Held", config, opened.append)(cell, world, motion),
+    ):
+        cell.enter("hold")
+        cell.stay(0.3)
     assert opened == ["http://viewer:1"]
     rrd = Rrd(tmp_path / "live.rrd")
     path = "joints/panda_joint4/position"

@@ -1,9 +1,9 @@
-"""The way into a shelf, cut off and compared, on paths whose bend is known."""
+"""The approach to a shelf, cut off and compared, on paths whose deviation is known."""
 
 import numpy as np
 import pytest
 
-from hrc_learn.experiments.placing.trial import Insertion
+from hrc_learn.experiments.placing.trial import ApproachPath
 
 GOAL = np.array([0.4, -0.6, 0.3])
 
@@ -14,38 +14,38 @@ def straight(samples=200, start=0.2):
     return np.stack([np.full(samples, GOAL[0]), y, np.full(samples, GOAL[2])], axis=1)
 
 
-def test_a_path_moved_with_its_goal_is_not_bent():
+def test_a_path_moved_with_its_goal_does_not_deviate():
     shift = np.array([0.1, -0.05, 0.24])
     path = straight()
     path[:, 2] += 0.03 * np.sin(8 * path[:, 1])  # any shape, the same for both
-    shown = Insertion.of(path, path[-1], edge=-0.47)
-    moved = Insertion.of(path + shift, path[-1] + shift, edge=-0.47 + shift[1])
-    assert moved.bend(shown) == pytest.approx(0.0, abs=1e-12)
+    demonstrated = ApproachPath.of(path, path[-1], edge=-0.47)
+    moved = ApproachPath.of(path + shift, path[-1] + shift, edge=-0.47 + shift[1])
+    assert moved.deviation(demonstrated) == pytest.approx(0.0, abs=1e-12)
 
 
-def test_the_bend_is_the_largest_distance_at_equal_depth():
-    shown = Insertion.of(straight(), GOAL, edge=-0.47)
-    bent = straight(samples=301, start=0.1)
-    share = np.clip((bent[:, 1] + 0.47) / -0.13, 0, 1)
-    bent[:, 0] += 0.03 * np.sin(np.pi * share)
-    bent[:, 2] -= 0.04 * np.sin(np.pi * share)
-    done = Insertion.of(bent, GOAL, edge=-0.47)
-    assert done.bend(shown) == pytest.approx(0.05, rel=1e-3)
-    at = int(done.aside(shown).argmax())
-    assert done.left[at] == pytest.approx(0.065, abs=1e-3)
+def test_the_deviation_is_the_largest_distance_at_equal_depth():
+    demonstrated = ApproachPath.of(straight(), GOAL, edge=-0.47)
+    deviating = straight(samples=301, start=0.1)
+    fraction = np.clip((deviating[:, 1] + 0.47) / -0.13, 0, 1)
+    deviating[:, 0] += 0.03 * np.sin(np.pi * fraction)
+    deviating[:, 2] -= 0.04 * np.sin(np.pi * fraction)
+    done = ApproachPath.of(deviating, GOAL, edge=-0.47)
+    assert done.deviation(demonstrated) == pytest.approx(0.05, rel=1e-3)
+    at = int(done.distance(demonstrated).argmax())
+    assert done.remaining[at] == pytest.approx(0.065, abs=1e-3)
 
 
 def test_only_what_lies_behind_the_edge_counts():
     away = straight()
     away[away[:, 1] > -0.46, 0] += 1.0
-    shown = Insertion.of(straight(), GOAL, edge=-0.47)
-    assert Insertion.of(away, GOAL, edge=-0.47).bend(shown) < 1e-12
-    assert Insertion.of(away, GOAL, edge=-0.40).bend(shown) > 0.9
+    demonstrated = ApproachPath.of(straight(), GOAL, edge=-0.47)
+    assert ApproachPath.of(away, GOAL, edge=-0.47).deviation(demonstrated) < 1e-12
+    assert ApproachPath.of(away, GOAL, edge=-0.40).deviation(demonstrated) > 0.9
 
 
 def test_it_begins_where_the_edge_is_crossed_for_the_last_time():
     there_and_back = np.concatenate([straight()[:150], straight()[:150][::-1], straight()])
-    inside = Insertion.of(there_and_back, GOAL, edge=-0.3)
+    inside = ApproachPath.of(there_and_back, GOAL, edge=-0.3)
     assert len(inside.offset) == (straight()[:, 1] <= -0.3).sum()
 
 
@@ -53,10 +53,10 @@ def test_a_tremor_along_the_way_does_not_confuse_depths():
     path = straight()
     path[:, 1] += 1e-3 * np.sin(np.arange(len(path)))
     path[-1] = GOAL
-    shown = Insertion.of(path, GOAL, edge=-0.47)
-    assert Insertion.of(straight(), GOAL, edge=-0.47).bend(shown) < 1e-12
+    demonstrated = ApproachPath.of(path, GOAL, edge=-0.47)
+    assert ApproachPath.of(straight(), GOAL, edge=-0.47).deviation(demonstrated) < 1e-12
 
 
-def test_a_path_that_stays_outside_is_bent_beyond_measure():
-    shown = Insertion.of(straight(), GOAL, edge=-0.47)
-    assert Insertion.of(straight()[:50], GOAL, edge=-0.47).bend(shown) == np.inf
+def test_a_path_that_stays_outside_deviates_infinitely():
+    demonstrated = ApproachPath.of(straight(), GOAL, edge=-0.47)
+    assert ApproachPath.of(straight()[:50], GOAL, edge=-0.47).deviation(demonstrated) == np.inf

@@ -38,7 +38,7 @@ def labelled(axes):
     return {line.get_label(): np.asarray(line.get_ydata(), float) for line in axes.get_lines()}
 
 
-def test_paths_have_a_panel_for_each_way_of_planning():
+def test_paths_have_a_panel_for_each_space_of_planning():
     figure = draw.shelf_paths_figure(
         motion(duration=15), {"joint space": by_shelf(), "task space": by_shelf()}, (BOX,)
     )
@@ -63,9 +63,11 @@ def test_each_joint_shows_the_demonstration_and_every_shelf():
     assert figure.axes[0].get_xlim()[1] == pytest.approx(15.0)
 
 
-def test_bends_are_in_millimetres_below_or_above_the_bound():
-    way = draw.WayIn(left=np.linspace(0.13, 0, 50), aside=np.full(50, 0.06))
-    figure = draw.bend_figure({"joint space": dict.fromkeys(SHELVES, way)}, 0.012)
+def test_deviations_are_in_millimetres_below_or_above_the_bound():
+    approach = draw.ApproachDistance(
+        remaining=np.linspace(0.13, 0, 50), distance=np.full(50, 0.06)
+    )
+    figure = draw.approach_figure({"joint space": dict.fromkeys(SHELVES, approach)}, 0.012)
     lines = labelled(figure.axes[0])
     np.testing.assert_allclose(lines["upper shelf"], 60.0)
     np.testing.assert_allclose(lines["bound"], 12.0)
@@ -92,8 +94,8 @@ def test_snapshots_keep_their_order_and_titles():
 
 
 def test_every_trial_is_a_dot():
-    values = {"goal error [mm]": {shelf: np.linspace(0.1, 1, 50) for shelf in SHELVES}}
-    (axes,) = draw.repetition_figure(values, {"goal error [mm]": 2.0}).axes
+    values = {"place error [mm]": {shelf: np.linspace(0.1, 1, 50) for shelf in SHELVES}}
+    (axes,) = draw.trials_figure(values, {"place error [mm]": 2.0}).axes
     *dots, bound = axes.get_lines()
     assert [np.size(line.get_xdata()) for line in dots] == [50, 50, 50]
     assert all(np.ptp(line.get_xdata()) < 0.5 for line in dots)

@@ -6,23 +6,30 @@ import numpy as np
 import pytest
 import torch
 
+from hrc_learn.experiments.metric_table import evaluate
 from hrc_learn.experiments.monte_carlo import Trial
-from hrc_learn.experiments.placing.experiment import demonstrated_shelf, perturbed_start
-from hrc_learn.experiments.placing.metrics import evaluate_lessons, evaluate_random_starts
-from hrc_learn.experiments.placing.trial import PlacingFigures
+from hrc_learn.experiments.placing import arm_angle_ablation
+from hrc_learn.experiments.placing.experiment import demonstrated_shelf
+from hrc_learn.experiments.placing.metrics import (
+    BLOCKED,
+    placing_metrics,
+    random_start_metrics,
+)
+from hrc_learn.experiments.placing.trial import PlacingOutcome
+from hrc_learn.experiments.pose_randomization import random_start
 from hrc_learn.kinematics import panda
-from hrc_learn.sim import World
+from hrc_learn.sim import Touch, World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.work_cell import TaskFailedError
 
 WORKPLACE = Workplace()
 SHELVES = WORKPLACE.shelf_names()
-GOOD = PlacingFigures(
-    bend=2e-3,
-    goal_distance=1e-4,
-    goal_angle=1e-4,
+GOOD = PlacingOutcome(
+    deviation=2e-3,
+    place_error=1e-4,
+    place_tilt=1e-4,
     violations=0,
-    touches=[],
+    contacts=(),
     peak_speed=0.5,
     jerk=1e-5,
     placed=True,
@@ -31,67 +38,86 @@ GOOD = PlacingFigures(
 
 def trial(seed, **changes):
     """A trial in which the upper shelf differs."""
-    values = {}
-    for shelf in SHELVES:
-        figures = replace(GOOD, **changes) if shelf == "upper" else GOOD
-        values |= {f"{shelf}_{name}": value for name, value in figures.row().items()}
-        values[f"{shelf}_joint_space_blocked"] = shelf == "lower"
-    return Trial(seed=seed, values=values)
+    outcomes = dict.fromkeys(SHELVES, GOOD) | {"upper": replace(GOOD, **changes)}
+    values = evaluate(placing_metrics(SHELVES), outcomes).values
+    return Trial(seed=seed, values={**values, BLOCKED: 1})
+
+
+def random_starts(trials):
+    return evaluate(random_start_metrics(SHELVES), trials).table
 
 
 def missed(table):
     return {m.name.removeprefix("random starts, ") for m in table if m.ok is False}
 
 
+def faults(**changes):
+    outcomes = dict.fromkeys(SHELVES, GOOD) | {"upper": replace(GOOD, **changes)}
+    return evaluate(placing_metrics(SHELVES), outcomes).faults
+
+
 def test_a_good_placing_has_no_faults():
-    assert GOOD.faults == []
+    assert faults() == ()
+
+
+TOUCH = Touch(first="box", second="board_middle", start=6.1, end=6.2, depth=0.0121)
 
 
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"bend": 0.0121}, "bent by 12.1 mm"),
-        ({"goal_distance": 0.0025}, "missed by 2.5 mm"),
-        ({"goal_angle": 0.01}, "missed by 0.57 deg"),
-        ({"violations": 3}, "3 steps"),
-        ({"touches": ["box met board_middle at 6.10 s, 12.1 mm deep"]}, "box met board_middle"),
-        ({"placed": False}, "does not stand"),
+        ({"deviation": 0.0121}, "upper shelf, approach-path deviation: 12.1 mm"),
+        ({"place_error": 0.0025}, "place error: 2.5 mm"),
+        ({"place_tilt": 0.01}, "place tilt: 0.573 deg"),
+        ({"violations": 3}, "joint limit violations: 3"),
+        ({"contacts": (TOUCH,)}, "upper shelf: box met board_middle at 6.10 s, 12.1 mm deep"),
+        ({"placed": False}, "objects that stand on their shelf: 2"),
     ],
 )
 def test_each_fault_is_named(changes, words):
-    (fault,) = replace(GOOD, **changes).faults
+    (fault,) = faults(**changes)
     assert words in fault
 
 
+@pytest.mark.parametrize("changes", [{"peak_speed": 1.1}, {"jerk": 0.02}])
+def test_what_is_only_wanted_is_missed_but_no_fault(changes):
+    outcomes = dict.fromkeys(SHELVES, replace(GOOD, **changes))
+    evaluation = evaluate(placing_metrics(SHELVES), outcomes)
+    assert [m.ok for m in evaluation.table].count(False) == 1
+    assert evaluation.faults == ()
+
+
 def test_good_trials_miss_nothing():
-    table = evaluate_random_starts([trial(k) for k in range(10)], SHELVES)
+    table = random_starts([trial(k) for k in range(10)])
     assert missed(table) == set()
     values = {m.name: m.value for m in table}
     assert values["random starts, placings"] == 30
-    blocked = values["random starts, share of joint space plans that are not free"]
+    blocked = values["random starts, fraction of joint-space plans that are blocked"]
     assert blocked == pytest.approx(1 / 3)
 
 
 def test_one_contact_in_fifty_placings_is_allowed_and_two_are_not():
     good = [trial(k) for k in range(20)]
-    touched = [trial(20 + k, touches=["a met b"]) for k in range(2)]
-    assert missed(evaluate_random_starts([*good, touched[0]], SHELVES)) == set()
-    assert missed(evaluate_random_starts([*good, *touched], SHELVES)) == {
-        "share without contact"
-    }
+    touched = [trial(20 + k, contacts=(TOUCH,)) for k in range(2)]
+    assert missed(random_starts([*good, touched[0]])) == set()
+    assert missed(random_starts([*good, *touched])) == {"fraction without contact"}
 
 
 def test_a_trial_that_was_given_up_keeps_no_target():
     trials = [trial(0), Trial(seed=1, values={}, failure="no free start")]
-    assert "largest goal error" in missed(evaluate_random_starts(trials, SHELVES))
+    assert "largest place error" in missed(random_starts(trials))
 
 
-def test_lessons_may_hit_without_the_body_but_not_with_it():
-    def lesson(seed, untaught, taught):
-        return Trial(seed=seed, values={"untaught_hit": untaught, "taught_hit": taught})
+def test_the_arm_may_hit_the_cabinet_without_the_posture_but_not_with_it():
+    def pair(seed, without, taught):
+        values = {"without_posture_hit": without, "with_posture_hit": taught}
+        return Trial(seed=seed, values=values)
 
-    assert missed(evaluate_lessons([lesson(0, 1, 0), lesson(1, 1, 0)])) == set()
-    assert len(missed(evaluate_lessons([lesson(0, 1, 0), lesson(1, 0, 1)]))) == 1
+    def evaluated(*pairs):
+        return evaluate(arm_angle_ablation.TRIAL_METRICS, pairs).table
+
+    assert missed(evaluated(pair(0, 1, 0), pair(1, 1, 0))) == set()
+    assert len(missed(evaluated(pair(0, 1, 0), pair(1, 0, 1)))) == 1
 
 
 def test_the_demonstrated_shelf_is_where_the_hand_ended():
@@ -104,7 +130,7 @@ def test_the_demonstrated_shelf_is_where_the_hand_ended():
 
 def test_random_starts_are_free_and_each_another():
     world, rng = World(WORKPLACE.scene), np.random.default_rng(0)
-    starts = [perturbed_start(world, WORKPLACE, 0.1, rng) for _ in range(2)]
+    starts = [random_start(world, WORKPLACE, 0.1, rng) for _ in range(2)]
     assert world.holds(WORKPLACE.scene.objects[0].name)
     assert not torch.equal(*starts)
     for start in starts:
@@ -115,4 +141,4 @@ def test_random_starts_are_free_and_each_another():
 def test_starts_that_cannot_be_free_are_given_up():
     world, rng = World(WORKPLACE.scene), np.random.default_rng(0)
     with pytest.raises(TaskFailedError, match="no free start"):
-        perturbed_start(world, WORKPLACE, 1e3, rng)
+        random_start(world, WORKPLACE, 1e3, rng)

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from hrc_learn.experiments.collaboration.experiment import OBJECTS_REACH, with_objects
-from hrc_learn.experiments.pose_randomization import THREE_OBJECTS, scatter
+from hrc_learn.experiments.collaboration.trial import OBJECTS_REACH, with_objects
+from hrc_learn.experiments.pose_randomization import THREE_OBJECTS, random_object_poses
 from hrc_learn.sim import FINGER_STROKE, World
 from hrc_learn.sim.workplace import Workplace
 
@@ -11,7 +11,7 @@ WORKPLACE = with_objects(Workplace(), THREE_OBJECTS)
 
 def scattered(seed):
     rng = np.random.default_rng(seed)
-    return scatter(THREE_OBJECTS, WORKPLACE.table_centre, OBJECTS_REACH, rng)
+    return random_object_poses(THREE_OBJECTS, WORKPLACE.table_centre, OBJECTS_REACH, rng)
 
 
 def test_objects_lie_on_the_table_in_reach_and_in_view_with_room_for_the_fingers():
@@ -54,4 +54,6 @@ def test_scattered_objects_rest_where_they_were_put():
 
 def test_more_objects_than_fit_are_refused():
     with pytest.raises(ValueError, match="do not fit"):
-        scatter(THREE_OBJECTS, (0.2, 0.5), (0.01, 0.01), np.random.default_rng(0), attempts=20)
+        random_object_poses(
+            THREE_OBJECTS, (0.2, 0.5), (0.01, 0.01), np.random.default_rng(0), attempts=20
+        )

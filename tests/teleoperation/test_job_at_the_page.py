@@ -8,8 +8,8 @@ import pytest
 from page_in_browser import PATIENCE, Browser, chromium, wait_until
 from taught_skills import taught_aiming, taught_placing
 
-from hrc_learn.experiments.collaboration.experiment import simulate_collaboration
-from hrc_learn.experiments.run_recording import ELBOW, Deviation, link_poses, span
+from hrc_learn.experiments.collaboration.trial import simulate_collaboration
+from hrc_learn.experiments.run_measures import ELBOW, Deviation, link_poses, span
 from hrc_learn.skills.pick_and_place import PickAndPlaceConfig
 from hrc_learn.teleoperation import page_session as task_page
 from hrc_learn.teleoperation.page import Page, PageConfig
@@ -21,7 +21,7 @@ class Job:
     """A collaboration beside its page, in a thread of its own, which waits for a browser."""
 
     def __init__(self, aiming, placing):
-        self.pages, self.cell, self.done = [], None, None
+        self.pages, self.station, self.done = [], None, None
         self.begin = threading.Event()
         self._thread = threading.Thread(target=self._run, args=(aiming, placing))
 
@@ -31,15 +31,15 @@ class Job:
             placing,
             ("middle",),
             camera="synthetic",
-            pulls=(),
+            forces=(),
             config=PickAndPlaceConfig(interaction=15.0),
             seed=3,
-            page=PageConfig(port=8600, timeout=PATIENCE),
-            watch=self._watch,
+            page=PageConfig(port=8600, patience=PATIENCE),
+            view=self._watch,
         )
 
-    def _watch(self, cell, world, motion):
-        self.cell = cell
+    def _watch(self, station, world, motion):
+        self.station = station
         self.begin.wait()
         return nullcontext()
 
@@ -48,11 +48,11 @@ class Job:
         return page
 
     def phase(self) -> str:
-        events = self.cell.log.events
+        events = self.station.log.events
         return events[-1].text if events else ""
 
     def link(self, index: int) -> np.ndarray:
-        return link_poses(self.cell.log.snapshot()).position[-1, index].numpy()
+        return link_poses(self.station.log.snapshot()).position[-1, index].numpy()
 
     def __enter__(self):
         self._thread.start()
@@ -71,18 +71,18 @@ def test_the_elbow_yields_to_the_mouse_while_the_hand_aims(tmp_path, monkeypatch
     )
     # The browser, which takes most of the machine, is closed before the job goes on.
     with job, chromium(tmp_path / "chromium") as tab:
-        wait_until(lambda: job.cell, "a page", timeout=180)
-        browser = Browser(tab, job.pages[0], guides=False)
+        wait_until(lambda: job.station, "a page", timeout=180)
+        browser = Browser(tab, job.pages[0], leads=False)
         job.begin.set()
         wait_until(lambda: job.phase() == "interact", "time for the person", timeout=300)
-        tab.get_by_text("the end effector keeps servoing").wait_for()
+        tab.get_by_text("the hand goes on aiming").wait_for()
         assert not tab.get_by_role("button", name="Start", exact=True).count()
         elbow = job.link(ELBOW)
         with browser.dragging(elbow, by=(70, -10)):
             wait_until(lambda: np.linalg.norm(job.link(ELBOW) - elbow) > 0.05, "motion")
             tab.screenshot(path=tmp_path / "pulled.png")
     result = job.done
-    log = result.cell.log
+    log = result.station.log
     assert result.failure == ""
     time = log["time"]
     start, end = span(log, "interact")

@@ -111,7 +111,8 @@ def test_ones_own_demonstration_is_recorded_learned_and_run(tmp_path):
     options = ("--out", tmp_path / "run", "--no-pictures", "--json", tmp_path / "measured")
     run("control/run_placing.py", "--placing", model, *options, status=(0, 1))
     measured = json.loads((tmp_path / "measured").read_text())
-    assert measured["joint_middle_placed"] == measured["pose_middle_placed"] == 1
-    assert measured["pose_middle_contacts"] == 0
+    assert measured["joint_space_middle_shelf_placed"] == 1
+    assert measured["middle_shelf_placed"] == 1
+    assert measured["middle_shelf_contacts"] == 0
     # Within what a person shows; taps of a key leave the primitive a little short.
-    assert measured["pose_middle_goal_error_mm"] < 10
+    assert measured["middle_shelf_place_error_mm"] < 10

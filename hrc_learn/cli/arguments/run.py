@@ -17,9 +17,9 @@ def _camera_change() -> Any:
 
 
 def _serving() -> Any:
-    from hrc_learn.experiments.run_recording import ServeConfig
+    from hrc_learn.experiments.live_view import LiveViewConfig
 
-    return ServeConfig()
+    return LiveViewConfig()
 
 
 def _collaboration() -> Any:
@@ -93,7 +93,7 @@ class RunPlacing:
     """Random starts from which to place on each shelf besides."""
     noise: float = 0.1
     """Standard deviation of each joint at these starts, about home [rad]."""
-    lessons: int = 0
+    ablation: int = 0
     """Further demonstrations with and without the body's shape."""
     processes: int = 1
     """Of the repetitions, at once."""
@@ -197,7 +197,7 @@ class RunCollaboration:
     """How far, with --camera-moved."""
     latency: More[float] = 0.0
     """From an image being taken until its markers are known [s]."""
-    drop: More[float] = 0.0
+    frame_loss: More[float] = 0.0
     """Share of the images that are lost."""
     camera: Camera = "auto"
     """Camera: rendered by "egl", or "synthetic", which needs no OpenGL; "auto" renders where

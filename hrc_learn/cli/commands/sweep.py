@@ -18,6 +18,7 @@ from hrc_learn.experiments.controller.sweep import (
     Criterion,
     chunks,
     compared,
+    join,
     run_chunk,
 )
 from hrc_learn.store import new_folder
@@ -106,7 +107,7 @@ def _run(jobs: list[Job], spread: Callable[[list[Job]], Iterator[Any]]) -> dict[
         for (name, *_), part in zip(jobs, spread(jobs), strict=True):
             parts.setdefault(name, []).append(part)
             progress.update(task, advance=1, description=name)
-    return {name: EXPERIMENTS[name].join(results) for name, results in parts.items()}
+    return {name: join(results) for name, results in parts.items()}
 
 
 def _in_turn(jobs: list[Job]) -> Iterator[Any]:
@@ -136,29 +137,33 @@ def _show(names: list[str], figures: dict[str, float]) -> list[Criterion]:
     grasps = [name for name in names if f"{name}_success" in figures]
     if grasps:
         console.print(_grasp_table(grasps, figures))
-    criteria = [c for c in CRITERIA if c.experiment in names and c.key in figures]
     table = Table(title="Measured and wanted")
     for column in ("figure", "experiment", "what", "measured", "target", ""):
         right = column in ("measured", "target")
         table.add_column(column, no_wrap=True, justify="right" if right else "left")
-    for criterion in criteria:
-        value = figures[criterion.key]
+    missed = []
+    for criterion in CRITERIA:
+        measured = criterion.metric.measure(figures)
+        if criterion.experiment not in names or measured is None:
+            continue
+        if not measured.ok:
+            missed.append(criterion)
         table.add_row(
             criterion.number,
             criterion.experiment,
-            criterion.figure.replace("_", " "),
-            f"{value:.4g}",
-            criterion.bound,
-            "met" if criterion.met(value) else "missed",
+            measured.name,
+            measured.shown,
+            measured.bound,
+            "met" if measured.ok else "missed",
         )
-    if criteria:
+    if table.rows:
         console.print(table)
-    if any(c.number == "1" for c in criteria):
+    if "near" in names:
         console.print(
             "Figures 6 and 8 need the simulator: hrc run placing --trials 40 and "
             "hrc run collaboration --trials 50"
         )
-    return [c for c in criteria if not c.met(figures[c.key])]
+    return missed
 
 
 def _grasp_table(names: list[str], figures: dict[str, float]) -> Table:

@@ -1,7 +1,6 @@
-"""Figures of a job done for several objects in turn, after those of the paper's
-Experiment 3.
+"""Figures of a collaboration with several objects, after those of the paper's Experiment 3.
 
-Each takes the recording of the run and when which object was dealt with, by name.
+Each takes the recording of the run and the time interval of each object, by its name.
 """
 
 from collections.abc import Mapping
@@ -27,16 +26,16 @@ from hrc_learn.viz.figure_parts import (
 )
 
 Spans = Mapping[str, tuple[float, float]]
-"""When an object was dealt with, begin and end [s], by its name."""
+"""Begin and end of the work on each object [s], by its name."""
 
 CARRYING = ("transfer", "release")
-"""Phases in which the hand moves into the cabinet with an object."""
+"""Phases in which the end effector moves into the cabinet with an object."""
 
 _HIDDEN = "#8D8F94"
 
 
 def trajectories_figure(run: RunRecording, objects: Spans) -> Figure:
-    """Paths of the hand with every object, beside the demonstration."""
+    """Paths of the end effector with every object, beside the demonstration."""
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, 5.2))
         axes = space(figure)
@@ -56,13 +55,13 @@ def trajectories_figure(run: RunRecording, objects: Spans) -> Figure:
             if len(path):
                 axes.plot(*path[-1], "s", color=colour, ms=5)
         axes.legend(loc="upper right")
-        axes.set_title("Paths of the tool centre point (square: let go)", loc="left")
+        axes.set_title("Paths of the tool centre point (square: release)", loc="left")
         frame_space(axes, points)
     return figure
 
 
 def marker_figure(run: RunRecording, objects: Spans) -> Figure:
-    """Paths of the hand's marker in the image, and when it was seen how far from its target."""
+    """Paths of the gripper's marker in the image, and its distance from the target."""
     camera = needed(run.camera, "camera")
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, 6.0))
@@ -86,15 +85,16 @@ def marker_figure(run: RunRecording, objects: Spans) -> Figure:
             aspect="equal",
             xlabel="u [px]",
             ylabel="v [px]",
-            title="Path of the hand's marker (dot: seen first, cross: target)",
+            title="Path of the gripper's marker (dot: first seen, cross: target)",
         )
-        image.legend(loc="upper right", frameon=True, framealpha=0.75, edgecolor="none")
-        hidden = _wanted_unseen(run)
+        if image.get_legend_handles_labels()[0]:  # none where the marker was never seen
+            image.legend(loc="upper right", frameon=True, framealpha=0.75, edgecolor="none")
+        hidden = _out_of_sight(run)
         _shade(error, run.time, hidden, _HIDDEN)
         error.set_yscale("log")
         error.margins(x=0)
         error.set(
-            xlabel="time [s] (shaded: the marker is wanted and not seen)",
+            xlabel="time [s] (shaded: marker out of sight)",
             ylabel="distance [px]",
             title="Distance to the target",
         )
@@ -102,18 +102,18 @@ def marker_figure(run: RunRecording, objects: Spans) -> Figure:
     return figure
 
 
-def hand_figure(run: RunRecording) -> Figure:
-    """Translation and orientation of the hand, and the person's effort, over time."""
+def end_effector_figure(run: RunRecording) -> Figure:
+    """Position and orientation of the end effector, and the person's effort, over time."""
     effort = needed(run.human_effort, "human_effort")
     hand = next((body for body in run.bodies if body.name == "hand"), None)
     acting = np.linalg.norm(effort, axis=1) > 0
     rows = [
-        ("position [m]", "Translation of the hand", run.position, "xyz"),
+        ("position [m]", "Position of the end effector", run.position, "xyz"),
         ("effort d [N m]", "Null-space effort of the person, by joint", effort, None),
     ]
     if hand is not None:
         turn = _euler_angles(hand.orientation)
-        rows.insert(1, ("angle [deg]", "Orientation of the hand", turn, _ANGLES))
+        rows.insert(1, ("angle [deg]", "Orientation of the end effector", turn, _ANGLES))
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, 1.9 * len(rows)))
         column = figure.subplots(len(rows), 1, sharex=True)
@@ -128,13 +128,13 @@ def hand_figure(run: RunRecording) -> Figure:
                 loc="center left",
                 bbox_to_anchor=(1.0, 0.5),
             )
-        column[-1].set_xlabel("time [s] (shaded: the expert pulls joint 4)")
+        column[-1].set_xlabel("time [s] (shaded: a person pushes the elbow)")
         figure.align_ylabels()
     return figure
 
 
 def timeline_figure(run: RunRecording, objects: Spans) -> Figure:
-    """What the robot was about, object by object, and what people did meanwhile."""
+    """Phases of the task, object by object, with the person's pushes and occlusions below."""
     events = [(event, end) for event, end in _lasting(run) if end > event.time]
     names = list(dict.fromkeys(event.text for event, _ in events))
     with matplotlib.rc_context(STYLE):
@@ -146,7 +146,7 @@ def timeline_figure(run: RunRecording, objects: Spans) -> Figure:
             colour = palette.GREY if owner is None else colours[owner]
             bar = (event.time, max(end - event.time, 0.15))
             axes.broken_barh([bar], (names.index(event.text) - 0.38, 0.76), color=colour)
-        rows = {"person pulls": _acting(run), "marker unseen": _wanted_unseen(run)}
+        rows = {"person pushes": _acting(run), "marker out of sight": _out_of_sight(run)}
         for k, (active, colour) in enumerate(
             zip(rows.values(), (palette.PURPLE, _HIDDEN), strict=True), start=len(names)
         ):
@@ -167,7 +167,7 @@ _ANGLES = ("about x", "about y", "about z")
 
 
 def _euler_angles(q: Float[np.ndarray, "time 4"]) -> Float[np.ndarray, "time 3"]:
-    """Turns about the base's x, then y, then z from the hand pointing down, unwrapped [deg]."""
+    """Turns about the base's x, then y, then z from gripper down, unwrapped [deg]."""
     w, x, y, z = q.T
     # q = turn * down, where down = (0, s, s, 0) with s^2 = 1/2: turn = q * conj(down).
     s = np.sqrt(0.5)
@@ -179,7 +179,7 @@ def _euler_angles(q: Float[np.ndarray, "time 4"]) -> Float[np.ndarray, "time 3"]
 
 
 def _lasting(run: RunRecording) -> list[tuple[Event, float]]:
-    """Each phase, and when the next one began [s]."""
+    """Each phase and when the next one began [s]."""
     ends = [*(event.time for event in run.phases[1:]), float(run.time[-1])]
     return list(zip(run.phases, ends, strict=True))
 
@@ -204,12 +204,12 @@ def _acting(run: RunRecording) -> Bool[np.ndarray, " time"]:
     return np.linalg.norm(run.human_effort, axis=1) > 0
 
 
-def _wanted_unseen(run: RunRecording) -> Bool[np.ndarray, " time"]:
-    """Where the controller had a target for the marker, and no marker."""
+def _out_of_sight(run: RunRecording) -> Bool[np.ndarray, " time"]:
+    """Where the controller had a target for the marker and the camera did not see it."""
     if run.camera is None:
         return np.zeros(len(run.time), dtype=bool)
-    wanted = np.isfinite(run.camera.target).all(axis=1)
-    return np.asarray(wanted & ~np.isfinite(run.camera.feature).all(axis=1))
+    targeted = np.isfinite(run.camera.target).all(axis=1)
+    return np.asarray(targeted & ~np.isfinite(run.camera.feature).all(axis=1))
 
 
 def _shade(

@@ -1,245 +1,193 @@
-"""What a run of the collaboration has to reach, measured, once or for each seed."""
+"""What is measured of a collaboration. Of several objects the worst counts.
+
+Success is read from the simulator's contacts and poses, not from what the task believes.
+"""
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
+from collections.abc import Callable, Sequence
+from typing import get_args
 
 import numpy as np
-import torch
 
-from hrc_learn.experiments.collaboration.experiment import (
-    PULLS,
-    Disturbances,
-    SimulatedJob,
-    simulate_collaboration,
-    with_objects,
+from hrc_learn.experiments.collaboration.trial import CollaborationRun
+from hrc_learn.experiments.metric_table import Metric
+from hrc_learn.experiments.monte_carlo import Trial
+from hrc_learn.experiments.run_measures import (
+    TOOL,
+    Deviation,
+    limit_violations,
+    link_poses,
+    spans,
+    unwanted_contacts,
 )
-from hrc_learn.experiments.pose_randomization import THREE_OBJECTS
-from hrc_learn.experiments.run_recording import Deviation, spans
-from hrc_learn.kinematics import panda
+from hrc_learn.experiments.trial_statistics import median, p95, success_rate
 from hrc_learn.sim import Touch
-from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.pick_and_place import RELEASE, PickAndPlaceConfig, PickPlaceJob
-from hrc_learn.skills.placing import PlacingSkill
-from hrc_learn.skills.visual_servoing import VisualServoSkill
-from hrc_learn.skills.work_cell import WorkCell, WorkCellConfig
-from hrc_learn.viz.report import Measurement
+from hrc_learn.skills.pick_and_place import RELEASE, Mishap, PickPlaceJob
 
-# What a run of the collaboration has to reach, measured.
+_CONTACTS = {
+    "cabinet": "contacts with the cabinet",
+    "table": "contacts with the table",
+    "arm itself": "contacts of the arm with itself",
+}
 
 
-def evaluate(job: SimulatedJob, fit: Mapping[str, float]) -> list[Measurement]:
-    """Compare a run with its targets; of several objects the worst counts.
-
-    Success is read from the simulator's contacts and poses, not from what the task believes.
+def collaboration_metrics(
+    objects: int, reproduction_nrmse: float
+) -> list[Metric[CollaborationRun]]:
+    """The table.
 
     Args:
-        job: The run.
-        fit: Metrics of the fitted primitives.
-
-    Raises:
-        ValueError: If no object was released on a shelf; there is nothing to measure then.
+        objects: How many there are to be placed.
+        reproduction_nrmse: Of the primitives, from their fit.
     """
-    released = [pick for pick in job.picks if pick.release is not None]
-    if not released:
-        raise ValueError(f"the job failed, so there is nothing to measure: {job.failure}")
-    objects = len(job.workplace.scene.objects)
-    distance, angle = np.max([pick.goal_error for pick in released], axis=0)
-    at_most = [
-        ("reproduction of the demonstrations, NRMSE", fit["joint_nrmse_median"], "", 1e-3),
-        ("time to aim", max(pick.servo_time for pick in released), "s", None),
-        (
-            "pixel error when the hand goes down",
-            max(pick.pixel_error for pick in released),
-            "px",
-            5.0,
-        ),
-        ("goal error at the shelf", 1e3 * distance, "mm", 2.0),
-        ("goal error at the shelf, angle", _degrees(angle), "deg", 0.5),
-        ("joint limit violations", limit_violations(job.cell), "steps", 0),
-        *((f"collisions {what}", n, "", 0) for what, n in collisions(job).items()),
-        ("time of the whole job", job.cell.time, "s", None),
-    ]
-    at_most += [
-        (f"recovered from: {mishap}", times, "", None)
-        for mishap, times in recoveries(job).items()
-    ]
-    stand = float(len(standing(job)))
-    at_least = [("objects that stand on their shelf", stand, "", float(objects))]
-    if bool((job.cell.log["human_effort"] != 0).any()):
-        deviation = Deviation.of(job.cell.log)
-        moved, turned = 1e3 * deviation.most_moved, _degrees(deviation.most_turned)
-        at_most.append(("end effector moved by the person", moved, "mm", 1.0))
-        at_most.append(("end effector turned by the person", turned, "deg", 0.2))
-        at_least.append(("elbow moved by the person", deviation.elbow_most_moved, "m", 0.1))
     return [
-        Measurement(
-            name=name,
-            value=value,
-            unit=unit,
-            target=target,
-            at_least=rows is at_least,
-            claim=_CLAIMS.get(name, ""),
-        )
-        for rows in (at_most, at_least)
-        for name, value, unit, target in rows
+        Metric(
+            "reproduction of the demonstrations, NRMSE",
+            lambda run: reproduction_nrmse,
+            at_most=1e-3,
+        ),
+        Metric("servoing time", lambda run: _worst(run, lambda e: e.servo_time), "s"),
+        Metric(
+            "pixel error at descent",
+            lambda run: _worst(run, lambda e: e.pixel_error),
+            "px",
+            at_most=5.0,
+        ),
+        Metric("grasp offset", grasp_offset, "mm"),
+        Metric(
+            "place error",
+            lambda run: _worst(run, lambda e: 1e3 * e.goal_error[0]),
+            "mm",
+            at_most=2.0,
+        ),
+        Metric(
+            "place tilt",
+            lambda run: _worst(run, lambda e: float(np.rad2deg(e.goal_error[1]))),
+            "deg",
+            at_most=0.5,
+        ),
+        Metric(
+            "joint limit violations",
+            lambda run: limit_violations(run.cell),
+            at_most=0,
+            essential=True,
+        ),
+        *(
+            Metric(
+                name,
+                lambda run, met=met: len(contacts(run)[met]),
+                at_most=0,
+                essential=True,
+                detail=lambda run, met=met: f"first {contacts(run)[met][0]}",
+            )
+            for met, name in _CONTACTS.items()
+        ),
+        # Not listed, as the rows above tell what was met.
+        Metric("contacts", lambda run: sum(map(len, contacts(run).values())), listed=False),
+        Metric(
+            "cycle time",
+            lambda run: run.cell.time,
+            "s",
+            claim="the first object on its shelf after 68 s (snapshots)",
+        ),
+        *(
+            Metric(
+                f"recovered from: {mishap}",
+                lambda run, mishap=mishap: recoveries(run).get(mishap),
+            )
+            for mishap in get_args(Mishap)
+        ),
+        Metric(
+            "objects that stand on their shelf",
+            lambda run: len(standing(run)),
+            at_least=objects,
+            claim="three objects, one after the other (Experiment 3)",
+            essential=True,
+            detail=lambda run: f"not {', '.join(_fallen(run))}",
+        ),
+        Metric(
+            "end effector deviation",
+            lambda run: _pushed(run, lambda d: 1e3 * d.largest_position),
+            "mm",
+            at_most=1.0,
+            claim="main task not affected (Experiment 3)",
+        ),
+        Metric(
+            "end effector rotation",
+            lambda run: _pushed(run, lambda d: float(np.rad2deg(d.largest_rotation))),
+            "deg",
+            at_most=0.2,
+            claim="main task not affected (Experiment 3)",
+        ),
+        Metric(
+            "elbow moved",
+            lambda run: _pushed(run, lambda d: 1e3 * d.largest_elbow),
+            "mm",
+            # Enough to reach under the arm; without it the deviation above would prove nothing.
+            at_least=100.0,
+            claim="joint 4 dragged forward for 7 s, backward for 4 s",
+        ),
     ]
 
 
-_CLAIMS = {
-    "objects that stand on their shelf": "three objects, one after the other (Experiment 3)",
-    "end effector moved by the person": "main task not affected (Experiment 3)",
-    "end effector turned by the person": "main task not affected (Experiment 3)",
-    "elbow moved by the person": "joint 4 dragged forward for 7 s, backward for 4 s",
-    "time of the whole job": "the first object on its shelf after 68 s (snapshots)",
-}
-"""What the paper says, by name of the measurement."""
+TRIAL_METRICS: Sequence[Metric[Sequence[Trial]]] = (
+    Metric("trials, success rate", success_rate),
+    Metric("trials, end effector deviation (95 %)", p95("end_effector_deviation_mm"), "mm"),
+    Metric("trials, elbow moved (median)", median("elbow_moved_mm"), "mm"),
+    Metric("trials, grasp offset (95 %)", p95("grasp_offset_mm"), "mm"),
+    Metric("trials, place error (95 %)", p95("place_error_mm"), "mm"),
+    Metric("trials, cycle time (median)", median("cycle_time_s"), "s"),
+)
+"""Rows of the table that repetitions add."""
 
 
-def standing(job: SimulatedJob) -> list[PickPlaceJob]:
+def _worst(run: CollaborationRun, measured: Callable[[PickPlaceJob], float]) -> float | None:
+    """Over the objects that were released on a shelf; None if it never came to that."""
+    return max((float(measured(e)) for e in run.picks if e.release is not None), default=None)
+
+
+def _pushed(run: CollaborationRun, measured: Callable[[Deviation], float]) -> float | None:
+    """Of a run in which a person pushed the elbow; None of any other."""
+    if not (run.cell.log["human_effort"] != 0).any():
+        return None
+    return measured(Deviation.of(run.cell.log))
+
+
+def grasp_offset(run: CollaborationRun) -> float | None:
+    """Horizontal distance of end effector and object at the last descent, worst object [mm]."""
+    log, offsets = run.cell.log, []
+    bodies = {body.name: body.position for body in run.motion.bodies()}
+    tool = link_poses(log).position[:, TOOL].numpy()
+    for pick in run.picks:
+        begin, end = pick.span
+        descents = [t for t, _ in spans(log, "grasp") if begin <= t < end]
+        if pick.release is None or not descents:
+            continue
+        # The last attempt: earlier ones missed the object or lost it.
+        step = int(np.searchsorted(log["time"], descents[-1]))
+        offsets.append(np.linalg.norm((tool[step] - bodies[pick.item.name][step])[:2]))
+    return 1e3 * float(max(offsets)) if offsets else None
+
+
+def standing(run: CollaborationRun) -> list[PickPlaceJob]:
     """Errands whose object stands on its shelf, touching nothing of the arm."""
     return [
-        pick for pick in job.picks if job.world.rests_on(pick.item.name, f"board_{pick.shelf}")
+        pick for pick in run.picks if run.world.rests_on(pick.item.name, f"board_{pick.shelf}")
     ]
 
 
-def collisions(job: SimulatedJob) -> dict[str, int]:
-    """Touches that there should not have been, by what was met."""
-    world = job.world
-    return {
-        "with the cabinet": len(world.cabinet_contacts.touches) + len(_carried_touches(job)),
-        "with the table": len(world.table_contacts.touches),
-        "of the arm with itself": len(world.self_contacts.touches),
-    }
+def _fallen(run: CollaborationRun) -> list[str]:
+    stand = {pick.item.name for pick in standing(run)}
+    return [item.name for item in run.workplace.scene.objects if item.name not in stand]
 
 
-def recoveries(job: SimulatedJob) -> Counter[str]:
+def contacts(run: CollaborationRun) -> dict[str, tuple[Touch, ...]]:
+    """Contacts that there should not have been, by what was met."""
+    names = [pick.item.name for pick in run.picks if pick.release is not None]
+    begun = [start for start, _ in spans(run.cell.log, RELEASE)]
+    return unwanted_contacts(run.world, dict(zip(names, begun, strict=True)))
+
+
+def recoveries(run: CollaborationRun) -> Counter[str]:
     """How often the task recovered from each kind of mishap."""
-    return Counter(note.mishap for pick in job.picks for note in pick.recoveries)
-
-
-def limit_violations(cell: WorkCell) -> int:
-    """Steps in which a joint was measured outside its range of position or velocity."""
-    q = torch.from_numpy(cell.log["joint_position"])
-    v = torch.from_numpy(cell.log["joint_velocity"])
-    limits = panda.limits
-    outside = (q < limits.lower) | (q > limits.upper) | (v.abs() > limits.velocity)
-    return int(outside.any(dim=-1).sum())
-
-
-def _carried_touches(job: SimulatedJob) -> list[Touch]:
-    """Touches of the cabinet by an object that had not been let go yet."""
-    released = [pick.item.name for pick in job.picks if pick.release is not None]
-    let_go = dict(zip(released, spans(job.cell.log, RELEASE), strict=True))
-    return [
-        touch
-        for touch in job.world.object_contacts.touches
-        if touch.start < let_go.get(touch.first, (np.inf, np.inf))[0]
-    ]
-
-
-def _degrees(angle: float) -> float:
-    return float(np.rad2deg(angle))
-
-
-# The collaboration once for each seed, judged by MuJoCo's contacts and poses.
-
-
-@dataclass(frozen=True, kw_only=True)
-class CollaborationTrials:
-    """Runs the job with a seed; for `repeat`."""
-
-    aiming: Path
-    """Folder of the aiming skill."""
-    placing: Path
-    """Folder of the placing skill."""
-    shelves: tuple[str, ...]
-    """One for each of up to three objects."""
-    shelf_x: float = Workplace.shelf_x
-    """Where along the boards objects are put [m]."""
-    shelf_depth: float = Workplace.shelf_depth
-    """How far behind the boards' front edge [m]."""
-    person: bool = True
-    """Whether the scripted person pulls the elbow."""
-    disturbances: Disturbances = field(default_factory=Disturbances)
-    cell: WorkCellConfig = field(default_factory=lambda: WorkCellConfig(keep_image_every=0))
-    config: PickAndPlaceConfig = field(default_factory=PickAndPlaceConfig)
-
-    def workplace(self) -> Workplace:
-        """With as many objects as there are shelves named.
-
-        Raises:
-            ValueError: If there are more shelves named than objects known.
-        """
-        return workplace_for(self.shelves, self.shelf_x, self.shelf_depth)
-
-    def __call__(self, seed: int) -> dict[str, float | str]:
-        job = simulate_collaboration(
-            VisualServoSkill.load(self.aiming),
-            PlacingSkill.load(self.placing),
-            self.shelves,
-            workplace=self.workplace(),
-            camera="synthetic",
-            pulls=PULLS if self.person else (),
-            disturbances=self.disturbances,
-            config=self.config,
-            cell_config=self.cell,
-            seed=seed,
-        )
-        values: dict[str, float | str] = {**measured(job)}
-        if failure := verdict(job):
-            values["failure"] = failure
-        return values
-
-
-def workplace_for(shelves: Sequence[str], shelf_x: float, shelf_depth: float) -> Workplace:
-    """A workplace with an object for each shelf.
-
-    Raises:
-        ValueError: If there are too many, or none.
-    """
-    if not 1 <= len(shelves) <= len(THREE_OBJECTS):
-        raise ValueError(
-            f"there are 1 to {len(THREE_OBJECTS)} objects to put on shelves, but "
-            f"{len(shelves)} shelves are named."
-        )
-    workplace = Workplace(shelf_x=shelf_x, shelf_depth=shelf_depth)
-    return with_objects(workplace, THREE_OBJECTS[: len(shelves)])
-
-
-def measured(job: SimulatedJob) -> dict[str, float]:
-    """Figures of a run, successful or not."""
-    deviation = Deviation.of(job.cell.log)
-    released = [pick for pick in job.picks if pick.release is not None]
-    values = {
-        "standing": float(len(standing(job))),
-        "time_s": job.cell.time,
-        "limit_violations": float(limit_violations(job.cell)),
-        "collisions": float(sum(collisions(job).values())),
-        "moved_by_person_mm": 1e3 * deviation.most_moved,
-        "elbow_moved_mm": 1e3 * deviation.elbow_most_moved,
-    }
-    if released:
-        values |= {
-            "aim_time_s": max(pick.servo_time for pick in released),
-            "pixel_error_px": max(pick.pixel_error for pick in released),
-            "goal_error_mm": 1e3 * max(pick.goal_error[0] for pick in released),
-        }
-    return values | {
-        f"recovered_{mishap.replace(' ', '_')}": float(times)
-        for mishap, times in recoveries(job).items()
-    }
-
-
-def verdict(job: SimulatedJob) -> str:
-    """Why a run does not count as a success; empty if it does."""
-    reasons = [job.failure] if job.failure else []
-    stand = [pick.item.name for pick in standing(job)]
-    fallen = [item.name for item in job.workplace.scene.objects if item.name not in stand]
-    if fallen:
-        reasons.append(f"not on their shelf: {', '.join(fallen)}")
-    reasons += [f"{n} collisions {what}" for what, n in collisions(job).items() if n]
-    if violations := limit_violations(job.cell):
-        reasons.append(f"joint limits left in {violations} steps")
-    return "; ".join(reasons)
+    return Counter(note.mishap for pick in run.picks for note in pick.recoveries)

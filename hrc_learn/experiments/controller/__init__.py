@@ -1,1 +1,1 @@
-"""The controller in batches of closed loops: grasps, a person's effort, stress."""
+"""The controller in batches of closed loops: grasps, a person's null-space force, stress."""

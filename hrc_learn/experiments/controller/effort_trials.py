@@ -1,8 +1,7 @@
-"""Effort trials: how far the tool moves while a person moves the elbow."""
+"""Null-space force trials: how far the tool moves while a person pushes the elbow."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -21,21 +20,21 @@ from hrc_learn.sim.closed_loop import (
 )
 
 ELBOW = 4
-"""Joint that is pulled."""
+"""Joint that is pushed."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class EffortConfig:
-    """How the person pulls while the arm servoes on its target."""
+    """How the person pushes while the arm servoes on its target."""
 
     count: int = 60
     seed: int = 0
     force: float = 6.0
-    """Of the pull, over the elbow's Jacobian the effort d; away and back."""
+    """Of the person; the elbow's Jacobian maps it to the null-space input d [N]."""
     away: float = 7.0
-    """Time of the pull one way [s]."""
+    """Time of pushing one way, as in the paper [s]."""
     back: float = 4.0
-    """Time of the pull back [s]."""
+    """Time of pushing back [s]."""
     dt: float = 0.001
     """Control step [s]."""
     noise: float = 0.0
@@ -54,15 +53,6 @@ class EffortResult:
     turn: Float[Tensor, "trials"]
     """Turn of the tool [rad]."""
 
-    @staticmethod
-    def join(parts: Sequence[EffortResult]) -> EffortResult:
-        """The trials of several results."""
-        return EffortResult(
-            elbow=torch.cat([part.elbow for part in parts]),
-            deviation=torch.cat([part.deviation for part in parts]),
-            turn=torch.cat([part.turn for part in parts]),
-        )
-
     def summary(self) -> dict[str, float]:
         """Medians and 95th percentiles in mm and degrees."""
         deviation, turn = 1e3 * self.deviation, torch.rad2deg(self.turn)
@@ -76,9 +66,10 @@ class EffortResult:
 
 
 def run_effort_trials(config: EffortConfig) -> EffortResult:
-    """Pull the elbow of many arms, each servoing on a target where its tool already is."""
+    """Push the elbow of many arms, each servoing on a target where its tool already is."""
     rng = torch.Generator().manual_seed(config.seed)
     noise = torch.randn(config.count, 7, generator=rng, dtype=torch.float64)
+    # 0.2 rad on each joint: postures that differ, all within the limits and off the table.
     q = panda.ready + 0.2 * noise
     tool, elbow = panda.forward(q), _elbow(q)
     one = torch.ones(config.count, dtype=torch.float64)
@@ -100,7 +91,7 @@ def run_effort_trials(config: EffortConfig) -> EffortResult:
     way = _self_motion(q)
     largest = torch.zeros(3, config.count, dtype=torch.float64)
 
-    def pull(step: int, q: Tensor) -> Tensor:
+    def force(step: int, q: Tensor) -> Tensor:
         sign = 1.0 if step * config.dt < config.away else -1.0
         J = panda.joint_jacobian(q, ELBOW)[:, :3]
         return torch.linalg.vecdot(J, sign * config.force * way.unsqueeze(-1), dim=-2)
@@ -123,7 +114,7 @@ def run_effort_trials(config: EffortConfig) -> EffortResult:
             q,
             steps=round((config.away + config.back) / config.dt),
             dt=config.dt,
-            nullspace_input=pull,
+            nullspace_input=force,
             on_step=watch,
         )
     return EffortResult(elbow=largest[0], deviation=largest[1], turn=largest[2])

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Literal
 
 import torch
@@ -42,8 +42,6 @@ from hrc_learn.sim.closed_loop import (
     simulate_closed_loop,
 )
 
-# How far the arm is from itself and from what stands in the workplace of the trials.
-
 TABLE = ((0.26, 0.54, -0.02), (0.42, 0.34, 0.02))
 """Centre and half edges of the table [m], as simulated."""
 PEDESTAL = ((-0.03, 0.0, -0.36), (0.12, 0.12, 0.36))
@@ -63,13 +61,11 @@ def clearance(q: Float[Tensor, "*batch 7"]) -> Float[Tensor, "*batch"]:
     return distance
 
 
-# Grasp trials: many random starts, cameras and targets as one batch of closed loops.
-
 ROLL_CLASSES = ((0, 30), (30, 60), (60, 90), (90, 135), (135, 180))
 """Camera roll from the paper's camera [deg], one class for each fifth of the trials."""
 
 CENTRE = (0.2, 0.5, 0.3)
-"""Of the box: the middle of the paper's neurons in x and y [m]."""
+"""Of the Cartesian region: the middle of the paper's RBF centers in x and y [m]."""
 
 _HALF_SIDE = 0.024
 CORNERS = tuple(
@@ -77,7 +73,9 @@ CORNERS = tuple(
 )
 """Of the marker, from its centre in the tool's frame [m]."""
 
+# At the joints' speeds the arm moves less than 5 cm in between [s].
 _SECONDS_BETWEEN_CONTACT_CHECKS = 0.024
+# Starts are drawn again below this distance from contact [m].
 _START_CLEARANCE = 0.01
 
 
@@ -103,7 +101,7 @@ class TrialConfig:
     law: Literal["recommended", "printed"] = "recommended"
     """The paper's law as printed has Table I's gains and no joint-space approach."""
     initial_jacobian: Callable[[Tensor], Tensor] = lambda J: J
-    """What to make of the paper's initial image Jacobian."""
+    """Change of the paper's initial image Jacobian."""
     contacts: bool = False
     """Look for contacts of the arm with itself, the table and the pedestal, at a third more
     time. Starts are free of them in any case."""
@@ -111,12 +109,12 @@ class TrialConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class TrialResult:
-    """What came out; one entry a trial."""
+    """Results, one entry for each trial."""
 
     roll_class: Int[Tensor, "trials"]
     success: Bool[Tensor, "trials"]
-    """Final pixel error below 5 px with the tool in the box, no limit broken. Of corners it is
-    the mean that counts: the law turns the tool into its orientation cone, not further."""
+    """Final pixel error below 5 px with the tool in the region, no limit broken. Of corners the
+    mean counts: the law turns the tool into its orientation cone, not further."""
     time: Float[Tensor, "trials"]
     """Until the pixel error stayed below 5 px [s]; infinite if it did not."""
     vision_time: Float[Tensor, "trials"]
@@ -124,26 +122,18 @@ class TrialResult:
     violations: Int[Tensor, "trials"]
     """Steps that broke a limit of position, velocity, acceleration or jerk."""
     touched: Bool[Tensor, "trials"]
-    """Whether the arm met itself, the table or the pedestal; False where not looked for."""
+    """Contact of the arm with itself, the table or the pedestal; False if not checked."""
     peak_speed: Float[Tensor, "trials"]
     """Largest joint velocity over its limit."""
     hand_overs: Int[Tensor, "trials"]
     """How often the camera took over or let go."""
 
-    @staticmethod
-    def join(parts: Sequence[TrialResult]) -> TrialResult:
-        """The trials of several results."""
-        names = [field.name for field in fields(TrialResult)]
-        return TrialResult(
-            **{name: torch.cat([getattr(part, name) for part in parts]) for name in names}
-        )
-
     def summary(self) -> dict[str, float]:
-        """Shares, medians and totals, by name."""
+        """Rates, medians and totals, by name."""
         figures = {
-            "success": _share(self.success),
-            "free_success": _share(self.success & ~self.touched),
-            "touched": _share(self.touched),
+            "success": _rate(self.success),
+            "free_success": _rate(self.success & ~self.touched),
+            "touched": _rate(self.touched),
             "t50": self.time.quantile(0.5, interpolation="higher").item(),
             "t95": self.time.quantile(0.95, interpolation="higher").item(),
             "vision_phase": _median(self.vision_time),
@@ -153,12 +143,12 @@ class TrialResult:
         }
         for k, (low, high) in enumerate(ROLL_CLASSES):
             members = self.roll_class == k
-            figures[f"success_roll_{low}_{high}"] = _share(self.success[members])
+            figures[f"success_roll_{low}_{high}"] = _rate(self.success[members])
             figures[f"vision_phase_roll_{low}_{high}"] = _median(self.vision_time[members])
         return figures
 
 
-def _share(flags: Tensor) -> float:
+def _rate(flags: Tensor) -> float:
     return flags.double().mean().item()
 
 
@@ -170,7 +160,7 @@ def _median(times: Tensor) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class _Scene:
-    """What is drawn at random."""
+    """Random initial conditions of all trials."""
 
     camera: PinholeCamera
     target: Tensor
@@ -275,7 +265,7 @@ def _controller(
 
 
 class _Judge:
-    """Watches a closed-loop simulation and keeps what the result needs."""
+    """Watches the closed loops and keeps what the result needs."""
 
     def __init__(self, scene: _Scene, controller: AdaptiveController, config: TrialConfig):
         self.scene, self.controller, self.dt = scene, controller, config.dt

@@ -1,8 +1,7 @@
-"""Stress trials: random goals, cameras, efforts and faults; does a limit ever break?"""
+"""Stress trials: random goals, cameras, null-space inputs and faults; do limits break?"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -22,9 +21,9 @@ Fault = Literal["none", "nan", "late", "lost"]
 """NaN in 1 % of images and of joint readings; images 100 ms late and joint states that stay
 away for 100 ms; a marker covered every other second for up to 3 s."""
 
-_FRAME = 0.03
-_LATE = 0.1
-_EFFORT_TIME = 0.4
+_FRAME = 0.03  # interval of images [s]
+_LATE = 0.1  # delay of images, and for how long joint states stay away [s]
+_EFFORT_TIME = 0.4  # after which the null-space input is drawn again [s]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +39,7 @@ class StressConfig:
     """Control step [s]."""
 
     def imperfections(self) -> Imperfections:
-        """What is wrong with the camera."""
+        """Imperfections of the camera's measurement."""
         frame_steps = max(1, round(_FRAME / self.dt))
         late = self.fault == "late"
         return Imperfections(
@@ -54,7 +53,7 @@ class StressConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class StressResult:
-    """What came out; one entry a trial."""
+    """Results, one entry for each trial."""
 
     beyond: Int[Tensor, "trials 4"]
     """Steps beyond the limits of position, velocity, acceleration and jerk."""
@@ -62,15 +61,6 @@ class StressResult:
     """Steps with a NaN in command or state."""
     interventions: Int[Tensor, "trials kinds"]
     """Steps in which the safety filter acted, by kind."""
-
-    @staticmethod
-    def join(parts: Sequence[StressResult]) -> StressResult:
-        """The trials of several results."""
-        return StressResult(
-            beyond=torch.cat([part.beyond for part in parts]),
-            unknown=torch.cat([part.unknown for part in parts]),
-            interventions=torch.cat([part.interventions for part in parts]),
-        )
 
     def summary(self) -> dict[str, float]:
         """Totals by name."""
@@ -98,6 +88,7 @@ def run_stress_trials(config: StressConfig) -> StressResult:
     with torch.inference_mode():
         for k in range(round(config.duration / config.dt)):
             if k % round(_EFFORT_TIME / config.dt) == 0:
+                # Far beyond what a person applies (6 N in the force trials).
                 effort = 20 * _normal(rng, count, 7)
             measured, stale = joints.read(q)
             image: dict[str, Any] = virtual.observe(panda.forward(q), q, config.dt)
@@ -152,7 +143,7 @@ def _controller(count: int, rng: torch.Generator) -> tuple[AdaptiveController, P
 
 
 class _JointReadings:
-    """What the controller is told of the joints, and which of it is too old."""
+    """Joint positions as the controller reads them, and which are stale."""
 
     def __init__(self, config: StressConfig, rng: torch.Generator):
         self.fault, self.dt, self.rng = config.fault, config.dt, rng

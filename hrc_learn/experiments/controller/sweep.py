@@ -1,27 +1,18 @@
-"""Experiments on the controller by name, each in batches of its own seed, and what they
-are to reach.
-"""
+"""Closed loops of the controller in batches: experiments by name, and their bounds."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
+import torch
 from torch import Tensor
 
-from hrc_learn.experiments.controller.effort_trials import (
-    EffortConfig,
-    EffortResult,
-    run_effort_trials,
-)
+from hrc_learn.experiments.controller.effort_trials import EffortConfig, run_effort_trials
 from hrc_learn.experiments.controller.grasp_trials import TrialConfig, TrialResult, run_trials
-from hrc_learn.experiments.controller.stress_trials import (
-    StressConfig,
-    StressResult,
-    run_stress_trials,
-)
+from hrc_learn.experiments.controller.stress_trials import StressConfig, run_stress_trials
+from hrc_learn.experiments.metric_table import Metric
 from hrc_learn.jacobian import (
     BroydenEstimator,
     CompositeEstimator,
@@ -33,64 +24,60 @@ from hrc_learn.jacobian import (
     RecursiveLeastSquaresEstimator,
 )
 
-# Experiments by name: grasps, a person's pull, and stress, each in batches of its own seed.
-
 
 @dataclass(frozen=True, kw_only=True)
-class Experiment:
-    """One kind of trials; `run` takes a configuration, `join` the results of several runs."""
+class BatchedTrials:
+    """One kind of trials; `run` takes a configuration with a seed."""
 
-    says: str
+    label: str
     config: Any
     run: Callable[[Any], Any]
-    join: Callable[[Any], Any]
     suite: str = "acceptance"
     whole: bool = False
     """Whether it is run as it is, not with a chosen number of trials in chunks."""
     main: bool = False
-    """Whether its share of successes has to be known to a tenth of a percent."""
+    """Whether its success rate has to be known to a tenth of a percent."""
+
+
+def join[Result](parts: Sequence[Result]) -> Result:
+    """The trials of several results: tensors with one entry a trial."""
+    first = parts[0]
+    columns = {
+        field.name: torch.cat([getattr(part, field.name) for part in parts])
+        for field in fields(first)  # pyright: ignore[reportArgumentType]
+    }
+    return type(first)(**columns)
 
 
 def _grasp(
-    says: str,
+    label: str,
     estimator: Callable[[RBFImageJacobian], ImageJacobianEstimator] = KalmanEstimator,
     *,
     suite: str = "acceptance",
     main: bool = False,
     **changes: Any,
-) -> Experiment:
+) -> BatchedTrials:
     def run(config: TrialConfig) -> TrialResult:
         return run_trials(estimator, config)
 
     settings: dict[str, Any] = {"duration": 8.0} | changes
     config = TrialConfig(**settings)
-    return Experiment(
-        says=says, config=config, run=run, join=TrialResult.join, suite=suite, main=main
-    )
+    return BatchedTrials(label=label, config=config, run=run, suite=suite, main=main)
 
 
 def _imperfect(**changes: Any) -> dict[str, Any]:
     return {"imperfections": replace(TrialConfig().imperfections, **changes)}
 
 
-def _effort(says: str, **changes: Any) -> Experiment:
-    return Experiment(
-        says=says,
-        config=EffortConfig(**changes),
-        run=run_effort_trials,
-        join=EffortResult.join,
-        whole=True,
-    )
+def _effort(label: str, **changes: Any) -> BatchedTrials:
+    config = EffortConfig(**changes)
+    return BatchedTrials(label=label, config=config, run=run_effort_trials, whole=True)
 
 
-def _stress(says: str, **changes: Any) -> Experiment:
-    return Experiment(
-        says=says,
-        config=StressConfig(**changes),
-        run=run_stress_trials,
-        join=StressResult.join,
-        suite="stress",
-        main=True,
+def _stress(label: str, **changes: Any) -> BatchedTrials:
+    config = StressConfig(**changes)
+    return BatchedTrials(
+        label=label, config=config, run=run_stress_trials, suite="stress", main=True
     )
 
 
@@ -99,7 +86,7 @@ def flip_row(J: Tensor) -> Tensor:
     return J * J.new_tensor([[-1.0], [1.0]])
 
 
-EXPERIMENTS: Mapping[str, Experiment] = {
+EXPERIMENTS: Mapping[str, BatchedTrials] = {
     "near": _grasp("starts near the ready posture", main=True, contacts=True),
     "global": _grasp(
         "starts anywhere within the limits",
@@ -133,7 +120,7 @@ EXPERIMENTS: Mapping[str, Experiment] = {
         duration=20.0,
         **_imperfect(loss_rate=1 / 3, loss_time=3.0),
     ),
-    "effort": _effort("a person pulls the elbow away for 7 s and back for 4 s, at 1 kHz"),
+    "effort": _effort("a person pushes the elbow away for 7 s and back for 4 s, at 1 kHz"),
     "effort_noise": _effort("the same with 0.5 px of noise", noise=0.5),
     "faulty_images": _grasp(
         "1 % of measurements NaN", suite="estimators", **_imperfect(nan_fraction=0.01)
@@ -172,100 +159,107 @@ def chunks(name: str, count: int, seed: int, size: int) -> list[tuple[str, int, 
     if EXPERIMENTS[name].whole:
         return [(name, count, seed)]
     starts = range(0, count, size)
+    # A prime larger than any number of chunks keeps the chunks of all seeds apart.
     return [
         (name, min(size, count - start), 1_000_003 * seed + k) for k, start in enumerate(starts)
     ]
 
 
-# What the controller is to reach: bounds on the figures of experiments.
+type Figures = Mapping[str, float]
+"""Figures of all experiments, each behind the name of its experiment."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Criterion:
-    """A bound on one figure."""
+    """A bound on one figure of an experiment, or of `compared`."""
 
     number: str
     """Of the acceptance figure."""
     experiment: str
-    figure: str
-    """Name in the summary of the experiment, or one of `compared`."""
-    least: float = -math.inf
-    most: float = math.inf
-
-    @property
-    def key(self) -> str:
-        """Name of the figure among those of all experiments."""
-        return f"{self.experiment}_{self.figure}"
-
-    def met(self, value: float) -> bool:
-        """Whether a measured value lies within the bound."""
-        return self.least <= value <= self.most
-
-    @property
-    def bound(self) -> str:
-        """In words."""
-        return f">= {self.least:g}" if self.most == math.inf else f"<= {self.most:g}"
+    metric: Metric[Figures]
 
 
-def _criteria(number: str, experiment: str, **bounds: tuple[float, float]) -> list[Criterion]:
-    """One criterion for each figure of an experiment: its name, and its lowest and highest."""
-    return [
-        Criterion(number=number, experiment=experiment, figure=figure, least=low, most=high)
-        for figure, (low, high) in bounds.items()
-    ]
+def _criteria(
+    number: str,
+    experiment: str,
+    *,
+    at_least: Mapping[str, float] | None = None,
+    at_most: Mapping[str, float] | None = None,
+) -> list[Criterion]:
+    """One criterion for each figure of an experiment: its name, and its bound."""
+    lower, upper = at_least or {}, at_most or {}
+
+    def criterion(figure: str) -> Criterion:
+        def value(figures: Figures) -> float | None:
+            # None where the experiment was not run: the row is left out.
+            return figures.get(f"{experiment}_{figure}")
+
+        name = figure.replace("_", " ")
+        metric = Metric(name, value, at_least=lower.get(figure), at_most=upper.get(figure))
+        return Criterion(number=number, experiment=experiment, metric=metric)
+
+    return [criterion(figure) for figure in (*lower, *upper)]
 
 
-def _least(value: float) -> tuple[float, float]:
-    return value, math.inf
-
-
-def _most(value: float) -> tuple[float, float]:
-    return -math.inf, value
-
-
-_SAFE = {"violations": _most(0.0)}
-_ROBUST = {"success": _least(0.98)} | _SAFE
-_NEVER = {
-    "beyond_position": _most(0.0),
-    "beyond_velocity": _most(0.0),
-    "beyond_acceleration": _most(0.0),
-    "beyond_jerk": _most(0.0),
-    "nan": _most(0.0),
-}
+_SAFE = {"violations": 0.0}
+_NO_VIOLATION: dict[str, float] = dict.fromkeys(
+    ("beyond_position", "beyond_velocity", "beyond_acceleration", "beyond_jerk", "nan"), 0.0
+)
 _GUESSES = ("jacobian_0.3", "jacobian_3", "row_flipped", "rows_swapped")
 _CAMERAS = ("noise", "latency", "slow_camera", "tilt")
 _STRESSES = ("stress", "stress_nan", "stress_late", "stress_lost", "stress_1khz")
 
+
+def _robust(number: str, names: Sequence[str], success: float = 0.98) -> list[Criterion]:
+    """Success rates under a disturbance, without breaking a limit."""
+    bounds = {"success": success}
+    return [
+        c for name in names for c in _criteria(number, name, at_least=bounds, at_most=_SAFE)
+    ]
+
+
 CRITERIA: tuple[Criterion, ...] = (
-    *_criteria("1", "near", success=_least(0.99), t50=_most(5.5), t95=_most(8.0), **_SAFE),
-    *_criteria("2", "global", free_success=_least(0.98), **_SAFE),
+    *_criteria(
+        "1", "near", at_least={"success": 0.99}, at_most={"t50": 5.5, "t95": 8.0, **_SAFE}
+    ),
+    *_criteria("2", "global", at_least={"free_success": 0.98}, at_most=_SAFE),
     *_criteria(
         "3",
         "near",
-        speed_up_roll_0_30=_least(1.0),
-        speed_up_roll_30_60=_least(1.0),
-        speed_up_roll_60_90=_least(2.0),
+        at_least={
+            "speed_up_roll_0_30": 1.0,
+            "speed_up_roll_30_60": 1.0,
+            "speed_up_roll_60_90": 2.0,
+        },
     ),
-    *(c for name in _GUESSES for c in _criteria("4", name, **_ROBUST)),
-    *(c for name in _CAMERAS for c in _criteria("5", name, **_ROBUST)),
-    *_criteria("5", "marker_lost", success=_least(0.97), **_SAFE),
+    *_robust("4", _GUESSES),
+    *_robust("5", _CAMERAS),
+    *_robust("5", ("marker_lost",), success=0.97),
     *_criteria(
         "7",
         "effort",
-        elbow_mm=_least(100.0),
-        deviation_mm=_most(0.2),
-        turn_deg=_most(0.05),
-        deviation_p95_mm=_most(1.5),
-        turn_p95_deg=_most(0.5),
+        at_least={"elbow_mm": 100.0},
+        at_most={
+            "deviation_mm": 0.2,
+            "turn_deg": 0.05,
+            "deviation_p95_mm": 1.5,
+            "turn_p95_deg": 0.5,
+        },
     ),
-    *_criteria("7", "effort_noise", elbow_mm=_least(100.0), deviation_p95_mm=_most(2.5)),
-    *(c for name in _STRESSES for c in _criteria("limits", name, **_NEVER)),
+    *_criteria(
+        "7", "effort_noise", at_least={"elbow_mm": 100.0}, at_most={"deviation_p95_mm": 2.5}
+    ),
+    *(
+        criterion
+        for name in _STRESSES
+        for criterion in _criteria("limits", name, at_most=_NO_VIOLATION)
+    ),
 )
 """All bounds. Figures 6 and 8, placing and the whole pipeline, need the simulator."""
 
 
 def compared(figures: Mapping[str, float]) -> dict[str, float]:
-    """Figures made of those of two experiments: how much faster adaptation is than none."""
+    """How much faster adaptation is than none, from figures of two experiments."""
     gains: dict[str, float] = {}
     for key, with_ in figures.items():
         if key.startswith("near_vision_phase_roll"):

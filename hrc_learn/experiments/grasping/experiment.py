@@ -1,220 +1,124 @@
-"""Experiment 2 of the paper: one setting, grasped by several ways to know the camera."""
+"""Experiment 2 of the paper: an object grasped with an uncalibrated camera."""
 
-import copy
-import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import ClassVar
 
 import numpy as np
-import torch
-from jaxtyping import Float
 
+from hrc_learn.experiments.frame import TRIALS, UNOBSERVED, Observer, RepeatedRun, Study
+from hrc_learn.experiments.grasping.metrics import TRIAL_METRICS, grasping_metrics
+from hrc_learn.experiments.grasping.report import SUMMARY, grasping_sections, record_grasp
 from hrc_learn.experiments.grasping.trial import (
-    GraspingSetting,
-    GraspingSettingConfig,
-    GraspOutcome,
+    DEFAULT,
+    VARIANTS,
+    GraspingRun,
     SimulatedGrasp,
     simulate_grasp,
 )
-from hrc_learn.experiments.run_recording import Watch, unwatched
-from hrc_learn.jacobian import (
-    CompositeEstimator,
-    FixedEstimator,
-    ImageJacobianEstimator,
-    KalmanEstimator,
-    PaperEstimator,
-    RBFImageJacobian,
-)
-from hrc_learn.kinematics import panda
+from hrc_learn.experiments.live_view import LiveView, no_live_view
+from hrc_learn.experiments.metric_table import Metric
+from hrc_learn.experiments.pose_randomization import GraspingScene, GraspingSceneConfig
 from hrc_learn.sim import CameraKind
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.grasping import GraspingConfig
-from hrc_learn.skills.visual_servoing import VisualServoSkill, from_learned, guessed_network
+from hrc_learn.skills.visual_servoing import VisualServoSkill
+from hrc_learn.viz import LoggedSteps, RunRecording
+from hrc_learn.viz.report import Section
 
-# Image Jacobians that a grasp can start from, learned or guessed, and laws to adapt them.
-
-
-@dataclass(frozen=True, kw_only=True)
-class GraspingVariant:
-    """One way to know the image Jacobian."""
-
-    says: str
-    estimator: Callable[[RBFImageJacobian], ImageJacobianEstimator]
-    """From the learned image Jacobian."""
-    claim: str = ""
-    """What the paper states about it."""
-
-
-DEFAULT = "learned"
-
-VARIANTS: Mapping[str, GraspingVariant] = {
-    DEFAULT: GraspingVariant(
-        says="Kalman filter from the learned Jacobian", estimator=from_learned
-    ),
-    "kalman": GraspingVariant(
-        says="Kalman filter from the paper's guess",
-        estimator=lambda _: KalmanEstimator(guessed_network()),
-    ),
-    "composite": GraspingVariant(
-        says="composite law from the paper's guess",
-        estimator=lambda _: CompositeEstimator(guessed_network()),
-    ),
-    "paper": GraspingVariant(
-        says="the paper's law from its guess",
-        claim="reaches the target, faster than without adaptation (Experiment 2)",
-        estimator=lambda _: PaperEstimator(guessed_network()),
-    ),
-    "fixed": GraspingVariant(
-        says="the paper's guess, not adapted",
-        claim="reaches the target, slower (Experiment 2)",
-        estimator=lambda _: FixedEstimator(guessed_network()),
-    ),
-    "unadapted": GraspingVariant(
-        says="the learned Jacobian, not adapted",
-        estimator=lambda learned: FixedEstimator(copy.deepcopy(learned).double()),
-    ),
-}
-"""What can be compared, the default first."""
-
-# A grasp as one trial of many, each with a setting of its own.
-
-_TIMEOUT = 20.0  # with a variant that is only compared [s]
-
-
-@dataclass(frozen=True, kw_only=True)
-class GraspingTrials:
-    """Called with a seed, grasps once and tells what came of it."""
-
-    aiming: Path
-    """Folder of the learned image Jacobian and visual target."""
-    setting: GraspingSettingConfig = field(
-        default_factory=lambda: GraspingSettingConfig(random_camera=True)
-    )
-    camera: CameraKind = "synthetic"
-    config: GraspingConfig = field(default_factory=GraspingConfig)
-
-    def __call__(self, seed: int) -> Mapping[str, Any]:
-        """Measured values, and `failure` if it was no success."""
-        outcome = GraspOutcome.of(self.run(seed))
-        return outcome.values() | ({"failure": outcome.failure} if outcome.failure else {})
-
-    def run(self, seed: int, watch: Watch = unwatched) -> SimulatedGrasp:
-        """One grasp, all of it, which somebody may watch."""
-        return self._grasp(seed, DEFAULT, told_target=False, config=self.config, watch=watch)
-
-    def compare(self, seed: int, variant: str) -> SimulatedGrasp:
-        """The same by a variant in `VARIANTS`, for comparison.
-
-        It is told the pixel to aim at, goes straight there, and tries but once.
-        """
-        servo = replace(self.config.servo, probe=0.0, timeout=_TIMEOUT)
-        config = replace(self.config, servo=servo, attempts=1)
-        return self._grasp(seed, variant, told_target=True, config=config)
-
-    def _grasp(
-        self,
-        seed: int,
-        variant: str,
-        *,
-        told_target: bool,
-        config: GraspingConfig,
-        watch: Watch = unwatched,
-    ) -> SimulatedGrasp:
-        skill, rng = VisualServoSkill.load(self.aiming), np.random.default_rng(seed)
-        setting = GraspingSetting.draw(Workplace(), self.setting, rng, self.camera)
-        return simulate_grasp(
-            skill,
-            setting,
-            estimator=VARIANTS[variant].estimator(skill.jacobian),
-            told_target=told_target,
-            camera=self.camera,
-            config=config,
-            rng=np.random.default_rng([seed, 1]),
-            watch=watch,
-        )
-
-
-# Experiment 2: one setting, grasped by several ways to know the camera.
-
-REACHED = 5.0
-"""Distance of the marker from where it truly should be that counts as there [px]."""
+_COMPARED_TIMEOUT = 20.0
+"""Of servoing by a variant that is only compared [s]: three times as long as the slow ones
+need, and some never arrive."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class GraspingExperiment:
-    """Grasps of the same object from the same start, seen by the same camera."""
+    """Grasp once by the default, then servo to the same target by each of the variants."""
 
-    trials: GraspingTrials
-    grasp: SimulatedGrasp
-    """By the default, all of it: this is what has to succeed."""
-    compared: Mapping[str, SimulatedGrasp]
-    """By variant, each told where to aim."""
+    title: ClassVar[str] = "Grasping with an uncalibrated camera"
+    summary: ClassVar[str] = SUMMARY
 
-    @classmethod
-    def run(
-        cls,
-        trials: GraspingTrials,
-        seed: int,
-        variants: Sequence[str],
-        on_run: Callable[[str], None] = lambda what: None,
-        watch: Watch = unwatched,
-    ) -> "GraspingExperiment":
-        """Grasp, then compare.
+    aiming: Path
+    """Folder of the visual-servoing skill."""
+    variants: tuple[str, ...] = ()
+    """Names in `VARIANTS` to compare."""
+    scene: GraspingSceneConfig = field(
+        default_factory=lambda: GraspingSceneConfig(random_camera=True)
+    )
+    """How camera, start and object are drawn."""
+    camera: CameraKind = "synthetic"
+    config: GraspingConfig = field(default_factory=GraspingConfig)
 
-        Args:
-            trials: How.
-            seed: Of the setting.
-            variants: What to compare.
-            on_run: Told of each run as it begins.
-            watch: Watches the grasp from the side.
-        """
-        on_run("the whole grasp")
-        grasp, compared = trials.run(seed, watch), {}
-        for variant in dict.fromkeys(variants):
-            on_run(VARIANTS[variant].says)
-            compared[variant] = trials.compare(seed, variant)
-        return cls(trials=trials, grasp=grasp, compared=compared)
+    def __post_init__(self) -> None:
+        if unknown := [name for name in self.variants if name not in VARIANTS]:
+            raise ValueError(f"no variant {unknown[0]!r}; there are {', '.join(VARIANTS)}.")
 
-    @cached_property
-    def outcome(self) -> GraspOutcome:
-        """What came of the grasp."""
-        return GraspOutcome.of(self.grasp)
+    def run(self, seed: int, observer: Observer = UNOBSERVED) -> GraspingRun:
+        """The grasp, then the comparison; the seed draws the scene and the image noise."""
+        observer.tell("The whole grasp")
+        grasp, compared = self._grasp(seed, DEFAULT, view=observer.view), {}
+        for name in dict.fromkeys(self.variants):
+            observer.tell(f"Comparison: {VARIANTS[name].label}")
+            compared[name] = self._grasp(seed, name, compared=True)
+        return GraspingRun(grasp=grasp, compared=compared)
 
-    @property
-    def target(self) -> Float[np.ndarray, "2"]:
-        """Where the hand's marker truly should be [px]."""
-        return self.grasp.setting.true_target(self.grasp.world)
+    def _grasp(
+        self, seed: int, variant: str, *, compared: bool = False, view: LiveView = no_live_view
+    ) -> SimulatedGrasp:
+        """One grasp; for comparison it knows the target, goes straight there and tries once."""
+        config = self.config
+        if compared:
+            aiming = replace(config.servo, probe=0.0, timeout=_COMPARED_TIMEOUT)
+            config = replace(config, aiming=aiming, attempts=1)
+        skill, rng = VisualServoSkill.load(self.aiming), np.random.default_rng(seed)
+        return simulate_grasp(
+            skill,
+            GraspingScene.draw(Workplace(), self.scene, rng, self.camera),
+            estimator=VARIANTS[variant].estimator(skill.jacobian),
+            told_target=compared,
+            camera=self.camera,
+            config=config,
+            rng=np.random.default_rng([seed, 1]),
+            view=view,
+        )
 
-    def arrival(self, variant: str) -> float:
-        """From when the camera took over until the marker was there for good [s].
+    def failure(self, run: GraspingRun) -> str:
+        """Why the task gave up."""
+        return run.grasp.failure
 
-        Infinite if it never was.
-        """
-        log = self.compared[variant].cell.log
-        led = np.flatnonzero(log["vision_activation"] > 0)
-        if not len(led):
-            return math.inf
-        error = np.linalg.norm(log["feature"] - self.target, axis=1)
-        aimed = np.flatnonzero(np.isfinite(log["target"]).all(axis=1))
-        within = ~(error[aimed] > REACHED)  # a marker covered for a moment has not gone away
-        if not within[-1]:
-            return math.inf
-        since = aimed[int(np.flatnonzero(~within)[-1]) + 1] if (~within).any() else aimed[0]
-        return float(max(log["time"][since] - log["time"][led[0]], 0.0))
+    def metrics(self) -> Sequence[Metric[GraspingRun]]:
+        """Of the grasp, and of what it is compared with."""
+        return grasping_metrics(tuple(dict.fromkeys(self.variants)))
 
-    def jacobian_error(self) -> tuple[float, float]:
-        """Of the linear part, relative, as the camera takes over and as the hand goes down."""
-        world, log = self.grasp.world, self.grasp.cell.log
-        rows = np.flatnonzero(log["vision_activation"] > 0)
-        if not len(rows):
-            return math.nan, math.nan
-        ends = rows[[0, -1]]
-        hand = panda.forward(torch.from_numpy(log["joint_position"][ends]))
-        marker = hand.apply(torch.from_numpy(world.hand_marker_offset())).numpy()
-        true = world.config.camera.image_jacobian(marker)[..., :3]
-        wrong = np.linalg.norm(log["image_jacobian"][ends, :, :3] - true, axis=(1, 2))
-        first, last = wrong / np.linalg.norm(true, axis=(1, 2))
-        return float(first), float(last)
+    def recordings(self, run: GraspingRun) -> Mapping[str, RunRecording]:
+        """The grasp and each variant."""
+        compared = {
+            f"compared_{name}": record_grasp(
+                grasp, self.config.servo, f"Visual servoing, {VARIANTS[name].label}"
+            )
+            for name, grasp in run.compared.items()
+        }
+        return {"run": record_grasp(run.grasp, self.config.servo, "Grasping"), **compared}
+
+    def log(self, run: GraspingRun) -> LoggedSteps:
+        """Of the grasp."""
+        return run.grasp.cell.log
+
+    def sections(
+        self, run: GraspingRun, recordings: Mapping[str, RunRecording]
+    ) -> Sequence[Section]:
+        """Comparison, regions, image Jacobian."""
+        return grasping_sections(run, recordings, self.config.servo)
+
+    def studies(self) -> Mapping[str, Study]:
+        """Grasps by the default alone, in random scenes, with the synthetic camera."""
+        scene = replace(self.scene, random_camera=True)
+        trial = replace(self, variants=(), scene=scene, camera="synthetic")
+        study = Study(
+            title="Grasps in random scenes",
+            trial=RepeatedRun(trial),
+            metrics=TRIAL_METRICS,
+            text="Another camera pose, start and object pose for each seed.",
+        )
+        return {TRIALS: study}

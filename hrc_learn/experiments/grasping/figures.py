@@ -1,4 +1,4 @@
-"""Figures of grasps: several ways to know the camera side by side, and which region led."""
+"""Figures of grasps: estimators of the image Jacobian compared, and which region led."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -14,8 +14,8 @@ from matplotlib.ticker import StrMethodFormatter
 from hrc_learn.viz import CameraRecording, RunRecording, palette
 from hrc_learn.viz.figure_parts import STYLE, WIDTH, draw_box, frame_space, near, needed, space
 
-_REACHED = 5.0  # pixel error that counts as there
-_NOTHING_LEFT = 1e-6  # of a potential
+_REACHED = 5.0  # pixel error at which the target counts as reached, to be drawn
+_NOTHING_LEFT = 1e-6  # potential below which a region counts as reached
 _REGIONS = (palette.ORANGE, palette.VERMILION, palette.GREEN)  # Cartesian ones alike
 
 
@@ -23,8 +23,8 @@ def variants_figure(runs: Mapping[str, RunRecording], target: Float[np.ndarray, 
     """Paths of the feature in the image, and pixel errors over time, of several runs.
 
     Args:
-        runs: By what is to be read in the legend, the most important one first. All started
-            alike. Time counts from when the first of them saw the feature.
+        runs: By label in the legend, the most important one first. All start alike. Time
+            counts from when the first of them saw the feature.
         target: Where the feature truly should be [px]; all errors are measured from it.
     """
     cameras = {name: needed(run.camera, "camera") for name, run in runs.items()}
@@ -59,12 +59,12 @@ def variants_figure(runs: Mapping[str, RunRecording], target: Float[np.ndarray, 
 
 
 def _dashed(k: int) -> dict[str, Any]:
-    """Every other curve is dashed and on top: some lie exactly upon one another."""
+    """Every other curve is dashed and on top: some coincide exactly."""
     return {"ls": "--", "zorder": 3} if k % 2 else {"ls": "-", "zorder": 2}
 
 
 def _seen(camera: CameraRecording) -> Bool[np.ndarray, " time"]:
-    """Where the feature was followed to a target, and known."""
+    """Where the feature was seen and had a target."""
     return np.asarray(np.isfinite(camera.feature).all(1) & np.isfinite(camera.target).all(1))
 
 
@@ -114,30 +114,33 @@ def reach_figure(run: RunRecording) -> Figure:
 
 def regions_figure(
     run: RunRecording,
-    shares: Mapping[str, Float[np.ndarray, " time"]],
+    fractions: Mapping[str, Float[np.ndarray, " time"]],
     potentials: Mapping[str, Float[np.ndarray, " time"]],
 ) -> Figure:
-    """Which region led when, and what was left of each potential.
+    """Which feedback led when, and the potentials of the regions.
 
     Args:
         run: For its times and phases.
-        shares: Of each kind of feedback in the command, 0 to 1; NaN while none was active.
+        fractions: Of each kind of feedback in the command, 0 to 1; NaN while none was active.
         potentials: Of the regions of position, orientation and vision.
     """
-    active = np.logical_or.reduce([np.isfinite(values) for values in shares.values()])
+    active = np.logical_or.reduce([np.isfinite(values) for values in fractions.values()])
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, 4.2))
         above, below = figure.subplots(2, 1, sharex=True, height_ratios=[1, 1.4])
-        for k, (name, values) in enumerate(shares.items()):
+        for k, (name, values) in enumerate(fractions.items()):
             colour = palette.SERIES[k]
             above.fill_between(run.time, values, alpha=0.15, color=colour, lw=0)
             above.plot(run.time, values, color=colour, label=name, **_dashed(k))
-        above.set(ylabel="share [-]", ylim=(-0.03, 1.08), title="Which feedback leads the arm")
+        above.set(ylabel="fraction [-]", ylim=(-0.03, 1.08), title="Which feedback leads")
         for colour, (name, values) in zip(_REGIONS, potentials.items(), strict=True):
             left = np.where(values > _NOTHING_LEFT, values, np.nan)
             below.plot(run.time, left, color=colour, label=name)
         below.set(
-            xlabel="time [s]", ylabel="potential [-]", yscale="log", title="What is left to do"
+            xlabel="time [s]",
+            ylabel="potential [-]",
+            yscale="log",
+            title="Potentials",
         )
         for axes in (above, below):
             axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))

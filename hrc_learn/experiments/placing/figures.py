@@ -1,6 +1,6 @@
-"""Figures of placing on several shelves: paths, joints, ways in, smoothness, repetitions.
+"""Figures of placing on several shelves: paths, joints, approach, smoothness, trials.
 
-Shelves have one colour each throughout, demonstrations are grey.
+Each shelf has one colour throughout, demonstrations are grey.
 """
 
 from collections.abc import Mapping, Sequence
@@ -51,18 +51,18 @@ def shelf_paths_figure(
     motions: Mapping[str, Mapping[str, Motion]],
     boxes: tuple[Box, ...],
 ) -> Figure:
-    """Paths of the hand in space, one panel for each way of planning.
+    """Paths of the end effector, one panel for each space of planning.
 
     Args:
-        demonstration: What was shown.
-        motions: By way of planning and shelf.
+        demonstration: The demonstrated motion.
+        motions: By space of planning and shelf.
         boxes: What stands around.
     """
     everything = [m.path for by_shelf in motions.values() for m in by_shelf.values()]
     points = np.concatenate([demonstration.path, *everything])
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, 4.5))
-        for i, (way, by_shelf) in enumerate(motions.items()):
+        for i, (space_name, by_shelf) in enumerate(motions.items()):
             axes = space(figure, position=(1, len(motions), 1 + i))
             for box in near(boxes, points):
                 draw_box(axes, box, "#8D8F94", alpha=0.08)
@@ -71,7 +71,7 @@ def shelf_paths_figure(
                 path = by_shelf[shelf].path
                 axes.plot(*path.T, color=colour, lw=1.8, label=f"{shelf} shelf")
                 axes.plot(*path[-1], "s", color=colour, ms=4)
-            axes.set_title(way.capitalize(), loc="left")
+            axes.set_title(space_name.capitalize(), loc="left")
             frame_space(axes, points, zoom=1.0)
             axes.xaxis.set_major_locator(MaxNLocator(3))
             axes.view_init(elev=16, azim=62)
@@ -89,7 +89,7 @@ def shelf_joints_figure(
 
     Args:
         names: Of the joints.
-        demonstration: What was shown.
+        demonstration: The demonstrated motion.
         motions: By shelf.
         limits: Of the joints.
     """
@@ -98,9 +98,11 @@ def shelf_joints_figure(
         figure = Figure(figsize=(WIDTH, 1.45 * rows + 0.5))
         grid = figure.subplots(rows, 2, sharex=True, squeeze=False).ravel()
         for i, (axes, name) in enumerate(zip(grid, names, strict=False)):
-            shown = demonstration.joint_position[:, i]
-            axes.plot(demonstration.time, shown, color=palette.DEMO, lw=3.5, label="demo")
-            values = [shown]
+            demonstrated = demonstration.joint_position[:, i]
+            axes.plot(
+                demonstration.time, demonstrated, color=palette.DEMO, lw=3.5, label="demo"
+            )
+            values = [demonstrated]
             for shelf, colour in shelf_colours(list(motions)).items():
                 motion = motions[shelf]
                 values.append(motion.joint_position[:, i])
@@ -124,43 +126,50 @@ def _keep_limits_in_sight(
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class WayIn:
-    """How far a way into a shelf is from the demonstrated one."""
+class ApproachDistance:
+    """Distance of an approach path from the demonstrated one."""
 
-    left: Float[np.ndarray, " samples"]
-    """Of the way [m]."""
-    aside: Float[np.ndarray, " samples"]
-    """Distance there [m]."""
+    remaining: Float[np.ndarray, " samples"]
+    """Distance left to the goal [m]."""
+    distance: Float[np.ndarray, " samples"]
+    """From the demonstrated path there [m]."""
 
 
-def bend_figure(ways: Mapping[str, Mapping[str, WayIn]], bound: float) -> Figure:
-    """How far the ways into the shelves are bent, one panel for each way of planning.
+def approach_figure(
+    approaches: Mapping[str, Mapping[str, ApproachDistance]], bound: float
+) -> Figure:
+    """Deviation of the approach paths, one panel for each space of planning.
 
     Args:
-        ways: By way of planning and shelf.
-        bound: Of what is good enough [m].
+        approaches: By space of planning and shelf.
+        bound: Of a good placing [m].
     """
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, 2.9))
-        panels = figure.subplots(1, len(ways), sharey=True, squeeze=False)[0]
-        for axes, (title, by_shelf) in zip(panels, ways.items(), strict=True):
+        panels = figure.subplots(1, len(approaches), sharey=True, squeeze=False)[0]
+        for axes, (title, by_shelf) in zip(panels, approaches.items(), strict=True):
             for shelf, colour in shelf_colours(list(by_shelf)).items():
-                left, aside = 1e3 * by_shelf[shelf].left, 1e3 * by_shelf[shelf].aside
-                axes.plot(left, aside, color=colour, label=f"{shelf} shelf")
+                approach = by_shelf[shelf]
+                axes.plot(
+                    1e3 * approach.remaining,
+                    1e3 * approach.distance,
+                    color=colour,
+                    label=f"{shelf} shelf",
+                )
             axes.axhline(1e3 * bound, color=palette.LIMIT, lw=1, ls="--", label="bound")
-            axes.set(title=title.capitalize(), xlabel="way left to the goal [mm]")
+            axes.set(title=title.capitalize(), xlabel="distance left to the goal [mm]")
             axes.set_yscale("log")
             axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
             axes.set_ylim(0.1, 400)
-            longest = max(way.left.max(initial=1e-3) for way in by_shelf.values())
+            longest = max(a.remaining.max(initial=1e-3) for a in by_shelf.values())
             axes.set_xlim(1e3 * longest, 0)
-        panels[0].set_ylabel("off the demonstrated way [mm]")
+        panels[0].set_ylabel("approach-path deviation [mm]")
         _legend_above(figure)
     return figure
 
 
 def smoothness_figure(demonstration: Motion, reproduction: Motion) -> Figure:
-    """Speed and jerk of the hand over the share of the motion, demonstrated and reproduced.
+    """Speed and jerk of the end effector, demonstrated and reproduced.
 
     Both are scaled by duration and length of the path, so that neither a faster nor a longer
     motion counts as less smooth.
@@ -172,15 +181,19 @@ def smoothness_figure(demonstration: Motion, reproduction: Motion) -> Figure:
             ("demonstration", demonstration, palette.DEMO, 1.2),
             ("reproduction", reproduction, palette.RUN, 1.6),
         ):
-            share, first, third = _scaled_derivatives(motion)
-            speed.plot(share, first, color=colour, lw=width, label=label)
-            jerk.plot(share, third, color=colour, lw=width, label=label)
-        speed.set(title="Speed of the hand", ylabel="[path lengths / duration]", ylim=(0, None))
-        jerk.set(title="Jerk of the hand", ylabel="[path lengths / duration³]")
+            fraction, first, third = _scaled_derivatives(motion)
+            speed.plot(fraction, first, color=colour, lw=width, label=label)
+            jerk.plot(fraction, third, color=colour, lw=width, label=label)
+        speed.set(
+            title="Speed of the end effector",
+            ylabel="[path lengths / duration]",
+            ylim=(0, None),
+        )
+        jerk.set(title="Jerk of the end effector", ylabel="[path lengths / duration³]")
         jerk.set_yscale("log")
         jerk.set_ylim(10, None)
         for axes in (speed, jerk):
-            axes.set_xlabel("share of the motion")
+            axes.set_xlabel("fraction of the motion")
             axes.margins(x=0)
         _legend_above(figure)
     return figure
@@ -193,14 +206,14 @@ def _legend_above(figure: Figure) -> None:
 
 
 def _scaled_derivatives(motion: Motion) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Share of the duration, and size of the first and third derivative by it."""
-    share = (motion.time - motion.time[0]) / (motion.time[-1] - motion.time[0])
+    """Fraction of the duration, and size of the first and third derivative by it."""
+    fraction = (motion.time - motion.time[0]) / (motion.time[-1] - motion.time[0])
     path = motion.path / np.linalg.norm(np.diff(motion.path, axis=0), axis=1).sum()
     sizes, values = [], path
     for _ in range(3):
-        values = np.gradient(values, share, axis=0)
+        values = np.gradient(values, fraction, axis=0)
         sizes.append(np.linalg.norm(values, axis=1))
-    return share, sizes[0], sizes[2]
+    return fraction, sizes[0], sizes[2]
 
 
 def snapshots_figure(
@@ -221,7 +234,7 @@ def snapshots_figure(
     return figure
 
 
-def repetition_figure(
+def trials_figure(
     values: Mapping[str, Mapping[str, Float[np.ndarray, " trials"]]],
     bounds: Mapping[str, float],
 ) -> Figure:
@@ -229,7 +242,7 @@ def repetition_figure(
 
     Args:
         values: By measure (with its unit) and shelf.
-        bounds: Of what is good enough, by measure.
+        bounds: Of a good placing, by measure.
     """
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, 2.9))
@@ -237,7 +250,7 @@ def repetition_figure(
         for axes, (measure, by_shelf) in zip(panels, values.items(), strict=True):
             for x, (shelf, colour) in enumerate(shelf_colours(list(by_shelf)).items()):
                 dots = by_shelf[shelf]
-                # Spread evenly, in no order: dots that hide each other cannot be counted.
+                # Spread by the golden ratio: dots that hide each other cannot be counted.
                 aside = 0.3 * (np.modf(np.arange(len(dots)) * 0.618)[0] - 0.5)
                 axes.plot(x + aside, dots, ".", color=colour, ms=4, alpha=0.7)
             axes.axhline(bounds[measure], color=palette.LIMIT, lw=1, ls="--")

@@ -1,217 +1,204 @@
-"""What the experiment on placing has to reach, measured, beside what the paper claims."""
+"""What is measured of placings, by shelf and over all shelves, once and from random starts."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from hrc_learn.experiments.metric_table import Metric
 from hrc_learn.experiments.monte_carlo import Trial
-from hrc_learn.experiments.placing.experiment import SPACES, PlacingExperiment
-from hrc_learn.experiments.placing.trial import BEND, GOAL_ANGLE, GOAL_DISTANCE, PlacingFigures
-from hrc_learn.skills.placing import PlanningSpace
-from hrc_learn.viz.report import Measurement
+from hrc_learn.experiments.placing import arm_angle_ablation
+from hrc_learn.experiments.placing.trial import (
+    SPACES,
+    PlacingOutcome,
+    PlacingRun,
+    demonstrated_joints,
+)
+from hrc_learn.experiments.trial_statistics import column, largest, total
 
-_COLLIDES = "the 4th link collides with the cabinet"
-_AVOIDED = "the collision is avoided"
-_FREE = "no collision with the cabinet"
+# Bounds of a good placing. Approach paths planned in task space deviate by 2 mm, those planned
+# in joint space with a shifted goal by 100 mm.
+DEVIATION_MM, PLACE_ERROR_MM, PLACE_TILT_DEG = 12.0, 2.0, 0.5
+# Of 50 placings from random starts one may touch something.
+_FREE_FRACTION = 0.98
+# What of the demonstration's dimensionless jerk a reproduction may keep.
+_JERK = 1e-2
+_NO_COLLISION = "no collision with the cabinet"
 
-JERK = 1e-2
-"""Share of the demonstration's dimensionless jerk that a reproduction may keep."""
-FREE = 0.98
-"""Share of placings from random starts that have to be free of contacts."""
+type ByShelf = Mapping[str, PlacingOutcome]
 
 
-def evaluate_placing(experiment: PlacingExperiment) -> list[Measurement]:
-    """Measured values of the detailed runs.
-
-    Bounds are those of task space: the paper's joint space is reported beside it.
-    """
+def placing_metrics(shelves: Sequence[str]) -> list[Metric[ByShelf]]:
+    """The table of one placing on each of the shelves."""
     return [
-        *_reproduction(experiment),
-        *(m for space in SPACES for m in _shelves(experiment, space)),
-        Measurement(
-            name="contacts of the arm with the cabinet, hand alone shown",
-            value=len(experiment.untaught.met_by_arm),
-            target=1,
-            at_least=True,
-            claim=_COLLIDES,
+        *(metric for shelf in shelves for metric in _shelf_metrics(shelf)),
+        Metric(
+            "place error",
+            lambda outcomes: 1e3 * max(o.place_error for o in outcomes.values()),
+            "mm",
+            at_most=PLACE_ERROR_MM,
+            essential=True,
         ),
-        Measurement(
-            name="contacts with the cabinet, body shown as well",
-            value=len(experiment.taught.touches),
-            target=0,
-            claim=_AVOIDED,
+        Metric(
+            "place tilt",
+            lambda outcomes: _degrees(max(o.place_tilt for o in outcomes.values())),
+            "deg",
+            at_most=PLACE_TILT_DEG,
+            essential=True,
         ),
-        Measurement(
-            name="shelves within reach if joint 7 stays as demonstrated",
-            value=len(experiment.same_joint7),
+        Metric(
+            "joint limit violations",
+            lambda outcomes: sum(o.violations for o in outcomes.values()),
+            at_most=0,
+            essential=True,
+        ),
+        Metric(
+            "contacts",
+            lambda outcomes: sum(len(o.contacts) for o in outcomes.values()),
+            at_most=0,
+            claim=_NO_COLLISION,
+            essential=True,
+            detail=lambda outcomes: "; ".join(
+                f"{shelf} shelf: {o.contacts[0]}" for shelf, o in outcomes.items() if o.contacts
+            ),
+        ),
+        Metric(
+            "peak joint speed, fraction of its limit",
+            lambda outcomes: max(o.peak_speed for o in outcomes.values()),
+            at_most=1.0,
+        ),
+        Metric(
+            "dimensionless jerk, fraction of the demonstration's",
+            lambda outcomes: max(o.jerk for o in outcomes.values()),
+            at_most=_JERK,
+            claim="several unnecessary jerks removed",
+        ),
+        Metric(
+            "objects that stand on their shelf",
+            lambda outcomes: sum(o.placed for o in outcomes.values()),
+            at_least=len(shelves),
+            essential=True,
+        ),
+    ]
+
+
+def _shelf_metrics(shelf: str) -> list[Metric[ByShelf]]:
+    return [
+        Metric(
+            f"{shelf} shelf, approach-path deviation",
+            lambda outcomes: 1e3 * outcomes[shelf].deviation,
+            "mm",
+            at_most=DEVIATION_MM,
+            claim="similar paths towards the goals",
+            essential=True,
+        ),
+        Metric(f"{shelf} shelf, contacts", lambda outcomes: len(outcomes[shelf].contacts)),
+        Metric(
+            f"{shelf} shelf, place error",
+            lambda outcomes: 1e3 * outcomes[shelf].place_error,
+            "mm",
+            listed=False,
+        ),
+        Metric(
+            f"{shelf} shelf, place tilt",
+            lambda outcomes: _degrees(outcomes[shelf].place_tilt),
+            "deg",
+            listed=False,
+        ),
+        Metric(
+            f"{shelf} shelf, placed", lambda outcomes: int(outcomes[shelf].placed), listed=False
+        ),
+    ]
+
+
+def run_metrics(shelves: Sequence[str]) -> list[Metric[PlacingRun]]:
+    """The table of an experiment: reproduction, task space, joint space, ablation."""
+    table = placing_metrics(shelves)
+    return [
+        Metric(
+            "demonstration, duration",
+            lambda run: float(run.demonstration.duration),
+            "s",
+            claim="30 s",
+        ),
+        Metric(
+            "reproduction, duration",
+            lambda run: run.reproduction.plan.duration,
+            "s",
+            claim="20 s, tau = 1.5",
+        ),
+        Metric("reproduction, joint RMSE", joint_rmse, "deg", at_most=2.0),
+        *(metric.of_part(lambda run: run.outcomes["pose"]) for metric in table),
+        *(
+            metric.of_part(
+                lambda run: run.outcomes["joint"], f"{SPACES['joint']}, ", bounded=False
+            )
+            for metric in table
+        ),
+        *(metric.of_part(lambda run: run.ablation) for metric in arm_angle_ablation.METRICS),
+        Metric(
+            "shelves within reach with joint 7 as demonstrated",
+            lambda run: len(run.same_joint7),
             claim="joint 7 is fixed for all three",
         ),
     ]
 
 
-def _reproduction(experiment: PlacingExperiment) -> Iterable[Measurement]:
-    run = experiment.reproduction
-    yield Measurement(
-        name="demonstration, duration",
-        value=float(experiment.demonstration.duration),
-        unit="s",
-        claim="30 s",
-    )
-    yield Measurement(
-        name="reproduction, duration",
-        value=run.plan.duration,
-        unit="s",
-        claim="20 s, tau = 1.5",
-    )
-    yield Measurement(
-        name="reproduction, joints off the demonstration (RMS)",
-        value=_degrees(experiment.joint_rmse),
-        unit="deg",
-        target=2.0,
-    )
+def joint_rmse(run: PlacingRun) -> float:
+    """Of the reproduction, from the demonstration at the same fraction of the motion [deg]."""
+    done = run.reproduction
+    demonstrated = demonstrated_joints(run.demonstration, done.time / done.time[-1])
+    return _degrees(float(np.sqrt(np.square(done.joint_position - demonstrated).mean())))
 
 
-def _shelves(experiment: PlacingExperiment, space: PlanningSpace) -> Iterable[Measurement]:
-    by_shelf = {
-        shelf: experiment.figures[space, shelf] for shelf in experiment.workplace.shelf_names()
-    }
-    for m in _bounded(by_shelf):
-        m = replace(m, name=f"{SPACES[space]}, {m.name}")
-        yield m if space == "pose" else replace(m, target=None)
+BLOCKED = "joint_space_plans_blocked"
+"""Value of a trial from random starts: how many of the paper's plans are not free."""
 
 
-def _bounded(by_shelf: Mapping[str, PlacingFigures]) -> Iterable[Measurement]:
-    for shelf, figures in by_shelf.items():
-        yield Measurement(
-            name=f"{shelf} shelf: way in bent",
-            value=1e3 * figures.bend,
-            unit="mm",
-            target=1e3 * BEND,
-            claim="similar paths towards the goals",
-        )
-    for shelf, figures in by_shelf.items():
-        yield Measurement(
-            name=f"{shelf} shelf: contacts",
-            value=len(figures.touches),
-            target=0,
-            claim=_FREE,
-        )
+def random_start_metrics(shelves: Sequence[str]) -> list[Metric[Sequence[Trial]]]:
+    """Rows of the table that placings from random starts add."""
 
-    def worst(of: str) -> float:
-        return float(max(getattr(figures, of) for figures in by_shelf.values()))
+    def fraction(trials: Sequence[Trial], key: str, wanted: int) -> float:
+        values = [column(trials, f"{shelf}_shelf_{key}") for shelf in shelves]
+        return float((np.array(values) == wanted).mean())
 
-    yield Measurement(
-        name="goal error, worst shelf",
-        value=1e3 * worst("goal_distance"),
-        unit="mm",
-        target=1e3 * GOAL_DISTANCE,
-    )
-    yield Measurement(
-        name="goal error, angle, worst shelf",
-        value=_degrees(worst("goal_angle")),
-        unit="deg",
-        target=_degrees(GOAL_ANGLE),
-    )
-    yield Measurement(
-        name="joint limit violations",
-        value=sum(figures.violations for figures in by_shelf.values()),
-        unit="steps",
-        target=0,
-    )
-    yield Measurement(
-        name="peak joint speed, share of its limit", value=worst("peak_speed"), target=1.0
-    )
-    yield Measurement(
-        name="dimensionless jerk left of the demonstration's, worst shelf",
-        value=worst("jerk"),
-        target=JERK,
-        claim="several unnecessary jerks removed",
-    )
-    yield Measurement(
-        name="things that stand on their shelf",
-        value=sum(figures.placed for figures in by_shelf.values()),
-        target=len(by_shelf),
-        at_least=True,
-    )
-
-
-def evaluate_random_starts(
-    trials: Sequence[Trial], shelves: Sequence[str]
-) -> list[Measurement]:
-    """Measured values of placings from random starts, planned in task space.
-
-    Args:
-        trials: Of `PlacingTrials`.
-        shelves: On which was placed in each.
-    """
-
-    def values(name: str) -> np.ndarray:
-        # A trial that was given up measured nothing: NaN keeps no target.
-        rows = [t.values.get(f"{shelf}_{name}", np.nan) for t in trials for shelf in shelves]
-        return np.array(rows, dtype=float)
-
-    free = float((values("contacts") == 0).mean())
-    start = "random starts"
+    deviations = [f"{shelf}_shelf_approach_path_deviation_mm" for shelf in shelves]
     return [
-        Measurement(name=f"{start}, placings", value=len(trials) * len(shelves)),
-        Measurement(
-            name=f"{start}, share without contact", value=free, target=FREE, at_least=True
+        Metric("random starts, placings", lambda trials: len(trials) * len(shelves)),
+        Metric(
+            "random starts, fraction without contact",
+            lambda trials: fraction(trials, "contacts", 0),
+            at_least=_FREE_FRACTION,
         ),
-        Measurement(
-            name=f"{start}, share that stands on its shelf",
-            value=float(values("placed").mean()),
-            target=FREE,
-            at_least=True,
+        Metric(
+            "random starts, fraction that stands on its shelf",
+            lambda trials: fraction(trials, "placed", 1),
+            at_least=_FREE_FRACTION,
         ),
-        Measurement(
-            name=f"{start}, joint limit violations",
-            value=float(values("limit_violations").sum()),
-            unit="steps",
-            target=0,
+        Metric(
+            "random starts, joint limit violations", total("joint_limit_violations"), at_most=0
         ),
-        Measurement(
-            name=f"{start}, largest goal error",
-            value=float(values("goal_error_mm").max()),
-            unit="mm",
-            target=1e3 * GOAL_DISTANCE,
+        Metric(
+            "random starts, largest place error",
+            largest("place_error_mm"),
+            "mm",
+            at_most=PLACE_ERROR_MM,
         ),
-        Measurement(
-            name=f"{start}, largest goal error, angle",
-            value=float(values("goal_error_deg").max()),
-            unit="deg",
-            target=_degrees(GOAL_ANGLE),
+        Metric(
+            "random starts, largest place tilt",
+            largest("place_tilt_deg"),
+            "deg",
+            at_most=PLACE_TILT_DEG,
         ),
-        Measurement(
-            name=f"{start}, way in bent most",
-            value=float(values("bend_mm").max()),
-            unit="mm",
-            target=1e3 * BEND,
+        Metric(
+            "random starts, largest approach-path deviation",
+            lambda trials: float(np.max([column(trials, key) for key in deviations])),
+            "mm",
+            at_most=DEVIATION_MM,
         ),
-        Measurement(
-            name=f"{start}, share of joint space plans that are not free",
-            value=float(values("joint_space_blocked").mean()),
-            claim=_FREE,
-        ),
-    ]
-
-
-def evaluate_lessons(trials: Sequence[Trial]) -> list[Measurement]:
-    """Measured values of demonstrations with and without the body's shape."""
-    untaught = sum(int(trial.values["untaught_hit"]) for trial in trials)
-    taught = sum(int(trial.values["taught_hit"]) for trial in trials)
-    return [
-        Measurement(name="demonstrations with and without body shape", value=len(trials)),
-        Measurement(
-            name="demonstrations in which the arm hit the cabinet, hand alone shown",
-            value=untaught,
-            claim=_COLLIDES,
-        ),
-        Measurement(
-            name="demonstrations in which something hit the cabinet, body shown as well",
-            value=taught,
-            target=0,
-            claim=_AVOIDED,
+        Metric(
+            "random starts, fraction of joint-space plans that are blocked",
+            lambda trials: float(column(trials, BLOCKED).mean()) / len(shelves),
+            claim=_NO_COLLISION,
         ),
     ]
 

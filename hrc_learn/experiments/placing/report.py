@@ -1,274 +1,227 @@
-"""The report on the experiment on placing, and its recording."""
+"""The report of placings: recordings, and sections with their figures."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 
-from hrc_learn import viz
+from hrc_learn.demos import Demonstration
 from hrc_learn.experiments.monte_carlo import Trial
-from hrc_learn.experiments.placing import figures as draw
-from hrc_learn.experiments.placing.experiment import SPACES, PlacingExperiment, shown_joints
-from hrc_learn.experiments.placing.snapshots import Image
-from hrc_learn.experiments.placing.trial import (
-    BEND,
-    GOAL_ANGLE,
-    GOAL_DISTANCE,
-    PlacingRun,
-    demonstrated_way_in,
-    hand_path,
-    way_in,
+from hrc_learn.experiments.placing.figures import (
+    ApproachDistance,
+    Motion,
+    approach_figure,
+    shelf_joints_figure,
+    shelf_paths_figure,
+    smoothness_figure,
+    snapshots_figure,
+    trials_figure,
 )
+from hrc_learn.experiments.placing.metrics import (
+    DEVIATION_MM,
+    PLACE_ERROR_MM,
+    PLACE_TILT_DEG,
+)
+from hrc_learn.experiments.placing.snapshots import Snapshots
+from hrc_learn.experiments.placing.trial import (
+    SPACES,
+    PlacingRun,
+    SimulatedPlacing,
+    approach_path,
+    demonstrated_approach,
+    demonstrated_joints,
+    demonstrated_path,
+)
+from hrc_learn.experiments.run_recording import PANDA_LIMITS
+from hrc_learn.experiments.trial_statistics import column
+from hrc_learn.geometry import Box
 from hrc_learn.kinematics import panda
 from hrc_learn.skills.work_cell import SAFETY_COLUMNS
-from hrc_learn.viz.report import Measurement, Picture, Report, Section, software_versions
+from hrc_learn.viz import RunRecording
+from hrc_learn.viz.report import Picture, Section
 
-# A placing run as a recording to look at.
+SUMMARY = (
+    "An expert leads the end effector of an arm into a cabinet and at the same time moves its "
+    "elbow around the open door. A movement primitive learned from that reproduces the motion "
+    "faster and more smoothly, and adapts it to the shelves above and below: in task space "
+    "with the learned null-space posture, and, for comparison, in joint space with a shifted "
+    "goal, as in the paper.\n\n"
+    "Everything runs in MuJoCo with the object held by friction; contacts, poses and where the "
+    "object stands are read from the simulator. Values are of task space and of the worst "
+    "shelf unless they say otherwise."
+)
 
 
-def record_placing(run: PlacingRun, experiment: PlacingExperiment) -> viz.RunRecording:
-    """Everything worth looking at in a run, beside the demonstration."""
-    log, demonstration = run.cell.log, experiment.demonstration
+def record_placing(
+    run: SimulatedPlacing, demonstration: Demonstration, boxes: tuple[Box, ...]
+) -> RunRecording:
+    """The recording of a placing, beside the demonstration.
+
+    Args:
+        run: The placing.
+        demonstration: One that the motion was learned from.
+        boxes: What stands around.
+    """
+    log = run.cell.log
     joints, safety = log["joint_position"], log["safety"]
-    shown = np.full_like(joints, np.nan)
-    shown[run.transfer] = shown_joints(demonstration, run.time / run.time[-1])
-    return viz.RunRecording(
+    demonstrated = np.full_like(joints, np.nan)
+    demonstrated[run.transfer] = demonstrated_joints(demonstration, run.time / run.time[-1])
+    return RunRecording(
         title=f"Placing on the {run.shelf} shelf",
         time=log["time"],
         joint_names=panda.joint_names,
         joint_position=joints,
         joint_limits=PANDA_LIMITS,
-        demo_joint_position=shown,
+        demo_joint_position=demonstrated,
         position=panda.forward(torch.from_numpy(joints)).position.numpy(),
-        demo_path=hand_path(demonstration),
+        demo_path=demonstrated_path(demonstration),
         plan_path=run.plan.tool_pose.position.numpy(),
         bodies=run.motion.bodies(),
-        boxes=tuple(experiment.workplace.scene.boxes()),
+        boxes=boxes,
         safety={name: safety[:, i] for i, name in enumerate(SAFETY_COLUMNS)},
         phases=tuple(log.events),
     )
 
 
-PANDA_LIMITS = viz.JointLimits(
-    lower=panda.limits.lower.numpy(), upper=panda.limits.upper.numpy()
-)
-"""To be drawn beside joint positions."""
-
-# The report on the experiment on placing.
-
-Pictures = Mapping[str, Sequence[tuple[str, Image]]]
-"""Rendered ones with their titles, by what they show: "motion", "body_shape", "shelves"."""
-
-
-def placing_report(
-    experiment: PlacingExperiment,
-    table: Sequence[Measurement],
-    *,
-    trials: Sequence[Trial] = (),
-    pictures: Pictures | None = None,
-    configuration: Mapping[str, object],
-    command: str,
-) -> Report:
-    """Figures, table and how to do it again.
+def placing_sections(run: PlacingRun, snapshots: Snapshots) -> list[Section]:
+    """Shelves, approach, smoothness, null-space posture.
 
     Args:
-        experiment: What was done.
-        table: What was measured.
-        trials: From random starts, where there were any.
-        pictures: Rendered ones, where this machine can.
-        configuration: Of the run.
-        command: That repeats it.
+        run: What happened.
+        snapshots: Rendered pictures; empty where this machine cannot render.
     """
-    sections = [
-        _shelves(experiment, pictures or {}),
-        _way_in(experiment),
-        _smoothness(experiment, pictures or {}),
-        _body_shape(pictures or {}),
-    ]
-    if trials:
-        sections.append(_random_starts(trials, experiment.workplace.shelf_names()))
-    return Report(
-        title="Placing: shown once, repeated faster, and on other shelves",
-        summary=(
-            "An expert leads the hand of an arm into a cabinet and pulls its elbow around the "
-            "open door at once. A movement primitive learned from that repeats the motion "
-            "faster and more smoothly, and carries it over to the shelves above and below: in "
-            "joint space with a shifted goal, as in the paper, and in task space with the "
-            "learned body shape.\n\n"
-            "Everything runs in MuJoCo with the thing held by friction; contacts, poses and "
-            "where the thing stands are read from the simulator."
-        ),
-        table=table,
-        sections=[section for section in sections if section.figures],
-        configuration=configuration,
-        versions=software_versions(),
-        command=command,
+    demonstration = Motion(
+        time=run.demonstration.time - run.demonstration.time[0],
+        joint_position=np.asarray(run.demonstration.joint_position),
+        path=demonstrated_path(run.demonstration),
     )
-
-
-def _shelves(experiment: PlacingExperiment, pictures: Pictures) -> Section:
-    demonstration, motions = _demonstrated(experiment), _motions(experiment)
-    boxes = tuple(experiment.workplace.scene.cabinet.boxes())
-    figures = [
-        Picture(
-            "paths",
-            draw.shelf_paths_figure(demonstration, motions, boxes),
-            "Paths of the hand. A shifted goal bends the joint-space motion; in task space the "
-            "way in keeps its shape.",
-        )
-    ]
-    figures += [
-        Picture(
-            f"joints_{space}_space",
-            draw.shelf_joints_figure(
-                panda.joint_names, demonstration, motions[way], PANDA_LIMITS
+    sections = [
+        _shelves(run, demonstration, snapshots),
+        _approach(run),
+        Section(
+            heading="Faster and smoother than demonstrated",
+            text="The primitive leaves out the tremor of the hand that led the arm.",
+            figures=(
+                Picture(
+                    "smoothness",
+                    smoothness_figure(demonstration, _motion(run.reproduction)),
+                    "Speed and jerk of the end effector, scaled by duration and length.",
+                ),
+                *_pictures(
+                    snapshots, "snapshots", "The demonstration, and the faster reproduction."
+                ),
             ),
-            f"Joints in {way}: the demonstration, and the faster motions to three goals.",
-        )
-        for space, way in SPACES.items()
+        ),
     ]
-    if "shelves" in pictures:
-        figures.append(
-            Picture(
-                "shelves",
-                draw.snapshots_figure(pictures["shelves"], columns=3),
-                "At the three goals, planned in task space.",
-            )
+    if "null_space_posture" in snapshots:
+        posture = Section(
+            heading="Null-space posture",
+            text=(
+                "The same motion of the end effector, demonstrated with and without moving "
+                "the elbow aside. The link that touches the cabinet is coloured."
+            ),
+            figures=_pictures(
+                snapshots,
+                "null_space_posture",
+                "Without the null-space posture the arm is stopped by the open door.",
+            ),
         )
+        sections.append(posture)
+    return sections
+
+
+def _shelves(run: PlacingRun, demonstration: Motion, snapshots: Snapshots) -> Section:
+    motions = {
+        label: {
+            shelf: _motion(run.placings[space, shelf]) for shelf in run.workplace.shelf_names()
+        }
+        for space, label in SPACES.items()
+    }
+    shelves = " and the ".join(run.same_joint7)
     return Section(
         heading="Other shelves",
         text=(
             "One demonstration on one shelf, three goals. Goals in joint space come from the "
             "analytic inverse kinematics. The paper keeps joint 7 fixed; where the "
-            f"demonstration left it, this arm reaches {_listed(experiment.same_joint7)} only, "
-            "so it is free here."
+            "demonstration left it, this arm reaches "
+            f"{f'the {shelves} shelf' if shelves else 'no shelf'} only, so it is free here."
         ),
-        figures=figures,
+        figures=(
+            Picture(
+                "paths",
+                shelf_paths_figure(
+                    demonstration, motions, tuple(run.workplace.scene.cabinet.boxes())
+                ),
+                "Paths of the end effector. A shifted goal bends the joint-space motion; in "
+                "task space the approach keeps its shape.",
+            ),
+            *(
+                Picture(
+                    f"joints_{space}_space",
+                    shelf_joints_figure(
+                        panda.joint_names, demonstration, motions[label], PANDA_LIMITS
+                    ),
+                    f"Joints, planned in {label}: the demonstration, and the faster motions to "
+                    "three goals.",
+                )
+                for space, label in SPACES.items()
+            ),
+            *_pictures(
+                snapshots, "shelves", "At the three goals, planned in task space.", columns=3
+            ),
+        ),
     )
 
 
-def _way_in(experiment: PlacingExperiment) -> Section:
-    shown = demonstrated_way_in(experiment.demonstration, experiment.workplace)
-    ways: dict[str, dict[str, draw.WayIn]] = {way: {} for way in SPACES.values()}
-    for (space, shelf), run in experiment.runs.items():
-        done = way_in(run.path, run.plan.goal, experiment.workplace)
-        ways[SPACES[space]][shelf] = draw.WayIn(left=done.left, aside=done.aside(shown))
-    return Section(
-        heading="The way into the shelf",
-        text=(
-            "How far the hand is, sideways and in height, from the demonstrated way in, moved "
-            "to the goal, from where what it carries crosses the boards' front edge."
-        ),
-        figures=[
-            Picture(
-                "bend",
-                draw.bend_figure(ways, BEND),
-                "Distance from the demonstrated way in; the demonstration's own tremor is part "
-                "of it.",
-            )
-        ],
-    )
-
-
-def _smoothness(experiment: PlacingExperiment, pictures: Pictures) -> Section:
-    figures = [
-        Picture(
-            "smoothness",
-            draw.smoothness_figure(_demonstrated(experiment), _motion(experiment.reproduction)),
-            "Speed and jerk of the hand, scaled by duration and length of the path.",
-        )
-    ]
-    if "motion" in pictures:
-        figures.append(
-            Picture(
-                "snapshots",
-                draw.snapshots_figure(pictures["motion"]),
-                "The demonstration, and the faster reproduction.",
-            )
+def _approach(run: PlacingRun) -> Section:
+    reference = demonstrated_approach(run.demonstration, run.workplace)
+    distances: dict[str, dict[str, ApproachDistance]] = {}
+    for (space, shelf), placing in run.placings.items():
+        approach = approach_path(placing.path, placing.plan.goal, run.workplace)
+        distances.setdefault(SPACES[space], {})[shelf] = ApproachDistance(
+            remaining=approach.remaining, distance=approach.distance(reference)
         )
     return Section(
-        heading="Faster and smoother than shown",
-        text="The primitive leaves out the tremor of the hand that led the arm.",
-        figures=figures,
-    )
-
-
-def _body_shape(pictures: Pictures) -> Section:
-    shown = pictures.get("body_shape", ())
-    return Section(
-        heading="The body's shape",
+        heading="The approach path",
         text=(
-            "The same motion of the hand, shown with and without pulling the elbow aside. The "
-            "link that touches the cabinet is coloured."
+            "Distance of the end effector, sideways and in height, from the demonstrated "
+            "approach moved to the goal, from where the object crosses the boards' front edge."
         ),
-        figures=[
+        figures=(
             Picture(
-                "body_shape",
-                draw.snapshots_figure(shown),
-                "Without the body's shape the arm is stopped by the open door.",
-            )
-        ]
-        if shown
-        else [],
+                "approach",
+                approach_figure(distances, 1e-3 * DEVIATION_MM),
+                "Distance from the demonstrated approach path; the demonstration's own tremor "
+                "is part of it.",
+            ),
+        ),
     )
 
 
-def _random_starts(trials: Sequence[Trial], shelves: Sequence[str]) -> Section:
+def random_start_pictures(trials: Sequence[Trial], shelves: Sequence[str]) -> list[Picture]:
+    """Every trial as a dot, beside the bounds."""
     measures = {
-        "goal error [mm]": ("goal_error_mm", 1e3 * GOAL_DISTANCE),
-        "goal error [deg]": ("goal_error_deg", float(np.rad2deg(GOAL_ANGLE))),
-        "way in bent [mm]": ("bend_mm", 1e3 * BEND),
+        "place error [mm]": ("place_error_mm", PLACE_ERROR_MM),
+        "place tilt [deg]": ("place_tilt_deg", PLACE_TILT_DEG),
+        "approach deviation [mm]": ("approach_path_deviation_mm", DEVIATION_MM),
     }
     values = {
-        measure: {
-            shelf: np.array([t.values.get(f"{shelf}_{name}", np.nan) for t in trials], float)
-            for shelf in shelves
-        }
-        for measure, (name, _) in measures.items()
+        label: {shelf: column(trials, f"{shelf}_shelf_{key}") for shelf in shelves}
+        for label, (key, _) in measures.items()
     }
-    failed = [f"Seed {trial.seed}: {trial.failure}." for trial in trials if trial.failure]
-    return Section(
-        heading=f"From {len(trials)} random starts to each shelf",
-        text=(
-            "Every joint of the start is drawn about home; planned in task space.\n\n"
-            + ("\n\n".join(failed) or "None failed.")
-        ),
-        figures=[
-            Picture(
-                "random_starts",
-                draw.repetition_figure(
-                    values, {m: bound for m, (_, bound) in measures.items()}
-                ),
-                "Each dot is a placing; dashed: the bound.",
-            )
-        ],
-    )
+    bounds = {label: bound for label, (_, bound) in measures.items()}
+    caption = "Each dot is a placing; dashed: the bound."
+    return [Picture("random_starts", trials_figure(values, bounds), caption)]
 
 
-def _listed(shelves: Sequence[str]) -> str:
-    return f"the {' and the '.join(shelves)} shelf" if shelves else "no shelf"
+def _pictures(
+    snapshots: Snapshots, name: str, caption: str, columns: int = 2
+) -> tuple[Picture, ...]:
+    """The figure of these snapshots, if there are any."""
+    if name not in snapshots:
+        return ()
+    return (Picture(name, snapshots_figure(snapshots[name], columns=columns), caption),)
 
 
-def _motions(experiment: PlacingExperiment) -> dict[str, dict[str, draw.Motion]]:
-    """By way of planning, then by shelf."""
-    return {
-        way: {
-            shelf: _motion(experiment.runs[space, shelf])
-            for shelf in experiment.workplace.shelf_names()
-        }
-        for space, way in SPACES.items()
-    }
-
-
-def _motion(run: PlacingRun) -> draw.Motion:
-    return draw.Motion(time=run.time, joint_position=run.joint_position, path=run.path)
-
-
-def _demonstrated(experiment: PlacingExperiment) -> draw.Motion:
-    shown = experiment.demonstration
-    assert shown.joint_position is not None
-    return draw.Motion(
-        time=shown.time - shown.time[0],
-        joint_position=shown.joint_position,
-        path=hand_path(shown),
-    )
+def _motion(run: SimulatedPlacing) -> Motion:
+    return Motion(time=run.time, joint_position=run.joint_position, path=run.path)

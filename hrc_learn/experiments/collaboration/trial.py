@@ -1,0 +1,245 @@
+"""One collaboration in simulation: scenario, run, and what is kept of it."""
+
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from hrc_learn.experiments.live_view import LiveView, no_live_view
+from hrc_learn.experiments.pose_randomization import THREE_OBJECTS, random_object_poses
+from hrc_learn.kinematics import panda
+from hrc_learn.sim import (
+    CameraChange,
+    CameraKind,
+    ChangingCamera,
+    MotionLog,
+    ObjectConfig,
+    OcclusionInterval,
+    ScriptedOcclusion,
+    World,
+    open_camera,
+)
+from hrc_learn.sim.workplace import Workplace
+from hrc_learn.skills.marker_sensor import MarkerSensor
+from hrc_learn.skills.pick_and_place import (
+    INTERACT,
+    PickAndPlace,
+    PickAndPlaceConfig,
+    PickPlaceJob,
+)
+from hrc_learn.skills.placing import PlacingSkill, Plan, check_plan
+from hrc_learn.skills.visual_servoing import VisualServoSkill
+from hrc_learn.skills.work_cell import WorkCell, WorkCellConfig
+from hrc_learn.teleoperation import ScriptedForce, ScriptedPerturbation
+from hrc_learn.teleoperation.page import PageConfig
+from hrc_learn.teleoperation.page_session import task_page
+from hrc_learn.vision import CameraModel
+
+NULL_SPACE_FORCES = (
+    ScriptedForce(start=0.5, duration=4.5, towards=(0.40, 0.00, 0.50), max_force=60.0),
+    ScriptedForce(start=5.5, duration=4.5, towards=(-0.10, 0.25, 0.60), max_force=60.0),
+)
+"""A worker reaches under the arm: the elbow is pushed aside and back. A force of 60 N moves it
+by 0.2 to 0.4 m within the 4.5 s of an interval."""
+
+OBJECT_REACH = (0.10, 0.08, 0.0)
+"""Largest distance of a single object from the middle of the table [m]."""
+OBJECTS_REACH = (0.12, 0.10)
+"""The same of several objects, along x and y [m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Disturbances:
+    """What happens to camera and images during the job."""
+
+    occlusions: tuple[OcclusionInterval, ...] = ()
+    """Intervals in which the gripper's marker is hidden."""
+    camera_change: CameraChange | None = None
+    """How the camera is moved between two objects; None: it stays."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CollaborationRun:
+    """One run of the whole job, successful or not."""
+
+    workplace: Workplace
+    world: World
+    """As the run left it."""
+    cell: WorkCell
+    motion: MotionLog
+    picks: tuple[PickPlaceJob, ...]
+    """The result for each object, in order."""
+    cameras: tuple[tuple[float, CameraModel], ...]
+    """The true cameras, and from when on each watched [s]."""
+    disturbances: Disturbances = field(default_factory=Disturbances)
+
+    @property
+    def failure(self) -> str:
+        """Why objects were not delivered, as the robot sees it; empty if all were."""
+        failures = [pick.failure for pick in self.picks if pick.failure]
+        if left := len(self.workplace.scene.objects) - len(self.picks):
+            failures.append(f"{left} objects were not started")
+        return "; ".join(failures)
+
+
+def simulate_collaboration(
+    aiming: VisualServoSkill,
+    placing: PlacingSkill,
+    shelves: Sequence[str],
+    *,
+    workplace: Workplace | None = None,
+    camera: CameraKind = "auto",
+    forces: Sequence[ScriptedForce] = NULL_SPACE_FORCES,
+    disturbances: Disturbances | None = None,
+    config: PickAndPlaceConfig | None = None,
+    station_config: WorkCellConfig | None = None,
+    seed: int = 0,
+    page: PageConfig | None = None,
+    view: LiveView = no_live_view,
+    on_start: Callable[[World, WorkCell], None] = lambda world, cell: None,
+    on_phase: Callable[[str, float], None] = lambda phase, time: None,
+    on_page: Callable[[str], None] = lambda address: None,
+) -> CollaborationRun:
+    """Grasp objects that lie at random and put them on shelves, in MuJoCo.
+
+    Args:
+        aiming: Learned image Jacobian and visual target.
+        placing: Learned placing motion.
+        shelves: Where to put each of the scene's objects, in turn.
+        workplace: Where.
+        camera: Which kind of camera watches.
+        forces: Of the person on the elbow, in time since the robot waits for them.
+        disturbances: What happens to camera and images during the job.
+        config: How the job is done.
+        station_config: How the loop runs; images may be late or lost.
+        seed: Of the objects' poses and of image noise.
+        page: Serve a page from which people push the elbow too, and let the world go on in
+            real time; None: no page.
+        view: Dashboard of the run while it goes on.
+        on_start: Given world and cell before the job begins.
+        on_phase: Told the name of each phase of the task, and when it begins [s].
+        on_page: Told the address of the page.
+
+    Raises:
+        ValueError: If there is not one shelf for each object, there is no such shelf, or the
+            arm cannot reach it.
+    """
+    workplace = (workplace or Workplace()).approached(aiming.approach)
+    rng = np.random.default_rng(seed)
+    disturbances = disturbances or Disturbances()
+    station_config = station_config or WorkCellConfig()
+    items = workplace.scene.objects
+    _check_shelves(workplace, shelves)
+    world = World(workplace.scene)
+    world.reset(workplace.home_joints().numpy(), _object_poses(workplace, rng))
+    person, motion = ScriptedPerturbation(panda, forces, begin=None), MotionLog(world)
+    occluder = ScriptedOcclusion(world, disturbances.occlusions)
+    eyes = ChangingCamera(
+        workplace.scene.camera, lambda model: open_camera(world, camera, model, rng=rng)
+    )
+
+    def advance(duration: float) -> None:
+        motion.advance(duration)
+        occluder.update()
+
+    def enter(phase: str, time: float) -> None:
+        on_phase(phase, time)
+        if phase == INTERACT:
+            person.begin(time)
+
+    def check(plan: Plan) -> None:
+        held = (item.name for item in items if world.holds(item.name))
+        check_plan(plan, world, next(held, None))
+
+    def before(number: int) -> None:
+        change = disturbances.camera_change
+        if change is not None and number > 0:
+            model = change.applied(eyes.model, _watched(workplace, world), rng)
+            eyes.change(world.time, model)
+
+    with torch.inference_mode(), ExitStack() as stack:
+        human, passing, beside = person, advance, None
+        if page is not None:
+            opened = task_page(world, station_config.dt, page, on_page)
+            beside = stack.enter_context(opened)
+            human, passing = beside.joined(person, advance)
+        cell = WorkCell(
+            chain=panda,
+            arm=world.arm,
+            gripper=world.arm,
+            sensor=MarkerSensor(eyes, workplace.scene.marker_ids),
+            human=human,
+            advance=passing,
+            config=station_config,
+            on_phase=enter,
+            rng=rng,
+        )
+        if beside is not None:
+            beside.follow(cell)
+        stack.enter_context(view(cell, world, motion))
+        on_start(world, cell)
+        task = PickAndPlace(cell, workplace, aiming, placing, check, config)
+        picks = task.run(list(zip(items, shelves, strict=True)), before)
+    return CollaborationRun(
+        workplace=workplace,
+        world=world,
+        cell=cell,
+        motion=motion,
+        picks=tuple(picks),
+        cameras=tuple(eyes.history),
+        disturbances=disturbances,
+    )
+
+
+def with_objects(workplace: Workplace, items: Sequence[ObjectConfig]) -> Workplace:
+    """The workplace with these objects on its table."""
+    return replace(workplace, scene=replace(workplace.scene, objects=tuple(items)))
+
+
+def workplace_for(shelves: Sequence[str], shelf_x: float, shelf_depth: float) -> Workplace:
+    """A workplace with an object for each shelf.
+
+    Raises:
+        ValueError: If there are more shelves named than objects known, or none.
+    """
+    if not 1 <= len(shelves) <= len(THREE_OBJECTS):
+        raise ValueError(
+            f"there are 1 to {len(THREE_OBJECTS)} objects to put on shelves, but "
+            f"{len(shelves)} shelves are named."
+        )
+    workplace = Workplace(shelf_x=shelf_x, shelf_depth=shelf_depth)
+    return with_objects(workplace, THREE_OBJECTS[: len(shelves)])
+
+
+def _check_shelves(workplace: Workplace, shelves: Sequence[str]) -> None:
+    items = workplace.scene.objects
+    for name in shelves:
+        workplace.shelf(name)
+    if len(shelves) != len(items) or len(set(shelves)) != len(shelves):
+        raise ValueError(
+            f"each of the {len(items)} objects needs a shelf of its own, but the shelves are "
+            f"{', '.join(shelves)}."
+        )
+
+
+def _object_poses(
+    workplace: Workplace, rng: np.random.Generator
+) -> dict[str, Float[np.ndarray, "4 4"]]:
+    items = workplace.scene.objects
+    if len(items) == 1:
+        return {items[0].name: workplace.random_object_pose(OBJECT_REACH, rng)}
+    return random_object_poses(items, workplace.table_centre, OBJECTS_REACH, rng)
+
+
+def _watched(workplace: Workplace, world: World) -> Float[np.ndarray, "points 3"]:
+    """What a camera has to see: where objects lie, and the gripper's marker above them."""
+    reach = np.array([*OBJECTS_REACH, 0.0])
+    signs = np.array([[a, b, 0.0] for a in (-1, 1) for b in (-1, 1)])
+    hover = workplace.hover()
+    marker = hover.apply(torch.from_numpy(world.hand_marker_offset())).numpy()
+    on_table = np.array([*workplace.table_centre, workplace.scene.objects[0].half_size[2]])
+    # A marker's plate reaches 3 cm from its centre; the rest is margin.
+    return np.concatenate([middle + signs * (reach + 0.05) for middle in (on_table, marker)])

@@ -1,0 +1,329 @@
+"""The frame of every experiment: run once, repeat with other seeds, evaluate, report.
+
+An experiment is a frozen dataclass of its settings with the methods of `Experiment`; what a
+program does with it is here.
+"""
+
+import shlex
+import shutil
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any, ClassVar, Protocol, runtime_checkable
+
+from hrc_learn.experiments.live_view import LiveView, LiveViewConfig, live_view, no_live_view
+from hrc_learn.experiments.metric_table import Evaluation, Metric, evaluate
+from hrc_learn.experiments.monte_carlo import Run as TrialRun
+from hrc_learn.experiments.monte_carlo import Trial, repeat
+from hrc_learn.experiments.trial_statistics import Summary
+from hrc_learn.skills.work_cell import TaskFailedError
+from hrc_learn.store import new_folder, write_json
+from hrc_learn.viz import LoggedSteps, RunRecording
+from hrc_learn.viz.report import (
+    Measurement,
+    Picture,
+    Report,
+    Section,
+    show_measurements,
+    software_versions,
+    write_report,
+)
+from hrc_learn.viz.run_dashboard import record_run
+
+
+@dataclass(frozen=True, kw_only=True)
+class Observer:
+    """Who looks on while an experiment runs; by default nobody."""
+
+    view: LiveView = no_live_view
+    """A dashboard of the run while it goes on."""
+    tell: Callable[[str], None] = lambda text: None
+    """Shows a line about what happens next."""
+
+
+UNOBSERVED = Observer()
+
+TRIALS = "trials"
+"""Name of the study whose statistics are the experiment's own."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Study:
+    """A Monte Carlo study beside the run that is shown in detail."""
+
+    title: str
+    """Heading of its section in the report."""
+    trial: TrialRun
+    """Runs one trial with a seed. A frozen dataclass, so that other processes can have it and
+    the file of the trials can hold its settings."""
+    metrics: Sequence[Metric[Sequence[Trial]]] = ()
+    """Rows of the table that its trials add."""
+    text: str = ""
+    """How the trials differ."""
+    pictures: Callable[[Sequence[Trial]], Sequence[Picture]] = lambda trials: ()
+    """Figures of the trials."""
+
+    def section(self, trials: Sequence[Trial]) -> Section:
+        """The study in the report: success rate, failures, statistics, figures."""
+        summary = Summary.of(trials)
+        lines = [
+            self.text,
+            f"{summary.rate}.",
+            *(f"Seed {seed}: {reason}." for seed, reason in summary.failed.items()),
+        ]
+        return Section(
+            heading=self.title,
+            text="\n\n".join(filter(None, lines)),
+            figures=self.pictures(trials),
+        )
+
+
+@runtime_checkable
+class Experiment[Run](Protocol):
+    """What an experiment supplies; `Run` is what one run leaves to be evaluated and drawn."""
+
+    title: ClassVar[str]
+    """Heading of the report."""
+    summary: ClassVar[str]
+    """What is done, in plain text; blank lines part paragraphs."""
+
+    def run(self, seed: int, observer: Observer = UNOBSERVED) -> Run:
+        """Draw a scenario from the seed and carry it out once."""
+        ...
+
+    def failure(self, run: Run) -> str:
+        """Why the task gave up; empty if it did not. Missed metrics are found by the frame."""
+        ...
+
+    def metrics(self) -> Sequence[Metric[Run]]:
+        """What is measured of a run, in the order of the report's table."""
+        ...
+
+    def recordings(self, run: Run) -> Mapping[str, RunRecording]:
+        """Recordings to look at, by the name of the file."""
+        ...
+
+    def log(self, run: Run) -> LoggedSteps:
+        """All columns of the control loop."""
+        ...
+
+    def sections(self, run: Run, recordings: Mapping[str, RunRecording]) -> Sequence[Section]:
+        """Text and figures of the report, from the run and its recordings."""
+        ...
+
+    def studies(self) -> Mapping[str, Study]:
+        """Monte Carlo studies by the names of their files, the one named `TRIALS` first."""
+        ...
+
+
+@dataclass(frozen=True)
+class RepeatedRun:
+    """An experiment as one trial of many: its metrics are the values of the trial."""
+
+    experiment: Experiment[Any]
+
+    def __call__(self, seed: int) -> Mapping[str, Any]:
+        """Run once and measure."""
+        run = self.experiment.run(seed)
+        evaluation = evaluate(self.experiment.metrics(), run)
+        failure = failure_of(self.experiment.failure(run), evaluation)
+        return {**evaluation.values, "failure": failure}
+
+
+def failure_of(given_up: str, evaluation: Evaluation) -> str:
+    """Why a run was no success: the task gave up, or an essential bound was missed."""
+    return "; ".join(filter(None, (given_up, *evaluation.faults)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Results:
+    """What a run and the studies beside it came to."""
+
+    table: tuple[Measurement, ...]
+    values: dict[str, float | int]
+    """Of run and studies, as written to JSON."""
+    failure: str
+    """Why the run was no success; empty if it was."""
+    trials: Mapping[str, Sequence[Trial]] = field(default_factory=dict)
+    """By name of the study."""
+
+    @classmethod
+    def of[Run](
+        cls,
+        experiment: Experiment[Run],
+        run: Run,
+        seed: int,
+        trials: Mapping[str, Sequence[Trial]],
+    ) -> "Results":
+        """Evaluate.
+
+        Statistics of the study `TRIALS` have no prefix; without it they are those of the run
+        itself, so that the same keys are there in any case.
+        """
+        total = evaluate(experiment.metrics(), run)
+        failure = failure_of(experiment.failure(run), total)
+        single = Trial(seed=seed, values=total.values, failure=failure)
+        values = Summary.of(trials.get(TRIALS) or [single]).figures()
+        for name, study in experiment.studies().items():
+            if known := trials.get(name):
+                total += evaluate(study.metrics, known)
+                if name != TRIALS:
+                    summary = Summary.of(known).figures()
+                    values |= {f"{name}_{key}": value for key, value in summary.items()}
+        return cls(
+            table=total.table,
+            # Totals over all trials take the place of the counts of the single run.
+            values=total.values | values,
+            failure=failure,
+            trials=trials,
+        )
+
+    @property
+    def ok(self) -> bool:
+        """Whether the run succeeded and every bound of the table is kept."""
+        return not self.failure and all(m.ok is not False for m in self.table)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions:
+    """How an experiment is run and where its results go: options that all programs share."""
+
+    out: Path
+    """Folder for recordings, report and measured values."""
+    seed: int = 0
+    """Seed of the run; the first one of the trials."""
+    trials: int = 0
+    """Repeat with so many seeds besides, and sum up. A stopped repetition goes on with the
+    same command."""
+    processes: int = 1
+    """Of the trials, at once."""
+    serve: bool = False
+    """Serve the dashboard of the run in the browser while it goes on."""
+    serving: LiveViewConfig = field(default_factory=LiveViewConfig)
+    """Where, with --serve."""
+    overwrite: bool = False
+    """Replace an older run in that folder."""
+    json: Path | None = None
+    """File for the measured values."""
+
+    @classmethod
+    def of(cls, args: object) -> "RunOptions":
+        """Those of a command line that has options of the same names."""
+        return cls(**{option.name: getattr(args, option.name) for option in fields(cls)})
+
+
+def conduct[Run](
+    experiment: Experiment[Run],
+    options: RunOptions,
+    *,
+    counts: Mapping[str, int] | None = None,
+    configuration: Mapping[str, object] | None = None,
+    command: str = "",
+) -> int:
+    """Run an experiment and its studies, write and show the results.
+
+    Args:
+        experiment: What to run.
+        options: How, and where results go.
+        counts: Number of trials of studies other than `TRIALS`, by name.
+        configuration: For the report; the options and the experiment's settings if None.
+        command: That repeats all this; the command line of this process if empty.
+
+    Returns:
+        Exit status: 0, or 1 if the run failed or a bound was missed.
+
+    Raises:
+        ValueError: If a number of trials is negative.
+    """
+    from rich.console import Console
+
+    counts = {TRIALS: options.trials, **(counts or {})}
+    if negative := [name for name, count in counts.items() if count < 0]:
+        raise ValueError(f"--{negative[0]} must not be negative, but is {counts[negative[0]]}.")
+    console = Console()
+    if configuration is None:
+        configuration = asdict(options) | asdict(experiment)  # pyright: ignore[reportArgumentType]
+    with new_folder(options.out, configuration, options.overwrite) as folder:
+        run = experiment.run(options.seed, _observer(experiment, options, console.print))
+        trials = {
+            name: _repeat(study, name, counts[name], options)
+            for name, study in experiment.studies().items()
+            if counts.get(name)
+        }
+        results = Results.of(experiment, run, options.seed, trials)
+        with console.status("Writing recordings and report"):
+            recordings = experiment.recordings(run)
+            for name, recording in recordings.items():
+                record_run(folder / f"{name}.rrd", recording)
+            experiment.log(run).save(folder / "log.npz")
+            sections = experiment.sections(run, recordings)
+            report = report_of(experiment, sections, results, configuration, command)
+            write_report(folder, report)
+            write_json(folder / "measured.json", results.values)
+            for name in trials:
+                shutil.copy(_trial_file(options, name), folder / f"{name}.jsonl")
+    for name in trials:
+        _trial_file(options, name).unlink()
+    if options.json is not None:
+        write_json(options.json, results.values)
+    show_measurements(results.table)
+    for name, known in trials.items():
+        console.print(Summary.of(known).table(experiment.studies()[name].title))
+    if results.failure:
+        print(f"failed: {results.failure}", file=sys.stderr)
+    console.print(f"Recordings rerun {options.out / '*.rrd'}")
+    console.print(f"Report     {options.out / 'report.html'}")
+    return 0 if results.ok else 1
+
+
+def report_of(
+    experiment: Experiment[Any],
+    sections: Sequence[Section],
+    results: Results,
+    configuration: Mapping[str, object],
+    command: str = "",
+) -> Report:
+    """Table, sections of the run and of its studies, and how to do it again."""
+    studies = experiment.studies()
+    return Report(
+        title=experiment.title,
+        summary=experiment.summary,
+        table=results.table,
+        sections=(
+            *sections,
+            *(studies[name].section(known) for name, known in results.trials.items()),
+        ),
+        configuration=configuration,
+        versions=software_versions(),
+        command=command or shlex.join(["python", *sys.argv]),
+    )
+
+
+def _observer(
+    experiment: Experiment[Any], options: RunOptions, tell: Callable[[str], None]
+) -> Observer:
+    if not options.serve:
+        return Observer(tell=tell)
+
+    def opened(address: str) -> None:
+        tell(f"Dashboard at {address}")
+
+    return Observer(view=live_view(experiment.title, options.serving, opened), tell=tell)
+
+
+def _repeat(study: Study, name: str, count: int, options: RunOptions) -> list[Trial]:
+    return repeat(
+        study.trial,
+        range(options.seed, options.seed + count),
+        _trial_file(options, name),
+        made_by=asdict(study.trial),  # pyright: ignore[reportArgumentType]
+        processes=options.processes,
+        failures=(TaskFailedError,),
+        title=study.title,
+    )
+
+
+def _trial_file(options: RunOptions, name: str) -> Path:
+    """Beside the folder, which is there only when all is done: a stopped run goes on."""
+    return options.out.with_name(f"{options.out.name}.{name}.jsonl")

@@ -1,0 +1,242 @@
+"""The frame, on a fourth experiment: a throw of a ball that lands somewhere."""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+from typing import ClassVar
+
+import numpy as np
+import pytest
+from sample_runs import sample_run
+
+from hrc_learn.experiments.frame import (
+    TRIALS,
+    UNOBSERVED,
+    Observer,
+    RepeatedRun,
+    Results,
+    RunOptions,
+    Study,
+    conduct,
+)
+from hrc_learn.experiments.metric_table import Metric, evaluate
+from hrc_learn.experiments.monte_carlo import Trial
+from hrc_learn.experiments.trial_statistics import p95
+from hrc_learn.viz import LoggedSteps, RunRecording, StepLog
+from hrc_learn.viz.report import Picture, Section, read_report
+
+
+@dataclass(frozen=True)
+class Throw:
+    landed: float
+    """[m]"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ThrowExperiment:
+    """How far from its target a ball lands."""
+
+    title: ClassVar[str] = "Throwing"
+    summary: ClassVar[str] = "A ball is thrown."
+
+    target: float = 1.0
+    spread: float = 0.01
+    bound: float = 50.0
+    """[mm]"""
+    gives_up: bool = False
+
+    def run(self, seed: int, observer: Observer = UNOBSERVED) -> Throw:
+        observer.tell("throwing")
+        return Throw(self.target + self.spread * np.random.default_rng(seed).standard_normal())
+
+    def failure(self, run: Throw) -> str:
+        return "the ball was dropped" if self.gives_up else ""
+
+    def metrics(self) -> Sequence[Metric[Throw]]:
+        return [
+            Metric(
+                "error",
+                lambda run: 1e3 * abs(run.landed - self.target),
+                "mm",
+                at_most=self.bound,
+                essential=True,
+                detail=lambda run: f"it landed at {run.landed:.2f} m",
+            ),
+            Metric("throws", lambda run: 1),
+            Metric("height", lambda run: None, "m", at_most=2.0),
+        ]
+
+    def recordings(self, run: Throw) -> Mapping[str, RunRecording]:
+        return {"run": sample_run()}
+
+    def log(self, run: Throw) -> LoggedSteps:
+        log = StepLog()
+        log.append(landed=run.landed)
+        return log
+
+    def sections(self, run: Throw, recordings: Mapping[str, RunRecording]) -> Sequence[Section]:
+        grey = np.full((4, 4, 3), 128, np.uint8)
+        return [Section(heading="The throw", figures=[Picture("throw", grey, "Grey.")])]
+
+    def studies(self) -> Mapping[str, Study]:
+        return {
+            TRIALS: Study(
+                title="Other throws",
+                trial=RepeatedRun(replace(self, gives_up=False)),
+                metrics=[Metric("throws, error (95 %)", p95("error_mm"), "mm", at_most=1e3)],
+            ),
+            "wide": Study(title="Wide throws", trial=RepeatedRun(replace(self, spread=0.5))),
+        }
+
+
+def errors(count, spread=0.01):
+    drawn = [np.random.default_rng(seed).standard_normal() for seed in range(count)]
+    return [1e3 * spread * abs(z) for z in drawn]
+
+
+@pytest.fixture
+def work(tmp_path, capsys):
+    def run(experiment, folder="run", **options):
+        counts = {"wide": options.pop("wide", 0)}
+        chosen = RunOptions(out=tmp_path / folder, json=tmp_path / "values.json", **options)
+        status = conduct(experiment, chosen, counts=counts, command="throw")
+        values = json.loads((tmp_path / "values.json").read_text())
+        return status, values, chosen.out, capsys.readouterr()
+
+    return run
+
+
+def test_a_new_experiment_is_run_repeated_and_reported(work):
+    status, values, folder, shown = work(ThrowExperiment(), trials=4, wide=3)
+    assert status == 0
+    assert "throwing" in shown.out
+    assert values["trials"] == values["throws"] == 4
+    assert values["error_max_mm"] == pytest.approx(max(errors(4)))
+    assert values["error_mm"] == pytest.approx(errors(1)[0])
+    assert values["wide_trials"] == 3
+    assert values["wide_error_max_mm"] == pytest.approx(max(errors(3, 0.5)))
+    assert {path.name for path in folder.iterdir()} == {
+        "figures",
+        "log.npz",
+        "made_by.json",
+        "measured.json",
+        "report.html",
+        "report.json",
+        "run.rrd",
+        "trials.jsonl",
+        "wide.jsonl",
+    }
+    assert not list(folder.parent.glob("*.jsonl"))
+    report = read_report(folder)
+    assert [section.heading for section in report.sections] == [
+        "The throw",
+        "Other throws",
+        "Wide throws",
+    ]
+    assert "4 of 4 succeeded" in report.sections[1].text
+    assert [m.name for m in report.table] == ["error", "throws", "throws, error (95 %)"]
+    assert report.command == "throw"
+    assert report.configuration["target"] == 1.0
+
+
+def test_without_trials_the_statistics_are_those_of_the_run(work):
+    _, values, *_ = work(ThrowExperiment())
+    assert values["trials"] == values["success_rate"] == 1
+    assert values["error_p95_mm"] == values["error_median_mm"] == values["error_mm"]
+
+
+def test_a_missed_bound_and_a_task_given_up_are_failures_with_reasons(work):
+    status, values, _, shown = work(ThrowExperiment(bound=1e-6))
+    assert status == 1
+    assert values["success_rate"] == 0
+    assert "error: 1.26 mm, but ≤ 1e-06 mm is wanted (it landed at 1.00 m)" in shown.err
+    status, values, _, shown = work(ThrowExperiment(gives_up=True), "other")
+    assert (status, values["success_rate"]) == (1, 0)
+    assert shown.err == "failed: the ball was dropped\n"
+
+
+def test_failed_trials_do_not_fail_the_run_unless_a_metric_bounds_them(work):
+    status, values, folder, _ = work(ThrowExperiment(bound=5.0), trials=4)
+    failed = [error > 5.0 for error in errors(4)]
+    assert 0 < sum(failed) < 4
+    assert not failed[0]
+    assert values["successes"] == 4 - sum(failed)
+    assert status == 0
+    assert f"Seed {failed.index(True)}: error: " in read_report(folder).sections[1].text
+
+
+def test_a_stopped_repetition_goes_on(tmp_path, work, monkeypatch):
+    options = RunOptions(out=tmp_path / "run", trials=3)
+    run, seeds = ThrowExperiment.run, []
+
+    def stopped(self, seed, observer=UNOBSERVED):
+        seeds.append(seed)
+        if len(seeds) == 3:
+            raise KeyboardInterrupt
+        return run(self, seed, observer)
+
+    monkeypatch.setattr(ThrowExperiment, "run", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        conduct(ThrowExperiment(), options)
+    assert seeds == [0, 0, 1]  # the run itself, then the trials
+    assert not options.out.exists()
+    conduct(ThrowExperiment(), options)
+    assert seeds == [0, 0, 1, 0, 1, 2]
+    assert len((options.out / "trials.jsonl").read_text().splitlines()) == 4
+
+
+def test_negative_numbers_of_trials_are_refused_before_anything_runs(tmp_path):
+    options = RunOptions(out=tmp_path / "run")
+    with pytest.raises(ValueError, match="--trials must not be negative, but is -1"):
+        conduct(ThrowExperiment(), replace(options, trials=-1))
+    with pytest.raises(ValueError, match="--wide must not be negative"):
+        conduct(ThrowExperiment(), options, counts={"wide": -2})
+    assert not list(tmp_path.iterdir())
+
+
+def test_options_are_taken_from_any_command_line_that_has_them(tmp_path):
+    options = RunOptions(out=tmp_path, trials=3, overwrite=True)
+    assert RunOptions.of(SimpleNamespace(**vars(options), speed=1.5)) == options
+
+
+def test_an_older_run_is_replaced_only_on_request(tmp_path, work):
+    work(ThrowExperiment())
+    with pytest.raises(FileExistsError):
+        work(ThrowExperiment())
+    assert work(ThrowExperiment(target=2.0), overwrite=True)[0] == 0
+    made_by = json.loads((tmp_path / "run" / "made_by.json").read_text())
+    assert made_by["target"] == 2.0
+
+
+def test_a_study_is_not_evaluated_without_trials():
+    run = Throw(1.0)
+    results = Results.of(ThrowExperiment(), run, 0, {})
+    assert [m.name for m in results.table] == ["error", "throws"]
+    assert results.ok
+    trials = [Trial(seed=k, values={"error_mm": 2e3}) for k in range(3)]
+    results = Results.of(ThrowExperiment(), run, 0, {TRIALS: trials})
+    assert [m.ok for m in results.table] == [True, None, False]
+    assert not results.ok
+
+
+def test_a_metric_of_a_part_keeps_its_bound_unless_it_is_only_compared():
+    metric = Metric("error", lambda x: x, "mm", at_most=1.0, claim="small", essential=True)
+    whole = {"a": 2.0, "b": 3.0}
+    bounded = metric.of_part(lambda w: w["a"])
+    compared = metric.of_part(lambda w: w["b"], "theirs, ", bounded=False)
+    evaluation = evaluate([bounded, compared], whole)
+    assert evaluation.values == {"error_mm": 2.0, "theirs_error_mm": 3.0}
+    assert [m.ok for m in evaluation.table] == [False, None]
+    assert len(evaluation.faults) == 1
+
+
+def test_rows_that_are_not_listed_are_measured_and_nan_keeps_no_bound():
+    hidden = Metric("hidden", lambda x: x, at_least=1.0, listed=False, essential=True)
+    evaluation = evaluate([hidden], math.nan)
+    assert evaluation.table == ()
+    assert list(evaluation.values) == ["hidden"]
+    assert evaluation.faults[0].startswith("hidden: nan")
+    with pytest.raises(ValueError, match="both sides"):
+        Metric("both", lambda x: x, at_most=1.0, at_least=0.0)
