@@ -183,7 +183,7 @@ class World:
 
         Args:
             path: Joint positions [rad].
-            carried: An object to carry along, at its present pose in the end effector.
+            carried: An object to carry along, at its present pose in the gripper.
         """
         data = mujoco.MjData(self.model)
         data.qpos[:] = self.data.qpos
