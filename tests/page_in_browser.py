@@ -118,19 +118,45 @@ class Browser:
         return box["x"] + box["width"] / 2 + f * x / z, box["y"] + box["height"] / 2 + f * y / z
 
     @contextmanager
-    def dragging(self, start, by: tuple[float, float]) -> Iterator[None]:
-        """Take hold at a point of the workplace, and pull by some pixels; let go at the end."""
+    def dragging(
+        self,
+        start,
+        by: tuple[float, float],
+        until: Callable[[], object] = lambda: True,
+        limit: float = 240.0,
+    ) -> Iterator[None]:
+        """Take hold at a point of the workplace, and pull by some pixels; let go at the end.
+
+        A busy machine draws late, and a mouse meets only what is drawn: the drag is repeated
+        until it has an effect.
+        """
         x, y = self.pixel(start)
-        self.tab.mouse.move(x, y)
-        time.sleep(0.3)
-        self.tab.mouse.down()
+        end = time.monotonic() + limit
         try:
-            for share in np.linspace(0.2, 1.0, 5):
-                self.tab.mouse.move(x + share * by[0], y + share * by[1])
-                time.sleep(0.05)
+            self._drag(x, y, by)
+            while not self._soon(until):
+                self.tab.mouse.up()
+                if time.monotonic() > end:
+                    pytest.fail(f"no effect of a drag at {start} within {limit} s")
+                self._drag(x, y, by)
             yield
         finally:
             self.tab.mouse.up()
+
+    def _drag(self, x: float, y: float, by: tuple[float, float]) -> None:
+        self.tab.mouse.move(x, y)
+        time.sleep(0.3)
+        self.tab.mouse.down()
+        for fraction in np.linspace(0.2, 1.0, 5):
+            self.tab.mouse.move(x + fraction * by[0], y + fraction * by[1])
+            time.sleep(0.05)
+
+    @staticmethod
+    def _soon(condition: Callable[[], object], seconds: float = 15.0) -> bool:
+        end = time.monotonic() + seconds
+        while not (met := bool(condition())) and time.monotonic() < end:
+            time.sleep(0.02)
+        return met
 
 
 @contextmanager

@@ -41,7 +41,7 @@ class PandaModelConfig:
     grip_force: float = 40.0
     """Largest force of a finger [N] (the end effector's continuous rating is 70 N)."""
     marker: Plate | None = None
-    """ArUco plate on the end effector, in the end effector's frame."""
+    """ArUco plate on the end effector, in the gripper's frame."""
 
 
 # Masses of links 1 to 7 [kg], from franka_description.

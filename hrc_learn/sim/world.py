@@ -111,7 +111,7 @@ class World:
     def move_obstacle(
         self, name: str, centre: tuple[float, float, float] | Float[np.ndarray, "3"]
     ) -> None:
-        """Put an obstacle, or the cover, somewhere at once; `NOWHERE` takes it away.
+        """Put an obstacle, or the occluder, somewhere at once; `NOWHERE` takes it away.
 
         Args:
             name: Of the obstacle.
@@ -183,7 +183,7 @@ class World:
 
         Args:
             path: Joint positions [rad].
-            carried: An object to carry along, at its present pose in the end effector.
+            carried: An object to carry along, at its present pose in the gripper.
         """
         data = mujoco.MjData(self.model)
         data.qpos[:] = self.data.qpos

@@ -62,7 +62,7 @@ class Scenario(ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class Placing(Scenario):
-    """Put the object in the end effector on a shelf, and let go."""
+    """Put the object in the gripper on a shelf, and let go."""
 
     workplace: Workplace = field(default_factory=Workplace)
     shelf: str = "middle"
@@ -338,9 +338,7 @@ def check_scenario(name: str, shelf: str, pixels: bool) -> None:
     if shelf not in SHELVES:
         raise ValueError(f"no shelf {shelf!r}: there are {', '.join(SHELVES)}.")
     if pixels and name == "placing":
-        raise ValueError(
-            "placing begins with the object in the end effector, so it has no pixels."
-        )
+        raise ValueError("placing begins with the object in the gripper, so it has no pixels.")
 
 
 def make_scenario(name: str, shelf: str) -> Scenario:

@@ -96,7 +96,7 @@ def test_what_is_not_connected_says_so(tmp_path):
     [
         ({"scenario": "pouring"}, "no scenario 'pouring'"),
         ({"shelf": "attic"}, "no shelf 'attic'"),
-        ({"pixels": True}, "object in the hand"),
+        ({"pixels": True}, "object in the gripper"),
         ({"fps": 1.0}, "fps must be"),
     ],
 )

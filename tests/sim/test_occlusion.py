@@ -66,14 +66,14 @@ def test_a_board_that_is_taken_away_is_seen_by_no_camera(world):
     assert above.in_view(np.array([NOWHERE])).all()
     world.move_obstacle("occluder", NOWHERE)
     assert occluding_boards(world, above) == []
-    world.move_obstacle("cover", (*NOWHERE[:2], 0.5))
+    world.move_obstacle("occluder", (*NOWHERE[:2], 0.5))
     assert len(occluding_boards(world, above)) == 1
     world.move_obstacle("occluder", NOWHERE)
 
 
 def test_nothing_touches_the_board(world):
     world.reset(WORKPLACE.hover_joints().numpy())
-    world.move_obstacle("cover", world.arm.tcp_pose()[:3, 3])
+    world.move_obstacle("occluder", world.arm.tcp_pose()[:3, 3])
     assert world.collisions_along(WORKPLACE.hover_joints().numpy()[None]) == []
     world.move_obstacle("occluder", NOWHERE)
 

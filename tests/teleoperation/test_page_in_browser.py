@@ -27,8 +27,9 @@ def still(session):
 
 def test_a_dragged_elbow_yields_and_the_hand_stays(session, browser):
     elbow, hand = session.frame(4), session.frame(-1)
-    with browser.dragging(elbow, by=(70, -10)):
-        wait_until(lambda: session.asked.nullspace_input.any(), "effort")
+    pulled = lambda: session.asked.nullspace_input.any()  # noqa: E731
+    with browser.dragging(elbow, by=(70, -10), until=pulled):
+        wait_until(pulled, "null-space input")
         effort = session.asked.nullspace_input
         wait_until(lambda: np.linalg.norm(session.frame(4) - elbow) > 0.02, "motion")
     assert np.abs(effort).max() <= 20.0

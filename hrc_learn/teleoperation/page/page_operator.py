@@ -97,7 +97,7 @@ class GizmoCommand:
     twist: Float[np.ndarray, "6"]
     """Of the end effector, linear [m/s] and angular [rad/s]."""
     arrows: Float[np.ndarray, "gizmos 2 3"]
-    """From the point held to the handle, in the base frame [m]."""
+    """From the point held to the pointer, in the base frame [m]."""
 
 
 def gizmo_command(
