@@ -117,7 +117,3 @@ def test_every_requirement_has_a_lower_bound():
         and not any(bound.operator in {">=", "=="} for bound in needed.specifier)
     ]
     assert unbounded == []
-
-
-def test_the_package_tells_type_checkers_that_it_is_typed():
-    assert (ROOT / "hrc_learn" / "py.typed").read_text() == ""
