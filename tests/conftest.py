@@ -19,3 +19,21 @@ def no_waiting_for_the_disk():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", lambda descriptor: None)
         yield
+
+
+NEEDED = {
+    "browser": "a headless Chromium (Debian: apt install chromium)",
+    "egl": "EGL for rendered images (Debian: apt install libegl1)",
+}
+"""What tests with a mark need, and where it comes from."""
+
+
+def pytest_terminal_summary(terminalreporter):
+    """Say last which tests did not run, as a suite that skipped them looks as green."""
+    skipped = terminalreporter.stats.get("skipped", [])
+    for mark, need in NEEDED.items():
+        missing = sorted({report.nodeid for report in skipped if mark in report.keywords})
+        if missing:
+            terminalreporter.write_line(f"{len(missing)} tests did not run without {need}:")
+            for name in missing:
+                terminalreporter.write_line(f"    {name}")

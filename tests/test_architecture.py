@@ -22,14 +22,14 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 CORE: dict[str, set[str]] = {
     "pytree": set(),
     "store": set(),
-    "storage": {"store"},
+    "model_files": {"store"},
     "distributed": set(),
     "protocols": set(),
     "geometry": set(),
     "kinematics": {"store", "geometry"},
-    "dmp": {"store", "storage", "distributed", "geometry"},
+    "dmp": {"store", "model_files", "distributed", "geometry"},
     "regions": {"pytree", "geometry"},
-    "jacobian": {"pytree", "storage", "distributed", "geometry"},
+    "jacobian": {"pytree", "model_files", "distributed", "geometry"},
     "controller": {"pytree", "geometry", "kinematics", "regions", "jacobian"},
     "deploy": {
         "pytree",

@@ -231,14 +231,14 @@ def read_file(out: Path) -> int:
 def write_models(out: Path) -> None:
     import torch
 
-    from hrc_learn.storage import write_model
+    from hrc_learn.model_files import write_model
 
     for number in numbers(out, read_model):
         write_model(out, "Number", {"number": number}, {"number": torch.tensor([number])})
 
 
 def read_model(out: Path) -> int:
-    from hrc_learn.storage import SavedModel
+    from hrc_learn.model_files import SavedModel
 
     model = SavedModel(out, "Number")
     number = model.get("number", int)

@@ -20,7 +20,7 @@ from hrc_learn.dmp.motion_primitive import AdaptedPrimitive
 from hrc_learn.dmp.orientation_error import intrinsic_mean
 from hrc_learn.dmp.pose_dmp import PoseCoordinates, PoseDMP, PoseState, PoseTrajectory
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.storage import SavedModel
+from hrc_learn.model_files import SavedModel
 
 STATE_FIELDS = tuple(field.name for field in fields(DMPState))
 

@@ -33,7 +33,7 @@ from hrc_learn.dmp.orientation_dmp import OrientationDMP
 from hrc_learn.dmp.orientation_error import to_orientation
 from hrc_learn.dmp.pose_dmp import BODY, ERROR, POSITION, PoseDMP, PoseState
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.storage import saved_kind
+from hrc_learn.model_files import saved_kind
 
 PRIMITIVE, PROGRAM = "primitive", "step.pt2"
 STATE = tuple(field.name for field in fields(DMPState))

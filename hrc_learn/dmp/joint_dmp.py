@@ -16,7 +16,7 @@ from hrc_learn.dmp.forcing_scale import Scaling, find_scaling
 from hrc_learn.dmp.linear_primitive import ColumnEnds, LinearPrimitive, check_names
 from hrc_learn.dmp.motion_primitive import AdaptedPrimitive
 from hrc_learn.geometry import Pose
-from hrc_learn.storage import SavedModel
+from hrc_learn.model_files import SavedModel
 
 
 class JointCoordinates(CoordinateAdapter[Vectors, Trajectory, DMPState]):

@@ -26,7 +26,7 @@ from hrc_learn.dmp.fitting.solvers import FitOptions
 from hrc_learn.dmp.joint_dmp import JointDMP, given_points
 from hrc_learn.dmp.linear_primitive import ColumnEnds, LinearPrimitive
 from hrc_learn.dmp.motion_primitive import AdaptedPrimitive
-from hrc_learn.storage import SavedModel
+from hrc_learn.model_files import SavedModel
 
 TENSORS = ("lower", "upper", "softness")
 CLOSEST = 1e-6

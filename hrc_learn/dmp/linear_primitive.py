@@ -22,7 +22,7 @@ from hrc_learn.dmp.closed_loop_step import DMPState
 from hrc_learn.dmp.fitting.motion_samples import FitReport
 from hrc_learn.dmp.forcing_scale import Demonstrated, NoScaling, Scaling, find_scaling
 from hrc_learn.dmp.serialization import TENSORS, basis_config, linear_arguments
-from hrc_learn.storage import SavedModel
+from hrc_learn.model_files import SavedModel
 
 
 class ColumnEnds(NamedTuple):

@@ -19,7 +19,7 @@ from hrc_learn.dmp.closed_loop_step import DMPState
 from hrc_learn.dmp.coordinate_adapter import CoordinateAdapter
 from hrc_learn.dmp.linear_primitive import ColumnEnds, LinearPrimitive
 from hrc_learn.dmp.probabilistic.vmp import ViaPoints, through_via_points
-from hrc_learn.storage import SavedModel, write_model
+from hrc_learn.model_files import SavedModel, write_model
 
 
 @runtime_checkable

@@ -17,7 +17,7 @@ from hrc_learn.dmp.orientation_coordinates import (
 )
 from hrc_learn.dmp.orientation_error import fitted_error, reference_of, to_orientation
 from hrc_learn.dmp.ude_formulation import UdeCoordinates, follow_errors
-from hrc_learn.storage import SavedModel
+from hrc_learn.model_files import SavedModel
 
 FORMULATIONS: dict[str, type[OrientationCoordinates]] = {
     "log": OrientationCoordinates,

@@ -28,7 +28,7 @@ from hrc_learn.dmp.orientation_error import (
     unit_quaternion,
 )
 from hrc_learn.geometry import Pose
-from hrc_learn.storage import SavedModel
+from hrc_learn.model_files import SavedModel
 
 POSITION, ERROR, BODY = slice(0, 3), slice(3, 6), slice(6, None)
 """Columns of a pose: position [m], orientation error [rad], and what moves along."""

@@ -18,7 +18,7 @@ from hrc_learn.dmp._system.canonical import ExponentialPhase, SigmoidPhase
 from hrc_learn.dmp._system.spring import SpringDamper
 from hrc_learn.dmp.fitting.motion_samples import FitReport
 from hrc_learn.dmp.forcing_scale import Scaling, find_scaling
-from hrc_learn.storage import SavedModel
+from hrc_learn.model_files import SavedModel
 
 BASES: dict[str, type[Any]] = {
     basis.__name__: basis

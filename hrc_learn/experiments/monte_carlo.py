@@ -13,11 +13,11 @@ from typing import Any
 
 import torch
 
+from hrc_learn.store import Claim, new_file, sync_file
+
 # Keys of a line of the file: one JSON object a trial. The first line of the file holds what was
 # tried under the last key, so that results of different settings never mix.
 _SEED, _FAILURE, _MADE_BY = "seed", "failure", "made_by"
-
-from hrc_learn.store import Claim, new_file, sync_file
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -24,7 +24,7 @@ from hrc_learn.jacobian.samples import (
     image_demonstrations,
     statistics_by_fold,
 )
-from hrc_learn.storage import SavedModel, write_model
+from hrc_learn.model_files import SavedModel, write_model
 
 _KIND = "RBFImageJacobian"
 _UNITS = {"position": "m", "rotation": "rad", "jacobian": "px/m, px/rad", "pixels": "u, v"}

@@ -136,9 +136,9 @@ class ImportArrays:
 class Show:
     """Look at the demonstrations of a LeRobot dataset: a Rerun recording of all of them.
 
-    Paths of the end effector in 3D with the arm (a Panda; of other robots the paths alone), every joint
-    of all demonstrations over one another, and for each what else was recorded: image feature,
-    the person's effort, gripper.
+    Paths of the end effector in 3D with the arm (a Panda; of other robots the paths alone),
+    every joint of all demonstrations over one another, and for each what else was recorded:
+    image feature, the person's effort, gripper.
     """
 
     dataset: Path

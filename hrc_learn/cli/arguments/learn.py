@@ -39,9 +39,9 @@ def _few_starts() -> Any:
 class FitPrimitives:
     """Fit movement primitives to the demonstrations of a LeRobot dataset.
 
-    Learns the motion of the joints, of any robot, and that of the end effector where its pose is
-    recorded. Several demonstrations give one primitive each and what they have in common: their
-    mean, their distribution, a function of a context, or one primitive fitted to all of them in
+    Learns the motion of the joints, of any robot, and that of the end effector where its pose
+    is recorded. Several demonstrations give one primitive each and what they have in common:
+    their mean, their distribution, a function of a context, or one primitive fitted to all of them in
     one pass. Writes a folder with the primitives, the measured errors, demonstrations beside
     reproductions as figures and a Rerun recording, and what it was made from.
     """
@@ -106,7 +106,7 @@ class FitImageJacobian:
     episodes: tuple[int, ...] = ()
     """Episodes to learn from; all when empty."""
     neurons: Literal["around", "grid"] = "around"
-    """Thirteen that see all of the hand's pose, placed about what was demonstrated; or a grid that
+    """Thirteen over the whole pose, placed about what was demonstrated; or a grid that
     sees x and y, as in the paper."""
     x: More[tuple[float, float, int]] = (0.05, 0.35, 3)
     """Of a grid: first and last centre along x [m], and how many (paper, Table I)."""

@@ -49,7 +49,7 @@ class RecordPlacing:
 
 @dataclass(frozen=True, kw_only=True)
 class RecordServoing:
-    """Record demonstrations of visual servoing to an object in the image of an uncalibrated camera.
+    """Record demonstrations of visual servoing to an object by an uncalibrated camera.
 
     The scripted expert moves the marked end effector over the table and ends right above an
     object. The camera's pose and lens are in none of the columns. Writes a LeRobot dataset of

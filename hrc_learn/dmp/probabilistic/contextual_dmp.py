@@ -15,7 +15,7 @@ from hrc_learn.dmp._types import ArrayLike, Mask, Points, Times, Vectors, to_ten
 from hrc_learn.dmp.fitting.motion_samples import FitReport, check_samples
 from hrc_learn.dmp.joint_dmp import JointDMP
 from hrc_learn.dmp.probabilistic.linear_view import mean_primitive
-from hrc_learn.storage import SavedModel, write_model
+from hrc_learn.model_files import SavedModel, write_model
 
 type FeatureMap = Callable[[Tensor], Tensor]
 """Maps contexts (*batch, C) to features (*batch, F); a constant one is not needed."""
