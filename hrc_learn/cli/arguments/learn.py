@@ -41,9 +41,9 @@ class FitPrimitives:
 
     Learns the motion of the joints, of any robot, and that of the end effector where its pose
     is recorded. Several demonstrations give one primitive each and what they have in common:
-    their mean, their distribution, a function of a context, or one primitive fitted to all of them in
-    one pass. Writes a folder with the primitives, the measured errors, demonstrations beside
-    reproductions as figures and a Rerun recording, and what it was made from.
+    their mean, their distribution, a function of a context, or one primitive fitted to all of
+    them in one pass. Writes a folder with the primitives, the measured errors, demonstrations
+    beside reproductions as figures and a Rerun recording, and what it was made from.
     """
 
     dataset: Path
