@@ -95,6 +95,8 @@ class Browser:
         self.tab = tab
         tab.set_default_timeout(1e3 * timeout)
         tab.goto(page.url)
+        # viser warns of drawing without a GPU, right over the arm that the mouse is to meet.
+        tab.add_style_tag(content="[class*=Notifications] { display: none !important; }")
         (self.button("Start") if guides else tab.get_by_text("Safety filter")).wait_for()
         wait_until(page._server.get_clients, "a client", timeout)
         clients = page._server.get_clients()
