@@ -91,7 +91,9 @@ def install(uv: str, wheel: Path, environment: str, python: str, folder: Path) -
     """
     chosen = extras(environment)
     bounds, resolved = folder / "bounds.txt", folder / "resolved.txt"
-    bounds.write_text("\n".join(lower_bounds(chosen)) if environment == "lowest" else "")
+    bounds.write_text(
+        "\n".join(lower_bounds(chosen)) if environment == "lowest" else "", encoding="utf-8"
+    )
     run(
         *(uv, "pip", "compile", "--quiet", "--no-annotate", "--no-header"),
         *("--python-version", python, "--constraint", str(bounds)),
@@ -109,7 +111,11 @@ def install(uv: str, wheel: Path, environment: str, python: str, folder: Path) -
     names = {
         found["name"] for text in lower_bounds(chosen) if (found := REQUIREMENT.match(text))
     }
-    ours = [line for line in resolved.read_text().split() if line.split("==")[0] in names]
+    ours = [
+        line
+        for line in resolved.read_text(encoding="utf-8").split()
+        if line.split("==")[0] in names
+    ]
     print(f"{environment}, Python {python}: {' '.join(ours)}", flush=True)
     return inside
 

@@ -22,7 +22,7 @@ from hrc_learn.demos.repair import RepairOptions
 from hrc_learn.dmp.forcing_scale import SCALINGS
 from hrc_learn.experiments.controller.sweep import EXPERIMENTS
 from hrc_learn.experiments.grasping.experiment import VARIANTS
-from hrc_learn.learning.channels import KINDS
+from hrc_learn.learning.channels import CHANNELS
 from hrc_learn.sim import CameraKind
 from hrc_learn.sim.workplace import Workplace
 
@@ -135,7 +135,7 @@ def test_the_short_help_says_what_is_required_and_the_defaults():
     [
         (choices.Shelf, Workplace().shelf_names()),
         (choices.Camera, typing.get_args(CameraKind)),
-        (choices.Kind, KINDS),
+        (choices.Channel, CHANNELS),
         (choices.Scaling, SCALINGS),
         (choices.Variant, [*VARIANTS, "none"]),
         (choices.Experiment, EXPERIMENTS),

@@ -6,7 +6,7 @@ import pytest
 from commands import done, hrc
 
 from hrc_learn.cli.commands import (
-    demo,
+    _demo_models,
     fit_image_jacobian,
     fit_primitives,
     record_placing,
@@ -54,12 +54,12 @@ def test_models_that_are_not_given_are_those_of_the_demo(asked):
     from rich.console import Console
 
     console = Console(quiet=True)
-    assert demo.model(Path("mine"), "placing", console) == Path("mine")
+    assert _demo_models.model(Path("mine"), "placing", console) == Path("mine")
     assert not asked
     # They are learned once, both together.
-    assert demo.model(None, "placing", console) == Path("outputs/demo/placing")
+    assert _demo_models.model(None, "placing", console) == Path("outputs/demo/placing")
     assert len(asked) == 4
-    assert demo.model(None, "aiming", console) == Path("outputs/demo/aiming")
+    assert _demo_models.model(None, "aiming", console) == Path("outputs/demo/aiming")
     assert len(asked) == 4
 
 

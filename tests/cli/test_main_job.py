@@ -37,7 +37,17 @@ def test_the_job_is_done_and_every_target_met(work):
         *("run", "collaboration", "--placing", work / "placing"),
         *("--aiming", work / "aiming", "--out", out, "--shelf", "lower"),
         *("--camera", "synthetic", "--seed", 3, "--json", work / "measured.json"),
-        *("--config.interaction", 5, "--occlusion", 0, 3, "--latency", 0.04, "--drop", 0.1),
+        *(
+            "--config.interaction",
+            5,
+            "--occlusion",
+            0,
+            3,
+            "--latency",
+            0.04,
+            "--frame-loss",
+            0.1,
+        ),
     )
     assert "missed" not in outcome.output
     measured = json.loads((work / "measured.json").read_text())

@@ -35,7 +35,7 @@ BRIEF = PickAndPlaceConfig(interaction=0.0)
 HASTY = replace(
     BRIEF,
     grasping=GraspingConfig(
-        aiming=VisualServoConfig(unseen_patience=2.5), timeout=0.1, attempts=1
+        servo=VisualServoConfig(occlusion_timeout=2.5), detection_timeout=0.1, attempts=1
     ),
 )
 """Gives up as soon as the arm has come to where it should see its marker."""
@@ -93,8 +93,8 @@ def test_the_object_ends_on_the_shelf_and_every_target_is_met(job, placing):
 def test_the_phases_come_in_order(job):
     phases = [event.text for event in job.cell.log.events]
     assert phases == [
-        "look",
-        "aim",
+        "detect",
+        "servo",
         "interact",
         "grasp",
         "lift",
@@ -190,7 +190,7 @@ def test_an_unknown_shelf_is_refused_before_anything_moves(aiming, placing):
 
 def test_a_hidden_marker_is_waited_for_and_the_wait_noted(job):
     (note,) = [note for pick in job.picks for note in pick.recoveries]
-    assert note.mishap == "marker out of sight"
+    assert note.mishap == "marker occluded"
     feature = job.cell.log["feature"][:, 0]
     assert np.isnan(feature[job.cell.log["time"] < 3.0]).all()
     assert verdict(job) == ""
@@ -208,7 +208,7 @@ def provoked(aiming, placing, workplace=WORKPLACE, config=BRIEF, **options):
         camera="synthetic",
         forces=(),
         config=config,
-        station_config=WorkCellConfig(keep_image_every=0),
+        cell_config=WorkCellConfig(keep_image_every=0),
         **options,
     )
 
@@ -286,7 +286,7 @@ def with_obstacle(centre, half_size):
 def test_a_blocked_way_is_gone_round(aiming, placing):
     workplace = with_obstacle((0.55, -0.10, 0.305), (0.05, 0.02, 0.04))
     job = provoked(aiming, placing, workplace, seed=5)
-    assert set(mishaps(job)) == {"blocked way"}
+    assert set(mishaps(job)) == {"blocked path"}
     assert verdict(job) == ""
 
 
@@ -299,7 +299,7 @@ def test_what_blocks_every_way_is_waited_for(aiming, placing):
     job = provoked(
         aiming, placing, workplace, on_start=meddler.start, on_phase=meddler.phase, seed=5
     )
-    assert mishaps(job) == ["blocked way"]
+    assert mishaps(job) == ["blocked path"]
     assert verdict(job) == ""
 
 
@@ -308,7 +308,7 @@ def test_where_no_way_gets_free_the_object_is_put_back(aiming, placing):
     workplace = with_obstacle((0.40, -0.40, 0.40), (0.15, 0.03, 0.15))
     config = replace(BRIEF, waits=1, wait=0.5)
     job = provoked(aiming, placing, workplace, config, seed=5)
-    assert mishaps(job) == ["blocked way", "blocked way"]
+    assert mishaps(job) == ["blocked path", "blocked path"]
     assert "stayed blocked" in job.failure
     assert job.world.rests_on("box", "table")
     place = job.world.object_pose("box")[:2, 3]
@@ -323,7 +323,7 @@ def test_a_marker_that_stays_hidden_ends_the_attempts_cleanly(aiming, placing):
     config = replace(BRIEF, grasping=replace(HASTY.grasping, attempts=2))
     hidden = Disturbances(occlusions=(OcclusionInterval(start=0.0, duration=1e3),))
     job = provoked(aiming, placing, config=config, disturbances=hidden, seed=5)
-    assert mishaps(job) == ["marker out of sight", "marker out of sight"]
+    assert mishaps(job) == ["marker occluded", "marker occluded"]
     assert "marker" in job.failure
     assert job.world.rests_on("box", "table")
 
@@ -351,7 +351,7 @@ def test_three_objects_are_placed_though_the_camera_is_changed_between_them(
             camera_change=change,
         ),
         config=PickAndPlaceConfig(interaction=2.5),
-        station_config=WorkCellConfig(keep_image_every=0),
+        cell_config=WorkCellConfig(keep_image_every=0),
         seed=1,
     )
     assert verdict(job) == ""

@@ -118,6 +118,7 @@ def test_a_new_experiment_is_run_repeated_and_reported(work):
     assert values["wide_trials"] == 3
     assert values["wide_error_max_mm"] == pytest.approx(max(errors(3, 0.5)))
     assert {path.name for path in folder.iterdir()} == {
+        ".manifest.json",
         "figures",
         "log.npz",
         "made_by.json",

@@ -1,4 +1,4 @@
-"""A dashboard beside a cell: all that is logged arrives, whatever the thread catches."""
+"""A dashboard beside a work cell: all that is logged arrives, whatever the thread catches."""
 
 from contextlib import contextmanager
 
@@ -21,10 +21,10 @@ def test_a_station_is_shown_while_it_works(tmp_path, monkeypatch):
     def into_a_file(port, data_port):
         stream = rr.RecordingStream("test")
         stream.save(tmp_path / "live.rrd")
-        yield servers.Served(stream, f"http://viewer:{port}", f"data:{data_port}")
+        yield servers.DashboardServer(stream, f"http://viewer:{port}", f"data:{data_port}")
         stream.disconnect()
 
-    monkeypatch.setattr(servers, "served", into_a_file)
+    monkeypatch.setattr(servers, "serve_stream", into_a_file)
     workplace, opened = Workplace(), []
     world = World(workplace.scene)
     world.reset(workplace.home_joints().numpy())
@@ -41,8 +41,8 @@ def test_a_station_is_shown_while_it_works(tmp_path, monkeypatch):
         torch.inference_mode(),
         live_view("Held", config, opened.append)(cell, world, motion),
     ):
-        cell.enter("hold")
-        cell.stay(0.3)
+        cell.begin_phase("hold")
+        cell.hold_pose(0.3)
     assert opened == ["http://viewer:1"]
     rrd = Rrd(tmp_path / "live.rrd")
     path = "joints/panda_joint4/position"

@@ -31,7 +31,7 @@ from hrc_learn.sim import World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.cartesian_motion import joint_line
 from hrc_learn.skills.grasping import GraspingConfig
-from hrc_learn.skills.visual_servoing import Aim, VisualServoConfig, VisualServoSkill
+from hrc_learn.skills.visual_servoing import ServoTarget, VisualServoConfig, VisualServoSkill
 from hrc_learn.skills.visual_target import VisualTarget
 
 WORKPLACE = Workplace()
@@ -86,7 +86,7 @@ def test_the_object_is_held_though_the_camera_was_turned(grasp):
     assert lift(grasp) > 0.1
     descent = Descent.of(grasp)
     assert 0 < descent.offset < 0.015
-    assert 0 < descent.vision_time < grasp.result.servo_time < grasp.station.time
+    assert 0 < descent.vision_time < grasp.result.servo_time < grasp.cell.time
     values = evaluate(grasp_metrics(), grasp).values
     assert values["grasp_offset_mm"] == 1e3 * descent.offset
     assert values["object_held_lifted_and_carried_home"] == 1
@@ -104,7 +104,7 @@ def test_the_image_jacobian_is_wrong_at_first_and_right_at_the_descent(grasp):
 
 def test_feedback_goes_from_joint_space_to_the_image(grasp):
     activity = RegionActivity.of(grasp, VisualServoConfig())
-    aimed = np.isfinite(grasp.station.log["target"]).all(axis=1)
+    aimed = np.isfinite(grasp.cell.log["target"]).all(axis=1)
     first, last = np.flatnonzero(aimed)[[0, -1]]
     assert (activity.approach[first], activity.vision[first]) == (1.0, 0.0)
     assert (activity.approach[last], activity.vision[last]) == (0.0, 1.0)
@@ -165,8 +165,8 @@ def test_a_missed_grasp_is_begun_anew(skill):
     class Astray(VisualTarget):
         """Misses the object by a hand's breadth until it has looked twice."""
 
-        def seen_by(self, pixel, jacobian):
-            seen = super().seen_by(pixel, jacobian)
+        def from_view(self, pixel, jacobian):
+            seen = super().from_view(pixel, jacobian)
             if not tries or np.allclose(pixel, tries[0], atol=1e-12):
                 tries[:] = [pixel]
                 return seen + np.array([0.0, 150.0])
@@ -212,13 +212,13 @@ def test_the_hand_is_turned_as_the_demonstrations_approached(skill):
     run = simulate_grasp(tilted, turned(20), camera="synthetic", rng=np.random.default_rng(0))
     assert succeeded(run)
     assert Descent.of(run).angle < 0.02
-    hand = panda.forward(torch.from_numpy(run.station.log["joint_position"]))
-    down = np.flatnonzero(run.station.log["time"] >= phase_time(run, "lift"))[0]
+    hand = panda.forward(torch.from_numpy(run.cell.log["joint_position"]))
+    down = np.flatnonzero(run.cell.log["time"] >= phase_time(run, "lift"))[0]
     assert float(quaternion.angle(hand.orientation[down], shown)) < 0.02
 
 
 def phase_time(run, phase):
-    return next(event.time for event in run.station.log.events if event.text == phase)
+    return next(event.time for event in run.cell.log.events if event.text == phase)
 
 
 SWEPT = 17
@@ -226,6 +226,7 @@ SWEPT = 17
 above the table leads through the object."""
 
 
+@shapes_unchecked()
 def test_the_arm_comes_to_the_table_clear_of_what_lies_there(skill):
     """Nobody told it where that is."""
     config = GraspingSceneConfig(random_camera=True)
@@ -240,7 +241,7 @@ def test_the_arm_comes_to_the_table_clear_of_what_lies_there(skill):
     assert distance(joint_line(start, WORKPLACE.hover_joints(), 0.6, 0.05)) < 0
     with shapes_unchecked():
         run = grasped(skill, scene)
-    log = run.station.log
+    log = run.cell.log
     coming = log["time"] < phase_time(run, "grasp")
     assert distance(torch.from_numpy(log["joint_position"][coming])) > 0.05
     assert succeeded(run)
@@ -250,8 +251,8 @@ def test_the_arm_comes_to_the_table_clear_of_what_lies_there(skill):
 def test_coming_down_again_finds_the_object_by_any_camera(skill):
     """Cameras moved, tilted and turned by any angle."""
 
-    def runs(most_probes):
-        grasping = GraspingConfig(aiming=VisualServoConfig(most_probes=most_probes))
+    def runs(max_probes):
+        grasping = GraspingConfig(servo=VisualServoConfig(max_probes=max_probes))
         for seed in (1, 12, 19, 27):
             rng = np.random.default_rng(seed)
             trial = simulate_grasp(
@@ -276,7 +277,7 @@ def test_a_hand_that_comes_down_along_the_line_stays_on_it():
     line = np.array([0.3, -0.2, 1.0])
     line /= np.linalg.norm(line)
     hover = WORKPLACE.hover()
-    aim = Aim(
+    target = ServoTarget(
         config=VisualServoConfig(), above=hover, posture=None, target=lambda J: J, line=line
     )
 
@@ -284,7 +285,7 @@ def test_a_hand_that_comes_down_along_the_line_stays_on_it():
         moved = along * line + np.array(aside)
         return Pose(hover.position + torch.from_numpy(moved), hover.orientation)
 
-    assert aim.aside(hand(0.0), hand(0.03)) == pytest.approx(0.0, abs=1e-12)
-    assert aim.aside(hand(0.04), hand(0.01)) == pytest.approx(0.0, abs=1e-12)
+    assert target.deviation(hand(0.0), hand(0.03)) == pytest.approx(0.0, abs=1e-12)
+    assert target.deviation(hand(0.04), hand(0.01)) == pytest.approx(0.0, abs=1e-12)
     there = hand(0.0, (0.012, 0.005, 0.0))
-    assert aim.aside(there, hand(0.03)) == pytest.approx(0.013, abs=1e-12)
+    assert target.deviation(there, hand(0.03)) == pytest.approx(0.013, abs=1e-12)

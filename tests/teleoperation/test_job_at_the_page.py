@@ -21,7 +21,7 @@ class Job:
     """A collaboration beside its page, in a thread of its own, which waits for a browser."""
 
     def __init__(self, aiming, placing):
-        self.pages, self.station, self.done = [], None, None
+        self.pages, self.cell, self.done = [], None, None
         self.begin = threading.Event()
         self._thread = threading.Thread(target=self._run, args=(aiming, placing))
 
@@ -34,12 +34,12 @@ class Job:
             forces=(),
             config=PickAndPlaceConfig(interaction=15.0),
             seed=3,
-            page=PageConfig(port=8600, patience=PATIENCE),
+            page=PageConfig(port=8600, timeout=PATIENCE),
             view=self._watch,
         )
 
-    def _watch(self, station, world, motion):
-        self.station = station
+    def _watch(self, cell, world, motion):
+        self.cell = cell
         self.begin.wait()
         return nullcontext()
 
@@ -48,11 +48,11 @@ class Job:
         return page
 
     def phase(self) -> str:
-        events = self.station.log.events
+        events = self.cell.log.events
         return events[-1].text if events else ""
 
     def link(self, index: int) -> np.ndarray:
-        return link_poses(self.station.log.snapshot()).position[-1, index].numpy()
+        return link_poses(self.cell.log.snapshot()).position[-1, index].numpy()
 
     def __enter__(self):
         self._thread.start()
@@ -71,18 +71,18 @@ def test_the_elbow_yields_to_the_mouse_while_the_hand_aims(tmp_path, monkeypatch
     )
     # The browser, which takes most of the machine, is closed before the job goes on.
     with job, chromium(tmp_path / "chromium") as tab:
-        wait_until(lambda: job.station, "a page", timeout=180)
-        browser = Browser(tab, job.pages[0], leads=False)
+        wait_until(lambda: job.cell, "a page", timeout=180)
+        browser = Browser(tab, job.pages[0], guides=False)
         job.begin.set()
         wait_until(lambda: job.phase() == "interact", "time for the person", timeout=300)
-        tab.get_by_text("the hand goes on aiming").wait_for()
+        tab.get_by_text("the end effector keeps servoing").wait_for()
         assert not tab.get_by_role("button", name="Start", exact=True).count()
         elbow = job.link(ELBOW)
         with browser.dragging(elbow, by=(70, -10)):
             wait_until(lambda: np.linalg.norm(job.link(ELBOW) - elbow) > 0.05, "motion")
             tab.screenshot(path=tmp_path / "pulled.png")
     result = job.done
-    log = result.station.log
+    log = result.cell.log
     assert result.failure == ""
     time = log["time"]
     start, end = span(log, "interact")
@@ -90,7 +90,7 @@ def test_the_elbow_yields_to_the_mouse_while_the_hand_aims(tmp_path, monkeypatch
     assert effort[(time >= start) & (time < end)].max() > 1.0
     assert not effort[time < start].any()
     deviation = Deviation.of(log)
-    assert deviation.elbow_most_moved > 0.05
+    assert deviation.largest_elbow > 0.05
     assert deviation.most_moved < 1e-3
     # To the right of the screen is +y.
     moved = link_poses(log).position.numpy()[:, ELBOW] - elbow
