@@ -194,7 +194,7 @@ def test_a_hidden_marker_is_waited_for_and_the_wait_noted(job):
     feature = job.cell.log["feature"][:, 0]
     assert np.isnan(feature[job.cell.log["time"] < 3.0]).all()
     assert verdict(job) == ""
-    assert evaluated(job).values["recovered_from_marker_out_of_sight"] == 1
+    assert evaluated(job).values["recovered_from_marker_occluded"] == 1
 
 
 @shapes_unchecked()

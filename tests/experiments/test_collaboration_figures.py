@@ -63,7 +63,7 @@ def test_the_marker_is_shaded_where_it_is_wanted_and_not_seen(run):
 def test_the_timeline_has_a_row_for_each_phase_and_for_people(run):
     axes = timeline_figure(run, OBJECTS).axes[0]
     labels = [label.get_text() for label in axes.get_yticklabels()]
-    assert labels == [*PHASES, "person pushes", "marker out of sight"]
+    assert labels == [*PHASES, "person pushes", "marker occluded"]
 
 
 def test_angles_count_from_the_hand_pointing_down(run):

@@ -71,7 +71,7 @@ class CollaborationExperiment:
             forces=NULL_SPACE_FORCES if self.person else (),
             disturbances=self.disturbances,
             config=self.config,
-            station_config=replace(self.cell, keep_image_every=keep_every),
+            cell_config=replace(self.cell, keep_image_every=keep_every),
             seed=seed,
             page=self.page,
             view=observer.view,

@@ -94,7 +94,7 @@ def marker_figure(run: RunRecording, objects: Spans) -> Figure:
         error.set_yscale("log")
         error.margins(x=0)
         error.set(
-            xlabel="time [s] (shaded: marker out of sight)",
+            xlabel="time [s] (shaded: marker occluded)",
             ylabel="distance [px]",
             title="Distance to the target",
         )
@@ -146,7 +146,7 @@ def timeline_figure(run: RunRecording, objects: Spans) -> Figure:
             colour = palette.GREY if owner is None else colours[owner]
             bar = (event.time, max(end - event.time, 0.15))
             axes.broken_barh([bar], (names.index(event.text) - 0.38, 0.76), color=colour)
-        rows = {"person pushes": _acting(run), "marker out of sight": _out_of_sight(run)}
+        rows = {"person pushes": _acting(run), "marker occluded": _out_of_sight(run)}
         for k, (active, colour) in enumerate(
             zip(rows.values(), (palette.PURPLE, _HIDDEN), strict=True), start=len(names)
         ):

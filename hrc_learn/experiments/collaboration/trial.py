@@ -95,7 +95,7 @@ def simulate_collaboration(
     forces: Sequence[ScriptedForce] = NULL_SPACE_FORCES,
     disturbances: Disturbances | None = None,
     config: PickAndPlaceConfig | None = None,
-    station_config: WorkCellConfig | None = None,
+    cell_config: WorkCellConfig | None = None,
     seed: int = 0,
     page: PageConfig | None = None,
     view: LiveView = no_live_view,
@@ -114,7 +114,7 @@ def simulate_collaboration(
         forces: Of the person on the elbow, in time since the robot waits for them.
         disturbances: What happens to camera and images during the job.
         config: How the job is done.
-        station_config: How the loop runs; images may be late or lost.
+        cell_config: How the loop runs; images may be late or lost.
         seed: Of the objects' poses and of image noise.
         page: Serve a page from which people push the elbow too, and let the world go on in
             real time; None: no page.
@@ -130,7 +130,7 @@ def simulate_collaboration(
     workplace = (workplace or Workplace()).approached(aiming.approach)
     rng = np.random.default_rng(seed)
     disturbances = disturbances or Disturbances()
-    station_config = station_config or WorkCellConfig()
+    cell_config = cell_config or WorkCellConfig()
     items = workplace.scene.objects
     _check_shelves(workplace, shelves)
     world = World(workplace.scene)
@@ -163,7 +163,7 @@ def simulate_collaboration(
     with torch.inference_mode(), ExitStack() as stack:
         human, passing, beside = person, advance, None
         if page is not None:
-            opened = task_page(world, station_config.dt, page, on_page)
+            opened = task_page(world, cell_config.dt, page, on_page)
             beside = stack.enter_context(opened)
             human, passing = beside.joined(person, advance)
         cell = WorkCell(
@@ -173,7 +173,7 @@ def simulate_collaboration(
             sensor=MarkerSensor(eyes, workplace.scene.marker_ids),
             human=human,
             advance=passing,
-            config=station_config,
+            config=cell_config,
             on_phase=enter,
             rng=rng,
         )

@@ -46,7 +46,7 @@ class Descent:
         descents = [event.time for event in log.events if event.text == "grasp"]
         if not descents:
             return cls()
-        servoing, time = span(log, "aim"), log["time"]
+        servoing, time = span(log, "servo"), log["time"]
         last = int(np.searchsorted(time, descents[-1])) - 1
         tool = panda.forward(torch.from_numpy(log["joint_position"][last]))
         above = Pose(tool.position, run.scene.workplace.hover().orientation)
