@@ -11,10 +11,12 @@ from jaxtyping import Shaped, UInt8
 
 # What stands where in a LeRobot dataset of version 3.0.
 #
-# data/chunk-000/file-000.parquet frames, one row group an episode meta/info.json features,
-# frame rate, counts meta/stats.json statistics of every feature meta/tasks.parquet task texts
-# by index meta/episodes/chunk-000/file-000.parquet where each episode lies, its statistics
-# meta/hrc_learn.json units, frames, meaning of columns (our own)
+# data/chunk-000/file-000.parquet            frames, one row group an episode
+# meta/info.json                             features, frame rate, counts
+# meta/stats.json                            statistics of every feature
+# meta/tasks.parquet                         task texts by index
+# meta/episodes/chunk-000/file-000.parquet   where each episode lies, its statistics
+# meta/hrc_learn.json                        units, frames, meaning of columns (our own)
 
 VERSION = "v3.0"
 INDEX_FEATURES = {
