@@ -32,7 +32,7 @@ def collaboration_sections(run: CollaborationRun, recording: RunRecording) -> li
         Section(
             heading="The job",
             text=(
-                "A state machine: look, aim, wait for the person, grasp, carry home, transfer, "
+                "A state machine: detect, servo, wait for the person, grasp, carry home, transfer, "
                 f"release, retreat. {' '.join(notes) or 'No recovery was needed.'}"
             ),
             figures=(
