@@ -69,8 +69,8 @@ class GraspingExperiment:
         """One grasp; for comparison it knows the target, goes straight there and tries once."""
         config = self.config
         if compared:
-            aiming = replace(config.servo, probe=0.0, timeout=_COMPARED_TIMEOUT)
-            config = replace(config, aiming=aiming, attempts=1)
+            servo = replace(config.servo, probe=0.0, timeout=_COMPARED_TIMEOUT)
+            config = replace(config, servo=servo, attempts=1)
         skill, rng = VisualServoSkill.load(self.aiming), np.random.default_rng(seed)
         return simulate_grasp(
             skill,
