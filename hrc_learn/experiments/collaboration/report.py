@@ -32,8 +32,8 @@ def collaboration_sections(run: CollaborationRun, recording: RunRecording) -> li
         Section(
             heading="The job",
             text=(
-                "A state machine: detect, servo, wait for the person, grasp, carry home, transfer, "
-                f"release, retreat. {' '.join(notes) or 'No recovery was needed.'}"
+                "A state machine: detect, servo, wait for the person, grasp, carry home, "
+                f"transfer, release, retreat. {' '.join(notes) or 'No recovery was needed.'}"
             ),
             figures=(
                 Picture("timeline", timeline_figure(recording, objects), "Phases over time."),
