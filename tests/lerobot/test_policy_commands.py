@@ -127,7 +127,7 @@ def test_a_closed_form_policy_is_a_checkpoint(numbers, tmp_path):
     tuned = tmp_path / "tuned"
     start = f"--policy.path={folder}"
     train(ALSO_OF_A_PATH, start, *common(numbers, tuned), "--batch_size=4", "--steps=1")
-    refused = subprocess.run([*fit, "--kinds", "joint"], capture_output=True, text=True)
+    refused = subprocess.run([*fit, "--channels", "joint"], capture_output=True, text=True)
     assert refused.returncode == 2
     assert "takes --n-basis and --episodes alone" in refused.stderr
 

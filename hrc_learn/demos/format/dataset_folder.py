@@ -272,7 +272,7 @@ def count_faults(folder: DatasetFolder) -> Iterator[DatasetError]:
         if info.get(name, counted) != counted:
             yield DatasetError(
                 f"says {info[name]}, but the list of episodes counts {counted}: episodes were "
-                f"lost, or the file belongs to another copy; repair_dataset.py counts anew",
+                f"lost, or the file belongs to another copy; hrc repair counts anew",
                 file=INFO_PATH,
                 key=name,
             )

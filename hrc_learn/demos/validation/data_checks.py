@@ -31,7 +31,7 @@ def check_finite(
             name = component_name(features.get(key), component)
             report.error(
                 f"{name} is {values[frame, component]} ({len(bad)} values are not finite); "
-                f"repair_dataset.py --drop-bad-frames (or --drop-bad-episodes) makes a copy "
+                f"hrc repair --drop-bad-frames (or --drop-bad-episodes) makes a copy "
                 f"without",
                 file=entry.file,
                 episode=entry.index,
@@ -56,7 +56,7 @@ def check_repeats(entry: EpisodeEntry, frames: RawFrames, report: ValidationRepo
     elif same.mean() > _REPEATED:
         report.warning(
             f"{100 * same.mean():.0f} % of the frames repeat the one before; the recording is "
-            f"faster than the robot reports, or the robot stood still; repair_dataset.py drops "
+            f"faster than the robot reports, or the robot stood still; hrc repair drops "
             f"them",
             file=entry.file,
             episode=entry.index,
@@ -154,7 +154,7 @@ def check_jumps(
     step = change[frame, joint]
     wrapped = abs(abs(step) - 2 * np.pi) < 0.3
     cause = (
-        "the encoder wrapped: repair_dataset.py unwraps it"
+        "the encoder wrapped: hrc repair unwraps it"
         if wrapped
         else "a glitch, or frames were lost: look at it, or leave the episode out"
     )
@@ -189,7 +189,7 @@ def check_stillness(
     ):
         if seconds > _STILL_SECONDS:
             report.warning(
-                f"{place} with {seconds:.1f} s of standing still: repair_dataset.py trims it",
+                f"{place} with {seconds:.1f} s of standing still: hrc repair trims it",
                 file=entry.file,
                 episode=entry.index,
                 frame=frame,
@@ -260,7 +260,7 @@ def check_timestamps(
         k = int(stalled[0])
         report.error(
             f"stamps must increase, but go from {time[k]:.6f} s to {time[k + 1]:.6f} s "
-            f"({len(stalled)} times); repair_dataset.py drops the repeated "
+            f"({len(stalled)} times); hrc repair drops the repeated "
             f"frames",
             frame=k + 1,
             **place,
@@ -270,7 +270,7 @@ def check_timestamps(
     if abs(usual * fps - 1) > _RATE_TOLERANCE:
         report.warning(
             f"frames are {1e3 * usual:.4g} ms apart ({1 / usual:.4g} Hz), but fps says "
-            f"{fps:g}; repair_dataset.py --fps {round(1 / usual)} resamples to the true rate",
+            f"{fps:g}; hrc repair --fps {round(1 / usual)} resamples to the true rate",
             **place,
         )
     gaps = np.flatnonzero(steps > _GAP * usual)
@@ -278,7 +278,7 @@ def check_timestamps(
         lost = int(np.rint(steps[gaps] / usual - 1).sum())
         report.warning(
             f"{len(gaps)} gaps, about {lost} frames lost; the first is "
-            f"{1e3 * steps[gaps[0]]:.4g} ms long; repair_dataset.py --fps {fps:g} fills them "
+            f"{1e3 * steps[gaps[0]]:.4g} ms long; hrc repair --fps {fps:g} fills them "
             f"in",
             frame=int(gaps[0]) + 1,
             **place,
@@ -286,7 +286,7 @@ def check_timestamps(
     jitter = float(np.quantile(np.abs(np.delete(steps, gaps) - usual), 0.95)) / usual
     if jitter > _JITTER_TOLERANCE:
         report.warning(
-            f"steps vary by {100 * jitter:.0f} % (95th percentile); repair_dataset.py "
+            f"steps vary by {100 * jitter:.0f} % (95th percentile); hrc repair "
             f"--fps {fps:g} resamples",
             **place,
         )

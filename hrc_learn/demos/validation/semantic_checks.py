@@ -127,7 +127,7 @@ def _check_orientation(
         if len(flips):
             report.warning(
                 f"the quaternion changes its sign {len(flips)} times without turning; "
-                f"load_demos makes it continuous, repair_dataset.py does so on disk",
+                f"load_demos makes it continuous, hrc repair does so on disk",
                 file=entry.file,
                 episode=entry.index,
                 frame=int(flips[0]) + 1,

@@ -156,9 +156,7 @@ def _report_missing(file: str, key: str, report: ValidationReport) -> None:
     if key in INDEX_KEYS:
         # All files come from one recorder: the first one tells it for all.
         if not any(finding.key == key for finding in report.warnings):
-            message = (
-                "the column is missing: LeRobot cannot open this, repair_dataset.py adds it"
-            )
+            message = "the column is missing: LeRobot cannot open this, hrc repair adds it"
             report.warning(message, file=file, key=key)
     else:
         report.error(
