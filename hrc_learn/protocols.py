@@ -23,6 +23,8 @@ class ArmState:
     """Joint velocities [rad/s]."""
     gripper_width: float
     """Opening between the finger pads [m]."""
+    external_torque: Float[np.ndarray, " joints"] | None = None
+    """Estimate of what the surroundings exert on the joints [N m]; None: the arm has none."""
 
 
 @runtime_checkable

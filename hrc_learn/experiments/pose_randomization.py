@@ -37,10 +37,9 @@ THREE_OBJECTS = (
 """Three boxes of sizes that the gripper takes, none so tall that the palm meets it when the
 fingers reach down beside it."""
 
-_APART = (0.115, 0.095)
-"""Distance along x or y at which the open fingers about one object clear the next [m]."""
-_TURN = 0.06
-"""Largest turn of an object, either way; the fingers still close on it squarely [rad]."""
+_APART = 0.118
+"""Distance at which the open fingers about one object clear the next, however both lie [m]:
+0.06 m to the outside of a finger, 0.046 m to the corner of the largest object."""
 _PATH_STEP = 0.05
 """Time between the samples of an approach that are checked for contacts [s]."""
 _APPROACH_SPEED = 0.6
@@ -52,6 +51,9 @@ def random_object_poses(
     middle: tuple[float, float],
     reach: tuple[float, float],
     rng: np.random.Generator,
+    *,
+    yaw: float = np.pi,
+    table_top: float = 0.0,
     attempts: int = 10_000,
 ) -> dict[str, Float[np.ndarray, "4 4"]]:
     """Random poses of objects on the table, clear of each other.
@@ -61,6 +63,8 @@ def random_object_poses(
         middle: Of the region of the table where they lie [m].
         reach: Largest distance from its middle along x and y [m].
         rng: Source of positions and turns.
+        yaw: Largest turn, either way [rad].
+        table_top: Height of the table [m].
         attempts: Arrangements tried.
 
     Raises:
@@ -70,7 +74,7 @@ def random_object_poses(
         positions = np.array(middle) + rng.uniform(-1, 1, (len(items), 2)) * reach
         if _clear(positions):
             return {
-                item.name: _pose_on_table(item, position, rng.uniform(-_TURN, _TURN))
+                item.name: _pose_on_table(item, position, rng.uniform(-yaw, yaw), table_top)
                 for item, position in zip(items, positions, strict=True)
             }
     raise ValueError(
@@ -81,17 +85,17 @@ def random_object_poses(
 
 def _clear(positions: Float[np.ndarray, "objects 2"]) -> bool:
     first, second = np.triu_indices(len(positions), k=1)
-    gaps = np.abs(positions[first] - positions[second])
-    return bool((gaps >= _APART).any(axis=1).all())
+    gaps = np.linalg.norm(positions[first] - positions[second], axis=1)
+    return bool((gaps >= _APART).all())
 
 
 def _pose_on_table(
-    item: ObjectConfig, position: Float[np.ndarray, "2"], turn: float
+    item: ObjectConfig, position: Float[np.ndarray, "2"], turn: float, table_top: float
 ) -> Float[np.ndarray, "4 4"]:
     c, s = np.cos(turn), np.sin(turn)
     pose = np.eye(4)
     pose[:2, :2] = [[c, -s], [s, c]]
-    pose[:3, 3] = (*position, item.half_size[2])
+    pose[:3, 3] = (*position, table_top + item.half_size[2])
     return pose
 
 

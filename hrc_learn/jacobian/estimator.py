@@ -227,7 +227,7 @@ class KeyFrameEstimator(ImageJacobianEstimator):
         """
         twist = key.pose.twist_to(measurement.pose)
         distance = torch.linalg.vector_norm(twist * self.scale, dim=-1)
-        moved = measurement.valid & key.present & (distance >= config.min_step)
+        moved = measurement.valid & key.present & (distance >= config.least_step)
         valid = moved & (distance <= config.max_step)
         # What is not valid may be NaN: zero instead, which leaves every weight as it is.
         use = valid.unsqueeze(-1)

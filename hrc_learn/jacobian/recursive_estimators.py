@@ -12,10 +12,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.geometry.small_matrices import matmul
-from hrc_learn.jacobian.estimator import KeyFrame, KeyFrameEstimator, Measurement, MotionSample
+from hrc_learn.jacobian.estimator import KeyFrame, KeyFrameEstimator, Measurement, MotionSample, evaluate
 from hrc_learn.jacobian.fitting import weight_covariance
 from hrc_learn.jacobian.network import RBFImageJacobian
-from hrc_learn.jacobian.samples import KeyFrameConfig
+from hrc_learn.jacobian.samples import KeyFrameConfig, component_scale
 from hrc_learn.pytree import pytree
 
 
@@ -32,10 +32,27 @@ class RecursiveConfig(KeyFrameConfig):
     weight_bound: float = 2e4
     """Largest entry of the weights [px/m], rotation counted with `rotation_scale`."""
 
-    @property
-    def pair_noise(self) -> float:
-        """Variance of each coordinate of dx [px^2]."""
-        return 2 * self.pixel_noise**2
+    def pair_noise(
+        self, weight: Float[Tensor, "*batch entries K"], theta: Float[Tensor, "*batch K"]
+    ) -> float | Float[Tensor, "*batch 1 1"]:
+        """Variance of each coordinate of dx - J_s_hat dr [px^2].
+
+        Both ends of a pair are measured with noise, in the image and in the pose, which the
+        Jacobian turns into pixels: the effective variance of an errors-in-variables model.
+
+        Args:
+            weight: Of the network [px/m, px/rad].
+            theta: Neurons of the pair.
+        """
+        pixels = 2 * self.pixel_noise**2
+        if self.pose_noise == 0:
+            return pixels
+        rows = evaluate(weight, theta)
+        # A radian of noise counts as so many metres of it.
+        metres = rows / component_scale(rows, self.rotation_scale)
+        # The larger of the image rows, as both share one covariance.
+        square = metres.square().sum(-1).amax(-1)
+        return (pixels + 2 * self.pose_noise**2 * square)[..., None, None]
 
 
 @pytree
@@ -82,7 +99,7 @@ def condition(
     covariance: Float[Tensor, "*batch P P"],
     pair: MotionSample,
     scale: Float[Tensor, "6"],
-    noise: float,
+    noise: float | Float[Tensor, "*batch 1 1"],
 ) -> tuple[Float[Tensor, "*batch entries K"], Float[Tensor, "*batch P P"]]:
     """Mean and covariance given one more pair; unchanged where there is none.
 
@@ -93,7 +110,7 @@ def condition(
         covariance: Covariance before.
         pair: Motion seen.
         scale: Metres that each component of a twist counts for.
-        noise: Variance of each coordinate of dx [px^2].
+        noise: Variance of each coordinate of dx - J_s_hat dr [px^2].
     """
     phi = (pair.dr.unsqueeze(-1) * pair.theta.unsqueeze(-2)).flatten(-2).unsqueeze(-2)
     P_phi = matmul(phi, covariance)  # (*batch, 1, P); P is symmetric
@@ -140,7 +157,7 @@ class RecursiveLeastSquaresEstimator(RecursiveEstimator):
             state.covariance / kept[..., None, None],
             pair,
             self.scale,
-            self.config.pair_noise,
+            self.config.pair_noise(state.weight, pair.theta),
         )
         trace = covariance.diagonal(dim1=-2, dim2=-1).sum(-1)
         shrink = torch.clamp_max(self.largest_trace / trace, 1.0)[..., None, None]
@@ -155,6 +172,9 @@ class KalmanConfig(RecursiveConfig):
 
     drift: float = 100.0
     """Random walk of the Jacobian as a whole [px/m/sqrt(s)]."""
+    watched_drift: float | None = None
+    """The same while images arrive, when a camera that is moved would be noticed; None: as
+    `drift`, which then is that of pauses alone."""
 
 
 class KalmanEstimator(RecursiveEstimator):
@@ -189,6 +209,8 @@ class KalmanEstimator(RecursiveEstimator):
         K = len(network.centers)
         walk = torch.block_diag(*[network.centers.new_ones(K, K)] * 6)
         self.register_buffer("walk", self.config.drift**2 * walk, persistent=False)
+        drift, watched = self.config.drift, self.config.watched_drift
+        self.watched = 1.0 if watched is None else (watched / drift) ** 2
 
     def resumed(self, state: RecursiveState, pause: float) -> RecursiveState:
         """No key frame, and the drift of the pause."""
@@ -201,9 +223,9 @@ class KalmanEstimator(RecursiveEstimator):
         key, pair = self.advance(state.key, measurement, theta, self.config)
         weight, covariance = condition(
             state.weight,
-            state.covariance + measurement.dt * self.walk,
+            state.covariance + measurement.dt * self.watched * self.walk,
             pair,
             self.scale,
-            self.config.pair_noise,
+            self.config.pair_noise(state.weight, pair.theta),
         )
         return RecursiveState(weight=self.projected(weight), covariance=covariance, key=key)

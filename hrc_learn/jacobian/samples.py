@@ -26,11 +26,22 @@ class KeyFrameConfig:
     """Which frames of a demonstration, or of a run, are compared."""
 
     min_step: float = 2e-4
-    """Least motion between key frames [m], rotation counted with `rotation_scale`."""
+    """Least motion between key frames [m], rotation counted with `rotation_scale`; more where
+    `pose_noise` asks for more."""
+    pose_noise: float = 0.0
+    """Standard deviation of each component of a measured pose [m], rotation counted with
+    `rotation_scale`. Pairs of frames nearer than ten times that are motion of the noise: they
+    would shrink the Jacobian towards zero (regression dilution)."""
     max_step: float = 0.05
     """Pairs further apart [m] span a gap in visibility and are left out."""
     rotation_scale: float = 0.15
     """Metres that a radian counts for [m/rad]: a typical lever arm."""
+
+    @property
+    def least_step(self) -> float:
+        """Least motion between key frames, noise considered [m]."""
+        # The estimate shrinks by the ratio of both variances: 2 in 100 where they are ten apart.
+        return max(self.min_step, 10.0 * self.pose_noise)
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,7 +195,7 @@ def key_frames(pose: Pose, visible: Bool[Tensor, " time"], config: KeyFrameConfi
     place = torch.cat([pose.position, turn], dim=-1).detach().cpu().numpy()
     keys: list[int] = []
     for frame in visible.nonzero().flatten().tolist():
-        if not keys or np.linalg.norm(place[frame] - place[keys[-1]]) >= config.min_step:
+        if not keys or np.linalg.norm(place[frame] - place[keys[-1]]) >= config.least_step:
             keys.append(frame)
     return torch.tensor(keys, dtype=torch.long, device=visible.device)
 

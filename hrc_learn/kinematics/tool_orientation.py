@@ -58,9 +58,29 @@ def coarse_orientation(
     return quaternion.multiply(turn, gripper_down().to(position))
 
 
+def turn_about_vertical(
+    orientation: Float[Tensor, "4"], reference: Float[Tensor, "4"]
+) -> float:
+    """Turn about the base's z axis that brings one orientation nearest to another [rad].
+
+    Args:
+        orientation: The turned one (wxyz).
+        reference: The one that is not turned.
+
+    Returns:
+        From -pi to pi.
+    """
+    w, _, _, z = quaternion.multiply(orientation, quaternion.conjugate(reference)).tolist()
+    # Of the rotation between both, the part about z (swing-twist decomposition).
+    return math.remainder(2 * math.atan2(z, w), 2 * math.pi)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Approach:
-    """Orientation of the end effector in front of an object, from demonstrated approaches."""
+    """Orientation of the end effector in front of an object, from demonstrated approaches.
+
+    As it would be were the gripper not turned about the vertical: objects lie at any yaw.
+    """
 
     orientation: Float[Tensor, "4"]
     """(wxyz); its z axis is the direction in which it goes on to the object."""
@@ -87,6 +107,7 @@ class Approach:
         """
         if not paths:
             raise ValueError("an approach is learned from one demonstration or more: got none.")
+        paths = [_unturned(path) for path in paths]
         demonstrated = _mean([path.orientation[-1] for path in paths])
         tangents = torch.stack([tangent(path.position) for path in paths])
         mean = tangents.mean(dim=0)
@@ -142,6 +163,15 @@ def tangent(position: Float[Tensor, "time 3"], near: float = NEAR) -> Float[Tens
     before = (way.norm(dim=-1) > near).nonzero()[:, 0]
     chord = way[int(before[-1])] if len(before) else way[0]
     return chord / chord.norm().clamp(min=_SHORTEST)
+
+
+def _unturned(path: Pose) -> Pose:
+    """The path turned about the vertical for the gripper to end closing along x."""
+    turn = turn_about_vertical(path.orientation[-1], gripper_down())
+    back = quaternion.exp(torch.tensor([0.0, 0.0, -turn], dtype=torch.float64))
+    return Pose(
+        quaternion.rotate(back, path.position), quaternion.multiply(back, path.orientation)
+    )
 
 
 def _mean(orientations: Sequence[Tensor]) -> Float[Tensor, "4"]:

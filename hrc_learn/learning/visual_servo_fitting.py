@@ -24,7 +24,8 @@ from hrc_learn.jacobian import (
 from hrc_learn.kinematics import panda
 from hrc_learn.kinematics.tool_orientation import Approach
 from hrc_learn.skills.visual_servoing import VisualServoSkill
-from hrc_learn.skills.visual_target import OBJECT_FEATURE, VisualTarget
+from hrc_learn.skills.marker_angle import AngleDemonstration, MarkerAngle
+from hrc_learn.skills.visual_target import ANGLE_FEATURE, OBJECT_FEATURE, VisualTarget
 
 type Demonstrations = DemonstrationSet | DemonstrationSource
 """In memory, or read one by one."""
@@ -67,6 +68,7 @@ def fit_visual_servo(
         jacobian=network,
         target=_visual_target(ends) if ends else None,
         approach=Approach.fit([end.path for end in ends]) if ends else None,
+        angle=_marker_angle([end.angle for end in ends if end.angle is not None]),
         learned=learned,
         cells=cells,
     )
@@ -131,6 +133,8 @@ class _End(NamedTuple):
     hand_pixel: Float[np.ndarray, "2"]
     jacobian: Float[np.ndarray, "2 6"]
     path: Pose
+    orientation: Tensor
+    angle: AngleDemonstration | None
 
 
 def _ends(demos: Demonstrations, network: RBFImageJacobian) -> list[_End]:
@@ -166,7 +170,28 @@ def _end(demo: Demonstration, source: str, network: RBFImageJacobian) -> _End:
         hand_pixel=image_demonstrations.feature[last].mean(dim=0).numpy(),
         jacobian=jacobian.numpy(),
         path=image_demonstrations.pose,
+        orientation=image_demonstrations.pose.orientation[last[-1]],
+        angle=_angles(demo, image_demonstrations, int(last[-1])),
     )
+
+
+def _angles(
+    demo: Demonstration, watched: ImageDemonstration, last: int
+) -> AngleDemonstration | None:
+    """Directions of the markers along a demonstration; None where they were not recorded."""
+    if ANGLE_FEATURE not in demo.extra:
+        return None
+    tool, item = torch.from_numpy(demo.extra[ANGLE_FEATURE]).double().T
+    return AngleDemonstration(
+        pose=watched.pose,
+        tool=torch.where(watched.visible, tool, torch.nan),
+        item=float(item[last]),
+        final=float(tool[last]),
+    )
+
+
+def _marker_angle(demonstrations: Sequence[AngleDemonstration]) -> MarkerAngle | None:
+    return MarkerAngle.fit(demonstrations) if demonstrations else None
 
 
 def _visual_target(ends: Sequence[_End]) -> VisualTarget:
@@ -174,4 +199,5 @@ def _visual_target(ends: Sequence[_End]) -> VisualTarget:
         np.array([end.object_pixel for end in ends]),
         np.array([end.hand_pixel for end in ends]),
         np.array([end.jacobian for end in ends]),
+        torch.stack([end.orientation for end in ends]),
     )

@@ -24,8 +24,6 @@ def _vector(*values: float) -> Float[Tensor, " n"]:
 
 # Upper arm forward: the branch in which joint 1 keeps clear of its limits on both sides.
 _LEANING_FORWARD = _vector(1.0, 0.3, -1.2, -1.8, 0.3, 1.9, -1.0)
-# Objects lie along the table's axes within this, as a person puts them down [rad].
-_OBJECT_TURN = 0.06
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,6 +45,13 @@ class Workplace:
     """Of the end effector above the table (wxyz)."""
     hover_q7: float = -0.1
     """Joint 7 above the table [rad]."""
+    fingertip: float = 0.012
+    """How far the fingers reach beyond the tool centre point, in the middle of the pads [m]."""
+    palm: float = 0.0374
+    """How far the palm stands back from it [m]."""
+    hover_turns: tuple[float, float] = (np.deg2rad(-75.0), np.deg2rad(105.0))
+    """Least and greatest turn of the end effector about the vertical there [rad]: half a turn,
+    in which the forearm does not come between its marker and the camera."""
     shelf_x: float = 0.40
     """Where along the boards objects are put [m]."""
     shelf_depth: float = 0.10
@@ -113,15 +118,16 @@ class Workplace:
         return _vector(*self.table_centre, highest / 2), half
 
     def random_object_pose(
-        self, reach: tuple[float, float, float], rng: np.random.Generator
+        self, reach: tuple[float, float, float], rng: np.random.Generator, yaw: float = np.pi
     ) -> Float[np.ndarray, "4 4"]:
         """Random pose of the scene's first object around the middle of the table.
 
         Args:
             reach: Largest distances from the middle, along x and y [m]; z is not used.
             rng: Source of position and yaw.
+            yaw: Largest turn, either way [rad].
         """
-        turn = rng.uniform(-_OBJECT_TURN, _OBJECT_TURN)
+        turn = rng.uniform(-yaw, yaw)
         c, s = np.cos(turn), np.sin(turn)
         pose = np.eye(4)
         pose[:2, :2] = [[c, -s], [s, c]]

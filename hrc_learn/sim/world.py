@@ -9,6 +9,7 @@ from jaxtyping import Float
 from hrc_learn.kinematics import panda
 from hrc_learn.protocols import ArmState
 from hrc_learn.sim.contacts import ContactMonitor, Touch
+from hrc_learn.sim.imperfections import CommandChannel, DrawnImperfections, Imperfections
 from hrc_learn.sim.panda_model import FINGER_STROKE
 from hrc_learn.sim.scene import HAND_MARKER, SceneConfig, build_scene
 
@@ -31,11 +32,23 @@ class World:
         self_contacts: Touches of the arm with itself.
     """
 
-    def __init__(self, config: SceneConfig | None = None):
+    def __init__(
+        self, config: SceneConfig | None = None, imperfections: DrawnImperfections | None = None
+    ):
+        """Build it.
+
+        Args:
+            config: What stands in it, as it is believed to.
+            imperfections: How what there is departs from that; None: in nothing.
+        """
         self.config = config or SceneConfig()
-        self.model = build_scene(self.config).compile()
+        self.imperfections = imperfections or Imperfections().draw(np.random.default_rng(0))
+        self.config = self.imperfections.real_scene(self.config)
+        spec = build_scene(self.config)
+        self.imperfections.apply(spec)
+        self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
-        self.arm = MujocoArm(self.model, self.data)
+        self.arm = MujocoArm(self.model, self.data, self.imperfections)
         obstacles = [box.name for box in self.config.obstacles]
         cabinet = [box.name for box in self.config.cabinet.boxes()] + obstacles
         self.cabinet_contacts = ContactMonitor(self.model, _ARM_BODIES, cabinet)
@@ -54,6 +67,12 @@ class World:
     def time(self) -> float:
         """Simulated time [s]."""
         return self.data.time
+
+    @property
+    def table_top(self) -> float:
+        """Height of the table's top [m]."""
+        table = self.config.table
+        return table.centre[2] + table.half_size[2]
 
     def reset(
         self,
@@ -216,7 +235,14 @@ class World:
 class MujocoArm:
     """The simulated Panda as an `Arm` and a `Gripper`."""
 
-    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData):
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        data: mujoco.MjData,
+        imperfections: DrawnImperfections | None = None,
+    ):
+        self._errors = imperfections or Imperfections().draw(np.random.default_rng(0))
+        self._channel = CommandChannel(self._errors, panda.limits.acceleration.numpy())
         self._model = model
         self._data = data
         names = panda.joint_names
@@ -231,22 +257,22 @@ class MujocoArm:
         # Position errors [rad] from which on the servos pull no harder.
         strongest = model.actuator_forcerange[self._position_servos, 1]
         self._reach = strongest / model.actuator_gainprm[self._position_servos, 0]
-        self._velocity = np.zeros(len(names))
 
     def read(self) -> ArmState:
-        """Return the present state, encoders without noise."""
+        """Return the present state, as the arm's own sensors have it."""
         return ArmState(
             time=self._data.time,
-            joint_position=self._data.qpos[self.joints].copy(),
+            joint_position=self._errors.encoders(self._data.qpos[self.joints]),
             joint_velocity=self._data.qvel[self._velocities].copy(),
             gripper_width=float(self._data.qpos[self._fingers].sum()),
+            external_torque=self._errors.torques(self._data.qfrc_constraint[self._velocities]),
         )
 
     def command(self, joint_velocity: Float[np.ndarray, "7"]) -> None:
         """Set the joint velocities to hold from now on [rad/s]."""
         if not np.isfinite(joint_velocity).all():
             raise ValueError(f"joint_velocity must be finite, but is {joint_velocity}.")
-        self._velocity = np.array(joint_velocity, dtype=float)
+        self._channel.send(self._data.time, joint_velocity)
 
     def move(self, width: float) -> None:
         """Open or close the gripper to a width [m]; 0 squeezes what is between the fingers."""
@@ -255,7 +281,7 @@ class MujocoArm:
     def place(self, joint_position: Float[np.ndarray, "7"], gripper_width: float) -> None:
         """Set the joints at once, at rest. For resets, not for control."""
         self._reference = np.array(joint_position, dtype=float)
-        self._velocity = np.zeros_like(self._reference)
+        self._channel.rest()
         self._data.qpos[self.joints] = self._reference
         self._data.qvel[self._velocities] = 0.0
         self._data.qpos[self._fingers] = gripper_width / 2
@@ -269,10 +295,13 @@ class MujocoArm:
         once they come free.
         """
         q = self._data.qpos[self.joints]
-        reference = self._reference + self._velocity * self._model.opt.timestep
-        self._reference = np.clip(reference, q - self._reach, q + self._reach)
+        dt = self._model.opt.timestep
+        velocity = self._channel.advance(self._data.time, dt)
+        self._reference = np.clip(
+            self._reference + velocity * dt, q - self._reach, q + self._reach
+        )
         self._data.ctrl[self._position_servos] = self._reference
-        self._data.ctrl[self._velocity_servos] = self._velocity
+        self._data.ctrl[self._velocity_servos] = velocity
 
     def tcp_pose(self, data: mujoco.MjData | None = None) -> Float[np.ndarray, "4 4"]:
         """True pose of the tool centre point in the base frame."""

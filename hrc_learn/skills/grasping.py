@@ -50,14 +50,17 @@ _PLATE_CLEARANCE = 0.06
 _CHECK_EVERY = 5
 # Largest distance of a joint from home that still counts as at home [rad].
 _AT_HOME = 0.05
+# By how much the table may be higher or lower than believed [m].
+_TABLE_RANGE = 0.05
 # Time for the fingers to close and for the grip to settle [s].
 _CLOSING_TIME = 0.7
 
 type TargetLaw = Callable[
-    [Float[np.ndarray, "2"], Float[np.ndarray, "2 6"]], Float[np.ndarray, "2"]
+    [Float[np.ndarray, "2"], Float[np.ndarray, "2 6"], Float[Tensor, "4"]],
+    Float[np.ndarray, "2"],
 ]
-"""From the object's marker [px] and the image Jacobian to the target of the end effector's
-marker [px]."""
+"""From the object's marker [px], the image Jacobian and the end effector's orientation to the
+target of the end effector's marker [px]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,16 +136,19 @@ class Grasping:
         self._cell = cell
         self._workplace = workplace
         self._target = target or skill.target_of
-        self._offset_line = UP if skill.target is None else skill.target.line()
+        self._lines = (lambda _: UP) if skill.target is None else skill.target.line
         self._config = config = config or GraspingConfig()
         self._check = check
+        self._table: float | None = None
         controller = AdaptiveController(
             cell.chain,
             estimator or from_learned(skill.jacobian),
             Goals.at(workplace.hover().position, workplace.hover().orientation),
             config=config.controller,
         )
-        self.servo = VisualServo(cell, controller, workplace.tool_marker, config.servo)
+        self.servo = VisualServo(
+            cell, controller, workplace.tool_marker, config.servo, skill.angle
+        )
 
     def grasp(
         self,
@@ -188,34 +194,37 @@ class Grasping:
         Raises:
             TaskFailedError: If the object's marker stays undetected.
         """
-        pixel = self._detect(item)
+        detected = self._detect(item)
         away = self._cell.joints - self._workplace.home_joints()
-        if pixel is None and float(away.abs().max()) >= _AT_HOME:
+        if detected is None and float(away.abs().max()) >= _AT_HOME:
             self.go_home()
-            pixel = self._detect(item)
-        if pixel is None:
+            detected = self._detect(item)
+        if detected is None:
             raise TaskFailedError(
                 f"detect: the camera does not see marker {item.marker.id} of {item.name!r}. "
                 "Put it into the camera's view, and the arm out of it."
             )
+        pixel, angle = detected
         return ServoTarget(
             config=self._config.servo,
             above=self._workplace.hover(),
             posture=self._posture() if self._config.approach else None,
             target=partial(self._target, pixel),
-            line=self._offset_line,
+            lines=self._lines,
+            angle=angle,
+            allowed=self._workplace.hover_turns,
         )
 
-    def _detect(self, item: GraspObject) -> Float[np.ndarray, "2"] | None:
-        """Pixel of an object's marker; None if it stays undetected."""
+    def _detect(self, item: GraspObject) -> tuple[Float[np.ndarray, "2"], float] | None:
+        """Pixel and direction of an object's marker; None if it stays undetected."""
         cell = self._cell
         cell.begin_phase("detect")
         deadline = cell.time + self._config.detection_timeout
-        while (pixel := cell.wait_for_detection().pixels.get(item.marker.id)) is None:
+        while item.marker.id not in (seen := cell.wait_for_detection()).pixels:
             if cell.time >= deadline:
                 return None
             cell.hold_pose(cell.config.detect_every * cell.config.dt)
-        return pixel
+        return seen.pixels[item.marker.id], seen.angles[item.marker.id]
 
     def _posture(self) -> Float[Tensor, " joints"]:
         """Joint positions above the table that can be reached, and home from there.
@@ -249,6 +258,8 @@ class Grasping:
         """
         self._cell.begin_phase("grasp")
         self._cell.tracked_markers = ()
+        if self._table is None:
+            self._table = self._touch_table(item)
         self._cell.move_straight(self._grasp_pose(item), speed=DESCENT_SPEED)
         self._cell.gripper.move(CLOSED)
         self._cell.hold_pose(_CLOSING_TIME)
@@ -257,11 +268,30 @@ class Grasping:
                 f"grasp: the fingers closed on nothing. Is {item.name!r} where its marker says?"
             )
 
+    def _touch_table(self, item: GraspObject) -> float:
+        """Height of the table [m], felt with the fingers about an object that stands on it.
+
+        Its believed height where nothing is felt.
+        """
+        # What is met first: the table by the fingers, or a tall object's top by the palm.
+        reach = max(self._workplace.fingertip, 2 * item.half_size[2] - self._workplace.palm)
+        self._cell.move_straight(self._at_height(reach + _TABLE_RANGE), speed=DESCENT_SPEED)
+        if not self._cell.move_until_contact(self._at_height(reach - _TABLE_RANGE)):
+            return 0.0
+        return float(self._cell.pose.position[2]) - reach
+
     def _grasp_pose(self, item: GraspObject) -> Pose:
         """Fingers around the object, from here along the end effector's own direction."""
-        position, orientation = self._cell.pose.position, self._workplace.hover().orientation
+        assert self._table is not None
+        return self._at_height(self._table + item.half_size[2])
+
+    def _at_height(self, height: float) -> Pose:
+        """The end effector at a height [m], from here along its own direction."""
+        position, orientation = self._cell.pose.position, self.servo.orientation
+        if orientation is None:
+            orientation = self._workplace.hover().orientation
         direction = quaternion.to_matrix(orientation)[:, 2]
-        way = (item.half_size[2] - position[2]) / direction[2]
+        way = (height - position[2]) / direction[2]
         return Pose(position + way * direction, orientation)
 
     def lift(self) -> None:

@@ -12,7 +12,7 @@ from torch import Tensor
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import panda
 from hrc_learn.protocols import Camera
-from hrc_learn.vision import MarkerDetector, centre
+from hrc_learn.vision import MarkerDetector, angle, centre
 from hrc_learn.viz import StepLog
 
 
@@ -40,8 +40,11 @@ class MarkerSensor:
             ids: Markers that matter now; None: all. Searching for one that is out of sight
                 takes ten times as long as tracking one that is seen.
         """
-        found = self._detector.detect(self.read(), ids)
-        return {id: centre(corners) for id, corners in found.items()}
+        return {id: centre(corners) for id, corners in self.corners(ids).items()}
+
+    def corners(self, ids: Iterable[int] | None = None) -> dict[int, Float[np.ndarray, "4 2"]]:
+        """The same with the pixels of each marker's corners, top left first and clockwise."""
+        return self._detector.detect(self.read(), ids)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,6 +57,8 @@ class MarkerObservation:
     """Joint positions at that time [rad]."""
     pixels: Mapping[int, Float[np.ndarray, "2"]] = field(default_factory=dict)
     """Centre of each marker in it, by number (u, v) [px]."""
+    angles: Mapping[int, float] = field(default_factory=dict)
+    """Direction of each marker in it, by number [rad]."""
 
 
 @dataclass(frozen=True, kw_only=True)

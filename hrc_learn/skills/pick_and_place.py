@@ -18,7 +18,7 @@ counted:
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Literal
 
@@ -141,6 +141,8 @@ INTERACT, TRANSFER, RELEASE = Phase.INTERACT, Phase.TRANSFER, Phase.RELEASE
 # Delays and occlusions up to this are no recovery [s]: a few lost images, or a blink.
 _NEGLIGIBLE = 0.3
 # Time for the fingers to open and for the released object to come to rest [s].
+# How far below its goal an object is let down until it meets the board [m].
+_LOWERING = 0.02
 _RELEASE_TIME = 0.8
 
 
@@ -289,6 +291,7 @@ class PickAndPlace:
         job.time_for_person = 0.0
         # The person's push may leave twice the tolerance; beyond that the target is lost.
         on_target = servo.error(job.target) < 2 * self._config.grasping.servo.tolerance
+        job.target = replace(job.target, posture=None)
         return Phase.GRASP if on_target else Phase.SERVO
 
     def _grasp(self, job: PickPlaceJob) -> Phase:
@@ -363,6 +366,9 @@ class PickAndPlace:
 
     def _release(self, job: PickPlaceJob) -> Phase:
         self._cell.begin_phase(Phase.RELEASE)
+        below = Pose(job.goal.position.clone(), job.goal.orientation)
+        below.position[2] -= _LOWERING
+        self._cell.move_until_contact(below)
         job.release = self._cell.pose
         self._cell.gripper.move(OPEN)
         self._cell.hold_pose(_RELEASE_TIME)

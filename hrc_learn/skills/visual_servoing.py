@@ -23,17 +23,24 @@ from hrc_learn.controller import (
     Observation,
 )
 from hrc_learn.controller.interface import IMAGE_SIZE
-from hrc_learn.geometry import Pose
+from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import (
     CellErrors,
     EvidenceResult,
+    KalmanConfig,
     KalmanEstimator,
     RBFImageJacobian,
     paper_grid,
 )
 from hrc_learn.kinematics.tool_orientation import Approach
+from hrc_learn.skills.marker_angle import AngleServo, MarkerAngle
 from hrc_learn.skills.visual_target import OBJECT_FEATURE, VisualTarget
 from hrc_learn.skills.work_cell import MissedGraspError, WorkCell
+
+
+POSE_NOISE = 2e-4
+"""Standard deviation of a pose by encoders with noise of 1e-4 rad, on levers of up to 0.8 m, as
+the estimator of the image Jacobian has to expect it [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,6 +53,8 @@ class VisualServoConfig:
     """How long it has to stay there [s]."""
     height_tolerance: float = 0.01
     """How far above or below the middle of the box the end effector may then be [m]."""
+    turn_tolerance: float = 0.03
+    """Angle between the end effector's orientation and its goal then [rad]."""
     timeout: float = 40.0
     """After which servoing is given up [s]."""
     occlusion_timeout: float = 10.0
@@ -125,10 +134,20 @@ class ServoTarget:
     posture: Float[Tensor, " joints"] | None
     """Joint positions there, approached in joint space [rad]; None: approached by the
     Cartesian regions."""
-    target: Callable[[Float[np.ndarray, "2 6"]], Float[np.ndarray, "2"]]
-    """Where the end effector's marker should be [px], given the image Jacobian there."""
-    line: Float[np.ndarray, "3"]
-    """Direction from the object's marker to the end effector's, base frame; it leads up."""
+    target: Callable[
+        [Float[np.ndarray, "2 6"], Float[Tensor, "4"]], Float[np.ndarray, "2"]
+    ]
+    """Where the end effector's marker should be [px], given the image Jacobian there and the
+    end effector's orientation."""
+    lines: Callable[[Float[Tensor, "4"]], Float[np.ndarray, "3"]]
+    """From the end effector's orientation to the direction from the object's marker to the end
+    effector's, base frame; it leads up."""
+    angle: float | None = None
+    """Direction of the object's marker in the image [rad]; None: the gripper does not turn."""
+    allowed: tuple[float, float] = (0.0, 0.0)
+    """Least and greatest turn of the gripper about the vertical [rad]."""
+    orientation: Float[Tensor, "4"] | None = None
+    """Of the end effector, turned for the object; None: that of `above`."""
     raised: float = 0.0
     """Height above the box to servo at for now, further along the line [m]."""
 
@@ -137,7 +156,7 @@ class ServoTarget:
     ) -> Goals:
         """Goals by an estimate of the image Jacobian, at a pose of the end effector."""
         offset = torch.from_numpy(self._offset(self.raised))
-        above = Pose(self.above.position + offset, self.above.orientation)
+        above = Pose(self.above.position + offset, self.upright)
         goals = self.config.goals(above, self.pixel(image_jacobian, pose), detected=detected)
         return goals.approached_by(self.posture)
 
@@ -147,7 +166,7 @@ class ServoTarget:
         """Where the marker should be for the end effector to be on the line at its height."""
         height = float(pose.position[2] - self.above.position[2])
         offset = self._offset(min(max(height, 0.0), self.config.probe))
-        pixel = self.target(image_jacobian) + image_jacobian[:, :3] @ offset
+        pixel = self.target(image_jacobian, self.upright) + image_jacobian[:, :3] @ offset
         return self.config.within(pixel) if self.raised else pixel
 
     def deviation(self, pose: Pose, before: Pose) -> float:
@@ -155,9 +174,15 @@ class ServoTarget:
         moved = (pose.position - before.position).numpy()
         return float(np.linalg.norm((moved - self._offset(moved[2]))[:2]))
 
+    @property
+    def upright(self) -> Float[Tensor, "4"]:
+        """Orientation of the end effector."""
+        return self.above.orientation if self.orientation is None else self.orientation
+
     def _offset(self, height: float) -> Float[np.ndarray, "3"]:
         """Way along the line to a height above its beginning [m]."""
-        return height / self.line[2] * self.line
+        line = self.lines(self.upright)
+        return height / line[2] * line
 
 
 class VisualServo:
@@ -173,6 +198,7 @@ class VisualServo:
         controller: AdaptiveController,
         marker: int,
         config: VisualServoConfig | None = None,
+        angle: MarkerAngle | None = None,
     ):
         """Prepare.
 
@@ -181,6 +207,7 @@ class VisualServo:
             controller: The adaptive controller.
             marker: ArUco number of the end effector's marker.
             config: When the target counts as reached.
+            angle: How the marker turns in the image; None: the gripper is not turned.
         """
         self._cell = cell
         self._controller = controller
@@ -189,6 +216,9 @@ class VisualServo:
         self._last_image = self._last_detection = -np.inf
         self._cached = (np.nan, np.zeros((2, 6)))  # time of an image, and the Jacobian at it
         self._detected = False
+        self._angle = None if angle is None else AngleServo(angle)
+        self._turned: Tensor | None = None
+        self._arrived = False
         self.state: ControllerState = controller.initial_state(cell.joints)
 
     def servo_to(self, target: ServoTarget) -> float:
@@ -201,7 +231,7 @@ class VisualServo:
             MissedGraspError: If it takes too long, or the marker stays undetected.
         """
         start, config = self._cell.time, self._config
-        self._detected = False
+        self._detected = self._arrived = False
         self._resume()
         reached, above = start, self._cell.pose
         for _ in range(config.max_probes if config.probe > 0 else 1):
@@ -224,6 +254,9 @@ class VisualServo:
             estimator = self._controller.estimator
             resumed = estimator.resumed(self.state.estimator, pause)
             self.state = replace(self.state, estimator=resumed)
+        if self._angle is not None:
+            self._angle.restart()
+        self._turned = None
 
     def _converge(self, target: ServoTarget, tolerance: float, start: float) -> float:
         """Step until marker and height have stayed at the target; when they got there [s]."""
@@ -232,7 +265,8 @@ class VisualServo:
             self.step(target)
             height = float(self._cell.pose.position[2] - target.above.position[2])
             at_height = abs(height - target.raised) < self._config.height_tolerance
-            if not (self.error(target) < tolerance and at_height):
+            turned = self.turn_error(target) < self._config.turn_tolerance
+            if not (self.error(target) < tolerance and at_height and turned):
                 reached = self._cell.time
             self._check_timeouts(target, self._cell.time - start)
         return reached
@@ -245,13 +279,20 @@ class VisualServo:
             self.step(replace(target, raised=float(height)))
 
     def hold(self, target: ServoTarget, duration: float) -> None:
-        """Keep servoing for a while [s], whatever the person does to the null space."""
+        """Keep the end effector where it is in the image for a while [s], whatever the person
+        does to the null space."""
         end = self._cell.time + duration
+        # What is learned meanwhile of the image Jacobian must not move the target.
+        pixel = replace(target, orientation=self._turned).pixel(
+            self._image_jacobian(), self._cell.pose
+        )
+        held = replace(target, target=lambda jacobian, orientation: pixel)
         while self._cell.time < end:
-            self.step(target)
+            self.step(held)
 
     def error(self, target: ServoTarget) -> float:
         """Distance of the feature from its target [px]; NaN if it is not detected."""
+        target = replace(target, orientation=self._turned)
         pixel = target.pixel(self._image_jacobian(), self._cell.pose)
         return float(np.linalg.norm(self._feature() - pixel))
 
@@ -261,6 +302,13 @@ class VisualServo:
         feature = torch.from_numpy(self._feature())
         visible = torch.tensor(bool(torch.isfinite(feature).all()))
         new = torch.tensor(observation.time > self._last_image)
+        if new:
+            self._turn(target)
+        target = replace(target, orientation=self._turned)
+        if self._arrived:
+            # A person's pull or a turn for the object takes the joints far from the posture:
+            # that must not call the arm back, not even while the marker is out of sight.
+            target = replace(target, posture=None)
         self._last_image = observation.time
         if visible:
             self._last_detection, self._detected = observation.time, True
@@ -280,9 +328,34 @@ class VisualServo:
                 dt=self._cell.config.dt,
             ),
         )
+        self._arrived = self._arrived or float(self.state.task_level) == 1.0
         approach = 0.0 if target.posture is None else 1.0 - float(self.state.task_level)
         pixel = goals.vision.target.numpy()
         self._cell.execute(command, pixel, feature.numpy(), approach)
+
+    def _turn(self, target: ServoTarget) -> None:
+        """Find from a new image how the gripper has to be turned for the object."""
+        observation = self._cell.observation
+        angle = observation.angles.get(self._marker)
+        if self._angle is None or target.angle is None or angle is None:
+            return
+        joints = self._cell.joints if observation.joints is None else observation.joints
+        pose = self._cell.chain.forward(joints)
+        elapsed = observation.time - self._last_image
+        self._angle.update(pose, angle, elapsed if math.isfinite(elapsed) else 0.0)
+        self._turned = self._angle.turned(
+            pose, angle, target.angle, target.above.orientation, target.allowed
+        )
+
+    def turn_error(self, target: ServoTarget) -> float:
+        """Angle between the end effector's orientation and the one it should have [rad]."""
+        goal = target.above.orientation if self._turned is None else self._turned
+        return float(quaternion.angle(self._cell.pose.orientation, goal))
+
+    @property
+    def orientation(self) -> Float[Tensor, "4"] | None:
+        """Of the end effector above the object, as far as images have told; else None."""
+        return self._turned
 
     def _image_jacobian(self) -> Float[np.ndarray, "2 6"]:
         """Estimate at the pose of the newest image [px/m, px/rad], computed once an image."""
@@ -320,6 +393,8 @@ class VisualServoSkill:
     """None where no object was observed."""
     approach: Approach | None = None
     """None where no object was observed."""
+    angle: MarkerAngle | None = None
+    """None where no directions of markers were recorded: the gripper is not turned."""
     learned: EvidenceResult | None = None
     """How RBF centres, noise and prior were learned; None where they were given."""
     cells: CellErrors | None = None
@@ -332,6 +407,8 @@ class VisualServoSkill:
             self.target.save(folder / "visual_target.json")
         if self.approach is not None:
             self.approach.save(folder / "approach.json")
+        if self.angle is not None:
+            self.angle.save(folder)
 
     @classmethod
     def load(cls, folder: Path) -> "VisualServoSkill":
@@ -346,10 +423,14 @@ class VisualServoSkill:
             jacobian=RBFImageJacobian.load(folder / "jacobian"),
             target=VisualTarget.load(target) if target.exists() else None,
             approach=Approach.load(approach) if approach.exists() else None,
+            angle=MarkerAngle.load(folder) if (folder / "angle").exists() else None,
         )
 
     def target_of(
-        self, pixel: Float[np.ndarray, "2"], jacobian: Float[np.ndarray, "2 6"]
+        self,
+        pixel: Float[np.ndarray, "2"],
+        jacobian: Float[np.ndarray, "2 6"],
+        orientation: Float[Tensor, "4"],
     ) -> Float[np.ndarray, "2"]:
         """Where the marker should be for the end effector to be above an object at a pixel.
 
@@ -357,6 +438,7 @@ class VisualServoSkill:
             pixel: Of the object's marker [px].
             jacobian: Estimate of the image Jacobian of the end effector's marker
                 [px/m, px/rad].
+            orientation: Of the end effector there.
 
         Raises:
             ValueError: If no object was observed in the demonstrations.
@@ -365,7 +447,7 @@ class VisualServoSkill:
             raise ValueError(
                 f"the skill knows no visual target: its demonstrations lack {OBJECT_FEATURE}."
             )
-        return self.target.from_view(pixel, jacobian)
+        return self.target(pixel, jacobian, orientation)
 
     def metrics(self) -> dict[str, float]:
         """How well image motion and visual targets are predicted.
@@ -397,7 +479,8 @@ class VisualServoSkill:
             }
         if self.target is not None:
             values["target_error_px"] = self.target.error
-            values["target_error_by_offset_px"] = self.target.offset_error
+        if self.angle is not None:
+            values["angle_spread_deg"] = math.degrees(self.angle.spread)
         if self.approach is not None:
             values["approach_spread_deg"] = math.degrees(self.approach.spread)
             values["approach_turned_deg"] = math.degrees(self.approach.turned)
@@ -412,7 +495,7 @@ def from_learned(learned: RBFImageJacobian) -> KalmanEstimator:
     """
     network = copy.deepcopy(learned).double()
     network.covariance = None
-    return KalmanEstimator(network)
+    return KalmanEstimator(network, KalmanConfig(pose_noise=POSE_NOISE, watched_drift=10.0))
 
 
 def guessed_network() -> RBFImageJacobian:

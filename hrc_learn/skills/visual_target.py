@@ -4,9 +4,8 @@ The markers of end effector and object are at different heights and places, so t
 the object's pixel. With an uncalibrated camera the offset has to be learned: each demonstration
 ends with the end effector right above an object, and gives one pair of pixels.
 
-For a camera at its place in the demonstrations, a map from pixel to pixel is enough. One that
-has been moved since sees the same offset in space from another side: the image Jacobian, which
-adapts, projects it into the image.
+The offset is one in space, fixed to the tool that turns with the object. The image Jacobian,
+which adapts to a camera that has been moved, projects it into the image.
 """
 
 import json
@@ -14,13 +13,19 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 from jaxtyping import Float
+from torch import Tensor
 
+from hrc_learn.geometry import quaternion
 from hrc_learn.store import new_file
 
 OBJECT_FEATURE = "observation.object_feature"
 """Column of a dataset with the object's marker in the image."""
 OBJECT_FEATURE_NAMES = ("u", "v", "visible")
+ANGLE_FEATURE = "observation.marker_angle"
+"""Column with the directions of the end effector's and of the object's marker [rad]."""
+ANGLE_FEATURE_NAMES = ("tool", "object")
 UP = np.array([0.0, 0.0, 1.0])
 LONGEST_OFFSET = 0.3
 """Of the end effector's marker from the object's [m]. From few demonstrations along a flat box
@@ -30,29 +35,21 @@ metres long."""
 
 @dataclass(frozen=True, kw_only=True)
 class VisualTarget:
-    """Affine map from the pixel of an object's marker to that of the end effector's above it.
+    """Offset from the object's marker to the end effector's right above it."""
 
-    Affine is exact for a camera that looks straight down through a perfect lens, and good to a
-    few pixels for one that does not; `error` tells.
-    """
-
-    matrix: Float[np.ndarray, "2 3"]
-    """Maps (u, v, 1) of the object's marker to (u, v) of the end effector's [px]."""
+    offset: Float[np.ndarray, "3"]
+    """In the tool's frame, by the image Jacobian there [m]: shorter than the true one, as
+    perspective shrinks what is further away."""
     error: float
     """Leave-one-out error, root mean square [px]; NaN from fewer than five demonstrations."""
-    offset: Float[np.ndarray, "3"] | None = None
-    """From the object's marker to the end effector's, base frame [m], by the image Jacobian at
-    the latter: shorter than the true one, as perspective shrinks what is further away. None
-    where no image Jacobian was given."""
-    offset_error: float = float("nan")
-    """As `error`, of targets by the offset [px]."""
 
     @classmethod
     def fit(
         cls,
         objects: Float[np.ndarray, "demos 2"],
         tools: Float[np.ndarray, "demos 2"],
-        jacobians: Float[np.ndarray, "demos 2 6"] | None = None,
+        jacobians: Float[np.ndarray, "demos 2 6"],
+        orientations: Float[Tensor, "demos 4"],
     ) -> "VisualTarget":
         """Fit to the ends of demonstrations.
 
@@ -60,63 +57,53 @@ class VisualTarget:
             objects: Pixels of the object's marker [px].
             tools: Pixels of the end effector's marker right above it [px].
             jacobians: Image Jacobians of that marker there [px/m, px/rad].
+            orientations: Of the end effector there.
 
         Raises:
-            ValueError: If there are fewer than three demonstrations, or they lie on a line.
+            ValueError: If there are fewer than three demonstrations.
         """
-        design = np.column_stack([objects, np.ones(len(objects))])
-        if np.linalg.matrix_rank(design - design.mean(axis=0)) < 2:
+        if len(objects) < 3:
             raise ValueError(
                 f"{len(objects)} demonstrations do not determine the visual target: at least "
-                "three are needed, with objects that do not lie on one line in the image."
+                "three are needed."
             )
-        matrix, error = _solved(np.kron(design, np.eye(2)), tools)
-        offset, offset_error = None, float("nan")
-        if jacobians is not None:
-            directions = jacobians[..., :3].reshape(-1, 3)
-            offset, offset_error = _solved(directions, tools - objects, LONGEST_OFFSET)
-        return cls(
-            matrix=matrix.reshape(3, 2).T,
-            error=error,
-            offset=offset,
-            offset_error=offset_error,
-        )
+        design = jacobians[..., :3] @ quaternion.to_matrix(orientations).numpy()
+        offset, error = _solved(design.reshape(-1, 3), tools - objects, LONGEST_OFFSET)
+        return cls(offset=offset, error=error)
 
-    def __call__(self, pixel: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
-        """Where the end effector's marker should be for an object's marker at `pixel` [px]."""
-        return self.matrix @ np.append(pixel, 1.0)
-
-    def from_view(
-        self, pixel: Float[np.ndarray, "2"], jacobian: Float[np.ndarray, "2 6"]
+    def __call__(
+        self,
+        pixel: Float[np.ndarray, "2"],
+        jacobian: Float[np.ndarray, "2 6"],
+        orientation: Float[Tensor, "4"],
     ) -> Float[np.ndarray, "2"]:
-        """The same for a camera that may have been moved since the demonstrations.
+        """Where the end effector's marker should be for an object's marker at `pixel` [px].
 
         Args:
             pixel: Of the object's marker [px].
             jacobian: Estimate of the image Jacobian of the end effector's marker
                 [px/m, px/rad].
+            orientation: Of the end effector when it is there.
         """
-        return self(pixel) if self.offset is None else pixel + jacobian[:, :3] @ self.offset
+        return pixel + jacobian[:, :3] @ self._in_base(orientation)
 
-    def line(self) -> Float[np.ndarray, "3"]:
+    def line(self, orientation: Float[Tensor, "4"]) -> Float[np.ndarray, "3"]:
         """Direction from the object's marker to the end effector's above it, base frame.
 
-        Straight up without a learned offset, or with one that is flatter than 30 degrees,
-        which few demonstrations cannot tell from noise.
+        Straight up for an offset that is flatter than 30 degrees, which few demonstrations
+        cannot tell from noise.
         """
-        if self.offset is None or self.offset[2] < 0.5 * np.linalg.norm(self.offset):
-            return UP
-        return self.offset / np.linalg.norm(self.offset)
+        offset = self._in_base(orientation)
+        length = np.linalg.norm(offset)
+        return UP if offset[2] < 0.5 * length else offset / length
+
+    def _in_base(self, orientation: Float[Tensor, "4"]) -> Float[np.ndarray, "3"]:
+        return quaternion.rotate(orientation, torch.from_numpy(self.offset)).numpy()
 
     def save(self, path: Path) -> None:
         """Write to a JSON file, whole or not at all."""
-        content = {
-            "version": 1,
-            "matrix": self.matrix.tolist(),
-            "error_px": _or_none(self.error),
-            "offset_m": None if self.offset is None else self.offset.tolist(),
-            "offset_error_px": _or_none(self.offset_error),
-        }
+        error = None if np.isnan(self.error) else self.error
+        content = {"version": 2, "offset_m": self.offset.tolist(), "error_px": error}
         with new_file(path) as part:
             part.write_text(json.dumps(content, indent=2), encoding="utf-8")
 
@@ -129,14 +116,12 @@ class VisualTarget:
             ValueError: If it is not one of ours.
         """
         content = json.loads(path.read_text(encoding="utf-8"))
-        if content.get("version") != 1 or "matrix" not in content:
+        if content.get("version") != 2 or "offset_m" not in content:
             raise ValueError(f"{path} is not a visual target of a known version: fit it again.")
-        offset = content.get("offset_m")
+        error = content["error_px"]
         return cls(
-            matrix=np.array(content["matrix"]),
-            error=_or_nan(content["error_px"]),
-            offset=None if offset is None else np.array(offset),
-            offset_error=_or_nan(content.get("offset_error_px")),
+            offset=np.array(content["offset_m"]),
+            error=float("nan") if error is None else float(error),
         )
 
 
@@ -183,11 +168,3 @@ def _ridge_inverse(
             middle = (low + high) / 2
             low, high = (middle, high) if length(middle) > longest else (low, middle)
     return (vt.T * (s / (s**2 + high))) @ u.T
-
-
-def _or_none(error: float) -> float | None:
-    return None if np.isnan(error) else error
-
-
-def _or_nan(error: float | None) -> float:
-    return float("nan") if error is None else float(error)

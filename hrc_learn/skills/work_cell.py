@@ -1,5 +1,6 @@
 """A work cell under one clock: arm, gripper, camera and person, stepped and logged."""
 
+from collections import deque
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 
@@ -19,6 +20,7 @@ from hrc_learn.skills.marker_sensor import (
     MarkerObservation,
     MarkerSensor,
 )
+from hrc_learn.vision import angle, centre
 from hrc_learn.viz import StepLog
 
 
@@ -36,6 +38,11 @@ class BlockedPathError(TaskFailedError):
 
 SAFETY_COLUMNS = INTERVENTIONS
 """Names of the components of the log's column "safety"."""
+
+# Readings of the torque that are averaged, and steps in which an arm gets under way: friction
+# keeps it back at first.
+_FELT = 5
+_GETTING_UNDER_WAY = 25
 
 _NAN = float("nan")
 # Logged by steps in which no camera is in the loop.
@@ -159,8 +166,15 @@ class WorkCell:
 
     def detect(self, ids: Collection[int] | None = None) -> None:
         """Take an image and detect markers in it, all by default; it may be late, or lost."""
-        pixels = {} if self._sensor is None else self._sensor.detect(ids)
-        self._channel.send(MarkerObservation(time=self.time, joints=self.joints, pixels=pixels))
+        found = {} if self._sensor is None else self._sensor.corners(ids)
+        self._channel.send(
+            MarkerObservation(
+                time=self.time,
+                joints=self.joints,
+                pixels={id: centre(corners) for id, corners in found.items()},
+                angles={id: angle(corners) for id, corners in found.items()},
+            )
+        )
         self._receive()
 
     def wait_for_detection(self, ids: Collection[int] | None = None) -> MarkerObservation:
@@ -235,6 +249,45 @@ class WorkCell:
         for pose, twist in straight_line(self.pose, goal, speed, self.config.dt):
             self.track_pose(pose, twist)
         self._settle(goal, settle)
+
+    def move_until_contact(self, goal: Pose, speed: float = 0.02, force: float = 12.0) -> bool:
+        """Move on a straight line, and stop where something is met; whether it was.
+
+        Args:
+            goal: Where to, if nothing is met.
+            speed: Mean speed [m/s]: what is met gives by as much as the arm moves until it stops.
+            force: Of the contact against the motion [N]. Friction and an unknown load are felt
+                too, so what counts is the change since the motion began.
+
+        Returns:
+            False also for an arm that does not tell external torques.
+        """
+        along = goal.position - self.pose.position
+        along = (along / along.norm().clamp(min=1e-9)).numpy()
+        felt: deque[float] = deque(maxlen=_FELT)
+        free = None
+        for k, (pose, twist) in enumerate(
+            straight_line(self.pose, goal, speed, self.config.dt)
+        ):
+            self.track_pose(pose, twist)
+            felt.append(-float(self._contact_force() @ along))
+            if k < _FELT + _GETTING_UNDER_WAY:
+                continue
+            # Friction turns with the motion: what is felt under way is the reference.
+            now = float(np.mean(felt))
+            free = now if free is None else free
+            if now - free > force:
+                self.hold_pose(_FELT * self.config.dt)
+                return True
+        return False
+
+    def _contact_force(self) -> Float[np.ndarray, "3"]:
+        """Estimate of the force on the end effector [N]; zero if the arm tells none."""
+        torque = self.state.external_torque
+        if torque is None:
+            return np.zeros(3)
+        J = self.chain.jacobian(self.joints).numpy()
+        return np.linalg.lstsq(J.T, torque, rcond=None)[0][:3]
 
     def follow_path(
         self,

@@ -45,6 +45,21 @@ class Workplace(Protocol):
         """Height of the tool centre point while it servoes to an object [m]."""
         ...
 
+    @property
+    def fingertip(self) -> float:
+        """How far the fingers reach beyond the tool centre point [m]."""
+        ...
+
+    @property
+    def palm(self) -> float:
+        """How far the palm stands back from the tool centre point [m]."""
+        ...
+
+    @property
+    def hover_turns(self) -> tuple[float, float]:
+        """Least and greatest turn of the end effector about the vertical there [rad]."""
+        ...
+
     def hover(self) -> Pose:
         """End effector above the middle of the table."""
         ...

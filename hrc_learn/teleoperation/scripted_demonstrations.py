@@ -11,16 +11,17 @@ import torch
 from jaxtyping import Float
 
 from hrc_learn.demos import DatasetWriter
-from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.geometry import Pose, minimum_jerk, quaternion
 from hrc_learn.kinematics import gripper_down, panda
 from hrc_learn.protocols import Human
 from hrc_learn.sim import HAND_MARKER, Touch, World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.cartesian_motion import nearest_configuration
 from hrc_learn.skills.marker_sensor import MarkerSensor
-from hrc_learn.skills.visual_target import OBJECT_FEATURE
+from hrc_learn.skills.visual_target import ANGLE_FEATURE, OBJECT_FEATURE
 from hrc_learn.skills.work_cell import TaskFailedError
 from hrc_learn.store import DATASET, replacing
+from hrc_learn.vision import angle, centre
 from hrc_learn.teleoperation.hand_guiding import Frame, HandGuidedArm, HandGuidingConfig
 from hrc_learn.teleoperation.interaction_force import ScriptedForce
 from hrc_learn.teleoperation.scripted_expert import GuidedPath, ScriptedExpert, Tremor
@@ -148,6 +149,7 @@ def servo_expert(
     above: Float[np.ndarray, "3"],
     config: ServoDemonstrationConfig,
     rng: np.random.Generator,
+    turned: float = 0.0,
 ) -> ScriptedExpert:
     """The expert who moves about over the table and ends at a given point, gripper down.
 
@@ -166,6 +168,9 @@ def servo_expert(
         # They fade out before the end, where the end effector is at rest above the object.
         fading = float(np.clip((0.75 * path.end - time) / 1.0, 0.0, 1.0))
         turn = config.wobble * fading * np.sin(rates * time + phases)
+        # The gripper turns for the object over the middle of the motion.
+        progress, _ = minimum_jerk((time / path.end - 0.2) / 0.5)
+        turn[2] += turned * progress
         return quaternion.multiply(quaternion.exp(torch.from_numpy(turn)), gripper_down())
 
     return ScriptedExpert(
@@ -191,31 +196,39 @@ def demonstrate_servoing(
     item = workplace.scene.objects[0]
     pose = workplace.random_object_pose(config.reach, rng)
     world.reset(workplace.home_joints().numpy(), {item.name: pose})
-    target = sensor.detect().get(item.marker.id)
+    target = sensor.corners().get(item.marker.id)
     if target is None:
         raise ValueError(
             f"the camera does not see marker {item.marker.id} on the table: move the camera or "
             "put the object into its view."
         )
     above = np.append(pose[:2, 3], workplace.hover_height)
-    expert = servo_expert(workplace, above, config, rng)
+    expert = servo_expert(workplace, above, config, rng, _turn_for(pose, workplace))
     start = torch.from_numpy(expert.path.position(0.0))
     goal = Pose(start, expert.orientation(start, 0.0))
     q = nearest_configuration(goal, near=workplace.hover_joints())
     world.reset(q.numpy(), {item.name: pose})
-    last = np.zeros(2)
+    last = np.zeros((4, 2))
 
     def observe() -> Frame:
         nonlocal last
-        feature = sensor.detect().get(HAND_MARKER)
-        last = last if feature is None else feature
+        corners = sensor.corners().get(HAND_MARKER)
+        last = last if corners is None else corners
         return {
-            "feature": last,
-            "feature_visible": feature is not None,
-            OBJECT_FEATURE: np.array([*target, 1.0]),
+            "feature": centre(last) if last.any() else last[0],
+            "feature_visible": corners is not None,
+            OBJECT_FEATURE: np.array([*centre(target), 1.0]),
+            ANGLE_FEATURE: np.array([angle(last), angle(target)]),
         }
 
     return list(guided_frames(world, expert, config.duration + config.settle, config, observe))
+
+
+def _turn_for(pose: Float[np.ndarray, "4 4"], workplace: Workplace) -> float:
+    """Turn of the gripper that closes along an object's x axis, within reach [rad]."""
+    low, high = workplace.hover_turns
+    yaw = float(np.arctan2(pose[1, 0], pose[0, 0]))
+    return low + (yaw - low) % np.pi if high - low >= np.pi - 1e-9 else yaw
 
 
 # The elbow is pulled around the open door: first away from the cabinet, then over beside it.

@@ -202,6 +202,13 @@ def centre(corners: Float[np.ndarray, "4 2"]) -> Float[np.ndarray, "2"]:
     return a + s * ca
 
 
+def angle(corners: Float[np.ndarray, "4 2"]) -> float:
+    """Direction of a marker's x axis in the image, from u towards v [rad]."""
+    # The mean of its upper and its lower edge.
+    u, v = corners[1] - corners[0] + corners[2] - corners[3]
+    return float(np.arctan2(v, u))
+
+
 def _grey(image: np.ndarray) -> np.ndarray:
     import cv2
 

@@ -22,8 +22,9 @@ from hrc_learn.sim import (
     World,
     open_camera,
 )
+from hrc_learn.sim.imperfections import Imperfections
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.marker_sensor import MarkerSensor
+from hrc_learn.skills.marker_sensor import LatencyConfig, MarkerSensor
 from hrc_learn.skills.pick_and_place import (
     INTERACT,
     PickAndPlace,
@@ -36,7 +37,7 @@ from hrc_learn.skills.work_cell import WorkCell, WorkCellConfig
 from hrc_learn.teleoperation import ScriptedForce, ScriptedPerturbation
 from hrc_learn.teleoperation.page import PageConfig
 from hrc_learn.teleoperation.page_session import task_page
-from hrc_learn.vision import CameraModel
+from hrc_learn.vision import CameraModel, ImageNoise
 
 NULL_SPACE_FORCES = (
     ScriptedForce(start=0.5, duration=4.5, towards=(0.40, 0.00, 0.50), max_force=60.0),
@@ -96,6 +97,7 @@ def simulate_collaboration(
     disturbances: Disturbances | None = None,
     config: PickAndPlaceConfig | None = None,
     cell_config: WorkCellConfig | None = None,
+    imperfections: Imperfections | None = None,
     seed: int = 0,
     page: PageConfig | None = None,
     view: LiveView = no_live_view,
@@ -131,14 +133,25 @@ def simulate_collaboration(
     rng = np.random.default_rng(seed)
     disturbances = disturbances or Disturbances()
     cell_config = cell_config or WorkCellConfig()
+    sizes = imperfections or Imperfections.ideal()
+    latency = LatencyConfig(
+        delay=max(cell_config.latency.delay, sizes.image_delay),
+        frame_loss=max(cell_config.latency.frame_loss, sizes.image_loss),
+    )
+    cell_config = replace(cell_config, latency=latency)
+    noise = ImageNoise(
+        blur=ImageNoise.blur + sizes.image_blur, noise=ImageNoise.noise + sizes.image_noise
+    )
     items = workplace.scene.objects
     _check_shelves(workplace, shelves)
-    world = World(workplace.scene)
-    world.reset(workplace.home_joints().numpy(), _object_poses(workplace, rng))
+    world = World(workplace.scene, sizes.draw(rng))
+    world.reset(
+        workplace.home_joints().numpy(), _object_poses(workplace, world, sizes.object_yaw, rng)
+    )
     person, motion = ScriptedPerturbation(panda, forces, begin=None), MotionLog(world)
     occluder = ScriptedOcclusion(world, disturbances.occlusions)
     eyes = ChangingCamera(
-        workplace.scene.camera, lambda model: open_camera(world, camera, model, rng=rng)
+        workplace.scene.camera, lambda model: open_camera(world, camera, model, rng=rng, noise=noise)
     )
 
     def advance(duration: float) -> None:
@@ -226,12 +239,14 @@ def _check_shelves(workplace: Workplace, shelves: Sequence[str]) -> None:
 
 
 def _object_poses(
-    workplace: Workplace, rng: np.random.Generator
+    workplace: Workplace, world: World, yaw: float, rng: np.random.Generator
 ) -> dict[str, Float[np.ndarray, "4 4"]]:
-    items = workplace.scene.objects
-    if len(items) == 1:
-        return {items[0].name: workplace.random_object_pose(OBJECT_REACH, rng)}
-    return random_object_poses(items, workplace.table_centre, OBJECTS_REACH, rng)
+    """Poses on the table as it is, of objects as tall as they are."""
+    items = world.config.objects
+    reach = OBJECT_REACH[:2] if len(items) == 1 else OBJECTS_REACH
+    return random_object_poses(
+        items, workplace.table_centre, reach, rng, yaw=yaw, table_top=world.table_top
+    )
 
 
 def _watched(workplace: Workplace, world: World) -> Float[np.ndarray, "points 3"]:

@@ -1,0 +1,300 @@
+"""How far a simulated work cell departs from an ideal one: arm, calibration, camera, objects.
+
+`Imperfections` says how large the errors are, `Imperfections.draw` what they are in one run.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass, fields, replace
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from hrc_learn.kinematics import panda
+from hrc_learn.sim.scene import SceneConfig
+
+# pyright: reportAttributeAccessIssue=false
+# MuJoCo ships no type stubs; its names come from a compiled module.
+
+# Heights are drawn for as many objects, so that further draws do not depend on their number.
+_MOST_OBJECTS = 8
+
+
+@dataclass(frozen=True, kw_only=True)
+class Imperfections:
+    """Sizes of the errors of a run; each field of zero is the ideal.
+
+    Standard deviations belong to normal distributions. Ranges are uniform, to both sides.
+    """
+
+    encoder_noise: float = 0.0
+    """Standard deviation of a joint position reading [rad]. Nominal 1e-4 rad."""
+    encoder_offset: float = 0.0
+    """Range of the constant error of each joint's zero [rad]. Nominal 2 mrad."""
+    command_delay: float = 0.0
+    """From a command being sent until the servos follow it [s]. Nominal 20 ms."""
+    command_jitter: float = 0.0
+    """Standard deviation of that delay from one command to the next [s]. Nominal 2 ms."""
+    servo_lag: float = 0.0
+    """Time constant with which the servos follow a changed velocity [s]. Nominal 10 ms."""
+    slowness: float = 0.0
+    """How much of the joint limits of acceleration the driver does not use, 0 to 1: drivers
+    such as franky plan with a fraction of them. Nominal 0.3."""
+    joint_friction: float = 0.0
+    """Dry friction of every joint [N m]. Nominal 1 N m."""
+    gravity_error: float = 0.0
+    """Range of the error of the arm's own gravity compensation, a fraction of its weight.
+    Nominal 2 %."""
+    payload: float = 0.0
+    """Largest mass at the hand of which the arm does not know [kg]. Nominal 0.5 kg."""
+    torque_noise: float = 0.0
+    """Standard deviation of an estimated external joint torque [N m]. Nominal 0.2 N m."""
+    base_error: float = 0.0
+    """Range of the position of the base along each axis [m]. Nominal 1 mm."""
+    base_turn: float = 0.0
+    """Range of the turn of the base about the vertical [rad]. Nominal 1 mrad."""
+    tool_error: float = 0.0
+    """Range of the tool centre point along each axis [m]. Nominal 1 mm."""
+    tool_turn: float = 0.0
+    """Range of the turn of the tool about each axis [rad]. Nominal 3 mrad."""
+    image_delay: float = 0.0
+    """From an image being taken until its markers are known [s]. Nominal 80 ms."""
+    image_loss: float = 0.0
+    """Fraction of the images that never arrive. Nominal 20 %."""
+    image_noise: float = 0.0
+    """Standard deviation of the sensor noise, grey levels of 255, beyond the camera's own.
+    Nominal 2."""
+    image_blur: float = 0.0
+    """Standard deviation of the blur, beyond the camera's own [px]. Nominal 0.5 px."""
+    table_height: float = 0.0
+    """Range of the height of the table's top [m]. Nominal 2 cm."""
+    object_height: float = 0.0
+    """Range of the height of each object [m]. Nominal 5 mm."""
+    object_yaw: float = 0.0
+    """Range of the yaw of objects on the table [rad]. Nominal: any."""
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if not (math.isfinite(value) and value >= 0):
+                raise ValueError(f"{field.name} must not be negative, but is {value}.")
+        for name, most in (("image_loss", 0.9), ("slowness", 0.9)):
+            if getattr(self, name) > most:
+                raise ValueError(f"{name} must be at most {most}, but is {getattr(self, name)}.")
+
+    @classmethod
+    def ideal(cls) -> Imperfections:
+        """None at all."""
+        return cls()
+
+    @classmethod
+    def nominal(cls) -> Imperfections:
+        """Those of an ordinary laboratory; docs/experiments.md gives the sources."""
+        return cls(
+            encoder_noise=1e-4,
+            encoder_offset=2e-3,
+            command_delay=0.020,
+            command_jitter=0.002,
+            servo_lag=0.010,
+            slowness=0.3,
+            joint_friction=1.0,
+            gravity_error=0.02,
+            payload=0.5,
+            torque_noise=0.2,
+            base_error=1e-3,
+            base_turn=1e-3,
+            tool_error=1e-3,
+            tool_turn=3e-3,
+            image_delay=0.080,
+            image_loss=0.20,
+            image_noise=2.0,
+            image_blur=0.5,
+            table_height=0.02,
+            object_height=0.005,
+            object_yaw=math.pi,
+        )
+
+    def scaled(self, factor: float) -> Imperfections:
+        """All of them so many times as large, fractions up to 0.9, the yaw up to any.
+
+        Raises:
+            ValueError: If the factor is negative.
+        """
+        values = {f.name: factor * getattr(self, f.name) for f in fields(self)}
+        values["image_loss"] = min(values["image_loss"], 0.9)
+        values["slowness"] = min(values["slowness"], 0.9)
+        values["object_yaw"] = min(values["object_yaw"], math.pi)
+        return Imperfections(**values)
+
+    def draw(self, rng: np.random.Generator, joints: int = 7) -> DrawnImperfections:
+        """What they are in one run.
+
+        Args:
+            rng: Source of chance, also of the noise during the run.
+            joints: Of the arm.
+        """
+
+        def uniform(size: int | None = None):
+            return rng.uniform(-1.0, 1.0, size)
+
+        return DrawnImperfections(
+            sizes=self,
+            rng=rng,
+            encoder_offset=self.encoder_offset * uniform(joints),
+            gravity_error=self.gravity_error * float(uniform()),
+            payload=self.payload * float(rng.uniform()),
+            base_shift=self.base_error * uniform(3),
+            base_turn=self.base_turn * float(uniform()),
+            tool_shift=self.tool_error * uniform(3),
+            tool_turn=self.tool_turn * uniform(3),
+            table_height=self.table_height * float(uniform()),
+            object_heights=uniform(_MOST_OBJECTS),
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class DrawnImperfections:
+    """The constant errors of one run, and the source of its noise."""
+
+    sizes: Imperfections
+    rng: np.random.Generator
+    encoder_offset: Float[np.ndarray, " joints"]
+    """What the encoders read too much [rad]."""
+    gravity_error: float
+    """Fraction of the arm's weight that is compensated too much."""
+    payload: float
+    """Unknown mass at the hand [kg]."""
+    base_shift: Float[np.ndarray, "3"]
+    """Where the base stands, less where it is believed to [m]."""
+    base_turn: float
+    """About the vertical [rad]."""
+    tool_shift: Float[np.ndarray, "3"]
+    """Where the tool is, less where it is believed to be, in the hand's frame [m]."""
+    tool_turn: Float[np.ndarray, "3"]
+    """Rotation vector in the hand's frame [rad]."""
+    table_height: float
+    """Height of the table's top above where it is believed to be [m]."""
+
+    object_heights: Float[np.ndarray, " objects"]
+    """By which each object is higher than believed, as a fraction of `object_height`."""
+
+    def real_scene(self, believed: SceneConfig) -> SceneConfig:
+        """The scene with the table and the objects as high as they are."""
+        x, y, z = believed.table.centre
+        objects = []
+        for item, fraction in zip(believed.objects, self.object_heights, strict=False):
+            a, b, c = item.half_size
+            taller = self.sizes.object_height * float(fraction) / 2
+            objects.append(replace(item, half_size=(a, b, c + taller)))
+        return replace(
+            believed,
+            table=replace(believed.table, centre=(x, y, z + self.table_height)),
+            objects=tuple(objects),
+        )
+
+    def apply(self, spec: mujoco.MjSpec) -> None:
+        """Give a scene's description the errors of the arm: calibration, friction, weights."""
+        base, hand = spec.body("link0"), spec.body("hand")
+        base.pos = base.pos + self.base_shift
+        base.quat = _turned(base.quat, np.array([0.0, 0.0, self.base_turn]))
+        # The hand's own frame: first along its axes, then turned about them.
+        shift = np.zeros(3)
+        mujoco.mju_rotVecQuat(shift, self.tool_shift, hand.quat)
+        hand.pos = hand.pos + shift
+        hand.quat = _turned(hand.quat, self.tool_turn)
+        if self.payload > 0:
+            # At the palm; a small sphere's inertia, which matters little beside its mass.
+            load = hand.add_body(name="payload", pos=(0.0, 0.0, 0.03))
+            load.add_geom(
+                name="payload",
+                type=mujoco.mjtGeom.mjGEOM_SPHERE,
+                size=(0.02, 0, 0),
+                mass=self.payload,
+                contype=0,
+                conaffinity=0,
+                group=5,
+            )
+        for name in panda.joint_names:
+            joint = spec.joint(name)
+            joint.frictionloss = self.sizes.joint_friction
+            joint.parent.gravcomp = 1.0 + self.gravity_error
+
+    def encoders(
+        self, joint_position: Float[np.ndarray, " joints"]
+    ) -> Float[np.ndarray, " joints"]:
+        """A reading of joint positions [rad]."""
+        noise = self.sizes.encoder_noise * self.rng.standard_normal(joint_position.shape)
+        return joint_position + self.encoder_offset + noise
+
+    def torques(self, external: Float[np.ndarray, " joints"]) -> Float[np.ndarray, " joints"]:
+        """An estimate of external joint torques [N m]."""
+        return external + self.sizes.torque_noise * self.rng.standard_normal(external.shape)
+
+
+
+class CommandChannel:
+    """Delays commands on their way to an arm; each takes its own time, none overtakes another.
+
+    The arm then follows with its servos' lag and its driver's limits of acceleration.
+    """
+
+    def __init__(
+        self,
+        drawn: DrawnImperfections,
+        acceleration: Float[np.ndarray, " joints"],
+    ):
+        """Start at rest.
+
+        Args:
+            drawn: Delay, jitter and lag.
+            acceleration: Limits of the joints [rad/s^2].
+        """
+        self._drawn = drawn
+        self._limit = (1 - drawn.sizes.slowness) * acceleration
+        self._pending: deque[tuple[float, Float[np.ndarray, " joints"]]] = deque()
+        self.rest()
+
+    def rest(self) -> None:
+        """Forget all commands; the arm is at rest."""
+        self._pending.clear()
+        self._wanted = np.zeros_like(self._limit)
+        self.velocity = np.zeros_like(self._limit)
+
+    def send(self, time: float, joint_velocity: Float[np.ndarray, " joints"]) -> None:
+        """Send a command at a time [s, rad/s]."""
+        sizes = self._drawn.sizes
+        jitter = sizes.command_jitter * self._drawn.rng.standard_normal()
+        due = time + max(sizes.command_delay + jitter, 0.0)
+        if self._pending:
+            due = max(due, self._pending[-1][0])
+        self._pending.append((due, np.array(joint_velocity, dtype=float)))
+
+    def advance(self, time: float, dt: float) -> Float[np.ndarray, " joints"]:
+        """Joint velocity that the servos follow in a step of dt from a time on [rad/s]."""
+        # Clocks add up steps of rounded length: a nanosecond early still counts as due.
+        while self._pending and self._pending[0][0] <= time + 1e-9:
+            self._wanted = self._pending.popleft()[1]
+        lag = self._drawn.sizes.servo_lag
+        fraction = 1.0 if lag == 0 else -math.expm1(-dt / lag)
+        change = fraction * (self._wanted - self.velocity)
+        if self._drawn.sizes.slowness > 0:
+            change = np.clip(change, -self._limit * dt, self._limit * dt)
+        self.velocity = self.velocity + change
+        return self.velocity
+
+
+
+
+def _turned(
+    orientation: Float[np.ndarray, "4"], turn: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "4"]:
+    """A unit quaternion (wxyz) followed by a rotation vector in its own frame [rad]."""
+    angle = float(np.linalg.norm(turn))
+    by, turned = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(4)
+    if angle > 0:
+        mujoco.mju_axisAngle2Quat(by, turn / angle, angle)
+    mujoco.mju_mulQuat(turned, np.array(orientation, dtype=float), by)
+    return turned
