@@ -14,7 +14,6 @@ from torch import Tensor
 from hrc_learn.controller.blending import BlendingState
 from hrc_learn.controller.interface import Goals, Observation
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.geometry.rotation_rates import left_jacobian, left_jacobian_transposed
 
 # Pixel rate that is always allowed [px/s]: keeps the cap above zero at the target itself.
 _LEAST_PIXEL_RATE = 1.0
@@ -90,7 +89,7 @@ def analytic_descent(
         orientation: Of the tool.
     """
     phi = quaternion.log(orientation)
-    turn = left_jacobian(phi, left_jacobian_transposed(phi, s[..., 3:]))
+    turn = quaternion.left_jacobian(phi, quaternion.left_jacobian_transposed(phi, s[..., 3:]))
     return torch.cat([s[..., :3], turn], dim=-1)
 
 

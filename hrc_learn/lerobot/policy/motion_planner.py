@@ -77,7 +77,7 @@ class ActionEncoding(nn.Module):
         """
         for k, triple in enumerate(self.triples):
             q = quaternion.exp(torch.cat([e[:, triple] for e in episodes]))
-            self.reference[k] = _mean_orientation(q)
+            self.reference[k] = quaternion.mean(q)
         unrolled = [self._unrolled(episode) for episode in episodes]
         for triple in self.triples:
             for k, episode in enumerate(unrolled):
@@ -104,11 +104,6 @@ class ActionEncoding(nn.Module):
 def _replaced(values: Tensor, columns: list[int], new: Tensor) -> Tensor:
     index = torch.tensor(columns, device=values.device)
     return values.index_copy(-1, index, new.to(values))
-
-
-def _mean_orientation(q: Float[Tensor, "n 4"]) -> Float[Tensor, "4"]:
-    """The one whose squared chords to all are the shortest (Markley et al. 2007)."""
-    return torch.linalg.eigh(q.double().mT @ q.double()).eigenvectors[:, -1].to(q)
 
 
 # Which components of action and state belong together, by their names.
