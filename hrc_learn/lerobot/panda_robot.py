@@ -241,7 +241,7 @@ class PandaRobot(Device, Robot):
 
     def __init__(self, config: PandaRobotConfig):
         super().__init__(config)
-        self.space = config.action_space
+        self.space: ActionSpace = config.action_space
         self.dt = 1.0 / config.fps
         self.cameras: dict[str, Any] = {}
         self.beginnings = 0
