@@ -11,8 +11,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.geometry.small_matrices import matmul
-from hrc_learn.jacobian.estimator import KeyFrame, KeyFrameEstimator, Measurement, MotionSample, evaluate
+from hrc_learn.geometry.numerics import matmul
+from hrc_learn.jacobian.estimator import (
+    KeyFrame,
+    KeyFrameEstimator,
+    Measurement,
+    MotionSample,
+    evaluate,
+)
 from hrc_learn.jacobian.fitting import weight_covariance
 from hrc_learn.jacobian.network import RBFImageJacobian
 from hrc_learn.jacobian.samples import KeyFrameConfig, component_scale

@@ -108,7 +108,8 @@ class Approach:
         if not paths:
             raise ValueError("an approach is learned from one demonstration or more: got none.")
         paths = [_unturned(path) for path in paths]
-        demonstrated = _mean([path.orientation[-1] for path in paths])
+        ends = torch.stack([path.orientation[-1] for path in paths])
+        demonstrated = quaternion.mean(ends.double())
         tangents = torch.stack([tangent(path.position) for path in paths])
         mean = tangents.mean(dim=0)
         mean = mean / mean.norm().clamp(min=_SHORTEST)
@@ -172,12 +173,6 @@ def _unturned(path: Pose) -> Pose:
     return Pose(
         quaternion.rotate(back, path.position), quaternion.multiply(back, path.orientation)
     )
-
-
-def _mean(orientations: Sequence[Tensor]) -> Float[Tensor, "4"]:
-    """Of unit quaternions, whatever their signs (Markley et al. 2007)."""
-    q = torch.stack(list(orientations)).double()
-    return torch.linalg.eigh(q.T @ q).eigenvectors[:, -1]
 
 
 def _angle(a: Float[Tensor, "*batch 3"], b: Float[Tensor, "3"]) -> Float[Tensor, "*batch"]:
