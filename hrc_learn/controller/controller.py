@@ -61,6 +61,9 @@ class ControllerConfig:
     jacobian: Literal["geometric", "analytic"] = "geometric"
     """By which gradients become motions of the tool: the analytic one counts rotation by the
     rotation vector, whose rates differ from angular velocity the more the tool is turned."""
+    command_delay: float = 0.0
+    """From a command until the arm follows it, its servos' lag included [s]: the joint velocity
+    is computed for where the arm will be by then."""
     null_damping: float = 3.0
     """c_d: null-space input divided by it is velocity."""
     null_space_yields: bool = True
@@ -277,7 +280,9 @@ class AdaptiveController(nn.Module):
             off = torch.zeros_like(state.pose_drift.active)
             pose_drift = replace(state.pose_drift, active=off)
         else:
-            planned = planned_motion(motion.task_twist, J, v, observation.dt)
+            planned = planned_motion(
+                motion.task_twist, motion.twist, J, v, observation.dt
+            )
             pose_drift = replace(motion.pose_drift, planned=planned)
         command = Command(
             joint_velocity=v,
@@ -326,6 +331,10 @@ class AdaptiveController(nn.Module):
             pose_drift = measure_drift(state.pose_drift, q, J, active)
             twist = torch.add(task_twist, pose_drift.drift, alpha=rate)
 
+        ahead = self.config.command_delay
+        if ahead > 0:
+            # Where the arm will be when it follows: the null space is that of then.
+            J = self.chain.jacobian(q + ahead * state.safety.velocity)
         task, null = resolved_rate(J, twist, null)
         if goals.posture is not None:
             approach = approach_velocity(goals.posture, q, J, self.caps[1])

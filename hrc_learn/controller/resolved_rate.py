@@ -153,7 +153,12 @@ def measure_drift(
     )
 
 
+# Speed below which what is done of a twist cannot be told [m/s, rad/s]; all of it then.
+_NO_SPEED = 1e-6
+
+
 def planned_motion(
+    task_twist: Float[Tensor, "*batch 6"],
     twist: Float[Tensor, "*batch 6"],
     jacobian: Float[Tensor, "*batch 6 n"],
     joint_velocity: Float[Tensor, "*batch n"],
@@ -161,11 +166,20 @@ def planned_motion(
 ) -> Float[Tensor, "*batch 6"]:
     """The part of the step to come that the task has planned.
 
-    Limits may slow the task down. That is no drift, so only the fraction of the twist that the
-    filtered joint velocity carries out counts as planned.
+    Limits may slow the motion down. That is no drift, so only the fraction that the filtered
+    joint velocity carries out counts as planned. The fraction is that of the whole twist: the
+    correction of measured noise, which is as large as a slow task's own twist, would make that
+    of the task alone seem not to be carried out.
+
+    Args:
+        task_twist: Of the task alone.
+        twist: Of the task and the correction of the drift.
+        jacobian: Of the tool.
+        joint_velocity: Filtered [rad/s].
+        dt: Step [s].
     """
     done = torch.linalg.vecdot(jacobian, joint_velocity.unsqueeze(-2))
-    along = torch.linalg.vecdot(done, twist)
-    square = torch.linalg.vecdot(twist, twist).clamp(min=torch.finfo(twist.dtype).tiny)
+    along = torch.linalg.vecdot(done, twist) + _NO_SPEED**2
+    square = torch.linalg.vecdot(twist, twist) + _NO_SPEED**2
     fraction = (along / square).clamp(0, 1)
-    return (fraction * dt).unsqueeze(-1) * twist
+    return (fraction * dt).unsqueeze(-1) * task_twist

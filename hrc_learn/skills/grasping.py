@@ -69,7 +69,7 @@ class GraspingConfig:
 
     servo: VisualServoConfig = field(default_factory=VisualServoConfig)
     controller: ControllerConfig = field(
-        default_factory=lambda: ControllerConfig(drift_compensation_rate=10.0)
+        default_factory=lambda: ControllerConfig(drift_compensation_rate=10.0, command_delay=0.03)
     )
     """Settings of the adaptive controller; the high hold rate compensates the drift that steps
     of 10 ms leave."""

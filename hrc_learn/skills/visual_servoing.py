@@ -283,9 +283,8 @@ class VisualServo:
         does to the null space."""
         end = self._cell.time + duration
         # What is learned meanwhile of the image Jacobian must not move the target.
-        pixel = replace(target, orientation=self._turned).pixel(
-            self._image_jacobian(), self._cell.pose
-        )
+        upright = replace(target, orientation=self._turned).upright
+        pixel = target.target(self._image_jacobian(), upright)
         held = replace(target, target=lambda jacobian, orientation: pixel)
         while self._cell.time < end:
             self.step(held)

@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Callable, Collection
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -39,6 +39,8 @@ class BlockedPathError(TaskFailedError):
 SAFETY_COLUMNS = INTERVENTIONS
 """Names of the components of the log's column "safety"."""
 
+# Null-space input below which one that has ended is over [N m].
+_LEAST_INPUT = 0.05
 # Readings of the torque that are averaged, and steps in which an arm gets under way: friction
 # keeps it back at first.
 _FELT = 5
@@ -72,6 +74,8 @@ class WorkCellConfig:
     """Delay and loss of the camera's images."""
     damping: float = 3.0
     """c_d: null-space input per unit of joint velocity (paper, Table I) [N m s/rad]."""
+    nullspace_rise: float = 0.15
+    """Time constant with which the null-space input is smoothed [s]."""
     pose_gain: float = 4.0
     """Decay rate of the pose error on given motions [1/s]."""
 
@@ -333,13 +337,26 @@ class WorkCell:
         self._advance(self.config.dt)
         self._ticks += 1
         self.state = self._arm.read()
-        self.human_input = self._human.read(self.state)
+        self.human_input = self._smoothed(self._human.read(self.state))
         self._receive()
         if self.tracked_markers and self._ticks % self.config.detect_every == 0:
             self.detect(self.tracked_markers)
         every = self.config.keep_image_every
         if self._sensor is not None and every and self._ticks % every == 0:
             self.images.append(KeptImage(time=self.time, image=self._sensor.read()))
+
+    def _smoothed(self, asked: HumanInput) -> HumanInput:
+        """What a person asks for, the null-space input without jumps.
+
+        An arm follows late and with limited acceleration, each joint in its own way. A jump of
+        its null-space motion would therefore move the end effector.
+        """
+        share = min(self.config.dt / self.config.nullspace_rise, 1.0)
+        before = self.human_input.nullspace_input
+        smooth = before + share * (asked.nullspace_input - before)
+        if not asked.nullspace_input.any() and np.abs(smooth).max() < _LEAST_INPUT:
+            smooth = asked.nullspace_input
+        return replace(asked, nullspace_input=smooth)
 
     def _receive(self) -> None:
         self.observation = self._channel.newest(self.time) or self.observation
