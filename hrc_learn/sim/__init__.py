@@ -6,6 +6,9 @@ from hrc_learn.sim.camera_disturbances import OcclusionInterval as OcclusionInte
 from hrc_learn.sim.camera_disturbances import ScriptedOcclusion as ScriptedOcclusion
 from hrc_learn.sim.contacts import ContactMonitor as ContactMonitor
 from hrc_learn.sim.contacts import Touch as Touch
+from hrc_learn.sim.imperfections import CommandChannel as CommandChannel
+from hrc_learn.sim.imperfections import DrawnImperfections as DrawnImperfections
+from hrc_learn.sim.imperfections import Imperfections as Imperfections
 from hrc_learn.sim.marker_plates import Plate as Plate
 from hrc_learn.sim.moving_bodies import MotionLog as MotionLog
 from hrc_learn.sim.moving_bodies import MovingBodies as MovingBodies
