@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from hrc_learn.demos.demonstration import JOINT_FIELDS
-from hrc_learn.demos.format.features import INFO_PATH, Feature, Sidecar
+from hrc_learn.demos.format.metadata import INFO_PATH, Feature, Sidecar
 from hrc_learn.demos.issue import DatasetError
-from hrc_learn.demos.read.component_names import (
+from hrc_learn.demos.read.roles import (
     INDEX_KEYS,
     ORIENTATION_ROLES,
     ROLES,

@@ -19,7 +19,8 @@ from hrc_learn.demos.preprocessing.resampling import nearest_frames
 from hrc_learn.demos.read.column_mapping import ColumnMapping
 from hrc_learn.demos.read.episodes import Quantities, select_quantities
 from hrc_learn.demos.read.frames import RawFrames
-from hrc_learn.demos.read.value_encodings import UnitDecision, to_quaternion
+from hrc_learn.demos.read.reader import to_quaternion
+from hrc_learn.demos.read.roles import UnitDecision
 from hrc_learn.demos.validation.data_checks import repeated_frames
 from hrc_learn.geometry import quaternion
 
@@ -88,8 +89,7 @@ class EpisodeEdit:
         original = None if frame is None or self.kept is None else int(self.kept[frame])
         return DatasetError(
             message,
-            file=self.entry.file,
-            episode=self.entry.index,
+            **self.entry.location,
             frame=original,
             key=key,
         )

@@ -2,11 +2,7 @@
 
 import pytest
 
-from hrc_learn.demos.read.component_names import (
-    ComponentMeaning,
-    meaning_of_component,
-    role_of_key,
-)
+from hrc_learn.demos.read.roles import ComponentMeaning, meaning_of_component, role_of_key
 
 
 @pytest.mark.parametrize(
