@@ -3,7 +3,6 @@
 import contextlib
 import itertools
 import os
-import re
 import time
 import warnings
 from collections.abc import Iterator
@@ -17,7 +16,6 @@ from hrc_learn.store._disk import (
     dump_json,
     entries,
     holder,
-    is_alive,
     is_at,
     read_json,
     sign,
@@ -26,7 +24,7 @@ from hrc_learn.store._disk import (
     sync_tree,
     try_lock,
 )
-from hrc_learn.store._ownership import DATASET, RESULTS, Kind, owned_entries, write_manifest
+from hrc_learn.store._ownership import Kind, owned_entries, write_manifest
 
 SUFFIX = ".writing"
 """End of the name of a workspace."""
@@ -70,7 +68,7 @@ class Claim:
         self.workspace = workspace_of(self.target)
         self.new = self.workspace / _NEW
         # What is written inside another workspace is brought to disk with all that is in there.
-        self._sync = not any(is_workspace(parent) for parent in self.target.parents)
+        self._sync = not any(_is_workspace(parent.name) for parent in self.target.parents)
         self._old = self.workspace / _OLD
         self._owned = self.workspace / _OWNED
         self._lock = self._acquire(wait)
@@ -258,9 +256,8 @@ def resolved(path: str | os.PathLike[str]) -> Path:
     return Path(path).resolve()
 
 
-def is_workspace(path: Path) -> bool:
-    """Whether a folder has the name of a workspace."""
-    return path.name.startswith(".") and path.name.endswith(SUFFIX)
+def _is_workspace(name: str) -> bool:
+    return name.startswith(".") and name.endswith(SUFFIX) and name != SUFFIX
 
 
 def workspace_of(target: Path) -> Path:
@@ -282,13 +279,6 @@ def _require_ours(workspace: Path) -> None:
         raise InTheWayError(
             f"{workspace} is in the way, and not of hrc_learn: move it elsewhere"
         )
-
-
-# Workspaces, and what versions without them left: .NAME.partial.PID and .NAME.old.PID.
-_HIDDEN = re.compile(
-    rf"\.(?P<name>.+?)({re.escape(SUFFIX)}"
-    r"|\.(?P<what>partial|old)\.(?P<pid>\d+)(\.recording)?)"
-)
 
 
 def recover(path: str | os.PathLike[str]) -> list[str]:
@@ -324,53 +314,17 @@ def settle(path: str | os.PathLike[str]) -> None:
         place = place.parent
 
 
-def mend_earlier_versions(claim: Claim) -> list[str]:
-    """Mend what a killed process of a version without workspaces left of a folder."""
-    done = []
-    for place, what in _of_earlier_versions(claim.target):
-        if what == "partial":
-            delete(place)
-            done.append(f"{place}: removed, it was left unfinished")
-        elif not os.path.lexists(claim.target):
-            claim.rename(place, claim.target)
-            done.append(f"{claim.target}: brought back from an interrupted replacement")
-        else:
-            for kind in (RESULTS, DATASET):
-                delete_entries(place, owned_entries(place, kind) or ())
-            done.append(f"{place}: removed, it was replaced")
-            if place.exists():
-                done[-1] = f"{claim.set_aside(place, 'kept')}: from an interrupted replacement"
-    return done
-
-
 def _recover_one(target: Path) -> list[str]:
     with Claim(target) as claim:
-        return claim.mended + mend_earlier_versions(claim)
+        return claim.mended
 
 
 def _is_interrupted(target: Path) -> bool:
-    return bool(target.name) and (
-        workspace_of(target).is_dir() or bool(_of_earlier_versions(target))
-    )
+    return bool(target.name) and workspace_of(target).is_dir()
 
 
 def _interrupted_below(folder: Path) -> Iterator[Path]:
     for place, folders, _ in os.walk(folder):
-        for name in list(folders):
-            match = _HIDDEN.fullmatch(name)
-            if match:
-                folders.remove(name)  # what is in there goes with it
-                yield Path(place) / match["name"]
-
-
-def _of_earlier_versions(target: Path) -> list[tuple[Path, str]]:
-    """Temporary folders of dead processes, and which of the two each is."""
-    found = []
-    with contextlib.suppress(OSError), os.scandir(target.parent) as places:
-        for place in places:
-            match = _HIDDEN.fullmatch(place.name)
-            if not match or match["name"] != target.name or not match["what"]:
-                continue
-            if not is_alive(int(match["pid"])):
-                found.append((Path(place.path), match["what"]))
-    return found
+        for name in filter(_is_workspace, list(folders)):
+            folders.remove(name)  # what is in there goes with it
+            yield Path(place) / name[1 : -len(SUFFIX)]

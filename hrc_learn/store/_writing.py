@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal, SupportsFloat
 
-from hrc_learn.store._claim import Claim, InTheWayError, mend_earlier_versions, resolved, settle
+from hrc_learn.store._claim import Claim, InTheWayError, resolved, settle
 from hrc_learn.store._disk import dump_json
 from hrc_learn.store._ownership import MADE_BY, RESULTS, Kind
 
@@ -71,7 +71,6 @@ def replacing(
     if not isinstance(path, Claim):
         resolved(path).parent.mkdir(parents=True, exist_ok=True)
     with _claimed(path) as claim:
-        mend_earlier_versions(claim)
         claim.require_replaceable(kind, overwrite, foreign=keep, adopt=keep)
         yield claim.new
         claim.commit(kind, overwrite, keep=keep, source=source)

@@ -1,4 +1,9 @@
-"""From saved episodes to a dataset, however often that is broken off."""
+"""From saved episodes to a dataset, however often that is broken off.
+
+A recording lives in `NAME.recording/` and says there which one it is, and to how many episodes
+it is appended (`recording.json`). The dataset made of it keeps that name, so that a recording
+which ended between the two last steps is not taken for another.
+"""
 
 import itertools
 import json
@@ -116,7 +121,7 @@ def assemble(
     """Write the dataset of these staged episodes.
 
     Args:
-        paths: Files of `staging.write_episode`, in order.
+        paths: Files of `episode.write_episode`, in order.
         target: Folder of the new dataset.
         earlier: A dataset of our own that they are appended to; it stays as it is, and
             its files get a second name in the new one.
@@ -224,30 +229,11 @@ def _count_videos(index: _Index, key: str) -> int:
 
 
 _RECORDING = "recording.json"
-_FILES = (
-    "episode_*",
-    "*.unfinished.mp4",
-    ".*.writing/*",
-    # Of versions that assembled the dataset in there.
-    "appended_to.json",
-    "*.unfinished",
-    "dataset/*",
-    *(f"earlier/{file}" for file in DATASET.files),
-)
+_FILES = ("episode_*", "*.unfinished.mp4", ".*.writing/*")
 """What a recording holds besides."""
 
 
-def claim_recording(root: Path) -> Claim:
-    """The sole right to record a dataset.
-
-    Raises:
-        BusyError: Another process is recording it.
-    """
-    staging_folder(root).parent.mkdir(parents=True, exist_ok=True)
-    return Claim(root)
-
-
-def begin(root: Path, earlier_episodes: int | None) -> Path:
+def begin(root: Path, earlier_episodes: int | None) -> None:
     """Make the folder of a recording, whose claim is held.
 
     Args:
@@ -275,7 +261,6 @@ def begin(root: Path, earlier_episodes: int | None) -> Path:
             f"episodes; remove it to start anew"
         ) from None
     _write(staging, earlier_episodes)
-    return staging
 
 
 def recover_dataset(root: str | Path) -> Path:
@@ -307,7 +292,6 @@ def recover_dataset(root: str | Path) -> Path:
 def finish(root: Path, claim: Claim) -> None:
     """Make or lengthen a dataset from its recording, and remove that; as `recover_dataset`."""
     root, staging = resolved(root), staging_folder(root)
-    _bring_back_earlier(root, staging)
     if not _is_done(root, staging):
         recording = _read(staging)
         episodes = recording["episodes"]
@@ -370,22 +354,14 @@ def recover_all(path: str | Path) -> list[str]:
             done.append(str(error))
         else:
             done.append(f"{root}: made of what an interrupted recording had saved")
-    # Earlier versions gave what they were deleting such a name.
-    for folder in (path.parent, path):
-        for rest in folder.glob(f".{path.name if folder != path else '*'}{suffix}.done"):
-            delete_files(rest, _FILES)
-            done.append(f"{rest}: removed")
     return done
 
 
 def _read(staging: Path) -> dict[str, Any]:
     """Name of a recording, and of how many episodes the dataset is that it is appended to."""
     path = staging / _RECORDING
-    if not path.is_file():  # of a version that did not name them
-        mark, episodes = staging / "appended_to.json", None
-        if mark.is_file():
-            episodes = _read_count(mark)
-        _write(staging, episodes)
+    if not path.is_file():  # broken off before it was named
+        _write(staging, None)
     return json.loads(path.read_text(encoding="utf-8"))
 
 
@@ -401,20 +377,5 @@ def _episodes(staging: Path) -> bool:
 
 def _is_done(root: Path, staging: Path) -> bool:
     """Whether the dataset holds what was recorded: only the recording was not yet removed."""
-    if not root.is_dir():
-        return False
-    if (staging / _RECORDING).is_file():
-        return source_of(root) == _read(staging)["id"]
-    mark = staging / "appended_to.json"  # of a version that did not name recordings
-    return mark.is_file() and len(open_folder(root).episodes) > _read_count(mark)
-
-
-def _read_count(mark: Path) -> int:
-    return json.loads(mark.read_text(encoding="utf-8"))["episodes"]
-
-
-def _bring_back_earlier(root: Path, staging: Path) -> None:
-    """Of a version that kept the dataset in there while the longer one took its place."""
-    earlier = staging / "earlier"
-    if earlier.is_dir() and not os.path.lexists(root):
-        earlier.rename(root)
+    named = root.is_dir() and (staging / _RECORDING).is_file()
+    return named and source_of(root) == _read(staging)["id"]

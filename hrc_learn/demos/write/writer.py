@@ -12,7 +12,7 @@ from hrc_learn.demos.format.dataset_folder import DatasetFolder, open_folder
 from hrc_learn.demos.format.metadata import INDEX_FEATURES, episode_statistics, read_sidecar
 from hrc_learn.demos.format.videos import CameraRecorder, Image, video_features
 from hrc_learn.demos.issue import DatasetError
-from hrc_learn.demos.write.assembly import begin, claim_recording, discard, finish
+from hrc_learn.demos.write.assembly import begin, discard, finish
 from hrc_learn.demos.write.episode import (
     Column,
     Episode,
@@ -32,7 +32,7 @@ from hrc_learn.demos.write.episode import (
     to_table,
     write_episode,
 )
-from hrc_learn.store import DATASET
+from hrc_learn.store import DATASET, Claim
 
 
 class DatasetWriter:
@@ -110,7 +110,8 @@ class DatasetWriter:
         self._video_features = video_features(cameras or {}, self.fps)
         self._staging = staging_folder(self.root)
         self._images = CameraRecorder(cameras or {}, self.fps, self._staging)
-        self._claim = claim_recording(self.root)
+        self._staging.parent.mkdir(parents=True, exist_ok=True)
+        self._claim = Claim(self.root)
         try:
             self._earlier = self._continue() if append else None
             if append:
