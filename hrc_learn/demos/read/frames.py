@@ -106,10 +106,10 @@ def _read_batch(
         try:
             columns[key] = to_numpy(table.column(key))
         except BadRowError as error:
-            entry = _entry_at(entries, error.row + rows.start)
-            frame = error.row + rows.start - entry.start
+            row = error.row + rows.start
+            entry = next(e for e in entries if e.start <= row < e.start + e.length)
             raise DatasetError(
-                str(error), file=file, episode=entry.index, frame=frame, key=key
+                str(error), **entry.location, frame=row - entry.start, key=key
             ) from error
         _require_width(folder, file, key, columns[key])
     for entry in entries:
@@ -159,10 +159,6 @@ def _require_episode(file: str, entry: EpisodeEntry, frames: RawFrames) -> None:
             frame=int(wrong[0]),
             key="episode_index",
         )
-
-
-def _entry_at(entries: Sequence[EpisodeEntry], row: int) -> EpisodeEntry:
-    return next(entry for entry in entries if entry.start <= row < entry.start + entry.length)
 
 
 # When each frame was taken.

@@ -89,7 +89,8 @@ def _pose(
         orientation = to_quaternion(role, quantities[role])
         if "position" in scaled:
             return {"orientation": orientation}
-        position = matrix_position(quantities[role]) * decisions[role].factor
+        matrices = _as_transforms(torch.from_numpy(quantities[role]))
+        position = matrices[:, :3, 3].numpy() * decisions[role].factor
         return {"orientation": orientation, "position": position}
     except ValueError as error:
         raise DatasetError(str(error), **entry.location, key=role) from error
@@ -134,18 +135,11 @@ def to_quaternion(
         case "rotation_6d":
             orientation = _from_two_columns(numbers)
         case _:
-            orientation = quaternion.from_matrix(as_transforms(numbers)[:, :3, :3])
+            orientation = quaternion.from_matrix(_as_transforms(numbers)[:, :3, :3])
     return quaternion.continuous(orientation).numpy()
 
 
-def matrix_position(
-    values: Float64[np.ndarray, "frames 16"],
-) -> Float64[np.ndarray, "frames 3"]:
-    """Translation of flattened 4x4 transforms."""
-    return as_transforms(torch.from_numpy(values))[:, :3, 3].numpy()
-
-
-def as_transforms(values: Tensor) -> Tensor:
+def _as_transforms(values: Tensor) -> Tensor:
     """4x4 transforms from 16 numbers, whether written by rows or, as libfranka, by columns.
 
     Raises:
@@ -222,20 +216,23 @@ class DemonstrationSource(Sequence[Demonstration]):
         reader: EpisodeReader,
         decisions: Mapping[str, UnitDecision],
         joint_names: Sequence[str] | None = None,
-        notes: Sequence[str] = (),
     ):
         """
         Args:
             reader: The episodes, in order.
             decisions: Unit of each quantity on disk, by role.
             joint_names: Joints wanted, all of the dataset; None: all as they come.
-            notes: What to tell the user.
+
+        Raises:
+            DatasetError: A joint wanted is not of the dataset.
         """
         self._reader = reader
         self._decisions = dict(decisions)
         names = reader.column_mapping.joint_names if joint_names is None else joint_names
+        joint_columns(reader.column_mapping.joint_names, names)
         self.joint_names = tuple(names)
-        self.notes = tuple(notes)
+        guesses = (decision.note for decision in decisions.values() if decision.note)
+        self.notes = (*reader.notes, *guesses)
         self.source = str(reader.folder.root)
 
     @overload
@@ -245,16 +242,16 @@ class DemonstrationSource(Sequence[Demonstration]):
     def __getitem__(self, index):
         if isinstance(index, slice):
             chosen = replace(self._reader, entries=self._reader.entries[index])
-            return DemonstrationSource(chosen, self._decisions, self.joint_names, self.notes)
+            return DemonstrationSource(chosen, self._decisions, self.joint_names)
         (episode,) = self._reader.read([self._reader.entries[index]])
-        return self._convert(episode)
+        return self.convert(episode)
 
     def __len__(self) -> int:
         return len(self._reader.entries)
 
     def __iter__(self) -> Iterator[Demonstration]:
         for run in _runs(self._reader.entries):
-            yield from map(self._convert, self._reader.read(run))
+            yield from map(self.convert, self._reader.read(run))
 
     def __repr__(self) -> str:
         return (
@@ -285,7 +282,8 @@ class DemonstrationSource(Sequence[Demonstration]):
         """
         return DemonstrationSet([*self], notes=self.notes, source=self.source)
 
-    def _convert(self, episode: RawEpisode) -> Demonstration:
+    def convert(self, episode: RawEpisode) -> Demonstration:
+        """The demonstration of an episode that its reader has read."""
         reader = self._reader
         demo = to_demonstration(reader.folder, episode, reader.column_mapping, self._decisions)
         if reader.extracted is not None:
@@ -340,21 +338,12 @@ def load_demos(
             key where known, and what to do.
     """
     reader = open_reader(path, episodes, mapping, tasks, where)
-    column_mapping = reader.column_mapping
     raw = {e.entry.index: e for e in reader.read(tuple(dict.fromkeys(reader.entries)))}
     decisions = reader.decide_units(raw.values(), units or {})
-    demos = [
-        to_demonstration(reader.folder, raw[entry.index], column_mapping, decisions)
-        for entry in reader.entries
-    ]
-    if reader.extracted is not None:
-        demos = [with_feature(demo, reader.extracted) for demo in demos]
-    if joint_names is not None:
-        joint_columns(column_mapping.joint_names, joint_names)
-        demos = [demo.select_joints(joint_names) for demo in demos]
+    source = DemonstrationSource(reader, decisions, joint_names)
+    demos = [source.convert(raw[entry.index]) for entry in reader.entries]
     _warn_of_conversions(reader.folder.root, decisions)
-    notes = [*reader.notes, *_guesses(decisions)]
-    return DemonstrationSet(demos, notes=notes, source=str(reader.folder.root))
+    return DemonstrationSet(demos, notes=source.notes, source=source.source)
 
 
 def open_demos(
@@ -374,19 +363,14 @@ def open_demos(
     question are read once through here; a declared or given unit spares that.
     """
     reader = open_reader(path, episodes, mapping, tasks, where)
-    if joint_names is not None:
+    if joint_names is not None:  # before anything long is read
         joint_columns(reader.column_mapping.joint_names, joint_names)
     decisions = reader.survey(units or {})
     _warn_of_conversions(reader.folder.root, decisions)
-    notes = (*reader.notes, *_guesses(decisions))
-    return DemonstrationSource(reader, decisions, joint_names, notes)
+    return DemonstrationSource(reader, decisions, joint_names)
 
 
 def _warn_of_conversions(root: Path, decisions: Mapping[str, UnitDecision]) -> None:
     for decision in decisions.values():
         if decision.converts:
             warnings.warn(f"{root}: {decision.note}", UnitsWarning, stacklevel=3)
-
-
-def _guesses(decisions: Mapping[str, UnitDecision]) -> list[str]:
-    return [decision.note for decision in decisions.values() if decision.note]

@@ -263,14 +263,19 @@ def decide_units(
     """
     for role, unit in given.items():
         unit_factor(role, unit)
-    _check_declared(declared)
+    for role, unit in declared.items():
+        try:
+            unit_factor(role, unit)
+        except DatasetError as error:
+            raise DatasetError(str(error), file=SIDECAR_PATH, key=f"units.{role}") from error
     stated = {**declared, **given}
     decisions: dict[str, UnitDecision] = {}
     for role in sorted(largest, key=lambda role: role in _FOLLOWERS):
         if role in stated:
             decisions[role] = UnitDecision(role=role, unit=stated[role])
         elif (leader := decisions.get(_FOLLOWERS.get(role, ""))) is not None:
-            decisions[role] = UnitDecision(role=role, unit=_following_unit(role, leader.unit))
+            per_second = "/s" if role.endswith("velocity") else ""
+            decisions[role] = UnitDecision(role=role, unit=leader.unit + per_second)
         elif role == "time":
             decisions[role] = _guess_time(frame_step)
         elif role in _GUESSABLE:
@@ -283,18 +288,6 @@ def decide_units(
 def guessed_from_values(roles: Iterable[str], stated: Collection[str]) -> list[str]:
     """Quantities whose unit can only be told from the size of their values."""
     return [role for role in roles if role in _GUESSABLE and role not in stated]
-
-
-def _check_declared(declared: Mapping[str, str]) -> None:
-    for role, unit in declared.items():
-        try:
-            unit_factor(role, unit)
-        except DatasetError as error:
-            raise DatasetError(str(error), file=SIDECAR_PATH, key=f"units.{role}") from error
-
-
-def _following_unit(role: str, unit: str) -> str:
-    return f"{unit}/s" if role.endswith("velocity") else unit
 
 
 def _guess(role: str, largest: float) -> UnitDecision:

@@ -94,7 +94,7 @@ def repair_dataset(
             report.frames_before += entry.length
             try:
                 edit = _repair(folder, entry, semantics, options)
-                cut = cut_segments(edit, recast.videos_of(entry), folder.fps)
+                cut = recast.videos_of(edit)
             except DatasetError as error:
                 if not options.drop_bad_episodes:
                     raise
@@ -214,22 +214,36 @@ class ColumnRewriter:
             sidecar=self._sidecar(sidecar, units),
         )
 
-    def videos_of(self, entry: EpisodeEntry) -> Segments:
-        """Where the images of the cameras that are kept lie.
+    def videos_of(self, edit: EpisodeEdit) -> Segments:
+        """The parts of the old videos that show the frames that are left.
 
         Raises:
-            DatasetError: Some of them are not there.
+            DatasetError: Some of them are not there, or those frames are not in one piece.
         """
-        found = self._segments.get(entry.index, {})
+        found, fps = self._segments.get(edit.entry.index, {}), self._folder.fps
         missing = [key for key in self._cameras if key not in found]
         if missing:
             raise DatasetError(
                 "the video of this episode is missing: leave out the videos (videos=False), or "
                 "the episode (drop_bad_episodes)",
-                episode=entry.index,
+                episode=edit.entry.index,
                 key=missing[0],
             )
-        return {key: found[key] for key in self._cameras}
+        if self._cameras and (edit.kept is None or (np.diff(edit.kept) != 1).any()):
+            raise edit.bad(
+                "its videos would have to be encoded anew, because frames were dropped in the "
+                "middle or resampled: leave the videos out (videos=False), or the frames as "
+                "they are (drop_repeats=False, drop_bad_frames=False, fps=None)"
+            )
+        first = 0 if edit.kept is None else int(edit.kept[0])
+        return {
+            key: VideoSegment(
+                file=found[key].file,
+                start=found[key].start + first / fps,
+                stop=found[key].start + (first + len(edit)) / fps,
+            )
+            for key in self._cameras
+        }
 
     def stage(self, path: Path, edit: EpisodeEdit, frames_before: int) -> None:
         """Write one episode beside the new dataset."""
@@ -294,31 +308,3 @@ class ColumnRewriter:
             return np.array([self._task_index[int(i)] for i in edit.frames["task_index"][:, 0]])
         texts = edit.entry.tasks or self.tasks[:1]
         return np.full(len(edit), self.tasks.index(texts[0]))
-
-
-# Images of repaired episodes: the parts of the old videos that show what is left.
-
-
-def cut_segments(edit: EpisodeEdit, segments: Segments, fps: float) -> Segments:
-    """The images of those frames that are left.
-
-    Raises:
-        DatasetError: They are not in one piece.
-    """
-    if not segments:
-        return {}
-    if edit.kept is None or (np.diff(edit.kept) != 1).any():
-        raise edit.bad(
-            "its videos would have to be encoded anew, because frames were dropped in the "
-            "middle or resampled: leave the videos out (videos=False), or the frames as they "
-            "are (drop_repeats=False, drop_bad_frames=False, fps=None)"
-        )
-    first, count = int(edit.kept[0]), len(edit.kept)
-    return {
-        key: VideoSegment(
-            file=segment.file,
-            start=segment.start + first / fps,
-            stop=segment.start + (first + count) / fps,
-        )
-        for key, segment in segments.items()
-    }

@@ -52,7 +52,12 @@ def check_metadata(root: Path, report: ValidationReport) -> DatasetFolder | None
     )
     for fault in count_faults(folder):
         report.add(fault)
-    _check_statistics(folder, report)
+    statistics = ("meta/stats.json", "meta/episodes_stats.jsonl")
+    if not any((root / file).is_file() for file in statistics):
+        report.warning(
+            "no statistics: LeRobot's policies cannot normalise their inputs",
+            file=statistics[0],
+        )
     _check_videos(folder, report)
     return folder
 
@@ -166,15 +171,6 @@ def _report_missing(file: str, key: str, report: ValidationReport) -> None:
     else:
         report.error(
             "the column is declared in meta/info.json, but missing", file=file, key=key
-        )
-
-
-def _check_statistics(folder: DatasetFolder, report: ValidationReport) -> None:
-    files = ("meta/stats.json", "meta/episodes_stats.jsonl")
-    if not any((folder.root / file).is_file() for file in files):
-        report.warning(
-            "no statistics: LeRobot's policies cannot normalise their inputs",
-            file=files[0],
         )
 
 

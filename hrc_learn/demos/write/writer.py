@@ -93,7 +93,11 @@ class DatasetWriter:
             raise ValueError(f"fps must be positive, got {fps}")
         if len(set(joint_names)) != len(joint_names):
             raise ValueError(f"joint names must differ, got {', '.join(joint_names)}")
-        _check_feature_keys(features or {})
+        for key in features or {}:
+            if not key.startswith(("observation.", "action.")):
+                raise ValueError(
+                    f"feature {key!r} needs a key that LeRobot understands: 'observation.{key}'"
+                )
         self.fps = float(fps)
         self.robot_type = robot_type
         self.joint_names = tuple(joint_names)
@@ -336,11 +340,3 @@ def _require_same_columns(folder: DatasetFolder, header: RecordingHeader) -> Non
             f"{theirs.get(differing[0])}, here {ours.get(differing[0])}; record the same "
             f"quantities with the same settings, or a dataset of its own"
         )
-
-
-def _check_feature_keys(features: Mapping[str, Sequence[str]]) -> None:
-    for key in features:
-        if not key.startswith(("observation.", "action.")):
-            raise ValueError(
-                f"feature {key!r} needs a key that LeRobot understands: 'observation.{key}'"
-            )
