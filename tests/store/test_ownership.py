@@ -8,6 +8,7 @@ from cakes import KIND, cake, contents, fill
 from hrc_learn.store import (
     MADE_BY,
     MANIFEST,
+    Kind,
     new_folder,
     replacing,
 )
@@ -57,6 +58,28 @@ def test_what_older_versions_wrote_is_replaced(tmp_path):
     (tmp_path / "out" / MANIFEST).unlink()
     fill(tmp_path / "out", "new", overwrite=True)
     assert contents(tmp_path) == cake("new")
+
+
+@pytest.mark.parametrize(
+    ("text", "ours"),
+    [('{"by": "us"}', True), ('{"by": "them"}', False), ("[]", False), ("no JSON", False)],
+)
+def test_a_mark_without_a_manifest_must_say_whose_it_is(tmp_path, text, ours):
+    kind = Kind(name="pie", mark="mark", says=("by", "us"), files=("mark",), manifest=False)
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "mark").write_text(text)
+
+    def bake():
+        with replacing(tmp_path / "out", kind, overwrite=True) as folder:
+            folder.mkdir()
+            (folder / "mark").write_text("new")
+
+    if ours:
+        bake()
+    else:
+        with pytest.raises(FileExistsError, match="not ours to overwrite"):
+            bake()
+    assert contents(tmp_path) == {"out/mark": "new" if ours else text}
 
 
 def test_an_empty_folder_may_be_filled(tmp_path):

@@ -1,8 +1,12 @@
 """Files and folders are whole or not there at all, whatever happens to their writer."""
 
+import json
+import math
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 from cakes import KIND, WorkFailedError, cake, contents, fail_to_fill, fill
 
 from hrc_learn import store
@@ -142,3 +146,14 @@ def test_results_replace_older_results_only(tmp_path):
     ):
         pass
     assert contents(tmp_path / "cake")["result"] == "sweet"
+
+
+def test_folders_of_texts_and_values_are_made_where_they_are_missing(tmp_path):
+    path = tmp_path / "far" / "away" / "text"
+    for text in ("süß\n", "newer\n"):
+        store.write_text(path, text)
+        assert path.read_text(encoding="utf-8") == text
+    values = {"a": np.float32(0.5), "b": torch.tensor(3), "c": math.inf, "d": True}
+    store.write_json(path.with_name("values"), values)
+    written = json.loads(path.with_name("values").read_text())
+    assert written == {"a": 0.5, "b": 3, "c": None, "d": True}
