@@ -194,8 +194,9 @@ def watch_command(name: str, inputs: Path, folder: Path, rng: random.Random) -> 
         start_again(run, root, count)
         if not case.long:
             put_back(before, root)
-            watch(words, root, folder / f"{turn} killed", count, rng, rng.randint(1, changes))
-            mend_and_judge(run, root, count, {}, "killed")
+            change = rng.randint(1, max(1, changes // 2))  # it may be quicker this time
+            watch(words, root, folder / f"{turn} killed", count, rng, change)
+            mend_and_judge(run, root, count, {}, "killed", by_name=True)
         put_back(after, root)
     return count
 
@@ -224,7 +225,7 @@ def watch(
     copies.mkdir()
     recorder, pause, changes = Recorder(root, copies), SHORTEST, 0
     recorder.take()
-    with open(f"{copies}.log", "wb") as log:
+    with copies.with_name(f"{copies.name}.log").open("wb") as log:
         process = subprocess.Popen(
             [sys.executable, os.path.abspath(__file__), str(copies.resolve()), *words],
             cwd=root,
@@ -254,7 +255,7 @@ def watch(
 
 
 class Recorder:
-    """Copies a folder whenever it has changed; files that have not are links to the last copy."""
+    """Copies a folder when it has changed; files that have not are links to the last copy."""
 
     def __init__(self, root: Path, copies: Path):
         self.last = root
@@ -320,7 +321,12 @@ def run_watched(copies: Path, words: list[str]) -> None:
 
 
 def mend_and_judge(
-    run: Run, root: Path, count: Count, episodes: dict[str, int], state: str
+    run: Run,
+    root: Path,
+    count: Count,
+    episodes: dict[str, int],
+    state: str,
+    by_name: bool = False,
 ) -> None:
     """Recover the folder, and count what is wrong with it then.
 
@@ -330,16 +336,21 @@ def mend_and_judge(
         count: Of faults.
         episodes: Of each dataset, how many were seen in earlier states: none may be lost.
         state: For messages.
+        by_name: Leave the contents of files aside, as they are those of another run.
     """
     from hrc_learn.demos import check_dataset, load_demos, recover_all
 
     case = run.case
     done = recover_all(root)
-    found = tree(root)
-    for unit in sorted({_unit(name, case.depth) for name in (*found, *run.before, *run.after)}):
+    trees = (tree(root), run.before, run.after)
+    for unit in sorted({_unit(name, case.depth) for files in trees for name in files}):
         here, old, new = (
-            {name: digest for name, digest in files.items() if _unit(name, case.depth) == unit}
-            for files in (found, run.before, run.after)
+            {
+                name: "" if by_name else digest
+                for name, digest in files.items()
+                if _unit(name, case.depth) == unit
+            }
+            for files in trees
         )
         fault = None
         if unit in case.datasets and here not in (old, new):
@@ -430,10 +441,10 @@ def make_inputs(inputs: Path) -> None:
             subprocess.run([*hrc, *words.split(), "--out", name], cwd=inputs, check=True)
     time_ = np.arange(200) / 50
     np.savez(inputs / "x.npz", q=np.sin(time_[:, None] + np.arange(3)), t=time_)
-    processors = ("policy_preprocessor.json", "policy_postprocessor.json")
     (inputs / "checkpoint").mkdir(exist_ok=True)
-    for name in processors:
-        (inputs / "checkpoint" / name).write_text(json.dumps({"name": "policy", "steps": []}))
+    for name in ("policy_preprocessor.json", "policy_postprocessor.json"):
+        text = json.dumps({"name": "policy", "steps": []})
+        (inputs / "checkpoint" / name).write_text(text, encoding="utf-8")
     if not (inputs / "marked").exists():
         _record_marker(inputs / "marked")
     if not (inputs / "set.recording").exists():
