@@ -28,7 +28,7 @@ from hrc_learn.jacobian import (
     paper_grid,
 )
 from hrc_learn.jacobian.estimator import MotionSample
-from hrc_learn.jacobian.recursive_estimators import condition
+from hrc_learn.jacobian.learning_estimators import condition
 
 ALL = [
     FixedEstimator,
