@@ -7,13 +7,21 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from hrc_learn.dmp._arguments import (
+    FitReport,
+    Mask,
+    Points,
+    Quaternions,
+    Scalars,
+    Times,
+    Vectors,
+    to_tensor,
+)
+from hrc_learn.dmp._closed_loop_step import DMPState
+from hrc_learn.dmp._fitting import FitOptions
 from hrc_learn.dmp._system.response import Trajectory
-from hrc_learn.dmp._types import Mask, Points, Quaternions, Scalars, Times, Vectors, to_tensor
-from hrc_learn.dmp.closed_loop_step import DMPState
-from hrc_learn.dmp.coordinate_adapter import CoordinateAdapter, Retargeted
+from hrc_learn.dmp.coordinate_adapter import ColumnPoints, CoordinateAdapter, Ends, Retargeted
 from hrc_learn.dmp.coupling import velocity_coupling
-from hrc_learn.dmp.fitting.motion_samples import FitReport
-from hrc_learn.dmp.fitting.solvers import FitOptions
 from hrc_learn.dmp.joint_dmp import JointDMP
 from hrc_learn.dmp.linear_primitive import ColumnEnds, LinearPrimitive
 from hrc_learn.dmp.motion_primitive import AdaptedPrimitive
@@ -83,15 +91,13 @@ class DualArmCoordinates(CoordinateAdapter[Pose, PoseTrajectory, DualArmState]):
     def ends(
         self,
         motion: LinearPrimitive,
-        start: Pose | None,
-        goal: Pose | None,
+        given: Ends,
         duration: Tensor,
-        velocity: Vectors | None,
         **body: Vectors | None,
     ) -> tuple[ColumnEnds, Tensor]:
         """Start of both hands, goal of the object."""
-        goals = None if goal is None else self._goals(goal)
-        return self.hands.ends(motion, start, goals, duration, velocity, **body)
+        goals = None if given.goal is None else self._goals(given.goal)
+        return self.hands.ends(motion, given._replace(goal=goals), duration, **body)
 
     def trajectory(self, columns: Trajectory, frame: Tensor) -> PoseTrajectory:
         """Of both hands, with nothing to push them."""
@@ -151,15 +157,13 @@ class DualArmCoordinates(CoordinateAdapter[Pose, PoseTrajectory, DualArmState]):
     def via_points(
         self,
         motion: LinearPrimitive,
-        s: Tensor,
-        position: Tensor,
-        velocity: Tensor,
+        now: ColumnPoints,
         value: Pose | Any,
-        rate: Points | None,
+        velocity: Points | None,
         **body: Points | None,
-    ) -> tuple[Tensor, Tensor]:
+    ) -> ColumnPoints:
         """Poses of both hands, (*batch, 2, n)."""
-        return self.hands.via_points(motion, s, position, velocity, value, rate, **body)
+        return self.hands.via_points(motion, now, value, velocity, **body)
 
     def each(self, value: Scalars | None) -> Tensor | None:
         """The same for both hands."""

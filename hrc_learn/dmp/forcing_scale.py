@@ -19,7 +19,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from hrc_learn.dmp.fitting.motion_samples import demo_label
+from hrc_learn.dmp._arguments import demo_label
 
 MINIMUM_WAY = 1e-3
 """Smallest |g - y_0|, as a share of the range covered, that can be divided by: weights would be

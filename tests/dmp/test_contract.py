@@ -7,7 +7,7 @@ from dmp_contract import DMPContract
 from unchecked import shapes_unchecked
 
 from hrc_learn.dmp import JointDMP, OrientationDMP, PoseDMP, SplineBasis
-from hrc_learn.dmp import ude_formulation as ude
+from hrc_learn.dmp import _ude_formulation as ude
 from hrc_learn.geometry import Pose, quaternion
 
 

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.dmp._system.canonical import ROUNDING, ExponentialPhase, Phase, check_positive
+from hrc_learn.dmp._system.closed_forms import ROUNDING, ExponentialPhase, Phase, check_positive
 
 DOMAINS = ("time", "phase")
 

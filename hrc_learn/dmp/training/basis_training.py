@@ -14,15 +14,18 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from hrc_learn.dmp._arguments import Mask, Points, Times, check_samples
 from hrc_learn.dmp._system.bases import LearnedGaussianBasis, placed_activation
-from hrc_learn.dmp._system.canonical import ExponentialPhase, Phase
-from hrc_learn.dmp._system.forced_response import accumulate, impulse
-from hrc_learn.dmp._system.quintic_curves import approach_state
-from hrc_learn.dmp._system.spring import SpringDamper, transition
-from hrc_learn.dmp._types import Mask, Points, Times
-from hrc_learn.dmp.fitting.motion_samples import check_samples
+from hrc_learn.dmp._system.closed_forms import (
+    ExponentialPhase,
+    Phase,
+    SpringDamper,
+    approach_state,
+    transition,
+)
+from hrc_learn.dmp._system.response import accumulate, impulse
 from hrc_learn.dmp.joint_dmp import JointDMP
-from hrc_learn.dmp.training.gradient_descent import (
+from hrc_learn.dmp.training.weight_training import (
     DescentConfig,
     Progress,
     TrainingResult,

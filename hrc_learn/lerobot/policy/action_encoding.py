@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from hrc_learn.dmp.orientation_error import nearest_turn, to_error, to_orientation
+from hrc_learn.dmp import orientation_error
 from hrc_learn.geometry import quaternion
 
 # The coordinates in which actions move linearly.
@@ -55,8 +55,10 @@ class ActionEncoding(nn.Module):
         """Actions again; rotation vectors are the ones nearest to the reference's."""
         actions = coordinates * self.std + self.mean
         for triple, reference in zip(self.triples, self.reference, strict=True):
-            q = to_orientation(actions[..., triple], reference)
-            vector = nearest_turn(quaternion.log(q), quaternion.log(reference))
+            q = orientation_error.to_orientation(actions[..., triple], reference)
+            vector = orientation_error.nearest_turn(
+                quaternion.log(q), quaternion.log(reference)
+            )
             actions = _replaced(actions, triple, vector)
         return actions
 
@@ -89,7 +91,8 @@ class ActionEncoding(nn.Module):
     def _unrolled(self, actions: Tensor) -> Tensor:
         for triple, reference in zip(self.triples, self.reference, strict=True):
             q = quaternion.exp(actions[..., triple])
-            actions = _replaced(actions, triple, quaternion.unwrap_log(to_error(q, reference)))
+            error = orientation_error.to_error(q, reference)
+            actions = _replaced(actions, triple, quaternion.unwrap_log(error))
         return actions
 
 
