@@ -33,8 +33,8 @@ class FitOptions(TypedDict, total=False):
     """`"trajectory"` (default), least squares on the positions, the closest reproduction;
     `"ridge"`, regression on the force; `"lwr"`, the paper's."""
     robust: str | None
-    """`"huber"` or `"tukey"`: how samples that lie far off are trusted less; see `robust.py`.
-    None (default): all alike."""
+    """`"huber"` or `"tukey"`: how samples that lie far off are trusted less.
+    None (default): all alike. See `robust_weights`."""
     approach: float | int
     """Share of the motion, 0 to 1, along which a new start and goal are taken up, smoothly;
     0 (default): at once, as the paper has it."""

@@ -1,11 +1,12 @@
 """Movement primitive of two arms that hold on to each other's motion."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple, Unpack
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.utils._pytree import tree_map
 
 from hrc_learn.dmp._arguments import (
     FitReport,
@@ -29,8 +30,6 @@ from hrc_learn.dmp.orientation_error import intrinsic_mean
 from hrc_learn.dmp.pose_dmp import PoseCoordinates, PoseDMP, PoseState, PoseTrajectory
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.model_files import SavedModel
-
-STATE_FIELDS = tuple(field.name for field in fields(DMPState))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -107,26 +106,19 @@ class DualArmCoordinates(CoordinateAdapter[Pose, PoseTrajectory, DualArmState]):
         """Twice the same, and how the hands are held."""
         state = self.hands.state(*self.hands.begin(columns, frame))
         held, _ = relation(state.pose, state.twist)
-        both = {name: torch.stack([getattr(columns, name)] * 2) for name in STATE_FIELDS}
-        return DMPState(**both), HandsFrame(torch.stack([state.reference] * 2), held)
+        twice = tree_map(lambda x: torch.stack([x, x]), state)
+        return twice.motion, HandsFrame(twice.reference, held)
 
     def state(self, columns: DMPState, frame: HandsFrame) -> DualArmState:
         """Hands as they are and as planned, apart."""
-        arms, planned = (
-            PoseState(
-                motion=DMPState(**{name: getattr(columns, name)[k] for name in STATE_FIELDS}),
-                reference=frame.reference[k],
-            )
-            for k in range(2)
-        )
+        both = PoseState(motion=columns, reference=frame.reference)
+        arms, planned = tree_map(lambda x: x[0], both), tree_map(lambda x: x[1], both)
         return DualArmState(arms=arms, planned=planned, held=frame.held)
 
     def columns(self, state: DualArmState) -> tuple[DMPState, HandsFrame]:
         """Both in one batch, so that one step serves them."""
-        both = state.arms.motion, state.planned.motion
-        stacked = {name: torch.stack([getattr(x, name) for x in both]) for name in STATE_FIELDS}
-        reference = torch.stack([state.arms.reference, state.planned.reference])
-        return DMPState(**stacked), HandsFrame(reference, state.held)
+        both = tree_map(lambda *x: torch.stack(x), state.arms, state.planned)
+        return both.motion, HandsFrame(both.reference, state.held)
 
     def retarget(
         self,

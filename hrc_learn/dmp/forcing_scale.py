@@ -94,8 +94,7 @@ class Scaling(ABC):
         ones = torch.ones_like(values[..., :1, :])
         return values / self.scale(ones, reference.start, reference.goal, reference)
 
-    @abstractmethod
-    def check(
+    def check(  # noqa: B027  any motion will do unless a scaling says otherwise
         self, reference: Demonstrated, batch: tuple[int, ...], names: Sequence[str] | None
     ) -> None:
         """See whether demonstrations, on a flat batch, can be scaled so.
@@ -122,11 +121,6 @@ class NoScaling(Scaling):
 
     name: ClassVar[str] = "none"
 
-    def check(
-        self, reference: Demonstrated, batch: tuple[int, ...], names: Sequence[str] | None
-    ) -> None:
-        """Any motion will do."""
-
     def _scale(
         self, values: Any, start: Any, goal: Any, reference: Demonstrated, xp: ModuleType
     ) -> Any:
@@ -138,11 +132,6 @@ class AmplitudeScaling(Scaling):
     """By the range that each coordinate covers."""
 
     name: ClassVar[str] = "amplitude"
-
-    def check(
-        self, reference: Demonstrated, batch: tuple[int, ...], names: Sequence[str] | None
-    ) -> None:
-        """Any motion will do."""
 
     def _scale(
         self, values: Any, start: Any, goal: Any, reference: Demonstrated, xp: ModuleType

@@ -61,6 +61,12 @@ class SoftLimits:
         below = upper - beta * (_softplus(-b) - _softplus(-a))
         return self.clamp(torch.where(a + b < 0, above, below))
 
+    def constrain_rate(
+        self, x: Float[Tensor, "*#batch D"], rate: Float[Tensor, "*#batch D"]
+    ) -> Float[Tensor, "*batch D"]:
+        """Rate of q, from x and its rate."""
+        return torch.func.jvp(self.constrain, (x,), (rate,))[1]
+
     def release(self, q: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch D"]:
         """X of q, which lies between the limits: the inverse of `constrain`."""
         lower, upper, beta = self._like(q)
@@ -113,16 +119,13 @@ class LimitedTrajectory:
     @cached_property
     def velocity(self) -> Float[Tensor, "*batch T D"]:
         """The same per second."""
-        return self._velocity(self._free.position, self._free.velocity)
+        return self._limits.constrain_rate(self._free.position, self._free.velocity)
 
     @cached_property
     def acceleration(self) -> Float[Tensor, "*batch T D"]:
         """The same per second squared."""
         x, rate, curvature = self._free.position, self._free.velocity, self._free.acceleration
-        return torch.func.jvp(self._velocity, (x, rate), (rate, curvature))[1]
-
-    def _velocity(self, x: Tensor, rate: Tensor) -> Tensor:
-        return torch.func.jvp(self._limits.constrain, (x,), (rate,))[1]
+        return torch.func.jvp(self._limits.constrain_rate, (x, rate), (rate, curvature))[1]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -141,9 +144,7 @@ class LimitedState:
     @property
     def velocity(self) -> Float[Tensor, "*batch D"]:
         """Per second."""
-        motion = self.motion
-        rate = motion.velocity
-        return torch.func.jvp(self.limits.constrain, (motion.position,), (rate,))[1]
+        return self.limits.constrain_rate(self.motion.position, self.motion.velocity)
 
 
 torch.export.register_dataclass(LimitedState, serialized_type_name="hrc_learn.dmp.LimitedState")

@@ -169,7 +169,7 @@ class Response:
             spring: Gains.
             basis: Of the forcing term.
             approach: Share of the motion over which start and goal act along a minimum-jerk
-                curve, see `approach.py`; 0: they act through the spring alone, as printed.
+                curve, see `closed_forms.py`; 0: they act through the spring alone, as printed.
         """
         if not 0 <= approach <= 1 or (approach and basis.periodic):
             raise ValueError(

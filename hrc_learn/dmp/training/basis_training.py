@@ -29,6 +29,7 @@ from hrc_learn.dmp.training.weight_training import (
     DescentConfig,
     Progress,
     TrainingResult,
+    check_learnable,
     descend,
 )
 
@@ -86,11 +87,7 @@ def learn_basis(
     Raises:
         ValueError: Bad samples (says which) or unknown names.
     """
-    unknown = set(learn) - {*LEARNABLE}
-    if unknown or not learn:
-        raise ValueError(
-            f"learn must name some of {', '.join(LEARNABLE)}, got {', '.join(learn) or 'none'}"
-        )
+    check_learnable(learn, LEARNABLE)
     samples = check_samples(time, position, mask=mask)
     placement = Placement(n_basis, spring or SpringDamper(), phase or ExponentialPhase())
     # Relative to what the motions cover, so that tolerances mean the same for all.

@@ -161,7 +161,7 @@ def train[P: nn.Module](
 
     Args:
         dmp: Joint, orientation or pose primitive, or a batch; left as it is.
-        loss: Of a trajectory, one number per motion; see `losses.py`.
+        loss: Of a trajectory, one number per motion; see `trajectory_losses.py`.
         config: How far and how long.
         learn: `"weights"`, and `"goal"` of a joint primitive.
         condition: Arguments of `rollout` to train for, or what makes new ones of a generator
@@ -227,11 +227,7 @@ class _Shifted(nn.Module):
 
 def _parts(dmp: nn.Module, learn: Sequence[str], hold_end: bool) -> dict[str, _Shifted]:
     """What is learned, by its name in `_Rollout`."""
-    unknown = set(learn) - {*LEARNABLE}
-    if unknown or not learn:
-        raise ValueError(
-            f"learn must name some of {', '.join(LEARNABLE)}, got {', '.join(learn) or 'none'}"
-        )
+    check_learnable(learn, LEARNABLE)
     joint = isinstance(dmp, JointDMP)
     motion = dmp if joint else getattr(dmp, "motion", None)
     if not isinstance(motion, JointDMP):
@@ -248,6 +244,14 @@ def _parts(dmp: nn.Module, learn: Sequence[str], hold_end: bool) -> dict[str, _S
         unit = motion.amplitude.amax() * torch.eye(motion.goal.shape[-1])
         parts["dmp.goal"] = _Shifted(motion.goal, unit)
     return parts
+
+
+def check_learnable(learn: Sequence[str], known: Sequence[str]) -> None:
+    """Raise ValueError unless something is to be learned, and nothing unknown."""
+    if set(learn) - set(known) or not learn:
+        raise ValueError(
+            f"learn must name some of {', '.join(known)}, got {', '.join(learn) or 'none'}"
+        )
 
 
 def weight_directions(motion: JointDMP, hold_end: bool) -> Float[Tensor, "K N"]:
