@@ -20,7 +20,7 @@ from hrc_learn.dmp._arguments import (
     to_tensor,
 )
 from hrc_learn.geometry import quaternion
-from hrc_learn.geometry.rotation_rates import axis_drift, drift_free_rate, drift_free_slope
+from hrc_learn.geometry.quaternion import axis_drift, drift_free_rate, drift_free_slope
 
 _NO_AXIS = 1e-9
 """Rotation vectors shorter than this [rad] have no direction of their own."""
