@@ -9,7 +9,7 @@ from hrc_learn.demos import Demonstration, DemonstrationSet
 from hrc_learn.jacobian import EvidenceResult, RBFCenters
 from hrc_learn.kinematics import panda
 from hrc_learn.learning.visual_servo_fitting import Demonstrations, FeatureTrajectories
-from hrc_learn.skills.visual_servoing import VisualServoSkill
+from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.viz import (
     DemonstrationsRecording,
     DemonstrationTrace,

@@ -3,7 +3,7 @@ import json
 import numpy as np
 import pytest
 
-from hrc_learn.skills.visual_target import LONGEST_OFFSET, VisualTarget
+from hrc_learn.skills.visual_skill import LONGEST_OFFSET, VisualTarget
 
 
 def demonstrations(n, noise=0.0, seed=0):
