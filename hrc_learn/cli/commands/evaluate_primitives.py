@@ -13,8 +13,13 @@ from hrc_learn.cli.arguments.learn import EvaluatePrimitives as Args
 from hrc_learn.cli.arguments.learn import FitPrimitives
 from hrc_learn.cli.commands import fit_primitives
 from hrc_learn.demos import DemonstrationSet, load_demos, open_demos
-from hrc_learn.learning.channels import CHANNELS, Motions, load_primitive
-from hrc_learn.learning.reproduction_metrics import ReproductionError, reproduction_error
+from hrc_learn.learning.channels import (
+    CHANNELS,
+    Motions,
+    ReproductionError,
+    load_primitive,
+    reproduction_error,
+)
 from hrc_learn.store import new_folder, read_made_by
 from hrc_learn.viz.figures import measures_figure
 

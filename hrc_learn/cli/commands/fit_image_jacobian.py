@@ -11,8 +11,7 @@ from hrc_learn.cli._values import show_values, write_json
 from hrc_learn.cli.arguments.learn import FitImageJacobian as Args
 from hrc_learn.demos import DemonstrationSource, open_demos
 from hrc_learn.jacobian import CellErrors, RBFCenters, grid
-from hrc_learn.learning.fit_recordings import learning_recording
-from hrc_learn.learning.visual_servo_fitting import fit_visual_servo
+from hrc_learn.learning.visual_servo_fitting import fit_visual_servo, learning_recording
 from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.store import new_folder
 from hrc_learn.viz.figures import learning_figure, workspace_figure

@@ -76,7 +76,7 @@ def _fit_streamed(args: Args) -> None:
 
 def _fit_policy(args: Args, console: Console) -> None:
     # LeRobot takes ten seconds to import.
-    from hrc_learn.lerobot.policy.closed_form_checkpoint import write_closed_form_policy
+    from hrc_learn.lerobot.policy.modeling_dmp import write_closed_form_policy
 
     given = (args.channels, args.context, args.joint_names, args.robust)
     if any(given) or (args.several, args.method, args.scaling) != (

@@ -18,7 +18,7 @@ from hrc_learn.experiments.placing.arm_angle_ablation import Ablation
 from hrc_learn.experiments.run_measures import limit_violations, unwanted_contacts
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import panda
-from hrc_learn.learning.reproduction_metrics import dimensionless_jerk
+from hrc_learn.learning.channels import dimensionless_jerk
 from hrc_learn.sim import MotionLog, Touch, World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.grasping import OPEN
