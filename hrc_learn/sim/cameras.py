@@ -226,8 +226,6 @@ def open_camera(
 
 # How far above the marker the board is held, towards the camera: clear of the gripper [m].
 _BOARD_HEIGHT = 0.10
-# Directions tried in which a camera may move and still see what it should.
-_ATTEMPTS = 10_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -254,6 +252,7 @@ class CameraChange:
         model: CameraModel,
         watched: Float[np.ndarray, "points 3"],
         rng: np.random.Generator,
+        attempts: int = 10_000,
     ) -> CameraModel:
         """A changed camera that still sees what it is there for.
 
@@ -261,12 +260,13 @@ class CameraChange:
             model: The camera as it is.
             watched: Points that stay in its view [m].
             rng: Source of the directions.
+            attempts: Directions tried.
 
         Raises:
             ValueError: If the points are out of view whatever the direction.
         """
         (fx, fy), s = model.focal, self.focus
-        for _ in range(_ATTEMPTS):
+        for _ in range(attempts):
             pose = model.pose.copy()
             pose[:3, 3] += self.distance * _direction(rng)
             turn = quaternion.exp(torch.from_numpy(self.angle * _direction(rng)))

@@ -216,7 +216,7 @@ def learning_figure(held_out: Sequence[float], best: int, unit: str) -> Figure:
     return figure
 
 
-def _ring(axes: Axes, x: float, y: float, words: str) -> None:
+def _ring(axes: Axes, x: float | int, y: float, words: str) -> None:
     """A ring around a point, with words beside it."""
     axes.plot(x, y, "o", color=palette.LIMIT, ms=8, mfc="none", mew=1.8)
     beside = {"xytext": (8, 8), "textcoords": "offset points"}

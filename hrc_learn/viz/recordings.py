@@ -124,7 +124,7 @@ class RunRecording:
         if self.camera is not None:
             series["camera.feature"] = self.camera.feature
             series["camera.target"] = self.camera.target
-        _check_samples("", self.time, series)
+        _check_samples(self.time, series)
 
 
 _SERIES = (
@@ -143,12 +143,12 @@ _SERIES = (
 
 
 def _check_samples(
-    of: str, time: Float[np.ndarray, " time"], series: Mapping[str, np.ndarray | None]
+    time: Float[np.ndarray, " time"], series: Mapping[str, np.ndarray | None]
 ) -> None:
     wrong = {n: len(v) for n, v in series.items() if v is not None and len(v) != len(time)}
     if wrong:
         raise ValueError(
-            f"{of}time has {len(time)} samples, but "
+            f"time has {len(time)} samples, but "
             + ", ".join(f"{name} has {n}" for name, n in wrong.items())
             + ". Log every field at every control step, with NaN where it has no value."
         )
@@ -225,8 +225,8 @@ class DemonstrationTrace:
 
     def __post_init__(self) -> None:
         names = ("joint_position", "position", "feature", "human_effort", "gripper")
-        series = {name: getattr(self, name) for name in names}
-        _check_samples(f"episode {self.episode}: ", self.time, series)
+        series = {f"episode {self.episode}: {name}": getattr(self, name) for name in names}
+        _check_samples(self.time, series)
 
     @property
     def duration(self) -> float:

@@ -109,7 +109,7 @@ def test_what_cannot_be_shown_is_refused():
     torn = shown(3, 20)
     # Set afterwards, since the checks of array shapes in tests would speak first.
     object.__setattr__(torn, "gripper", np.zeros(4))
-    with pytest.raises(ValueError, match="episode 3: gripper has 4 samples, but time has 20"):
+    with pytest.raises(ValueError, match="time has 20 samples, but episode 3: gripper has 4"):
         torn.__post_init__()
     with pytest.raises(ValueError, match="no demonstration to show"):
         DemonstrationsRecording(title="", joint_names=NAMES, demonstrations=())
