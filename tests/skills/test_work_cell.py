@@ -63,3 +63,21 @@ def test_a_path_is_left_when_its_end_is_told(cell):
     far = torch.full((7,), 0.1, dtype=torch.float64)
     path = joint_line(panda.ready, panda.ready + far, speed=0.3, dt=0.01).numpy()
     assert cell.follow_path(path, until=lambda: len(cell.log) == 12) == 12
+
+
+class CountingSensor:
+    def __init__(self):
+        self.asked = []
+
+    def detect(self, ids):
+        self.asked.append(ids)
+        return {}
+
+
+@pytest.mark.parametrize("tracked", [(), (7,)])
+def test_markers_are_detected_now_and_then_while_they_are_tracked(cell, tracked):
+    cell._sensor, cell.tracked_markers = CountingSensor(), tracked
+    cell.hold_pose(0.02)
+    assert cell._sensor.asked == []
+    cell.hold_pose(0.10)  # twelve steps by now, with a detection at each fourth
+    assert cell._sensor.asked == 3 * [tracked] * bool(tracked)
