@@ -170,7 +170,9 @@ def build_scene(config: SceneConfig) -> mujoco.MjSpec:
         _add_box(spec, obstacle).mocap = True
     for item in config.objects:
         _add_object(spec, item)
-    _add_occluder(spec)
+    # A board that may be held in front of the camera; nothing can touch it.
+    board = spec.worldbody.add_body(name=OCCLUDER, pos=NOWHERE, mocap=True)
+    add_box(board, OCCLUDER, OCCLUDER_HALF_SIZE, OCCLUDER_COLOUR, contype=0, conaffinity=0)
     return spec
 
 
@@ -220,12 +222,6 @@ def _add_box(spec: mujoco.MjSpec, box: Box):
     body = spec.worldbody.add_body(name=box.name, pos=box.centre)
     add_box(body, box.name, box.half_size, box.colour)
     return body
-
-
-def _add_occluder(spec: mujoco.MjSpec) -> None:
-    """A board that may be held in front of the camera; nothing can touch it."""
-    body = spec.worldbody.add_body(name=OCCLUDER, pos=NOWHERE, mocap=True)
-    add_box(body, OCCLUDER, OCCLUDER_HALF_SIZE, OCCLUDER_COLOUR, contype=0, conaffinity=0)
 
 
 def _add_object(spec: mujoco.MjSpec, item: ObjectConfig) -> None:

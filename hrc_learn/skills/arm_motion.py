@@ -163,11 +163,7 @@ class PositionServo:
     """
 
     def __init__(
-        self,
-        chain: SerialChain,
-        arm: Arm,
-        dt: float,
-        config: PositionServoConfig | None = None,
+        self, chain: SerialChain, arm: Arm, dt: float, config: PositionServoConfig | None = None
     ):
         """Connect to the arm at rest.
 

@@ -139,10 +139,7 @@ class Grasping:
         )
         self.servo = VisualServo(cell, controller, workplace.tool_marker, config.servo)
 
-    def grasp(
-        self,
-        item: GraspObject,
-    ) -> GraspResult:
+    def grasp(self, item: GraspObject) -> GraspResult:
         """Grasp an object and lift it.
 
         Args:

@@ -34,12 +34,7 @@ from hrc_learn.skills.grasping import (
     raised,
 )
 from hrc_learn.skills.marker_sensor import longest_occlusion
-from hrc_learn.skills.placing import (
-    PlacingSkill,
-    Plan,
-    PlanningSpace,
-    plan_candidates,
-)
+from hrc_learn.skills.placing import PlacingSkill, Plan, PlanningSpace, plan_candidates
 from hrc_learn.skills.visual_servoing import ServoTarget
 from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.skills.work_cell import (

@@ -27,11 +27,7 @@ from hrc_learn.kinematics import (
     panda,
 )
 from hrc_learn.regions import JointRegion
-from hrc_learn.skills.arm_motion import (
-    joint_line,
-    nearest_configuration,
-    resolved_rate,
-)
+from hrc_learn.skills.arm_motion import joint_line, nearest_configuration, resolved_rate
 from hrc_learn.skills.work_cell import BlockedPathError, CollisionChecker, Workplace
 
 PlanningSpace = Literal["joint", "pose"]

@@ -12,12 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.controller import (
-    AdaptiveController,
-    ControllerState,
-    Goals,
-    Observation,
-)
+from hrc_learn.controller import AdaptiveController, ControllerState, Goals, Observation
 from hrc_learn.controller.interface import IMAGE_SIZE
 from hrc_learn.geometry import Pose
 from hrc_learn.skills.work_cell import MissedGraspError, WorkCell

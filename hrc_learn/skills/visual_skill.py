@@ -91,10 +91,7 @@ class VisualTarget:
             directions = jacobians[..., :3].reshape(-1, 3)
             offset, offset_error = _solved(directions, tools - objects, LONGEST_OFFSET)
         return cls(
-            matrix=matrix.reshape(3, 2).T,
-            error=error,
-            offset=offset,
-            offset_error=offset_error,
+            matrix=matrix.reshape(3, 2).T, error=error, offset=offset, offset_error=offset_error
         )
 
     def __call__(self, pixel: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:

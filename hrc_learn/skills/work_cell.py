@@ -355,9 +355,7 @@ class WorkCell:
         self._settle(goal, _SETTLING_TIME)
 
     def follow_path(
-        self,
-        path: Float[np.ndarray, "steps joints"],
-        until: Callable[[], bool] = lambda: False,
+        self, path: Float[np.ndarray, "steps joints"], until: Callable[[], bool] = lambda: False
     ) -> int:
         """Move the joints along a path sampled at the control step.
 

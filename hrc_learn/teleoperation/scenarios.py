@@ -17,10 +17,7 @@ from hrc_learn.kinematics import gripper_down, panda
 from hrc_learn.protocols import ArmState, Human, HumanInput
 from hrc_learn.sim import CameraKind, World, open_camera
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.arm_motion import (
-    PositionServo,
-    nearest_configuration,
-)
+from hrc_learn.skills.arm_motion import PositionServo, nearest_configuration
 from hrc_learn.skills.grasping import CLOSED, OPEN
 from hrc_learn.skills.marker_sensor import MarkerSensor
 from hrc_learn.teleoperation.scripted_demonstrations import (
@@ -189,13 +186,7 @@ class ScenarioRun:
 
     expert: Human
 
-    def __init__(
-        self,
-        scenario: Scenario,
-        fps: float,
-        *,
-        seed: int = 0,
-    ):
+    def __init__(self, scenario: Scenario, fps: float, *, seed: int = 0):
         """Begin.
 
         Args:

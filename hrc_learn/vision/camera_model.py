@@ -120,11 +120,7 @@ class CameraModel:
             )
 
     def look_at(
-        self,
-        eye: Float[np.ndarray, "3"],
-        target: Float[np.ndarray, "3"],
-        *,
-        roll: float = 0.0,
+        self, eye: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"], *, roll: float = 0.0
     ) -> "CameraModel":
         """The same camera placed at `eye` with `target` on its optical axis.
 

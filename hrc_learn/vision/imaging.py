@@ -90,11 +90,8 @@ class Lens:
             principal=((width - 1) / 2, (height - 1) / 2),
             distortion=NONE,
         )
-        self._map = self._source_pixels()
-
-    def _source_pixels(self) -> Float32[np.ndarray, "h w 2"]:
-        normalised = pixel_rays(self.model)
-        return (normalised * self.pinhole.focal + self.pinhole.principal).astype(np.float32)
+        rays = pixel_rays(model)
+        self._map = (rays * self.pinhole.focal + self.pinhole.principal).astype(np.float32)
 
     def apply(self, image: UInt8[np.ndarray, "ph pw 3"]) -> UInt8[np.ndarray, "h w 3"]:
         """The image of `model` from the image of `pinhole`."""

@@ -330,9 +330,7 @@ class SweptTrials:
         """The trials of a class."""
         chosen = self.group == group
         return SweptTrials(
-            success=self.success[chosen],
-            arrival=self.arrival[chosen],
-            group=self.group[chosen],
+            success=self.success[chosen], arrival=self.arrival[chosen], group=self.group[chosen]
         )
 
 

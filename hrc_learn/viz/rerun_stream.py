@@ -102,9 +102,7 @@ def send_curves(
 def style(curves: Curves) -> rr.SeriesLines:
     """Names, colours and widths of curves."""
     return rr.SeriesLines(
-        names=curves.names,
-        colors=curves.colours,
-        widths=[curves.width] * len(curves.names),
+        names=curves.names, colors=curves.colours, widths=[curves.width] * len(curves.names)
     )
 
 
@@ -320,8 +318,7 @@ class CameraStream:
                 _ROOT,
                 seconds(camera.image_time[self._images :]),
                 rr.EncodedImage.columns(
-                    blob=[_jpeg(image) for image in new],
-                    media_type=["image/jpeg"] * len(new),
+                    blob=[_jpeg(image) for image in new], media_type=["image/jpeg"] * len(new)
                 ),
             )
         self._images += len(new)

@@ -16,7 +16,7 @@ from urllib.parse import quote
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-from jaxtyping import Float, Int, Shaped
+from jaxtyping import Int, Shaped
 
 from hrc_learn.viz import palette
 from hrc_learn.viz.panels import Plot, run_tabs, several
@@ -50,11 +50,13 @@ def run_outline(run: RunRecording) -> tuple:
 
 def run_layout(run: RunRecording) -> rrb.Blueprint:
     """The robot and its camera beside tabs of curves."""
+    # The first look at the scene should not miss the camera.
+    eyes = [] if run.camera is None else [run.camera.model.pose[None, :3, 3]]
     scene = rrb.Spatial3DView(
         origin="/world",
         contents=["+ /world/**", "- /world/camera/image/**"],
         name="Robot: path of the run (blue), demonstration (grey), plan (orange)",
-        eye_controls=frame_view(_sights(run)),
+        eye_controls=frame_view(np.concatenate([run.position, *eyes])),
     )
     left: list[rrb.View] = [scene]
     if run.camera is not None:
@@ -73,12 +75,6 @@ def run_layout(run: RunRecording) -> rrb.Blueprint:
         right.append(rrb.TextLogView(origin="/phases", name="Phases of the task", columns=text))
     tabs_and_text = rrb.Vertical(contents=right, row_shares=[5, 1][: len(right)])
     return dashboard(left, [tabs_and_text], row_shares=(3, 2))
-
-
-def _sights(run: RunRecording) -> Float[np.ndarray, "n 3"]:
-    """What the first look at the scene should not miss: the path and the camera."""
-    eyes = [] if run.camera is None else [run.camera.model.pose[None, :3, 3]]
-    return np.concatenate([run.position, *eyes])
 
 
 _POSE_RATE = 30.0  # robot poses sent a second
@@ -202,12 +198,7 @@ class LogStream:
     `stream.connect_grpc()` show it in a viewer, `stream.save()` keeps it.
     """
 
-    def __init__(
-        self,
-        log: LoggedSteps,
-        stream: rr.RecordingStream,
-        columns: Sequence[str],
-    ):
+    def __init__(self, log: LoggedSteps, stream: rr.RecordingStream, columns: Sequence[str]):
         """Send the layout.
 
         Args:

@@ -128,7 +128,10 @@ class PageScene:
         self._own = [self._draw("", body) for body in bodies]
         # Objects that are carried have no twin: what matters is what can be held.
         self._copies = [
-            self._draw("/twin", body) if _is_part_of_arm(body) else None for body in bodies
+            self._draw("/twin", body)
+            if body.name.startswith("link") or body.name in _END_EFFECTOR_PARTS
+            else None
+            for body in bodies
         ]
         self._knobs = {joint: self._draw_knob("", joint) for joint in _KNOBS}
         self._twin_knobs = {joint: self._draw_knob("/twin", joint) for joint in _KNOBS}
@@ -142,7 +145,8 @@ class PageScene:
         here = np.zeros(3)
         for body, own, copy in zip(self._bodies, self._own, self._copies, strict=True):
             is_hand = body.name in _END_EFFECTOR_PARTS
-            joint = None if is_hand else _joint_of(body)
+            link = None if is_hand else re.fullmatch(r"link([1-9]\d*)", body.name)
+            joint = int(link[1]) if link else None
             if is_hand or joint is not None:
                 yield own, joint, here
                 if copy is not None:
@@ -246,16 +250,6 @@ class PageScene:
         server.initial_camera.position = (2.65, 1.05, 1.15)
         server.initial_camera.look_at = (0.1, 0.47, 0.12)
         server.initial_camera.fov = 0.9
-
-
-def _joint_of(body: Body) -> int | None:
-    """Joint that moves a link, by its name; None for what is no link that moves."""
-    match = re.fullmatch(r"link([1-9]\d*)", body.name)
-    return int(match[1]) if match else None
-
-
-def _is_part_of_arm(body: Body) -> bool:
-    return body.name.startswith("link") or body.name in _END_EFFECTOR_PARTS
 
 
 _BASE_AXES = (1.0, 0.0, 0.0, 0.0)  # unit quaternion (wxyz)

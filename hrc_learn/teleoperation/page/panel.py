@@ -49,28 +49,23 @@ def state_html(status: PageStatus, rate: float, people: int) -> str:
         rate: Steps that the loop takes [1/s].
         people: Browsers that show the page.
     """
+    if status.doing:
+        doing = f"{_badge(BLUE, status.doing)}&ensp;{status.seconds:.1f} s"
+    else:
+        colour, words = {
+            "ready": (GREY, "ready"),
+            "recording": (VERMILION, f"recording {status.seconds:.1f} s"),
+            "stopped": (PERSON, f"stopped at {status.seconds:.1f} s"),
+        }[status.recording]
+        doing = f"{_badge(colour, words)}&ensp;{status.saved} saved"
     return (
         '<div style="padding:.2em .9em .5em;line-height:1.5">'
         f'<div style="font-size:1.15em;font-weight:600">{html.escape(status.title)}</div>'
-        f"{_doing_html(status) if status.doing else _recording_html(status)}"
+        f"{doing}"
         f'<div style="opacity:.75;font-size:.85em">{html.escape(status.note) or "&nbsp;"}</div>'
         f'<div style="opacity:.75;font-size:.85em">{rate:.0f} steps a second, '
         f"{people} connected</div></div>"
     )
-
-
-def _doing_html(status: PageStatus) -> str:
-    return f"{_badge(BLUE, status.doing)}&ensp;{status.seconds:.1f} s"
-
-
-def _recording_html(status: PageStatus) -> str:
-    colour = {"ready": GREY, "recording": VERMILION, "stopped": PERSON}[status.recording]
-    words = {
-        "ready": "ready",
-        "recording": f"recording {status.seconds:.1f} s",
-        "stopped": f"stopped at {status.seconds:.1f} s",
-    }[status.recording]
-    return f"{_badge(colour, words)}&ensp;{status.saved} saved"
 
 
 def _badge(colour: str, words: str) -> str:

@@ -88,10 +88,7 @@ def meet_box(
 
 
 def region_over(
-    points: Float[np.ndarray, "points 3"],
-    bottom: float,
-    height: float,
-    smallest: float = 0.02,
+    points: Float[np.ndarray, "points 3"], bottom: float, height: float, smallest: float = 0.02
 ) -> DrawnRegion:
     """The upright box over the rectangle that holds some points, along the base axes.
 

@@ -18,13 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from hrc_learn.store import new_file
-from hrc_learn.viz.report.content import (
-    Measurement,
-    Picture,
-    Report,
-    Section,
-    flatten,
-)
+from hrc_learn.viz.report.content import Measurement, Picture, Report, Section, flatten
 
 
 def reports_page(title: str, reports: Sequence[Report]) -> str:
@@ -47,18 +41,15 @@ def reports_page(title: str, reports: Sequence[Report]) -> str:
             for i, report in enumerate(reports, 1)
         ]
         heading = f"<h1>{escape(title)}</h1>"
-        body = "\n".join([heading, _overview(reports), _side_by_side(reports), *articles])
+        overview = "\n".join(
+            f'<tr><td class="n">{i}</td><td><a href="#run{i}">{escape(report.title)}</a></td>'
+            f"<td>{_verdict(report)}</td></tr>"
+            for i, report in enumerate(reports, 1)
+        )
+        overview = f'<table class="overview"><tbody>{overview}</tbody></table>'
+        body = "\n".join([heading, overview, _side_by_side(reports), *articles])
     style = files(__package__).joinpath("style.css").read_text(encoding="utf-8")
     return _PAGE.format(title=escape(title), style=style, body=body)
-
-
-def _overview(reports: Sequence[Report]) -> str:
-    rows = "\n".join(
-        f'<tr><td class="n">{i}</td><td><a href="#run{i}">{escape(report.title)}</a></td>'
-        f"<td>{_verdict(report)}</td></tr>"
-        for i, report in enumerate(reports, 1)
-    )
-    return f'<table class="overview"><tbody>{rows}</tbody></table>'
 
 
 def _side_by_side(reports: Sequence[Report]) -> str:
@@ -77,9 +68,14 @@ def _side_by_side(reports: Sequence[Report]) -> str:
     for name in shared:
         cells = "".join(_cell(tables[i].get(name)) for i in compared)
         rows.append(f"<tr><td>{escape(name)}</td>{cells}</tr>")
+    return f"<h2>Side by side</h2>{_table(f'<th>Measured</th>{heads}', rows)}"
+
+
+def _table(heads: str, rows: Sequence[str]) -> str:
+    """A table that scrolls by itself where the page is narrow."""
     return (
-        '<h2>Side by side</h2><div class="scroll"><table><thead>'
-        f"<tr><th>Measured</th>{heads}</tr></thead><tbody>{'\n'.join(rows)}</tbody></table></div>"
+        f'<div class="scroll"><table><thead><tr>{heads}</tr></thead>'
+        f"<tbody>{'\n'.join(rows)}</tbody></table></div>"
     )
 
 
@@ -98,7 +94,10 @@ def _report(report: Report, anchor: str) -> str:
             _paragraphs(report.summary),
             _measurements(report.table),
             *(_section(section) for section in report.sections),
-            _reproduce(report.command),
+            *(
+                [f"<h2>Reproduce</h2>\n<pre>{escape(report.command)}</pre>"]
+                * bool(report.command)
+            ),
             _details("Configuration", flatten(report.configuration)),
             _details("Versions", report.versions),
         ]
@@ -122,11 +121,7 @@ def _measurements(table: Sequence[Measurement]) -> str:
     heads = '<th>Measured</th><th class="n">Value</th><th class="n">Target</th><th></th>'
     if claims:
         heads += "<th>The paper says</th>"
-    rows = "\n".join(_row(m, claims) for m in table)
-    return (
-        f'<div class="scroll"><table><thead><tr>{heads}</tr></thead>'
-        f"<tbody>{rows}</tbody></table></div>"
-    )
+    return _table(heads, [_row(m, claims) for m in table])
 
 
 def _row(m: Measurement, claims: bool) -> str:
@@ -160,10 +155,6 @@ def _figure(picture: Picture) -> str:
 def _paragraphs(text: str) -> str:
     parts = [part.strip() for part in text.split("\n\n")]
     return "\n".join(f"<p>{escape(part)}</p>" for part in parts if part)
-
-
-def _reproduce(command: str) -> str:
-    return f"<h2>Reproduce</h2>\n<pre>{escape(command)}</pre>" if command else ""
 
 
 def _details(summary: str, values: Mapping[str, object]) -> str:
