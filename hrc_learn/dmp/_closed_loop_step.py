@@ -13,9 +13,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from hrc_learn.dmp._system.quintic_curves import approach_state
+from hrc_learn.dmp._system.closed_forms import SpringDamper, approach_state
 from hrc_learn.dmp._system.response import Response, broadcast_shapes
-from hrc_learn.dmp._system.spring import SpringDamper
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

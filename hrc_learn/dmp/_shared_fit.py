@@ -16,11 +16,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn import distributed
+from hrc_learn.dmp._arguments import Points, Samples, Times, check_samples
+from hrc_learn.dmp._fitting import ridge_inverse
 from hrc_learn.dmp._system.bases import Basis, GaussianBasis, balanced_units
+from hrc_learn.dmp._system.closed_forms import SpringDamper
 from hrc_learn.dmp._system.response import Response, response_of
-from hrc_learn.dmp._system.spring import SpringDamper
-from hrc_learn.dmp._types import Points, Times
-from hrc_learn.dmp.fitting.motion_samples import Samples, check_samples
 from hrc_learn.dmp.joint_dmp import JointDMP
 
 
@@ -76,9 +76,8 @@ class LeastSquares:
         """
         n = self.unknowns
         unit = torch.ones(n, dtype=torch.float64) if unit is None else unit
-        U, sigma, Vh = torch.linalg.svd(self.design * unit)
-        gain = sigma / (sigma**2 + (regularization * sigma[0]) ** 2)
-        return unit[:, None] * (Vh.mT @ (gain[:, None] * (U.mT @ self.factor[:n, n:])))
+        inverse = ridge_inverse(self.design * unit, regularization)
+        return unit[:, None] * (inverse @ self.factor[:n, n:])
 
     def residual(self, X: Float[Tensor, "n k"]) -> Float[Tensor, "k"]:
         """Root mean square of A X - B over all rows, column by column."""

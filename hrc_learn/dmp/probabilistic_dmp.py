@@ -1,17 +1,132 @@
-"""A Gaussian over primitives, learned from several demonstrations of one motion."""
+"""Primitives from several demonstrations of one motion: their mean, and a Gaussian over them.
+
+Orientations, poses and limited joints move linearly in columns of their own: what is true of
+linear primitives is worked out once, on their `motion`.
+"""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.dmp._types import ArrayLike, Points, Times, to_tensor
-from hrc_learn.dmp.linear_primitive import LinearPrimitive
+from hrc_learn.dmp._arguments import Points, Scalars, Times, Vectors, to_tensor
+from hrc_learn.dmp._via_points import ViaPoints
+from hrc_learn.dmp.joint_dmp import JointDMP
+from hrc_learn.dmp.linear_primitive import ColumnEnds, LinearPrimitive
 from hrc_learn.dmp.motion_primitive import AdaptedPrimitive
-from hrc_learn.dmp.probabilistic.linear_view import alike, mean_primitive
-from hrc_learn.dmp.probabilistic.vmp import ViaPoints
+from hrc_learn.dmp.orientation_error import (
+    intrinsic_mean,
+    nearest_turn,
+    reference_of,
+    to_error,
+)
 from hrc_learn.geometry import Pose
+
+SAME = 1e-9
+"""Orientations closer than this [rad] are one: well above rounding, well below any sensor."""
+
+
+# Of every kind alike, and methods since: names of earlier versions.
+via_point_primitive = AdaptedPrimitive.condition
+with_ends = AdaptedPrimitive.with_ends
+
+
+def mean_primitive[P: AdaptedPrimitive](primitives: P) -> P:
+    """The mean over all batch dimensions of a primitive.
+
+    A rollout is linear in weights, start, goal and start velocity. So for one duration, and
+    forcing that does not scale with start and goal, its mean is the rollout of the means.
+
+    Args:
+        primitives: Fitted to several demonstrations of one motion.
+
+    Returns:
+        A primitive without batch dimensions, and without a fit report.
+
+    Raises:
+        ValueError: Primitives whose scaling turns them, each with the way of its own.
+    """
+    motion, columns = _mean_motion(primitives.motion), primitives.adapter.error_columns
+    if columns is None:
+        return primitives.with_motion(motion)
+    goal = _mean_goal(_goal_orientation(primitives))
+    return primitives.with_motion(motion, reference_of(motion.goal[..., columns], goal))
+
+
+def alike[P: AdaptedPrimitive](primitives: P) -> P:
+    """A batch of primitives in columns that mean the same for all of them.
+
+    Orientations with goals of their own are taken as errors to the mean of those. That is
+    not linear, so the errors are fitted anew.
+    """
+    columns = primitives.adapter.error_columns
+    if columns is None:
+        return primitives
+    own = reference(primitives)
+    middle = intrinsic_mean(own.reshape(-1, 4))
+    motion = primitives.linear_motion()
+    if (to_error(own, middle).abs() < SAME).all():
+        return primitives
+    if motion.basis.periodic:
+        raise ValueError("rhythms about different centres have no distribution")
+    with torch.no_grad():
+        shown: Any = primitives.rollout()
+        errors = shown_columns(motion)[..., columns]
+    fitted = JointDMP.fit(
+        shown.time,
+        nearest_turn(to_error(shown.orientation, middle), errors),
+        basis=motion.basis,
+        spring=motion.spring,
+        approach=motion.response.approach,
+    )
+    x = motion.coordinates().detach().clone()
+    x[..., columns, :] = fitted.coordinates().detach()
+    motion = motion.with_coordinates(x, motion.duration)
+    return primitives.with_motion(motion, middle.expand_as(own))
+
+
+def reference(primitive: Any) -> Float[Tensor, "*batch 4"]:
+    """What orientation errors of a primitive that has them are taken to."""
+    return primitive.reference
+
+
+def shown_columns(motion: LinearPrimitive) -> Float[Tensor, "*batch T D"]:
+    """Columns along the demonstration."""
+    return motion.roll(ColumnEnds(), motion.duration).position
+
+
+def _goal_orientation(primitives: Any) -> Float[Tensor, "*batch 4"]:
+    goal = primitives.goal
+    return goal if isinstance(goal, Tensor) else goal.orientation
+
+
+def _mean_goal(goals: Float[Tensor, "*batch 4"]) -> Float[Tensor, "4"]:
+    goals = goals.reshape(-1, 4)
+    # Both signs are the same orientation: bring all to the side of the first.
+    goals = goals * torch.where((goals @ goals[0])[:, None] < 0, -1.0, 1.0).to(goals)
+    return torch.nn.functional.normalize(goals.mean(dim=0), dim=-1)
+
+
+def _mean_motion(motions: LinearPrimitive) -> LinearPrimitive:
+    if motions.forcing_scale.turns and motions.weights.ndim > 2:
+        raise ValueError(
+            f"scaling {motions.scaling!r} gives each primitive a frame of its own: fit with "
+            "'none' to average them"
+        )
+    x, count = motions.coordinates().detach(), motions.timestamps.shape[-1]
+    batch = x.ndim - 2
+
+    def mean(tensor: Tensor) -> Tensor:
+        return tensor.flatten(0, batch - 1).mean(dim=0) if batch else tensor
+
+    return motions.with_coordinates(
+        mean(x),
+        mean(motions.duration),
+        amplitude=mean(motions.amplitude),
+        timestamps=torch.linspace(0, 1, count, dtype=torch.float64).to(motions.timestamps),
+    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -113,7 +228,7 @@ class ProbabilisticDMP[P: AdaptedPrimitive]:
         *,
         body: Points | None = None,
         body_velocity: Points | None = None,
-        noise: ArrayLike = 1e-6,
+        noise: Scalars | Vectors = 1e-6,
     ) -> "ProbabilisticDMP[P]":
         """The distribution, given where the motion passes at some times, and how fast.
 

@@ -22,13 +22,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.dmp import orientation_error
+from hrc_learn.dmp._arguments import Samples, Scalars, Times, to_tensor
+from hrc_learn.dmp._closed_loop_step import DMPState
+from hrc_learn.dmp._fitting import ridge_inverse
 from hrc_learn.dmp._system.response import Trajectory
-from hrc_learn.dmp._types import Scalars, Times, to_tensor
-from hrc_learn.dmp.closed_loop_step import DMPState
-from hrc_learn.dmp.fitting.motion_samples import Samples
-from hrc_learn.dmp.fitting.solvers import ridge_operator
 from hrc_learn.dmp.linear_primitive import ColumnEnds, LinearPrimitive
-from hrc_learn.dmp.orientation_coordinates import OrientationCoordinates
+from hrc_learn.dmp.orientation_dmp import FORMULATIONS, OrientationCoordinates
 from hrc_learn.geometry.quaternion import axis_drift, drift_free_rate, drift_free_slope
 
 LONGEST = 1 / 200
@@ -46,6 +45,34 @@ class UdeCoordinates(OrientationCoordinates):
     """The error as ever, but what moves linearly is (e, v), up to the drift of its axis."""
 
     linear: ClassVar[bool] = False
+
+    @staticmethod
+    def follow(motion: LinearPrimitive, errors: Samples) -> None:
+        """Add to fitted weights what the other state takes to follow the same path.
+
+        Raises:
+            ValueError: The demonstration passes a whole turn from its goal, where e' has no
+                bound.
+        """
+        count = SAMPLES * motion.basis.count
+        s = torch.linspace(0, 1, count, dtype=torch.float64, device=motion.weights.device)
+        with torch.no_grad():
+            linear = motion.roll(ColumnEnds(velocity=_per_s(motion)), _one(motion), s)
+            e, rate, curvature = (
+                x.double() for x in (linear.position, linear.velocity, linear.acceleration)
+            )
+            if (e.norm(dim=-1) >= 2 * torch.pi).any():
+                raise ValueError(
+                    "orientation is a whole turn or more from its end: formulation 'ude' "
+                    "cannot follow that, use 'log'"
+                )
+            v, slope = drift_free_rate(e, rate), drift_free_slope(e, rate, curvature)
+            force = slope - curvature + motion.spring.alpha * (v - rate)
+            change = (ridge_inverse(motion.basis.forcing(s), RIDGE) @ force).mT
+            motion.weights += change.to(motion.weights)
+            ends = motion.start, motion.duration, motion.start_velocity
+            reproduction = UdeMotion(motion, motion.timestamps, *ends, None).position.mT
+        motion.fit_report = errors.compare(reproduction.reshape(errors.position.shape))
 
     def roll(
         self,
@@ -98,34 +125,6 @@ class UdeCoordinates(OrientationCoordinates):
             rate=v + axis_drift(error, v),
             goal=columns.goal + error - columns.position,
         )
-
-
-def follow_errors(motion: LinearPrimitive, errors: Samples) -> None:
-    """Add to fitted weights what the other state takes to follow the same path.
-
-    Raises:
-        ValueError: The demonstration passes a whole turn from its goal, where e' has no
-            bound.
-    """
-    count = SAMPLES * motion.basis.count
-    s = torch.linspace(0, 1, count, dtype=torch.float64, device=motion.weights.device)
-    with torch.no_grad():
-        linear = motion.roll(ColumnEnds(velocity=_per_s(motion)), _one(motion), s)
-        e, rate, curvature = (
-            x.double() for x in (linear.position, linear.velocity, linear.acceleration)
-        )
-        if (e.norm(dim=-1) >= 2 * torch.pi).any():
-            raise ValueError(
-                "orientation is a whole turn or more from its end: formulation 'ude' "
-                "cannot follow that, use 'log'"
-            )
-        v, slope = drift_free_rate(e, rate), drift_free_slope(e, rate, curvature)
-        force = slope - curvature + motion.spring.alpha * (v - rate)
-        change = (ridge_operator(motion.response, s, RIDGE) @ force).mT
-        motion.weights += change.to(motion.weights)
-        ends = motion.start, motion.duration, motion.start_velocity
-        reproduction = UdeMotion(motion, motion.timestamps, *ends, None).position.mT
-    motion.fit_report = errors.compare(reproduction.reshape(errors.position.shape))
 
 
 class UdeMotion:
@@ -268,3 +267,7 @@ def _per_s(motion: LinearPrimitive) -> Tensor:
 def _one(motion: LinearPrimitive) -> Tensor:
     """The duration of a motion whose times are s."""
     return motion.resolve_duration(1.0, None)
+
+
+# Where `OrientationDMP` finds it: nothing below this module has to know of it.
+FORMULATIONS["ude"] = UdeCoordinates

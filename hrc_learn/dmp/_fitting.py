@@ -1,10 +1,17 @@
 """From sampled motions to the weights of a linear primitive.
 
 Demonstrations sampled at the same normalised times are fitted by one matrix product.
+
+Samples that lie far off can be taken back to where the others lead: M-estimates by iteratively
+reweighted least squares (Huber and Ronchetti 2009, "Robust statistics", chapter 7), the motion
+of a primitive that is closest to the samples, each weighed by the trust in it, which falls with
+its residual over their spread. A motion through y* = y_fit + trust (y - y_fit), fitted by plain
+least squares, is the same one: so these stand for the samples, whatever the method that fits
+them.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, TypedDict
 
@@ -12,11 +19,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from hrc_learn.dmp._arguments import FitReport, Samples
 from hrc_learn.dmp._system.bases import Basis, GaussianBasis, balanced_units
+from hrc_learn.dmp._system.closed_forms import SpringDamper
 from hrc_learn.dmp._system.response import Response, response_of
-from hrc_learn.dmp._system.spring import SpringDamper
-from hrc_learn.dmp.fitting.motion_samples import FitReport, Samples
-from hrc_learn.dmp.fitting.robust_weights import robust_weights
 from hrc_learn.dmp.forcing_scale import Demonstrated, Scaling
 
 
@@ -27,8 +33,8 @@ class FitOptions(TypedDict, total=False):
     """`"trajectory"` (default), least squares on the positions, the closest reproduction;
     `"ridge"`, regression on the force; `"lwr"`, the paper's."""
     robust: str | None
-    """`"huber"` or `"tukey"`: how samples that lie far off are trusted less; see `robust.py`.
-    None (default): all alike."""
+    """`"huber"` or `"tukey"`: how samples that lie far off are trusted less.
+    None (default): all alike. See `robust_weights`."""
     approach: float | int
     """Share of the motion, 0 to 1, along which a new start and goal are taken up, smoothly;
     0 (default): at once, as the paper has it."""
@@ -82,16 +88,23 @@ def _fit(
     rate: Float[Tensor, "*batch D T"] | None,
     regularization: float,
 ) -> Fit:
+    # Timestamps as something to look an operator up by.
+    sampled = response, s.cpu().numpy().tobytes(), s.device
     if method == "trajectory":
-        return _trajectory(response, s, position, rate, regularization)
+        # The squared distance to the samples, without differentiation. Start and goal are the
+        # first and the last sample, the start velocity the recorded one or fitted along.
+        K, to_weights = _trajectory_operator(*sampled, rate is None, regularization)
+        unknown = _apply(position, K)
+        if rate is None:
+            return unknown[..., :-1], unknown[..., -1]
+        return unknown - rate[..., :1] * to_weights, rate[..., 0]
     if rate is None:
         rate = differentiate(s, position)
     goal = position[..., -1:]
     force = differentiate(s, rate) - response.spring.acceleration(position - goal, rate)
     if response.approach:
         force = force - (goal - position[..., :1]) * response.approach_force(s)
-    K = _force_operator(method, response, _key(s), s.device, regularization)
-    return _apply(force, K), rate[..., 0]
+    return _apply(force, _force_operator(*sampled, method, regularization)), rate[..., 0]
 
 
 def _apply(
@@ -114,24 +127,6 @@ def differentiate(
     return torch.cat([first, inner, last], dim=-1)
 
 
-def _trajectory(
-    response: Response, s: Tensor, position: Tensor, rate: Tensor | None, regularization: float
-) -> Fit:
-    """Minimise the squared distance between motion and samples; no differentiation.
-
-    Start and goal are the first and the last sample. The start velocity is the recorded one
-    or, without, fitted along.
-    """
-    K, to_weights = _trajectory_operator(
-        response, _key(s), s.device, rate is None, regularization
-    )
-    unknown = _apply(position, K)
-    if rate is None:
-        return unknown[..., :-1], unknown[..., -1]
-    start_rate = rate[..., 0]
-    return unknown - start_rate[..., None] * to_weights, start_rate
-
-
 # Sampled alike, demonstrations share one: 16 of them are as many datasets.
 @lru_cache(maxsize=16)
 def _trajectory_operator(
@@ -151,53 +146,38 @@ def _trajectory_operator(
     H = response.evaluate(s)[:, 0]
     velocity, start, goal = H[:, N], H[:, N + 1], H[:, N + 2]
     unit = balanced_units(response.basis, H, int(fit_rate))
-    K = unit[:, None] * _ridge_inverse(H[:, : N + fit_rate] * unit, regularization)
+    K = unit[:, None] * ridge_inverse(H[:, : N + fit_rate] * unit, regularization)
     from_samples = K.clone()
     from_samples[:, 0] -= K @ start
     from_samples[:, -1] -= K @ goal
     return from_samples, K @ velocity
 
 
-def _key(s: Float[Tensor, "T"]) -> bytes:
-    """Timestamps as something to look an operator up by."""
-    return s.cpu().numpy().tobytes()
+@lru_cache(maxsize=16)
+def _force_operator(
+    response: Response,
+    timestamps: bytes,
+    device: torch.device,
+    method: str,
+    regularization: float,
+) -> Float[Tensor, "N T"]:
+    """Maps a force to the weights closest to it."""
+    s, basis = _timestamps(timestamps, device), response.basis
+    if method == "ridge":
+        return ridge_inverse(basis.forcing(s), regularization)
+    # w_i = (z' Gamma_i f) / (z' Gamma_i z), the paper's solution of its (Cost_i). Without a
+    # ridge: each weight is a mean of its own samples, so that nothing is ill-posed.
+    z = basis.phase(s)
+    weighted = (basis.kernels(s) * z[:, None]).T
+    # A Gaussian narrower than the sampling may see no sample: its weight is zero then.
+    return weighted / (weighted @ z).clamp_min(torch.finfo(s.dtype).tiny)[:, None]
 
 
 def _timestamps(key: bytes, device: torch.device) -> Float[Tensor, "T"]:
     return torch.frombuffer(bytearray(key), dtype=torch.float64).to(device)
 
 
-@lru_cache(maxsize=16)
-def _force_operator(
-    method: str,
-    response: Response,
-    timestamps: bytes,
-    device: torch.device,
-    regularization: float,
-) -> Float[Tensor, "N T"]:
-    s = _timestamps(timestamps, device)
-    if method == "ridge":
-        return ridge_operator(response, s, regularization)
-    return _lwr_operator(response, s)
-
-
-def ridge_operator(
-    response: Response, s: Float[Tensor, "T"], regularization: float
-) -> Float[Tensor, "N T"]:
-    """Maps a force at times `s` to the weights closest to it."""
-    return _ridge_inverse(response.basis.forcing(s), regularization)
-
-
-def _lwr_operator(response: Response, s: Tensor) -> Tensor:
-    """w_i = (z' Gamma_i f) / (z' Gamma_i z), the paper's solution of its (Cost_i)."""
-    # Without a ridge: each weight is a mean of its own samples, so that nothing is ill-posed.
-    z = response.basis.phase(s)
-    weighted = (response.basis.kernels(s) * z[:, None]).T
-    # A Gaussian narrower than the sampling may see no sample: its weight is zero then.
-    return weighted / (weighted @ z).clamp_min(torch.finfo(s.dtype).tiny)[:, None]
-
-
-def _ridge_inverse(A: Float[Tensor, "T n"], regularization: float) -> Float[Tensor, "n T"]:
+def ridge_inverse(A: Float[Tensor, "T n"], regularization: float) -> Float[Tensor, "n T"]:
     """(A'A + (r sigma_max)^2 I)^-1 A', by singular values: A'A is never formed."""
     U, sigma, Vh = torch.linalg.svd(A, full_matrices=False)
     damping = regularization * sigma[0]
@@ -281,3 +261,113 @@ def fit_motion(
     return MotionFit(
         response=response, samples=samples, trust=trust, weights=weights, rate=rate
     )
+
+
+HUBER, TUKEY = 1.345, 4.685
+"""Residuals in standard deviations beyond which trust falls and ends: 95 % efficient for
+Gaussian noise."""
+SPREAD_OF_MEDIAN = 1.4826
+"""Standard deviation over median absolute value of Gaussian noise."""
+LEAST_SPREAD = 1e-12
+"""Of residuals, as a share of the range covered: below, they are rounding."""
+ROUNDS = 50
+"""At most: trust may swing to and fro between samples and never settle."""
+SETTLED = 1e-3
+"""Change of trust at which the iteration ends."""
+
+
+def huber(residual: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+    """Trust by residual in standard deviations, >= 0: whole, then falling as its inverse."""
+    return HUBER / residual.clamp(min=HUBER)
+
+
+def tukey(residual: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+    """Biweight: falls from the start, and far off there is none."""
+    return (1 - (residual / TUKEY).clamp(max=1) ** 2) ** 2
+
+
+LOSSES: dict[str, Callable[[Tensor], Tensor]] = {"huber": huber, "tukey": tukey}
+
+
+def robust_weights(
+    loss: str, response: Response, samples: Samples, regularization: float
+) -> tuple[Samples, Float[Tensor, "B D T"]]:
+    """Samples with outliers taken back, and the trust in what was recorded.
+
+    Args:
+        loss: `"huber"`, convex, so that there is one answer; `"tukey"`, which from that answer
+            on forgets what lies far off.
+        response: Of the primitive to be fitted.
+        samples: Of one demonstration or many.
+        regularization: Ridge, relative to the largest singular value.
+
+    Raises:
+        ValueError: No such loss.
+    """
+    if loss not in LOSSES:
+        raise ValueError(f"unknown robust loss {loss!r}; there are {', '.join(LOSSES)}")
+    position = samples.position.double()
+    trust = torch.zeros_like(position)
+    tamed, reach = position.clone(), None
+    for i, valid in enumerate(samples.mask):
+        if reach is None or not samples.shared:
+            reach = _Reach(response, samples.s[i, valid], regularization)
+        y = position[i, :, valid]
+        fitted, trusted = _fit_robustly(loss, reach, y)
+        trust[i, :, valid] = trusted
+        tamed[i, :, valid] = fitted + trusted * (y - fitted)
+    return replace(samples, position=tamed.to(samples.position)), trust
+
+
+class _Reach:
+    """The motions that a primitive can make at given times, start and goal free too.
+
+    The goal is where the motion is at the end. Without that the last sample would be the goal,
+    and nothing could tell whether it is an outlier.
+    """
+
+    def __init__(self, response: Response, s: Float[Tensor, "T"], regularization: float):
+        N = response.basis.count
+        H = response.evaluate(s)[:, 0]
+        goal = torch.zeros_like(H[-1])
+        goal[-1] = 1.0
+        # The motion at all times but the last, the goal, and by how much it is missed.
+        A = torch.cat([H[:-1], goal[None], (H[-1] - goal)[None]])
+        U, sigma, _ = torch.linalg.svd(
+            A * balanced_units(response.basis, A, A.shape[1] - N), full_matrices=False
+        )
+        self._U = U
+        self._ridge = torch.diag((regularization * sigma[0] / sigma) ** 2)
+
+    def closest(
+        self, y: Float[Tensor, "D T"], trust: Float[Tensor, "D T"]
+    ) -> Float[Tensor, "D T"]:
+        """The motion with the least weighted squared distance to samples."""
+        trust = torch.nn.functional.pad(trust, (0, 1), value=1.0)
+        y = torch.nn.functional.pad(y, (0, 1))
+        weighted = self._U.mT * trust[:, None]
+        # U is orthonormal: little is lost by squaring it.
+        normal = weighted @ self._U + self._ridge
+        c = torch.linalg.solve(normal, weighted @ y[..., None])
+        return (self._U @ c)[:, :-1, 0]
+
+
+def _fit_robustly(
+    loss: str, reach: _Reach, y: Float[Tensor, "D T"]
+) -> tuple[Float[Tensor, "D T"], Float[Tensor, "D T"]]:
+    """The closest motion and the trust in each sample."""
+    trust, spread = torch.ones_like(y), torch.zeros_like(y[:, :1])
+    fitted = reach.closest(y, trust)
+    # The smallest number as well: a coordinate that never moves covers no range.
+    least = LEAST_SPREAD * (y.amax(-1) - y.amin(-1))[:, None] + torch.finfo(y.dtype).tiny
+    for name in dict.fromkeys(("huber", loss)):
+        for _ in range(ROUNDS):
+            residual = (y - fitted).abs()
+            if name == "huber":
+                spread = SPREAD_OF_MEDIAN * residual.median(-1, keepdim=True).values
+                spread = torch.maximum(spread, least)
+            before, trust = trust, LOSSES[name](residual / spread)
+            fitted = reach.closest(y, trust)
+            if (trust - before).abs().amax() < SETTLED:
+                break
+    return fitted, trust

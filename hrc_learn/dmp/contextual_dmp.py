@@ -11,10 +11,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from hrc_learn.dmp._types import ArrayLike, Mask, Points, Times, Vectors, to_tensor
-from hrc_learn.dmp.fitting.motion_samples import FitReport, check_samples
+from hrc_learn.dmp._arguments import (
+    FitReport,
+    Mask,
+    Points,
+    Times,
+    Vectors,
+    check_samples,
+    to_tensor,
+)
 from hrc_learn.dmp.joint_dmp import JointDMP
-from hrc_learn.dmp.probabilistic.linear_view import mean_primitive
+from hrc_learn.dmp.probabilistic_dmp import mean_primitive
 from hrc_learn.model_files import SavedModel, write_model
 
 type FeatureMap = Callable[[Tensor], Tensor]
@@ -318,5 +325,5 @@ def _saved_features(saved: SavedModel, given: FeatureMap | None) -> FeatureMap:
         raise saved.invalid_field("features", error) from None
 
 
-def _shape(values: ArrayLike) -> tuple[int, ...]:
+def _shape(values: Points | Vectors) -> tuple[int, ...]:
     return tuple(to_tensor(values).shape)

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from hrc_learn.dmp._system.quintic_curves import piecewise_quintic
+from hrc_learn.dmp._system.closed_forms import piecewise_quintic
 from hrc_learn.dmp._system.response import Response
 from hrc_learn.dmp.forcing_scale import Demonstrated
 from hrc_learn.dmp.linear_primitive import ColumnEnds, LinearPrimitive

@@ -7,6 +7,7 @@ from typing import Any
 
 from torch import Tensor
 
+from hrc_learn.dmp._arguments import FitReport
 from hrc_learn.dmp._system.bases import (
     Basis,
     GaussianBasis,
@@ -14,9 +15,7 @@ from hrc_learn.dmp._system.bases import (
     PeriodicBasis,
     SplineBasis,
 )
-from hrc_learn.dmp._system.canonical import ExponentialPhase, SigmoidPhase
-from hrc_learn.dmp._system.spring import SpringDamper
-from hrc_learn.dmp.fitting.motion_samples import FitReport
+from hrc_learn.dmp._system.closed_forms import ExponentialPhase, SigmoidPhase, SpringDamper
 from hrc_learn.dmp.forcing_scale import Scaling, find_scaling
 from hrc_learn.model_files import SavedModel
 
