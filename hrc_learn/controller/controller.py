@@ -280,9 +280,7 @@ class AdaptiveController(nn.Module):
             off = torch.zeros_like(state.pose_drift.active)
             pose_drift = replace(state.pose_drift, active=off)
         else:
-            planned = planned_motion(
-                motion.task_twist, motion.twist, J, v, observation.dt
-            )
+            planned = planned_motion(motion.task_twist, motion.twist, J, v, observation.dt)
             pose_drift = replace(motion.pose_drift, planned=planned)
         command = Command(
             joint_velocity=v,

@@ -7,14 +7,13 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 import mujoco
 import numpy as np
 from jaxtyping import Float
 
 from hrc_learn.kinematics import panda
-from hrc_learn.sim.scene import SceneConfig
 
 # pyright: reportAttributeAccessIssue=false
 # MuJoCo ships no type stubs; its names come from a compiled module.
@@ -83,7 +82,9 @@ class Imperfections:
                 raise ValueError(f"{field.name} must not be negative, but is {value}.")
         for name, most in (("image_loss", 0.9), ("slowness", 0.9)):
             if getattr(self, name) > most:
-                raise ValueError(f"{name} must be at most {most}, but is {getattr(self, name)}.")
+                raise ValueError(
+                    f"{name} must be at most {most}, but is {getattr(self, name)}."
+                )
 
     @classmethod
     def ideal(cls) -> Imperfections:
@@ -151,7 +152,7 @@ class Imperfections:
             tool_shift=self.tool_error * uniform(3),
             tool_turn=self.tool_turn * uniform(3),
             table_height=self.table_height * float(uniform()),
-            object_heights=uniform(_MOST_OBJECTS),
+            object_heights=self.object_height * uniform(_MOST_OBJECTS),
         )
 
 
@@ -179,21 +180,7 @@ class DrawnImperfections:
     """Height of the table's top above where it is believed to be [m]."""
 
     object_heights: Float[np.ndarray, " objects"]
-    """By which each object is higher than believed, as a fraction of `object_height`."""
-
-    def real_scene(self, believed: SceneConfig) -> SceneConfig:
-        """The scene with the table and the objects as high as they are."""
-        x, y, z = believed.table.centre
-        objects = []
-        for item, fraction in zip(believed.objects, self.object_heights, strict=False):
-            a, b, c = item.half_size
-            taller = self.sizes.object_height * float(fraction) / 2
-            objects.append(replace(item, half_size=(a, b, c + taller)))
-        return replace(
-            believed,
-            table=replace(believed.table, centre=(x, y, z + self.table_height)),
-            objects=tuple(objects),
-        )
+    """By which each object is higher than believed [m]."""
 
     def apply(self, spec: mujoco.MjSpec) -> None:
         """Give a scene's description the errors of the arm: calibration, friction, weights."""
@@ -232,7 +219,6 @@ class DrawnImperfections:
     def torques(self, external: Float[np.ndarray, " joints"]) -> Float[np.ndarray, " joints"]:
         """An estimate of external joint torques [N m]."""
         return external + self.sizes.torque_noise * self.rng.standard_normal(external.shape)
-
 
 
 class CommandChannel:
@@ -284,8 +270,6 @@ class CommandChannel:
             change = np.clip(change, -self._limit * dt, self._limit * dt)
         self.velocity = self.velocity + change
         return self.velocity
-
-
 
 
 def _turned(

@@ -89,9 +89,7 @@ class MarkerAngle:
         mean = np.exp(2j * differences).mean()
         offset = float(np.angle(mean)) / 2
         off = np.array([_wrapped(d - offset) for d in differences])
-        return cls(
-            jacobian=learned, offset=offset, spread=float(np.sqrt((off**2).mean()))
-        )
+        return cls(jacobian=learned, offset=offset, spread=float(np.sqrt((off**2).mean())))
 
     def save(self, folder: Path) -> None:
         """Write `folder/angle` and `folder/angle.json`."""
@@ -223,4 +221,3 @@ def _measured(pose: Pose, angle: Tensor, dt: float) -> Measurement:
         xi_x=torch.zeros(1, dtype=torch.float64),
         xi_r=torch.zeros(6, dtype=torch.float64),
     )
-

@@ -12,7 +12,7 @@ from torch import Tensor
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import panda
 from hrc_learn.protocols import Camera
-from hrc_learn.vision import MarkerDetector, angle, centre
+from hrc_learn.vision import MarkerDetector, centre
 from hrc_learn.viz import StepLog
 
 

@@ -32,7 +32,7 @@ from hrc_learn.skills.pick_and_place import (
     PickPlaceJob,
 )
 from hrc_learn.skills.placing import PlacingSkill, Plan, check_plan
-from hrc_learn.skills.visual_servoing import VisualServoSkill
+from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.skills.work_cell import WorkCell, WorkCellConfig
 from hrc_learn.teleoperation import ScriptedForce, ScriptedPerturbation
 from hrc_learn.teleoperation.page import PageConfig
@@ -151,7 +151,8 @@ def simulate_collaboration(
     person, motion = ScriptedPerturbation(panda, forces, begin=None), MotionLog(world)
     occluder = ScriptedOcclusion(world, disturbances.occlusions)
     eyes = ChangingCamera(
-        workplace.scene.camera, lambda model: open_camera(world, camera, model, rng=rng, noise=noise)
+        workplace.scene.camera,
+        lambda model: open_camera(world, camera, model, rng=rng, noise=noise),
     )
 
     def advance(duration: float) -> None:
