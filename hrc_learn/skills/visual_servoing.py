@@ -4,6 +4,7 @@
 from demonstrations: the image Jacobian, the visual target and the approach direction.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
