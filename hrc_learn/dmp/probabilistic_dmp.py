@@ -169,6 +169,7 @@ class ProbabilisticDMP[P: AdaptedPrimitive]:
         reference = getattr(primitives, "reference", None)
         if reference is not None:
             reference = reference.reshape(-1, 4)[0]
+        # n - 1: the mean is taken from the same primitives.
         spread = (x - mean).flatten(1).mT / (len(x) - 1) ** 0.5
         if slack:
             spread = torch.cat([spread, _free_forcing(middle, slack)], dim=1)
