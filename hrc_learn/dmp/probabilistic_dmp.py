@@ -28,9 +28,10 @@ SAME = 1e-9
 """Orientations closer than this [rad] are one: well above rounding, well below any sensor."""
 
 
-# Of every kind alike, and methods since: names of earlier versions.
 via_point_primitive = AdaptedPrimitive.condition
+"""The method as a function of the primitive, and of what the method takes."""
 with_ends = AdaptedPrimitive.with_ends
+"""Likewise."""
 
 
 def mean_primitive[P: AdaptedPrimitive](primitives: P) -> P:
