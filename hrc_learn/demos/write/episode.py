@@ -1,16 +1,21 @@
-"""Episodes on their way to disk: how quantities become columns, and the open episode of a
-recording.
-"""
+"""One episode of a recording: gathered frame by frame, put into columns, kept as a file."""
 
+import json
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import torch
-from jaxtyping import Float64, Shaped
+from jaxtyping import Float64, Int64, Shaped
 
-from hrc_learn.demos.read.component_names import ROLES
+from hrc_learn.demos.format.metadata import SIDECAR_FORMAT, Statistics
+from hrc_learn.demos.issue import DatasetError
+from hrc_learn.demos.read.roles import ROLES
 from hrc_learn.geometry import quaternion
+from hrc_learn.store import new_file, resolved
 
 # How recorded quantities become the columns of a LeRobot dataset.
 #
@@ -107,6 +112,27 @@ def lerobot_features(columns: Sequence[Column], dtype: str) -> dict[str, dict]:
             "names": components,
         }
         for key, components in names.items()
+    }
+
+
+def sidecar_content(
+    columns: Sequence[Column],
+    joint_names: Sequence[str],
+    frames: Mapping[str, str],
+    details: Mapping[str, object],
+) -> dict:
+    """What the file of a dataset with these columns says."""
+    known = {column.role: column for column in columns if column.role is not None}
+    return {
+        "format": SIDECAR_FORMAT,
+        "units": {role: ROLES[role].unit for role in known},
+        "columns": {
+            role: {"key": column.key, "names": list(column.names)}
+            for role, column in known.items()
+        },
+        "joint_names": list(joint_names),
+        "frames": dict(frames),
+        "details": dict(details),
     }
 
 
@@ -233,3 +259,131 @@ def examine(episode: Episode) -> None:
                 f"orientation must be a unit quaternion (w, x, y, z), but is not at frame "
                 f"{wrong.argmax()}"
             )
+
+
+_METADATA_KEY = b"hrc_learn"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordingHeader:
+    """What all episodes of a recording have in common; plain JSON values only."""
+
+    fps: float
+    robot_type: str
+    features: dict[str, dict]
+    """As in `meta/info.json`, LeRobot's index columns included."""
+    sidecar: dict
+    """Content of `meta/hrc_learn.json`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StagedEpisode:
+    """One saved episode."""
+
+    header: RecordingHeader
+    tasks: list[str]
+    """Texts of the tasks it shows, at least one."""
+    statistics: Statistics
+    table: pa.Table
+
+
+def staging_folder(root: Path) -> Path:
+    """Where the recording of the dataset `root` is kept until it is whole."""
+    root = resolved(root)
+    return root.with_name(root.name + ".recording")
+
+
+def episode_path(folder: Path, index: int) -> Path:
+    return folder / f"episode_{index:06d}.parquet"
+
+
+def write_episode(path: Path, episode: StagedEpisode) -> None:
+    """Write one episode so that `path` exists only once it is complete and on disk."""
+    metadata = {
+        "header": vars(episode.header),
+        "tasks": episode.tasks,
+        "statistics": episode.statistics,
+    }
+    table = episode.table.replace_schema_metadata({_METADATA_KEY: json.dumps(metadata)})
+    with new_file(path) as part:
+        pq.write_table(table, part)
+
+
+def read_episode(path: Path) -> StagedEpisode:
+    """Read an episode that `write_episode` wrote."""
+    table = pq.read_table(path)
+    metadata = json.loads(table.schema.metadata[_METADATA_KEY])
+    return StagedEpisode(
+        header=RecordingHeader(**metadata["header"]),
+        tasks=metadata["tasks"],
+        statistics=metadata["statistics"],
+        table=table,
+    )
+
+
+def staged_paths(folder: Path, first: int = 0) -> list[Path]:
+    """Files of the saved episodes, in order.
+
+    Args:
+        folder: The staging folder.
+        first: Index of the first one: the episodes of the dataset that is appended to.
+
+    Raises:
+        DatasetError: None was saved, or one in the middle is gone.
+    """
+    paths = sorted(folder.glob("episode_*.parquet"))
+    if not paths:
+        raise DatasetError("no episode was saved, so there is no dataset to write", file=folder)
+    for index, path in enumerate(paths, start=first):
+        if path != episode_path(folder, index):
+            raise DatasetError(
+                "this episode is missing from the recording; rename the later ones to close "
+                "the gap if it is lost",
+                file=episode_path(folder, index),
+                episode=index,
+            )
+    return paths
+
+
+def to_table(values: dict[str, np.ndarray], features: dict[str, dict]) -> pa.Table:
+    """Arrow table of one episode: a number or a list of fixed length a frame."""
+    arrays = {
+        key: _to_arrow(values[key], feature["dtype"], feature["shape"][0])
+        for key, feature in features.items()
+        if feature["dtype"] != "video"
+    }
+    return pa.table(arrays)
+
+
+def _to_arrow(values: np.ndarray, dtype: str, width: int) -> pa.Array:
+    contiguous = np.ascontiguousarray(values, dtype=dtype)
+    if contiguous.dtype == bool:
+        flat = pa.array(contiguous.reshape(-1))  # packed to bits
+        return flat if width == 1 else pa.FixedSizeListArray.from_arrays(flat, width)
+    # Not pa.array(): it imports pandas, which would hold up the first episode for a second.
+    buffers = [None, pa.py_buffer(contiguous)]
+    flat = pa.Array.from_buffers(
+        pa.from_numpy_dtype(contiguous.dtype), contiguous.size, buffers
+    )
+    return flat if width == 1 else pa.FixedSizeListArray.from_arrays(flat, width)
+
+
+def index_columns(
+    fps: float, episode: int, first: int, task_index: Int64[np.ndarray, " _frames"]
+) -> dict[str, np.ndarray]:
+    """The columns by which LeRobot counts, of one episode.
+
+    Args:
+        fps: Frame rate [1/s].
+        episode: Its index.
+        first: Index of its first frame among all of the dataset.
+        task_index: Task of each frame.
+    """
+    frame = np.arange(len(task_index))
+    return {
+        "timestamp": frame / fps,
+        "frame_index": frame,
+        "episode_index": np.full_like(frame, episode),
+        "index": frame + first,
+        "task_index": task_index,
+    }
