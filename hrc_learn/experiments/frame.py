@@ -17,6 +17,7 @@ from hrc_learn.experiments.metric_table import Evaluation, Metric, evaluate
 from hrc_learn.experiments.monte_carlo import Run as TrialRun
 from hrc_learn.experiments.monte_carlo import Trial, repeat
 from hrc_learn.experiments.trial_statistics import Summary
+from hrc_learn.sim import PhysicsError
 from hrc_learn.skills.work_cell import TaskFailedError
 from hrc_learn.store import new_folder, write_json
 from hrc_learn.viz import LoggedSteps, RunRecording
@@ -231,11 +232,26 @@ def conduct[Run](
         command: That repeats all this; the command line of this process if empty.
 
     Returns:
-        Exit status: 0, or 1 if the run failed or a bound was missed.
+        Exit status: 0, or 1 if the run failed or a bound was missed. A run whose physics failed
+        leaves no folder, as nothing measured of it would hold.
 
     Raises:
         ValueError: If a number of trials is negative.
     """
+    try:
+        return _conduct(experiment, options, counts, configuration, command)
+    except PhysicsError as error:
+        print(f"failed: {error}", file=sys.stderr)
+        return 1
+
+
+def _conduct[Run](
+    experiment: Experiment[Run],
+    options: RunOptions,
+    counts: Mapping[str, int] | None,
+    configuration: Mapping[str, object] | None,
+    command: str,
+) -> int:
     from rich.console import Console
 
     counts = {TRIALS: options.trials, **(counts or {})}
@@ -319,7 +335,7 @@ def _repeat(study: Study, name: str, count: int, options: RunOptions) -> list[Tr
         _trial_file(options, name),
         made_by=asdict(study.trial),  # pyright: ignore[reportArgumentType]
         processes=options.processes,
-        failures=(TaskFailedError,),
+        failures=(TaskFailedError, PhysicsError),
         title=study.title,
     )
 

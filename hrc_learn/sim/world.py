@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from hrc_learn.sim.imperfections import DrawnImperfections, Imperfections
 from hrc_learn.sim.panda_model import FINGER_STROKE, MujocoArm, frame_of
+from hrc_learn.sim.physics_watch import PhysicsWatch
 from hrc_learn.sim.scene import HAND_MARKER, SceneConfig, build_scene
 
 # pyright: reportAttributeAccessIssue=false
@@ -132,6 +133,7 @@ class World:
         self.imperfections.apply(spec)
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
+        self._watch = PhysicsWatch(self.model, self.data)
         self.arm = MujocoArm(self.model, self.data, self.imperfections)
         obstacles = [box.name for box in self.config.obstacles]
         cabinet = [box.name for box in self.config.cabinet.boxes()] + obstacles
@@ -179,16 +181,23 @@ class World:
         for name, pose in (objects or {}).items():
             _put(self.data, name, pose)
         mujoco.mj_forward(self.model, self.data)
+        self._watch.restart()
         for monitor in self._monitors:
             monitor.clear()
 
     def advance(self, duration: float) -> None:
-        """Run the physics for a while, the arm following its last command [s]."""
+        """Run the physics for a while, the arm following its last command [s].
+
+        Raises:
+            PhysicsError: The simulation diverged, or somebody reset it without `reset`.
+        """
         for _ in range(max(1, round(duration / self.model.opt.timestep))):
             self.arm.drive()
             mujoco.mj_step(self.model, self.data)
+            self._watch.after_step()
             for monitor in self._monitors:
                 monitor.update(self.data)
+        self._watch.check()
         # A step leaves the poses of bodies as they were before it: bring them up to date.
         mujoco.mj_kinematics(self.model, self.data)
 
@@ -208,6 +217,7 @@ class World:
         self.arm.move(0.0)
         self.advance(0.5)
         self.data.time = 0.0
+        self._watch.restart()
 
     def move_obstacle(
         self, name: str, centre: tuple[float, float, float] | Float[np.ndarray, "3"]

@@ -24,6 +24,7 @@ from hrc_learn.experiments.frame import (
 from hrc_learn.experiments.metric_table import Metric, evaluate
 from hrc_learn.experiments.monte_carlo import Trial
 from hrc_learn.experiments.trial_statistics import p95
+from hrc_learn.sim import PhysicsError
 from hrc_learn.viz import LoggedSteps, RunRecording, StepLog
 from hrc_learn.viz.report import Picture, Section, read_report
 
@@ -156,6 +157,26 @@ def test_a_missed_bound_and_a_task_given_up_are_failures_with_reasons(work):
     status, values, _, shown = work(ThrowExperiment(gives_up=True), "other")
     assert (status, values["success_rate"]) == (1, 0)
     assert shown.err == "failed: the ball was dropped\n"
+
+
+def test_physics_that_fails_ends_the_run_and_counts_as_a_failed_trial(
+    tmp_path, work, monkeypatch, capsys
+):
+    run = ThrowExperiment.run
+
+    def diverging(self, seed, observer=UNOBSERVED):
+        if seed == 1:
+            raise PhysicsError("a velocity is nan", 2.5, "ball")
+        return run(self, seed, observer)
+
+    monkeypatch.setattr(ThrowExperiment, "run", diverging)
+    reason = "physics failed at ball at 2.500 s: a velocity is nan"
+    _, values, folder, _ = work(ThrowExperiment(), trials=3)
+    assert (values["trials"], values["successes"]) == (3, 2)
+    assert f"Seed 1: {reason}." in read_report(folder).sections[1].text
+    assert conduct(ThrowExperiment(), RunOptions(out=tmp_path / "single", seed=1)) == 1
+    assert capsys.readouterr().err == f"failed: {reason}\n"
+    assert not (tmp_path / "single").exists()
 
 
 def test_failed_trials_do_not_fail_the_run_unless_a_metric_bounds_them(work):

@@ -9,7 +9,7 @@ from rich.progress import track
 from hrc_learn.cli._options import resolved
 from hrc_learn.cli._values import configuration, write_json
 from hrc_learn.cli.arguments.record import RecordPlacing as Args
-from hrc_learn.sim import World
+from hrc_learn.sim import PhysicsError, World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.work_cell import TaskFailedError
 from hrc_learn.teleoperation.hand_guiding import Frame
@@ -51,7 +51,7 @@ def run(args: Args) -> int:
             },
             overwrite=args.overwrite,
         )
-    except TaskFailedError as error:
+    except (TaskFailedError, PhysicsError) as error:
         print(f"failed: {error}", file=sys.stderr)
         return 1
     print(f"{args.episodes} demonstrations in {args.out} ({sum(thrown_away)} discarded)")

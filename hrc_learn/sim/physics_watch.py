@@ -1,0 +1,122 @@
+"""Watches whether what MuJoCo computes can still be believed.
+
+MuJoCo goes on when a simulation diverges: it writes a line to a log, puts everything back to
+the first pose at time zero, and counts a warning. What is measured of such a run is about
+something else.
+"""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+# pyright: reportAttributeAccessIssue=false
+# MuJoCo ships no type stubs; its names come from a compiled module.
+
+FASTEST = 1e3
+"""Speed of a coordinate beyond which nothing here moves [m/s or rad/s]: the arm's joints reach
+2.6 rad/s, and a fall takes 100 s to it. MuJoCo itself objects at 1e10 only."""
+
+_WARNINGS = {
+    # In the order in which a step can give them.
+    mujoco.mjtWarning.mjWARN_BADQPOS: ("a position is not finite, or huge", "qpos"),
+    mujoco.mjtWarning.mjWARN_BADQVEL: ("a velocity is not finite, or huge", "qvel"),
+    mujoco.mjtWarning.mjWARN_CONTACTFULL: ("there was no room for all contacts", ""),
+    mujoco.mjtWarning.mjWARN_CNSTRFULL: ("there was no room for all constraints", ""),
+    mujoco.mjtWarning.mjWARN_INERTIA: ("the inertia matrix is singular", ""),
+    mujoco.mjtWarning.mjWARN_BADCTRL: ("a command is not finite, or huge", ""),
+    mujoco.mjtWarning.mjWARN_BADQACC: ("an acceleration is not finite, or huge", "qacc"),
+}
+"""What it means, and where the coordinate stands that it is about, if it is about one."""
+
+
+class PhysicsError(RuntimeError):
+    """A simulation diverged or was reset from inside: nothing measured of it holds.
+
+    Not a task that failed, so no skill tries again; an experiment counts the run as failed.
+
+    Attributes:
+        time: When it was noticed, in simulated time [s].
+        body: Where it began, as far as that is known; empty if it is not.
+    """
+
+    def __init__(self, reason: str, time: float, body: str = ""):
+        where = f" at {body}" if body else ""
+        super().__init__(f"physics failed{where} at {time:.3f} s: {reason}")
+        self.reason, self.time, self.body = reason, time, body
+
+    def __reduce__(self):
+        # Trials run in other processes, and an exception is pickled by its message otherwise.
+        return type(self), (self.reason, self.time, self.body)
+
+
+class PhysicsWatch:
+    """Looks at a simulation after each step, and more closely now and then."""
+
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData):
+        """Watch a simulation.
+
+        A state that is no state is then left as it is, for whoever looks for the cause, not put
+        back to the first one.
+
+        Args:
+            model: The model.
+            data: Its state.
+        """
+        self._model, self._data = model, data
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        self.restart()
+
+    def restart(self) -> None:
+        """Take the present state for a healthy one: time and warnings count from here."""
+        self._time = self._data.time
+        self._warnings = np.array(self._data.warning.number)
+
+    def after_step(self) -> None:
+        """Find a speed that nothing has, before it spreads to other bodies.
+
+        Raises:
+            PhysicsError: There is one, or one is not a number.
+        """
+        speed = np.abs(self._data.qvel)
+        # Written so that NaN is found too.
+        if not speed.max(initial=0.0) <= FASTEST:
+            self.check()
+            dof = int(np.nanargmax(speed))
+            raise self._error(f"it moves at {speed[dof]:.3g} m/s or rad/s", self._body(dof))
+
+    def check(self) -> None:
+        """Look at state, warnings and time since the last look.
+
+        Raises:
+            PhysicsError: A value is not finite, MuJoCo warned, or time went backwards.
+        """
+        data = self._data
+        # Such a force spoils the accelerations of all bodies in the same step.
+        if len(bad := np.flatnonzero(~np.isfinite(data.xfrc_applied).all(-1))):
+            body = self._model.body(int(bad[0])).name
+            raise self._error("a force on it is not finite", body)
+        numbers = np.array(data.warning.number)
+        for kind, (reason, has_place) in _WARNINGS.items():
+            if numbers[kind] != self._warnings[kind]:
+                # Where it began: by the end of the step it may be everywhere.
+                place = int(data.warning.lastinfo[kind])
+                body = self._body(place, has_place) if has_place else ""
+                raise self._error(f"MuJoCo warns that {reason}", body)
+        for name in ("qpos", "qvel", "qacc"):
+            if len(bad := np.flatnonzero(~np.isfinite(values := getattr(data, name)))):
+                place = int(bad[0])
+                raise self._error(f"{name} holds {values[place]}", self._body(place, name))
+        if data.time < self._time:
+            raise self._error(f"time went back from {self._time:.3f} s")
+        self._time = data.time
+
+    def _body(self, place: int, values: str = "qvel") -> str:
+        """Name of the body whose coordinate stands at a place of `qpos`, `qvel` or `qacc`."""
+        model = self._model
+        starts = model.jnt_qposadr if values == "qpos" else model.jnt_dofadr
+        joint = int(np.searchsorted(starts, place, side="right")) - 1
+        return model.body(int(model.jnt_bodyid[joint])).name
+
+    def _error(self, reason: str, body: str = "") -> PhysicsError:
+        return PhysicsError(reason, self._data.time, body)
