@@ -196,7 +196,10 @@ class Rate:
             rate.wait()
 
     Attributes:
-        missed: Periods skipped because the loop was still busy, or woken too late.
+        ticks: Returns of `wait`.
+        missed: Ticks that never came, as the loop was still busy or woken too late when the
+            next one was due already.
+        latest: Largest lateness of a tick so far [s].
     """
 
     def __init__(
@@ -218,24 +221,32 @@ class Rate:
         """
         if not period > 0:
             raise ValueError(f"period must be positive, but is {period}")
-        self.missed = 0
+        self.ticks, self.missed, self.latest = 0, 0, 0.0
         self._period, self._clock, self._sleep = period, clock, sleep
         self._next = clock() + period
 
+    @property
+    def missed_fraction(self) -> float:
+        """Share of the ticks that were due and never came, 0 to 1."""
+        return self.missed / max(1, self.ticks + self.missed)
+
     def wait(self) -> float:
-        """Wait for the end of the period; one that ended a whole period ago is skipped.
+        """Wait for the next tick; where several are due by then, all but one are missed.
 
         Returns:
-            How late the loop goes on [s].
+            How long ago the first tick that was due should have come [s]: more than a period if
+            ticks are missed.
         """
-        # Ends are counted from the start, not from the last return: delays do not add up.
+        # Ticks are counted from the start, not from the last return: delays do not add up.
         rest = self._next - self._clock()
         if rest > _SPIN:
             self._sleep(rest - _SPIN)
         while (now := self._clock()) < self._next:
             pass
-        skipped = int((now - self._next) / self._period)
+        late = now - self._next
+        skipped = int(late / self._period)
+        self.ticks += 1
         self.missed += skipped
-        late = now - self._next - skipped * self._period
+        self.latest = max(self.latest, late)
         self._next += (skipped + 1) * self._period
         return late

@@ -45,10 +45,31 @@ def test_a_late_loop_catches_up_within_a_period(clock, rate):
 
 def test_ticks_a_loop_slept_through_are_counted_not_made_up_for(clock, rate):
     clock.now += 0.045
-    assert rate.wait() == pytest.approx(0.005, abs=1e-5)
-    assert rate.missed == 3
+    assert rate.wait() == pytest.approx(0.035, abs=1e-5)  # the first one was due at 0.010
+    assert (rate.ticks, rate.missed) == (1, 3)
     rate.wait()
     assert clock.now == pytest.approx(5.05, abs=1e-5)
+    assert rate.latest == pytest.approx(0.035, abs=1e-5)
+
+
+@pytest.mark.parametrize("work", [0.004, 0.0199, 0.0299, 0.0421])
+def test_lateness_and_missed_ticks_are_those_of_an_independent_log(clock, rate, work):
+    """A loop whose work takes as long each time, against the due times of all its ticks."""
+    due, returned = [5.0 + 0.01 * k for k in range(1, 400)], []
+    lateness = []
+    for _ in range(60):
+        clock.now += work
+        lateness.append(rate.wait())
+        returned.append(clock.now)
+    # Each return serves the newest tick that was due; it is late for the oldest not yet served.
+    served = [max(t for t in due if t <= now) for now in returned]
+    owed = [min(t for t in due if t > last) for last in [5.0, *served[:-1]]]
+    expected = [now - t for now, t in zip(returned, owed, strict=True)]
+    assert lateness == pytest.approx(expected, abs=1e-5)
+    passed = sum(t <= returned[-1] for t in due)
+    assert rate.missed == passed - 60
+    assert rate.missed_fraction == pytest.approx(1 - 60 / passed)
+    assert rate.latest == max(lateness)
 
 
 def test_a_period_of_nothing_is_refused():
