@@ -1,15 +1,19 @@
 """A command run: its command line parsed, its errors told in a line, its exit status.
 
-Exit status: 0 done, 1 the work failed, 2 bad input. Bad input ends in one line on stderr.
+Exit status: 0 done, 1 the work failed, 2 bad input, 143 ended by SIGTERM. Bad input ends in one
+line on stderr.
 """
 
 import io
 import re
+import signal
 import sys
+import threading
 import warnings
-from collections.abc import Callable, Sequence
-from contextlib import redirect_stderr
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, redirect_stderr
 from pathlib import Path
+from types import FrameType
 from typing import NoReturn
 
 from hrc_learn.cli._help import short_help
@@ -51,10 +55,15 @@ def run[Args](main: Callable[[Args], int | None], args: type[Args]) -> NoReturn:
 
 
 def status_of(work: Callable[[], int]) -> int:
-    """Do the work; its exit status, what went wrong told in one line on stderr."""
+    """Do the work; its exit status, what went wrong told in one line on stderr.
+
+    SIGTERM ends it as an exception, so that arms are stopped and files are closed on the way
+    out, with status 143.
+    """
     warnings.formatwarning = _warning_line
     try:
-        return work()
+        with _ended_by_sigterm():
+            return work()
     except (ValueError, FileNotFoundError, FileExistsError, NotADirectoryError) as error:
         print(f"error: {one_line(error)}", file=sys.stderr)
         return 2
@@ -68,6 +77,25 @@ def status_of(work: Callable[[], int]) -> int:
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 1
+
+
+@contextmanager
+def _ended_by_sigterm() -> Iterator[None]:
+    """SIGTERM becomes `SystemExit` where it would have killed the process."""
+    mine = threading.current_thread() is threading.main_thread()
+    if not mine or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+        yield
+        return
+
+    def end(number: int, frame: FrameType | None) -> None:
+        signal.signal(number, signal.SIG_IGN)  # once is enough, what follows must be finished
+        raise SystemExit(128 + number)
+
+    signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def parse[Args](

@@ -18,7 +18,6 @@ from hrc_learn.controller.interface import Observation as Observation
 from hrc_learn.controller.interface import paper_goals as paper_goals
 from hrc_learn.controller.interface import paper_joint_region as paper_joint_region
 from hrc_learn.controller.monitors import LimitMonitor as LimitMonitor
-from hrc_learn.controller.monitors import Watchdog as Watchdog
 from hrc_learn.controller.monitors import lyapunov_function as lyapunov_function
 from hrc_learn.controller.monitors import lyapunov_rate as lyapunov_rate
 from hrc_learn.controller.motion_barriers import SeparationConfig as SeparationConfig
@@ -27,3 +26,5 @@ from hrc_learn.controller.safety_filter import SafetyConfig as SafetyConfig
 from hrc_learn.controller.safety_filter import SafetyFilter as SafetyFilter
 from hrc_learn.controller.safety_filter import SafetyReport as SafetyReport
 from hrc_learn.controller.safety_filter import SafetyState as SafetyState
+from hrc_learn.watchdog import Watchdog as Watchdog
+from hrc_learn.watchdog import WatchdogError as WatchdogError

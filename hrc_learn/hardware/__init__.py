@@ -1,3 +1,6 @@
 """Real arms, grippers and cameras; a driver is imported when its device is opened."""
 
+from hrc_learn.hardware.arm_process import ArmProcess as ArmProcess
+from hrc_learn.hardware.arm_process import DriverError as DriverError
+from hrc_learn.hardware.ending import ending_at_rest as ending_at_rest
 from hrc_learn.hardware.franky_arm import FrankyArm as FrankyArm

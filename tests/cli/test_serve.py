@@ -20,10 +20,12 @@ def _unchecked():
 
 def check(figures: dict[str, float], steps: int) -> None:
     assert figures["steps"] == steps
-    for kind in ("step", "wake_up"):
+    for kind in ("step", "late"):
         values = [figures[f"{kind}_p{p}_us"] for p in ("50", "90", "99", "99.9", "100")]
         assert values[0] > 0
         assert values == sorted(values)
+    missed = figures["missed_ticks"]
+    assert figures["missed_percent"] == pytest.approx(100 * missed / (steps + missed))
     # The arm starts outside its box: it has to speed up, and nothing else may happen to it.
     assert figures["safety_acceleration"] > 0
     assert figures["safety_invalid"] == figures["safety_stopped"] == 0

@@ -9,6 +9,7 @@ import pytest
 import torch
 from lerobot.robots import make_robot_from_config
 
+from hrc_learn.hardware import DriverError
 from hrc_learn.kinematics import panda
 from hrc_learn.lerobot.panda_robot import GRIPPER, JOINTS
 from hrc_learn.lerobot.robots import FrankaPandaConfig
@@ -21,7 +22,12 @@ FPS = 20.0
 def franka(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "franky", fake_franky)
     config = FrankaPandaConfig(
-        calibration_dir=tmp_path, ip="172.16.0.2", fps=FPS, timeout=0.3, tcp_speed=0.2
+        calibration_dir=tmp_path,
+        ip="172.16.0.2",
+        fps=FPS,
+        timeout=0.3,
+        tcp_speed=0.2,
+        own_process=False,
     )
     robot = make_robot_from_config(config)
     robot.connect()
@@ -88,8 +94,39 @@ def test_the_gripper_squeezes_and_the_arm_rests_at_the_end(franka):
     assert isinstance(driver.motions[-1], fake_franky.JointVelocityStopMotion)
 
 
-def test_without_the_driver_the_cure_is_named(tmp_path, monkeypatch):
+@pytest.mark.parametrize("own", [True, False])
+def test_without_the_driver_the_cure_is_named(tmp_path, monkeypatch, own):
     monkeypatch.setitem(sys.modules, "franky", None)
-    robot = make_robot_from_config(FrankaPandaConfig(calibration_dir=tmp_path, ip="x"))
-    with pytest.raises(ImportError, match="pip install franky-control"):
+    robot = make_robot_from_config(
+        FrankaPandaConfig(calibration_dir=tmp_path, ip="x", own_process=own)
+    )
+    error = DriverError if own else ImportError  # here it is the other process that imports
+    with pytest.raises(error, match="pip install franky-control"):
         robot.connect()
+
+
+def test_with_its_driver_in_another_process_a_silent_loop_is_stopped_and_goes_on_from_rest(
+    tmp_path, monkeypatch
+):
+    (tmp_path / "franky.py").write_text("from fake_franky import *\n")
+    monkeypatch.syspath_prepend(tmp_path)  # which the other process inherits
+    config = FrankaPandaConfig(calibration_dir=tmp_path, ip="x", fps=FPS, timeout=0.5)
+    robot = make_robot_from_config(config)
+    robot.connect()
+    goal = dict(zip(JOINTS, (READY + 0.3).tolist(), strict=True)) | {GRIPPER: 0.04}
+    for _ in range(4):
+        robot.send_action(goal)
+    trips = robot.watchdog.trips
+    moving = np.array(robot._arm.read().joint_velocity)
+    assert moving.any()
+    deadline = time.monotonic() + 30
+    while robot._arm.read().joint_velocity.any() and time.monotonic() < deadline:
+        time.sleep(0.02)  # reading is no sign of life
+    assert robot.watchdog.trips == trips + 1
+    robot.send_action(goal)
+    resumed = np.array(robot._arm.read().joint_velocity)
+    assert resumed.any()
+    assert (np.abs(resumed) <= panda.limits.acceleration.numpy() / FPS + 1e-9).all()
+    process = robot.watchdog._process
+    robot.disconnect()
+    assert process.exitcode == 0

@@ -290,9 +290,9 @@ class Serve:
     """Run the controller at a fixed rate on the simulated arm, and report how fast it answers.
 
     The arm servoes on a marker that an uncalibrated camera sees at 31 Hz. Step latency is the
-    time from reading the joints to the command, wake-up latency how late the loop is woken for
-    its tick, both in wall-clock time. A tick is missed when the loop, physics included, was
-    still busy a whole period after it.
+    time from reading the joints to the command, lateness how long ago the tick was due, or the
+    first of those that were missed before it; both in wall-clock time. A tick is missed when
+    the loop, physics included, was still busy when the next one was due.
     """
 
     duration: float = 8.0

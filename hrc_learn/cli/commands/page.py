@@ -7,6 +7,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import sys
 from dataclasses import replace
 
+import numpy as np
 import torch
 from rich.console import Console
 
@@ -15,6 +16,7 @@ from hrc_learn.cli._values import configuration, write_json
 from hrc_learn.cli.arguments.run import ServePage as Args
 from hrc_learn.demos import DatasetWriter
 from hrc_learn.deploy import Rate
+from hrc_learn.hardware import ending_at_rest
 from hrc_learn.kinematics import panda
 from hrc_learn.protocols import Human
 from hrc_learn.sim import MovingBodies, World
@@ -79,14 +81,15 @@ def _serve(
     session: PageSession, page: Page, dt: float, duration: float | None
 ) -> dict[str, float | int]:
     """Run the loop in the arm's own time; what was measured of it."""
-    rate, steps, latest = Rate(dt), 0, 0.0
+    rate, steps = Rate(dt), 0
     try:
-        while page.alive and not session.finished:
-            session.step()
-            steps += 1
-            if duration is not None and steps * dt >= duration:
-                break
-            latest = max(latest, rate.wait())
+        with ending_at_rest(lambda: session.world.arm.command(np.zeros(7))):
+            while page.alive and not session.finished:
+                session.step()
+                steps += 1
+                if duration is not None and steps * dt >= duration:
+                    break
+                rate.wait()
     except KeyboardInterrupt:
         print()
-    return {"steps": steps, "missed_ticks": rate.missed, "latest_s": latest}
+    return {"steps": steps, "missed_ticks": rate.missed, "latest_s": rate.latest}

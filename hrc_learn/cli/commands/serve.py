@@ -24,6 +24,7 @@ from hrc_learn.controller import (
 )
 from hrc_learn.deploy import EagerRunner, Rate, StepRunner, open_step
 from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.hardware import ending_at_rest
 from hrc_learn.jacobian import KalmanEstimator, RBFImageJacobian, paper_grid
 from hrc_learn.kinematics import panda
 from hrc_learn.protocols import Arm
@@ -42,9 +43,11 @@ class Latencies:
     """One entry a step [s]."""
 
     step: np.ndarray
-    wake_up: np.ndarray
+    """From reading the joints to the command."""
+    late: np.ndarray
+    """How long ago the tick was due, or the first of those that were missed before it."""
     missed: int
-    """Ticks that were skipped."""
+    """Ticks that never came."""
 
 
 def run(args: Args) -> None:
@@ -77,8 +80,9 @@ def _figures(latencies: Latencies) -> dict[str, float | int]:
     figures: dict[str, float | int] = {
         "steps": len(latencies.step),
         "missed_ticks": latencies.missed,
+        "missed_percent": 100 * latencies.missed / (len(latencies.step) + latencies.missed),
     }
-    for name, seconds in (("step", latencies.step), ("wake_up", latencies.wake_up)):
+    for name, seconds in (("step", latencies.step), ("late", latencies.late)):
         values = 1e6 * np.percentile(seconds, PERCENTILES)
         for percentile, value in zip(PERCENTILES, values, strict=True):
             figures[f"{name}_p{percentile:g}_us"] = float(value)
@@ -132,17 +136,18 @@ def _serve(
     _answer(runner, world.arm)  # the first call is slower than any other
     runner.start(panda.ready.numpy())
     rate = Rate(dt)
-    for k in range(steps):
-        began = time.perf_counter()
-        _answer(runner, world.arm)
-        took[k] = time.perf_counter() - began
-        world.advance(dt)
-        runner.observation["feature_new"][...] = k % frame_steps == 0
-        if k % frame_steps == 0:
-            _look(runner.observation, camera, world.arm)
-        late[k] = rate.wait()
+    with ending_at_rest(lambda: world.arm.command(np.zeros(7))):
+        for k in range(steps):
+            began = time.perf_counter()
+            _answer(runner, world.arm)
+            took[k] = time.perf_counter() - began
+            world.advance(dt)
+            runner.observation["feature_new"][...] = k % frame_steps == 0
+            if k % frame_steps == 0:
+                _look(runner.observation, camera, world.arm)
+            late[k] = rate.wait()
     error = float(np.linalg.norm(runner.observation["feature"] - target))
-    return Latencies(step=took, wake_up=late, missed=rate.missed), error
+    return Latencies(step=took, late=late, missed=rate.missed), error
 
 
 def _answer(runner: StepRunner, arm: Arm) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,13 +14,18 @@ from lerobot.robots import RobotConfig
 
 from hrc_learn.controller import SafetyConfig, Watchdog
 from hrc_learn.geometry import Pose
-from hrc_learn.hardware.franky_arm import FrankyArm
+from hrc_learn.hardware import ArmProcess, FrankyArm
 from hrc_learn.kinematics import panda
 from hrc_learn.lerobot.panda_robot import PandaRobot, PandaRobotConfig
 from hrc_learn.protocols import Arm
+from hrc_learn.watchdog import bring_to_rest
 
 if TYPE_CHECKING:
     from hrc_learn.skills.arm_motion import PositionServo
+
+
+_PATIENCE = 5.0
+"""How long the last stop is tried [s]; each velocity ends by itself long before."""
 
 
 @RobotConfig.register_subclass("franka_panda")
@@ -35,6 +41,9 @@ class FrankaPandaConfig(PandaRobotConfig):
     """Cap on the speed of the tool centre point [m/s] (ISO 10218: reduced speed)."""
     timeout: float = 0.15
     """Silence of the loop after which the arm is stopped [s]."""
+    own_process: bool = True
+    """Whether the driver runs in a process of its own, which stops the arm also when this one
+    hangs, is stopped or dies."""
     grip_force: float = 20.0
     """With which the gripper squeezes [N]."""
     grip_speed: float = 0.1
@@ -60,8 +69,8 @@ class FrankaPanda(PandaRobot):
 
     NOT RUN ON HARDWARE. Between an action and the arm stand, in this order: the limits of the
     joints' motion (`ActionChunkFilter`), the safety filter with a cap on the speed of the tool,
-    a watchdog that stops the arm when the loop falls silent, and the driver, which ends every
-    velocity by itself. Keep the stop button in hand.
+    a watchdog that stops the arm when the loop falls silent, in a process of its own with the
+    driver, and the driver, which ends every velocity by itself. Keep the stop button in hand.
 
     Attributes:
         watchdog: While connected; counts its trips.
@@ -69,14 +78,15 @@ class FrankaPanda(PandaRobot):
 
     config_class = FrankaPandaConfig
     name = "franka_panda"
-    watchdog: Watchdog
+    watchdog: Watchdog | ArmProcess
 
     def __init__(self, config: FrankaPandaConfig):
         super().__init__(config)
         self.config = config
         self.cameras = make_cameras_from_configs(config.cameras)
-        self._arm: FrankyArm
+        self._arm: FrankyArm | ArmProcess
         self._servo: PositionServo
+        self._trips = 0
 
     @property
     def observation_features(self) -> dict[str, Any]:
@@ -94,27 +104,37 @@ class FrankaPanda(PandaRobot):
         from hrc_learn.skills.arm_motion import PositionServo, PositionServoConfig
 
         config = self.config
-        self._arm = FrankyArm(
+        open_arm = partial(
+            FrankyArm,
             config.ip,
             dynamics=config.dynamics,
             timeout=config.timeout,
             grip_force=config.grip_force,
             grip_speed=config.grip_speed,
         )
+        if config.own_process:
+            self._arm = self.watchdog = ArmProcess(open_arm, timeout=config.timeout)
+        else:
+            self._arm = open_arm()
+            self.watchdog = Watchdog(config.timeout, self._arm.stop)
         safety = SafetyConfig(tcp_speed=config.tcp_speed)
         self._servo = PositionServo(
             panda, self._arm, self.dt, PositionServoConfig(safety=safety)
         )
         for camera in self.cameras.values():
             camera.connect()
-        self.watchdog = Watchdog(config.timeout, self._arm.stop)
-        self.watchdog.__enter__()
+        if isinstance(self.watchdog, Watchdog):
+            self.watchdog.start()
+        self._trips = self.watchdog.trips
 
     def _close(self) -> None:
-        self.watchdog.__exit__(None, None, None)
-        self._arm.stop()
-        for camera in self.cameras.values():
-            camera.disconnect()
+        try:
+            self.watchdog.close()
+            if isinstance(self._arm, FrankyArm):
+                bring_to_rest(self._arm.stop, _PATIENCE)
+        finally:
+            for camera in self.cameras.values():
+                camera.disconnect()
 
     def get_observation(self) -> dict[str, Any]:
         values = super().get_observation()
@@ -126,7 +146,8 @@ class FrankaPanda(PandaRobot):
         return self._servo.joints_at(pose)
 
     def _command(self, joints: Float[np.ndarray, "7"], width: float) -> Float[np.ndarray, "7"]:
-        if self.watchdog.tripped:
+        if self.watchdog.trips != self._trips:
+            self._trips = self.watchdog.trips
             self._servo.restart()  # the arm is at rest, which the servo does not know
         with torch.inference_mode():
             _, sent = self._servo.follow(joints)

@@ -1,0 +1,286 @@
+"""A real arm's driver in a process of its own, which brings the arm to rest when the control
+loop stalls, is stopped, or dies.
+
+Each request of the loop is its heartbeat, each answer that of the process: both learn within
+the timeout that the other is gone.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from types import TracebackType
+from typing import Any, Protocol, final, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float
+
+from hrc_learn.hardware.ending import ending_at_rest
+from hrc_learn.protocols import ArmState
+from hrc_learn.watchdog import Watchdog, WatchdogError, bring_to_rest
+
+_PATIENCE = 60.0
+"""How long the process goes on trying to stop an arm whose loop has died [s]: longer than a
+control box takes to start again."""
+_STARTUP = 60.0
+"""Longest that connecting may take [s]."""
+
+
+@runtime_checkable
+class StoppableArm(Protocol):
+    """An arm and its gripper, as a driver has them."""
+
+    def read(self) -> ArmState:
+        """Return the newest state."""
+        ...
+
+    def command(self, joint_velocity: Float[np.ndarray, " joints"]) -> None:
+        """Set the joint velocities [rad/s]."""
+        ...
+
+    def stop(self) -> None:
+        """Bring the arm to rest."""
+        ...
+
+    def move(self, width: float) -> None:
+        """Set the opening of the gripper [m]."""
+        ...
+
+
+class DriverError(RuntimeError):
+    """The driver of an arm raised an exception; the message has it."""
+
+
+@final
+class ArmProcess:
+    """An `Arm` and a `Gripper` behind a driver that runs in another process.
+
+    with ArmProcess(partial(FrankyArm, ip), timeout=0.15) as arm:
+        while servoing():
+            arm.command(velocity(arm.read()))
+
+    The process stops the arm when no command has come for the timeout, whatever the loop's own
+    process does: holds the interpreter, is stopped or is killed. Ctrl-C does not reach it, on
+    SIGTERM it stops the arm and ends. If the process itself dies, its connection to the arm
+    falls, which ends the motion at any arm with a control box, and the loop's next request
+    raises `WatchdogError`.
+
+    After a trip commands are not carried out until the loop has seen that `trips` has changed
+    and starts from rest: the first command after one only brings the news.
+
+    Attributes:
+        trips: How often the process had stopped the arm, as of its last answer.
+        failures: How many of its stops had failed.
+    """
+
+    def __init__(self, open_arm: Callable[[], StoppableArm], *, timeout: float):
+        """Start the process and connect.
+
+        Args:
+            open_arm: Connects to the arm, in the process; it is pickled.
+            timeout: Longest silence of the loop, and longest wait for an answer [s].
+
+        Raises:
+            ValueError: The timeout is not positive.
+            DriverError: The arm cannot be reached.
+            WatchdogError: The process died, or takes too long.
+        """
+        if not timeout > 0:
+            raise ValueError(f"timeout must be positive, but is {timeout}")
+        self.trips, self.failures = 0, 0
+        self._timeout, self._gone = timeout, ""
+        # A forked process would have the loop's threads' locks, but not the threads.
+        context = multiprocessing.get_context("spawn")
+        self._connection, theirs = context.Pipe()
+        self._process = context.Process(
+            target=_serve, args=(theirs, open_arm, timeout), name="arm", daemon=True
+        )
+        self._process.start()
+        theirs.close()  # or its end would never be noticed here
+        try:
+            self._answer(_STARTUP)
+        except BaseException:
+            self._end()
+            raise
+
+    @property
+    def pid(self) -> int | None:
+        """Number of the process."""
+        return self._process.pid
+
+    def read(self) -> ArmState:
+        """Return the newest state.
+
+        Raises:
+            DriverError: The driver does.
+            WatchdogError: The process does not answer.
+        """
+        return self._ask("read")
+
+    def command(self, joint_velocity: Float[np.ndarray, " joints"]) -> None:
+        """Set the joint velocities [rad/s], and report that the loop is alive.
+
+        Raises:
+            DriverError: The driver does; such a command is no sign of life.
+            WatchdogError: The process does not answer.
+        """
+        self._ask("command", np.asarray(joint_velocity, dtype=float), self.trips)
+
+    def move(self, width: float) -> None:
+        """Set the opening of the gripper [m].
+
+        Raises:
+            DriverError: The driver does.
+            WatchdogError: The process does not answer.
+        """
+        self._ask("move", float(width))
+
+    def feed(self) -> None:
+        """Report that the loop is alive, with no command.
+
+        Raises:
+            WatchdogError: The process does not answer.
+        """
+        self._ask("feed")
+
+    def stop(self) -> None:
+        """Bring the arm to rest.
+
+        Raises:
+            DriverError: The driver does.
+            WatchdogError: The process does not answer.
+        """
+        self._ask("stop")
+
+    def close(self) -> None:
+        """Bring the arm to rest and end the process.
+
+        Raises:
+            WatchdogError: The arm could not be stopped, or the process was gone.
+        """
+        try:
+            if not self._ask("close", wait=_PATIENCE + self._timeout):
+                raise WatchdogError(f"the arm could not be stopped for {_PATIENCE:g} s.")
+        finally:
+            self._end()
+
+    def __enter__(self) -> ArmProcess:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if error is None:
+            self.close()
+            return
+        try:
+            self.close()
+        except WatchdogError as another:
+            error.add_note(str(another))
+
+    def _ask(self, *request: object, wait: float | None = None) -> Any:
+        if self._gone:
+            raise WatchdogError(self._gone)
+        try:
+            self._connection.send(request)
+        except OSError as error:
+            raise self._lost("has ended") from error
+        return self._answer(self._timeout if wait is None else wait)
+
+    def _answer(self, wait: float) -> Any:
+        try:
+            if not self._connection.poll(wait):
+                raise self._lost(f"has not answered for {wait:g} s")
+            value, error, self.trips, self.failures = self._connection.recv()
+        except (EOFError, OSError) as error:
+            raise self._lost("has ended") from error
+        if error:
+            raise DriverError(error)
+        return value
+
+    def _lost(self, what: str) -> WatchdogError:
+        # Later answers would be those of earlier questions.
+        self._gone = (
+            f"the process that watches the arm {what}: make sure that the arm is at rest, and "
+            "connect again."
+        )
+        return WatchdogError(self._gone)
+
+    def _end(self) -> None:
+        self._connection.close()
+        self._process.join(self._timeout + 1.0)
+        if self._gone and self._process.is_alive():
+            # It hangs or is stopped. Without its connection the control box ends the motion.
+            self._process.kill()
+            self._process.join()
+
+
+def _serve(
+    connection: Connection, open_arm: Callable[[], StoppableArm], timeout: float
+) -> None:
+    """What runs in the process: answers requests until the loop's process closes or dies."""
+    # Ctrl-C reaches all processes of a terminal: the loop decides what follows from it.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        arm = open_arm()
+    except Exception as error:
+        connection.send((None, _told(error), 0, 0))
+        return
+    dog = Watchdog(timeout, arm.stop)
+    with ending_at_rest(arm.stop, patience=_PATIENCE):
+        dog.start()
+        connection.send((None, "", 0, 0))
+        try:
+            _answer_requests(connection, arm, dog)
+        finally:
+            dog.close()
+
+
+def _answer_requests(connection: Connection, arm: StoppableArm, dog: Watchdog) -> None:
+    while True:
+        try:
+            name, *arguments = connection.recv()
+        except (EOFError, OSError):
+            return  # the loop's process has died
+        value, error = None, ""
+        try:
+            value = _carry_out(name, arguments, arm, dog)
+        except Exception as raised:
+            error = _told(raised)
+        try:
+            connection.send((value, error, dog.trips, dog.failures))
+        except OSError:
+            return
+        if name == "close":
+            return
+
+
+def _carry_out(name: str, arguments: list[Any], arm: StoppableArm, dog: Watchdog) -> Any:
+    if name == "read":
+        return arm.read()
+    if name == "command":
+        velocity, trips = arguments
+        # A loop that does not know of a stop would make the arm jump to its velocity.
+        if trips == dog.trips:
+            arm.command(velocity)
+        dog.feed()
+    elif name == "feed":
+        dog.feed()
+    elif name == "move":
+        arm.move(*arguments)
+    elif name == "stop":
+        arm.stop()
+    elif name == "close":
+        return bring_to_rest(arm.stop, _PATIENCE)
+    else:
+        raise ValueError(f"no request {name!r}")
+    return None
+
+
+def _told(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}"

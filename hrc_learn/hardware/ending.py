@@ -1,0 +1,80 @@
+"""Programs that move an arm end with the arm at rest, also when a signal tells them to."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any
+
+from hrc_learn.watchdog import Report, bring_to_rest, report_failed_stop
+
+SIGNALS = tuple(
+    getattr(signal, name) for name in ("SIGTERM", "SIGINT", "SIGHUP") if hasattr(signal, name)
+)
+"""By which a program is told to end: by its surroundings, by Ctrl-C, by a closed terminal."""
+
+
+@contextmanager
+def ending_at_rest(
+    stop: Callable[[], object], *, patience: float = 5.0, report: Report = report_failed_stop
+) -> Iterator[None]:
+    """Whatever ends this block, the arm is brought to rest before the process goes on.
+
+        with ending_at_rest(arm.stop):
+            while servoing():
+                arm.command(runner.step())
+
+    SIGTERM and SIGHUP end the block as `SystemExit` with status 128 + number, SIGINT as
+    `KeyboardInterrupt`; further ones change nothing until the arm is at rest. A signal that was
+    ignored stays so. In a thread other than the main one, which signals do not reach, they are
+    left alone.
+
+    Args:
+        stop: Brings the arm to rest.
+        patience: How long to go on trying if that fails [s].
+        report: Told of each failure.
+
+    Raises:
+        RuntimeError: The arm could not be stopped, and nothing else was wrong.
+    """
+    ending = False
+
+    def end(number: int, frame: FrameType | None) -> None:
+        nonlocal ending
+        if ending:
+            return
+        ending = True
+        if number == signal.SIGINT:
+            raise KeyboardInterrupt
+        raise SystemExit(128 + number)
+
+    before = _handled_by(end)
+    stopped = False
+    try:
+        try:
+            yield
+        finally:
+            ending = True
+    finally:  # also where the signal came in the line above
+        stopped = bring_to_rest(stop, patience, report)
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        if not stopped:
+            print(f"the arm could not be stopped for {patience:g} s", file=sys.stderr)
+    if not stopped:
+        raise RuntimeError(f"the arm could not be stopped for {patience:g} s.")
+
+
+def _handled_by(handler: Callable[[int, FrameType | None], None]) -> dict[int, Any]:
+    """Set a handler of the signals; those before it."""
+    before: dict[int, Any] = {}
+    if threading.current_thread() is threading.main_thread():
+        for number in SIGNALS:
+            # None: a library handles it by itself.
+            if signal.getsignal(number) not in (signal.SIG_IGN, None):
+                before[number] = signal.signal(number, handler)
+    return before

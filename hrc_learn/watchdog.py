@@ -1,0 +1,202 @@
+"""Stops an arm whose control loop has fallen silent, however often the stop fails at first."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from types import TracebackType
+from typing import final
+
+_FIRST_PAUSE = 0.02
+_LONGEST_PAUSE = 1.0
+"""Between two attempts to stop [s]: doubled from the first to the longest. Network drivers
+recover within some tens of milliseconds, a control box within seconds."""
+
+
+class WatchdogError(RuntimeError):
+    """Nobody watches any more: the arm must not be moved on."""
+
+
+def report_failed_stop(error: BaseException, attempts: int) -> None:
+    """Tell on stderr that a stop failed, and how often it has been tried."""
+    if attempts & (attempts - 1) == 0:  # the 1st, 2nd, 4th, ...
+        print(f"watchdog: stop failed {attempts} times, trying on: {error!r}", file=sys.stderr)
+
+
+Report = Callable[[BaseException, int], object]
+"""Told of each stop that failed, and how many did in a row."""
+
+
+def bring_to_rest(
+    stop: Callable[[], object],
+    patience: float,
+    report: Report = report_failed_stop,
+    sleep: Callable[[float], None] = time.sleep,
+) -> bool:
+    """Stop an arm, trying again with growing pauses.
+
+    Args:
+        stop: Brings it to rest.
+        patience: How long to go on trying [s].
+        report: Told of each failure.
+        sleep: Lets at least a given time pass [s].
+
+    Returns:
+        Whether an attempt succeeded.
+    """
+    end, pause, attempts = time.monotonic() + patience, _FIRST_PAUSE, 0
+    while (error := _attempt(stop)) is not None:
+        attempts += 1
+        _tell(report, error, attempts)
+        if time.monotonic() + pause > end:
+            return False
+        sleep(pause)
+        pause = min(2 * pause, _LONGEST_PAUSE)
+    return True
+
+
+def _attempt(stop: Callable[[], object]) -> BaseException | None:
+    """Try once; what went wrong."""
+    try:
+        stop()
+    except (Exception, SystemExit) as error:  # a driver's sys.exit() must not end the watch
+        return error
+    return None
+
+
+def _tell(report: Report, error: BaseException, attempts: int) -> None:
+    with suppress(Exception):  # a closed stderr must not end the watch either
+        report(error, attempts)
+
+
+@final
+class Watchdog:
+    """Calls for a stop once a loop has not reported for too long.
+
+    with Watchdog(0.05, arm.stop) as watchdog:
+        while servoing():
+            arm.command(runner.step())
+            watchdog.feed()
+
+    It runs in a thread of its own, so it also notices a loop that hangs, but not one that holds
+    the interpreter, nor a process that is stopped or killed: for a real arm take `ArmProcess`.
+    A stop that fails is tried again, with growing pauses, until it succeeds or the loop reports
+    again. After a trip the arm is at rest, which the controller does not know: start from
+    `initial_state` again. Left by an exception, or with a stop that has not succeeded, the
+    context stops the arm.
+
+    Attributes:
+        trips: How often it had to act.
+        failures: How many stops failed.
+        error: Why the last of them did; None: none has.
+    """
+
+    def __init__(
+        self,
+        timeout: float,
+        stop: Callable[[], object],
+        *,
+        clock: Callable[[], float] = time.monotonic,
+        report: Report = report_failed_stop,
+    ):
+        """Set up; the time starts with the first `feed`, or on entering the context.
+
+        Args:
+            timeout: Longest silence [s]; it is noticed up to a quarter of it late.
+            stop: Brings the arm to rest. Called once for every silence, and again if it fails.
+            clock: Tells the time [s].
+            report: Told of each stop that failed; by default a line on stderr.
+
+        Raises:
+            ValueError: The timeout is not positive.
+        """
+        if not timeout > 0:
+            raise ValueError(f"timeout must be positive, but is {timeout}")
+        self.trips, self.failures = 0, 0
+        self.error: BaseException | None = None
+        self._timeout, self._stop, self._clock, self._report = timeout, stop, clock, report
+        self._fed: float | None = None
+        # When to stop next, and the pause after that; None: there is nothing to stop.
+        self._due: float | None = None
+        self._pause, self._in_a_row = _FIRST_PAUSE, 0
+        self._stopping_since: float | None = None
+        self._lock = threading.Lock()
+        self._done = threading.Event()
+        self._thread = threading.Thread(target=self._watch, name="watchdog", daemon=True)
+
+    @property
+    def tripped(self) -> bool:
+        """Whether it has acted since it was last fed."""
+        return self.trips > 0 and self._fed is None
+
+    def feed(self) -> None:
+        """Report that the loop is alive.
+
+        Raises:
+            WatchdogError: The watchdog is not: its thread has ended, or hangs in a stop.
+        """
+        with self._lock:
+            if self._thread.ident is not None and not self._thread.is_alive():
+                raise WatchdogError("the watchdog's thread has ended: stop the arm.")
+            now, since = self._clock(), self._stopping_since
+            if since is not None and now - since > self._timeout:
+                raise WatchdogError(f"the watchdog hangs in a stop for {now - since:.2f} s.")
+            self._fed, self._due = now, None
+
+    def check(self) -> bool:
+        """Stop the arm if that is due; whether it was. The thread does this by itself."""
+        with self._lock:
+            now = self._clock()
+            if self._fed is not None and now - self._fed > self._timeout:
+                self._fed, self._due = None, now  # until fed again there is nothing to notice
+                self._pause, self._in_a_row = _FIRST_PAUSE, 0
+                self.trips += 1
+            if self._due is None or now < self._due:
+                return False
+            self._due, self._stopping_since = None, now
+        # Outside the lock: stopping an arm may take long, and may feed.
+        error = _attempt(self._stop)
+        with self._lock:
+            self._stopping_since = None
+            if error is None:
+                return True
+            self.failures += 1
+            self._in_a_row += 1
+            self.error = error
+            if self._fed is None:  # if it was fed meanwhile, the loop is in charge again
+                self._due = self._clock() + self._pause
+                self._pause = min(2 * self._pause, _LONGEST_PAUSE)
+        _tell(self._report, error, self._in_a_row)
+        return True
+
+    def start(self) -> None:
+        """Begin to watch, from the first `feed` on."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Watch no more. A stop that hangs is not waited for: the process must end."""
+        self._done.set()
+        self._thread.join(self._timeout + _LONGEST_PAUSE)
+
+    def __enter__(self) -> Watchdog:
+        self.feed()
+        self.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+        if error is not None or self._due is not None:
+            bring_to_rest(self._stop, _LONGEST_PAUSE, self._report)
+
+    def _watch(self) -> None:
+        # A silence is noticed at most a quarter of the timeout late.
+        while not self._done.wait(self._timeout / 4):
+            self.check()

@@ -1,0 +1,31 @@
+"""Commands that are told to end."""
+
+import signal
+import subprocess
+import sys
+
+import pytest
+
+PROGRAM = """
+import sys, time
+from hrc_learn.cli._run import status_of
+
+def work():
+    try:
+        print("at work", flush=True)
+        time.sleep(60)
+    finally:
+        print("tidied up", flush=True)
+
+sys.exit(status_of(work))
+"""
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 1)])
+def test_a_signal_ends_a_command_by_way_of_its_finally(number, status):
+    command = [sys.executable, "-c", PROGRAM]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as program:
+        assert program.stdout.readline() == "at work\n"
+        program.send_signal(number)
+        assert program.stdout.read() == "tidied up\n"
+        assert program.wait(60) == status
