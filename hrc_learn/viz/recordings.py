@@ -100,8 +100,8 @@ class RunRecording:
     potential_rate: Float[np.ndarray, " time"] | None = None
     """Rate of the sum of the potentials that the estimated image Jacobian predicts [1/s]."""
 
-    human_effort: Float[np.ndarray, "time joints"] | None = None
-    """Null-space effort d of the person, on each joint."""
+    nullspace_input: Float[np.ndarray, "time joints"] | None = None
+    """Null-space input d of the person, on each joint [N m]."""
     elbow_motion: Float[np.ndarray, " time"] | None = None
     """How far the elbow is from where it would be undisturbed [m]."""
     position_deviation: Float[np.ndarray, " time"] | None = None
@@ -150,7 +150,7 @@ _SERIES = (
     "true_image_jacobian",
     "weight_norm",
     "potential_rate",
-    "human_effort",
+    "nullspace_input",
     "elbow_motion",
     "position_deviation",
     "rotation_deviation",

@@ -7,8 +7,8 @@ import torch
 from PIL import Image
 from sample_runs import sample_run
 
-from hrc_learn.experiments.collaboration import figures as collaboration_figures
-from hrc_learn.experiments.collaboration.figures import (
+from hrc_learn.experiments.collaboration import report as collaboration_figures
+from hrc_learn.experiments.collaboration.report import (
     end_effector_figure,
     marker_figure,
     timeline_figure,
@@ -89,7 +89,7 @@ def test_figures_of_a_job_that_never_saw_its_marker_are_drawn_all_the_same(run):
         camera=replace(
             run.camera, feature=unknown, target=unknown, images=(), image_time=np.empty(0)
         ),
-        human_effort=np.zeros_like(run.human_effort),
+        nullspace_input=np.zeros_like(run.nullspace_input),
         demo_path=None,
     )
     for draw in (trajectories_figure, marker_figure, timeline_figure):

@@ -15,8 +15,7 @@ from hrc_learn.experiments.placing.metrics import (
     placing_metrics,
     random_start_metrics,
 )
-from hrc_learn.experiments.placing.trial import PlacingOutcome
-from hrc_learn.experiments.pose_randomization import random_start
+from hrc_learn.experiments.placing.trial import PlacingOutcome, random_start
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import Touch, World
 from hrc_learn.sim.workplace import Workplace

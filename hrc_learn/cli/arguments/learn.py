@@ -23,13 +23,13 @@ def _jacobian_fit() -> Any:
 
 
 def _starts() -> Any:
-    from hrc_learn.experiments.initialization_study import StartsConfig
+    from hrc_learn.experiments.controller.initialization_study import StartsConfig
 
     return StartsConfig()
 
 
 def _few_starts() -> Any:
-    from hrc_learn.experiments.initialization_study import StartsConfig
+    from hrc_learn.experiments.controller.initialization_study import StartsConfig
 
     # A search measures each gain on all of them.
     return StartsConfig(count=48)

@@ -17,7 +17,7 @@ def _camera_change() -> Any:
 
 
 def _serving() -> Any:
-    from hrc_learn.experiments.live_view import LiveViewConfig
+    from hrc_learn.experiments.run_recording import LiveViewConfig
 
     return LiveViewConfig()
 

@@ -7,7 +7,7 @@ from hrc_learn.cli._options import resolved
 from hrc_learn.cli._values import show_values, write_json
 from hrc_learn.cli.arguments.learn import EvaluateImageJacobian as Args
 from hrc_learn.demos import load_demos
-from hrc_learn.experiments.initialization_study import (
+from hrc_learn.experiments.controller.initialization_study import (
     ClosedLoops,
     compare_starts,
     compare_with_truth,

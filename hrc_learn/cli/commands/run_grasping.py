@@ -11,7 +11,7 @@ from hrc_learn.cli.arguments.run import RunGrasping as Args
 from hrc_learn.cli.commands._demo_models import model
 from hrc_learn.experiments.frame import RunOptions, conduct
 from hrc_learn.experiments.grasping.experiment import GraspingExperiment
-from hrc_learn.experiments.pose_randomization import GraspingSceneConfig
+from hrc_learn.experiments.grasping.trial import GraspingSceneConfig
 from hrc_learn.learning.tuning import with_gains
 
 

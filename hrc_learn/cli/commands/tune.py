@@ -14,7 +14,11 @@ from hrc_learn.cli._options import resolved
 from hrc_learn.cli._values import show_values, write_json, write_text
 from hrc_learn.cli.arguments.learn import Tune as Args
 from hrc_learn.controller import ControllerConfig
-from hrc_learn.experiments.initialization_study import ClosedLoops, StartsConfig, summary
+from hrc_learn.experiments.controller.initialization_study import (
+    ClosedLoops,
+    StartsConfig,
+    summary,
+)
 from hrc_learn.jacobian import KalmanEstimator
 from hrc_learn.learning.tuning import TUNED, TuningState
 from hrc_learn.sim import World

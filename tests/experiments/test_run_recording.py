@@ -7,7 +7,7 @@ import rerun as rr
 import torch
 from rrd_reading import Rrd
 
-from hrc_learn.experiments.live_view import LiveViewConfig, live_view
+from hrc_learn.experiments.run_recording import LiveViewConfig, live_view
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import MotionLog, World
 from hrc_learn.sim.workplace import Workplace
