@@ -6,7 +6,7 @@ from contextlib import nullcontext
 import numpy as np
 import pytest
 from page_in_browser import PATIENCE, Browser, chromium, wait_until
-from taught_skills import taught_aiming, taught_placing
+from taught_models import teach
 
 from hrc_learn.experiments.collaboration.trial import simulate_collaboration
 from hrc_learn.experiments.run_recording import ELBOW, Deviation, link_poses, span
@@ -63,9 +63,8 @@ class Job:
         self._thread.join()
 
 
-def test_the_elbow_yields_to_the_mouse_while_the_hand_aims(tmp_path, monkeypatch):
-    aiming, (placing, _) = taught_aiming(tmp_path / "aim"), taught_placing(tmp_path / "place")
-    job = Job(aiming, placing)
+def test_the_elbow_yields_to_the_mouse_while_the_end_effector_servoes(tmp_path, monkeypatch):
+    job = Job(*teach(tmp_path))
     monkeypatch.setattr(
         task_page, "Page", lambda *given, **named: job.open(Page(*given, **named))
     )

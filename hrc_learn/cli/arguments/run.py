@@ -44,6 +44,8 @@ class Demo(Measured):
 class RunExperiment(Written):
     """What the paper's three experiments have in common."""
 
+    out: Path
+    """Folder for recordings, report and measured values."""
     seed: int = 0
     """First seed of the run and of its repetitions."""
     trials: int = 0
@@ -84,7 +86,6 @@ class RunPlacing(RunExperiment):
     """Folder of `hrc fit`, from demonstrations of placing. Those of `hrc demo` when not given,
     made first where they are missing."""
     out: Path = Path("outputs/placing")
-    """Folder for recordings, report and measured values."""
     demonstrations: Path | None = None
     """Dataset the motion was learned from; the one named in that folder when None."""
     speed: float = 1.5
@@ -114,7 +115,6 @@ class RunGrasping(RunServoing):
     """Folder of `hrc fit image-jacobian`. That of `hrc demo` when not given, made first where
     it is missing."""
     out: Path = Path("outputs/grasping")
-    """Folder for recordings, report and measured values."""
     camera_roll: float = 60.0
     """By how much the camera was turned about its axis since the demonstrations [deg]."""
     random_camera: bool = False
@@ -148,7 +148,6 @@ class RunCollaboration(RunServoing):
     aiming: Path | None = None
     """Folder of `hrc fit image-jacobian`. That of `hrc demo` when not given, likewise."""
     out: Path = Path("outputs/collaboration")
-    """Folder for recording, report and measured values."""
     shelf: Shelf = "middle"
     """Where to put the object."""
     shelves: tuple[Shelf, ...] = ()

@@ -185,7 +185,9 @@ def grasp_metrics() -> list[Metric[SimulatedGrasp]]:
 
 def grasping_metrics(variants: Sequence[str]) -> list[Metric[GraspingRun]]:
     """The table of a grasp and of the variants it is compared with, which have no bounds."""
-    table = [metric.of_part(lambda run: run.grasp) for metric in grasp_metrics()]
+    table: list[Metric[GraspingRun]] = [
+        metric.of_part(lambda run: run.grasp) for metric in grasp_metrics()
+    ]
     for name in variants:
 
         def time(run: GraspingRun, name: str = name) -> float | None:

@@ -36,6 +36,7 @@ from hrc_learn.experiments.placing.trial import (
     SPACES,
     PlacingOutcome,
     PlacingRun,
+    SimulatedPlacing,
     demonstrated_path,
     place,
     random_start,
@@ -44,7 +45,7 @@ from hrc_learn.experiments.run_recording import no_live_view
 from hrc_learn.kinematics import UnreachableError, panda
 from hrc_learn.sim import RenderingUnavailableError, World
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.placing import PlacingSkill, check_plan
+from hrc_learn.skills.placing import PlacingSkill, PlanningSpace, check_plan
 from hrc_learn.skills.work_cell import BlockedPathError
 from hrc_learn.store import read_made_by
 from hrc_learn.viz import LoggedSteps, RunRecording
@@ -93,7 +94,8 @@ class PlacingExperiment:
         goal_shelf = demonstrated_shelf(demonstrated_path(demonstration)[-1], workplace)
         assert demonstration.joint_position is not None
         start = torch.from_numpy(demonstration.joint_position[0])
-        placings, outcomes = {}, {space: {} for space in SPACES}
+        placings: dict[tuple[PlanningSpace, str], SimulatedPlacing] = {}
+        outcomes: dict[PlanningSpace, dict[str, PlacingOutcome]] = {s: {} for s in SPACES}
         for space, label in SPACES.items():
             for shelf in workplace.shelf_names():
                 observer.tell(f"Placing on the {shelf} shelf, planned in {label}")
