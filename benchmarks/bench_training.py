@@ -20,7 +20,7 @@ from hrc_learn.demos import DatasetWriter, Demonstration, open_demos
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import ImageJacobianFitConfig, RBFCenters, RBFImageJacobian
 from hrc_learn.learning.primitive_fitting import fit_streamed
-from hrc_learn.learning.visual_servo_fitting import FeatureTrajectories
+from hrc_learn.learning.visual_servo_fitting import feature_trajectories
 
 JOINTS = tuple(f"joint{i + 1}" for i in range(7))
 
@@ -55,7 +55,7 @@ def main(args: Args) -> None:
         figures["dmp_fit_s"] = took
         figures["dmp_fit_peak_growth_mb"] = _peak_memory() - before
         figures["dmp_rmse_rad"] = float(fits["joint"].rmse.square().mean().sqrt())
-        camera = FeatureTrajectories(demos)
+        camera = feature_trajectories(demos)
         config = ImageJacobianFitConfig(pixel_noise=0.1)
         took, network = _timed(
             lambda: RBFImageJacobian.fit_demonstrations(

@@ -11,8 +11,8 @@ from torch import Tensor
 from hrc_learn.demos import DatasetWriter
 from hrc_learn.dmp._system.quintic_curves import quintic
 from hrc_learn.lerobot import DMPConfig
+from hrc_learn.lerobot.policy.closed_form import SampleWindows
 from hrc_learn.lerobot.policy.modeling_dmp import DMPPolicy
-from hrc_learn.lerobot.policy.sample_windows import SampleWindows
 
 FPS = 20.0
 NAMES = ["a.pos", "b.pos"]

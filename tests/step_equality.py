@@ -13,7 +13,7 @@ from hrc_learn.controller import (
     Goals,
     Observation,
 )
-from hrc_learn.deploy.io_layout import PackedStep, StepLayouts, Vectors
+from hrc_learn.deploy.package import PackedStep, StepLayouts, Vectors
 from hrc_learn.geometry import quaternion
 from hrc_learn.jacobian import KalmanEstimator, RBFImageJacobian, paper_grid
 from hrc_learn.kinematics import panda

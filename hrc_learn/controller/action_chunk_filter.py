@@ -160,7 +160,13 @@ class ActionChunkFilter(nn.Module):
         rate = state.velocity - (velocity - acceleration * dt)
         approach, slope = _braking_rate(error, self.braking_acceleration, self.position_rate)
         fade, _ = _braking_rate(rate + approach, self.braking_jerk, self.velocity_rate)
-        a = self._clamped(state, acceleration - slope * rate - fade)
+        a = self.barrier.nearest_acceleration(
+            acceleration - slope * rate - fade,
+            state.acceleration,
+            state.velocity,
+            self.barrier.velocity_bounds(state.position),
+            dt,
+        )
         v = state.velocity + a * dt
         return ActionChunkState(
             position=state.position + v * dt,
@@ -186,18 +192,6 @@ class ActionChunkFilter(nn.Module):
         jerk = (limited - state.reference_acceleration) / dt
         motion = (jerk.abs() <= barrier.jerk * _ROUNDING) & (limited == change)
         return state.reference_velocity + limited * dt, limited.masked_fill(~motion, 0)
-
-    def _clamped(self, state: ActionChunkState, acceleration: Tensor) -> Tensor:
-        """The nearest acceleration with which the limits are kept, now and later."""
-        barrier, last, reach = self.barrier, state.acceleration, self.barrier.jerk * self.dt
-        bounds = barrier.velocity_bounds(state.position)
-        lower, upper = barrier.acceleration_bounds(state.velocity, bounds, self.dt)
-        acceleration = acceleration.clamp(lower, upper)
-        # Last what no start can exceed: outside its set the barrier may ask for more.
-        return acceleration.clamp(
-            torch.maximum(last - reach, -barrier.acceleration),
-            torch.minimum(last + reach, barrier.acceleration),
-        )
 
     def _broken_limits(self, asked: Tensor, state: ActionChunkState) -> Tensor:
         """Flags of a report."""

@@ -2,30 +2,29 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import replace
-from typing import Any, NamedTuple, final
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, NamedTuple, final
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.utils import _pytree
 
-from hrc_learn.controller.blending import (
-    BlendingState,
-    VisionBlending,
-    approach_velocity,
-    next_task_level,
-)
-from hrc_learn.controller.config import ControllerConfig
 from hrc_learn.controller.feedback import (
+    BlendingConfig,
+    BlendingState,
     Feedback,
+    VisionBlending,
     analytic_descent,
+    approach_velocity,
     effective_goals,
+    next_task_level,
     regional_feedback,
     validated_position,
 )
-from hrc_learn.controller.interface import Command, ControllerState, Goals, Observation
+from hrc_learn.controller.interface import Command, Goals, Observation
 from hrc_learn.controller.monitors import potential_rate
 from hrc_learn.controller.resolved_rate import (
     PoseDrift,
@@ -35,11 +34,91 @@ from hrc_learn.controller.resolved_rate import (
     resolved_rate,
     scale_null_space,
 )
-from hrc_learn.controller.safety_filter import SafetyFilter
+from hrc_learn.controller.safety_filter import SafetyConfig, SafetyFilter, SafetyState
 from hrc_learn.geometry import Pose
 from hrc_learn.jacobian import ImageJacobianEstimator, Measurement
 from hrc_learn.kinematics import SerialChain
+from hrc_learn.pytree import pytree
 from hrc_learn.regions import JointRegion
+
+
+@dataclass(frozen=True, kw_only=True)
+class ControllerConfig:
+    """Settings of the law; the defaults are those that were measured to work best."""
+
+    linear_speed: float = 0.25
+    """Cap on the linear part of the twist [m/s]; the direction of the twist is kept."""
+    angular_speed: float = 1.0
+    """Cap on its angular part [rad/s]."""
+    vision_rate: float = 4.0
+    """Fastest decay of the pixel error that the estimate may ask for [1/s]. The gain of the
+    law grows with the square of the Jacobian over that of the region: uncapped it can exceed
+    what images at 15 to 30 Hz, late by a frame or more, allow."""
+    approach_linear_speed: float = 0.5
+    """Cap on the linear speed of the tool during a joint-space approach [m/s]."""
+    approach_angular_speed: float = 2.0
+    """Cap on its angular speed then [rad/s]."""
+    jacobian: Literal["geometric", "analytic"] = "geometric"
+    """By which gradients become motions of the tool: the analytic one counts rotation by the
+    rotation vector, whose rates differ from angular velocity the more the tool is turned."""
+    null_damping: float = 3.0
+    """c_d: null-space input divided by it is velocity."""
+    null_space_yields: bool = True
+    """Scale null-space motion as a whole where a limit would cut single joints."""
+    drift_compensation_rate: float = 2.0
+    """Rate at which the tool returns to its place while a person acts [1/s]; 0: it does not."""
+    blending: BlendingConfig = field(default_factory=BlendingConfig)
+    safety: SafetyConfig = field(default_factory=SafetyConfig)
+
+    def __post_init__(self):
+        for name in (
+            "linear_speed",
+            "angular_speed",
+            "vision_rate",
+            "approach_linear_speed",
+            "approach_angular_speed",
+            "null_damping",
+        ):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive, but is {getattr(self, name)}")
+        if self.jacobian not in ("geometric", "analytic"):
+            raise ValueError(
+                f"jacobian must be 'geometric' or 'analytic', but is {self.jacobian!r}"
+            )
+        if self.drift_compensation_rate < 0:
+            raise ValueError(
+                "drift_compensation_rate must not be negative, but is "
+                f"{self.drift_compensation_rate}"
+            )
+
+    @classmethod
+    def paper(cls) -> ControllerConfig:
+        """The law as printed: nothing between it and the safety filter."""
+        return cls(
+            linear_speed=math.inf,
+            angular_speed=math.inf,
+            vision_rate=math.inf,
+            null_space_yields=False,
+            drift_compensation_rate=0.0,
+            blending=BlendingConfig(hysteresis=0.0, blend_time=0.0),
+        )
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
+class ControllerState:
+    """All that the controller remembers from one step to the next."""
+
+    blending: BlendingState
+    """Between Cartesian and vision feedback."""
+    task_level: Float[Tensor, "*batch"]
+    """Fraction to which both have taken over from a joint-space approach, 0 to 1."""
+    pose_drift: PoseDrift
+    """Of the tool while a person acts."""
+    safety: SafetyState
+    """Of the safety filter, with its counts of interventions."""
+    estimator: Any
+    """Of the image Jacobian: whatever the estimator keeps."""
 
 
 class _Motion(NamedTuple):

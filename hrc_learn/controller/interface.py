@@ -1,22 +1,28 @@
-"""What goes into a control step and what comes out of it: goals, observation, state,
-command. All are pytrees of tensors, so a step compiles, exports and maps over batches.
+"""What goes into a control step and what comes out of it: goals, observation, command.
+
+All are pytrees of tensors, so a step compiles, exports and maps over batches.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from hrc_learn.controller.blending import BlendingState
-from hrc_learn.controller.resolved_rate import PoseDrift
-from hrc_learn.controller.safety_filter import SafetyReport, SafetyState
+from hrc_learn.controller.safety_filter import SafetyReport
+from hrc_learn.geometry import quaternion
+from hrc_learn.kinematics import JointLimits
 from hrc_learn.pytree import pytree
-from hrc_learn.regions import OrientationRegion, PositionRegion, PostureRegion, VisionRegion
+from hrc_learn.regions import (
+    JointRegion,
+    OrientationRegion,
+    PositionRegion,
+    PostureRegion,
+    VisionRegion,
+)
 
 HALF_SIZE = (0.12, 0.12, 0.08)
 """Half edges of the box that proved large enough to find the marker in view [m]."""
@@ -148,23 +154,6 @@ class Observation:
 
 @pytree
 @dataclass(frozen=True, kw_only=True)
-class ControllerState:
-    """All that the controller remembers from one step to the next."""
-
-    blending: BlendingState
-    """Between Cartesian and vision feedback."""
-    task_level: Float[Tensor, "*batch"]
-    """Fraction to which both have taken over from a joint-space approach, 0 to 1."""
-    pose_drift: PoseDrift
-    """Of the tool while a person acts."""
-    safety: SafetyState
-    """Of the safety filter, with its counts of interventions."""
-    estimator: Any
-    """Of the image Jacobian: whatever the estimator keeps."""
-
-
-@pytree
-@dataclass(frozen=True, kw_only=True)
 class Command:
     """The joint velocity to send, and how it came about."""
 
@@ -196,3 +185,47 @@ class Command:
     alone (`hrc_learn.controller.monitors`)."""
     safety: SafetyReport
     """What the safety filter did."""
+
+
+# Parameters of the paper's grasping experiment (Table I), as printed.
+
+GRIPPER_DOWN = (-0.28, 0.63, 0.66, 0.28)
+"""p_g as printed; its norm is 0.995, and scalar first it points the gripper down."""
+
+INITIAL_IMAGE_JACOBIAN = (
+    (-1500.0, 0.0, 0.0, 0.0, -200.0, 60.0),
+    (0.0, 2400.0, 170.0, -200.0, 0.0, 180.0),
+)
+"""J_s_hat at t = 0 [px/m, px/rad] (eq_js0): a camera above whose image right is -x."""
+
+
+def paper_joint_region(limits: JointLimits) -> JointRegion:
+    """The paper's joint-space region in its printed, symmetric form; default gains."""
+    return JointRegion.from_limits(limits.lower, limits.upper, formulation="paper")
+
+
+def paper_goals(
+    centre: Float[Tensor, "*#batch 3"],
+    half_size: Float[Tensor, "*#batch 3"],
+    target: Float[Tensor, "*#batch 2"],
+) -> Goals:
+    """The paper's regions with their printed gains and gradients.
+
+    Args:
+        centre: Of the box, which the paper leaves to the expert [m].
+        half_size: Of the box, which the paper leaves to the expert [m].
+        target: In the image [px].
+    """
+    goal = quaternion.normalize(centre.new_tensor(GRIPPER_DOWN))
+    return Goals(
+        position=PositionRegion(
+            centre=centre, half_size=half_size, stiffness=(4e-4, 4e-4, 4e-5)
+        ),
+        orientation=OrientationRegion(goal=goal, stiffness=1.0, formulation="paper"),
+        vision=VisionRegion(
+            target=target,
+            half_size=target.new_tensor((1440.0, 1080.0)),
+            formulation="paper",
+        ),
+        vision_enabled=torch.tensor(True, device=centre.device),
+    )

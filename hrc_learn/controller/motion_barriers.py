@@ -130,6 +130,31 @@ class LimitBarrier(nn.Module):
         down, up = (square.clamp(min=0).sqrt() - offset).unbind(-2)
         return -down, up
 
+    def nearest_acceleration(
+        self,
+        wanted: Float[Tensor, "*batch n"],
+        last: Float[Tensor, "*batch n"],
+        velocity: Float[Tensor, "*batch n"],
+        bounds: tuple[Tensor, Tensor],
+        dt: float | Float[Tensor, ""],
+    ) -> Float[Tensor, "*batch n"]:
+        """The nearest acceleration with which the limits are kept, now and later [rad/s^2].
+
+        Args:
+            wanted: Acceleration wanted [rad/s^2].
+            last: Acceleration of the last step [rad/s^2].
+            velocity: Of the last step [rad/s].
+            bounds: `velocity_bounds` now.
+            dt: Step [s].
+        """
+        inside = wanted.clamp(*self.acceleration_bounds(velocity, bounds, dt))
+        # Last what the arm cannot exceed: outside its set the barrier may ask for more.
+        reach = self.jerk * dt
+        return inside.clamp(
+            torch.maximum(last - reach, -self.acceleration),
+            torch.minimum(last + reach, self.acceleration),
+        )
+
 
 @dataclass(frozen=True, kw_only=True)
 class SeparationConfig:

@@ -12,9 +12,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from hrc_learn.geometry.constants import Constant
-from hrc_learn.geometry.small_matrices import inverse_norm, matmul, solve_positive
-from hrc_learn.kinematics.pseudo_inverse import SINGULAR_BELOW
+from hrc_learn.geometry.numerics import Constant, inverse_norm, matmul, solve_positive
+from hrc_learn.kinematics.redundancy import SINGULAR_BELOW
 from hrc_learn.pytree import pytree
 
 # Lets the Cholesky factorisation go through at a singularity; used there only to see how

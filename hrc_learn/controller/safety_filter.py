@@ -303,13 +303,8 @@ class SafetyFilter(nn.Module):
         step = wanted - state.acceleration
         excess_j = _excess(step, reach)
         acceleration = torch.addcdiv(state.acceleration, step, excess_j.clamp(min=1))
-        # As above, and here too what comes last is what the arm cannot exceed.
-        acceleration = acceleration.clamp(
-            *barrier.acceleration_bounds(state.velocity, bounds, dt)
-        )
-        acceleration = acceleration.clamp(
-            torch.maximum(state.acceleration - reach, -barrier.acceleration),
-            torch.minimum(state.acceleration + reach, barrier.acceleration),
+        acceleration = barrier.nearest_acceleration(
+            acceleration, state.acceleration, state.velocity, bounds, dt
         )
         return state.velocity + acceleration * dt, acceleration, excess_a, excess_j
 

@@ -1,19 +1,22 @@
-"""The control step compiled ahead of time into one file."""
+"""The control step compiled ahead of time into one file, named by a hash of what it does."""
 
 from __future__ import annotations
 
 import hashlib
 import os
 import sys
+from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
+from typing import Any, final
 
 import torch
+from torch import Tensor
 from torch.utils import _pytree
 
 from hrc_learn.controller import AdaptiveController, Observation
 from hrc_learn.deploy._inductor import tuned_for
-from hrc_learn.deploy.io_layout import PackedStep
-from hrc_learn.deploy.package import UnknownCodeError, content_hash, describe, machine
+from hrc_learn.deploy.package import PackedStep, describe, machine
 from hrc_learn.store import Claim, new_file
 
 
@@ -91,7 +94,7 @@ def _structure(observation: Observation) -> list[tuple[str, str]]:
     return [
         (
             _pytree.keystr(path),
-            f"{x.dtype} {tuple(x.shape)}" if isinstance(x, torch.Tensor) else repr(x),
+            f"{x.dtype} {tuple(x.shape)}" if isinstance(x, Tensor) else repr(x),
         )
         for path, x in leaves
     ]
@@ -105,7 +108,7 @@ def _digest(step: PackedStep, program: torch.export.ExportedProgram) -> str:
         digest.update(str(text).encode())
     digest.update(step.first_state.numpy().tobytes())
     for name, value in sorted((program.state_dict | program.constants).items()):
-        assert isinstance(value, torch.Tensor)
+        assert isinstance(value, Tensor)
         digest.update(name.encode() + value.detach().cpu().numpy().tobytes())
     return digest.hexdigest()
 
@@ -130,3 +133,95 @@ def _default_folder() -> Path:
     else:
         base = Path(os.environ.get("XDG_CACHE_HOME", home / ".cache"))
     return base / "hrc_learn"
+
+
+# The hash that names a package: of all values within a controller and of the source of this
+# library. An equal hash means that the compiled code would do the same.
+
+# What a compiled step is made from: the package itself, and those it imports.
+_ROOT = Path(__file__).parents[1]
+_SOURCES = (
+    "pytree.py",
+    "geometry",
+    "kinematics",
+    "regions",
+    "jacobian",
+    "controller",
+    "deploy",
+)
+# Values whose `repr` says all of them.
+_PLAIN = (type(None), bool, int, float, str, bytes, torch.dtype, torch.device)
+
+
+class UnknownCodeError(TypeError):
+    """An object is of a class, or holds a function, whose code is not ours to know."""
+
+
+def content_hash(*objects: Any) -> str:
+    """Hash of all values within some objects, and of the source of this library.
+
+    Args:
+        objects: Modules, dataclasses and what they hold.
+
+    Raises:
+        UnknownCodeError: They hold something whose code is not of this library or torch's.
+    """
+    hasher = _ObjectHasher()
+    for x in objects:
+        hasher.add(x)
+    hasher.digest.update(_source_hash())
+    return hasher.digest.hexdigest()
+
+
+@final
+class _ObjectHasher:
+    """Hashes values in a fixed order; each object once, later visits by its number."""
+
+    def __init__(self):
+        self.digest = hashlib.sha256()
+        self.seen: dict[int, Any] = {}  # keeps what it names alive, or ids would be reused
+
+    def add(self, x: Any) -> None:
+        kind = type(x)
+        self._say(f"{kind.__module__}.{kind.__qualname__}")
+        if isinstance(x, Tensor):
+            self._say(f"{x.dtype} {tuple(x.shape)} {x.device}")
+            self.digest.update(x.detach().cpu().contiguous().numpy().tobytes())
+        elif isinstance(x, _PLAIN):
+            self._say(repr(x))
+        elif id(x) in self.seen:
+            self._say(f"again {list(self.seen).index(id(x))}")
+        else:
+            self.seen[id(x)] = x
+            self._add_parts(x)
+
+    def _add_parts(self, x: Any) -> None:
+        if isinstance(x, Mapping):
+            for key, value in x.items():
+                self.add(key)
+                self.add(value)
+        elif isinstance(x, set):
+            self.add(sorted(x, key=repr))
+        elif isinstance(x, list | tuple):
+            for value in x:
+                self.add(value)
+        elif type(x).__module__.split(".")[0] in ("hrc_learn", "torch") and hasattr(
+            x, "__dict__"
+        ):
+            self.add(x.__getstate__())
+        else:
+            raise UnknownCodeError(f"cannot tell what a {type(x).__qualname__} does")
+        self._say("end")
+
+    def _say(self, text: str) -> None:
+        self.digest.update(f"{text}\n".encode())
+
+
+@cache
+def _source_hash() -> bytes:
+    digest = hashlib.sha256()
+    for name in _SOURCES:
+        for path in sorted([_ROOT / name, *(_ROOT / name).rglob("*.py")]):
+            if path.is_file():
+                digest.update(str(path.relative_to(_ROOT)).encode() + path.read_bytes())
+    return digest.digest()

@@ -13,7 +13,7 @@ from torch import Tensor, broadcast_tensors
 from hrc_learn.dmp._types import Mask, Quaternions, Times, Vectors, to_tensor
 from hrc_learn.dmp.fitting.motion_samples import check_samples, demo_label
 from hrc_learn.geometry import quaternion
-from hrc_learn.geometry.rotation_rates import axis_drift, drift_free_rate, drift_free_slope
+from hrc_learn.geometry.quaternion import axis_drift, drift_free_rate, drift_free_slope
 
 _NO_AXIS = 1e-9
 """Rotation vectors shorter than this [rad] have no direction of their own."""

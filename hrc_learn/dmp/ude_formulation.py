@@ -29,7 +29,7 @@ from hrc_learn.dmp.fitting.motion_samples import Samples
 from hrc_learn.dmp.fitting.solvers import ridge_operator
 from hrc_learn.dmp.linear_primitive import ColumnEnds, LinearPrimitive
 from hrc_learn.dmp.orientation_coordinates import OrientationCoordinates
-from hrc_learn.geometry.rotation_rates import axis_drift, drift_free_rate, drift_free_slope
+from hrc_learn.geometry.quaternion import axis_drift, drift_free_rate, drift_free_slope
 
 LONGEST = 1 / 200
 """Longest step of a rollout, in s; the fourth power of it is what the rollout is off by."""

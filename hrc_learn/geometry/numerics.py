@@ -1,8 +1,8 @@
-"""Functions that are delicate near a removable singularity, in one place.
+"""The delicate numerics of the package: singular functions, small matrices, fixed tensors.
 
-Each is a function of the *squared* length: a Euclidean norm has no second derivative at
-zero, its square has all of them. On either side of a threshold a Taylor series or the
-closed form is chosen by `where`, and the form that is not chosen is evaluated at a harmless
+Functions with a removable singularity take the *squared* length: a Euclidean norm has no second
+derivative at zero, its square has all of them. On either side of a threshold a Taylor series or
+the closed form is chosen by `where`, and the form that is not chosen is evaluated at a harmless
 argument, because a NaN there would reach the gradient as 0 * NaN.
 """
 
@@ -81,3 +81,139 @@ def minimum_jerk(x: float) -> tuple[float, float]:
     """
     x = min(max(x, 0.0), 1.0)
     return x**3 * (10 - 15 * x + 6 * x**2), 30 * x**2 * (1 - x) ** 2
+
+
+class Constant:
+    """A fixed tensor, kept ready for every dtype and device it has met.
+
+    Floating-point values are converted from float64; integers keep their dtype.
+    """
+
+    def __init__(self, value: Tensor):
+        self._value = value
+        self._ready: dict[tuple[torch.dtype, torch.device], Tensor] = {}
+
+    def __getstate__(self) -> dict[str, object]:
+        # What was met is no part of what it is.
+        return {"_value": self._value, "_ready": {}}
+
+    def like(self, x: Tensor) -> Tensor:
+        """The tensor on the device of `x`, and of its dtype if floating-point."""
+        dtype = x.dtype if self._value.is_floating_point() else self._value.dtype
+        if torch.compiler.is_compiling():
+            return self._value.to(device=x.device, dtype=dtype)
+        key = (dtype, x.device)
+        tensor = self._ready.get(key)
+        if tensor is None:
+            # Once kept, it must serve autograd as well.
+            with torch.inference_mode(False):
+                tensor = self._value.to(device=x.device, dtype=dtype)
+            if _outlives_the_call(tensor):
+                self._ready[key] = tensor
+        return tensor
+
+
+def _outlives_the_call(tensor: Tensor) -> bool:
+    """False for stand-ins that a tracer or a functional transform will take down again."""
+    functorch = torch._C._functorch  # pyright: ignore[reportAttributeAccessIssue]
+    return type(tensor) is Tensor and not functorch.is_functorch_wrapped_tensor(tensor)
+
+
+# Products and solutions with matrices of a few rows. Eagerly each call costs more than its
+# arithmetic, so one call of BLAS or LAPACK is best. A compiler fuses sums of products with all
+# that surrounds them, across a batch as well, but has to leave its loop for every such call. So
+# what is compiled is written out.
+
+
+def matmul(
+    A: Float[Tensor, "*#batch m k"], B: Float[Tensor, "*#batch k n"]
+) -> Float[Tensor, "*batch m n"]:
+    """A B."""
+    if not torch.compiler.is_compiling():
+        return A @ B
+    return unrolled_matmul(A, B)
+
+
+def inverse_norm(A: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch"]:
+    """Frobenius norm of A^-1, for a symmetric positive definite A."""
+    if not torch.compiler.is_compiling():
+        factor, _ = torch.linalg.cholesky_ex(A)
+        return torch.linalg.matrix_norm(torch.cholesky_inverse(factor))
+    return unrolled_inverse_norm(A)
+
+
+def solve_positive(
+    A: Float[Tensor, "*batch n n"], B: Float[Tensor, "*batch n k"]
+) -> Float[Tensor, "*batch n k"]:
+    """A^-1 B for a symmetric positive definite A."""
+    if not torch.compiler.is_compiling():
+        factor, _ = torch.linalg.cholesky_ex(A)
+        return torch.cholesky_solve(B, factor)
+    return unrolled_solve(A, B)
+
+
+def unrolled_matmul(
+    A: Float[Tensor, "*#batch m k"], B: Float[Tensor, "*#batch k n"]
+) -> Float[Tensor, "*batch m n"]:
+    """`matmul` as a sum of products."""
+    return (A.unsqueeze(-1) * B.unsqueeze(-3)).sum(-2)
+
+
+def unrolled_solve(
+    A: Float[Tensor, "*batch n n"], B: Float[Tensor, "*batch n k"]
+) -> Float[Tensor, "*batch n k"]:
+    """`solve_positive` row by row from A = L D L^T, with unit lower triangular L."""
+    L, inverse_d = _factors(A)
+    rows = list(B.unbind(-2))
+    for i in range(len(rows)):  # L y = b
+        for j in range(i):
+            rows[i] = rows[i] - L[i][j].unsqueeze(-1) * rows[j]
+    for i in reversed(range(len(rows))):  # L^T x = D^-1 y
+        rows[i] = rows[i] * inverse_d[i].unsqueeze(-1)
+        for j in range(i + 1, len(rows)):
+            rows[i] = rows[i] - L[j][i].unsqueeze(-1) * rows[j]
+    return torch.stack(rows, dim=-2)
+
+
+def unrolled_inverse_norm(A: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch"]:
+    """`inverse_norm` from the entries of A^-1 = M^T D^-1 M with M = L^-1."""
+    L, inverse_d = _factors(A)
+    n = len(inverse_d)
+    M: list[list[Tensor]] = [[] for _ in range(n)]
+    for i in range(n):
+        for j in range(i):
+            M[i].append(-_sum([L[i][j], *(L[i][k] * M[k][j] for k in range(j + 1, i))]))
+        M[i].append(torch.ones_like(inverse_d[i]))
+    square = []
+    for i in range(n):
+        for j in range(i + 1):
+            entry = _sum([M[k][i] * M[k][j] * inverse_d[k] for k in range(i, n)])
+            square.append(entry * entry * (1 if i == j else 2))
+    return _sum(square).sqrt()
+
+
+def _factors(A: Tensor) -> tuple[list[list[Tensor]], list[Tensor]]:
+    """L, as rows of entries left of the diagonal, and 1/D of A = L D L^T."""
+    n = A.shape[-1]
+    L: list[list[Tensor]] = [[] for _ in range(n)]
+    inverse_d: list[Tensor] = []
+    for i in range(n):
+        scaled: list[Tensor] = []  # L[i][j] D[j]
+        for j in range(i):
+            entry = A[..., i, j]
+            for k in range(j):
+                entry = entry - scaled[k] * L[j][k]
+            scaled.append(entry)
+            L[i].append(entry * inverse_d[j])
+        d = A[..., i, i]
+        for k in range(i):
+            d = d - scaled[k] * L[i][k]
+        inverse_d.append(1 / d)
+    return L, inverse_d
+
+
+def _sum(terms: list[Tensor]) -> Tensor:
+    total = terms[0]
+    for term in terms[1:]:
+        total = total + term
+    return total

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from hrc_learn.geometry import Pose
-from hrc_learn.geometry.small_matrices import matmul
+from hrc_learn.geometry.numerics import matmul
 from hrc_learn.jacobian.network import RBFImageJacobian
 from hrc_learn.jacobian.samples import KeyFrameConfig, component_scale
 from hrc_learn.pytree import pytree

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.geometry.small_matrices import matmul
+from hrc_learn.geometry.numerics import matmul
 from hrc_learn.jacobian.estimator import (
     ImageJacobianEstimator,
     KeyFrame,

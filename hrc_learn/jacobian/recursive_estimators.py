@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.geometry.small_matrices import matmul
+from hrc_learn.geometry.numerics import matmul
 from hrc_learn.jacobian.estimator import KeyFrame, KeyFrameEstimator, Measurement, MotionSample
 from hrc_learn.jacobian.fitting import weight_covariance
 from hrc_learn.jacobian.network import RBFImageJacobian

@@ -14,8 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.geometry import quaternion
-from hrc_learn.kinematics.chain import SerialChain
-from hrc_learn.kinematics.limits import JointLimits
+from hrc_learn.kinematics.chain import JointLimits, SerialChain
 
 if TYPE_CHECKING:
     import pytorch_kinematics

@@ -87,7 +87,8 @@ class Approach:
         """
         if not paths:
             raise ValueError("an approach is learned from one demonstration or more: got none.")
-        demonstrated = _mean([path.orientation[-1] for path in paths])
+        ends = torch.stack([path.orientation[-1] for path in paths])
+        demonstrated = quaternion.mean(ends.double())
         tangents = torch.stack([tangent(path.position) for path in paths])
         mean = tangents.mean(dim=0)
         mean = mean / mean.norm().clamp(min=_SHORTEST)
@@ -142,12 +143,6 @@ def tangent(position: Float[Tensor, "time 3"], near: float = NEAR) -> Float[Tens
     before = (way.norm(dim=-1) > near).nonzero()[:, 0]
     chord = way[int(before[-1])] if len(before) else way[0]
     return chord / chord.norm().clamp(min=_SHORTEST)
-
-
-def _mean(orientations: Sequence[Tensor]) -> Float[Tensor, "4"]:
-    """Of unit quaternions, whatever their signs (Markley et al. 2007)."""
-    q = torch.stack(list(orientations)).double()
-    return torch.linalg.eigh(q.T @ q).eigenvectors[:, -1]
 
 
 def _angle(a: Float[Tensor, "*batch 3"], b: Float[Tensor, "3"]) -> Float[Tensor, "*batch"]:

@@ -2,13 +2,13 @@
 
 from hrc_learn.learning.channels import CHANNELS as CHANNELS
 from hrc_learn.learning.channels import Motions as Motions
+from hrc_learn.learning.channels import ReproductionError as ReproductionError
 from hrc_learn.learning.channels import load_primitive as load_primitive
+from hrc_learn.learning.channels import reproduction_error as reproduction_error
 from hrc_learn.learning.primitive_fitting import FittedPrimitives as FittedPrimitives
 from hrc_learn.learning.primitive_fitting import fit_contextual as fit_contextual
 from hrc_learn.learning.primitive_fitting import fit_primitives as fit_primitives
 from hrc_learn.learning.primitive_fitting import fit_streamed as fit_streamed
-from hrc_learn.learning.reproduction_metrics import ReproductionError as ReproductionError
-from hrc_learn.learning.reproduction_metrics import reproduction_error as reproduction_error
 from hrc_learn.learning.tuning import TuningState as TuningState
 from hrc_learn.learning.tuning import with_gains as with_gains
 from hrc_learn.learning.visual_servo_fitting import fit_visual_servo as fit_visual_servo

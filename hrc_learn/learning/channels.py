@@ -1,19 +1,27 @@
-"""Channels of a demonstration to learn: joints, position, orientation, or pose."""
+"""Channels of demonstrations to learn (joints, position, orientation, or pose), how far motions
+are from them in the measures of the field, and demonstrations as a recording to look at.
+"""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, overload
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.demos import DemonstrationSet, PaddedDemonstrations
+from hrc_learn.demos import Demonstration, DemonstrationSet, PaddedDemonstrations
 from hrc_learn.dmp import JointDMP, OrientationDMP, PoseDMP
-from hrc_learn.geometry import Pose
+from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import arm_angle, panda
+from hrc_learn.viz import (
+    DemonstrationsRecording,
+    DemonstrationTrace,
+    JointLimits,
+)
+from hrc_learn.viz.arm_bodies import panda_bodies
 
 type Channel = Literal["joint", "position", "orientation", "pose"]
 type Primitive = JointDMP | OrientationDMP | PoseDMP
@@ -31,6 +39,28 @@ CLASSES = {
     "orientation": OrientationDMP,
     "pose": PoseDMP,
 }
+
+
+class LazyMap[S, T](Sequence[T]):
+    """Items of a sequence through a function, each when it is asked for."""
+
+    def __init__(self, items: Sequence[S], function: Callable[[S], T]):
+        self._items, self._function = items, function
+
+    @overload
+    def __getitem__(self, index: int) -> T: ...
+    @overload
+    def __getitem__(self, index: slice) -> "LazyMap[S, T]": ...
+    def __getitem__(self, index):
+        if isinstance(index, slice):
+            return LazyMap(self._items[index], self._function)
+        return self._function(self._items[index])
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    def __iter__(self) -> Iterator[T]:
+        return map(self._function, self._items)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -195,3 +225,140 @@ def select_channels(motions: Motions, wanted: Sequence[str]) -> tuple[str, ...]:
     whole = [channel for channel in ("joint", "pose") if channel in available]
     parts = [channel for channel in ("position", "orientation") if channel in available]
     return tuple(whole if "pose" in whole else whole + parts)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ReproductionError:
+    """One row a demonstration; None where a channel of motion has no such measure."""
+
+    nrmse: Float[Tensor, " demos"] | None = None
+    """Root mean square error over the largest range of any coordinate."""
+    largest: Float[Tensor, " demos"] | None = None
+    """Largest error of any coordinate [rad] or [m]."""
+    goal_error: Float[Tensor, " demos"] | None = None
+    """Distance of the last samples [rad] or [m]."""
+    jerk: Float[Tensor, " demos"] | None = None
+    """Dimensionless jerk of the motion over that of the demonstration (see
+    `dimensionless_jerk`): below one, it is smoother."""
+    turn_rmse: Float[Tensor, " demos"] | None = None
+    """Root mean square angle between orientations [deg]."""
+    turn_at_goal: Float[Tensor, " demos"] | None = None
+    """Angle between the last orientations [deg]."""
+
+    def columns(self) -> dict[str, Float[Tensor, " demos"]]:
+        """The measures there are, by name."""
+        return {name: values for name, values in vars(self).items() if values is not None}
+
+    def summary(self, prefix: str) -> dict[str, float]:
+        """Median and maximum of each, by name."""
+        figures = {}
+        for name, values in self.columns().items():
+            figures[f"{prefix}_{name}_median"] = float(values.quantile(0.5))
+            figures[f"{prefix}_{name}_max"] = float(values.max())
+        return figures
+
+
+def reproduction_error(channel: str, motions: Motions, made: Reproduction) -> ReproductionError:
+    """Compare motions with the demonstrations they are of.
+
+    Args:
+        channel: What they are motions of.
+        motions: The demonstrations.
+        made: At their stamps.
+    """
+    measures: dict[str, Tensor] = {}
+    mask, last = motions.demos.mask, (motions.demos.length - 1)[:, None]
+    if made.position is not None:
+        measures |= _linear(motions, motions.column(CHANNELS[channel][0]), made.position)
+    if made.orientation is not None:
+        shown = motions.column("orientation")
+        angle = quaternion.angle(made.orientation, shown).rad2deg()
+        square = torch.where(mask, angle, 0.0).square().sum(dim=-1)
+        measures["turn_rmse"] = (square / mask.sum(dim=-1)).sqrt()
+        measures["turn_at_goal"] = angle.take_along_dim(last, dim=1)[:, 0]
+    return ReproductionError(**measures)
+
+
+def _linear(motions: Motions, shown: Tensor, made: Tensor) -> dict[str, Tensor]:
+    mask, length = motions.demos.mask, motions.demos.length
+    error = torch.where(mask[..., None], made - shown, 0.0)
+    samples = mask.sum(dim=-1) * shown.shape[-1]
+    low = torch.where(mask[..., None], shown, torch.inf).amin(dim=-2)
+    high = torch.where(mask[..., None], shown, -torch.inf).amax(dim=-2)
+    rmse = (error.square().sum(dim=(-2, -1)) / samples).sqrt()
+    time = motions.demos.time
+    jerk = [
+        dimensionless_jerk(time[i, :n], made[i, :n])
+        / dimensionless_jerk(time[i, :n], shown[i, :n])
+        for i, n in enumerate(length.tolist())
+    ]
+    return {
+        "nrmse": rmse / (high - low).amax(dim=-1).clamp_min(1e-12),
+        "largest": error.abs().amax(dim=(-2, -1)),
+        "goal_error": error.take_along_dim((length - 1)[:, None, None], dim=1)[:, 0].norm(
+            dim=-1
+        ),
+        "jerk": torch.stack(jerk),
+    }
+
+
+def dimensionless_jerk(
+    time: Float[Tensor, "T"], position: Float[Tensor, "T D"]
+) -> Float[Tensor, ""]:
+    """Integral of the squared jerk, times duration^5 / length^2 of the path.
+
+    Neither units, nor speed, nor size change it (Hogan and Sternad 2009, "Sensitivity of
+    smoothness measures to movement duration, amplitude, and arrests"). By differences of
+    samples, so noise counts.
+    """
+    values = position
+    for _ in range(3):
+        values = torch.gradient(values, spacing=(time,), dim=0)[0]
+    duration = time[-1] - time[0]
+    length = position.diff(dim=0).norm(dim=-1).sum().clamp_min(1e-12)
+    square = torch.trapezoid(values.square().sum(dim=-1), time)
+    return square * duration**5 / length**2
+
+
+def demonstrations_recording(demos: DemonstrationSet, title: str) -> DemonstrationsRecording:
+    """Everything worth looking at; a Panda is drawn, and its hand's path found if unrecorded.
+
+    Args:
+        demos: All by one robot.
+        title: What they are.
+    """
+    names = demos[0].joint_names
+    known = names == panda.joint_names
+    limits = panda.limits
+    return DemonstrationsRecording(
+        title=title,
+        joint_names=names,
+        demonstrations=tuple(_shown(demo, known) for demo in demos),
+        joint_limits=JointLimits(lower=limits.lower.numpy(), upper=limits.upper.numpy())
+        if known
+        else None,
+        notes=tuple(str(note) for note in demos.notes),
+    )
+
+
+def _shown(demo: Demonstration, is_panda: bool) -> DemonstrationTrace:
+    q, position = demo.joint_position, demo.position
+    bodies = ()
+    if is_panda and q is not None:
+        bodies = panda_bodies(q)
+        if position is None:
+            position = panda.forward(torch.from_numpy(q)).position.numpy()
+    feature = demo.feature
+    if feature is not None and demo.feature_visible is not None:
+        feature = np.where(demo.feature_visible[:, None], feature, np.nan)
+    return DemonstrationTrace(
+        episode=demo.episode,
+        task=demo.task,
+        time=demo.time,
+        joint_position=q,
+        position=position,
+        feature=feature,
+        human_effort=demo.human_effort,
+        gripper=demo.gripper,
+        bodies=bodies,
+    )

@@ -2,10 +2,11 @@
 context, or streamed from disk.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any, cast, overload
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -30,8 +31,14 @@ from hrc_learn.dmp import (
     select_basis_count,
 )
 from hrc_learn.kinematics import panda
-from hrc_learn.learning.channels import CHANNELS, Motions, Primitive, select_channels
-from hrc_learn.learning.reproduction_metrics import reproduction_error
+from hrc_learn.learning.channels import (
+    CHANNELS,
+    LazyMap,
+    Motions,
+    Primitive,
+    reproduction_error,
+    select_channels,
+)
 from hrc_learn.viz import FitRecording, JointLimits
 
 EACH = "each"
@@ -292,34 +299,6 @@ def fit_contextual(
     return metrics
 
 
-class _Columns(Sequence[tuple[np.ndarray, np.ndarray]]):
-    """Stamps and one column of demonstrations, read when asked for."""
-
-    def __init__(self, demos: Sequence[Demonstration], name: str, source: str):
-        self._demos, self._name, self._source = demos, name, source
-
-    @overload
-    def __getitem__(self, index: int) -> tuple[np.ndarray, np.ndarray]: ...
-    @overload
-    def __getitem__(self, index: slice) -> "_Columns": ...
-    def __getitem__(self, index):
-        if isinstance(index, slice):
-            return _Columns(self._demos[index], self._name, self._source)
-        return self._column(self._demos[index])
-
-    def __len__(self) -> int:
-        return len(self._demos)
-
-    def __iter__(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        return map(self._column, self._demos)
-
-    def _column(self, demo: Demonstration) -> tuple[np.ndarray, np.ndarray]:
-        values = getattr(demo, self._name)
-        if values is None:
-            raise ValueError(f"{self._source}, episode {demo.episode}: no {self._name}.")
-        return demo.time, values
-
-
 def fit_streamed(
     demos: DemonstrationSource, n_basis: int, *, channels: Sequence[str] = ()
 ) -> tuple[dict[str, SharedFit], dict[str, float]]:
@@ -341,8 +320,9 @@ def fit_streamed(
         if channel not in ("joint", "position"):
             raise ValueError(f"channel {channel!r} is not streamed: joint and position are.")
         names = demos.joint_names if channel == "joint" else ("x", "y", "z")
+        column = partial(_stamped_column, name=CHANNELS[channel][0], source=demos.source)
         fit = fit_shared(
-            _Columns(demos, CHANNELS[channel][0], demos.source),
+            LazyMap(demos, column),
             n_basis,
             joint_names=names,
             units="rad" if channel == "joint" else "m",
@@ -350,3 +330,13 @@ def fit_streamed(
         fits[channel] = fit
         metrics[f"mean_{channel}_rmse"] = float(fit.rmse.square().mean().sqrt())
     return fits, metrics
+
+
+def _stamped_column(
+    demo: Demonstration, name: str, source: str
+) -> tuple[Float[np.ndarray, " T"], Float[np.ndarray, "T D"]]:
+    """Stamps [s] and one column of a demonstration."""
+    values = getattr(demo, name)
+    if values is None:
+        raise ValueError(f"{source}, episode {demo.episode}: no {name}.")
+    return demo.time, values

@@ -1,18 +1,22 @@
-"""From demonstrations of visual servoing: image Jacobian, visual target, approach direction."""
+"""From demonstrations of visual servoing: image Jacobian, target in the image, approach; and a
+recording of what was learned.
+"""
 
 import copy
-from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple, overload
+from collections.abc import Callable, Sequence
+from functools import partial
+from itertools import islice
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor
 
 from hrc_learn.demos import Demonstration, DemonstrationSet, DemonstrationSource
 from hrc_learn.geometry import Pose
 from hrc_learn.jacobian import (
     EvidenceConfig,
+    EvidenceResult,
     EvidenceRound,
     ImageDemonstration,
     ImageJacobianFitConfig,
@@ -23,8 +27,13 @@ from hrc_learn.jacobian import (
 )
 from hrc_learn.kinematics import panda
 from hrc_learn.kinematics.tool_orientation import Approach
+from hrc_learn.learning.channels import LazyMap
 from hrc_learn.skills.visual_servoing import VisualServoSkill
 from hrc_learn.skills.visual_target import OBJECT_FEATURE, VisualTarget
+from hrc_learn.viz import (
+    ErrorMap,
+    LearningRecording,
+)
 
 type Demonstrations = DemonstrationSet | DemonstrationSource
 """In memory, or read one by one."""
@@ -53,7 +62,7 @@ def fit_visual_servo(
     Raises:
         ValueError: If a demonstration lacks a column; names it and the episode.
     """
-    camera = FeatureTrajectories(demos)
+    camera = feature_trajectories(demos)
     config = config or ImageJacobianFitConfig()
     neurons = neurons or RBFCenters.around(camera)
     learned = None
@@ -72,27 +81,9 @@ def fit_visual_servo(
     )
 
 
-class FeatureTrajectories(Sequence[ImageDemonstration]):
+def feature_trajectories(demos: Demonstrations) -> LazyMap[Demonstration, ImageDemonstration]:
     """Demonstrations as the fit of an image Jacobian takes them, read when asked for."""
-
-    def __init__(self, demos: Sequence[Demonstration], source: str | None = None):
-        self._demos = demos
-        self._source = getattr(demos, "source", "") if source is None else source
-
-    @overload
-    def __getitem__(self, index: int) -> ImageDemonstration: ...
-    @overload
-    def __getitem__(self, index: slice) -> "FeatureTrajectories": ...
-    def __getitem__(self, index):
-        if isinstance(index, slice):
-            return FeatureTrajectories(self._demos[index], self._source)
-        return _watched(self._demos[index], self._source)
-
-    def __len__(self) -> int:
-        return len(self._demos)
-
-    def __iter__(self) -> Iterator[ImageDemonstration]:
-        return (_watched(demo, self._source) for demo in self._demos)
+    return LazyMap(demos, partial(_watched, source=demos.source))
 
 
 def _watched(demo: Demonstration, source: str) -> ImageDemonstration:
@@ -114,14 +105,11 @@ def _watched(demo: Demonstration, source: str) -> ImageDemonstration:
 def _pose(demo: Demonstration) -> Pose | None:
     """Of the end effector, as recorded or from the joints of a known arm."""
     if demo.position is not None and demo.orientation is not None:
-        return Pose(_double(demo.position), _double(demo.orientation))
+        position, orientation = map(torch.from_numpy, (demo.position, demo.orientation))
+        return Pose(position.double(), orientation.double())
     if demo.joint_position is not None and demo.joint_names == panda.joint_names:
-        return panda.forward(_double(demo.joint_position))
+        return panda.forward(torch.from_numpy(demo.joint_position).double())
     return None
-
-
-def _double(values: np.ndarray) -> Tensor:
-    return torch.from_numpy(values).double()
 
 
 class _End(NamedTuple):
@@ -151,21 +139,21 @@ def _ends(demos: Demonstrations, network: RBFImageJacobian) -> list[_End]:
 
 def _end(demo: Demonstration, source: str, network: RBFImageJacobian) -> _End:
     """Means over the rest at the end."""
-    image_demonstrations = _watched(demo, source)
+    watched = _watched(demo, source)
     at_rest = torch.from_numpy(demo.time > demo.time[-1] - _REST)
-    last = (image_demonstrations.visible & at_rest).nonzero()[:, 0]
+    last = (watched.visible & at_rest).nonzero()[:, 0]
     if not len(last):
         raise ValueError(
             f"{source}, episode {demo.episode}: the end effector's marker is not seen in "
             f"the last {_REST} s, where it is above the object. Leave this episode out."
         )
     with torch.no_grad():
-        jacobian = network(image_demonstrations.pose[last]).mean(dim=0)
+        jacobian = network(watched.pose[last]).mean(dim=0)
     return _End(
         object_pixel=demo.extra[OBJECT_FEATURE][last.numpy(), :2].mean(axis=0),
-        hand_pixel=image_demonstrations.feature[last].mean(dim=0).numpy(),
+        hand_pixel=watched.feature[last].mean(dim=0).numpy(),
         jacobian=jacobian.numpy(),
-        path=image_demonstrations.pose,
+        path=watched.pose,
     )
 
 
@@ -175,3 +163,69 @@ def _visual_target(ends: Sequence[_End]) -> VisualTarget:
         np.array([end.hand_pixel for end in ends]),
         np.array([end.jacobian for end in ends]),
     )
+
+
+# Paths drawn at most: more hide each other.
+_MOST_PATHS = 30
+# Distance of the error map under the lowest path, so that both can be seen [m].
+_BELOW = 0.03
+
+
+def learning_recording(
+    skill: VisualServoSkill, demos: Demonstrations, title: str
+) -> LearningRecording:
+    """What is to be shown of a skill just fitted.
+
+    Args:
+        skill: With its held-out errors, and the rounds of learning if there were any.
+        demos: That it was fitted to; the first of them are drawn.
+        title: Of the recording.
+
+    Raises:
+        ValueError: If the skill was loaded: only one just fitted knows how it was learned.
+    """
+    measured, cells = skill.metrics(), skill.cells
+    assert cells is not None  # or there would be no metrics
+    shown = islice(feature_trajectories(demos), _MOST_PATHS)
+    paths = tuple(watched.pose.position.numpy() for watched in shown)
+    height = float(np.mean([path[:, 2].mean() for path in paths]))
+    x, y = cells.edges.mT.numpy()
+    learned = skill.learned
+    return LearningRecording(
+        title=title,
+        measured=measured,
+        curves={} if learned is None else _curves(learned),
+        best=0 if learned is None else learned.best,
+        centers=np.zeros((1, 0, 3))
+        if learned is None
+        else np.stack([_places(state.neurons, height) for state in learned.rounds]),
+        paths=paths,
+        errors=ErrorMap(
+            x=x,
+            y=y,
+            z=min(float(path[:, 2].min()) for path in paths) - _BELOW,
+            share=cells.relative.numpy(),
+        ),
+    )
+
+
+def _curves(learned: EvidenceResult) -> dict[str, np.ndarray]:
+    rounds, configs = learned.rounds, [state.config for state in learned.rounds]
+    return {
+        "Error on demonstrations held out [px]": np.array([s.held_out_error for s in rounds]),
+        "Negative log evidence per pair [-]": np.array([s.evidence for s in rounds]),
+        "Width of the neurons [m, rad]": np.array([float(s.neurons.width) for s in rounds]),
+        "Noise of the camera [px]": np.array([c.pixel_noise for c in configs]),
+        "Prior deviation, common part [px/m]": np.array([c.bias_std for c in configs]),
+        "Prior deviation, weights [px/m]": np.array([c.weight_std for c in configs]),
+    }
+
+
+def _places(neurons: RBFCenters, height: float) -> np.ndarray:
+    """Where neurons stand [m]; those that do not see a coordinate, in the middle of it."""
+    centers, places = neurons.centers.numpy(), np.zeros((len(neurons.centers), 3))
+    places[:, 2] = height
+    for column, component in enumerate(neurons.input_indices):
+        if component < 3:
+            places[:, component] = centers[:, column]
+    return places

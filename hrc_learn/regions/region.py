@@ -1,10 +1,20 @@
-"""The interface of regions: a region function, a potential and its gradient."""
+"""The interface of regions, and the Cartesian ones: a box for the position, a cone round a goal
+orientation.
+"""
+
+from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import final
+from dataclasses import dataclass
+from typing import Literal, final
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
+
+from hrc_learn.geometry import quaternion
+from hrc_learn.geometry.numerics import cos_and_sinc
+from hrc_learn.pytree import pytree, static
 
 
 class Region(ABC):
@@ -34,3 +44,173 @@ class Region(ABC):
     def gradient(self, x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*both m"]:
         """Regional feedback xi = dP/dx."""
         return self.feedback(x)[1]
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
+class PositionRegion(Region):
+    """Box with smooth walls; its potential is zero inside.
+
+    f_i = ((r_i - c_i) / h_i)^2 - 1                                      (CaFun)
+    P   = sum_i k_c/2 max(0, f_i)^2                                      (CaPeFun)
+
+    k_c has the unit of a potential: the speed it asks for, 2 k_c f (r - c)/h^2, grows as the
+    box shrinks, and near a wall the excess decays at the rate 4 k_c/h^2 [1/s].
+    """
+
+    centre: Float[Tensor, "*#batch 3"]
+    """Centre of the box [m]."""
+    half_size: Float[Tensor, "*#batch 3"]
+    """Half of its edges, all positive [m]."""
+    rotation: Float[Tensor, "*#batch 4"] | None = None
+    """Orientation of the box as a unit quaternion (w, x, y, z); None: along the base axes."""
+    stiffness: float | tuple[float, float, float] = static(4e-3)
+    """k_c, one for all or one for each axis of the box. Ten times that of Table I: there the
+    excess near a wall of 0.12 m decays in 9 s, which leaves the tool outside for long."""
+
+    def value(self, x: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*both 3"]:
+        """Region function f of each pair of walls at the position x [m]."""
+        scaled = self._in_box(x) / self.half_size
+        return scaled * scaled - 1
+
+    def feedback(
+        self, x: Float[Tensor, "*batch 3"]
+    ) -> tuple[Float[Tensor, "*both"], Float[Tensor, "*both 3"]]:
+        """Potential and its gradient over the position, in the base frame."""
+        scaled = self._in_box(x) / self.half_size
+        f = (scaled * scaled - 1).clamp(min=0)
+        k_c = self.stiffness
+        # One for each axis of the box, or one for all.
+        pull = (f.new_tensor(k_c) if isinstance(k_c, tuple) else k_c) * f
+        P = 0.5 * (pull * f).sum(-1)
+        gradient = 2 * pull * scaled / self.half_size
+        if self.rotation is not None:
+            gradient = quaternion.rotate(self.rotation, gradient)
+        return P, gradient
+
+    def _in_box(self, x: Tensor) -> Tensor:
+        """Offset from the centre, along the axes of the box [m]."""
+        offset = x - self.centre
+        if self.rotation is None:
+            return offset
+        return quaternion.rotate(quaternion.conjugate(self.rotation), offset)
+
+
+# Shorter axes are rounding noise. They occur at the goal, deep inside the cone, where the
+# gradient is zero whatever the axis.
+_SHORTEST_AXIS = 1e-12
+# Smaller components are not divided by: the printed form has poles there.
+_LEAST_COMPONENT = 1e-9
+# Below this angle squared the closed form of the last term loses digits, its series none.
+_SMALL = 1e-3
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
+class OrientationRegion(Region):
+    """All orientations within an angle of the goal; its potential is zero inside.
+
+    f = alpha_o |log(p * p_g^-1)| - 1                                    (OrtRegion)
+    P = k_o/2 max(0, f)^2                                                (OrtFun1)
+
+    The norm of the quaternion logarithm is *half* the rotation angle phi, so the cone is
+    phi <= 2/alpha_o: 7.6 degrees for alpha_o = 15. The error takes the sign of the shortest
+    rotation, so p and -p are the same orientation.
+
+    The gradient belongs to the geometric Jacobian: it is dP over a small rotation of the end
+    effector about the base axes, k_o max(0, f) (alpha_o/2) n with the axis n of the error.
+    `formulation="paper"` is the printed alpha_o k_o max(0, f) phi n (orient_diff_potential),
+    which has the same direction and 2 phi times that length.
+
+    With `coordinates="rotation_vector"` it belongs to the analytic Jacobian: it is dP over the
+    rotation vector of x, J_l^T times the above. `formulation="paper"` is then the printed chain
+    (PartialV2Quat), (JacobianQuatAngAxisDetailed), which is twice as long.
+    """
+
+    goal: Float[Tensor, "*#batch 4"]
+    """Goal orientation, a unit quaternion (w, x, y, z) of either sign."""
+    sharpness: float = static(15.0)
+    """alpha_o, two over the tolerated angle [1/rad]."""
+    stiffness: float = static(0.02)
+    """k_o."""
+    formulation: Literal["exact", "paper"] = static("exact")
+    coordinates: Literal["rotation", "rotation_vector"] = static("rotation")
+
+    @property
+    def tolerance(self) -> float:
+        """Half opening angle of the cone [rad]."""
+        return 2 / self.sharpness
+
+    def value(self, x: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*both"]:
+        """Region function f at the orientation x (a unit quaternion)."""
+        error = self._error(x)
+        half_angle = torch.atan2(
+            torch.linalg.vector_norm(error[..., 1:], dim=-1), error[..., 0]
+        )
+        return self.sharpness * half_angle - 1
+
+    def feedback(
+        self, x: Float[Tensor, "*batch 4"]
+    ) -> tuple[Float[Tensor, "*both"], Float[Tensor, "*both 3"]]:
+        """Potential of shape (*both,) and its gradient (*both, 3) [1/rad]."""
+        error = self._error(x)
+        sine = torch.linalg.vector_norm(error[..., 1:], dim=-1, keepdim=True)
+        half_angle = torch.atan2(sine, error[..., :1])
+        f = (self.sharpness * half_angle - 1).clamp(min=0)
+        P = (0.5 * self.stiffness) * (f * f).squeeze(-1)
+        # Over the sine, as the vector part of the error is sin(phi/2) n.
+        slope = (0.5 * self.stiffness * self.sharpness) * f / sine.clamp(min=_SHORTEST_AXIS)
+        if self.coordinates == "rotation_vector":
+            if self.formulation == "paper":
+                return P, -2 * slope * printed_derivative(quaternion.canonical(x), self.goal)
+            gradient = slope * error[..., 1:]
+            r = quaternion.log(x).expand_as(gradient)
+            return P, quaternion.left_jacobian_transposed(r, gradient)
+        if self.formulation == "paper":
+            slope = slope * (4 * half_angle)
+        return P, slope * error[..., 1:]
+
+    def _error(self, x: Tensor) -> Tensor:
+        """Error p * p_g^-1 with the sign of the shortest rotation."""
+        return quaternion.canonical(quaternion.multiply(x, quaternion.conjugate(self.goal)))
+
+
+def printed_derivative(
+    p: Float[Tensor, "*#batch 4"], goal: Float[Tensor, "*#batch 4"]
+) -> Float[Tensor, "*both 3"]:
+    """Derivative of v_e as the paper prints it: (PartialV2Quat) times J_rot
+    (JacobianQuatAngAxisDetailed).
+
+    It divides by the components of both quaternions and counts the constraint of unit length
+    twice: along unit quaternions it is twice the true derivative, for which `OrientationRegion`
+    has a form without divisions.
+
+    Args:
+        p: Orientation with p_w >= 0; r_o is its rotation vector.
+        goal: p_g. The sign of the error's real part v_e is made positive.
+    """
+    g = quaternion.conjugate(goal)  # (v_g, u_g) are components of the inverse
+    real = quaternion.multiply(p, g)[..., :1]
+    g = torch.where(real < 0, -g, g)
+    p, g = torch.broadcast_tensors(p, g)
+    sign = p.new_tensor([1.0, -1.0, -1.0, -1.0])
+    tiny = p.abs() < _LEAST_COMPONENT
+    ratio = torch.where(tiny, 0.0, sign * g / torch.where(tiny, 1.0, p))
+    # Each line adds p_i times minus the ratios of the other three.
+    over_p = sign * g - p * (ratio.sum(-1, keepdim=True) - ratio)
+    return _over_rotation_vector(over_p, quaternion.log(p))
+
+
+def _over_rotation_vector(over_p: Tensor, r: Tensor) -> Tensor:
+    """The row d v_e/d p times J_rot, whose columns are
+
+    d p_w/d r = -sinc(phi/2)/4 r,   d p_u/d r = sinc(phi/2)/2 (I - n n^T) + cos(phi/2)/2 n n^T.
+    """
+    square = (r * r).sum(-1, keepdim=True)
+    cosine, sinc = cos_and_sinc(square / 4)
+    closed = (cosine - sinc) / (2 * square.clamp(min=_SMALL))
+    series = -1 / 24 + square.clamp(max=_SMALL) / 960
+    along = torch.where(square < _SMALL, series, closed) * (over_p[..., 1:] * r).sum(
+        -1, keepdim=True
+    )
+    return sinc / 2 * over_p[..., 1:] + (along - sinc / 4 * over_p[..., :1]) * r

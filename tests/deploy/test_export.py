@@ -23,8 +23,7 @@ from hrc_learn.deploy import EagerRunner, NoCompilerError, PackageRunner, export
 from hrc_learn.deploy import export as export_module
 from hrc_learn.deploy import package as package_module
 from hrc_learn.deploy.export import trace
-from hrc_learn.deploy.io_layout import PackedStep, tensors_of
-from hrc_learn.deploy.package import load
+from hrc_learn.deploy.package import PackedStep, load, tensors_of
 from hrc_learn.kinematics import panda
 
 ROOT = Path(__file__).parents[2]
@@ -43,7 +42,7 @@ def test_the_traced_step_equals_the_eager_one_and_is_written_out():
     traced = trace(PackedStep(controller, observation), observation)
     assert not library_calls(traced)
     program = traced.module()
-    assert_equal_steps(controller, observation, lambda vectors: program(*vectors), 100)
+    assert_equal_steps(controller, observation, lambda vectors: program(*vectors), 40)
 
 
 class TestArrays:

@@ -15,9 +15,8 @@ from hrc_learn.controller import (
     Goals,
     Observation,
 )
-from hrc_learn.deploy import package
-from hrc_learn.deploy.export import _structure
-from hrc_learn.deploy.package import UnknownCodeError, content_hash
+from hrc_learn.deploy import export
+from hrc_learn.deploy.export import UnknownCodeError, _structure, content_hash
 from hrc_learn.geometry import quaternion
 from hrc_learn.jacobian import (
     FixedEstimator,
@@ -102,14 +101,14 @@ def test_code_it_cannot_know_is_refused():
 def test_a_change_of_any_source_that_a_step_is_made_from_changes_the_hash(
     tmp_path, monkeypatch
 ):
-    for name in package._SOURCES:
-        source = package._ROOT / name
+    for name in export._SOURCES:
+        source = export._ROOT / name
         assert source.exists(), f"{name} has moved: its changes would go unnoticed"
         copy = shutil.copytree if source.is_dir() else shutil.copy
         copy(source, tmp_path / name)
-    monkeypatch.setattr(package, "_ROOT", tmp_path)
+    monkeypatch.setattr(export, "_ROOT", tmp_path)
     whole = fresh_hash()
-    for name in ("controller/safety_filter.py", "kinematics/franka.py", "deploy/io_layout.py"):
+    for name in ("controller/safety_filter.py", "kinematics/franka.py", "deploy/package.py"):
         file = tmp_path / name
         text = file.read_text(encoding="utf-8")
         file.write_text(text + "# changed\n", encoding="utf-8")
@@ -119,8 +118,8 @@ def test_a_change_of_any_source_that_a_step_is_made_from_changes_the_hash(
 
 
 def fresh_hash() -> str:
-    package._source_hash.cache_clear()
+    export._source_hash.cache_clear()
     try:
         return content_hash()
     finally:
-        package._source_hash.cache_clear()
+        export._source_hash.cache_clear()

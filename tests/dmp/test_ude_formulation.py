@@ -12,7 +12,7 @@ from unchecked import shapes_unchecked
 from hrc_learn.dmp import OrientationDMP
 from hrc_learn.dmp.orientation_error import angular_velocity
 from hrc_learn.geometry import quaternion
-from hrc_learn.geometry.rotation_rates import axis_drift, drift_free_rate
+from hrc_learn.geometry.quaternion import axis_drift, drift_free_rate
 
 GOAL = quaternion.exp(torch.tensor([0.9, -0.7, 0.6], dtype=torch.float64))
 TURN_RATE = torch.tensor([1.5, -2.0, 0.5], dtype=torch.float64)

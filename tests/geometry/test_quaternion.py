@@ -185,3 +185,19 @@ def test_broadcasts():
     assert quaternion.multiply(q, many).shape == (4, 5, 4)
     assert quaternion.rotate(q, directions(5, rng=rng)).shape == (4, 5, 3)
     assert quaternion.rotate(many[0], directions(5, rng=rng)).shape == (5, 3)
+
+
+def test_the_mean_is_nearest_to_all_matrices_whatever_the_signs():
+    spread = 0.4 * torch.randn(7, 3, generator=generator(3), dtype=torch.float64)
+    centre = quaternion.exp(torch.tensor([3.0, 0.5, 0.0], dtype=torch.float64))
+    q = quaternion.multiply(centre, quaternion.exp(spread))
+    sign = torch.tensor([1, -1, 1, 1, -1, -1, 1], dtype=torch.float64)
+    mean = quaternion.mean(sign[:, None] * q)
+
+    def distance(m):
+        difference = quaternion.to_matrix(q) - quaternion.to_matrix(m)
+        return difference.square().sum()
+
+    assert mean.norm().item() == pytest.approx(1, abs=1e-12)
+    for step in 1e-3 * torch.cat([torch.eye(3), -torch.eye(3)]).double():
+        assert distance(quaternion.multiply(quaternion.exp(step), mean)) > distance(mean)

@@ -12,9 +12,14 @@ from hrc_learn.controller import ControllerConfig
 from hrc_learn.demos import Demonstration, DemonstrationSet
 from hrc_learn.dmp import ContextualDMP, JointDMP, OrientationDMP, PoseDMP
 from hrc_learn.geometry import quaternion
-from hrc_learn.learning.channels import Motions, Reproduction, load_primitive
+from hrc_learn.learning.channels import (
+    Motions,
+    Reproduction,
+    dimensionless_jerk,
+    load_primitive,
+    reproduction_error,
+)
 from hrc_learn.learning.primitive_fitting import EACH, contexts, fit_contextual, fit_primitives
-from hrc_learn.learning.reproduction_metrics import dimensionless_jerk, reproduction_error
 from hrc_learn.learning.tuning import TuningState, with_gains
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from hrc_learn.lerobot.panda_device import robot_registry
+from hrc_learn.lerobot.panda_robot import robot_registry
 from hrc_learn.lerobot.robots import MujocoPanda, MujocoPandaConfig
 
 

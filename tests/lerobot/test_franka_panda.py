@@ -10,7 +10,7 @@ import torch
 from lerobot.robots import make_robot_from_config
 
 from hrc_learn.kinematics import panda
-from hrc_learn.lerobot.panda_features import GRIPPER, JOINTS
+from hrc_learn.lerobot.panda_robot import GRIPPER, JOINTS
 from hrc_learn.lerobot.robots import FrankaPandaConfig
 
 READY = panda.ready.numpy()

@@ -7,7 +7,7 @@ from lerobot.robots import make_robot_from_config
 from lerobot.teleoperators import make_teleoperator_from_config
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 
-from hrc_learn.lerobot.panda_features import GRIPPER, HAND, JOINTS, PIXELS
+from hrc_learn.lerobot.panda_robot import GRIPPER, HAND, JOINTS, PIXELS
 from hrc_learn.lerobot.robots import MujocoPandaConfig
 from hrc_learn.lerobot.teleoperators import PandaExpertConfig
 

@@ -6,7 +6,7 @@ import torch
 
 from hrc_learn.geometry import quaternion
 from hrc_learn.regions import OrientationRegion
-from hrc_learn.regions.orientation import printed_derivative
+from hrc_learn.regions.region import printed_derivative
 
 GOAL = quaternion.normalize(torch.tensor([-0.28, 0.63, 0.66, 0.28], dtype=torch.float64))
 

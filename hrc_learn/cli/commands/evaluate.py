@@ -17,8 +17,13 @@ from hrc_learn.cli.arguments.learn import (
 )
 from hrc_learn.cli.commands.fit import fit_primitives
 from hrc_learn.demos import DemonstrationSet, load_demos, open_demos
-from hrc_learn.learning.channels import CHANNELS, Motions, load_primitive
-from hrc_learn.learning.reproduction_metrics import ReproductionError, reproduction_error
+from hrc_learn.learning.channels import (
+    CHANNELS,
+    Motions,
+    ReproductionError,
+    load_primitive,
+    reproduction_error,
+)
 from hrc_learn.skills.visual_servoing import VisualServoSkill
 from hrc_learn.store import new_folder, read_made_by, write_json
 from hrc_learn.viz.figures import measures_figure

@@ -14,7 +14,6 @@ from hrc_learn.cli._run import show_values, write_values
 from hrc_learn.cli.arguments.learn import FitImageJacobian, FitPrimitives
 from hrc_learn.demos import DemonstrationSource, load_demos, open_demos
 from hrc_learn.jacobian import CellErrors, RBFCenters, grid
-from hrc_learn.learning.fit_recordings import learning_recording
 from hrc_learn.learning.primitive_fitting import (
     FittedPrimitives,
     fit_contextual,
@@ -22,7 +21,7 @@ from hrc_learn.learning.primitive_fitting import (
     fit_streamed,
 )
 from hrc_learn.learning.primitive_fitting import fit_primitives as fit_demonstrations
-from hrc_learn.learning.visual_servo_fitting import fit_visual_servo
+from hrc_learn.learning.visual_servo_fitting import fit_visual_servo, learning_recording
 from hrc_learn.skills.visual_servoing import VisualServoSkill
 from hrc_learn.store import new_folder, write_json
 from hrc_learn.viz.figures import (
@@ -87,7 +86,7 @@ def _fit_streamed(args: FitPrimitives) -> None:
 
 def _fit_policy(args: FitPrimitives, console: Console) -> None:
     # LeRobot takes ten seconds to import.
-    from hrc_learn.lerobot.policy.closed_form_checkpoint import write_closed_form_policy
+    from hrc_learn.lerobot.policy.modeling_dmp import write_closed_form_policy
 
     given = (args.channels, args.context, args.joint_names, args.robust)
     if any(given) or (args.several, args.method, args.scaling) != (

@@ -14,9 +14,8 @@ def smooth(args: Smooth) -> None:
     if not args.checkpoint.is_dir():
         raise FileNotFoundError(f"there is no folder {args.checkpoint}")
     # LeRobot takes seconds to import.
-    from hrc_learn.lerobot.processor import add_smoothing
-    from hrc_learn.lerobot.processor.action_limits import demonstrated_limits
-    from hrc_learn.lerobot.processor.checkpoint_steps import remove_smoothing
+    from hrc_learn.lerobot.action_limits import demonstrated_limits
+    from hrc_learn.lerobot.processor import add_smoothing, remove_smoothing
 
     if args.remove:
         remove_smoothing(args.checkpoint)

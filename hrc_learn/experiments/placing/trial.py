@@ -23,7 +23,7 @@ from hrc_learn.experiments.run_recording import (
 )
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import panda
-from hrc_learn.learning.reproduction_metrics import dimensionless_jerk
+from hrc_learn.learning.channels import dimensionless_jerk
 from hrc_learn.sim import MotionLog, Touch, World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.grasping import OPEN

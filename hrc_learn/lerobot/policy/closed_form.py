@@ -1,14 +1,14 @@
-"""A policy's first primitives, by regression instead of gradients, from whole
-demonstrations.
+"""A policy's first primitives, by regression instead of gradients, from whole demonstrations;
+and samples of these for the gradients that may follow.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
@@ -16,7 +16,7 @@ from hrc_learn.demos.format.dataset_folder import open_folder
 from hrc_learn.demos.read.episodes import select_episodes
 from hrc_learn.demos.read.frames import read_frames
 from hrc_learn.dmp import JointDMP, Response, RidgeFit, fit_ridge
-from hrc_learn.lerobot.policy.primitive_head import ContextualMotion
+from hrc_learn.lerobot.policy.networks import ContextualMotion
 
 # A policy's first primitives, by regression instead of gradients.
 
@@ -158,3 +158,55 @@ def read_episodes(
         {key: torch.from_numpy(np.array(frames[key])) for key in keys}
         for _, frames in read_frames(folder, entries, keys)
     ]
+
+
+class SampleWindows:
+    """Samples of all frames of episodes, with the steps around each that a policy asks for.
+
+    The same batches as of LeRobot's loader, which looks up every action of every chunk by
+    itself, some 200 samples a second; few demonstrations fit into memory, where a batch is one
+    gather.
+    """
+
+    def __init__(
+        self,
+        episodes: Sequence[Mapping[str, Tensor]],
+        deltas: Mapping[str, Sequence[int] | None],
+        fps: float | int,
+    ):
+        """Lay the episodes out.
+
+        Args:
+            episodes: Columns by key, (frames, ...) each.
+            deltas: For each key wanted, offsets in frames; None: the frame itself, without
+                an axis of time.
+            fps: Frames a second.
+        """
+        lengths = torch.tensor([len(next(iter(episode.values()))) for episode in episodes])
+        self._columns = {key: torch.cat([e[key] for e in episodes]) for key in deltas}
+        self._deltas = deltas
+        end = lengths.cumsum(0)
+        self._start = (end - lengths).repeat_interleave(lengths)
+        self._last = (end - 1).repeat_interleave(lengths)
+        self._fps = fps
+
+    def __len__(self) -> int:
+        return len(self._start)
+
+    def batch(self, index: Int[Tensor, "B"]) -> dict[str, Tensor]:
+        """Samples by the number of their frame, counted through all episodes."""
+        start, last = self._start[index], self._last[index]
+        batch = {"timestamp": (index - start) / self._fps}
+        for key, deltas in self._deltas.items():
+            if deltas is None:
+                batch[key] = self._columns[key][index]
+                continue
+            wanted = index[:, None] + torch.tensor(deltas)
+            within = wanted.clamp(start[:, None], last[:, None])
+            batch[key] = self._columns[key][within]
+            batch[f"{key}_is_pad"] = within != wanted
+        return batch
+
+    def draw(self, size: int, generator: torch.Generator) -> dict[str, Tensor]:
+        """Samples drawn at random."""
+        return self.batch(torch.randint(len(self), (size,), generator=generator))

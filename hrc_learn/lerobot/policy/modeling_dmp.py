@@ -1,29 +1,33 @@
-"""The policy `dmp` as LeRobot calls it."""
+"""The policy `dmp` as LeRobot calls it, and its checkpoint without training."""
 
 import logging
 import math
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 from jaxtyping import Float
+from lerobot.configs import FeatureType
+from lerobot.policies import make_pre_post_processors
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+from lerobot.utils.feature_utils import dataset_to_policy_features
 from torch import Tensor
 
 from hrc_learn.dmp import GaussianBasis, SpringDamper, response_of
-from hrc_learn.lerobot.policy.action_encoding import (
+from hrc_learn.lerobot.policy.closed_form import read_episodes
+from hrc_learn.lerobot.policy.configuration_dmp import DMPConfig
+from hrc_learn.lerobot.policy.motion_planner import (
     ActionEncoding,
+    InitialPlan,
+    MotionPlanner,
+    Start,
     matched_columns,
     rotation_triples,
 )
-from hrc_learn.lerobot.policy.chunk_planner import InitialPlan, MotionPlanner, Start
-from hrc_learn.lerobot.policy.closed_form import read_episodes
-from hrc_learn.lerobot.policy.configuration_dmp import DMPConfig
-from hrc_learn.lerobot.policy.observation_encoder import ObservationEncoder
-from hrc_learn.lerobot.policy.primitive_head import ContextualMotion
+from hrc_learn.lerobot.policy.networks import ContextualMotion, ObservationEncoder
 
 logger = logging.getLogger(__name__)
 
@@ -210,3 +214,46 @@ def _frame_rate(config: DMPConfig, dataset_meta: Any) -> float:
             "resample it, or train a policy of its own"
         )
     return trained
+
+
+def write_closed_form_policy(
+    dataset: Path, folder: Path, *, n_basis: int, episodes: Sequence[int] | None = None
+) -> dict[str, float]:
+    """Fit the policy to a dataset and write what LeRobot loads, trains on and rolls out.
+
+    Images are left out: what to see in them takes gradients to learn.
+
+    Args:
+        dataset: LeRobot dataset with actions, and a state or an environment state.
+        folder: Existing folder for the checkpoint.
+        n_basis: Basis functions a coordinate.
+        episodes: To learn from; None: all.
+
+    Returns:
+        How many demonstrations, and the error of those left out, in the spread of the actions.
+
+    Raises:
+        ValueError: The dataset cannot be read or holds nothing to learn a policy from.
+    """
+    from lerobot.datasets import LeRobotDatasetMetadata  # who only runs a policy needs none
+
+    if not (dataset / "meta" / "info.json").is_file():
+        raise FileNotFoundError(f"there is no LeRobot dataset in {dataset}")
+    meta = LeRobotDatasetMetadata(f"local/{dataset.name}", root=dataset)
+    features = dataset_to_policy_features(meta.features)
+    config = DMPConfig(
+        n_basis=n_basis,
+        fit_episodes=None if episodes is None else list(episodes),
+        input_features={k: features[k] for k in (OBS_STATE, OBS_ENV_STATE) if k in features},
+        output_features={k: f for k, f in features.items() if f.type is FeatureType.ACTION},
+        device="cpu",
+        push_to_hub=False,
+    )
+    config.set_dataset_feature_metadata(meta.features)
+    stats: Any = meta.stats
+    policy = DMPPolicy(config, dataset_stats=stats, dataset_meta=meta)
+    policy.save_pretrained(folder)
+    for processor in make_pre_post_processors(config, dataset_stats=stats):
+        processor.save_pretrained(folder)
+    shown = meta.total_episodes if episodes is None else len(episodes)
+    return {"demonstrations": float(shown), "left_out_error": policy.left_out_error}

@@ -2,23 +2,57 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from lerobot.cameras import make_cameras_from_configs
+from lerobot.cameras import CameraConfig, make_cameras_from_configs
+from lerobot.robots import RobotConfig
 
 from hrc_learn.controller import SafetyConfig, Watchdog
 from hrc_learn.geometry import Pose
 from hrc_learn.hardware.franky_arm import FrankyArm
 from hrc_learn.kinematics import panda
-from hrc_learn.lerobot.robots.config_franka_panda import FrankaPandaConfig
-from hrc_learn.lerobot.robots.panda_robot import PandaRobot
+from hrc_learn.lerobot.panda_robot import PandaRobot, PandaRobotConfig
 from hrc_learn.protocols import Arm
 
 if TYPE_CHECKING:
     from hrc_learn.skills.position_servo import PositionServo
+
+
+@RobotConfig.register_subclass("franka_panda")
+@dataclass(kw_only=True)
+class FrankaPandaConfig(PandaRobotConfig):
+    """A Franka Panda at its control box; `--robot.type=franka_panda`."""
+
+    ip: str
+    """Address of the control box."""
+    dynamics: float = 0.3
+    """Share of the driver's own limits of velocity, acceleration and jerk."""
+    tcp_speed: float = 0.25
+    """Cap on the speed of the tool centre point [m/s] (ISO 10218: reduced speed)."""
+    timeout: float = 0.15
+    """Silence of the loop after which the arm is stopped [s]."""
+    grip_force: float = 20.0
+    """With which the gripper squeezes [N]."""
+    grip_speed: float = 0.1
+    """Of the fingers [m/s]."""
+    cameras: dict[str, CameraConfig] = field(default_factory=dict)
+    """Cameras of LeRobot, by name."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 5 <= self.fps <= 1000:
+            raise ValueError(f"fps must be from 5 to 1000, but is {self.fps}.")
+        if not 0 < self.dynamics <= 1:
+            raise ValueError(f"dynamics must be in (0, 1], but is {self.dynamics}.")
+        if not self.timeout > 1.5 / self.fps:
+            raise ValueError(
+                f"timeout must be longer than an action and a half at {self.fps:g} fps, but is "
+                f"{self.timeout} s."
+            )
 
 
 class FrankaPanda(PandaRobot):
@@ -38,11 +72,8 @@ class FrankaPanda(PandaRobot):
     watchdog: Watchdog
 
     def __init__(self, config: FrankaPandaConfig):
-        super().__init__(
-            config, config.action_space, velocity=config.velocity, hand=config.hand
-        )
+        super().__init__(config)
         self.config = config
-        self.dt = 1.0 / config.fps
         self.cameras = make_cameras_from_configs(config.cameras)
         self._arm: FrankyArm
         self._servo: PositionServo

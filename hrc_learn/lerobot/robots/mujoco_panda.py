@@ -3,20 +3,66 @@
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from jaxtyping import Float
+from lerobot.robots import RobotConfig
 
 from hrc_learn.geometry import Pose
-from hrc_learn.lerobot.panda_features import DOWN, PIXELS
-from hrc_learn.lerobot.robots.config_mujoco_panda import MujocoPandaConfig
-from hrc_learn.lerobot.robots.panda_robot import PandaRobot
+from hrc_learn.lerobot.panda_robot import DOWN, PIXELS, PandaRobot, PandaRobotConfig
 from hrc_learn.protocols import Arm
-from hrc_learn.teleoperation.scenarios import make_scenario
+from hrc_learn.teleoperation.scenarios import check_scenario, make_scenario
 
 if TYPE_CHECKING:
     from hrc_learn.teleoperation.scenarios import ScenarioRun
+
+
+@dataclass
+class ImagesConfig:
+    """Images of the simulated workplace."""
+
+    kind: Literal["none", "auto", "egl", "synthetic"] = "none"
+    """Which camera: "egl" renders everything, "synthetic" draws the markers on the table only
+    and needs no OpenGL, "auto" renders where that is possible."""
+    width: int = 160
+    """[px]"""
+    height: int = 120
+    """[px]"""
+
+
+@RobotConfig.register_subclass("mujoco_panda")
+@dataclass(kw_only=True)
+class MujocoPandaConfig(PandaRobotConfig):
+    """The Panda in our MuJoCo workplace; `--robot.type=mujoco_panda`.
+
+    `fps` counts commands a second of simulated time.
+    """
+
+    scenario: str = "placing"
+    """What is to be done: "placing" or "grasping"."""
+    shelf: str = "middle"
+    """Where to place: "lower", "middle" or "upper"."""
+    seed: int = 0
+    """Of the first beginning; each one after has the next."""
+    pixels: bool = False
+    """Whether the pixel of the object is observed, as the fixed camera saw it at the beginning:
+    what a policy needs to grasp without images."""
+    images: ImagesConfig = field(default_factory=ImagesConfig)
+    """Images to be observed."""
+    episode_time: float = 0.0
+    """Begin anew when this much time [s] has passed, as `--dataset.episode_time_s` says when
+    lerobot-record ends an episode, of which it tells a robot nothing; 0: never."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_scenario(self.scenario, self.shelf, self.pixels)
+        if not 5 <= self.fps <= 500:
+            raise ValueError(f"fps must be from 5 to 500, but is {self.fps}.")
+        if self.episode_time < 0:
+            raise ValueError("episode_time must not be negative.")
+
 
 CAMERA = "front"
 
@@ -36,11 +82,8 @@ class MujocoPanda(PandaRobot):
     run: ScenarioRun
 
     def __init__(self, config: MujocoPandaConfig):
-        super().__init__(
-            config, config.action_space, velocity=config.velocity, hand=config.hand
-        )
+        super().__init__(config)
         self.config = config
-        self.dt = 1.0 / config.fps
         self._began = 0.0
 
     @property
@@ -75,6 +118,8 @@ class MujocoPanda(PandaRobot):
         self._need_connection()
         self._begin_anew_in_time()
         values = super().get_observation()
+        if self.config.pixels:
+            values |= zip(PIXELS, map(float, self.run.object_pixel()), strict=True)
         for name, camera in self.cameras.items():
             values[name] = camera.read()
         return values
@@ -97,11 +142,6 @@ class MujocoPanda(PandaRobot):
         self.run.begin(seed)
         self.beginnings += 1
         self._rotation = DOWN
-
-    def _further_values(self) -> dict[str, float]:
-        if not self.config.pixels:
-            return {}
-        return dict(zip(PIXELS, map(float, self.run.object_pixel()), strict=True))
 
     def _joints_at(self, pose: Pose) -> Float[np.ndarray, "7"]:
         return self.run.servo.joints_at(pose)

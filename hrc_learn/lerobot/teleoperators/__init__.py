@@ -1,8 +1,10 @@
 """Who leads a Panda: a script that shows a job, or a person in a browser."""
 
-from hrc_learn.lerobot.teleoperators.config_panda_expert import (
+from hrc_learn.lerobot.teleoperators.panda_teleoperators import PandaExpert as PandaExpert
+from hrc_learn.lerobot.teleoperators.panda_teleoperators import (
     PandaExpertConfig as PandaExpertConfig,
 )
-from hrc_learn.lerobot.teleoperators.config_panda_page import PandaPageConfig as PandaPageConfig
-from hrc_learn.lerobot.teleoperators.panda_expert import PandaExpert as PandaExpert
-from hrc_learn.lerobot.teleoperators.panda_page import PandaPage as PandaPage
+from hrc_learn.lerobot.teleoperators.panda_teleoperators import PandaPage as PandaPage
+from hrc_learn.lerobot.teleoperators.panda_teleoperators import (
+    PandaPageConfig as PandaPageConfig,
+)

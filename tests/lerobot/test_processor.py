@@ -14,11 +14,12 @@ from lerobot.processor.converters import (
     transition_to_policy_action,
 )
 
-from hrc_learn.lerobot.processor import WatchStateStep, add_smoothing
-from hrc_learn.lerobot.processor.action_limits import ActionLimits
-from hrc_learn.lerobot.processor.checkpoint_steps import (
+from hrc_learn.lerobot.action_limits import ActionLimits
+from hrc_learn.lerobot.processor import (
     POSTPROCESSOR,
     PREPROCESSOR,
+    WatchStateStep,
+    add_smoothing,
     remove_smoothing,
 )
 

@@ -4,7 +4,7 @@ import torch
 
 from hrc_learn.demos import Demonstration, DemonstrationSet
 from hrc_learn.kinematics import panda, panda_capsules
-from hrc_learn.learning.fit_recordings import demonstrations_recording
+from hrc_learn.learning.channels import demonstrations_recording
 from hrc_learn.viz.arm_bodies import panda_bodies
 
 

@@ -8,9 +8,9 @@ import numpy as np
 
 from hrc_learn.demos.format.dataset_folder import open_folder
 from hrc_learn.kinematics import panda
-from hrc_learn.lerobot.panda_features import JOINTS
-from hrc_learn.lerobot.policy.action_encoding import matched_columns
+from hrc_learn.lerobot.panda_robot import JOINTS
 from hrc_learn.lerobot.policy.closed_form import read_episodes
+from hrc_learn.lerobot.policy.motion_planner import matched_columns
 
 ACTION, STATE = "action", "observation.state"
 

@@ -1,14 +1,18 @@
-"""Steps of LeRobot's processors: one watches where the robot is, one smooths what it is
-sent.
+"""Smooth, limit-checked actions for any policy, as steps of its processors.
+
+One step watches where the robot is, one smooths what it is sent; `add_smoothing` adds both to a
+checkpoint that was trained without them.
 """
 
 from __future__ import annotations
 
+import json
 import logging
 import math
 import weakref
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
+from pathlib import Path
 from typing import Any, ClassVar
 from weakref import WeakValueDictionary
 
@@ -27,6 +31,8 @@ from hrc_learn.controller import (
     ActionChunkState,
 )
 from hrc_learn.kinematics import MotionLimits
+from hrc_learn.lerobot.action_limits import ActionLimits
+from hrc_learn.store import new_file
 
 # What smoothing has changed, added up.
 
@@ -59,10 +65,9 @@ class Changes:
         change = report.change.abs().reshape(-1, len(self.names))
         self.steps += len(change)
         self.changed += int((change > _SAME).any(-1).sum())
-        for kind, count in zip(
-            LIMIT_KINDS, report.broken.flatten(0, -2).sum(0).tolist(), strict=True
-        ):
-            self.broken[kind] += int(count)
+        broken = report.broken.flatten(0, -2).sum(0).tolist()
+        for kind, count in zip(LIMIT_KINDS, broken, strict=True):
+            self.broken[kind] += count
         for name, most in zip(self.names, torch.amax(change, 0).tolist(), strict=True):
             self.largest[name] = max(self.largest[name], most)
 
@@ -75,15 +80,16 @@ class Changes:
         )
 
 
-# The steps: one that watches where the robot is, one that smooths what it is sent.
+# The steps.
 
+WATCH, SMOOTH = "hrc_learn_watch_state", "hrc_learn_smooth_actions"
 _JUMP = 5.0
 """A robot that moves this many times faster than its limit was put there: an episode began."""
 
 _Features = dict[PipelineFeatureType, dict[str, PolicyFeature]]
 
 
-@ProcessorStepRegistry.register("hrc_learn_watch_state")
+@ProcessorStepRegistry.register(WATCH)
 @dataclass
 class WatchStateStep(ProcessorStep):
     """Keeps the state as the robot reports it, for the `SmoothActionsStep` of the same name.
@@ -126,7 +132,7 @@ class WatchStateStep(ProcessorStep):
         return features
 
 
-@ProcessorStepRegistry.register("hrc_learn_smooth_actions")
+@ProcessorStepRegistry.register(SMOOTH)
 @dataclass
 class SmoothActionsStep(ProcessorStep):
     """Keeps actions within limits of position, velocity, acceleration and jerk.
@@ -165,7 +171,14 @@ class SmoothActionsStep(ProcessorStep):
                     f"smooth actions: {name} must have one entry for each of "
                     f"{', '.join(self.names)}, but has {len(getattr(self, name))}."
                 )
-        self._smoother = ActionChunkFilter(self._limits(), 1.0 / self.fps)
+        limits = MotionLimits(
+            lower=_tensor(self.lower, missing=-math.inf),
+            upper=_tensor(self.upper, missing=math.inf),
+            velocity=_tensor(self.velocity),
+            acceleration=_tensor(self.acceleration),
+            jerk=_tensor(self.jerk),
+        )
+        self._smoother = ActionChunkFilter(limits, 1.0 / self.fps)
         self._columns = torch.tensor(self.state_columns)
         self._state: ActionChunkState | None = None
         self._chunk: Tensor | None = None
@@ -187,7 +200,9 @@ class SmoothActionsStep(ProcessorStep):
         with torch.inference_mode():
             state = self._start(chunk, whole)
             smooth, self._state, report = self._smoother(chunk, state)
-        self._keep(smooth, report, whole)
+        self.changes.add(report)
+        # An acceleration takes three actions; with fewer the next chunk goes on from the state.
+        self._chunk = smooth.to(torch.float64) if whole and smooth.shape[-2] > 2 else None
         smooth = smooth.to(action)
         return {**transition, TransitionKey.ACTION: smooth if whole else smooth.squeeze(-2)}  # pyright: ignore[reportReturnType]
 
@@ -198,29 +213,10 @@ class SmoothActionsStep(ProcessorStep):
         self._state = self._chunk = self._before = None
 
     def get_config(self) -> dict[str, Any]:
-        return {
-            "fps": self.fps,
-            "names": self.names,
-            "velocity": self.velocity,
-            "acceleration": self.acceleration,
-            "jerk": self.jerk,
-            "lower": self.lower,
-            "upper": self.upper,
-            "state_columns": self.state_columns,
-            "pair": self.pair,
-        }
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.init}
 
     def transform_features(self, features: _Features) -> _Features:
         return features
-
-    def _limits(self) -> MotionLimits:
-        return MotionLimits(
-            lower=_tensor(self.lower, missing=-math.inf),
-            upper=_tensor(self.upper, missing=math.inf),
-            velocity=_tensor(self.velocity),
-            acceleration=_tensor(self.acceleration),
-            jerk=_tensor(self.jerk),
-        )
 
     def _start(self, chunk: Tensor, whole: bool) -> ActionChunkState:
         """Where the motion goes on from."""
@@ -252,8 +248,7 @@ class SmoothActionsStep(ProcessorStep):
 
     def _jumped(self, measured: Tensor) -> Bool[Tensor, " batch"]:
         """Whether the robot was put somewhere, which no motion explains."""
-        if self._before is None or self._before.shape != measured.shape:
-            return torch.ones(measured.shape[:-1], dtype=torch.bool)
+        assert self._before is not None  # there is one as soon as there is a state
         farthest = _JUMP * self._smoother.barrier.velocity / self.fps
         moved = (measured - self._before).abs() > farthest
         return (moved & (self._columns >= 0)).any(-1)
@@ -269,10 +264,6 @@ class SmoothActionsStep(ProcessorStep):
         state = self._smoother.initial_state(last, velocity)
         acceleration = (velocity - (middle - first) * self.fps) * self.fps
         return replace(state, acceleration=acceleration)
-
-    def _keep(self, smooth: Tensor, report: ActionChunkReport, whole: bool) -> None:
-        self.changes.add(report)
-        self._chunk = smooth.to(torch.float64) if whole and smooth.shape[-2] > 2 else None
 
 
 def _tensor(values: Sequence[float | None], missing: float = math.nan) -> Float[Tensor, " n"]:
@@ -292,3 +283,57 @@ def _where(
 def _log(changes: Changes) -> None:
     if changes.steps:
         logging.info("smooth actions: %s", changes)
+
+
+# Adding the steps to a checkpoint.
+
+PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor.json", "policy_postprocessor.json"
+
+
+def add_smoothing(checkpoint: Path, limits: ActionLimits) -> None:
+    """Let a trained policy's actions be smoothed wherever its checkpoint is used.
+
+    Steps from an earlier call are replaced. Weights and all other steps stay as they are.
+
+    Args:
+        checkpoint: Folder `pretrained_model` of a checkpoint of any policy.
+        limits: Of its actions.
+
+    Raises:
+        FileNotFoundError: The folder holds no processors.
+        ValueError: They cannot be read.
+    """
+    before, after = (_read(checkpoint / name) for name in (PREPROCESSOR, POSTPROCESSOR))
+    watch = {"registry_name": WATCH, "config": {"pair": "smooth"}}
+    smooth = {"registry_name": SMOOTH, "config": {**asdict(limits), "pair": "smooth"}}
+    before["steps"].insert(0, watch)  # before a step that renames or normalises the state
+    after["steps"].append(smooth)
+    # Without the one that watches, the other still works: so it comes first.
+    _write(checkpoint / PREPROCESSOR, before)
+    _write(checkpoint / POSTPROCESSOR, after)
+
+
+def remove_smoothing(checkpoint: Path) -> None:
+    """Take the steps out again; complains as `add_smoothing`."""
+    for name in (PREPROCESSOR, POSTPROCESSOR):
+        _write(checkpoint / name, _read(checkpoint / name))
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """A pipeline's settings without our steps."""
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"there is no {path}: give the folder `pretrained_model` of a LeRobot checkpoint."
+        )
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        steps = content["steps"]
+    except (json.JSONDecodeError, KeyError, TypeError) as error:
+        raise ValueError(f"{path} is not a processor of LeRobot: {error}") from None
+    content["steps"] = [s for s in steps if s.get("registry_name") not in (WATCH, SMOOTH)]
+    return content
+
+
+def _write(path: Path, content: dict[str, Any]) -> None:
+    with new_file(path) as new:
+        new.write_text(json.dumps(content, indent=2), encoding="utf-8")

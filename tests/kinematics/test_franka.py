@@ -2,7 +2,7 @@ import frankik
 import pytest
 import torch
 from arm_samples import joint_positions
-from sampling import generator
+from sampling import generator, within
 from torch.testing import assert_close
 
 from hrc_learn.geometry import Pose
@@ -112,3 +112,24 @@ def test_unreachable_pose_names_itself_and_says_what_to_do():
 def test_joint_7_outside_its_limits_is_unreachable():
     with pytest.raises(ValueError, match=r"joint 7 at 3\.0000 rad"):
         panda.inverse(panda.forward(panda.ready), 3.0)
+
+
+def test_position_limits_are_those_of_the_inverse_kinematics_library():
+    def theirs(values):
+        return torch.tensor(values, dtype=torch.float64)
+
+    assert_close(panda.limits.lower, theirs(frankik.q_min_panda), rtol=0, atol=1e-4)
+    assert_close(panda.limits.upper, theirs(frankik.q_max_panda), rtol=0, atol=1e-4)
+
+
+def test_contain_tells_inside_from_outside():
+    limits = panda.limits
+    q = within(limits.lower, limits.upper, 3, 2, rng=generator(1))
+    assert limits.contain(q).shape == (3, 2)
+    assert bool(limits.contain(q).all())
+    assert bool(limits.contain(limits.lower))
+    for joint in range(7):
+        outside = q.clone()
+        outside[..., joint] = limits.upper[joint] + 1e-6
+        assert not bool(limits.contain(outside).any())
+    assert bool(limits.contain(limits.middle.float()))

@@ -7,10 +7,158 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from hrc_learn.lerobot.policy.action_encoding import ActionEncoding
+from hrc_learn.dmp.orientation_error import nearest_turn, to_error, to_orientation
+from hrc_learn.geometry import quaternion
 from hrc_learn.lerobot.policy.closed_form import fit_closed_form
-from hrc_learn.lerobot.policy.observation_encoder import Observation, ObservationEncoder
-from hrc_learn.lerobot.policy.primitive_head import ContextualMotion, Primitives
+from hrc_learn.lerobot.policy.networks import (
+    ContextualMotion,
+    Observation,
+    ObservationEncoder,
+    Primitives,
+)
+
+# The coordinates in which actions move linearly.
+
+SMALLEST_SPREAD = 1e-3
+"""Components that vary by less are not blown up to a spread of one."""
+
+
+class ActionEncoding(nn.Module):
+    """Actions as coordinates of mean zero and spread one, and back.
+
+    A rotation vector becomes the error e = log(r conj(q)) to a reference r, in which an
+    orientation moves linearly (see `hrc_learn/dmp/orientation_error.py`), r being the mean
+    orientation of the demonstrations. So nothing jumps where a rotation vector does, at half a
+    turn, which is where a hand that points down is.
+    """
+
+    mean: Tensor
+    std: Tensor
+    reference: Tensor
+    """Unit quaternions (w, x, y, z), one for each rotation vector."""
+
+    def __init__(self, width: int, triples: Sequence[Sequence[int]]):
+        """Identity, until it has learned.
+
+        Args:
+            width: A, components of an action.
+            triples: Those that make up rotation vectors [rad].
+        """
+        super().__init__()
+        self.triples = [list(triple) for triple in triples]
+        self.register_buffer("mean", torch.zeros(width))
+        self.register_buffer("std", torch.ones(width))
+        identity = torch.tensor([1.0, 0.0, 0.0, 0.0])
+        self.register_buffer("reference", identity.repeat(len(self.triples), 1))
+
+    def to_coordinates(
+        self, actions: Float[Tensor, "*batch T A"]
+    ) -> Float[Tensor, "*batch T A"]:
+        """Coordinates of actions along time."""
+        return (self._unrolled(actions) - self.mean) / self.std
+
+    def to_actions(
+        self, coordinates: Float[Tensor, "*batch T A"]
+    ) -> Float[Tensor, "*batch T A"]:
+        """Actions again; rotation vectors are the ones nearest to the reference's."""
+        actions = coordinates * self.std + self.mean
+        for triple, reference in zip(self.triples, self.reference, strict=True):
+            q = to_orientation(actions[..., triple], reference)
+            vector = nearest_turn(quaternion.log(q), quaternion.log(reference))
+            actions = _replaced(actions, triple, vector)
+        return actions
+
+    @torch.no_grad()
+    def learn(self, episodes: Sequence[Float[Tensor, "_frames A"]]) -> None:
+        """Take mean, spread and references from demonstrated actions.
+
+        Raises:
+            ValueError: Orientations more than half a turn away from their mean.
+        """
+        for k, triple in enumerate(self.triples):
+            q = quaternion.exp(torch.cat([e[:, triple] for e in episodes]))
+            self.reference[k] = quaternion.mean(q)
+        unrolled = [self._unrolled(episode) for episode in episodes]
+        for triple in self.triples:
+            for k, episode in enumerate(unrolled):
+                if (episode[:, triple].norm(dim=-1) > torch.pi).any():
+                    raise ValueError(
+                        f"demonstration {k} turns the hand by more than half a turn from the "
+                        "mean orientation, where a rotation vector is ambiguous: leave it out "
+                        "(fit_episodes), or use joints as actions"
+                    )
+        self.whiten(*torch.std_mean(torch.cat(unrolled), dim=0))
+
+    def whiten(self, std: Float[Tensor, "A"], mean: Float[Tensor, "A"]) -> None:
+        """Take these for spread and mean of what is to be whitened."""
+        self.mean.copy_(mean)
+        self.std.copy_(std.clamp_min(SMALLEST_SPREAD))
+
+    def _unrolled(self, actions: Tensor) -> Tensor:
+        for triple, reference in zip(self.triples, self.reference, strict=True):
+            q = quaternion.exp(actions[..., triple])
+            actions = _replaced(actions, triple, quaternion.unwrap_log(to_error(q, reference)))
+        return actions
+
+
+def _replaced(values: Tensor, columns: list[int], new: Tensor) -> Tensor:
+    index = torch.tensor(columns, device=values.device)
+    return values.index_copy(-1, index, new.to(values))
+
+
+# Which components of action and state belong together, by their names.
+
+ROTATION = ("wx", "wy", "wz")
+"""Last part of the names of a rotation vector's components, as LeRobot has them."""
+ENDINGS = ("", ".pos")
+"""What may follow it: lerobot-rollout hands on no names but those with an ending."""
+
+
+def rotation_triples(names: Sequence[str] | None) -> list[list[int]]:
+    """Components that make up rotation vectors, such as ee.wx, ee.wy, ee.wz.
+
+    Args:
+        names: Of all components; None: unknown, so that there is none.
+    """
+    index = {name: i for i, name in enumerate(names or ())}
+    triples = []
+    for name in index:
+        for ending in ENDINGS:
+            stem = name.removesuffix(ROTATION[0] + ending)
+            triple = [stem + part + ending for part in ROTATION]
+            if stem != name and index.keys() >= {*triple}:
+                triples.append([index[part] for part in triple])
+    return triples
+
+
+def matched_columns(
+    action_names: Sequence[str] | None,
+    state_names: Sequence[str] | None,
+    widths: tuple[int, int],
+) -> list[int]:
+    """Where each component of the action is measured: columns of the state, -1 for nowhere.
+
+    Where neither has names, states as wide as actions are taken for what they command. A
+    rotation vector is taken whole or not at all.
+
+    Args:
+        action_names: None: unknown.
+        state_names: None: unknown.
+        widths: Number of components of action and state.
+    """
+    actions, states = widths
+    if action_names is None and state_names is None and actions == states:
+        return list(range(actions))
+    index = {name: i for i, name in enumerate(state_names or ())}
+    columns = [index.get(name, -1) for name in action_names or [""] * actions]
+    for triple in rotation_triples(action_names):
+        if any(columns[i] < 0 for i in triple):
+            for i in triple:
+                columns[i] = -1
+    return columns
+
+
+# Chunks of the motion.
 
 STATE = "observation.state"
 

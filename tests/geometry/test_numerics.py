@@ -1,4 +1,4 @@
-"""What is written out for compilers, against LAPACK."""
+"""Small matrices written out for compilers, against LAPACK, and constants."""
 
 import pytest
 import sampling
@@ -7,7 +7,8 @@ from graphs import library_calls
 from torch import Tensor
 from unchecked import shapes_unchecked
 
-from hrc_learn.geometry.small_matrices import (
+from hrc_learn.geometry.numerics import (
+    Constant,
     inverse_norm,
     matmul,
     solve_positive,
@@ -86,3 +87,22 @@ def test_what_is_traced_is_written_out():
         traced, eager = program.module()(A, B), All()(A, B)
     assert not library_calls(program)
     torch.testing.assert_close(traced, eager, rtol=1e-12, atol=1e-12)
+
+
+def test_a_value_first_met_in_a_control_loop_serves_autograd_later():
+    constant = Constant(torch.tensor([2.0, 3.0], dtype=torch.float64))
+    x = torch.ones(2)
+    with torch.inference_mode():
+        constant.like(x)
+    x.requires_grad_()
+    (constant.like(x) * x * x).sum().backward()
+    assert x.grad is not None
+    assert x.grad.tolist() == [4.0, 6.0]
+
+
+def test_it_is_converted_once():
+    constant = Constant(torch.ones(3, dtype=torch.float64))
+    x = torch.zeros(1)
+    assert constant.like(x) is constant.like(x)
+    assert constant.like(x).dtype == torch.float32
+    assert Constant(torch.arange(2)).like(x).dtype == torch.int64

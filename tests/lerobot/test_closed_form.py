@@ -2,7 +2,7 @@ import pytest
 import torch
 from lerobot_samples import reaching
 
-from hrc_learn.lerobot.policy.sample_windows import SampleWindows
+from hrc_learn.lerobot.policy.closed_form import SampleWindows
 
 EPISODES = reaching(3)
 DELTAS = {"observation.state": [-1000, 0], "action": [-2, 0, 5], "observation.goal": None}

@@ -3,7 +3,7 @@ import sampling
 import torch
 
 from hrc_learn.geometry import quaternion
-from hrc_learn.geometry.rotation_rates import (
+from hrc_learn.geometry.quaternion import (
     axis_drift,
     drift_free_rate,
     drift_free_slope,

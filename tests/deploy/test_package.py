@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from hrc_learn.deploy.io_layout import IOLayout
+from hrc_learn.deploy.package import IOLayout
 from hrc_learn.pytree import pytree
 
 DOUBLE = torch.float64

@@ -6,7 +6,7 @@ import torch
 
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import panda
-from hrc_learn.lerobot.panda_features import JOINTS, action_of, hand_vector, target_of
+from hrc_learn.lerobot.panda_robot import JOINTS, action_of, hand_vector, target_of
 
 READY = panda.ready.numpy()
 

@@ -1,0 +1,191 @@
+"""Placing and grasping as environments for lerobot-eval."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from jaxtyping import Float, UInt8
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.envs.configs import EnvConfig
+from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
+
+from hrc_learn.lerobot.panda_robot import ActionSpace, action_names
+from hrc_learn.lerobot.robots import MujocoPanda, MujocoPandaConfig
+from hrc_learn.lerobot.robots.mujoco_panda import CAMERA, ImagesConfig
+from hrc_learn.teleoperation.scenarios import ScenarioView, make_scenario
+
+_MORE_TIME = 1.25
+"""What a policy gets, in durations of a demonstration."""
+
+
+@EnvConfig.register_subclass("panda")
+@dataclass
+class PandaEnvConfig(EnvConfig):
+    """Scenarios of a `mujoco_panda`, judged by MuJoCo's contacts; `--env.type=panda`.
+
+    Observations and actions are those of the robot with the same settings, in the same order,
+    so that what was recorded on it can be evaluated here.
+    """
+
+    task: str | None = "placing"
+    """What is to be done: "placing" or "grasping"."""
+    fps: int = 50
+    """Of the dataset that the policy was trained on."""
+    shelf: str = "middle"
+    """Where to place: "lower", "middle" or "upper"."""
+    action_space: ActionSpace = "joint"
+    """As of the robot."""
+    velocity: bool = False
+    """As of the robot."""
+    hand: bool = False
+    """As of the robot."""
+    pixels: bool = False
+    """As of the robot."""
+    images: ImagesConfig = field(default_factory=ImagesConfig)
+    """As of the robot."""
+    episode_length: int | None = None
+    """Actions after which an episode has failed; None: a quarter more than a demonstration."""
+
+    def __post_init__(self) -> None:
+        robot = MujocoPanda(self.robot_config())
+        values = robot.observation_features
+        state = sum(shape is float for shape in values.values())
+        self.features = {
+            ACTION: PolicyFeature(FeatureType.ACTION, (len(action_names(self.action_space)),)),
+            "agent_pos": PolicyFeature(FeatureType.STATE, (state,)),
+        }
+        self.features_map = {ACTION: ACTION, "agent_pos": OBS_STATE}
+        if CAMERA in values:
+            self.features[f"pixels/{CAMERA}"] = PolicyFeature(
+                FeatureType.VISUAL, values[CAMERA]
+            )
+            self.features_map[f"pixels/{CAMERA}"] = f"{OBS_IMAGES}.{CAMERA}"
+
+    def robot_config(self) -> MujocoPandaConfig:
+        """Settings of the robot in it."""
+        return MujocoPandaConfig(
+            scenario=self.task or "placing",
+            shelf=self.shelf,
+            fps=float(self.fps),
+            action_space=self.action_space,
+            velocity=self.velocity,
+            hand=self.hand,
+            pixels=self.pixels,
+            images=self.images,
+        )
+
+    @property
+    def gym_kwargs(self) -> dict[str, Any]:
+        return {"config": self.robot_config(), "max_episode_steps": self._length()}
+
+    def _length(self) -> int:
+        if self.episode_length is not None:
+            return self.episode_length
+        robot = self.robot_config()
+        duration = make_scenario(robot.scenario, robot.shelf).duration
+        return round(_MORE_TIME * duration * self.fps)
+
+    def create_envs(
+        self, n_envs: int, use_async_envs: bool = False
+    ) -> dict[str, dict[int, gym.vector.VectorEnv]]:
+        """One vector of environments that differ by their seeds."""
+        makers = [partial(PandaEnv, **self.gym_kwargs)] * n_envs
+        mode = AutoresetMode.SAME_STEP
+        if use_async_envs and n_envs > 1:
+            vector = gym.vector.AsyncVectorEnv(
+                makers, autoreset_mode=mode, context="forkserver"
+            )
+        else:
+            vector = gym.vector.SyncVectorEnv(makers, autoreset_mode=mode)
+        return {self.type: {0: vector}}
+
+
+_PICTURE = (240, 180)
+"""Size of the pictures of `render` [px]."""
+_STEADY = 0.3
+"""How long the job must stay done to count [s]: a thing that topples rests for a moment."""
+
+
+class PandaEnv(gym.Env):
+    """The job is done, and the episode over, once MuJoCo's contacts say so for a while.
+
+    The same seed and actions lead to the same end.
+    """
+
+    def __init__(self, config: MujocoPandaConfig, max_episode_steps: int):
+        """Set up.
+
+        Args:
+            config: Of the robot, with the scenario.
+            max_episode_steps: Actions after which an episode has failed.
+        """
+        self._robot = MujocoPanda(config)
+        self._robot.connect()
+        self._actions = action_names(config.action_space)
+        self._max_episode_steps = max_episode_steps
+        self._steps = self._done = 0
+        self._view: ScenarioView | None = None
+        self.task = config.scenario
+        self.task_description = self._robot.run.scenario.task
+        self.metadata = {"render_modes": ["rgb_array"], "render_fps": round(config.fps)}
+        self.render_mode = "rgb_array"
+        values = self._robot.observation_features
+        self._state = [name for name, shape in values.items() if shape is float]
+        self.action_space = _unbounded(len(self._actions))
+        spaces: dict[str, gym.Space] = {"agent_pos": _unbounded(len(self._state))}
+        if CAMERA in values:
+            image = gym.spaces.Box(0, 255, values[CAMERA], np.uint8)
+            spaces["pixels"] = gym.spaces.Dict({CAMERA: image})
+        self.observation_space = gym.spaces.Dict(spaces)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Begin as a seed has it, or as the next random number."""
+        super().reset(seed=seed)
+        if seed is None:
+            seed = int(self.np_random.integers(2**31))
+        self._robot.begin(seed)
+        self._steps = self._done = 0
+        return self._observation(), {"is_success": False}
+
+    def step(
+        self, action: Float[np.ndarray, " values"]
+    ) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        """Send an action, and let 1/fps pass. The reward is one for a job done."""
+        self._robot.send_action(
+            dict(zip(self._actions, np.asarray(action).tolist(), strict=True))
+        )
+        self._steps += 1
+        self._done = self._done + 1 if self._robot.run.succeeded() else 0
+        success = self._done * self._robot.dt >= _STEADY
+        late = self._steps >= self._max_episode_steps and not success
+        return self._observation(), float(success), success, late, {"is_success": success}
+
+    def render(self) -> UInt8[np.ndarray, "height width 3"]:
+        """A picture of the workplace."""
+        if self._view is None:
+            self._view = ScenarioView(self._robot.run, *_PICTURE)
+        return self._view.read()
+
+    def close(self) -> None:
+        """Let go of the robot."""
+        if self._robot.is_connected:
+            self._robot.disconnect()
+
+    def _observation(self) -> dict[str, Any]:
+        values = self._robot.get_observation()
+        state = np.array([values[name] for name in self._state], dtype=np.float32)
+        observation: dict[str, Any] = {"agent_pos": state}
+        if CAMERA in values:
+            observation["pixels"] = {CAMERA: values[CAMERA]}
+        return observation
+
+
+def _unbounded(size: int) -> gym.spaces.Box:
+    return gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)
