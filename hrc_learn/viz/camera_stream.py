@@ -23,7 +23,7 @@ class CameraStream:
 
         Args:
             stream: Into a file or to a viewer.
-            still: What was sent of the things that stand still.
+            still: What was sent of what stands still.
             quality: Of the JPEG images, 1 to 95.
         """
         self._stream, self._still, self._quality = stream, still, quality

@@ -165,7 +165,7 @@ def _blueprint(shown: DemonstrationsRecording, tabs: list[Tab]) -> rrb.Blueprint
         left.append(
             rrb.Spatial3DView(
                 origin="/world",
-                name=f"Paths of the hand, dots: now{arm}",
+                name=f"Paths of the end effector, dots: now{arm}",
                 eye_controls=frame_view(np.concatenate(paths)),
             )
         )

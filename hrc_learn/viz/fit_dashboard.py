@@ -246,7 +246,7 @@ def _learning_blueprint(learning: LearningRecording, tab: Tab) -> rrb.Blueprint:
             0,
             rrb.Spatial3DView(
                 origin="/world",
-                name="Hand (grey), neurons (orange), error on held-out image motion (blue)",
+                name="End effector (grey), neurons (orange), held-out error (blue)",
                 eye_controls=_look_down(np.concatenate(every)),
             ),
         )

@@ -309,7 +309,7 @@ class LearningRecording:
     )
     """Where the neurons stood in each [m]."""
     paths: tuple[Float[np.ndarray, "_ 3"], ...] = ()
-    """Of the hand in demonstrations [m]."""
+    """Of the end effector in demonstrations [m]."""
     errors: ErrorMap | None = None
     """On demonstrations held out."""
 

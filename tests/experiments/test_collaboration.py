@@ -329,7 +329,7 @@ def mishaps(job):
 
 
 @pytest.mark.slow
-def test_an_object_moved_away_under_the_hand_is_grasped_at_the_second_attempt(skills):
+def test_an_object_moved_away_under_the_gripper_is_grasped_at_the_second_attempt(skills):
     meddler = Meddler("grasp", shifted(0.0, 0.09))
     job = provoked(skills, on_start=meddler.start, on_phase=meddler.phase, seed=5)
     assert mishaps(job) == ["missed grasp"]

@@ -66,7 +66,7 @@ def test_the_timeline_has_a_row_for_each_phase_and_for_people(run):
     assert labels == [*PHASES, "person pushes", "marker occluded"]
 
 
-def test_angles_count_from_the_hand_pointing_down(run):
+def test_angles_count_from_the_gripper_pointing_down(run):
     turns = np.deg2rad([[0.0, 0.0, 0.0], [-90.0, 0.0, 0.0], [0.0, 0.0, 20.0], [0.0, 15.0, 0.0]])
     down = gripper_down()
     q = quaternion.multiply(quaternion.exp(torch.from_numpy(turns)), down).numpy()

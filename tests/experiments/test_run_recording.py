@@ -16,7 +16,7 @@ from hrc_learn.teleoperation import ScriptedPerturbation
 from hrc_learn.viz import live_dashboard as servers
 
 
-def test_a_station_is_shown_while_it_works(tmp_path, monkeypatch):
+def test_a_cell_is_shown_while_it_works(tmp_path, monkeypatch):
     @contextmanager
     def into_a_file(port, data_port):
         stream = rr.RecordingStream("test")

@@ -171,4 +171,4 @@ class Recover(Measured):
     """
 
     path: Path
-    """A dataset, model or folder of results, or a folder of such things."""
+    """A dataset, model or folder of results, or a folder of several."""

@@ -196,7 +196,7 @@ def grasping_metrics(variants: Sequence[str]) -> list[Metric[GraspingRun]]:
 
         variant = VARIANTS[name]
         table += [
-            Metric(
+            Metric[GraspingRun](
                 f"{variant.label}, target reached",
                 lambda run, time=time: int(time(run) is not None),
                 claim=variant.claim,

@@ -219,7 +219,7 @@ def smoothness_figure(demonstration: Motion, reproduction: Motion) -> Figure:
 
 
 def _legend_above(figure: Figure) -> None:
-    """One legend for all panels, which show the same things."""
+    """One legend for all panels, which show the same curves."""
     handles, labels = figure.axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=len(labels))
 

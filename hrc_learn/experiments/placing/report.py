@@ -99,7 +99,7 @@ def placing_sections(run: PlacingRun, snapshots: Snapshots) -> list[Section]:
         _approach(run),
         Section(
             heading="Faster and smoother than demonstrated",
-            text="The primitive leaves out the tremor of the hand that led the arm.",
+            text="The primitive leaves out the tremor of the person's hand that led the arm.",
             figures=(
                 Picture(
                     "smoothness",
