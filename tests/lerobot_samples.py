@@ -9,7 +9,7 @@ from lerobot.configs import FeatureType, PolicyFeature
 from torch import Tensor
 
 from hrc_learn.demos import DatasetWriter
-from hrc_learn.dmp._system.quintic_curves import quintic
+from hrc_learn.dmp._system.closed_forms import quintic
 from hrc_learn.lerobot import DMPConfig
 from hrc_learn.lerobot.policy.closed_form import SampleWindows
 from hrc_learn.lerobot.policy.modeling_dmp import DMPPolicy

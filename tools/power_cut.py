@@ -1,22 +1,18 @@
 """Kill writing programs at random moments, and see that nothing is lost or left behind.
 
 Writers of this package are killed while they write one thing after another, and say of each
-when it is safe. A command of your own is killed instead with --command, in which {out} stands
-for what it writes:
+when it is safe. What a kill leaves is mended in turns by `recover_all` and by the next start.
+With --commands, those of `hrc` are watched while they write, see `power_cut_commands.py`:
 
-    tools/power_cut.py --command "python training/fit_dmp.py --dataset demos --out {out}
-        --overwrite" --check "python training/evaluate.py --dataset demos --model {out}"
+    tools/power_cut.py --commands all --inputs outputs/power_cut --json outputs/power_cut.json
 
-What a kill leaves is mended in turns by `recover_all` and by the next start. Exit status 1 if
-anything that had been acknowledged is lost, a result is broken, or something is left over.
+Exit status 1 if anything that had been acknowledged is lost, a result is broken, or something
+is left over.
 """
 
 import itertools
-import os
 import random
-import shlex
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
@@ -26,6 +22,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import NamedTuple
 
+from power_cut_commands import CASES, Count, make_inputs, watch_command
 from rich.console import Console
 from rich.table import Table
 
@@ -39,13 +36,13 @@ WINDOW = 0.5
 @dataclass(frozen=True, kw_only=True)
 class Args:
     kills: int = 50
-    """Kills of each writer, or of the command."""
+    """Kills of each writer."""
     writers: tuple[str, ...] = ()
     """Writers to kill: file, model, results, recording, append, trials; all when none."""
-    command: str = ""
-    """Command to kill instead; {out} stands for the path that it writes."""
-    check: str = ""
-    """Command that must succeed whenever {out} is there."""
+    commands: tuple[str, ...] = ()
+    """Commands to watch instead, such as "record placing"; "all" for every one."""
+    inputs: Path | None = None
+    """What they are given; made there where it is missing, which takes minutes."""
     seed: int = 0
     """Of the moments."""
     json: Path | None = None
@@ -56,39 +53,25 @@ class Args:
     """What it writes."""
 
 
-@dataclass
-class Count:
-    """What came of the kills."""
-
-    kills: int = 0
-    interrupted: int = 0
-    """Those that left something to mend."""
-    lost: int = 0
-    """Acknowledged, and not there afterwards."""
-    broken: int = 0
-    """There, but not whole."""
-    orphans: int = 0
-    """Files that belong to nothing."""
-    stuck: int = 0
-    """Starts that failed because of what the kill had left."""
-
-    @property
-    def failures(self) -> int:
-        return self.lost + self.broken + self.orphans + self.stuck
-
-
 def main(args: Args) -> int:
     if args.write:
         assert args.out is not None
         WRITERS[args.write].write(args.out)
         return 0
-    unknown = [name for name in args.writers if name not in WRITERS]
-    if unknown or args.kills < 1:
-        raise ValueError(f"there are --writers {', '.join(WRITERS)}, and --kills of 1 or more")
+    commands = tuple(CASES) if args.commands == ("all",) else args.commands
+    if {*args.writers} - {*WRITERS} or {*commands} - {*CASES} or args.kills < 1:
+        raise ValueError(
+            f"there are --writers {', '.join(WRITERS)}, --commands {', '.join(CASES)}, and "
+            f"--kills of 1 or more"
+        )
     rng = random.Random(args.seed)
     with tempfile.TemporaryDirectory() as folder:
-        if args.command:
-            counts = {"command": kill_command(args, Path(folder), rng)}
+        if commands:
+            inputs = args.inputs or Path(folder) / "inputs"
+            make_inputs(inputs)
+            counts = {
+                name: watch_command(name, inputs, Path(folder) / name, rng) for name in commands
+            }
         else:
             counts = {
                 name: kill_writer(name, args.kills, Path(folder) / name, rng)
@@ -142,62 +125,6 @@ def kill_writer(name: str, kills: int, folder: Path, rng: random.Random) -> Coun
         count.broken += found > acknowledged + 1
         count.orphans += [path.name for path in folder.iterdir()] != ["out"]
     return count
-
-
-def kill_command(args: Args, folder: Path, rng: random.Random) -> Count:
-    """Kill a command again and again."""
-    count, out = Count(), folder / "here" / "out"
-    out.parent.mkdir()
-    replaces = "--overwrite" in args.command
-    start = time.perf_counter()
-    if not run(args.command, out):
-        raise ValueError("the command fails without being killed, too")
-    duration, whole = time.perf_counter() - start, names(out)
-    beside = names(out.parent) - {f"out/{name}" for name in whole}
-    for number in range(args.kills):
-        # In turns with an older result to replace, and without.
-        older = replaces and number % 4 < 2 and out.exists()
-        if not older:
-            shutil.rmtree(out.parent)
-            out.parent.mkdir()
-        done = run(args.command, out, rng.uniform(0, duration))
-        count.kills += 1
-        count.interrupted += names(out.parent) != {f"out/{n}" for n in whole} | beside
-        if number % 2:
-            recover(out.parent)
-            # What the next start goes on with, such as trials, is no orphan.
-            rest = {n for n in names(out.parent) - beside if not n.startswith("out")}
-            count.orphans += bool(rest)
-            count.lost += (done or older) and not out.exists()
-        else:
-            if out.exists() and not replaces:
-                shutil.rmtree(out)
-            count.stuck += not run(args.command, out)
-            count.orphans += names(out.parent) != {f"out/{n}" for n in whole} | beside
-        if out.exists():
-            sound = names(out) == whole and (not args.check or run(args.check, out))
-            count.broken += not sound
-    return count
-
-
-def run(command: str, out: Path, seconds: float | None = None) -> bool:
-    """Run a command, and kill it after some time with all that it has started."""
-    process = subprocess.Popen(
-        shlex.split(command.format(out=shlex.quote(str(out)))),
-        stdout=subprocess.DEVNULL,
-        start_new_session=True,
-    )
-    try:
-        return process.wait(seconds) == 0
-    except subprocess.TimeoutExpired:
-        os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
-        return False
-
-
-def names(path: Path) -> set[str]:
-    """All files below a path."""
-    return {str(file.relative_to(path)) for file in path.rglob("*") if not file.is_dir()}
 
 
 def recover(folder: Path) -> None:
@@ -339,9 +266,11 @@ WRITERS = {
 
 
 def show(counts: dict[str, Count]) -> None:
-    table = Table("killed", *Count.__annotations__, title="Power cuts")
+    # Of writers that are killed nothing is watched.
+    shown = [k for k in Count.__annotations__ if any(asdict(c)[k] for c in counts.values())]
+    table = Table("", *shown, title="Power cuts")
     for name, count in counts.items():
-        table.add_row(name, *map(str, asdict(count).values()))
+        table.add_row(name, *(str(asdict(count)[key]) for key in shown))
     Console().print(table)
 
 

@@ -10,11 +10,11 @@ from hrc_learn.demos.issue import DatasetError as DatasetError
 from hrc_learn.demos.issue import Issue as Issue
 from hrc_learn.demos.issue import UnitsWarning as UnitsWarning
 from hrc_learn.demos.issue import ValidationReport as ValidationReport
-from hrc_learn.demos.read.component_names import ROLES as ROLES
 from hrc_learn.demos.read.reader import DemonstrationSource as DemonstrationSource
 from hrc_learn.demos.read.reader import load_demos as load_demos
 from hrc_learn.demos.read.reader import open_demos as open_demos
+from hrc_learn.demos.read.roles import ROLES as ROLES
 from hrc_learn.demos.validation.check import check_dataset as check_dataset
-from hrc_learn.demos.write.recovery import recover_all as recover_all
-from hrc_learn.demos.write.recovery import recover_dataset as recover_dataset
+from hrc_learn.demos.write.assembly import recover_all as recover_all
+from hrc_learn.demos.write.assembly import recover_dataset as recover_dataset
 from hrc_learn.demos.write.writer import DatasetWriter as DatasetWriter

@@ -3,7 +3,7 @@ demonstrations.
 """
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,51 +13,22 @@ import pyarrow.parquet as pq
 from jaxtyping import Bool, Float64, UInt8
 
 from hrc_learn.demos.demonstration import Demonstration, DemonstrationSet
-from hrc_learn.demos.format.dataset_folder import EpisodeEntry, open_folder
-from hrc_learn.demos.format.parquet import open_parquet, read_table, to_numpy
-from hrc_learn.demos.format.video_segments import VideoSegment, read_segments, video_keys
+from hrc_learn.demos.format.dataset_folder import (
+    EpisodeEntry,
+    open_folder,
+    open_parquet,
+    read_table,
+)
+from hrc_learn.demos.format.videos import (
+    VideoSegment,
+    decode,
+    image_key,
+    read_segments,
+    video_keys,
+)
 from hrc_learn.demos.issue import DatasetError
-from hrc_learn.demos.write.video_encoder import image_key
+from hrc_learn.demos.read.frames import to_numpy
 from hrc_learn.store import new_file
-
-# Images of one episode, decoded from its video.
-
-
-def decode(
-    segment: VideoSegment, fps: float
-) -> Iterator[tuple[int, UInt8[np.ndarray, "height width 3"]]]:
-    """Images (RGB) with the frames of the episode they belong to, in order.
-
-    Args:
-        segment: Where they lie.
-        fps: Frame rate of the dataset [1/s].
-
-    Raises:
-        DatasetError: The file is no video that can be decoded.
-    """
-    import av
-
-    half_period = 0.5 / fps
-    try:
-        with av.open(str(segment.file)) as container:
-            stream = container.streams.video[0]
-            stream.thread_type = "AUTO"
-            if segment.start > 0 and stream.time_base is not None:
-                # To the key frame before; what lies between is decoded and left out.
-                container.seek(int(segment.start / stream.time_base), stream=stream)
-            for image in container.decode(stream):
-                time = float(image.time or 0.0)
-                if time > segment.stop - half_period:
-                    return
-                if time > segment.start - half_period:
-                    yield round((time - segment.start) * fps), image.to_ndarray(format="rgb24")
-    except (av.FFmpegError, IndexError) as error:
-        raise DatasetError(
-            f"cannot be decoded ({error}): the recording was broken off, or the copy is "
-            f"incomplete",
-            file=segment.file,
-        ) from error
-
 
 # Image features of a dataset in a folder beside it: one file an episode.
 #

@@ -1,30 +1,36 @@
 """Dynamic movement primitives: learned motions that start, goal and duration reshape."""
 
+from hrc_learn.dmp import _ude_formulation as _ude_formulation  # adds its formulation
 from hrc_learn.dmp import coupling as coupling
+from hrc_learn.dmp import orientation_error as orientation_error
+from hrc_learn.dmp._arguments import FitReport as FitReport
+from hrc_learn.dmp._closed_loop_step import DMPState as DMPState
+from hrc_learn.dmp._closed_loop_step import continue_motion as continue_motion
+from hrc_learn.dmp._fitting import FitOptions as FitOptions
+from hrc_learn.dmp._shared_fit import SharedFit as SharedFit
+from hrc_learn.dmp._shared_fit import fit_shared as fit_shared
 from hrc_learn.dmp._system.bases import GaussianBasis as GaussianBasis
 from hrc_learn.dmp._system.bases import LearnedGaussianBasis as LearnedGaussianBasis
 from hrc_learn.dmp._system.bases import PeriodicBasis as PeriodicBasis
 from hrc_learn.dmp._system.bases import SplineBasis as SplineBasis
-from hrc_learn.dmp._system.canonical import ExponentialPhase as ExponentialPhase
-from hrc_learn.dmp._system.canonical import SigmoidPhase as SigmoidPhase
+from hrc_learn.dmp._system.closed_forms import ExponentialPhase as ExponentialPhase
+from hrc_learn.dmp._system.closed_forms import SigmoidPhase as SigmoidPhase
+from hrc_learn.dmp._system.closed_forms import SpringDamper as SpringDamper
 from hrc_learn.dmp._system.response import Response as Response
 from hrc_learn.dmp._system.response import Trajectory as Trajectory
 from hrc_learn.dmp._system.response import response_of as response_of
-from hrc_learn.dmp._system.spring import SpringDamper as SpringDamper
-from hrc_learn.dmp.closed_loop_step import DMPState as DMPState
-from hrc_learn.dmp.closed_loop_step import continue_motion as continue_motion
+from hrc_learn.dmp.contextual_dmp import ContextualDMP as ContextualDMP
+from hrc_learn.dmp.contextual_dmp import PolynomialFeatures as PolynomialFeatures
+from hrc_learn.dmp.contextual_dmp import RidgeFit as RidgeFit
+from hrc_learn.dmp.contextual_dmp import fit_ridge as fit_ridge
 from hrc_learn.dmp.coordinate_adapter import CoordinateAdapter as CoordinateAdapter
 from hrc_learn.dmp.dual_arm_dmp import DualArmDMP as DualArmDMP
 from hrc_learn.dmp.dual_arm_dmp import DualArmState as DualArmState
 from hrc_learn.dmp.exported_dmp import ExportedDMP as ExportedDMP
 from hrc_learn.dmp.exported_dmp import load_stepper as load_stepper
-from hrc_learn.dmp.fitting.basis_selection import BasisSelection as BasisSelection
-from hrc_learn.dmp.fitting.basis_selection import select_basis_count as select_basis_count
-from hrc_learn.dmp.fitting.motion_samples import FitReport as FitReport
-from hrc_learn.dmp.fitting.solvers import FitOptions as FitOptions
-from hrc_learn.dmp.fitting.streaming import SharedFit as SharedFit
-from hrc_learn.dmp.fitting.streaming import fit_shared as fit_shared
+from hrc_learn.dmp.joint_dmp import BasisSelection as BasisSelection
 from hrc_learn.dmp.joint_dmp import JointDMP as JointDMP
+from hrc_learn.dmp.joint_dmp import select_basis_count as select_basis_count
 from hrc_learn.dmp.limited_dmp import LimitedDMP as LimitedDMP
 from hrc_learn.dmp.limited_dmp import LimitedState as LimitedState
 from hrc_learn.dmp.limited_dmp import LimitedTrajectory as LimitedTrajectory
@@ -39,22 +45,18 @@ from hrc_learn.dmp.numpy_stepper import OrientationStepper as OrientationStepper
 from hrc_learn.dmp.numpy_stepper import PoseStepper as PoseStepper
 from hrc_learn.dmp.numpy_stepper import Stepper as Stepper
 from hrc_learn.dmp.numpy_stepper import StepperState as StepperState
-from hrc_learn.dmp.orientation_coordinates import OrientationState as OrientationState
-from hrc_learn.dmp.orientation_coordinates import OrientationTrajectory as OrientationTrajectory
 from hrc_learn.dmp.orientation_dmp import OrientationDMP as OrientationDMP
+from hrc_learn.dmp.orientation_dmp import OrientationState as OrientationState
+from hrc_learn.dmp.orientation_dmp import OrientationTrajectory as OrientationTrajectory
 from hrc_learn.dmp.pose_dmp import PoseDMP as PoseDMP
 from hrc_learn.dmp.pose_dmp import PoseState as PoseState
 from hrc_learn.dmp.pose_dmp import PoseTrajectory as PoseTrajectory
-from hrc_learn.dmp.probabilistic.contextual_dmp import ContextualDMP as ContextualDMP
-from hrc_learn.dmp.probabilistic.contextual_dmp import PolynomialFeatures as PolynomialFeatures
-from hrc_learn.dmp.probabilistic.contextual_dmp import RidgeFit as RidgeFit
-from hrc_learn.dmp.probabilistic.contextual_dmp import fit_ridge as fit_ridge
-from hrc_learn.dmp.probabilistic.linear_view import mean_primitive as mean_primitive
-from hrc_learn.dmp.probabilistic.linear_view import (
+from hrc_learn.dmp.probabilistic_dmp import ProbabilisticDMP as ProbabilisticDMP
+from hrc_learn.dmp.probabilistic_dmp import mean_primitive as mean_primitive
+from hrc_learn.dmp.probabilistic_dmp import (
     via_point_primitive as via_point_primitive,
 )
-from hrc_learn.dmp.probabilistic.linear_view import with_ends as with_ends
-from hrc_learn.dmp.probabilistic.probabilistic_dmp import ProbabilisticDMP as ProbabilisticDMP
+from hrc_learn.dmp.probabilistic_dmp import with_ends as with_ends
 from hrc_learn.dmp.rhythmic_dmp import fit_rhythmic as fit_rhythmic
 from hrc_learn.dmp.rhythmic_dmp import fit_rhythmic_orientation as fit_rhythmic_orientation
 from hrc_learn.dmp.rhythmic_dmp import fit_rhythmic_pose as fit_rhythmic_pose

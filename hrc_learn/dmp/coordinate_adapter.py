@@ -10,9 +10,26 @@ from typing import Any, ClassVar, NamedTuple
 
 from torch import Tensor
 
-from hrc_learn.dmp._types import Scalars, Times
-from hrc_learn.dmp.closed_loop_step import DMPState
+from hrc_learn.dmp._arguments import Scalars, Times
+from hrc_learn.dmp._closed_loop_step import DMPState
 from hrc_learn.dmp.linear_primitive import ColumnEnds, LinearPrimitive
+
+
+class Ends(NamedTuple):
+    """Ends of a motion as a caller gives them; None: those of the demonstration."""
+
+    start: Any = None
+    goal: Any = None
+    velocity: Any = None
+    """At the start, per second."""
+
+
+class ColumnPoints(NamedTuple):
+    """Columns at the times of via points, (*batch, n, D); NaN where they are free."""
+
+    position: Tensor
+    velocity: Tensor
+    """Per second."""
 
 
 class Retargeted(NamedTuple):
@@ -42,22 +59,14 @@ class CoordinateAdapter[Value, Path, State](ABC):
 
     @abstractmethod
     def ends(
-        self,
-        motion: LinearPrimitive,
-        start: Value | None,
-        goal: Value | None,
-        duration: Tensor,
-        velocity: Any,
-        **others: Any,
+        self, motion: LinearPrimitive, given: Ends, duration: Tensor, **others: Any
     ) -> tuple[ColumnEnds, Any]:
         """Ends of a motion in columns, and its frame.
 
         Args:
-            motion: Gives what is None.
-            start: Where it starts.
-            goal: Where it ends.
+            motion: Supplies what is None.
+            given: Where it starts and ends, and how fast.
             duration: [s], as `each` made it.
-            velocity: At the start, per second.
             others: Ends that only this kind has.
         """
 
@@ -96,26 +105,19 @@ class CoordinateAdapter[Value, Path, State](ABC):
     def via_points(
         self,
         motion: LinearPrimitive,
-        s: Tensor,
-        position: Tensor,
-        velocity: Tensor,
+        now: ColumnPoints,
         value: Any,
-        rate: Any,
+        velocity: Any,
         **others: Any,
-    ) -> tuple[Tensor, Tensor]:
+    ) -> ColumnPoints:
         """Values and velocities at times on the way, as columns in the primitive's own frame.
 
         Args:
             motion: Of the columns.
-            s: Normalised times, (*batch, n).
-            position: Of the columns there when nothing else is asked for, (*batch, n, D).
-            velocity: Likewise, per second.
+            now: Where the columns are when nothing else is asked for.
             value: As the caller gives it; None or NaN is free.
-            rate: Per second, likewise.
+            velocity: Per second, likewise.
             others: Values that only this kind has.
-
-        Returns:
-            Position and velocity per second of the columns; NaN where they are free.
         """
 
     def begin(self, columns: DMPState, frame: Any) -> tuple[DMPState, Any]:

@@ -21,7 +21,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.dmp._system.spring import SpringDamper
+from hrc_learn.dmp._system.closed_forms import SpringDamper
 
 TOUCH = 1e-3
 """Nearer than this [m], repulsion grows no further: it has no bound at contact."""

@@ -1,19 +1,28 @@
 """Movement primitive of two arms that hold on to each other's motion."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple, Unpack
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.utils._pytree import tree_map
 
+from hrc_learn.dmp._arguments import (
+    FitReport,
+    Mask,
+    Points,
+    Quaternions,
+    Scalars,
+    Times,
+    Vectors,
+    to_tensor,
+)
+from hrc_learn.dmp._closed_loop_step import DMPState
+from hrc_learn.dmp._fitting import FitOptions
 from hrc_learn.dmp._system.response import Trajectory
-from hrc_learn.dmp._types import Mask, Points, Quaternions, Scalars, Times, Vectors, to_tensor
-from hrc_learn.dmp.closed_loop_step import DMPState
-from hrc_learn.dmp.coordinate_adapter import CoordinateAdapter, Retargeted
+from hrc_learn.dmp.coordinate_adapter import ColumnPoints, CoordinateAdapter, Ends, Retargeted
 from hrc_learn.dmp.coupling import velocity_coupling
-from hrc_learn.dmp.fitting.motion_samples import FitReport
-from hrc_learn.dmp.fitting.solvers import FitOptions
 from hrc_learn.dmp.joint_dmp import JointDMP
 from hrc_learn.dmp.linear_primitive import ColumnEnds, LinearPrimitive
 from hrc_learn.dmp.motion_primitive import AdaptedPrimitive
@@ -21,8 +30,6 @@ from hrc_learn.dmp.orientation_error import intrinsic_mean
 from hrc_learn.dmp.pose_dmp import PoseCoordinates, PoseDMP, PoseState, PoseTrajectory
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.model_files import SavedModel
-
-STATE_FIELDS = tuple(field.name for field in fields(DMPState))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -83,15 +90,13 @@ class DualArmCoordinates(CoordinateAdapter[Pose, PoseTrajectory, DualArmState]):
     def ends(
         self,
         motion: LinearPrimitive,
-        start: Pose | None,
-        goal: Pose | None,
+        given: Ends,
         duration: Tensor,
-        velocity: Vectors | None,
         **body: Vectors | None,
     ) -> tuple[ColumnEnds, Tensor]:
         """Start of both hands, goal of the object."""
-        goals = None if goal is None else self._goals(goal)
-        return self.hands.ends(motion, start, goals, duration, velocity, **body)
+        goals = None if given.goal is None else self._goals(given.goal)
+        return self.hands.ends(motion, given._replace(goal=goals), duration, **body)
 
     def trajectory(self, columns: Trajectory, frame: Tensor) -> PoseTrajectory:
         """Of both hands, with nothing to push them."""
@@ -101,26 +106,19 @@ class DualArmCoordinates(CoordinateAdapter[Pose, PoseTrajectory, DualArmState]):
         """Twice the same, and how the hands are held."""
         state = self.hands.state(*self.hands.begin(columns, frame))
         held, _ = relation(state.pose, state.twist)
-        both = {name: torch.stack([getattr(columns, name)] * 2) for name in STATE_FIELDS}
-        return DMPState(**both), HandsFrame(torch.stack([state.reference] * 2), held)
+        twice = tree_map(lambda x: torch.stack([x, x]), state)
+        return twice.motion, HandsFrame(twice.reference, held)
 
     def state(self, columns: DMPState, frame: HandsFrame) -> DualArmState:
         """Hands as they are and as planned, apart."""
-        arms, planned = (
-            PoseState(
-                motion=DMPState(**{name: getattr(columns, name)[k] for name in STATE_FIELDS}),
-                reference=frame.reference[k],
-            )
-            for k in range(2)
-        )
+        both = PoseState(motion=columns, reference=frame.reference)
+        arms, planned = tree_map(lambda x: x[0], both), tree_map(lambda x: x[1], both)
         return DualArmState(arms=arms, planned=planned, held=frame.held)
 
     def columns(self, state: DualArmState) -> tuple[DMPState, HandsFrame]:
         """Both in one batch, so that one step serves them."""
-        both = state.arms.motion, state.planned.motion
-        stacked = {name: torch.stack([getattr(x, name) for x in both]) for name in STATE_FIELDS}
-        reference = torch.stack([state.arms.reference, state.planned.reference])
-        return DMPState(**stacked), HandsFrame(reference, state.held)
+        both = tree_map(lambda *x: torch.stack(x), state.arms, state.planned)
+        return both.motion, HandsFrame(both.reference, state.held)
 
     def retarget(
         self,
@@ -151,15 +149,13 @@ class DualArmCoordinates(CoordinateAdapter[Pose, PoseTrajectory, DualArmState]):
     def via_points(
         self,
         motion: LinearPrimitive,
-        s: Tensor,
-        position: Tensor,
-        velocity: Tensor,
+        now: ColumnPoints,
         value: Pose | Any,
-        rate: Points | None,
+        velocity: Points | None,
         **body: Points | None,
-    ) -> tuple[Tensor, Tensor]:
+    ) -> ColumnPoints:
         """Poses of both hands, (*batch, 2, n)."""
-        return self.hands.via_points(motion, s, position, velocity, value, rate, **body)
+        return self.hands.via_points(motion, now, value, velocity, **body)
 
     def each(self, value: Scalars | None) -> Tensor | None:
         """The same for both hands."""

@@ -6,12 +6,11 @@ without this package:
     program = torch.export.load("place/step.pt2").module()
     state = program(state, dt, inputs)
 
-What the dictionaries hold is registered here for each kind of primitive and of state.
+They hold a state's tensors by the names of its fields.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from functools import singledispatch
 from pathlib import Path
 from typing import Any
 
@@ -21,22 +20,22 @@ from torch.export import Dim, ExportedProgram
 from torch.utils._pytree import tree_map
 
 from hrc_learn import store
-from hrc_learn.dmp.closed_loop_step import DMPState
+from hrc_learn.dmp._closed_loop_step import DMPState
 from hrc_learn.dmp.dual_arm_dmp import DualArmDMP, DualArmState
-from hrc_learn.dmp.joint_dmp import JointDMP
-from hrc_learn.dmp.limited_dmp import LimitedDMP, LimitedState
+from hrc_learn.dmp.limited_dmp import LimitedDMP
 from hrc_learn.dmp.motion_primitive import AdaptedPrimitive, export_primitive
-from hrc_learn.dmp.moving_goal_dmp import MovingGoalDMP, MovingGoalState
-from hrc_learn.dmp.numpy_stepper import AnyStepper, freeze_stepper
-from hrc_learn.dmp.orientation_coordinates import OrientationState
-from hrc_learn.dmp.orientation_dmp import OrientationDMP
+from hrc_learn.dmp.numpy_stepper import STEPPERS, AnyStepper, freeze_stepper
+from hrc_learn.dmp.orientation_dmp import OrientationState
 from hrc_learn.dmp.orientation_error import to_orientation
-from hrc_learn.dmp.pose_dmp import BODY, ERROR, POSITION, PoseDMP, PoseState
+from hrc_learn.dmp.pose_dmp import BODY, POSITION, PoseDMP, PoseState
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.model_files import saved_kind
 
 PRIMITIVE, PROGRAM = "primitive", "step.pt2"
 STATE = tuple(field.name for field in fields(DMPState))
+HANDS = "arms", "planned"
+FRAMES = "reference", "goal_velocity"
+"""What states call the frame of their columns."""
 TRACED_BATCH = 3
 """Any but 0 and 1, which a tracer would take for constants."""
 SAME = 8
@@ -109,7 +108,7 @@ def load_stepper(folder: str | Path) -> AnyStepper:
     folder = Path(folder)
     store.settle(folder)
     folder = folder / PRIMITIVE if (folder / PRIMITIVE).is_dir() else folder
-    kinds = {kind.__name__: kind for kind in freeze_stepper.registry if kind is not object}
+    kinds = {kind.__name__: kind for kind in STEPPERS}
     kind = saved_kind(folder)
     if kind not in kinds:
         raise ValueError(f"{folder}: steps {', '.join(kinds)}, got {kind!r}")
@@ -149,128 +148,69 @@ def state_tensors(state: Any) -> Tensors:
     return {name: x.detach().clone() for name, x in tensors.items()}
 
 
-@singledispatch
 def _named(state: Any) -> Tensors:
-    """All of a state that changes along a motion, by name."""
-    raise TypeError(f"no program has a state of {type(state).__name__}")
+    """All of a state that changes along a motion, by name; limits are the primitive's own."""
+    tensors: Tensors = {}
+    for name, part in vars(state).items():
+        match part:
+            case Tensor():
+                tensors[name] = part
+            case DMPState():
+                tensors |= _named(part)
+            case PoseState():
+                tensors |= {f"{name}.{key}": x for key, x in _named(part).items()}
+            case Pose():
+                tensors |= {f"{name}_position": part.position}
+                tensors |= {f"{name}_orientation": part.orientation}
+    return tensors
 
 
-@_named.register(DMPState)
-def _name_columns(state: DMPState) -> Tensors:
-    return {name: getattr(state, name) for name in STATE}
+def _part(tensors: Mapping[str, Tensor], name: str) -> Tensors:
+    """Those of one state inside of another."""
+    prefix = f"{name}."
+    return {k.removeprefix(prefix): x for k, x in tensors.items() if k.startswith(prefix)}
 
 
-@_named.register(LimitedState)
-def _name_limited(state: LimitedState) -> Tensors:
-    return _name_columns(state.motion)  # the limits are the primitive's own
-
-
-@_named.register(MovingGoalState)
-def _name_moving_goal(state: MovingGoalState) -> Tensors:
-    return _name_columns(state.motion) | {"goal_velocity": state.goal_velocity}
-
-
-@_named.register(OrientationState)
-@_named.register(PoseState)
-def _name_errors(state: OrientationState | PoseState) -> Tensors:
-    return _name_columns(state.motion) | {"reference": state.reference}
-
-
-@_named.register(DualArmState)
-def _name_arms(state: DualArmState) -> Tensors:
-    arms, planned = _name_errors(state.arms), _name_errors(state.planned)
-    tensors = {f"arms.{name}": x for name, x in arms.items()}
-    tensors |= {f"planned.{name}": x for name, x in planned.items()}
-    held = {"held_position": state.held.position, "held_orientation": state.held.orientation}
-    return tensors | held
-
-
-@singledispatch
 def given_state(dmp: Any, tensors: Tensors) -> Any:
     """The state that `state_tensors` made tensors of."""
-    raise TypeError(f"no exporter is registered for {type(dmp).__name__}")
+    if isinstance(dmp, DualArmDMP):
+        hands = {name: given_state(dmp.arms, _part(tensors, name)) for name in HANDS}
+        held = Pose(tensors["held_position"], tensors["held_orientation"])
+        return DualArmState(**hands, held=held)
+    columns = DMPState(**{name: tensors[name] for name in STATE})
+    frames = [tensors[name] for name in FRAMES if name in tensors]
+    return dmp.adapter.state(columns, frames[0] if frames else getattr(dmp, "limits", None))
 
 
-@given_state.register(JointDMP)
-def _joint_state(dmp: JointDMP, tensors: Tensors) -> DMPState:
-    return DMPState(**{name: tensors[name] for name in STATE})
-
-
-@given_state.register(LimitedDMP)
-def _limited_state(dmp: LimitedDMP, tensors: Tensors) -> LimitedState:
-    return LimitedState(motion=_joint_state(dmp.motion, tensors), limits=dmp.limits)
-
-
-@given_state.register(MovingGoalDMP)
-def _moving_goal_state(dmp: MovingGoalDMP, tensors: Tensors) -> MovingGoalState:
-    motion = _joint_state(dmp.motion, tensors)
-    return MovingGoalState(motion=motion, goal_velocity=tensors["goal_velocity"])
-
-
-@given_state.register(OrientationDMP)
-def _orientation_state(dmp: OrientationDMP, tensors: Tensors) -> OrientationState:
-    motion = _joint_state(dmp.motion, tensors)
-    return OrientationState(motion=motion, reference=tensors["reference"])
-
-
-@given_state.register(PoseDMP)
-def _pose_state(dmp: PoseDMP, tensors: Tensors) -> PoseState:
-    return PoseState(motion=_joint_state(dmp.motion, tensors), reference=tensors["reference"])
-
-
-@given_state.register(DualArmDMP)
-def _dual_arm_state(dmp: DualArmDMP, tensors: Tensors) -> DualArmState:
-    def hands(part: str) -> PoseState:
-        own = {k.removeprefix(part): x for k, x in tensors.items() if k.startswith(part)}
-        return _pose_state(dmp.arms, own)
-
-    held = Pose(tensors["held_position"], tensors["held_orientation"])
-    return DualArmState(arms=hands("arms."), planned=hands("planned."), held=held)
-
-
-@singledispatch
 def resting_inputs(dmp: Any, state: Mapping[str, Tensor]) -> Tensors:
     """Inputs of the program that change nothing: the goal as it is, and no coupling."""
-    target = state["target"]
-    return _inputs(state["pace"], torch.zeros_like(target), goal=target.clone())
-
-
-@resting_inputs.register(LimitedDMP)
-def _rest_limited(dmp: LimitedDMP, state: Mapping[str, Tensor]) -> Tensors:
-    target = state["target"]
-    goal = dmp.limits.constrain(target)
-    return _inputs(state["pace"], torch.zeros_like(target), goal=goal)
-
-
-@resting_inputs.register(OrientationDMP)
-def _rest_orientation(dmp: OrientationDMP, state: Mapping[str, Tensor]) -> Tensors:
-    goal = to_orientation(dmp.motion.goal.detach(), state["reference"])
-    return _inputs(state["pace"], torch.zeros_like(state["target"]), goal=goal)
-
-
-@resting_inputs.register(PoseDMP)
-def _rest_pose(dmp: PoseDMP, state: Mapping[str, Tensor]) -> Tensors:
-    target, error = state["target"], dmp.motion.goal.detach()[..., ERROR]
-    goals = {
+    if isinstance(dmp, DualArmDMP):
+        hands = resting_inputs(dmp.arms, _part(state, "planned"))
+        hand = Pose(hands["goal_position"][..., 0, :], hands["goal_orientation"][..., 0, :])
+        goal = hand @ dmp.grasp[..., 0].inverse()
+        return {
+            "phase_stopping": hands["phase_stopping"][..., 0],
+            "coupling": hands["coupling"],
+            "goal_position": goal.position,
+            "goal_orientation": goal.orientation,
+        }
+    target, errors = state["target"], dmp.adapter.error_columns
+    rest = {
+        "phase_stopping": torch.zeros_like(state["pace"]),
+        "coupling": torch.zeros_like(target),
+    }
+    if errors is None:
+        limited = isinstance(dmp, LimitedDMP)
+        return rest | {"goal": dmp.limits.constrain(target) if limited else target.clone()}
+    rotation = to_orientation(dmp.motion.goal.detach()[..., errors], state["reference"])
+    if not isinstance(dmp, PoseDMP):
+        return rest | {"goal": rotation}
+    return rest | {
+        "coupling": torch.zeros_like(target[..., :6]),
         "goal_position": target[..., POSITION].clone(),
-        "goal_orientation": to_orientation(error, state["reference"]),
+        "goal_orientation": rotation,
         "goal_body": target[..., BODY].clone(),
     }
-    return _inputs(state["pace"], torch.zeros_like(target[..., :6]), **goals)
-
-
-@resting_inputs.register(DualArmDMP)
-def _rest_arms(dmp: DualArmDMP, state: Mapping[str, Tensor]) -> Tensors:
-    planned = {"target": state["planned.target"], "reference": state["planned.reference"]}
-    hands = _rest_pose(dmp.arms, planned | {"pace": state["planned.pace"]})
-    hand = Pose(hands["goal_position"][..., 0, :], hands["goal_orientation"][..., 0, :])
-    goal = hand @ dmp.grasp[..., 0].inverse()
-    goals = {"goal_position": goal.position, "goal_orientation": goal.orientation}
-    return _inputs(state["planned.pace"][..., 0], hands["coupling"], **goals)
-
-
-def _inputs(pace: Tensor, coupling: Tensor, **goals: Tensor) -> Tensors:
-    return {"phase_stopping": torch.zeros_like(pace), "coupling": coupling, **goals}
 
 
 def given_goals(dmp: AdaptedPrimitive, inputs: Tensors) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from hrc_learn.dmp.fitting.motion_samples import demo_label
+from hrc_learn.dmp._arguments import demo_label
 
 MINIMUM_WAY = 1e-3
 """Smallest |g - y_0|, as a share of the range covered, that can be divided by: weights would be
@@ -94,8 +94,7 @@ class Scaling(ABC):
         ones = torch.ones_like(values[..., :1, :])
         return values / self.scale(ones, reference.start, reference.goal, reference)
 
-    @abstractmethod
-    def check(
+    def check(  # noqa: B027  any motion will do unless a scaling says otherwise
         self, reference: Demonstrated, batch: tuple[int, ...], names: Sequence[str] | None
     ) -> None:
         """See whether demonstrations, on a flat batch, can be scaled so.
@@ -122,11 +121,6 @@ class NoScaling(Scaling):
 
     name: ClassVar[str] = "none"
 
-    def check(
-        self, reference: Demonstrated, batch: tuple[int, ...], names: Sequence[str] | None
-    ) -> None:
-        """Any motion will do."""
-
     def _scale(
         self, values: Any, start: Any, goal: Any, reference: Demonstrated, xp: ModuleType
     ) -> Any:
@@ -138,11 +132,6 @@ class AmplitudeScaling(Scaling):
     """By the range that each coordinate covers."""
 
     name: ClassVar[str] = "amplitude"
-
-    def check(
-        self, reference: Demonstrated, batch: tuple[int, ...], names: Sequence[str] | None
-    ) -> None:
-        """Any motion will do."""
 
     def _scale(
         self, values: Any, start: Any, goal: Any, reference: Demonstrated, xp: ModuleType

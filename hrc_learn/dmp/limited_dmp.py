@@ -17,13 +17,22 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from hrc_learn.dmp._arguments import (
+    FitReport,
+    Mask,
+    Points,
+    Scalars,
+    Times,
+    Vectors,
+    check_samples,
+    demo_label,
+    to_tensor,
+)
+from hrc_learn.dmp._closed_loop_step import DMPState
+from hrc_learn.dmp._fitting import FitOptions
 from hrc_learn.dmp._system.response import Trajectory
-from hrc_learn.dmp._types import Mask, Points, Scalars, Times, Vectors, to_tensor
-from hrc_learn.dmp.closed_loop_step import DMPState
-from hrc_learn.dmp.coordinate_adapter import CoordinateAdapter, Retargeted
-from hrc_learn.dmp.fitting.motion_samples import FitReport, check_samples, demo_label
-from hrc_learn.dmp.fitting.solvers import FitOptions
-from hrc_learn.dmp.joint_dmp import JointDMP, given_points
+from hrc_learn.dmp.coordinate_adapter import ColumnPoints, CoordinateAdapter, Ends, Retargeted
+from hrc_learn.dmp.joint_dmp import JointDMP, points_as_given
 from hrc_learn.dmp.linear_primitive import ColumnEnds, LinearPrimitive
 from hrc_learn.dmp.motion_primitive import AdaptedPrimitive
 from hrc_learn.model_files import SavedModel
@@ -51,6 +60,12 @@ class SoftLimits:
         above = lower + beta * (_softplus(a) - _softplus(b))
         below = upper - beta * (_softplus(-b) - _softplus(-a))
         return self.clamp(torch.where(a + b < 0, above, below))
+
+    def constrain_rate(
+        self, x: Float[Tensor, "*#batch D"], rate: Float[Tensor, "*#batch D"]
+    ) -> Float[Tensor, "*batch D"]:
+        """Rate of q, from x and its rate."""
+        return torch.func.jvp(self.constrain, (x,), (rate,))[1]
 
     def release(self, q: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch D"]:
         """X of q, which lies between the limits: the inverse of `constrain`."""
@@ -104,16 +119,13 @@ class LimitedTrajectory:
     @cached_property
     def velocity(self) -> Float[Tensor, "*batch T D"]:
         """The same per second."""
-        return self._velocity(self._free.position, self._free.velocity)
+        return self._limits.constrain_rate(self._free.position, self._free.velocity)
 
     @cached_property
     def acceleration(self) -> Float[Tensor, "*batch T D"]:
         """The same per second squared."""
         x, rate, curvature = self._free.position, self._free.velocity, self._free.acceleration
-        return torch.func.jvp(self._velocity, (x, rate), (rate, curvature))[1]
-
-    def _velocity(self, x: Tensor, rate: Tensor) -> Tensor:
-        return torch.func.jvp(self._limits.constrain, (x,), (rate,))[1]
+        return torch.func.jvp(self._limits.constrain_rate, (x, rate), (rate, curvature))[1]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -132,9 +144,7 @@ class LimitedState:
     @property
     def velocity(self) -> Float[Tensor, "*batch D"]:
         """Per second."""
-        motion = self.motion
-        rate = motion.velocity
-        return torch.func.jvp(self.limits.constrain, (motion.position,), (rate,))[1]
+        return self.limits.constrain_rate(self.motion.position, self.motion.velocity)
 
 
 torch.export.register_dataclass(LimitedState, serialized_type_name="hrc_learn.dmp.LimitedState")
@@ -147,19 +157,14 @@ class LimitedCoordinates(CoordinateAdapter[Vectors, LimitedTrajectory, LimitedSt
     limits: SoftLimits
 
     def ends(
-        self,
-        motion: LinearPrimitive,
-        start: Vectors | None,
-        goal: Vectors | None,
-        duration: Tensor,
-        velocity: Vectors | None,
+        self, motion: LinearPrimitive, given: Ends, duration: Tensor
     ) -> tuple[ColumnEnds, SoftLimits]:
         """Released from the limits; a goal beyond one is taken to the nearest place within.
 
         Raises:
             ValueError: A start that is not between the limits.
         """
-        limits = self.limits
+        limits, (start, goal, velocity) = self.limits, given
         q = limits.constrain(motion.start) if start is None else self._as_tensor(start)
         x = None
         if start is not None:
@@ -202,20 +207,17 @@ class LimitedCoordinates(CoordinateAdapter[Vectors, LimitedTrajectory, LimitedSt
     def via_points(
         self,
         motion: LinearPrimitive,
-        s: Tensor,
-        position: Tensor,
-        velocity: Tensor,
+        now: ColumnPoints,
         value: Points | None,
-        rate: Points | None,
-    ) -> tuple[Tensor, Tensor]:
+        velocity: Points | None,
+    ) -> ColumnPoints:
         """Released from the limits, which via points have to lie between."""
-        limits = self.limits
-        q, joint_rate = given_points(value, position), given_points(rate, velocity, "velocity")
+        limits, (q, joint_rate) = self.limits, points_as_given(now, value, velocity)
         if (q.isfinite() & ~limits.contain(q)).any():
             raise ValueError(f"via point {q.tolist()} is not between the limits")
-        there = limits.clamp(torch.where(q.isnan(), limits.constrain(position), q))
+        there = limits.clamp(torch.where(q.isnan(), limits.constrain(now.position), q))
         released = torch.func.jvp(limits.release, (there,), (joint_rate.nan_to_num(),))
-        return (
+        return ColumnPoints(
             released[0].masked_fill(q.isnan(), torch.nan),
             released[1].masked_fill(joint_rate.isnan(), torch.nan),
         )

@@ -12,16 +12,23 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from hrc_learn.dmp import closed_loop_step
+from hrc_learn.dmp import _closed_loop_step as closed_loop_step
+from hrc_learn.dmp._arguments import (
+    FitReport,
+    Scalars,
+    Times,
+    Vectors,
+    normalised_time,
+    positive,
+    to_tensor,
+)
+from hrc_learn.dmp._arguments import vector as checked_vector
+from hrc_learn.dmp._closed_loop_step import DMPState
+from hrc_learn.dmp._serialization import TENSORS, basis_config, linear_arguments
 from hrc_learn.dmp._system.bases import Basis
+from hrc_learn.dmp._system.closed_forms import SpringDamper
 from hrc_learn.dmp._system.response import Response, Trajectory, response_of
-from hrc_learn.dmp._system.spring import SpringDamper
-from hrc_learn.dmp._types import Scalars, Times, Vectors, normalised_time, positive, to_tensor
-from hrc_learn.dmp._types import vector as checked_vector
-from hrc_learn.dmp.closed_loop_step import DMPState
-from hrc_learn.dmp.fitting.motion_samples import FitReport
 from hrc_learn.dmp.forcing_scale import Demonstrated, NoScaling, Scaling, find_scaling
-from hrc_learn.dmp.serialization import TENSORS, basis_config, linear_arguments
 from hrc_learn.model_files import SavedModel
 
 

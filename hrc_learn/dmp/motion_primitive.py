@@ -12,13 +12,13 @@ from pathlib import Path as FilePath
 from typing import Any, Protocol, runtime_checkable
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
-from hrc_learn.dmp._types import Points, Scalars, Times, to_tensor
-from hrc_learn.dmp.closed_loop_step import DMPState
-from hrc_learn.dmp.coordinate_adapter import CoordinateAdapter
+from hrc_learn.dmp._arguments import FitReport, Points, Scalars, Times, to_tensor
+from hrc_learn.dmp._via_points import ViaPoints, through_via_points
+from hrc_learn.dmp.coordinate_adapter import ColumnPoints, CoordinateAdapter, Ends
 from hrc_learn.dmp.linear_primitive import ColumnEnds, LinearPrimitive
-from hrc_learn.dmp.probabilistic.vmp import ViaPoints, through_via_points
 from hrc_learn.model_files import SavedModel, write_model
 
 
@@ -136,8 +136,8 @@ class AdaptedPrimitive[Value, Path, State](nn.Module, ABC):
             ends: Others that the kind has.
         """
         motion, adapter = self.motion, self.adapter
-        tau = motion.resolve_duration(adapter.each(duration), adapter.each(speed))
-        columns, frame = adapter.ends(motion, start, goal, tau, start_velocity, **ends)
+        given = Ends(start, goal, start_velocity)
+        columns, tau, frame = self._columns(given, duration, speed, ends)
         times = None if time is None else adapter.times(time)
         rolled = adapter.roll(motion, columns, tau, times, adapter.each(forcing_gain))
         return adapter.trajectory(rolled, frame)
@@ -153,8 +153,10 @@ class AdaptedPrimitive[Value, Path, State](nn.Module, ABC):
         **ends: Any,
     ) -> State:
         """State at the start of a motion, for `step`; arguments as in `rollout`."""
-        columns, frame = self._begin(start, goal, duration, start_velocity, speed, ends)
-        return self.adapter.state(*self.adapter.begin(columns, frame))
+        given = Ends(start, goal, start_velocity)
+        columns, tau, frame = self._columns(given, duration, speed, ends)
+        begun = self.adapter.begin(self.motion.begin(columns, tau), frame)
+        return self.adapter.state(*begun)
 
     def step(
         self,
@@ -294,11 +296,11 @@ class AdaptedPrimitive[Value, Path, State](nn.Module, ABC):
         if others and not adapter.has_body:
             raise ValueError("only a pose has a body")
         duration = motion.duration.double()[..., None]
-        s = moment / duration
         now = motion.roll(ColumnEnds(), motion.duration, moment.detach())
-        q, v = now.position.detach().double(), now.velocity.detach().double()
-        position, rate = adapter.via_points(motion, s, q, v, value, velocity, **others)
-        return ViaPoints(s=s, position=position, rate=rate * duration[..., None])
+        now = ColumnPoints(*(x.detach().double() for x in (now.position, now.velocity)))
+        via = adapter.via_points(motion, now, value, velocity, **others)
+        rate = via.velocity * duration[..., None]
+        return ViaPoints(s=moment / duration, position=via.position, rate=rate)
 
     def with_ends[S: "AdaptedPrimitive"](
         self: S,
@@ -320,7 +322,9 @@ class AdaptedPrimitive[Value, Path, State](nn.Module, ABC):
             raise ValueError(
                 f"scaling {motion.scaling!r} changes with the ends: fit with 'none'"
             )
-        moved, frame = self._begin(start, goal, duration, start_velocity, speed, ends)
+        given = Ends(start, goal, start_velocity)
+        columns, tau, frame = self._columns(given, duration, speed, ends)
+        moved = motion.begin(columns, tau)
         rest = torch.stack([moved.rate, moved.position, moved.goal], dim=-1)
         weights = motion.weights.expand(*rest.shape[:-1], -1)
         x = torch.cat([weights, rest], dim=-1)
@@ -366,17 +370,25 @@ class AdaptedPrimitive[Value, Path, State](nn.Module, ABC):
         """
         return export_primitive(self, goal_filter=goal_filter)
 
-    def _begin(
-        self,
-        start: Any,
-        goal: Any,
-        duration: Scalars | None,
-        velocity: Any,
-        speed: Scalars | None,
-        ends: dict[str, Any],
-    ) -> tuple[DMPState, Any]:
-        """Columns at the start of a motion, and their frame."""
-        motion, adapter = self.motion, self.adapter
-        tau = motion.resolve_duration(adapter.each(duration), adapter.each(speed))
-        columns, frame = adapter.ends(motion, start, goal, tau, velocity, **ends)
-        return motion.begin(columns, tau), frame
+    def _columns(
+        self, given: Ends, duration: Scalars | None, speed: Scalars | None, ends: dict[str, Any]
+    ) -> tuple[ColumnEnds, Tensor, Any]:
+        """Ends of a motion in columns, its duration, and their frame."""
+        each = self.adapter.each
+        tau = self.motion.resolve_duration(each(duration), each(speed))
+        columns, frame = self.adapter.ends(self.motion, given, tau, **ends)
+        return columns, tau, frame
+
+
+class WrappedPrimitive[Value, Path, State](AdaptedPrimitive[Value, Path, State]):
+    """A primitive around a linear one of its own."""
+
+    @property
+    def duration(self) -> Float[Tensor, "*batch"]:
+        """Of the demonstration [s]."""
+        return self.motion.duration
+
+    @property
+    def fit_report(self) -> FitReport | None:
+        """Residuals by column."""
+        return self.motion.fit_report

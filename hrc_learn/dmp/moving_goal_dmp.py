@@ -7,25 +7,21 @@ velocity in the damping term). The goal passes g at s = 1 with velocity v. Seen 
 x = y - (s - 1) v, this is the equation of a goal at rest: rollouts and steps stay exact.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Unpack
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from hrc_learn.dmp._arguments import Points, Times, Vectors, to_tensor
+from hrc_learn.dmp._closed_loop_step import DMPState
 from hrc_learn.dmp._system.response import Trajectory
-from hrc_learn.dmp._types import Mask, Points, Times, Vectors, to_tensor
-from hrc_learn.dmp.closed_loop_step import DMPState
-from hrc_learn.dmp.coordinate_adapter import CoordinateAdapter, Retargeted
-from hrc_learn.dmp.fitting.motion_samples import FitReport
-from hrc_learn.dmp.fitting.solvers import FitOptions
-from hrc_learn.dmp.forcing_scale import Scaling
-from hrc_learn.dmp.joint_dmp import JointDMP, given_points
+from hrc_learn.dmp.coordinate_adapter import ColumnPoints, CoordinateAdapter, Ends, Retargeted
+from hrc_learn.dmp.joint_dmp import JointDMP, points_as_given
 from hrc_learn.dmp.linear_primitive import ColumnEnds, LinearPrimitive
-from hrc_learn.dmp.motion_primitive import AdaptedPrimitive
+from hrc_learn.dmp.motion_primitive import WrappedPrimitive
 from hrc_learn.model_files import SavedModel
 
 
@@ -93,29 +89,27 @@ class MovingGoalCoordinates(CoordinateAdapter[Vectors, MovingTrajectory, MovingG
     def ends(
         self,
         motion: LinearPrimitive,
-        start: Vectors | None,
-        goal: Vectors | None,
+        given: Ends,
         duration: Tensor,
-        velocity: Vectors | None,
         end_velocity: Vectors | None = None,
     ) -> tuple[ColumnEnds, Tensor]:
         """Start and rate as seen from a goal that moves so that `end_velocity` is met."""
 
-        def given(value: Vectors | None, otherwise: Tensor) -> Tensor:
+        def known(value: Vectors | None, otherwise: Tensor) -> Tensor:
             if value is None:
                 return otherwise
             return to_tensor(value, otherwise.dtype, otherwise.device)
 
         demonstrated = motion.start_velocity * (motion.duration / duration)[..., None]
-        start, goal = given(start, motion.start), given(goal, motion.goal)
-        rate = given(velocity, demonstrated)
+        start, goal = known(given.start, motion.start), known(given.goal, motion.goal)
+        rate = known(given.velocity, demonstrated)
         end = duration[..., None]
         still = motion.roll(ColumnEnds(start, goal, rate), duration, end).velocity[..., 0, :]
         # Per unit of v the start is seen shifted by v, its rate by -v.
         at_end = motion.response.evaluate(torch.ones((), dtype=torch.float64))[1]
         # Columns -2 and -3 of the response are the start and its rate; the goal's own is one.
         gain = 1 + at_end[-2] - at_end[-3]
-        v = (given(end_velocity, still) - still) / gain.to(still)
+        v = (known(end_velocity, still) - still) / gain.to(still)
         return ColumnEnds(start + v * end, goal, rate - v), v
 
     def trajectory(self, columns: Trajectory, frame: Tensor) -> MovingTrajectory:
@@ -143,17 +137,15 @@ class MovingGoalCoordinates(CoordinateAdapter[Vectors, MovingTrajectory, MovingG
     def via_points(
         self,
         motion: LinearPrimitive,
-        s: Tensor,
-        position: Tensor,
-        velocity: Tensor,
+        now: ColumnPoints,
         value: Points | None,
-        rate: Points | None,
-    ) -> tuple[Tensor, Tensor]:
+        velocity: Points | None,
+    ) -> ColumnPoints:
         """As given: with the demonstrated end velocity the goal is at rest."""
-        return given_points(value, position), given_points(rate, velocity, "velocity")
+        return points_as_given(now, value, velocity)
 
 
-class MovingGoalDMP(AdaptedPrimitive[Vectors, MovingTrajectory, MovingGoalState]):
+class MovingGoalDMP(WrappedPrimitive[Vectors, MovingTrajectory, MovingGoalState]):
     """A joint primitive that passes its goal with a velocity of the caller's choice.
 
     Values are (*batch, D) in the units of the demonstration, velocities the same per second.
@@ -180,28 +172,11 @@ class MovingGoalDMP(AdaptedPrimitive[Vectors, MovingTrajectory, MovingGoalState]
         cls,
         time: Times,
         position: Points,
-        n_basis: int = 50,
-        velocity: Points | None = None,
-        mask: Mask | None = None,
-        *,
-        scaling: str | Scaling = "none",
-        joint_names: Sequence[str] | None = None,
-        units: str = "rad",
-        **options: Unpack[FitOptions],
+        *arguments: Any,
+        **options: Any,
     ) -> "MovingGoalDMP":
         """Learn one primitive from each demonstration; arguments as in `JointDMP.fit`."""
-        motion = JointDMP.fit(
-            time,
-            position,
-            n_basis,
-            velocity,
-            mask,
-            scaling=scaling,
-            joint_names=joint_names,
-            units=units,
-            **options,
-        )
-        return cls(motion)
+        return cls(JointDMP.fit(time, position, *arguments, **options))
 
     @property
     def adapter(self) -> MovingGoalCoordinates:
@@ -217,16 +192,6 @@ class MovingGoalDMP(AdaptedPrimitive[Vectors, MovingTrajectory, MovingGoalState]
     def goal(self) -> Float[Tensor, "*batch D"]:
         """Where it ends."""
         return self.motion.goal
-
-    @property
-    def duration(self) -> Float[Tensor, "*batch"]:
-        """Of the demonstration [s]."""
-        return self.motion.duration
-
-    @property
-    def fit_report(self) -> FitReport | None:
-        """How well the fit reproduces its demonstrations."""
-        return self.motion.fit_report
 
     def rollout(  # pyright: ignore[reportIncompatibleMethodOverride]
         self,

@@ -1,14 +1,17 @@
-"""Closed-loop steps in NumPy, of one primitive each, for loops that count microseconds."""
+"""Closed-loop steps in NumPy, of one primitive each, for loops that count microseconds.
+
+Those of joints first; then errors of orientations, one at a time, and the steppers of what has
+one.
+"""
 
 import math
-from functools import singledispatch
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
+from torch import Tensor
 
-from hrc_learn.dmp import numpy_orientation as arrays
-from hrc_learn.dmp._system.quintic_curves import quintic
+from hrc_learn.dmp._system.closed_forms import quintic
 from hrc_learn.dmp.forcing_scale import Demonstrated
 from hrc_learn.dmp.joint_dmp import JointDMP
 from hrc_learn.dmp.orientation_dmp import OrientationDMP
@@ -66,9 +69,10 @@ class Stepper:
             raise ValueError(
                 f"a stepper takes one primitive, got a batch {tuple(dmp.weights.shape[:-2])}"
             )
-        forced, weights = dmp.response.forced, dmp.weights.detach().double().cpu()
-        self._scaling, self._shown = dmp.forcing_scale, _demonstrated(dmp)
-        weights = weights.numpy().T
+        forced, weights = dmp.response.forced, _array(dmp.weights).T
+        start, goal, amplitude = (_array(x) for x in (dmp.start, dmp.goal, dmp.amplitude))
+        self._shown = Demonstrated(start=start, goal=goal, amplitude=amplitude)
+        self._scaling = dmp.forcing_scale
         if not self._scaling.follows_ends:
             weights = self._scaled(weights, self._shown.start, self._shown.goal)
         table = forced.coefficients.cpu().numpy() @ weights
@@ -77,12 +81,13 @@ class Stepper:
         self._interval = forced.interval
         self._end = math.inf if forced.periodic else forced.end
         self._spring, self._approach = dmp.spring, dmp.response.approach
-        self._velocity = dmp.start_velocity.detach().double().cpu().numpy()
+        self._velocity = _array(dmp.start_velocity)
         self._duration = dmp.duration.item()
-        half = self._spring.alpha / 2
-        self._stiffness = self._spring.stiffness
+        half, self._stiffness = self._spring.alpha / 2, self._spring.stiffness
+        # A + alpha / 2 I, see `SpringDamper.propagator`.
+        self._shifted = np.array([[half, 1.0], [-self._stiffness, -half]])
+        # NaN differs from every step length: none is known yet.
         self._transition = math.nan, np.eye(2), np.zeros((2, 1))
-        self._shifted = np.array([[half, 1.0], [-self._spring.stiffness, -half]])
 
     def initial_state(
         self,
@@ -178,11 +183,137 @@ class Stepper:
         return E
 
 
-def _demonstrated(dmp: JointDMP) -> Demonstrated:
-    start, goal, amplitude = (
-        x.detach().double().cpu().numpy() for x in (dmp.start, dmp.goal, dmp.amplitude)
+def _array(x: Tensor) -> Float64[np.ndarray, "..."]:
+    return x.detach().double().cpu().numpy()
+
+
+# Errors of orientations
+
+Vector3 = Float64[np.ndarray, "3"]
+Quaternion = Float64[np.ndarray, "4"]
+
+SMALL = 2e-2
+"""Angles [rad] below which closed forms cancel; two terms of their series are exact to 1e-11
+there."""
+SINGULAR = 1e-3
+"""Share of an angular velocity that still counts as rate of the error: below it, one whole turn
+away, the inverse would blow the rest up a thousand times."""
+NO_AXIS = 1e-9
+"""Rotation vectors shorter than this [rad] have no direction of their own."""
+
+
+def _multiply(p: Quaternion, q: Quaternion) -> Quaternion:
+    """Hamilton product."""
+    a, b, c, d = p
+    w, x, y, z = q
+    return np.array(
+        [
+            a * w - b * x - c * y - d * z,
+            a * x + b * w + c * z - d * y,
+            a * y - b * z + c * w + d * x,
+            a * z + b * y - c * x + d * w,
+        ]
     )
-    return Demonstrated(start=start, goal=goal, amplitude=amplitude)
+
+
+def _exp(v: Vector3) -> Quaternion:
+    """Unit quaternion of a rotation vector [rad]."""
+    half = 0.5 * math.sqrt(v @ v)
+    return np.array([math.cos(half), *(0.5 * _sinc(half) * v)])
+
+
+def _sinc(x: float) -> float:
+    """sin(x) / x, which cancels nowhere."""
+    return math.sin(x) / x if x else 1.0
+
+
+def _log(q: Quaternion) -> Vector3:
+    """Rotation vector of the shortest rotation [rad]; at half a turn as `quaternion.log`."""
+    sign = np.sign(q) @ [8.0, 4.0, 2.0, 1.0]
+    w, v = np.sign(sign) * q[0], np.sign(sign) * q[1:]
+    sine = math.sqrt(v @ v)
+    return (2 * math.atan2(sine, w) / sine if sine else 2.0) * v
+
+
+def _to_orientation(error: Vector3, goal: Quaternion) -> Quaternion:
+    """Orientation that differs from the goal by this error."""
+    return _multiply(_exp(-error), goal)
+
+
+def _to_error(q: Quaternion, goal: Quaternion) -> Vector3:
+    """Shortest error of an orientation to the goal [rad]."""
+    return _log(_multiply(goal, q * [1.0, -1.0, -1.0, -1.0]))
+
+
+def _reference_of(error: Vector3, orientation: Quaternion) -> Quaternion:
+    """The reference to which an orientation, of any length, has this error."""
+    return _multiply(_exp(error), orientation / np.sqrt(orientation @ orientation))
+
+
+def _velocity_map(error: Vector3) -> Float64[np.ndarray, "3 3"]:
+    """Maps the rate of an error to the angular velocity of the orientation.
+
+    omega = -J(-e) e', J the left Jacobian of the rotation group, J(v) = I + (1 - cos t) / t^2
+    [v] + (t - sin t) / t^3 [v]^2, t = |v| (Sola et al. 2018, "A micro Lie theory", eq. 145).
+    """
+    square = float(error @ error)
+    angle = square**0.5
+    if angle < SMALL:
+        first = 0.5 - square / 24 + square**2 / 720
+        second = 1 / 6 - square / 120 + square**2 / 5040
+    else:
+        # Half angles: 1 - cos cancels for small ones.
+        first = 2 * (math.sin(angle / 2) / angle) ** 2
+        second = (angle - math.sin(angle)) / (angle * square)
+    cross = _skew(error)
+    return first * cross - second * (cross @ cross) - np.eye(3)
+
+
+def _angular_velocity(error: Vector3, rate: Vector3) -> Vector3:
+    """Angular velocity in the base frame, of an error and its rate."""
+    return _velocity_map(error) @ rate
+
+
+def _error_rate(error: Vector3, velocity: Vector3) -> Vector3:
+    """Rate of an error, of an angular velocity: the inverse of `_angular_velocity`.
+
+    Whole turns away the error has a rate about its own axis only.
+    """
+    square = float(error @ error)
+    half = square**0.5 / 2
+    sinc = _sinc(half)
+    if abs(sinc) < SINGULAR:
+        return -(error @ velocity) / square * error
+    near = 2 * half < SMALL
+    share = 1 / 12 + square / 720 if near else (1 - math.cos(half) / sinc) / square
+    cross = _skew(error)
+    across = cross @ velocity
+    return -velocity - 0.5 * across - share * (cross @ across)
+
+
+def _skew(v: Vector3) -> Float64[np.ndarray, "3 3"]:
+    """The matrix [v] with [v] u = v x u."""
+    x, y, z = v
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def _retarget(
+    error: Vector3, rate: Vector3, old_goal: Quaternion, goal: Quaternion
+) -> tuple[Vector3, Vector3]:
+    """Error to a new goal and its rate, for the same orientation and angular velocity."""
+    new = _nearest_turn(_to_error(_to_orientation(error, old_goal), goal), error)
+    return new, _error_rate(new, _angular_velocity(error, rate))
+
+
+def _nearest_turn(error: Vector3, reference: Vector3) -> Vector3:
+    """The same rotation as `error`, with the whole turns that bring it closest to another."""
+    axis = error if np.sqrt(error @ error) > NO_AXIS else reference
+    axis = axis / max(np.sqrt(axis @ axis), NO_AXIS)
+    turns = np.round((reference - error) @ axis / (2 * np.pi))
+    return error + 2 * np.pi * turns * axis
+
+
+# Steppers of what has an orientation
 
 
 class OrientationStepperState(NamedTuple):
@@ -190,67 +321,18 @@ class OrientationStepperState(NamedTuple):
 
     motion: StepperState
     """Of the error to the goal [rad]."""
-    reference: Float64[np.ndarray, "4"]
+    reference: Quaternion
     """The goal, unless the primitive says otherwise."""
 
     @property
-    def orientation(self) -> Float64[np.ndarray, "4"]:
+    def orientation(self) -> Quaternion:
         """Unit quaternion (w, x, y, z)."""
-        return arrays.to_orientation(self.motion.position, self.reference)
+        return _to_orientation(self.motion.position, self.reference)
 
     @property
-    def angular_velocity(self) -> Float64[np.ndarray, "3"]:
+    def angular_velocity(self) -> Vector3:
         """In the base frame [rad/s]."""
-        return arrays.angular_velocity(self.motion.position, self.motion.velocity)
-
-
-class OrientationStepper:
-    """One unbatched primitive, frozen; `step` does what `OrientationDMP.step` does."""
-
-    def __init__(self, dmp: OrientationDMP):
-        """Freeze a primitive.
-
-        Raises:
-            ValueError: The primitive is a batch, or of the formulation of Ude et al.
-        """
-        if dmp.formulation != "log":
-            raise ValueError(
-                f"a stepper takes the formulation 'log', got {dmp.formulation!r}, whose steps "
-                f"are integrated: use the exported program"
-            )
-        self._motion = Stepper(dmp.motion)
-        self._goal = dmp.motion.goal.detach().double().cpu().numpy()
-        self._dmp = dmp
-
-    def initial_state(self, **arguments: Any) -> OrientationStepperState:
-        """State at the start of a motion; arguments as in `OrientationDMP.rollout`."""
-        state = self._dmp.initial_state(**arguments)
-        motion = start_stepper(self._motion, state.motion)
-        return OrientationStepperState(motion, state.reference.detach().double().cpu().numpy())
-
-    def step(
-        self,
-        state: OrientationStepperState,
-        dt: float,
-        goal: Float64[np.ndarray, "4"] | None = None,
-        phase_stopping: float = 0.0,
-    ) -> OrientationStepperState:
-        """Advance by `dt` [s]; a new goal is there at once."""
-        motion, reference = state
-        if goal is not None:
-            reference = arrays.reference_of(self._goal, goal)
-            ends = arrays.retarget(motion.y[0], motion.y[1], state.reference, reference)
-            motion = motion._replace(y=np.stack(ends))
-        motion = self._motion.step(motion, dt, phase_stopping=phase_stopping)
-        return OrientationStepperState(motion, reference)
-
-
-def start_stepper(stepper: Stepper, state: Any) -> StepperState:
-    """State of a stepper at the start, from that of the primitive it is of."""
-    start, goal, velocity = (
-        x.detach().double().cpu().numpy() for x in (state.start, state.goal, state.velocity)
-    )
-    return stepper.initial_state(start, goal, state.duration.item(), velocity)
+        return _angular_velocity(self.motion.position, self.motion.velocity)
 
 
 class PoseStepperState(NamedTuple):
@@ -258,18 +340,18 @@ class PoseStepperState(NamedTuple):
 
     motion: StepperState
     """Of position, error to the goal, and body."""
-    reference: Float64[np.ndarray, "4"]
+    reference: Quaternion
     """The goal's orientation, unless the primitive says otherwise."""
 
     @property
-    def position(self) -> Float64[np.ndarray, "3"]:
+    def position(self) -> Vector3:
         """[m]."""
         return self.motion.position[POSITION]
 
     @property
-    def orientation(self) -> Float64[np.ndarray, "4"]:
+    def orientation(self) -> Quaternion:
         """Unit quaternion (w, x, y, z)."""
-        return arrays.to_orientation(self.motion.position[ERROR], self.reference)
+        return _to_orientation(self.motion.position[ERROR], self.reference)
 
     @property
     def body(self) -> Float64[np.ndarray, "K"]:
@@ -280,37 +362,86 @@ class PoseStepperState(NamedTuple):
     def twist(self) -> Float64[np.ndarray, "6"]:
         """(linear [m/s], angular [rad/s]) in the base frame."""
         position, velocity = self.motion.position, self.motion.velocity
-        angular = arrays.angular_velocity(position[ERROR], velocity[ERROR])
+        angular = _angular_velocity(position[ERROR], velocity[ERROR])
         return np.concatenate([velocity[POSITION], angular])
 
 
-class PoseStepper:
-    """One unbatched primitive, frozen; `step` does what `PoseDMP.step` does."""
+class _ErrorStepper:
+    """A stepper of columns some of which are the error of an orientation."""
 
-    def __init__(self, dmp: PoseDMP):
+    def __init__(self, dmp: OrientationDMP | PoseDMP):
         """Freeze a primitive.
 
         Raises:
-            ValueError: The primitive is a batch.
+            ValueError: The primitive is a batch, or of the formulation of Ude et al.
         """
-        self._motion = Stepper(dmp.motion)
-        self._goal = dmp.motion.goal[ERROR].detach().double().cpu().numpy()
+        if getattr(dmp, "formulation", "log") != "log":
+            raise ValueError(
+                f"a stepper takes the formulation 'log', got {dmp.formulation!r}, whose steps "
+                f"are integrated: use the exported program"
+            )
+        self._motion, self._columns = Stepper(dmp.motion), dmp.adapter.error_columns
+        self._goal = _array(dmp.motion.goal[self._columns])
         self._dmp = dmp
+
+    def _begin(self, arguments: dict[str, Any]) -> tuple[StepperState, Quaternion]:
+        state = self._dmp.initial_state(**arguments)
+        motion = state.motion
+        start, goal, velocity = (
+            _array(x) for x in (motion.start, motion.goal, motion.velocity)
+        )
+        begun = self._motion.initial_state(start, goal, motion.duration.item(), velocity)
+        return begun, _array(state.reference)
+
+    def _retarget(
+        self, motion: StepperState, reference: Quaternion, orientation: Quaternion
+    ) -> tuple[StepperState, Quaternion]:
+        """The same orientation and angular velocity, on the way to a new goal."""
+        new = _reference_of(self._goal, orientation)
+        y = motion.y.copy()
+        y[:, self._columns] = _retarget(
+            y[0, self._columns], y[1, self._columns], reference, new
+        )
+        return motion._replace(y=y), new
+
+
+class OrientationStepper(_ErrorStepper):
+    """One unbatched primitive, frozen; `step` does what `OrientationDMP.step` does."""
+
+    def initial_state(self, **arguments: Any) -> OrientationStepperState:
+        """State at the start of a motion; arguments as in `OrientationDMP.rollout`."""
+        return OrientationStepperState(*self._begin(arguments))
+
+    def step(
+        self,
+        state: OrientationStepperState,
+        dt: float,
+        goal: Quaternion | None = None,
+        phase_stopping: float = 0.0,
+    ) -> OrientationStepperState:
+        """Advance by `dt` [s]; a new goal is there at once."""
+        motion, reference = state
+        if goal is not None:
+            motion, reference = self._retarget(motion, reference, goal)
+        motion = self._motion.step(motion, dt, phase_stopping=phase_stopping)
+        return OrientationStepperState(motion, reference)
+
+
+class PoseStepper(_ErrorStepper):
+    """One unbatched primitive, frozen; `step` does what `PoseDMP.step` does."""
 
     def initial_state(self, **arguments: Any) -> PoseStepperState:
         """State at the start of a motion; arguments as in `PoseDMP.rollout`."""
-        state = self._dmp.initial_state(**arguments)
-        rotation = state.reference.detach().double().cpu().numpy()
-        return PoseStepperState(start_stepper(self._motion, state.motion), rotation)
+        return PoseStepperState(*self._begin(arguments))
 
     def step(
         self,
         state: PoseStepperState,
         dt: float,
-        position: Float64[np.ndarray, "3"] | None = None,
-        orientation: Float64[np.ndarray, "4"] | None = None,
+        position: Vector3 | None = None,
+        orientation: Quaternion | None = None,
         body: Float64[np.ndarray, "K"] | None = None,
-        coupling: Float64[np.ndarray, "3"] | None = None,
+        coupling: Vector3 | None = None,
         phase_stopping: float = 0.0,
     ) -> PoseStepperState:
         """Advance by `dt` [s].
@@ -324,48 +455,35 @@ class PoseStepper:
             coupling: Acceleration added to the position [m/s^2].
             phase_stopping: The clock runs 1 + this times slower.
         """
-        motion, rotation = state
-        goal, push = motion.goal, None
+        motion, reference = state
+        goal, push = motion.goal.copy(), None
         for columns, value in ((POSITION, position), (BODY, body)):
             if value is not None:
-                goal = goal.copy()
                 goal[columns] = value
         if orientation is not None:
-            rotation = arrays.reference_of(self._goal, orientation)
-            y = motion.y.copy()
-            y[:, ERROR] = arrays.retarget(y[0, ERROR], y[1, ERROR], state.reference, rotation)
-            motion = motion._replace(y=y)
+            motion, reference = self._retarget(motion, reference, orientation)
         if coupling is not None:
             push = np.zeros_like(goal)
             push[POSITION] = coupling
-        return PoseStepperState(
-            self._motion.step(motion, dt, goal, push, phase_stopping), rotation
-        )
+        motion = self._motion.step(motion, dt, goal, push, phase_stopping)
+        return PoseStepperState(motion, reference)
 
 
 type AnyStepper = Stepper | OrientationStepper | PoseStepper
+STEPPERS: dict[type, Any] = {
+    JointDMP: Stepper,
+    OrientationDMP: OrientationStepper,
+    PoseDMP: PoseStepper,
+}
+"""By the primitives that they step."""
 
 
-@singledispatch
 def freeze_stepper(primitive: Any) -> AnyStepper | None:
     """The NumPy stepper of one primitive; None: only its exported program steps it.
 
     Raises:
         ValueError: The primitive is a batch.
     """
-    return None
-
-
-@freeze_stepper.register(JointDMP)
-def _freeze_joints(primitive: JointDMP) -> AnyStepper | None:
-    return Stepper(primitive)
-
-
-@freeze_stepper.register(OrientationDMP)
-def _freeze_orientation(primitive: OrientationDMP) -> AnyStepper | None:
-    return OrientationStepper(primitive) if primitive.formulation == "log" else None
-
-
-@freeze_stepper.register(PoseDMP)
-def _freeze_pose(primitive: PoseDMP) -> AnyStepper | None:
-    return PoseStepper(primitive)
+    integrated = getattr(primitive, "formulation", "log") != "log"
+    kinds = (kind for kind in STEPPERS if isinstance(primitive, kind) and not integrated)
+    return next((STEPPERS[kind](primitive) for kind in kinds), None)

@@ -10,8 +10,15 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, broadcast_tensors
 
-from hrc_learn.dmp._types import Mask, Quaternions, Times, Vectors, to_tensor
-from hrc_learn.dmp.fitting.motion_samples import check_samples, demo_label
+from hrc_learn.dmp._arguments import (
+    Mask,
+    Quaternions,
+    Times,
+    Vectors,
+    check_samples,
+    demo_label,
+    to_tensor,
+)
 from hrc_learn.geometry import quaternion
 from hrc_learn.geometry.quaternion import axis_drift, drift_free_rate, drift_free_slope
 

@@ -9,17 +9,24 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.dmp import orientation_error
+from hrc_learn.dmp._arguments import (
+    Mask,
+    Points,
+    Quaternions,
+    Times,
+    Vectors,
+    check_samples,
+    to_tensor,
+)
+from hrc_learn.dmp._closed_loop_step import DMPState
+from hrc_learn.dmp._fitting import FitOptions
 from hrc_learn.dmp._system.response import Trajectory
-from hrc_learn.dmp._types import Mask, Points, Quaternions, Times, Vectors, to_tensor
-from hrc_learn.dmp.closed_loop_step import DMPState
-from hrc_learn.dmp.coordinate_adapter import CoordinateAdapter, Retargeted
-from hrc_learn.dmp.fitting.motion_samples import FitReport, check_samples
-from hrc_learn.dmp.fitting.solvers import FitOptions
+from hrc_learn.dmp.coordinate_adapter import ColumnPoints, CoordinateAdapter, Ends, Retargeted
 from hrc_learn.dmp.forcing_scale import find_scaling
 from hrc_learn.dmp.joint_dmp import JointDMP, given_points
 from hrc_learn.dmp.linear_primitive import ColumnEnds, LinearPrimitive
-from hrc_learn.dmp.motion_primitive import AdaptedPrimitive
-from hrc_learn.dmp.orientation_coordinates import OrientationTrajectory, via_errors
+from hrc_learn.dmp.motion_primitive import WrappedPrimitive
+from hrc_learn.dmp.orientation_dmp import OrientationTrajectory, via_errors
 from hrc_learn.dmp.orientation_error import (
     error_ends,
     fitted_error,
@@ -145,15 +152,13 @@ class PoseCoordinates(CoordinateAdapter[Pose, PoseTrajectory, PoseState]):
     def ends(
         self,
         motion: LinearPrimitive,
-        start: Pose | None,
-        goal: Pose | None,
+        given: Ends,
         duration: Tensor,
-        velocity: Vectors | None,
         start_body: Vectors | None = None,
         goal_body: Vectors | None = None,
     ) -> tuple[ColumnEnds, Tensor]:
         """A new orientation moves the start's error or the reference, the rest its columns."""
-        like = motion.start
+        like, (start, goal, velocity) = motion.start, given
         demonstrated = motion.start_velocity * (motion.duration / duration)[..., None]
         twist = None if velocity is None else to_tensor(velocity, like.dtype, like.device)
         error, rate, reference = error_ends(
@@ -247,14 +252,12 @@ class PoseCoordinates(CoordinateAdapter[Pose, PoseTrajectory, PoseState]):
     def via_points(
         self,
         motion: LinearPrimitive,
-        s: Tensor,
-        position: Tensor,
-        velocity: Tensor,
+        now: ColumnPoints,
         value: Pose | Any,
-        rate: Points | None,
+        velocity: Points | None,
         body: Points | None = None,
         body_velocity: Points | None = None,
-    ) -> tuple[Tensor, Tensor]:
+    ) -> ColumnPoints:
         """Each part of a pose on its own; NaN leaves it free."""
         if value is not None and not isinstance(value, Pose):
             raise ValueError(
@@ -262,20 +265,21 @@ class PoseCoordinates(CoordinateAdapter[Pose, PoseTrajectory, PoseState]):
             )
         place = None if value is None else value.position
         rotation = None if value is None else value.orientation
-        twist = given_points(rate, velocity, "velocity", columns=6)
+        position = now.position
+        twist = given_points(velocity, now.velocity, "velocity", columns=6)
         error, error_rate = via_errors(
             self.reference(motion), position[..., ERROR], rotation, twist[..., 3:]
         )
         place = given_points(place, position[..., POSITION])
         body = given_points(body, position[..., BODY], "body")
-        body_rate = given_points(body_velocity, velocity[..., BODY], "body_velocity")
-        return (
+        body_rate = given_points(body_velocity, now.velocity[..., BODY], "body_velocity")
+        return ColumnPoints(
             torch.cat([place, error, body], dim=-1),
             torch.cat([twist[..., :3], error_rate, body_rate], dim=-1),
         )
 
 
-class PoseDMP(AdaptedPrimitive[Pose, PoseTrajectory, PoseState]):
+class PoseDMP(WrappedPrimitive[Pose, PoseTrajectory, PoseState]):
     """Discrete movement primitive of a pose under one phase.
 
     Position, orientation error (see `orientation_error`) and, if given, K coordinates of the
@@ -286,6 +290,10 @@ class PoseDMP(AdaptedPrimitive[Pose, PoseTrajectory, PoseState]):
     couplings accelerations of the position [m/s^2], (*batch, 3), or of the pose, (*batch, 6),
     the angular part in the base frame. `rollout`, `initial_state` and `with_ends` also take
     `start_body` and `goal_body`, (*batch, K), and so does `step` take `goal_body`.
+
+    The fit report has residuals by column: position [m], orientation error [rad], body. Those
+    of the error's components bound those of the angle. The largest range, which `nrmse`
+    divides by, mixes units: prefer `select` and read one kind at a time.
     """
 
     goal_orientation: Tensor
@@ -365,20 +373,6 @@ class PoseDMP(AdaptedPrimitive[Pose, PoseTrajectory, PoseState]):
     def reference(self) -> Float[Tensor, "*batch 4"]:
         """What the orientation error is taken to."""
         return reference_of(self.motion.goal[..., ERROR], self.goal_orientation)
-
-    @property
-    def duration(self) -> Float[Tensor, "*batch"]:
-        """Of the demonstration [s]."""
-        return self.motion.duration
-
-    @property
-    def fit_report(self) -> FitReport | None:
-        """Residuals by column: position [m], orientation error [rad], body.
-
-        Those of the error's components bound those of the angle. The largest range, which
-        `nrmse` divides by, mixes units: prefer `select` and read one kind at a time.
-        """
-        return self.motion.fit_report
 
     def with_motion[S: "PoseDMP"](self: S, motion: JointDMP, frame: Tensor | None = None) -> S:
         """Around another motion of the columns, to this reference or another."""

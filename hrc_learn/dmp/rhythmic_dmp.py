@@ -6,11 +6,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from hrc_learn.dmp._arguments import Mask, Points, Quaternions, Times, check_samples
+from hrc_learn.dmp._fitting import ridge_inverse
 from hrc_learn.dmp._system.bases import PeriodicBasis
+from hrc_learn.dmp._system.closed_forms import SpringDamper
 from hrc_learn.dmp._system.response import Response, response_of
-from hrc_learn.dmp._system.spring import SpringDamper
-from hrc_learn.dmp._types import Mask, Points, Quaternions, Times
-from hrc_learn.dmp.fitting.motion_samples import check_samples
 from hrc_learn.dmp.joint_dmp import JointDMP
 from hrc_learn.dmp.orientation_dmp import OrientationDMP
 from hrc_learn.dmp.orientation_error import centred_error, to_orientation
@@ -158,10 +158,8 @@ def _solve(
     # Units in which the ridge weighs all columns alike.
     A = H[:, :-1]
     size = A.norm(dim=0)
-    U, sigma, Vh = torch.linalg.svd(A / size, full_matrices=False)
-    inverse = sigma / (sigma**2 + (regularization * sigma[0]) ** 2)
     residual = y - H[:, -1:] * centre
-    x = (Vh.mT * inverse) @ (U.mT @ residual) / size[:, None]
+    x = ridge_inverse(A / size, regularization) @ residual / size[:, None]
     return x[:-2].mT, x[-2], x[-1], centre
 
 

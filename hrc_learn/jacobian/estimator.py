@@ -150,6 +150,25 @@ class KeyFrame:
 
 @pytree
 @dataclass(frozen=True, kw_only=True)
+class KeyFrameState:
+    """Weights and the frame that the next one is compared with."""
+
+    weight: Float[Tensor, "*batch entries K"]
+    """W [px/m, px/rad]."""
+    key: KeyFrame
+    """Last key frame."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LearningConfig(KeyFrameConfig):
+    """What all estimators that learn from key frames have to be told."""
+
+    weight_bound: float = 2e4
+    """Largest entry of the weights [px/m], rotation counted with `rotation_scale`."""
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
 class MotionSample:
     """Motion from the key frame to now; zero where there is none to learn from."""
 
@@ -160,7 +179,7 @@ class MotionSample:
     dx: Float[Tensor, "*batch rows"]
     """Motion of the feature [px]."""
     theta: Float[Tensor, "*batch K"]
-    """RBFCenters half-way: the mean of both ends."""
+    """Neurons half-way: the mean of both ends."""
     valid: Bool[Tensor, "*batch"]
     """Whether there is a pair."""
 
@@ -170,8 +189,10 @@ class MotionSample:
         return self.dx - matmul(J, self.twist.unsqueeze(-1)).squeeze(-1)
 
 
-class KeyFrameEstimator(ImageJacobianEstimator):
+class KeyFrameEstimator[Config: LearningConfig](ImageJacobianEstimator):
     """An estimator that learns from pairs of key frames."""
+
+    config: Config
 
     scale: Tensor
     """Metres that each component of a twist counts for, (6,)."""
@@ -179,17 +200,17 @@ class KeyFrameEstimator(ImageJacobianEstimator):
     bound: Tensor
     """Largest absolute value of each entry of the weights, (entries, 1)."""
 
-    def __init__(self, network: RBFImageJacobian, config: KeyFrameConfig, weight_bound: float):
+    def __init__(self, network: RBFImageJacobian, config: Config):
         """Prepare the scales.
 
         Args:
-            network: RBFCenters and initial weights.
-            config: Choice of key frames.
-            weight_bound: Largest entry of the weights [px/m].
+            network: Neurons and initial weights.
+            config: Choice of key frames, and what the estimator needs besides.
         """
         super().__init__(network)
+        self.config = config
         scale = component_scale(network.centers, config.rotation_scale)
-        bound = weight_bound * scale.repeat(network.rows).unsqueeze(-1)
+        bound = config.weight_bound * scale.repeat(network.rows).unsqueeze(-1)
         self.register_buffer("scale", scale, persistent=False)
         self.register_buffer("bound", bound, persistent=False)
 
@@ -212,7 +233,6 @@ class KeyFrameEstimator(ImageJacobianEstimator):
         key: KeyFrame,
         measurement: Measurement,
         theta: Float[Tensor, "*batch K"],
-        config: KeyFrameConfig,
     ) -> tuple[KeyFrame, MotionSample]:
         """Compare with the key frame; move it here once the tool is `min_step` away.
 
@@ -223,8 +243,8 @@ class KeyFrameEstimator(ImageJacobianEstimator):
             key: Key frame before.
             measurement: Now.
             theta: Neurons at the pose of the measurement.
-            config: Distances.
         """
+        config = self.config
         twist = key.pose.twist_to(measurement.pose)
         distance = torch.linalg.vector_norm(twist * self.scale, dim=-1)
         moved = measurement.valid & key.present & (distance >= config.min_step)

@@ -14,10 +14,12 @@ from hrc_learn.geometry import Pose
 from hrc_learn.jacobian.fitting import (
     ImageJacobianFitConfig,
     ImageJacobianFitReport,
+    RBFCenters,
     fit_weights,
+    pose_inputs,
     prior_precision,
+    radial_basis,
 )
-from hrc_learn.jacobian.rbf_centers import RBFCenters, pose_inputs, radial_basis
 from hrc_learn.jacobian.samples import (
     ImageDemonstration,
     component_scale,

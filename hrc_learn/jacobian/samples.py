@@ -6,16 +6,18 @@ Sums add up over demonstrations and processes, so one demonstration is in memory
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
+from operator import add
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.utils._pytree import tree_map
 
 from hrc_learn import distributed
 from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.pytree import pytree
 
 # Parts of the data, each of which is held out in turn to measure the error on unseen data.
 FOLDS = 5
@@ -33,6 +35,7 @@ class KeyFrameConfig:
     """Metres that a radian counts for [m/rad]: a typical lever arm."""
 
 
+@pytree
 @dataclass(frozen=True, eq=False)
 class RegressionStatistics:
     """Sums over samples: all a linear fit needs to know, in any order and from any machine."""
@@ -67,12 +70,7 @@ class RegressionStatistics:
 
     def __add__(self, other: RegressionStatistics) -> RegressionStatistics:
         """Statistics of both sets of pairs together."""
-        return RegressionStatistics(
-            self.gram + other.gram,
-            self.cross + other.cross,
-            self.energy + other.energy,
-            self.count + other.count,
-        )
+        return tree_map(add, self, other)
 
     def squared_error(self, weights: Float[Tensor, "P 2"]) -> float:
         """Sum over the pairs of |dx - weights^T phi|^2 [px^2]."""
@@ -81,6 +79,7 @@ class RegressionStatistics:
         return max(float(self.energy + change), 0.0)
 
 
+@pytree
 @dataclass(frozen=True, eq=False)
 class MotionSamples:
     """Motion from each key frame of a demonstration to the next one within reach."""
@@ -133,17 +132,7 @@ class MotionSamples:
     @staticmethod
     def joined(motions: Sequence[MotionSamples]) -> MotionSamples:
         """The pairs of several demonstrations as one."""
-
-        def join(name: str) -> Any:
-            parts = [getattr(motion, name) for motion in (MotionSamples.empty(), *motions)]
-            if isinstance(parts[0], Tensor):
-                return torch.cat(parts)
-            return Pose(
-                torch.cat([part.position for part in parts]),
-                torch.cat([part.orientation for part in parts]),
-            )
-
-        return MotionSamples(*(join(field.name) for field in fields(MotionSamples)))
+        return tree_map(lambda *parts: torch.cat(parts), MotionSamples.empty(), *motions)
 
     def split(self, parts: int) -> list[MotionSamples]:
         """The pairs in order, in parts of nearly the same number."""
@@ -156,7 +145,7 @@ class MotionSamples:
 
     def __getitem__(self, index: Tensor) -> MotionSamples:
         """Some of the pairs."""
-        return MotionSamples(*(getattr(self, field.name)[index] for field in fields(self)))
+        return tree_map(lambda values: values[index], self)
 
     def regressors(self, basis: Callable[[Pose], Tensor]) -> Float[Tensor, "pairs P"]:
         """Columns phi = dr (x) theta, 6 K of them columns in (component, neuron) order [m].

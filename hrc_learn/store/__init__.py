@@ -25,7 +25,9 @@ it points to.
 from hrc_learn.store._claim import BusyError as BusyError
 from hrc_learn.store._claim import Claim as Claim
 from hrc_learn.store._claim import InTheWayError as InTheWayError
+from hrc_learn.store._claim import recover as recover
 from hrc_learn.store._claim import resolved as resolved
+from hrc_learn.store._claim import settle as settle
 from hrc_learn.store._disk import delete_files as delete_files
 from hrc_learn.store._disk import sync_file as sync_file
 from hrc_learn.store._ownership import DATASET as DATASET
@@ -36,11 +38,9 @@ from hrc_learn.store._ownership import MODEL as MODEL
 from hrc_learn.store._ownership import RESULTS as RESULTS
 from hrc_learn.store._ownership import Kind as Kind
 from hrc_learn.store._ownership import source_of as source_of
-from hrc_learn.store._recovery import recover as recover
-from hrc_learn.store._recovery import settle as settle
-from hrc_learn.store._values import write_json as write_json
-from hrc_learn.store._values import write_text as write_text
 from hrc_learn.store._writing import new_file as new_file
 from hrc_learn.store._writing import new_folder as new_folder
 from hrc_learn.store._writing import read_made_by as read_made_by
 from hrc_learn.store._writing import replacing as replacing
+from hrc_learn.store._writing import write_json as write_json
+from hrc_learn.store._writing import write_text as write_text

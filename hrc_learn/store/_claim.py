@@ -1,10 +1,11 @@
-"""The sole right to write something, and the steps by which it takes its name."""
+"""The sole right to write something, the steps by which it takes its name, and mending."""
 
 import contextlib
 import itertools
 import os
 import time
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TextIO
 
@@ -12,14 +13,17 @@ from hrc_learn.store._disk import (
     carry_over,
     delete,
     delete_entries,
+    dump_json,
     entries,
+    holder,
+    is_at,
     read_json,
+    sign,
     sync_file,
     sync_folder,
     sync_tree,
-    write_json,
+    try_lock,
 )
-from hrc_learn.store._lock import holder, is_at, sign, try_lock
 from hrc_learn.store._ownership import Kind, owned_entries, write_manifest
 
 SUFFIX = ".writing"
@@ -64,7 +68,7 @@ class Claim:
         self.workspace = workspace_of(self.target)
         self.new = self.workspace / _NEW
         # What is written inside another workspace is brought to disk with all that is in there.
-        self._sync = not any(is_workspace(parent) for parent in self.target.parents)
+        self._sync = not any(_is_workspace(parent.name) for parent in self.target.parents)
         self._old = self.workspace / _OLD
         self._owned = self.workspace / _OWNED
         self._lock = self._acquire(wait)
@@ -162,7 +166,7 @@ class Claim:
             if keep:  # after the manifest: they are not ours in the new one either
                 owned |= carry_over(entries(self.target) - owned, self.target, self.new)
         if replaces:
-            write_json(self._owned, sorted(owned))
+            dump_json(self._owned, sorted(owned))
         if self._sync:
             sync_tree(self.workspace)
         if replaces:
@@ -252,9 +256,8 @@ def resolved(path: str | os.PathLike[str]) -> Path:
     return Path(path).resolve()
 
 
-def is_workspace(path: Path) -> bool:
-    """Whether a folder has the name of a workspace."""
-    return path.name.startswith(".") and path.name.endswith(SUFFIX)
+def _is_workspace(name: str) -> bool:
+    return name.startswith(".") and name.endswith(SUFFIX) and name != SUFFIX
 
 
 def workspace_of(target: Path) -> Path:
@@ -276,3 +279,52 @@ def _require_ours(workspace: Path) -> None:
         raise InTheWayError(
             f"{workspace} is in the way, and not of hrc_learn: move it elsewhere"
         )
+
+
+def recover(path: str | os.PathLike[str]) -> list[str]:
+    """Mend what interrupted writers left, of a path and of anything below it.
+
+    Args:
+        path: What was being written, or a folder of such things. What is still being written
+            below it is left alone.
+
+    Returns:
+        What was done, in words.
+
+    Raises:
+        BusyError: `path` itself is being written.
+    """
+    target = resolved(path)
+    done = _recover_one(target) if _is_interrupted(target) else []
+    for other in list(_interrupted_below(target)):
+        # In use, or of other origin, or not ours to write.
+        with contextlib.suppress(FileExistsError, PermissionError):
+            done += _recover_one(other)
+    return done
+
+
+def settle(path: str | os.PathLike[str]) -> None:
+    """Finish an interrupted replacement that has left nothing at `path`, for who reads it."""
+    place = resolved(path)
+    while not place.exists() and place != place.parent:
+        if _is_interrupted(place):
+            # Who may not mend it, or comes while it is written, sees that nothing is there.
+            with contextlib.suppress(OSError):
+                _recover_one(place)
+        place = place.parent
+
+
+def _recover_one(target: Path) -> list[str]:
+    with Claim(target) as claim:
+        return claim.mended
+
+
+def _is_interrupted(target: Path) -> bool:
+    return bool(target.name) and workspace_of(target).is_dir()
+
+
+def _interrupted_below(folder: Path) -> Iterator[Path]:
+    for place, folders, _ in os.walk(folder):
+        for name in filter(_is_workspace, list(folders)):
+            folders.remove(name)  # what is in there goes with it
+            yield Path(place) / name[1 : -len(SUFFIX)]

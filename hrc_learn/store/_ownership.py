@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hrc_learn.store._disk import entries, matches, read_json, write_json
+from hrc_learn.store._disk import dump_json, entries, matches, read_json
 
 MADE_BY = "made_by.json"
 """File in each folder of results: what it was made from."""
@@ -123,7 +123,7 @@ def write_manifest(folder: Path, kind: Kind, source: str) -> None:
         "source": source,
         "entries": sorted(entries(folder) - {MANIFEST}),
     }
-    write_json(folder / MANIFEST, content)
+    dump_json(folder / MANIFEST, content)
 
 
 def source_of(folder: str | os.PathLike[str]) -> str:

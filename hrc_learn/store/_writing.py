@@ -1,16 +1,16 @@
-"""Writing files and folders."""
+"""Writing files and folders that are whole or not there at all."""
 
 import json
+import math
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, SupportsFloat
 
-from hrc_learn.store._claim import Claim, InTheWayError, resolved
-from hrc_learn.store._disk import write_json
+from hrc_learn.store._claim import Claim, InTheWayError, resolved, settle
+from hrc_learn.store._disk import dump_json
 from hrc_learn.store._ownership import MADE_BY, RESULTS, Kind
-from hrc_learn.store._recovery import mend_earlier_versions, settle
 
 
 @contextmanager
@@ -71,7 +71,6 @@ def replacing(
     if not isinstance(path, Claim):
         resolved(path).parent.mkdir(parents=True, exist_ok=True)
     with _claimed(path) as claim:
-        mend_earlier_versions(claim)
         claim.require_replaceable(kind, overwrite, foreign=keep, adopt=keep)
         yield claim.new
         claim.commit(kind, overwrite, keep=keep, source=source)
@@ -98,7 +97,7 @@ def new_folder(
     with replacing(path, RESULTS, overwrite) as folder:
         folder.mkdir()
         yield folder
-        write_json(folder / MADE_BY, made_by)
+        dump_json(folder / MADE_BY, made_by)
 
 
 def read_made_by(folder: str | os.PathLike[str]) -> dict[str, Any]:
@@ -109,6 +108,31 @@ def read_made_by(folder: str | os.PathLike[str]) -> dict[str, Any]:
     """
     settle(folder)
     return json.loads((Path(folder) / MADE_BY).read_text(encoding="utf-8"))
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Write a text file, UTF-8; its folder is made where missing."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with new_file(path) as part:
+        part.write_text(text, encoding="utf-8")
+
+
+def write_json(path: str | Path, values: Mapping[str, SupportsFloat]) -> None:
+    """Write measured values as one flat JSON object.
+
+    Args:
+        path: File to write; its folder is made where missing.
+        values: Name -> number. Numbers that are not finite become null, as JSON has none.
+    """
+    content = {name: _plain(value) for name, value in values.items()}
+    write_text(path, json.dumps(content, indent=2) + "\n")
+
+
+def _plain(value: Any) -> float | int | bool | None:
+    # numpy's and torch's scalars come as their plain counterparts.
+    plain = value.item() if hasattr(value, "item") else value
+    return None if isinstance(plain, float) and not math.isfinite(plain) else plain
 
 
 @contextmanager

@@ -155,21 +155,6 @@ def test_a_dataset_behind_a_link_grows_there(tmp_path):
     assert sorted(tmp_path.rglob("set")) == [tmp_path / "disk" / "set", link]
 
 
-def test_what_an_older_version_left_is_recovered(tmp_path):
-    """It kept the dataset in the recording's folder while the longer one took its place."""
-    root = record(tmp_path / "set", [0], ["reach"])
-    with pytest.raises(KeyboardInterrupt):
-        record(root, [1], ["place"], append=True, then=KeyboardInterrupt())
-    staging = tmp_path / "set.recording"
-    (staging / "recording.json").unlink()
-    (staging / "appended_to.json").write_text('{"episodes": 1}')
-    (root / ".manifest.json").unlink()
-    root.rename(staging / "earlier")
-    recover_dataset(root)
-    assert_holds(root, [0, 1], ["reach", "place"])
-    assert list(tmp_path.iterdir()) == [root]
-
-
 def test_videos_are_appended_too(tmp_path):
     root, cameras = tmp_path / "set", {"front": (16, 24)}
     for append in (False, True):

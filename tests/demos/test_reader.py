@@ -387,6 +387,27 @@ def test_shards_are_read_from_their_own_first_row(tmp_path):
         np.testing.assert_allclose(demo.joint_position, q, atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        ('{"episode_index": 0, "length": 60}\n\n{"episode_index"', "line 3 is no valid JSON"),
+        ('{"episode_index": 0, "length": 60}\n{"length": 60}\n', "line 2 lacks episode_index"),
+    ],
+)
+def test_a_line_of_json_that_cannot_be_read_is_named_by_its_number(tmp_path, text, fault):
+    motions = [joint_path(60, seed=seed) for seed in (0, 1)]
+    root = write_folder(
+        tmp_path / "set",
+        [{STATE: q} for q in motions],
+        {STATE: ["a.pos", "b.pos", "c.pos"]},
+        version="v2.1",
+    )
+    (root / "meta/episodes.jsonl").write_text(text, encoding="utf-8")
+    with pytest.raises(DatasetError, match=fault) as raised:
+        load_demos(root)
+    assert str(raised.value.file).endswith("meta/episodes.jsonl")
+
+
 def transforms(q: np.ndarray, order) -> np.ndarray:
     """Flattened 4x4 transforms that turn by q and move by q / 2."""
     T = np.tile(np.eye(4), (len(q), 1, 1))

@@ -40,7 +40,8 @@ def test_what_is_sound_stays_as_it_is_in_every_version(tmp_path, version, withou
     report, demos = repaired(tmp_path, motions, RepairOptions(trim=False), **how)
     assert report.changed == 0
     assert "episode 1: as it was" in str(report)
-    assert read_info(tmp_path / "new")["codebase_version"] == "v3.0"
+    info = read_info(tmp_path / "new")
+    assert (info["codebase_version"], info["robot_type"]) == ("v3.0", "test")
     assert [demo.task for demo in demos] == ["reach", "place"]
     for demo, q in zip(demos, motions, strict=True):
         np.testing.assert_array_equal(demo.joint_position, q)

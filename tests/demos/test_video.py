@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hrc_learn.demos import DatasetWriter, check_dataset, load_demos, recover_dataset
-from hrc_learn.demos.write.video_encoder import video_path
+from hrc_learn.demos.format.videos import video_path
 
 SIZE = (96, 128)
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -14,6 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from lerobot_folders import joint_path
+from power_cuts import cut_off
 
 from hrc_learn.demos import (
     DatasetError,
@@ -21,6 +23,7 @@ from hrc_learn.demos import (
     Demonstration,
     check_dataset,
     load_demos,
+    recover_all,
     recover_dataset,
 )
 
@@ -319,9 +322,17 @@ def test_a_recovery_that_was_killed_starts_anew(tmp_path):
     root = tmp_path / "set"
     with pytest.raises(KeyboardInterrupt):
         record_one(root, [{"gripper": 0.1}], then=KeyboardInterrupt())
-    (tmp_path / "set.recording/dataset/meta").mkdir(parents=True)
-    (tmp_path / "set.recording/episode_000001.unfinished").write_bytes(b"PAR1")
-    assert len(load_demos(recover_dataset(root))) == 1
+    interrupted = tmp_path / "interrupted"
+    shutil.copytree(root.with_name("set.recording"), interrupted)
+    mended = 0
+    for _ in cut_off(lambda: recover_dataset(root)):
+        recover_all(root)
+        assert len(load_demos(root)) == 1
+        assert sorted(tmp_path.iterdir()) == [interrupted, root]
+        shutil.rmtree(root)
+        shutil.copytree(interrupted, root.with_name("set.recording"))
+        mended += 1
+    assert mended > 20
 
 
 def test_a_recording_killed_before_its_first_episode_is_no_obstacle(tmp_path):

@@ -7,7 +7,7 @@ from dmp_contract import DMPContract
 from unchecked import shapes_unchecked
 
 from hrc_learn.dmp import JointDMP, OrientationDMP, PoseDMP, SplineBasis
-from hrc_learn.dmp import ude_formulation as ude
+from hrc_learn.dmp import _ude_formulation as ude
 from hrc_learn.geometry import Pose, quaternion
 
 
@@ -169,6 +169,10 @@ class TestOrientationOfUde(TestOrientation):
     @pytest.fixture(autouse=True)
     def coarse(self, monkeypatch):
         monkeypatch.setattr(ude, "LONGEST", 1 / 80)
+        # Its many short steps take four times as long with their shapes checked, which the
+        # tests of the formulation do.
+        with shapes_unchecked():
+            yield
 
     def fit(self, *demonstration, **kwargs):
         return OrientationDMP.fit(*demonstration, formulation="ude", **kwargs)

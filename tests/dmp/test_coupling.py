@@ -1,6 +1,7 @@
 import pytest
 import torch
 from demo_motions import minimum_jerk
+from unchecked import shapes_unchecked
 
 from hrc_learn.dmp import JointDMP
 from hrc_learn.dmp.coupling import (
@@ -23,7 +24,7 @@ def reach_past_the_obstacle():
 
 def run(dmp, couple, steps=600):
     state, path = dmp.initial_state(), []
-    with torch.no_grad():
+    with torch.no_grad(), shapes_unchecked():
         for _ in range(steps):
             state = dmp.step(state, 0.01, coupling=couple(state))
             path.append(state.position)
@@ -112,7 +113,7 @@ def test_a_held_robot_is_waited_for():
     """Held at its start, the motion all but stops; let go, it ends on its path."""
     dmp = reach_past_the_obstacle()
     state, robot = dmp.initial_state(), dmp.start
-    with torch.no_grad():
+    with torch.no_grad(), shapes_unchecked():
         for k in range(1500):
             waiting = phase_stopping(state.position, robot, gain=1e4)
             state = dmp.step(state, 0.01, phase_stopping=waiting)

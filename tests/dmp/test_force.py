@@ -6,6 +6,7 @@ from dmp_oracle import forcing
 from scipy.integrate import solve_ivp
 from torch.autograd import gradcheck
 from torch.autograd.functional import jvp
+from unchecked import shapes_unchecked
 
 from hrc_learn.dmp import JointDMP
 from hrc_learn.dmp.coupling import distance_error, learn, offset_error, velocity_coupling
@@ -44,7 +45,7 @@ def printed_form(dmp, goal, end, velocity, lead=0.0):
 def run(dmp, goal, end, n_steps, couple):
     """State after s = end; `couple(k, state)` gives V and its rate."""
     state = dmp.initial_state(goal=goal)
-    with torch.no_grad():
+    with torch.no_grad(), shapes_unchecked():
         for k in range(n_steps):
             V, V_dot, lead = couple(k, state)
             push = velocity_coupling(
@@ -92,7 +93,7 @@ def press_on_a_wall(dmp, wanted, learned, dt):
     feed_forward = torch.gradient(learned, spacing=dt, dim=0)[0]
     wanted_rate = torch.gradient(wanted, spacing=dt, dim=0)[0]
     forces, state = [], dmp.initial_state()
-    with torch.no_grad():
+    with torch.no_grad(), shapes_unchecked():
         for k in range(len(wanted)):
             depth = state.position - 0.3
             force = STIFFNESS * depth.clamp(min=0)
@@ -224,13 +225,13 @@ def test_arms_keep_their_distance_on_the_way_and_may_turn():
     distances = {}
     for name, wanted_gain in (("linked", 1.0), ("alone", 0.0)):
         state, distances[name] = dmp.initial_state(goal=goal), []
-        for _ in range(300):
-            (a, b), (va, vb) = state.position, state.velocity
-            V, V_dot, _ = mirrored(*distance_error(a, va, b, vb, 0.5))
-            push = velocity_coupling(V, V_dot, spring=dmp.spring, duration=state.duration)
-            with torch.no_grad():
+        with torch.no_grad(), shapes_unchecked():
+            for _ in range(300):
+                (a, b), (va, vb) = state.position, state.velocity
+                V, V_dot, _ = mirrored(*distance_error(a, va, b, vb, 0.5))
+                push = velocity_coupling(V, V_dot, spring=dmp.spring, duration=state.duration)
                 state = dmp.step(state, 0.01, coupling=wanted_gain * push)
-            distances[name].append((b - a).norm().item())
+                distances[name].append((b - a).norm().item())
     linked, alone = (abs(np.array(distances[n]) - 0.5).max() for n in ("linked", "alone"))
     assert linked < 0.15 * alone
     turned = state.position[1] - state.position[0]  # the arms alone

@@ -180,13 +180,14 @@ def test_gradients_are_exact(turn):
     goal = dmp.start + turn * (dmp.goal - dmp.start) + 0.1
     inputs = (dmp.weights, dmp.start, goal, dmp.duration)
     inputs = tuple(x.detach().clone().requires_grad_() for x in inputs)
-    assert gradcheck(outputs, inputs, atol=1e-6)
+    with shapes_unchecked():
+        assert gradcheck(outputs, inputs, atol=1e-6)
 
 
 # Steps, in every scaling
 
 
-@pytest.mark.parametrize("n_steps", [20, 1000])
+@pytest.mark.parametrize("n_steps", [20, 400])
 @pytest.mark.parametrize("scaling", SCALINGS)
 def test_steps_solve_the_equation(scaling, n_steps):
     """Against an adaptive solver, to a goal that jumps half way."""
@@ -216,7 +217,7 @@ def test_steps_solve_the_equation(scaling, n_steps):
     state = dmp.initial_state(goal=goals[0])
     x = torch.cat([state.position, state.rate]).detach().numpy()
     x = solve(solve(x, goals[0], (0.0, 0.5)), goals[1], (0.5, 1.1))
-    # Unchecked: a thousand steps with all their shapes checked take seconds.
+    # Unchecked: hundreds of steps with all their shapes checked take seconds.
     with torch.no_grad(), shapes_unchecked():
         for k in range(n_steps):
             first = k < n_steps // 2

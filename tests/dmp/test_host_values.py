@@ -5,7 +5,7 @@ import torch
 from demo_motions import arm_motion
 
 from hrc_learn.dmp import JointDMP, SpringDamper
-from hrc_learn.dmp.closed_loop_step import host_values
+from hrc_learn.dmp._closed_loop_step import host_values
 
 SPRINGS = [
     SpringDamper(),

@@ -248,7 +248,8 @@ def test_gradients_are_exact(own_grid, scaling):
     dmp.forward = dmp.rollout
     inputs = (dmp.weights, dmp.start, dmp.goal, dmp.start_velocity, dmp.duration)
     inputs = tuple(x.detach().clone().requires_grad_() for x in inputs)
-    assert gradcheck(outputs, inputs, atol=1e-6)
+    with shapes_unchecked():
+        assert gradcheck(outputs, inputs, atol=1e-6)
 
 
 # Bad input

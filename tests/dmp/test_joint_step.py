@@ -5,18 +5,19 @@ import pytest
 import torch
 from demo_motions import arm_motion
 from dmp_oracle import solve
+from unchecked import shapes_unchecked
 
 from hrc_learn.dmp import JointDMP, SpringDamper
 
 
-@pytest.mark.parametrize("n_steps", [1, 20, 1000])
+@pytest.mark.parametrize("n_steps", [1, 20, 400])
 @pytest.mark.parametrize("scaling", ["none", "paper"])
 def test_steps_end_where_the_rollout_does(n_steps, scaling):
     time, position = arm_motion(moving_start=True)
     dmp = JointDMP.fit(time, position, scaling=scaling)
     goal = position[-1] + 0.2
     state = dmp.initial_state(goal=goal, duration=2.0)
-    with torch.no_grad():
+    with torch.no_grad(), shapes_unchecked():
         for _ in range(n_steps):
             state = dmp.step(state, 2.2 / n_steps)
     end = dmp.rollout(time=[2.2], goal=goal, duration=2.0)
@@ -99,17 +100,18 @@ def exact(dmp, y, rate, goal, span, push=None):
     return solve(dmp.spring, dmp.basis, weights, y, rate, goal, np.array(span), push)[:, -1]
 
 
-@pytest.mark.parametrize("n_steps", [20, 1000])
+@pytest.mark.parametrize("n_steps", [20, 400])
 def test_steps_solve_the_equation_also_when_the_goal_jumps(n_steps):
     dmp = primitive()
     state = dmp.initial_state()
     y, rate = state.position.item(), state.rate.item()
     middle = exact(dmp, y, rate, dmp.goal.item(), (0.0, 0.5))
     expected = exact(dmp, *middle, 1.5, (0.5, 1.2))
-    for _ in range(n_steps // 2):
-        state = dmp.step(state, 2.0 * 0.5 / (n_steps // 2))
-    for _ in range(n_steps // 2):
-        state = dmp.step(state, 2.0 * 0.7 / (n_steps // 2), goal=[1.5])
+    with torch.no_grad(), shapes_unchecked():
+        for _ in range(n_steps // 2):
+            state = dmp.step(state, 2.0 * 0.5 / (n_steps // 2))
+        for _ in range(n_steps // 2):
+            state = dmp.step(state, 2.0 * 0.7 / (n_steps // 2), goal=[1.5])
     got = [state.position.item(), state.rate.item()]
     np.testing.assert_allclose(got, expected, rtol=0, atol=1e-8)
 
@@ -129,8 +131,9 @@ def test_coupling_sampled_at_the_start_of_a_step_is_of_first_order():
     errors = []
     for n_steps in (100, 200, 400):
         state = start
-        for _ in range(n_steps):
-            state = dmp.step(state, 2.0 / n_steps, coupling=30 * (1 - state.position))
+        with torch.no_grad(), shapes_unchecked():
+            for _ in range(n_steps):
+                state = dmp.step(state, 2.0 / n_steps, coupling=30 * (1 - state.position))
         errors.append(abs(state.position.item() - expected))
     orders = np.log2(np.array(errors[:-1]) / errors[1:])
     assert ((orders > 0.9) & (orders < 1.2)).all(), orders

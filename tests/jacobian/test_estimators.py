@@ -28,7 +28,7 @@ from hrc_learn.jacobian import (
     paper_grid,
 )
 from hrc_learn.jacobian.estimator import MotionSample
-from hrc_learn.jacobian.recursive_estimators import condition
+from hrc_learn.jacobian.learning_estimators import condition
 
 ALL = [
     FixedEstimator,
@@ -496,7 +496,8 @@ def test_learning_can_be_differentiated(Estimator):
         return estimator.jacobian(end, poses[:, -1])
 
     weight = state.weight.clone().requires_grad_()
-    assert torch.autograd.gradcheck(last_jacobian, weight, eps=1e-2)
+    with shapes_unchecked():
+        assert torch.autograd.gradcheck(last_jacobian, weight, eps=1e-2)
 
 
 @pytest.mark.parametrize("Estimator", LEARNING)

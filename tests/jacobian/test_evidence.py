@@ -17,8 +17,8 @@ from hrc_learn.jacobian import (
     maximize_evidence,
     paper_grid,
 )
-from hrc_learn.jacobian.evidence import NegativeLogEvidence
 from hrc_learn.jacobian.fitting import weight_covariance
+from hrc_learn.jacobian.model_selection import NegativeLogEvidence
 from hrc_learn.jacobian.samples import KeyFrameConfig, MotionSamples
 
 CAMERA = Pinhole.overhead(roll=0.7)

@@ -1,24 +1,25 @@
-"""Where the parts of a LeRobot dataset lie, for its versions 2.0, 2.1 and 3.0, and
-whether its counts agree.
+"""Where the parts of a LeRobot dataset lie, for its versions 2.0, 2.1 and 3.0.
+
+Reads the metadata alone. The three versions end in one form, `DatasetFolder`; what the frames
+hold is the business of `read.frames` and `read.column_mapping`.
 """
 
 import json
-from collections import Counter
-from collections.abc import Iterable, Iterator
+from bisect import bisect_left, bisect_right
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import accumulate
 from pathlib import Path
+from typing import Any
 
-from hrc_learn.demos.format.features import INFO_PATH, Feature, read_features
-from hrc_learn.demos.format.parquet import read_rows
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from hrc_learn.demos.format.metadata import INFO_PATH, Feature, read_features
 from hrc_learn.demos.issue import DatasetError
-from hrc_learn.demos.write.staging import staging_folder
+from hrc_learn.demos.write.episode import staging_folder
 from hrc_learn.store import settle
-
-# Where the parts of a LeRobot dataset lie, for its versions 2.0, 2.1 and 3.0.
-#
-# Reads the metadata alone. The three versions end in one form, `DatasetFolder`; what the
-# frames hold is the business of `frames` and `column_mapping`.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,6 +34,11 @@ class EpisodeEntry:
     """Data file, relative to the dataset."""
     start: int
     """Row of its first frame in that file."""
+
+    @property
+    def location(self) -> dict[str, Any]:
+        """Where it lies, for a `DatasetError` or a report."""
+        return {"file": self.file, "episode": self.index}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -257,35 +263,88 @@ def _read_json_lines(root: Path, file: str, required: tuple[str, ...]) -> list[d
     return rows
 
 
-# Episodes and frames counted in several places, which must agree.
+# Its files of Parquet, opened with errors that say what to do.
 
 
-def count_faults(folder: DatasetFolder) -> Iterator[DatasetError]:
-    """What the metadata contradict each other in."""
-    entries, info = folder.episodes, folder.info
-    if not entries:
-        yield DatasetError("the dataset holds no episodes", file=folder.root)
-    for name, counted in (
-        ("total_episodes", len(entries)),
-        ("total_frames", sum(entry.length for entry in entries)),
-    ):
-        if info.get(name, counted) != counted:
-            yield DatasetError(
-                f"says {info[name]}, but the list of episodes counts {counted}: episodes were "
-                f"lost, or the file belongs to another copy; hrc repair counts anew",
-                file=INFO_PATH,
-                key=name,
-            )
-    repeated = [index for index, n in Counter(e.index for e in entries).items() if n > 1]
-    for index in repeated:
-        yield DatasetError("is listed more than once", file="meta/episodes", episode=index)
-    missing = sorted(set(range(len(entries))) - {entry.index for entry in entries})
-    if missing and not repeated:
-        yield DatasetError(
-            "is missing from the list of episodes: indices must count from 0 without a gap",
-            file="meta/episodes",
-            episode=missing[0],
-        )
-    for entry in entries:
-        if entry.length <= 0:
-            yield DatasetError("has no frames", file=entry.file, episode=entry.index)
+def open_parquet(root: Path, file: str, episode: int | None = None) -> pq.ParquetFile:
+    """Open a file of the dataset.
+
+    Raises:
+        DatasetError: It is missing, or truncated.
+    """
+    try:
+        return pq.ParquetFile(root / file)
+    except FileNotFoundError as error:
+        raise DatasetError(
+            "not found: the copy is incomplete", file=file, episode=episode
+        ) from error
+    except (pa.ArrowInvalid, OSError) as error:
+        raise DatasetError(
+            "unreadable: the file is truncated, because the recording was not finalized or "
+            "the copy is incomplete",
+            file=file,
+            episode=episode,
+        ) from error
+
+
+def read_rows(
+    root: Path, file: str, required: Sequence[str], optional: Collection[str] | None = None
+) -> list[dict]:
+    """Rows of a metadata file as dicts.
+
+    Args:
+        root: The dataset.
+        file: The file, relative to it.
+        required: Columns that must be there.
+        optional: Columns to read besides where they exist; None reads all.
+
+    Raises:
+        DatasetError: The file is missing, truncated, or lacks a required column.
+    """
+    parquet = open_parquet(root, file)
+    existing = parquet.schema_arrow.names
+    for name in required:
+        if name not in existing:
+            raise DatasetError("the column is missing", file=file, key=name)
+    wanted = None if optional is None else [*required, *(n for n in optional if n in existing)]
+    return read_table(parquet, file, wanted).to_pylist()
+
+
+def read_table(
+    parquet: pq.ParquetFile,
+    file: str,
+    columns: Sequence[str] | None = None,
+    rows: slice | None = None,
+) -> pa.Table:
+    """Columns of an open file, of all rows or of a range of them.
+
+    Of a range, only the row groups it touches are read: LeRobot writes one an episode.
+
+    Raises:
+        DatasetError: The file is damaged.
+    """
+    wanted = None if columns is None else list(columns)
+    try:
+        if rows is None or (rows.start, rows.stop) == (0, parquet.metadata.num_rows):
+            return parquet.read(columns=wanted)
+        groups, offset = _row_groups(parquet.metadata, rows)
+        table = parquet.read_row_groups(groups, columns=wanted)
+        return table.slice(rows.start - offset, rows.stop - rows.start)
+    except (pa.ArrowInvalid, OSError) as error:
+        raise DatasetError(
+            f"unreadable: the file is damaged ({error}); copy it again", file=file
+        ) from error
+
+
+def row_group_starts(metadata: pq.FileMetaData) -> list[int]:
+    """Row that each row group begins at."""
+    sizes = [metadata.row_group(i).num_rows for i in range(metadata.num_row_groups)]
+    return [0, *accumulate(sizes)][:-1]
+
+
+def _row_groups(metadata: pq.FileMetaData, rows: slice) -> tuple[list[int], int]:
+    """Row groups that hold a range of rows, and the row the first of them begins at."""
+    starts = row_group_starts(metadata)
+    first = bisect_right(starts, rows.start) - 1
+    stop = bisect_left(starts, rows.stop)
+    return list(range(first, stop)), starts[first]

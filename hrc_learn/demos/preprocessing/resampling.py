@@ -4,7 +4,7 @@ from dataclasses import replace
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, Float64, Int64
+from jaxtyping import Float, Float64, Int64
 
 from hrc_learn.demos.demonstration import Demonstration, DemonstrationSet
 
@@ -88,7 +88,8 @@ def fields_at(
     for name in demo.recorded[1:]:
         values = getattr(demo, name)
         if name == "feature_visible":
-            rows[name] = _both(demo.time, values, time)
+            # In both neighbours; a weight of 1e-9 is rounding at the frame itself.
+            rows[name] = linear(demo.time, values.astype(float), time) > 1 - 1e-9
         elif name in _SMOOTH:
             rows[name] = _moving(name, demo.time, values, time, method)
         else:
@@ -138,14 +139,6 @@ def _turn(
 
 def _unit(q: np.ndarray) -> np.ndarray:
     return q / np.linalg.norm(q, axis=1, keepdims=True)
-
-
-def _both(
-    known: Float64[np.ndarray, " frames"],
-    values: Bool[np.ndarray, " frames"],
-    time: Float64[np.ndarray, " times"],
-) -> Bool[np.ndarray, " times"]:
-    return linear(known, values.astype(float), time) > 1 - 1e-9
 
 
 def _extra(

@@ -130,17 +130,13 @@ def split_at_rest(
 def _speed(
     demo: Demonstration, criterion: RestCriterion
 ) -> tuple[Float64[np.ndarray, " frames"], tuple[float, float]]:
-    if demo.joint_position is not None:
-        rates = _rates(demo, demo.joint_position, criterion.window)
-        return np.abs(rates).max(1), criterion.joint_speed
-    if demo.position is not None:
-        rates = _rates(demo, demo.position, criterion.window)
+    values = demo.position if demo.joint_position is None else demo.joint_position
+    if values is None:
+        raise ValueError("rest shows in joint positions or positions; neither is recorded")
+    _, rates = local_polynomial(demo.time, values, window=criterion.window, degree=2)
+    if demo.joint_position is None:
         return np.linalg.norm(rates, axis=1), criterion.linear_speed
-    raise ValueError("rest shows in joint positions or positions; neither is recorded")
-
-
-def _rates(demo: Demonstration, values: np.ndarray, window: float) -> np.ndarray:
-    return local_polynomial(demo.time, values, window=window, degree=2)[1]
+    return np.abs(rates).max(1), criterion.joint_speed
 
 
 def _runs(flags: Bool[np.ndarray, " frames"]) -> list[tuple[int, int]]:

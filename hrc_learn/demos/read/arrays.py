@@ -10,8 +10,8 @@ from jaxtyping import Float64
 
 from hrc_learn.demos.demonstration import Demonstration
 from hrc_learn.demos.issue import DatasetError
-from hrc_learn.demos.read.component_names import meaning_of_component
-from hrc_learn.demos.read.value_encodings import to_quaternion, unit_factor
+from hrc_learn.demos.read.reader import to_quaternion
+from hrc_learn.demos.read.roles import meaning_of_component, unit_factor
 
 # Arrays read from .npz, .npy and .csv files.
 

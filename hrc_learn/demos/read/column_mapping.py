@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from hrc_learn.demos.demonstration import JOINT_FIELDS
-from hrc_learn.demos.format.features import INFO_PATH, Feature, Sidecar
+from hrc_learn.demos.format.metadata import INFO_PATH, Feature, Sidecar
 from hrc_learn.demos.issue import DatasetError
-from hrc_learn.demos.read.component_names import (
+from hrc_learn.demos.read.roles import (
     INDEX_KEYS,
     ORIENTATION_ROLES,
     ROLES,
@@ -65,9 +65,8 @@ def parse_mapping(
             raise DatasetError(
                 f"mapping names the unknown quantity {role!r}; known are {', '.join(ROLES)}"
             )
-        if columns is None:
-            continue
-        selections[role] = _selection(role, columns, features)
+        if columns is not None:
+            selections[role] = _selection(role, columns, features)
     return selections
 
 
@@ -190,7 +189,11 @@ def map_columns(
         found = parse_mapping(declared, usable)
     else:
         found = _by_convention(usable, notes)
-    found = _override(found, mapping or {}, usable)
+    dropped = {*(mapping or {})}
+    if dropped & {*ORIENTATION_ROLES}:  # one encoding takes the place of all
+        dropped |= {*ORIENTATION_ROLES}
+    found = {role: selection for role, selection in found.items() if role not in dropped}
+    found |= parse_mapping(mapping or {}, usable)
     names, found, unmatched = _align_joints(found)
     notes.extend(
         f"{role} is of other joints ({', '.join(others)}) than the rest ({', '.join(names)}); "
@@ -210,16 +213,6 @@ def map_columns(
         notes=tuple(notes),
         unmatched=unmatched,
     )
-
-
-def _override(
-    found: dict[str, ColumnSelection], mapping: MappingSpec, features: Mapping[str, Feature]
-) -> dict[str, ColumnSelection]:
-    explicit = parse_mapping(mapping, features)
-    dropped = set(mapping)
-    if dropped & set(ORIENTATION_ROLES):
-        dropped |= set(ORIENTATION_ROLES)
-    return {role: s for role, s in found.items() if role not in dropped} | explicit
 
 
 def _by_convention(

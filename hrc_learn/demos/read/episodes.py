@@ -2,6 +2,7 @@
 in the units on disk.
 """
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,13 +11,8 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float64
 
-from hrc_learn.demos.format.dataset_folder import (
-    DatasetFolder,
-    EpisodeEntry,
-    count_faults,
-    open_folder,
-)
-from hrc_learn.demos.format.features import Sidecar, read_sidecar
+from hrc_learn.demos.format.dataset_folder import DatasetFolder, EpisodeEntry, open_folder
+from hrc_learn.demos.format.metadata import INFO_PATH, Sidecar, read_sidecar
 from hrc_learn.demos.image_features import FeatureCache, only_feature
 from hrc_learn.demos.issue import DatasetError
 from hrc_learn.demos.read.column_mapping import (
@@ -26,12 +22,46 @@ from hrc_learn.demos.read.column_mapping import (
     map_columns,
 )
 from hrc_learn.demos.read.frames import RawFrames, read_frames
-from hrc_learn.demos.read.value_encodings import (
+from hrc_learn.demos.read.roles import (
     UnitDecision,
     decide_units,
     guessed_from_values,
     unit_factor,
 )
+
+# Episodes and frames counted in several places, which must agree.
+
+
+def count_faults(folder: DatasetFolder) -> Iterator[DatasetError]:
+    """What the metadata contradict each other in."""
+    entries, info = folder.episodes, folder.info
+    if not entries:
+        yield DatasetError("the dataset holds no episodes", file=folder.root)
+    for name, counted in (
+        ("total_episodes", len(entries)),
+        ("total_frames", sum(entry.length for entry in entries)),
+    ):
+        if info.get(name, counted) != counted:
+            yield DatasetError(
+                f"says {info[name]}, but the list of episodes counts {counted}: episodes were "
+                f"lost, or the file belongs to another copy; hrc repair counts anew",
+                file=INFO_PATH,
+                key=name,
+            )
+    repeated = [index for index, n in Counter(e.index for e in entries).items() if n > 1]
+    for index in repeated:
+        yield DatasetError("is listed more than once", file="meta/episodes", episode=index)
+    missing = sorted(set(range(len(entries))) - {entry.index for entry in entries})
+    if missing and not repeated:
+        yield DatasetError(
+            "is missing from the list of episodes: indices must count from 0 without a gap",
+            file="meta/episodes",
+            episode=missing[0],
+        )
+    for entry in entries:
+        if entry.length <= 0:
+            yield DatasetError("has no frames", **entry.location)
+
 
 # Quantities picked out of raw columns, still in the units they have on disk.
 
@@ -46,11 +76,24 @@ def select_quantities(
     return {role: _columns(frames, selection.columns) for role, selection in selections.items()}
 
 
-def frame_step(time: Float64[np.ndarray, "frames 1"] | None, fps: float) -> float:
-    """Usual step of true stamps as a multiple of the nominal period; 1 without stamps."""
-    if time is None or len(time) < 2:
-        return 1.0
-    return float(np.median(np.diff(time[:, 0]))) * fps
+def units_on_disk(
+    roles: Iterable[str],
+    episodes: Iterable[Quantities],
+    fps: float,
+    declared: Mapping[str, str],
+    given: Mapping[str, str],
+) -> dict[str, UnitDecision]:
+    """The unit of each of these quantities, as `decide_units`, from their finite values."""
+    largest, step = dict.fromkeys(roles, 0.0), None
+    for quantities in episodes:
+        for role, values in quantities.items():
+            peak = np.abs(values).max(initial=0.0, where=np.isfinite(values))
+            largest[role] = max(largest[role], float(peak))
+        time = quantities.get("time", np.empty((0, 1)))
+        if step is None and len(time) > 1:
+            # The usual one as a multiple of the nominal period.
+            step = float(np.median(np.diff(time[:, 0]))) * fps
+    return decide_units(largest, declared, given, 1.0 if step is None else step)
 
 
 def _columns(
@@ -191,8 +234,6 @@ class EpisodeReader:
         for entry, frames in read_frames(
             self.folder, sorted(entries, key=_place), sorted(keys)
         ):
-            if not entry.length:
-                raise DatasetError("has no frames", file=entry.file, episode=entry.index)
             quantities = select_quantities(frames, selections)
             _refuse_non_finite(entry, quantities, self.column_mapping)
             yield RawEpisode(entry=entry, frames=frames, quantities=quantities)
@@ -213,14 +254,13 @@ class EpisodeReader:
         Raises:
             DatasetError: A unit is unknown, or does not fit its quantity.
         """
-        largest = dict.fromkeys(self.column_mapping.selections, 0.0)
-        steps = []
-        for episode in episodes:
-            for role, values in episode.quantities.items():
-                largest[role] = max(largest[role], float(np.abs(values).max()))
-            if not steps:
-                steps.append(frame_step(episode.quantities.get("time"), self.folder.fps))
-        return decide_units(largest, self.sidecar.units, given, *steps)
+        return units_on_disk(
+            self.column_mapping.selections,
+            (episode.quantities for episode in episodes),
+            self.folder.fps,
+            self.sidecar.units,
+            given,
+        )
 
     def survey(self, given: Mapping[str, str]) -> dict[str, UnitDecision]:
         """The same from a pass of its own over those columns whose unit must be guessed.
@@ -289,8 +329,7 @@ def _refuse_non_finite(
             raise DatasetError(
                 f"{role} is {values[frame, component]} there; leave the episode out "
                 f"(episodes=[...]) or repair the recording",
-                file=entry.file,
-                episode=entry.index,
+                **entry.location,
                 frame=frame,
                 key=f"{selection.columns[component][0]} ({selection.labels[component]})",
             )

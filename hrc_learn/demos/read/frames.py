@@ -4,16 +4,16 @@ from collections.abc import Iterator, Sequence
 from itertools import groupby
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 from jaxtyping import Float64, Shaped
 
-from hrc_learn.demos.format.dataset_folder import DatasetFolder, EpisodeEntry
-from hrc_learn.demos.format.parquet import (
-    BadRowError,
+from hrc_learn.demos.format.dataset_folder import (
+    DatasetFolder,
+    EpisodeEntry,
     open_parquet,
     read_table,
     row_group_starts,
-    to_numpy,
 )
 from hrc_learn.demos.issue import DatasetError
 
@@ -106,10 +106,10 @@ def _read_batch(
         try:
             columns[key] = to_numpy(table.column(key))
         except BadRowError as error:
-            entry = _entry_at(entries, error.row + rows.start)
-            frame = error.row + rows.start - entry.start
+            row = error.row + rows.start
+            entry = next(e for e in entries if e.start <= row < e.start + e.length)
             raise DatasetError(
-                str(error), file=file, episode=entry.index, frame=frame, key=key
+                str(error), **entry.location, frame=row - entry.start, key=key
             ) from error
         _require_width(folder, file, key, columns[key])
     for entry in entries:
@@ -145,6 +145,8 @@ def _require_width(folder: DatasetFolder, file: str, key: str, values: np.ndarra
 
 
 def _require_episode(file: str, entry: EpisodeEntry, frames: RawFrames) -> None:
+    if not entry.length:
+        raise DatasetError("has no frames", **entry.location)
     if "episode_index" not in frames:
         return
     wrong = np.flatnonzero(frames["episode_index"] != entry.index)
@@ -159,11 +161,14 @@ def _require_episode(file: str, entry: EpisodeEntry, frames: RawFrames) -> None:
         )
 
 
-def _entry_at(entries: Sequence[EpisodeEntry], row: int) -> EpisodeEntry:
-    return next(entry for entry in entries if entry.start <= row < entry.start + entry.length)
-
-
 # When each frame was taken.
+
+
+def recorded_stamps(folder: DatasetFolder, frames: RawFrames) -> Float64[np.ndarray, " frames"]:
+    """LeRobot's own stamps of one episode, 1/fps apart where there are none [s]."""
+    if "timestamp" in frames:
+        return frames["timestamp"][:, 0].astype(float)
+    return np.arange(len(next(iter(frames.values())))) / folder.fps
 
 
 def frame_timestamps(
@@ -180,13 +185,9 @@ def frame_timestamps(
     Raises:
         DatasetError: The stamps do not increase.
     """
-    nominal = np.arange(entry.length) / folder.fps
+    time, key = recorded_stamps(folder, frames), "timestamp"
     if true_stamps is not None:
         time, key = true_stamps[:, 0], "time"
-    elif "timestamp" in frames:
-        time, key = frames["timestamp"][:, 0].astype(float), "timestamp"
-    else:
-        return nominal
     stalled = np.flatnonzero(~(np.diff(time) > 0))
     if len(stalled):
         k = int(stalled[0])
@@ -194,13 +195,68 @@ def frame_timestamps(
             f"stamps must increase, but go from {time[k]:.6f} s to {time[k + 1]:.6f} s; "
             f"drop the repeated frames, or have frames taken 1/fps apart "
             f"(mapping={{'time': None}} where the column is one of true stamps)",
-            file=entry.file,
-            episode=entry.index,
+            **entry.location,
             frame=k + 1,
             key=key,
         )
     resolution = 2 * np.finfo(np.float32).eps * max(1.0, float(np.abs(time).max()))
-    regular = time[0] + nominal
+    regular = time[0] + np.arange(entry.length) / folder.fps
     if key == "timestamp" and (np.abs(time - regular) <= resolution).all():
         return regular
     return time
+
+
+# Columns of Parquet files as arrays.
+
+
+class BadRowError(ValueError):
+    """A row of a column that holds no usable value; `row` counts from the table's start."""
+
+    def __init__(self, row: int, message: str):
+        super().__init__(message)
+        self.row = row
+
+
+def to_numpy(column: pa.ChunkedArray) -> Shaped[np.ndarray, "rows components"]:
+    """Values of a column, in their own type; lists and nested lists are laid flat.
+
+    Raises:
+        BadRowError: A value is missing, or rows differ in their number of components.
+    """
+    array = pa.concat_arrays(column.chunks or [pa.array([], column.type)])
+    rows = len(array)
+    while True:
+        _refuse_nulls(array, rows)
+        if isinstance(array, pa.ExtensionArray):
+            array = array.storage
+        elif pa.types.is_fixed_size_list(array.type):
+            array = array.flatten()
+        elif pa.types.is_list(array.type) or pa.types.is_large_list(array.type):
+            array = _flatten_ragged(array, rows)
+        else:
+            break
+    values = _without_pandas(array)
+    return values.reshape(rows, len(values) // rows if rows else 0)
+
+
+def _flatten_ragged(array: pa.Array, rows: int) -> pa.Array:
+    widths = _without_pandas(array.value_lengths())
+    differing = np.flatnonzero(widths != widths[0]) if len(widths) else []
+    if len(differing):
+        row = int(differing[0]) * rows // len(array)
+        found, expected = int(widths[differing[0]]), int(widths[0])
+        raise BadRowError(row, f"holds {found} components, the first row {expected}")
+    return array.flatten()
+
+
+def _refuse_nulls(array: pa.Array, rows: int) -> None:
+    if array.null_count:
+        at = int(np.flatnonzero(_without_pandas(array.is_null()))[0])
+        raise BadRowError(at * rows // len(array), "holds no value (null)")
+
+
+def _without_pandas(array: pa.Array) -> Shaped[np.ndarray, " values"]:
+    """Values of an array of numbers; its own `to_numpy` imports pandas, for a second."""
+    if pa.types.is_boolean(array.type):  # packed to bits, which numpy cannot view
+        return np.from_dlpack(array.cast(pa.uint8())).astype(bool)
+    return np.from_dlpack(array)

@@ -8,6 +8,9 @@ from pathlib import Path
 from typing import overload
 
 import numpy as np
+import torch
+from jaxtyping import Float64
+from torch import Tensor
 
 from hrc_learn.demos.demonstration import (
     JOINT_FIELDS,
@@ -19,7 +22,6 @@ from hrc_learn.demos.format.dataset_folder import DatasetFolder, EpisodeEntry
 from hrc_learn.demos.image_features import with_feature
 from hrc_learn.demos.issue import DatasetError, UnitsWarning
 from hrc_learn.demos.read.column_mapping import ColumnMapping, MappingSpec
-from hrc_learn.demos.read.component_names import ORIENTATION_ROLES
 from hrc_learn.demos.read.episodes import (
     EpisodeFilter,
     EpisodeReader,
@@ -29,7 +31,8 @@ from hrc_learn.demos.read.episodes import (
     open_reader,
 )
 from hrc_learn.demos.read.frames import RawFrames, frame_timestamps
-from hrc_learn.demos.read.value_encodings import UnitDecision, matrix_position, to_quaternion
+from hrc_learn.demos.read.roles import ORIENTATION_ROLES, UnitDecision
+from hrc_learn.geometry import quaternion
 
 # From quantities in the units on disk to a `Demonstration`.
 
@@ -86,12 +89,11 @@ def _pose(
         orientation = to_quaternion(role, quantities[role])
         if "position" in scaled:
             return {"orientation": orientation}
-        position = matrix_position(quantities[role]) * decisions[role].factor
+        matrices = _as_transforms(torch.from_numpy(quantities[role]))
+        position = matrices[:, :3, 3].numpy() * decisions[role].factor
         return {"orientation": orientation, "position": position}
     except ValueError as error:
-        raise DatasetError(
-            str(error), file=entry.file, episode=entry.index, key=role
-        ) from error
+        raise DatasetError(str(error), **entry.location, key=role) from error
 
 
 def _task(folder: DatasetFolder, entry: EpisodeEntry, frames: RawFrames) -> str:
@@ -100,6 +102,91 @@ def _task(folder: DatasetFolder, entry: EpisodeEntry, frames: RawFrames) -> str:
     if "task_index" in frames:
         return folder.tasks.get(int(frames["task_index"][0, 0]), "")
     return ""
+
+
+# Orientations in the encodings datasets use, as continuous unit quaternions.
+
+
+def to_quaternion(
+    role: str, values: Float64[np.ndarray, "frames components"]
+) -> Float64[np.ndarray, "frames 4"]:
+    """Unit quaternions (w, x, y, z), neighbours on the same half of the sphere.
+
+    Args:
+        role: One of `roles.ORIENTATION_ROLES`.
+        values: Its components in our units.
+
+    Raises:
+        ValueError: Quaternions are far from unit length, matrices are no transforms, or two
+            columns span no plane.
+    """
+    numbers = torch.from_numpy(values)
+    match role:
+        case "quaternion_wxyz":
+            orientation = _unit(numbers)
+        case "quaternion_xyzw":
+            orientation = _unit(numbers.roll(1, dims=-1))
+        case "rotation_vector":
+            orientation = quaternion.exp(numbers)
+        case "euler_xyz":
+            orientation = _from_euler(numbers, (2, 1, 0))
+        case "euler_intrinsic_xyz":
+            orientation = _from_euler(numbers, (0, 1, 2))
+        case "rotation_6d":
+            orientation = _from_two_columns(numbers)
+        case _:
+            orientation = quaternion.from_matrix(_as_transforms(numbers)[:, :3, :3])
+    return quaternion.continuous(orientation).numpy()
+
+
+def _as_transforms(values: Tensor) -> Tensor:
+    """4x4 transforms from 16 numbers, whether written by rows or, as libfranka, by columns.
+
+    Raises:
+        ValueError: Neither reading has (0, 0, 0, 1) for its last row.
+    """
+    by_rows = values.reshape(-1, 4, 4)
+    last = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=values.dtype)
+    for matrices in (by_rows, by_rows.mT):
+        if torch.allclose(matrices[:, 3], last.expand(len(matrices), 4), atol=1e-4):
+            return matrices
+    raise ValueError("16 numbers that are no 4x4 transform: no last row 0, 0, 0, 1")
+
+
+def _unit(q: Tensor) -> Tensor:
+    wrong = ((q.norm(dim=-1) - 1).abs() > 0.01).nonzero()
+    if len(wrong):
+        k = int(wrong[0])
+        raise ValueError(
+            f"quaternion of length {float(q[k].norm()):.4g} at frame {k}: the columns hold no "
+            f"quaternion, or it was lost there"
+        )
+    return quaternion.normalize(q)
+
+
+def _from_euler(angles: Tensor, order: tuple[int, int, int]) -> Tensor:
+    """Turns about the axes x, y, z, multiplied from left to right in this order.
+
+    About fixed axes, R = Rz(yaw) Ry(pitch) Rx(roll); about turning ones, R = Rx Ry Rz.
+    """
+    axes = torch.eye(3, dtype=angles.dtype)
+    first, second, third = (quaternion.exp(angles[:, k, None] * axes[k]) for k in order)
+    return quaternion.multiply(first, quaternion.multiply(second, third))
+
+
+def _from_two_columns(values: Tensor) -> Tensor:
+    """Two columns of a rotation matrix, made orthonormal (Zhou et al., CVPR 2019, eq. 15)."""
+    first, second = values[:, :3], values[:, 3:]
+    third = torch.linalg.cross(first, second)
+    lost = (third.norm(dim=-1) < 1e-6).nonzero()
+    if len(lost):
+        raise ValueError(
+            f"the two columns at frame {int(lost[0])} span no plane: they hold no rotation"
+        )
+    first = first / first.norm(dim=-1, keepdim=True)
+    third = third / third.norm(dim=-1, keepdim=True)
+    matrix = torch.stack([first, torch.linalg.cross(third, first), third], dim=-1)
+    return quaternion.from_matrix(matrix)
 
 
 # Demonstrations that stay on disk until they are asked for.
@@ -129,20 +216,23 @@ class DemonstrationSource(Sequence[Demonstration]):
         reader: EpisodeReader,
         decisions: Mapping[str, UnitDecision],
         joint_names: Sequence[str] | None = None,
-        notes: Sequence[str] = (),
     ):
         """
         Args:
             reader: The episodes, in order.
             decisions: Unit of each quantity on disk, by role.
             joint_names: Joints wanted, all of the dataset; None: all as they come.
-            notes: What to tell the user.
+
+        Raises:
+            DatasetError: A joint wanted is not of the dataset.
         """
         self._reader = reader
         self._decisions = dict(decisions)
         names = reader.column_mapping.joint_names if joint_names is None else joint_names
+        joint_columns(reader.column_mapping.joint_names, names)
         self.joint_names = tuple(names)
-        self.notes = tuple(notes)
+        guesses = (decision.note for decision in decisions.values() if decision.note)
+        self.notes = (*reader.notes, *guesses)
         self.source = str(reader.folder.root)
 
     @overload
@@ -152,16 +242,16 @@ class DemonstrationSource(Sequence[Demonstration]):
     def __getitem__(self, index):
         if isinstance(index, slice):
             chosen = replace(self._reader, entries=self._reader.entries[index])
-            return DemonstrationSource(chosen, self._decisions, self.joint_names, self.notes)
+            return DemonstrationSource(chosen, self._decisions, self.joint_names)
         (episode,) = self._reader.read([self._reader.entries[index]])
-        return self._convert(episode)
+        return self.convert(episode)
 
     def __len__(self) -> int:
         return len(self._reader.entries)
 
     def __iter__(self) -> Iterator[Demonstration]:
         for run in _runs(self._reader.entries):
-            yield from map(self._convert, self._reader.read(run))
+            yield from map(self.convert, self._reader.read(run))
 
     def __repr__(self) -> str:
         return (
@@ -192,7 +282,8 @@ class DemonstrationSource(Sequence[Demonstration]):
         """
         return DemonstrationSet([*self], notes=self.notes, source=self.source)
 
-    def _convert(self, episode: RawEpisode) -> Demonstration:
+    def convert(self, episode: RawEpisode) -> Demonstration:
+        """The demonstration of an episode that its reader has read."""
         reader = self._reader
         demo = to_demonstration(reader.folder, episode, reader.column_mapping, self._decisions)
         if reader.extracted is not None:
@@ -247,21 +338,12 @@ def load_demos(
             key where known, and what to do.
     """
     reader = open_reader(path, episodes, mapping, tasks, where)
-    column_mapping = reader.column_mapping
     raw = {e.entry.index: e for e in reader.read(tuple(dict.fromkeys(reader.entries)))}
     decisions = reader.decide_units(raw.values(), units or {})
-    demos = [
-        to_demonstration(reader.folder, raw[entry.index], column_mapping, decisions)
-        for entry in reader.entries
-    ]
-    if reader.extracted is not None:
-        demos = [with_feature(demo, reader.extracted) for demo in demos]
-    if joint_names is not None:
-        joint_columns(column_mapping.joint_names, joint_names)
-        demos = [demo.select_joints(joint_names) for demo in demos]
+    source = DemonstrationSource(reader, decisions, joint_names)
+    demos = [source.convert(raw[entry.index]) for entry in reader.entries]
     _warn_of_conversions(reader.folder.root, decisions)
-    notes = [*reader.notes, *_guesses(decisions)]
-    return DemonstrationSet(demos, notes=notes, source=str(reader.folder.root))
+    return DemonstrationSet(demos, notes=source.notes, source=source.source)
 
 
 def open_demos(
@@ -281,19 +363,14 @@ def open_demos(
     question are read once through here; a declared or given unit spares that.
     """
     reader = open_reader(path, episodes, mapping, tasks, where)
-    if joint_names is not None:
+    if joint_names is not None:  # before anything long is read
         joint_columns(reader.column_mapping.joint_names, joint_names)
     decisions = reader.survey(units or {})
     _warn_of_conversions(reader.folder.root, decisions)
-    notes = (*reader.notes, *_guesses(decisions))
-    return DemonstrationSource(reader, decisions, joint_names, notes)
+    return DemonstrationSource(reader, decisions, joint_names)
 
 
 def _warn_of_conversions(root: Path, decisions: Mapping[str, UnitDecision]) -> None:
     for decision in decisions.values():
         if decision.converts:
             warnings.warn(f"{root}: {decision.note}", UnitsWarning, stacklevel=3)
-
-
-def _guesses(decisions: Mapping[str, UnitDecision]) -> list[str]:
-    return [decision.note for decision in decisions.values() if decision.note]

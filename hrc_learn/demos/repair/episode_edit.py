@@ -19,7 +19,8 @@ from hrc_learn.demos.preprocessing.resampling import nearest_frames
 from hrc_learn.demos.read.column_mapping import ColumnMapping
 from hrc_learn.demos.read.episodes import Quantities, select_quantities
 from hrc_learn.demos.read.frames import RawFrames
-from hrc_learn.demos.read.value_encodings import UnitDecision, to_quaternion
+from hrc_learn.demos.read.reader import to_quaternion
+from hrc_learn.demos.read.roles import UnitDecision
 from hrc_learn.demos.validation.data_checks import repeated_frames
 from hrc_learn.geometry import quaternion
 
@@ -32,10 +33,6 @@ class ColumnSemantics:
 
     column_mapping: ColumnMapping
     units: dict[str, UnitDecision]
-
-    def whole_turn(self, role: str) -> float:
-        """A turn in the unit that the quantity has on disk."""
-        return 2 * np.pi / self.units[role].factor
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,22 +74,12 @@ class EpisodeEdit:
             changes=(*self.changes, change),
         )
 
-    def with_columns(self, columns: RawFrames, change: str) -> "EpisodeEdit":
-        """Some columns replaced."""
-        return replace(self, frames=self.frames | columns, changes=(*self.changes, change))
-
     def bad(
         self, message: str, frame: int | None = None, key: str | None = None
     ) -> DatasetError:
         """An error that names the episode."""
         original = None if frame is None or self.kept is None else int(self.kept[frame])
-        return DatasetError(
-            message,
-            file=self.entry.file,
-            episode=self.entry.index,
-            frame=original,
-            key=key,
-        )
+        return DatasetError(message, **self.entry.location, frame=original, key=key)
 
 
 # Turns taken out of angles, and signs out of quaternions.
@@ -105,9 +92,9 @@ _TOLERANCE = 0.3 / (2 * np.pi)
 def unwrap(edit: EpisodeEdit, semantics: ColumnSemantics) -> EpisodeEdit:
     """Joints, Euler angles and rotation vectors without jumps by whole turns."""
     for role, values in edit.quantities(semantics).items():
-        turn = semantics.whole_turn(role) if role in (*_ANGLES, "rotation_vector") else None
-        if turn is None:
+        if role not in (*_ANGLES, "rotation_vector"):
             continue
+        turn = 2 * np.pi / semantics.units[role].factor  # in the unit on disk
         if role == "rotation_vector":
             scaled = torch.from_numpy(values * 2 * np.pi / turn)
             smooth = quaternion.unwrap_log(scaled).numpy() * turn / (2 * np.pi)
@@ -156,7 +143,7 @@ def _with_quantity(
     for number, (key, index) in enumerate(semantics.column_mapping.selections[role].columns):
         column = columns.setdefault(key, edit.frames[key].copy())
         column[:, index] = values[:, number]
-    return edit.with_columns(columns, change)
+    return replace(edit, frames=edit.frames | columns, changes=(*edit.changes, change))
 
 
 # An episode at the frames of a regular grid.

@@ -6,10 +6,10 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from hrc_learn.demos.format.dataset_folder import DatasetFolder, EpisodeEntry
-from hrc_learn.demos.format.features import Feature
+from hrc_learn.demos.format.metadata import Feature
 from hrc_learn.demos.issue import ValidationReport
-from hrc_learn.demos.read.component_names import INDEX_KEYS
 from hrc_learn.demos.read.frames import RawFrames
+from hrc_learn.demos.read.roles import INDEX_KEYS
 
 # Faults of single values and columns.
 
@@ -33,8 +33,7 @@ def check_finite(
                 f"{name} is {values[frame, component]} ({len(bad)} values are not finite); "
                 f"hrc repair --drop-bad-frames (or --drop-bad-episodes) makes a copy "
                 f"without",
-                file=entry.file,
-                episode=entry.index,
+                **entry.location,
                 frame=frame,
                 key=key,
             )
@@ -48,8 +47,7 @@ def check_repeats(entry: EpisodeEntry, frames: RawFrames, report: ValidationRepo
     if same.all():
         report.warning(
             "the state never changes: the recorder lost the robot",
-            file=entry.file,
-            episode=entry.index,
+            **entry.location,
             frame=0,
             key="observation.state",
         )
@@ -58,8 +56,7 @@ def check_repeats(entry: EpisodeEntry, frames: RawFrames, report: ValidationRepo
             f"{100 * same.mean():.0f} % of the frames repeat the one before; the recording is "
             f"faster than the robot reports, or the robot stood still; hrc repair drops "
             f"them",
-            file=entry.file,
-            episode=entry.index,
+            **entry.location,
             frame=int(same.argmax()) + 1,
         )
 
@@ -162,8 +159,7 @@ def check_jumps(
         f"{joint_names[joint]} jumps by {step:.3g} rad in one frame "
         f"({speed[frame, joint]:.3g} rad/s, limit {limits[joint]:.3g}); {cause}. "
         f"{int(too_fast.any(1).sum())} such frames in the episode",
-        file=entry.file,
-        episode=entry.index,
+        **entry.location,
         frame=frame + 1,
         key=f"joint_position ({joint_names[joint]})",
     )
@@ -190,8 +186,7 @@ def check_stillness(
         if seconds > _STILL_SECONDS:
             report.warning(
                 f"{place} with {seconds:.1f} s of standing still: hrc repair trims it",
-                file=entry.file,
-                episode=entry.index,
+                **entry.location,
                 frame=frame,
             )
 
@@ -203,8 +198,7 @@ def check_commands(
     if joint_position.shape == command.shape and np.array_equal(joint_position, command):
         report.warning(
             "is a copy of the state at the same frame; a policy learns to stay where it is",
-            file=entry.file,
-            episode=entry.index,
+            **entry.location,
             key="action",
         )
 
@@ -224,8 +218,7 @@ def check_duplicates(
                 report.warning(
                     f"shows the same motion as episode {earlier.index}: recorded once, "
                     f"stored twice?",
-                    file=entry.file,
-                    episode=entry.index,
+                    **entry.location,
                 )
                 break
         seen.append((entry, sketch))
@@ -249,7 +242,7 @@ def check_timestamps(
     report: ValidationReport,
 ) -> None:
     """Order, rate, regularity and gaps of the stamps [s] of one episode."""
-    place = {"file": entry.file, "episode": entry.index, "key": key}
+    place = entry.location | {"key": key}
     if not np.isfinite(time).all():
         return  # reported with the values that are not finite
     steps = np.diff(time)
@@ -298,6 +291,5 @@ def check_length(entry: EpisodeEntry, fps: float, report: ValidationReport) -> N
     if entry.length < _SHORT_FRAMES or seconds < _SHORT_SECONDS:
         report.warning(
             f"only {entry.length} frames ({seconds:.2g} s): a false start?",
-            file=entry.file,
-            episode=entry.index,
+            **entry.location,
         )

@@ -8,16 +8,23 @@ import numpy as np
 from hrc_learn.demos.format.dataset_folder import (
     DatasetFolder,
     EpisodeEntry,
-    count_faults,
+    open_parquet,
     read_episodes,
     read_info,
+    read_table,
     read_tasks,
 )
-from hrc_learn.demos.format.features import Feature, read_features
-from hrc_learn.demos.format.parquet import BadRowError, open_parquet, read_table, to_numpy
+from hrc_learn.demos.format.metadata import Feature, read_features
 from hrc_learn.demos.issue import DatasetError, ValidationReport
-from hrc_learn.demos.read.component_names import INDEX_KEYS
-from hrc_learn.demos.read.frames import RawFrames, require_rows, slice_frames
+from hrc_learn.demos.read.episodes import count_faults
+from hrc_learn.demos.read.frames import (
+    BadRowError,
+    RawFrames,
+    require_rows,
+    slice_frames,
+    to_numpy,
+)
+from hrc_learn.demos.read.roles import INDEX_KEYS
 
 
 def check_metadata(root: Path, report: ValidationReport) -> DatasetFolder | None:
@@ -45,7 +52,12 @@ def check_metadata(root: Path, report: ValidationReport) -> DatasetFolder | None
     )
     for fault in count_faults(folder):
         report.add(fault)
-    _check_statistics(folder, report)
+    statistics = ("meta/stats.json", "meta/episodes_stats.jsonl")
+    if not any((root / file).is_file() for file in statistics):
+        report.warning(
+            "no statistics: LeRobot's policies cannot normalise their inputs",
+            file=statistics[0],
+        )
     _check_videos(folder, report)
     return folder
 
@@ -86,8 +98,7 @@ def check_indices(
             report.error(
                 f"is {frames[key][k, 0]:g}, expected {values[k]:g}; frames were lost, repeated "
                 f"or moved",
-                file=entry.file,
-                episode=entry.index,
+                **entry.location,
                 frame=k,
                 key=key,
             )
@@ -97,8 +108,7 @@ def check_indices(
             k = int(known.argmin())
             report.error(
                 f"task {frames['task_index'][k, 0]:g} is not in the list of tasks",
-                file=entry.file,
-                episode=entry.index,
+                **entry.location,
                 frame=k,
                 key="task_index",
             )
@@ -161,15 +171,6 @@ def _report_missing(file: str, key: str, report: ValidationReport) -> None:
     else:
         report.error(
             "the column is declared in meta/info.json, but missing", file=file, key=key
-        )
-
-
-def _check_statistics(folder: DatasetFolder, report: ValidationReport) -> None:
-    files = ("meta/stats.json", "meta/episodes_stats.jsonl")
-    if not any((folder.root / file).is_file() for file in files):
-        report.warning(
-            "no statistics: LeRobot's policies cannot normalise their inputs",
-            file=files[0],
         )
 
 

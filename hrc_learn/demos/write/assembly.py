@@ -1,19 +1,29 @@
-"""A LeRobot dataset of version 3.0 put together from staged episodes."""
+"""From saved episodes to a dataset, however often that is broken off.
 
+A recording lives in `NAME.recording/` and says there which one it is, and to how many episodes
+it is appended (`recording.json`). The dataset made of it keeps that name, so that a recording
+which ended between the two last steps is not taken for another.
+"""
+
+import itertools
+import json
+import os
+import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from hrc_learn.demos.format.dataset_folder import open_folder
-from hrc_learn.demos.format.features import SIDECAR_PATH
-from hrc_learn.demos.format.lerobot_v3 import (
+from hrc_learn.demos.format.dataset_folder import open_folder, read_rows
+from hrc_learn.demos.format.metadata import (
     CHUNK_SIZE,
     DATA_PATH,
     EPISODES_PATH,
     FILE_SIZE_MB,
+    SIDECAR_PATH,
     Statistics,
     combined_statistics,
     data_schema,
@@ -22,10 +32,32 @@ from hrc_learn.demos.format.lerobot_v3 import (
     write_json,
     write_tasks,
 )
-from hrc_learn.demos.format.parquet import read_rows
-from hrc_learn.demos.format.video_segments import Segments, VideoPlacement, VideoSegment, link
-from hrc_learn.demos.write.staging import RecordingHeader, StagedEpisode, read_episode
-from hrc_learn.demos.write.video_encoder import video_path
+from hrc_learn.demos.format.videos import (
+    Segments,
+    VideoPlacement,
+    VideoSegment,
+    link,
+    video_path,
+)
+from hrc_learn.demos.issue import DatasetError
+from hrc_learn.demos.write.episode import (
+    RecordingHeader,
+    StagedEpisode,
+    read_episode,
+    staged_paths,
+    staging_folder,
+)
+from hrc_learn.store import (
+    DATASET,
+    BusyError,
+    Claim,
+    delete_files,
+    new_file,
+    recover,
+    replacing,
+    resolved,
+    source_of,
+)
 
 
 @dataclass
@@ -89,7 +121,7 @@ def assemble(
     """Write the dataset of these staged episodes.
 
     Args:
-        paths: Files of `staging.write_episode`, in order.
+        paths: Files of `episode.write_episode`, in order.
         target: Folder of the new dataset.
         earlier: A dataset of our own that they are appended to; it stays as it is, and
             its files get a second name in the new one.
@@ -194,3 +226,156 @@ def _count_videos(index: _Index, key: str) -> int:
         for row in index.rows
     ]
     return 1 + max(numbers, default=-1)
+
+
+_RECORDING = "recording.json"
+_FILES = ("episode_*", "*.unfinished.mp4", ".*.writing/*")
+"""What a recording holds besides."""
+
+
+def begin(root: Path, earlier_episodes: int | None) -> None:
+    """Make the folder of a recording, whose claim is held.
+
+    Args:
+        root: The dataset it is to become, or to be appended to.
+        earlier_episodes: Episodes of the dataset it is appended to; None: a new one.
+
+    Raises:
+        FileExistsError: `root` is already there, or may not be replaced by a longer one, or an
+            interrupted recording of it holds episodes.
+    """
+    root, staging = resolved(root), staging_folder(root)
+    if staging.is_dir() and (_is_done(root, staging) or not _episodes(staging)):
+        discard(staging)  # nothing in it that the dataset lacks
+    if earlier_episodes is None and os.path.lexists(root):
+        raise FileExistsError(
+            f"{root} already exists: choose another folder, remove it, or append to it "
+            f"(append=True)"
+        )
+    try:
+        staging.mkdir()
+    except FileExistsError:
+        raise FileExistsError(
+            f"{staging} holds a recording that was interrupted: "
+            f"hrc_learn.demos.recover_dataset({str(root)!r}) makes a dataset of its saved "
+            f"episodes; remove it to start anew"
+        ) from None
+    _write(staging, earlier_episodes)
+
+
+def recover_dataset(root: str | Path) -> Path:
+    """Make the dataset of a recording that was broken off, from the episodes it had saved.
+
+    Episodes that were being appended to a dataset are added to it; until then, and if none
+    was saved, it stays as it was.
+
+    Args:
+        root: Folder that the recording was to become, or to be appended to.
+
+    Returns:
+        The same folder, now a dataset.
+
+    Raises:
+        BusyError: The recording is still going on.
+        FileNotFoundError: There is no recording of that name.
+        FileExistsError: There is a dataset of that name, and the recording was none of it.
+        DatasetError: The recording held no saved episode; it is removed.
+    """
+    root = Path(root)
+    if not staging_folder(root).is_dir():
+        raise FileNotFoundError(f"no interrupted recording at {staging_folder(root)}")
+    with Claim(root) as claim:
+        finish(root, claim)
+    return root
+
+
+def finish(root: Path, claim: Claim) -> None:
+    """Make or lengthen a dataset from its recording, and remove that; as `recover_dataset`."""
+    root, staging = resolved(root), staging_folder(root)
+    if not _is_done(root, staging):
+        recording = _read(staging)
+        episodes = recording["episodes"]
+        if not _episodes(staging):
+            discard(staging)
+            if episodes is None:
+                raise DatasetError("no episode was saved, so there is no dataset", file=root)
+            return
+        if episodes is None and os.path.lexists(root):
+            raise FileExistsError(
+                f"{root} already exists: remove {staging} if it is the same recording, or move "
+                f"{root} away to make a dataset of it"
+            )
+        paths = staged_paths(staging, episodes or 0)
+        with replacing(
+            claim,
+            DATASET,
+            overwrite=episodes is not None,
+            others="keep",
+            source=recording["id"],
+        ) as new:
+            assemble(paths, new, earlier=None if episodes is None else root)
+    discard(staging)
+
+
+def discard(staging: Path) -> None:
+    """Remove the folder of a recording, but nothing that somebody else put there."""
+    # Last what tells that the rest is not needed any more: this may be broken off too.
+    delete_files(staging, _FILES)
+    if not delete_files(staging, [_RECORDING]):
+        kept = (staging.with_name(f"{staging.name}.kept{n or ''}") for n in itertools.count())
+        staging.rename(next(path for path in kept if not os.path.lexists(path)))
+
+
+def recover_all(path: str | Path) -> list[str]:
+    """Mend whatever interrupted programs left, of a path and of anything below it.
+
+    Interrupted recordings become datasets, interrupted replacements are finished, and what was
+    left unfinished is removed. What is still being written below `path` is left alone.
+
+    Args:
+        path: A dataset, folder of results or model, or a folder of such things.
+
+    Returns:
+        What was done, in words.
+
+    Raises:
+        BusyError: `path` itself is being written.
+    """
+    path = resolved(path)
+    done = recover(path)
+    suffix = staging_folder(path).name.removeprefix(path.name)
+    for staging in [staging_folder(path), *path.glob(f"**/*{suffix}")]:
+        if not staging.is_dir():
+            continue
+        root = staging.with_name(staging.name.removesuffix(suffix))
+        try:
+            recover_dataset(root)
+        except (BusyError, DatasetError, FileExistsError) as error:
+            done.append(str(error))
+        else:
+            done.append(f"{root}: made of what an interrupted recording had saved")
+    return done
+
+
+def _read(staging: Path) -> dict[str, Any]:
+    """Name of a recording, and of how many episodes the dataset is that it is appended to."""
+    path = staging / _RECORDING
+    if not path.is_file():  # broken off before it was named
+        _write(staging, None)
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def _write(staging: Path, earlier_episodes: int | None) -> None:
+    with new_file(staging / _RECORDING) as part:
+        content = {"id": uuid.uuid4().hex, "episodes": earlier_episodes}
+        part.write_text(json.dumps(content), encoding="utf-8")
+
+
+def _episodes(staging: Path) -> bool:
+    return any(staging.glob("episode_*.parquet"))
+
+
+def _is_done(root: Path, staging: Path) -> bool:
+    """Whether the dataset holds what was recorded: only the recording was not yet removed."""
+    named = root.is_dir() and (staging / _RECORDING).is_file()
+    return named and source_of(root) == _read(staging)["id"]

@@ -9,32 +9,30 @@ import numpy as np
 
 from hrc_learn.demos.demonstration import Demonstration
 from hrc_learn.demos.format.dataset_folder import DatasetFolder, open_folder
-from hrc_learn.demos.format.features import read_sidecar, sidecar_content
-from hrc_learn.demos.format.lerobot_v3 import INDEX_FEATURES, episode_statistics
+from hrc_learn.demos.format.metadata import INDEX_FEATURES, episode_statistics, read_sidecar
+from hrc_learn.demos.format.videos import CameraRecorder, Image, video_features
 from hrc_learn.demos.issue import DatasetError
-from hrc_learn.demos.write.recovery import begin, claim_recording, discard, finish
-from hrc_learn.demos.write.schema import (
-    TIME_KEY,
+from hrc_learn.demos.write.assembly import begin, discard, finish
+from hrc_learn.demos.write.episode import (
     Column,
     Episode,
     EpisodeBuffer,
+    RecordingHeader,
+    StagedEpisode,
     columns_for,
     complete,
     describe_difference,
     encode,
-    examine,
-    lerobot_features,
-)
-from hrc_learn.demos.write.staging import (
-    RecordingHeader,
-    StagedEpisode,
     episode_path,
+    examine,
+    index_columns,
+    lerobot_features,
+    sidecar_content,
     staging_folder,
     to_table,
     write_episode,
 )
-from hrc_learn.demos.write.video_encoder import CameraRecorder, Image, video_features
-from hrc_learn.store import DATASET
+from hrc_learn.store import DATASET, Claim
 
 
 class DatasetWriter:
@@ -95,7 +93,11 @@ class DatasetWriter:
             raise ValueError(f"fps must be positive, got {fps}")
         if len(set(joint_names)) != len(joint_names):
             raise ValueError(f"joint names must differ, got {', '.join(joint_names)}")
-        _check_feature_keys(features or {})
+        for key in features or {}:
+            if not key.startswith(("observation.", "action.")):
+                raise ValueError(
+                    f"feature {key!r} needs a key that LeRobot understands: 'observation.{key}'"
+                )
         self.fps = float(fps)
         self.robot_type = robot_type
         self.joint_names = tuple(joint_names)
@@ -112,7 +114,8 @@ class DatasetWriter:
         self._video_features = video_features(cameras or {}, self.fps)
         self._staging = staging_folder(self.root)
         self._images = CameraRecorder(cameras or {}, self.fps, self._staging)
-        self._claim = claim_recording(self.root)
+        self._staging.parent.mkdir(parents=True, exist_ok=True)
+        self._claim = Claim(self.root)
         try:
             self._earlier = self._continue() if append else None
             if append:
@@ -292,7 +295,13 @@ class DatasetWriter:
         except ValueError as error:
             raise ValueError(f"episode {self.episodes} was not saved: {error}") from error
         self._columns = columns
-        values = self._with_indices(encode(columns, episode), task)
+        number = self._tasks.setdefault(task, len(self._tasks))
+        values = encode(columns, episode) | index_columns(
+            self.fps,
+            self.episodes,
+            self._saved_frames,
+            np.full(len(episode["time"]), number),
+        )
         header = self._header()
         if self._earlier is not None:
             _require_same_columns(self._earlier, header)
@@ -306,16 +315,6 @@ class DatasetWriter:
         self._saved_frames += len(staged.table)
         self.episodes += 1
         return self.episodes - 1
-
-    def _with_indices(self, values: dict[str, np.ndarray], task: str) -> dict[str, np.ndarray]:
-        frame = np.arange(len(values[TIME_KEY]))
-        return values | {
-            "timestamp": frame / self.fps,
-            "frame_index": frame,
-            "episode_index": np.full_like(frame, self.episodes),
-            "index": frame + self._saved_frames,
-            "task_index": np.full_like(frame, self._tasks.setdefault(task, len(self._tasks))),
-        }
 
     def _header(self) -> RecordingHeader:
         return RecordingHeader(
@@ -341,11 +340,3 @@ def _require_same_columns(folder: DatasetFolder, header: RecordingHeader) -> Non
             f"{theirs.get(differing[0])}, here {ours.get(differing[0])}; record the same "
             f"quantities with the same settings, or a dataset of its own"
         )
-
-
-def _check_feature_keys(features: Mapping[str, Sequence[str]]) -> None:
-    for key in features:
-        if not key.startswith(("observation.", "action.")):
-            raise ValueError(
-                f"feature {key!r} needs a key that LeRobot understands: 'observation.{key}'"
-            )

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.dmp._system.canonical import ROUNDING, ExponentialPhase, Phase, check_positive
+from hrc_learn.dmp._system.closed_forms import ROUNDING, ExponentialPhase, Phase, check_positive
 
 DOMAINS = ("time", "phase")
 
@@ -81,17 +81,14 @@ class GaussianBasis:
     phase: Phase = field(default_factory=ExponentialPhase)
     """The canonical system, whose z fades the forcing term."""
     periodic: ClassVar[bool] = False
+    knot_spacing = None
+    """Smooth everywhere."""
 
     def __post_init__(self):
         check_positive("width", self.width)
         check_count(self.count)
         if self.domain not in DOMAINS:
             raise ValueError(f"unknown domain {self.domain!r}; there are {', '.join(DOMAINS)}")
-
-    @property
-    def knot_spacing(self) -> None:
-        """Smooth everywhere."""
-        return None
 
     @property
     def horizon(self) -> float:
@@ -157,25 +154,19 @@ class PeriodicBasis:
     width: float = 0.6
     """Standard deviation of a bell as a share of the distance between centres."""
     periodic: ClassVar[bool] = True
+    horizon = 1.0
+    """The period."""
+    knot_spacing = 1.0
+    """A period: the table of the response has to close on itself."""
 
     def __post_init__(self):
         check_positive("width", self.width)
         check_count(self.count)
 
     @property
-    def horizon(self) -> float:
-        """The period."""
-        return 1.0
-
-    @property
     def smooth_interval(self) -> float:
         """Length over which the forcing is a polynomial of low degree."""
         return min(0.5, 1.4 * self.width**2) / self.count
-
-    @property
-    def knot_spacing(self) -> float:
-        """A period: the table of the response has to close on itself."""
-        return 1.0
 
     def phase(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
         """What fades the forcing term: nothing."""
@@ -291,6 +282,8 @@ class LearnedGaussianBasis:
     phase: Phase = field(default_factory=ExponentialPhase)
     """The canonical system, whose z fades the forcing term."""
     periodic: ClassVar[bool] = False
+    knot_spacing = None
+    """Smooth everywhere."""
 
     def __post_init__(self):
         check_count(self.count)
@@ -311,11 +304,6 @@ class LearnedGaussianBasis:
     def count(self) -> int:
         """N, the number of basis functions."""
         return len(self.centres)
-
-    @property
-    def knot_spacing(self) -> None:
-        """Smooth everywhere."""
-        return None
 
     @property
     def horizon(self) -> float:

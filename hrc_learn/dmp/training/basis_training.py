@@ -14,18 +14,22 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from hrc_learn.dmp._arguments import Mask, Points, Times, check_samples
 from hrc_learn.dmp._system.bases import LearnedGaussianBasis, placed_activation
-from hrc_learn.dmp._system.canonical import ExponentialPhase, Phase
-from hrc_learn.dmp._system.forced_response import accumulate, impulse
-from hrc_learn.dmp._system.quintic_curves import approach_state
-from hrc_learn.dmp._system.spring import SpringDamper, transition
-from hrc_learn.dmp._types import Mask, Points, Times
-from hrc_learn.dmp.fitting.motion_samples import check_samples
+from hrc_learn.dmp._system.closed_forms import (
+    ExponentialPhase,
+    Phase,
+    SpringDamper,
+    approach_state,
+    transition,
+)
+from hrc_learn.dmp._system.response import accumulate, impulse
 from hrc_learn.dmp.joint_dmp import JointDMP
-from hrc_learn.dmp.training.gradient_descent import (
+from hrc_learn.dmp.training.weight_training import (
     DescentConfig,
     Progress,
     TrainingResult,
+    check_learnable,
     descend,
 )
 
@@ -83,11 +87,7 @@ def learn_basis(
     Raises:
         ValueError: Bad samples (says which) or unknown names.
     """
-    unknown = set(learn) - {*LEARNABLE}
-    if unknown or not learn:
-        raise ValueError(
-            f"learn must name some of {', '.join(LEARNABLE)}, got {', '.join(learn) or 'none'}"
-        )
+    check_learnable(learn, LEARNABLE)
     samples = check_samples(time, position, mask=mask)
     placement = Placement(n_basis, spring or SpringDamper(), phase or ExponentialPhase())
     # Relative to what the motions cover, so that tolerances mean the same for all.

@@ -15,8 +15,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from hrc_learn.dmp._arguments import Points, Vectors, to_tensor
 from hrc_learn.dmp._system.response import Trajectory
-from hrc_learn.dmp._types import ArrayLike, to_tensor
 from hrc_learn.geometry.numerics import safe_norm
 
 
@@ -91,7 +91,7 @@ class Sum(Loss):
 class Tracking(Loss):
     """Mean squared distance to a wanted path."""
 
-    wanted: ArrayLike
+    wanted: Points
     """(T, K) or (*batch, T, K), at the times of the rollout."""
     task: Task | None = None
 
@@ -111,7 +111,7 @@ class Tracking(Loss):
 class Via(Loss):
     """Squared distance to a point at one time."""
 
-    target: ArrayLike
+    target: Vectors
     """(K,) or (*batch, K)."""
     time: float | int | None = None
     """[s], between samples by a straight line; None: the last of the rollout."""
@@ -154,9 +154,9 @@ class Jerk(Loss):
 class Bounds(Loss):
     """Mean squared excess over bounds, such as the limits of joints, in parts of their span."""
 
-    lower: ArrayLike
+    lower: Vectors
     """(D,)."""
-    upper: ArrayLike
+    upper: Vectors
     """(D,)."""
     margin: float = 0.0
     """How far inside the bounds the motion shall stay, as a share of their span."""
@@ -199,7 +199,7 @@ def _apply(task: Task | None, position: Tensor) -> Tensor:
     return position if task is None else task(position)
 
 
-def _fixed(values: ArrayLike, like: Tensor) -> Tensor:
+def _fixed(values: Points | Vectors, like: Tensor) -> Tensor:
     # Detached: it may come from a rollout, whose graph serves one step only.
     return to_tensor(values, like.dtype, like.device).detach()
 

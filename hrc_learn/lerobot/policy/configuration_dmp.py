@@ -6,7 +6,7 @@ from typing import Any
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig
 
-from hrc_learn.demos.format.features import flatten_names
+from hrc_learn.demos.format.metadata import flatten_names
 
 EARLIEST = -1_000_000
 """Offset [frames] at which LeRobot, as it stays within the episode, takes its first frame."""

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from hrc_learn.dmp.orientation_error import nearest_turn, to_error, to_orientation
+from hrc_learn.dmp import orientation_error
 from hrc_learn.geometry import quaternion
 from hrc_learn.lerobot.policy.closed_form import fit_closed_form
 from hrc_learn.lerobot.policy.networks import (
@@ -63,8 +63,10 @@ class ActionEncoding(nn.Module):
         """Actions again; rotation vectors are the ones nearest to the reference's."""
         actions = coordinates * self.std + self.mean
         for triple, reference in zip(self.triples, self.reference, strict=True):
-            q = to_orientation(actions[..., triple], reference)
-            vector = nearest_turn(quaternion.log(q), quaternion.log(reference))
+            q = orientation_error.to_orientation(actions[..., triple], reference)
+            vector = orientation_error.nearest_turn(
+                quaternion.log(q), quaternion.log(reference)
+            )
             actions = _replaced(actions, triple, vector)
         return actions
 
@@ -97,7 +99,8 @@ class ActionEncoding(nn.Module):
     def _unrolled(self, actions: Tensor) -> Tensor:
         for triple, reference in zip(self.triples, self.reference, strict=True):
             q = quaternion.exp(actions[..., triple])
-            actions = _replaced(actions, triple, quaternion.unwrap_log(to_error(q, reference)))
+            error = orientation_error.to_error(q, reference)
+            actions = _replaced(actions, triple, quaternion.unwrap_log(error))
         return actions
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
-from scipy.signal import butter, freqz
+from scipy.signal import butter, freqz, savgol_filter
 from scipy.spatial.transform import Rotation, Slerp
 
 from hrc_learn.demos import Demonstration, DemonstrationSet
@@ -165,6 +165,15 @@ def test_smoothing_of_orientations_does_not_depend_on_the_frame():
         angle(one, turn(time)).mean()
         < angle(noisy.as_quat(scalar_first=True), turn(time)).mean() / 1.5
     )
+
+
+def test_joints_on_even_stamps_are_smoothed_as_scipy_does_by_cubics():
+    time = np.arange(120) / 50
+    noisy = np.sin(3 * time) + 0.1 * np.random.default_rng(5).normal(size=120)
+    demo = swing(time, joint_position=np.stack([noisy, 2 * noisy], axis=1))
+    expected = savgol_filter(demo.joint_position, 15, 3, axis=0, mode="interp")
+    smooth = savitzky_golay(demo, window=0.3).joint_position
+    np.testing.assert_allclose(smooth, expected, atol=1e-9)
 
 
 def _continuous(q):

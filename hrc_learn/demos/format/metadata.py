@@ -1,0 +1,309 @@
+"""What the metadata of a dataset say: its features, our own `meta/hrc_learn.json`, and what
+LeRobot's version 3.0 keeps besides.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from math import prod
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from jaxtyping import Shaped, UInt8
+
+from hrc_learn.demos.issue import DatasetError
+
+# The columns of a dataset as its `meta/info.json` declares them.
+
+INFO_PATH = "meta/info.json"
+NUMERIC = ("float", "int", "uint", "bool")
+"""How the dtypes begin that hold numbers."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Feature:
+    """One column of the frames, as `meta/info.json` declares it."""
+
+    key: str
+    dtype: str
+    shape: tuple[int, ...]
+    names: tuple[str, ...] | None
+    """One name a component, from whichever nesting they were written in."""
+
+    @property
+    def width(self) -> int:
+        """Components a frame."""
+        return prod(self.shape)
+
+    @property
+    def numeric(self) -> bool:
+        return self.dtype.startswith(NUMERIC)
+
+
+def read_features(info: dict) -> dict[str, Feature]:
+    """The declared features.
+
+    Raises:
+        DatasetError: A declaration is malformed, or gives not one name a component.
+    """
+    features = {}
+    for key, declared in info["features"].items():
+        names = None
+        try:
+            dtype, shape = str(declared["dtype"]), tuple(int(n) for n in declared["shape"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise DatasetError(
+                f"the feature's declaration is malformed: {error!r}", file=INFO_PATH, key=key
+            ) from error
+        if dtype.startswith(NUMERIC):
+            names = flatten_names(declared.get("names"))
+            if names is not None and len(names) != prod(shape):
+                raise DatasetError(
+                    f"{len(names)} names for {prod(shape)} components; correct names or "
+                    f"shape of the feature",
+                    file=INFO_PATH,
+                    key=key,
+                )
+        features[key] = Feature(key=key, dtype=dtype, shape=shape, names=names)
+    return features
+
+
+def flatten_names(names: object) -> tuple[str, ...] | None:
+    """Names of components from any of the forms met: flat, nested, in a dict, or none."""
+    if names is None:
+        return None
+    if isinstance(names, dict):
+        names = list(names.values())
+    if not isinstance(names, list | tuple):
+        return (str(names),)
+    flat: list[str] = []
+    for item in names:
+        flat.extend(flatten_names(item) or () if isinstance(item, list | dict) else [str(item)])
+    return tuple(flat)
+
+
+# `meta/hrc_learn.json`: what LeRobot's own metadata cannot say.
+#
+# LeRobot declares no units and no frames, and drops fields it does not know from its own
+# files, so they stand in a file beside them.
+
+SIDECAR_PATH = "meta/hrc_learn.json"
+SIDECAR_FORMAT = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sidecar:
+    """Units and meaning of a dataset's columns, as its writer declared them."""
+
+    units: dict[str, str] = field(default_factory=dict)
+    """Role -> unit of its values on disk."""
+    columns: dict[str, dict] = field(default_factory=dict)
+    """Role -> {"key": feature, "names": components}."""
+    joint_names: tuple[str, ...] = ()
+    frames: dict[str, str] = field(default_factory=dict)
+    """What poses are relative to ("base") and of ("ee")."""
+    details: dict = field(default_factory=dict)
+    """Whatever else the writer was asked to keep."""
+
+
+def sidecar_copy(sidecar: Sidecar, units: Mapping[str, str]) -> dict:
+    """What the file of a copy says, in these units; {} where there is nothing to be said."""
+    if not units and sidecar == Sidecar():
+        return {}
+    return {"format": SIDECAR_FORMAT, **vars(sidecar), "units": dict(units)}
+
+
+def read_sidecar(root: Path) -> Sidecar:
+    """The dataset's sidecar, an empty one where there is none.
+
+    Raises:
+        DatasetError: The file is damaged or of a later format.
+    """
+    path = root / SIDECAR_PATH
+    if not path.exists():
+        return Sidecar()
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        if content["format"] != SIDECAR_FORMAT:
+            raise DatasetError(
+                f"format {content['format']} is not known here (only {SIDECAR_FORMAT}); "
+                f"a newer hrc_learn wrote it",
+                file=SIDECAR_PATH,
+            )
+        return Sidecar(
+            units=content["units"],
+            columns=content["columns"],
+            joint_names=tuple(content["joint_names"]),
+            frames=content["frames"],
+            details=content["details"],
+        )
+    except (json.JSONDecodeError, KeyError, TypeError) as error:
+        raise DatasetError(
+            f"damaged ({error!r}); delete it to have units guessed, or restore it",
+            file=SIDECAR_PATH,
+        ) from error
+
+
+# What stands where in a LeRobot dataset of version 3.0.
+#
+# data/chunk-000/file-000.parquet            frames, one row group an episode
+# meta/info.json                             features, frame rate, counts
+# meta/stats.json                            statistics of every feature
+# meta/tasks.parquet                         task texts by index
+# meta/episodes/chunk-000/file-000.parquet   where each episode lies, its statistics
+# meta/hrc_learn.json                        units, frames, meaning of columns (our own)
+
+VERSION = "v3.0"
+INDEX_FEATURES = {
+    "timestamp": {"dtype": "float32", "shape": [1], "names": None},
+    **{
+        key: {"dtype": "int64", "shape": [1], "names": None}
+        for key in ("frame_index", "episode_index", "index", "task_index")
+    },
+}
+"""Features that LeRobot adds to every dataset."""
+
+DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
+EPISODES_PATH = "meta/episodes/chunk-000/file-000.parquet"
+CHUNK_SIZE = 1000
+FILE_SIZE_MB = 100
+VIDEO_FILE_SIZE_MB = 200
+
+# pandas reads the task texts as the table's index only when told so in its own terms.
+_PANDAS_INDEX = {
+    "index_columns": ["task"],
+    "column_indexes": [],
+    "columns": [
+        {
+            "name": name,
+            "field_name": name,
+            "pandas_type": kind,
+            "numpy_type": numpy_kind,
+            "metadata": None,
+        }
+        for name, kind, numpy_kind in (
+            ("task_index", "int64", "int64"),
+            ("task", "unicode", "object"),
+        )
+    ],
+}
+
+
+def place(template: str, number: int, **fields: str) -> str:
+    """Path of the file of that number; a chunk holds `CHUNK_SIZE` of them."""
+    chunk, file = divmod(number, CHUNK_SIZE)
+    return template.format(chunk_index=chunk, file_index=file, **fields)
+
+
+def data_schema(schema: pa.Schema, features: Mapping[str, dict]) -> pa.Schema:
+    """The schema with the types in Hugging Face's own terms, as LeRobot leaves them."""
+    types = {}
+    for name in schema.names:
+        value = {"dtype": features[name]["dtype"], "_type": "Value"}
+        width = features[name]["shape"][0]
+        types[name] = (
+            value if width == 1 else {"feature": value, "length": width, "_type": "List"}
+        )
+    return schema.with_metadata({"huggingface": json.dumps({"info": {"features": types}})})
+
+
+def write_tasks(path: Path, tasks: Sequence[str]) -> None:
+    """The list of task texts, each at its index."""
+    table = pa.table({"task_index": pa.array(range(len(tasks)), pa.int64()), "task": tasks})
+    pq.write_table(table.replace_schema_metadata({"pandas": json.dumps(_PANDAS_INDEX)}), path)
+
+
+def info(
+    features: Mapping[str, dict],
+    fps: float,
+    robot_type: str,
+    *,
+    episodes: int,
+    frames: int,
+    tasks: int,
+) -> dict:
+    """Content of `meta/info.json`."""
+    has_video = any(feature["dtype"] == "video" for feature in features.values())
+    return {
+        "codebase_version": VERSION,
+        "fps": int(fps) if float(fps).is_integer() else fps,
+        "features": dict(features),
+        "total_episodes": episodes,
+        "total_frames": frames,
+        "total_tasks": tasks,
+        "chunks_size": CHUNK_SIZE,
+        "data_files_size_in_mb": FILE_SIZE_MB,
+        "video_files_size_in_mb": VIDEO_FILE_SIZE_MB,
+        "data_path": DATA_PATH,
+        "video_path": VIDEO_PATH if has_video else None,
+        "robot_type": robot_type,
+        "splits": {"train": f"0:{episodes}"},
+    }
+
+
+def write_json(path: Path, content: Mapping) -> None:
+    text = json.dumps(content, indent=4, ensure_ascii=False) + "\n"
+    path.write_text(text, encoding="utf-8")
+
+
+# Statistics of features, as LeRobot keeps them for every episode and for the whole.
+
+QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
+
+Statistics = dict[str, dict[str, list]]
+"""Feature -> statistic (min, max, mean, std, count, q01 ... q99) -> one number a component."""
+
+
+def episode_statistics(features: Mapping[str, Shaped[np.ndarray, "_frames ..."]]) -> Statistics:
+    """Statistics of each feature over the frames of one episode."""
+    return {key: _of_columns(np.asarray(values, float)) for key, values in features.items()}
+
+
+def image_statistics(images: UInt8[np.ndarray, "_count _height _width 3"]) -> dict[str, list]:
+    """Statistics of each colour channel, scaled to 0..1, in the nesting LeRobot expects."""
+    flat = _of_columns(images.reshape(-1, 3) / 255)
+    nested = {name: [[[value]] for value in values] for name, values in flat.items()}
+    return nested | {"count": [len(images)]}
+
+
+def combined_statistics(episodes: Sequence[Statistics]) -> Statistics:
+    """Statistics over all episodes.
+
+    Exact but for the quantiles, which are the means of the episodes' weighted by length:
+    that is how LeRobot itself combines them.
+    """
+    return {key: _combine([episode[key] for episode in episodes]) for key in episodes[0]}
+
+
+def _of_columns(values: np.ndarray) -> dict[str, list]:
+    values = values.reshape(len(values), -1)
+    quantiles = np.quantile(values, list(QUANTILES.values()), axis=0)
+    return {
+        "min": values.min(0).tolist(),
+        "max": values.max(0).tolist(),
+        "mean": values.mean(0).tolist(),
+        "std": values.std(0).tolist(),
+        "count": [len(values)],
+        **{name: row.tolist() for name, row in zip(QUANTILES, quantiles, strict=True)},
+    }
+
+
+def _combine(episodes: Sequence[dict[str, list]]) -> dict[str, list]:
+    stacked = {name: np.array([episode[name] for episode in episodes]) for name in episodes[0]}
+    weights = (stacked["count"] / stacked["count"].sum()).reshape(
+        -1, *[1] * (stacked["mean"].ndim - 1)
+    )
+    mean = (weights * stacked["mean"]).sum(0)
+    variance = (weights * (stacked["std"] ** 2 + (stacked["mean"] - mean) ** 2)).sum(0)
+    combined = {
+        "min": stacked["min"].min(0),
+        "max": stacked["max"].max(0),
+        "mean": mean,
+        "std": np.sqrt(variance),
+        "count": stacked["count"].sum(0),
+        **{name: (weights * stacked[name]).sum(0) for name in QUANTILES},
+    }
+    return {name: values.tolist() for name, values in combined.items()}

@@ -1,0 +1,373 @@
+"""From sampled motions to the weights of a linear primitive.
+
+Demonstrations sampled at the same normalised times are fitted by one matrix product.
+
+Samples that lie far off can be taken back to where the others lead: M-estimates by iteratively
+reweighted least squares (Huber and Ronchetti 2009, "Robust statistics", chapter 7), the motion
+of a primitive that is closest to the samples, each weighed by the trust in it, which falls with
+its residual over their spread. A motion through y* = y_fit + trust (y - y_fit), fitted by plain
+least squares, is the same one: so these stand for the samples, whatever the method that fits
+them.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any, TypedDict
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hrc_learn.dmp._arguments import FitReport, Samples
+from hrc_learn.dmp._system.bases import Basis, GaussianBasis, balanced_units
+from hrc_learn.dmp._system.closed_forms import SpringDamper
+from hrc_learn.dmp._system.response import Response, response_of
+from hrc_learn.dmp.forcing_scale import Demonstrated, Scaling
+
+
+class FitOptions(TypedDict, total=False):
+    """Options of `fit`, handed on unchanged to where they are used: `fit_motion`."""
+
+    method: str
+    """`"trajectory"` (default), least squares on the positions, the closest reproduction;
+    `"ridge"`, regression on the force; `"lwr"`, the paper's."""
+    robust: str | None
+    """`"huber"` or `"tukey"`: how samples that lie far off are trusted less.
+    None (default): all alike. See `robust_weights`."""
+    approach: float | int
+    """Share of the motion, 0 to 1, along which a new start and goal are taken up, smoothly;
+    0 (default): at once, as the paper has it."""
+    basis: Basis | None
+    """Shape of the forcing term; `n_basis` Gaussians unless given."""
+    spring: SpringDamper | None
+    """Gains; alpha = 25, critically damped, unless given."""
+    regularization: float
+    """Ridge, relative to the largest singular value; 1e-7 unless given."""
+
+
+METHODS = ("trajectory", "ridge", "lwr")
+type Fit = tuple[Float[Tensor, "*batch D N"], Float[Tensor, "*batch D"]]
+
+
+def fit_samples(
+    method: str, response: Response, samples: Samples, regularization: float
+) -> tuple[Float[Tensor, "B D N"], Float[Tensor, "B D"]]:
+    """Weights of the unscaled forcing term and start velocity dy/ds, in float64.
+
+    Args:
+        method: `"trajectory"`, least squares on the positions themselves; `"ridge"`, ridge
+            regression on the force; `"lwr"`, locally weighted regression on the force as in
+            the paper, which fits each weight alone.
+        response: Of the primitive to be fitted.
+        samples: Of one demonstration or many.
+        regularization: Ridge, relative to the largest singular value of the design matrix.
+    """
+    if method not in METHODS:
+        raise ValueError(f"unknown method {method!r}; there are {', '.join(METHODS)}")
+    position = samples.position.double()
+    rate = None
+    if samples.velocity is not None:
+        rate = samples.velocity.double() * samples.duration[:, None, None]
+    if samples.shared:
+        return _fit(method, response, samples.s[0], position, rate, regularization)
+    fits = []
+    for i, valid in enumerate(samples.mask):
+        one_rate = None if rate is None else rate[i, :, valid]
+        s = samples.s[i, valid]
+        fits.append(_fit(method, response, s, position[i, :, valid], one_rate, regularization))
+    weights, start_rate = zip(*fits, strict=True)
+    return torch.stack(weights), torch.stack(start_rate)
+
+
+def _fit(
+    method: str,
+    response: Response,
+    s: Float[Tensor, "T"],
+    position: Float[Tensor, "*batch D T"],
+    rate: Float[Tensor, "*batch D T"] | None,
+    regularization: float,
+) -> Fit:
+    # Timestamps as something to look an operator up by.
+    sampled = response, s.cpu().numpy().tobytes(), s.device
+    if method == "trajectory":
+        # The squared distance to the samples, without differentiation. Start and goal are the
+        # first and the last sample, the start velocity the recorded one or fitted along.
+        K, to_weights = _trajectory_operator(*sampled, rate is None, regularization)
+        unknown = _apply(position, K)
+        if rate is None:
+            return unknown[..., :-1], unknown[..., -1]
+        return unknown - rate[..., :1] * to_weights, rate[..., 0]
+    if rate is None:
+        rate = differentiate(s, position)
+    goal = position[..., -1:]
+    force = differentiate(s, rate) - response.spring.acceleration(position - goal, rate)
+    if response.approach:
+        force = force - (goal - position[..., :1]) * response.approach_force(s)
+    return _apply(force, _force_operator(*sampled, method, regularization)), rate[..., 0]
+
+
+def _apply(
+    y: Float[Tensor, "*batch D T"], K: Float[Tensor, "n T"]
+) -> Float[Tensor, "*batch D n"]:
+    """One flat product K y for every coordinate of every demonstration."""
+    return (y.reshape(-1, y.shape[-1]) @ K.T).view(*y.shape[:-1], -1)
+
+
+def differentiate(
+    s: Float[Tensor, "T"], y: Float[Tensor, "*batch T"]
+) -> Float[Tensor, "*batch T"]:
+    """dy/ds of second order on any spacing, ends included (exact for parabolas)."""
+    slope = y.diff() / s.diff()
+    h = s.diff()
+    # The parabola through three samples: each slope counts by the step on the other side.
+    inner = (h[1:] * slope[..., :-1] + h[:-1] * slope[..., 1:]) / (h[1:] + h[:-1])
+    first = 2 * slope[..., :1] - inner[..., :1]
+    last = 2 * slope[..., -1:] - inner[..., -1:]
+    return torch.cat([first, inner, last], dim=-1)
+
+
+# Sampled alike, demonstrations share one: 16 of them are as many datasets.
+@lru_cache(maxsize=16)
+def _trajectory_operator(
+    response: Response,
+    timestamps: bytes,
+    device: torch.device,
+    fit_rate: bool,
+    regularization: float,
+) -> tuple[Float[Tensor, "unknown T"], Float[Tensor, "unknown"]]:
+    """Maps samples to unknowns, and a known start velocity to what it takes off them.
+
+    With y_0 = y(0) and g = y(1) read off the samples, the residual is linear in the samples
+    too, so that one matrix does it all.
+    """
+    N = response.basis.count
+    s = _timestamps(timestamps, device)
+    H = response.evaluate(s)[:, 0]
+    velocity, start, goal = H[:, N], H[:, N + 1], H[:, N + 2]
+    unit = balanced_units(response.basis, H, int(fit_rate))
+    K = unit[:, None] * ridge_inverse(H[:, : N + fit_rate] * unit, regularization)
+    from_samples = K.clone()
+    from_samples[:, 0] -= K @ start
+    from_samples[:, -1] -= K @ goal
+    return from_samples, K @ velocity
+
+
+@lru_cache(maxsize=16)
+def _force_operator(
+    response: Response,
+    timestamps: bytes,
+    device: torch.device,
+    method: str,
+    regularization: float,
+) -> Float[Tensor, "N T"]:
+    """Maps a force to the weights closest to it."""
+    s, basis = _timestamps(timestamps, device), response.basis
+    if method == "ridge":
+        return ridge_inverse(basis.forcing(s), regularization)
+    # w_i = (z' Gamma_i f) / (z' Gamma_i z), the paper's solution of its (Cost_i). Without a
+    # ridge: each weight is a mean of its own samples, so that nothing is ill-posed.
+    z = basis.phase(s)
+    weighted = (basis.kernels(s) * z[:, None]).T
+    # A Gaussian narrower than the sampling may see no sample: its weight is zero then.
+    return weighted / (weighted @ z).clamp_min(torch.finfo(s.dtype).tiny)[:, None]
+
+
+def _timestamps(key: bytes, device: torch.device) -> Float[Tensor, "T"]:
+    return torch.frombuffer(bytearray(key), dtype=torch.float64).to(device)
+
+
+def ridge_inverse(A: Float[Tensor, "T n"], regularization: float) -> Float[Tensor, "n T"]:
+    """(A'A + (r sigma_max)^2 I)^-1 A', by singular values: A'A is never formed."""
+    U, sigma, Vh = torch.linalg.svd(A, full_matrices=False)
+    damping = regularization * sigma[0]
+    return (Vh.T * (sigma / (sigma**2 + damping**2))) @ U.T
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MotionFit:
+    """What was fitted to a flat batch of demonstrations, in float64."""
+
+    response: Response
+    """Of the spring and the basis."""
+    samples: Samples
+    """Those fitted: as recorded, but for outliers of a robust fit."""
+    trust: Float[Tensor, "B D T"] | None
+    """In each recorded sample, 0 to 1; None: whole in all."""
+    weights: Float[Tensor, "B D N"]
+    """Of the unscaled forcing term."""
+    rate: Float[Tensor, "B D"]
+    """Start velocity dy/ds."""
+
+    def arguments(self, scaling: Scaling, names: Sequence[str] | None) -> dict[str, Any]:
+        """What a `JointDMP` is put together from, in the demonstrations' shape and dtype.
+
+        Raises:
+            ValueError: A scaling that a motion forbids; `names` are those of its coordinates.
+        """
+        samples = self.samples
+        # One where a coordinate never moves: nothing to scale, and nothing to divide by.
+        amplitude = torch.where(samples.span > 0, samples.span, 1.0)
+        shown = Demonstrated(*(x.double() for x in (samples.first, samples.last, amplitude)))
+        scaling.check(shown, samples.batch, names)
+        s = samples.s[0] if samples.shared else samples.s.view(*samples.batch, -1)
+        return {
+            "weights": self._batched(scaling.unscale(self.weights.mT, shown).mT),
+            "start": self._batched(samples.first),
+            "goal": self._batched(samples.last),
+            "start_velocity": self._batched(self.rate / samples.duration[:, None]),
+            "duration": self._batched(samples.duration),
+            "amplitude": self._batched(amplitude),
+            "timestamps": s,
+            "basis": self.response.basis,
+            "spring": self.response.spring,
+            "scaling": scaling,
+            "approach": self.response.approach,
+        }
+
+    def report(self, reproduction: Float[Tensor, "*batch T D"]) -> FitReport:
+        """Residuals of a motion, at all samples."""
+        trust = None if self.trust is None else self._batched(self.trust).mT
+        return self.samples.compare(reproduction.mT.reshape(self.samples.position.shape), trust)
+
+    def _batched(self, values: Tensor) -> Tensor:
+        samples = self.samples
+        return values.to(samples.position.dtype).reshape(samples.batch + values.shape[1:])
+
+
+def fit_motion(
+    samples: Samples,
+    n_basis: int,
+    *,
+    method: str = "trajectory",
+    robust: str | None = None,
+    approach: float | int = 0.0,
+    basis: Basis | None = None,
+    spring: SpringDamper | None = None,
+    # Far above rounding, far below what a sensor can tell.
+    regularization: float = 1e-7,
+) -> MotionFit:
+    """Fit weights and start velocity; arguments as in `FitOptions`.
+
+    Raises:
+        ValueError: An option that there is not.
+    """
+    basis, spring = basis or GaussianBasis(count=n_basis), spring or SpringDamper()
+    response = response_of(spring, basis, float(approach))
+    trust = None
+    if robust is not None:
+        samples, trust = robust_weights(robust, response, samples, regularization)
+    weights, rate = fit_samples(method, response, samples, regularization)
+    return MotionFit(
+        response=response, samples=samples, trust=trust, weights=weights, rate=rate
+    )
+
+
+HUBER, TUKEY = 1.345, 4.685
+"""Residuals in standard deviations beyond which trust falls and ends: 95 % efficient for
+Gaussian noise."""
+SPREAD_OF_MEDIAN = 1.4826
+"""Standard deviation over median absolute value of Gaussian noise."""
+LEAST_SPREAD = 1e-12
+"""Of residuals, as a share of the range covered: below, they are rounding."""
+ROUNDS = 50
+"""At most: trust may swing to and fro between samples and never settle."""
+SETTLED = 1e-3
+"""Change of trust at which the iteration ends."""
+
+
+def huber(residual: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+    """Trust by residual in standard deviations, >= 0: whole, then falling as its inverse."""
+    return HUBER / residual.clamp(min=HUBER)
+
+
+def tukey(residual: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+    """Biweight: falls from the start, and far off there is none."""
+    return (1 - (residual / TUKEY).clamp(max=1) ** 2) ** 2
+
+
+LOSSES: dict[str, Callable[[Tensor], Tensor]] = {"huber": huber, "tukey": tukey}
+
+
+def robust_weights(
+    loss: str, response: Response, samples: Samples, regularization: float
+) -> tuple[Samples, Float[Tensor, "B D T"]]:
+    """Samples with outliers taken back, and the trust in what was recorded.
+
+    Args:
+        loss: `"huber"`, convex, so that there is one answer; `"tukey"`, which from that answer
+            on forgets what lies far off.
+        response: Of the primitive to be fitted.
+        samples: Of one demonstration or many.
+        regularization: Ridge, relative to the largest singular value.
+
+    Raises:
+        ValueError: No such loss.
+    """
+    if loss not in LOSSES:
+        raise ValueError(f"unknown robust loss {loss!r}; there are {', '.join(LOSSES)}")
+    position = samples.position.double()
+    trust = torch.zeros_like(position)
+    tamed, reach = position.clone(), None
+    for i, valid in enumerate(samples.mask):
+        if reach is None or not samples.shared:
+            reach = _Reach(response, samples.s[i, valid], regularization)
+        y = position[i, :, valid]
+        fitted, trusted = _fit_robustly(loss, reach, y)
+        trust[i, :, valid] = trusted
+        tamed[i, :, valid] = fitted + trusted * (y - fitted)
+    return replace(samples, position=tamed.to(samples.position)), trust
+
+
+class _Reach:
+    """The motions that a primitive can make at given times, start and goal free too.
+
+    The goal is where the motion is at the end. Without that the last sample would be the goal,
+    and nothing could tell whether it is an outlier.
+    """
+
+    def __init__(self, response: Response, s: Float[Tensor, "T"], regularization: float):
+        N = response.basis.count
+        H = response.evaluate(s)[:, 0]
+        goal = torch.zeros_like(H[-1])
+        goal[-1] = 1.0
+        # The motion at all times but the last, the goal, and by how much it is missed.
+        A = torch.cat([H[:-1], goal[None], (H[-1] - goal)[None]])
+        U, sigma, _ = torch.linalg.svd(
+            A * balanced_units(response.basis, A, A.shape[1] - N), full_matrices=False
+        )
+        self._U = U
+        self._ridge = torch.diag((regularization * sigma[0] / sigma) ** 2)
+
+    def closest(
+        self, y: Float[Tensor, "D T"], trust: Float[Tensor, "D T"]
+    ) -> Float[Tensor, "D T"]:
+        """The motion with the least weighted squared distance to samples."""
+        trust = torch.nn.functional.pad(trust, (0, 1), value=1.0)
+        y = torch.nn.functional.pad(y, (0, 1))
+        weighted = self._U.mT * trust[:, None]
+        # U is orthonormal: little is lost by squaring it.
+        normal = weighted @ self._U + self._ridge
+        c = torch.linalg.solve(normal, weighted @ y[..., None])
+        return (self._U @ c)[:, :-1, 0]
+
+
+def _fit_robustly(
+    loss: str, reach: _Reach, y: Float[Tensor, "D T"]
+) -> tuple[Float[Tensor, "D T"], Float[Tensor, "D T"]]:
+    """The closest motion and the trust in each sample."""
+    trust, spread = torch.ones_like(y), torch.zeros_like(y[:, :1])
+    fitted = reach.closest(y, trust)
+    # The smallest number as well: a coordinate that never moves covers no range.
+    least = LEAST_SPREAD * (y.amax(-1) - y.amin(-1))[:, None] + torch.finfo(y.dtype).tiny
+    for name in dict.fromkeys(("huber", loss)):
+        for _ in range(ROUNDS):
+            residual = (y - fitted).abs()
+            if name == "huber":
+                spread = SPREAD_OF_MEDIAN * residual.median(-1, keepdim=True).values
+                spread = torch.maximum(spread, least)
+            before, trust = trust, LOSSES[name](residual / spread)
+            fitted = reach.closest(y, trust)
+            if (trust - before).abs().amax() < SETTLED:
+                break
+    return fitted, trust

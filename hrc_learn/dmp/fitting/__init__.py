@@ -1,1 +1,0 @@
-"""From sampled motions to the weights of a primitive."""

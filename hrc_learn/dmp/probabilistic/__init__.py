@@ -1,1 +1,0 @@
-"""Primitives from several demonstrations: distributions, via points and contexts."""

@@ -1,0 +1,163 @@
+"""What may be replaced: what was written here, and nothing else."""
+
+import json
+
+import pytest
+from cakes import KIND, cake, contents, fill
+
+from hrc_learn.store import (
+    MADE_BY,
+    MANIFEST,
+    Kind,
+    new_folder,
+    replacing,
+)
+
+
+@pytest.mark.parametrize("kind", ["folder", "file"])
+def test_what_is_not_ours_is_never_overwritten(tmp_path, kind):
+    out = tmp_path / "out"
+    precious = out if kind == "file" else out / "thesis.tex"
+    precious.parent.mkdir(exist_ok=True)
+    precious.write_text("years")
+    with pytest.raises(FileExistsError, match="not ours to overwrite"):
+        fill(out, "new", overwrite=True)
+    assert precious.read_text() == "years"
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+@pytest.mark.parametrize(
+    ("with_manifest", "name"),
+    [
+        (True, "thesis.tex"),
+        (True, "layers/own"),
+        (True, "own/empty folder/"),
+        (False, "thesis.tex"),
+        (False, "own/empty folder/"),
+    ],
+)
+def test_a_folder_that_holds_files_of_the_users_own_is_not_replaced(
+    tmp_path, with_manifest, name
+):
+    out = tmp_path / "out"
+    fill(out, "old")
+    if not with_manifest:
+        (out / MANIFEST).unlink()
+    precious = out / name
+    precious.parent.mkdir(exist_ok=True)
+    precious.mkdir() if name.endswith("/") else precious.write_text("years")
+    with pytest.raises(FileExistsError, match="out holds more than a cake"):
+        fill(out, "new", overwrite=True)
+    assert precious.exists()
+    assert (out / "result").read_text() == "old"
+    precious.rmdir() if name.endswith("/") else precious.unlink()
+
+
+def test_what_older_versions_wrote_is_replaced(tmp_path):
+    fill(tmp_path / "out", "old")
+    (tmp_path / "out" / MANIFEST).unlink()
+    fill(tmp_path / "out", "new", overwrite=True)
+    assert contents(tmp_path) == cake("new")
+
+
+@pytest.mark.parametrize(
+    ("text", "ours"),
+    [('{"by": "us"}', True), ('{"by": "them"}', False), ("[]", False), ("no JSON", False)],
+)
+def test_a_mark_without_a_manifest_must_say_whose_it_is(tmp_path, text, ours):
+    kind = Kind(name="pie", mark="mark", says=("by", "us"), files=("mark",), manifest=False)
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "mark").write_text(text)
+
+    def bake():
+        with replacing(tmp_path / "out", kind, overwrite=True) as folder:
+            folder.mkdir()
+            (folder / "mark").write_text("new")
+
+    if ours:
+        bake()
+    else:
+        with pytest.raises(FileExistsError, match="not ours to overwrite"):
+            bake()
+    assert contents(tmp_path) == {"out/mark": "new" if ours else text}
+
+
+def test_an_empty_folder_may_be_filled(tmp_path):
+    (tmp_path / "out").mkdir()
+    fill(tmp_path / "out", "new", overwrite=True)
+    assert contents(tmp_path) == cake("new")
+
+
+def test_files_of_other_origin_are_carried_over_on_request(tmp_path):
+    out = tmp_path / "out"
+    fill(out, "old")
+    (out / "notes").mkdir()
+    (out / "notes" / "mine").write_text("years")
+    (out / "link").symlink_to("notes/mine")
+    for text in ("new", "newer"):  # and are not taken for results afterwards
+        fill(out, text, overwrite=True, others="keep")
+        assert (out / "link").is_symlink()
+        own = {"out/notes/mine": "years", "out/link": "years"}
+        assert contents(tmp_path) == cake(text) | own
+    with pytest.raises(FileExistsError, match="link and 2 more"):
+        fill(out, "last", overwrite=True)
+
+
+def test_a_file_put_there_in_the_meantime_is_kept_aside(tmp_path):
+    out = tmp_path / "out"
+    fill(out, "old")
+
+    def write() -> None:
+        with replacing(out, KIND, overwrite=True) as folder:
+            folder.mkdir()
+            (out / "thesis.tex").write_text("years")
+
+    with pytest.warns(UserWarning, match=r"out\.kept"):
+        write()
+    assert contents(tmp_path) == {"out.kept/thesis.tex": "years"}
+
+
+def test_a_folder_put_there_in_the_meantime_is_not_replaced(tmp_path):
+    out = tmp_path / "out"
+
+    def write() -> None:
+        with replacing(out, KIND) as folder:
+            folder.mkdir()
+            (folder / "result").write_text("hours")
+            out.mkdir()
+            (out / "thesis.tex").write_text("years")
+
+    with pytest.raises(FileExistsError, match="exists") as raised:
+        write()
+    assert contents(tmp_path) == {"out/thesis.tex": "years", "out.new/result": "hours"}
+    assert "out.new" in raised.value.__notes__[0]
+
+
+def test_a_manifest_reaches_nothing_outside_its_folder(tmp_path):
+    (tmp_path / "precious").write_text("years")
+    out = tmp_path / "out"
+    fill(out, "old")
+    manifest = json.loads((out / MANIFEST).read_text())
+    manifest["entries"] += ["../precious", str(tmp_path / "precious"), "../"]
+    (out / MANIFEST).write_text(json.dumps(manifest))
+    fill(out, "new", overwrite=True)
+    assert contents(tmp_path) == cake("new") | {"precious": "years"}
+
+
+def test_results_inside_results_belong_to_them_only_if_written_with_them(tmp_path):
+    out = tmp_path / "out"
+
+    def write(overwrite: bool = False) -> None:
+        with new_folder(out, {}, overwrite) as folder:
+            fill(folder / "inner", "old")
+
+    write()
+    fill(out / "inner", "again", overwrite=True)  # with other files than before
+    write(overwrite=True)
+    assert contents(tmp_path) == cake("old", "out/inner") | {f"out/{MADE_BY}": "{}\n"}
+    fill(out / "another", "run")
+    with pytest.raises(FileExistsError, match="another/"):
+        write(overwrite=True)
+    assert contents(out / "another") == {
+        name.removeprefix("x/"): text for name, text in cake("run", "x").items()
+    }
