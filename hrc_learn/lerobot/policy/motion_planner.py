@@ -86,8 +86,8 @@ class ActionEncoding(nn.Module):
                 if (episode[:, triple].norm(dim=-1) > torch.pi).any():
                     raise ValueError(
                         f"demonstration {k} turns the end effector by more than half a turn "
-                        "from the mean orientation, where a rotation vector is ambiguous: leave "
-                        "it out (fit_episodes), or use joints as actions"
+                        "from the mean orientation, where a rotation vector is ambiguous: "
+                        "leave it out (fit_episodes), or use joints as actions"
                     )
         self.whiten(*torch.std_mean(torch.cat(unrolled), dim=0))
 
