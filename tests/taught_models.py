@@ -7,7 +7,7 @@ from commands import done
 from unchecked import shapes_unchecked
 
 from hrc_learn.skills.placing import PlacingSkill
-from hrc_learn.skills.visual_servoing import VisualServoSkill
+from hrc_learn.skills.visual_skill import VisualServoSkill
 
 
 @shapes_unchecked()  # minutes of simulation would be twice as many

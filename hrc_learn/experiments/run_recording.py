@@ -269,7 +269,7 @@ def live_view(title: str, config: LiveViewConfig, on_open: Callable[[str], None]
     @contextmanager
     def watch(cell: WorkCell, world: World, motion: MotionLog) -> Iterator[None]:
         # rerun takes a second to import.
-        from hrc_learn.viz.live_dashboard import live_dashboard, serve_stream
+        from hrc_learn.viz.run_dashboard import live_dashboard, serve_stream
 
         def snapshot() -> RunRecording | None:
             return record(title, cell, world, motion) if len(motion) else None

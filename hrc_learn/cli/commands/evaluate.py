@@ -24,7 +24,7 @@ from hrc_learn.learning.channels import (
     load_primitive,
     reproduction_error,
 )
-from hrc_learn.skills.visual_servoing import VisualServoSkill
+from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.store import new_folder, read_made_by, write_json
 from hrc_learn.viz.figures import measures_figure
 

@@ -22,7 +22,7 @@ from hrc_learn.learning.primitive_fitting import (
 )
 from hrc_learn.learning.primitive_fitting import fit_primitives as fit_demonstrations
 from hrc_learn.learning.visual_servo_fitting import fit_visual_servo, learning_recording
-from hrc_learn.skills.visual_servoing import VisualServoSkill
+from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.store import new_folder, write_json
 from hrc_learn.viz.figures import (
     fit_joints_figure,
@@ -30,7 +30,7 @@ from hrc_learn.viz.figures import (
     residual_figure,
     workspace_figure,
 )
-from hrc_learn.viz.fit_dashboard import record_fit, record_learning
+from hrc_learn.viz.learning_dashboards import record_fit, record_learning
 
 
 def fit_primitives(args: FitPrimitives) -> None:

@@ -12,7 +12,7 @@ def show(args: Show) -> None:
     # Rerun and PyTorch, which a report does without.
     from hrc_learn.demos import load_demos
     from hrc_learn.learning.channels import demonstrations_recording
-    from hrc_learn.viz.demonstration_dashboard import record_demonstrations
+    from hrc_learn.viz.learning_dashboards import record_demonstrations
 
     demos = load_demos(args.dataset, episodes=args.episodes or None, units=args.units or None)
     title = f"Demonstrations in {args.dataset.resolve().name}"

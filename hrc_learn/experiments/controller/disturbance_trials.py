@@ -26,7 +26,7 @@ from hrc_learn.sim.closed_loop import (
     VirtualCamera,
     simulate_closed_loop,
 )
-from hrc_learn.skills.visual_servoing import guessed_network
+from hrc_learn.skills.visual_skill import guessed_network
 
 ELBOW = 4
 """Joint that is pushed."""
