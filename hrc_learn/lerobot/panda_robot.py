@@ -109,7 +109,7 @@ def observed(
     values = dict(zip(JOINTS, state.joint_position.tolist(), strict=True))
     values |= zip(VELOCITIES, state.joint_velocity.tolist(), strict=True)
     values[GRIPPER] = state.gripper_width
-    if HAND[0] in names:
+    if not {*HAND}.isdisjoint(names):
         values |= zip(HAND, hand_vector(state.joint_position, near).tolist(), strict=True)
     return {name: float(values[name]) for name in names}
 

@@ -94,3 +94,11 @@ def test_actions_are_measured_where_the_state_has_their_names(actions, states, c
 
 def test_unnamed_states_of_another_width_are_something_else():
     assert matched_columns(None, None, (2, 3)) == [-1, -1]
+
+
+def test_before_it_has_learned_the_reference_is_the_base_frame():
+    encoding = ActionEncoding(4, [[1, 2, 3]]).double()
+    vector = torch.tensor([[0.5, 0.3, -0.2, 0.1]], dtype=torch.float64)
+    coordinates = encoding.to_coordinates(vector)
+    torch.testing.assert_close(coordinates.abs(), vector.abs())
+    torch.testing.assert_close(encoding.to_actions(coordinates), vector)
