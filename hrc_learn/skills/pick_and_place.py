@@ -127,7 +127,7 @@ class Phase(StrEnum):
     OVER = "over"
 
 
-INTERACT, TRANSFER, RELEASE = Phase.INTERACT, Phase.TRANSFER, Phase.RELEASE
+INTERACT, HOME, TRANSFER, RELEASE = Phase.INTERACT, Phase.HOME, Phase.TRANSFER, Phase.RELEASE
 """Phases that others look up in the log."""
 
 # Delays and occlusions up to this are no recovery [s]: a few lost images, or a blink.
