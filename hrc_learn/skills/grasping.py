@@ -25,12 +25,11 @@ from hrc_learn.skills.visual_servoing import ServoTarget, VisualServo, VisualSer
 from hrc_learn.skills.visual_skill import UP, VisualServoSkill, from_learned
 from hrc_learn.skills.work_cell import (
     BlockedPathError,
-    GraspObject,
     MissedGraspError,
     TaskFailedError,
     WorkCell,
-    Workplace,
 )
+from hrc_learn.skills.workplace import GraspObject, Workplace
 
 OPEN, CLOSED = 0.08, 0.0
 """Widths the gripper is commanded to [m]: its full stroke; closed, it squeezes the object."""

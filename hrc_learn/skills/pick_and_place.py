@@ -39,12 +39,11 @@ from hrc_learn.skills.visual_servoing import ServoTarget
 from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.skills.work_cell import (
     BlockedPathError,
-    GraspObject,
     MissedGraspError,
     TaskFailedError,
     WorkCell,
-    Workplace,
 )
+from hrc_learn.skills.workplace import GraspObject, Workplace
 
 Mishap = Literal[
     "object not detected", "marker occluded", "missed grasp", "dropped object", "blocked path"
