@@ -343,6 +343,17 @@ def test_demonstrations_are_brought_to_the_timing_of_one():
     np.testing.assert_allclose(aligned[1].joint_velocity, demos[0].joint_velocity, atol=0.5)
 
 
+def test_orientations_that_agree_are_no_angle_apart():
+    """Products of unit quaternions are rounded to more than one, of which there is no arccos."""
+    time = np.arange(100) / 50
+    q = np.random.default_rng(0).normal(size=(100, 4))
+    q /= np.linalg.norm(q, axis=1, keepdims=True)
+    assert (np.square(q).sum(1) > 1).any()
+    demo = Demonstration(time=time, orientation=q, fps=50)
+    aligned = align(DemonstrationSet([demo, replace(demo, episode=1)]), reference=0)
+    np.testing.assert_allclose(np.abs((aligned[1].orientation * q).sum(1)), 1, atol=1e-9)
+
+
 def test_poses_are_aligned_too_and_the_median_leads():
     time = np.arange(200) / 50
     demos = DemonstrationSet(
