@@ -32,9 +32,9 @@ def warp(
     D[i, j] = cost[i, j] + min(D[i-1, j-1], D[i-1, j], D[i, j-1])
 
     Entries of one anti-diagonal depend on earlier ones only, so each is computed as a whole:
-    exact, at some 0.1 s for 1000 samples against 1000. Of the libraries, `dtaidistance` takes no
-    costs such as those of orientations, and `tslearn`, which finds the same path ten times as
-    fast, needs numba, scikit-learn and statsmodels.
+    exact, at some 0.1 s for 1000 samples against 1000. Of the libraries, `dtaidistance` takes
+    no costs, such as those of orientations, and `tslearn`, which finds a path of the same cost
+    ten times as fast, needs numba, scikit-learn and statsmodels.
 
     Args:
         cost: Cost of pairing sample i of the first with sample j of the second.

@@ -344,7 +344,7 @@ def test_demonstrations_are_brought_to_the_timing_of_one():
 
 
 def test_orientations_that_agree_are_no_angle_apart():
-    """Products of unit quaternions are rounded to more than one, of which there is no arccos."""
+    """Products of unit quaternions are rounded beyond one, of which there is no arccos."""
     time = np.arange(100) / 50
     q = np.random.default_rng(0).normal(size=(100, 4))
     q /= np.linalg.norm(q, axis=1, keepdims=True)
