@@ -24,8 +24,7 @@ from timing import time_calls
 from hrc_learn import cli
 from hrc_learn.vision import CameraModel, Marker, MarkerDetector, SyntheticCamera
 from hrc_learn.viz import CameraRecording, RunRecording, StepLog
-from hrc_learn.viz.live_dashboard import LiveSender
-from hrc_learn.viz.run_dashboard import LogStream, record_run
+from hrc_learn.viz.run_dashboard import LiveSender, LogStream, record_run
 
 STEPS = 200  # timed together, since one takes less than the clock resolves
 TARGETS = {"log_step_us": 2.0, "log_live_us": 2.0, "camera_ms": 4.0, "detect_ms": 4.0}

@@ -13,8 +13,7 @@ from hrc_learn.sim import World, open_camera
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.marker_sensor import MarkerSensor
 from hrc_learn.skills.placing import PlacingSkill
-from hrc_learn.skills.visual_servoing import VisualServoSkill
-from hrc_learn.skills.visual_target import OBJECT_FEATURE, OBJECT_FEATURE_NAMES
+from hrc_learn.skills.visual_skill import OBJECT_FEATURE, OBJECT_FEATURE_NAMES, VisualServoSkill
 from hrc_learn.teleoperation.scripted_demonstrations import (
     PlacingDemonstrationConfig,
     ServoDemonstrationConfig,

@@ -24,8 +24,8 @@ from hrc_learn.jacobian import (
 )
 from hrc_learn.kinematics import gripper_down, panda
 from hrc_learn.sim.closed_loop import Imperfections, VirtualCamera, simulate_closed_loop
-from hrc_learn.skills.cartesian_motion import nearest_configuration
-from hrc_learn.skills.visual_servoing import guessed_network
+from hrc_learn.skills.arm_motion import nearest_configuration
+from hrc_learn.skills.visual_skill import guessed_network
 from hrc_learn.vision import CameraModel
 
 

@@ -45,10 +45,8 @@ def live_view(title: str, config: LiveViewConfig, on_open: Callable[[str], None]
 
     @contextmanager
     def watch(cell: WorkCell, world: World, motion: MotionLog) -> Iterator[None]:
-        from hrc_learn.viz.live_dashboard import (
-            live_dashboard,  # rerun takes a second
-            serve_stream,
-        )
+        # Rerun takes a second.
+        from hrc_learn.viz.run_dashboard import live_dashboard, serve_stream
 
         def snapshot():
             return record(title, cell, world, motion) if len(motion) else None

@@ -12,7 +12,7 @@ from hrc_learn.geometry import quaternion
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import CameraKind, ObjectConfig, World, open_camera
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.cartesian_motion import joint_line
+from hrc_learn.skills.arm_motion import joint_line
 from hrc_learn.skills.marker_sensor import MarkerSensor
 from hrc_learn.skills.work_cell import TaskFailedError
 from hrc_learn.vision import CameraModel, Marker

@@ -28,8 +28,7 @@ from hrc_learn.jacobian import (
 from hrc_learn.kinematics import panda
 from hrc_learn.kinematics.tool_orientation import Approach
 from hrc_learn.learning.channels import LazyMap
-from hrc_learn.skills.visual_servoing import VisualServoSkill
-from hrc_learn.skills.visual_target import OBJECT_FEATURE, VisualTarget
+from hrc_learn.skills.visual_skill import OBJECT_FEATURE, VisualServoSkill, VisualTarget
 from hrc_learn.viz import (
     ErrorMap,
     LearningRecording,

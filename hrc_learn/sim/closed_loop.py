@@ -183,7 +183,8 @@ class VirtualCamera:
     def _take_image(self, tool: Pose, joint_position: Tensor, frame_time: float) -> None:
         imperfections = self.imperfections
         feature, visible = self.camera.project(tool)
-        feature = feature + imperfections.noise * self._normal(feature)
+        noise = torch.randn(feature.shape, generator=self.generator, dtype=feature.dtype)
+        feature = feature + imperfections.noise * noise
         broken = self._uniform(visible) < imperfections.nan_fraction
         feature = torch.where(broken.unsqueeze(-1), torch.nan, feature)
         visible = visible & ~self._cover(visible, frame_time)
@@ -203,9 +204,6 @@ class VirtualCamera:
 
     def _uniform(self, like: Tensor) -> Tensor:
         return torch.rand(like.shape, generator=self.generator, dtype=torch.float64)
-
-    def _normal(self, like: Tensor) -> Tensor:
-        return torch.randn(like.shape, generator=self.generator, dtype=like.dtype)
 
 
 def simulate_closed_loop(

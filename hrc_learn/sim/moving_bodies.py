@@ -5,9 +5,8 @@ import numpy as np
 from jaxtyping import Float
 
 from hrc_learn.geometry import Body, Box, Capsule
-from hrc_learn.sim.contacts import body_geoms
 from hrc_learn.sim.scene import OCCLUDER
-from hrc_learn.sim.world import World
+from hrc_learn.sim.world import World, body_geoms
 from hrc_learn.viz.arm_bodies import panda_mesh
 
 # pyright: reportAttributeAccessIssue=false

@@ -1,4 +1,4 @@
-"""The Panda as a MuJoCo model: our kinematics, primitive geoms, two actuators a joint.
+"""The Panda in MuJoCo: model, gripper, marker plate, and its driver.
 
 Body frames come from `hrc_learn.kinematics.panda`, so that simulator and controller share
 one table of numbers. Capsules and boxes follow the published link shapes to about a
@@ -10,10 +10,12 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 import torch
+from jaxtyping import Float
 
 from hrc_learn.geometry import quaternion
 from hrc_learn.kinematics import LINK_CAPSULES, panda
-from hrc_learn.sim.marker_plates import Plate, add_plate
+from hrc_learn.protocols import ArmState
+from hrc_learn.vision import Marker, marker_texture
 
 # pyright: reportAttributeAccessIssue=false
 # MuJoCo ships no type stubs; its names come from a compiled module.
@@ -26,8 +28,85 @@ _HIDDEN = 4  # sites of this group are not drawn
 _WHITE = (0.92, 0.93, 0.95, 1.0)
 _GREY = (0.35, 0.37, 0.40, 1.0)
 
+FIRM = {"condim": 4, "solref": (0.004, 1.0), "solimp": (0.97, 0.99, 0.0005, 0.5, 2)}
+"""Of contacts that hold a grasp: with torsional friction, and a fifth of MuJoCo's default time
+constant."""
+
 FINGER_STROKE = 0.04
 """Travel of one finger [m]; the gripper opens to twice this."""
+
+
+_THICKNESS = 0.002  # of a plate [m]
+_TEXELS = 400  # along its edge: whole texels for each of its 8 modules
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plate:
+    """A square plate that carries one marker, facing +z of its own frame."""
+
+    marker: Marker
+    """Which marker, and the edge length of its black square [m]."""
+    position: tuple[float, float, float]
+    """Centre of the plate's face in the frame of the body that carries it [m]."""
+    orientation: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    """Orientation of the plate's frame (wxyz): x along the marker's top edge, y up its side."""
+    solid: bool = True
+    """Whether the plate touches objects. A sticker on a box does not."""
+
+
+def add_plate(spec: mujoco.MjSpec, body, name: str, plate: Plate) -> None:
+    """Add a plate to a body: geom `name` (picture), site `name` (frame of the marker)."""
+    half = plate.marker.plate_size / 2
+    _add_picture(spec, name, marker_texture(plate.marker.id, _TEXELS))
+    mesh = spec.add_mesh(name=name)
+    mesh.uservert = [-half, -half, 0, half, -half, 0, half, half, 0, -half, half, 0]
+    mesh.userface = [0, 1, 2, 0, 2, 3]
+    mesh.usertexcoord = [0, 1, 1, 1, 1, 0, 0, 0]
+    mesh.userfacetexcoord = [0, 1, 2, 0, 2, 3]
+    mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+    pose = {"pos": plate.position, "quat": plate.orientation}
+    body.add_geom(
+        name=name,
+        type=mujoco.mjtGeom.mjGEOM_MESH,
+        meshname=name,
+        material=name,
+        contype=0,
+        conaffinity=0,
+        mass=0.0,
+        **pose,
+    )
+    body.add_site(name=name, group=4, **pose)  # groups above 2 are not drawn
+    if plate.solid:
+        normal = np.zeros(3)
+        mujoco.mju_rotVecQuat(normal, np.array([0.0, 0.0, 1.0]), np.array(plate.orientation))
+        add_box(
+            body,
+            f"{name}_plate",
+            (half, half, _THICKNESS / 2),
+            (0.9, 0.9, 0.9, 1.0),
+            # Just below the picture, or the two would flicker through each other.
+            pos=np.array(plate.position) - 0.75 * _THICKNESS * normal,
+            quat=plate.orientation,
+            mass=0.02,
+        )
+
+
+def add_box(body, name: str, half_size, colour, **more):
+    """Add a box to a body, by half edges [m] and colour (RGBA)."""
+    return body.add_geom(name=name, type=_BOX, size=half_size, rgba=colour, **more)
+
+
+def _add_picture(spec: mujoco.MjSpec, name: str, pixels: np.ndarray) -> None:
+    texture = spec.add_texture(
+        name=name,
+        type=mujoco.mjtTexture.mjTEXTURE_2D,
+        width=pixels.shape[1],
+        height=pixels.shape[0],
+        nchannel=3,
+    )
+    texture.data = np.repeat(pixels[..., None], 3, axis=-1).tobytes()
+    material = spec.add_material(name=name, specular=0.0, shininess=0.0)
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,26 +200,23 @@ def _add_joint(spec: mujoco.MjSpec, body, name: str, i: int, config: PandaModelC
     torque = float(limits.torque[i])
     # Position and velocity servo together follow a moving reference without lag, as the
     # arm's own velocity interface does.
-    position = spec.add_actuator(name=f"{name}_position", target=name)
-    position.trntype = mujoco.mjtTrn.mjTRN_JOINT
+    position = _add_servo(spec, f"{name}_position", name, torque)
     position.set_to_position(kp=config.stiffness[i])
-    velocity = spec.add_actuator(name=f"{name}_velocity", target=name)
-    velocity.trntype = mujoco.mjtTrn.mjTRN_JOINT
+    velocity = _add_servo(spec, f"{name}_velocity", name, torque)
     velocity.set_to_velocity(kv=config.damping[i])
-    for actuator in (position, velocity):
-        actuator.forcelimited = True
-        actuator.forcerange = (-torque, torque)
+
+
+def _add_servo(spec: mujoco.MjSpec, name: str, joint: str, strongest: float):
+    """An actuator of a joint, with a bound on its torque [N m] or force [N]."""
+    servo = spec.add_actuator(name=name, target=joint)
+    servo.trntype = mujoco.mjtTrn.mjTRN_JOINT
+    servo.forcelimited = True
+    servo.forcerange = (-strongest, strongest)
+    return servo
 
 
 def _add_hand(spec: mujoco.MjSpec, hand, config: PandaModelConfig) -> None:
-    hand.add_geom(
-        name="hand",
-        type=_BOX,
-        pos=(0, 0, 0.033),
-        size=(0.03, 0.1, 0.033),
-        mass=0.73,
-        rgba=_GREY,
-    )
+    add_box(hand, "hand", (0.03, 0.1, 0.033), _GREY, pos=(0, 0, 0.033), mass=0.73)
     if config.marker is not None:
         add_plate(spec, hand, "hand_marker", config.marker)
     for name, side in (("finger_left", 1.0), ("finger_right", -1.0)):
@@ -154,34 +230,96 @@ def _add_hand(spec: mujoco.MjSpec, hand, config: PandaModelConfig) -> None:
             armature=0.1,
             damping=5.0,
         )
-        finger.add_geom(
-            name=name,
-            type=_BOX,
-            pos=(0, side * 0.012, 0.018),
-            size=(0.009, 0.008, 0.016),
-            mass=0.01,
-            rgba=_GREY,
-        )
-        finger.add_geom(
-            name=f"{name}_pad",
-            type=_BOX,
+        place = (0, side * 0.012, 0.018)
+        add_box(finger, name, (0.009, 0.008, 0.016), _GREY, pos=place, mass=0.01)
+        add_box(
+            finger,
+            f"{name}_pad",
+            (0.010, 0.004, 0.012),
+            (0.1, 0.1, 0.1, 1.0),
             pos=(0, side * 0.004, 0.045),
-            size=(0.010, 0.004, 0.012),
             mass=0.005,
             # Torsional friction keeps a held box from turning about the pads' axis.
             friction=(1.5, 0.02, 0.001),
-            condim=4,
-            solref=(0.004, 1.0),
-            solimp=(0.97, 0.99, 0.0005, 0.5, 2),
-            rgba=(0.1, 0.1, 0.1, 1.0),
+            **FIRM,
         )
-        servo = spec.add_actuator(name=name, target=name)
-        servo.trntype = mujoco.mjtTrn.mjTRN_JOINT
-        servo.set_to_position(kp=2000.0, kv=60.0)
-        servo.forcelimited = True
-        servo.forcerange = (-config.grip_force, config.grip_force)
+        _add_servo(spec, name, name, config.grip_force).set_to_position(kp=2000.0, kv=60.0)
     # One motor drives both fingers of the real hand.
     coupling = spec.add_equality(name="fingers", name1="finger_left", name2="finger_right")
     coupling.type = mujoco.mjtEq.mjEQ_JOINT
     coupling.objtype = mujoco.mjtObj.mjOBJ_JOINT
     coupling.data[:5] = (0.0, 1.0, 0.0, 0.0, 0.0)
+
+
+class MujocoArm:
+    """The simulated Panda as an `Arm` and a `Gripper`."""
+
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData):
+        self._model = model
+        self._data = data
+        names = panda.joint_names
+        self.joints = np.array([model.joint(n).qposadr[0] for n in names])
+        self._velocities = np.array([model.joint(n).dofadr[0] for n in names])
+        self._position_servos = np.array([model.actuator(f"{n}_position").id for n in names])
+        self._velocity_servos = np.array([model.actuator(f"{n}_velocity").id for n in names])
+        fingers = ("finger_left", "finger_right")
+        self._fingers = np.array([model.joint(n).qposadr[0] for n in fingers])
+        self._finger_servos = np.array([model.actuator(n).id for n in fingers])
+        self._reference = np.zeros(len(names))
+        # Position errors [rad] from which on the servos pull no harder.
+        strongest = model.actuator_forcerange[self._position_servos, 1]
+        self._reach = strongest / model.actuator_gainprm[self._position_servos, 0]
+        self._velocity = np.zeros(len(names))
+
+    def read(self) -> ArmState:
+        """Return the present state, encoders without noise."""
+        return ArmState(
+            time=self._data.time,
+            joint_position=self._data.qpos[self.joints].copy(),
+            joint_velocity=self._data.qvel[self._velocities].copy(),
+            gripper_width=float(self._data.qpos[self._fingers].sum()),
+        )
+
+    def command(self, joint_velocity: Float[np.ndarray, "7"]) -> None:
+        """Set the joint velocities to hold from now on [rad/s]."""
+        if not np.isfinite(joint_velocity).all():
+            raise ValueError(f"joint_velocity must be finite, but is {joint_velocity}.")
+        self._velocity = np.array(joint_velocity, dtype=float)
+
+    def move(self, width: float) -> None:
+        """Open or close the gripper to a width [m]; 0 squeezes what is between the fingers."""
+        self._data.ctrl[self._finger_servos] = np.clip(width / 2, 0.0, FINGER_STROKE)
+
+    def place(self, joint_position: Float[np.ndarray, "7"], gripper_width: float) -> None:
+        """Set the joints at once, at rest. For resets, not for control."""
+        self._reference = np.array(joint_position, dtype=float)
+        self._velocity = np.zeros_like(self._reference)
+        self._data.qpos[self.joints] = self._reference
+        self._data.qvel[self._velocities] = 0.0
+        self._data.qpos[self._fingers] = gripper_width / 2
+        self.move(gripper_width)
+        self.drive()
+
+    def drive(self) -> None:
+        """Advance the servos' reference by one physics step.
+
+        It waits for joints that are held up by a contact: what they missed is not made up for
+        once they come free.
+        """
+        q = self._data.qpos[self.joints]
+        reference = self._reference + self._velocity * self._model.opt.timestep
+        self._reference = np.clip(reference, q - self._reach, q + self._reach)
+        self._data.ctrl[self._position_servos] = self._reference
+        self._data.ctrl[self._velocity_servos] = self._velocity
+
+    def tcp_pose(self, data: mujoco.MjData | None = None) -> Float[np.ndarray, "4 4"]:
+        """True pose of the tool centre point in the base frame."""
+        return frame_of((data or self._data).site("tcp"))
+
+
+def frame_of(thing) -> Float[np.ndarray, "4 4"]:
+    """Pose of a site or body of MuJoCo's in the base frame."""
+    pose = np.eye(4)
+    pose[:3, :3] = thing.xmat.reshape(3, 3)
+    pose[:3, 3] = thing.xpos
+    return pose

@@ -12,15 +12,19 @@ import mujoco
 import numpy as np
 
 from hrc_learn.geometry import Box
-from hrc_learn.sim.marker_plates import Plate, add_plate
-from hrc_learn.sim.panda_model import PandaModelConfig, add_panda
+from hrc_learn.sim.panda_model import (
+    FIRM,
+    PandaModelConfig,
+    Plate,
+    add_box,
+    add_panda,
+    add_plate,
+)
 from hrc_learn.vision import CameraModel, Marker
 
 # pyright: reportAttributeAccessIssue=false
 # MuJoCo ships no type stubs; its names come from a compiled module.
 
-
-_BOX = mujoco.mjtGeom.mjGEOM_BOX
 
 HAND_MARKER = 7
 """ArUco number of the plate on the end effector."""
@@ -65,43 +69,26 @@ class CabinetConfig:
         y, d = self.front - self.depth / 2, self.depth / 2
         t, z, h = self.thickness / 2, (self.top + self.bottom) / 2, (self.top - self.bottom) / 2
         wood, glass = (0.75, 0.62, 0.45, 1.0), (0.55, 0.70, 0.75, 0.45)
-        boards = [
-            Box(name=f"board_{name}", centre=(x, y, top - t), half_size=(w, d, t), colour=wood)
-            for name, top in self.shelves.items()
+        door_y, back_y = self.front + self.door_reach / 2, self.front - self.depth - t
+        parts = [
+            *(
+                (f"board_{name}", (x, y, top - t), (w, d, t))
+                for name, top in self.shelves.items()
+            ),
+            ("cabinet_top", (x, y, self.top - t), (w, d, t)),
+            ("cabinet_left", (self.left - t, y, z), (t, d, h)),
+            ("cabinet_right", (self.right + t, y, z), (t, d, h)),
+            ("cabinet_back", (x, back_y, z), (w + 2 * t, t, h)),
+            ("cabinet_door", (self.left - t, door_y, z), (t, self.door_reach / 2, h)),
         ]
-        door_y = self.front + self.door_reach / 2
         return [
-            *boards,
             Box(
-                name="cabinet_top",
-                centre=(x, y, self.top - t),
-                half_size=(w, d, t),
-                colour=wood,
-            ),
-            Box(
-                name="cabinet_left",
-                centre=(self.left - t, y, z),
-                half_size=(t, d, h),
-                colour=wood,
-            ),
-            Box(
-                name="cabinet_right",
-                centre=(self.right + t, y, z),
-                half_size=(t, d, h),
-                colour=wood,
-            ),
-            Box(
-                name="cabinet_back",
-                centre=(x, self.front - self.depth - t, z),
-                half_size=(w + 2 * t, t, h),
-                colour=wood,
-            ),
-            Box(
-                name="cabinet_door",
-                centre=(self.left - t, door_y, z),
-                half_size=(t, self.door_reach / 2, h),
-                colour=glass,
-            ),
+                name=name,
+                centre=centre,
+                half_size=half_size,
+                colour=glass if name == "cabinet_door" else wood,
+            )
+            for name, centre, half_size in parts
         ]
 
 
@@ -183,7 +170,9 @@ def build_scene(config: SceneConfig) -> mujoco.MjSpec:
         _add_box(spec, obstacle).mocap = True
     for item in config.objects:
         _add_object(spec, item)
-    _add_occluder(spec)
+    # A board that may be held in front of the camera; nothing can touch it.
+    board = spec.worldbody.add_body(name=OCCLUDER, pos=NOWHERE, mocap=True)
+    add_box(board, OCCLUDER, OCCLUDER_HALF_SIZE, OCCLUDER_COLOUR, contype=0, conaffinity=0)
     return spec
 
 
@@ -225,47 +214,22 @@ def _add_surroundings(spec: mujoco.MjSpec) -> None:
         pos=(0, 0, -0.72),
         rgba=(0.62, 0.64, 0.66, 1.0),
     )
-    spec.worldbody.add_geom(
-        name="pedestal",
-        type=_BOX,
-        size=(0.12, 0.12, 0.36),
-        pos=(-0.03, 0, -0.36),
-        rgba=(0.3, 0.3, 0.32, 1),
-    )
+    grey = (0.3, 0.3, 0.32, 1)
+    add_box(spec.worldbody, "pedestal", (0.12, 0.12, 0.36), grey, pos=(-0.03, 0, -0.36))
 
 
 def _add_box(spec: mujoco.MjSpec, box: Box):
     body = spec.worldbody.add_body(name=box.name, pos=box.centre)
-    body.add_geom(name=box.name, type=_BOX, size=box.half_size, rgba=box.colour)
+    add_box(body, box.name, box.half_size, box.colour)
     return body
-
-
-def _add_occluder(spec: mujoco.MjSpec) -> None:
-    """A board that may be held in front of the camera; nothing can touch it."""
-    body = spec.worldbody.add_body(name=OCCLUDER, pos=NOWHERE, mocap=True)
-    body.add_geom(
-        name=OCCLUDER,
-        type=_BOX,
-        size=OCCLUDER_HALF_SIZE,
-        rgba=OCCLUDER_COLOUR,
-        contype=0,
-        conaffinity=0,
-    )
 
 
 def _add_object(spec: mujoco.MjSpec, item: ObjectConfig) -> None:
     body = spec.worldbody.add_body(name=item.name, pos=(0.22, 0.5, item.half_size[2]))
     body.add_freejoint(name=item.name)
-    body.add_geom(
-        name=item.name,
-        type=_BOX,
-        size=item.half_size,
-        mass=item.mass,
-        friction=(1.0, 0.02, 0.001),
-        condim=4,
-        solref=(0.004, 1.0),
-        solimp=(0.97, 0.99, 0.0005, 0.5, 2),
-        rgba=item.colour,
+    friction = (1.0, 0.02, 0.001)  # sliding, about the normal [m], rolling [m]
+    add_box(
+        body, item.name, item.half_size, item.colour, mass=item.mass, friction=friction, **FIRM
     )
     top = Plate(
         marker=item.marker, position=(0.0, 0.0, item.half_size[2] + 0.0005), solid=False

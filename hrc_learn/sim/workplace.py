@@ -8,12 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.geometry import Pose
-from hrc_learn.kinematics import (
-    coarse_orientation,
-    comfortable_postures,
-    gripper_down,
-    panda,
-)
+from hrc_learn.kinematics import coarse_orientation, comfortable_postures, gripper_down, panda
 from hrc_learn.kinematics.tool_orientation import Approach
 from hrc_learn.sim.scene import HAND_MARKER, SceneConfig
 

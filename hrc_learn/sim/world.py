@@ -1,19 +1,103 @@
-"""The workplace in motion: MuJoCo behind the `Arm` and `Gripper` protocols."""
+"""The workplace in motion: a MuJoCo world to reset, to advance and to ask who touches whom."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from hrc_learn.kinematics import panda
-from hrc_learn.protocols import ArmState
-from hrc_learn.sim.contacts import ContactMonitor, Touch
-from hrc_learn.sim.panda_model import FINGER_STROKE
+from hrc_learn.sim.panda_model import FINGER_STROKE, MujocoArm, frame_of
 from hrc_learn.sim.scene import HAND_MARKER, SceneConfig, build_scene
 
 # pyright: reportAttributeAccessIssue=false
 # MuJoCo ships no type stubs; its names come from a compiled module.
+
+
+@dataclass(frozen=True, kw_only=True)
+class Touch:
+    """Two objects in contact, from `start` until `end`."""
+
+    first: str
+    """Geom of the moving side (arm, hand or carried object)."""
+    second: str
+    """Geom that it met."""
+    start: float
+    """[s]"""
+    end: float
+    """Time of the last step in contact [s]."""
+    depth: float
+    """Deepest penetration [m]."""
+
+    def __str__(self) -> str:
+        depth_mm = 1e3 * self.depth
+        return f"{self.first} met {self.second} at {self.start:.2f} s, {depth_mm:.1f} mm deep"
+
+
+def body_geoms(model: mujoco.MjModel, bodies: Iterable[str]) -> np.ndarray:
+    """Mask over geoms: those of the named bodies and of all that hangs on them."""
+    roots = {model.body(name).id for name in bodies}
+    member = np.zeros(model.nbody, dtype=bool)
+    for body in range(model.nbody):  # parents come before children
+        member[body] = body in roots or (body != 0 and member[model.body_parentid[body]])
+    return member[model.geom_bodyid]
+
+
+class ContactMonitor:
+    """Remembers every touch between two groups of geoms.
+
+    Attributes:
+        touches: Finished and running touches, in order of their start.
+    """
+
+    def __init__(self, model: mujoco.MjModel, movers: Iterable[str], obstacles: Iterable[str]):
+        """Watch contacts of one group of bodies with another.
+
+        Args:
+            model: The model.
+            movers: Bodies that move, with all that hangs on them.
+            obstacles: Bodies they should not meet.
+        """
+        self._model = model
+        mover, obstacle = body_geoms(model, movers), body_geoms(model, obstacles)
+        self._mover, self._obstacle = mover, obstacle
+        # One look-up a contact: most steps end there, five times a control step.
+        self._matters = np.outer(mover, obstacle) | np.outer(obstacle, mover)
+        self.touches: list[Touch] = []
+        self._running: dict[tuple[int, int], int] = {}
+
+    def clear(self) -> None:
+        """Forget all touches."""
+        self.touches = []
+        self._running = {}
+
+    def update(self, data: mujoco.MjData) -> None:
+        """Look at the contacts of one step."""
+        running = {}
+        for pair, depth in self._current(data).items():
+            k = self._running.get(pair, len(self.touches))
+            if k == len(self.touches):
+                first, second = (self._model.geom(g).name for g in pair)
+                self.touches.append(
+                    Touch(
+                        first=first, second=second, start=data.time, end=data.time, depth=depth
+                    )
+                )
+            else:
+                old = self.touches[k]
+                self.touches[k] = replace(old, end=data.time, depth=max(old.depth, depth))
+            running[pair] = k
+        self._running = running
+
+    def _current(self, data: mujoco.MjData) -> dict[tuple[int, int], float]:
+        geoms = data.contact.geom
+        matters = self._matters[geoms[:, 0], geoms[:, 1]]
+        found: dict[tuple[int, int], float] = {}
+        for i in np.flatnonzero(matters & (data.contact.dist < 0)):
+            a, b = geoms[i].tolist()
+            pair = (a, b) if self._mover[a] and self._obstacle[b] else (b, a)
+            found[pair] = max(found.get(pair, 0.0), -float(data.contact.dist[i]))
+        return found
 
 
 _ARM_BODIES = ("link1",)  # the tree from link 1 on, hand and fingers included
@@ -74,9 +158,7 @@ class World:
         mujoco.mj_resetData(self.model, self.data)
         self.arm.place(joint_position, gripper_width)
         for name, pose in (objects or {}).items():
-            joint = self.data.joint(name)
-            joint.qpos[:3] = pose[:3, 3]
-            mujoco.mju_mat2Quat(joint.qpos[3:7], np.ascontiguousarray(pose[:3, :3]).ravel())
+            _put(self.data, name, pose)
         mujoco.mj_forward(self.model, self.data)
         for monitor in self._monitors:
             monitor.clear()
@@ -130,35 +212,34 @@ class World:
     def object_pose(self, name: str) -> Float[np.ndarray, "4 4"]:
         """Pose of an object's centre in the base frame."""
         self._object(name)
-        return _pose(self.data.body(name))
+        return frame_of(self.data.body(name))
 
     def holds(self, name: str) -> bool:
         """Whether both finger pads touch an object."""
-        touching = set()
-        target = self.model.geom(name).id
-        for geoms in self.data.contact.geom[self.data.contact.dist < 1e-4]:
-            if target in geoms:
-                touching.update(self.model.geom(int(g)).name for g in geoms)
-        return {"finger_left_pad", "finger_right_pad"} <= touching
+        return {"finger_left_pad", "finger_right_pad"} <= self._partners(name)
 
     def rests_on(self, name: str, board: str) -> bool:
         """Whether an object touches a piece of furniture and nothing of the arm."""
-        target, support = self.model.geom(name).id, self.model.geom(board).id
-        partners = set()
-        for geoms in self.data.contact.geom[self.data.contact.dist < 1e-4]:
-            if target in geoms:
-                partners.update(int(g) for g in geoms)
-        furniture = {self.model.geom(box.name).id for box in self.config.boxes()}
-        return support in partners and partners <= furniture | {target}
+        partners = self._partners(name)
+        return board in partners and partners <= {box.name for box in self.config.boxes()}
+
+    def _partners(self, name: str) -> set[str]:
+        """Geoms that touch an object's."""
+        target = self.model.geom(name).id
+        # A tenth of a millimetre apart still counts as touching.
+        pairs = self.data.contact.geom[self.data.contact.dist < 1e-4]
+        return {
+            self.model.geom(int(g)).name for pair in pairs if target in pair for g in pair
+        } - {name}
 
     def marker_poses(self) -> dict[int, Float[np.ndarray, "4 4"]]:
         """Pose of every marker's face in the base frame, by ArUco number."""
         poses = {
-            item.marker.id: _pose(self.data.site(f"{item.name}_marker"))
+            item.marker.id: frame_of(self.data.site(f"{item.name}_marker"))
             for item in self.config.objects
         }
         if self.config.arm.marker is not None:
-            poses[HAND_MARKER] = _pose(self.data.site("hand_marker"))
+            poses[HAND_MARKER] = frame_of(self.data.site("hand_marker"))
         return poses
 
     def hand_marker_offset(self) -> Float[np.ndarray, "3"]:
@@ -200,11 +281,8 @@ class World:
         for k, q in enumerate(path):
             data.qpos[self.arm.joints] = q
             mujoco.mj_kinematics(self.model, data)
-            if in_hand is not None:
-                pose = self.arm.tcp_pose(data) @ in_hand
-                joint = data.joint(carried)
-                joint.qpos[:3] = pose[:3, 3]
-                mujoco.mju_mat2Quat(joint.qpos[3:7], np.ascontiguousarray(pose[:3, :3]).ravel())
+            if carried is not None and in_hand is not None:
+                _put(data, carried, self.arm.tcp_pose(data) @ in_hand)
                 mujoco.mj_kinematics(self.model, data)
             mujoco.mj_collision(self.model, data)
             data.time = float(k)
@@ -213,74 +291,8 @@ class World:
         return [touch for monitor in monitors for touch in monitor.touches]
 
 
-class MujocoArm:
-    """The simulated Panda as an `Arm` and a `Gripper`."""
-
-    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData):
-        self._model = model
-        self._data = data
-        names = panda.joint_names
-        self.joints = np.array([model.joint(n).qposadr[0] for n in names])
-        self._velocities = np.array([model.joint(n).dofadr[0] for n in names])
-        self._position_servos = np.array([model.actuator(f"{n}_position").id for n in names])
-        self._velocity_servos = np.array([model.actuator(f"{n}_velocity").id for n in names])
-        fingers = ("finger_left", "finger_right")
-        self._fingers = np.array([model.joint(n).qposadr[0] for n in fingers])
-        self._finger_servos = np.array([model.actuator(n).id for n in fingers])
-        self._reference = np.zeros(len(names))
-        # Position errors [rad] from which on the servos pull no harder.
-        strongest = model.actuator_forcerange[self._position_servos, 1]
-        self._reach = strongest / model.actuator_gainprm[self._position_servos, 0]
-        self._velocity = np.zeros(len(names))
-
-    def read(self) -> ArmState:
-        """Return the present state, encoders without noise."""
-        return ArmState(
-            time=self._data.time,
-            joint_position=self._data.qpos[self.joints].copy(),
-            joint_velocity=self._data.qvel[self._velocities].copy(),
-            gripper_width=float(self._data.qpos[self._fingers].sum()),
-        )
-
-    def command(self, joint_velocity: Float[np.ndarray, "7"]) -> None:
-        """Set the joint velocities to hold from now on [rad/s]."""
-        if not np.isfinite(joint_velocity).all():
-            raise ValueError(f"joint_velocity must be finite, but is {joint_velocity}.")
-        self._velocity = np.array(joint_velocity, dtype=float)
-
-    def move(self, width: float) -> None:
-        """Open or close the gripper to a width [m]; 0 squeezes what is between the fingers."""
-        self._data.ctrl[self._finger_servos] = np.clip(width / 2, 0.0, FINGER_STROKE)
-
-    def place(self, joint_position: Float[np.ndarray, "7"], gripper_width: float) -> None:
-        """Set the joints at once, at rest. For resets, not for control."""
-        self._reference = np.array(joint_position, dtype=float)
-        self._velocity = np.zeros_like(self._reference)
-        self._data.qpos[self.joints] = self._reference
-        self._data.qvel[self._velocities] = 0.0
-        self._data.qpos[self._fingers] = gripper_width / 2
-        self.move(gripper_width)
-        self.drive()
-
-    def drive(self) -> None:
-        """Advance the servos' reference by one physics step.
-
-        It waits for joints that are held up by a contact: what they missed is not made up for
-        once they come free.
-        """
-        q = self._data.qpos[self.joints]
-        reference = self._reference + self._velocity * self._model.opt.timestep
-        self._reference = np.clip(reference, q - self._reach, q + self._reach)
-        self._data.ctrl[self._position_servos] = self._reference
-        self._data.ctrl[self._velocity_servos] = self._velocity
-
-    def tcp_pose(self, data: mujoco.MjData | None = None) -> Float[np.ndarray, "4 4"]:
-        """True pose of the tool centre point in the base frame."""
-        return _pose((data or self._data).site("tcp"))
-
-
-def _pose(thing) -> Float[np.ndarray, "4 4"]:
-    pose = np.eye(4)
-    pose[:3, :3] = thing.xmat.reshape(3, 3)
-    pose[:3, 3] = thing.xpos
-    return pose
+def _put(data: mujoco.MjData, name: str, pose: Float[np.ndarray, "4 4"]) -> None:
+    """Move a free object to a pose."""
+    joint = data.joint(name)
+    joint.qpos[:3] = pose[:3, 3]
+    mujoco.mju_mat2Quat(joint.qpos[3:7], np.ascontiguousarray(pose[:3, :3]).ravel())

@@ -1,9 +1,11 @@
 """Visual servoing, grasping, placing, pick and place. Skills know protocols, not devices."""
 
-from hrc_learn.skills.cartesian_motion import joint_line as joint_line
-from hrc_learn.skills.cartesian_motion import nearest_configuration as nearest_configuration
-from hrc_learn.skills.cartesian_motion import resolved_rate as resolved_rate
-from hrc_learn.skills.cartesian_motion import straight_line as straight_line
+from hrc_learn.skills.arm_motion import PositionServo as PositionServo
+from hrc_learn.skills.arm_motion import PositionServoConfig as PositionServoConfig
+from hrc_learn.skills.arm_motion import joint_line as joint_line
+from hrc_learn.skills.arm_motion import nearest_configuration as nearest_configuration
+from hrc_learn.skills.arm_motion import resolved_rate as resolved_rate
+from hrc_learn.skills.arm_motion import straight_line as straight_line
 from hrc_learn.skills.grasping import Grasping as Grasping
 from hrc_learn.skills.grasping import GraspingConfig as GraspingConfig
 from hrc_learn.skills.grasping import GraspResult as GraspResult
@@ -19,18 +21,16 @@ from hrc_learn.skills.placing import PlacingSkill as PlacingSkill
 from hrc_learn.skills.placing import Plan as Plan
 from hrc_learn.skills.placing import check_plan as check_plan
 from hrc_learn.skills.placing import plan_candidates as plan_candidates
-from hrc_learn.skills.position_servo import PositionServo as PositionServo
-from hrc_learn.skills.position_servo import PositionServoConfig as PositionServoConfig
 from hrc_learn.skills.visual_servoing import ServoTarget as ServoTarget
 from hrc_learn.skills.visual_servoing import VisualServo as VisualServo
 from hrc_learn.skills.visual_servoing import VisualServoConfig as VisualServoConfig
-from hrc_learn.skills.visual_servoing import VisualServoSkill as VisualServoSkill
-from hrc_learn.skills.visual_target import VisualTarget as VisualTarget
+from hrc_learn.skills.visual_skill import VisualServoSkill as VisualServoSkill
+from hrc_learn.skills.visual_skill import VisualTarget as VisualTarget
 from hrc_learn.skills.work_cell import BlockedPathError as BlockedPathError
+from hrc_learn.skills.work_cell import CollisionChecker as CollisionChecker
+from hrc_learn.skills.work_cell import GraspObject as GraspObject
 from hrc_learn.skills.work_cell import MissedGraspError as MissedGraspError
 from hrc_learn.skills.work_cell import TaskFailedError as TaskFailedError
 from hrc_learn.skills.work_cell import WorkCell as WorkCell
 from hrc_learn.skills.work_cell import WorkCellConfig as WorkCellConfig
-from hrc_learn.skills.workplace import CollisionChecker as CollisionChecker
-from hrc_learn.skills.workplace import GraspObject as GraspObject
-from hrc_learn.skills.workplace import Workplace as Workplace
+from hrc_learn.skills.work_cell import Workplace as Workplace

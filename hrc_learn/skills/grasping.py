@@ -19,23 +19,18 @@ from hrc_learn.controller import AdaptiveController, ControllerConfig, Goals
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import ImageJacobianEstimator
 from hrc_learn.kinematics import panda_capsules
-from hrc_learn.skills.cartesian_motion import joint_line
+from hrc_learn.skills.arm_motion import joint_line
 from hrc_learn.skills.placing import Plan
-from hrc_learn.skills.visual_servoing import (
-    ServoTarget,
-    VisualServo,
-    VisualServoConfig,
-    VisualServoSkill,
-    from_learned,
-)
-from hrc_learn.skills.visual_target import UP
+from hrc_learn.skills.visual_servoing import ServoTarget, VisualServo, VisualServoConfig
+from hrc_learn.skills.visual_skill import UP, VisualServoSkill, from_learned
 from hrc_learn.skills.work_cell import (
     BlockedPathError,
+    GraspObject,
     MissedGraspError,
     TaskFailedError,
     WorkCell,
+    Workplace,
 )
-from hrc_learn.skills.workplace import GraspObject, Workplace
 
 OPEN, CLOSED = 0.08, 0.0
 """Widths the gripper is commanded to [m]: its full stroke; closed, it squeezes the object."""
@@ -144,16 +139,11 @@ class Grasping:
         )
         self.servo = VisualServo(cell, controller, workplace.tool_marker, config.servo)
 
-    def grasp(
-        self,
-        item: GraspObject,
-        on_reached: Callable[[ServoTarget], None] = lambda target: None,
-    ) -> GraspResult:
+    def grasp(self, item: GraspObject) -> GraspResult:
         """Grasp an object and lift it.
 
         Args:
             item: What to grasp.
-            on_reached: Called when the end effector is above the object for the first time.
 
         Raises:
             TaskFailedError: If the object is not detected, or all attempts fail.
@@ -164,8 +154,6 @@ class Grasping:
             target = self.locate(item)
             try:
                 servo_time = self.servo_to(target)
-                if not setbacks:
-                    on_reached(target)
                 pixel_error = self.servo.error(target)
                 self.close_on(item)
             except MissedGraspError as error:

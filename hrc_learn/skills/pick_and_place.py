@@ -17,13 +17,13 @@ counted:
   put back where it was.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Literal
 
 from hrc_learn.geometry import Pose
-from hrc_learn.skills.cartesian_motion import nearest_configuration
+from hrc_learn.skills.arm_motion import nearest_configuration
 from hrc_learn.skills.grasping import (
     DESCENT_SPEED,
     OPEN,
@@ -34,28 +34,20 @@ from hrc_learn.skills.grasping import (
     raised,
 )
 from hrc_learn.skills.marker_sensor import longest_occlusion
-from hrc_learn.skills.placing import (
-    CandidatePlan,
-    PlacingSkill,
-    Plan,
-    PlanningSpace,
-    plan_candidates,
-)
-from hrc_learn.skills.visual_servoing import ServoTarget, VisualServoSkill
+from hrc_learn.skills.placing import PlacingSkill, Plan, PlanningSpace, plan_candidates
+from hrc_learn.skills.visual_servoing import ServoTarget
+from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.skills.work_cell import (
     BlockedPathError,
+    GraspObject,
     MissedGraspError,
     TaskFailedError,
     WorkCell,
+    Workplace,
 )
-from hrc_learn.skills.workplace import GraspObject, Workplace
 
 Mishap = Literal[
-    "object not detected",
-    "marker occluded",
-    "missed grasp",
-    "dropped object",
-    "blocked path",
+    "object not detected", "marker occluded", "missed grasp", "dropped object", "blocked path"
 ]
 """What a job recovers from."""
 
@@ -340,7 +332,16 @@ class PickAndPlace:
         for wait in range(1 + self._config.waits):
             if wait:
                 self._cell.hold_pose(self._config.wait)
-            for candidate in self._candidates(job.goal):
+            candidates = plan_candidates(
+                job.goal,
+                self._cell.joints,
+                self._placing,
+                self._workplace,
+                space=self._config.planning,
+                dt=self._cell.config.dt,
+                speed=self._config.speed,
+            )
+            for candidate in candidates:
                 try:
                     self._check(candidate.plan)
                 except BlockedPathError as error:
@@ -349,17 +350,6 @@ class PickAndPlace:
                 else:
                     return candidate.plan
         return None
-
-    def _candidates(self, goal: Pose) -> Iterator[CandidatePlan]:
-        return plan_candidates(
-            goal,
-            self._cell.joints,
-            self._placing,
-            self._workplace,
-            space=self._config.planning,
-            dt=self._cell.config.dt,
-            speed=self._config.speed,
-        )
 
     def _release(self, job: PickPlaceJob) -> Phase:
         self._cell.begin_phase(Phase.RELEASE)

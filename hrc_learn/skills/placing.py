@@ -27,15 +27,13 @@ from hrc_learn.kinematics import (
     panda,
 )
 from hrc_learn.regions import JointRegion
-from hrc_learn.skills.cartesian_motion import (
-    joint_line,
-    nearest_configuration,
-    resolved_rate,
-)
-from hrc_learn.skills.work_cell import BlockedPathError
-from hrc_learn.skills.workplace import CollisionChecker, Workplace
+from hrc_learn.skills.arm_motion import joint_line, nearest_configuration, resolved_rate
+from hrc_learn.skills.work_cell import BlockedPathError, CollisionChecker, Workplace
 
 PlanningSpace = Literal["joint", "pose"]
+
+# Decay rates of the errors of pose (k_e) and arm angle (k_a) along a planned path [1/s].
+_POSE_GAIN, _ANGLE_GAIN = 10.0, 4.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,34 +109,28 @@ class PlacingSkill:
         Raises:
             UnreachableError: If no joint positions reach the goal.
         """
+        # Of both spaces: a goal out of reach is refused before anything is planned.
         end = nearest_configuration(goal, near=self.joint.goal)
         duration = float(self.joint.duration) / speed
         time = torch.arange(0.0, duration + dt / 2, dt, dtype=torch.float64)
         with torch.no_grad():
             if space == "joint":
-                path = self._plan_joints(start, end, time, duration)
+                still = torch.zeros_like(start)
+                path = self.joint.rollout(
+                    time, start=start, goal=end, duration=duration, start_velocity=still
+                ).position
             else:
-                path = self._plan_pose(start, goal, time, duration)
+                motion = self.pose.rollout(
+                    time,
+                    start=panda.forward(start),
+                    goal=goal,
+                    duration=duration,
+                    start_velocity=torch.zeros(6, dtype=time.dtype),
+                    start_body=arm_angle(panda, start)[None],
+                )
+                angle = motion.body[:, 0]
+                path = follow_pose(panda, start, motion.pose, motion.twist, angle, dt)
         return Plan(goal=goal, dt=dt, path=path.numpy())
-
-    def _plan_joints(self, start: Tensor, end: Tensor, time: Tensor, duration: float) -> Tensor:
-        still = torch.zeros_like(start)
-        motion = self.joint.rollout(
-            time, start=start, goal=end, duration=duration, start_velocity=still
-        )
-        return motion.position
-
-    def _plan_pose(self, start: Tensor, goal: Pose, time: Tensor, duration: float) -> Tensor:
-        motion = self.pose.rollout(
-            time,
-            start=panda.forward(start),
-            goal=goal,
-            duration=duration,
-            start_velocity=torch.zeros(6, dtype=time.dtype),
-            start_body=arm_angle(panda, start)[None],
-        )
-        dt = float(time[1] - time[0])
-        return follow_pose(panda, start, motion.pose, motion.twist, motion.body[:, 0], dt)
 
 
 def follow_pose(
@@ -148,12 +140,10 @@ def follow_pose(
     twist: Float[Tensor, "steps 6"],
     angle: Float[Tensor, " steps"],
     dt: float,
-    gain: float = 10.0,
-    angle_gain: float = 4.0,
 ) -> Float[Tensor, "steps 7"]:
     """Joint path that tracks poses of the end effector, and arm angles in the null space.
 
-    u = J^+ (twist + gain e) + N n (angle' + angle_gain (angle - angle(q))) - N xi_q, where
+    u = J^+ (twist + k_e e) + N n (angle' + k_a (angle - angle(q))) - N xi_q, where
     n turns the arm angle at unit rate and xi_q is the gradient of the joint-limit region: the
     poses are met, the arm angle as far as the null space and the joint limits allow.
 
@@ -164,19 +154,17 @@ def follow_pose(
         twist: Its desired motion (linear [m/s], angular [rad/s]).
         angle: Desired arm angles, continuous [rad].
         dt: Time between samples [s].
-        gain: Decay rate of the pose error [1/s].
-        angle_gain: Decay rate of the arm angle's error [1/s].
     """
     limits = JointRegion.from_limits(chain.limits.lower, chain.limits.upper)
     rate = torch.gradient(angle, spacing=dt)[0]
     q, path = start, [start]
     for k in range(len(angle) - 1):
         pose, J = chain.forward_and_jacobian(q)
-        desired = twist[k] + gain * pose.twist_to(poses[k])
+        desired = twist[k] + _POSE_GAIN * pose.twist_to(poses[k])
         measured, motion = arm_angle_and_motion(chain, q, J)
         # The shorter way around the circle.
         error = torch.remainder(angle[k] - measured + torch.pi, 2 * torch.pi) - torch.pi
-        null_velocity = motion * (rate[k] + angle_gain * error) - limits.gradient(q)
+        null_velocity = motion * (rate[k] + _ANGLE_GAIN * error) - limits.gradient(q)
         q = q + dt * resolved_rate(J, desired, null_velocity)
         path.append(q)
     return torch.stack(path)

@@ -4,35 +4,17 @@
 from demonstrations: the image Jacobian, the visual target and the approach direction.
 """
 
-import copy
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.controller import (
-    INITIAL_IMAGE_JACOBIAN,
-    AdaptiveController,
-    ControllerState,
-    Goals,
-    Observation,
-)
+from hrc_learn.controller import AdaptiveController, ControllerState, Goals, Observation
 from hrc_learn.controller.interface import IMAGE_SIZE
 from hrc_learn.geometry import Pose
-from hrc_learn.jacobian import (
-    CellErrors,
-    EvidenceResult,
-    KalmanEstimator,
-    RBFImageJacobian,
-    paper_grid,
-)
-from hrc_learn.kinematics.tool_orientation import Approach
-from hrc_learn.skills.visual_target import OBJECT_FEATURE, VisualTarget
 from hrc_learn.skills.work_cell import MissedGraspError, WorkCell
 
 
@@ -309,113 +291,3 @@ class VisualServo:
 
     def _feature(self) -> Float[np.ndarray, "2"]:
         return self._cell.observation.pixels.get(self._marker, np.full(2, np.nan))
-
-
-@dataclass(frozen=True, kw_only=True)
-class VisualServoSkill:
-    """What was learned from demonstrations of visual servoing."""
-
-    jacobian: RBFImageJacobian
-    target: VisualTarget | None
-    """None where no object was observed."""
-    approach: Approach | None = None
-    """None where no object was observed."""
-    learned: EvidenceResult | None = None
-    """How RBF centres, noise and prior were learned; None where they were given."""
-    cells: CellErrors | None = None
-    """Held-out errors by cell of a grid; None of a skill that was loaded."""
-
-    def save(self, folder: Path) -> None:
-        """Write `folder/jacobian`, `folder/visual_target.json`, `folder/approach.json`."""
-        self.jacobian.save(folder / "jacobian")
-        if self.target is not None:
-            self.target.save(folder / "visual_target.json")
-        if self.approach is not None:
-            self.approach.save(folder / "approach.json")
-
-    @classmethod
-    def load(cls, folder: Path) -> "VisualServoSkill":
-        """Read what `training/fit_image_jacobian.py` wrote.
-
-        Raises:
-            FileNotFoundError: If there is no such folder or file.
-            ValueError: If a file is not one of ours.
-        """
-        target, approach = folder / "visual_target.json", folder / "approach.json"
-        return cls(
-            jacobian=RBFImageJacobian.load(folder / "jacobian"),
-            target=VisualTarget.load(target) if target.exists() else None,
-            approach=Approach.load(approach) if approach.exists() else None,
-        )
-
-    def target_of(
-        self, pixel: Float[np.ndarray, "2"], jacobian: Float[np.ndarray, "2 6"]
-    ) -> Float[np.ndarray, "2"]:
-        """Where the marker should be for the end effector to be above an object at a pixel.
-
-        Args:
-            pixel: Of the object's marker [px].
-            jacobian: Estimate of the image Jacobian of the end effector's marker
-                [px/m, px/rad].
-
-        Raises:
-            ValueError: If no object was observed in the demonstrations.
-        """
-        if self.target is None:
-            raise ValueError(
-                f"the skill knows no visual target: its demonstrations lack {OBJECT_FEATURE}."
-            )
-        return self.target.from_view(pixel, jacobian)
-
-    def metrics(self) -> dict[str, float]:
-        """How well image motion and visual targets are predicted.
-
-        Raises:
-            ValueError: If the skill was loaded; its metrics are in metrics.json.
-        """
-        report = self.jacobian.report
-        if report is None or self.cells is None:
-            raise ValueError("only a skill just fitted has metrics; see its metrics.json.")
-        known = self.cells.relative[self.cells.pairs > 0]
-        values = {
-            "pairs": float(report.pairs),
-            "neurons": float(len(self.jacobian.centers)),
-            "motion_px": report.motion,
-            "fit_error_px": report.error,
-            "held_out_error_px": report.held_out_error,
-            "held_out_relative": report.held_out_error / report.motion,
-            "held_out_relative_worst_cell": float(known.max()),
-        }
-        if self.learned is not None:
-            first, best = self.learned.rounds[0], self.learned.rounds[self.learned.best]
-            values |= {
-                "pixel_noise_px": self.learned.config.pixel_noise,
-                "width": float(self.learned.neurons.width),
-                "learning_rounds": float(self.learned.best),
-                "before_learning_error_px": first.held_out_error,
-                "after_learning_error_px": best.held_out_error,
-            }
-        if self.target is not None:
-            values["target_error_px"] = self.target.error
-            values["target_error_by_offset_px"] = self.target.offset_error
-        if self.approach is not None:
-            values["approach_spread_deg"] = math.degrees(self.approach.spread)
-            values["approach_turned_deg"] = math.degrees(self.approach.turned)
-        return values
-
-
-def from_learned(learned: RBFImageJacobian) -> KalmanEstimator:
-    """A Kalman filter that starts from the learned Jacobian, but does not rely on it.
-
-    The camera may have been moved since it was learned, about which the covariance of the fit
-    knows nothing; the wide prior of a guess takes its place.
-    """
-    network = copy.deepcopy(learned).double()
-    network.covariance = None
-    return KalmanEstimator(network)
-
-
-def guessed_network() -> RBFImageJacobian:
-    """The paper's initial image Jacobian, the same everywhere."""
-    guess = torch.tensor(INITIAL_IMAGE_JACOBIAN, dtype=torch.float64)
-    return RBFImageJacobian.from_jacobian(guess, paper_grid(), 0.1)

@@ -1,7 +1,8 @@
-"""A work cell under one clock: arm, gripper, camera and person, stepped and logged."""
+"""A work cell: the place skills work in; arm, gripper, camera and person under one clock."""
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -12,14 +13,130 @@ from hrc_learn.controller import INTERVENTIONS, Command, SafetyFilter
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.protocols import Arm, ArmState, Gripper, Human, HumanInput
-from hrc_learn.skills.cartesian_motion import path_velocity, resolved_rate, straight_line
+from hrc_learn.skills.arm_motion import resolved_rate, straight_line
 from hrc_learn.skills.marker_sensor import (
     DelayedChannel,
     LatencyConfig,
     MarkerObservation,
     MarkerSensor,
 )
+from hrc_learn.vision import Marker
 from hrc_learn.viz import StepLog
+
+# What skills ask of the place they work in, whether simulated or real.
+
+
+@runtime_checkable
+class GraspObject(Protocol):
+    """A box to grasp, with a marker on top."""
+
+    @property
+    def name(self) -> str:
+        """Name of the object."""
+        ...
+
+    @property
+    def half_size(self) -> tuple[float, float, float]:
+        """Half edges [m]; the gripper closes along x."""
+        ...
+
+    @property
+    def marker(self) -> Marker:
+        """Marker by which the camera finds it."""
+        ...
+
+
+@runtime_checkable
+class Workplace(Protocol):
+    """Poses of a task: table, home and shelves, known roughly, in the base frame."""
+
+    @property
+    def tool_marker(self) -> int:
+        """ArUco number of the marker on the end effector."""
+        ...
+
+    @property
+    def hover_height(self) -> float:
+        """Height of the tool centre point while it servoes to an object [m]."""
+        ...
+
+    def hover(self) -> Pose:
+        """End effector above the middle of the table."""
+        ...
+
+    def hover_joints(self) -> Float[Tensor, "7"]:
+        """Joint positions there [rad]."""
+        ...
+
+    def hover_postures(self) -> Sequence[Float[Tensor, "7"]]:
+        """Several joint positions there, the preferred ones first [rad]."""
+        ...
+
+    def home_joints(
+        self, offset: Float[Tensor, "3"] | None = None, q7_offset: float = 0.0
+    ) -> Float[Tensor, "7"]:
+        """Joint positions at home, where a placing motion starts [rad].
+
+        Args:
+            offset: Of the end effector from home [m].
+            q7_offset: Change of joint 7, which moves the elbow about the line to the wrist
+                [rad].
+
+        Raises:
+            UnreachableError: If no joint positions reach it.
+        """
+        ...
+
+    def object_region(self) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
+        """Box in which objects may be on the table: centre and half edges [m]."""
+        ...
+
+    def shelf(self, name: str, half_size: tuple[float, float, float] | None = None) -> Pose:
+        """End effector where it releases an object of a size [m] on a shelf.
+
+        Raises:
+            ValueError: If there is no such shelf.
+        """
+        ...
+
+
+@runtime_checkable
+class Collision(Protocol):
+    """A contact that a planned path would make."""
+
+    @property
+    def first(self) -> str:
+        """What moves."""
+        ...
+
+    @property
+    def second(self) -> str:
+        """What it meets."""
+        ...
+
+    @property
+    def start(self) -> float:
+        """Number of the first sample of the path in contact."""
+        ...
+
+    @property
+    def depth(self) -> float:
+        """Deepest penetration [m]."""
+        ...
+
+
+@runtime_checkable
+class CollisionChecker(Protocol):
+    """A geometric model of the workplace."""
+
+    def collisions_along(
+        self, path: Float[np.ndarray, "steps 7"], carried: str | None = None
+    ) -> Sequence[Collision]:
+        """Contacts along a path of joint positions [rad], with an object carried along."""
+        ...
+
+
+# The control loop.
 
 
 class TaskFailedError(RuntimeError):
@@ -37,6 +154,8 @@ class BlockedPathError(TaskFailedError):
 SAFETY_COLUMNS = INTERVENTIONS
 """Names of the components of the log's column "safety"."""
 
+# At the end of a straight line, for the pose error to decay by pose_gain [s].
+_SETTLING_TIME = 0.4
 _NAN = float("nan")
 # Logged by steps in which no camera is in the loop.
 _NO_VISION = {
@@ -163,13 +282,13 @@ class WorkCell:
         self._channel.send(MarkerObservation(time=self.time, joints=self.joints, pixels=pixels))
         self._receive()
 
-    def wait_for_detection(self, ids: Collection[int] | None = None) -> MarkerObservation:
+    def wait_for_detection(self) -> MarkerObservation:
         """Hold still until an image taken from now on has arrived; what was detected in it."""
         now = self.time
-        self.detect(ids)
+        self.detect()
         while self.observation.time < now:
             self.hold_pose(self.config.detect_every * self.config.dt)
-            self.detect(ids)
+            self.detect()
         return self.observation
 
     def step(self, joint_velocity: Float[Tensor, " joints"]) -> None:
@@ -224,22 +343,19 @@ class WorkCell:
         """Keep the end effector where it is for a while [s], yielding to the person."""
         self._settle(self.pose, duration)
 
-    def move_straight(self, goal: Pose, speed: float = 0.15, settle: float = 0.4) -> None:
+    def move_straight(self, goal: Pose, speed: float = 0.15) -> None:
         """Move the end effector to a pose on a straight line, and let it settle.
 
         Args:
             goal: Where to.
             speed: Mean speed [m/s].
-            settle: Time at the goal [s].
         """
         for pose, twist in straight_line(self.pose, goal, speed, self.config.dt):
             self.track_pose(pose, twist)
-        self._settle(goal, settle)
+        self._settle(goal, _SETTLING_TIME)
 
     def follow_path(
-        self,
-        path: Float[np.ndarray, "steps joints"],
-        until: Callable[[], bool] = lambda: False,
+        self, path: Float[np.ndarray, "steps joints"], until: Callable[[], bool] = lambda: False
     ) -> int:
         """Move the joints along a path sampled at the control step.
 
@@ -253,12 +369,13 @@ class WorkCell:
         Returns:
             Number of samples that were tracked.
         """
+        dt = self.config.dt
+        velocity = np.gradient(path, dt, axis=0) if len(path) > 1 else np.zeros_like(path)
         for k, q in enumerate(path):
             if until():
                 return k
             error = torch.from_numpy(q) - self.joints
-            velocity = torch.from_numpy(path_velocity(path, k, self.config.dt))
-            self.step(velocity + self.config.pose_gain * error)
+            self.step(torch.from_numpy(velocity[k]) + self.config.pose_gain * error)
         return len(path)
 
     def _settle(self, goal: Pose, duration: float) -> None:

@@ -4,8 +4,7 @@ import contextlib
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from types import TracebackType
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -62,12 +61,7 @@ class DemonstrationRecorder:
     def __enter__(self) -> "DemonstrationRecorder":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
         self._thread.shutdown(wait=True)
         empty = contextlib.nullcontext()
         if error is None and not self._writer.episodes:

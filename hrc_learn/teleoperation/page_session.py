@@ -19,8 +19,8 @@ from hrc_learn.sim import MovingBodies, World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.pick_and_place import INTERACT
 from hrc_learn.skills.work_cell import SAFETY_COLUMNS, WorkCell
-from hrc_learn.teleoperation.combined_input import CombinedInput, InputFilter, InputFilterConfig
 from hrc_learn.teleoperation.demonstration_recorder import DemonstrationRecorder
+from hrc_learn.teleoperation.devices import CombinedInput, InputFilter, InputFilterConfig
 from hrc_learn.teleoperation.hand_guiding import (
     Frame,
     GuidedStep,
@@ -114,7 +114,7 @@ class PageSession:
     Attributes:
         world: That the arm is in.
         finished: Whether the person is done.
-        arm: The end effector-guided arm.
+        arm: The hand-guided arm.
     """
 
     def __init__(

@@ -17,18 +17,15 @@ from hrc_learn.kinematics import gripper_down, panda
 from hrc_learn.protocols import ArmState, Human, HumanInput
 from hrc_learn.sim import CameraKind, World, open_camera
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.cartesian_motion import nearest_configuration
+from hrc_learn.skills.arm_motion import PositionServo, nearest_configuration
+from hrc_learn.skills.grasping import CLOSED, OPEN
 from hrc_learn.skills.marker_sensor import MarkerSensor
-from hrc_learn.skills.position_servo import PositionServo, PositionServoConfig
 from hrc_learn.teleoperation.scripted_demonstrations import (
     PlacingDemonstrationConfig,
     placing_expert,
 )
 from hrc_learn.teleoperation.scripted_expert import GuidedPath, ScriptedExpert, Tremor
 from hrc_learn.vision import CameraModel, ImageNoise, SyntheticCamera
-
-OPEN, CLOSED = 0.08, 0.0
-"""Openings that the gripper is sent to [m]; closed, it squeezes what is between the fingers."""
 
 
 class Scenario(ABC):
@@ -189,25 +186,17 @@ class ScenarioRun:
 
     expert: Human
 
-    def __init__(
-        self,
-        scenario: Scenario,
-        fps: float,
-        *,
-        seed: int = 0,
-        servo: PositionServoConfig | None = None,
-    ):
+    def __init__(self, scenario: Scenario, fps: float, *, seed: int = 0):
         """Begin.
 
         Args:
             scenario: What is to be done.
             fps: Commands a second of the world's time.
             seed: Of the first beginning.
-            servo: How positions are followed.
         """
         self.scenario, self.dt = scenario, 1.0 / fps
         self.world = World(scenario.workplace.scene)
-        self.servo = PositionServo(panda, self.world.arm, self.dt, servo)
+        self.servo = PositionServo(panda, self.world.arm, self.dt)
         self._noise = np.random.default_rng(0)
         self.begin(seed)
 

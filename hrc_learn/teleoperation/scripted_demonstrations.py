@@ -16,14 +16,18 @@ from hrc_learn.kinematics import gripper_down, panda
 from hrc_learn.protocols import Human
 from hrc_learn.sim import HAND_MARKER, Touch, World
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.cartesian_motion import nearest_configuration
+from hrc_learn.skills.arm_motion import nearest_configuration
 from hrc_learn.skills.marker_sensor import MarkerSensor
-from hrc_learn.skills.visual_target import OBJECT_FEATURE
+from hrc_learn.skills.visual_skill import OBJECT_FEATURE
 from hrc_learn.skills.work_cell import TaskFailedError
 from hrc_learn.store import DATASET, replacing
 from hrc_learn.teleoperation.hand_guiding import Frame, HandGuidedArm, HandGuidingConfig
-from hrc_learn.teleoperation.interaction_force import ScriptedForce
-from hrc_learn.teleoperation.scripted_expert import GuidedPath, ScriptedExpert, Tremor
+from hrc_learn.teleoperation.scripted_expert import (
+    GuidedPath,
+    ScriptedExpert,
+    ScriptedForce,
+    Tremor,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -218,6 +222,9 @@ def demonstrate_servoing(
     return list(guided_frames(world, expert, config.duration + config.settle, config, observe))
 
 
+# Demonstrations begun before one without contact is given up.
+_ATTEMPTS = 3
+
 # The elbow is pulled around the open door: first away from the cabinet, then over beside it.
 ELBOW_FORCES = (
     ScriptedForce(start=0.5, duration=5.0, towards=(0.20, 0.25, 0.58)),
@@ -292,7 +299,6 @@ def demonstrate_placing_without_contact(
     shelf: str,
     config: PlacingDemonstrationConfig,
     rng: np.random.Generator,
-    attempts: int = 3,
 ) -> tuple[list[Frame], int]:
     """Demonstrate until nothing is touched on the way, as a person would.
 
@@ -302,8 +308,8 @@ def demonstrate_placing_without_contact(
     Raises:
         TaskFailedError: If something was touched each time.
     """
-    for attempt in range(attempts):
+    for attempt in range(_ATTEMPTS):
         frames, touches = demonstrate_placing(world, workplace, shelf, config, rng)
         if not touches:
             return frames, attempt
-    raise TaskFailedError(f"{attempts} demonstrations in a row hit the cabinet: {touches[0]}")
+    raise TaskFailedError(f"{_ATTEMPTS} demonstrations in a row hit the cabinet: {touches[0]}")

@@ -1,6 +1,9 @@
-"""The scripted expert: guides the end effector along way points, and pulls at the elbow."""
+"""Scripted people: one who pulls at the arm at given times, and the expert, who also guides the
+end effector along way points.
+"""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -10,7 +13,84 @@ from scipy.interpolate import PchipInterpolator
 from hrc_learn.geometry import Pose, minimum_jerk
 from hrc_learn.kinematics import SerialChain, coarse_orientation
 from hrc_learn.protocols import ArmState, HumanInput
-from hrc_learn.teleoperation.interaction_force import ScriptedForce, ScriptedPerturbation
+from hrc_learn.teleoperation.hand_guiding import TINY, force_to_nullspace_input
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScriptedForce:
+    """A pull at a joint towards a point during an interval, with soft start and end."""
+
+    start: float
+    """[s]"""
+    duration: float
+    """[s]"""
+    towards: tuple[float, float, float]
+    """Where the person's hand is, in the base frame [m]."""
+    stiffness: float = 100.0
+    """Force per distance between the joint and the person's hand [N/m]."""
+    max_force: float = 25.0
+    """Largest force [N]."""
+    joint: int = 4
+    """Which joint is pulled, counted from 1."""
+    ramp: float = 0.4
+    """Time to full strength, and back to none [s]."""
+
+    @property
+    def end(self) -> float:
+        """[s]"""
+        return self.start + self.duration
+
+    def strength(self, time: float) -> float:
+        """Fraction of full strength at a time, 0 to 1."""
+        edge = min(time - self.start, self.end - time) / self.ramp
+        s = min(max(edge, 0.0), 1.0)
+        # Smoothstep: the force starts and ends without a jump of its rate.
+        return s * s * (3.0 - 2.0 * s)
+
+    def force(self, time: float, origin: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+        """Force at a time on a joint whose origin is there now [N]."""
+        pull = self.stiffness * (np.array(self.towards) - origin)
+        size = float(np.linalg.norm(pull))
+        return pull * self.strength(time) * min(1.0, self.max_force / max(size, TINY))
+
+
+class ScriptedPerturbation:
+    """A person who pulls at the arm at given times, and does nothing else."""
+
+    def __init__(
+        self, chain: SerialChain, forces: Sequence[ScriptedForce], begin: float | None = 0.0
+    ):
+        """Prepare the script.
+
+        Args:
+            chain: The arm.
+            forces: When and where it is pulled.
+            begin: Time from which their intervals count [s]; None: once `begin` is called.
+        """
+        self._chain = chain
+        self.forces = tuple(forces)
+        self._begin = begin
+
+    def begin(self, time: float) -> None:
+        """Start the script now [s]."""
+        self._begin = time
+
+    def read(self, state: ArmState) -> HumanInput:
+        """The null-space input of all forces that act now."""
+        d = np.zeros(len(self._chain.joint_names))
+        if self._begin is None:
+            return HumanInput(nullspace_input=d, twist=np.zeros(6))
+        time = state.time - self._begin
+        active = [force for force in self.forces if force.strength(time) > 0.0]
+        if active:
+            q = torch.from_numpy(state.joint_position)
+            origins = self._chain.link_poses(q).position.numpy()
+            for scripted in active:
+                force = scripted.force(time, origins[scripted.joint - 1])
+                d += force_to_nullspace_input(
+                    self._chain, state.joint_position, scripted.joint, force
+                )
+        return HumanInput(nullspace_input=d, twist=np.zeros(6))
 
 
 class GuidedPath:
@@ -65,15 +145,15 @@ class GuidedPath:
 class Tremor:
     """The shaking of a hand: a slow random drift and an 8 Hz tremor, in velocity [m/s]."""
 
-    def __init__(self, amplitude: float, rng: np.random.Generator, frequency: float = 8.0):
+    def __init__(self, amplitude: float, rng: np.random.Generator):
         """Draw the phases.
 
         Args:
             amplitude: Of the tremor's displacement [m]; the drift's is three times as large.
             rng: Source of the phases.
-            frequency: Of the tremor [Hz] (Elble and Koller 1990: 8 to 12 Hz).
         """
-        self._omega = 2 * np.pi * np.array([frequency, 0.9 * frequency, 0.35, 0.22])
+        # Two tremors (Elble and Koller 1990: 8 to 12 Hz), and a drift of two slow waves.
+        self._omega = 2 * np.pi * np.array([8.0, 7.2, 0.35, 0.22])
         self._amplitude = amplitude * np.array([1.0, 0.7, 3.0, 3.0])
         self._phase = rng.uniform(0, 2 * np.pi, size=(3, 4))
 
@@ -83,6 +163,9 @@ class Tremor:
             axis=1
         )
 
+
+# How fast the expert corrects an error of pose by eye [1/s].
+_GAIN = 4.0
 
 Orientation = Callable[[Float[torch.Tensor, "3"], float], Float[torch.Tensor, "4"]]
 """Orientation (wxyz) the end effector should have at a position [m] and time [s]."""
@@ -106,7 +189,6 @@ class ScriptedExpert:
         forces: Sequence[ScriptedForce] = (),
         tremor: Tremor | None = None,
         orientation: Orientation = _by_the_rule,
-        gain: float = 4.0,
     ):
         """Prepare the script.
 
@@ -116,14 +198,10 @@ class ScriptedExpert:
             forces: When and how the body is pulled.
             tremor: Unsteadiness of the end effector.
             orientation: Rule for the orientation; the paper's coarse one by default.
-            gain: How fast an error of pose is corrected [1/s].
         """
-        self.path = path
-        self.orientation = orientation
-        self._chain = chain
+        self.path, self.orientation = path, orientation
+        self._chain, self._tremor = chain, tremor
         self._puller = ScriptedPerturbation(chain, forces)
-        self._tremor = tremor
-        self._gain = gain
 
     def read(self, state: ArmState) -> HumanInput:
         """Motion of the end effector and pull at the body at the state's time."""
@@ -131,7 +209,7 @@ class ScriptedExpert:
         wanted = torch.from_numpy(self.path.position(state.time))
         # The rule turns the end effector where it is, not where it should be.
         goal = Pose(wanted, self.orientation(pose.position, state.time))
-        twist = self._gain * pose.twist_to(goal).numpy()
+        twist = _GAIN * pose.twist_to(goal).numpy()
         twist[:3] += self.path.velocity(state.time)
         if self._tremor is not None and state.time < self.path.end:
             twist[:3] += self._tremor.velocity(state.time)

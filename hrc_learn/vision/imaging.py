@@ -1,11 +1,18 @@
-"""What a real camera does to a perfect image: lens distortion, blur, sensor noise."""
+"""Images as a real camera takes them, with lens distortion, blur and sensor noise; and a camera
+without OpenGL, which draws markers by exact ray casting into a static background.
 
+It renders what matters to visual servoing, in a fraction of a renderer's time: sweeps and
+machines without OpenGL use it in place of the simulator's camera.
+"""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float, Float32, UInt8
 
 from hrc_learn.vision.camera_model import NONE, CameraModel, undistort
+from hrc_learn.vision.markers import PLATE_MODULES, Marker, marker_texture
 
 # Samples of noise drawn for an image, of which rows are random windows (see `_noise`).
 _POOL = 1 << 16
@@ -83,11 +90,8 @@ class Lens:
             principal=((width - 1) / 2, (height - 1) / 2),
             distortion=NONE,
         )
-        self._map = self._source_pixels()
-
-    def _source_pixels(self) -> Float32[np.ndarray, "h w 2"]:
-        normalised = pixel_rays(self.model)
-        return (normalised * self.pinhole.focal + self.pinhole.principal).astype(np.float32)
+        rays = pixel_rays(model)
+        self._map = (rays * self.pinhole.focal + self.pinhole.principal).astype(np.float32)
 
     def apply(self, image: UInt8[np.ndarray, "ph pw 3"]) -> UInt8[np.ndarray, "h w 3"]:
         """The image of `model` from the image of `pinhole`."""
@@ -114,3 +118,193 @@ def pixel_rays(model: CameraModel) -> Float32[np.ndarray, "h w 2"]:
         distorted = np.stack([(u - cx) / fx, (v + (top - cy)) / fy], axis=-1)
         band[:] = undistort(distorted, model.distortion)
     return rays
+
+
+MarkerPoses = Callable[[], Mapping[int, Float[np.ndarray, "4 4"]]]
+"""Returns the pose of each marker now, by its id: p_base = pose @ p_marker."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class OccludingBoard:
+    """A flat board in one colour, in front of everything else."""
+
+    corners: Float[np.ndarray, "corners 3"]
+    """Of a convex outline, in the base frame [m]."""
+    colour: tuple[float, float, float]
+    """Red, green, blue, 0 to 1."""
+
+
+# Texture resolutions, one octave apart: bilinear sampling aliases beyond a factor of two.
+_MODULE_PIXELS = (1, 2, 4, 8, 16, 32, 64)
+# Grey levels of a lit print: white is not 255, black not 0.
+_PAPER, _INK = 235.0, 25.0
+# A plate closer to the camera plane than this is not drawn: its projection diverges [m].
+_NEAR = 0.02
+
+
+class SyntheticCamera:
+    """Implements the `Camera` protocol: `read()` returns the scene's markers as seen now.
+
+    A plate is drawn only where it can be seen: facing the camera, in front of it, inside the
+    image, and not reported by `hidden`. Nearer plates cover farther ones.
+    """
+
+    def __init__(
+        self,
+        model: CameraModel,
+        markers: Iterable[Marker],
+        poses: MarkerPoses,
+        *,
+        rng: np.random.Generator,
+        noise: ImageNoise | None = None,
+        hidden: Callable[[], Set[int]] = frozenset,
+        occluders: Callable[[], Sequence[OccludingBoard]] = tuple,
+        background: UInt8[np.ndarray, "h w 3"] | None = None,
+    ):
+        """Draw everything that stays the same from frame to frame.
+
+        Args:
+            model: Camera, with its pose and lens.
+            markers: The markers that may appear.
+            poses: Called at each frame; ids it leaves out are not drawn.
+            rng: Source of the noise.
+            noise: Blur and noise of the sensor; the defaults of `ImageNoise` when None.
+            hidden: Called at each frame; ids that are occluded now.
+            occluders: Called at each frame; boards held in front of the camera now.
+            background: What is seen where no marker is; a plain table top when None.
+
+        Raises:
+            ValueError: If two markers share an id, or the background has another size.
+        """
+        self.model = model
+        self.markers = _by_id(markers)
+        self._poses, self._hidden, self._occluders = poses, hidden, occluders
+        self._rng, self._noise = rng, noise or ImageNoise()
+        self._clean = table_top(model.width, model.height) if background is None else background
+        if self._clean.shape[:2] != (model.height, model.width):
+            raise ValueError(
+                f"background must be {model.width}x{model.height} as the camera, but is "
+                f"{self._clean.shape[1]}x{self._clean.shape[0]}."
+            )
+        self._background = self._noise.degrade(self._clean, rng)
+        self._canvas = self._clean.copy()  # equals `_clean` between frames
+        self._rays = pixel_rays(model)
+        self._textures = {id: _octaves(id) for id in self.markers}
+        # Wide enough for the blur of a plate's edge to end inside the region redrawn.
+        self._margin = 2 + int(np.ceil(3 * self._noise.blur))
+
+    def read(self) -> UInt8[np.ndarray, "h w 3"]:
+        """The image now, RGB."""
+        drawn = [self._draw(marker, pose) for marker, pose in self._visible()]
+        drawn += [self._draw_board(board) for board in self._occluders()]
+        image = self._background.copy()
+        for roi in drawn:
+            image[roi] = self._noise.degrade(self._canvas[roi], self._rng)
+        for roi in drawn:
+            self._canvas[roi] = self._clean[roi]
+        return image
+
+    def _visible(self) -> list[tuple[Marker, Float[np.ndarray, "4 4"]]]:
+        """Markers that the camera sees the front of, with their poses, farthest first."""
+        hidden = self._hidden()
+        eye = self.model.pose[:3, 3]
+        seen = []
+        for id, pose in self._poses().items():
+            to_eye = eye - pose[:3, 3]
+            if id not in self.markers or id in hidden or to_eye @ pose[:3, 2] <= 0:
+                continue
+            corners = self.markers[id].plate_corners @ pose[:3, :3].T + pose[:3, 3]
+            in_front = self.model.to_camera(corners)[:, 2].min() > _NEAR
+            if in_front and self.model.in_view(corners).any():
+                seen.append((float(to_eye @ to_eye), self.markers[id], pose))
+        seen.sort(key=lambda entry: -entry[0])
+        return [(marker, pose) for _, marker, pose in seen]
+
+    def _draw(self, marker: Marker, pose: Float[np.ndarray, "4 4"]) -> tuple[slice, slice]:
+        """Draw a plate on the canvas and return the region it touched."""
+        import cv2
+
+        corners = marker.plate_corners @ pose[:3, :3].T + pose[:3, 3]
+        pixels = self.model.project(corners)
+        roi = self._around(pixels)
+        texture = self._textures[marker.id][_octave(pixels)]
+        where = self._texture_coordinates(
+            self._rays[roi], pose, marker.plate_size, len(texture) - 2
+        )
+        grey_alpha = np.asarray(cv2.remap(texture, where, None, cv2.INTER_LINEAR))  # pyright: ignore[reportCallIssue, reportArgumentType]
+        grey, alpha = grey_alpha[..., :1], grey_alpha[..., 1:]
+        # Grey is already weighted by opacity, so this is exact at the soft edges too.
+        self._canvas[roi] = np.rint(grey + (1.0 - alpha) * self._canvas[roi])
+        return roi
+
+    def _draw_board(self, board: OccludingBoard) -> tuple[slice, slice]:
+        """Paint a board over what has been drawn and return the region it touched."""
+        import cv2
+
+        pixels = self.model.project(board.corners)
+        colour = tuple(255.0 * c for c in board.colour)
+        outline = np.rint(pixels).astype(np.int32)
+        cv2.fillConvexPoly(self._canvas, outline, colour, cv2.LINE_AA)
+        return self._around(pixels)
+
+    def _around(self, pixels: Float[np.ndarray, "corners 2"]) -> tuple[slice, slice]:
+        """Part of the image about some pixels, with room for the blur."""
+        low = np.maximum(np.floor(pixels.min(axis=0)).astype(int) - self._margin, 0)
+        high = np.maximum(np.ceil(pixels.max(axis=0)).astype(int) + self._margin + 1, 0)
+        return np.s_[low[1] : high[1], low[0] : high[0]]  # slices end at the image's edge
+
+    def _texture_coordinates(
+        self,
+        rays: Float32[np.ndarray, "h w 2"],
+        pose: Float[np.ndarray, "4 4"],
+        plate_size: float,
+        pixels: int,
+    ) -> Float32[np.ndarray, "h w 2"]:
+        """Where on the texture, which has a border of one pixel, each ray meets the plate."""
+        R = self.model.pose[:3, :3].T @ pose[:3, :3]
+        t = self.model.to_camera(pose[:3, 3])
+        # [R_x R_y t] takes points of the plate to rays; its inverse takes rays to the plate.
+        to_plate = np.linalg.inv(np.column_stack([R[:, 0], R[:, 1], t]))
+        density, middle = pixels / plate_size, (pixels + 1) / 2
+        to_texture = np.array([[density, 0, middle], [0, -density, middle], [0, 0, 1]])
+        H = (to_texture @ to_plate).astype(np.float32)
+        homogeneous = rays @ H[:, :2].T + H[:, 2]
+        return np.ascontiguousarray(homogeneous[..., :2] / homogeneous[..., 2:])
+
+
+def _by_id(markers: Iterable[Marker]) -> dict[int, Marker]:
+    by_id: dict[int, Marker] = {}
+    for marker in markers:
+        if marker.id in by_id:
+            raise ValueError(
+                f"Markers {by_id[marker.id]} and {marker} share id {marker.id}: a detector "
+                "could not tell them apart. Give each marker of a scene its own id."
+            )
+        by_id[marker.id] = marker
+    return by_id
+
+
+def table_top(width: int, height: int) -> UInt8[np.ndarray, "h w 3"]:
+    """A plain wooden surface, lit from one side."""
+    u = np.linspace(-1, 1, width)[None, :, None]
+    v = np.linspace(-1, 1, height)[:, None, None]
+    light = 1.0 - 0.12 * u - 0.08 * v - 0.1 * (u * u + v * v)
+    return np.rint(light * [168.0, 148.0, 124.0]).clip(0, 255).astype(np.uint8)
+
+
+def _octaves(id: int) -> list[Float32[np.ndarray, "n n 2"]]:
+    """Opacity-weighted grey, and opacity, of a plate at every resolution; clear border."""
+    octaves = []
+    for module in _MODULE_PIXELS:
+        white = marker_texture(id, module * PLATE_MODULES) / 255.0
+        grey = _INK + (_PAPER - _INK) * white
+        grey_alpha = np.stack([grey, np.ones_like(grey)], axis=-1)
+        octaves.append(np.pad(grey_alpha, ((1, 1), (1, 1), (0, 0))).astype(np.float32))
+    return octaves
+
+
+def _octave(plate_pixels: Float[np.ndarray, "4 2"]) -> int:
+    """Texture resolution nearest to that of the image, so that edges are one pixel soft."""
+    edges = np.linalg.norm(plate_pixels - np.roll(plate_pixels, 1, axis=0), axis=1)
+    octave = np.log2(max(edges.mean() / PLATE_MODULES, 1.0))
+    return min(int(np.rint(octave)), len(_MODULE_PIXELS) - 1)

@@ -1,4 +1,8 @@
-"""Figures of runs, fits and sweeps for reports and papers."""
+"""Figures of runs, fits and sweeps for reports and papers.
+
+Plain matplotlib `Figure` objects: no pyplot, no global state, no window. Those of runs and fits
+take the recording that the dashboards take, and raise ValueError where it lacks the data.
+"""
 
 from collections.abc import Mapping, Sequence
 from itertools import product
@@ -8,92 +12,20 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator, StrMethodFormatter
+from matplotlib.ticker import MaxNLocator
 
 from hrc_learn.viz import palette
 from hrc_learn.viz.figure_parts import (
     STYLE,
     WIDTH,
-    draw_box,
     draw_limits,
     finite_span,
-    frame_space,
     legend_in_free_cell,
-    near,
     needed,
     scaled,
     shade,
-    space,
 )
 from hrc_learn.viz.recordings import FitRecording, JointLimits, RunRecording
-
-# Figures of runs and fits for reports and papers.
-#
-# Plain matplotlib `Figure` objects: no pyplot, no global state, no window. Every function
-# takes the recording that the dashboards take, and raises ValueError where it lacks the data.
-
-
-def image_figure(run: RunRecording) -> Figure:
-    """Path of the feature over the image, and its distance from the target over time."""
-    camera = needed(run.camera, "camera")
-    servoing = np.isfinite(camera.error)
-    if not servoing.any():
-        raise ValueError("feature and target were never known together: nothing to draw.")
-    path = np.where(servoing[:, None], camera.feature, np.nan)
-    first, last = np.flatnonzero(servoing)[[0, -1]]
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH, 2.9))
-        image, error = figure.subplots(1, 2, width_ratios=[1.15, 1])
-        if camera.images:
-            final = np.searchsorted(camera.image_time, run.time[last], side="right") - 1
-            image.imshow(camera.images[max(final, 0)], alpha=0.55)
-        image.plot(*camera.feature.T, color=palette.RUN, alpha=0.3, lw=1.0)
-        image.plot(*path.T, color=palette.RUN, label="feature")
-        image.plot(*path[first], "o", color=palette.ORANGE, ms=5, label="start")
-        image.plot(*camera.target[last], "+", color=palette.LIMIT, ms=13, mew=2, label="target")
-        image.set(
-            xlim=(0, camera.model.width),
-            ylim=(camera.model.height, 0),
-            aspect="equal",
-            xlabel="u [px]",
-            ylabel="v [px]",
-            title="Path of the feature in the image",
-        )
-        image.legend(loc="best", frameon=True, framealpha=0.75, edgecolor="none")
-        error.plot(run.time, camera.error, color=palette.RUN)
-        error.set(xlabel="time [s]", ylabel="distance to target [px]", title="Pixel error")
-        # From hundreds of pixels to a fraction of one: a linear scale would hide the end.
-        error.set_yscale("log")
-        error.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-        finite_span(error, run.time, servoing)
-    return figure
-
-
-def paths_figure(run: RunRecording) -> Figure:
-    """Path of the tool centre point in space, with the demonstration, boxes and region."""
-    lines = [
-        ("demonstration", run.demo_path, palette.DEMO, 4.0),
-        ("plan", run.plan_path, palette.ORANGE, 3.0),
-        ("run", run.position, palette.RUN, 1.4),
-    ]
-    shown = [line for line in lines if line[1] is not None]
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH, 5.2))
-        axes = space(figure)
-        points = np.concatenate([path for _, path, _, _ in shown if path is not None])
-        for box in near(run.boxes, points):
-            draw_box(axes, box, "#8D8F94", alpha=0.10)
-        if run.region is not None:
-            draw_box(axes, run.region, palette.GREEN, alpha=0.15)
-        for label, path, colour, width in shown:
-            assert path is not None
-            axes.plot(*path.T, color=colour, lw=width, label=label)
-        axes.plot(*run.position[0], "o", color=palette.RUN, ms=4)
-        axes.plot(*run.position[-1], "s", color=palette.RUN, ms=4)
-        axes.legend(loc="upper left")
-        axes.set_title("Path of the tool centre point (dot: start, square: end)", loc="left")
-        frame_space(axes, points)
-    return figure
 
 
 def joints_figure(run: RunRecording) -> Figure:
@@ -107,18 +39,12 @@ def joints_figure(run: RunRecording) -> Figure:
     )
 
 
-def fit_joints_figure(fit: FitRecording, most: int = 4) -> Figure:
-    """Every joint of the first demonstrations and of their reproductions."""
-    reproductions = list(zip(fit.time, fit.reproductions, strict=True))[:most]
-    demos = list(zip(fit.time, fit.demos, strict=True))[:most]
-    return _joints(
-        fit.joint_names,
-        reproductions,
-        demos,
-        fit.joint_limits,
-        label="reproduction",
-        unit=fit.unit,
-    )
+def fit_joints_figure(fit: FitRecording) -> Figure:
+    """Every joint of the first four demonstrations and of their reproductions."""
+    reproductions = list(zip(fit.time, fit.reproductions, strict=True))[:4]
+    demos = list(zip(fit.time, fit.demos, strict=True))[:4]
+    names, limits = fit.joint_names, fit.joint_limits
+    return _joints(names, reproductions, demos, limits, label="reproduction", unit=fit.unit)
 
 
 def person_figure(run: RunRecording) -> Figure:
@@ -201,15 +127,7 @@ def residual_figure(fit: FitRecording) -> Figure:
         axes = figure.subplots()
         axes.plot(counts, [fit.residual[n] for n in counts], "o-", color=palette.RUN, ms=4)
         if fit.n_basis is not None and fit.n_basis in fit.residual:
-            used = fit.residual[fit.n_basis]
-            axes.plot(fit.n_basis, used, "o", color=palette.LIMIT, ms=8, mfc="none", mew=1.8)
-            axes.annotate(
-                f"used: {fit.n_basis}",
-                (fit.n_basis, used),
-                xytext=(8, 8),
-                textcoords="offset points",
-                color=palette.LIMIT,
-            )
+            _ring(axes, fit.n_basis, fit.residual[fit.n_basis], f"used: {fit.n_basis}")
         axes.set(yscale="log", xlabel="basis functions N", ylabel="normalised RMS error [-]")
         axes.set_title("How well the primitive follows the demonstrations")
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
@@ -240,9 +158,6 @@ def _joints(
                 draw_limits(axes, float(limits.lower[i]), float(limits.upper[i]))
         legend_in_free_cell(figure, grid, len(names))
     return figure
-
-
-# Figures of what training measured.
 
 
 def workspace_figure(
@@ -291,14 +206,7 @@ def learning_figure(held_out: Sequence[float], best: int, unit: str) -> Figure:
         figure = Figure(figsize=(0.62 * WIDTH, 2.5))
         axes = figure.subplots()
         axes.plot(held_out, "o-", color=palette.RUN, ms=4)
-        axes.plot(best, held_out[best], "o", color=palette.LIMIT, ms=9, mfc="none", mew=1.8)
-        axes.annotate(
-            "kept",
-            (best, held_out[best]),
-            xytext=(8, 8),
-            textcoords="offset points",
-            color=palette.LIMIT,
-        )
+        _ring(axes, best, held_out[best], "kept")
         axes.set(
             xlabel="round",
             ylabel=f"held-out error [{unit}]",
@@ -306,6 +214,13 @@ def learning_figure(held_out: Sequence[float], best: int, unit: str) -> Figure:
         )
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     return figure
+
+
+def _ring(axes: Axes, x: float | int, y: float, words: str) -> None:
+    """A ring around a point, with words beside it."""
+    axes.plot(x, y, "o", color=palette.LIMIT, ms=8, mfc="none", mew=1.8)
+    beside = {"xytext": (8, 8), "textcoords": "offset points"}
+    axes.annotate(words, (x, y), color=palette.LIMIT, **beside)
 
 
 def measures_figure(
@@ -339,8 +254,6 @@ def measures_figure(
         figure.supxlabel("episode (line: median)", fontsize=9)
     return figure
 
-
-# Figures of what sweeps measured.
 
 _DASHES = ("-", "--", ":", "-.")
 

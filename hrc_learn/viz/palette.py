@@ -33,13 +33,13 @@ PERSON = ORANGE
 """What a person did."""
 
 
-def rgba(colour: str, opacity: float = 1.0) -> tuple[int, int, int, int]:
-    """Bytes of a "#RRGGBB" colour."""
+def rgba(colour: str) -> tuple[int, int, int, int]:
+    """Bytes of a "#RRGGBB" colour, opaque."""
     r, g, b = (int(colour[i : i + 2], 16) for i in (1, 3, 5))
-    return r, g, b, round(255 * opacity)
+    return r, g, b, 255
 
 
-def lighten(colour: str, share: float = 0.55) -> tuple[int, int, int, int]:
+def lighten(colour: str) -> tuple[int, int, int, int]:
     """A colour mixed with white, for the curve that lies behind."""
     r, g, b, a = rgba(colour)
-    return *(round(c + share * (255 - c)) for c in (r, g, b)), a  # pyright: ignore[reportReturnType]
+    return *(round(c + 0.55 * (255 - c)) for c in (r, g, b)), a  # pyright: ignore[reportReturnType]

@@ -125,21 +125,22 @@ def _person(run: RunRecording) -> Tab:
         effort = several("person/effort", run.joint_names, run.human_effort)
         title = "Null-space effort d of the person, by joint [N m]"
         plots.append(Plot(title=title, curves=(effort,), legend=True, share=2.0))
-    if run.elbow_motion is not None:
-        elbow = single("person/elbow", "elbow", 1e3 * run.elbow_motion, palette.PERSON)
-        plots.append(Plot(title="Elbow moved by the person [mm]", curves=(elbow,)))
-    if run.position_deviation is not None:
-        moved = 1e3 * run.position_deviation
-        curves = single("person/position_deviation", "position", moved, palette.RUN_ON_DARK)
-        plots.append(
-            Plot(title="Deviation of the end effector, position [mm]", curves=(curves,))
-        )
-    if run.rotation_deviation is not None:
-        turned = np.degrees(run.rotation_deviation)
-        curves = single("person/rotation_deviation", "rotation", turned, palette.PURPLE)
-        plots.append(
-            Plot(title="Deviation of the end effector, rotation [deg]", curves=(curves,))
-        )
+    moved, turned = run.position_deviation, run.rotation_deviation
+    blue, deviation = palette.RUN_ON_DARK, "Deviation of the end effector"
+    for path, values, unit, colour, title in (
+        ("elbow", run.elbow_motion, 1e3, palette.PERSON, "Elbow moved by the person [mm]"),
+        ("position_deviation", moved, 1e3, blue, f"{deviation}, position [mm]"),
+        (
+            "rotation_deviation",
+            turned,
+            180 / np.pi,
+            palette.PURPLE,
+            f"{deviation}, rotation [deg]",
+        ),
+    ):
+        if values is not None:
+            curve = single(f"person/{path}", path.split("_")[0], unit * values, colour)
+            plots.append(Plot(title=title, curves=(curve,)))
     return Tab(title="Person", plots=tuple(plots))
 
 

@@ -1,5 +1,7 @@
-"""What runs, fits, sweeps and demonstrations hand over to be shown: plain arrays, no
-robot model, no library.
+"""What runs, fits, sweeps and demonstrations hand over to be shown: plain arrays, no robot
+model, no library.
+
+Whatever is None or empty drops its panel or figure. Times are seconds from the run's start.
 """
 
 from collections.abc import Mapping
@@ -11,10 +13,6 @@ from jaxtyping import Bool, Float, Int, UInt8
 from hrc_learn.geometry import Body, Box
 from hrc_learn.vision import CameraModel
 from hrc_learn.viz.step_log import Event
-
-# What a run and a fit hand over to be shown: plain arrays, no robot model, no library.
-#
-# Whatever is None or empty drops its panel or figure. Times are seconds from the run's start.
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -117,7 +115,6 @@ class RunRecording:
     """When the task entered each of its phases."""
 
     def __post_init__(self) -> None:
-        steps = len(self.time)
         series: dict[str, np.ndarray | None] = {name: getattr(self, name) for name in _SERIES}
         series |= {f"potentials[{name!r}]": value for name, value in self.potentials.items()}
         series |= {f"safety[{name!r}]": value for name, value in self.safety.items()}
@@ -125,21 +122,9 @@ class RunRecording:
             series[f"bodies: {body.name}.position"] = body.position
             series[f"bodies: {body.name}.orientation"] = body.orientation
         if self.camera is not None:
-            series |= {
-                "camera.feature": self.camera.feature,
-                "camera.target": self.camera.target,
-            }
-        wrong = {
-            name: len(value)
-            for name, value in series.items()
-            if value is not None and len(value) != steps
-        }
-        if wrong:
-            raise ValueError(
-                f"time has {steps} samples, but "
-                + ", ".join(f"{name} has {n}" for name, n in wrong.items())
-                + ". Log every field at every control step, with NaN where it has no value."
-            )
+            series["camera.feature"] = self.camera.feature
+            series["camera.target"] = self.camera.target
+        _check_samples(self.time, series)
 
 
 _SERIES = (
@@ -155,6 +140,18 @@ _SERIES = (
     "position_deviation",
     "rotation_deviation",
 )
+
+
+def _check_samples(
+    time: Float[np.ndarray, " time"], series: Mapping[str, np.ndarray | None]
+) -> None:
+    wrong = {n: len(v) for n, v in series.items() if v is not None and len(v) != len(time)}
+    if wrong:
+        raise ValueError(
+            f"time has {len(time)} samples, but "
+            + ", ".join(f"{name} has {n}" for name, n in wrong.items())
+            + ". Log every field at every control step, with NaN where it has no value."
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -202,9 +199,6 @@ class FitRecording:
                 )
 
 
-# What a set of demonstrations hands over to be shown.
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DemonstrationTrace:
     """One demonstration; whatever was not recorded is None.
@@ -230,13 +224,9 @@ class DemonstrationTrace:
     """The arm along the demonstration."""
 
     def __post_init__(self) -> None:
-        for name in ("joint_position", "position", "feature", "human_effort", "gripper"):
-            value = getattr(self, name)
-            if value is not None and len(value) != len(self.time):
-                raise ValueError(
-                    f"episode {self.episode}: {name} has {len(value)} samples, but time has "
-                    f"{len(self.time)}."
-                )
+        names = ("joint_position", "position", "feature", "human_effort", "gripper")
+        series = {f"episode {self.episode}: {name}": getattr(self, name) for name in names}
+        _check_samples(self.time, series)
 
     @property
     def duration(self) -> float:
@@ -269,9 +259,6 @@ class DemonstrationsRecording:
     def __post_init__(self) -> None:
         if not self.demonstrations:
             raise ValueError("there is no demonstration to show.")
-
-
-# What a fit in rounds hands over to be shown: how it converged, and where it errs.
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -325,9 +312,6 @@ class LearningRecording:
             raise ValueError(f"best must be one of the {rounds} rounds, but is {self.best}.")
 
 
-# What a sweep hands over to be shown: how often and how fast its trials succeeded.
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SweptTrials:
     """The trials of one experiment."""
@@ -346,9 +330,7 @@ class SweptTrials:
         """The trials of a class."""
         chosen = self.group == group
         return SweptTrials(
-            success=self.success[chosen],
-            arrival=self.arrival[chosen],
-            group=self.group[chosen],
+            success=self.success[chosen], arrival=self.arrival[chosen], group=self.group[chosen]
         )
 
 

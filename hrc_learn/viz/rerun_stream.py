@@ -1,18 +1,24 @@
-"""Writing one .rrd file: all or nothing, columns instead of single values."""
+"""Sending to Rerun: one .rrd file all or nothing, columns instead of single values, and the
+layouts of dashboards.
+"""
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
+from PIL import Image
 
 from hrc_learn.geometry import Body, Box, Capsule, MeshFile
 from hrc_learn.store import new_file
+from hrc_learn.viz import palette
 from hrc_learn.viz.panels import Curves, Plot, Tab
+from hrc_learn.viz.recordings import CameraRecording
 
 TIMELINE = "time"
 """All that is recorded lies on this timeline [s]: the viewer shows one at a time."""
@@ -78,28 +84,26 @@ def seconds(time: Float[np.ndarray, " time"]) -> list[rr.TimeColumn]:
     return [rr.TimeColumn(TIMELINE, duration=np.rint(1e9 * time).astype("timedelta64[ns]"))]
 
 
+def send_tab(stream: rr.RecordingStream, time: Float[np.ndarray, " time"], tab: Tab) -> None:
+    """Send all curves of a tab, which have the same times [s]."""
+    for plot in tab.plots:
+        for curves in plot.curves:
+            send_curves(stream, time, curves)
+
+
 def send_curves(
     stream: rr.RecordingStream, time: Float[np.ndarray, " time"], curves: Curves
 ) -> None:
     """Send curves with their names and colours; they break off where they are NaN."""
     stream.log(curves.path, style(curves), static=True)
-    send_values(stream, time, curves)
+    send_rows(stream, seconds(time), curves)
 
 
 def style(curves: Curves) -> rr.SeriesLines:
     """Names, colours and widths of curves."""
     return rr.SeriesLines(
-        names=curves.names,
-        colors=curves.colours,
-        widths=[curves.width] * len(curves.names),
+        names=curves.names, colors=curves.colours, widths=[curves.width] * len(curves.names)
     )
-
-
-def send_values(
-    stream: rr.RecordingStream, time: Float[np.ndarray, " time"], curves: Curves
-) -> None:
-    """Send the samples of curves."""
-    send_rows(stream, seconds(time), curves)
 
 
 def send_rows(stream: rr.RecordingStream, index: list[rr.TimeColumn], curves: Curves) -> None:
@@ -209,6 +213,43 @@ def plot_view(plot: Plot) -> rrb.TimeSeriesView:
     )
 
 
+def dashboard(
+    left: Sequence[rrb.View],
+    right: Sequence[rrb.Container | rrb.View],
+    *,
+    row_shares: tuple[int, ...] = (1,),
+    column_shares: tuple[int, ...] = (1, 1),
+    timeline: str = TIMELINE,
+) -> rrb.Blueprint:
+    """Layout of a dashboard: views above one another, with further columns to their right.
+
+    Args:
+        left: The views.
+        right: The columns.
+        row_shares: Heights of the views, in proportion.
+        column_shares: Widths of all columns, in proportion.
+        timeline: That is shown.
+    """
+    columns = [rrb.Vertical(contents=left, row_shares=row_shares[: len(left)]), *right]
+    return rrb.Blueprint(
+        rrb.Horizontal(contents=columns, column_shares=column_shares[: len(columns)]),
+        rrb.TimePanel(state="collapsed", timeline=timeline),
+        collapse_panels=True,
+    )
+
+
+def send_summary(stream: rr.RecordingStream, markdown: str) -> None:
+    """Send the text of the view "/summary"."""
+    text = rr.TextDocument(markdown, media_type="text/markdown")
+    stream.log("summary", text, static=True)
+
+
+def markdown_table(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> list[str]:
+    """Lines of a table."""
+    cells = [heads, ["---"] * len(heads), *rows]
+    return [f"| {' | '.join(map(str, row))} |" for row in cells]
+
+
 def frame_view(path: Float[np.ndarray, "n 3"], *, base: bool = True) -> rrb.EyeControls3D:
     """An eye in front of the robot, to its left, that sees the whole path.
 
@@ -237,3 +278,117 @@ def thin(path: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "m d"]:
     if len(path) <= _PATH_POINTS:
         return path
     return path[np.linspace(0, len(path) - 1, _PATH_POINTS).astype(int)]
+
+
+_CROSS = 60.0  # half the size of the mark of the target [px]
+_ROOT = "world/camera/image"
+
+
+class CameraStream:
+    """Sends the frustum of a camera, its images, and marks over them."""
+
+    def __init__(self, stream: rr.RecordingStream, still: StaticShapes):
+        """Send to a recording stream.
+
+        Args:
+            stream: Into a file or to a viewer.
+            still: What was sent of the things that stand still.
+        """
+        self._stream, self._still, self._images = stream, still, 0
+
+    def send_images(self, camera: CameraRecording) -> None:
+        """Send the frustum, and the images that were not sent before."""
+        model = camera.model
+        place = rr.Transform3D(translation=model.pose[:3, 3], mat3x3=model.pose[:3, :3])
+        pinhole = rr.Pinhole(
+            image_from_camera=model.matrix,
+            resolution=[model.width, model.height],
+            camera_xyz=rr.ViewCoordinates.RDF,
+            image_plane_distance=0.25,
+            color=palette.rgba(palette.SKY),
+        )
+        self._still.send(
+            "world/camera",
+            (model.pose.tobytes(), model.matrix.tobytes()),
+            lambda: (place, pinhole),
+        )
+        new = camera.images[self._images :]
+        if new:
+            self._stream.send_columns(
+                _ROOT,
+                seconds(camera.image_time[self._images :]),
+                rr.EncodedImage.columns(
+                    blob=[_jpeg(image) for image in new], media_type=["image/jpeg"] * len(new)
+                ),
+            )
+        self._images += len(new)
+
+    def send_overlays(
+        self,
+        time: Float[np.ndarray, " time"],
+        camera: CameraRecording,
+        at: Int[np.ndarray, " chosen"],
+        ends: Int[np.ndarray, " ends"],
+    ) -> None:
+        """Send feature, target and path of the feature.
+
+        Args:
+            time: Of the whole run [s].
+            camera: What it saw in the whole run.
+            at: Samples at which the marks are sent.
+            ends: Samples at which the path so far is sent.
+        """
+        crosses = [_cross(pixel) for pixel in camera.target[at]]
+        self._send_lines(f"{_ROOT}/target", time[at], crosses, palette.TARGET)
+        seen = np.asarray(np.isfinite(camera.feature).all(axis=-1))
+        trails = [[thin(camera.feature[: end + 1][seen[: end + 1]])] for end in ends]
+        self._send_lines(f"{_ROOT}/path", time[ends], trails, palette.SKY)
+        self._still.send(
+            f"{_ROOT}/feature",
+            None,
+            lambda: rr.Points2D.from_fields(
+                radii=[-5.0],  # negative: in points of the screen, whatever the zoom
+                colors=[palette.rgba(palette.ORANGE)],
+                draw_order=30.0,
+            ),
+        )
+        # A sample without points takes the mark away while the feature is not seen.
+        columns = rr.Points2D.columns(positions=camera.feature[at][seen[at]])
+        self._stream.send_columns(
+            f"{_ROOT}/feature", seconds(time[at]), columns.partition(seen[at].astype(int))
+        )
+
+    def _send_lines(
+        self,
+        path: str,
+        time: Float[np.ndarray, " samples"],
+        strips: list[list[Float[np.ndarray, "_ 2"]]],
+        colour: str,
+    ) -> None:
+        """Lines over the image, any number of them at each sample."""
+        self._still.send(
+            path,
+            None,
+            lambda: rr.LineStrips2D.from_fields(
+                radii=[-2.0], colors=[palette.rgba(colour)], draw_order=20.0
+            ),
+        )
+        columns = rr.LineStrips2D.columns(strips=[strip for here in strips for strip in here])
+        counts = [len(here) for here in strips]
+        self._stream.send_columns(path, seconds(time), columns.partition(counts))
+
+
+def _cross(pixel: Float[np.ndarray, "2"]) -> list[Float[np.ndarray, "2 2"]]:
+    """Two strokes across a pixel; none where there is no target."""
+    if not np.isfinite(pixel).all():
+        return []
+    return [
+        pixel + _CROSS * np.array([[-1, 0], [1, 0]]),
+        pixel + _CROSS * np.array([[0, -1], [0, 1]]),
+    ]
+
+
+def _jpeg(image: UInt8[np.ndarray, "h w 3"]) -> bytes:
+    buffer = BytesIO()
+    Image.fromarray(image).save(buffer, "JPEG", quality=75)
+    return buffer.getvalue()

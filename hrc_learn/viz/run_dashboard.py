@@ -1,37 +1,45 @@
-"""A run as a Rerun recording: the robot in 3D, what its camera saw, and every curve."""
+"""A run as a Rerun recording: the robot in 3D, what its camera saw, and every curve.
+
+The same dashboard shows a finished run from a file, and one that still goes on in a browser.
+"""
 
 import os
-from collections.abc import Sequence
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
+from typing import Any, NamedTuple
+from urllib.parse import quote
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-from jaxtyping import Float, Int, Shaped
+from jaxtyping import Int, Shaped
 
 from hrc_learn.viz import palette
-from hrc_learn.viz.camera_stream import CameraStream
 from hrc_learn.viz.panels import Plot, run_tabs, several
 from hrc_learn.viz.recordings import RunRecording
 from hrc_learn.viz.rerun_stream import (
-    TIMELINE,
+    CameraStream,
     StaticShapes,
+    begin,
     boxes,
+    dashboard,
     frame_view,
     plot_view,
     rrd_file,
     samples,
     seconds,
     send_poses,
+    send_rows,
     send_shapes,
-    send_values,
     style,
     tab_view,
     thin,
 )
 from hrc_learn.viz.step_log import LoggedSteps
-
-# How the dashboard of a run is laid out.
 
 
 def run_outline(run: RunRecording) -> tuple:
@@ -42,11 +50,13 @@ def run_outline(run: RunRecording) -> tuple:
 
 def run_layout(run: RunRecording) -> rrb.Blueprint:
     """The robot and its camera beside tabs of curves."""
+    # The first look at the scene should not miss the camera.
+    eyes = [] if run.camera is None else [run.camera.model.pose[None, :3, 3]]
     scene = rrb.Spatial3DView(
         origin="/world",
         contents=["+ /world/**", "- /world/camera/image/**"],
         name="Robot: path of the run (blue), demonstration (grey), plan (orange)",
-        eye_controls=frame_view(_sights(run)),
+        eye_controls=frame_view(np.concatenate([run.position, *eyes])),
     )
     left: list[rrb.View] = [scene]
     if run.camera is not None:
@@ -63,24 +73,9 @@ def run_layout(run: RunRecording) -> rrb.Blueprint:
         # The text tells the time as well: all other columns would only narrow it.
         text = rrb.TextLogColumns(timeline_columns=[], text_log_columns=["Body"])
         right.append(rrb.TextLogView(origin="/phases", name="Phases of the task", columns=text))
-    return rrb.Blueprint(
-        rrb.Horizontal(
-            rrb.Vertical(contents=left, row_shares=[3, 2][: len(left)]),
-            rrb.Vertical(contents=right, row_shares=[5, 1][: len(right)]),
-            column_shares=[1, 1],
-        ),
-        rrb.TimePanel(state="collapsed", timeline=TIMELINE),
-        collapse_panels=True,
-    )
+    tabs_and_text = rrb.Vertical(contents=right, row_shares=[5, 1][: len(right)])
+    return dashboard(left, [tabs_and_text], row_shares=(3, 2))
 
-
-def _sights(run: RunRecording) -> Float[np.ndarray, "n 3"]:
-    """What the first look at the scene should not miss: the path and the camera."""
-    eyes = [] if run.camera is None else [run.camera.model.pose[None, :3, 3]]
-    return np.concatenate([run.position, *eyes])
-
-
-# Sending a run to Rerun, all at once or as it grows.
 
 _POSE_RATE = 30.0  # robot poses sent a second
 _PATH_RATE = 6.0  # times a second at which the growing path is sent anew
@@ -93,15 +88,14 @@ class RunStream:
     it, sends one that still goes on. What arrives is the same.
     """
 
-    def __init__(self, stream: rr.RecordingStream, *, image_quality: int = 75):
+    def __init__(self, stream: rr.RecordingStream):
         """Send to a recording stream.
 
         Args:
             stream: Into a file or to a viewer.
-            image_quality: Of the JPEG images, 1 to 95.
         """
         self._stream, self._still = stream, StaticShapes(stream)
-        self._camera = CameraStream(stream, self._still, image_quality)
+        self._camera = CameraStream(stream, self._still)
         self._rows = self._phases = 0
         self._outline: tuple | None = None
 
@@ -162,7 +156,7 @@ class RunStream:
                 for curves in plot.curves:
                     self._still.send(curves.path, curves.names, lambda c=curves: style(c))
                     new = replace(curves, values=curves.values[first:])
-                    send_values(self._stream, time[first:], new)
+                    send_rows(self._stream, seconds(time[first:]), new)
 
     def _send_path(self, run: RunRecording, ends: Int[np.ndarray, " ends"]) -> None:
         path, colours = "world/paths/run", [palette.rgba(palette.RUN_ON_DARK)]
@@ -186,24 +180,15 @@ class RunStream:
             )
 
 
-# A run as one Rerun recording: the robot in 3D, what its camera saw, and every curve.
-
-
-def record_run(
-    path: str | os.PathLike[str], run: RunRecording, *, image_quality: int = 75
-) -> None:
+def record_run(path: str | os.PathLike[str], run: RunRecording) -> None:
     """Write a run as an .rrd file with its layout; `rerun FILE` shows it.
 
     Args:
         path: File to write; it appears only when complete.
         run: What happened. Panels without data are left out.
-        image_quality: Of the JPEG images, 1 to 95.
     """
     with rrd_file(path, run.title) as stream:
-        RunStream(stream, image_quality=image_quality).send(run)
-
-
-# Curves of any log, sent to Rerun as it grows.
+        RunStream(stream).send(run)
 
 
 class LogStream:
@@ -213,25 +198,16 @@ class LogStream:
     `stream.connect_grpc()` show it in a viewer, `stream.save()` keeps it.
     """
 
-    def __init__(
-        self,
-        log: LoggedSteps,
-        stream: rr.RecordingStream,
-        columns: Sequence[str],
-        *,
-        time: str = "time",
-    ):
+    def __init__(self, log: LoggedSteps, stream: rr.RecordingStream, columns: Sequence[str]):
         """Send the layout.
 
         Args:
-            log: What a loop appends to.
+            log: What a loop appends to; its column "time" holds the time [s].
             stream: Where to send.
             columns: Columns of the log to send.
-            time: Column that holds the time [s].
         """
         self._log, self._stream, self._still = log, stream, StaticShapes(stream)
-        self._columns, self._time = tuple(columns), time
-        self._rows = 0
+        self._columns, self._rows = tuple(columns), 0
         views = [plot_view(_plot(name, np.empty((0, 1)))) for name in self._columns]
         stream.send_blueprint(rrb.Blueprint(rrb.Grid(contents=views), collapse_panels=True))
 
@@ -243,7 +219,7 @@ class LogStream:
                     values = rows[name].reshape(len(rows), -1)
                     for curves in _plot(name, values).curves:
                         self._still.send(curves.path, None, lambda c=curves: style(c))
-                        send_values(self._stream, rows[self._time], curves)
+                        send_rows(self._stream, seconds(rows["time"]), curves)
                 self._rows += len(rows)
 
 
@@ -252,3 +228,129 @@ def _plot(name: str, values: Shaped[np.ndarray, "rows curves"]) -> Plot:
     names = [name] if count == 1 else [f"{name} {i + 1}" for i in range(count)]
     curves = several(f"live/{name}", names, values.astype(float))
     return Plot(title=name, curves=(curves,), legend=True)
+
+
+_SHARE = 0.2  # of a thread's time that may go into sending
+
+
+class LiveSender:
+    """Calls a function a few times a second, and once more when it is closed.
+
+    An error of the function ends the thread and is raised where the `with` block is left.
+
+        log = StepLog()
+        with LiveSender(LogStream(log, stream, ["joint_position", "feature"]).send):
+            ...  # the loop, which appends to `log`
+    """
+
+    def __init__(self, send: Callable[[], object], *, period: float = 0.25):
+        """Prepare the thread; it starts with the `with` block.
+
+        Args:
+            send: Sends what is new.
+            period: How often [s]; less often where sending would take more than a fifth of
+                the time.
+        """
+        self._send, self._period = send, period
+        self._closing = threading.Event()
+        self._error: Exception | None = None
+        self._thread = threading.Thread(target=self._run, name="LiveSender", daemon=True)
+
+    def __enter__(self) -> "LiveSender":
+        self._thread.start()
+        return self
+
+    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
+        self._closing.set()
+        self._thread.join()
+        if self._error is not None and error is None:
+            raise self._error
+
+    def _run(self) -> None:
+        pause = self._period
+        try:
+            while not self._closing.wait(pause):
+                began = time.monotonic()
+                self._send()
+                pause = max(self._period, (time.monotonic() - began) * (1 / _SHARE - 1))
+            self._send()
+        except Exception as error:  # handed over to the thread that closes
+            self._error = error
+
+
+@contextmanager
+def live_dashboard(
+    stream: rr.RecordingStream,
+    snapshot: Callable[[], RunRecording | None],
+    *,
+    period: float = 0.25,
+) -> Iterator[None]:
+    """Show a run while it goes on, as `record_run` keeps it afterwards.
+
+    Args:
+        stream: Where to send; `hrc_learn.viz.run_dashboard` gives one that a browser shows.
+        snapshot: The run so far, None before there is anything; called by another thread.
+        period: How often to send [s].
+    """
+    sender = RunStream(stream)
+    begun = False
+
+    def send() -> None:
+        nonlocal begun
+        run = snapshot()
+        if run is not None:
+            if not begun:
+                begin(stream, run.title)
+                begun = True
+            sender.send(run)
+
+    with LiveSender(send, period=period):
+        yield
+    stream.flush()
+
+
+class DashboardServer(NamedTuple):
+    """A stream that is served on this machine."""
+
+    stream: rr.RecordingStream
+    viewer: str
+    """Address of the viewer, for a browser."""
+    data: str
+    """Address of the data, for `rerun ADDRESS`."""
+
+
+@contextmanager
+def serve_stream(port: int = 9090, data_port: int = 9876) -> Iterator[DashboardServer]:
+    """Serve a stream and a viewer for it, for as long as the `with` block lasts.
+
+    Who opens the page later sees all that was sent before, as far as a gigabyte goes.
+
+    Args:
+        port: Of the viewer's page.
+        data_port: Of the data that the page fetches.
+
+    Raises:
+        ValueError: If a port is taken.
+    """
+    for number in (port, data_port):
+        _check_free(number)
+    stream = rr.RecordingStream("hrc_learn")
+    data = stream.serve_grpc(grpc_port=data_port)
+    rr.serve_web_viewer(web_port=port, open_browser=False, connect_to=data)
+    try:
+        yield DashboardServer(
+            stream, f"http://127.0.0.1:{port}?url={quote(data, safe='')}", data
+        )
+    finally:
+        stream.disconnect()
+
+
+def _check_free(port: int) -> None:
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("", port))
+        except OSError as error:
+            raise ValueError(
+                f"port {port} is taken: end what uses it, or choose another."
+            ) from error

@@ -11,8 +11,6 @@ import numpy as np
 
 from hrc_learn.store import new_file
 
-# What was logged: columns of equal length, one row a step, and what happened when.
-
 
 class Event(NamedTuple):
     """Something worth a line of text, such as a task entering its next phase."""
@@ -77,8 +75,6 @@ class LoggedSteps:
         with new_file(Path(path)) as part, part.open("wb") as file:
             np.savez(file, **arrays)
 
-
-# A log that a control loop can afford: about a microsecond a step, no files, no threads.
 
 Value = np.ndarray | np.generic | float | int | bool
 """A measurement of one step: an array of any shape, or a number."""
@@ -162,11 +158,9 @@ class StepLog(LoggedSteps):
 
     def append_row(self, row: np.ndarray) -> None:
         """Add a copy of a row made by `prepare`."""
-        i = self._length - self._first
-        if i == self._block:
+        if self._length - self._first == self._block:
             self._extend()
-            i = 0
-        self._blocks[-1][i] = row
+        self._blocks[-1][self._length - self._first] = row
         self._length += 1
 
     def event(self, time: float, text: str) -> None:
@@ -185,23 +179,14 @@ class StepLog(LoggedSteps):
             times, texts = file["event/time"].tolist(), file["event/text"].tolist()
         log = cls()
         log.events = [Event(time, text) for time, text in zip(times, texts, strict=True)]
-        if columns:
-            log._fill(columns)
+        for row in zip(*columns.values(), strict=True):
+            log.append(**dict(zip(columns, row, strict=True)))
         return log
 
-    def _fill(self, columns: dict[str, np.ndarray]) -> None:
-        self._open({name: np.zeros(c.shape[1:], c.dtype) for name, c in columns.items()})
-        self._length = len(next(iter(columns.values())))
-        while self._first + self._block < self._length:
-            self._extend()
-        for i, block in enumerate(self._blocks):
-            for name, column in columns.items():
-                part = column[i * self._block : (i + 1) * self._block]
-                block[name][: len(part)] = part
-
     def _open(self, values: Mapping[str, Value]) -> None:
+        kinds = {name: np.asarray(value).dtype == bool for name, value in values.items()}
         self._dtype = np.dtype(
-            [(name, _kind(value), np.shape(value)) for name, value in values.items()]
+            [(name, bool if kinds[name] else float, np.shape(v)) for name, v in values.items()]
         )
         self._extend()
 
@@ -226,7 +211,3 @@ class StepLog(LoggedSteps):
         self._blocks.append(rows)
         self._columns = [(name, rows[name]) for name in self.names]
         self._first = (len(self._blocks) - 1) * self._block
-
-
-def _kind(value: Value) -> type:
-    return bool if np.asarray(value).dtype == bool else float

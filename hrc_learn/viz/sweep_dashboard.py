@@ -10,8 +10,16 @@ from jaxtyping import Float
 from hrc_learn.viz import palette
 from hrc_learn.viz.panels import Plot, Tab, several, slug
 from hrc_learn.viz.recordings import SweepRecording, SweptTrials
-from hrc_learn.viz.rerun_stream import TIMELINE, rrd_file, send_curves, tab_view
+from hrc_learn.viz.rerun_stream import (
+    dashboard,
+    markdown_table,
+    rrd_file,
+    send_summary,
+    send_tab,
+    tab_view,
+)
 
+# Of the curves over time: about as many as the plot has pixels.
 _SAMPLES = 400
 _COLUMNS = 2
 
@@ -23,18 +31,20 @@ def record_sweep(path: str | os.PathLike[str], sweep: SweepRecording) -> None:
         path: File to write; it appears only when complete.
         sweep: What was measured.
     """
-    time = _times(sweep)
+    arrivals = np.concatenate([trials.arrival for trials in sweep.experiments.values()])
+    latest = arrivals[np.isfinite(arrivals)].max(initial=0.0)
+    time = np.linspace(0.0, 1.05 * latest or 1.0, _SAMPLES)
     tabs = sweep_tabs(sweep, time)
-    with rrd_file(path, sweep.title, _blueprint(sweep, tabs)) as stream:
-        table = rr.TextDocument(_table(sweep), media_type="text/markdown")
-        stream.log("summary", table, static=True)
+    summary = rrb.TextDocumentView(origin="/summary", name="Sweep")
+    views = [*(tab_view(tab) for tab in tabs), _bar_charts(sweep)]
+    layout = dashboard([summary], [rrb.Tabs(contents=views, active_tab=0)])
+    with rrd_file(path, sweep.title, layout) as stream:
+        send_summary(stream, _measured(sweep))
         for name, trials in sweep.experiments.items():
             bars = rr.BarChart(_success(sweep, trials), color=palette.rgba(palette.SKY))
             stream.log(_bars(name), bars, static=True)
         for tab in tabs:
-            for plot in tab.plots:
-                for curves in plot.curves:
-                    send_curves(stream, time, curves)
+            send_tab(stream, time, tab)
 
 
 def sweep_tabs(sweep: SweepRecording, time: Float[np.ndarray, " time"]) -> list[Tab]:
@@ -53,12 +63,6 @@ def sweep_tabs(sweep: SweepRecording, time: Float[np.ndarray, " time"]) -> list[
     return [*tabs, Tab(title="Arrival by class", plots=tuple(plots), columns=_COLUMNS)]
 
 
-def _times(sweep: SweepRecording) -> Float[np.ndarray, " time"]:
-    arrivals = np.concatenate([trials.arrival for trials in sweep.experiments.values()])
-    latest = arrivals[np.isfinite(arrivals)].max(initial=0.0)
-    return np.linspace(0.0, 1.05 * latest or 1.0, _SAMPLES)
-
-
 def _success(sweep: SweepRecording, trials: SweptTrials) -> list[float]:
     """Of each class [%]; none where it has no trials."""
     groups = [trials.of(group).success for group in range(len(sweep.groups))]
@@ -69,32 +73,7 @@ def _bars(name: str) -> str:
     return f"success/{slug(name)}"
 
 
-def _table(sweep: SweepRecording) -> str:
-    """What was measured, as Markdown."""
-    heads = ["experiment", "trials", "success [%]", *sweep.groups, "median [s]", "95 % [s]"]
-    lines = [f"# {sweep.title}", "", _line(heads), _line(["---"] * len(heads))]
-    for name, trials in sweep.experiments.items():
-        ordered = np.sort(trials.arrival)
-        when = [ordered[int(np.ceil(share * len(ordered))) - 1] for share in (0.5, 0.95)]
-        lines.append(
-            _line(
-                [
-                    name,
-                    str(len(ordered)),
-                    f"{100 * trials.success.mean():.1f}",
-                    *(f"{share:.0f}" for share in _success(sweep, trials)),
-                    *(f"{t:.2f}" if np.isfinite(t) else "never" for t in when),
-                ]
-            )
-        )
-    return "\n".join([*lines, "", "Success by class in percent; times until on target."])
-
-
-def _line(cells: list[str]) -> str:
-    return f"| {' | '.join(cells)} |"
-
-
-def _blueprint(sweep: SweepRecording, tabs: list[Tab]) -> rrb.Blueprint:
+def _bar_charts(sweep: SweepRecording) -> rrb.Grid:
     bars = [
         rrb.BarChartView(
             origin=_bars(name),
@@ -103,14 +82,19 @@ def _blueprint(sweep: SweepRecording, tabs: list[Tab]) -> rrb.Blueprint:
         )
         for name in sweep.experiments
     ]
-    order = f"Success by class: {', '.join(sweep.groups)}"
-    success = rrb.Grid(contents=bars, grid_columns=_COLUMNS, name=order)
-    return rrb.Blueprint(
-        rrb.Horizontal(
-            rrb.TextDocumentView(origin="/summary", name="Sweep"),
-            rrb.Tabs(contents=[*(tab_view(tab) for tab in tabs), success], active_tab=0),
-            column_shares=[1, 1],
-        ),
-        rrb.TimePanel(state="collapsed", timeline=TIMELINE),
-        collapse_panels=True,
-    )
+    title = f"Success by class: {', '.join(sweep.groups)}"
+    return rrb.Grid(contents=bars, grid_columns=_COLUMNS, name=title)
+
+
+def _measured(sweep: SweepRecording) -> str:
+    """What was measured, as Markdown."""
+    heads = ["experiment", "trials", "success [%]", *sweep.groups, "median [s]", "95 % [s]"]
+    rows = []
+    for name, trials in sweep.experiments.items():
+        ordered = np.sort(trials.arrival)
+        when = [ordered[int(np.ceil(share * len(ordered))) - 1] for share in (0.5, 0.95)]
+        row = [name, len(ordered), f"{100 * trials.success.mean():.1f}"]
+        row += [f"{share:.0f}" for share in _success(sweep, trials)]
+        rows.append([*row, *(f"{t:.2f}" if np.isfinite(t) else "never" for t in when)])
+    note = "Success by class in percent; times until on target."
+    return "\n".join([f"# {sweep.title}", "", *markdown_table(heads, rows), "", note])

@@ -224,3 +224,23 @@ def test_limits_that_make_no_sense_are_refused(change, message):
 def test_dt_must_be_positive():
     with pytest.raises(ValueError, match="dt must be positive"):
         ActionChunkFilter(limits(), 0.0)
+
+
+@pytest.mark.parametrize("dt", [0.001, 0.1])
+def test_it_can_stop_within_a_tenth_of_the_range_and_gives_up_no_more(dt):
+    """The larger of both terms of the way that braking from rest takes is half of that."""
+    j = torch.logspace(0, 4, 40, dtype=torch.float64)
+    limits = MotionLimits(
+        lower=-torch.ones_like(j),
+        upper=torch.full_like(j, 2.0),
+        velocity=torch.ones_like(j),
+        acceleration=torch.full_like(j, 15.0),
+        jerk=j,
+    )
+    used = ActionChunkFilter(limits, dt).barrier.acceleration
+    way = torch.maximum(used**3 / (8 * j**2), used**2 * dt / (2 * j))
+    lowered = used < 15.0
+    assert lowered.any()
+    assert not lowered.all()
+    torch.testing.assert_close(way[lowered], torch.full_like(way[lowered], 3.0 / 20))
+    assert (way[~lowered] <= 3.0 / 20).all()

@@ -46,7 +46,8 @@ def test_limits_that_slow_the_task_leave_no_drift():
     v = torch.tensor([0.1, -0.2, 0.1, 0.3, 0.0, 0.1, -0.1], dtype=torch.float64)
     twist = J @ v
     torch.testing.assert_close(planned_motion(twist, J, 0.3 * v, 0.01), 0.003 * twist)
-    # What goes backwards or is not planned at all is not planned motion.
+    # What goes beyond the plan, backwards, or at all is not planned motion.
+    torch.testing.assert_close(planned_motion(twist, J, 2 * v, 0.01), 0.01 * twist)
     assert (planned_motion(twist, J, -v, 0.01) == 0).all()
     assert (planned_motion(torch.zeros_like(twist), J, v, 0.01) == 0).all()
 

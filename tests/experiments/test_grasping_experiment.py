@@ -10,7 +10,7 @@ from hrc_learn.experiments.grasping import experiment
 from hrc_learn.experiments.grasping.experiment import GraspingExperiment
 from hrc_learn.experiments.grasping.trial import SimulatedGrasp
 from hrc_learn.jacobian import RBFImageJacobian, paper_grid
-from hrc_learn.skills.visual_servoing import VisualServoSkill
+from hrc_learn.skills.visual_skill import VisualServoSkill
 
 
 @pytest.fixture

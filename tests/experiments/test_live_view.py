@@ -13,7 +13,7 @@ from hrc_learn.sim import MotionLog, World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.work_cell import WorkCell
 from hrc_learn.teleoperation import ScriptedPerturbation
-from hrc_learn.viz import live_dashboard as servers
+from hrc_learn.viz import run_dashboard as servers
 
 
 def test_a_station_is_shown_while_it_works(tmp_path, monkeypatch):

@@ -1,8 +1,15 @@
+"""Policies by regression, against loops over the demonstrations, and samples of these."""
+
+import math
+
 import pytest
 import torch
-from lerobot_samples import reaching
+from lerobot_samples import reaching, write_dataset
 
-from hrc_learn.lerobot.policy.closed_form import SampleWindows
+from hrc_learn.dmp import GaussianBasis, SpringDamper, response_of
+from hrc_learn.lerobot.policy import closed_form
+from hrc_learn.lerobot.policy.closed_form import SampleWindows, fit_closed_form
+from hrc_learn.lerobot.policy.networks import ContextualMotion
 
 EPISODES = reaching(3)
 DELTAS = {"observation.state": [-1000, 0], "action": [-2, 0, 5], "observation.goal": None}
@@ -33,3 +40,95 @@ def test_samples_are_drawn_from_all_frames():
     again = samples.draw(500, torch.Generator().manual_seed(0))
     assert drawn["action"].equal(again["action"])
     assert len(drawn["timestamp"].unique()) > 30
+
+
+def motion_of(*, context: int = 2) -> ContextualMotion:
+    response = response_of(SpringDamper(), GaussianBasis(count=12))
+    motion = ContextualMotion(response, 2, context, features=4, hidden=8)
+    return motion.double()
+
+
+def fitted(demonstrations, contexts):
+    motion = motion_of(context=contexts.shape[1])
+    return motion, fit_closed_form(motion, demonstrations, contexts, fps=20.0)
+
+
+ACTIONS = [episode["action"].double() for episode in EPISODES]
+GOALS = torch.stack([episode["observation.environment_state"][0] for episode in EPISODES])
+GOALS = GOALS.double() - GOALS.double().mean(0)
+
+
+def traced(motion, x):
+    """A primitive's path at a hundred moments of its own duration, and that."""
+    motion.base.data.copy_(x)  # durations count from it
+    p = motion.primitives(x[None])
+    time = p.duration[:, None] * torch.linspace(0, 1, 100, dtype=torch.float64)
+    path, _ = motion.continued(
+        p, p.start, p.start_velocity, elapsed=torch.zeros(1).double(), time=time
+    )
+    return path[0].detach(), p.duration.log().detach()
+
+
+def test_the_error_of_the_mean_is_that_of_demonstrations_left_out():
+    """Each by itself, against the mean of the others, moment by moment."""
+    nothing = torch.zeros(len(ACTIONS), 2, dtype=torch.float64)
+    motion, error = fitted(ACTIONS, nothing)
+    each = [fitted([action], nothing[:1])[0].base.detach() for action in ACTIONS]
+    torch.testing.assert_close(motion.base.detach(), torch.stack(each).mean(0))
+    assert not motion.slopes.any()
+    squares, durations = [], []
+    for k, x in enumerate(each):
+        others = torch.stack([y for i, y in enumerate(each) if i != k]).mean(0)
+        (path, log_duration), (mean, mean_log) = traced(motion, x), traced(motion, others)
+        squares.append((path - mean).square().mean())
+        durations.append((log_duration - mean_log).square())
+    expected = torch.stack(squares).mean() + torch.stack(durations).mean()
+    assert error == pytest.approx(expected.sqrt().item(), rel=1e-6)
+
+
+def test_one_demonstration_tells_no_error():
+    assert math.isnan(fitted(ACTIONS[:1], GOALS[:1])[1])
+
+
+def test_contexts_count_as_far_as_half_of_their_range_beyond_it():
+    motion, _ = fitted(ACTIONS, GOALS)
+    low, high = GOALS.amin(0), GOALS.amax(0)
+    torch.testing.assert_close(motion.low, low - (high - low) / 2)
+    torch.testing.assert_close(motion.high, high + (high - low) / 2)
+    torch.testing.assert_close(motion.centre, GOALS.mean(0))
+
+
+@pytest.mark.parametrize(("count", "follows"), [(3, False), (4, True)])
+def test_a_regression_takes_four_demonstrations(count, follows):
+    episodes = reaching(count, seed=2)
+    actions = [episode["action"].double() for episode in episodes]
+    goals = torch.stack([action[-1] for action in actions])
+    assert bool(fitted(actions, goals)[0].slopes.any()) == follows
+
+
+def test_what_hardly_differs_between_demonstrations_is_left_out():
+    """Numbers that vary by less than a twentieth of their spread, which is one."""
+    episodes = reaching(12, seed=2)
+    actions = [episode["action"].double() for episode in episodes]
+    goals = torch.stack([action[-1] for action in actions])
+    goals = (goals - goals.mean(0)) / goals.std(0, correction=0)
+    contexts = torch.cat([goals, 0.049 * goals[:, :1] + 7, 0.051 * goals[:, 1:]], dim=-1)
+    motion, error = fitted(actions, contexts)
+    assert motion.slopes.abs().sum(-1).gt(0).tolist() == [True, True, False, True]
+    _, of_the_mean = fitted(actions, torch.zeros_like(goals))
+    assert error < 0.5 * of_the_mean
+    # The goal is the last coordinate before the next one's, and follows the context.
+    reached = motion.primitives(motion.base + (contexts - motion.centre) @ motion.slopes).goal
+    ends = torch.stack([action[-1] for action in actions])
+    assert (reached - ends).norm(dim=-1).max() < 0.1 * ends.std(0).norm()
+
+
+def test_of_many_demonstrations_some_are_read_spread_evenly(tmp_path, monkeypatch):
+    episodes = reaching(5)
+    folder = write_dataset(tmp_path / "set", episodes)
+    monkeypatch.setattr(closed_form, "MOST", 3)
+    read = closed_form.read_episodes(folder, ["action"])
+    assert len(read) == 3
+    for found, k in zip(read, (0, 2, 4), strict=True):
+        torch.testing.assert_close(found["action"], episodes[k]["action"])
+    assert len(closed_form.read_episodes(folder, ["action"], [1, 3])) == 2

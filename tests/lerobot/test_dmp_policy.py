@@ -22,7 +22,7 @@ from lerobot_samples import (
 )
 
 from hrc_learn.lerobot import DMPConfig
-from hrc_learn.lerobot.policy.modeling_dmp import DMPPolicy
+from hrc_learn.lerobot.policy.modeling_dmp import DMPPolicy, write_closed_form_policy
 from hrc_learn.lerobot.policy.processor_dmp import make_dmp_pre_post_processors
 
 SHOWN = reaching(10)
@@ -292,3 +292,33 @@ def test_backbones_are_told_by_name():
     policy = fitted_policy(image, vision_backbone="resnet18")
     loss, _ = policy.forward(windows(policy, image).batch(torch.arange(2)))
     assert loss.isfinite()
+
+
+@pytest.mark.parametrize("episodes", [None, [0, 2]])
+def test_a_closed_form_policy_is_a_checkpoint_of_numbers_alone(tmp_path, episodes):
+    dataset = write_dataset(tmp_path / "set", SHOWN[:4], images=True)
+    (tmp_path / "policy").mkdir()
+    figures = write_closed_form_policy(
+        dataset, tmp_path / "policy", n_basis=12, episodes=episodes
+    )
+    chosen = range(4) if episodes is None else episodes
+    assert figures["demonstrations"] == len(chosen)
+    policy = DMPPolicy.from_pretrained(tmp_path / "policy")
+    config = policy.config
+    assert config.fit_episodes == episodes
+    assert config.input_features.keys() == {STATE, GOAL}
+    assert config.output_features.keys() == {"action"}
+    assert (config.fps, config.n_basis, config.push_to_hub) == (FPS, 12, False)
+    shown = [e | {STATE: e["action"]} for e in (SHOWN[k] for k in chosen)]
+    like = DMPPolicy(config_for(shown[0], state_names=["a.pos", "b.pos"]))
+    like.planner.encoder.load_state_dict(policy.planner.encoder.state_dict())
+    error = like.planner.fit(shown, "action")
+    assert figures["left_out_error"] == pytest.approx(error, rel=1e-5)
+    torch.testing.assert_close(policy.planner.motion.base, like.planner.motion.base)
+    for name in ("policy_preprocessor.json", "policy_postprocessor.json"):
+        assert (tmp_path / "policy" / name).is_file()
+
+
+def test_a_closed_form_policy_takes_a_dataset(tmp_path):
+    with pytest.raises(FileNotFoundError, match="no LeRobot dataset"):
+        write_closed_form_policy(tmp_path, tmp_path, n_basis=12)

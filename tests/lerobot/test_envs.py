@@ -2,11 +2,14 @@
 
 import numpy as np
 import pytest
+from gymnasium.vector import SyncVectorEnv
 from lerobot.teleoperators import make_teleoperator_from_config
 from unchecked import shapes_unchecked
 
-from hrc_learn.lerobot.envs import PandaEnvConfig
+from hrc_learn.lerobot.envs import PandaEnv, PandaEnvConfig
+from hrc_learn.lerobot.robots.mujoco_panda import ImagesConfig
 from hrc_learn.lerobot.teleoperators import PandaExpertConfig
+from hrc_learn.teleoperation.scenarios import make_scenario
 
 FPS = 20
 
@@ -58,3 +61,83 @@ def test_an_episode_ends_when_its_time_is_up():
     assert not terminated.any()
     assert not info["final_info"]["is_success"].any()
     vector.close()
+
+
+def environment(**settings):
+    config = PandaEnvConfig(task="grasping", fps=FPS, **settings)
+    return config, PandaEnv(**config.gym_kwargs)
+
+
+def held(env):
+    """The action that keeps the arm where it is."""
+    names = list(env._robot.action_features)
+    values = env._robot.get_observation()
+    return np.array([values[name] for name in names], dtype=np.float32)
+
+
+def test_an_episode_has_a_quarter_more_time_than_a_demonstration():
+    config, env = environment()
+    duration = make_scenario("grasping", "middle").duration
+    assert config.gym_kwargs["max_episode_steps"] == round(1.25 * duration * FPS)
+    env.close()
+
+
+def test_the_job_must_stay_done_for_a_while(monkeypatch):
+    """0.3 s, six actions; a thing that topples starts the count anew."""
+    _, env = environment()
+    env.reset(seed=0)
+    still, told = held(env), []
+    for done in (True, True, False, *[True] * 6):
+        monkeypatch.setattr(env._robot.run, "succeeded", lambda done=done: done)
+        _, reward, terminated, truncated, info = env.step(still)
+        assert reward == float(terminated) == float(info["is_success"])
+        assert not truncated
+        told.append(terminated)
+    assert told == [False] * 8 + [True]
+    env.close()
+
+
+def test_a_seed_is_a_beginning_and_others_are_drawn():
+    config, env = environment()
+    state, info = env.reset(seed=7)
+    assert env._robot.run.seed == 7
+    assert info == {"is_success": False}
+    assert state["agent_pos"].shape == config.features["agent_pos"].shape
+
+    def drawn():
+        env.reset()
+        return env._robot.run.seed
+
+    seeds = [drawn() for _ in range(3)]
+    assert len({*seeds}) == 3
+    assert 2**16 < max(seeds) < 2**31
+    env.reset(seed=7)
+    assert [drawn() for _ in range(3)] == seeds
+    assert env.render().shape == (180, 240, 3)
+    env.close()
+    env.close()  # twice is once
+
+
+def test_images_are_observed_as_declared():
+    config, env = environment(images=ImagesConfig(kind="synthetic", width=64, height=48))
+    assert config.features["pixels/front"].shape == (48, 64, 3)
+    assert config.features_map["pixels/front"] == "observation.images.front"
+    state, _ = env.reset(seed=0)
+    assert env.observation_space.contains(state)
+    assert state["pixels"]["front"].shape == (48, 64, 3)
+    assert state["pixels"]["front"].any()
+    assert env.action_space.contains(held(env))
+    env.close()
+
+
+def test_a_vector_has_environments_of_its_own():
+    vector = PandaEnvConfig(task="grasping", fps=FPS).create_envs(2)["panda"][0]
+    assert isinstance(vector, SyncVectorEnv)
+    state, _ = vector.reset(seed=[1, 2])
+    assert state["agent_pos"].shape[0] == 2
+    assert [env._robot.run.seed for env in vector.envs] == [1, 2]
+    vector.close()
+    (one,) = PandaEnvConfig(task=None).create_envs(1, use_async_envs=True)["panda"].values()
+    assert isinstance(one, SyncVectorEnv)
+    assert one.envs[0].task == "placing"
+    one.close()

@@ -1,11 +1,14 @@
 """Processor steps that keep any policy's actions within limits."""
 
+import functools
 import gc
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from lerobot.lerobot_types import TransitionKey
 from lerobot.processor import PolicyProcessorPipeline, ProcessorStepRegistry
 from lerobot.processor.converters import (
     batch_to_transition,
@@ -14,25 +17,29 @@ from lerobot.processor.converters import (
     transition_to_policy_action,
 )
 
+from hrc_learn.controller import ActionChunkReport
 from hrc_learn.lerobot.action_limits import ActionLimits
 from hrc_learn.lerobot.processor import (
     POSTPROCESSOR,
     PREPROCESSOR,
+    Changes,
+    SmoothActionsStep,
     WatchStateStep,
     add_smoothing,
     remove_smoothing,
 )
 
-LIMITS = ActionLimits(
-    names=["a.pos", "b.pos"],
-    fps=50.0,
-    velocity=[1.0, 2.0],
-    acceleration=[4.0, 8.0],
-    jerk=[40.0, 80.0],
-    lower=[-1.0, None],
-    upper=[1.0, None],
-    state_columns=[1, -1],
-)
+SETTINGS = {
+    "fps": 50.0,
+    "names": ["a.pos", "b.pos"],
+    "velocity": [1.0, 2.0],
+    "acceleration": [4.0, 8.0],
+    "jerk": [40.0, 80.0],
+    "lower": [-1.0, None],
+    "upper": [1.0, None],
+    "state_columns": [0, -1],
+}
+LIMITS = ActionLimits(**SETTINGS | {"state_columns": [1, -1]})
 
 
 @pytest.fixture
@@ -153,3 +160,119 @@ def test_a_step_that_is_gone_is_no_longer_asked():
     del watch
     gc.collect()
     assert WatchStateStep.newest_state("of a policy") is None
+
+
+def chunk_of(a, b=0.0, batch=1):
+    """A chunk of given paths of both values, the same for all robots of a batch."""
+    a = torch.as_tensor(a, dtype=torch.float64)
+    return torch.stack([a, torch.as_tensor(b, dtype=a.dtype).expand_as(a)], -1).repeat(
+        batch, 1, 1
+    )
+
+
+@pytest.mark.parametrize("reached", [0, 1, 2, 5, 19])
+def test_a_chunk_goes_on_from_the_three_actions_up_to_where_the_robot_is(reached):
+    """Or from the first three, where it has not come that far: an acceleration takes three."""
+    watch = WatchStateStep(pair="reached")
+    smooth = SmoothActionsStep(**SETTINGS | {"pair": "reached"})
+    wave = 0.2 * (1 - np.cos(2 * np.arange(1, 41) / 50))
+    send = functools.partial(sent_by, watch, smooth)
+    whole = chunk_of(wave, wave)
+    torch.testing.assert_close(send(0.0, whole[:, :20]), whole[:, :20], atol=1e-9, rtol=0)
+    # What is not measured is sent elsewhere, and says nothing about how far the robot is.
+    start = max(reached, 2) + 1
+    asked = chunk_of(wave[start : start + 20], 0.0)
+    second = send(wave[reached], asked)
+    torch.testing.assert_close(second[..., 0], asked[..., 0], atol=1e-9, rtol=0)
+
+
+def sent_by(watch, smooth, a, chunk):
+    """What becomes of a chunk when the robot's first value is measured."""
+    state = torch.as_tensor(a, dtype=torch.float64).reshape(-1, 1)
+    watch(batch_to_transition({"observation.state": state}))
+    return smooth(policy_action_to_transition(chunk))[TransitionKey.ACTION]
+
+
+@pytest.mark.parametrize(
+    ("moved", "jumps"), [(0.09, False), (-0.09, False), (0.11, True), (-0.11, True)]
+)
+def test_only_what_no_motion_explains_begins_an_episode(moved, jumps):
+    """Five times the limit of 1/s, at 50 actions a second, is 0.1."""
+    watch = WatchStateStep(pair="jump")
+    smooth = SmoothActionsStep(**SETTINGS | {"pair": "jump"})
+    send = functools.partial(sent_by, watch, smooth)
+    still = [0.2, 0.2]  # of two robots
+    for _ in range(5):
+        send(still, torch.tensor([[0.2, 0.0]] * 2, dtype=torch.float64))
+    asked = torch.tensor([[0.2 + moved, 0.0], [0.2, 0.0]], dtype=torch.float64)
+    action = send([0.2 + moved, 0.2], asked)
+    begun_anew = abs(action[0, 0] - (0.2 + moved)) < 1e-9
+    assert bool(begun_anew) == (abs(moved) > 0.1)
+    assert action[1, 0] == pytest.approx(0.2)  # the other robot goes on
+
+
+def test_a_state_of_other_robots_is_not_taken_for_these():
+    watch = WatchStateStep(pair="others")
+    smooth = SmoothActionsStep(**SETTINGS | {"pair": "others"})
+    actions = torch.tensor([[0.5, 0.1], [0.6, 0.2]], dtype=torch.float64)
+    torch.testing.assert_close(sent_by(watch, smooth, 0.0, actions), actions)
+
+
+def test_a_reset_begins_where_the_robot_then_is():
+    watch = WatchStateStep(pair="reset")
+    smooth = SmoothActionsStep(**SETTINGS | {"pair": "reset"})
+    send = functools.partial(sent_by, watch, smooth)
+    send(0.0, torch.tensor([[0.9, 0.0]], dtype=torch.float64))
+    assert smooth.changes.steps == 1
+    smooth.reset()
+    assert smooth.changes.steps == 0
+    here = torch.tensor([[0.05, 0.0]], dtype=torch.float64)
+    torch.testing.assert_close(send(0.05, here), here)
+
+
+def test_what_is_no_action_or_no_observation_passes():
+    smooth, watch = SmoothActionsStep(**SETTINGS), WatchStateStep()
+    nothing = {TransitionKey.ACTION: None}
+    assert smooth(nothing) is nothing
+    watch({TransitionKey.OBSERVATION: {"observation.state": torch.zeros(3)}})
+    for transition in (nothing, {TransitionKey.OBSERVATION: {"other": torch.ones(1)}}):
+        assert watch(transition) is transition
+    assert watch.state.shape == (1, 3)
+    watch.reset()
+    assert watch.state is None
+
+
+def test_settings_that_do_not_fit_are_refused():
+    with pytest.raises(ValueError, match="velocity must have one entry for each of"):
+        SmoothActionsStep(**SETTINGS | {"velocity": [1.0]})
+    watch = WatchStateStep(pair="short")
+    smooth = SmoothActionsStep(**SETTINGS | {"pair": "short", "state_columns": [-1, 1]})
+    action = torch.zeros(1, 2, dtype=torch.float64)
+    with pytest.raises(ValueError, match="state_columns reach 1, but the state has 1 values"):
+        sent_by(watch, smooth, 0.0, action)
+
+
+def test_changes_add_up():
+    changes = Changes(["a", "b"])
+    broken = torch.zeros(1, 3, 4, dtype=torch.bool)
+    broken[0, :2, 1] = broken[0, 2, 3] = True
+    change = torch.tensor([[[0.0, 2e-6], [-0.3, 0.0], [1e-7, 0.0]]], dtype=torch.float64)
+    report = ActionChunkReport(broken=broken, change=change)
+    changes.add(report)
+    assert (changes.steps, changes.changed) == (3, 2)
+    assert changes.broken == {"position": 0, "velocity": 2, "acceleration": 0, "jerk": 1}
+    assert changes.largest == {"a": pytest.approx(0.3), "b": pytest.approx(2e-6)}
+    changes.add(replace(report, change=change.flip(-1) / 3))
+    assert (changes.steps, changes.changed) == (6, 3)
+    assert changes.broken["velocity"] == 4
+    assert changes.largest == {"a": pytest.approx(0.3), "b": pytest.approx(0.1)}
+    assert "3 of 6 actions changed, by at most 0.3 (a)" in str(changes)
+    changes.clear()
+    assert (changes.steps, changes.changed, changes.broken["jerk"]) == (0, 0, 0)
+    assert changes.largest == {"a": 0.0, "b": 0.0}
+
+
+def test_what_is_no_processor_is_refused(tmp_path):
+    (tmp_path / PREPROCESSOR).write_text("[]")
+    with pytest.raises(ValueError, match="is not a processor of LeRobot"):
+        remove_smoothing(tmp_path)

@@ -4,7 +4,7 @@ import torch
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import UnreachableError, panda
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.cartesian_motion import nearest_configuration
+from hrc_learn.skills.arm_motion import nearest_configuration
 
 WORKPLACE = Workplace()
 

@@ -29,10 +29,10 @@ from hrc_learn.kinematics import panda, panda_capsules
 from hrc_learn.kinematics.tool_orientation import Approach
 from hrc_learn.sim import World
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.cartesian_motion import joint_line
+from hrc_learn.skills.arm_motion import joint_line
 from hrc_learn.skills.grasping import GraspingConfig
-from hrc_learn.skills.visual_servoing import ServoTarget, VisualServoConfig, VisualServoSkill
-from hrc_learn.skills.visual_target import VisualTarget
+from hrc_learn.skills.visual_servoing import ServoTarget, VisualServoConfig
+from hrc_learn.skills.visual_skill import VisualServoSkill, VisualTarget
 
 WORKPLACE = Workplace()
 

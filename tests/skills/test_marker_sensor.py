@@ -1,9 +1,17 @@
 import numpy as np
 import pytest
 
-from hrc_learn.skills.marker_sensor import DelayedChannel, LatencyConfig, MarkerObservation
+from hrc_learn.sim.workplace import Workplace
+from hrc_learn.skills.marker_sensor import (
+    DelayedChannel,
+    LatencyConfig,
+    MarkerObservation,
+    longest_occlusion,
+)
+from hrc_learn.viz import StepLog
 
 PERIOD = 0.04
+WORKPLACE = Workplace()
 
 
 def arrivals(config, images=400, step=0.01, seed=0):
@@ -42,3 +50,28 @@ def test_the_fraction_asked_for_is_lost():
 def test_what_no_camera_does_is_refused(wrong):
     with pytest.raises(ValueError, match="delay must not be negative"):
         LatencyConfig(**wrong)
+
+
+@pytest.mark.parametrize("since", [0.0, 0.3])
+def test_the_longest_occlusion_over_the_table_is_found(since):
+    over, away = WORKPLACE.hover_joints().numpy(), WORKPLACE.home_joints().numpy()
+    rng = np.random.default_rng(3)
+    log, step = StepLog(), 0.02
+    # Spells of random lengths, over the table or not, with the marker seen or not.
+    spells = [(int(n), *(rng.random(2) < 0.5)) for n in rng.integers(1, 9, size=30)]
+    rows = [(there, seen) for n, there, seen in spells for _ in range(n)]
+    longest = running = 0
+    for k, (there, seen) in enumerate(rows):
+        feature = np.array([100.0, 50.0]) if seen else np.full(2, np.nan)
+        log.append(time=k * step, joint_position=over if there else away, feature=feature)
+        running = running + 1 if there and not seen and k * step >= since else 0
+        longest = max(longest, running)
+    assert longest > 1
+    found = longest_occlusion(log, WORKPLACE.hover(), since)
+    assert found == pytest.approx(longest * step)
+
+
+def test_a_log_of_one_step_tells_of_no_occlusion():
+    log = StepLog()
+    log.append(time=0.0, joint_position=WORKPLACE.hover_joints().numpy(), feature=np.ones(2))
+    assert longest_occlusion(log, WORKPLACE.hover(), 0.0) == 0.0

@@ -1,15 +1,20 @@
-"""Keys and gamepads, with a terminal and a controller that the tests play."""
+"""Keys and gamepads, with a terminal and a controller that the tests play; several at once."""
 
 import numpy as np
 import pytest
 import torch
 
 from hrc_learn.kinematics import coarse_orientation, panda
-from hrc_learn.protocols import ArmState, Human
-from hrc_learn.teleoperation import InteractionForceConfig
-from hrc_learn.teleoperation.devices import Gamepad, GamepadConfig, TerminalKeyboard
-from hrc_learn.teleoperation.devices.gamepad import deflection
-from hrc_learn.teleoperation.devices.keyboard import DIRECTIONS, KeyboardState
+from hrc_learn.protocols import ArmState, Human, HumanInput
+from hrc_learn.teleoperation import InputFilter, InputFilterConfig, InteractionForceConfig
+from hrc_learn.teleoperation.devices import (
+    DIRECTIONS,
+    Gamepad,
+    GamepadConfig,
+    KeyboardState,
+    TerminalKeyboard,
+    deflection,
+)
 
 Q = panda.ready.numpy()
 STATE = ArmState(time=0.0, joint_position=Q, joint_velocity=0 * Q, gripper_width=0.08)
@@ -42,7 +47,7 @@ class Pad:
 def test_the_numbers_are_those_of_the_library():
     pygame = pytest.importorskip("pygame", reason="the extra `gamepad` is not installed")
     controller = pytest.importorskip("pygame._sdl2.controller")
-    from hrc_learn.teleoperation.devices import gamepad
+    from hrc_learn.teleoperation import devices as gamepad
 
     for name in ("get_axis", "get_button", "attached"):
         assert callable(getattr(controller.Controller, name))
@@ -50,9 +55,7 @@ def test_the_numbers_are_those_of_the_library():
     assert gamepad._LEFT_Y == pygame.CONTROLLER_AXIS_LEFTY
     assert gamepad._RIGHT_Y == pygame.CONTROLLER_AXIS_RIGHTY
     buttons = ("A", "B", "X", "Y", "BACK", "START")
-    assert [getattr(pygame, f"CONTROLLER_BUTTON_{b}") for b in buttons] == list(
-        gamepad.REQUESTS
-    )
+    assert [getattr(pygame, f"CONTROLLER_BUTTON_{b}") for b in buttons] == list(gamepad.BUTTONS)
     assert gamepad._LEFT_SHOULDER == pygame.CONTROLLER_BUTTON_LEFTSHOULDER
     assert gamepad._RIGHT_SHOULDER == pygame.CONTROLLER_BUTTON_RIGHTSHOULDER
 
@@ -202,3 +205,67 @@ def test_a_keyboard_without_a_terminal_is_refused(monkeypatch):
     monkeypatch.setattr("sys.stdin", io.StringIO())
     with pytest.raises(ValueError, match="needs a terminal"):
         TerminalKeyboard.open(panda)
+
+
+CONFIG = InputFilterConfig(linear=1.5, angular=5.0)
+LED = np.array([0.25, 0.0, 0.0, 0.0, 0.4, 0.3])
+
+
+class Person:
+    twist = LED
+
+    def read(self, state):
+        return HumanInput(nullspace_input=np.ones(7), twist=self.twist, gripper=0.05)
+
+
+def at(time):
+    still = np.zeros(7)
+    return ArmState(time=time, joint_position=still, joint_velocity=still, gripper_width=0.08)
+
+
+def motion(person, times):
+    eased = InputFilter(person, CONFIG)
+    return np.stack([eased.read(at(time)).twist for time in times])
+
+
+@pytest.mark.parametrize("dt", [0.001, 0.01, 0.04])
+def test_speed_comes_up_at_the_rate_allowed_and_stays(dt):
+    times = np.arange(0.0, 0.5, dt)
+    twist = motion(Person(), times)
+    linear, angular = LED[:3], LED[3:]
+    ramp = np.minimum(times * CONFIG.linear / np.linalg.norm(linear), 1.0)
+    np.testing.assert_allclose(twist[:, :3], ramp[:, None] * linear, atol=1e-12)
+    ramp = np.minimum(times * CONFIG.angular / np.linalg.norm(angular), 1.0)
+    np.testing.assert_allclose(twist[:, 3:], ramp[:, None] * angular, atol=1e-12)
+    assert (twist[-1] == LED).all()  # to the last bit: nothing creeps on
+
+
+def test_a_hand_that_is_let_go_comes_to_rest():
+    person = Person()
+    eased = InputFilter(person, CONFIG)
+    for time in (0.0, 0.2):
+        eased.read(at(time))
+    person.twist = np.zeros(6)
+    assert eased.read(at(0.21)).twist.any()
+    assert not eased.read(at(0.41)).twist.any()
+
+
+def test_all_else_is_handed_on_as_it_is():
+    asked = InputFilter(Person()).read(at(3.0))
+    assert not asked.twist.any()  # how long it has been asked for is not known yet
+    np.testing.assert_array_equal(asked.nullspace_input, np.ones(7))
+    assert asked.gripper == 0.05
+
+
+def test_a_clock_that_is_set_back_stops_nothing_and_starts_nothing():
+    eased = InputFilter(Person(), CONFIG)
+    eased.read(at(5.0))
+    before = eased.read(at(5.1)).twist
+    np.testing.assert_array_equal(eased.read(at(0.0)).twist, before)
+    assert np.linalg.norm(eased.read(at(0.05)).twist[:3]) > np.linalg.norm(before[:3])
+
+
+@pytest.mark.parametrize("name", ["linear", "angular"])
+def test_an_acceleration_that_is_none_is_refused(name):
+    with pytest.raises(ValueError, match=f"{name} must be positive"):
+        InputFilterConfig(**{name: 0.0})

@@ -1,13 +1,25 @@
-"""An arm that is led, on one that does exactly as it is told."""
+"""Pulls as null-space input, and the hand-guided arm."""
 
 import numpy as np
 import pytest
 import torch
 
+from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import panda
 from hrc_learn.protocols import ArmState, DrawnRegion, HumanInput
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.teleoperation.hand_guiding import HandGuidedArm, HandGuidingConfig
+from hrc_learn.teleoperation import (
+    InteractionForceConfig,
+    force_to_nullspace_input,
+    gizmo_nullspace_input,
+    guiding_twist,
+)
+from hrc_learn.teleoperation.hand_guiding import (
+    HandGuidedArm,
+    HandGuidingConfig,
+    bounded,
+    capped,
+)
 
 
 class IdealArm:
@@ -106,3 +118,130 @@ def test_limits_hold_whatever_is_asked():
 def test_settings_that_make_no_sense_are_refused(name):
     with pytest.raises(ValueError, match=f"{name} must be positive"):
         HandGuidingConfig(**{name: 0.0})
+
+
+UNBOUNDED = InteractionForceConfig(speed=1e9, max_force=1e9, max_nullspace_input=1e9)
+
+
+def configurations(n, seed=0):
+    rng = np.random.default_rng(seed)
+    return rng.uniform(panda.limits.lower.numpy(), panda.limits.upper.numpy(), size=(n, 7))
+
+
+def point_on_link(q, joint, offset):
+    """Where a point fixed to the link that a joint moves is, by forward kinematics alone."""
+    return panda.link_poses(torch.from_numpy(q))[joint - 1].apply(offset).numpy()
+
+
+def numeric_jacobian(q, joint, offset, h=1e-6):
+    columns = [
+        (point_on_link(q + h * e, joint, offset) - point_on_link(q - h * e, joint, offset))
+        / (2 * h)
+        for e in np.eye(7)
+    ]
+    return np.stack(columns, axis=-1)
+
+
+@pytest.mark.parametrize("joint", range(1, 8))
+def test_a_handle_moves_its_point_as_fast_as_the_displacement_says(joint):
+    rng = np.random.default_rng(joint)
+    for q in configurations(10, seed=joint):
+        offset = torch.from_numpy(rng.uniform(-0.2, 0.2, size=3))
+        point = point_on_link(q, joint, offset)
+        displacement = rng.normal(size=3)
+        d = gizmo_nullspace_input(panda, q, joint, point, displacement, UNBOUNDED)
+        J = numeric_jacobian(q, joint, offset)
+        # Least squares: the first joints cannot move their link in every direction.
+        expected, *_ = np.linalg.lstsq(J, UNBOUNDED.rate * displacement, rcond=1e-6)
+        # Near singularities finite differences are all that limits the comparison.
+        error = 1e-7 * (1 + np.linalg.norm(expected))
+        np.testing.assert_allclose(d / UNBOUNDED.damping, expected, atol=error)
+        assert not d[joint:].any()
+
+
+def test_a_spring_does_the_work_of_its_force():
+    config = InteractionForceConfig(mapping="transpose", max_force=1e9, max_nullspace_input=1e9)
+    rng = np.random.default_rng(0)
+    for q in configurations(20):
+        offset = torch.from_numpy(rng.uniform(-0.2, 0.2, size=3))
+        displacement = rng.normal(size=3)
+        d = gizmo_nullspace_input(
+            panda, q, 5, point_on_link(q, 5, offset), displacement, config
+        )
+        q_dot = rng.normal(size=7)
+        velocity = numeric_jacobian(q, 5, offset) @ q_dot
+        power = config.stiffness * displacement @ velocity
+        assert d @ q_dot == pytest.approx(power, abs=1e-5)
+
+
+def test_a_pull_at_the_joint_itself_needs_no_point():
+    q = configurations(1)[0]
+    origin = point_on_link(q, 4, torch.zeros(3, dtype=torch.float64))
+    pull = np.array([1.0, -2.0, 0.5])
+    for mapping in ("pinv", "transpose"):
+        at_point = force_to_nullspace_input(panda, q, 4, pull, mapping, origin)
+        np.testing.assert_allclose(
+            at_point, force_to_nullspace_input(panda, q, 4, pull, mapping), atol=1e-12
+        )
+
+
+@pytest.mark.parametrize("mapping", ["pinv", "transpose"])
+def test_far_handles_pull_as_hard_as_they_may_and_in_their_direction(mapping):
+    config = InteractionForceConfig(mapping=mapping)
+    far = InteractionForceConfig(mapping=mapping, max_nullspace_input=0.5)
+    for q in configurations(20):
+        point, way = point_on_link(q, 4, torch.zeros(3).double()), np.array([0.3, -0.2, 0.9])
+        d = [gizmo_nullspace_input(panda, q, 4, point, k * way, config) for k in (10.0, 100.0)]
+        np.testing.assert_allclose(d[0], d[1], atol=1e-12)
+        small = gizmo_nullspace_input(panda, q, 4, point, 10.0 * way, far)
+        assert np.abs(small).max() <= 0.5 + 1e-12
+        np.testing.assert_allclose(small * np.abs(d[0]).max(), d[0] * np.abs(small).max())
+
+
+def test_a_handle_that_is_not_displaced_asks_for_nothing():
+    q = configurations(1)[0]
+    point = point_on_link(q, 6, torch.zeros(3).double())
+    assert not gizmo_nullspace_input(
+        panda, q, 6, point, np.zeros(3), InteractionForceConfig()
+    ).any()
+
+
+def test_a_joint_that_is_not_there_is_refused():
+    with pytest.raises(ValueError, match="joint must be 1 to 7"):
+        gizmo_nullspace_input(
+            panda, configurations(1)[0], 8, np.zeros(3), np.ones(3), InteractionForceConfig()
+        )
+
+
+def test_caps_shorten_and_never_lengthen():
+    assert capped(np.array([3.0, 4.0]), 2.5).tolist() == [1.5, 2.0]
+    assert capped(np.array([3.0, 4.0]), 9.0).tolist() == [3.0, 4.0]
+    assert bounded(np.array([-4.0, 2.0]), 1.0).tolist() == [-1.0, 0.5]
+    assert bounded(np.zeros(2), 1.0).tolist() == [0.0, 0.0]
+
+
+def test_a_hand_follows_and_turns_the_shorter_way():
+    config = InteractionForceConfig(turn_rate=1.0, turn_speed=10.0)
+    turn = torch.tensor([0.3, -0.5, 0.2], dtype=torch.float64)
+    start = quaternion.normalize(torch.tensor([0.2, 0.9, -0.3, 0.1], dtype=torch.float64))
+    goal = quaternion.multiply(quaternion.exp(turn), start)
+    hand = Pose(torch.zeros(3, dtype=torch.float64), start)
+    for sign in (1.0, -1.0):
+        twist = guiding_twist(hand, np.array([0.1, 0.0, 0.0]), sign * goal, config)
+        np.testing.assert_allclose(twist, [0.1, 0.0, 0.0, *turn.tolist()], atol=1e-12)
+
+
+def test_a_hand_is_led_no_faster_than_allowed():
+    config = InteractionForceConfig(speed=0.2, turn_speed=0.3)
+    start = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
+    goal = quaternion.exp(torch.tensor([0.0, 2.0, 0.0], dtype=torch.float64))
+    hand = Pose(torch.zeros(3, dtype=torch.float64), start)
+    twist = guiding_twist(hand, np.array([0.0, 3.0, 4.0]), goal, config)
+    np.testing.assert_allclose(twist, [0.0, 0.12, 0.16, 0.0, 0.3, 0.0], atol=1e-12)
+    assert not guiding_twist(hand, np.zeros(3), None, config).any()
+
+
+@pytest.mark.parametrize("name", ["rate", "speed", "stiffness", "damping", "turn_speed"])
+def test_strengths_that_make_no_sense_are_refused(name):
+    with pytest.raises(ValueError, match=f"{name} must be positive"):
+        InteractionForceConfig(**{name: 0.0})

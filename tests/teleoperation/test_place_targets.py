@@ -24,7 +24,7 @@ def test_a_thing_let_go_at_a_shelf_stands_on_the_field_drawn_there(shelf):
 
 
 def _joints(goal):
-    from hrc_learn.skills.cartesian_motion import nearest_configuration
+    from hrc_learn.skills.arm_motion import nearest_configuration
 
     return nearest_configuration(goal, near=WORKPLACE.home_joints()).numpy()
 

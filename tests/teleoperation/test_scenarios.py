@@ -8,7 +8,7 @@ from unchecked import shapes_unchecked
 from hrc_learn.kinematics import panda
 from hrc_learn.protocols import ArmState, HumanInput
 from hrc_learn.sim import World
-from hrc_learn.skills.position_servo import PositionServo, PositionServoConfig
+from hrc_learn.skills.arm_motion import PositionServo, PositionServoConfig
 from hrc_learn.teleoperation.hand_guiding import HandGuidedArm, HandGuidingConfig
 from hrc_learn.teleoperation.scenarios import (
     Grasping,

@@ -15,7 +15,7 @@ from hrc_learn.experiments.initialization_study import (
 )
 from hrc_learn.sim import World
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.visual_servoing import VisualServoSkill
+from hrc_learn.skills.visual_skill import VisualServoSkill
 
 MOST_ERROR = 0.05
 LEAST_SPEED_UP = 1.5

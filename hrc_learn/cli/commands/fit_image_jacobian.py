@@ -12,10 +12,10 @@ from hrc_learn.cli.arguments.learn import FitImageJacobian as Args
 from hrc_learn.demos import DemonstrationSource, open_demos
 from hrc_learn.jacobian import CellErrors, RBFCenters, grid
 from hrc_learn.learning.visual_servo_fitting import fit_visual_servo, learning_recording
-from hrc_learn.skills.visual_servoing import VisualServoSkill
+from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.store import new_folder
 from hrc_learn.viz.figures import learning_figure, workspace_figure
-from hrc_learn.viz.fit_dashboard import record_learning
+from hrc_learn.viz.learning_dashboards import record_learning
 
 
 def run(args: Args) -> None:

@@ -21,7 +21,7 @@ from hrc_learn.learning.primitive_fitting import (
 )
 from hrc_learn.store import new_folder
 from hrc_learn.viz.figures import fit_joints_figure, residual_figure
-from hrc_learn.viz.fit_dashboard import record_fit
+from hrc_learn.viz.learning_dashboards import record_fit
 
 
 def run(args: Args) -> None:

@@ -11,7 +11,7 @@ from hrc_learn.cli.arguments.record import RecordServoing as Args
 from hrc_learn.sim import World, open_camera
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.marker_sensor import MarkerSensor
-from hrc_learn.skills.visual_target import OBJECT_FEATURE, OBJECT_FEATURE_NAMES
+from hrc_learn.skills.visual_skill import OBJECT_FEATURE, OBJECT_FEATURE_NAMES
 from hrc_learn.teleoperation.hand_guiding import Frame
 from hrc_learn.teleoperation.scripted_demonstrations import (
     demonstrate_servoing,

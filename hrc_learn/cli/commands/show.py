@@ -4,7 +4,7 @@ from hrc_learn.cli._values import write_json
 from hrc_learn.cli.arguments.dataset import Show as Args
 from hrc_learn.demos import load_demos
 from hrc_learn.learning.channels import demonstrations_recording
-from hrc_learn.viz.demonstration_dashboard import record_demonstrations
+from hrc_learn.viz.learning_dashboards import record_demonstrations
 
 
 def run(args: Args) -> None:

@@ -19,7 +19,7 @@ from hrc_learn.jacobian import KalmanEstimator
 from hrc_learn.learning.tuning import TUNED, TuningState
 from hrc_learn.sim import World
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.visual_servoing import guessed_network
+from hrc_learn.skills.visual_skill import guessed_network
 from hrc_learn.store import new_folder
 from hrc_learn.viz.figures import learning_figure
 

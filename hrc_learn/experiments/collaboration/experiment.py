@@ -24,7 +24,7 @@ from hrc_learn.sim import CameraKind
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.pick_and_place import PickAndPlaceConfig
 from hrc_learn.skills.placing import PlacingSkill
-from hrc_learn.skills.visual_servoing import VisualServoSkill
+from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.skills.work_cell import WorkCellConfig
 from hrc_learn.store import read_made_by
 from hrc_learn.teleoperation.page import PageConfig

@@ -31,7 +31,7 @@ from hrc_learn.skills.pick_and_place import (
     PickPlaceJob,
 )
 from hrc_learn.skills.placing import PlacingSkill, Plan, check_plan
-from hrc_learn.skills.visual_servoing import VisualServoSkill
+from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.skills.work_cell import WorkCell, WorkCellConfig
 from hrc_learn.teleoperation import ScriptedForce, ScriptedPerturbation
 from hrc_learn.teleoperation.page import PageConfig

@@ -23,7 +23,7 @@ from hrc_learn.experiments.pose_randomization import GraspingScene, GraspingScen
 from hrc_learn.sim import CameraKind
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.grasping import GraspingConfig
-from hrc_learn.skills.visual_servoing import VisualServoSkill
+from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.viz import LoggedSteps, RunRecording
 from hrc_learn.viz.report import Section
 

@@ -22,7 +22,7 @@ from hrc_learn.sim import CameraKind, MotionLog, ObjectConfig, World, open_camer
 from hrc_learn.skills.grasping import Grasping, GraspingConfig, GraspResult
 from hrc_learn.skills.marker_sensor import MarkerSensor
 from hrc_learn.skills.placing import Plan, check_plan
-from hrc_learn.skills.visual_servoing import VisualServoSkill, from_learned, guessed_network
+from hrc_learn.skills.visual_skill import VisualServoSkill, from_learned, guessed_network
 from hrc_learn.skills.work_cell import TaskFailedError, WorkCell
 from hrc_learn.teleoperation import ScriptedPerturbation
 

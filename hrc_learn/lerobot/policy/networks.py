@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -109,16 +110,15 @@ class ObservationEncoder(nn.Module):
         self.size = len(self.mean) + 2 * n_keypoints * len(images)
         """Number of features."""
 
-    def whiten(self, stats: Mapping[str, Mapping[str, Tensor]]) -> None:
+    def whiten(self, stats: Mapping[str, Mapping[str, Any]]) -> None:
         """Take mean and spread of the numbers from a dataset's statistics."""
         if not self.widths:
             return
-
-        def all_of(statistic: str) -> Tensor:
-            return torch.cat([torch.as_tensor(stats[key][statistic]) for key in self.widths])
-
-        self.mean.copy_(all_of("mean"))
-        std = all_of("std")
+        mean, std = (
+            torch.cat([torch.as_tensor(stats[key][name]) for key in self.widths])
+            for name in ("mean", "std")
+        )
+        self.mean.copy_(mean)
         self.std.copy_(torch.where(std > SMALLEST_SPREAD, std, 1.0))
 
     def numbers(self, observation: Observation) -> Float[Tensor, "*batch C"]:

@@ -7,13 +7,12 @@ from lerobot.processor import (
     PolicyProcessorPipeline,
     make_default_pre_post_processors,
 )
-from torch import Tensor
 
 from hrc_learn.lerobot.policy.configuration_dmp import DMPConfig
 
 
 def make_dmp_pre_post_processors(
-    config: DMPConfig, dataset_stats: dict[str, dict[str, Tensor]] | None = None
+    config: DMPConfig, dataset_stats: dict[str, dict[str, Any]] | None = None
 ) -> tuple[
     PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
     PolicyProcessorPipeline[PolicyAction, PolicyAction],

@@ -19,7 +19,7 @@ from hrc_learn.lerobot.panda_robot import PandaRobot, PandaRobotConfig
 from hrc_learn.protocols import Arm
 
 if TYPE_CHECKING:
-    from hrc_learn.skills.position_servo import PositionServo
+    from hrc_learn.skills.arm_motion import PositionServo
 
 
 @RobotConfig.register_subclass("franka_panda")
@@ -91,7 +91,7 @@ class FrankaPanda(PandaRobot):
         return self._arm
 
     def _open(self) -> None:
-        from hrc_learn.skills.position_servo import PositionServo, PositionServoConfig
+        from hrc_learn.skills.arm_motion import PositionServo, PositionServoConfig
 
         config = self.config
         self._arm = FrankyArm(

@@ -5,22 +5,50 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from threading import Event, Thread
-from types import TracebackType
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
 
 from hrc_learn.geometry import Body, Box, Pose
-from hrc_learn.kinematics import SerialChain, coarse_orientation
+from hrc_learn.kinematics import SerialChain
 from hrc_learn.protocols import ArmState, HumanInput
-from hrc_learn.teleoperation.interaction_force import InteractionForceConfig, guiding_twist
-from hrc_learn.teleoperation.page.gizmos import Gizmos, HeldGizmos
-from hrc_learn.teleoperation.page.page_config import PageConfig, PageStatus
-from hrc_learn.teleoperation.page.page_operator import GizmoCommand, PageHuman, gizmo_command
-from hrc_learn.teleoperation.page.page_scene import PageScene
-from hrc_learn.teleoperation.page.panel import Panel
+from hrc_learn.teleoperation.hand_guiding import InteractionForceConfig, leading_twist
+from hrc_learn.teleoperation.page.page_operator import (
+    GizmoCommand,
+    HeldGizmos,
+    PageHuman,
+    gizmo_command,
+)
+from hrc_learn.teleoperation.page.page_scene import Gizmos, PageScene
+from hrc_learn.teleoperation.page.panel import PageStatus, Panel
+
+
+@dataclass(frozen=True, kw_only=True)
+class PageConfig:
+    """The page's own settings."""
+
+    host: str = "127.0.0.1"
+    """Address to serve at. Whoever reaches it can move the arm."""
+    port: int = 8080
+    """Port to serve at; the next free one is taken if it is in use."""
+    forces: InteractionForceConfig = field(default_factory=InteractionForceConfig)
+    """How strongly gizmos act."""
+    timeout: float = 0.6
+    """Time without a sign of life from a browser after which its grips are let go [s]."""
+    refresh: float = 25.0
+    """Times a second that the page follows the arm, and efforts are computed anew [1/s]."""
+    twin: tuple[float, float, float] = (-0.1, 1.3, 0.0)
+    """Where the virtual twin stands, from the arm [m]."""
+
+    def __post_init__(self) -> None:
+        for name in ("timeout", "refresh"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive, but is {getattr(self, name)}.")
+
 
 _PANEL_EVERY = 5  # refreshes of the scene for one of the panel: text need not be as smooth
 
@@ -79,15 +107,17 @@ class Page:
         self._panel = Panel(
             self._server,
             boxes,
-            config,
+            config.forces,
             self.human.request,
             self._scene.show_twin,
             self._gizmos.let_turn,
             task,
             guides=guides,
         )
-        first = [np.stack([getattr(b, name)[0] for b in bodies]) for name in _POSE]
-        self._poses: tuple[np.ndarray, np.ndarray] = (first[0], first[1])
+        self._poses = (
+            np.stack([body.position[0] for body in bodies]),
+            np.stack([body.orientation[0] for body in bodies]),
+        )
         self._status = PageStatus()
         self._placed, self._counted = 0, (0, time.monotonic())
         self._closing = Event()
@@ -102,12 +132,7 @@ class Page:
             thread.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
         self._closing.set()
         for thread in self._threads:
             thread.join()
@@ -182,7 +207,8 @@ class Page:
         )
         twist = command.twist
         if not twist.any():
-            twist = self._keyed(state, forces)
+            way, joints = panel.direction(), state.joint_position
+            twist = leading_twist(self._chain, joints, way, forces, coarse=panel.coarse)
         self.human.post(
             HumanInput(
                 nullspace_input=command.nullspace_input,
@@ -193,15 +219,6 @@ class Page:
             )
         )
         return command
-
-    def _keyed(self, state: ArmState, forces: InteractionForceConfig) -> Float[np.ndarray, "6"]:
-        """Motion of the end effector that the keys ask for."""
-        direction = self._panel.direction()
-        if not direction.any():
-            return np.zeros(6)
-        tool = self._chain.forward(_joints(state))
-        orientation = coarse_orientation(tool.position) if self._panel.coarse else None
-        return guiding_twist(tool, forces.speed * direction, orientation, forces)
 
     def _listen(self) -> None:
         """Ask the browsers of those who hold something whether they are still there.
@@ -220,9 +237,6 @@ class Page:
                     client.local_storage.get_item("alive", timeout=self._config.timeout)
                     if time.monotonic() - sent < self._config.timeout:
                         self._held_gizmos.hear(holder)
-
-
-_POSE = ("position", "orientation")
 
 
 def _joints(state: ArmState) -> Float[torch.Tensor, " joints"]:

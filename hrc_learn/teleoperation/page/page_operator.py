@@ -1,9 +1,12 @@
-"""The people at the page as one `Human`: what all who hold a gizmo ask for together."""
+"""The people at the page as one `Human`: who holds which gizmo, and what all ask for."""
+
+from __future__ import annotations
 
 import time
 from collections import deque
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
+from threading import Lock
 
 import numpy as np
 import torch
@@ -12,13 +15,113 @@ from jaxtyping import Float
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import SerialChain, coarse_orientation
 from hrc_learn.protocols import ArmState, HumanInput, Request
-from hrc_learn.teleoperation.interaction_force import (
+from hrc_learn.teleoperation.hand_guiding import (
     InteractionForceConfig,
     bounded,
     gizmo_nullspace_input,
     guiding_twist,
 )
-from hrc_learn.teleoperation.page.gizmos import HeldGizmo
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class HeldGizmo:
+    """A gizmo that somebody holds in their browser."""
+
+    joint: int | None
+    """Joint that moves the link held, counted from 1; None: the end effector is held."""
+    held_at: Float[np.ndarray, "3"]
+    """Point of the link that is held, in the frame of the link; of the end effector: that point
+    less the tool centre point, in the base frame [m]."""
+    pointer: Float[np.ndarray, "3"]
+    """Where the gizmo has been dragged to, in the base frame [m]."""
+    orientation: Float[np.ndarray, "4"] | None = None
+    """Orientation the end effector's gizmo has been turned to (wxyz)."""
+
+
+class HeldGizmos:
+    """All held gizmos, each until it is released or its holder's browser times out.
+
+    Safe to use from several threads. A holder is whatever tells two browsers apart.
+    """
+
+    def __init__(self, timeout: float, clock: Callable[[], float] = time.monotonic):
+        """Start with nobody holding anything.
+
+        Args:
+            timeout: Time after the last sign of life at which a holder is given up [s].
+            clock: Tells the time [s].
+
+        Raises:
+            ValueError: The timeout is not positive.
+        """
+        if not timeout > 0:
+            raise ValueError(f"timeout must be positive, but is {timeout}.")
+        self.timeout = timeout
+        self._clock = clock
+        self._held: dict[tuple[int, str], HeldGizmo] = {}
+        self._heard: dict[int, float] = {}
+        self._lock = Lock()
+
+    def take(self, holder: int, handle: str, held: HeldGizmo) -> None:
+        """Begin to hold a gizmo."""
+        with self._lock:
+            self._held[holder, handle] = held
+            self._heard[holder] = self._clock()
+
+    def move(
+        self,
+        holder: int,
+        handle: str,
+        pointer: Float[np.ndarray, "3"],
+        orientation: Float[np.ndarray, "4"] | None = None,
+    ) -> None:
+        """Drag a gizmo on; one that is not held (any more) stays where it is."""
+        with self._lock:
+            self._heard[holder] = self._clock()
+            held = self._held.get((holder, handle))
+            if held is not None:
+                self._held[holder, handle] = replace(
+                    held, pointer=pointer, orientation=orientation
+                )
+
+    def release(self, holder: int, handle: str) -> None:
+        """Let go of a gizmo."""
+        with self._lock:
+            self._held.pop((holder, handle), None)
+
+    def release_all(self, holder: int) -> None:
+        """Forget somebody who has left."""
+        with self._lock:
+            self._drop(holder)
+
+    def hear(self, holder: int) -> None:
+        """Note a sign of life."""
+        with self._lock:
+            if holder in self._heard:
+                self._heard[holder] = self._clock()
+
+    @property
+    def holders(self) -> set[int]:
+        """Those who hold something."""
+        with self._lock:
+            return {holder for holder, _ in self._held}
+
+    def held(self) -> dict[tuple[int, str], HeldGizmo]:
+        """Those whose holders have been heard of lately, by holder and name.
+
+        The others are released for good: a connection that comes back does not move the arm
+        before its gizmo is taken anew.
+        """
+        with self._lock:
+            now = self._clock()
+            for holder in [h for h, t in self._heard.items() if now - t > self.timeout]:
+                self._drop(holder)
+            return dict(self._held)
+
+    def _drop(self, holder: int) -> None:
+        self._heard.pop(holder, None)
+        for key in [key for key in self._held if key[0] == holder]:
+            del self._held[key]
 
 
 class PageHuman:

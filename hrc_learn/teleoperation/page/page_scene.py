@@ -1,22 +1,35 @@
-"""The page's 3D scene: the arm, its virtual twin and the furniture, drawn as meshes."""
+"""The page's 3D scene: the arm, its virtual twin and the furniture as meshes, and the mouse on
+them: links, knobs and the end effector's gizmo.
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+import torch
 from jaxtyping import Float, Int
 
-from hrc_learn.geometry import Body, Box, Capsule
-from hrc_learn.teleoperation.page._viser import (
-    Holdable,
-    IcosphereHandle,
-    MeshHandle,
-    ViserServer,
-)
+from hrc_learn.geometry import Body, Box, Capsule, Pose
+from hrc_learn.teleoperation.page.page_operator import HeldGizmo, HeldGizmos
 from hrc_learn.viz.palette import PERSON, SKY, rgba
+
+# viser is imported when a page is opened, and not before.
+if TYPE_CHECKING:
+    from viser import IcosphereHandle as IcosphereHandle
+    from viser import MeshHandle as MeshHandle
+    from viser import SceneClickEvent as SceneClickEvent
+    from viser import SceneNodeDragEvent as SceneNodeDragEvent
+    from viser import SceneRectSelectEvent as SceneRectSelectEvent
+    from viser import ViserServer as ViserServer
+
+    Holdable = MeshHandle | IcosphereHandle
+else:
+    # What checks annotations while the program runs must find something.
+    IcosphereHandle = MeshHandle = Holdable = ViserServer = Any
+    SceneClickEvent = SceneNodeDragEvent = SceneRectSelectEvent = Any
 
 
 class Mesh(NamedTuple):
@@ -115,7 +128,10 @@ class PageScene:
         self._own = [self._draw("", body) for body in bodies]
         # Objects that are carried have no twin: what matters is what can be held.
         self._copies = [
-            self._draw("/twin", body) if _is_part_of_arm(body) else None for body in bodies
+            self._draw("/twin", body)
+            if body.name.startswith("link") or body.name in _END_EFFECTOR_PARTS
+            else None
+            for body in bodies
         ]
         self._knobs = {joint: self._draw_knob("", joint) for joint in _KNOBS}
         self._twin_knobs = {joint: self._draw_knob("/twin", joint) for joint in _KNOBS}
@@ -129,7 +145,8 @@ class PageScene:
         here = np.zeros(3)
         for body, own, copy in zip(self._bodies, self._own, self._copies, strict=True):
             is_hand = body.name in _END_EFFECTOR_PARTS
-            joint = None if is_hand else _joint_of(body)
+            link = None if is_hand else re.fullmatch(r"link([1-9]\d*)", body.name)
+            joint = int(link[1]) if link else None
             if is_hand or joint is not None:
                 yield own, joint, here
                 if copy is not None:
@@ -235,11 +252,102 @@ class PageScene:
         server.initial_camera.fov = 0.9
 
 
-def _joint_of(body: Body) -> int | None:
-    """Joint that moves a link, by its name; None for what is no link that moves."""
-    match = re.fullmatch(r"link([1-9]\d*)", body.name)
-    return int(match[1]) if match else None
+_BASE_AXES = (1.0, 0.0, 0.0, 0.0)  # unit quaternion (wxyz)
 
 
-def _is_part_of_arm(body: Body) -> bool:
-    return body.name.startswith("link") or body.name in _END_EFFECTOR_PARTS
+class Gizmos:
+    """Lets people hold links, knobs and the end effector's gizmo with the mouse.
+
+    Callbacks are coroutines: the browser's messages then come in their order.
+    """
+
+    def __init__(
+        self,
+        server: ViserServer,
+        scene: PageScene,
+        held_gizmos: HeldGizmos,
+        links: Callable[[], Pose | None],
+        *,
+        guides: bool = True,
+    ):
+        """Connect.
+
+        Args:
+            server: Of the page.
+            scene: What can be held.
+            held_gizmos: Who holds what.
+            links: Frames of the arm as they are now (see `SerialChain.link_poses`); None
+                before the arm is known.
+            guides: Whether the end effector can be held, too, and has a gizmo.
+        """
+        self._held_gizmos, self._links, self._turns = held_gizmos, links, False
+        for node, joint, offset in scene.holdables():
+            if guides or joint is not None:
+                self._connect(node, joint, offset)
+        self._gizmo = None
+        if guides:
+            self._gizmo = server.scene.add_transform_controls(
+                "/end_effector", scale=0.2, disable_rotations=True, depth_test=False
+            )
+            self._gizmo.on_update(self._gizmo_dragged)
+        server.on_client_disconnect(lambda client: held_gizmos.release_all(client.client_id))
+
+    def follow(self, pose: Pose) -> None:
+        """Keep the end effector's gizmo at the end effector while nobody holds it."""
+        gizmo = self._gizmo
+        if gizmo is None or any(name == gizmo.name for _, name in self._held_gizmos.held()):
+            return
+        gizmo.position = pose.position.numpy()
+        # Without rotation it moves along the axes of the base.
+        gizmo.wxyz = pose.orientation.numpy() if self._turns else _BASE_AXES
+
+    def let_turn(self, turns: bool) -> None:
+        """Whether the end effector's gizmo has rings to turn it by."""
+        self._turns = turns
+        if self._gizmo is not None:
+            self._gizmo.disable_rotations = not turns
+
+    def _connect(
+        self, node: Holdable, joint: int | None, offset: Float[np.ndarray, "3"]
+    ) -> None:
+        @node.on_drag
+        async def dragged(event: SceneNodeDragEvent) -> None:
+            pointer = np.array(event.end_position) - offset
+            if event.phase == "start":
+                held = np.array(event.start_position) - offset
+                self._take(event.client_id, node.name, joint, held, pointer)
+            elif event.phase == "update":
+                self._held_gizmos.move(event.client_id, node.name, pointer)
+            else:
+                self._held_gizmos.release(event.client_id, node.name)
+
+    def _take(
+        self,
+        holder: int,
+        name: str,
+        joint: int | None,
+        held: Float[np.ndarray, "3"],
+        pointer: Float[np.ndarray, "3"],
+    ) -> None:
+        links = self._links()
+        if links is None:
+            return
+        if joint is None:
+            held_at = held - links[-1].position.numpy()
+        else:
+            held_at = links[joint - 1].inverse().apply(torch.from_numpy(held)).numpy()
+        self._held_gizmos.take(
+            holder, name, HeldGizmo(joint=joint, held_at=held_at, pointer=pointer)
+        )
+
+    async def _gizmo_dragged(self, event: Any) -> None:
+        name, pointer = event.target.name, event.target.position.copy()
+        if event.client_id is None:
+            return
+        if event.phase == "start":
+            held = HeldGizmo(joint=None, held_at=np.zeros(3), pointer=pointer)
+            self._held_gizmos.take(event.client_id, name, held)
+        elif event.phase == "update":
+            self._held_gizmos.move(event.client_id, name, pointer, event.target.wxyz.copy())
+        else:
+            self._held_gizmos.release(event.client_id, name)

@@ -4,20 +4,41 @@ from __future__ import annotations
 
 import html
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
 
 from hrc_learn.geometry import Box
 from hrc_learn.protocols import DrawnRegion, Request
-from hrc_learn.teleoperation.devices.keyboard import DIRECTIONS, KeyboardState
-from hrc_learn.teleoperation.interaction_force import InteractionForceConfig
-from hrc_learn.teleoperation.page._viser import ViserServer
-from hrc_learn.teleoperation.page.page_config import PageConfig, PageStatus
+from hrc_learn.teleoperation.devices import DIRECTIONS, KeyboardState
+from hrc_learn.teleoperation.hand_guiding import InteractionForceConfig
+from hrc_learn.teleoperation.page.page_scene import ViserServer
 from hrc_learn.teleoperation.page.region_editor import RegionEditor
 from hrc_learn.viz.palette import BLUE, GREEN, GREY, PERSON, VERMILION
+
+
+@dataclass(frozen=True, kw_only=True)
+class PageStatus:
+    """What the session lets the page show."""
+
+    title: str = ""
+    """What is guided here."""
+    doing: str = ""
+    """What an arm that works by itself is doing; empty where a person leads and records."""
+    recording: Literal["ready", "recording", "stopped"] = "ready"
+    """Stopped: a demonstration waits to be saved or discarded."""
+    seconds: float = 0.0
+    """Length of the demonstration in hand, or how long the arm has been at work [s]."""
+    saved: int = 0
+    """Demonstrations saved."""
+    note: str = ""
+    """What became of the last request."""
+    interventions: Mapping[str, int] = field(default_factory=dict)
+    """Steps in which each kind of intervention of the safety filter was needed."""
+    contacts: int = 0
+    """Touches of the surroundings."""
 
 
 def state_html(status: PageStatus, rate: float, people: int) -> str:
@@ -28,28 +49,23 @@ def state_html(status: PageStatus, rate: float, people: int) -> str:
         rate: Steps that the loop takes [1/s].
         people: Browsers that show the page.
     """
+    if status.doing:
+        doing = f"{_badge(BLUE, status.doing)}&ensp;{status.seconds:.1f} s"
+    else:
+        colour, words = {
+            "ready": (GREY, "ready"),
+            "recording": (VERMILION, f"recording {status.seconds:.1f} s"),
+            "stopped": (PERSON, f"stopped at {status.seconds:.1f} s"),
+        }[status.recording]
+        doing = f"{_badge(colour, words)}&ensp;{status.saved} saved"
     return (
         '<div style="padding:.2em .9em .5em;line-height:1.5">'
         f'<div style="font-size:1.15em;font-weight:600">{html.escape(status.title)}</div>'
-        f"{_doing_html(status) if status.doing else _recording_html(status)}"
+        f"{doing}"
         f'<div style="opacity:.75;font-size:.85em">{html.escape(status.note) or "&nbsp;"}</div>'
         f'<div style="opacity:.75;font-size:.85em">{rate:.0f} steps a second, '
         f"{people} connected</div></div>"
     )
-
-
-def _doing_html(status: PageStatus) -> str:
-    return f"{_badge(BLUE, status.doing)}&ensp;{status.seconds:.1f} s"
-
-
-def _recording_html(status: PageStatus) -> str:
-    colour = {"ready": GREY, "recording": VERMILION, "stopped": PERSON}[status.recording]
-    words = {
-        "ready": "ready",
-        "recording": f"recording {status.seconds:.1f} s",
-        "stopped": f"stopped at {status.seconds:.1f} s",
-    }[status.recording]
-    return f"{_badge(colour, words)}&ensp;{status.saved} saved"
 
 
 def _badge(colour: str, words: str) -> str:
@@ -125,138 +141,18 @@ _MAPPINGS = {"velocity (paper's)": "pinv", "spring": "transpose"}
 _KEYS = {"i": "away", "k": "back", "j": "left", "l": "right", "u": "up", "o": "down"}
 
 
-class RecordingControls:
-    """Start, stop, save and discard demonstrations."""
-
-    def __init__(self, server: ViserServer, request: Callable[[Request], None], task: str):
-        """Add them to the folder that is open.
-
-        Args:
-            server: Of the page.
-            request: Receives what buttons ask for.
-            task: What is to be demonstrated, in words.
-        """
-        self._server, self._request = server, request
-        self._next: Request = "start"
-        self._task = server.gui.add_text("Task", task)
-        self._switch = server.gui.add_button("Start", color="red", icon=_ICONS["start"])
-        self._switch.on_click(lambda _: request(self._next))
-        self._offer("Keep it?", {"save": "save", "discard": "discard"})
-        self._offer("Session", {"back to start": "home", "finish": "finish"})
-
-    @property
-    def task(self) -> str:
-        """What is demonstrated, in words."""
-        return self._task.value
-
-    def refresh(self, recording: bool) -> None:
-        """Let the switch offer what comes next."""
-        self._next = "stop" if recording else "start"
-        self._switch.label = self._next.capitalize()
-        self._switch.icon = _ICONS[self._next]
-
-    def _offer(self, label: str, requests: Mapping[str, Request]) -> None:
-        """A row of buttons that ask for something."""
-        group = self._server.gui.add_button_group(label, tuple(requests))
-        group.on_click(lambda _: self._request(requests[group.value]))
-
-
-class EndEffectorControls:
-    """Move the end effector by keys, turn it, open and close it.
+class Panel:
+    """All controls, and the status above them.
 
     Attributes:
         gripper: Opening the person wants [m]; None until asked for.
     """
 
-    def __init__(self, server: ViserServer, let_turn: Callable[[bool], None]):
-        """Add them to the folder that is open.
-
-        Args:
-            server: Of the page.
-            let_turn: Whether the end effector's gizmo can be turned.
-        """
-        gui = server.gui
-        self.gripper: float | None = None
-        self._keys = KeyboardState()
-        self._coarse = gui.add_checkbox(
-            "Coarse orientation rule",
-            True,
-            hint="Down in front of the robot, level at the end of its reach.",
-        )
-        self._coarse.on_update(lambda _: let_turn(not self._coarse.value))
-        gripper = gui.add_button_group("Gripper", ("open", "close"))
-        gripper.on_click(lambda _: self._move_gripper(gripper.value))
-        for key in DIRECTIONS:
-            command = gui.add_command(
-                f"Move the end effector {_KEYS[key]}",
-                hotkey=key.upper(),  # type: ignore
-            )
-            command.on_trigger(self._presses(key))
-        gui.add_markdown(
-            "Keys **I K J L U O** move the end effector away, back, left, right, up, down."
-        )
-
-    @property
-    def coarse(self) -> bool:
-        """Whether the end effector turns by the coarse orientation rule."""
-        return self._coarse.value
-
-    def direction(self) -> Float[np.ndarray, "3"]:
-        """Where the keys move the end effector: a unit vector, or zero."""
-        return self._keys.direction()
-
-    def _presses(self, key: str) -> Callable[[Any], Any]:
-        async def pressed(_event: Any) -> None:
-            self._keys.press(key)
-
-        return pressed
-
-    def _move_gripper(self, word: str) -> None:
-        self.gripper = OPEN if word == "open" else 0.0
-
-
-class ForceControls:
-    """How a pull at the body acts, and whether the twin stands by."""
-
-    def __init__(
-        self,
-        server: ViserServer,
-        config: InteractionForceConfig,
-        show_twin: Callable[[bool], None],
-    ):
-        """Add them to the folder that is open.
-
-        Args:
-            server: Of the page.
-            config: How strongly gizmos act to begin with.
-            show_twin: Shows or hides the twin.
-        """
-        gui = server.gui
-        self._config = config
-        twin = gui.add_checkbox("Virtual twin", True, hint="Hold it instead of the arm.")
-        twin.on_update(lambda _: show_twin(twin.value))
-        first = next(word for word, m in _MAPPINGS.items() if m == config.mapping)
-        self._mapping = gui.add_dropdown("A pull is a", tuple(_MAPPINGS), initial_value=first)
-        self._strength = gui.add_slider("Strength [%]", 20, 200, 10, 100)
-
-    @property
-    def forces(self) -> InteractionForceConfig:
-        """How strongly gizmos act."""
-        mapping: Any = _MAPPINGS[self._mapping.value]
-        share, base = self._strength.value / 100, self._config
-        return replace(
-            base, mapping=mapping, rate=share * base.rate, stiffness=share * base.stiffness
-        )
-
-
-class Panel:
-    """All controls, and the status above them."""
-
     def __init__(
         self,
         server: ViserServer,
         boxes: Sequence[Box],
-        config: PageConfig,
+        forces: InteractionForceConfig,
         request: Callable[[Request], None],
         show_twin: Callable[[bool], None],
         let_turn: Callable[[bool], None],
@@ -269,7 +165,7 @@ class Panel:
         Args:
             server: Of the page.
             boxes: Furniture that targets may be marked on.
-            config: Of the page.
+            forces: How strongly gizmos act to begin with.
             request: Receives what buttons ask for.
             show_twin: Shows or hides the twin.
             let_turn: Whether the end effector's gizmo can be turned.
@@ -277,7 +173,7 @@ class Panel:
             guides: Whether the person guides the end effector, draws regions and records;
                 otherwise there are no controls but those of forces.
         """
-        self._max_input = config.forces.max_nullspace_input
+        self._gui, self._initial_forces = server.gui, forces
         gui = server.gui
         gui.configure_theme(
             control_width="medium",
@@ -286,38 +182,85 @@ class Panel:
             brand_color=(0, 114, 178),
         )
         gui.main_panel.dock_right()
+        self._task = self._switch = self._coarse = self._region = None
+        self._next: Request = "start"
+        self._keys = KeyboardState()
+        self.gripper: float | None = None
         self._state = gui.add_html("")
-        self._recording = self._end_effector = self._region = None
         if guides:
             with gui.add_folder("Demonstration"):
-                self._recording = RecordingControls(server, request, task)
+                self._add_recording(request, task)
         with gui.add_folder("Null-space input and safety"):
             self._bars = gui.add_html("")
             self._safety = gui.add_html("")
         with gui.add_folder("Arm"):
             if guides:
-                self._end_effector = EndEffectorControls(server, let_turn)
-            self._forces = ForceControls(server, config.forces, show_twin)
+                self._add_end_effector(let_turn)
+            twin = gui.add_checkbox("Virtual twin", True, hint="Hold it instead of the arm.")
+            twin.on_update(lambda _: show_twin(twin.value))
+            first = next(word for word, m in _MAPPINGS.items() if m == forces.mapping)
+            pulls = tuple(_MAPPINGS)
+            self._mapping = gui.add_dropdown("A pull is a", pulls, initial_value=first)
+            self._strength = gui.add_slider("Strength [%]", 20, 200, 10, 100)
         if guides:
             with gui.add_folder("Region and target"):
                 self._region = RegionEditor(server, boxes)
         self._seen: Mapping[str, int] = {}
         self._latest = ""
 
+    def _add_recording(self, request: Callable[[Request], None], task: str) -> None:
+        """Start, stop, save and discard demonstrations."""
+        self._task = self._gui.add_text("Task", task)
+        self._switch = self._gui.add_button("Start", color="red", icon=_ICONS["start"])
+        self._switch.on_click(lambda _: request(self._next))
+        rows: dict[str, dict[str, Request]] = {
+            "Keep it?": {"save": "save", "discard": "discard"},
+            "Session": {"back to start": "home", "finish": "finish"},
+        }
+        for label, requests in rows.items():
+            group = self._gui.add_button_group(label, tuple(requests))
+            group.on_click(
+                lambda event, requests=requests: request(requests[event.target.value])
+            )
+
+    def _add_end_effector(self, let_turn: Callable[[bool], None]) -> None:
+        """Move the end effector by keys, turn it, open and close it."""
+        coarse = self._coarse = self._gui.add_checkbox(
+            "Coarse orientation rule",
+            True,
+            hint="Down in front of the robot, level at the end of its reach.",
+        )
+        coarse.on_update(lambda _: let_turn(not coarse.value))
+        gripper = self._gui.add_button_group("Gripper", ("open", "close"))
+        gripper.on_click(lambda _: self._move_gripper(gripper.value))
+        for key in DIRECTIONS:
+            command = self._gui.add_command(
+                f"Move the end effector {_KEYS[key]}",
+                hotkey=key.upper(),  # type: ignore
+            )
+            command.on_trigger(self._presses(key))
+        self._gui.add_markdown(
+            "Keys **I K J L U O** move the end effector away, back, left, right, up, down."
+        )
+
+    def _presses(self, key: str) -> Callable[[Any], Any]:
+        async def pressed(_event: Any) -> None:
+            self._keys.press(key)
+
+        return pressed
+
+    def _move_gripper(self, word: str) -> None:
+        self.gripper = OPEN if word == "open" else 0.0
+
     @property
     def task(self) -> str:
         """What is demonstrated, in words."""
-        return "" if self._recording is None else self._recording.task
+        return "" if self._task is None else self._task.value
 
     @property
     def coarse(self) -> bool:
         """Whether the end effector turns by the coarse orientation rule."""
-        return self._end_effector is None or self._end_effector.coarse
-
-    @property
-    def gripper(self) -> float | None:
-        """Opening the person wants [m]; None until asked for."""
-        return None if self._end_effector is None else self._end_effector.gripper
+        return self._coarse is None or self._coarse.value
 
     @property
     def region(self) -> DrawnRegion | None:
@@ -332,11 +275,15 @@ class Panel:
     @property
     def forces(self) -> InteractionForceConfig:
         """How strongly gizmos act."""
-        return self._forces.forces
+        mapping: Any = _MAPPINGS[self._mapping.value]
+        share, base = self._strength.value / 100, self._initial_forces
+        return replace(
+            base, mapping=mapping, rate=share * base.rate, stiffness=share * base.stiffness
+        )
 
     def direction(self) -> Float[np.ndarray, "3"]:
         """Where keys move the end effector: a unit vector, or zero."""
-        return np.zeros(3) if self._end_effector is None else self._end_effector.direction()
+        return self._keys.direction()
 
     def refresh(
         self,
@@ -353,19 +300,16 @@ class Panel:
             rate: Steps that the loop takes [1/s].
             people: Browsers that show the page.
         """
-        if self._recording is not None:
-            self._recording.refresh(status.recording == "recording")
+        if self._switch is not None:
+            self._next = "stop" if status.recording == "recording" else "start"
+            self._switch.label = self._next.capitalize()
+            self._switch.icon = _ICONS[self._next]
+        largest = self._initial_forces.max_nullspace_input
         self._state.content = state_html(status, rate, people)
-        self._bars.content = nullspace_input_html(nullspace_input, self._max_input)
-        self._safety.content = self._safety_html(status)
-
-    def _safety_html(self, status: PageStatus) -> str:
-        more = [
-            name
-            for name, count in status.interventions.items()
-            if count > self._seen.get(name, 0)
-        ]
-        self._seen = dict(status.interventions)
+        self._bars.content = nullspace_input_html(nullspace_input, largest)
+        counts, seen = status.interventions, self._seen
+        more = [name for name, count in counts.items() if count > seen.get(name, 0)]
+        self._seen = dict(counts)
         if more:
             self._latest = more[-1]
-        return interventions_html(status, more, self._latest)
+        self._safety.content = interventions_html(status, more, self._latest)

@@ -13,12 +13,11 @@ from jaxtyping import Float
 
 from hrc_learn.geometry import Box, quaternion
 from hrc_learn.protocols import DrawnRegion
-from hrc_learn.teleoperation.page._viser import (
+from hrc_learn.teleoperation.page.page_scene import (
     SceneClickEvent,
     SceneRectSelectEvent,
     ViserServer,
 )
-from hrc_learn.teleoperation.page.page_config import FIRST_REGION
 from hrc_learn.viz.palette import GREEN, VERMILION, rgba
 
 
@@ -89,10 +88,7 @@ def meet_box(
 
 
 def region_over(
-    points: Float[np.ndarray, "points 3"],
-    bottom: float,
-    height: float,
-    smallest: float = 0.02,
+    points: Float[np.ndarray, "points 3"], bottom: float, height: float, smallest: float = 0.02
 ) -> DrawnRegion:
     """The upright box over the rectangle that holds some points, along the base axes.
 
@@ -108,6 +104,9 @@ def region_over(
     c = max(height / 2, smallest)
     return DrawnRegion(centre=(x, y, bottom + c), half_size=(a, b, c))
 
+
+FIRST_REGION = DrawnRegion(centre=(0.35, 0.45, 0.22), half_size=(0.14, 0.14, 0.10))
+"""Where the region is before anybody has drawn one."""
 
 _COLOUR = rgba(GREEN)[:3]
 _DRAW: Any = "cube-plus"

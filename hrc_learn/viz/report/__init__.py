@@ -12,7 +12,7 @@ from hrc_learn.viz.report.content import Section as Section
 from hrc_learn.viz.report.content import flatten as flatten
 from hrc_learn.viz.report.content import show_measurements as show_measurements
 from hrc_learn.viz.report.content import software_versions as software_versions
-from hrc_learn.viz.report.folder import REPORT as REPORT
-from hrc_learn.viz.report.folder import read_report as read_report
-from hrc_learn.viz.report.folder import write_report as write_report
-from hrc_learn.viz.report.html import reports_page as reports_page
+from hrc_learn.viz.report.files import REPORT as REPORT
+from hrc_learn.viz.report.files import read_report as read_report
+from hrc_learn.viz.report.files import reports_page as reports_page
+from hrc_learn.viz.report.files import write_report as write_report

@@ -1,13 +1,9 @@
-"""What a report holds: text, measured values beside their targets, pictures, versions;
-and several runs side by side.
-"""
+"""What a report holds: text, measured values beside their targets, pictures, versions."""
 
 import platform
 import re
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from html import escape
 from importlib.metadata import PackageNotFoundError, version
 from io import BytesIO
 from typing import TYPE_CHECKING
@@ -18,9 +14,7 @@ from jaxtyping import UInt8
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# What a report holds: text, measured values beside their targets, and pictures.
-
-_DPI = 150
+_DPI = 150  # sharp in print, at the width of a page
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -165,41 +159,6 @@ def flatten(mapping: Mapping[str, object], prefix: str = "") -> dict[str, object
     return flat
 
 
-# What several runs measured, side by side.
-
-
-def side_by_side(reports: Sequence[Report]) -> str:
-    """A table, as HTML, of everything that two runs or more measured; empty without any.
-
-    A column stands for a run, numbered as in the overview. A value that missed its target is
-    marked.
-    """
-    tables = [{m.name: m for m in report.table} for report in reports]
-    shared = [name for name, n in Counter(n for t in tables for n in t).items() if n > 1]
-    if not shared:
-        return ""
-    compared = [i for i, table in enumerate(tables) if table.keys() & set(shared)]
-    heads = "".join(f'<th class="n"><a href="#run{i + 1}">{i + 1}</a></th>' for i in compared)
-    rows = "\n".join(_row(name, [tables[i].get(name) for i in compared]) for name in shared)
-    return (
-        '<h2>Side by side</h2><div class="scroll"><table><thead>'
-        f"<tr><th>Measured</th>{heads}</tr></thead><tbody>{rows}</tbody></table></div>"
-    )
-
-
-def _row(name: str, measured: Sequence[Measurement | None]) -> str:
-    return f"<tr><td>{escape(name)}</td>{''.join(_cell(m) for m in measured)}</tr>"
-
-
-def _cell(m: Measurement | None) -> str:
-    if m is None:
-        return "<td></td>"
-    missed = ' class="n miss"' if m.ok is False else ' class="n"'
-    return f"<td{missed}>{escape(m.shown)}</td>"
-
-
-# Of which software a result is.
-
 _PACKAGES = (
     "hrc-learn",
     "torch",
@@ -222,15 +181,12 @@ def software_versions() -> dict[str, str]:
     return found
 
 
-# Measured values in the terminal.
-
-
-def show_measurements(table: Sequence[Measurement], title: str = "Measured") -> None:
+def show_measurements(table: Sequence[Measurement]) -> None:
     """Print measured values beside their targets."""
     from rich.console import Console
     from rich.table import Table
 
-    shown = Table("measured", "value", "target", "", title=title)
+    shown = Table("measured", "value", "target", "", title="Measured")
     marks = {True: "[green]ok[/]", False: "[red]missed[/]", None: ""}
     for m in table:
         shown.add_row(m.name, m.shown, m.bound, marks[m.ok])

@@ -3,7 +3,13 @@ import json
 import numpy as np
 import pytest
 
-from hrc_learn.skills.visual_target import LONGEST_OFFSET, VisualTarget
+from hrc_learn.jacobian.fitting import ImageJacobianFitReport
+from hrc_learn.skills.visual_skill import (
+    LONGEST_OFFSET,
+    VisualServoSkill,
+    VisualTarget,
+    guessed_network,
+)
 
 
 def demonstrations(n, noise=0.0, seed=0):
@@ -101,8 +107,24 @@ def test_it_survives_the_disk(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["target.json"]
 
 
-def test_other_files_are_refused(tmp_path):
+@pytest.mark.parametrize(
+    "content", [{"version": 99}, {"version": 99, "matrix": [[0.0] * 3] * 2}, {"version": 1}]
+)
+def test_other_files_are_refused(tmp_path, content):
     path = tmp_path / "target.json"
-    path.write_text(json.dumps({"version": 99}))
+    path.write_text(json.dumps(content))
     with pytest.raises(ValueError, match=r"target\.json"):
         VisualTarget.load(path)
+
+
+def test_a_skill_knows_its_metrics_only_where_it_was_fitted(tmp_path):
+    VisualServoSkill(jacobian=guessed_network(), target=None).save(tmp_path)
+    loaded = VisualServoSkill.load(tmp_path)
+    with pytest.raises(ValueError, match="just fitted"):
+        loaded.metrics()
+    fitted = guessed_network()
+    fitted.report = ImageJacobianFitReport(
+        pairs=9, motion=20.0, error=1.0, held_out_error=2.0, noise=1.0
+    )
+    with pytest.raises(ValueError, match="just fitted"):  # it lacks the errors by cell
+        VisualServoSkill(jacobian=fitted, target=None).metrics()

@@ -1,12 +1,10 @@
-import numpy as np
 import pytest
 import torch
 
 from hrc_learn.geometry import Pose, minimum_jerk, quaternion
 from hrc_learn.kinematics import panda
-from hrc_learn.skills.cartesian_motion import (
+from hrc_learn.skills.arm_motion import (
     joint_line,
-    path_velocity,
     resolved_rate,
     straight_line,
 )
@@ -77,11 +75,3 @@ def test_a_line_in_joint_space_keeps_its_speed():
     assert 0.45 < float(speed) < 0.51
     same = joint_line(start, start, speed=0.5, dt=0.01)
     torch.testing.assert_close(same, start.expand_as(same))
-
-
-def test_velocity_of_a_sampled_path():
-    time = np.arange(0, 1, 0.01)[:, None]
-    path = np.hstack([2 * time, time**2])
-    np.testing.assert_allclose(path_velocity(path, 50, 0.01), [2.0, 1.0], atol=1e-9)
-    np.testing.assert_allclose(path_velocity(path, 0, 0.01), [2.0, 0.01], atol=1e-9)
-    np.testing.assert_allclose(path_velocity(path[:1], 0, 0.01), [0.0, 0.0])

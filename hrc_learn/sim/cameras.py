@@ -1,0 +1,370 @@
+"""The workplace as a camera sees it: rendered by OpenGL without a screen or drawn without
+OpenGL, and what disturbs a camera in use: it is moved, refocused, or a marker is occluded.
+"""
+
+import sys
+import weakref
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import mujoco
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+
+from hrc_learn.geometry import quaternion
+from hrc_learn.protocols import Camera
+from hrc_learn.sim.scene import (
+    HAND_MARKER,
+    NOWHERE,
+    OCCLUDER,
+    OCCLUDER_COLOUR,
+    OCCLUDER_HALF_SIZE,
+)
+from hrc_learn.sim.world import World
+from hrc_learn.vision import (
+    CameraModel,
+    ImageNoise,
+    Lens,
+    Marker,
+    OccludingBoard,
+    SyntheticCamera,
+)
+
+# pyright: reportAttributeAccessIssue=false
+# MuJoCo ships no type stubs; its names come from a compiled module.
+
+
+CameraKind = Literal["auto", "egl", "synthetic"]
+
+
+class RenderingUnavailableError(RuntimeError):
+    """This machine cannot render without a screen."""
+
+
+class OffscreenRenderer:
+    """Renders a world from ideal pinhole cameras into arrays."""
+
+    def __init__(self, world: World, width: int, height: int):
+        """Open an OpenGL context.
+
+        Raises:
+            RenderingUnavailableError: If there is no EGL (on Linux) or no OpenGL to be had.
+        """
+        self._world = world
+        self._size = (width, height)
+        world.model.vis.global_.offwidth = max(width, world.model.vis.global_.offwidth)
+        world.model.vis.global_.offheight = max(height, world.model.vis.global_.offheight)
+        self._gl = _open_context(width, height)
+        self._context = mujoco.MjrContext(world.model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        self._free = weakref.finalize(self, _free, self._gl, self._context)
+        self._free.atexit = False
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+        self._scene = mujoco.MjvScene(world.model, maxgeom=1000)
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
+
+    def render(self, camera: CameraModel) -> UInt8[np.ndarray, "height width 3"]:
+        """The image of an undistorted camera of the renderer's size, RGB."""
+        width, height = self._size
+        self._gl.make_current()
+        mujoco.mjv_updateScene(
+            self._world.model,
+            self._world.data,
+            mujoco.MjvOption(),
+            None,
+            mujoco.MjvCamera(),
+            mujoco.mjtCatBit.mjCAT_ALL,
+            self._scene,
+        )
+        for view in self._scene.camera:
+            _set_view(view, camera)
+        viewport = mujoco.MjrRect(0, 0, width, height)
+        mujoco.mjr_render(viewport, self._scene, self._context)
+        image = np.empty((height, width, 3), dtype=np.uint8)
+        mujoco.mjr_readPixels(image, None, viewport, self._context)
+        return np.ascontiguousarray(image[::-1])
+
+    def close(self) -> None:
+        """Free the OpenGL context."""
+        self._free()
+
+
+def _free(gl, context: mujoco.MjrContext) -> None:
+    # OpenGL frees by number, and another renderer that is current has the same numbers: its
+    # images would be black from then on.
+    gl.make_current()
+    context.free()
+    gl.free()
+
+
+def _open_context(width: int, height: int):
+    try:
+        if sys.platform == "linux":
+            from mujoco.egl import GLContext
+        else:
+            from mujoco.gl_context import GLContext
+        context = GLContext(width, height)
+        context.make_current()
+    except Exception as error:  # PyOpenGL fails in many ways where a library is missing
+        raise RenderingUnavailableError(
+            f"this machine cannot render without a screen ({error}). Install EGL (Debian: "
+            "libegl1 and libgl1-mesa-dri), or use the camera that needs no OpenGL: 'synthetic'."
+        ) from error
+    return context
+
+
+def _set_view(view: mujoco.MjvGLCamera, camera: CameraModel) -> None:
+    """Give OpenGL's camera the pose and the frustum of a pinhole."""
+    R = camera.pose[:3, :3]
+    view.pos = camera.pose[:3, 3]
+    view.forward = R[:, 2]
+    view.up = -R[:, 1]
+    near = view.frustum_near
+    (fx, fy), (cx, cy) = camera.focal, camera.principal
+    # Pixel centres lie at whole numbers, so the image's edges lie half a pixel outside.
+    view.frustum_center = near * ((camera.width - 1) / 2 - cx) / fx
+    view.frustum_width = near * camera.width / fx / 2
+    view.frustum_top = near * (cy + 0.5) / fy
+    view.frustum_bottom = -near * (camera.height - 0.5 - cy) / fy
+    view.orthographic = 0
+
+
+class EGLCamera:
+    """The workplace seen through a lens, noise and all."""
+
+    def __init__(
+        self,
+        world: World,
+        model: CameraModel | None = None,
+        *,
+        rng: np.random.Generator,
+        noise: ImageNoise | None = None,
+    ):
+        """Open a renderer for the world's camera, or for another one.
+
+        Raises:
+            RenderingUnavailableError: If this machine cannot render without a screen.
+        """
+        self.model = model or world.config.camera
+        self._lens = Lens(self.model)
+        pinhole = self._lens.pinhole
+        self._renderer = OffscreenRenderer(world, pinhole.width, pinhole.height)
+        self._noise = noise or ImageNoise()
+        self._rng = rng
+
+    def read(self) -> UInt8[np.ndarray, "height width 3"]:
+        """The image now, RGB."""
+        ideal = self._renderer.render(self._lens.pinhole)
+        return self._noise.degrade(self._lens.apply(ideal), self._rng)
+
+    def close(self) -> None:
+        """Free the OpenGL context."""
+        self._renderer.close()
+
+
+def hidden_markers(world: World, model: CameraModel, markers: list[Marker]) -> set[int]:
+    """Ids of markers of which a corner or the centre is occluded now, by casting rays."""
+    eye, poses = model.pose[:3, 3].copy(), world.marker_poses()
+    geom, normal = np.zeros(1, dtype=np.int32), np.zeros(3)
+    hidden = set()
+    for marker in markers:
+        pose = poses[marker.id]
+        for point in np.vstack([np.zeros(3), marker.corners]) @ pose[:3, :3].T + pose[:3, 3]:
+            length = np.linalg.norm(point - eye)
+            ray = (point - eye) / length
+            hit = mujoco.mj_ray(world.model, world.data, eye, ray, None, 1, -1, geom, normal)
+            # The marker's own plate is hit at its full distance, give or take its thickness.
+            if 0 <= hit < length - 5e-3:
+                hidden.add(marker.id)
+                break
+    return hidden
+
+
+def open_camera(
+    world: World,
+    kind: CameraKind = "auto",
+    model: CameraModel | None = None,
+    *,
+    rng: np.random.Generator,
+    noise: ImageNoise | None = None,
+) -> Camera:
+    """The world's fixed camera.
+
+    Args:
+        world: What to look at.
+        kind: "egl" renders everything; "synthetic" draws the markers only and needs no
+            OpenGL; "auto" renders where that is possible.
+        model: Another camera than the world's own.
+        rng: Source of the image noise.
+        noise: Blur and noise of the sensor.
+
+    Raises:
+        RenderingUnavailableError: If `kind` is "egl" and this machine cannot render.
+    """
+    if kind != "synthetic":
+        try:
+            return EGLCamera(world, model, rng=rng, noise=noise)
+        except RenderingUnavailableError:
+            if kind == "egl":
+                raise
+    model = model or world.config.camera
+    markers = [item.marker for item in world.config.objects]
+    if world.config.arm.marker is not None:
+        markers.append(world.config.arm.marker.marker)
+    return SyntheticCamera(
+        model,
+        markers,
+        world.marker_poses,
+        rng=rng,
+        noise=noise,
+        hidden=lambda: hidden_markers(world, model, markers),
+        occluders=lambda: occluding_boards(world, model),
+    )
+
+
+# How far above the marker the board is held, towards the camera: clear of the gripper [m].
+_BOARD_HEIGHT = 0.10
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraChange:
+    """How much a camera is changed at a time."""
+
+    distance: float = 0.10
+    """By which it is moved, in any direction [m]."""
+    angle: float = np.deg2rad(10.0)
+    """By which it is turned, about any axis [rad]."""
+    focus: float = 1.0
+    """Factor on its focal length."""
+
+    def __post_init__(self) -> None:
+        if self.distance < 0 or self.angle < 0 or not self.focus > 0:
+            raise ValueError(
+                "a camera's change needs distance and angle that are not negative and a "
+                f"positive focus, but they are {self.distance:g} m, {self.angle:g} rad and "
+                f"{self.focus:g}."
+            )
+
+    def applied(
+        self,
+        model: CameraModel,
+        watched: Float[np.ndarray, "points 3"],
+        rng: np.random.Generator,
+        attempts: int = 10_000,
+    ) -> CameraModel:
+        """A changed camera that still sees what it is there for.
+
+        Args:
+            model: The camera as it is.
+            watched: Points that stay in its view [m].
+            rng: Source of the directions.
+            attempts: Directions tried.
+
+        Raises:
+            ValueError: If the points are out of view whatever the direction.
+        """
+        (fx, fy), s = model.focal, self.focus
+        for _ in range(attempts):
+            pose = model.pose.copy()
+            pose[:3, 3] += self.distance * _direction(rng)
+            turn = quaternion.exp(torch.from_numpy(self.angle * _direction(rng)))
+            pose[:3, :3] = quaternion.to_matrix(turn).numpy() @ pose[:3, :3]
+            changed = replace(model, pose=pose, focal=(s * fx, s * fy))
+            if changed.in_view(watched).all():
+                return changed
+        raise ValueError(
+            f"a camera moved by {self.distance:g} m, turned by {np.rad2deg(self.angle):.0f} "
+            f"degrees and refocused by {s:g} does not see the workplace: change it less."
+        )
+
+
+class ChangingCamera:
+    """Implements the `Camera` protocol by one camera after the other.
+
+    Attributes:
+        history: When each of them came to be the one, and its true model.
+    """
+
+    def __init__(self, model: CameraModel, opened: Callable[[CameraModel], Camera]):
+        """Begin with a camera.
+
+        Args:
+            model: Of the first.
+            opened: Opens a camera.
+        """
+        self._open = opened
+        self._camera = opened(model)
+        self.history: list[tuple[float, CameraModel]] = [(-np.inf, model)]
+
+    @property
+    def model(self) -> CameraModel:
+        """The true camera now."""
+        return self.history[-1][1]
+
+    def change(self, time: float, model: CameraModel) -> None:
+        """See through another camera from a time on [s]."""
+        self._camera = self._open(model)
+        self.history.append((time, model))
+
+    def read(self) -> UInt8[np.ndarray, "height width 3"]:
+        """The image now, RGB."""
+        return self._camera.read()
+
+
+def _direction(rng: np.random.Generator) -> Float[np.ndarray, "3"]:
+    v = rng.standard_normal(3)
+    return v / np.linalg.norm(v)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OcclusionInterval:
+    """An interval in which a marker is occluded."""
+
+    start: float
+    """[s]"""
+    duration: float
+    """[s]"""
+    marker: int = HAND_MARKER
+    """ArUco number."""
+
+    def __post_init__(self) -> None:
+        if self.start < 0 or self.duration < 0:
+            raise ValueError(
+                "an occlusion's start and duration must not be negative, but are "
+                f"{self.start:g} s and {self.duration:g} s."
+            )
+
+
+class ScriptedOcclusion:
+    """Holds a board between the camera and a marker, wherever that moves."""
+
+    def __init__(self, world: World, intervals: Sequence[OcclusionInterval]):
+        self._world, self._intervals, self._held = world, tuple(intervals), False
+
+    def update(self) -> None:
+        """Move the board to where it belongs now."""
+        now = self._world.time
+        for interval in self._intervals:
+            if interval.start <= now < interval.start + interval.duration:
+                marker = self._world.marker_poses()[interval.marker][:3, 3]
+                towards = self._world.config.camera.pose[:3, 3] - marker
+                offset = _BOARD_HEIGHT * towards / np.linalg.norm(towards)
+                self._world.move_obstacle(OCCLUDER, marker + offset)
+                self._held = True
+                return
+        if self._held:
+            self._world.move_obstacle(OCCLUDER, NOWHERE)
+            self._held = False
+
+
+def occluding_boards(world: World, model: CameraModel) -> list[OccludingBoard]:
+    """The board as a camera without OpenGL is to draw it, if it is in the scene."""
+    centre = world.data.body(OCCLUDER).xpos
+    x, y, z = OCCLUDER_HALF_SIZE
+    corners = centre + np.array([[-x, -y, z], [x, -y, z], [x, y, z], [-x, y, z]])
+    # Taken away it lies under the floor, which hides it from every camera.
+    if np.array_equal(centre, NOWHERE) or not model.in_view(corners).any():
+        return []
+    return [OccludingBoard(corners=corners, colour=OCCLUDER_COLOUR[:3])]

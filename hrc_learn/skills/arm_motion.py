@@ -1,0 +1,239 @@
+"""Motions of the arm: resolved rates, straight lines, inverse kinematics of a goal; and how
+policies and teleoperators command positions, which are tracked by velocities.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hrc_learn.controller import (
+    ActionChunkFilter,
+    ActionChunkState,
+    SafetyConfig,
+    SafetyFilter,
+    SafetyState,
+)
+from hrc_learn.geometry import Pose, minimum_jerk, quaternion
+from hrc_learn.kinematics import (
+    SerialChain,
+    UnreachableError,
+    panda,
+    pseudo_inverse,
+    singularity_damping,
+)
+from hrc_learn.protocols import Arm, ArmState
+
+# Mean speed of turning along a straight line, where that takes longer than the way [rad/s].
+_TURNING_SPEED = 0.6
+# Of Newton's method, which doubles the digits each time: from 1 cm to below 1e-9 m.
+_ITERATIONS = 4
+
+
+def resolved_rate(
+    jacobian: Float[Tensor, "*batch 6 joints"],
+    twist: Float[Tensor, "*batch 6"],
+    null_velocity: Float[Tensor, "*batch joints"],
+) -> Float[Tensor, "*batch joints"]:
+    """Joint velocities for a given twist, as close as possible to given joint velocities.
+
+    u = J^+ twist + N null_velocity, with N = I - J^+ J.
+
+    Args:
+        jacobian: Geometric Jacobian of the end effector.
+        twist: Linear [m/s] and angular [rad/s] velocity of the end effector.
+        null_velocity: Desired joint velocities; only their null-space part acts [rad/s].
+    """
+    J_pinv = pseudo_inverse(jacobian, singularity_damping(jacobian))
+    remaining = twist - (jacobian @ null_velocity.unsqueeze(-1)).squeeze(-1)
+    return null_velocity + (J_pinv @ remaining.unsqueeze(-1)).squeeze(-1)
+
+
+def straight_line(
+    start: Pose, goal: Pose, speed: float, dt: float
+) -> Iterator[tuple[Pose, Float[Tensor, "6"]]]:
+    """Poses and twists along a straight line, from rest to rest.
+
+    Args:
+        start: First pose.
+        goal: Last pose.
+        speed: Mean speed of the end effector [m/s].
+        dt: Time between samples [s].
+
+    Yields:
+        Pose and twist (linear [m/s], angular [rad/s]) at each sample, the last at rest.
+    """
+    twist = start.twist_to(goal)
+    distance, turn = float(twist[:3].norm()), float(twist[3:].norm())
+    # Not below 0.3 s: a short motion would need accelerations beyond the safety filter's.
+    duration = max(distance / speed, turn / _TURNING_SPEED, 0.3)
+    for k in range(1, math.ceil(duration / dt) + 1):
+        s, slope = minimum_jerk(k * dt / duration)
+        turned = quaternion.multiply(quaternion.exp(s * twist[3:]), start.orientation)
+        yield Pose(start.position + s * twist[:3], turned), twist * (slope / duration)
+
+
+def joint_line(
+    start: Float[Tensor, " joints"], goal: Float[Tensor, " joints"], speed: float, dt: float
+) -> Float[Tensor, "steps joints"]:
+    """Joint positions on a straight line in joint space, from rest to rest.
+
+    Args:
+        start: First [rad].
+        goal: Last [rad].
+        speed: Largest speed of any joint [rad/s].
+        dt: Time between samples [s].
+    """
+    # A minimum jerk motion peaks at 1.875 times its mean speed.
+    duration = max(1.875 * float((goal - start).abs().max()) / speed, dt)
+    steps = round(duration / dt) + 1
+    progress = torch.tensor(
+        [minimum_jerk(k * dt / duration)[0] for k in range(steps + 1)], dtype=start.dtype
+    )
+    return torch.lerp(start, goal, progress[:, None])
+
+
+def nearest_configuration(
+    goal: Pose, near: Float[Tensor, "7"], samples: int = 57
+) -> Float[Tensor, "7"]:
+    """Joint positions that reach a pose, as near as can be to given ones.
+
+    Scans joint 7, the redundant one, and keeps the best of the analytic solutions.
+
+    Args:
+        goal: Pose of the tool centre point.
+        near: Joint positions [rad].
+        samples: Values of joint 7 tried between its limits.
+
+    Raises:
+        UnreachableError: If no value of joint 7 reaches the pose within the limits.
+    """
+    lower, upper = float(panda.limits.lower[6]), float(panda.limits.upper[6])
+    # A little inside the limits, where the arm can still be corrected.
+    candidates = torch.linspace(lower + 0.02, upper - 0.02, samples, dtype=torch.float64)
+    candidates = torch.cat([near[6:7], candidates])
+    best, distance = None, math.inf
+    for q7 in candidates:
+        try:
+            q = panda.inverse(goal, q7, near=near)
+        except UnreachableError:
+            continue
+        if (d := float((q - near).norm())) < distance:
+            best, distance = q, d
+    if best is None:
+        x, y, z = goal.position.tolist()
+        w = [round(v, 3) for v in quaternion.normalize(goal.orientation).tolist()]
+        raise UnreachableError(
+            f"no joint positions within the limits reach position ({x:.3f}, {y:.3f}, {z:.3f}) "
+            f"m with orientation {w} (wxyz): move the goal towards the robot or turn it."
+        )
+    return best
+
+
+@dataclass(frozen=True, kw_only=True)
+class PositionServoConfig:
+    """How positions are tracked."""
+
+    gain: float = 8.0
+    """Decay rate of the tracking error [1/s]."""
+    lag: float = 0.1
+    """Largest tracking error of a joint; beyond, the motion restarts where the arm is [rad]."""
+    safety: SafetyConfig = field(default_factory=SafetyConfig)
+    """The safety filter, which has the last word."""
+
+    def __post_init__(self) -> None:
+        if not (self.gain > 0 and self.lag > 0):
+            raise ValueError(
+                f"gain and lag must be positive, but are {self.gain} and {self.lag}."
+            )
+
+
+class PositionServo:
+    """Tracks joint positions, or poses of the end effector, by velocities within the limits.
+
+    Positions that keep the limits are reached when the next one is due. The others are
+    tracked as `ActionChunkFilter` does, so a target that jumps makes no jump of the arm.
+
+    Attributes:
+        safety: State of the safety filter, with its counts of interventions.
+    """
+
+    def __init__(
+        self, chain: SerialChain, arm: Arm, dt: float, config: PositionServoConfig | None = None
+    ):
+        """Connect to the arm at rest.
+
+        Args:
+            chain: Its kinematics.
+            arm: Its driver.
+            dt: Time between targets [s].
+            config: How they are tracked.
+
+        Raises:
+            ValueError: dt is longer than the safety filter can guarantee its limits for.
+        """
+        self._chain, self._arm, self._dt = chain, arm, dt
+        self._config = config = config or PositionServoConfig()
+        self._filter = SafetyFilter(chain.limits, config.safety)
+        if not 0 < dt <= 1 / config.safety.rate:
+            raise ValueError(
+                f"targets must come within {1 / config.safety.rate:g} s of each other, but dt "
+                f"is {dt:g} s: raise the rate of frames."
+            )
+        # Within the limits of the safety filter, which then has nothing to do.
+        limits, margin = chain.limits, 1.5 * config.safety.margin
+        self._smoother = ActionChunkFilter(
+            replace(limits, lower=limits.lower + margin, upper=limits.upper - margin), dt
+        )
+        self.safety: SafetyState
+        self._motion: ActionChunkState
+        self.restart()
+
+    def restart(self) -> None:
+        """Restart where the arm is, at rest."""
+        q = torch.from_numpy(self._arm.read().joint_position)
+        self.safety = self._filter.initial_state(q)
+        self._motion = self._smoother.initial_state(q)
+
+    def follow(
+        self, target: Float[np.ndarray, " joints"]
+    ) -> tuple[ArmState, Float[np.ndarray, " joints"]]:
+        """Command the velocity with which the target is reached, or neared, within dt.
+
+        Args:
+            target: Joint positions [rad]. NaN leaves a joint to its present motion.
+
+        Returns:
+            The reading of the arm it is based on, and the commanded positions [rad]. The
+            caller lets dt pass.
+        """
+        state = self._arm.read()
+        q, before = torch.from_numpy(state.joint_position), self._motion
+        _, self._motion, _ = self._smoother(
+            torch.from_numpy(np.asarray(target, dtype=float))[None], before
+        )
+        wanted = self._motion.velocity + self._config.gain * (before.position - q)
+        velocity, self.safety, _ = self._filter.step(
+            self.safety, q, wanted, self._dt, jacobian=self._chain.jacobian(q)
+        )
+        self._arm.command(velocity.numpy())
+        if float((before.position - q).abs().max()) > self._config.lag:
+            self._motion = self._smoother.initial_state(q + velocity * self._dt, velocity)
+        return state, self._motion.position.numpy()
+
+    def joints_at(self, pose: Pose) -> Float[np.ndarray, " joints"]:
+        """Joint positions, near the commanded ones, with the end effector at a pose [rad].
+
+        Args:
+            pose: Of the end effector. Out of reach: positions that come closer.
+        """
+        q = self._motion.position
+        still = torch.zeros_like(q)
+        for _ in range(_ITERATIONS):
+            now, J = self._chain.forward_and_jacobian(q)
+            q = q + resolved_rate(J, now.twist_to(pose), still)
+        return q.numpy()

@@ -1,0 +1,386 @@
+"""Devices that move the end effector, as stand-ins for a haptic one: a gamepad, the keys of a
+terminal; several sources of human input at once, and a filter that bounds their acceleration.
+
+A device is whatever has `Human.read`: it says at each step what the person asks for.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float
+
+from hrc_learn.kinematics import SerialChain
+from hrc_learn.protocols import ArmState, Human, HumanInput, Request
+from hrc_learn.teleoperation.hand_guiding import InteractionForceConfig, capped, leading_twist
+
+
+class CombinedInput:
+    """Joins several sources, as the paper's mixed interface has a haptic device and a headset.
+
+    Null-space inputs and twists add up. Of gripper, region and target the first source that
+    sets them is used; requests of all are passed on.
+    """
+
+    def __init__(self, *sources: Human):
+        """Join them.
+
+        Raises:
+            ValueError: There are none.
+        """
+        if not sources:
+            raise ValueError("a combined input needs at least one source.")
+        self._sources = sources
+
+    def read(self, state: ArmState) -> HumanInput:
+        """What all sources ask for together."""
+        inputs = [source.read(state) for source in self._sources]
+        return HumanInput(
+            nullspace_input=np.sum([i.nullspace_input for i in inputs], axis=0),
+            twist=np.sum([i.twist for i in inputs], axis=0),
+            gripper=next((i.gripper for i in inputs if i.gripper is not None), None),
+            region=next((i.region for i in inputs if i.region is not None), None),
+            target=next((i.target for i in inputs if i.target is not None), None),
+            requests=tuple(request for i in inputs for request in i.requests),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class InputFilterConfig:
+    """Bounds on the acceleration of the end effector."""
+
+    linear: float = 1.5
+    """[m/s^2]: from rest to a gizmo's full speed, and back, in a sixth of a second."""
+    angular: float = 5.0
+    """[rad/s^2]"""
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not value > 0:
+                raise ValueError(f"{name} must be positive, but is {value}.")
+
+
+class InputFilter:
+    """Passes human input on with the acceleration of the end effector bounded.
+
+    A key that is pressed asks for full speed at once, and a gizmo that is released for none:
+    unfiltered, the arm would jerk, and so would what is learned from it.
+    """
+
+    def __init__(self, human: Human, config: InputFilterConfig | None = None):
+        """Start at rest.
+
+        Args:
+            human: Source of the input.
+            config: Bounds.
+        """
+        self._human, self._config = human, config or InputFilterConfig()
+        # The first reading has no predecessor: an infinite time makes its dt zero below.
+        self._twist, self._time = np.zeros(6), np.inf
+
+    def read(self, state: ArmState) -> HumanInput:
+        """The filtered input now."""
+        human_input, config = self._human.read(state), self._config
+        dt = max(state.time - self._time, 0.0)
+        change = human_input.twist - self._twist
+        self._time = state.time
+        self._twist = self._twist + np.concatenate(
+            [capped(change[:3], config.linear * dt), capped(change[3:], config.angular * dt)]
+        )
+        return replace(human_input, twist=self._twist)
+
+
+# SDL's layout of a game controller, the same for every make (CONTROLLER_AXIS_*, _BUTTON_*).
+_LEFT_X, _LEFT_Y, _RIGHT_Y = 0, 1, 3
+_A, _B, _X, _Y, _BACK, _START, _LEFT_SHOULDER, _RIGHT_SHOULDER = 0, 1, 2, 3, 4, 6, 9, 10
+_FULL = 32767.0  # an axis at its end
+
+BUTTONS: MappingProxyType[int, Request] = MappingProxyType(
+    {_A: "start", _B: "stop", _X: "save", _Y: "discard", _BACK: "home", _START: "finish"}
+)
+"""What the buttons ask for: A starts, B stops, X saves, Y discards, "back" goes back to the
+start, "start" finishes."""
+
+
+@runtime_checkable
+class Controller(Protocol):
+    """What we use of SDL's game controllers, as pygame has them."""
+
+    def get_axis(self, axis: int) -> int: ...
+    def get_button(self, button: int) -> bool: ...
+    def attached(self) -> bool: ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class GamepadConfig:
+    """How sticks act."""
+
+    dead_zone: float = 0.12
+    """Fraction of its range in which a stick has no effect: worn sticks do not return to 0."""
+    curve: float = 2.0
+    """Power of the deflection: above 1 it is finer near the middle."""
+    forces: InteractionForceConfig = field(default_factory=InteractionForceConfig)
+    """Fastest motion of the end effector, and how it turns."""
+    opening: float = 0.08
+    """Width of the open gripper [m]."""
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.dead_zone < 1 and self.curve > 0):
+            raise ValueError(
+                "dead_zone must be in [0, 1) and curve positive, but are "
+                f"{self.dead_zone} and {self.curve}."
+            )
+
+
+def deflection(
+    stick: Float[np.ndarray, " axes"], dead_zone: float, curve: float
+) -> Float[np.ndarray, " axes"]:
+    """A stick's effect, 0 to 1 in length, in the direction of the stick.
+
+    Zero in the dead zone, and from its edge on without a jump: the zone is a ball, as one for
+    each axis by itself would bend slow motions towards the axes.
+
+    Args:
+        stick: Its place, each axis -1 to 1.
+        dead_zone: Fraction of its way without effect.
+        curve: Power of what remains.
+    """
+    length = float(np.linalg.norm(stick))
+    if length <= dead_zone:
+        return np.zeros_like(stick)
+    beyond = min((length - dead_zone) / (1 - dead_zone), 1.0)
+    return stick / length * beyond**curve
+
+
+class Gamepad:
+    """Moves the end effector by the sticks: left one level, right one up and down.
+
+    Shoulder buttons open and close the gripper, the others ask what `BUTTONS` says. The end
+    effector turns by the coarse orientation rule. A gamepad that is unplugged asks for nothing.
+    """
+
+    def __init__(
+        self,
+        chain: SerialChain,
+        controller: Controller,
+        update: Callable[[], None] = lambda: None,
+        config: GamepadConfig | None = None,
+    ):
+        """Take an open controller; `Gamepad.open` finds one.
+
+        Args:
+            chain: The arm that is guided.
+            controller: The gamepad.
+            update: Lets the library read the device.
+            config: How sticks act.
+        """
+        self._chain, self._controller, self._update = chain, controller, update
+        self._config = config or GamepadConfig()
+        self._held: set[int] = set()
+        self._gripper: float | None = None
+
+    @classmethod
+    def open(cls, chain: SerialChain, index: int = 0) -> Gamepad:
+        """Open a gamepad by pygame, which the extra `gamepad` brings.
+
+        Args:
+            chain: The arm that is guided.
+            index: Which gamepad, counted from 0.
+
+        Raises:
+            ValueError: There is no such gamepad.
+        """
+        import os
+
+        # No window is opened, so events must come without one in front.
+        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+        os.environ.setdefault("SDL_JOYSTICK_ALLOW_BACKGROUND_EVENTS", "1")
+        os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+        import pygame
+        from pygame._sdl2 import controller as library
+
+        pygame.display.init()
+        library.init()
+        count = library.get_count()
+        if not (0 <= index < count and library.is_controller(index)):
+            raise ValueError(
+                f"no gamepad {index}: SDL finds {count} devices. Plug one in, and see that "
+                "this user may read /dev/input."
+            )
+        return cls(chain, library.Controller(index), pygame.event.pump)
+
+    def read(self, state: ArmState) -> HumanInput:
+        """Motion of the end effector, gripper and requests, as sticks and buttons are now."""
+        self._update()
+        if not self._controller.attached():
+            self._held = set()
+            return HumanInput(nullspace_input=np.zeros(len(state.joint_position)))
+        pressed = self._pressed()
+        for button, width in ((_LEFT_SHOULDER, self._config.opening), (_RIGHT_SHOULDER, 0.0)):
+            if button in pressed:
+                self._gripper = width
+        return HumanInput(
+            nullspace_input=np.zeros(len(state.joint_position)),
+            twist=self._twist(state),
+            gripper=self._gripper,
+            requests=tuple(BUTTONS[b] for b in sorted(pressed & BUTTONS.keys())),
+        )
+
+    def _twist(self, state: ArmState) -> Float[np.ndarray, "6"]:
+        config = self._config
+        x, y, z = (
+            self._controller.get_axis(axis) / _FULL for axis in (_LEFT_X, _LEFT_Y, _RIGHT_Y)
+        )
+        # A stick that points forward or up reads negative; the base's y axis points left.
+        stick = np.array([-y, -x, -z])
+        way = deflection(stick, config.dead_zone, config.curve)
+        return leading_twist(self._chain, state.joint_position, way, config.forces)
+
+    def _pressed(self) -> set[int]:
+        """Buttons that have gone down since the last reading."""
+        buttons = (*BUTTONS, _LEFT_SHOULDER, _RIGHT_SHOULDER)
+        held = {button for button in buttons if self._controller.get_button(button)}
+        pressed, self._held = held - self._held, held
+        return pressed
+
+
+DIRECTIONS = MappingProxyType(
+    {
+        "i": (1.0, 0.0, 0.0),
+        "k": (-1.0, 0.0, 0.0),
+        "j": (0.0, 1.0, 0.0),
+        "l": (0.0, -1.0, 0.0),
+        "u": (0.0, 0.0, 1.0),
+        "o": (0.0, 0.0, -1.0),
+    }
+)
+"""Direction of each key in the base frame: i away from the robot, j to its left, u up."""
+
+
+class KeyboardState:
+    """Which keys are held, and the direction they ask for.
+
+    Terminals and browsers tell presses and repeats, no releases: a press counts for a moment,
+    and a key that is held is pressed again before that is over (after a quarter to half a
+    second at first, then every 30 ms). So a keyboard that falls silent asks for no motion.
+    """
+
+    def __init__(self, holds_for: float = 0.3, clock: Callable[[], float] = time.monotonic):
+        """Start with no key held.
+
+        Args:
+            holds_for: Time that a press counts [s].
+            clock: Tells the time [s].
+
+        Raises:
+            ValueError: `holds_for` is not positive.
+        """
+        if not holds_for > 0:
+            raise ValueError(f"holds_for must be positive, but is {holds_for}.")
+        self._holds_for, self._clock = holds_for, clock
+        self._until = dict.fromkeys(DIRECTIONS, float("-inf"))
+
+    def press(self, key: str) -> bool:
+        """Note a press or repeat; whether the key has a direction."""
+        if key not in self._until:
+            return False
+        self._until[key] = self._clock() + self._holds_for
+        return True
+
+    def direction(self) -> Float[np.ndarray, "3"]:
+        """The direction asked for now: a unit vector, or zero."""
+        now = self._clock()
+        held = [DIRECTIONS[key] for key, until in self._until.items() if now < until]
+        total = np.sum(held, axis=0) if held else np.zeros(3)
+        length = float(np.linalg.norm(total))
+        return total / length if length > 0 else total
+
+
+KEYS: MappingProxyType[str, Request] = MappingProxyType(
+    {"1": "start", "2": "stop", "3": "save", "4": "discard", "0": "home", "q": "finish"}
+)
+"""What keys ask for, beside those that lead (see `DIRECTIONS`)."""
+
+_GRIPPER = {"[": 0.08, "]": 0.0}
+
+
+class TerminalKeyboard:
+    """Moves the end effector by keys: i k away and back, j l left and right, u o up and down.
+
+    [ opens the gripper, ] closes it; `KEYS` has the rest. The end effector turns by the
+    coarse orientation rule.
+    """
+
+    def __init__(
+        self, chain: SerialChain, typed: Callable[[], str], keys: KeyboardState | None = None
+    ):
+        """Take a source of characters; `TerminalKeyboard.open` takes the terminal.
+
+        Args:
+            chain: The arm that is guided.
+            typed: Characters typed since it was last asked; does not wait.
+            keys: How long a press counts.
+        """
+        self._chain, self._typed = chain, typed
+        self._keys, self._config = keys or KeyboardState(), InteractionForceConfig()
+        self._gripper: float | None = None
+
+    @classmethod
+    def open(cls, chain: SerialChain) -> TerminalKeyboard:
+        """Read the terminal this process runs in, key by key, until the process ends.
+
+        Raises:
+            ValueError: Standard input is no terminal.
+        """
+        if not sys.stdin.isatty():
+            raise ValueError("the keyboard needs a terminal: standard input is none.")
+        _take_terminal()
+        return cls(chain, _typed_in_terminal)
+
+    def read(self, state: ArmState) -> HumanInput:
+        """Motion of the end effector, gripper and requests, by the keys typed lately."""
+        requests = []
+        for key in self._typed():
+            if key in KEYS:
+                requests.append(KEYS[key])
+            elif key in _GRIPPER:
+                self._gripper = _GRIPPER[key]
+            else:
+                self._keys.press(key)
+        way = self._keys.direction()
+        return HumanInput(
+            nullspace_input=np.zeros(len(state.joint_position)),
+            twist=leading_twist(self._chain, state.joint_position, way, self._config),
+            gripper=self._gripper,
+            requests=tuple(requests),
+        )
+
+
+def _take_terminal() -> None:
+    """Let characters come without a line's end and unseen, and give the terminal back."""
+    import atexit
+    import termios
+    import tty
+
+    number = sys.stdin.fileno()
+    before = termios.tcgetattr(number)
+    atexit.register(termios.tcsetattr, number, termios.TCSADRAIN, before)
+    tty.setcbreak(number)
+
+
+def _typed_in_terminal() -> str:
+    number, text = sys.stdin.fileno(), ""
+    while select.select([number], [], [], 0)[0]:
+        more = os.read(number, 64)
+        if not more:  # the terminal is gone
+            break
+        text += more.decode(errors="ignore")
+    return text

@@ -1,0 +1,311 @@
+"""Reports as files: one self-contained HTML page, and the folder of a run.
+
+The page has no script, no font, no picture from elsewhere: it can be mailed, printed, and read
+on a phone without a network. The folder is written once, and read again to put runs beside
+one another.
+"""
+
+import base64
+import json
+import math
+import os
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from hrc_learn.store import new_file
+from hrc_learn.viz.report.content import Measurement, Picture, Report, Section, flatten
+
+
+def reports_page(title: str, reports: Sequence[Report]) -> str:
+    """One page about one or several runs, as HTML.
+
+    Args:
+        title: Of the page.
+        reports: In order. Several are listed with their verdicts first.
+
+    Raises:
+        ValueError: If there is no report.
+    """
+    if not reports:
+        raise ValueError("a page needs at least one report.")
+    if len(reports) == 1:
+        body = _report(reports[0], "run1")
+    else:
+        articles = [
+            f"<article>{_report(report, f'run{i}')}</article>"
+            for i, report in enumerate(reports, 1)
+        ]
+        heading = f"<h1>{escape(title)}</h1>"
+        overview = "\n".join(
+            f'<tr><td class="n">{i}</td><td><a href="#run{i}">{escape(report.title)}</a></td>'
+            f"<td>{_verdict(report)}</td></tr>"
+            for i, report in enumerate(reports, 1)
+        )
+        overview = f'<table class="overview"><tbody>{overview}</tbody></table>'
+        body = "\n".join([heading, overview, _side_by_side(reports), *articles])
+    style = files(__package__).joinpath("style.css").read_text(encoding="utf-8")
+    return _PAGE.format(title=escape(title), style=style, body=body)
+
+
+def _side_by_side(reports: Sequence[Report]) -> str:
+    """A table, as HTML, of everything that two runs or more measured; empty without any.
+
+    A column stands for a run, numbered as in the overview. A value that missed its target is
+    marked.
+    """
+    tables = [{m.name: m for m in report.table} for report in reports]
+    shared = [name for name, n in Counter(n for t in tables for n in t).items() if n > 1]
+    if not shared:
+        return ""
+    compared = [i for i, table in enumerate(tables) if table.keys() & set(shared)]
+    heads = "".join(f'<th class="n"><a href="#run{i + 1}">{i + 1}</a></th>' for i in compared)
+    rows = []
+    for name in shared:
+        cells = "".join(_cell(tables[i].get(name)) for i in compared)
+        rows.append(f"<tr><td>{escape(name)}</td>{cells}</tr>")
+    return f"<h2>Side by side</h2>{_table(f'<th>Measured</th>{heads}', rows)}"
+
+
+def _table(heads: str, rows: Sequence[str]) -> str:
+    """A table that scrolls by itself where the page is narrow."""
+    return (
+        f'<div class="scroll"><table><thead><tr>{heads}</tr></thead>'
+        f"<tbody>{'\n'.join(rows)}</tbody></table></div>"
+    )
+
+
+def _cell(m: Measurement | None) -> str:
+    if m is None:
+        return "<td></td>"
+    missed = ' class="n miss"' if m.ok is False else ' class="n"'
+    return f"<td{missed}>{escape(m.shown)}</td>"
+
+
+def _report(report: Report, anchor: str) -> str:
+    return "\n".join(
+        [
+            f'<h1 id="{anchor}">{escape(report.title)}</h1>',
+            _verdict(report),
+            _paragraphs(report.summary),
+            _measurements(report.table),
+            *(_section(section) for section in report.sections),
+            *(
+                [f"<h2>Reproduce</h2>\n<pre>{escape(report.command)}</pre>"]
+                * bool(report.command)
+            ),
+            _details("Configuration", flatten(report.configuration)),
+            _details("Versions", report.versions),
+        ]
+    )
+
+
+def _verdict(report: Report) -> str:
+    if not report.targets:
+        return ""
+    if not report.missed:
+        reached = "The target" if report.targets == 1 else f"All {report.targets} targets"
+        return f'<span class="verdict ok">{reached} reached.</span>'
+    missed = f"{len(report.missed)} of {report.targets} targets missed."
+    return f'<span class="verdict miss">{missed}</span>'
+
+
+def _measurements(table: Sequence[Measurement]) -> str:
+    if not table:
+        return ""
+    claims = any(m.claim for m in table)
+    heads = '<th>Measured</th><th class="n">Value</th><th class="n">Target</th><th></th>'
+    if claims:
+        heads += "<th>The paper says</th>"
+    return _table(heads, [_row(m, claims) for m in table])
+
+
+def _row(m: Measurement, claims: bool) -> str:
+    marks = {
+        True: '<td class="ok">✓ ok</td>',
+        False: '<td class="miss">✗ missed</td>',
+        None: "<td></td>",
+    }
+    claim = f"<td>{escape(m.claim)}</td>" if claims else ""
+    return (
+        f'<tr><td>{escape(m.name)}</td><td class="n">{escape(m.shown)}</td>'
+        f'<td class="n">{escape(m.bound)}</td>{marks[m.ok]}{claim}</tr>'
+    )
+
+
+def _section(section: Section) -> str:
+    figures = "\n".join(_figure(picture) for picture in section.figures)
+    heading = f"<h2>{escape(section.heading)}</h2>"
+    return f"<section>{heading}{_paragraphs(section.text)}{figures}</section>"
+
+
+def _figure(picture: Picture) -> str:
+    data = base64.b64encode(picture.png()).decode("ascii")
+    caption = escape(picture.caption)
+    return (
+        f'<figure><img alt="{caption}" src="data:image/png;base64,{data}">'
+        f"<figcaption>{caption}</figcaption></figure>"
+    )
+
+
+def _paragraphs(text: str) -> str:
+    parts = [part.strip() for part in text.split("\n\n")]
+    return "\n".join(f"<p>{escape(part)}</p>" for part in parts if part)
+
+
+def _details(summary: str, values: Mapping[str, object]) -> str:
+    if not values:
+        return ""
+    rows = "\n".join(
+        f"<tr><td>{escape(str(key))}</td><td>{escape(str(value))}</td></tr>"
+        for key, value in values.items()
+    )
+    return (
+        f"<details><summary>{escape(summary)}</summary>"
+        '<div class="scroll"><table class="plain"><tbody>'
+        f"{rows}</tbody></table></div></details>"
+    )
+
+
+_PAGE = """<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{title}</title>
+<style>
+{style}</style>
+</head>
+<body><main>
+{body}
+</main></body>
+</html>
+"""
+
+
+REPORT = "report.json"
+"""File that tells the folder of a run that has a report."""
+PAGE = "report.html"
+FIGURES = "figures"
+FORMAT = "hrc_learn report"
+VERSION = 1
+
+
+def write_report(folder: str | os.PathLike[str], report: Report) -> None:
+    """Write `report.json`, `figures/*.png` and the self-contained page `report.html`.
+
+    Args:
+        folder: Of the run. Each file appears only when it is complete, `report.json` last.
+        report: What was done and measured.
+    """
+    folder = Path(folder)
+    report = _drawn(report)
+    (folder / FIGURES).mkdir(parents=True, exist_ok=True)
+    for picture in report.pictures:
+        with new_file(folder / FIGURES / f"{picture.name}.png") as part:
+            part.write_bytes(picture.png())
+    with new_file(folder / PAGE) as part:
+        part.write_text(reports_page(report.title, [report]), encoding="utf-8")
+    with new_file(folder / REPORT) as part:
+        text = json.dumps(_to_json(report), indent=2, ensure_ascii=False, allow_nan=False)
+        part.write_text(text + "\n", encoding="utf-8")
+
+
+def read_report(folder: str | os.PathLike[str]) -> Report:
+    """Read what `write_report` left in a folder.
+
+    Raises:
+        FileNotFoundError: If there is no such folder, or a picture of the report is missing.
+        ValueError: If the folder holds no report, or one that this version cannot read.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise FileNotFoundError(f"{folder} is not a folder.")
+    path = folder / REPORT
+    if not path.is_file():
+        raise ValueError(
+            f"{folder} holds no {REPORT}: it is not the folder of a run, or of one that failed "
+            "before there was anything to report."
+        )
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged: {error}") from error
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise ValueError(f"{path} is not a report of ours.")
+    if content["version"] != VERSION:
+        raise ValueError(
+            f"{path} is of version {content['version']}; this package reads {VERSION}. "
+            "Read it with the package that wrote it, or run the program again."
+        )
+    return _from_json(content, folder)
+
+
+def _drawn(report: Report) -> Report:
+    """The report with every figure drawn, so that none is drawn twice."""
+    sections = [
+        replace(section, figures=[replace(p, drawing=p.png()) for p in section.figures])
+        for section in report.sections
+    ]
+    return replace(report, sections=sections)
+
+
+def _to_json(report: Report) -> dict[str, Any]:
+    configuration = flatten(report.configuration)
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "title": report.title,
+        "summary": report.summary,
+        "command": report.command,
+        "table": [asdict(m) | {"value": _finite(m.value)} for m in report.table],
+        "sections": [
+            {
+                "heading": section.heading,
+                "text": section.text,
+                "figures": [{"name": p.name, "caption": p.caption} for p in section.figures],
+            }
+            for section in report.sections
+        ],
+        "configuration": {key: _plain(value) for key, value in configuration.items()},
+        "versions": dict(report.versions),
+    }
+
+
+def _from_json(content: Mapping[str, Any], folder: Path) -> Report:
+    sections = [
+        Section(
+            heading=section["heading"],
+            text=section["text"],
+            figures=[
+                Picture(
+                    figure["name"],
+                    (folder / FIGURES / f"{figure['name']}.png").read_bytes(),
+                    figure["caption"],
+                )
+                for figure in section["figures"]
+            ],
+        )
+        for section in content["sections"]
+    ]
+    table = [
+        Measurement(**row | {"value": math.nan if row["value"] is None else row["value"]})
+        for row in content["table"]
+    ]
+    same = ("title", "summary", "command", "configuration", "versions")
+    return Report(table=table, sections=sections, **{name: content[name] for name in same})
+
+
+def _finite(value: float | int) -> float | int | None:
+    """JSON has no numbers that are not finite."""
+    return value if math.isfinite(value) else None
+
+
+def _plain(value: object) -> object:
+    """What JSON knows as it is, everything else as text."""
+    known = isinstance(value, (bool, int, str, type(None)))
+    return value if known or (isinstance(value, float) and math.isfinite(value)) else str(value)

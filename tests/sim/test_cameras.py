@@ -1,0 +1,234 @@
+"""Cameras on the workplace: rendered images, occluded markers, cameras that are moved."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from hrc_learn.geometry import Pose
+from hrc_learn.kinematics import panda
+from hrc_learn.sim import (
+    HAND_MARKER,
+    NOWHERE,
+    CameraChange,
+    ChangingCamera,
+    EGLCamera,
+    OcclusionInterval,
+    RenderingUnavailableError,
+    SceneConfig,
+    ScriptedOcclusion,
+    World,
+    cameras,
+    open_camera,
+)
+from hrc_learn.sim.cameras import occluding_boards
+from hrc_learn.sim.workplace import Workplace
+from hrc_learn.skills.marker_sensor import MarkerSensor
+from hrc_learn.vision import MarkerDetector, SyntheticCamera, centre
+
+WORKPLACE = Workplace()
+
+
+def beside_the_box():
+    hover = WORKPLACE.hover()
+    beside = Pose(hover.position + torch.tensor([0.18, 0.02, 0.0]), hover.orientation)
+    return panda.inverse(beside, 0.2, near=panda.ready).numpy()
+
+
+@pytest.fixture
+def world():
+    world = World(WORKPLACE.scene)
+    world.reset(beside_the_box())
+    return world
+
+
+def egl_or_skip(world):
+    try:
+        return EGLCamera(world, rng=np.random.default_rng(0))
+    except RenderingUnavailableError as reason:
+        pytest.skip(str(reason))
+
+
+def detected(world, image):
+    ids = [HAND_MARKER, *(item.marker.id for item in world.config.objects)]
+    return {id: centre(corners) for id, corners in MarkerDetector(ids).detect(image).items()}
+
+
+def projected(world):
+    camera = world.config.camera
+    return {id: camera.project(pose[:3, 3]) for id, pose in world.marker_poses().items()}
+
+
+@pytest.mark.egl
+def test_a_camera_sees_on_when_the_one_before_it_is_gone(world):
+    camera = egl_or_skip(world)
+    seen = set(detected(world, camera.read()))
+    camera = EGLCamera(world, rng=np.random.default_rng(0))  # the first one is dropped here
+    assert set(detected(world, camera.read())) == seen
+    other = EGLCamera(world, rng=np.random.default_rng(0))
+    other.close()
+    other.close()
+    assert set(detected(world, camera.read())) == seen
+    camera.close()
+
+
+@pytest.mark.egl
+def test_rendered_markers_stand_where_the_camera_model_says(world):
+    camera = egl_or_skip(world)
+    found = detected(world, camera.read())
+    camera.close()
+    assert set(found) == set(projected(world))
+    for id, pixel in projected(world).items():
+        assert np.linalg.norm(found[id] - pixel) < 0.5
+
+
+def test_the_camera_without_opengl_sees_the_same(world):
+    camera = open_camera(world, "synthetic", rng=np.random.default_rng(0))
+    found = detected(world, camera.read())
+    assert set(found) == set(projected(world))
+    for id, pixel in projected(world).items():
+        assert np.linalg.norm(found[id] - pixel) < 0.5
+
+
+def test_the_arm_hides_what_is_behind_it(world):
+    under_the_hand = np.eye(4)
+    under_the_hand[:3, 3] = world.arm.tcp_pose()[:3, 3]
+    under_the_hand[2, 3] = 0.03
+    world.reset(beside_the_box(), {"box": under_the_hand})
+    camera = open_camera(world, "synthetic", rng=np.random.default_rng(0))
+    assert set(detected(world, camera.read())) == {HAND_MARKER}
+
+
+def test_without_opengl_auto_falls_back_and_egl_says_what_to_install(world, monkeypatch):
+    def unavailable(width, height):
+        raise RenderingUnavailableError("no EGL here. Install EGL")
+
+    monkeypatch.setattr(cameras, "_open_context", unavailable)
+    rng = np.random.default_rng(0)
+    assert isinstance(open_camera(world, "auto", rng=rng), SyntheticCamera)
+    with pytest.raises(RenderingUnavailableError, match="Install"):
+        open_camera(world, "egl", rng=rng)
+
+
+@pytest.fixture(scope="module")
+def board_world():
+    return World(WORKPLACE.scene)
+
+
+def sensor_for(world, kind):
+    return MarkerSensor(
+        open_camera(world, kind, rng=np.random.default_rng(0)), WORKPLACE.scene.marker_ids
+    )
+
+
+@pytest.mark.parametrize("kind", ["synthetic", pytest.param("egl", marks=pytest.mark.egl)])
+def test_a_marker_is_hidden_for_a_spell_and_seen_again(board_world, kind):
+    board_world.reset(WORKPLACE.hover_joints().numpy())
+    sensor = sensor_for(board_world, kind)
+    occluder = ScriptedOcclusion(board_world, [OcclusionInterval(start=0.1, duration=0.2)])
+    seen = []
+    for _ in range(4):
+        occluder.update()
+        image = sensor.read()
+        seen.append(
+            (
+                round(board_world.time, 3),
+                HAND_MARKER in sensor.detect(),
+                image.mean(axis=-1).std(),
+            )
+        )
+        board_world.advance(0.1)
+    assert [found for _, found, _ in seen] == [True, False, False, True]
+
+
+def test_the_board_is_drawn_between_camera_and_marker(board_world):
+    board_world.reset(WORKPLACE.hover_joints().numpy())
+    camera = open_camera(board_world, "synthetic", rng=np.random.default_rng(0))
+    before = camera.read()
+    u, v = WORKPLACE.scene.camera.project(board_world.marker_poses()[HAND_MARKER][:3, 3])
+    ScriptedOcclusion(board_world, [OcclusionInterval(start=0.0, duration=1.0)]).update()
+    pixel = camera.read()[round(v), round(u)].astype(float)
+    np.testing.assert_allclose(pixel / 255, (0.55, 0.36, 0.30), atol=0.06)
+    board_world.move_obstacle("occluder", NOWHERE)
+    assert (camera.read()[:40] == before[:40]).all()
+
+
+def test_a_board_that_is_taken_away_is_seen_by_no_camera(board_world):
+    """Not even by one that would see it through the floor."""
+    camera = WORKPLACE.scene.camera
+    pose = camera.pose.copy()
+    pose[:2, 3] = NOWHERE[:2]
+    above = replace(camera, pose=pose)
+    assert above.in_view(np.array([NOWHERE])).all()
+    board_world.move_obstacle("occluder", NOWHERE)
+    assert occluding_boards(board_world, above) == []
+    board_world.move_obstacle("occluder", (*NOWHERE[:2], 0.5))
+    assert len(occluding_boards(board_world, above)) == 1
+    board_world.move_obstacle("occluder", NOWHERE)
+
+
+def test_nothing_touches_the_board(board_world):
+    board_world.reset(WORKPLACE.hover_joints().numpy())
+    board_world.move_obstacle("occluder", board_world.arm.tcp_pose()[:3, 3])
+    assert board_world.collisions_along(WORKPLACE.hover_joints().numpy()[None]) == []
+    board_world.move_obstacle("occluder", NOWHERE)
+
+
+def test_spells_of_no_length_in_time_are_refused():
+    with pytest.raises(ValueError, match="must not be negative"):
+        OcclusionInterval(start=-1.0, duration=2.0)
+
+
+MODEL = SceneConfig().camera
+WATCHED = np.array([[0.14, 0.46, 0.06], [0.34, 0.62, 0.06], [0.24, 0.54, 0.25]])
+
+
+def turn_between(a, b):
+    cosine = (np.trace(a[:3, :3].T @ b[:3, :3]) - 1) / 2
+    return float(np.arccos(np.clip(cosine, -1, 1)))
+
+
+def test_a_changed_camera_is_moved_and_turned_as_far_as_asked_and_sees_what_it_should():
+    change, rng = CameraChange(), np.random.default_rng(0)
+    directions = []
+    for _ in range(20):
+        changed = change.applied(MODEL, WATCHED, rng)
+        moved = changed.pose[:3, 3] - MODEL.pose[:3, 3]
+        assert np.linalg.norm(moved) == pytest.approx(0.10)
+        assert turn_between(changed.pose, MODEL.pose) == pytest.approx(np.deg2rad(10))
+        assert changed.in_view(WATCHED).all()
+        assert changed.distortion == MODEL.distortion
+        directions.append(moved)
+    assert np.linalg.norm(np.mean(directions, axis=0)) < 0.05
+
+
+def test_refocusing_scales_the_image_about_the_principal_point():
+    change = CameraChange(distance=0.0, angle=0.0, focus=1.1)
+    changed = change.applied(MODEL, WATCHED, np.random.default_rng(0))
+    offset = MODEL.project(WATCHED) - MODEL.principal
+    np.testing.assert_allclose(changed.project(WATCHED) - MODEL.principal, 1.1 * offset)
+
+
+def test_a_camera_that_would_look_elsewhere_is_refused():
+    with pytest.raises(ValueError, match="change it less"):
+        CameraChange(focus=9.0).applied(MODEL, WATCHED, np.random.default_rng(0), 50)
+    with pytest.raises(ValueError, match="not negative"):
+        CameraChange(distance=-0.1)
+
+
+def test_images_come_from_the_camera_of_the_day():
+    class Named:
+        def __init__(self, model):
+            self.model = model
+
+        def read(self):
+            return np.full((1, 1, 3), int(self.model.focal[0]) % 256, dtype=np.uint8)
+
+    camera = ChangingCamera(MODEL, Named)
+    other = CameraChange(focus=1.1).applied(MODEL, WATCHED, np.random.default_rng(1))
+    before = camera.read()
+    camera.change(3.5, other)
+    assert (camera.read() != before).all()
+    assert [time for time, _ in camera.history] == [-np.inf, 3.5]
+    assert camera.model is other

@@ -1,0 +1,68 @@
+"""Steps of visual servoing that a whole grasp would hide."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from hrc_learn.kinematics import panda
+from hrc_learn.sim.workplace import Workplace
+from hrc_learn.skills import MarkerObservation, ServoTarget, VisualServo, VisualServoConfig
+
+CONFIG = VisualServoConfig()
+
+
+class StillCell:
+    """A work cell at rest, whose newest image was taken elsewhere."""
+
+    chain, config = panda, SimpleNamespace(dt=0.01)
+    joints, time = panda.ready + 0.2, 1.0
+
+    def __init__(self, image_joints):
+        self.observation = MarkerObservation(time=0.9, joints=image_joints)
+
+
+class Estimator:
+    """Notes at which poses it was asked for an image Jacobian."""
+
+    def __init__(self):
+        self.asked = []
+
+    def jacobian(self, _state, pose):
+        self.asked.append(pose)
+        return torch.zeros(2, 6)
+
+
+def servo_in(cell):
+    servo, estimator = VisualServo.__new__(VisualServo), Estimator()
+    servo._cell, servo._config = cell, CONFIG
+    servo._controller = SimpleNamespace(estimator=estimator)
+    servo._cached = (np.nan, np.zeros((2, 6)))
+    servo.state = SimpleNamespace(estimator=None)
+    return servo, estimator
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_the_image_jacobian_is_estimated_once_an_image_where_that_was_taken(known):
+    cell = StillCell(panda.ready if known else None)
+    servo, estimator = servo_in(cell)
+    servo._image_jacobian()
+    servo._image_jacobian()
+    (pose,) = estimator.asked
+    there = panda.forward(panda.ready if known else cell.joints)
+    torch.testing.assert_close(pose.position, there.position)
+
+
+def test_a_probe_comes_down_at_its_speed_from_where_it_begins():
+    servo, _ = servo_in(StillCell(None))
+    heights = []
+    servo.step = lambda target: heights.append(target.raised)
+    above = Workplace().hover()
+    up = np.array([0.0, 0.0, 1.0])
+    servo._descend(
+        ServoTarget(config=CONFIG, above=above, posture=None, target=lambda J: J, line=up)
+    )
+    assert heights[0] == CONFIG.probe
+    np.testing.assert_allclose(np.diff(heights), -CONFIG.probe_speed * 0.01)
+    assert 0 < heights[-1] <= CONFIG.probe_speed * 0.01 * (1 + 1e-9)
