@@ -328,6 +328,16 @@ def warped(time, strength):
     return time[-1] * (s + strength * np.sin(np.pi * s) ** 2)
 
 
+def test_a_rest_as_long_as_the_shortest_is_one():
+    demo = with_rests()
+    still = resting(demo, RestCriterion(shortest=0.0))
+    inner = np.flatnonzero(still & (demo.time > 2) & (demo.time < 4.5))
+    lasts = demo.time[inner[-1]] - demo.time[inner[0]]
+    assert lasts > 0.5
+    assert resting(demo, RestCriterion(shortest=lasts - 1e-9))[inner].all()
+    assert not resting(demo, RestCriterion(shortest=lasts + 1e-9))[inner].any()
+
+
 def test_demonstrations_are_brought_to_the_timing_of_one():
     time = np.arange(300) / 50
     paces = [warped(time, strength) for strength in (0.0, 0.12, -0.1)]
