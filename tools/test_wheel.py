@@ -37,7 +37,7 @@ TESTED = (
         "viz",
         "lerobot",
     ),
-    *("dmp/test_contract.py", "dmp/test_export.py", "deploy/test_batch_export.py"),
+    *("dmp/test_contract.py", "dmp/test_exported_dmp.py", "deploy/test_batch_export.py"),
 )
 # Not with a lowest version of their own: no user installs them with us.
 TOOLS = ("pytest>=8.3", "hypothesis>=6.100", "beartype>=0.19", "playwright>=1.49")

@@ -129,8 +129,10 @@ def advance(
     forced = response.forced.to(s.device)(now).to(target) @ weights.mT
     if coast is not None:
         forced = coast.to(target) @ forced
+    # What the forcing causes is known at both ends of the step; the difference dies out.
     before, after = scale(state.forced), scale(forced)
     if response.approach:
+        # Along the curve of an approach start and goal act beside the weights, unscaled.
         share, way = response.approach, state.way[..., None, :]
         before = before + approach_state(state.s, share).to(way)[..., None] * way
         after = after + approach_state(s, share).to(way)[..., None] * way
@@ -199,6 +201,7 @@ def _lagging(
             f"a goal filter needs a positive rate off the modes of the spring, got {rate}"
         )
     gain = spring.stiffness / denominator
+    # A goal behind its target decays to it, and the motion it leads to with it.
     lag_before = goal - target
     lag_after = lag_before * torch.exp(-rate * ds).to(goal)[..., None]
     before, after = (

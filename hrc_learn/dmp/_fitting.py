@@ -122,6 +122,7 @@ def differentiate(
     h = s.diff()
     # The parabola through three samples: each slope counts by the step on the other side.
     inner = (h[1:] * slope[..., :-1] + h[:-1] * slope[..., 1:]) / (h[1:] + h[:-1])
+    # Slopes of the outer parabolas at their ends: linear, with the mean one in the middle.
     first = 2 * slope[..., :1] - inner[..., :1]
     last = 2 * slope[..., -1:] - inner[..., -1:]
     return torch.cat([first, inner, last], dim=-1)
@@ -147,6 +148,7 @@ def _trajectory_operator(
     velocity, start, goal = H[:, N], H[:, N + 1], H[:, N + 2]
     unit = balanced_units(response.basis, H, int(fit_rate))
     K = unit[:, None] * ridge_inverse(H[:, : N + fit_rate] * unit, regularization)
+    # What start and goal cause by themselves is taken off the samples.
     from_samples = K.clone()
     from_samples[:, 0] -= K @ start
     from_samples[:, -1] -= K @ goal
@@ -310,6 +312,7 @@ def robust_weights(
     trust = torch.zeros_like(position)
     tamed, reach = position.clone(), None
     for i, valid in enumerate(samples.mask):
+        # Sampled alike, all demonstrations can make the same motions.
         if reach is None or not samples.shared:
             reach = _Reach(response, samples.s[i, valid], regularization)
         y = position[i, :, valid]
@@ -360,6 +363,8 @@ def _fit_robustly(
     fitted = reach.closest(y, trust)
     # The smallest number as well: a coordinate that never moves covers no range.
     least = LEAST_SPREAD * (y.amax(-1) - y.amin(-1))[:, None] + torch.finfo(y.dtype).tiny
+    # Biweights have several minima: they start from the answer that is unique, and keep its
+    # spread.
     for name in dict.fromkeys(("huber", loss)):
         for _ in range(ROUNDS):
             residual = (y - fitted).abs()

@@ -83,6 +83,7 @@ class LeastSquares:
         """Root mean square of A X - B over all rows, column by column."""
         n = self.unknowns
         error = self.factor[:, :n] @ X - self.factor[:, n:]
+        # R'R is that of all rows, so norms are too.
         return error.norm(dim=0) / max(self.rows, 1) ** 0.5
 
     def _with_factor(self, more: Tensor, rows: int) -> "LeastSquares":

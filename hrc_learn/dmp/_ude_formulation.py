@@ -193,6 +193,7 @@ class UdeMotion:
     @cached_property
     def _state(self) -> Float[Tensor, "*batch T 2 3"]:
         """(e, v) at the times asked for: from the knot before each, by one step."""
+        # No longer than what the forcing changes smoothly over.
         size = min(LONGEST, self._motion.response.forced.interval / 2)
         s = self._s.expand(*self._batch, -1) if self._s.ndim > 1 else self._s
         knot = (s.detach() / size).floor()
@@ -245,6 +246,7 @@ def deviation(
     begin, middle, end = linear
     E = motion.spring.propagator(h.double() / 2).to(z)
     h = h.to(z)[..., None, None]
+    # Slopes are carried along by the spring, by half a step each.
     k1 = _slope(begin + z)
     free = E @ z
     k2 = _slope(middle + free + E @ k1 * (h / 2))

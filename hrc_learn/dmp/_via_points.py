@@ -71,6 +71,7 @@ def _change(
         raise ValueError("a rhythm has no via points: its motion has no first time")
     window = _window(motion, within)
     part = _follower(motion.response, window)
+    # Position and rate at each via point, and at the end: an equation each.
     if 2 + 2 * via.s.shape[-1] > len(part.chosen):
         raise ValueError(
             f"{via.s.shape[-1]} via points are too many for the {len(part.chosen)} basis "
@@ -78,6 +79,7 @@ def _change(
         )
     missing = _missing(motion, via)
     knots, order = _knots(via.s, window)
+    # At the ends of the window nothing changes.
     ends = torch.nn.functional.pad(missing, (0, 0, 0, 0, 1, 1))
     ends = torch.take_along_dim(ends, order[..., None, None], dim=-3)
     active = ~ends[..., 0, :].isnan()
@@ -94,6 +96,7 @@ def _change(
     wanted = torch.where(asked, missing.flatten(-3, -2).mT, 0.0)
     wanted = torch.nn.functional.pad(wanted, (0, len(part.end)))
     size = A.norm(dim=-1)
+    # Rows for what is not asked for are zero and stay so.
     size = torch.where(size > 0, size, 1.0)
     residual = (wanted - (A @ z[..., None])[..., 0]) / size
     z = z + (torch.linalg.pinv(A / size[..., None], rtol=SAME) @ residual[..., None])[..., 0]

@@ -96,6 +96,7 @@ def fit_ridge(
     scale = torch.where(varies, deviation, 1.0)
     A = torch.cat([torch.ones_like(features[:, :1]), (features - mean) / scale], dim=1)
     penalty = torch.zeros(F, F + 1).to(A)
+    # The constant is not penalised.
     penalty[:, 1:].fill_diagonal_((n * regularization) ** 0.5)
     # QR of the stacked system: A'A would square its condition number.
     Q, R = torch.linalg.qr(torch.cat([A, penalty]))

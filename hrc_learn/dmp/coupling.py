@@ -71,6 +71,7 @@ def steering(
     v = velocity[..., None, :].expand(towards.shape)
     normal = torch.linalg.cross(towards, v)
     sine, cosine = normal.norm(dim=-1, keepdim=True), (towards * v).sum(-1, keepdim=True)
+    # Straight ahead there is no axis: zero over tiny is zero.
     axis = normal / sine.clamp_min(torch.finfo(sine.dtype).tiny)
     angle = torch.atan2(sine, cosine)
     term = gain * torch.linalg.cross(axis, v) * angle * torch.exp(-sharpness * angle)
@@ -100,6 +101,7 @@ def repulsion(
     away = position[..., None, :] - obstacles
     distance = away.norm(dim=-1, keepdim=True)
     d = distance.clamp_min(TOUCH)
+    # Beyond `reach` nothing acts.
     strength = gain * (1 / d - 1 / reach).clamp_min(0) / d**2
     return (strength * away / d).sum(-2)
 

@@ -310,6 +310,7 @@ class DualArmDMP(AdaptedPrimitive[Pose, PoseTrajectory, DualArmState]):
     @property
     def goal(self) -> Pose:
         """Of the object, (*batch)."""
+        # Either hand tells where the object is.
         return (self.arms.goal @ self.grasp.inverse())[..., 0]
 
     @property

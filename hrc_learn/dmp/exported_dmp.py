@@ -186,6 +186,7 @@ def resting_inputs(dmp: Any, state: Mapping[str, Tensor]) -> Tensors:
     """Inputs of the program that change nothing: the goal as it is, and no coupling."""
     if isinstance(dmp, DualArmDMP):
         hands = resting_inputs(dmp.arms, _part(state, "planned"))
+        # Either hand tells where the object is.
         hand = Pose(hands["goal_position"][..., 0, :], hands["goal_orientation"][..., 0, :])
         goal = hand @ dmp.grasp[..., 0].inverse()
         return {

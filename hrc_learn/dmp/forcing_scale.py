@@ -209,6 +209,7 @@ class RotationScaling(Scaling):
         length = _squared(shown) ** 0.5
         a, way = shown / length, (goal - start) / length
         growth = _squared(way).clip(min=NO_WAY) ** 0.5
+        # Two reflections are the rotation by twice the angle between their normals.
         turned = _reflected(_reflected(values, a), _half_way(a, way / growth, xp))
         return turned * growth[..., None, :]
 

@@ -77,6 +77,7 @@ class SoftLimits:
     def clamp(self, q: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch D"]:
         """The nearest q that an x leads to: between the limits, in any precision."""
         lower, upper, beta = self._like(q)
+        # A few roundings of the limits: nearer, q could not be told from them.
         rounding = 4 * torch.finfo(q.dtype).eps * torch.maximum(lower.abs(), upper.abs())
         room = torch.maximum(CLOSEST * beta, rounding)
         return torch.minimum(torch.maximum(q, lower + room), upper - room)

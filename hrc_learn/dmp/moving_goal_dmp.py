@@ -109,6 +109,7 @@ class MovingGoalCoordinates(CoordinateAdapter[Vectors, MovingTrajectory, MovingG
         at_end = motion.response.evaluate(torch.ones((), dtype=torch.float64))[1]
         # Columns -2 and -3 of the response are the start and its rate; the goal's own is one.
         gain = 1 + at_end[-2] - at_end[-3]
+        # Linear in v: one evaluation finds what makes up the difference.
         v = (known(end_velocity, still) - still) / gain.to(still)
         return ColumnEnds(start + v * end, goal, rate - v), v
 

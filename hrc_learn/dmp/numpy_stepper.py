@@ -75,6 +75,7 @@ class Stepper:
         self._scaling = dmp.forcing_scale
         if not self._scaling.follows_ends:
             weights = self._scaled(weights, self._shown.start, self._shown.goal)
+        # One motion instead of one for each basis function.
         table = forced.coefficients.cpu().numpy() @ weights
         self._table = np.ascontiguousarray(table.reshape(*table.shape[:2], -1))
         self._exponents = np.arange(table.shape[1], dtype=float)
@@ -140,6 +141,7 @@ class Stepper:
             E = self._propagator(ds)
             self._transition = ds, E, np.array([[1.0 - E[0, 0]], [-E[1, 0]]])
         _, E, attraction = self._transition
+        # Past its end the spring alone moves on what the forcing caused.
         forced = after = self._forced(s) if state.s < self._end else E.dot(before)
         if scale is not None:
             before, after = before.dot(scale), after.dot(scale)
@@ -171,6 +173,7 @@ class Stepper:
         """(y, dy/ds) that the forcing term has caused, by a table that ends where it does."""
         x = (s % 1.0 if self._end == math.inf else min(s, self._end)) / self._interval
         piece = min(int(x), len(self._table) - 1)
+        # From -1 to 1 along a piece, as in `PiecewisePolynomial`.
         powers = (2.0 * (x - piece) - 1.0) ** self._exponents
         forced = powers.dot(self._table[piece]).reshape(2, -1)
         return forced if s <= self._end else self._propagator(s - self._end).dot(forced)

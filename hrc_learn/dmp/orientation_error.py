@@ -47,6 +47,7 @@ def held(
     orientation: Float[Tensor, "*batch T 4"], mask: Bool[Tensor, "*batch T"]
 ) -> Float[Tensor, "*batch T 4"]:
     """Orientations along time, where `mask` is false the last before that counts."""
+    # Each sample points to the last one that counts; those before the first, to that.
     index = torch.arange(mask.shape[-1], device=mask.device).expand(mask.shape)
     first = mask.long().argmax(-1, keepdim=True)
     seen = torch.where(mask, index, first).cummax(-1).values
@@ -122,6 +123,7 @@ def nearest_turn(
     own = error.norm(dim=-1, keepdim=True) > _NO_AXIS
     axis = torch.where(own, error, reference).detach()
     axis = axis / axis.norm(dim=-1, keepdim=True).clamp_min(_NO_AXIS)
+    # How many turns is a choice, which has no derivative.
     along = ((reference - error) * axis).sum(-1, keepdim=True).detach()
     return error + 2 * torch.pi * torch.round(along / (2 * torch.pi)) * axis
 

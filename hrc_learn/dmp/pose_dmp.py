@@ -188,6 +188,7 @@ class PoseCoordinates(CoordinateAdapter[Pose, PoseTrajectory, PoseState]):
             linear = (per_s / duration[..., None])[..., POSITION]
         else:
             linear = twist[..., :3]
+        # The body goes on as demonstrated: a twist says nothing of it.
         velocity_columns = joined(linear, rate, demonstrated[..., BODY], like)
         return ColumnEnds(start_columns, goal_columns, velocity_columns), reference
 

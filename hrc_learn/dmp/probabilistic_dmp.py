@@ -28,9 +28,10 @@ SAME = 1e-9
 """Orientations closer than this [rad] are one: well above rounding, well below any sensor."""
 
 
-# Of every kind alike, and methods since: names of earlier versions.
 via_point_primitive = AdaptedPrimitive.condition
+"""The method as a function of the primitive, and of what the method takes."""
 with_ends = AdaptedPrimitive.with_ends
+"""Likewise."""
 
 
 def mean_primitive[P: AdaptedPrimitive](primitives: P) -> P:
@@ -169,6 +170,7 @@ class ProbabilisticDMP[P: AdaptedPrimitive]:
         reference = getattr(primitives, "reference", None)
         if reference is not None:
             reference = reference.reshape(-1, 4)[0]
+        # n - 1: the mean is taken from the same primitives.
         spread = (x - mean).flatten(1).mT / (len(x) - 1) ** 0.5
         if slack:
             spread = torch.cat([spread, _free_forcing(middle, slack)], dim=1)

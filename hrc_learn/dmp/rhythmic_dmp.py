@@ -136,6 +136,7 @@ def _autocorrelation_peak(elapsed: Tensor, y: Tensor) -> Tensor:
     after = torch.searchsorted(elapsed, even).clamp(1, T - 1)
     share = (even - elapsed[after - 1]) / (elapsed[after] - elapsed[after - 1])
     even_y = y[after - 1] + share[:, None] * (y[after] - y[after - 1])
+    # Padded to twice the length, so that the end does not meet the start.
     power = torch.fft.rfft(even_y - even_y.mean(0), n=2 * T, dim=0).abs().square()
     similar = torch.fft.irfft(power, n=2 * T, dim=0)[:T].sum(-1)
     # Late lags overlap little, and their sums are small for that: compare means, of enough.

@@ -389,7 +389,7 @@ class WorkCell:
             joint_position=self.state.joint_position,
             joint_velocity=self.state.joint_velocity,
             command_velocity=velocity.numpy(),
-            human_effort=self.human_input.nullspace_input,
+            nullspace_input=self.human_input.nullspace_input,
             gripper=self.state.gripper_width,
             **columns,
         )

@@ -1,6 +1,7 @@
 """The sweep, a few trials of it."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -9,7 +10,10 @@ import torch
 from commands import hrc
 from unchecked import shapes_unchecked
 
-from hrc_learn.cli.commands.sweep import _draw
+from hrc_learn.cli.commands import sweep as command
+from hrc_learn.experiments.controller import sweep as experiments
+from hrc_learn.experiments.controller.sweep import EXPERIMENTS
+from hrc_learn.sim.closed_loop import Imperfections
 
 
 @pytest.fixture(autouse=True)
@@ -19,7 +23,20 @@ def _unchecked():
         yield
 
 
-def test_it_writes_one_flat_object_of_figures(tmp_path: Path):
+@pytest.fixture
+def coarse(monkeypatch):
+    """Experiments with fewer and longer steps; `tests/experiments` has them as they are."""
+    near, late = EXPERIMENTS["near"], EXPERIMENTS["stress_late"]
+    images = Imperfections(frame_steps=2, noise=0.5)
+    coarse = replace(near.config, dt=0.02, duration=6.0, imperfections=images)
+    short = replace(late.config, duration=0.5)
+    known = {**EXPERIMENTS, "near": replace(near, config=coarse)}
+    known["stress_late"] = replace(late, config=short)
+    for module in (experiments, command):
+        monkeypatch.setattr(module, "EXPERIMENTS", known)
+
+
+def test_it_writes_one_flat_object_of_figures(tmp_path: Path, coarse):
     outcome = hrc(
         "sweep",
         *("--only", "near", "stress_late", "--trials", "5"),
@@ -53,6 +70,6 @@ def test_a_figure_that_is_broken_off_leaves_the_older_one(tmp_path, monkeypatch)
 
     monkeypatch.setattr("matplotlib.figure.Figure.savefig", break_off)
     with pytest.raises(KeyboardInterrupt):
-        _draw(path, {"near": SimpleNamespace(time=torch.tensor([1.0, 2.0]))})
+        command._draw(path, {"near": SimpleNamespace(time=torch.tensor([1.0, 2.0]))})
     assert path.read_text() == "older"
     assert list(tmp_path.iterdir()) == [path]

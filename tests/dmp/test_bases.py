@@ -1,6 +1,6 @@
 """Every basis and phase: what the response makes of it, its laws, and its files."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cache
 
 import numpy as np
@@ -15,6 +15,7 @@ from hrc_learn.dmp import (
     GaussianBasis,
     JointDMP,
     LearnedGaussianBasis,
+    PeriodicBasis,
     Response,
     SigmoidPhase,
     SplineBasis,
@@ -138,6 +139,40 @@ def test_alike_and_equally_placed_gaussians_are_the_usual_ones():
     placed = LearnedGaussianBasis(centres=tuple(k / 8 for k in range(9)), widths=(0.6 / 8,) * 9)
     s = torch.linspace(0, 1.5, 100, dtype=torch.float64)
     torch.testing.assert_close(placed.forcing(s), usual.forcing(s))
+
+
+def finer(basis):
+    """The same basis, that asks for a table of a third of the interval."""
+
+    class Finer(type(basis)):
+        @property
+        def smooth_interval(self):
+            return super().smooth_interval / 3
+
+    return Finer(**{field.name: getattr(basis, field.name) for field in fields(basis)})
+
+
+@pytest.mark.parametrize(
+    "basis",
+    [
+        GaussianBasis(count=6, width=0.35),
+        GaussianBasis(count=6, width=1.0),
+        GaussianBasis(count=6, width=1.0, phase=SigmoidPhase(steepness=80.0)),
+        PeriodicBasis(count=6, width=0.35),
+        PeriodicBasis(count=6, width=0.9),
+        SplineBasis(count=8),
+        LearnedGaussianBasis(
+            centres=(0.0, 0.1, 0.15, 0.5, 1.0), widths=(0.1, 0.03, 0.04, 0.2, 0.3)
+        ),
+    ],
+)
+def test_a_table_of_the_response_is_exact_to_rounding(basis):
+    """With a spring so slow that the basis alone says how fine it has to be."""
+    s, spring = torch.linspace(0, 1.4, 700, dtype=torch.float64), SpringDamper(alpha=5.0)
+    table, exact = (
+        Response(spring, b).evaluate(s)[:, :2, : basis.count] for b in (basis, finer(basis))
+    )
+    assert ((table - exact).abs().amax(0) / exact.abs().amax(0)).max() < 1e-12
 
 
 @pytest.mark.parametrize("method", ["trajectory", "ridge", "lwr"])

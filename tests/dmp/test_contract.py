@@ -161,6 +161,7 @@ class TestOrientationOfUde(TestOrientation):
     """Integrated: what is exact elsewhere holds to the error of the method here."""
 
     reproduction = 1e-4
+    fast_gradients = True
 
     @pytest.mark.slow
     def test_motion_settles_at_the_goal_from_anywhere(self, dmp):

@@ -252,6 +252,15 @@ def test_gradients_are_exact(own_grid, scaling):
         assert gradcheck(outputs, inputs, atol=1e-6)
 
 
+def test_rows_of_times_that_are_equal_have_gradients_of_their_own():
+    """By time, position has the velocity for derivative, row by row."""
+    dmp = JointDMP.fit(*arm_motion(n_samples=30, n_joints=2), n_basis=4).requires_grad_(False)
+    time = torch.tensor([[0.5, 1.7]] * 3, dtype=torch.float64, requires_grad=True)
+    motion = dmp.rollout(time=time)
+    (gradient,) = torch.autograd.grad(motion.position.sum(), time)
+    torch.testing.assert_close(gradient, motion.velocity.sum(-1))
+
+
 # Bad input
 
 

@@ -120,7 +120,7 @@ def test_ends_can_be_put_into_every_kind(kind):
     "kind", ["limited", "moving goal", pytest.param("two arms", marks=pytest.mark.slow)]
 )
 def test_a_program_of_every_kind_does_what_the_primitive_does(kind):
-    """Those of joints, orientations and poses are in `test_export.py`."""
+    """Those of joints, orientations and poses are in `test_exported_dmp.py`."""
     dmp = KINDS[kind]()
     with shapes_unchecked():
         exported = dmp.export()

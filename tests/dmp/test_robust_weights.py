@@ -4,7 +4,9 @@ import pytest
 import torch
 from demo_motions import arm_motion, turning_motion
 
-from hrc_learn.dmp import JointDMP, OrientationDMP
+from hrc_learn.dmp import GaussianBasis, JointDMP, OrientationDMP, SpringDamper, response_of
+from hrc_learn.dmp._arguments import check_samples
+from hrc_learn.dmp._fitting import robust_weights
 from hrc_learn.geometry import quaternion
 
 
@@ -53,6 +55,25 @@ def test_ends_may_be_hit_too():
     torch.testing.assert_close(dmp.start, clean[0], rtol=0, atol=1e-3)
     torch.testing.assert_close(dmp.goal, clean[-1], rtol=0, atol=1e-3)
     assert rms(dmp.rollout().position - clean) < 1e-3
+
+
+def test_samples_are_taken_back_as_far_as_they_are_not_trusted():
+    """All the way where there is no trust, not at all where it is whole."""
+    time, clean = arm_motion(moving_start=True)
+    position, hit = spiked(clean)
+    samples = check_samples(time, position)
+    response = response_of(SpringDamper(), GaussianBasis(count=20))
+    for loss in ("huber", "tukey"):
+        tamed, trust = robust_weights(loss, response, samples, 1e-7)
+        whole = trust == 1
+        assert whole.any() == (loss == "huber")
+        torch.testing.assert_close(tamed.position[whole], samples.position[whole])
+        none = trust == 0
+        assert none.any() == (loss == "tukey")
+        # Between its recorded and its fitted place, which is near the clean one.
+        back = (tamed.position - samples.position)[0].mT
+        wanted = (1 - trust[0].mT) * (clean - position)
+        assert (back - wanted)[hit].abs().max() < 0.05 * back[hit].abs().max()
 
 
 def test_the_report_says_which_samples_were_not_trusted():

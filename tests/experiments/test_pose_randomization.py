@@ -1,8 +1,12 @@
 import numpy as np
 import pytest
 
-from hrc_learn.experiments.collaboration.trial import OBJECTS_REACH, with_objects
-from hrc_learn.experiments.pose_randomization import THREE_OBJECTS, random_object_poses
+from hrc_learn.experiments.collaboration.trial import (
+    OBJECTS_REACH,
+    THREE_OBJECTS,
+    random_object_poses,
+    with_objects,
+)
 from hrc_learn.sim import FINGER_STROKE, World
 from hrc_learn.sim.workplace import Workplace
 

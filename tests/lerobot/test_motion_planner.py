@@ -52,7 +52,9 @@ def test_what_never_moves_is_not_blown_up():
 def test_more_than_half_a_turn_is_refused():
     angle = torch.linspace(-4, 4, 50, dtype=torch.float64)[:, None]
     turning = angle * torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    with pytest.raises(ValueError, match="demonstration 0 turns the hand by more than half"):
+    with pytest.raises(
+        ValueError, match="demonstration 0 turns the end effector by more than half"
+    ):
         ActionEncoding(3, [[0, 1, 2]]).double().learn([turning])
 
 
@@ -92,3 +94,11 @@ def test_actions_are_measured_where_the_state_has_their_names(actions, states, c
 
 def test_unnamed_states_of_another_width_are_something_else():
     assert matched_columns(None, None, (2, 3)) == [-1, -1]
+
+
+def test_before_it_has_learned_the_reference_is_the_base_frame():
+    encoding = ActionEncoding(4, [[1, 2, 3]]).double()
+    vector = torch.tensor([[0.5, 0.3, -0.2, 0.1]], dtype=torch.float64)
+    coordinates = encoding.to_coordinates(vector)
+    torch.testing.assert_close(coordinates.abs(), vector.abs())
+    torch.testing.assert_close(encoding.to_actions(coordinates), vector)

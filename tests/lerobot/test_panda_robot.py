@@ -14,6 +14,7 @@ from hrc_learn.lerobot.panda_robot import (
     VELOCITIES,
     action_of,
     hand_vector,
+    observed,
     robot_registry,
     target_of,
 )
@@ -114,3 +115,12 @@ def test_settings_have_bounds(config, good, bad):
     (wrong, *_) = (name for name in bad if bad[name] != good[name])
     with pytest.raises(ValueError, match=wrong):
         config(**base | bad)
+
+
+def test_one_value_alone_is_observed_as_among_others(simulated):
+    state = simulated(scenario="grasping").read_state()
+    names = (*JOINTS, *VELOCITIES, *HAND, GRIPPER)
+    everything = observed(state, names)
+    assert list(everything) == list(names)
+    for name in names:
+        assert observed(state, [name]) == {name: everything[name]}

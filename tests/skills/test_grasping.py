@@ -19,10 +19,14 @@ from hrc_learn.experiments.grasping.metrics import (
     lift,
 )
 from hrc_learn.experiments.grasping.report import RegionActivity, record_grasp
-from hrc_learn.experiments.grasping.trial import VARIANTS, simulate_grasp
+from hrc_learn.experiments.grasping.trial import (
+    VARIANTS,
+    GraspingScene,
+    GraspingSceneConfig,
+    simulate_grasp,
+)
 from hrc_learn.experiments.metric_table import evaluate
 from hrc_learn.experiments.monte_carlo import Trial
-from hrc_learn.experiments.pose_randomization import GraspingScene, GraspingSceneConfig
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import RBFImageJacobian, paper_grid
 from hrc_learn.kinematics import panda, panda_capsules

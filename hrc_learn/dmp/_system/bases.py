@@ -166,6 +166,7 @@ class PeriodicBasis:
     @property
     def smooth_interval(self) -> float:
         """Length over which the forcing is a polynomial of low degree."""
+        # Bells hand over to each other as Gaussians do; see `GaussianBasis.smooth_interval`.
         return min(0.5, 1.4 * self.width**2) / self.count
 
     def phase(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
@@ -314,6 +315,7 @@ class LearnedGaussianBasis:
         a = 0.5 * (1 / sigma[:-1] ** 2 - last)
         b = after / sigma[:-1] ** 2
         d = ROUNDING - 0.5 * (after / sigma[:-1]) ** 2
+        # The root that stays finite where a vanishes, widths being alike.
         root = 2 * d / (b + (b**2 + 4 * a * d).clamp_min(0).sqrt())
         end = c[-1] + root.clamp_min(0).amax()
         return min(end.item(), self.phase.horizon)

@@ -102,6 +102,7 @@ class SigmoidPhase:
     @property
     def horizon(self) -> float:
         """Normalised time after which forcing is lost in float64 rounding."""
+        # Late, the sigmoid falls as exp(-a (s - m)).
         return self.middle + ROUNDING / self.steepness
 
     @property
@@ -153,6 +154,7 @@ class SpringDamper:
         """Length over which the unforced motion is a polynomial of low degree."""
         half = self.alpha / 2
         fastest = half + math.sqrt(max(half**2 - self.stiffness, 0.0))
+        # Complex modes have the root of the stiffness for modulus.
         return 1 / max(fastest, math.sqrt(self.stiffness))
 
     def acceleration(self, offset: Tensor, velocity: Tensor) -> Tensor:
@@ -273,6 +275,7 @@ def piecewise_quintic(
     m, slope = quintic(u)
     curvature = 60 * u * (1 - u) * (1 - 2 * u)
     way, w0, w1 = y1 - y0, v0 * L, v1 * L
+    # Hermite's quintic with no second derivative at its ends: of the way and of both rates.
     position = y0 + way * m
     position = position + w0 * (u - u**3 * (6 - 8 * u + 3 * u**2))
     position = position - w1 * u**3 * (4 - 7 * u + 3 * u**2)

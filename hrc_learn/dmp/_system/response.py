@@ -302,6 +302,7 @@ class _StateAt(torch.autograd.Function):
     @staticmethod
     def backward(ctx, grad):
         (s,) = ctx.saved_tensors
+        # Of (H, H'), the derivative is (H', H'').
         rate = ctx.response.evaluate(s)[..., 1:, :]
         return (grad * rate).sum((-2, -1)), None
 

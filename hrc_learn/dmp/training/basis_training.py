@@ -143,6 +143,7 @@ class Placement(nn.Module):
 
     def placed(self) -> tuple[Float[Tensor, "N"], Float[Tensor, "N"]]:
         """Centres from 0 to 1, and widths."""
+        # The gaps sum to one whatever the logits are.
         floor = SMALLEST_GAP / (self.count - 1)
         gaps = floor + (1 - SMALLEST_GAP) * torch.softmax(self.centres, dim=0)
         centres = torch.cat([gaps.new_zeros(1), gaps.cumsum(0)])
@@ -152,6 +153,7 @@ class Placement(nn.Module):
 
     def alpha(self) -> Float[Tensor, ""]:
         """Positive, so that the spring is stable."""
+        # Bounded both ways, and unchanged at zero.
         return self.initial.alpha * GAIN_RANGE ** torch.tanh(self.gain)
 
     def basis(self) -> LearnedGaussianBasis:

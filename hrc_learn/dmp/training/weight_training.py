@@ -107,6 +107,7 @@ def descend(
             history.converged = True
             break
         halvings, since = halvings + 1, 0
+        # Anew from the best state: the moments of Adam belong to where it has been since.
         _put(parameters, best)
         optimizer = torch.optim.Adam(parameters, optimizer.param_groups[0]["lr"] / 2)
     _put(parameters, best)

@@ -10,9 +10,9 @@ from typing import get_args
 import numpy as np
 
 from hrc_learn.experiments.collaboration.trial import CollaborationRun
-from hrc_learn.experiments.metric_table import Metric
+from hrc_learn.experiments.metric_table import Metric, median, p95, success_rate
 from hrc_learn.experiments.monte_carlo import Trial
-from hrc_learn.experiments.run_measures import (
+from hrc_learn.experiments.run_recording import (
     TOOL,
     Deviation,
     limit_violations,
@@ -20,7 +20,6 @@ from hrc_learn.experiments.run_measures import (
     spans,
     unwanted_contacts,
 )
-from hrc_learn.experiments.trial_statistics import median, p95, success_rate
 from hrc_learn.sim import Touch
 from hrc_learn.skills.pick_and_place import RELEASE, Mishap, PickPlaceJob
 
@@ -29,6 +28,7 @@ _CONTACTS = {
     "table": "contacts with the table",
     "arm itself": "contacts of the arm with itself",
 }
+"""Names of metrics, by what was met."""
 
 
 def collaboration_metrics(
@@ -53,7 +53,7 @@ def collaboration_metrics(
             "px",
             at_most=5.0,
         ),
-        Metric("grasp offset", grasp_offset, "mm"),
+        Metric("grasp offset", _grasp_offset, "mm"),
         Metric(
             "place error",
             lambda run: _worst(run, lambda e: 1e3 * e.goal_error[0]),
@@ -75,15 +75,15 @@ def collaboration_metrics(
         *(
             Metric(
                 name,
-                lambda run, met=met: len(contacts(run)[met]),
+                lambda run, met=met: len(_contacts(run)[met]),
                 at_most=0,
                 essential=True,
-                detail=lambda run, met=met: f"first {contacts(run)[met][0]}",
+                detail=lambda run, met=met: f"first {_contacts(run)[met][0]}",
             )
             for met, name in _CONTACTS.items()
         ),
         # Not listed, as the rows above tell what was met.
-        Metric("contacts", lambda run: sum(map(len, contacts(run).values())), listed=False),
+        Metric("contacts", lambda run: sum(map(len, _contacts(run).values())), listed=False),
         Metric(
             "cycle time",
             lambda run: run.cell.time,
@@ -93,35 +93,35 @@ def collaboration_metrics(
         *(
             Metric(
                 f"recovered from: {mishap}",
-                lambda run, mishap=mishap: recoveries(run).get(mishap),
+                lambda run, mishap=mishap: _recoveries(run)[mishap] or None,
             )
             for mishap in get_args(Mishap)
         ),
         Metric(
             "objects that stand on their shelf",
-            lambda run: len(standing(run)),
+            lambda run: len(_standing(run)),
             at_least=objects,
             claim="three objects, one after the other (Experiment 3)",
             essential=True,
-            detail=lambda run: f"not {', '.join(_fallen(run))}",
+            detail=_fallen,
         ),
         Metric(
             "end effector deviation",
-            lambda run: _pushed(run, lambda d: 1e3 * d.largest_position),
+            lambda run: _pushed(run, lambda d: 1e3 * d.position),
             "mm",
             at_most=1.0,
             claim="main task not affected (Experiment 3)",
         ),
         Metric(
             "end effector rotation",
-            lambda run: _pushed(run, lambda d: float(np.rad2deg(d.largest_rotation))),
+            lambda run: _pushed(run, lambda d: np.rad2deg(d.rotation)),
             "deg",
             at_most=0.2,
             claim="main task not affected (Experiment 3)",
         ),
         Metric(
             "elbow moved",
-            lambda run: _pushed(run, lambda d: 1e3 * d.largest_elbow),
+            lambda run: _pushed(run, lambda d: 1e3 * d.elbow),
             "mm",
             # Enough to reach under the arm; without it the deviation above would prove nothing.
             at_least=100.0,
@@ -146,14 +146,16 @@ def _worst(run: CollaborationRun, measured: Callable[[PickPlaceJob], float]) -> 
     return max((float(measured(e)) for e in run.picks if e.release is not None), default=None)
 
 
-def _pushed(run: CollaborationRun, measured: Callable[[Deviation], float]) -> float | None:
-    """Of a run in which a person pushed the elbow; None of any other."""
-    if not (run.cell.log["human_effort"] != 0).any():
+def _pushed(run: CollaborationRun, of: Callable[[Deviation], np.ndarray]) -> float | None:
+    """Largest value in a run in which a person pushed the elbow; None of any other."""
+    log = run.cell.log
+    if not (log["nullspace_input"] != 0).any():
         return None
-    return measured(Deviation.of(run.cell.log))
+    # NaN stands for the time before the first push and after the last.
+    return float(np.nan_to_num(of(Deviation.of(log))).max())
 
 
-def grasp_offset(run: CollaborationRun) -> float | None:
+def _grasp_offset(run: CollaborationRun) -> float | None:
     """Horizontal distance of end effector and object at the last descent, worst object [mm]."""
     log, offsets = run.cell.log, []
     bodies = {body.name: body.position for body in run.motion.bodies()}
@@ -169,25 +171,24 @@ def grasp_offset(run: CollaborationRun) -> float | None:
     return 1e3 * float(max(offsets)) if offsets else None
 
 
-def standing(run: CollaborationRun) -> list[PickPlaceJob]:
-    """Errands whose object stands on its shelf, touching nothing of the arm."""
-    return [
-        pick for pick in run.picks if run.world.rests_on(pick.item.name, f"board_{pick.shelf}")
-    ]
+def _standing(run: CollaborationRun) -> list[str]:
+    """Objects that stand on their shelf, touching nothing of the arm."""
+    places = {pick.item.name: f"board_{pick.shelf}" for pick in run.picks}
+    return [name for name, place in places.items() if run.world.rests_on(name, place)]
 
 
-def _fallen(run: CollaborationRun) -> list[str]:
-    stand = {pick.item.name for pick in standing(run)}
-    return [item.name for item in run.workplace.scene.objects if item.name not in stand]
+def _fallen(run: CollaborationRun) -> str:
+    names, standing = [item.name for item in run.workplace.scene.objects], _standing(run)
+    return f"not {', '.join(name for name in names if name not in standing)}"
 
 
-def contacts(run: CollaborationRun) -> dict[str, tuple[Touch, ...]]:
+def _contacts(run: CollaborationRun) -> dict[str, tuple[Touch, ...]]:
     """Contacts that there should not have been, by what was met."""
     names = [pick.item.name for pick in run.picks if pick.release is not None]
     begun = [start for start, _ in spans(run.cell.log, RELEASE)]
     return unwanted_contacts(run.world, dict(zip(names, begun, strict=True)))
 
 
-def recoveries(run: CollaborationRun) -> Counter[str]:
+def _recoveries(run: CollaborationRun) -> Counter[str]:
     """How often the task recovered from each kind of mishap."""
     return Counter(note.mishap for pick in run.picks for note in pick.recoveries)

@@ -8,8 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from hrc_learn.experiments.live_view import LiveView, no_live_view
-from hrc_learn.experiments.pose_randomization import THREE_OBJECTS, random_object_poses
+from hrc_learn.experiments.run_recording import LiveView, no_live_view
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import (
     CameraChange,
@@ -36,7 +35,32 @@ from hrc_learn.skills.work_cell import WorkCell, WorkCellConfig
 from hrc_learn.teleoperation import ScriptedForce, ScriptedPerturbation
 from hrc_learn.teleoperation.page import PageConfig
 from hrc_learn.teleoperation.page_session import task_page
-from hrc_learn.vision import CameraModel
+from hrc_learn.vision import CameraModel, Marker
+
+THREE_OBJECTS = (
+    ObjectConfig(),
+    ObjectConfig(
+        name="carton",
+        half_size=(0.027, 0.034, 0.028),
+        mass=0.15,
+        marker=Marker(12, 0.030),
+        colour=(0.80, 0.47, 0.13, 1.0),
+    ),
+    ObjectConfig(
+        name="tin",
+        half_size=(0.019, 0.036, 0.026),
+        mass=0.10,
+        marker=Marker(13, 0.027),
+        colour=(0.20, 0.55, 0.38, 1.0),
+    ),
+)
+"""Three boxes of sizes that the gripper takes, none so tall that the palm meets it when the
+fingers reach down beside it."""
+
+_APART = (0.115, 0.095)
+"""Distance along x or y at which the open fingers about one object clear the next [m]."""
+_TURN = 0.06
+"""Largest turn of an object, either way; the fingers still close on it squarely [rad]."""
 
 NULL_SPACE_FORCES = (
     ScriptedForce(start=0.5, duration=4.5, towards=(0.40, 0.00, 0.50), max_force=60.0),
@@ -232,6 +256,54 @@ def _object_poses(
     if len(items) == 1:
         return {items[0].name: workplace.random_object_pose(OBJECT_REACH, rng)}
     return random_object_poses(items, workplace.table_centre, OBJECTS_REACH, rng)
+
+
+def random_object_poses(
+    items: Sequence[ObjectConfig],
+    middle: tuple[float, float],
+    reach: tuple[float, float],
+    rng: np.random.Generator,
+    attempts: int = 10_000,
+) -> dict[str, Float[np.ndarray, "4 4"]]:
+    """Random poses of objects on the table, clear of each other.
+
+    Args:
+        items: The objects.
+        middle: Of the region of the table where they lie [m].
+        reach: Largest distance from its middle along x and y [m].
+        rng: Source of positions and turns.
+        attempts: Arrangements tried.
+
+    Raises:
+        ValueError: If they do not fit.
+    """
+    for _ in range(attempts):
+        positions = np.array(middle) + rng.uniform(-1, 1, (len(items), 2)) * reach
+        if _clear(positions):
+            return {
+                item.name: _pose_on_table(item, position, rng.uniform(-_TURN, _TURN))
+                for item, position in zip(items, positions, strict=True)
+            }
+    raise ValueError(
+        f"{len(items)} objects do not fit within {reach[0]:g} and {reach[1]:g} m of the "
+        "middle with room for the fingers between them: fewer objects, or more reach."
+    )
+
+
+def _clear(positions: Float[np.ndarray, "objects 2"]) -> bool:
+    first, second = np.triu_indices(len(positions), k=1)
+    gaps = np.abs(positions[first] - positions[second])
+    return bool((gaps >= _APART).any(axis=1).all())
+
+
+def _pose_on_table(
+    item: ObjectConfig, position: Float[np.ndarray, "2"], turn: float
+) -> Float[np.ndarray, "4 4"]:
+    c, s = np.cos(turn), np.sin(turn)
+    pose = np.eye(4)
+    pose[:2, :2] = [[c, -s], [s, c]]
+    pose[:3, 3] = (*position, item.half_size[2])
+    return pose
 
 
 def _watched(workplace: Workplace, world: World) -> Float[np.ndarray, "points 3"]:

@@ -261,6 +261,17 @@ def test_a_speed_between_the_bounds_changes_nothing():
     )
 
 
+def test_an_arm_moves_until_it_clearly_rests_and_rests_until_it_clearly_moves():
+    # Between the bounds, still, between them again, and fast.
+    time = np.arange(500) / 100
+    speed = np.select([time < 1, time < 2, time < 3], [0.02, 0.0, 0.02], 0.5)
+    q = np.cumsum(speed)[:, None] * 0.01
+    still = resting(swing(time, joint_position=np.hstack([q, q]), joint_velocity=None))
+    assert not still[:85].any()
+    assert still[115:285].all()
+    assert not still[315:].any()
+
+
 def test_rest_is_trimmed_and_demonstrations_are_split_at_it():
     demo = with_rests()
     trimmed = trim_rest(demo, keep=0.1)

@@ -71,6 +71,13 @@ def test_the_map_is_strict_and_inverted(dtype):
     torch.testing.assert_close(back, q, rtol=0, atol=1e-12 if dtype == torch.float64 else 1e-6)
 
 
+def test_narrow_limits_far_from_zero_hold_in_single_precision():
+    lower, upper = torch.tensor([1000.0]), torch.tensor([1001.0])
+    limits = SoftLimits(lower, upper, 0.02 * (upper - lower))
+    away = torch.logspace(-3, 6, 50)[:, None]
+    assert limits.contain(limits.constrain(1000.5 + torch.cat([away, -away]))).all()
+
+
 def test_the_middle_of_the_range_is_left_as_it_is():
     limits = SoftLimits(LOWER, UPPER, 0.02 * (UPPER - LOWER))
     q = LOWER + (UPPER - LOWER) * torch.linspace(0.2, 0.8, 50)[:, None].double()

@@ -1,3 +1,5 @@
+"""Steps in closed loop, and motions carried on from any state."""
+
 import dataclasses
 
 import numpy as np
@@ -7,7 +9,8 @@ from demo_motions import arm_motion
 from dmp_oracle import solve
 from unchecked import shapes_unchecked
 
-from hrc_learn.dmp import JointDMP, SpringDamper
+from hrc_learn.dmp import GaussianBasis, JointDMP, SpringDamper, continue_motion, response_of
+from hrc_learn.dmp._closed_loop_step import host_values
 
 
 @pytest.mark.parametrize("n_steps", [1, 20, 400])
@@ -178,3 +181,175 @@ def test_impossible_goal_filters_are_refused(rate):
     dmp = primitive()
     with pytest.raises(ValueError, match="goal filter"):
         dmp.step(dmp.initial_state(), 0.1, goal=[0.0], goal_filter=rate)
+
+
+# Steps whose times are read as numbers against those whose times stay tensors
+
+
+SPRINGS = [
+    SpringDamper(),
+    SpringDamper(alpha=30.0, beta=2.0),
+    SpringDamper(alpha=12.0, beta=20.0),
+]
+
+
+@pytest.mark.parametrize("spring", SPRINGS)
+def test_a_step_alone_is_that_of_a_batch(spring):
+    """From before the end of the forcing to long after it; a batch is never read."""
+    dmp = JointDMP.fit(*arm_motion(moving_start=True), 20, spring=spring)
+    one, many = dmp.initial_state(), dmp.initial_state(duration=dmp.duration[None])
+    for dt in (1e-3, 1.3, 1.3, 0.8, 0.0, 4.0):
+        one, many = dmp.step(one, dt), dmp.step(many, dt)
+        for name in ("position", "rate", "s", "forced"):
+            alone, batched = getattr(one, name), getattr(many, name)[0]
+            torch.testing.assert_close(alone, batched, rtol=1e-12, atol=1e-11)
+
+
+def test_derivatives_by_times_are_kept():
+    """Backward, forward and mapped, all through one step of one motion."""
+    dmp = JointDMP.fit(*arm_motion(), 12)
+    state = dmp.step(dmp.initial_state(), 0.4)
+
+    def position(dt):
+        return dmp.step(state, dt).position
+
+    dt = torch.tensor(0.2, dtype=torch.float64)
+    velocity = dmp.step(state, dt).velocity
+    backward = torch.autograd.functional.jacobian(position, dt)
+    forward = torch.func.jvp(position, (dt,), (torch.ones_like(dt),))[1]
+    torch.testing.assert_close(backward, velocity)
+    torch.testing.assert_close(forward, velocity)
+    lengths = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
+    expected = torch.stack([position(length) for length in lengths])
+    torch.testing.assert_close(torch.func.vmap(position)(lengths), expected)
+
+
+def test_only_single_plain_times_are_read():
+    time = torch.tensor(0.5, dtype=torch.float64)
+    assert host_values(time, time) == (0.5, 0.5)
+    for kept in (time[None], time.clone().requires_grad_()):
+        assert host_values(time, kept) == (time, kept)
+
+
+# Motions carried on
+
+
+RESPONSE = response_of(SpringDamper(), GaussianBasis(count=12))
+
+
+def random_primitive(batch: tuple[int, ...], seed: int = 0) -> JointDMP:
+    """Three coordinates with weights, ends and durations drawn at random."""
+    rng = torch.Generator().manual_seed(seed)
+
+    def draw(*shape: int) -> torch.Tensor:
+        return torch.randn((*batch, *shape), generator=rng, dtype=torch.float64)
+
+    return JointDMP(
+        weights=100 * draw(3, 12),
+        start=draw(3),
+        goal=draw(3),
+        start_velocity=draw(3),
+        duration=1 + draw().abs(),
+        amplitude=torch.ones(*batch, 3, dtype=torch.float64),
+        timestamps=torch.linspace(0, 1, 5, dtype=torch.float64),
+        basis=RESPONSE.basis,
+        spring=RESPONSE.spring,
+    )
+
+
+@pytest.mark.parametrize("batch", [(), (1,), (2, 3)])
+def test_from_the_start_it_is_the_rollout(batch):
+    dmp = random_primitive(batch)
+    time = torch.linspace(0, 3, 7, dtype=torch.float64)
+    y, v = continue_motion(
+        RESPONSE,
+        dmp.weights,
+        dmp.goal,
+        dmp.start,
+        dmp.start_velocity,
+        duration=dmp.duration,
+        elapsed=torch.zeros_like(dmp.duration),
+        time=time.expand(*batch, -1),
+    )
+    rollout = dmp.rollout(time)
+    torch.testing.assert_close(y, rollout.position, rtol=0, atol=1e-9)
+    torch.testing.assert_close(v, rollout.velocity, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("elapsed", [0.3, 1.7, 4.0])
+def test_of_a_motion_left_alone_it_is_what_follows(elapsed):
+    """Cut anywhere, also after its end, a motion goes on as if it had not been."""
+    dmp = random_primitive((2,), seed=1)
+    ahead = torch.linspace(0, 1, 5, dtype=torch.float64)
+    cut = dmp.rollout(torch.tensor([elapsed]))
+    y, v = continue_motion(
+        RESPONSE,
+        dmp.weights,
+        dmp.goal,
+        cut.position[:, 0],
+        cut.velocity[:, 0],
+        duration=dmp.duration,
+        elapsed=torch.full((2,), elapsed),
+        time=ahead.expand(2, -1),
+    )
+    # The cut is at a float32 time, and all that follows with it.
+    whole = dmp.rollout(torch.tensor(elapsed).double() + ahead)
+    torch.testing.assert_close(y, whole.position, rtol=0, atol=1e-9)
+    torch.testing.assert_close(v, whole.velocity, rtol=0, atol=1e-9)
+
+
+def test_after_a_push_it_is_what_steps_come_to():
+    """The exact steps of the primitive, from the same disturbed state."""
+    dmp = random_primitive((), seed=2)
+    state = dmp.initial_state()
+    for _ in range(10):
+        state = dmp.step(state, 0.02, coupling=torch.full((3,), 40.0, dtype=torch.float64))
+    time = 0.03 * torch.arange(1, 6, dtype=torch.float64)
+    y, v = continue_motion(
+        RESPONSE,
+        dmp.weights,
+        dmp.goal,
+        state.position,
+        state.velocity,
+        duration=dmp.duration,
+        elapsed=state.s * dmp.duration,
+        time=time,
+    )
+    for k in range(5):
+        state = dmp.step(state, 0.03)
+        torch.testing.assert_close(y[k], state.position, rtol=0, atol=1e-9)
+        torch.testing.assert_close(v[k], state.velocity, rtol=0, atol=1e-9)
+
+
+def test_gradients_reach_everything():
+    dmp, time = random_primitive((2,), seed=3), torch.tensor([[0.0, 0.4], [0.1, 2.5]]).double()
+    arguments = (
+        dmp.weights.detach(),
+        dmp.goal,
+        dmp.start,
+        dmp.start_velocity,
+        dmp.duration,
+        torch.tensor([0.2, 0.5], dtype=torch.float64),
+    )
+
+    def motion(w, g, y, v, duration, elapsed):
+        return continue_motion(
+            RESPONSE, w, g, y, v, duration=duration, elapsed=elapsed, time=time
+        )
+
+    assert torch.autograd.gradcheck(motion, [x.requires_grad_() for x in arguments])
+
+
+def test_an_approach_cannot_be_continued():
+    dmp = random_primitive(())
+    with pytest.raises(ValueError, match="approach 0"):
+        continue_motion(
+            response_of(SpringDamper(), GaussianBasis(count=12), 1.0),
+            dmp.weights,
+            dmp.goal,
+            dmp.start,
+            dmp.start_velocity,
+            duration=dmp.duration,
+            elapsed=dmp.duration,
+            time=dmp.timestamps,
+        )
