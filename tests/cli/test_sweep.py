@@ -3,8 +3,10 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+import torch
 from commands import hrc
 from unchecked import shapes_unchecked
 
@@ -56,3 +58,18 @@ def test_an_unknown_experiment_ends_in_one_line():
     assert outcome.status == 2
     assert outcome.error.startswith("error: invalid choice 'far' for argument '--only'")
     assert outcome.error.count("\n") == 1
+
+
+def test_a_figure_that_is_broken_off_leaves_the_older_one(tmp_path, monkeypatch):
+    path = tmp_path / "times.png"
+    path.write_text("older")
+
+    def break_off(figure, place, **options):
+        Path(place).write_text("half")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", break_off)
+    with pytest.raises(KeyboardInterrupt):
+        command._draw(path, {"near": SimpleNamespace(time=torch.tensor([1.0, 2.0]))})
+    assert path.read_text() == "older"
+    assert list(tmp_path.iterdir()) == [path]

@@ -21,7 +21,7 @@ from hrc_learn.experiments.controller.sweep import (
     join,
     run_chunk,
 )
-from hrc_learn.store import new_folder, write_json
+from hrc_learn.store import new_file, new_folder, write_json
 
 CHUNK = 250
 """Trials in one batch: their tensors stay in the cache."""
@@ -65,7 +65,8 @@ def _draw(path: Path, results: dict[str, Any]) -> None:
     from hrc_learn.viz.figures import arrival_figure  # matplotlib takes a second
 
     times = {name: r.time.numpy() for name, r in results.items() if hasattr(r, "time")}
-    arrival_figure(times).savefig(path, dpi=150)
+    with new_file(path) as part:
+        arrival_figure(times).savefig(part, dpi=150)
 
 
 def _record(path: Path, results: dict[str, Any]) -> None:
