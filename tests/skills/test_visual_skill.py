@@ -47,7 +47,9 @@ def test_the_offset_is_found_whatever_way_camera_and_tool_are_turned(n):
 def test_the_line_leads_up_along_the_offset_and_turns_with_the_tool():
     target = VisualTarget(offset=np.array([0.0, 0.1, -0.2]), error=0.0)
     down = gripper_down()
-    np.testing.assert_allclose(target.line(down), np.array([0.1, 0.0, 0.2]) / 0.05**0.5)
+    np.testing.assert_allclose(
+        target.line(down), np.array([0.1, 0.0, 0.2]) / 0.05**0.5, atol=1e-12
+    )
     quarter = quaternion.exp(torch.tensor([0.0, 0.0, np.pi / 2], dtype=torch.float64))
     turned = quaternion.multiply(quarter, down)
     np.testing.assert_allclose(
