@@ -257,8 +257,8 @@ class WorkCell:
             self.track_pose(pose, twist)
         self._settle(goal, _SETTLING_TIME)
 
-    def move_until_contact(self, goal: Pose, speed: float = 0.02, force: float = 12.0) -> bool:
-        """Move on a straight line, and stop where something is met; whether it was.
+    def move_until_contact(self, goal: Pose, speed: float = 0.02, force: float = 12.0) -> Pose | None:
+        """Move on a straight line, and stop where something is met; where that was.
 
         Args:
             goal: Where to, if nothing is met.
@@ -267,26 +267,30 @@ class WorkCell:
                 too, so what counts is the change since the motion began.
 
         Returns:
-            False also for an arm that does not tell external torques.
+            Pose of the end effector when it met something; None if it met nothing, also for an
+            arm that does not tell external torques.
         """
         along = goal.position - self.pose.position
         along = (along / along.norm().clamp(min=1e-9)).numpy()
         felt: deque[float] = deque(maxlen=_FELT)
+        before: deque[Pose] = deque(maxlen=_FELT)
         free = None
         for k, (pose, twist) in enumerate(
             straight_line(self.pose, goal, speed, self.config.dt)
         ):
             self.track_pose(pose, twist)
             felt.append(-float(self._contact_force() @ along))
+            before.append(self.pose)
             if k < _FELT + _GETTING_UNDER_WAY:
                 continue
             # Friction turns with the motion: what is felt under way is the reference.
             now = float(np.mean(felt))
             free = now if free is None else free
             if now - free > force:
+                # As long as it took to be sure, the arm has gone on and pushed.
                 self.hold_pose(_FELT * self.config.dt)
-                return True
-        return False
+                return before[0]
+        return None
 
     def _contact_force(self) -> Float[np.ndarray, "3"]:
         """Estimate of the force on the end effector [N]; zero if the arm tells none."""

@@ -59,11 +59,6 @@ def collaboration_metrics(
         Metric("grasp offset", _grasp_offset, "mm"),
         Metric("object tilt in the hand", lambda run: _held(run).tilt, "deg", at_most=3.0),
         Metric("slip in the hand", lambda run: _held(run).slip, "mm", at_most=3.0),
-        Metric(
-            "end effector error at the release",
-            lambda run: _worst(run, lambda e: 1e3 * e.goal_error[0]),
-            "mm",
-        ),
         Metric("place error", lambda run: _placed(run)[0], "mm", at_most=5.0),
         Metric("place tilt", lambda run: _placed(run)[1], "deg", at_most=3.0),
         Metric(
