@@ -97,19 +97,6 @@ class PickPlaceJob:
         """Whether the object was released at its shelf, as the robot sees it."""
         return self.release is not None and not self.failure
 
-    @property
-    def goal_error(self) -> tuple[float, float]:
-        """Of the end effector at the release [m, rad].
-
-        Raises:
-            ValueError: If it never came to that.
-        """
-        if self.release is None:
-            raise ValueError(f"{self.item.name!r} never came to its shelf: {self.failure}")
-        goal = self.goal if self.plan is None else self.plan.goal
-        twist = self.release.twist_to(goal)
-        return float(twist[:3].norm()), float(twist[3:].norm())
-
 
 class Phase(StrEnum):
     """What the robot is doing; the start of a phase is an event of the log."""

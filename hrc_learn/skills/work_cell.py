@@ -257,7 +257,9 @@ class WorkCell:
             self.track_pose(pose, twist)
         self._settle(goal, _SETTLING_TIME)
 
-    def move_until_contact(self, goal: Pose, speed: float = 0.02, force: float = 12.0) -> Pose | None:
+    def move_until_contact(
+        self, goal: Pose, speed: float = 0.02, force: float = 12.0
+    ) -> Pose | None:
         """Move on a straight line, and stop where something is met; where that was.
 
         Args:

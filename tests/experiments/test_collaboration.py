@@ -26,7 +26,7 @@ from hrc_learn.experiments.collaboration.trial import (
 from hrc_learn.experiments.metric_table import evaluate
 from hrc_learn.experiments.run_recording import Deviation, record, span, true_image_jacobian
 from hrc_learn.geometry import Box
-from hrc_learn.sim import NOWHERE, CameraChange, OcclusionInterval
+from hrc_learn.sim import NOWHERE, CameraChange, Imperfections, OcclusionInterval
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.grasping import GraspingConfig
 from hrc_learn.skills.marker_sensor import LatencyConfig
@@ -72,7 +72,7 @@ def job(skills):
         forces=FORCE,
         disturbances=Disturbances(occlusions=OCCLUDED),
         config=PickAndPlaceConfig(interaction=2.5, speed=2.0),
-        cell_config=WorkCellConfig(latency=LATE),
+        imperfections=Imperfections.nominal(),
         seed=3,
     )
 
@@ -113,6 +113,7 @@ def test_the_command_asks_for_the_job_and_reports_it(models, job, monkeypatch, t
         *("--aiming", models / "aiming", "--out", out, "--shelf", "upper"),
         *("--camera", "synthetic", "--seed", 3, "--json", figures, "--occlusion", 0, 3),
         *("--config.interaction", 2.5, "--latency", 0.04, "--frame-loss", 0.1),
+        *("--imperfections", 0.5),
     )
     ((shelves, options),) = asked
     assert (shelves, options["camera"], options["seed"]) == (("upper",), "synthetic", 3)
@@ -120,6 +121,7 @@ def test_the_command_asks_for_the_job_and_reports_it(models, job, monkeypatch, t
     assert options["disturbances"] == Disturbances(occlusions=OCCLUDED)
     assert options["cell_config"].latency == LATE
     assert options["config"].interaction == 2.5
+    assert options["imperfections"] == Imperfections.nominal().scaled(0.5)
     assert "missed" not in outcome.output
     measured = json.loads(figures.read_text())
     assert measured["objects_that_stand_on_their_shelf"] == 1
@@ -159,6 +161,7 @@ def test_the_command_asks_for_the_job_and_reports_it(models, job, monkeypatch, t
         (("--shelf", "attic"), "'lower', 'middle', 'upper'"),
         (("--shelves", "lower", "lower"), "a shelf of its own"),
         (("--placing", "nowhere"), "nowhere"),
+        (("--imperfections", -1), "--imperfections"),
     ],
 )
 def test_what_the_command_cannot_do_is_one_line(models, skills, tmp_path, arguments, reason):
@@ -198,7 +201,7 @@ def test_the_estimated_image_jacobian_is_close_to_the_true_one(job):
 
 
 def test_deviations_count_from_the_first_pull(job):
-    deviation = Deviation.of(job.cell.log)
+    deviation = Deviation.of(job.cell.log, job.motion, job.world)
     start, end = span(job.cell.log, "interact")
     time = job.cell.log["time"]
     outside = (time < start) | (time >= end)
@@ -207,7 +210,7 @@ def test_deviations_count_from_the_first_pull(job):
     assert deviation.position[first] == 0.0
     assert time[first] == pytest.approx(start + FORCE[0].start, abs=0.05)
     assert np.nanmax(deviation.elbow) > 0.1
-    assert np.nanmax(deviation.position) < 1e-3
+    assert np.nanmax(deviation.position) < 2e-3
 
 
 def test_the_recording_holds_what_the_run_did(job):
@@ -235,7 +238,7 @@ def test_a_person_who_keeps_away_changes_nothing(skills):
         *skills, ("middle",), camera="synthetic", forces=(), config=config, seed=5
     )
     assert job.failure == ""
-    assert np.isnan(Deviation.of(job.cell.log).elbow).all()
+    assert np.isnan(Deviation.of(job.cell.log, job.motion, job.world).elbow).all()
     assert job.world.rests_on("box", "board_middle")
 
 

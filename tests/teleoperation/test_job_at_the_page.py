@@ -88,7 +88,7 @@ def test_the_elbow_yields_to_the_mouse_while_the_end_effector_servoes(tmp_path, 
     effort = np.abs(log["nullspace_input"]).max(axis=1)
     assert effort[(time >= start) & (time < end)].max() > 1.0
     assert not effort[time < start].any()
-    deviation = Deviation.of(log)
+    deviation = Deviation.of(log, result.motion, result.world)
     assert np.nan_to_num(deviation.elbow).max() > 0.05
     assert np.nan_to_num(deviation.position).max() < 1e-3
     # To the right of the screen is +y.

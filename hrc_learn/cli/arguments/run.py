@@ -38,6 +38,10 @@ class Demo(Measured):
     """Where to put the object; the middle shelf is the demonstrated one."""
     seed: int = 0
     """Seed of where the object lies and of image noise."""
+    imperfections: float = 1.0
+    """Errors of arm, camera, calibration and objects, so many times their nominal size."""
+    ideal: bool = False
+    """Without any: --imperfections 0."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,10 +58,6 @@ class RunExperiment(Written):
     """Of the repetitions, at once."""
     robot: Robot = "panda"
     """Arm that does it."""
-    imperfections: float = 1.0
-    """Errors of arm, camera and calibration, so many times their nominal size."""
-    ideal: bool = False
-    """Without any: --imperfections 0."""
     serve: bool = False
     """Serve the dashboard in the browser while the run goes on."""
     serving: Configuration = Detail("hrc_learn.experiments.run_recording", "LiveViewConfig")
@@ -162,12 +162,16 @@ class RunCollaboration(RunServoing):
     """How far behind the board's front edge [m]."""
     occlusion: More[tuple[tuple[float, float], ...]] = ()
     """Intervals in which a board occludes the marker: start and duration [s]."""
+    imperfections: float = 1.0
+    """Errors of arm, camera, calibration and objects, so many times their nominal size."""
+    ideal: bool = False
+    """Without any: --imperfections 0."""
     camera_moved: bool = False
     """Move and turn the camera between two objects."""
     camera_change: Configuration = Detail("hrc_learn.sim", "CameraChange")
     """How far, with --camera-moved."""
     latency: More[float] = 0.0
-    """From an image being taken until its markers are known [s]."""
+    """From an image being taken until its markers are known [s]; more than by imperfections."""
     frame_loss: More[float] = 0.0
     """Share of the images that are lost."""
     person: bool = True

@@ -101,7 +101,7 @@ def run_collaboration(args: RunCollaboration) -> int:
     return _conduct(experiment, args)
 
 
-def _imperfections(args: RunExperiment) -> Imperfections:
+def _imperfections(args: RunCollaboration) -> Imperfections:
     if args.imperfections < 0:
         raise ValueError(f"--imperfections must not be negative, but is {args.imperfections}.")
     return Imperfections.nominal().scaled(0.0 if args.ideal else args.imperfections)
@@ -145,6 +145,8 @@ def demo(args: Demo) -> int:
             robot=args.robot,
             out=args.out / "run",
             seed=args.seed,
+            imperfections=args.imperfections,
+            ideal=args.ideal,
             overwrite=True,
             json=args.json,
         )
