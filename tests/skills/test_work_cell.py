@@ -115,7 +115,7 @@ def cell_with(arm):
     return WorkCell(
         chain=panda,
         arm=arm,
-        gripper=None,
+        gripper=arm,
         human=ScriptedPerturbation(panda, ()),
         advance=arm.advance,
     )
