@@ -14,6 +14,12 @@ from hrc_learn.sim.workplace import Workplace
 # MuJoCo ships no type stubs.
 
 
+@pytest.fixture(autouse=True)
+def _elsewhere(tmp_path, monkeypatch):
+    """MuJoCo writes its warnings into a file where it runs."""
+    monkeypatch.chdir(tmp_path)
+
+
 @pytest.fixture
 def world():
     workplace = Workplace()
