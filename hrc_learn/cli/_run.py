@@ -92,7 +92,7 @@ def _ended_by_sigterm() -> Iterator[None]:
         return
 
     def end(number: int, frame: FrameType | None) -> None:
-        signal.signal(number, signal.SIG_IGN)  # once is enough, what follows must be finished
+        signal.signal(number, signal.SIG_DFL)  # a second one does not wait for what follows
         raise SystemExit(128 + number)
 
     signal.signal(signal.SIGTERM, end)

@@ -29,3 +29,14 @@ def test_a_signal_ends_a_command_by_way_of_its_finally(number, status):
         program.send_signal(number)
         assert program.stdout.read() == "tidied up\n"
         assert program.wait(60) == status
+
+
+def test_a_second_sigterm_does_not_wait():
+    slow = PROGRAM.replace('print("tidied up", flush=True)', 'print("x", flush=True), work()')
+    command = [sys.executable, "-c", slow]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as program:
+        assert program.stdout.readline() == "at work\n"
+        program.send_signal(signal.SIGTERM)
+        assert program.stdout.readline() == "x\n"
+        program.send_signal(signal.SIGTERM)
+        assert program.wait(60) == -signal.SIGTERM
