@@ -12,6 +12,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,7 +27,6 @@ from hrc_learn.dmp import (
     ProbabilisticDMP,
     mean_primitive,
     through,
-    with_ends,
 )
 from hrc_learn.geometry import Pose, quaternion
 
@@ -59,8 +59,8 @@ class Task:
     """What is to be predicted, (T,)."""
 
     @property
-    def ends(self) -> dict[str, Pose]:
-        return {"start": self.shown[0], "goal": self.shown[-1]}
+    def ends(self) -> tuple[Pose, Pose]:
+        return self.shown[0], self.shown[-1]
 
     @property
     def via(self) -> Pose:
@@ -145,17 +145,17 @@ def another(task: Task) -> PoseDMP:
     away = start + goal
     nearest = torch.zeros(len(away), dtype=torch.bool)
     nearest[away.argmin()] = True
-    return with_ends(mean_primitive(select(task.others, nearest)), **task.ends)
+    return mean_primitive(select(task.others, nearest)).with_ends(*task.ends)
 
 
 def mean(task: Task) -> PoseDMP:
     """The mean of all others, adapted."""
-    return with_ends(mean_primitive(task.others), **task.ends)
+    return mean_primitive(task.others).with_ends(*task.ends)
 
 
 def gentle_mean(task: Task) -> PoseDMP:
     """The same along a minimum-jerk approach."""
-    return with_ends(mean_primitive(task.gentle), **task.ends)
+    return mean_primitive(task.gentle).with_ends(*task.ends)
 
 
 def conditioned(task: Task, slack: float, times: list[float]) -> PoseDMP:
@@ -170,7 +170,7 @@ def conditioned(task: Task, slack: float, times: list[float]) -> PoseDMP:
     return distribution.condition(times, via, noise=NOISE).mean_primitive()
 
 
-METHODS: dict[str, Callable[[Task], PoseDMP]] = {
+METHODS: dict[str, Callable[[Task], Any]] = {
     "nearest": another,
     "mean": mean,
     "mean, approach": gentle_mean,

@@ -124,10 +124,11 @@ def overhead_camera() -> CameraModel:
 
 
 def _marked_arm() -> PandaModelConfig:
-    # The plate sticks out sideways, clear of the forearm as seen from above.
+    # The plate sticks out sideways, clear of the forearm as seen from above, and is mounted off
+    # the middle: it is as wide as objects are, and must not be the first to meet a board.
     plate = Plate(
         marker=Marker(HAND_MARKER, 0.048),
-        position=(0.0, 0.145, 0.02),
+        position=(-0.008, 0.145, 0.02),
         orientation=(0.0, 1.0, 0.0, 0.0),
     )
     return PandaModelConfig(marker=plate)

@@ -278,7 +278,7 @@ def simulate_grasp(
             aiming,
             config,
             estimator=estimator,
-            target=(lambda pixel, jacobian: target) if told_target else None,
+            target=(lambda pixel, jacobian, orientation: target) if told_target else None,
             check=check,
         )
         try:
