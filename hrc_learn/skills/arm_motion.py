@@ -19,6 +19,7 @@ from hrc_learn.controller import (
     SafetyState,
 )
 from hrc_learn.geometry import Pose, minimum_jerk, quaternion
+from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import (
     SerialChain,
     UnreachableError,
@@ -41,7 +42,8 @@ def resolved_rate(
 ) -> Float[Tensor, "*batch joints"]:
     """Joint velocities for a given twist, as close as possible to given joint velocities.
 
-    u = J^+ twist + N null_velocity, with N = I - J^+ J.
+    u = J^+ twist + N null_velocity. J^+ is damped near singularities, N is not: nowhere does
+    null-space motion move the end effector.
 
     Args:
         jacobian: Geometric Jacobian of the end effector.
@@ -49,8 +51,8 @@ def resolved_rate(
         null_velocity: Desired joint velocities; only their null-space part acts [rad/s].
     """
     J_pinv = pseudo_inverse(jacobian, singularity_damping(jacobian))
-    remaining = twist - (jacobian @ null_velocity.unsqueeze(-1)).squeeze(-1)
-    return null_velocity + (J_pinv @ remaining.unsqueeze(-1)).squeeze(-1)
+    task = (J_pinv @ twist.unsqueeze(-1)).squeeze(-1)
+    return task + null_projection(jacobian, null_velocity)
 
 
 def straight_line(
