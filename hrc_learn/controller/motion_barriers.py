@@ -45,8 +45,13 @@ class LimitBarrier(nn.Module):
         delta >= A^3/(8 j^2) + A^2/(2 j rate),
 
     3 mrad for a Panda at 5 1/s, which the margin covers; the first term, the way on which
-    the acceleration ramps down, counts where A/j is long, as for slow axes. From rest nearer
-    to a limit, or past it, a joint moves inwards only.
+    the acceleration ramps down, counts where A/j is long, as for slow axes.
+
+    From rest nearer to a limit, or past it, a joint moves inwards only. `rests_outside` says
+    whether it must (False), or does so when asked to and else may rest (True): then the set is
+    v_hat <= max(h(delta), A^2/(2 j)), and a joint that comes to rest within its margin does so
+    at most A^2/(2 j) (A/j + dt) past the wall, 0.2 mrad for a Panda at 125 Hz. That set is
+    invariant as well: braking lowers v_hat.
     """
 
     velocity: Tensor
@@ -65,7 +70,15 @@ class LimitBarrier(nn.Module):
     reserve: Tensor
     """A^2/(2 j), what it takes to start braking [rad/s]; zero without a jerk limit."""
 
-    def __init__(self, limits: MotionLimits, *, margin: float, rate: float, jerk_limited: bool):
+    def __init__(
+        self,
+        limits: MotionLimits,
+        *,
+        margin: float,
+        rate: float,
+        jerk_limited: bool,
+        rests_outside: bool = False,
+    ):
         """Prepare the constants.
 
         Args:
@@ -73,8 +86,10 @@ class LimitBarrier(nn.Module):
             margin: Distance kept from every position limit [rad].
             rate: Fastest decay of the remaining distance [1/s].
             jerk_limited: Whether the acceleration changes by at most j dt in a step.
+            rests_outside: Whether a joint outside its limits may rest there.
         """
         super().__init__()
+        self.rests_outside = rests_outside
         self.jerk_limited = jerk_limited
         A, j = limits.acceleration, limits.jerk
         walls = torch.stack([-limits.lower - margin, limits.upper - margin])
@@ -103,6 +118,8 @@ class LimitBarrier(nn.Module):
         speed = torch.copysign(square.sqrt() - self.knee, room)
         if self.jerk_limited:
             speed = speed - self.reserve  # v_hat = v + A^2/(2 j) at a = 0
+        if self.rests_outside:
+            speed = speed.clamp(min=0)
         bounds = speed.clamp(-self.velocity, self.velocity) * -self.sides
         lower, upper = bounds.unbind(-2)
         return lower, upper
@@ -126,6 +143,7 @@ class LimitBarrier(nn.Module):
         slack = torch.stack([velocity - lower, upper - velocity], dim=-2)
         offset = self.acceleration + self.jerk * dt
         # Negative far outside the set, where no acceleration is enough: the clamp brakes hard.
+        offset = offset.unsqueeze(-2)  # for both limits; dt may differ between arms
         square = torch.addcmul(offset * offset, self.jerk, slack, value=2)
         down, up = (square.clamp(min=0).sqrt() - offset).unbind(-2)
         return -down, up

@@ -109,8 +109,9 @@ class SafetyFilter(nn.Module):
 
     They hold for *any* sequence of commands, by a control barrier (`LimitBarrier`), as long as
     the arm moves as it is told, or errs by less than the margins. Where it does not, the
-    limits of acceleration and jerk hold, and the others as soon as those let them. Within its
-    margin a joint is driven back.
+    limits of acceleration and jerk hold, and the others as soon as those let them. A joint
+    outside its limits, or within their margin, does not move further out. It may rest there,
+    and returns when the command asks it to: no stop becomes a motion.
 
     Velocity, tool speed, acceleration and jerk are limited by scaling the whole vector, which
     keeps its direction; only the barrier cuts single joints. The acceleration fades in time
@@ -125,6 +126,7 @@ class SafetyFilter(nn.Module):
             margin=config.margin,
             rate=config.rate,
             jerk_limited=config.jerk_limited,
+            rests_outside=True,
         )
 
     def initial_state(
