@@ -15,6 +15,7 @@ from torch import Tensor
 from hrc_learn.geometry.numerics import (
     Constant,
     inverse_norm,
+    is_number,
     matmul,
     null_projection,
     solve_positive,
@@ -130,6 +131,20 @@ class PoseDrift:
     """Motion the task had planned for the last step (linear [m], angular [rad])."""
     active: Bool[Tensor, "*batch"]
     """Whether drift was measured in the last step; where not, the rest may be old."""
+
+
+def restored_drift(drift: PoseDrift) -> PoseDrift:
+    """The same, or none where it is not of numbers."""
+    numbers = (drift.drift, drift.joint_position, drift.planned, drift.jacobian.flatten(-2))
+    known = is_number(torch.cat(numbers, dim=-1)).all(-1)
+    unknown = ~known.unsqueeze(-1)
+    return PoseDrift(
+        drift=drift.drift.masked_fill(unknown, 0),
+        joint_position=drift.joint_position.masked_fill(unknown, 0),
+        jacobian=drift.jacobian.masked_fill(unknown.unsqueeze(-1), 0),
+        planned=drift.planned.masked_fill(unknown, 0),
+        active=drift.active & known,
+    )
 
 
 def measure_drift(

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from hrc_learn.controller.motion_barriers import LimitBarrier, SeparationConfig
+from hrc_learn.geometry.numerics import is_number
 from hrc_learn.kinematics import JointLimits
 from hrc_learn.pytree import pytree
 
@@ -33,6 +34,8 @@ INTERVENTIONS = (
 # Fraction of a limit, or joint velocity [rad/s], beyond which an intervention is reported.
 # Below is rounding, in float32 too: a command led along a limit would be flagged by chance.
 _REPORTED = 1e-6
+# Step [s] to brake by while none has been valid: that of the fastest arms, so the gentlest.
+_SHORTEST_STEP = 1e-3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,6 +79,8 @@ class SafetyState:
     """By which it came about [rad/s^2]; zero where jerk is not limited."""
     position: Float[Tensor, "*batch n"]
     """Where the joints should be now [rad]: used while their measurement is invalid."""
+    dt: Float[Tensor, "*batch"]
+    """Last step of a valid length [s]: used while that is invalid."""
     counts: Int[Tensor, "*batch kinds"]
     """Steps in which each of `INTERVENTIONS` was needed."""
 
@@ -113,6 +118,9 @@ class SafetyFilter(nn.Module):
     outside its limits, or within their margin, does not move further out. It may rest there,
     and returns when the command asks it to: no stop becomes a motion.
 
+    Whatever is not a number, in any argument or in the state, brakes the arm to rest and is
+    forgotten: neither a command nor a state is ever NaN or infinite.
+
     Velocity, tool speed, acceleration and jerk are limited by scaling the whole vector, which
     keeps its direction; only the barrier cuts single joints. The acceleration fades in time
     for the velocity to arrive without overshoot, so stops and resumes are smooth.
@@ -143,7 +151,26 @@ class SafetyFilter(nn.Module):
             velocity=still.clone() if joint_velocity is None else still + joint_velocity,
             acceleration=still,
             position=joint_position,
+            dt=torch.full_like(still[..., 0], _SHORTEST_STEP),
             counts=counts,
+        )
+
+    def restored(self, state: SafetyState) -> SafetyState:
+        """The state, at rest in mid-range where it is not of numbers."""
+        lower, upper = self.barrier.walls.unbind(-2)
+        fallback = (
+            (state.velocity, torch.zeros_like(state.velocity)),
+            (state.acceleration, torch.zeros_like(state.acceleration)),
+            (state.position, (upper - lower) / 2),
+        )
+        v, a, q = (torch.where(is_number(x), x, instead) for x, instead in fallback)
+        valid = (state.dt > 0) & (state.dt <= 1 / self.config.rate)
+        return SafetyState(
+            velocity=v,
+            acceleration=a,
+            position=q,
+            dt=torch.where(valid, state.dt, _SHORTEST_STEP),
+            counts=state.counts,
         )
 
     def velocity_bounds(
@@ -171,24 +198,40 @@ class SafetyFilter(nn.Module):
             state: Of the step before.
             joint_position: Measured [rad]. Not finite: brake to rest.
             joint_velocity_command: Wanted [rad/s]. Not finite: brake to rest.
-            dt: Time until the next step [s].
-            jacobian: Of the tool centre point, linear rows first: enables its speed cap.
+            dt: Time until the next step [s]. A tensor outside (0, 1/rate]: brake to rest, by
+                the last step that was within.
+            jacobian: Of the tool centre point, linear rows first: enables its speed cap. Not
+                finite: brake to rest.
             human_distance: Of the nearest person [m], who slows the tool down and stops it;
                 NaN, not known: stop. None: nobody is watched for.
             stop: Brake to rest for another reason.
             stale: The joint position is too old to be used: brake to rest.
             bounds: `velocity_bounds` of a trusted joint position, where they are known.
+                Not finite: brake to rest, as hard as the arm can.
 
         Returns:
             The velocity (*batch, n) [rad/s], the next state, and what was done.
 
         Raises:
-            ValueError: dt is not in (0, 1/rate], or a distance comes without a Jacobian.
+            ValueError: A number dt is not in (0, 1/rate], or a distance comes without a
+                Jacobian.
         """
-        self._check_step(dt)
-        q, u, invalid, stopped = self._validated(
-            state, joint_position, joint_velocity_command, stop, stale
-        )
+        state, dt, invalid = self._validated_state(state, dt)
+        given = [joint_position, joint_velocity_command]
+        if jacobian is not None:
+            given.append(jacobian.flatten(-2))
+        invalid = invalid | ~is_number(torch.cat(given, dim=-1)).all(-1, keepdim=True)
+        if bounds is not None:
+            unknown = ~is_number(torch.cat(bounds, dim=-1)).all(-1, keepdim=True)
+            invalid = invalid | unknown
+            bounds = bounds[0].masked_fill(unknown, 0), bounds[1].masked_fill(unknown, 0)
+        if stale is not None:
+            invalid = invalid | stale.unsqueeze(-1)
+        stopped = torch.zeros_like(invalid) if stop is None else stop.unsqueeze(-1)
+        q = torch.where(invalid, state.position, joint_position)
+        u = joint_velocity_command.masked_fill(invalid | stopped, 0)
+        if jacobian is not None:
+            jacobian = jacobian.masked_fill(invalid.unsqueeze(-1), 0)
         bounds = bounds or self.velocity_bounds(q)
 
         excess = _excess(u, self.barrier.velocity)
@@ -208,34 +251,29 @@ class SafetyFilter(nn.Module):
                 velocity=v,
                 acceleration=acceleration,
                 position=q + v * dt,
+                dt=state.dt,
                 counts=state.counts + flags,
             ),
             SafetyReport(flags=flags),
         )
 
-    def _check_step(self, dt: float | Tensor) -> None:
-        if not isinstance(dt, Tensor) and not 0 < dt <= 1 / self.config.rate:
+    def _validated_state(
+        self, state: SafetyState, dt: float | Tensor
+    ) -> tuple[SafetyState, float | Tensor, Tensor]:
+        """A state of numbers, the step to compute with, and where either was invalid."""
+        known = is_number(torch.cat([state.velocity, state.acceleration], dim=-1))
+        invalid, longest = ~known.all(-1, keepdim=True), 1 / self.config.rate
+        state = self.restored(state)
+        if isinstance(dt, Tensor):
+            valid = (dt > 0) & (dt <= longest)
+            length = torch.where(valid, dt.to(state.dt), state.dt)
+            return replace(state, dt=length), length.unsqueeze(-1), invalid | ~valid
+        if not 0 < dt <= longest:
             raise ValueError(
-                f"the safety filter needs a step dt in (0, {1 / self.config.rate:g}] s to "
+                f"the safety filter needs a step dt in (0, {longest:g}] s to "
                 f"guarantee the limits, but got {dt:g} s; step faster or lower its rate"
             )
-
-    def _validated(
-        self,
-        state: SafetyState,
-        q: Tensor,
-        u: Tensor,
-        stop: Tensor | None,
-        stale: Tensor | None,
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Position and command to work with, and the flags `invalid` and `stopped`."""
-        invalid = ~torch.cat([q, u], dim=-1).isfinite().all(-1, keepdim=True)
-        if stale is not None:
-            invalid = invalid | stale.unsqueeze(-1)
-        stopped = torch.zeros_like(invalid) if stop is None else stop.unsqueeze(-1)
-        q = torch.where(invalid, state.position, q)
-        u = u.masked_fill(invalid | stopped, 0)
-        return q, u, invalid, stopped
+        return replace(state, dt=torch.full_like(state.dt, dt)), dt, invalid
 
     def _cap_tcp_speed(
         self, u: Tensor, jacobian: Tensor | None, human_distance: Tensor | None

@@ -223,7 +223,7 @@ def unrolled_inverse_norm(A: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*bat
 def unrolled_null_projection(
     J: Float[Tensor, "*batch m n"], w: Float[Tensor, "*batch n"]
 ) -> Float[Tensor, "*batch n"]:
-    """`null_projection` by reflections that make J^T triangular, applied to w there and back."""
+    """`null_projection` by the reflections that make J^T triangular, there and back."""
     m = J.shape[-2]
     columns = list(J.unbind(-2))
     reflections: list[tuple[Tensor, Tensor]] = []
@@ -247,7 +247,7 @@ def unrolled_null_projection(
 
 
 def _reflected(x: Tensor, k: int, v: Tensor, factor: Tensor) -> Tensor:
-    """x with its entries from k on mirrored in the plane across v."""
+    """Mirror the entries of x from k on in the plane across v."""
     rest = x[..., k:]
     rest = rest - factor * (rest * v).sum(-1, keepdim=True) * v
     return torch.cat([x[..., :k], rest], dim=-1)
