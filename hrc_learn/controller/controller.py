@@ -228,8 +228,8 @@ class AdaptiveController(nn.Module):
     ) -> tuple[Command, ControllerState]:
         """One step of the law.
 
-        What is not a number, and a tensor `dt` outside (0, 1/rate] of the safety filter, brakes
-        the arm, flagged `invalid`, or is done without, as a feature not seen. It is neither
+        What is not a number, and a tensor `dt` beyond `SafetyConfig.longest_step`, brakes the
+        arm, flagged `invalid`, or is done without, as a feature not seen. It is neither
         learned from nor remembered: the next step is healthy.
 
         Args:
@@ -240,11 +240,11 @@ class AdaptiveController(nn.Module):
             What to send and why, and the next state.
 
         Raises:
-            ValueError: A number dt is not in (0, 1/rate] of the safety filter.
+            ValueError: A number dt is not in (0, longest_step] of the safety settings.
         """
         state = self._restored(state)
         goals, known = effective_goals(observation, self.goals)
-        dt, timed = known_step(observation.dt, 1 / self.config.safety.rate)
+        dt, timed = known_step(observation.dt, self.config.safety.longest_step)
         q, stale = validated_position(observation, state.safety.position)
         pose, J = self.chain.forward_and_jacobian(q)
         task_level = next_task_level(

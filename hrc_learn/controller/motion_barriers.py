@@ -52,6 +52,11 @@ class LimitBarrier(nn.Module):
     v_hat <= max(h(delta), A^2/(2 j)), and a joint that comes to rest within its margin does so
     at most A^2/(2 j) (A/j + dt) past the wall, 0.2 mrad for a Panda at 125 Hz. That set is
     invariant as well: braking lowers v_hat.
+
+    Joints that do what they are told T late go on with the speed of then, v + A T at most,
+    while they brake. A wall that recedes by T v_hat, which braking lowers by T A dt in a step,
+    makes up for it: Q(v_hat) + T v_hat <= delta, which is 1/rate + T in place of 1/rate. In
+    steps that take (1 + jitter) dt, A dt brakes with A/(1 + jitter): so much for A in Q.
     """
 
     velocity: Tensor
@@ -78,6 +83,8 @@ class LimitBarrier(nn.Module):
         rate: float,
         jerk_limited: bool,
         rests_outside: bool = False,
+        delay: float = 0.0,
+        jitter: float = 0.0,
     ):
         """Prepare the constants.
 
@@ -87,11 +94,14 @@ class LimitBarrier(nn.Module):
             rate: Fastest decay of the remaining distance [1/s].
             jerk_limited: Whether the acceleration changes by at most j dt in a step.
             rests_outside: Whether a joint outside its limits may rest there.
+            delay: Until the joints do what they are told [s].
+            jitter: Fraction by which a step may be longer than it says.
         """
         super().__init__()
         self.rests_outside = rests_outside
         self.jerk_limited = jerk_limited
         A, j = limits.acceleration, limits.jerk
+        rate, slowest = rate / (1 + rate * delay), A / (1 + jitter)
         walls = torch.stack([-limits.lower - margin, limits.upper - margin])
         constants = {
             "velocity": limits.velocity * (1 - _ROUNDING),
@@ -99,9 +109,9 @@ class LimitBarrier(nn.Module):
             "jerk": j.clone(),
             "walls": walls,
             "sides": torch.tensor([[1.0], [-1.0]]).to(walls),
-            "knee": A / rate,
-            "knee_square": (A / rate) ** 2,
-            "twice_acceleration": 2 * A,
+            "knee": slowest / rate,
+            "knee_square": (slowest / rate) ** 2,
+            "twice_acceleration": 2 * slowest,
             "reserve": A**2 / (2 * j) if jerk_limited else torch.zeros_like(A),
         }
         for name, value in constants.items():

@@ -51,6 +51,13 @@ class SafetyConfig:
     """Fastest decay of the remaining distance to a limit [1/s]; at most 1/dt."""
     jerk_limited: bool = True
     """Whether the jerk of each joint is limited, which starts to matter below 4 ms a step."""
+    braking: float = 1.0
+    """Fraction of the limits of acceleration and jerk that the arm's driver uses, above 0 to
+    1. franky plans with the `dynamics` that it is given, 0.3 by default in our adapter."""
+    delay: float = 0.0
+    """Longest time from a joint position read to the arm doing what was made of it [s]."""
+    jitter: float = 0.0
+    """Largest fraction by which steps are longer or shorter than their `dt`, 0 to below 1."""
     tcp_speed: float = 1.0
     """Cap on the speed of the tool centre point [m/s]; acts where a Jacobian is given."""
     separation: SeparationConfig = field(default_factory=SeparationConfig)
@@ -62,10 +69,18 @@ class SafetyConfig:
                 raise ValueError(f"{name} must be positive, but is {getattr(self, name)}")
         if self.margin < 0:
             raise ValueError(f"margin must not be negative, but is {self.margin}")
-        if not 0 <= self.velocity_margin < 1:
-            raise ValueError(
-                f"velocity_margin must be in [0, 1), but is {self.velocity_margin}"
-            )
+        if self.delay < 0:
+            raise ValueError(f"delay must not be negative, but is {self.delay}")
+        if not 0 < self.braking <= 1:
+            raise ValueError(f"braking must be in (0, 1], but is {self.braking}")
+        for name in ("velocity_margin", "jitter"):
+            if not 0 <= getattr(self, name) < 1:
+                raise ValueError(f"{name} must be in [0, 1), but is {getattr(self, name)}")
+
+    @property
+    def longest_step(self) -> float:
+        """For which the limits can be guaranteed [s]."""
+        return 1 / (self.rate * (1 + self.jitter))
 
 
 @pytree
@@ -129,10 +144,19 @@ class SafetyFilter(nn.Module):
     def __init__(self, limits: JointLimits, config: SafetyConfig | None = None):
         super().__init__()
         self.config = config = config or SafetyConfig()
+        # What a shorter step makes of a change of velocity must be in the driver's power.
+        usable = config.braking * (1 - config.jitter)
         self.barrier = LimitBarrier(
-            replace(limits, velocity=(1 - config.velocity_margin) * limits.velocity),
+            replace(
+                limits,
+                velocity=(1 - config.velocity_margin) * limits.velocity,
+                acceleration=usable * limits.acceleration,
+                jerk=usable * limits.jerk,
+            ),
             margin=config.margin,
             rate=config.rate,
+            delay=config.delay,
+            jitter=config.jitter,
             jerk_limited=config.jerk_limited,
             rests_outside=True,
         )
@@ -164,7 +188,7 @@ class SafetyFilter(nn.Module):
             (state.position, (upper - lower) / 2),
         )
         v, a, q = (torch.where(is_number(x), x, instead) for x, instead in fallback)
-        valid = (state.dt > 0) & (state.dt <= 1 / self.config.rate)
+        valid = (state.dt > 0) & (state.dt <= self.config.longest_step)
         return SafetyState(
             velocity=v,
             acceleration=a,
@@ -198,8 +222,8 @@ class SafetyFilter(nn.Module):
             state: Of the step before.
             joint_position: Measured [rad]. Not finite: brake to rest.
             joint_velocity_command: Wanted [rad/s]. Not finite: brake to rest.
-            dt: Time until the next step [s]. A tensor outside (0, 1/rate]: brake to rest, by
-                the last step that was within.
+            dt: Time until the next step [s]. A tensor outside (0, longest_step]: brake to
+                rest, by the last step that was within.
             jacobian: Of the tool centre point, linear rows first: enables its speed cap. Not
                 finite: brake to rest.
             human_distance: Of the nearest person [m], who slows the tool down and stops it;
@@ -213,7 +237,7 @@ class SafetyFilter(nn.Module):
             The velocity (*batch, n) [rad/s], the next state, and what was done.
 
         Raises:
-            ValueError: A number dt is not in (0, 1/rate], or a distance comes without a
+            ValueError: A number dt is not in (0, longest_step], or a distance comes without a
                 Jacobian.
         """
         state, dt, invalid = self._validated_state(state, dt)
@@ -262,7 +286,7 @@ class SafetyFilter(nn.Module):
     ) -> tuple[SafetyState, float | Tensor, Tensor]:
         """A state of numbers, the step to compute with, and where either was invalid."""
         known = is_number(torch.cat([state.velocity, state.acceleration], dim=-1))
-        invalid, longest = ~known.all(-1, keepdim=True), 1 / self.config.rate
+        invalid, longest = ~known.all(-1, keepdim=True), self.config.longest_step
         state = self.restored(state)
         if isinstance(dt, Tensor):
             valid = (dt > 0) & (dt <= longest)

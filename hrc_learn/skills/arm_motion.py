@@ -181,15 +181,22 @@ class PositionServo:
         self._chain, self._arm, self._dt = chain, arm, dt
         self._config = config = config or PositionServoConfig()
         self._filter = SafetyFilter(chain.limits, config.safety)
-        if not 0 < dt <= 1 / config.safety.rate:
+        if not 0 < dt <= config.safety.longest_step:
             raise ValueError(
-                f"targets must come within {1 / config.safety.rate:g} s of each other, but dt "
-                f"is {dt:g} s: raise the rate of frames."
+                f"targets must come within {config.safety.longest_step:g} s of each other, but "
+                f"dt is {dt:g} s: raise the rate of frames."
             )
         # Within the limits of the safety filter, which then has nothing to do.
         limits, margin = chain.limits, 1.5 * config.safety.margin
         self._smoother = ActionChunkFilter(
-            replace(limits, lower=limits.lower + margin, upper=limits.upper - margin), dt
+            replace(
+                limits,
+                lower=limits.lower + margin,
+                upper=limits.upper - margin,
+                acceleration=self._filter.barrier.acceleration,
+                jerk=self._filter.barrier.jerk,
+            ),
+            dt,
         )
         self.safety: SafetyState
         self._motion: ActionChunkState

@@ -22,6 +22,10 @@ if TYPE_CHECKING:
     from hrc_learn.skills.arm_motion import PositionServo
 
 
+# From reading the joints to the arm following [s], as `Imperfections.nominal()`; not measured.
+_DELAY = 0.030
+
+
 @RobotConfig.register_subclass("franka_panda")
 @dataclass(kw_only=True)
 class FrankaPandaConfig(PandaRobotConfig):
@@ -101,7 +105,7 @@ class FrankaPanda(PandaRobot):
             grip_force=config.grip_force,
             grip_speed=config.grip_speed,
         )
-        safety = SafetyConfig(tcp_speed=config.tcp_speed)
+        safety = SafetyConfig(tcp_speed=config.tcp_speed, braking=config.dynamics, delay=_DELAY)
         self._servo = PositionServo(
             panda, self._arm, self.dt, PositionServoConfig(safety=safety)
         )
