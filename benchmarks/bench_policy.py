@@ -1,11 +1,11 @@
 """Compare the policy `dmp` with a small ACT, trained on the same demonstrations.
 
-A scripted expert shows a job in simulation, such as grasping a thing that lies anywhere and is
-seen once. Policies learn from one demonstration and from more, and then do the job from
+A scripted expert shows a job in simulation, such as grasping an object that lies anywhere and
+is seen once. Policies learn from one demonstration and from more, and then do the job from
 beginnings they have not seen. Reported are successes, by MuJoCo's contacts, the distance of
-the hand from the path that the expert takes from there, and how abruptly commands change where
-one chunk follows another. For those that are trained, the file of figures also says what
-the loss was at first, half-way and at last.
+the end effector from the path that the expert takes from there, and how abruptly commands
+change where one chunk follows another. For those that are trained, the file of figures also
+says what the loss was at first, half-way and at last.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class Figures:
     success: float
     """Share."""
     path_mm: float
-    """Distance of the hand from the expert's at the same time, root mean square [mm]."""
+    """Of the end effector from the expert's at the same time, root mean square [mm]."""
     seam: float
     """Largest change of the joints' commanded velocity where chunks meet, over the largest
     within chunks."""

@@ -184,7 +184,7 @@ def long_run(seconds: float) -> RunRecording:
         position=np.sin(times[:, None] + np.arange(3)),
         camera=camera,
         image_jacobian=np.random.default_rng(0).normal(size=(steps, 2, 6)),
-        human_effort=np.zeros((steps, 7)),
+        nullspace_input=np.zeros((steps, 7)),
     )
 
 

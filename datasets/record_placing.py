@@ -1,4 +1,4 @@
-"""Record demonstrations of placing a thing on a shelf, hand and body shape at once.
+"""Record demonstrations of placing an object, end effector and null-space posture at once.
 
 The same as `hrc record placing`.
 """

@@ -1,4 +1,4 @@
-"""Record demonstrations of aiming at an object in the image of an uncalibrated camera.
+"""Record demonstrations of servoing to an object in the image of an uncalibrated camera.
 
 The same as `hrc record servoing`.
 """

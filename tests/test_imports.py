@@ -1,5 +1,6 @@
-"""What importing the package pulls in, each time in a fresh interpreter."""
+"""What importing the package pulls in, part after part in one fresh interpreter."""
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -9,66 +10,80 @@ import pytest
 ROOT = Path(__file__).parents[1]
 EDGES = ("lerobot", "rerun", "mujoco", "cv2", "matplotlib", "pyarrow", "datasets", "viser")
 CORE = ("dmp", "controller", "jacobian", "regions", "kinematics", "geometry", "protocols")
+SIMULATOR = ("mujoco", "cv2", "lerobot")
 
+PROGRAM = f"""
+import json, sys
+from contextlib import contextmanager
+from importlib import import_module, util
 
-def run(code: str) -> str:
-    """What a program prints that is started in the root of the checkout."""
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout.strip()
+def loaded(names):
+    return [name for name in names if name in sys.modules]
 
+@contextmanager
+def missing(names):
+    # None in `sys.modules` makes an import fail as if the library were not installed.
+    kept = {{name: sys.modules.get(name) for name in names}}
+    sys.modules.update(dict.fromkeys(names))
+    yield
+    for name, module in kept.items():
+        sys.modules.pop(name)
+        if module is not None:
+            sys.modules[name] = module
 
-@pytest.mark.parametrize(
-    "modules",
-    [["hrc_learn"], [f"hrc_learn.{name}" for name in CORE]],
-    ids=["the package", "the core"],
-)
-def test_the_core_pulls_in_no_edge(modules):
-    loaded = f"[name for name in {EDGES} if name in sys.modules]"
-    assert run(f"import sys, {', '.join(modules)}; print({loaded})") == "[]"
+found = {{}}
+found["datasets"] = util.find_spec("datasets").origin
+import hrc_learn
+found["package"] = loaded({EDGES})
+for name in {CORE}:
+    import_module(f"hrc_learn.{{name}}")
+found["core"] = loaded({EDGES})
 
+with missing({EDGES}):
+    import torch
+    from hrc_learn.dmp import JointDMP
+    from hrc_learn.kinematics import panda
+    time = torch.linspace(0, 1, 50)
+    JointDMP.fit(time, time[:, None].expand(-1, 7), n_basis=5).rollout().position
+    q = torch.zeros(7, dtype=torch.float64)
+    found["jacobian"] = list(panda.forward_and_jacobian(q)[1].shape)
 
-def test_the_core_works_where_no_edge_is_installed():
-    """None in `sys.modules` makes an import fail as if the library were missing."""
-    code = f"""
-import sys
-sys.modules.update(dict.fromkeys({EDGES}))
-import torch
-from hrc_learn.dmp import JointDMP
-from hrc_learn.kinematics import panda
-time = torch.linspace(0, 1, 50)
-JointDMP.fit(time, time[:, None].expand(-1, 7), n_basis=5).rollout().position
-print(tuple(panda.forward_and_jacobian(torch.zeros(7, dtype=torch.float64))[1].shape))
-"""
-    assert run(code) == "(6, 7)"
-
-
-def test_the_person_needs_no_screen_until_a_page_is_opened():
-    code = """
-import sys
 import hrc_learn.teleoperation.page, hrc_learn.teleoperation.devices
-print([name for name in ("viser", "pygame", "rerun", "mujoco") if name in sys.modules])
+found["person"] = loaded(("viser", "pygame", "rerun", *{SIMULATOR}))
+
+with missing({SIMULATOR}):
+    import hrc_learn.learning, hrc_learn.demos
+print(json.dumps(found))
 """
-    assert run(code) == "[]"
 
 
-def test_datasets_is_hugging_faces_even_in_our_checkout():
+@pytest.fixture(scope="module")
+def found():
+    """What is in `sys.modules` after each part, started in the root of the checkout."""
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM], cwd=ROOT, capture_output=True, text=True
+    )
+    # Learning, last, needs no simulator: who has demonstrations installs none.
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+@pytest.mark.parametrize("part", ["package", "core"])
+def test_the_core_pulls_in_no_edge(found, part):
+    assert found[part] == []
+
+
+def test_the_core_works_where_no_edge_is_installed(found):
+    assert found["jacobian"] == [6, 7]
+
+
+def test_the_person_needs_no_screen_until_a_page_is_opened(found):
+    assert found["person"] == []
+
+
+def test_datasets_is_hugging_faces_even_in_our_checkout(found):
     """Our folder of that name loses to an installed package while it is none itself."""
-    code = "import importlib.util; print(importlib.util.find_spec('datasets').origin)"
-    origin = Path(run(code))
+    origin = Path(found["datasets"])
     assert origin.name == "__init__.py"
     assert ROOT / "datasets" not in origin.parents
     assert origin.parent.parent.name in {"site-packages", "dist-packages"}
-
-
-def test_learning_from_a_dataset_needs_no_simulator():
-    """A user with demonstrations of their own installs neither MuJoCo nor OpenCV."""
-    program = """
-import sys
-for name in ("mujoco", "cv2", "lerobot"):
-    sys.modules[name] = None
-import hrc_learn.learning, hrc_learn.demos
-"""
-    subprocess.run([sys.executable, "-c", program], check=True, timeout=600)

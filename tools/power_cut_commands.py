@@ -29,6 +29,8 @@ STEPS = ("mkdir", "rename", "replace", "link", "symlink", "unlink", "rmdir", "fs
 # Between two random moments, on average [s]: the first while something changes on disk, growing
 # to the second while nothing does, as in minutes of simulation.
 SHORTEST, LONGEST = 0.004, 0.15
+# For a process to stop [s]: many times over what a busy machine takes.
+PATIENCE = 2.0
 
 
 @dataclass(frozen=True)
@@ -236,8 +238,15 @@ def watch(
         )
     while True:
         time.sleep(rng.uniform(0, 2 * pause))
+        patience = time.perf_counter() + PATIENCE
         os.killpg(process.pid, signal.SIGSTOP)
-        _, status = os.waitpid(process.pid, os.WUNTRACED)
+        ended, status = os.waitpid(process.pid, os.WUNTRACED | os.WNOHANG)
+        while not ended and time.perf_counter() < patience:
+            time.sleep(1e-3)
+            ended, status = os.waitpid(process.pid, os.WUNTRACED | os.WNOHANG)
+        if not ended:  # it waits for a process it has just forked, which was stopped first
+            os.killpg(process.pid, signal.SIGCONT)
+            continue
         if not os.WIFSTOPPED(status):
             process.returncode = os.waitstatus_to_exitcode(status)
             return process.returncode, changes

@@ -1,4 +1,4 @@
-"""Tune gains of the controller: the hand's marker sooner at its target, in simulation.
+"""Tune gains of the controller: the gripper's marker sooner at its target, in simulation.
 
 The same as `hrc tune`.
 """

@@ -6,155 +6,133 @@ from dataclasses import dataclass
 from importlib import import_module, metadata
 from typing import Any, NoReturn
 
-from hrc_learn.cli._help import table
+from hrc_learn.cli._options import table
 from hrc_learn.cli._run import parse, status_of
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Command:
     """One command: where its parts are, imported when it is meant."""
 
     says: str
     """What it does, in a line of the list of commands."""
-    module: str
-    """Of `hrc_learn.cli.commands`; its `run` takes the arguments, returns the exit status."""
-    arguments: tuple[str, str]
-    """Module of `hrc_learn.cli.arguments`, and the dataclass in it."""
+    runs: str
+    """Module of `hrc_learn.cli.commands` and the function in it, which takes the arguments and
+    returns the exit status."""
+    arguments: str
+    """Module of `hrc_learn.cli.arguments` and the dataclass in it."""
     leading: tuple[str, ...] = ()
     """Options whose values may come first, without their names."""
 
     def arguments_type(self) -> type:
         """The dataclass that is its command line."""
-        module, name = self.arguments
-        return getattr(import_module(f"hrc_learn.cli.arguments.{module}"), name)
+        return _part("arguments", self.arguments)
 
     def work(self, args: Any) -> int:
         """Do it; the exit status."""
-        return import_module(f"hrc_learn.cli.commands.{self.module}").run(args) or 0
+        return _part("commands", self.runs)(args) or 0
+
+
+def _part(package: str, place: str) -> Any:
+    module, name = place.split(".")
+    return getattr(import_module(f"hrc_learn.cli.{package}.{module}"), name)
 
 
 COMMANDS: dict[str, Command] = {
     "demo": Command(
-        says="the whole main job: demonstrate, learn, grasp, place",
-        module="demo",
-        arguments=("run", "Demo"),
+        "the whole main job: demonstrate, learn, grasp, place", "run.demo", "run.Demo"
     ),
     "record placing": Command(
-        says="demonstrations of placing, by a scripted expert in simulation",
-        module="record_placing",
-        arguments=("record", "RecordPlacing"),
+        "demonstrations of placing, by a scripted expert in simulation",
+        "record.record_placing",
+        "record.RecordPlacing",
     ),
     "record servoing": Command(
-        says="demonstrations of aiming with an uncalibrated camera",
-        module="record_servoing",
-        arguments=("record", "RecordServoing"),
+        "demonstrations of servoing with an uncalibrated camera",
+        "record.record_servoing",
+        "record.RecordServoing",
     ),
     "record expert": Command(
-        says="the columns that LeRobot's robots have, by the same expert",
-        module="record_expert",
-        arguments=("record", "RecordExpert"),
+        "the columns that LeRobot's robots have, by the same expert",
+        "record.record_expert",
+        "record.RecordExpert",
     ),
     "import": Command(
-        says="arrays to a LeRobot dataset",
-        module="import_arrays",
-        arguments=("dataset", "ImportArrays"),
+        "arrays to a LeRobot dataset", "convert.import_arrays", "dataset.ImportArrays"
     ),
-    "show": Command(
-        says="demonstrations in Rerun",
-        module="show",
-        arguments=("dataset", "Show"),
-        leading=("dataset",),
-    ),
+    "show": Command("demonstrations in Rerun", "show.show", "dataset.Show", ("dataset",)),
     "check": Command(
-        says="errors and oddities by file, episode, frame and key",
-        module="check",
-        arguments=("dataset", "Check"),
-        leading=("dataset",),
+        "errors and oddities by file, episode, frame and key",
+        "check.check",
+        "dataset.Check",
+        ("dataset",),
     ),
     "repair": Command(
-        says="what can be mended of a dataset, in a copy",
-        module="repair",
-        arguments=("dataset", "Repair"),
-        leading=("dataset", "out"),
+        "what can be mended of a dataset, in a copy",
+        "check.repair",
+        "dataset.Repair",
+        ("dataset", "out"),
     ),
     "recover": Command(
-        says="what a process that was killed left behind",
-        module="recover",
-        arguments=("dataset", "Recover"),
-        leading=("path",),
+        "what a process that was killed left behind",
+        "check.recover",
+        "dataset.Recover",
+        ("path",),
     ),
     "extract": Command(
-        says="markers found in a dataset's videos",
-        module="extract",
-        arguments=("dataset", "Extract"),
-        leading=("dataset",),
+        "markers found in a dataset's videos",
+        "convert.extract",
+        "dataset.Extract",
+        ("dataset",),
     ),
     "fit primitives": Command(
-        says="movement primitives of joints and hand",
-        module="fit_primitives",
-        arguments=("learn", "FitPrimitives"),
+        "movement primitives of joints and end effector",
+        "fit.fit_primitives",
+        "learn.FitPrimitives",
     ),
     "fit image-jacobian": Command(
-        says="image Jacobian, and where to aim",
-        module="fit_image_jacobian",
-        arguments=("learn", "FitImageJacobian"),
+        "image Jacobian and visual target", "fit.fit_image_jacobian", "learn.FitImageJacobian"
     ),
     "evaluate primitives": Command(
-        says="primitives on demonstrations held out",
-        module="evaluate_primitives",
-        arguments=("learn", "EvaluatePrimitives"),
-        leading=("model", "dataset"),
+        "primitives on demonstrations held out",
+        "evaluate.evaluate_primitives",
+        "learn.EvaluatePrimitives",
+        ("model", "dataset"),
     ),
     "evaluate image-jacobian": Command(
-        says="an image Jacobian against the simulator's true one",
-        module="evaluate_image_jacobian",
-        arguments=("learn", "EvaluateImageJacobian"),
-        leading=("model", "dataset"),
+        "an image Jacobian against the simulator's true one",
+        "evaluate.evaluate_image_jacobian",
+        "learn.EvaluateImageJacobian",
+        ("model", "dataset"),
     ),
-    "tune": Command(
-        says="gains, searched over simulated grasps",
-        module="tune",
-        arguments=("learn", "Tune"),
-    ),
+    "tune": Command("gains, searched over simulated grasps", "tune.tune", "learn.Tune"),
     "smooth": Command(
-        says="limits on what any LeRobot policy asks for",
-        module="smooth",
-        arguments=("learn", "Smooth"),
+        "limits on what any LeRobot policy asks for", "smooth.smooth", "learn.Smooth"
     ),
     "run placing": Command(
-        says="the paper's first experiment: a motion repeated for other shelves",
-        module="run_placing",
-        arguments=("run", "RunPlacing"),
+        "the paper's first experiment: a motion repeated for other shelves",
+        "run.run_placing",
+        "run.RunPlacing",
     ),
     "run grasping": Command(
-        says="its second: a grasp with a camera nobody calibrated",
-        module="run_grasping",
-        arguments=("run", "RunGrasping"),
+        "its second: a grasp with a camera nobody calibrated",
+        "run.run_grasping",
+        "run.RunGrasping",
     ),
     "run collaboration": Command(
-        says="its third, the whole job, with one object or three",
-        module="run_collaboration",
-        arguments=("run", "RunCollaboration"),
+        "its third, the whole job, with one object or three",
+        "run.run_collaboration",
+        "run.RunCollaboration",
     ),
-    "report": Command(
-        says="one page from the folders of several runs",
-        module="report",
-        arguments=("run", "Report"),
-    ),
-    "sweep": Command(
-        says="thousands of simulated grasps as batches",
-        module="sweep",
-        arguments=("run", "Sweep"),
-    ),
+    "report": Command("one page from the folders of several runs", "show.report", "run.Report"),
+    "sweep": Command("thousands of simulated grasps as batches", "sweep.sweep", "run.Sweep"),
     "serve": Command(
-        says="the controller in a paced loop, and its latency",
-        module="serve",
-        arguments=("run", "Serve"),
+        "the controller in a paced loop, and its latency", "serve.serve", "run.Serve"
     ),
     "page": Command(
-        says="a page in the browser to lead the arm and record demonstrations",
-        module="page",
-        arguments=("run", "ServePage"),
+        "a page in the browser to lead the arm and record demonstrations",
+        "page.page",
+        "run.ServePage",
     ),
 }
 """By what is typed after `hrc`."""

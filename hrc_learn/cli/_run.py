@@ -1,20 +1,22 @@
-"""A command run: its command line parsed, its errors told in a line, its exit status.
+"""A command run: its command line, its exit status, and what it writes and prints.
 
 Exit status: 0 done, 1 the work failed, 2 bad input. Bad input ends in one line on stderr.
 """
 
 import io
+import json
 import re
+import shlex
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import redirect_stderr
+from dataclasses import asdict
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
-from hrc_learn.cli._help import short_help
-from hrc_learn.cli._options import complete, mentions_details
-from hrc_learn.cli._values import one_line
+from hrc_learn.cli._options import complete, mentions_details, short_help
+from hrc_learn.store import write_json
 
 EXTRAS = {
     "tyro": "programs",
@@ -46,13 +48,15 @@ def run[Args](main: Callable[[Args], int | None], args: type[Args]) -> NoReturn:
     with status 1.
     """
     words, program = sys.argv[1:], Path(sys.argv[0]).name
-    description = _summary(main)
+    # The program's own docstring says what it does.
+    description = (sys.modules[main.__module__].__doc__ or main.__doc__ or "").strip() or None
     sys.exit(status_of(lambda: main(parse(args, words, program, description)) or 0))
 
 
 def status_of(work: Callable[[], int]) -> int:
     """Do the work; its exit status, what went wrong told in one line on stderr."""
-    warnings.formatwarning = _warning_line
+    # As a user reads it: without the place in our code that warned.
+    warnings.formatwarning = lambda message, *_place, **_line: f"warning: {message}\n"
     try:
         return work()
     except (ValueError, FileNotFoundError, FileExistsError, NotADirectoryError) as error:
@@ -130,12 +134,50 @@ def _complaint(box: str) -> str:
     return " ".join(said.split()).split(" Got errors")[0].rstrip(".")
 
 
-def _warning_line(message: Warning | str, *_place: object, **_line: object) -> str:
-    """A warning as a user reads it: without the place in our code that gave it."""
-    return f"warning: {message}\n"
+def show_values(title: str, values: Mapping[str, float]) -> None:
+    """Print measured values as a table."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table("measure", "value", title=title)
+    for name, value in values.items():
+        table.add_row(name.replace("_", " "), f"{value:.3g}")
+    Console().print(table)
 
 
-def _summary(main: Callable) -> str | None:
-    """The program's own docstring."""
-    text = sys.modules[main.__module__].__doc__ or main.__doc__
-    return text and text.strip()
+def write_values(path: Path | None, values: Mapping[str, float | int]) -> None:
+    """Write measured values as one flat object, where a file is asked for."""
+    if path is not None:
+        write_json(path, values)
+
+
+def one_line(error: BaseException) -> str:
+    """What an exception says, with the notes added to it, on one line."""
+    if isinstance(error, OSError) and error.strerror and error.filename:
+        text = f"{error.filename}: {error.strerror}"
+    else:
+        text = str(error) or type(error).__name__
+    return " ".join(" ".join([text, *getattr(error, "__notes__", ())]).split())
+
+
+def refuse_existing(path: Path, overwrite: bool) -> None:
+    """Say before any work that its result would find something in its place.
+
+    Raises:
+        FileExistsError: If there is something that may not be replaced.
+    """
+    if path.exists() and not overwrite:
+        raise FileExistsError(f"{path} exists: give another --out, or --overwrite it")
+
+
+def configuration(args: Any) -> dict[str, Any]:
+    """The arguments of a command as they are kept with its results: plain JSON."""
+    return json.loads(json.dumps(asdict(args), default=str))
+
+
+def command_line() -> str:
+    """What was typed to start this process, to be typed again."""
+    program, *arguments = sys.argv
+    # The installed command is found by its name; a program needs Python before it.
+    start = ["python", program] if program.endswith(".py") else [Path(program).name]
+    return shlex.join([*start, *arguments])

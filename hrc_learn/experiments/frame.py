@@ -12,11 +12,15 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
-from hrc_learn.experiments.live_view import LiveView, LiveViewConfig, live_view, no_live_view
-from hrc_learn.experiments.metric_table import Evaluation, Metric, evaluate
+from hrc_learn.experiments.metric_table import Evaluation, Metric, Summary, evaluate
 from hrc_learn.experiments.monte_carlo import Run as TrialRun
 from hrc_learn.experiments.monte_carlo import Trial, repeat
-from hrc_learn.experiments.trial_statistics import Summary
+from hrc_learn.experiments.run_recording import (
+    LiveView,
+    LiveViewConfig,
+    live_view,
+    no_live_view,
+)
 from hrc_learn.skills.work_cell import TaskFailedError
 from hrc_learn.store import new_folder, write_json
 from hrc_learn.viz import LoggedSteps, RunRecording
@@ -145,8 +149,6 @@ class Results:
     """Of run and studies, as written to JSON."""
     failure: str
     """Why the run was no success; empty if it was."""
-    trials: Mapping[str, Sequence[Trial]] = field(default_factory=dict)
-    """By name of the study."""
 
     @classmethod
     def of[Run](
@@ -176,7 +178,6 @@ class Results:
             # Totals over all trials take the place of the counts of the single run.
             values=total.values | values,
             failure=failure,
-            trials=trials,
         )
 
     @property
@@ -241,15 +242,24 @@ def conduct[Run](
     counts = {TRIALS: options.trials, **(counts or {})}
     if negative := [name for name, count in counts.items() if count < 0]:
         raise ValueError(f"--{negative[0]} must not be negative, but is {counts[negative[0]]}.")
-    console = Console()
     if configuration is None:
         configuration = asdict(options) | asdict(experiment)  # pyright: ignore[reportArgumentType]
+    console, view, studies = Console(), no_live_view, experiment.studies()
+    if options.serve:
+        view = live_view(
+            experiment.title, options.serving, lambda at: console.print(f"Dashboard at {at}")
+        )
+    # Beside the folder, which is there only when all is done: a stopped run goes on.
+    files = {
+        name: options.out.with_name(f"{options.out.name}.{name}.jsonl")
+        for name in studies
+        if counts.get(name)
+    }
     with new_folder(options.out, configuration, options.overwrite) as folder:
-        run = experiment.run(options.seed, _observer(experiment, options, console.print))
+        run = experiment.run(options.seed, Observer(view=view, tell=console.print))
         trials = {
-            name: _repeat(study, name, counts[name], options)
-            for name, study in experiment.studies().items()
-            if counts.get(name)
+            name: _repeat(studies[name], counts[name], file, options)
+            for name, file in files.items()
         }
         results = Results.of(experiment, run, options.seed, trials)
         with console.status("Writing recordings and report"):
@@ -257,19 +267,29 @@ def conduct[Run](
             for name, recording in recordings.items():
                 record_run(folder / f"{name}.rrd", recording)
             experiment.log(run).save(folder / "log.npz")
-            sections = experiment.sections(run, recordings)
-            report = report_of(experiment, sections, results, configuration, command)
+            report = Report(
+                title=experiment.title,
+                summary=experiment.summary,
+                table=results.table,
+                sections=(
+                    *experiment.sections(run, recordings),
+                    *(studies[name].section(known) for name, known in trials.items()),
+                ),
+                configuration=configuration,
+                versions=software_versions(),
+                command=command or shlex.join(["python", *sys.argv]),
+            )
             write_report(folder, report)
             write_json(folder / "measured.json", results.values)
-            for name in trials:
-                shutil.copy(_trial_file(options, name), folder / f"{name}.jsonl")
-    for name in trials:
-        _trial_file(options, name).unlink()
+            for name, file in files.items():
+                shutil.copy(file, folder / f"{name}.jsonl")
+    for file in files.values():
+        file.unlink()
     if options.json is not None:
         write_json(options.json, results.values)
     show_measurements(results.table)
     for name, known in trials.items():
-        console.print(Summary.of(known).table(experiment.studies()[name].title))
+        console.print(Summary.of(known).table(studies[name].title))
     if results.failure:
         print(f"failed: {results.failure}", file=sys.stderr)
     console.print(f"Recordings rerun {options.out / '*.rrd'}")
@@ -277,53 +297,13 @@ def conduct[Run](
     return 0 if results.ok else 1
 
 
-def report_of(
-    experiment: Experiment[Any],
-    sections: Sequence[Section],
-    results: Results,
-    configuration: Mapping[str, object],
-    command: str = "",
-) -> Report:
-    """Table, sections of the run and of its studies, and how to do it again."""
-    studies = experiment.studies()
-    return Report(
-        title=experiment.title,
-        summary=experiment.summary,
-        table=results.table,
-        sections=(
-            *sections,
-            *(studies[name].section(known) for name, known in results.trials.items()),
-        ),
-        configuration=configuration,
-        versions=software_versions(),
-        command=command or shlex.join(["python", *sys.argv]),
-    )
-
-
-def _observer(
-    experiment: Experiment[Any], options: RunOptions, tell: Callable[[str], None]
-) -> Observer:
-    if not options.serve:
-        return Observer(tell=tell)
-
-    def opened(address: str) -> None:
-        tell(f"Dashboard at {address}")
-
-    return Observer(view=live_view(experiment.title, options.serving, opened), tell=tell)
-
-
-def _repeat(study: Study, name: str, count: int, options: RunOptions) -> list[Trial]:
+def _repeat(study: Study, count: int, file: Path, options: RunOptions) -> list[Trial]:
     return repeat(
         study.trial,
         range(options.seed, options.seed + count),
-        _trial_file(options, name),
+        file,
         made_by=asdict(study.trial),  # pyright: ignore[reportArgumentType]
         processes=options.processes,
         failures=(TaskFailedError,),
         title=study.title,
     )
-
-
-def _trial_file(options: RunOptions, name: str) -> Path:
-    """Beside the folder, which is there only when all is done: a stopped run goes on."""
-    return options.out.with_name(f"{options.out.name}.{name}.jsonl")

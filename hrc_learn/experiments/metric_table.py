@@ -1,9 +1,22 @@
-"""What an experiment measures, as a table: name, unit, bound and what the paper claims."""
+"""What an experiment measures, as a table: of one run, and over many trials.
 
-from collections.abc import Callable, Iterable
+A `Metric` has a name, a unit, a bound and what the paper claims. A `Summary` is the success
+rate, quantiles and totals of trials, of which `median`, `p95` and others make metrics.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
+from typing import TYPE_CHECKING
 
+import numpy as np
+from jaxtyping import Float
+
+from hrc_learn.experiments.monte_carlo import Trial
 from hrc_learn.viz.report import Measurement
+
+if TYPE_CHECKING:
+    from rich.table import Table
 
 
 @dataclass(frozen=True)
@@ -110,3 +123,187 @@ def evaluate[Run](metrics: Iterable[Metric[Run]], run: Run) -> Evaluation:
             detail = metric.detail(run)
             faults.append(f"{fault} ({detail})" if detail else fault)
     return Evaluation(table=tuple(table), values=values, faults=tuple(faults))
+
+
+# Quantile of the normal distribution for a two-sided interval of 95 %.
+_Z = 1.959964
+
+_UNITS = {"s", "m", "mm", "rad", "deg", "px", "%"}
+"""Ends of keys: statistics are named before them, as in `place_error_p95_mm`."""
+
+
+def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
+    """Interval of 95 % of a share (Wilson 1927); honest for few trials and shares near 0 or 1.
+
+    Args:
+        successes: Of the trials.
+        trials: At least one.
+
+    Raises:
+        ValueError: If there are no trials, or more successes than trials.
+    """
+    if not 0 <= successes <= trials or trials == 0:
+        raise ValueError(f"{successes} successes of {trials} trials make no share.")
+    share, z2 = successes / trials, _Z**2 / trials
+    middle = share + z2 / 2
+    half = _Z * math.sqrt(share * (1 - share) / trials + z2 / (4 * trials))
+    return max(0.0, (middle - half) / (1 + z2)), min(1.0, (middle + half) / (1 + z2))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Spread:
+    """Quantiles of one measured value over the trials that measured it."""
+
+    median: float
+    p95: float
+    min: float
+    max: float
+
+    @classmethod
+    def of(cls, values: Float[np.ndarray, " trials"]) -> "Spread":
+        """Of finite values, at least one."""
+        # "higher": a value that was measured, and at least the share asked for lies below it.
+        median, p95 = (float(np.quantile(values, q, method="higher")) for q in (0.5, 0.95))
+        return cls(median=median, p95=p95, min=float(values.min()), max=float(values.max()))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Summary:
+    """Statistics of a repeated experiment."""
+
+    trials: int
+    failed: Mapping[int, str]
+    """Reason by seed."""
+    spread: Mapping[str, Spread]
+    """By key of the values that are no counts; failed trials as far as they measured them."""
+    totals: Mapping[str, int]
+    """Sums of the values that are counts, by key."""
+
+    @classmethod
+    def of(cls, trials: Sequence[Trial]) -> "Summary":
+        """Count and sort.
+
+        Raises:
+            ValueError: Without trials.
+        """
+        if not trials:
+            raise ValueError("there are no trials to sum up.")
+        keys = list(dict.fromkeys(key for trial in trials for key in trial.values))
+        counts = [
+            key
+            for key in keys
+            if all(isinstance(trial.values.get(key, 0), int) for trial in trials)
+        ]
+        measured = {key: column(trials, key) for key in keys if key not in counts}
+        known = {key: values[np.isfinite(values)] for key, values in measured.items()}
+        return cls(
+            trials=len(trials),
+            failed={trial.seed: trial.failure for trial in trials if trial.failure},
+            spread={key: Spread.of(values) for key, values in known.items() if len(values)},
+            totals={
+                key: sum(int(trial.values.get(key, 0)) for trial in trials) for key in counts
+            },
+        )
+
+    @property
+    def successes(self) -> int:
+        """Number of trials that did not fail."""
+        return self.trials - len(self.failed)
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Interval of 95 % of the success rate."""
+        return wilson_interval(self.successes, self.trials)
+
+    @property
+    def rate(self) -> str:
+        """Successes and success rate in words."""
+        low, high = self.interval
+        return (
+            f"{self.successes} of {self.trials} succeeded "
+            f"({100 * low:.1f} to {100 * high:.1f} % with 95 % confidence)"
+        )
+
+    def figures(self) -> dict[str, float | int]:
+        """All of it as one flat object of numbers; seeds and reasons left out."""
+        low, high = self.interval
+        values: dict[str, float | int] = {
+            "trials": self.trials,
+            "successes": self.successes,
+            "success_rate": self.successes / self.trials,
+            "success_rate_low": low,
+            "success_rate_high": high,
+            **self.totals,
+        }
+        for key, spread in self.spread.items():
+            stem, _, unit = key.rpartition("_")
+            for kind, value in vars(spread).items():
+                name = f"{stem}_{kind}_{unit}" if unit in _UNITS else f"{key}_{kind}"
+                values[name] = value
+        return values
+
+    def table(self, title: str) -> "Table":
+        """To be printed; the heading has the success rate, the foot why others failed."""
+        from rich.table import Table
+        from rich.text import Text
+
+        # As text: brackets in a reason are no markup.
+        reasons = Text(
+            "\n".join(f"seed {seed}: {reason}" for seed, reason in self.failed.items())
+        )
+        table = Table(
+            "measured", title=f"{title}: {self.rate}", caption=reasons, caption_justify="left"
+        )
+        for column in ("median", "p95", "min", "max"):
+            table.add_column(column, justify="right")
+        for key, spread in self.spread.items():
+            numbers = vars(spread).values()
+            table.add_row(key.replace("_", " "), *(f"{number:.4g}" for number in numbers))
+        for key, count in self.totals.items():
+            table.add_row(f"{key.replace('_', ' ')}, in all", f"{count}")
+        return table
+
+
+def column(trials: Sequence[Trial], key: str) -> Float[np.ndarray, " trials"]:
+    """One value of every trial; NaN where a trial has no such number."""
+    values = (trial.values.get(key, math.nan) for trial in trials)
+    return np.array([math.nan if isinstance(v, str) else v for v in values], dtype=float)
+
+
+# What a metric over trials is computed by: `Metric("place error, p95", p95("place_error_mm"))`.
+
+type Statistic = Callable[[Sequence[Trial]], float | int | None]
+"""A number of many trials; None if no trial measured what it is made of."""
+
+
+def success_rate(trials: Sequence[Trial]) -> float:
+    """Share of the trials that did not fail."""
+    return sum(not trial.failure for trial in trials) / len(trials)
+
+
+def median(key: str) -> Statistic:
+    """Over the trials that measured the value."""
+    return _spread(key, "median")
+
+
+def p95(key: str) -> Statistic:
+    """95th percentile over the trials that measured the value."""
+    return _spread(key, "p95")
+
+
+def _spread(key: str, kind: str) -> Statistic:
+    def statistic(trials: Sequence[Trial]) -> float | None:
+        spread = Summary.of(trials).spread.get(key)
+        return None if spread is None else getattr(spread, kind)
+
+    return statistic
+
+
+def largest(key: str) -> Statistic:
+    """NaN, which keeps no bound, if a trial was given up before it measured the value."""
+    return lambda trials: float(column(trials, key).max())
+
+
+def total(key: str) -> Statistic:
+    """Sum over all trials; NaN as in `largest`."""
+    return lambda trials: float(column(trials, key).sum())

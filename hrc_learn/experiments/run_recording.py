@@ -1,27 +1,161 @@
-"""The recording of a run: what was logged and what the simulator knows, to be looked at."""
+"""What a run leaves to be measured and looked at, from its log and from the simulator.
+
+Quantities that several experiments measure, the recording of a run, and its dashboard in the
+browser while it goes on.
+"""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass
 
 import numpy as np
+import torch
 from jaxtyping import Float
 
 from hrc_learn.demos import Demonstration
-from hrc_learn.experiments.run_measures import (
-    TOOL,
-    Deviation,
-    link_poses,
-    spans,
-    true_image_jacobian,
-)
-from hrc_learn.geometry import Box
+from hrc_learn.geometry import Box, Pose, quaternion
 from hrc_learn.kinematics import panda
-from hrc_learn.sim import MotionLog, World
-from hrc_learn.skills.pick_and_place import TRANSFER
+from hrc_learn.sim import MotionLog, Touch, World
+from hrc_learn.skills.pick_and_place import INTERACT, TRANSFER
 from hrc_learn.skills.placing import Plan
 from hrc_learn.skills.work_cell import SAFETY_COLUMNS, WorkCell
 from hrc_learn.vision import CameraModel
 from hrc_learn.viz import CameraRecording, JointLimits, LoggedSteps, RunRecording
+
+ELBOW, TOOL = 3, 8
+"""Frames of the elbow and of the tool among the links."""
+
+
+def spans(log: LoggedSteps, phase: str) -> list[tuple[float, float]]:
+    """Start and end of each time a phase was entered [s]; infinite is the end of the last."""
+    events = log.events
+    return [
+        (event.time, math.inf if following is None else following.time)
+        for event, following in zip(events, [*events[1:], None], strict=True)
+        if event.text == phase
+    ]
+
+
+def span(log: LoggedSteps, phase: str) -> tuple[float, float]:
+    """Start and end of the first time a phase was entered [s]; empty if it never was."""
+    return (spans(log, phase) or [(0.0, 0.0)])[0]
+
+
+def true_image_jacobian(
+    log: LoggedSteps, world: World, cameras: Sequence[tuple[float, CameraModel]]
+) -> Float[np.ndarray, "time 2 6"]:
+    """True image Jacobian of the gripper's marker wherever the controller used its estimate.
+
+    Args:
+        log: The run's.
+        world: Knows where the marker is on the gripper.
+        cameras: The true ones, and from when on each watched [s].
+    """
+    used = np.isfinite(log["image_jacobian"]).all(axis=(1, 2))
+    jacobian = np.full_like(log["image_jacobian"], np.nan)
+    poses, offset = link_poses(log), torch.from_numpy(world.hand_marker_offset())
+    ends = [*(start for start, _ in cameras[1:]), math.inf]
+    for (start, camera), end in zip(cameras, ends, strict=True):
+        rows = used & (log["time"] >= start) & (log["time"] < end)
+        tool = poses[torch.from_numpy(rows), TOOL]
+        marker = tool.apply(offset).numpy()
+        jacobian[rows] = camera.image_jacobian(marker, tool.position.numpy())
+    return jacobian
+
+
+def true_tool(motion: MotionLog, world: World, steps: int) -> Pose:
+    """Poses of the tool as the simulator knows them, whatever the encoders say, (time,)."""
+    hand = _body(motion, "hand", steps)
+    # The hand itself may be mounted askew; the tool centre point lies along its axis.
+    return Pose(hand.apply(torch.from_numpy(world.arm.tool_offset)), hand.orientation)
+
+
+def _body(motion: MotionLog, name: str, steps: int) -> Pose:
+    (body,) = (body for body in motion.bodies(steps) if body.name == name)
+    return Pose(torch.from_numpy(body.position), torch.from_numpy(body.orientation))
+
+
+def link_poses(log: LoggedSteps) -> Pose:
+    """Poses of the joint frames, the flange and the tool at every step, (time, links)."""
+    return panda.link_poses(torch.from_numpy(log["joint_position"]))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Deviation:
+    """How far end effector and elbow really moved while a person pushed; NaN otherwise."""
+
+    position: Float[np.ndarray, " time"]
+    """Of the end effector [m]."""
+    rotation: Float[np.ndarray, " time"]
+    """Of the end effector [rad]."""
+    elbow: Float[np.ndarray, " time"]
+    """Of the elbow [m]."""
+
+    @classmethod
+    def of(cls, log: LoggedSteps, motion: MotionLog, world: World) -> "Deviation":
+        """From the first null-space force until the time left to the person is over.
+
+        Args:
+            log: The run's.
+            motion: Poses of everything that moved in it.
+            world: That it ran in.
+        """
+        time = log["time"]
+        start, end = span(log, INTERACT)
+        within = (time >= start) & (time < end)
+        pushed = within & (np.abs(log["nullspace_input"]).max(axis=1) > 0)
+        first = int(pushed.argmax()) if pushed.any() else 0
+        rows = within & (np.arange(len(time)) >= first) & bool(pushed.any())
+        tool = true_tool(motion, world, len(time))
+        # The frame of joint 4 is where the elbow is.
+        elbow = _body(motion, f"link{ELBOW + 1}", len(time))
+
+        def distance(pose: Pose) -> Float[np.ndarray, " time"]:
+            away = (pose.position - pose.position[first]).norm(dim=-1).numpy()
+            return np.where(rows, away, np.nan)
+
+        angle = quaternion.angle(tool.orientation, tool.orientation[first]).numpy()
+        return cls(
+            position=distance(tool),
+            rotation=np.where(rows, angle, np.nan),
+            elbow=distance(elbow),
+        )
+
+
+def limit_violations(cell: WorkCell) -> int:
+    """Steps in which a joint was measured outside its range of position or velocity."""
+    if not len(cell.log):
+        return 0
+    q = torch.from_numpy(cell.log["joint_position"])
+    v = torch.from_numpy(cell.log["joint_velocity"])
+    limits = panda.limits
+    outside = (q < limits.lower) | (q > limits.upper) | (v.abs() > limits.velocity)
+    return int(outside.any(dim=-1).sum())
+
+
+def unwanted_contacts(
+    world: World, released: Mapping[str, float] | None = None
+) -> dict[str, tuple[Touch, ...]]:
+    """Contacts of the arm and of what it carried, by what was met.
+
+    Args:
+        world: As the run left it.
+        released: When each object was let go on its shelf [s]: what it touches from then on is
+            wanted.
+    """
+    released = released or {}
+    carried = [
+        touch
+        for touch in world.object_contacts.touches
+        if touch.start < released.get(touch.first, math.inf)
+    ]
+    return {
+        "cabinet": (*world.cabinet_contacts.touches, *carried),
+        "table": tuple(world.table_contacts.touches),
+        "arm itself": tuple(world.self_contacts.touches),
+    }
+
 
 PANDA_LIMITS = JointLimits(lower=panda.limits.lower.numpy(), upper=panda.limits.upper.numpy())
 """To be drawn beside joint positions."""
@@ -54,7 +188,10 @@ def record(
     log = cell.log.snapshot(len(motion))
     time, safety = log["time"], log["safety"]
     images = tuple(cell.images)
-    deviation = Deviation.of(log)
+    deviation = Deviation.of(log, motion, world)
+    # The end effector backs out of a shelf the way it went in.
+    paths = [plan.tool_pose.position.numpy() for plan in plans]
+    plan_paths = [np.vstack([path, path[::-1]]) for path in paths]
     cameras = cameras or ((-math.inf, world.config.camera),)
     return RunRecording(
         title=title,
@@ -63,9 +200,9 @@ def record(
         joint_position=log["joint_position"],
         joint_limits=PANDA_LIMITS,
         demo_joint_position=_matching_demonstration(log, plans, demonstration),
-        position=link_poses(log).position[:, TOOL].numpy(),
+        position=true_tool(motion, world, len(log)).position.numpy(),
         demo_path=None if demonstration is None else demonstration.position,
-        plan_path=_paths(plans),
+        plan_path=np.concatenate(plan_paths) if plan_paths else None,
         bodies=motion.bodies(len(log)),
         boxes=tuple(world.config.boxes()),
         region=region,
@@ -81,19 +218,13 @@ def record(
         weight_norm=log["weight_norm"],
         potentials={"task space": log["potential"]},
         potential_rate=log["potential_rate"],
-        human_effort=log["human_effort"],
+        nullspace_input=log["nullspace_input"],
         elbow_motion=deviation.elbow,
         position_deviation=deviation.position,
         rotation_deviation=deviation.rotation,
         safety={name: safety[:, i] for i, name in enumerate(SAFETY_COLUMNS)},
         phases=tuple(log.events),
     )
-
-
-def _paths(plans: Sequence[Plan]) -> Float[np.ndarray, "samples 3"] | None:
-    """Path of the end effector along all plans; it backs out of a shelf the way it went in."""
-    paths = [plan.tool_pose.position.numpy() for plan in plans]
-    return np.concatenate([np.vstack([path, path[::-1]]) for path in paths]) if paths else None
 
 
 def _matching_demonstration(
@@ -106,7 +237,65 @@ def _matching_demonstration(
     matching = np.full_like(log["joint_position"], np.nan)
     for plan, (start, end) in zip(plans, spans(log, TRANSFER), strict=False):
         rows = (time >= start) & (time < end)
-        fraction = (time[rows] - start) / plan.duration * demonstration.duration
-        for joint, demonstrated in enumerate(demonstration.joint_position.T):
-            matching[rows, joint] = np.interp(fraction, demonstration.time, demonstrated)
+        fraction = (time[rows] - start) / plan.duration
+        matching[rows] = demonstrated_joints(demonstration, fraction)
     return matching
+
+
+def demonstrated_joints(
+    demonstration: Demonstration, fraction: Float[np.ndarray, " samples"]
+) -> Float[np.ndarray, "samples joints"]:
+    """Demonstrated joint positions at fractions of the motion, 0 to 1 [rad]."""
+    assert demonstration.joint_position is not None
+    time = demonstration.time[0] + fraction * demonstration.duration
+    columns = demonstration.joint_position.T
+    return np.column_stack([np.interp(time, demonstration.time, joint) for joint in columns])
+
+
+type LiveView = Callable[[WorkCell, World, MotionLog], AbstractContextManager[None]]
+"""Entered once a cell is ready to start, and left when the run is over."""
+
+
+def no_live_view(*_: object) -> AbstractContextManager[None]:
+    """Nobody watches."""
+    return nullcontext()
+
+
+@dataclass(frozen=True, kw_only=True)
+class LiveViewConfig:
+    """Where the dashboard of a run is served while it goes on."""
+
+    port: int = 9090
+    """Port of the page."""
+    data_port: int = 9876
+    """Port from which the page, or `rerun rerun+http://HOST:PORT/proxy`, gets the data."""
+    period: float = 0.25
+    """How often new data are sent [s]."""
+
+
+def live_view(title: str, config: LiveViewConfig, on_open: Callable[[str], None]) -> LiveView:
+    """Serve the dashboard of a run on a page of its own.
+
+    The loop pays for its log only: another thread makes and sends recordings of the run so
+    far. A page that is open when the run ends keeps what it shows.
+
+    Args:
+        title: Of the dashboard.
+        config: Where.
+        on_open: Told the address of the page.
+    """
+
+    @contextmanager
+    def watch(cell: WorkCell, world: World, motion: MotionLog) -> Iterator[None]:
+        # rerun takes a second to import.
+        from hrc_learn.viz.run_dashboard import live_dashboard, serve_stream
+
+        def snapshot() -> RunRecording | None:
+            return record(title, cell, world, motion) if len(motion) else None
+
+        with serve_stream(config.port, config.data_port) as server:
+            on_open(server.viewer)
+            with live_dashboard(server.stream, snapshot, period=config.period):
+                yield
+
+    return watch

@@ -42,7 +42,7 @@ class KeyFrameConfig:
     @property
     def least_step(self) -> float:
         """Least motion between key frames, noise considered [m]."""
-        # The estimate shrinks by the ratio of both variances: 2 in 100 where they are ten apart.
+        # The estimate shrinks by the ratio of both variances: by 2 % where they are ten apart.
         return max(self.min_step, 10.0 * self.pose_noise)
 
 

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Float
+from torch import Tensor
 
 from hrc_learn.demos import Demonstration, DemonstrationSet, DemonstrationSource
 from hrc_learn.geometry import Pose

@@ -29,7 +29,7 @@ GRIPPER = "gripper.pos"
 PIXELS = ("object.u.pos", "object.v.pos")
 
 ActionSpace = Literal["joint", "ee"]
-"""Positions of the joints, or of the hand; the gripper's opening in either case."""
+"""Positions of the joints, or of the end effector; the gripper's opening in either case."""
 
 
 def action_names(space: ActionSpace) -> tuple[str, ...]:
@@ -38,7 +38,7 @@ def action_names(space: ActionSpace) -> tuple[str, ...]:
 
 
 DOWN = quaternion.log(gripper_down()).numpy()
-"""Rotation vector of a hand that points down, by which those of others are told [rad]."""
+"""Rotation vector of a gripper that points down, by which those of others are told [rad]."""
 
 
 def action_of(
@@ -62,9 +62,9 @@ def action_of(
 def hand_vector(
     joints: Float[np.ndarray, "7"], near: Float[np.ndarray, "3"] = DOWN
 ) -> Float[np.ndarray, "6"]:
-    """Position [m] and rotation vector [rad] of the hand.
+    """Position [m] and rotation vector [rad] of the end effector.
 
-    A hand that points down is half a turn from the base, where the shortest rotation vector
+    A gripper that points down is half a turn from the base, where the shortest rotation vector
     jumps from one side to the other; `near` picks the side.
     """
     pose = panda.forward(torch.from_numpy(np.asarray(joints, dtype=float)))
@@ -77,8 +77,8 @@ def target_of(action: Mapping[str, Any]) -> tuple[Float[np.ndarray, "7"] | Pose,
     """Read an action of either space; names it does not know are passed over.
 
     Returns:
-        Positions of the joints [rad] or pose of the hand, and opening of the gripper [m], NaN
-        where none is given.
+        Positions of the joints [rad] or pose of the end effector, and opening of the gripper
+        [m], NaN where none is given.
 
     Raises:
         ValueError: Names are missing.
@@ -104,7 +104,7 @@ def observed(
     Args:
         state: Of the arm.
         names: Wanted, of those of this module but `PIXELS`.
-        near: Rotation vector of the hand before [rad].
+        near: Rotation vector of the end effector before [rad].
     """
     values = dict(zip(JOINTS, state.joint_position.tolist(), strict=True))
     values |= zip(VELOCITIES, state.joint_velocity.tolist(), strict=True)
@@ -219,15 +219,15 @@ class PandaRobotConfig(RobotConfig):
     fps: float = 50.0
     """Actions a second: the rate of the dataset, or of the rollout."""
     action_space: ActionSpace = "joint"
-    """What actions give: positions of the joints, or of the hand ("ee")."""
+    """What actions give: positions of the joints, or of the end effector ("ee")."""
     velocity: bool = False
     """Whether joint velocities are observed."""
     hand: bool = False
-    """Whether the pose of the hand is observed; it is where actions give it."""
+    """Whether the pose of the end effector is observed; it is where actions give it."""
 
 
 class PandaRobot(Device, Robot):
-    """A Panda led by positions of its joints, or of its hand.
+    """A Panda led by positions of its joints, or of its end effector.
 
     Actions of either space are obeyed, and values they do not name are left alone, so that
     lerobot-rollout's way back to the first position works as well. What an action asks for is
@@ -236,7 +236,8 @@ class PandaRobot(Device, Robot):
     Attributes:
         space: Of the actions that it declares.
         dt: Time between actions [s].
-        beginnings: How often everything has been put in place, which only a simulation can.
+        initial_configurations: How often everything has been put in place, which only a
+            simulation can.
     """
 
     def __init__(self, config: PandaRobotConfig):
@@ -244,7 +245,7 @@ class PandaRobot(Device, Robot):
         self.space: ActionSpace = config.action_space
         self.dt = 1.0 / config.fps
         self.cameras: dict[str, Any] = {}
-        self.beginnings = 0
+        self.initial_configurations = 0
         self._names = (
             *JOINTS,
             *(VELOCITIES if config.velocity else ()),
@@ -291,7 +292,7 @@ class PandaRobot(Device, Robot):
 
     @abstractmethod
     def _joints_at(self, pose: Pose) -> Float[np.ndarray, "7"]:
-        """Joint positions that bring the hand to a pose [rad]."""
+        """Joint positions that bring the end effector to a pose [rad]."""
 
     @abstractmethod
     def _command(self, joints: Float[np.ndarray, "7"], width: float) -> Float[np.ndarray, "7"]:

@@ -329,6 +329,11 @@ class MujocoArm:
         self._data.ctrl[self._position_servos] = self._reference
         self._data.ctrl[self._velocity_servos] = velocity
 
+    @property
+    def tool_offset(self) -> Float[np.ndarray, "3"]:
+        """Position of the tool centre point in the hand's frame [m]."""
+        return self._model.site("tcp").pos.copy()
+
     def tcp_pose(self, data: mujoco.MjData | None = None) -> Float[np.ndarray, "4 4"]:
         """True pose of the tool centre point in the base frame."""
         return frame_of((data or self._data).site("tcp"))

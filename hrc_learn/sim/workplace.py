@@ -113,14 +113,15 @@ class Workplace:
         return _vector(*self.table_centre, highest / 2), half
 
     def random_object_pose(
-        self, reach: tuple[float, float, float], rng: np.random.Generator, yaw: float = np.pi
+        self, reach: tuple[float, float, float], rng: np.random.Generator, yaw: float = 0.06
     ) -> Float[np.ndarray, "4 4"]:
         """Random pose of the scene's first object around the middle of the table.
 
         Args:
             reach: Largest distances from the middle, along x and y [m]; z is not used.
             rng: Source of position and yaw.
-            yaw: Largest turn, either way [rad].
+            yaw: Largest turn, either way [rad]; by default as people lay things down along
+                the table's edges.
         """
         turn = rng.uniform(-yaw, yaw)
         c, s = np.cos(turn), np.sin(turn)

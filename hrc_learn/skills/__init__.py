@@ -27,10 +27,10 @@ from hrc_learn.skills.visual_servoing import VisualServoConfig as VisualServoCon
 from hrc_learn.skills.visual_skill import VisualServoSkill as VisualServoSkill
 from hrc_learn.skills.visual_skill import VisualTarget as VisualTarget
 from hrc_learn.skills.work_cell import BlockedPathError as BlockedPathError
-from hrc_learn.skills.work_cell import CollisionChecker as CollisionChecker
-from hrc_learn.skills.work_cell import GraspObject as GraspObject
 from hrc_learn.skills.work_cell import MissedGraspError as MissedGraspError
 from hrc_learn.skills.work_cell import TaskFailedError as TaskFailedError
 from hrc_learn.skills.work_cell import WorkCell as WorkCell
 from hrc_learn.skills.work_cell import WorkCellConfig as WorkCellConfig
-from hrc_learn.skills.work_cell import Workplace as Workplace
+from hrc_learn.skills.workplace import CollisionChecker as CollisionChecker
+from hrc_learn.skills.workplace import GraspObject as GraspObject
+from hrc_learn.skills.workplace import Workplace as Workplace

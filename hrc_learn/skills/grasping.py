@@ -25,12 +25,11 @@ from hrc_learn.skills.visual_servoing import ServoTarget, VisualServo, VisualSer
 from hrc_learn.skills.visual_skill import UP, VisualServoSkill, from_learned
 from hrc_learn.skills.work_cell import (
     BlockedPathError,
-    GraspObject,
     MissedGraspError,
     TaskFailedError,
     WorkCell,
-    Workplace,
 )
+from hrc_learn.skills.workplace import GraspObject, Workplace
 
 OPEN, CLOSED = 0.08, 0.0
 """Widths the gripper is commanded to [m]: its full stroke; closed, it squeezes the object."""
@@ -266,9 +265,8 @@ class Grasping:
         # What is met first: the table by the fingers, or a tall object's top by the palm.
         reach = max(self._workplace.fingertip, 2 * item.half_size[2] - self._workplace.palm)
         self._cell.move_straight(self._at_height(reach + _TABLE_RANGE), speed=DESCENT_SPEED)
-        if not self._cell.move_until_contact(self._at_height(reach - _TABLE_RANGE)):
-            return 0.0
-        return float(self._cell.pose.position[2]) - reach
+        met = self._cell.move_until_contact(self._at_height(reach - _TABLE_RANGE))
+        return 0.0 if met is None else float(met.position[2]) - reach
 
     def _grasp_pose(self, item: GraspObject) -> Pose:
         """Fingers around the object, from here along the end effector's own direction."""

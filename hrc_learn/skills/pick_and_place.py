@@ -39,12 +39,11 @@ from hrc_learn.skills.visual_servoing import ServoTarget
 from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.skills.work_cell import (
     BlockedPathError,
-    GraspObject,
     MissedGraspError,
     TaskFailedError,
     WorkCell,
-    Workplace,
 )
+from hrc_learn.skills.workplace import GraspObject, Workplace
 
 Mishap = Literal[
     "object not detected", "marker occluded", "missed grasp", "dropped object", "blocked path"
@@ -98,19 +97,6 @@ class PickPlaceJob:
         """Whether the object was released at its shelf, as the robot sees it."""
         return self.release is not None and not self.failure
 
-    @property
-    def goal_error(self) -> tuple[float, float]:
-        """Of the end effector at the release [m, rad].
-
-        Raises:
-            ValueError: If it never came to that.
-        """
-        if self.release is None:
-            raise ValueError(f"{self.item.name!r} never came to its shelf: {self.failure}")
-        goal = self.goal if self.plan is None else self.plan.goal
-        twist = self.release.twist_to(goal)
-        return float(twist[:3].norm()), float(twist[3:].norm())
-
 
 class Phase(StrEnum):
     """What the robot is doing; the start of a phase is an event of the log."""
@@ -127,7 +113,7 @@ class Phase(StrEnum):
     OVER = "over"
 
 
-INTERACT, TRANSFER, RELEASE = Phase.INTERACT, Phase.TRANSFER, Phase.RELEASE
+INTERACT, HOME, TRANSFER, RELEASE = Phase.INTERACT, Phase.HOME, Phase.TRANSFER, Phase.RELEASE
 """Phases that others look up in the log."""
 
 # Delays and occlusions up to this are no recovery [s]: a few lost images, or a blink.

@@ -28,7 +28,8 @@ from hrc_learn.kinematics import (
 )
 from hrc_learn.regions import JointRegion
 from hrc_learn.skills.arm_motion import joint_line, nearest_configuration, resolved_rate
-from hrc_learn.skills.work_cell import BlockedPathError, CollisionChecker, Workplace
+from hrc_learn.skills.work_cell import BlockedPathError
+from hrc_learn.skills.workplace import CollisionChecker, Workplace
 
 PlanningSpace = Literal["joint", "pose"]
 

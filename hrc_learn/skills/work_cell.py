@@ -1,9 +1,8 @@
 """A work cell: the place skills work in; arm, gripper, camera and person under one clock."""
 
 from collections import deque
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, replace
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -21,138 +20,10 @@ from hrc_learn.skills.marker_sensor import (
     MarkerObservation,
     MarkerSensor,
 )
-from hrc_learn.vision import Marker, angle, centre
+from hrc_learn.vision import angle, centre
 from hrc_learn.viz import StepLog
 
 # What skills ask of the place they work in, whether simulated or real.
-
-
-@runtime_checkable
-class GraspObject(Protocol):
-    """A box to grasp, with a marker on top."""
-
-    @property
-    def name(self) -> str:
-        """Name of the object."""
-        ...
-
-    @property
-    def half_size(self) -> tuple[float, float, float]:
-        """Half edges [m]; the gripper closes along x."""
-        ...
-
-    @property
-    def marker(self) -> Marker:
-        """Marker by which the camera finds it."""
-        ...
-
-
-@runtime_checkable
-class Workplace(Protocol):
-    """Poses of a task: table, home and shelves, known roughly, in the base frame."""
-
-    @property
-    def tool_marker(self) -> int:
-        """ArUco number of the marker on the end effector."""
-        ...
-
-    @property
-    def hover_height(self) -> float:
-        """Height of the tool centre point while it servoes to an object [m]."""
-        ...
-
-    @property
-    def fingertip(self) -> float:
-        """How far the fingers reach beyond the tool centre point [m]."""
-        ...
-
-    @property
-    def palm(self) -> float:
-        """How far the palm stands back from the tool centre point [m]."""
-        ...
-
-    @property
-    def hover_turns(self) -> tuple[float, float]:
-        """Least and greatest turn of the end effector about the vertical there [rad]."""
-        ...
-
-    def hover(self) -> Pose:
-        """End effector above the middle of the table."""
-        ...
-
-    def hover_joints(self) -> Float[Tensor, "7"]:
-        """Joint positions there [rad]."""
-        ...
-
-    def hover_postures(self) -> Sequence[Float[Tensor, "7"]]:
-        """Several joint positions there, the preferred ones first [rad]."""
-        ...
-
-    def home_joints(
-        self, offset: Float[Tensor, "3"] | None = None, q7_offset: float = 0.0
-    ) -> Float[Tensor, "7"]:
-        """Joint positions at home, where a placing motion starts [rad].
-
-        Args:
-            offset: Of the end effector from home [m].
-            q7_offset: Change of joint 7, which moves the elbow about the line to the wrist
-                [rad].
-
-        Raises:
-            UnreachableError: If no joint positions reach it.
-        """
-        ...
-
-    def object_region(self) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-        """Box in which objects may be on the table: centre and half edges [m]."""
-        ...
-
-    def shelf(self, name: str, half_size: tuple[float, float, float] | None = None) -> Pose:
-        """End effector where it releases an object of a size [m] on a shelf.
-
-        Raises:
-            ValueError: If there is no such shelf.
-        """
-        ...
-
-
-@runtime_checkable
-class Collision(Protocol):
-    """A contact that a planned path would make."""
-
-    @property
-    def first(self) -> str:
-        """What moves."""
-        ...
-
-    @property
-    def second(self) -> str:
-        """What it meets."""
-        ...
-
-    @property
-    def start(self) -> float:
-        """Number of the first sample of the path in contact."""
-        ...
-
-    @property
-    def depth(self) -> float:
-        """Deepest penetration [m]."""
-        ...
-
-
-@runtime_checkable
-class CollisionChecker(Protocol):
-    """A geometric model of the workplace."""
-
-    def collisions_along(
-        self, path: Float[np.ndarray, "steps 7"], carried: str | None = None
-    ) -> Sequence[Collision]:
-        """Contacts along a path of joint positions [rad], with an object carried along."""
-        ...
-
-
-# The control loop.
 
 
 class TaskFailedError(RuntimeError):
@@ -386,36 +257,42 @@ class WorkCell:
             self.track_pose(pose, twist)
         self._settle(goal, _SETTLING_TIME)
 
-    def move_until_contact(self, goal: Pose, speed: float = 0.02, force: float = 12.0) -> bool:
-        """Move on a straight line, and stop where something is met; whether it was.
+    def move_until_contact(
+        self, goal: Pose, speed: float = 0.02, force: float = 12.0
+    ) -> Pose | None:
+        """Move on a straight line, and stop where something is met; where that was.
 
         Args:
             goal: Where to, if nothing is met.
-            speed: Mean speed [m/s]: what is met gives by as much as the arm moves until it stops.
+            speed: Mean speed [m/s]: what is met gives way by as much as it takes to stop.
             force: Of the contact against the motion [N]. Friction and an unknown load are felt
                 too, so what counts is the change since the motion began.
 
         Returns:
-            False also for an arm that does not tell external torques.
+            Pose of the end effector when it met something; None if it met nothing, also for an
+            arm that does not tell external torques.
         """
         along = goal.position - self.pose.position
         along = (along / along.norm().clamp(min=1e-9)).numpy()
         felt: deque[float] = deque(maxlen=_FELT)
+        before: deque[Pose] = deque(maxlen=_FELT)
         free = None
         for k, (pose, twist) in enumerate(
             straight_line(self.pose, goal, speed, self.config.dt)
         ):
             self.track_pose(pose, twist)
             felt.append(-float(self._contact_force() @ along))
+            before.append(self.pose)
             if k < _FELT + _GETTING_UNDER_WAY:
                 continue
             # Friction turns with the motion: what is felt under way is the reference.
             now = float(np.mean(felt))
             free = now if free is None else free
             if now - free > force:
+                # As long as it took to be sure, the arm has gone on and pushed.
                 self.hold_pose(_FELT * self.config.dt)
-                return True
-        return False
+                return before[0]
+        return None
 
     def _contact_force(self) -> Float[np.ndarray, "3"]:
         """Estimate of the force on the end effector [N]; zero if the arm tells none."""
@@ -460,7 +337,7 @@ class WorkCell:
             joint_position=self.state.joint_position,
             joint_velocity=self.state.joint_velocity,
             command_velocity=velocity.numpy(),
-            human_effort=self.human_input.nullspace_input,
+            nullspace_input=self.human_input.nullspace_input,
             gripper=self.state.gripper_width,
             **columns,
         )

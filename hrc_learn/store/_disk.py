@@ -163,7 +163,7 @@ def delete(place: Path) -> None:
     if place.is_dir() and not place.is_symlink():
         shutil.rmtree(place)
     else:
-        place.unlink(missing_ok=True)
+        place.unlink()
 
 
 def delete_entries(folder: Path, names: Iterable[str]) -> None:

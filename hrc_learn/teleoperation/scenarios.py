@@ -180,7 +180,7 @@ class ScenarioRun:
         dt: Time that passes with each command [s].
         expert: Who can show it from where it began.
         servo: Leads the arm by positions.
-        seed: Of the present beginning.
+        seed: Of the present initial configuration.
         commands: Given since then.
     """
 
@@ -192,7 +192,7 @@ class ScenarioRun:
         Args:
             scenario: What is to be done.
             fps: Commands a second of the world's time.
-            seed: Of the first beginning.
+            seed: Of the first initial configuration.
         """
         self.scenario, self.dt = scenario, 1.0 / fps
         self.world = World(scenario.workplace.scene)
@@ -290,7 +290,7 @@ class ScenarioView:
 
 
 def overview(width: int, height: int) -> CameraModel:
-    """A camera in front of the arm that has table, hand and shelves in view."""
+    """A camera in front of the arm that has table, end effector and shelves in view."""
     focal = 0.9 * min(width / 4 * 3, height)
     middle = ((width - 1) / 2, (height - 1) / 2)
     model = CameraModel(width=width, height=height, focal=(focal, focal), principal=middle)

@@ -2,6 +2,7 @@
 posture; and how they are recorded and written as a LeRobot dataset.
 """
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -142,6 +143,8 @@ class ServoDemonstrationConfig(DemonstrationConfig):
     """Height from which the end effector finally descends vertically [m]."""
     reach: tuple[float, float, float] = (0.10, 0.08, 0.06)
     """Largest distances of the points from the middle of the table, and above hovering [m]."""
+    yaw: float = math.pi
+    """Largest turn of the object on the table, either way [rad]."""
     wobble: float = 0.12
     """Amplitude of small rotations on the way, which show their effect in the image [rad]."""
     record_every: int = 4
@@ -198,7 +201,7 @@ def demonstrate_servoing(
         ValueError: If the camera does not see the object.
     """
     item = workplace.scene.objects[0]
-    pose = workplace.random_object_pose(config.reach, rng)
+    pose = workplace.random_object_pose(config.reach, rng, config.yaw)
     world.reset(workplace.home_joints().numpy(), {item.name: pose})
     target = sensor.corners().get(item.marker.id)
     if target is None:

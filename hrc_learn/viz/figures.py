@@ -52,7 +52,7 @@ def person_figure(run: RunRecording) -> Figure:
 
     The spells in which the person acted are shaded.
     """
-    effort = needed(run.human_effort, "human_effort")
+    effort = needed(run.nullspace_input, "nullspace_input")
     acting = np.linalg.norm(effort, axis=1) > 0
     rows = [
         ("effort d [N m]", "Null-space effort of the person, by joint", effort),

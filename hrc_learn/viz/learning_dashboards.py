@@ -76,7 +76,10 @@ def record_demonstrations(
     first = shown.demonstrations[0]
     if paths:
         arm = f"; the arm in episode {first.episode}" if first.bodies else ""
-        name, eye = f"Paths of the hand, dots: now{arm}", frame_view(np.concatenate(paths))
+        name, eye = (
+            f"Paths of the end effector, dots: now{arm}",
+            frame_view(np.concatenate(paths)),
+        )
         left.insert(0, rrb.Spatial3DView(origin="/world", name=name, eye_controls=eye))
     tabs = rrb.Tabs(contents=[tab_view(tab) for tab, _ in views], active_tab=0)
     layout = dashboard(left, [tabs], row_shares=(2, 1), column_shares=(2, 3))
@@ -292,7 +295,7 @@ def record_learning(path: str | os.PathLike[str], learning: LearningRecording) -
     tab = learning_tab(learning)
     left: list[rrb.View] = [rrb.TextDocumentView(origin="/summary", name="Fit")]
     if every := learning.paths or [path for path in learning.centers if len(path)]:
-        name = "Hand (grey), neurons (orange), error on held-out image motion (blue)"
+        name = "End effector (grey), neurons (orange), held-out error (blue)"
         eye = _look_down(np.concatenate(every))
         left.insert(0, rrb.Spatial3DView(origin="/world", name=name, eye_controls=eye))
     right = [tab_view(tab)] if tab.plots else []

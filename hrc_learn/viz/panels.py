@@ -121,8 +121,8 @@ def _jacobian_plot(run: RunRecording, row: int, pixel: str, half: str) -> Plot:
 
 def _person(run: RunRecording) -> Tab:
     plots = []
-    if run.human_effort is not None:
-        effort = several("person/effort", run.joint_names, run.human_effort)
+    if run.nullspace_input is not None:
+        effort = several("person/effort", run.joint_names, run.nullspace_input)
         title = "Null-space effort d of the person, by joint [N m]"
         plots.append(Plot(title=title, curves=(effort,), legend=True, share=2.0))
     moved, turned = run.position_deviation, run.rotation_deviation

@@ -98,8 +98,8 @@ class RunRecording:
     potential_rate: Float[np.ndarray, " time"] | None = None
     """Rate of the sum of the potentials that the estimated image Jacobian predicts [1/s]."""
 
-    human_effort: Float[np.ndarray, "time joints"] | None = None
-    """Null-space effort d of the person, on each joint."""
+    nullspace_input: Float[np.ndarray, "time joints"] | None = None
+    """Null-space input d of the person, on each joint [N m]."""
     elbow_motion: Float[np.ndarray, " time"] | None = None
     """How far the elbow is from where it would be undisturbed [m]."""
     position_deviation: Float[np.ndarray, " time"] | None = None
@@ -135,7 +135,7 @@ _SERIES = (
     "true_image_jacobian",
     "weight_norm",
     "potential_rate",
-    "human_effort",
+    "nullspace_input",
     "elbow_motion",
     "position_deviation",
     "rotation_deviation",
@@ -296,7 +296,7 @@ class LearningRecording:
     )
     """Where the neurons stood in each [m]."""
     paths: tuple[Float[np.ndarray, "_ 3"], ...] = ()
-    """Of the hand in demonstrations [m]."""
+    """Of the end effector in demonstrations [m]."""
     errors: ErrorMap | None = None
     """On demonstrations held out."""
 

@@ -14,9 +14,9 @@ from commands import hrc
 
 from hrc_learn import cli
 from hrc_learn.cli import _options
+from hrc_learn.cli import arguments as choices
 from hrc_learn.cli._commands import COMMANDS
-from hrc_learn.cli._help import short_help
-from hrc_learn.cli.arguments import choices
+from hrc_learn.cli._options import short_help
 from hrc_learn.cli.arguments.dataset import Repair
 from hrc_learn.demos.repair import RepairOptions
 from hrc_learn.dmp.forcing_scale import SCALINGS

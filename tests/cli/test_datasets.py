@@ -1,8 +1,6 @@
 """The commands for datasets as a user runs them: results, messages, exit status."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -179,17 +177,6 @@ def test_markers_are_found_in_the_videos_of_a_dataset(tmp_path):
     np.testing.assert_allclose(demo.feature, truth, atol=0.5)
     assert "1 known before" in hrc(*arguments)[1]
     assert hrc("extract", root, "--marker", 70)[0] == 2
-
-
-def test_the_benchmark_writes_its_figures(tmp_path):
-    program = ROOT / "benchmarks/bench_demos.py"
-    sizes = ["--episodes", "2", "--frames", "50", "--repeats", "1"]
-    subprocess.run(
-        [sys.executable, program, *sizes, "--json", tmp_path / "figures.json"], check=True
-    )
-    figures = json.loads((tmp_path / "figures.json").read_text())
-    assert figures["load_demos_samples_per_s"] > 0
-    assert all(isinstance(value, float) for value in figures.values())
 
 
 def test_no_package_shadows_hugging_faces_datasets():

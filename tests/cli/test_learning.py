@@ -9,7 +9,7 @@ from commands import done
 
 @pytest.fixture(scope="module")
 def poses(tmp_path_factory):
-    """A dataset of hands that move to different places, imported from an array."""
+    """A dataset of poses that move to different places, imported from an array."""
     folder = tmp_path_factory.mktemp("poses")
     s = np.linspace(0, 1, 80)[None, :, None]
     way = s**3 * (10 - 15 * s + 6 * s**2)
@@ -52,6 +52,30 @@ def test_a_streamed_fit(poses, tmp_path):
     metrics = json.loads((tmp_path / "model" / "metrics.json").read_text())
     assert metrics["frames"] == 320
     assert metrics["mean_position_rmse"] < 0.05
+
+
+def test_nothing_is_overwritten_unasked(poses, tmp_path):
+    arguments = ("fit", "--dataset", poses, "--out", tmp_path / "model", "--n-basis", 5)
+    arguments += ("--several", "streamed", "--channels", "position")
+    done(*arguments)
+    made_by = tmp_path / "model" / "made_by.json"
+    before = made_by.read_text()
+    assert "exists" in done(*arguments, status=2).error
+    assert made_by.read_text() == before
+    done(*arguments, "--seed", 1, "--overwrite")
+    assert made_by.read_text() != before
+
+
+def test_a_missing_dataset_and_unknown_joints_are_bad_input(tmp_path):
+    joints, out = tmp_path / "joints", tmp_path / "none"
+    np.savez(tmp_path / "joints.npz", t=0.01 * np.arange(20), q=np.zeros((20, 2)))
+    done("import", tmp_path / "joints.npz", "--out", joints, "--joints", "q", "--time", "t")
+    outcome = done("fit", "--dataset", tmp_path / "absent", "--out", out, status=2)
+    assert "absent" in outcome.error
+    outcome = done("fit", "--dataset", joints, "--out", out, "--joint-names", "elbow", status=2)
+    assert "elbow" in outcome.error
+    assert "joint1" in outcome.error
+    assert not out.exists()
 
 
 @pytest.mark.slow

@@ -1,11 +1,19 @@
 """The sweep, a few trials of it."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+import torch
 from commands import hrc
 from unchecked import shapes_unchecked
+
+from hrc_learn.cli.commands import sweep as command
+from hrc_learn.experiments.controller import sweep as experiments
+from hrc_learn.experiments.controller.sweep import EXPERIMENTS
+from hrc_learn.sim.closed_loop import Imperfections
 
 
 @pytest.fixture(autouse=True)
@@ -15,7 +23,20 @@ def _unchecked():
         yield
 
 
-def test_it_writes_one_flat_object_of_figures(tmp_path: Path):
+@pytest.fixture
+def coarse(monkeypatch):
+    """Experiments with fewer and longer steps; `tests/experiments` has them as they are."""
+    near, late = EXPERIMENTS["near"], EXPERIMENTS["stress_late"]
+    images = Imperfections(frame_steps=2, noise=0.5)
+    coarse = replace(near.config, dt=0.02, duration=6.0, imperfections=images)
+    short = replace(late.config, duration=0.5)
+    known = {**EXPERIMENTS, "near": replace(near, config=coarse)}
+    known["stress_late"] = replace(late, config=short)
+    for module in (experiments, command):
+        monkeypatch.setattr(module, "EXPERIMENTS", known)
+
+
+def test_it_writes_one_flat_object_of_figures(tmp_path: Path, coarse):
     outcome = hrc(
         "sweep",
         *("--only", "near", "stress_late", "--trials", "5"),
@@ -37,3 +58,18 @@ def test_an_unknown_experiment_ends_in_one_line():
     assert outcome.status == 2
     assert outcome.error.startswith("error: invalid choice 'far' for argument '--only'")
     assert outcome.error.count("\n") == 1
+
+
+def test_a_figure_that_is_broken_off_leaves_the_older_one(tmp_path, monkeypatch):
+    path = tmp_path / "times.png"
+    path.write_text("older")
+
+    def break_off(figure, place, **options):
+        Path(place).write_text("half")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", break_off)
+    with pytest.raises(KeyboardInterrupt):
+        command._draw(path, {"near": SimpleNamespace(time=torch.tensor([1.0, 2.0]))})
+    assert path.read_text() == "older"
+    assert list(tmp_path.iterdir()) == [path]

@@ -408,6 +408,17 @@ def test_a_line_of_json_that_cannot_be_read_is_named_by_its_number(tmp_path, tex
     assert str(raised.value.file).endswith("meta/episodes.jsonl")
 
 
+def test_a_quantity_is_put_together_from_two_features(tmp_path):
+    q, other = joint_path(60, seed=0), joint_path(60, seed=1)
+    names = {STATE: ["a.pos", "b.pos", "c.pos"], "observation.other": ["d", "e", "f"]}
+    root = write_folder(tmp_path / "set", [{STATE: q, "observation.other": other}], names)
+    columns = ["a.pos", "observation.other/e"]
+    (demo,) = load_demos(root, mapping={"joint_position": columns})
+    assert demo.joint_position is not None
+    expected = np.stack([q[:, 0], other[:, 1]], axis=1)
+    np.testing.assert_allclose(demo.joint_position, expected, atol=1e-6)
+
+
 def transforms(q: np.ndarray, order) -> np.ndarray:
     """Flattened 4x4 transforms that turn by q and move by q / 2."""
     T = np.tile(np.eye(4), (len(q), 1, 1))

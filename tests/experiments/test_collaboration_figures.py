@@ -7,8 +7,8 @@ import torch
 from PIL import Image
 from sample_runs import sample_run
 
-from hrc_learn.experiments.collaboration import figures as collaboration_figures
-from hrc_learn.experiments.collaboration.figures import (
+from hrc_learn.experiments.collaboration import report as collaboration_figures
+from hrc_learn.experiments.collaboration.report import (
     end_effector_figure,
     marker_figure,
     timeline_figure,
@@ -66,7 +66,7 @@ def test_the_timeline_has_a_row_for_each_phase_and_for_people(run):
     assert labels == [*PHASES, "person pushes", "marker occluded"]
 
 
-def test_angles_count_from_the_hand_pointing_down(run):
+def test_angles_count_from_the_gripper_pointing_down(run):
     turns = np.deg2rad([[0.0, 0.0, 0.0], [-90.0, 0.0, 0.0], [0.0, 0.0, 20.0], [0.0, 15.0, 0.0]])
     down = gripper_down()
     q = quaternion.multiply(quaternion.exp(torch.from_numpy(turns)), down).numpy()
@@ -89,7 +89,7 @@ def test_figures_of_a_job_that_never_saw_its_marker_are_drawn_all_the_same(run):
         camera=replace(
             run.camera, feature=unknown, target=unknown, images=(), image_time=np.empty(0)
         ),
-        human_effort=np.zeros_like(run.human_effort),
+        nullspace_input=np.zeros_like(run.nullspace_input),
         demo_path=None,
     )
     for draw in (trajectories_figure, marker_figure, timeline_figure):

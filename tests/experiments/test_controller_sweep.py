@@ -4,7 +4,7 @@ import pytest
 import torch
 from unchecked import shapes_unchecked
 
-from hrc_learn.experiments.controller.stress_trials import StressConfig, run_stress_trials
+from hrc_learn.experiments.controller.disturbance_trials import StressConfig, run_stress_trials
 from hrc_learn.experiments.controller.sweep import (
     CRITERIA,
     EXPERIMENTS,

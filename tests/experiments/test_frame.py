@@ -21,9 +21,8 @@ from hrc_learn.experiments.frame import (
     Study,
     conduct,
 )
-from hrc_learn.experiments.metric_table import Metric, evaluate
+from hrc_learn.experiments.metric_table import Metric, evaluate, p95
 from hrc_learn.experiments.monte_carlo import Trial
-from hrc_learn.experiments.trial_statistics import p95
 from hrc_learn.viz import LoggedSteps, RunRecording, StepLog
 from hrc_learn.viz.report import Picture, Section, read_report
 

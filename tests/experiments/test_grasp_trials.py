@@ -6,7 +6,7 @@ import torch
 from unchecked import shapes_unchecked
 
 from hrc_learn.controller import GRIPPER_DOWN
-from hrc_learn.experiments.controller.effort_trials import EffortConfig, run_effort_trials
+from hrc_learn.experiments.controller.disturbance_trials import EffortConfig, run_effort_trials
 from hrc_learn.experiments.controller.grasp_trials import (
     CENTRE,
     TrialConfig,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from sample_runs import STEPS, camera_recording, sample_run
 
-from hrc_learn.experiments.grasping.figures import reach_figure, regions_figure, variants_figure
+from hrc_learn.experiments.grasping.report import reach_figure, regions_figure, variants_figure
 
 TARGET = np.array([80.0, 80.0])
 

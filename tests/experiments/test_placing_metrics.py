@@ -15,8 +15,7 @@ from hrc_learn.experiments.placing.metrics import (
     placing_metrics,
     random_start_metrics,
 )
-from hrc_learn.experiments.placing.trial import PlacingOutcome
-from hrc_learn.experiments.pose_randomization import random_start
+from hrc_learn.experiments.placing.trial import PlacingOutcome, random_start
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import Touch, World
 from hrc_learn.sim.workplace import Workplace
@@ -120,7 +119,7 @@ def test_the_arm_may_hit_the_cabinet_without_the_posture_but_not_with_it():
     assert len(missed(evaluated(pair(0, 1, 0), pair(1, 0, 1)))) == 1
 
 
-def test_the_demonstrated_shelf_is_where_the_hand_ended():
+def test_the_demonstrated_shelf_is_where_the_end_effector_ended():
     for shelf in SHELVES:
         goal = WORKPLACE.shelf(shelf).position.numpy()
         assert demonstrated_shelf(goal + 0.01, WORKPLACE) == shelf

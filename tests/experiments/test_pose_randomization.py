@@ -1,12 +1,28 @@
 import numpy as np
 import pytest
 
-from hrc_learn.experiments.collaboration.trial import OBJECTS_REACH, with_objects
-from hrc_learn.experiments.pose_randomization import THREE_OBJECTS, random_object_poses
+from hrc_learn.experiments.collaboration.trial import (
+    OBJECTS_REACH,
+    THREE_OBJECTS,
+    random_object_poses,
+    with_objects,
+)
 from hrc_learn.sim import FINGER_STROKE, World
 from hrc_learn.sim.workplace import Workplace
 
 WORKPLACE = with_objects(Workplace(), THREE_OBJECTS)
+
+
+# Points of the open fingers beside an object, in its frame: along its x axis 4 to 6 cm to
+# either side, 1 cm deep; homogeneous.
+OPEN_FINGERS = np.array(
+    [
+        [side * x, y, 0.0, 1.0]
+        for side in (-1, 1)
+        for x in np.linspace(0.04, 0.06, 9)
+        for y in np.linspace(-0.01, 0.01, 9)
+    ]
+).T
 
 
 def scattered(seed):
@@ -25,12 +41,12 @@ def test_objects_lie_on_the_table_in_reach_and_in_view_with_room_for_the_fingers
             assert WORKPLACE.scene.camera.in_view(marker.T).all()
         off = np.abs(centres[:, :2] - WORKPLACE.table_centre)
         assert (off <= OBJECTS_REACH).all()
-        # Fingers stand open along x beside the object: 6 cm to either side, 1 cm deep.
-        for i, j in ((0, 1), (0, 2), (1, 2)):
-            dx, dy = np.abs(centres[i] - centres[j])[:2]
-            widest = max(item.half_size[0] for item in THREE_OBJECTS)
-            longest = max(item.half_size[1] for item in THREE_OBJECTS)
-            assert dx > 0.07 + widest or dy > 0.01 + longest
+        for one in THREE_OBJECTS:
+            for other in THREE_OBJECTS:
+                if one is not other:
+                    inside = np.linalg.inv(poses[other.name]) @ poses[one.name] @ OPEN_FINGERS
+                    beside = np.abs(inside[:2].T) > other.half_size[:2]
+                    assert beside.any(axis=1).all()
         places.append(centres[:, :2])
     assert np.std(places, axis=0).min() > 0.03  # at random, all of them
 

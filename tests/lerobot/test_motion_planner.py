@@ -52,7 +52,9 @@ def test_what_never_moves_is_not_blown_up():
 def test_more_than_half_a_turn_is_refused():
     angle = torch.linspace(-4, 4, 50, dtype=torch.float64)[:, None]
     turning = angle * torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    with pytest.raises(ValueError, match="demonstration 0 turns the hand by more than half"):
+    with pytest.raises(
+        ValueError, match="demonstration 0 turns the end effector by more than half"
+    ):
         ActionEncoding(3, [[0, 1, 2]]).double().learn([turning])
 
 

@@ -47,7 +47,7 @@ def test_a_sim_begins_anew_with_the_recorders_next_episode(simulated, monkeypatc
         clock[0] += pause
         seen = robot.get_observation()
         robot.send_action({name: seen[name] for name in (*JOINTS, GRIPPER)})
-        return robot.run.seed, robot.run.commands, robot.beginnings
+        return robot.run.seed, robot.run.commands, robot.initial_configurations
 
     robot.get_observation()  # somebody looks before the first episode
     clock[0] += 5.0

@@ -26,7 +26,7 @@ class Arm:
     """One that stays where it is put, as a robot of LeRobot's."""
 
     def __init__(self, space):
-        self.space, self.dt, self.beginnings = space, 0.1, 0
+        self.space, self.dt, self.initial_configurations = space, 0.1, 0
         self.joints = READY.copy()
 
     def read_state(self):

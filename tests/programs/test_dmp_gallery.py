@@ -2,7 +2,6 @@
 
 import importlib.util
 import re
-import subprocess
 import sys
 from pathlib import Path
 
@@ -51,8 +50,8 @@ def test_unknown_pictures_are_refused(gallery, tmp_path):
         gallery.main(gallery.Args(out=tmp_path, only=("portrait",)))
 
 
-def test_it_says_what_it_does():
-    command = [sys.executable, ROOT / "docs" / "dmp_gallery.py", "--help"]
-    shown = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+def test_it_says_what_it_does(run_here):
+    status, shown, _ = run_here("docs/dmp_gallery.py", "--help")
+    assert status == 0
     assert "Draw the pictures" in shown
     assert "--only" in shown

@@ -19,10 +19,14 @@ from hrc_learn.experiments.grasping.metrics import (
     lift,
 )
 from hrc_learn.experiments.grasping.report import RegionActivity, record_grasp
-from hrc_learn.experiments.grasping.trial import VARIANTS, simulate_grasp
+from hrc_learn.experiments.grasping.trial import (
+    VARIANTS,
+    GraspingScene,
+    GraspingSceneConfig,
+    simulate_grasp,
+)
 from hrc_learn.experiments.metric_table import evaluate
 from hrc_learn.experiments.monte_carlo import Trial
-from hrc_learn.experiments.pose_randomization import GraspingScene, GraspingSceneConfig
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import RBFImageJacobian, paper_grid
 from hrc_learn.kinematics import panda, panda_capsules
@@ -53,7 +57,9 @@ def skill():
     network = RBFImageJacobian.from_jacobian(
         torch.from_numpy(jacobians[0]), paper_grid().double(), 0.1
     )
-    target = VisualTarget.fit(camera.project(on_top), camera.project(marker), jacobians)
+    target = VisualTarget.fit(
+        camera.project(on_top), camera.project(marker), jacobians, hand.orientation
+    )
     return VisualServoSkill(jacobian=network, target=target)
 
 
@@ -165,15 +171,15 @@ def test_a_missed_grasp_is_begun_anew(skill):
     class Astray(VisualTarget):
         """Misses the object by a hand's breadth until it has looked twice."""
 
-        def from_view(self, pixel, jacobian):
-            seen = super().from_view(pixel, jacobian)
+        def __call__(self, pixel, jacobian, orientation):
+            seen = super().__call__(pixel, jacobian, orientation)
             if not tries or np.allclose(pixel, tries[0], atol=1e-12):
                 tries[:] = [pixel]
                 return seen + np.array([0.0, 150.0])
             return seen
 
     known = skill.target
-    target = Astray(matrix=known.matrix, error=known.error, offset=known.offset)
+    target = Astray(error=known.error, offset=known.offset)
     with shapes_unchecked():
         run = grasped(replace(skill, target=target), turned(0.0))
     assert run.result is not None
@@ -278,7 +284,11 @@ def test_a_hand_that_comes_down_along_the_line_stays_on_it():
     line /= np.linalg.norm(line)
     hover = WORKPLACE.hover()
     target = ServoTarget(
-        config=VisualServoConfig(), above=hover, posture=None, target=lambda J: J, line=line
+        config=VisualServoConfig(),
+        above=hover,
+        posture=None,
+        target=lambda J, orientation: J,
+        lines=lambda orientation: line,
     )
 
     def hand(along, aside=(0.0, 0.0, 0.0)):

@@ -141,7 +141,7 @@ def test_a_saved_angle_is_read_back(tmp_path):
     assert torch.equal(again.jacobian.weight, skill.jacobian.weight)
     path = tmp_path / "skill" / "angle.json"
     path.write_text(json.dumps({"version": 9}))
-    with pytest.raises(ValueError, match="angle.json"):
+    with pytest.raises(ValueError, match=r"angle\.json"):
         MarkerAngle.load(tmp_path / "skill")
 
 

@@ -61,7 +61,13 @@ def test_a_probe_comes_down_at_its_speed_from_where_it_begins():
     above = Workplace().hover()
     up = np.array([0.0, 0.0, 1.0])
     servo._descend(
-        ServoTarget(config=CONFIG, above=above, posture=None, target=lambda J: J, line=up)
+        ServoTarget(
+            config=CONFIG,
+            above=above,
+            posture=None,
+            target=lambda J, orientation: J,
+            lines=lambda orientation: up,
+        )
     )
     assert heights[0] == CONFIG.probe
     np.testing.assert_allclose(np.diff(heights), -CONFIG.probe_speed * 0.01)

@@ -2,8 +2,11 @@ import json
 
 import numpy as np
 import pytest
+import torch
 
+from hrc_learn.geometry import quaternion
 from hrc_learn.jacobian.fitting import ImageJacobianFitReport
+from hrc_learn.kinematics import gripper_down
 from hrc_learn.skills.visual_skill import (
     LONGEST_OFFSET,
     VisualServoSkill,
@@ -11,49 +14,49 @@ from hrc_learn.skills.visual_skill import (
     guessed_network,
 )
 
+OFFSET = np.array([0.12, -0.01, 0.18])
 
-def demonstrations(n, noise=0.0, seed=0):
+
+def random_turns(n, rng):
+    return quaternion.normalize(torch.from_numpy(rng.standard_normal((n, 4))))
+
+
+def demonstrations(n, noise=0.0, seed=3):
+    """Pixels of both markers, image Jacobians, and tools turned in any way."""
     rng = np.random.default_rng(seed)
-    objects = rng.uniform([200, 200], [1200, 900], size=(n, 2))
-    matrix = np.array([[1.15, 0.01, -310.0], [-0.02, 1.14, -80.0]])
-    hands = np.column_stack([objects, np.ones(n)]) @ matrix.T
-    return objects, hands + noise * rng.normal(size=hands.shape), matrix
+    objects, jacobians = rng.uniform(200, 900, (n, 2)), rng.normal(0, 1500, (n, 2, 6))
+    turns = random_turns(n, rng)
+    in_base = quaternion.rotate(turns, torch.from_numpy(OFFSET)).numpy()
+    hands = objects + np.einsum("nij,nj->ni", jacobians[..., :3], in_base)
+    return objects, hands + rng.normal(0, noise, hands.shape), jacobians, turns
 
 
 @pytest.mark.parametrize("n", [3, 4, 12])
-def test_an_affine_offset_is_found_exactly(n):
-    objects, hands, matrix = demonstrations(n)
-    target = VisualTarget.fit(objects, hands)
-    np.testing.assert_allclose(target.matrix, matrix, atol=1e-6)
-    np.testing.assert_allclose(target(np.array([500.0, 600.0])), matrix @ [500, 600, 1])
+def test_the_offset_is_found_whatever_way_camera_and_tool_are_turned(n):
+    target = VisualTarget.fit(*demonstrations(n))
+    np.testing.assert_allclose(target.offset, OFFSET, atol=1e-9)
+    rng = np.random.default_rng(9)
+    pixel, jacobian = np.array([500.0, 600.0]), rng.normal(0, 1500, (2, 6))
+    (turn,) = random_turns(1, rng)
+    in_base = quaternion.to_matrix(turn).numpy() @ OFFSET
+    np.testing.assert_allclose(
+        target(pixel, jacobian, turn), pixel + jacobian[:, :3] @ in_base, atol=1e-6
+    )
 
 
-def test_the_offset_in_space_is_found_whatever_way_the_camera_is_turned():
-    rng = np.random.default_rng(3)
-    objects, offset = rng.uniform(200, 900, (6, 2)), np.array([0.12, -0.01, 0.18])
-    jacobians = rng.normal(0, 1500, (6, 2, 6))
-    target = VisualTarget.fit(objects, objects + jacobians[..., :3] @ offset, jacobians)
-    np.testing.assert_allclose(target.offset, offset, atol=1e-9)
-    pixel, turned = np.array([500.0, 600.0]), rng.normal(0, 1500, (2, 6))
-    expected = pixel + turned[:, :3] @ offset
-    np.testing.assert_allclose(target.from_view(pixel, turned), expected, atol=1e-6)
-
-
-def test_without_an_image_jacobian_the_camera_is_taken_to_stand_still():
-    objects, hands, matrix = demonstrations(5)
-    target, pixel = VisualTarget.fit(objects, hands), np.array([500.0, 600.0])
-    expected = matrix @ np.append(pixel, 1.0)
-    np.testing.assert_allclose(target.from_view(pixel, np.ones((2, 6))), expected)
-
-
-def test_the_error_is_what_leaving_each_demonstration_out_gives():
-    objects, hands, _ = demonstrations(9, noise=2.0)
-    misses = []
-    for i in range(9):
-        rest = np.arange(9) != i
-        left_out = VisualTarget.fit(objects[rest], hands[rest])
-        misses.append(np.sum((left_out(objects[i]) - hands[i]) ** 2))
-    assert VisualTarget.fit(objects, hands).error == pytest.approx(np.sqrt(np.mean(misses)))
+def test_the_line_leads_up_along_the_offset_and_turns_with_the_tool():
+    target = VisualTarget(offset=np.array([0.0, 0.1, -0.2]), error=0.0)
+    down = gripper_down()
+    np.testing.assert_allclose(
+        target.line(down), np.array([0.1, 0.0, 0.2]) / 0.05**0.5, atol=1e-12
+    )
+    quarter = quaternion.exp(torch.tensor([0.0, 0.0, np.pi / 2], dtype=torch.float64))
+    turned = quaternion.multiply(quarter, down)
+    np.testing.assert_allclose(
+        target.line(turned), np.array([0.0, 0.1, 0.2]) / 0.05**0.5, atol=1e-12
+    )
+    flat = VisualTarget(offset=np.array([0.0, 0.2, -0.05]), error=0.0)
+    np.testing.assert_array_equal(flat.line(down), [0.0, 0.0, 1.0])
 
 
 def test_an_offset_that_only_metres_would_explain_is_kept_short():
@@ -68,47 +71,42 @@ def test_an_offset_that_only_metres_would_explain_is_kept_short():
         jacobians[..., :3].reshape(-1, 3), (hands - objects).ravel(), rcond=None
     )
     assert np.linalg.norm(free) > 2 * LONGEST_OFFSET
-    offset = VisualTarget.fit(objects, hands, jacobians).offset
+    upright = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).expand(5, 4)
+    offset = VisualTarget.fit(objects, hands, jacobians, upright).offset
     assert np.linalg.norm(offset) == pytest.approx(LONGEST_OFFSET, rel=1e-5)
     np.testing.assert_allclose(offset[:2], [0.12, 0.0], atol=0.01)
 
 
-def test_the_error_of_the_offset_is_what_leaving_each_demonstration_out_gives():
-    rng = np.random.default_rng(4)
-    objects, jacobians = rng.uniform(200, 900, (7, 2)), rng.normal(0, 1500, (7, 2, 6))
-    hands = objects + jacobians[..., :3] @ [0.12, -0.01, 0.18] + rng.normal(0, 2, (7, 2))
+def test_the_error_is_what_leaving_each_demonstration_out_gives():
+    objects, hands, jacobians, turns = demonstrations(7, noise=2.0)
     misses = []
     for i in range(7):
         rest = np.arange(7) != i
-        left_out = VisualTarget.fit(objects[rest], hands[rest], jacobians[rest])
-        misses.append(np.sum((left_out.from_view(objects[i], jacobians[i]) - hands[i]) ** 2))
-    target = VisualTarget.fit(objects, hands, jacobians)
-    assert target.offset_error == pytest.approx(np.sqrt(np.mean(misses)))
+        left_out = VisualTarget.fit(
+            objects[rest], hands[rest], jacobians[rest], turns[torch.from_numpy(rest)]
+        )
+        misses.append(np.sum((left_out(objects[i], jacobians[i], turns[i]) - hands[i]) ** 2))
+    target = VisualTarget.fit(objects, hands, jacobians, turns)
+    assert target.error == pytest.approx(np.sqrt(np.mean(misses)))
 
 
-def test_too_few_or_collinear_demonstrations_are_refused():
-    objects, hands, _ = demonstrations(2)
+def test_too_few_demonstrations_are_refused():
     with pytest.raises(ValueError, match="at least three"):
-        VisualTarget.fit(objects, hands)
-    line = np.outer(np.arange(6.0), [10.0, 20.0]) + 100.0
-    with pytest.raises(ValueError, match="line"):
-        VisualTarget.fit(line, line)
+        VisualTarget.fit(*demonstrations(2))
 
 
-def test_it_survives_the_disk(tmp_path):
-    objects, hands, _ = demonstrations(7, noise=1.0)
-    jacobians = np.random.default_rng(5).normal(size=(7, 2, 6))
-    target = VisualTarget.fit(objects, hands, jacobians)
+@pytest.mark.parametrize("n", [3, 7])
+def test_it_survives_the_disk(tmp_path, n):
+    target = VisualTarget.fit(*demonstrations(n, noise=1.0))
     target.save(tmp_path / "target.json")
     loaded = VisualTarget.load(tmp_path / "target.json")
-    np.testing.assert_array_equal(loaded.matrix, target.matrix)
     np.testing.assert_array_equal(loaded.offset, target.offset)
-    assert (loaded.error, loaded.offset_error) == (target.error, target.offset_error)
+    np.testing.assert_equal(loaded.error, target.error)
     assert [path.name for path in tmp_path.iterdir()] == ["target.json"]
 
 
 @pytest.mark.parametrize(
-    "content", [{"version": 99}, {"version": 99, "matrix": [[0.0] * 3] * 2}, {"version": 1}]
+    "content", [{"version": 99}, {"version": 99, "offset_m": [0.0] * 3}, {"version": 2}]
 )
 def test_other_files_are_refused(tmp_path, content):
     path = tmp_path / "target.json"

@@ -1,11 +1,15 @@
 """The control loop of a work cell, on an arm that does as it is told."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
+from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import panda
-from hrc_learn.protocols import ArmState
+from hrc_learn.protocols import ArmState, HumanInput
+from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills import WorkCell, joint_line
 from hrc_learn.teleoperation import ScriptedPerturbation
 
@@ -69,7 +73,7 @@ class CountingSensor:
     def __init__(self):
         self.asked = []
 
-    def detect(self, ids):
+    def corners(self, ids):
         self.asked.append(ids)
         return {}
 
@@ -81,3 +85,66 @@ def test_markers_are_detected_now_and_then_while_they_are_tracked(cell, tracked)
     assert cell._sensor.asked == []
     cell.hold_pose(0.10)  # twelve steps by now, with a detection at each fourth
     assert cell._sensor.asked == 3 * [tracked] * bool(tracked)
+
+
+class Wall(ObedientArm):
+    """Feels a stiff surface below a height."""
+
+    def __init__(self, height, noise=0.0):
+        super().__init__(HOVER.numpy())
+        self._height, self._noise = height, noise
+        self._rng = np.random.default_rng(0)
+
+    def read(self):
+        pose, J = panda.forward_and_jacobian(torch.from_numpy(self.q))
+        depth = max(self._height - float(pose.position[2]), 0.0)
+        push = torch.tensor([0, 0, 2e4 * depth, 0, 0, 0], dtype=torch.float64)
+        torque = (J.mT @ push).numpy() + self._noise * self._rng.standard_normal(7)
+        return replace(super().read(), external_torque=torque)
+
+
+HOVER = Workplace().hover_joints()
+
+
+def lowered(by):
+    start = panda.forward(HOVER)
+    return Pose(start.position - torch.tensor([0, 0, by]).double(), start.orientation)
+
+
+def cell_with(arm):
+    return WorkCell(
+        chain=panda,
+        arm=arm,
+        gripper=arm,
+        human=ScriptedPerturbation(panda, ()),
+        advance=arm.advance,
+    )
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.2])
+def test_a_surface_is_found_where_it_is(noise):
+    top = float(panda.forward(HOVER).position[2]) - 0.03
+    cell = cell_with(Wall(top, noise=noise))
+    met = cell.move_until_contact(lowered(0.06))
+    assert met is not None
+    assert float(met.position[2]) == pytest.approx(top, abs=1.5e-3)
+    assert float(cell.pose.position[2]) > top - 3e-3  # it did not go on
+
+
+def test_where_nothing_is_met_it_ends_at_the_goal():
+    cell = cell_with(Wall(-1.0, noise=0.2))
+    assert cell.move_until_contact(lowered(0.04)) is None
+    torch.testing.assert_close(cell.pose.position, lowered(0.04).position, rtol=0, atol=1e-3)
+
+
+def test_a_jump_of_the_null_space_input_comes_smoothly(cell):
+    class Jump:
+        def read(self, state):
+            return HumanInput(nullspace_input=np.full(7, 3.0 if state.time < 0.5 else 0.0))
+
+    cell._human = Jump()
+    cell.hold_pose(1.5)
+    d = cell.log["nullspace_input"][:, 0]
+    assert np.abs(np.diff(d)).max() < 0.3
+    assert d.max() > 2.8
+    assert d[-1] == 0.0

@@ -98,6 +98,27 @@ def test_a_second_claim_in_the_same_process_is_refused(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.skipif(os.name == "nt", reason="deletes no open file")
+def test_a_lock_is_held_until_it_is_gone(tmp_path, monkeypatch):
+    """Else who has opened it meanwhile would hold the lock of a file that nobody finds."""
+    import fcntl
+
+    unlink, seen = os.unlink, []
+
+    def check(path, **options):
+        if Path(path).name == "lock":
+            seen.append(path)
+            with open(path, encoding="utf-8") as other, pytest.raises(BlockingIOError):
+                fcntl.flock(other, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        unlink(path, **options)
+
+    monkeypatch.setattr(os, "unlink", check)
+    with new_file(tmp_path / "file") as part:
+        part.write_text("new", encoding="utf-8")
+    assert len(seen) == 1
+    assert contents(tmp_path) == {"file": "new"}
+
+
 def test_claims_that_wait_come_one_after_another(tmp_path):
     """Each adds one to a number; none is lost, though the workspace comes and goes."""
     path = tmp_path / "number"

@@ -6,10 +6,10 @@ from contextlib import nullcontext
 import numpy as np
 import pytest
 from page_in_browser import PATIENCE, Browser, chromium, wait_until
-from taught_skills import taught_aiming, taught_placing
+from taught_models import teach
 
 from hrc_learn.experiments.collaboration.trial import simulate_collaboration
-from hrc_learn.experiments.run_measures import ELBOW, Deviation, link_poses, span
+from hrc_learn.experiments.run_recording import ELBOW, Deviation, link_poses, span
 from hrc_learn.skills.pick_and_place import PickAndPlaceConfig
 from hrc_learn.teleoperation import page_session as task_page
 from hrc_learn.teleoperation.page import Page, PageConfig
@@ -63,9 +63,8 @@ class Job:
         self._thread.join()
 
 
-def test_the_elbow_yields_to_the_mouse_while_the_hand_aims(tmp_path, monkeypatch):
-    aiming, (placing, _) = taught_aiming(tmp_path / "aim"), taught_placing(tmp_path / "place")
-    job = Job(aiming, placing)
+def test_the_elbow_yields_to_the_mouse_while_the_end_effector_servoes(tmp_path, monkeypatch):
+    job = Job(*teach(tmp_path))
     monkeypatch.setattr(
         task_page, "Page", lambda *given, **named: job.open(Page(*given, **named))
     )
@@ -86,12 +85,12 @@ def test_the_elbow_yields_to_the_mouse_while_the_hand_aims(tmp_path, monkeypatch
     assert result.failure == ""
     time = log["time"]
     start, end = span(log, "interact")
-    effort = np.abs(log["human_effort"]).max(axis=1)
+    effort = np.abs(log["nullspace_input"]).max(axis=1)
     assert effort[(time >= start) & (time < end)].max() > 1.0
     assert not effort[time < start].any()
-    deviation = Deviation.of(log)
-    assert deviation.largest_elbow > 0.05
-    assert deviation.most_moved < 1e-3
+    deviation = Deviation.of(log, result.motion, result.world)
+    assert np.nan_to_num(deviation.elbow).max() > 0.05
+    assert np.nan_to_num(deviation.position).max() < 1e-3
     # To the right of the screen is +y.
     moved = link_poses(log).position.numpy()[:, ELBOW] - elbow
     assert moved[effort > 0][-1, 1] > 0

@@ -74,7 +74,7 @@ def test_person_figure_shows_the_time_in_which_the_person_is_about():
     run = sample_run()
     whole = figures.person_figure(run).axes[-1].get_xlim()
     assert whole == (run.time[0], run.time[-1])
-    unknown = np.where(run.human_effort[:, 3] > 0, run.position_deviation, np.nan)
+    unknown = np.where(run.nullspace_input[:, 3] > 0, run.position_deviation, np.nan)
     known_at = dict.fromkeys(
         ("elbow_motion", "position_deviation", "rotation_deviation"), unknown
     )
@@ -102,7 +102,7 @@ def test_residual_figure_marks_the_number_used():
 @pytest.mark.parametrize(
     ("draw", "field"),
     [
-        (figures.person_figure, "human_effort"),
+        (figures.person_figure, "nullspace_input"),
         (figures.image_jacobian_figure, "image_jacobian"),
     ],
 )

@@ -1,5 +1,72 @@
-"""Command lines of the commands: what can be asked for, known without importing how it is done.
+"""Command lines of the commands: what can be asked for, known without importing how.
 
 Nothing here imports torch, numpy, a simulator or a file format when it is imported. Choices are
-written out in `choices`, so that a mistyped one is found before any work.
+written out, so that a mistyped one is found before any work; tests hold each to its source.
 """
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from tyro.conf import Suppress
+
+Configuration = Annotated[Any, Suppress]
+"""Type of an option that has a `Detail` for default."""
+
+Shelf = Literal["lower", "middle", "upper"]
+"""Of `hrc_learn.sim.workplace.Workplace`."""
+Camera = Literal["auto", "egl", "synthetic"]
+"""`hrc_learn.sim.CameraKind`."""
+Channel = Literal["joint", "position", "orientation", "pose"]
+"""Keys of `hrc_learn.learning.channels.CHANNELS`."""
+Scaling = Literal["none", "paper", "amplitude", "rotation"]
+"""Keys of `hrc_learn.dmp.forcing_scale.SCALINGS`."""
+Robot = Literal["panda"]
+"""Arms that the simulated work cell has."""
+Variant = Literal["learned", "unadapted", "kalman", "composite", "paper", "fixed", "none"]
+"""Keys of `hrc_learn.experiments.grasping.experiment.VARIANTS`, and none of them."""
+Experiment = Literal[
+    "near",
+    "global",
+    "fixed",
+    "paper",
+    "printed",
+    "jacobian_0.3",
+    "jacobian_3",
+    "row_flipped",
+    "rows_swapped",
+    "noise",
+    "latency",
+    "slow_camera",
+    "tilt",
+    "marker_lost",
+    "effort",
+    "effort_noise",
+    "faulty_images",
+    "composite",
+    "least_squares",
+    "broyden",
+    "corners",
+    "stress",
+    "stress_nan",
+    "stress_late",
+    "stress_lost",
+    "stress_1khz",
+]
+"""Keys of `hrc_learn.experiments.controller.sweep.EXPERIMENTS`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measured:
+    """A command that measures something."""
+
+    json: Path | None = None
+    """Receives the measured values as one flat object of numbers."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Written(Measured):
+    """A command that writes a folder of results."""
+
+    overwrite: bool = False
+    """Replace an older result in that folder."""

@@ -7,10 +7,11 @@ from typing import Literal
 from tyro.conf import Positional
 
 from hrc_learn.cli._options import More
+from hrc_learn.cli.arguments import Measured, Written
 
 
 @dataclass(frozen=True, kw_only=True)
-class Check:
+class Check(Written):
     """Check a LeRobot dataset: what is broken, what is odd enough to look at before training.
 
     Every finding names the file, episode, frame and column as closely as is known. Exit status:
@@ -29,14 +30,10 @@ class Check:
     """Count warnings as errors in the exit status."""
     findings: Path | None = None
     """Receives every finding: a JSON list of kind, message, file, episode, frame, key."""
-    overwrite: bool = False
-    """Replace an older folder of findings."""
-    json: Path | None = None
-    """Receives the counts as one flat object."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Repair:
+class Repair(Measured):
     """Repair a LeRobot dataset into a new copy, and say what was changed in which episode.
 
     Standing still is trimmed, repeated frames are dropped, angles unwrapped and signs of
@@ -71,8 +68,6 @@ class Repair:
     """Keep the videos. Frames dropped in the middle and resampling would need new ones."""
     units: dict[str, str] = field(default_factory=dict)
     """Units on disk by quantity, such as: joint_position deg position mm."""
-    json: Path | None = None
-    """Receives the counts as one flat object."""
 
     @property
     def folder(self) -> Path:
@@ -81,7 +76,7 @@ class Repair:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ImportArrays:
+class ImportArrays(Measured):
     """Turn recordings kept as plain arrays (.npz, .npy, .csv) into a LeRobot dataset.
 
     Each file is one demonstration; an array of three axes (demonstrations, frames, components)
@@ -128,12 +123,10 @@ class ImportArrays:
     """What was shown, in words; the file's name where not given."""
     dtype: More[Literal["float32", "float64"]] = "float32"
     """Type on disk; LeRobot's policies want float32."""
-    json: Path | None = None
-    """Receives the counts as one flat object."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Show:
+class Show(Measured):
     """Look at the demonstrations of a LeRobot dataset: a Rerun recording of all of them.
 
     Paths of the end effector in 3D with the arm (a Panda; of other robots the paths alone),
@@ -149,12 +142,10 @@ class Show:
     """Episodes to show; all when empty."""
     units: dict[str, str] = field(default_factory=dict)
     """Units on disk by quantity, such as: joint_position deg position mm."""
-    json: Path | None = None
-    """File for the counts."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Extract:
+class Extract(Measured):
     """Find a marker in the videos of a LeRobot dataset and keep its pixels beside the dataset.
 
     The result lies in NAME.features, where `load_demos` finds it; the dataset is not touched.
@@ -169,12 +160,10 @@ class Extract:
     """Number of the marker, of OpenCV's ArUco dictionary 4x4_50."""
     camera: str | None = None
     """Name of the camera; may be left out where there is only one."""
-    json: Path | None = None
-    """Receives the counts as one flat object."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Recover:
+class Recover(Measured):
     """Recover what processes that were killed left behind, of a path and of anything below it.
 
     Interrupted recordings become datasets of their saved episodes, interrupted replacements are
@@ -182,6 +171,4 @@ class Recover:
     """
 
     path: Path
-    """A dataset, model or folder of results, or a folder of such things."""
-    json: Path | None = None
-    """Receives the counts as one flat object."""
+    """A dataset, model or folder of results, or a folder of several."""

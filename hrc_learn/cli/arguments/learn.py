@@ -1,42 +1,32 @@
 """Command lines of the commands that learn from demonstrations and measure what was learned."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
-
-from tyro.conf import Suppress
+from typing import Literal
 
 from hrc_learn.cli._options import Detail, More
-from hrc_learn.cli.arguments.choices import Channel, Scaling
-
-
-def _learning() -> Any:
-    from hrc_learn.jacobian import EvidenceConfig
-
-    return EvidenceConfig()
-
-
-def _jacobian_fit() -> Any:
-    from hrc_learn.jacobian import ImageJacobianFitConfig
-
-    return ImageJacobianFitConfig()
-
-
-def _starts() -> Any:
-    from hrc_learn.experiments.initialization_study import StartsConfig
-
-    return StartsConfig()
-
-
-def _few_starts() -> Any:
-    from hrc_learn.experiments.initialization_study import StartsConfig
-
-    # A search measures each gain on all of them.
-    return StartsConfig(count=48)
+from hrc_learn.cli.arguments import Channel, Configuration, Measured, Scaling, Written
 
 
 @dataclass(frozen=True, kw_only=True)
-class FitPrimitives:
+class Fit(Written):
+    """Where demonstrations are, and where the model goes."""
+
+    dataset: Path
+    """LeRobot dataset with the demonstrations."""
+    out: Path | None = None
+    """Folder for the model. DATASET_model when not given."""
+    episodes: tuple[int, ...] = ()
+    """Episodes to learn from; all when empty."""
+
+    @property
+    def folder(self) -> Path:
+        """Where the model is written."""
+        return self.out or self.dataset.with_name(f"{self.dataset.name}_model")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitPrimitives(Fit):
     """Fit movement primitives to the demonstrations of a LeRobot dataset.
 
     Learns the motion of the joints, of any robot, and that of the end effector where its pose
@@ -46,10 +36,6 @@ class FitPrimitives:
     beside reproductions as figures and a Rerun recording, and what it was made from.
     """
 
-    dataset: Path
-    """LeRobot dataset with the demonstrations."""
-    out: Path | None = None
-    """Folder for the model. DATASET_model when not given."""
     channels: tuple[Channel, ...] = ()
     """What to learn; joint and pose, or what there is of them, when empty."""
     several: Literal["mean", "distribution", "contextual", "streamed"] = "mean"
@@ -67,8 +53,6 @@ class FitPrimitives:
     """Trust samples that lie far off less."""
     scaling: More[Scaling] = "none"
     """How forcing scales with start and goal."""
-    episodes: tuple[int, ...] = ()
-    """Episodes to learn from; all when empty."""
     joint_names: More[tuple[str, ...]] = ()
     """Joints to learn, by name and in this order; all when empty."""
     as_lerobot_policy: bool = False
@@ -76,19 +60,10 @@ class FitPrimitives:
     the dataset's own actions, joints or the end effector, in closed form."""
     seed: int = 0
     """Of whatever is drawn at random."""
-    overwrite: bool = False
-    """Replace an older model in that folder."""
-    json: Path | None = None
-    """File for the measured values."""
-
-    @property
-    def folder(self) -> Path:
-        """Where the model is written."""
-        return self.out or self.dataset.with_name(f"{self.dataset.name}_model")
 
 
 @dataclass(frozen=True, kw_only=True)
-class FitImageJacobian:
+class FitImageJacobian(Fit):
     """Fit the image Jacobian of an uncalibrated camera to demonstrations.
 
     Learns how the image of the marker moves with the end effector, as a radial basis function
@@ -99,12 +74,6 @@ class FitImageJacobian:
     torchrun each process reads its share of the demonstrations.
     """
 
-    dataset: Path
-    """LeRobot dataset with the demonstrations."""
-    out: Path | None = None
-    """Folder for the model. DATASET_model when not given."""
-    episodes: tuple[int, ...] = ()
-    """Episodes to learn from; all when empty."""
     neurons: Literal["around", "grid"] = "around"
     """Thirteen over the whole pose, placed about what was demonstrated; or a grid that
     sees x and y, as in the paper."""
@@ -117,23 +86,14 @@ class FitImageJacobian:
     learn: bool = True
     """Whether neurons, noise and prior are learned. Needs --learning.hold-out demonstrations,
     fewer are fitted without."""
-    learning: Annotated[Any, Suppress] = field(default=Detail(_learning))
+    learning: Configuration = Detail("hrc_learn.jacobian", "EvidenceConfig")
     """How they are learned."""
-    fit: Annotated[Any, Suppress] = field(default=Detail(_jacobian_fit))
+    fit: Configuration = Detail("hrc_learn.jacobian", "ImageJacobianFitConfig")
     """What is compared, and what is believed before; where learning starts."""
-    overwrite: bool = False
-    """Replace an older model in that folder."""
-    json: Path | None = None
-    """File for the measured values."""
-
-    @property
-    def folder(self) -> Path:
-        """Where the model is written."""
-        return self.out or self.dataset.with_name(f"{self.dataset.name}_model")
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvaluatePrimitives:
+class EvaluatePrimitives(Written):
     """Evaluate fitted movement primitives on demonstrations, such as those held out.
 
     Each demonstration is predicted by the common primitive of `hrc fit`, told its start, goal
@@ -153,14 +113,10 @@ class EvaluatePrimitives:
     """Episodes to evaluate on; when empty those that were not learned from, or all."""
     most_nrmse: float | None = None
     """Largest median error that passes."""
-    overwrite: bool = False
-    """Replace an older evaluation in that folder."""
-    json: Path | None = None
-    """File for the measured values."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvaluateImageJacobian:
+class EvaluateImageJacobian(Measured):
     """Measure a learned image Jacobian against the truth, which the simulator knows.
 
     For models of `hrc fit image-jacobian` from demonstrations of `hrc record servoing`. Prints
@@ -178,14 +134,14 @@ class EvaluateImageJacobian:
     """Of the end effector, in the second of two grids [rad]; the first has it pointing down."""
     closed_loop: bool = True
     """Whether to run the closed loops, which take a minute or more."""
-    starts: Annotated[Any, Suppress] = field(default=Detail(_starts))
+    starts: Configuration = Detail(
+        "hrc_learn.experiments.controller.initialization_study", "StartsConfig"
+    )
     """How starts are drawn."""
-    json: Path | None = None
-    """File for the measured values."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Tune:
+class Tune(Written):
     """Tune gains of the controller: the marker sooner at its target, in simulation.
 
     Searches the gains over a batch of closed loops against the workplace's camera, turned by
@@ -202,20 +158,18 @@ class Tune:
     """Rounds of the search."""
     population: int = 8
     """Gains tried in each."""
-    starts: Annotated[Any, Suppress] = field(default=Detail(_few_starts))
+    starts: Configuration = Detail(
+        "hrc_learn.experiments.controller.initialization_study", "StartsConfig", {"count": 48}
+    )
     """How closed loops are drawn; their seed is that of the search."""
     held_out_seed: int = 1000
     """Seed of the closed loops of the final figures."""
     resume: bool = False
     """Go on from OUT.search.json, which an interrupted search leaves."""
-    overwrite: bool = False
-    """Replace older gains in that folder."""
-    json: Path | None = None
-    """File for the measured values."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Smooth:
+class Smooth(Measured):
     """Let a trained LeRobot policy's actions be smoothed: any policy, wherever it is run.
 
     Adds two steps to the processors of a checkpoint. They keep actions within limits of
@@ -232,5 +186,3 @@ class Smooth:
     """Share of the demonstrators' velocity, acceleration and jerk to allow."""
     remove: bool = False
     """Take the steps out again."""
-    json: Path | None = None
-    """File for the limits."""

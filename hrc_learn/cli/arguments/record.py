@@ -1,29 +1,15 @@
 """Command lines of `hrc record`."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
-
-from tyro.conf import Suppress
+from typing import Literal
 
 from hrc_learn.cli._options import Detail, More
-from hrc_learn.cli.arguments.choices import Camera, Shelf
-
-
-def _placing_demonstration() -> Any:
-    from hrc_learn.teleoperation.scripted_demonstrations import PlacingDemonstrationConfig
-
-    return PlacingDemonstrationConfig()
-
-
-def _servo_demonstration() -> Any:
-    from hrc_learn.teleoperation.scripted_demonstrations import ServoDemonstrationConfig
-
-    return ServoDemonstrationConfig()
+from hrc_learn.cli.arguments import Camera, Configuration, Measured, Shelf, Written
 
 
 @dataclass(frozen=True, kw_only=True)
-class RecordPlacing:
+class RecordPlacing(Written):
     """Record demonstrations of placing an object on a shelf, with the null-space posture.
 
     The scripted expert guides the simulated arm from home into the cabinet while pulling its
@@ -37,18 +23,16 @@ class RecordPlacing:
     """Demonstrations to record."""
     shelf: Shelf = "middle"
     """Shelf to place on."""
-    demonstration: Annotated[Any, Suppress] = field(default=Detail(_placing_demonstration))
+    demonstration: Configuration = Detail(
+        "hrc_learn.teleoperation.scripted_demonstrations", "PlacingDemonstrationConfig"
+    )
     """How the expert demonstrates."""
     seed: int = 0
     """Seed of the tremor and of initial positions."""
-    overwrite: bool = False
-    """Replace an older dataset in that folder."""
-    json: Path | None = None
-    """File for the measured values."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class RecordServoing:
+class RecordServoing(Written):
     """Record demonstrations of visual servoing to an object by an uncalibrated camera.
 
     The scripted expert moves the marked end effector over the table and ends right above an
@@ -62,18 +46,16 @@ class RecordServoing:
     """Demonstrations to record."""
     camera: Camera = "synthetic"
     """Camera: rendered by "egl", or "synthetic", which draws the markers only but is fast."""
-    demonstration: Annotated[Any, Suppress] = field(default=Detail(_servo_demonstration))
+    demonstration: Configuration = Detail(
+        "hrc_learn.teleoperation.scripted_demonstrations", "ServoDemonstrationConfig"
+    )
     """How the expert demonstrates."""
     seed: int = 1
     """Seed of objects, paths and image noise."""
-    overwrite: bool = False
-    """Replace an older dataset in that folder."""
-    json: Path | None = None
-    """File for the measured values."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class RecordExpert:
+class RecordExpert(Measured):
     """Record the scripted expert on LeRobot's simulated Panda, in simulated time.
 
     Writes what lerobot-record would write with --robot.type=mujoco_panda and
@@ -92,10 +74,8 @@ class RecordExpert:
     fps: int = 20
     """Frames a second."""
     action_space: Literal["joint", "ee"] = "joint"
-    """What actions give: positions of the joints, or of the hand."""
+    """What actions give: positions of the joints, or of the end effector."""
     pixels: More[bool] = True
     """Whether the pixel of the object to grasp is observed."""
     seed: int = 0
-    """Of the first beginning; each one after has the next."""
-    json: Path | None = None
-    """File for the measured values."""
+    """Of the first initial configuration; each one after has the next."""

@@ -1,56 +1,29 @@
 """Command lines of the commands that move the arm, and of what is made from their runs."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Literal
 
-from tyro.conf import Positional, Suppress
+from tyro.conf import Positional
 
 from hrc_learn.cli._options import Detail, More
-from hrc_learn.cli.arguments.choices import Camera, Experiment, Robot, Shelf, Variant
-
-
-def _camera_change() -> Any:
-    from hrc_learn.sim import CameraChange
-
-    return CameraChange()
-
-
-def _serving() -> Any:
-    from hrc_learn.experiments.live_view import LiveViewConfig
-
-    return LiveViewConfig()
-
-
-def _collaboration() -> Any:
-    from hrc_learn.skills.pick_and_place import PickAndPlaceConfig
-
-    return PickAndPlaceConfig()
-
-
-def _grasping() -> Any:
-    from hrc_learn.skills.grasping import GraspingConfig
-
-    return GraspingConfig()
-
-
-def _page() -> Any:
-    from hrc_learn.teleoperation.page import PageConfig
-
-    return PageConfig()
-
-
-def _session() -> Any:
-    from hrc_learn.teleoperation.page_session import PageSessionConfig
-
-    return PageSessionConfig()
+from hrc_learn.cli.arguments import (
+    Camera,
+    Configuration,
+    Experiment,
+    Measured,
+    Robot,
+    Shelf,
+    Variant,
+    Written,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Demo:
+class Demo(Measured):
     """Do the whole main job in simulation: demonstrate, learn, grasp, place.
 
-    Records demonstrations of placing and of aiming, fits a movement primitive and an image
+    Records demonstrations of placing and of servoing, fits a movement primitive and an image
     Jacobian to them, then grasps a box with an uncalibrated camera while a scripted person
     draws the elbow aside, carries it to the cabinet along the learned motion, and puts it on a
     shelf. Results of an older demo in the folder are replaced. Exit status 1 if the job failed
@@ -65,26 +38,58 @@ class Demo:
     """Where to put the object; the middle shelf is the demonstrated one."""
     seed: int = 0
     """Seed of where the object lies and of image noise."""
-    json: Path | None = None
-    """File for the measured values."""
+    imperfections: float = 1.0
+    """Errors of arm, camera, calibration and objects, so many times their nominal size."""
+    ideal: bool = False
+    """Without any: --imperfections 0."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunPlacing:
+class RunExperiment(Written):
+    """What the paper's three experiments have in common."""
+
+    out: Path
+    """Folder for recordings, report and measured values."""
+    seed: int = 0
+    """First seed of the run and of its repetitions."""
+    trials: int = 0
+    """Repeat with so many seeds besides, and sum up."""
+    processes: int = 1
+    """Of the repetitions, at once."""
+    robot: Robot = "panda"
+    """Arm that does it."""
+    serve: bool = False
+    """Serve the dashboard in the browser while the run goes on."""
+    serving: Configuration = Detail("hrc_learn.experiments.run_recording", "LiveViewConfig")
+    """Where, with --serve."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunServoing(RunExperiment):
+    """What those with a camera have in common."""
+
+    camera: Camera = "auto"
+    """Camera: rendered by "egl", or "synthetic", which needs no OpenGL; "auto" renders where
+    it can."""
+    gains: More[Path | None] = None
+    """gains.json of `hrc tune`, in place of those of the controller."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunPlacing(RunExperiment):
     """Place an object on three shelves by a motion that was demonstrated for one of them.
 
     In simulation, with the object held between the fingers: the demonstrated motion once more
     and faster, then the other shelves, as the paper does it (joint space, shifted goal) and in
-    task space with the learned body shape; the demonstration with and without that shape; on
-    request from many random starts. Writes Rerun recordings, a report and the measured values.
-    Exit status 1 if a target was missed.
+    task space with the learned null-space posture; the demonstration with and without that
+    posture; on request from many random starts. Writes Rerun recordings, a report and the
+    measured values. Exit status 1 if a target was missed.
     """
 
     placing: Path | None = None
     """Folder of `hrc fit`, from demonstrations of placing. Those of `hrc demo` when not given,
     made first where they are missing."""
     out: Path = Path("outputs/placing")
-    """Folder for recordings, report and measured values."""
     demonstrations: Path | None = None
     """Dataset the motion was learned from; the one named in that folder when None."""
     speed: float = 1.5
@@ -94,27 +99,13 @@ class RunPlacing:
     noise: float = 0.1
     """Standard deviation of each joint at these starts, about home [rad]."""
     ablation: int = 0
-    """Further demonstrations with and without the body's shape."""
-    processes: int = 1
-    """Of the repetitions, at once."""
-    seed: int = 0
-    """First seed of starts and demonstrations."""
-    robot: Robot = "panda"
-    """Arm that does it."""
-    serve: bool = False
-    """Serve the dashboard of the reproduction in the browser while it goes on."""
-    serving: Annotated[Any, Suppress] = field(default=Detail(_serving))
-    """Where, with --serve."""
+    """Further demonstrations with and without the null-space posture."""
     pictures: bool = True
     """Whether to render pictures of the arm, where this machine can."""
-    overwrite: bool = False
-    """Replace an older run in that folder."""
-    json: Path | None = None
-    """File for the measured values."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunGrasping:
+class RunGrasping(RunServoing):
     """Grasp an object from afar with a camera that nobody calibrated.
 
     In simulation: the arm starts anywhere within its joint limits, the camera was turned or
@@ -128,7 +119,6 @@ class RunGrasping:
     """Folder of `hrc fit image-jacobian`. That of `hrc demo` when not given, made first where
     it is missing."""
     out: Path = Path("outputs/grasping")
-    """Folder for recordings, report and measured values."""
     camera_roll: float = 60.0
     """By how much the camera was turned about its axis since the demonstrations [deg]."""
     random_camera: bool = False
@@ -137,37 +127,19 @@ class RunGrasping:
     """What to compare. A Kalman filter from the learned Jacobian and from the paper's guess;
     from that guess also the composite law, the paper's law and no adaptation; "unadapted", the
     learned Jacobian as it is. "none" for nothing."""
-    camera: Camera = "auto"
-    """Camera: rendered by "egl", or "synthetic", which needs no OpenGL; "auto" renders where
-    it can."""
-    serve: bool = False
-    """Serve the dashboard of the grasp in the browser while it goes on."""
-    serving: Annotated[Any, Suppress] = field(default=Detail(_serving))
-    """Where, with --serve."""
-    config: Annotated[Any, Suppress] = field(default=Detail(_grasping))
+    config: Configuration = Detail("hrc_learn.skills.grasping", "GraspingConfig")
     """How objects are grasped."""
-    gains: More[Path | None] = None
-    """gains.json of `hrc tune`, in place of those of the controller."""
-    seed: int = 0
-    """Seed of camera, start, object and image noise; the first one of many."""
     trials: int = 0
-    """Grasps besides, each with a random camera, start and object, by the default alone."""
-    processes: int = 1
-    """Of these grasps, at once. They are seen by the synthetic camera."""
-    robot: Robot = "panda"
-    """Arm that does it."""
-    overwrite: bool = False
-    """Replace an older run in that folder."""
-    json: Path | None = None
-    """File for the measured values."""
+    """Grasps besides, each with a random camera, start and object, by the default alone
+    and seen by the synthetic camera."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunCollaboration:
+class RunCollaboration(RunServoing):
     """Grasp objects beside a person, carry them to the cabinet and put them on shelves.
 
     In simulation: the learned skills run on MuJoCo's arm, an uncalibrated camera watches, and a
-    scripted person pulls the elbow aside while the arm aims. The camera may be moved between
+    scripted person pulls the elbow aside while the arm servoes. The camera may be moved between
     two objects, the marker may be hidden, images may be late or lost. Writes a Rerun recording,
     a report and the measured values. Exit status 1 if the job failed or a target was missed.
 
@@ -180,7 +152,6 @@ class RunCollaboration:
     aiming: Path | None = None
     """Folder of `hrc fit image-jacobian`. That of `hrc demo` when not given, likewise."""
     out: Path = Path("outputs/collaboration")
-    """Folder for recording, report and measured values."""
     shelf: Shelf = "middle"
     """Where to put the object."""
     shelves: tuple[Shelf, ...] = ()
@@ -191,48 +162,31 @@ class RunCollaboration:
     """How far behind the board's front edge [m]."""
     occlusion: More[tuple[tuple[float, float], ...]] = ()
     """Intervals in which a board occludes the marker: start and duration [s]."""
+    imperfections: float = 1.0
+    """Errors of arm, camera, calibration and objects, so many times their nominal size."""
+    ideal: bool = False
+    """Without any: --imperfections 0."""
     camera_moved: bool = False
     """Move and turn the camera between two objects."""
-    camera_change: Annotated[Any, Suppress] = field(default=Detail(_camera_change))
+    camera_change: Configuration = Detail("hrc_learn.sim", "CameraChange")
     """How far, with --camera-moved."""
     latency: More[float] = 0.0
-    """From an image being taken until its markers are known [s]."""
+    """From an image being taken until its markers are known [s]; more than by imperfections."""
     frame_loss: More[float] = 0.0
     """Share of the images that are lost."""
-    camera: Camera = "auto"
-    """Camera: rendered by "egl", or "synthetic", which needs no OpenGL; "auto" renders where
-    it can."""
     person: bool = True
     """Whether the scripted person pulls the elbow."""
     page: bool = False
-    """Serve a page in the browser, from which people watch and pull at the body too. The run
-    takes as long as it would on a real arm then."""
+    """Serve a page in the browser, from which people watch and pull at the elbow too. The
+    run takes as long as it would on a real arm then."""
     port: int = 8080
     """Port of that page."""
-    serve: bool = False
-    """Serve the dashboard in the browser while the run goes on."""
-    serving: Annotated[Any, Suppress] = field(default=Detail(_serving))
-    """Where, with --serve."""
-    config: Annotated[Any, Suppress] = field(default=Detail(_collaboration))
+    config: Configuration = Detail("hrc_learn.skills.pick_and_place", "PickAndPlaceConfig")
     """How the job is done."""
-    gains: More[Path | None] = None
-    """gains.json of `hrc tune`, in place of those of the controller."""
-    seed: int = 0
-    """Seed of where the objects lie and of image noise."""
-    trials: int = 0
-    """Do the job so many times more, with this seed and those after it, and sum up."""
-    processes: int = 1
-    """Of the repetitions, at once."""
-    robot: Robot = "panda"
-    """Arm that does it."""
-    overwrite: bool = False
-    """Replace an older run in that folder."""
-    json: Path | None = None
-    """File for the measured values."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Report:
+class Report(Measured):
     """Make one page from the folders of one or several runs.
 
     The page holds their figures, what they measured beside its targets and the paper's claims,
@@ -246,12 +200,10 @@ class Report:
     """HTML file to write; replaces an older one."""
     title: str = "Runs"
     """Heading above several runs."""
-    json: Path | None = None
-    """File for the measured values of all runs, each behind the name of its folder."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sweep:
+class Sweep(Written):
     """Thousands of simulated grasps as batches: how often, how fast and how safely.
 
     Random starts, targets and uncalibrated cameras, turned by up to 180 degrees from what the
@@ -275,10 +227,6 @@ class Sweep:
     """Spread the trials over processes or machines with Ray; the figures stay the same."""
     out: Path | None = None
     """Folder for the figures, the picture and the recording, all at once."""
-    overwrite: bool = False
-    """Replace an older sweep in that folder."""
-    json: Path | None = None
-    """Receives all figures as one flat object."""
     figure: Path | None = None
     """Receives a picture of the times to the target by experiment, as .png or .svg."""
     recording: Path | None = None
@@ -286,7 +234,7 @@ class Sweep:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Serve:
+class Serve(Measured):
     """Run the controller at a fixed rate on the simulated arm, and report how fast it answers.
 
     The arm servoes on a marker that an uncalibrated camera sees at 31 Hz. Step latency is the
@@ -304,12 +252,10 @@ class Serve:
     packages: Path | None = None
     """Folder in which compiled steps are kept; default: the user's cache. The first start
     compiles, in a minute or two; later ones, at any rate, take a tenth of a second."""
-    json: Path | None = None
-    """File for the measured values."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class ServePage:
+class ServePage(Measured):
     """Lead the simulated arm in a browser, and record demonstrations of your own.
 
     Open the address that is printed. Drag a link or a knob of the arm, or of its virtual twin,
@@ -329,9 +275,7 @@ class ServePage:
     or the keys of the terminal this runs in."""
     duration: float | None = None
     """End after this time [s]; None: when the person finishes."""
-    page: Annotated[Any, Suppress] = field(default=Detail(_page))
+    page: Configuration = Detail("hrc_learn.teleoperation.page", "PageConfig")
     """The page."""
-    session: Annotated[Any, Suppress] = field(default=Detail(_session))
+    session: Configuration = Detail("hrc_learn.teleoperation.page_session", "PageSessionConfig")
     """The session."""
-    json: Path | None = None
-    """File for the measured values."""

@@ -1,14 +1,18 @@
-"""`hrc check`: what is wrong with a dataset, and where."""
+"""`hrc check`, `hrc repair`, `hrc recover`: errors in a dataset, and their repair."""
 
 import json
+from dataclasses import fields
 
-from hrc_learn.cli._values import configuration, write_json, write_text
-from hrc_learn.cli.arguments.dataset import Check as Args
-from hrc_learn.demos import check_dataset
-from hrc_learn.store import new_folder
+from rich.progress import track
+
+from hrc_learn.cli._run import configuration, write_values
+from hrc_learn.cli.arguments.dataset import Check, Recover, Repair
+from hrc_learn.demos import check_dataset, recover_all
+from hrc_learn.demos.repair import RepairOptions, repair_dataset
+from hrc_learn.store import new_folder, write_json, write_text
 
 
-def run(args: Args) -> int:
+def check(args: Check) -> int:
     """Check the dataset and print the findings."""
     if not args.dataset.is_dir():
         raise FileNotFoundError(f"there is no dataset at {args.dataset}")
@@ -27,6 +31,41 @@ def run(args: Args) -> int:
             write_json(folder / "metrics.json", counts)
     if args.findings is not None:
         write_text(args.findings, findings)
-    if args.json is not None:
-        write_json(args.json, counts)
+    write_values(args.json, counts)
     return int(bool(report.errors or (args.strict and report.warnings)))
+
+
+def repair(args: Repair) -> None:
+    """Repair the dataset and print what was changed."""
+    # The options of both go by the same names.
+    options = RepairOptions(
+        **{field.name: getattr(args, field.name) for field in fields(RepairOptions)}
+    )
+    report = repair_dataset(
+        args.dataset,
+        args.folder,
+        options,
+        units=args.units,
+        progress=lambda episodes: track(episodes, description="Repairing"),
+    )
+    print(report)
+    counts = {
+        "episodes": len(report.changes),
+        "episodes_changed": report.changed,
+        "episodes_left_out": len(report.left_out),
+        "frames_before": report.frames_before,
+        "frames": report.frames,
+    }
+    write_values(args.json, counts)
+
+
+def recover(args: Recover) -> None:
+    """Finish or remove what a process that was killed left behind."""
+    done = recover_all(args.path)
+    if not done and not args.path.exists():
+        raise FileNotFoundError(f"there is nothing at {args.path}, nor was it being written")
+    for mended in done:
+        print(mended)
+    if not done:
+        print(f"{args.path}: nothing to recover")
+    write_values(args.json, {"mended": len(done)})

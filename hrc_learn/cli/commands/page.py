@@ -11,8 +11,8 @@ import torch
 from rich.console import Console
 
 from hrc_learn.cli._options import resolved
-from hrc_learn.cli._values import configuration, write_json
-from hrc_learn.cli.arguments.run import ServePage as Args
+from hrc_learn.cli._run import configuration, write_values
+from hrc_learn.cli.arguments.run import ServePage
 from hrc_learn.demos import DatasetWriter
 from hrc_learn.deploy import Rate
 from hrc_learn.kinematics import panda
@@ -32,7 +32,7 @@ SWITCH_INTERVAL = 0.0005
 """Longest that the page's threads keep the interpreter from the control loop [s]."""
 
 
-def run(args: Args) -> None:
+def page(args: ServePage) -> None:
     args = resolved(args)
     if args.port is not None:
         args = replace(args, page=replace(args.page, port=args.port))
@@ -65,8 +65,7 @@ def run(args: Args) -> None:
         if recorder.status.saved
         else "Nothing saved, so there is no dataset"
     )
-    if args.json is not None:
-        write_json(args.json, figures)
+    write_values(args.json, figures)
 
 
 def _beside(device: str) -> tuple[Human, ...]:

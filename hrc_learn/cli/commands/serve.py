@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from rich.console import Console
 
-from hrc_learn.cli._values import write_json
-from hrc_learn.cli.arguments.run import Serve as Args
+from hrc_learn.cli._run import write_values
+from hrc_learn.cli.arguments.run import Serve
 from hrc_learn.controller import (
     GRIPPER_DOWN,
     INITIAL_IMAGE_JACOBIAN,
@@ -47,7 +47,7 @@ class Latencies:
     """Ticks that were skipped."""
 
 
-def run(args: Args) -> None:
+def serve(args: Serve) -> None:
     if not (args.duration > 0 and args.rate > 0):
         raise ValueError("duration and rate must be positive")
     if args.rate < (slowest := SafetyConfig().rate):
@@ -69,8 +69,7 @@ def run(args: Args) -> None:
     figures |= {f"safety_{k}": int(n) for k, n in zip(INTERVENTIONS, counts, strict=True)}
     for name, value in figures.items():
         Console().print(f"{name:22} {value:.4g}", highlight=False)
-    if args.json is not None:
-        write_json(args.json, figures)
+    write_values(args.json, figures)
 
 
 def _figures(latencies: Latencies) -> dict[str, float | int]:

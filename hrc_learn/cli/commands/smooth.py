@@ -6,12 +6,11 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from hrc_learn.cli._values import write_json
-from hrc_learn.cli.arguments.learn import Smooth as Args
+from hrc_learn.cli._run import write_values
+from hrc_learn.cli.arguments.learn import Smooth
 
 
-def run(args: Args) -> None:
-
+def smooth(args: Smooth) -> None:
     if not args.checkpoint.is_dir():
         raise FileNotFoundError(f"there is no folder {args.checkpoint}")
     # LeRobot takes seconds to import.
@@ -35,10 +34,9 @@ def run(args: Args) -> None:
         table.add_row(name, *(f"{values[kind][i]:.3g}" for kind in kinds))
     Console().print(table)
     print(f"actions of {args.checkpoint} are kept within these limits")
-    if args.json is not None:
-        figures = {
-            f"{kind}_{name}": float(v)
-            for kind in kinds
-            for name, v in zip(limits.names, np.array(values[kind]), strict=True)
-        }
-        write_json(args.json, figures)
+    figures = {
+        f"{kind}_{name}": float(v)
+        for kind in kinds
+        for name, v in zip(limits.names, np.array(values[kind]), strict=True)
+    }
+    write_values(args.json, figures)

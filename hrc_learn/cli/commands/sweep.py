@@ -9,8 +9,8 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from hrc_learn.cli._values import configuration, refuse_existing, write_json
-from hrc_learn.cli.arguments.run import Sweep as Args
+from hrc_learn.cli._run import configuration, refuse_existing, write_values
+from hrc_learn.cli.arguments.run import Sweep
 from hrc_learn.experiments.controller.grasp_trials import ROLL_CLASSES
 from hrc_learn.experiments.controller.sweep import (
     CRITERIA,
@@ -21,7 +21,7 @@ from hrc_learn.experiments.controller.sweep import (
     join,
     run_chunk,
 )
-from hrc_learn.store import new_folder
+from hrc_learn.store import new_file, new_folder, write_json
 
 CHUNK = 250
 """Trials in one batch: their tensors stay in the cache."""
@@ -29,7 +29,7 @@ CHUNK = 250
 _WIDTH = 100
 
 
-def run(args: Args) -> int:
+def sweep(args: Sweep) -> int:
     """Run the experiments, print their figures beside the targets, write the figures."""
     if args.out is not None:
         refuse_existing(args.out, args.overwrite)
@@ -53,8 +53,7 @@ def run(args: Args) -> int:
             write_json(folder / "metrics.json", figures)
             _draw(folder / "times.png", results)
             _record(folder / "sweep.rrd", results)
-    if args.json is not None:
-        write_json(args.json, figures)
+    write_values(args.json, figures)
     if args.figure is not None:
         _draw(args.figure, results)
     if args.recording is not None:
@@ -66,7 +65,8 @@ def _draw(path: Path, results: dict[str, Any]) -> None:
     from hrc_learn.viz.figures import arrival_figure  # matplotlib takes a second
 
     times = {name: r.time.numpy() for name, r in results.items() if hasattr(r, "time")}
-    arrival_figure(times).savefig(path, dpi=150)
+    with new_file(path) as part:
+        arrival_figure(times).savefig(part, dpi=150)
 
 
 def _record(path: Path, results: dict[str, Any]) -> None:
@@ -85,7 +85,7 @@ def _record(path: Path, results: dict[str, Any]) -> None:
     record_sweep(path, SweepRecording(title=title, groups=groups, experiments=trials))
 
 
-def _chosen(args: Args) -> list[str]:
+def _chosen(args: Sweep) -> list[str]:
     for name in ("trials", "variants"):
         if getattr(args, name) < 1:
             raise ValueError(f"--{name} must be at least 1, but is {getattr(args, name)}")

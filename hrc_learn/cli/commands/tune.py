@@ -11,20 +11,24 @@ from rich.console import Console
 from rich.progress import Progress
 
 from hrc_learn.cli._options import resolved
-from hrc_learn.cli._values import show_values, write_json, write_text
-from hrc_learn.cli.arguments.learn import Tune as Args
+from hrc_learn.cli._run import show_values, write_values
+from hrc_learn.cli.arguments.learn import Tune
 from hrc_learn.controller import ControllerConfig
-from hrc_learn.experiments.initialization_study import ClosedLoops, StartsConfig, summary
+from hrc_learn.experiments.controller.initialization_study import (
+    ClosedLoops,
+    StartsConfig,
+    summary,
+)
 from hrc_learn.jacobian import KalmanEstimator
 from hrc_learn.learning.tuning import TUNED, TuningState
 from hrc_learn.sim import World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.visual_skill import guessed_network
-from hrc_learn.store import new_folder
+from hrc_learn.store import new_folder, write_json, write_text
 from hrc_learn.viz.figures import learning_figure
 
 
-def run(args: Args) -> None:
+def tune(args: Tune) -> None:
     args = resolved(args)
     if args.generations < 1 or args.population < 3:
         raise ValueError("a search needs --generations of 1 and --population of 3, or more")
@@ -53,12 +57,11 @@ def run(args: Args) -> None:
     place.unlink(missing_ok=True)
     show_values("Gains, on closed loops not searched", figures)
     console.print(f"Gains in {args.out / 'gains.json'}")
-    if args.json is not None:
-        write_json(args.json, figures)
+    write_values(args.json, figures)
 
 
 def _begin(
-    args: Args, place: Path, default: ControllerConfig
+    args: Tune, place: Path, default: ControllerConfig
 ) -> tuple[TuningState, list[float]]:
     """A new search, or the one that was interrupted."""
     if args.resume:
@@ -96,7 +99,7 @@ def _cost(loops: ClosedLoops, default: ControllerConfig) -> Callable[[dict[str, 
 
 
 def _figures(
-    args: Args, default: ControllerConfig, gains: dict[str, float]
+    args: Tune, default: ControllerConfig, gains: dict[str, float]
 ) -> dict[str, float]:
     """The gains, and times with and without them on closed loops that were not searched."""
     loops = _loops(replace(args.starts, seed=args.held_out_seed))

@@ -168,6 +168,7 @@ INDEX_FEATURES = {
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 EPISODES_PATH = "meta/episodes/chunk-000/file-000.parquet"
+# Those that LeRobot itself writes by default.
 CHUNK_SIZE = 1000
 FILE_SIZE_MB = 100
 VIDEO_FILE_SIZE_MB = 200

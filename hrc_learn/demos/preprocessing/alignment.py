@@ -32,7 +32,9 @@ def warp(
     D[i, j] = cost[i, j] + min(D[i-1, j-1], D[i-1, j], D[i, j-1])
 
     Entries of one anti-diagonal depend on earlier ones only, so each is computed as a whole:
-    exact, at some 20 ms for 1000 samples against 1000.
+    exact, at some 0.1 s for 1000 samples against 1000. Of the libraries, `dtaidistance` takes
+    no costs, such as those of orientations, and `tslearn`, which finds a path of the same cost
+    ten times as fast, needs numba, scikit-learn and statsmodels.
 
     Args:
         cost: Cost of pairing sample i of the first with sample j of the second.
@@ -67,7 +69,7 @@ def _within_band(cost: np.ndarray, band: float | int | None) -> np.ndarray:
         columns - 1, 1
     )
     widest = max(band, 1 / max(min(rows, columns) - 1, 1))
-    return np.where(np.abs(place) <= widest + 1e-12, cost, np.inf)
+    return np.where(np.abs(place) <= widest + 1e-12, cost, np.inf)  # beyond rounding
 
 
 def _trace(total: np.ndarray) -> WarpingPath:
@@ -127,6 +129,7 @@ class _Metric:
         self._fields = next((group for group in fields if group), ())
         if not self._fields:
             raise ValueError("demonstrations are aligned by joints or poses; none are in all")
+        # What rests has no range to be scaled by.
         self._range = {
             name: np.maximum(np.ptp(np.concatenate([getattr(d, name) for d in demos]), 0), 1e-9)
             for name in self._fields

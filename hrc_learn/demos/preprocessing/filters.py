@@ -79,6 +79,7 @@ MOVING_FIELDS = (
 """Fields that are smoothed where nothing else is asked for."""
 
 _EVEN = 0.01
+"""By how much of a step steps may differ and count as even."""
 
 
 def savitzky_golay(

@@ -148,12 +148,14 @@ def _as_transforms(values: Tensor) -> Tensor:
     by_rows = values.reshape(-1, 4, 4)
     last = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=values.dtype)
     for matrices in (by_rows, by_rows.mT):
+        # Room for float32 and for few printed digits.
         if torch.allclose(matrices[:, 3], last.expand(len(matrices), 4), atol=1e-4):
             return matrices
     raise ValueError("16 numbers that are no 4x4 transform: no last row 0, 0, 0, 1")
 
 
 def _unit(q: Tensor) -> Tensor:
+    # Rounding leaves far less; what is no quaternion is further off.
     wrong = ((q.norm(dim=-1) - 1).abs() > 0.01).nonzero()
     if len(wrong):
         k = int(wrong[0])
@@ -178,6 +180,7 @@ def _from_two_columns(values: Tensor) -> Tensor:
     """Two columns of a rotation matrix, made orthonormal (Zhou et al., CVPR 2019, eq. 15)."""
     first, second = values[:, :3], values[:, 3:]
     third = torch.linalg.cross(first, second)
+    # Parallel columns, or zeros where nothing was recorded.
     lost = (third.norm(dim=-1) < 1e-6).nonzero()
     if len(lost):
         raise ValueError(

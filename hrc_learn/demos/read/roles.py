@@ -189,7 +189,9 @@ encoders of hobby servos count; where their zero lies is not known."""
 
 # Two turns: wrists go past one, and no demonstration stays within 13 degrees.
 _JOINT_LIMITS = {"rad": 4 * math.pi, "deg": 400.0}
+# Further than an arm reaches that stands in one place.
 _REACH = {"m": 5.0, "cm": 500.0}
+# A turn and some noise; two of a vector that was unwrapped.
 _ROTATION_LIMIT = {
     "euler_xyz": 2 * math.pi + 0.1,
     "euler_intrinsic_xyz": 2 * math.pi + 0.1,
@@ -315,6 +317,7 @@ def _guess(role: str, largest: float) -> UnitDecision:
 def _guess_time(frame_step: float) -> UnitDecision:
     """The unit of stamps, from how far their step is off the frame rate."""
     sizes = _DIMENSIONS["time"]
+    # Of a step of zero there is no logarithm.
     off = {unit: abs(math.log10(max(frame_step, 1e-3) * size)) for unit, size in sizes.items()}
     unit = min(off, key=off.__getitem__)
     if unit == "s":

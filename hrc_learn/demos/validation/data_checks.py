@@ -14,7 +14,9 @@ from hrc_learn.demos.read.roles import INDEX_KEYS
 # Faults of single values and columns.
 
 _SATURATED = 0.25
+"""Share of the frames from which a component that sits at an end of its range is odd."""
 _REPEATED = 0.05
+"""Share of repeated frames that is put up with."""
 
 
 def check_finite(
@@ -125,6 +127,7 @@ def _is_clock(values: np.ndarray) -> bool:
 _FASTEST_ARM = 12.0
 """No joint of an arm turns faster [rad/s]; quicker steps are faults of the recording."""
 _STILL_SECONDS = 1.0
+"""Longest rest at an end that is no oddity."""
 _SAME_EPISODE = 1e-3
 
 Joints = Float64[np.ndarray, "frames joints"]
@@ -149,6 +152,7 @@ def check_jumps(
     frame = int(too_fast.any(1).argmax())
     joint = int((speed[frame] / limits).argmax())
     step = change[frame, joint]
+    # As far from a turn as what moves in a frame.
     wrapped = abs(abs(step) - 2 * np.pi) < 0.3
     cause = (
         "the encoder wrapped: hrc repair unwraps it"
@@ -175,6 +179,7 @@ def check_stillness(
     span = float(np.ptp(motion, axis=0).max())
     if span == 0:
         return  # reported as a state that never changes
+    # Half a percent of the motion: beyond the noise of encoders.
     away = np.abs(motion - motion[0]).max(1) > 0.005 * span
     not_there = np.abs(motion - motion[-1]).max(1) > 0.005 * span
     lead = float(time[away.argmax()] - time[0])
@@ -230,6 +235,7 @@ _RATE_TOLERANCE = 0.05
 _JITTER_TOLERANCE = 0.10
 _GAP = 1.6
 """Steps longer than this many usual ones have lost a frame between them."""
+# Less is a start that was broken off.
 _SHORT_FRAMES = 10
 _SHORT_SECONDS = 0.5
 

@@ -20,7 +20,7 @@ from hrc_learn.experiments.frame import TRIALS, UNOBSERVED, Observer, RepeatedRu
 from hrc_learn.experiments.metric_table import Metric
 from hrc_learn.experiments.run_recording import record
 from hrc_learn.geometry import Box
-from hrc_learn.sim import CameraKind
+from hrc_learn.sim import CameraKind, Imperfections
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.pick_and_place import PickAndPlaceConfig
 from hrc_learn.skills.placing import PlacingSkill
@@ -52,6 +52,8 @@ class CollaborationExperiment:
     person: bool = True
     """Whether the scripted person pushes the elbow."""
     disturbances: Disturbances = field(default_factory=Disturbances)
+    imperfections: Imperfections = field(default_factory=Imperfections.nominal)
+    """Of arm, calibration, camera and objects."""
     cell: WorkCellConfig = field(default_factory=WorkCellConfig)
     config: PickAndPlaceConfig = field(default_factory=PickAndPlaceConfig)
     camera: CameraKind = "auto"
@@ -71,6 +73,7 @@ class CollaborationExperiment:
             forces=NULL_SPACE_FORCES if self.person else (),
             disturbances=self.disturbances,
             config=self.config,
+            imperfections=self.imperfections,
             cell_config=replace(self.cell, keep_image_every=keep_every),
             seed=seed,
             page=self.page,

@@ -8,8 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from hrc_learn.experiments.live_view import LiveView, no_live_view
-from hrc_learn.experiments.pose_randomization import THREE_OBJECTS, random_object_poses
+from hrc_learn.experiments.run_recording import LiveView, no_live_view
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import (
     CameraChange,
@@ -37,7 +36,30 @@ from hrc_learn.skills.work_cell import WorkCell, WorkCellConfig
 from hrc_learn.teleoperation import ScriptedForce, ScriptedPerturbation
 from hrc_learn.teleoperation.page import PageConfig
 from hrc_learn.teleoperation.page_session import task_page
-from hrc_learn.vision import CameraModel, ImageNoise
+from hrc_learn.vision import CameraModel, ImageNoise, Marker
+
+THREE_OBJECTS = (
+    ObjectConfig(),
+    ObjectConfig(
+        name="carton",
+        half_size=(0.027, 0.034, 0.028),
+        mass=0.15,
+        marker=Marker(12, 0.030),
+        colour=(0.80, 0.47, 0.13, 1.0),
+    ),
+    ObjectConfig(
+        name="tin",
+        half_size=(0.019, 0.036, 0.026),
+        mass=0.10,
+        marker=Marker(13, 0.027),
+        colour=(0.20, 0.55, 0.38, 1.0),
+    ),
+)
+"""Three boxes of sizes that the gripper takes."""
+
+_APART = 0.118
+"""Distance at which the open fingers about one object clear the next, however both lie [m]:
+0.06 m to the outside of a finger, 0.046 m to the corner of the largest object."""
 
 NULL_SPACE_FORCES = (
     ScriptedForce(start=0.5, duration=4.5, towards=(0.40, 0.00, 0.50), max_force=60.0),
@@ -117,6 +139,7 @@ def simulate_collaboration(
         disturbances: What happens to camera and images during the job.
         config: How the job is done.
         cell_config: How the loop runs; images may be late or lost.
+        imperfections: Of arm, calibration, camera and objects; None: none.
         seed: Of the objects' poses and of image noise.
         page: Serve a page from which people push the elbow too, and let the world go on in
             real time; None: no page.
@@ -248,6 +271,59 @@ def _object_poses(
     return random_object_poses(
         items, workplace.table_centre, reach, rng, yaw=yaw, table_top=world.table_top
     )
+
+
+def random_object_poses(
+    items: Sequence[ObjectConfig],
+    middle: tuple[float, float],
+    reach: tuple[float, float],
+    rng: np.random.Generator,
+    *,
+    yaw: float = np.pi,
+    table_top: float = 0.0,
+    attempts: int = 10_000,
+) -> dict[str, Float[np.ndarray, "4 4"]]:
+    """Random poses of objects on the table, clear of each other.
+
+    Args:
+        items: The objects.
+        middle: Of the region of the table where they lie [m].
+        reach: Largest distance from its middle along x and y [m].
+        rng: Source of positions and turns.
+        yaw: Largest turn, either way [rad].
+        table_top: Height of the table [m].
+        attempts: Arrangements tried.
+
+    Raises:
+        ValueError: If they do not fit.
+    """
+    for _ in range(attempts):
+        positions = np.array(middle) + rng.uniform(-1, 1, (len(items), 2)) * reach
+        if _clear(positions):
+            return {
+                item.name: _pose_on_table(item, position, rng.uniform(-yaw, yaw), table_top)
+                for item, position in zip(items, positions, strict=True)
+            }
+    raise ValueError(
+        f"{len(items)} objects do not fit within {reach[0]:g} and {reach[1]:g} m of the "
+        "middle with room for the fingers between them: fewer objects, or more reach."
+    )
+
+
+def _clear(positions: Float[np.ndarray, "objects 2"]) -> bool:
+    first, second = np.triu_indices(len(positions), k=1)
+    gaps = np.linalg.norm(positions[first] - positions[second], axis=1)
+    return bool((gaps >= _APART).all())
+
+
+def _pose_on_table(
+    item: ObjectConfig, position: Float[np.ndarray, "2"], turn: float, table_top: float
+) -> Float[np.ndarray, "4 4"]:
+    c, s = np.cos(turn), np.sin(turn)
+    pose = np.eye(4)
+    pose[:2, :2] = [[c, -s], [s, c]]
+    pose[:3, 3] = (*position, table_top + item.half_size[2])
+    return pose
 
 
 def _watched(workplace: Workplace, world: World) -> Float[np.ndarray, "points 3"]:

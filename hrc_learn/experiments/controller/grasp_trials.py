@@ -67,6 +67,8 @@ ROLL_CLASSES = ((0, 30), (30, 60), (60, 90), (90, 135), (135, 180))
 CENTRE = (0.2, 0.5, 0.3)
 """Of the Cartesian region: the middle of the paper's RBF centers in x and y [m]."""
 
+MARKER = (0.05, 0.0, -0.08)
+"""In the frame of the tool centre point [m]."""
 _HALF_SIDE = 0.024
 CORNERS = tuple(
     (x * _HALF_SIDE, y * _HALF_SIDE, 0.0) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))
@@ -210,7 +212,7 @@ def _draw(config: TrialConfig, rng: torch.Generator) -> _Scene:
         roll=side * (low + (high - low) * uniform(0.0, 1.0)),
         tilt=uniform(*config.tilt),
         bearing=uniform(0.0, 2 * math.pi),
-        marker=centre.new_tensor((0.05, 0.0, -0.08)),
+        marker=centre.new_tensor(MARKER),
         corners=centre.new_tensor(CORNERS) if config.feature == "corners" else None,
     )
     spread = centre.new_tensor((0.08, 0.08, 0.05))

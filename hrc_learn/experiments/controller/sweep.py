@@ -9,9 +9,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from hrc_learn.experiments.controller.effort_trials import EffortConfig, run_effort_trials
+from hrc_learn.experiments.controller.disturbance_trials import (
+    EffortConfig,
+    StressConfig,
+    run_effort_trials,
+    run_stress_trials,
+)
 from hrc_learn.experiments.controller.grasp_trials import TrialConfig, TrialResult, run_trials
-from hrc_learn.experiments.controller.stress_trials import StressConfig, run_stress_trials
 from hrc_learn.experiments.metric_table import Metric
 from hrc_learn.jacobian import (
     BroydenEstimator,

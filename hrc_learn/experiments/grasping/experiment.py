@@ -14,12 +14,13 @@ from hrc_learn.experiments.grasping.trial import (
     DEFAULT,
     VARIANTS,
     GraspingRun,
+    GraspingScene,
+    GraspingSceneConfig,
     SimulatedGrasp,
     simulate_grasp,
 )
-from hrc_learn.experiments.live_view import LiveView, no_live_view
 from hrc_learn.experiments.metric_table import Metric
-from hrc_learn.experiments.pose_randomization import GraspingScene, GraspingSceneConfig
+from hrc_learn.experiments.run_recording import LiveView, no_live_view
 from hrc_learn.sim import CameraKind
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.grasping import GraspingConfig

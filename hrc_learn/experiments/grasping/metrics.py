@@ -1,18 +1,16 @@
 """What is measured of grasps, from MuJoCo's contacts and poses, whatever the task believes."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import chain
 
 import numpy as np
 import torch
 
 from hrc_learn.experiments.grasping.trial import VARIANTS, GraspingRun, SimulatedGrasp
-from hrc_learn.experiments.metric_table import Metric
+from hrc_learn.experiments.metric_table import Metric, median, p95, success_rate
 from hrc_learn.experiments.monte_carlo import Trial
-from hrc_learn.experiments.run_measures import limit_violations, span, unwanted_contacts
-from hrc_learn.experiments.trial_statistics import median, p95, success_rate
+from hrc_learn.experiments.run_recording import limit_violations, span, unwanted_contacts
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import Touch
@@ -63,8 +61,8 @@ class Descent:
         )
 
 
-def _contacts(run: SimulatedGrasp) -> list[Touch]:
-    return list(chain.from_iterable(unwanted_contacts(run.world).values()))
+def _contacts(run: SimulatedGrasp) -> tuple[Touch, ...]:
+    return sum(unwanted_contacts(run.world).values(), ())
 
 
 def lift(run: SimulatedGrasp) -> float:
@@ -80,10 +78,10 @@ def jacobian_errors(run: SimulatedGrasp) -> tuple[float, float]:
     NaN if it never took over.
     """
     log = run.cell.log
-    rows = np.flatnonzero(log["vision_activation"] > 0)
-    if not len(rows):
+    led = np.flatnonzero(log["vision_activation"] > 0)
+    if not len(led):
         return math.nan, math.nan
-    ends = rows[[0, -1]]
+    ends = led[[0, -1]]
     tool = panda.forward(torch.from_numpy(log["joint_position"][ends]))
     marker = tool.apply(torch.from_numpy(run.world.hand_marker_offset())).numpy()
     true = run.world.config.camera.image_jacobian(marker)[..., :3]
@@ -112,6 +110,11 @@ def arrival(run: SimulatedGrasp) -> float:
     return float(max(log["time"][since] - log["time"][led[0]], 0.0))
 
 
+def _reported(name: str) -> Callable[[SimulatedGrasp], float | None]:
+    """What the task reports; None if it failed."""
+    return lambda run: getattr(run.result, name, None)
+
+
 def grasp_metrics() -> list[Metric[SimulatedGrasp]]:
     """The table of one grasp."""
     return [
@@ -122,10 +125,10 @@ def grasp_metrics() -> list[Metric[SimulatedGrasp]]:
             claim="the robot grasped the object (Experiment 2)",
             essential=True,
         ),
-        Metric("attempts", lambda run: 0 if run.result is None else run.result.attempts),
+        Metric("attempts", lambda run: getattr(run.result, "attempts", 0)),
         Metric(
             "servoing time, from the remote start",
-            lambda run: None if run.result is None else run.result.servo_time,
+            _reported("servo_time"),
             "s",
             at_most=20.0,
             claim="9.2 s (Experiment 2)",
@@ -135,7 +138,7 @@ def grasp_metrics() -> list[Metric[SimulatedGrasp]]:
         Metric("cycle time", lambda run: run.cell.time, "s", claim="15 s (Experiment 2)"),
         Metric(
             "pixel error at descent",
-            lambda run: None if run.result is None else run.result.pixel_error,
+            _reported("pixel_error"),
             "px",
             at_most=5.0,
             claim="the desired position is reached (Experiment 2)",
@@ -180,33 +183,27 @@ def grasp_metrics() -> list[Metric[SimulatedGrasp]]:
     ]
 
 
-def _variant_metrics(name: str) -> list[Metric[SimulatedGrasp]]:
-    variant = VARIANTS[name]
-
-    def time(run: SimulatedGrasp) -> float | None:
-        # A report has no infinity: "target reached" tells that one never arrives.
-        return value if math.isfinite(value := arrival(run)) else None
-
-    return [
-        Metric(
-            f"{variant.label}, target reached",
-            lambda run: int(math.isfinite(arrival(run))),
-            claim=variant.claim,
-        ),
-        Metric(f"{variant.label}, time in vision", time, "s"),
-    ]
-
-
 def grasping_metrics(variants: Sequence[str]) -> list[Metric[GraspingRun]]:
     """The table of a grasp and of the variants it is compared with, which have no bounds."""
-    return [
-        *(metric.of_part(lambda run: run.grasp) for metric in grasp_metrics()),
-        *(
-            metric.of_part(lambda run, name=name: run.compared[name])
-            for name in variants
-            for metric in _variant_metrics(name)
-        ),
+    table: list[Metric[GraspingRun]] = [
+        metric.of_part(lambda run: run.grasp) for metric in grasp_metrics()
     ]
+    for name in variants:
+
+        def time(run: GraspingRun, name: str = name) -> float | None:
+            # A report has no infinity: "target reached" tells that one never arrives.
+            return value if math.isfinite(value := arrival(run.compared[name])) else None
+
+        variant = VARIANTS[name]
+        table += [
+            Metric[GraspingRun](
+                f"{variant.label}, target reached",
+                lambda run, time=time: int(time(run) is not None),
+                claim=variant.claim,
+            ),
+            Metric(f"{variant.label}, time in vision", time, "s"),
+        ]
+    return table
 
 
 _TIME, _PIXELS = "servoing_time_from_the_remote_start_s", "pixel_error_at_descent_px"

@@ -1,14 +1,16 @@
-"""One grasp in simulation, with a choice of image-Jacobian estimators."""
+"""One grasp in simulation: a random scene, and a choice of image-Jacobian estimators."""
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
-from hrc_learn.experiments.live_view import LiveView, no_live_view
-from hrc_learn.experiments.pose_randomization import GraspingScene
+from hrc_learn.experiments.run_recording import LiveView, no_live_view
+from hrc_learn.geometry import quaternion
 from hrc_learn.jacobian import (
     CompositeEstimator,
     FixedEstimator,
@@ -19,15 +21,152 @@ from hrc_learn.jacobian import (
 )
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import CameraKind, MotionLog, ObjectConfig, World, open_camera
+from hrc_learn.sim.workplace import Workplace
+from hrc_learn.skills.arm_motion import joint_line
 from hrc_learn.skills.grasping import Grasping, GraspingConfig, GraspResult
 from hrc_learn.skills.marker_sensor import MarkerSensor
 from hrc_learn.skills.placing import Plan, check_plan
 from hrc_learn.skills.visual_skill import VisualServoSkill, from_learned, guessed_network
 from hrc_learn.skills.work_cell import TaskFailedError, WorkCell
 from hrc_learn.teleoperation import ScriptedPerturbation
+from hrc_learn.vision import CameraModel
+
+# Of the approach that is checked for contacts: joint speed [rad/s], time between samples [s].
+_APPROACH_SPEED, _PATH_STEP = 0.6, 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
+class GraspingSceneConfig:
+    """How scenes are drawn. Lengths [m], angles [rad]."""
+
+    camera_roll: float = 0.0
+    """By which the camera is turned about its axis since the demonstrations."""
+    random_camera: bool = False
+    """Put the camera elsewhere, tilt it and turn it by any angle, `camera_roll` aside."""
+    camera_shift: float = 0.10
+    """Largest shift of a random camera along each axis."""
+    camera_miss: float = 0.04
+    """Largest distance from the middle of the workplace to where a random camera looks."""
+    object_reach: tuple[float, float, float] = (0.10, 0.08, 0.0)
+    """Largest distance of the object from the middle of the table."""
+    margin: float = 0.02
+    """Distance of the arm's start from its joint limits."""
+    distance: float = 0.35
+    """Least distance of the end effector at the start from where it will servo to."""
+    height: float = 0.15
+    """Least height of the end effector at the start."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class GraspingScene:
+    """Initial conditions of a grasp: camera, arm and object."""
+
+    workplace: Workplace
+    """With the camera of the run, which the controller is not told."""
+    start: Float[np.ndarray, "7"]
+    """Joint positions [rad]."""
+    object_pose: Float[np.ndarray, "4 4"]
+
+    def world(self) -> World:
+        """A simulated world with this scene, at rest."""
+        world = World(self.workplace.scene)
+        world.reset(self.start, {self.workplace.scene.objects[0].name: self.object_pose})
+        return world
+
+    def true_target(self, world: World) -> Float[np.ndarray, "2"]:
+        """Pixel of the gripper's marker with the end effector right above the object [px]."""
+        above = self.workplace.hover()
+        above.position[:2] = torch.from_numpy(self.object_pose[:2, 3])
+        marker = above.apply(torch.from_numpy(world.hand_marker_offset()))
+        return self.workplace.scene.camera.project(marker.numpy())
+
+    @classmethod
+    def draw(
+        cls,
+        workplace: Workplace,
+        config: GraspingSceneConfig,
+        rng: np.random.Generator,
+        camera: CameraKind = "synthetic",
+    ) -> "GraspingScene":
+        """Draw a scene.
+
+        The arm starts anywhere within its joint limits where it touches nothing, does not hide
+        the object from the camera, and is not shut in: straight lines in joint space lead home.
+
+        Args:
+            workplace: With the camera of the demonstrations.
+            config: How.
+            rng: Source of chance.
+            camera: Kind of camera that checks whether the object is hidden.
+        """
+        scene = workplace.scene
+        pose = workplace.random_object_pose(config.object_reach, rng)
+        workplace = replace(
+            workplace, scene=replace(scene, camera=_camera(workplace, config, rng))
+        )
+        item = scene.objects[0]
+        world = World(workplace.scene)
+        sensor = MarkerSensor(open_camera(world, camera, rng=rng), workplace.scene.marker_ids)
+        for start in _starts(workplace, config, rng):
+            world.reset(start, {item.name: pose})
+            if item.marker.id in sensor.detect() and _has_free_path(world, workplace, start):
+                return cls(workplace=workplace, start=start, object_pose=pose)
+        raise AssertionError("starts never end")
+
+
+def _camera(
+    workplace: Workplace, config: GraspingSceneConfig, rng: np.random.Generator
+) -> CameraModel:
+    """The camera of the demonstrations, moved and turned.
+
+    It looks at a point near the middle of the workplace and is then turned about its axis.
+    """
+    camera = workplace.scene.camera
+    rotation, position = camera.pose[:3, :3], camera.pose[:3, 3]
+    roll = config.camera_roll
+    if config.random_camera:
+        position = position + config.camera_shift * rng.uniform(-1, 1, 3)
+        middle = workplace.hover().position.numpy()
+        sight = middle + config.camera_miss * rng.uniform(-1, 1, 3) - position
+        # Sine of the angle times its axis: close to the rotation vector for these small tilts.
+        tilt = np.cross(rotation[:, 2], sight / np.linalg.norm(sight))
+        rotation = _rotation(tilt) @ rotation
+        roll = rng.uniform(-np.pi, np.pi)
+    pose = np.eye(4)
+    pose[:3, :3] = rotation @ _rotation(np.array([0.0, 0.0, roll]))
+    pose[:3, 3] = position
+    return replace(camera, pose=pose)
+
+
+def _rotation(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    return quaternion.to_matrix(quaternion.exp(torch.from_numpy(vector))).numpy()
+
+
+def _starts(
+    workplace: Workplace, config: GraspingSceneConfig, rng: np.random.Generator
+) -> Iterator[Float[np.ndarray, "7"]]:
+    """Joint positions within the limits, with the end effector up and away."""
+    limits, hover = panda.limits, workplace.hover().position
+    lower, upper = limits.lower + config.margin, limits.upper - config.margin
+    while True:
+        q = rng.uniform(lower, upper)
+        tool = panda.forward(torch.from_numpy(q)).position
+        if tool[2] > config.height and (tool - hover).norm() > config.distance:
+            yield q
+
+
+def _has_free_path(world: World, workplace: Workplace, start: Float[np.ndarray, "7"]) -> bool:
+    """Whether straight lines in joint space lead home, directly or by way of the table."""
+
+    def free(a: Float[Tensor, "7"], b: Float[Tensor, "7"]) -> bool:
+        return not world.collisions_along(joint_line(a, b, _APPROACH_SPEED, _PATH_STEP).numpy())
+
+    here, home = torch.from_numpy(start), workplace.home_joints()
+    postures = workplace.hover_postures()
+    return free(here, home) or any(free(here, q) and free(q, home) for q in postures)
+
+
+@dataclass(frozen=True)
 class Variant:
     """An initial image Jacobian, and a law that adapts it."""
 
@@ -38,32 +177,35 @@ class Variant:
     """What the paper says about it."""
 
 
+def _from_guess(
+    law: type[ImageJacobianEstimator],
+) -> Callable[[RBFImageJacobian], ImageJacobianEstimator]:
+    """The law from the paper's initial image Jacobian, whatever was learned."""
+    return lambda _: law(guessed_network())
+
+
 DEFAULT = "learned"
 
 VARIANTS: Mapping[str, Variant] = {
-    DEFAULT: Variant(label="Kalman filter from the learned Jacobian", estimator=from_learned),
-    "kalman": Variant(
-        label="Kalman filter from the paper's guess",
-        estimator=lambda _: KalmanEstimator(guessed_network()),
-    ),
+    DEFAULT: Variant("Kalman filter from the learned Jacobian", from_learned),
+    "kalman": Variant("Kalman filter from the paper's guess", _from_guess(KalmanEstimator)),
     "composite": Variant(
-        label="composite law from the paper's guess",
-        estimator=lambda _: CompositeEstimator(guessed_network()),
+        "composite law from the paper's guess", _from_guess(CompositeEstimator)
     ),
     "paper": Variant(
-        label="the paper's law from its guess",
+        "the paper's law from its guess",
+        _from_guess(PaperEstimator),
         claim="reaches the target, faster than without adaptation (Experiment 2)",
-        estimator=lambda _: PaperEstimator(guessed_network()),
     ),
     "fixed": Variant(
-        label="the paper's guess, not adapted",
+        "the paper's guess, not adapted",
+        _from_guess(FixedEstimator),
         claim="reaches the target, slower (Experiment 2)",
-        estimator=lambda _: FixedEstimator(guessed_network()),
     ),
     "unadapted": Variant(
-        label="the learned Jacobian, not adapted",
+        "the learned Jacobian, not adapted",
         # Estimators work in double precision, and the skill keeps its own network.
-        estimator=lambda learned: FixedEstimator(copy.deepcopy(learned).double()),
+        lambda learned: FixedEstimator(copy.deepcopy(learned).double()),
     ),
 }
 """What can be compared, the default first."""
@@ -95,7 +237,6 @@ def simulate_grasp(
     config: GraspingConfig | None = None,
     rng: np.random.Generator,
     view: LiveView = no_live_view,
-    on_phase: Callable[[str, float], None] = lambda phase, time: None,
 ) -> SimulatedGrasp:
     """Grasp an object and carry it home, in MuJoCo.
 
@@ -109,7 +250,6 @@ def simulate_grasp(
         config: How objects are grasped.
         rng: Source of image noise.
         view: Dashboard of the run while it goes on.
-        on_phase: Told the name of each phase of the task, and when it begins [s].
     """
     workplace = scene.workplace.approached(aiming.approach)
     scene = replace(scene, workplace=workplace)
@@ -130,7 +270,6 @@ def simulate_grasp(
             ),
             human=ScriptedPerturbation(panda, (), begin=None),
             advance=motion.advance,
-            on_phase=on_phase,
         )
         target = scene.true_target(world)
         task = Grasping(

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from hrc_learn.experiments.metric_table import Metric
+from hrc_learn.experiments.metric_table import Metric, total
 from hrc_learn.experiments.monte_carlo import Trial
-from hrc_learn.experiments.trial_statistics import total
 from hrc_learn.sim import Touch, World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.teleoperation.scripted_demonstrations import (

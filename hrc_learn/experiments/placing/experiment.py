@@ -16,10 +16,10 @@ from jaxtyping import Float
 
 from hrc_learn.demos import Demonstration, load_demos
 from hrc_learn.experiments.frame import TRIALS, UNOBSERVED, Observer, Study
-from hrc_learn.experiments.live_view import no_live_view
 from hrc_learn.experiments.metric_table import Metric, evaluate
 from hrc_learn.experiments.placing import arm_angle_ablation
 from hrc_learn.experiments.placing.arm_angle_ablation import Ablation, AblationTrial
+from hrc_learn.experiments.placing.figures import take_snapshots
 from hrc_learn.experiments.placing.metrics import (
     BLOCKED,
     placing_metrics,
@@ -32,19 +32,20 @@ from hrc_learn.experiments.placing.report import (
     random_start_pictures,
     record_placing,
 )
-from hrc_learn.experiments.placing.snapshots import take_snapshots
 from hrc_learn.experiments.placing.trial import (
     SPACES,
     PlacingOutcome,
     PlacingRun,
+    SimulatedPlacing,
     demonstrated_path,
     place,
+    random_start,
 )
-from hrc_learn.experiments.pose_randomization import random_start
+from hrc_learn.experiments.run_recording import no_live_view
 from hrc_learn.kinematics import UnreachableError, panda
 from hrc_learn.sim import RenderingUnavailableError, World
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.placing import PlacingSkill, check_plan
+from hrc_learn.skills.placing import PlacingSkill, PlanningSpace, check_plan
 from hrc_learn.skills.work_cell import BlockedPathError
 from hrc_learn.store import read_made_by
 from hrc_learn.viz import LoggedSteps, RunRecording
@@ -93,28 +94,25 @@ class PlacingExperiment:
         goal_shelf = demonstrated_shelf(demonstrated_path(demonstration)[-1], workplace)
         assert demonstration.joint_position is not None
         start = torch.from_numpy(demonstration.joint_position[0])
-        placings = {}
+        placings: dict[tuple[PlanningSpace, str], SimulatedPlacing] = {}
+        outcomes: dict[PlanningSpace, dict[str, PlacingOutcome]] = {s: {} for s in SPACES}
         for space, label in SPACES.items():
             for shelf in workplace.shelf_names():
                 observer.tell(f"Placing on the {shelf} shelf, planned in {label}")
                 viewed = (space, shelf) == ("joint", goal_shelf)
                 view = observer.view if viewed else no_live_view
-                placings[space, shelf] = place(
+                placed = place(
                     skill, workplace, shelf, start, space=space, speed=self.speed, view=view
                 )
+                placings[space, shelf] = placed
+                outcomes[space][shelf] = PlacingOutcome.of(placed, workplace, demonstration)
         observer.tell("Demonstrating with and without null-space posture")
         return PlacingRun(
             workplace=workplace,
             demonstration=demonstration,
             demonstrated_shelf=goal_shelf,
             placings=placings,
-            outcomes={
-                space: {
-                    shelf: PlacingOutcome.of(placings[space, shelf], workplace, demonstration)
-                    for shelf in workplace.shelf_names()
-                }
-                for space in SPACES
-            },
+            outcomes=outcomes,
             ablation=Ablation.run(workplace, goal_shelf, seed),
             same_joint7=_reached_with_joint7(workplace, demonstration.joint_position[-1]),
         )

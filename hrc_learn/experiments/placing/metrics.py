@@ -1,19 +1,14 @@
 """What is measured of placings, by shelf and over all shelves, once and from random starts."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from hrc_learn.experiments.metric_table import Metric
+from hrc_learn.experiments.metric_table import Metric, column, largest, total
 from hrc_learn.experiments.monte_carlo import Trial
 from hrc_learn.experiments.placing import arm_angle_ablation
-from hrc_learn.experiments.placing.trial import (
-    SPACES,
-    PlacingOutcome,
-    PlacingRun,
-    demonstrated_joints,
-)
-from hrc_learn.experiments.trial_statistics import column, largest, total
+from hrc_learn.experiments.placing.trial import SPACES, PlacingOutcome, PlacingRun
+from hrc_learn.experiments.run_recording import demonstrated_joints
 
 # Bounds of a good placing. Approach paths planned in task space deviate by 2 mm, those planned
 # in joint space with a shifted goal by 100 mm.
@@ -27,54 +22,58 @@ _NO_COLLISION = "no collision with the cabinet"
 type ByShelf = Mapping[str, PlacingOutcome]
 
 
+def _millimetres(outcome: PlacingOutcome) -> float:
+    return 1e3 * outcome.place_error
+
+
+def _degrees(outcome: PlacingOutcome) -> float:
+    return float(np.rad2deg(outcome.place_tilt))
+
+
 def placing_metrics(shelves: Sequence[str]) -> list[Metric[ByShelf]]:
     """The table of one placing on each of the shelves."""
+
+    def worst(of: Callable[[PlacingOutcome], float]) -> Callable[[ByShelf], float]:
+        return lambda outcomes: max(map(of, outcomes.values()))
+
+    def count(of: Callable[[PlacingOutcome], int]) -> Callable[[ByShelf], int]:
+        return lambda outcomes: sum(map(of, outcomes.values()))
+
+    def touched(outcomes: ByShelf) -> str:
+        first = {shelf: o.contacts[0] for shelf, o in outcomes.items() if o.contacts}
+        return "; ".join(f"{shelf} shelf: {touch}" for shelf, touch in first.items())
+
     return [
         *(metric for shelf in shelves for metric in _shelf_metrics(shelf)),
         Metric(
-            "place error",
-            lambda outcomes: 1e3 * max(o.place_error for o in outcomes.values()),
-            "mm",
-            at_most=PLACE_ERROR_MM,
-            essential=True,
+            "place error", worst(_millimetres), "mm", at_most=PLACE_ERROR_MM, essential=True
         ),
+        Metric("place tilt", worst(_degrees), "deg", at_most=PLACE_TILT_DEG, essential=True),
         Metric(
-            "place tilt",
-            lambda outcomes: _degrees(max(o.place_tilt for o in outcomes.values())),
-            "deg",
-            at_most=PLACE_TILT_DEG,
-            essential=True,
-        ),
-        Metric(
-            "joint limit violations",
-            lambda outcomes: sum(o.violations for o in outcomes.values()),
-            at_most=0,
-            essential=True,
+            "joint limit violations", count(lambda o: o.violations), at_most=0, essential=True
         ),
         Metric(
             "contacts",
-            lambda outcomes: sum(len(o.contacts) for o in outcomes.values()),
+            count(lambda o: len(o.contacts)),
             at_most=0,
             claim=_NO_COLLISION,
             essential=True,
-            detail=lambda outcomes: "; ".join(
-                f"{shelf} shelf: {o.contacts[0]}" for shelf, o in outcomes.items() if o.contacts
-            ),
+            detail=touched,
         ),
         Metric(
             "peak joint speed, fraction of its limit",
-            lambda outcomes: max(o.peak_speed for o in outcomes.values()),
+            worst(lambda o: o.peak_speed),
             at_most=1.0,
         ),
         Metric(
             "dimensionless jerk, fraction of the demonstration's",
-            lambda outcomes: max(o.jerk for o in outcomes.values()),
+            worst(lambda o: o.jerk),
             at_most=_JERK,
             claim="several unnecessary jerks removed",
         ),
         Metric(
             "objects that stand on their shelf",
-            lambda outcomes: sum(o.placed for o in outcomes.values()),
+            count(lambda o: o.placed),
             at_least=len(shelves),
             essential=True,
         ),
@@ -82,37 +81,26 @@ def placing_metrics(shelves: Sequence[str]) -> list[Metric[ByShelf]]:
 
 
 def _shelf_metrics(shelf: str) -> list[Metric[ByShelf]]:
-    return [
-        Metric(
-            f"{shelf} shelf, approach-path deviation",
-            lambda outcomes: 1e3 * outcomes[shelf].deviation,
+    metrics = (
+        Metric[PlacingOutcome](
+            "approach-path deviation",
+            lambda outcome: 1e3 * outcome.deviation,
             "mm",
             at_most=DEVIATION_MM,
             claim="similar paths towards the goals",
             essential=True,
         ),
-        Metric(f"{shelf} shelf, contacts", lambda outcomes: len(outcomes[shelf].contacts)),
-        Metric(
-            f"{shelf} shelf, place error",
-            lambda outcomes: 1e3 * outcomes[shelf].place_error,
-            "mm",
-            listed=False,
-        ),
-        Metric(
-            f"{shelf} shelf, place tilt",
-            lambda outcomes: _degrees(outcomes[shelf].place_tilt),
-            "deg",
-            listed=False,
-        ),
-        Metric(
-            f"{shelf} shelf, placed", lambda outcomes: int(outcomes[shelf].placed), listed=False
-        ),
-    ]
+        Metric[PlacingOutcome]("contacts", lambda outcome: len(outcome.contacts)),
+        Metric("place error", _millimetres, "mm", listed=False),
+        Metric("place tilt", _degrees, "deg", listed=False),
+        Metric[PlacingOutcome]("placed", lambda outcome: int(outcome.placed), listed=False),
+    )
+    return [metric.of_part(lambda run: run[shelf], f"{shelf} shelf, ") for metric in metrics]
 
 
 def run_metrics(shelves: Sequence[str]) -> list[Metric[PlacingRun]]:
     """The table of an experiment: reproduction, task space, joint space, ablation."""
-    table = placing_metrics(shelves)
+    table, joint_space = placing_metrics(shelves), f"{SPACES['joint']}, "
     return [
         Metric(
             "demonstration, duration",
@@ -126,15 +114,13 @@ def run_metrics(shelves: Sequence[str]) -> list[Metric[PlacingRun]]:
             "s",
             claim="20 s, tau = 1.5",
         ),
-        Metric("reproduction, joint RMSE", joint_rmse, "deg", at_most=2.0),
-        *(metric.of_part(lambda run: run.outcomes["pose"]) for metric in table),
+        Metric("reproduction, joint RMSE", _joint_rmse, "deg", at_most=2.0),
+        *(m.of_part(lambda run: run.outcomes["pose"]) for m in table),
         *(
-            metric.of_part(
-                lambda run: run.outcomes["joint"], f"{SPACES['joint']}, ", bounded=False
-            )
-            for metric in table
+            m.of_part(lambda run: run.outcomes["joint"], joint_space, bounded=False)
+            for m in table
         ),
-        *(metric.of_part(lambda run: run.ablation) for metric in arm_angle_ablation.METRICS),
+        *(m.of_part(lambda run: run.ablation) for m in arm_angle_ablation.METRICS),
         Metric(
             "shelves within reach with joint 7 as demonstrated",
             lambda run: len(run.same_joint7),
@@ -143,11 +129,11 @@ def run_metrics(shelves: Sequence[str]) -> list[Metric[PlacingRun]]:
     ]
 
 
-def joint_rmse(run: PlacingRun) -> float:
+def _joint_rmse(run: PlacingRun) -> float:
     """Of the reproduction, from the demonstration at the same fraction of the motion [deg]."""
     done = run.reproduction
     demonstrated = demonstrated_joints(run.demonstration, done.time / done.time[-1])
-    return _degrees(float(np.sqrt(np.square(done.joint_position - demonstrated).mean())))
+    return float(np.rad2deg(np.sqrt(np.square(done.joint_position - demonstrated).mean())))
 
 
 BLOCKED = "joint_space_plans_blocked"
@@ -157,51 +143,34 @@ BLOCKED = "joint_space_plans_blocked"
 def random_start_metrics(shelves: Sequence[str]) -> list[Metric[Sequence[Trial]]]:
     """Rows of the table that placings from random starts add."""
 
-    def fraction(trials: Sequence[Trial], key: str, wanted: int) -> float:
-        values = [column(trials, f"{shelf}_shelf_{key}") for shelf in shelves]
-        return float((np.array(values) == wanted).mean())
+    def by_shelf(trials: Sequence[Trial], key: str) -> np.ndarray:
+        return np.array([column(trials, f"{shelf}_shelf_{key}") for shelf in shelves])
 
-    deviations = [f"{shelf}_shelf_approach_path_deviation_mm" for shelf in shelves]
-    return [
-        Metric("random starts, placings", lambda trials: len(trials) * len(shelves)),
+    metrics: Sequence[Metric[Sequence[Trial]]] = (
+        Metric("placings", lambda trials: len(trials) * len(shelves)),
         Metric(
-            "random starts, fraction without contact",
-            lambda trials: fraction(trials, "contacts", 0),
+            "fraction without contact",
+            lambda trials: float((by_shelf(trials, "contacts") == 0).mean()),
             at_least=_FREE_FRACTION,
         ),
         Metric(
-            "random starts, fraction that stands on its shelf",
-            lambda trials: fraction(trials, "placed", 1),
+            "fraction that stands on its shelf",
+            lambda trials: float((by_shelf(trials, "placed") == 1).mean()),
             at_least=_FREE_FRACTION,
         ),
+        Metric("joint limit violations", total("joint_limit_violations"), at_most=0),
+        Metric("largest place error", largest("place_error_mm"), "mm", at_most=PLACE_ERROR_MM),
+        Metric("largest place tilt", largest("place_tilt_deg"), "deg", at_most=PLACE_TILT_DEG),
         Metric(
-            "random starts, joint limit violations", total("joint_limit_violations"), at_most=0
-        ),
-        Metric(
-            "random starts, largest place error",
-            largest("place_error_mm"),
-            "mm",
-            at_most=PLACE_ERROR_MM,
-        ),
-        Metric(
-            "random starts, largest place tilt",
-            largest("place_tilt_deg"),
-            "deg",
-            at_most=PLACE_TILT_DEG,
-        ),
-        Metric(
-            "random starts, largest approach-path deviation",
-            lambda trials: float(np.max([column(trials, key) for key in deviations])),
+            "largest approach-path deviation",
+            lambda trials: float(by_shelf(trials, "approach_path_deviation_mm").max()),
             "mm",
             at_most=DEVIATION_MM,
         ),
         Metric(
-            "random starts, fraction of joint-space plans that are blocked",
+            "fraction of joint-space plans that are blocked",
             lambda trials: float(column(trials, BLOCKED).mean()) / len(shelves),
             claim=_NO_COLLISION,
         ),
-    ]
-
-
-def _degrees(angle: float) -> float:
-    return float(np.rad2deg(angle))
+    )
+    return [metric.of_part(lambda trials: trials, "random starts, ") for metric in metrics]

@@ -6,10 +6,12 @@ import numpy as np
 import torch
 
 from hrc_learn.demos import Demonstration
+from hrc_learn.experiments.metric_table import column
 from hrc_learn.experiments.monte_carlo import Trial
 from hrc_learn.experiments.placing.figures import (
     ApproachDistance,
     Motion,
+    Snapshots,
     approach_figure,
     shelf_joints_figure,
     shelf_paths_figure,
@@ -22,18 +24,15 @@ from hrc_learn.experiments.placing.metrics import (
     PLACE_ERROR_MM,
     PLACE_TILT_DEG,
 )
-from hrc_learn.experiments.placing.snapshots import Snapshots
 from hrc_learn.experiments.placing.trial import (
     SPACES,
     PlacingRun,
     SimulatedPlacing,
     approach_path,
     demonstrated_approach,
-    demonstrated_joints,
     demonstrated_path,
 )
-from hrc_learn.experiments.run_recording import PANDA_LIMITS
-from hrc_learn.experiments.trial_statistics import column
+from hrc_learn.experiments.run_recording import PANDA_LIMITS, demonstrated_joints
 from hrc_learn.geometry import Box
 from hrc_learn.kinematics import panda
 from hrc_learn.skills.work_cell import SAFETY_COLUMNS
@@ -100,7 +99,7 @@ def placing_sections(run: PlacingRun, snapshots: Snapshots) -> list[Section]:
         _approach(run),
         Section(
             heading="Faster and smoother than demonstrated",
-            text="The primitive leaves out the tremor of the hand that led the arm.",
+            text="The primitive leaves out the tremor of the person's hand that led the arm.",
             figures=(
                 Picture(
                     "smoothness",

@@ -11,11 +11,16 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Float
+from torch import Tensor
 
 from hrc_learn.demos import Demonstration
-from hrc_learn.experiments.live_view import LiveView, no_live_view
 from hrc_learn.experiments.placing.arm_angle_ablation import Ablation
-from hrc_learn.experiments.run_measures import limit_violations, unwanted_contacts
+from hrc_learn.experiments.run_recording import (
+    LiveView,
+    limit_violations,
+    no_live_view,
+    unwanted_contacts,
+)
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import panda
 from hrc_learn.learning.channels import dimensionless_jerk
@@ -23,7 +28,7 @@ from hrc_learn.sim import MotionLog, Touch, World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.grasping import OPEN
 from hrc_learn.skills.placing import PlacingSkill, Plan, PlanningSpace
-from hrc_learn.skills.work_cell import WorkCell
+from hrc_learn.skills.work_cell import TaskFailedError, WorkCell
 from hrc_learn.teleoperation import ScriptedPerturbation
 
 TRANSFER, RELEASE, RETREAT = "transfer", "release", "retreat"
@@ -79,7 +84,7 @@ def place(
     skill: PlacingSkill,
     workplace: Workplace,
     shelf: str,
-    start: Float[torch.Tensor, "7"],
+    start: Float[Tensor, "7"],
     *,
     space: PlanningSpace,
     speed: float = 1.5,
@@ -146,6 +151,37 @@ def _back(released: Pose) -> Pose:
     """Clear of the object: straight back along the end effector's own axis."""
     offset = released.position.new_tensor([0.0, 0.0, -_CLEARANCE])
     return Pose(released.apply(offset), released.orientation)
+
+
+_DRAWS = 100
+"""Starts drawn before it is taken that there is no free one."""
+
+
+def random_start(
+    world: World, workplace: Workplace, noise: float, rng: np.random.Generator
+) -> Float[Tensor, "7"]:
+    """Joint positions about home that are within the limits and touch nothing.
+
+    Leaves the world there, with its first object in the gripper.
+
+    Args:
+        world: Of the workplace.
+        workplace: Where.
+        noise: Standard deviation of each joint [rad].
+        rng: Source of the noise.
+
+    Raises:
+        TaskFailedError: If no start drawn is free.
+    """
+    home, item = workplace.home_joints(), workplace.scene.objects[0].name
+    for _ in range(_DRAWS):
+        start = home + noise * torch.from_numpy(rng.standard_normal(len(home)))
+        if not panda.limits.contain(start):
+            continue
+        world.hold(item, start.numpy())
+        if not world.collisions_along(start.numpy()[None], item):
+            return start
+    raise TaskFailedError(f"no free start in {_DRAWS} draws with noise of {noise:g} rad")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -235,16 +271,6 @@ def demonstrated_path(demonstration: Demonstration) -> Float[np.ndarray, "frames
             f"{panda.joint_names}: give demonstrations of this arm."
         )
     return panda.forward(torch.from_numpy(joints)).position.numpy()
-
-
-def demonstrated_joints(
-    demonstration: Demonstration, fraction: Float[np.ndarray, " samples"]
-) -> Float[np.ndarray, "samples 7"]:
-    """Demonstrated joint positions at fractions of the motion, 0 to 1 [rad]."""
-    assert demonstration.joint_position is not None
-    time = demonstration.time[0] + fraction * demonstration.duration
-    columns = demonstration.joint_position.T
-    return np.column_stack([np.interp(time, demonstration.time, joint) for joint in columns])
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -29,7 +29,7 @@ class ActionEncoding(nn.Module):
     A rotation vector becomes the error e = log(r conj(q)) to a reference r, in which an
     orientation moves linearly (see `hrc_learn/dmp/orientation_error.py`), r being the mean
     orientation of the demonstrations. So nothing jumps where a rotation vector does, at half a
-    turn, which is where a hand that points down is.
+    turn, which is where a gripper that points down is.
     """
 
     mean: Tensor
@@ -85,9 +85,9 @@ class ActionEncoding(nn.Module):
             for k, episode in enumerate(unrolled):
                 if (episode[:, triple].norm(dim=-1) > torch.pi).any():
                     raise ValueError(
-                        f"demonstration {k} turns the hand by more than half a turn from the "
-                        "mean orientation, where a rotation vector is ambiguous: leave it out "
-                        "(fit_episodes), or use joints as actions"
+                        f"demonstration {k} turns the end effector by more than half a turn "
+                        "from the mean orientation, where a rotation vector is ambiguous: "
+                        "leave it out (fit_episodes), or use joints as actions"
                     )
         self.whiten(*torch.std_mean(torch.cat(unrolled), dim=0))
 

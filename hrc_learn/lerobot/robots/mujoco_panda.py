@@ -45,7 +45,7 @@ class MujocoPandaConfig(PandaRobotConfig):
     shelf: str = "middle"
     """Where to place: "lower", "middle" or "upper"."""
     seed: int = 0
-    """Of the first beginning; each one after has the next."""
+    """Of the first initial configuration; each one after has the next."""
     pixels: bool = False
     """Whether the pixel of the object is observed, as the fixed camera saw it at the beginning:
     what a policy needs to grasp without images."""
@@ -140,7 +140,7 @@ class MujocoPanda(PandaRobot):
     def begin(self, seed: int) -> None:
         """Put everything in place as a seed has it."""
         self.run.begin(seed)
-        self.beginnings += 1
+        self.initial_configurations += 1
         self._rotation = DOWN
 
     def _joints_at(self, pose: Pose) -> Float[np.ndarray, "7"]:

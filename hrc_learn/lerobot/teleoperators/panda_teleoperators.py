@@ -41,7 +41,7 @@ class GuidedRobot:
 
     Attributes:
         robot: That is led.
-        beginning: Of the robot's, that it started from.
+        initial_configuration: Number of the robot's that it started from.
     """
 
     def __init__(self, robot: PandaRobot, human: Human):
@@ -53,7 +53,7 @@ class GuidedRobot:
         """
         from hrc_learn.teleoperation.hand_guiding import HandGuidedArm, HandGuidingConfig
 
-        self.robot, self.beginning = robot, robot.beginnings
+        self.robot, self.initial_configuration = robot, robot.initial_configurations
         self._velocity = np.zeros(len(JOINTS))
         self._guided = HandGuidedArm(panda, self, human, HandGuidingConfig(dt=robot.dt))
         state = robot.read_state()
@@ -122,7 +122,11 @@ class PandaTeleoperator(Device, Teleoperator):
     def _guided_robot(self, robot: PandaRobot, human: Callable[[], Human]) -> GuidedRobot:
         """The guided robot, anew whenever everything has been put in place."""
         guided = self._guided
-        if guided is None or guided.robot is not robot or guided.beginning != robot.beginnings:
+        if (
+            guided is None
+            or guided.robot is not robot
+            or guided.initial_configuration != robot.initial_configurations
+        ):
             guided = self._guided = GuidedRobot(robot, human())
         return guided
 
@@ -138,7 +142,7 @@ class PandaExpertConfig(PandaTeleoperatorConfig):
 
 
 class PandaExpert(PandaTeleoperator):
-    """Shows a `mujoco_panda` its scenario, from each of its beginnings, then keeps still.
+    """Shows a `mujoco_panda` its scenario from each initial configuration, then keeps still.
 
     The same demonstrations as `hrc record placing` records, with the release of the
     object, and grasping.
@@ -169,7 +173,7 @@ class PandaPageConfig(PandaTeleoperatorConfig):
 
 
 class PandaPage(PandaTeleoperator):
-    """A person leads the hand, the body and the gripper in a browser.
+    """A person leads the end effector, the elbow and the gripper in a browser.
 
     Shows the arm where the robot reports it, simulated or real. "Home" begins the scenario of a
     `mujoco_panda` anew; what concerns recording is left to LeRobot.

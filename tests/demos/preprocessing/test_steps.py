@@ -339,6 +339,16 @@ def warped(time, strength):
     return time[-1] * (s + strength * np.sin(np.pi * s) ** 2)
 
 
+def test_a_rest_as_long_as_the_shortest_is_one():
+    demo = with_rests()
+    still = resting(demo, RestCriterion(shortest=0.0))
+    inner = np.flatnonzero(still & (demo.time > 2) & (demo.time < 4.5))
+    lasts = demo.time[inner[-1]] - demo.time[inner[0]]
+    assert lasts > 0.5
+    assert resting(demo, RestCriterion(shortest=lasts - 1e-9))[inner].all()
+    assert not resting(demo, RestCriterion(shortest=lasts + 1e-9))[inner].any()
+
+
 def test_demonstrations_are_brought_to_the_timing_of_one():
     time = np.arange(300) / 50
     paces = [warped(time, strength) for strength in (0.0, 0.12, -0.1)]
@@ -352,6 +362,17 @@ def test_demonstrations_are_brought_to_the_timing_of_one():
         assert difference.mean() < 0.01
     # Its velocities are those of the leader's timing now.
     np.testing.assert_allclose(aligned[1].joint_velocity, demos[0].joint_velocity, atol=0.5)
+
+
+def test_orientations_that_agree_are_no_angle_apart():
+    """Products of unit quaternions are rounded beyond one, of which there is no arccos."""
+    time = np.arange(100) / 50
+    q = np.random.default_rng(0).normal(size=(100, 4))
+    q /= np.linalg.norm(q, axis=1, keepdims=True)
+    assert (np.square(q).sum(1) > 1).any()
+    demo = Demonstration(time=time, orientation=q, fps=50)
+    aligned = align(DemonstrationSet([demo, replace(demo, episode=1)]), reference=0)
+    np.testing.assert_allclose(np.abs((aligned[1].orientation * q).sum(1)), 1, atol=1e-9)
 
 
 def test_poses_are_aligned_too_and_the_median_leads():

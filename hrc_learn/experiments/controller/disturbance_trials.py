@@ -1,4 +1,8 @@
-"""Stress trials: random goals, cameras, null-space inputs and faults; do limits break?"""
+"""Disturbance trials: does the tool stay while a person pushes, and the limits under stress?
+
+The controller in batches of closed loops: a person's null-space force on the elbow; and random
+goals, cameras, null-space inputs and faults.
+"""
 
 from __future__ import annotations
 
@@ -10,12 +14,128 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.utils import _pytree
 
-from hrc_learn.controller import INITIAL_IMAGE_JACOBIAN, AdaptiveController, Goals, Observation
+from hrc_learn.controller import AdaptiveController, Goals, Observation
 from hrc_learn.controller.monitors import LimitMonitor
+from hrc_learn.experiments.controller.grasp_trials import MARKER
 from hrc_learn.geometry import quaternion
-from hrc_learn.jacobian import CompositeEstimator, RBFImageJacobian, paper_grid
+from hrc_learn.jacobian import CompositeEstimator, FixedEstimator, RBFImageJacobian, paper_grid
 from hrc_learn.kinematics import panda
-from hrc_learn.sim.closed_loop import Imperfections, PinholeCamera, VirtualCamera
+from hrc_learn.sim.closed_loop import (
+    Imperfections,
+    PinholeCamera,
+    VirtualCamera,
+    simulate_closed_loop,
+)
+from hrc_learn.skills.visual_skill import guessed_network
+
+ELBOW = 4
+"""Joint that is pushed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EffortConfig:
+    """How the person pushes while the arm servoes on its target."""
+
+    count: int = 60
+    seed: int = 0
+    force: float = 6.0
+    """Of the person; the elbow's Jacobian maps it to the null-space input d [N]."""
+    away: float = 7.0
+    """Time of pushing one way, as in the paper [s]."""
+    back: float = 4.0
+    """Time of pushing back [s]."""
+    dt: float = 0.001
+    """Control step [s]."""
+    noise: float = 0.0
+    """Standard deviation of each pixel coordinate [px]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EffortResult:
+    """Largest values of each trial."""
+
+    elbow: Float[Tensor, "trials"]
+    """Displacement of the elbow [m]."""
+    deviation: Float[Tensor, "trials"]
+    """Displacement of the tool, on target at the start [m]."""
+    turn: Float[Tensor, "trials"]
+    """Turn of the tool [rad]."""
+
+    def summary(self) -> dict[str, float]:
+        """Medians and 95th percentiles in mm and degrees."""
+        deviation, turn = 1e3 * self.deviation, torch.rad2deg(self.turn)
+        return {
+            "elbow_mm": 1e3 * self.elbow.median().item(),
+            "deviation_mm": deviation.median().item(),
+            "deviation_p95_mm": deviation.quantile(0.95).item(),
+            "turn_deg": turn.median().item(),
+            "turn_p95_deg": turn.quantile(0.95).item(),
+        }
+
+
+def run_effort_trials(config: EffortConfig) -> EffortResult:
+    """Push the elbow of many arms, each servoing on a target where its tool already is."""
+    rng = torch.Generator().manual_seed(config.seed)
+    noise = torch.randn(config.count, 7, generator=rng, dtype=torch.float64)
+    # 0.2 rad on each joint: postures that differ, all within the limits and off the table.
+    q = panda.ready + 0.2 * noise
+
+    def elbow_position(q: Tensor) -> Tensor:
+        return panda.link_poses(q).position[..., ELBOW - 1, :]
+
+    tool, elbow = panda.forward(q), elbow_position(q)
+    one = torch.ones(config.count, dtype=torch.float64)
+    camera = PinholeCamera.above(
+        tool.position,
+        height=one,
+        roll=0.5 * noise[:, 0],
+        tilt=0.2 * one,
+        bearing=6.28 * noise[:, 1],
+        marker=tool.position.new_tensor(MARKER),
+    )
+    network = RBFImageJacobian.from_jacobian(
+        camera.image_jacobian(tool).mean(0), paper_grid(), 0.1
+    )
+    goals = Goals.at(tool.position, tool.orientation, camera.project(tool)[0])
+    controller = AdaptiveController(panda, FixedEstimator(network), goals)
+    way = _self_motion(q)
+    largest = torch.zeros(3, config.count, dtype=torch.float64)
+
+    def force(step: int, q: Tensor) -> Tensor:
+        sign = 1.0 if step * config.dt < config.away else -1.0
+        J = panda.joint_jacobian(q, ELBOW)[:, :3]
+        return torch.linalg.vecdot(J, sign * config.force * way.unsqueeze(-1), dim=-2)
+
+    def watch(step: int, q: Tensor, *_: object) -> None:
+        now = panda.forward(q)
+        moved = torch.stack([elbow_position(q) - elbow, now.position - tool.position])
+        turn = quaternion.angle(now.orientation, tool.orientation)
+        values = torch.cat([torch.linalg.vector_norm(moved, dim=-1), turn[None]])
+        torch.maximum(largest, values, out=largest)
+
+    with torch.inference_mode():
+        simulate_closed_loop(
+            controller,
+            VirtualCamera(
+                camera=camera,
+                imperfections=Imperfections(noise=config.noise),
+                generator=rng,
+            ),
+            q,
+            steps=round((config.away + config.back) / config.dt),
+            dt=config.dt,
+            nullspace_input=force,
+            on_step=watch,
+        )
+    return EffortResult(elbow=largest[0], deviation=largest[1], turn=largest[2])
+
+
+def _self_motion(q: Tensor) -> Tensor:
+    """Direction in which the elbow can move with the tool at rest."""
+    null = torch.linalg.svd(panda.jacobian(q)).Vh[..., -1, :]
+    motion = torch.linalg.vecdot(panda.joint_jacobian(q, ELBOW)[..., :3, :], null.unsqueeze(-2))
+    return motion / torch.linalg.vector_norm(motion, dim=-1, keepdim=True)
+
 
 Fault = Literal["none", "nan", "late", "lost"]
 """NaN in 1 % of images and of joint readings; images 100 ms late and joint states that stay
@@ -89,7 +209,7 @@ def run_stress_trials(config: StressConfig) -> StressResult:
         for k in range(round(config.duration / config.dt)):
             if k % round(_EFFORT_TIME / config.dt) == 0:
                 # Far beyond what a person applies (6 N in the force trials).
-                effort = 20 * _normal(rng, count, 7)
+                effort = 20 * torch.randn(count, 7, generator=rng, dtype=torch.float64)
             measured, stale = joints.read(q)
             image: dict[str, Any] = virtual.observe(panda.forward(q), q, config.dt)
             observation = Observation(
@@ -116,10 +236,6 @@ def _uniform(rng: torch.Generator, *shape: int) -> Tensor:
     return torch.rand(*shape, generator=rng, dtype=torch.float64)
 
 
-def _normal(rng: torch.Generator, *shape: int) -> Tensor:
-    return torch.randn(*shape, generator=rng, dtype=torch.float64)
-
-
 def _controller(count: int, rng: torch.Generator) -> tuple[AdaptiveController, PinholeCamera]:
     """Cameras over the workspace, goals anywhere, within reach or not."""
     turn = 2 * torch.pi * _uniform(rng, count)
@@ -130,16 +246,14 @@ def _controller(count: int, rng: torch.Generator) -> tuple[AdaptiveController, P
         roll=turn,
         tilt=0.5 * _uniform(rng, count),
         bearing=turn,
-        marker=middle.new_tensor((0.05, 0.0, -0.08)),
+        marker=middle.new_tensor(MARKER),
     )
-    goals = Goals.at(
-        _normal(rng, count, 3),
-        quaternion.normalize(_normal(rng, count, 4)),
-        100 + 800 * _uniform(rng, count, 2),
+    position, orientation = (
+        torch.randn(count, size, generator=rng, dtype=torch.float64) for size in (3, 4)
     )
-    J = torch.tensor(INITIAL_IMAGE_JACOBIAN, dtype=torch.float64)
-    network = RBFImageJacobian.from_jacobian(J, paper_grid(), 0.1)
-    return AdaptiveController(panda, CompositeEstimator(network), goals), camera
+    target = 100 + 800 * _uniform(rng, count, 2)
+    goals = Goals.at(position, quaternion.normalize(orientation), target)
+    return AdaptiveController(panda, CompositeEstimator(guessed_network()), goals), camera
 
 
 class _JointReadings:

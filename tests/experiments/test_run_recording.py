@@ -7,7 +7,7 @@ import rerun as rr
 import torch
 from rrd_reading import Rrd
 
-from hrc_learn.experiments.live_view import LiveViewConfig, live_view
+from hrc_learn.experiments.run_recording import LiveViewConfig, live_view
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import MotionLog, World
 from hrc_learn.sim.workplace import Workplace
@@ -16,7 +16,7 @@ from hrc_learn.teleoperation import ScriptedPerturbation
 from hrc_learn.viz import run_dashboard as servers
 
 
-def test_a_station_is_shown_while_it_works(tmp_path, monkeypatch):
+def test_a_cell_is_shown_while_it_works(tmp_path, monkeypatch):
     @contextmanager
     def into_a_file(port, data_port):
         stream = rr.RecordingStream("test")

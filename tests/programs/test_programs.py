@@ -3,6 +3,7 @@
 import ast
 import dataclasses
 import importlib.util
+import json
 import re
 import sys
 from functools import cache
@@ -107,3 +108,12 @@ def test_bad_input_of_a_benchmark_is_one_line(run_here, tmp_path):
     assert error.startswith("error: ")
     assert error.count("\n") == 1
     assert not list(tmp_path.iterdir())
+
+
+def test_a_benchmark_writes_its_figures(run_here, tmp_path):
+    sizes = ("--episodes", 2, "--frames", 50, "--repeats", 1)
+    out = tmp_path / "figures.json"
+    assert run_here("benchmarks/bench_demos.py", *sizes, "--json", out).status in (0, None)
+    figures = json.loads(out.read_text())
+    assert figures["load_demos_samples_per_s"] > 0
+    assert all(isinstance(value, float) for value in figures.values())

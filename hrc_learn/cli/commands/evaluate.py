@@ -1,4 +1,4 @@
-"""`hrc evaluate primitives`: primitives on demonstrations held out."""
+"""`hrc evaluate`: what was learned, on demonstrations held out and against the truth."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -8,10 +8,14 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from hrc_learn.cli._values import write_json
-from hrc_learn.cli.arguments.learn import EvaluatePrimitives as Args
-from hrc_learn.cli.arguments.learn import FitPrimitives
-from hrc_learn.cli.commands import fit_primitives
+from hrc_learn.cli._options import resolved
+from hrc_learn.cli._run import show_values, write_values
+from hrc_learn.cli.arguments.learn import (
+    EvaluateImageJacobian,
+    EvaluatePrimitives,
+    FitPrimitives,
+)
+from hrc_learn.cli.commands.fit import fit_primitives
 from hrc_learn.demos import DemonstrationSet, load_demos, open_demos
 from hrc_learn.learning.channels import (
     CHANNELS,
@@ -20,7 +24,8 @@ from hrc_learn.learning.channels import (
     load_primitive,
     reproduction_error,
 )
-from hrc_learn.store import new_folder, read_made_by
+from hrc_learn.skills.visual_skill import VisualServoSkill
+from hrc_learn.store import new_folder, read_made_by, write_json
 from hrc_learn.viz.figures import measures_figure
 
 UNITS = {
@@ -33,7 +38,8 @@ UNITS = {
 }
 
 
-def run(args: Args) -> int:
+def evaluate_primitives(args: EvaluatePrimitives) -> int:
+    """Primitives on demonstrations held out."""
     if args.model is not None:
         return _evaluate(args, args.model)
     if not args.dataset.is_dir():
@@ -44,16 +50,16 @@ def run(args: Args) -> int:
         return _evaluate(args, model)
 
 
-def _fit_most(args: Args, model: Path) -> None:
+def _fit_most(args: EvaluatePrimitives, model: Path) -> None:
     """Fit the demonstrations that are not to be evaluated on, into a folder."""
     count = len(open_demos(args.dataset))
     # Every fifth is held out, the last one of few; a single one cannot be.
     held_out = set(args.episodes or range(count)[4::5] or range(count)[1:][-1:])
     episodes = tuple(i for i in range(count) if i not in held_out)
-    fit_primitives.run(FitPrimitives(dataset=args.dataset, out=model, episodes=episodes))
+    fit_primitives(FitPrimitives(dataset=args.dataset, out=model, episodes=episodes))
 
 
-def _evaluate(args: Args, model: Path) -> int:
+def _evaluate(args: EvaluatePrimitives, model: Path) -> int:
     console = Console()
     channels = [channel for channel in CHANNELS if (model / channel).is_dir()]
     if not channels:
@@ -79,13 +85,14 @@ def _evaluate(args: Args, model: Path) -> int:
                 columns = {name: x.numpy() for name, x in error.columns().items()}
                 figure = measures_figure(columns, [demo.episode for demo in demos], UNITS)
                 figure.savefig(folder / f"{channel}.png", dpi=120)
-    if args.json is not None:
-        write_json(args.json, figures)
+    write_values(args.json, figures)
     limit = torch.inf if args.most_nrmse is None else args.most_nrmse
     return int(any(figures.get(f"{channel}_nrmse_median", 0.0) > limit for channel in channels))
 
 
-def _demonstrations(args: Args, model: Path, console: Console) -> DemonstrationSet:
+def _demonstrations(
+    args: EvaluatePrimitives, model: Path, console: Console
+) -> DemonstrationSet:
     """Those asked for, with the joints that were learned."""
     made_by = read_made_by(model)
     learned = [int(i) for i in made_by.get("episodes") or ()]
@@ -119,3 +126,51 @@ def _table(channel: str, demos: DemonstrationSet, error: ReproductionError) -> T
     table.add_section()
     table.add_row("median", *(f"{x.quantile(0.5):.3g}" for x in columns.values()))
     return table
+
+
+MOST_ERROR = 0.05
+LEAST_SPEED_UP = 1.5
+
+
+def evaluate_image_jacobian(args: EvaluateImageJacobian) -> int:
+    """An image Jacobian against the simulator's true one."""
+    # MuJoCo, which the evaluation of primitives does without.
+    from hrc_learn.experiments.controller.initialization_study import (
+        ClosedLoops,
+        compare_starts,
+        compare_with_truth,
+        held_out_grid,
+    )
+    from hrc_learn.sim import World
+    from hrc_learn.sim.workplace import Workplace
+
+    args = resolved(args)
+    torch.set_num_threads(1)
+    network = VisualServoSkill.load(args.model).jacobian
+    demos = load_demos(args.dataset)
+    if demos[0].position is None:
+        raise ValueError(f"{args.dataset}: no end-effector positions to place a grid by.")
+    shown = torch.cat([torch.from_numpy(demo.position) for demo in demos]).double()
+    workplace = Workplace()
+    world = World(workplace.scene)
+    world.reset(workplace.home_joints().numpy(), {})
+    camera, offset = workplace.scene.camera, world.hand_marker_offset()
+    figures: dict[str, float] = {}
+    for name, tilt in (("upright", 0.0), ("tilted", args.tilt)):
+        measured = compare_with_truth(network, held_out_grid(shown, tilt=tilt), camera, offset)
+        figures |= {f"{name}_{key}": value for key, value in measured.items()}
+    if args.closed_loop:
+        workspace = torch.stack([shown.quantile(0.05, dim=0), shown.quantile(0.95, dim=0)])
+        near = workplace.hover_joints()
+        with Console().status("Closed loops") as status:
+            loops = ClosedLoops.draw(camera, offset, workspace, near, args.starts)
+            figures |= compare_starts(
+                network,
+                loops,
+                on_run=lambda name: status.update(f"Closed loops, {name} Jacobian"),
+            )
+    show_values(f"Image Jacobian {args.model}", figures)
+    write_values(args.json, figures)
+    missed = figures["upright_relative_error_median"] > MOST_ERROR
+    missed |= figures.get("speed_up_over_fixed", LEAST_SPEED_UP) < LEAST_SPEED_UP
+    return int(missed)

@@ -1,0 +1,108 @@
+"""`hrc import`, `hrc extract`: datasets from arrays, and image features from videos."""
+
+import time
+from pathlib import Path
+
+import numpy as np
+from rich.progress import track
+
+from hrc_learn.cli._run import write_values
+from hrc_learn.cli.arguments.dataset import Extract, ImportArrays
+from hrc_learn.demos import DatasetWriter, Demonstration, Detector, extract_features
+from hrc_learn.demos.read.arrays import ArraySources, demonstrations_from_table, read_table
+from hrc_learn.vision import MarkerDetector, centre
+
+
+def import_arrays(args: ImportArrays) -> None:
+    """Import the recordings."""
+    if not args.files:
+        raise ValueError("name at least one recording to import")
+    demos = [demo for path in args.files for demo in _read(args, path)]
+    rates = sorted({demo.fps for demo in demos})
+    if len({demo.joint_names for demo in demos}) > 1 or len(rates) > 1:
+        raise ValueError(
+            f"the files do not fit into one dataset: joints "
+            f"{sorted({len(demo.joint_names) for demo in demos})}, frame rates {rates} Hz "
+            f"(give --fps to count all alike; stamps are kept)"
+        )
+    with DatasetWriter(
+        args.out, rates[0], args.robot_type, demos[0].joint_names, dtype=args.dtype
+    ) as writer:
+        for demo in demos:
+            writer.add_episode(demo)
+    summary = {
+        "episodes": len(demos),
+        "frames": sum(map(len, demos)),
+        "seconds": sum(demo.duration for demo in demos),
+        "fps": rates[0],
+    }
+    print(
+        f"{args.out}: {summary['episodes']} demonstrations, {summary['frames']} frames, "
+        f"{summary['seconds']:.1f} s"
+    )
+    write_values(args.json, summary)
+
+
+def _read(args: ImportArrays, path: Path) -> list[Demonstration]:
+    """Demonstrations of one file."""
+    sources = ArraySources(
+        joints=args.joints,
+        position=args.position,
+        orientation=args.orientation,
+        time=args.time,
+    )
+    return demonstrations_from_table(
+        read_table(path, [name for name in args.columns.split(",") if name]),
+        sources,
+        path=path,
+        units={
+            "joint_position": args.joint_unit,
+            "position": args.position_unit,
+            "time": args.time_unit,
+        },
+        quaternion_order=args.quaternion_order,
+        joint_names=args.joint_names,
+        duration=args.duration,
+        fps=args.fps,
+        task=path.stem if args.task is None else args.task,
+    )
+
+
+def extract(args: Extract) -> None:
+    """Look at every image that was not looked at before."""
+    if not 0 <= args.marker < 50:
+        raise ValueError(f"--marker must be from 0 to 49, got {args.marker}")
+    start = time.perf_counter()
+    done = extract_features(
+        args.dataset,
+        f"marker_{args.marker}",
+        lambda: _follow(args.marker),
+        camera=args.camera,
+        progress=lambda episodes: track(episodes, description="Looking at episodes"),
+    )
+    rate = done.frames / max(time.perf_counter() - start, 1e-9)
+    share = done.seen / done.frames if done.frames else 1.0
+    print(
+        f"{done.name}: {done.episodes} episodes looked at, {done.known} known before; seen in "
+        f"{100 * share:.1f} % of {done.frames} frames, {done.without_image} without an image"
+    )
+    values = {
+        "episodes": done.episodes,
+        "episodes_known_before": done.known,
+        "frames": done.frames,
+        "seen_share": share,
+        "frames_without_image": done.without_image,
+        "frames_per_s": rate,
+    }
+    write_values(args.json, values)
+
+
+def _follow(marker: int) -> Detector:
+    """A detector that follows one marker."""
+    markers = MarkerDetector([marker])
+
+    def detect(image: np.ndarray) -> np.ndarray | None:
+        corners = markers.detect(image).get(marker)
+        return None if corners is None else centre(corners)
+
+    return detect

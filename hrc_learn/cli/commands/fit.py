@@ -1,0 +1,203 @@
+"""`hrc fit`: movement primitives and image Jacobian from demonstrations."""
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from rich.console import Console
+
+from hrc_learn import distributed
+from hrc_learn.cli._options import resolved
+from hrc_learn.cli._run import show_values, write_values
+from hrc_learn.cli.arguments.learn import FitImageJacobian, FitPrimitives
+from hrc_learn.demos import DemonstrationSource, load_demos, open_demos
+from hrc_learn.jacobian import CellErrors, RBFCenters, grid
+from hrc_learn.learning.primitive_fitting import (
+    FittedPrimitives,
+    fit_contextual,
+    fit_recording,
+    fit_streamed,
+)
+from hrc_learn.learning.primitive_fitting import fit_primitives as fit_demonstrations
+from hrc_learn.learning.visual_servo_fitting import fit_visual_servo, learning_recording
+from hrc_learn.skills.visual_skill import VisualServoSkill
+from hrc_learn.store import new_folder, write_json
+from hrc_learn.viz.figures import (
+    fit_joints_figure,
+    learning_figure,
+    residual_figure,
+    workspace_figure,
+)
+from hrc_learn.viz.learning_dashboards import record_fit, record_learning
+
+
+def fit_primitives(args: FitPrimitives) -> None:
+    """Movement primitives of joints and end effector."""
+    torch.manual_seed(args.seed)
+    console = Console()
+    if args.as_lerobot_policy:
+        _fit_policy(args, console)
+        return
+    if args.several == "streamed":
+        _fit_streamed(args)
+        return
+    demos = load_demos(
+        args.dataset, episodes=args.episodes or None, joint_names=args.joint_names or None
+    )
+    for note in demos.notes:
+        console.print(f"note: {note}")
+    with new_folder(args.folder, _made_by(args), args.overwrite) as folder:
+        with console.status(f"Fitting {len(demos)} demonstrations"):
+            # Not every channel takes a scaling.
+            scaled: dict[str, Any] = {} if args.scaling == "none" else {"scaling": args.scaling}
+            fitted = fit_demonstrations(
+                demos,
+                args.n_basis,
+                args.method,
+                channels=args.channels,
+                robust=args.robust,
+                **scaled,
+            )
+            metrics = fitted.metrics()
+            if args.several == "contextual":
+                metrics |= fit_contextual(fitted, demos, args.context, folder)
+        fitted.save(folder, each=args.several == "distribution")
+        if args.several == "distribution":
+            metrics |= {f"{k}_spread": _spread(fitted, k) for k in fitted.each}
+        _draw(fitted, args, folder)
+        _finish(args, metrics, folder)
+
+
+def _fit_streamed(args: FitPrimitives) -> None:
+    with distributed.processes() as rank:
+        demos = open_demos(
+            args.dataset, episodes=args.episodes or None, joint_names=args.joint_names or None
+        )
+        fits, metrics = fit_streamed(demos, args.n_basis or 60, channels=args.channels)
+        if rank:
+            return
+        with new_folder(args.folder, _made_by(args), args.overwrite) as folder:
+            for channel, fit in fits.items():
+                fit.primitive.save(folder / channel)
+            _finish(args, metrics, folder)
+
+
+def _fit_policy(args: FitPrimitives, console: Console) -> None:
+    # LeRobot takes ten seconds to import.
+    from hrc_learn.lerobot.policy.modeling_dmp import write_closed_form_policy
+
+    given = (args.channels, args.context, args.joint_names, args.robust)
+    if any(given) or (args.several, args.method, args.scaling) != (
+        "mean",
+        "trajectory",
+        "none",
+    ):
+        raise ValueError(
+            "--as-lerobot-policy learns the dataset's actions from its observations: of what "
+            "to learn and how, it takes --n-basis and --episodes alone"
+        )
+    if args.n_basis is None:
+        raise ValueError("--as-lerobot-policy needs a number of basis functions: --n-basis 50")
+    with new_folder(args.folder, _made_by(args), args.overwrite) as folder:
+        with console.status("Fitting a policy"):
+            metrics = write_closed_form_policy(
+                args.dataset, folder, n_basis=args.n_basis, episodes=args.episodes or None
+            )
+        _finish(args, metrics, folder)
+
+
+def _made_by(args: FitPrimitives) -> dict:
+    return asdict(args) | {"dataset": args.dataset.resolve(), "out": args.folder}
+
+
+def _spread(fitted: FittedPrimitives, channel: str) -> float:
+    """Standard deviation of the motion over demonstrations, root mean square [rad or m]."""
+    distribution = fitted.distribution(channel)
+    durations = fitted.demonstrations.time.amax(dim=1)
+    time = torch.linspace(0, float(durations.mean()), 100, dtype=torch.float64)
+    return float(np.sqrt(np.square(distribution.position(time)[1].numpy()).mean()))
+
+
+def _draw(fitted: FittedPrimitives, args: FitPrimitives, folder: Path) -> None:
+    if set(fitted.each) == {"orientation"}:
+        return
+    shown = fit_recording(fitted, f"Fit of {args.dataset.name}")
+    record_fit(folder / "fit.rrd", shown)
+    name = "joints" if "joint" in fitted.each else "position"
+    fit_joints_figure(shown).savefig(folder / f"{name}.png", dpi=120)
+    if shown.residual:
+        residual_figure(shown).savefig(folder / "n_basis.png", dpi=120)
+
+
+def _finish(args: FitPrimitives, metrics: dict[str, float], folder: Path) -> None:
+    write_json(folder / "metrics.json", metrics)
+    show_values(f"Fit of {args.dataset}", metrics)
+    print(f"Model in {args.folder}")
+    write_values(args.json, metrics)
+
+
+def fit_image_jacobian(args: FitImageJacobian) -> None:
+    """Image Jacobian, and the visual target."""
+    args = resolved(args)
+    with distributed.processes() as rank:
+        console = Console(quiet=rank != 0)
+        demos = open_demos(args.dataset, episodes=args.episodes or None)
+        for note in demos.notes:
+            console.print(f"note: {note}")
+        if args.learn and len(demos) < args.learning.hold_out:
+            console.print(
+                f"note: {len(demos)} demonstrations are too few to learn the neurons from; "
+                f"fitted as they are (--learning.hold-out {args.learning.hold_out})"
+            )
+        with console.status(f"Fitting {len(demos)} demonstrations") as status:
+            skill = fit_visual_servo(
+                demos,
+                None if args.neurons == "around" else _grid(args),
+                args.fit,
+                args.learning if args.learn else None,
+                lambda number, state: status.update(
+                    f"Learning, round {number}: held-out error {state.held_out_error:.3f} px"
+                ),
+            )
+        if rank == 0:
+            _write(args, skill, demos, console)
+
+
+def _grid(args: FitImageJacobian) -> RBFCenters:
+    return RBFCenters(centers=grid(args.x, args.y), width=args.width)
+
+
+def _write(
+    args: FitImageJacobian,
+    skill: VisualServoSkill,
+    demos: DemonstrationSource,
+    console: Console,
+) -> None:
+    metrics = skill.metrics()
+    with new_folder(args.folder, asdict(args) | {"out": args.folder}, args.overwrite) as folder:
+        skill.save(folder)
+        write_json(folder / "metrics.json", metrics)
+        if skill.cells is not None:
+            _error_map(skill.cells, folder / "error_map.png")
+        if skill.learned is not None:
+            held_out = [state.held_out_error for state in skill.learned.rounds]
+            figure = learning_figure(held_out, skill.learned.best, "px")
+            figure.savefig(folder / "learning.png", dpi=120)
+        title = f"Image Jacobian from {args.dataset.name}"
+        record_learning(folder / "fit.rrd", learning_recording(skill, demos, title))
+    show_values(f"Image Jacobian from {args.dataset}", metrics)
+    console.print(f"Model in {args.folder}")
+    console.print(f"Recording  rerun {args.folder / 'fit.rrd'}")
+    write_values(args.json, metrics)
+
+
+def _error_map(cells: CellErrors, path: Path) -> None:
+    """Held-out error and posterior uncertainty over the horizontal plane."""
+    maps = [
+        ("Held-out error over image motion", cells.relative.numpy()),
+        ("Uncertainty of the Jacobian", cells.uncertainty.numpy()),
+    ]
+    x, y = cells.edges.mT.numpy()
+    workspace_figure(maps, x, y).savefig(path, dpi=120)
