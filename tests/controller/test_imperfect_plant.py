@@ -1,5 +1,7 @@
 """Limits with an arm that does less than it is told, later, and at other times."""
 
+from typing import NamedTuple
+
 import pytest
 import sampling
 import torch
@@ -14,15 +16,17 @@ FINE = 1e-3
 """Step of the simulated joints [s]."""
 
 
+class Plant(NamedTuple):
+    braking: float = 1.0
+    delay: float = 0.0
+    jitter: float = 0.0
+
+    def declared(self) -> SafetyConfig:
+        return SafetyConfig(braking=self.braking, delay=self.delay, jitter=self.jitter)
+
+
 def furthest_out(
-    config: SafetyConfig,
-    runs: int,
-    *,
-    braking: float = 1.0,
-    delay: float = 0.0,
-    jitter: float = 0.0,
-    dt: float = 0.01,
-    time: float = 3.0,
+    config: SafetyConfig, runs: int, plant: Plant, *, dt: float = 0.01, time: float = 3.0
 ) -> Tensor:
     """How far joints with such a driver come past their limits under hostile commands [rad].
 
@@ -31,18 +35,18 @@ def furthest_out(
     rng = sampling.generator(11)
     safety = SafetyFilter(LIMITS, config)
     q = sampling.within(LIMITS.lower, LIMITS.upper, runs, rng=rng, margin=0.3)
-    v, state, late = torch.zeros_like(q), safety.initial_state(q), round(delay / FINE)
-    told = [v] * (late + 1)
+    v, state, late = torch.zeros_like(q), safety.initial_state(q), round(plant.delay / FINE)
+    told, way, command = [v] * (late + 1), v, v
     worst, next_step = torch.full((runs,), -torch.inf, dtype=torch.float64), 0.0
     for k in range(round(time / FINE)):
         if k * FINE >= next_step - 1e-9:
             unit = 2 * torch.rand((), generator=rng, dtype=torch.float64) - 1
-            next_step = k * FINE + dt * (1 + jitter * float(unit))
+            next_step = k * FINE + dt * (1 + plant.jitter * float(unit))
             if k % 500 < dt / FINE * 2:
                 way = torch.sign(torch.randn(runs, 7, generator=rng, dtype=torch.float64))
             command, state, _ = safety.step(state, q, 10 * way, dt)
         told.append(command)
-        reach = braking * LIMITS.acceleration * FINE
+        reach = plant.braking * LIMITS.acceleration * FINE
         v = v + (told[-1 - late] - v).clamp(-reach, reach)
         q = q + v * FINE
         worst = torch.maximum(worst, torch.maximum(q - LIMITS.upper, LIMITS.lower - q).amax(-1))
@@ -50,10 +54,10 @@ def furthest_out(
 
 
 PLANTS = {
-    "slow": {"braking": 0.3},
-    "late": {"delay": 0.02},
-    "irregular": {"jitter": 0.5},
-    "all of it": {"braking": 0.3, "delay": 0.02, "jitter": 0.3},
+    "slow": Plant(braking=0.3),
+    "late": Plant(delay=0.02),
+    "irregular": Plant(jitter=0.5),
+    "all of it": Plant(braking=0.3, delay=0.02, jitter=0.3),
 }
 
 
@@ -61,15 +65,14 @@ PLANTS = {
 @pytest.mark.parametrize("plant", PLANTS)
 @shapes_unchecked()  # for speed
 def test_no_command_breaks_a_position_limit_of_a_plant_that_is_declared(plant, dt):
-    told = PLANTS[plant]
-    worst = furthest_out(SafetyConfig(**told), 256, **told, dt=dt)
+    worst = furthest_out(PLANTS[plant].declared(), 256, PLANTS[plant], dt=dt)
     assert (worst < -SafetyConfig().margin).all()  # all of it is left for what servos err by
     assert (worst > -0.1).float().mean() > 0.6  # they did come there
 
 
 @shapes_unchecked()  # for speed
 def test_a_plant_that_is_not_declared_leaves_them():
-    worst = furthest_out(SafetyConfig(), 64, braking=0.3, delay=0.02)
+    worst = furthest_out(SafetyConfig(), 64, Plant(braking=0.3, delay=0.02))
     assert (worst > 0.1).float().mean() > 0.3
 
 
@@ -85,6 +88,6 @@ def test_settings_that_no_driver_has_are_refused():
 @pytest.mark.slow
 @shapes_unchecked()
 def test_nor_does_any_of_ten_thousand_runs():
-    told = PLANTS["all of it"]
-    worst = furthest_out(SafetyConfig(**told), 10_000, **told, time=4.0)
+    plant = PLANTS["all of it"]
+    worst = furthest_out(plant.declared(), 10_000, plant, time=4.0)
     assert (worst < -SafetyConfig().margin).all()

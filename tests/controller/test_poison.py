@@ -321,7 +321,7 @@ def test_hostile_ticks_break_no_limit_and_leave_an_arm_that_moves(ticks):
             scene.pull = 10 * torch.randn(arms, 7, generator=rng, dtype=DOUBLE)
         observation = scene.observe(q)
         near = torch.rand(arms, generator=rng, dtype=DOUBLE) < 0.05
-        distance = torch.where(near, 0.3, observation.human_distance)
+        distance = 3.0 - 2.7 * near.double()
         observation = replace(observation, human_distance=distance)
         for arm in range(arms):
             if draw(3) == 0:

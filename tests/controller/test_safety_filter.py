@@ -1,4 +1,5 @@
 import dataclasses
+from typing import Any
 
 import pytest
 import sampling
@@ -175,7 +176,7 @@ def test_it_stops_short_of_the_limit_by_the_margin(jerk_limited: bool):
     torch.testing.assert_close(q, LIMITS.upper - 0.05 - room, rtol=0, atol=1e-6)
 
 
-HALTS = {
+HALTS: dict[str, dict[str, Any]] = {
     "a command of zero": {"joint_velocity_command": torch.zeros(7, dtype=torch.float64)},
     "a stop": {"stop": torch.tensor(True)},
     "a command of NaN": {
@@ -205,7 +206,7 @@ def test_outside_its_limits_a_stopped_arm_rests_and_returns_when_asked(
     )
     inwards = 0.3 * torch.sign(LIMITS.middle - q)
     state = safety.initial_state(q)
-    usual = {
+    usual: dict[str, Any] = {
         "joint_position": q,
         "joint_velocity_command": -inwards,
         "jacobian": panda.jacobian(q),
