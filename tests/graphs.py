@@ -4,7 +4,9 @@ import re
 
 import torch
 
-_LIBRARY = re.compile(r"aten\.(\w*mm|matmul|mv|addmv|\w*cholesky\w*|linalg_(solve|inv)\w*)\.")
+_LIBRARY = re.compile(
+    r"aten\.(\w*mm|matmul|mv|addmv|\w*cholesky\w*|linalg_(solve|inv|qr)\w*)\."
+)
 
 
 def library_calls(program: torch.export.ExportedProgram) -> set[str]:

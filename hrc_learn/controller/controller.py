@@ -20,6 +20,7 @@ from hrc_learn.controller.feedback import (
     analytic_descent,
     approach_velocity,
     effective_goals,
+    known_step,
     next_task_level,
     regional_feedback,
     validated_position,
@@ -32,10 +33,12 @@ from hrc_learn.controller.resolved_rate import (
     measure_drift,
     planned_motion,
     resolved_rate,
+    restored_drift,
     scale_null_space,
 )
 from hrc_learn.controller.safety_filter import SafetyConfig, SafetyFilter, SafetyState
 from hrc_learn.geometry import Pose
+from hrc_learn.geometry.numerics import is_number
 from hrc_learn.jacobian import ImageJacobianEstimator, Measurement
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.pytree import pytree
@@ -225,6 +228,10 @@ class AdaptiveController(nn.Module):
     ) -> tuple[Command, ControllerState]:
         """One step of the law.
 
+        What is not a number, and a tensor `dt` beyond `SafetyConfig.longest_step`, brakes the
+        arm, flagged `invalid`, or is done without, as a feature not seen. It is neither
+        learned from nor remembered: the next step is healthy.
+
         Args:
             state: Of the step before.
             observation: Of this step.
@@ -233,9 +240,11 @@ class AdaptiveController(nn.Module):
             What to send and why, and the next state.
 
         Raises:
-            ValueError: dt is not in (0, 1/rate] of the safety filter.
+            ValueError: A number dt is not in (0, longest_step] of the safety settings.
         """
+        state = self._restored(state)
         goals, known = effective_goals(observation, self.goals)
+        dt, timed = known_step(observation.dt, self.config.safety.longest_step)
         q, stale = validated_position(observation, state.safety.position)
         pose, J = self.chain.forward_and_jacobian(q)
         task_level = next_task_level(
@@ -243,7 +252,7 @@ class AdaptiveController(nn.Module):
             goals.posture,
             q,
             state.blending.active,
-            observation.dt,
+            dt,
             self.config.blending.blend_time,
         )
         usable = observation.feature_visible & goals.vision_enabled & known
@@ -252,7 +261,7 @@ class AdaptiveController(nn.Module):
             state.blending,
             observation.feature,
             usable if goals.posture is None else usable & (task_level > 0),
-            observation.dt,
+            dt,
             age=observation.feature_age,
         )
         J_s = self.estimator.jacobian(state.estimator, pose)
@@ -261,6 +270,8 @@ class AdaptiveController(nn.Module):
         if self.config.jacobian == "analytic":
             descent = analytic_descent(descent, pose.orientation)
         motion = self._motion(state, observation, goals, q, J, task_level, descent)
+        asked = torch.cat([motion.joint_velocity, feedback.xi_x, feedback.xi_r], dim=-1)
+        sound = timed & is_number(asked).all(-1)
         if observation.stop is not None:
             stop = observation.stop if stop is None else stop | observation.stop
         v, safety, report = self.safety.step(
@@ -271,16 +282,18 @@ class AdaptiveController(nn.Module):
             jacobian=J,
             human_distance=observation.human_distance,
             stop=stop,
-            stale=stale,
+            stale=stale | ~sound,
             bounds=motion.bounds,
         )
         # What the filter left of the task's motion is what the tool ought to do until the next
         # step: whatever else it does is drift.
         if motion.pose_drift is None:
-            off = torch.zeros_like(state.pose_drift.active)
-            pose_drift = replace(state.pose_drift, active=off)
+            pose_drift = replace(state.pose_drift, active=torch.zeros_like(stale))
         else:
-            planned = planned_motion(motion.task_twist, motion.twist, J, v, observation.dt)
+            planned = planned_motion(motion.task_twist, motion.twist, J, v, dt)
+            # An arm that only brakes does not drift.
+            braking = safety.dt.unsqueeze(-1) * torch.linalg.vecdot(J, v.unsqueeze(-2))
+            planned = torch.where(sound.unsqueeze(-1), planned, braking)
             pose_drift = replace(motion.pose_drift, planned=planned)
         command = Command(
             joint_velocity=v,
@@ -297,13 +310,25 @@ class AdaptiveController(nn.Module):
             potential_rate=potential_rate(feedback.s, J, v),
             safety=report,
         )
-        estimator = self._adapted(state, observation, pose, seen & ~stale, blending, feedback)
+        estimator = self._adapted(
+            state, observation, pose, dt, seen & ~stale & sound, blending, feedback, sound
+        )
         return command, ControllerState(
             blending=blending,
             task_level=task_level,
             pose_drift=pose_drift,
             safety=safety,
             estimator=estimator,
+        )
+
+    def _restored(self, state: ControllerState) -> ControllerState:
+        """The state, as at the start where it is not of numbers."""
+        return ControllerState(
+            blending=self.blending.restored(state.blending),
+            task_level=state.task_level.masked_fill(~is_number(state.task_level), 0),
+            pose_drift=restored_drift(state.pose_drift),
+            safety=self.safety.restored(state.safety),
+            estimator=self.estimator.restored(state.estimator),
         )
 
     def _motion(
@@ -347,15 +372,17 @@ class AdaptiveController(nn.Module):
         state: ControllerState,
         observation: Observation,
         pose: Pose,
+        dt: float | Tensor,
         seen: Tensor,
         blending: BlendingState,
         feedback: Feedback,
+        sound: Tensor,
     ) -> Any:
         """State of the estimator after what the camera saw."""
         q = observation.image_joint_position
         if q is not None:
             # Estimators compute with the pose even where they must not learn from it.
-            known = q.isfinite().all(-1)
+            known = is_number(q).all(-1)
             pose = self.chain.forward(
                 torch.where(known.unsqueeze(-1), q, state.safety.position)
             )
@@ -366,8 +393,8 @@ class AdaptiveController(nn.Module):
             pose=pose,
             feature=blending.feature,
             valid=seen,
-            dt=observation.dt,
-            xi_x=feedback.xi_x,
-            xi_r=feedback.xi_r,
+            dt=dt,
+            xi_x=feedback.xi_x.masked_fill(~sound.unsqueeze(-1), 0),
+            xi_r=feedback.xi_r.masked_fill(~sound.unsqueeze(-1), 0),
         )
         return self.estimator.update(state.estimator, measurement)

@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from hrc_learn.controller.interface import Goals, Observation
 from hrc_learn.controller.resolved_rate import excess_speed
 from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.geometry.numerics import is_number
 from hrc_learn.pytree import pytree
 from hrc_learn.regions import PostureRegion
 
@@ -78,6 +79,16 @@ class VisionBlending(nn.Module):
             feature=self.centre.repeat(points).expand(*level.shape, -1).clone(),
         )
 
+    def restored(self, state: BlendingState) -> BlendingState:
+        """The state, with nothing followed where it is not of numbers."""
+        known = is_number(state.level) & is_number(state.feature).all(-1)
+        fresh = self.initial_state(state.level.unsqueeze(-1), state.feature.shape[-1] // 2)
+        return BlendingState(
+            active=state.active & known,
+            level=torch.where(known, state.level, fresh.level),
+            feature=torch.where(known.unsqueeze(-1), state.feature, fresh.feature),
+        )
+
     def step(
         self,
         state: BlendingState,
@@ -102,7 +113,8 @@ class VisionBlending(nn.Module):
         """
         stop = None
         if age is not None:
-            late = age > self.config.max_feature_age
+            # An age of NaN is not known; one far below zero says that the clocks differ.
+            late = ~(age.abs() <= self.config.max_feature_age)
             stop = usable & late & state.active
             usable = usable & ~late
         # Distance to the nearest edge of the image; NaN compares as not seen.
@@ -270,10 +282,23 @@ def validated_position(
         The position, and where it is the expected one.
     """
     q = observation.joint_position
-    stale = ~q.isfinite().all(-1)
+    stale = ~is_number(q).all(-1)
     if observation.joint_state_stale is not None:
         stale = stale | observation.joint_state_stale
     return torch.where(stale.unsqueeze(-1), expected, q), stale
+
+
+def known_step(
+    dt: float | Float[Tensor, ""], longest: float
+) -> tuple[float | Tensor, Bool[Tensor, ""] | bool]:
+    """Time that passes until the next step [s], none where it is not known, and whether it is.
+
+    A number is known: the safety filter raises where it is outside (0, longest].
+    """
+    if not isinstance(dt, Tensor):
+        return dt, True
+    known = (dt > 0) & (dt <= longest)
+    return torch.where(known, dt, 0.0), known
 
 
 def effective_goals(
@@ -284,6 +309,6 @@ def effective_goals(
     target = observation.target
     if target is None:
         return goals, True
-    known = target.isfinite().all(-1)
+    known = is_number(target).all(-1)
     target = torch.where(known.unsqueeze(-1), target, goals.vision.target)
     return goals.aimed_at(target), known

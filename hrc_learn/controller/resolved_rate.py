@@ -12,7 +12,14 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from hrc_learn.geometry.numerics import Constant, inverse_norm, matmul, solve_positive
+from hrc_learn.geometry.numerics import (
+    Constant,
+    inverse_norm,
+    is_number,
+    matmul,
+    null_projection,
+    solve_positive,
+)
 from hrc_learn.kinematics.redundancy import SINGULAR_BELOW
 from hrc_learn.pytree import pytree
 
@@ -40,12 +47,16 @@ def resolved_rate(
     twist: Float[Tensor, "*batch 6"],
     null_velocity: Float[Tensor, "*batch n"],
 ) -> tuple[Float[Tensor, "*batch n"], Float[Tensor, "*batch n"]]:
-    """J^+ twist and N w, for a null-space velocity w, from one symmetric 6 x 6 solve.
+    """J^+ twist and N w, for a null-space velocity w.
 
-        J^+ v = J^T A^-1 v,   N w = w - J^T A^-1 J w,   A = J J^T + lambda^2 I
+        J^+ v = J^T (J J^T + lambda^2 I)^-1 v,   N w = w - Q Q^T w,   J^T = Q R
 
     The damping lambda is exactly zero unless J is near a singularity. It is judged by
-    |A^-1|_F^(-1/2), which is at most sigma_min and close to it where sigma_min is small.
+    |(J J^T)^-1|_F^(-1/2), which is at most sigma_min and close to it where sigma_min is small.
+
+    N is never damped: |J N w| <= 1e-12 |w| in float64 at any J, singular ones included. There
+    the null space has a dimension more, of which N keeps n - 6, and which ones may change from
+    one step to the next; the safety filter limits the acceleration that takes.
 
     Args:
         J: Geometric Jacobian.
@@ -61,11 +72,8 @@ def resolved_rate(
     sigma_square = 1 / inverse_norm(torch.add(gram, eye, alpha=_FLOOR))
     damping_square = (SINGULAR_BELOW**2 - sigma_square).clamp(min=0)
     damped = torch.addcmul(gram, eye, damping_square[..., None, None])
-    # Both right-hand sides in one solve: the task's twist, and the one that w would cause.
-    caused = matmul(J, null_velocity.unsqueeze(-1))
-    solution = solve_positive(damped, torch.cat([twist.unsqueeze(-1), caused], dim=-1))
-    task, compensation = matmul(J.mT, solution).unbind(-1)
-    return task, null_velocity - compensation
+    task = matmul(J.mT, solve_positive(damped, twist.unsqueeze(-1))).squeeze(-1)
+    return task, null_projection(J, null_velocity)
 
 
 def scale_null_space(
@@ -123,6 +131,20 @@ class PoseDrift:
     """Motion the task had planned for the last step (linear [m], angular [rad])."""
     active: Bool[Tensor, "*batch"]
     """Whether drift was measured in the last step; where not, the rest may be old."""
+
+
+def restored_drift(drift: PoseDrift) -> PoseDrift:
+    """The same, or none where it is not of numbers."""
+    numbers = (drift.drift, drift.joint_position, drift.planned, drift.jacobian.flatten(-2))
+    known = is_number(torch.cat(numbers, dim=-1)).all(-1)
+    unknown = ~known.unsqueeze(-1)
+    return PoseDrift(
+        drift=drift.drift.masked_fill(unknown, 0),
+        joint_position=drift.joint_position.masked_fill(unknown, 0),
+        jacobian=drift.jacobian.masked_fill(unknown.unsqueeze(-1), 0),
+        planned=drift.planned.masked_fill(unknown, 0),
+        active=drift.active & known,
+    )
 
 
 def measure_drift(

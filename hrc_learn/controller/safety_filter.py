@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from hrc_learn.controller.motion_barriers import LimitBarrier, SeparationConfig
+from hrc_learn.geometry.numerics import is_number
 from hrc_learn.kinematics import JointLimits
 from hrc_learn.pytree import pytree
 
@@ -33,6 +34,8 @@ INTERVENTIONS = (
 # Fraction of a limit, or joint velocity [rad/s], beyond which an intervention is reported.
 # Below is rounding, in float32 too: a command led along a limit would be flagged by chance.
 _REPORTED = 1e-6
+# Step [s] to brake by while none has been valid: that of the fastest arms, so the gentlest.
+_SHORTEST_STEP = 1e-3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,6 +51,13 @@ class SafetyConfig:
     """Fastest decay of the remaining distance to a limit [1/s]; at most 1/dt."""
     jerk_limited: bool = True
     """Whether the jerk of each joint is limited, which starts to matter below 4 ms a step."""
+    braking: float = 1.0
+    """Fraction of the limits of acceleration and jerk that the arm's driver uses, above 0 to
+    1. franky plans with the `dynamics` that it is given, 0.3 by default in our adapter."""
+    delay: float = 0.0
+    """Longest time from a joint position read to the arm doing what was made of it [s]."""
+    jitter: float = 0.0
+    """Largest fraction by which steps are longer or shorter than their `dt`, 0 to below 1."""
     tcp_speed: float = 1.0
     """Cap on the speed of the tool centre point [m/s]; acts where a Jacobian is given."""
     separation: SeparationConfig = field(default_factory=SeparationConfig)
@@ -59,10 +69,18 @@ class SafetyConfig:
                 raise ValueError(f"{name} must be positive, but is {getattr(self, name)}")
         if self.margin < 0:
             raise ValueError(f"margin must not be negative, but is {self.margin}")
-        if not 0 <= self.velocity_margin < 1:
-            raise ValueError(
-                f"velocity_margin must be in [0, 1), but is {self.velocity_margin}"
-            )
+        if self.delay < 0:
+            raise ValueError(f"delay must not be negative, but is {self.delay}")
+        if not 0 < self.braking <= 1:
+            raise ValueError(f"braking must be in (0, 1], but is {self.braking}")
+        for name in ("velocity_margin", "jitter"):
+            if not 0 <= getattr(self, name) < 1:
+                raise ValueError(f"{name} must be in [0, 1), but is {getattr(self, name)}")
+
+    @property
+    def longest_step(self) -> float:
+        """For which the limits can be guaranteed [s]."""
+        return 1 / (self.rate * (1 + self.jitter))
 
 
 @pytree
@@ -76,6 +94,8 @@ class SafetyState:
     """By which it came about [rad/s^2]; zero where jerk is not limited."""
     position: Float[Tensor, "*batch n"]
     """Where the joints should be now [rad]: used while their measurement is invalid."""
+    dt: Float[Tensor, "*batch"]
+    """Last step of a valid length [s]: used while that is invalid."""
     counts: Int[Tensor, "*batch kinds"]
     """Steps in which each of `INTERVENTIONS` was needed."""
 
@@ -109,8 +129,12 @@ class SafetyFilter(nn.Module):
 
     They hold for *any* sequence of commands, by a control barrier (`LimitBarrier`), as long as
     the arm moves as it is told, or errs by less than the margins. Where it does not, the
-    limits of acceleration and jerk hold, and the others as soon as those let them. Within its
-    margin a joint is driven back.
+    limits of acceleration and jerk hold, and the others as soon as those let them. A joint
+    outside its limits, or within their margin, does not move further out. It may rest there,
+    and returns when the command asks it to: no stop becomes a motion.
+
+    Whatever is not a number, in any argument or in the state, brakes the arm to rest and is
+    forgotten: neither a command nor a state is ever NaN or infinite.
 
     Velocity, tool speed, acceleration and jerk are limited by scaling the whole vector, which
     keeps its direction; only the barrier cuts single joints. The acceleration fades in time
@@ -120,11 +144,21 @@ class SafetyFilter(nn.Module):
     def __init__(self, limits: JointLimits, config: SafetyConfig | None = None):
         super().__init__()
         self.config = config = config or SafetyConfig()
+        # What a shorter step makes of a change of velocity must be in the driver's power.
+        usable = config.braking * (1 - config.jitter)
         self.barrier = LimitBarrier(
-            replace(limits, velocity=(1 - config.velocity_margin) * limits.velocity),
+            replace(
+                limits,
+                velocity=(1 - config.velocity_margin) * limits.velocity,
+                acceleration=usable * limits.acceleration,
+                jerk=usable * limits.jerk,
+            ),
             margin=config.margin,
             rate=config.rate,
+            delay=config.delay,
+            jitter=config.jitter,
             jerk_limited=config.jerk_limited,
+            rests_outside=True,
         )
 
     def initial_state(
@@ -141,7 +175,26 @@ class SafetyFilter(nn.Module):
             velocity=still.clone() if joint_velocity is None else still + joint_velocity,
             acceleration=still,
             position=joint_position,
+            dt=torch.full_like(still[..., 0], _SHORTEST_STEP),
             counts=counts,
+        )
+
+    def restored(self, state: SafetyState) -> SafetyState:
+        """The state, at rest in mid-range where it is not of numbers."""
+        lower, upper = self.barrier.walls.unbind(-2)
+        fallback = (
+            (state.velocity, torch.zeros_like(state.velocity)),
+            (state.acceleration, torch.zeros_like(state.acceleration)),
+            (state.position, (upper - lower) / 2),
+        )
+        v, a, q = (torch.where(is_number(x), x, instead) for x, instead in fallback)
+        valid = (state.dt > 0) & (state.dt <= self.config.longest_step)
+        return SafetyState(
+            velocity=v,
+            acceleration=a,
+            position=q,
+            dt=torch.where(valid, state.dt, _SHORTEST_STEP),
+            counts=state.counts,
         )
 
     def velocity_bounds(
@@ -169,24 +222,40 @@ class SafetyFilter(nn.Module):
             state: Of the step before.
             joint_position: Measured [rad]. Not finite: brake to rest.
             joint_velocity_command: Wanted [rad/s]. Not finite: brake to rest.
-            dt: Time until the next step [s].
-            jacobian: Of the tool centre point, linear rows first: enables its speed cap.
+            dt: Time until the next step [s]. A tensor outside (0, longest_step]: brake to
+                rest, by the last step that was within.
+            jacobian: Of the tool centre point, linear rows first: enables its speed cap. Not
+                finite: brake to rest.
             human_distance: Of the nearest person [m], who slows the tool down and stops it;
                 NaN, not known: stop. None: nobody is watched for.
             stop: Brake to rest for another reason.
             stale: The joint position is too old to be used: brake to rest.
             bounds: `velocity_bounds` of a trusted joint position, where they are known.
+                Not finite: brake to rest, as hard as the arm can.
 
         Returns:
             The velocity (*batch, n) [rad/s], the next state, and what was done.
 
         Raises:
-            ValueError: dt is not in (0, 1/rate], or a distance comes without a Jacobian.
+            ValueError: A number dt is not in (0, longest_step], or a distance comes without a
+                Jacobian.
         """
-        self._check_step(dt)
-        q, u, invalid, stopped = self._validated(
-            state, joint_position, joint_velocity_command, stop, stale
-        )
+        state, dt, invalid = self._validated_state(state, dt)
+        given = [joint_position, joint_velocity_command]
+        if jacobian is not None:
+            given.append(jacobian.flatten(-2))
+        invalid = invalid | ~is_number(torch.cat(given, dim=-1)).all(-1, keepdim=True)
+        if bounds is not None:
+            unknown = ~is_number(torch.cat(bounds, dim=-1)).all(-1, keepdim=True)
+            invalid = invalid | unknown
+            bounds = bounds[0].masked_fill(unknown, 0), bounds[1].masked_fill(unknown, 0)
+        if stale is not None:
+            invalid = invalid | stale.unsqueeze(-1)
+        stopped = torch.zeros_like(invalid) if stop is None else stop.unsqueeze(-1)
+        q = torch.where(invalid, state.position, joint_position)
+        u = joint_velocity_command.masked_fill(invalid | stopped, 0)
+        if jacobian is not None:
+            jacobian = jacobian.masked_fill(invalid.unsqueeze(-1), 0)
         bounds = bounds or self.velocity_bounds(q)
 
         excess = _excess(u, self.barrier.velocity)
@@ -206,34 +275,29 @@ class SafetyFilter(nn.Module):
                 velocity=v,
                 acceleration=acceleration,
                 position=q + v * dt,
+                dt=state.dt,
                 counts=state.counts + flags,
             ),
             SafetyReport(flags=flags),
         )
 
-    def _check_step(self, dt: float | Tensor) -> None:
-        if not isinstance(dt, Tensor) and not 0 < dt <= 1 / self.config.rate:
+    def _validated_state(
+        self, state: SafetyState, dt: float | Tensor
+    ) -> tuple[SafetyState, float | Tensor, Tensor]:
+        """A state of numbers, the step to compute with, and where either was invalid."""
+        known = is_number(torch.cat([state.velocity, state.acceleration], dim=-1))
+        invalid, longest = ~known.all(-1, keepdim=True), self.config.longest_step
+        state = self.restored(state)
+        if isinstance(dt, Tensor):
+            valid = (dt > 0) & (dt <= longest)
+            length = torch.where(valid, dt.to(state.dt), state.dt)
+            return replace(state, dt=length), length.unsqueeze(-1), invalid | ~valid
+        if not 0 < dt <= longest:
             raise ValueError(
-                f"the safety filter needs a step dt in (0, {1 / self.config.rate:g}] s to "
+                f"the safety filter needs a step dt in (0, {longest:g}] s to "
                 f"guarantee the limits, but got {dt:g} s; step faster or lower its rate"
             )
-
-    def _validated(
-        self,
-        state: SafetyState,
-        q: Tensor,
-        u: Tensor,
-        stop: Tensor | None,
-        stale: Tensor | None,
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Position and command to work with, and the flags `invalid` and `stopped`."""
-        invalid = ~torch.cat([q, u], dim=-1).isfinite().all(-1, keepdim=True)
-        if stale is not None:
-            invalid = invalid | stale.unsqueeze(-1)
-        stopped = torch.zeros_like(invalid) if stop is None else stop.unsqueeze(-1)
-        q = torch.where(invalid, state.position, q)
-        u = u.masked_fill(invalid | stopped, 0)
-        return q, u, invalid, stopped
+        return replace(state, dt=torch.full_like(state.dt, dt)), dt, invalid
 
     def _cap_tcp_speed(
         self, u: Tensor, jacobian: Tensor | None, human_distance: Tensor | None

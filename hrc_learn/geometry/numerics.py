@@ -7,7 +7,7 @@ argument, because a NaN there would reach the gradient as 0 * NaN.
 """
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 # Below it the series are exact to rounding in float64 (next term < 1e-16) while the closed
@@ -62,6 +62,15 @@ def safe_norm(vector: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
     square = (vector * vector).sum(-1)
     zero = square == 0
     return torch.where(zero, 0.0, torch.sqrt(torch.where(zero, 1.0, square)))
+
+
+# No measurement in SI units is as large. Squares of it fit into float32.
+_LARGEST_VALID = 1e12
+
+
+def is_number(x: Float[Tensor, "*shape"]) -> Bool[Tensor, "*shape"]:
+    """Where x is a number one can compute with: not NaN, not infinite, not absurdly large."""
+    return x.abs() < _LARGEST_VALID  # NaN compares false
 
 
 def polynomial(x: Tensor, coefficients: tuple[float, ...]) -> Tensor:
@@ -152,6 +161,25 @@ def solve_positive(
     return unrolled_solve(A, B)
 
 
+def null_projection(
+    J: Float[Tensor, "*batch m n"], w: Float[Tensor, "*batch n"]
+) -> Float[Tensor, "*batch n"]:
+    """The part of w that J maps to zero, to rounding: |J N w| <= 1e-14 |J| |w| or so.
+
+    By Householder's QR of J^T, which is as exact for a singular J as for a regular one; solving
+    with J J^T would square its condition. Where the rank is below m, what is left out is m
+    directions all the same: those of the range, and some of the null space.
+
+    Args:
+        J: With at least as many columns as rows.
+        w: To project.
+    """
+    if not torch.compiler.is_compiling():
+        Q = torch.linalg.qr(J.mT).Q
+        return w - (Q @ (Q.mT @ w.unsqueeze(-1))).squeeze(-1)
+    return unrolled_null_projection(J, w)
+
+
 def unrolled_matmul(
     A: Float[Tensor, "*#batch m k"], B: Float[Tensor, "*#batch k n"]
 ) -> Float[Tensor, "*batch m n"]:
@@ -190,6 +218,39 @@ def unrolled_inverse_norm(A: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*bat
             entry = _sum([M[k][i] * M[k][j] * inverse_d[k] for k in range(i, n)])
             square.append(entry * entry * (1 if i == j else 2))
     return _sum(square).sqrt()
+
+
+def unrolled_null_projection(
+    J: Float[Tensor, "*batch m n"], w: Float[Tensor, "*batch n"]
+) -> Float[Tensor, "*batch n"]:
+    """`null_projection` by the reflections that make J^T triangular, there and back."""
+    m = J.shape[-2]
+    columns = list(J.unbind(-2))
+    reflections: list[tuple[Tensor, Tensor]] = []
+    for k in range(m):
+        x = columns[k][..., k:]
+        norm = (x * x).sum(-1, keepdim=True).sqrt()
+        # Away from zero: no digits cancel.
+        v = torch.cat([x[..., :1] + torch.copysign(norm, x[..., :1]), x[..., 1:]], dim=-1)
+        square = (v * v).sum(-1, keepdim=True)
+        # A column of zeros needs no reflection.
+        factor = torch.where(square > 0, 2 / torch.where(square > 0, square, 1.0), 0.0)
+        reflections.append((v, factor))
+        for i in range(k + 1, m):
+            columns[i] = _reflected(columns[i], k, v, factor)
+    for k, (v, factor) in enumerate(reflections):
+        w = _reflected(w, k, v, factor)
+    w = torch.cat([torch.zeros_like(w[..., :m]), w[..., m:]], dim=-1)
+    for k in reversed(range(m)):
+        w = _reflected(w, k, *reflections[k])
+    return w
+
+
+def _reflected(x: Tensor, k: int, v: Tensor, factor: Tensor) -> Tensor:
+    """Mirror the entries of x from k on in the plane across v."""
+    rest = x[..., k:]
+    rest = rest - factor * (rest * v).sum(-1, keepdim=True) * v
+    return torch.cat([x[..., :k], rest], dim=-1)
 
 
 def _factors(A: Tensor) -> tuple[list[list[Tensor]], list[Tensor]]:

@@ -13,9 +13,10 @@ from typing import Any
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
+from torch.utils._pytree import tree_map
 
 from hrc_learn.geometry import Pose
-from hrc_learn.geometry.numerics import matmul
+from hrc_learn.geometry.numerics import is_number, matmul
 from hrc_learn.jacobian.network import RBFImageJacobian
 from hrc_learn.jacobian.samples import KeyFrameConfig, component_scale
 from hrc_learn.pytree import pytree
@@ -73,6 +74,12 @@ class ImageJacobianEstimator(nn.Module, ABC):
     def update(self, state: Any, measurement: Measurement) -> Any:
         """State after one control step."""
 
+    def restored(self, state: Any) -> Any:
+        """The state, as at the start where it is not of numbers."""
+        known = all_numbers(state.weight)
+        initial = self.network.weight.detach()
+        return replace(state, weight=torch.where(known, state.weight, initial))
+
     def resumed(self, state: Any, pause: float) -> Any:
         """State after a pause in which nobody watched.
 
@@ -100,6 +107,11 @@ class ImageJacobianEstimator(nn.Module, ABC):
         """The network's weights, once for each element of a batch."""
         weight = self.network.weight.detach()
         return weight.expand(*batch, *weight.shape).clone()
+
+
+def all_numbers(matrix: Float[Tensor, "*batch rows columns"]) -> Bool[Tensor, "*batch 1 1"]:
+    """Whether all entries are numbers."""
+    return is_number(matrix).all(-1, keepdim=True).all(-2, keepdim=True)
 
 
 def evaluate(
@@ -222,6 +234,23 @@ class KeyFrameEstimator[Config: LearningConfig](ImageJacobianEstimator):
         A projection on a convex set takes no estimate further from a truth inside the set.
         """
         return weight.clamp(-self.bound, self.bound)
+
+    def restored(self, state: Any) -> Any:
+        """Weights and key frame as at the start where they are not of numbers."""
+        state = super().restored(state)
+        key, batch = state.key, state.weight.shape[:-2]
+        pose = key.pose
+        numbers = torch.cat([pose.position, pose.orientation, key.feature, key.theta], dim=-1)
+        known = is_number(numbers).all(-1)
+        absent = KeyFrame.absent(self.network, *batch)
+        key = tree_map(
+            lambda x, none: torch.where(
+                known if x.dim() == known.dim() else known[..., None], x, none
+            ),
+            key,
+            absent,
+        )
+        return replace(state, key=key)
 
     def resumed(self, state: Any, pause: float) -> Any:
         """The same weights, and no key frame."""

@@ -24,6 +24,7 @@ from hrc_learn.jacobian.estimator import (
     Measurement,
     MotionSample,
     WeightState,
+    all_numbers,
     evaluate,
 )
 from hrc_learn.jacobian.fitting import weight_covariance
@@ -252,6 +253,12 @@ class RecursiveEstimator[Config: RecursiveConfig](KeyFrameEstimator[Config]):
             covariance=self.first_covariance.expand(*batch, *shape).clone(),
             key=KeyFrame.absent(self.network, *batch),
         )
+
+    def restored(self, state: RecursiveState) -> RecursiveState:
+        """As any other's; nor is more believed of initial weights than at the start."""
+        known = all_numbers(state.weight) & all_numbers(state.covariance)
+        covariance = torch.where(known, state.covariance, self.first_covariance)
+        return replace(super().restored(state), covariance=covariance)
 
 
 def condition(

@@ -19,6 +19,7 @@ from hrc_learn.controller import (
     SafetyState,
 )
 from hrc_learn.geometry import Pose, minimum_jerk, quaternion
+from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import (
     SerialChain,
     UnreachableError,
@@ -41,7 +42,8 @@ def resolved_rate(
 ) -> Float[Tensor, "*batch joints"]:
     """Joint velocities for a given twist, as close as possible to given joint velocities.
 
-    u = J^+ twist + N null_velocity, with N = I - J^+ J.
+    u = J^+ twist + N null_velocity. J^+ is damped near singularities, N is not: nowhere does
+    null-space motion move the end effector.
 
     Args:
         jacobian: Geometric Jacobian of the end effector.
@@ -49,8 +51,8 @@ def resolved_rate(
         null_velocity: Desired joint velocities; only their null-space part acts [rad/s].
     """
     J_pinv = pseudo_inverse(jacobian, singularity_damping(jacobian))
-    remaining = twist - (jacobian @ null_velocity.unsqueeze(-1)).squeeze(-1)
-    return null_velocity + (J_pinv @ remaining.unsqueeze(-1)).squeeze(-1)
+    task = (J_pinv @ twist.unsqueeze(-1)).squeeze(-1)
+    return task + null_projection(jacobian, null_velocity)
 
 
 def straight_line(
@@ -179,15 +181,22 @@ class PositionServo:
         self._chain, self._arm, self._dt = chain, arm, dt
         self._config = config = config or PositionServoConfig()
         self._filter = SafetyFilter(chain.limits, config.safety)
-        if not 0 < dt <= 1 / config.safety.rate:
+        if not 0 < dt <= config.safety.longest_step:
             raise ValueError(
-                f"targets must come within {1 / config.safety.rate:g} s of each other, but dt "
-                f"is {dt:g} s: raise the rate of frames."
+                f"targets must come within {config.safety.longest_step:g} s of each other, but "
+                f"dt is {dt:g} s: raise the rate of frames."
             )
         # Within the limits of the safety filter, which then has nothing to do.
         limits, margin = chain.limits, 1.5 * config.safety.margin
         self._smoother = ActionChunkFilter(
-            replace(limits, lower=limits.lower + margin, upper=limits.upper - margin), dt
+            replace(
+                limits,
+                lower=limits.lower + margin,
+                upper=limits.upper - margin,
+                acceleration=self._filter.barrier.acceleration,
+                jerk=self._filter.barrier.jerk,
+            ),
+            dt,
         )
         self.safety: SafetyState
         self._motion: ActionChunkState

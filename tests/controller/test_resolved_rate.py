@@ -42,6 +42,24 @@ def test_the_null_space_does_not_move_the_tool():
     assert (resolved_rate(J, zero, null)[1] - null).abs().max() < 1e-12
 
 
+def test_nor_does_it_where_the_task_is_damped():
+    """Anywhere within the limits, stretched out (rank 5), and next to that."""
+    rng = sampling.generator(5)
+    anywhere = sampling.within(panda.limits.lower, panda.limits.upper, 2000, rng=rng)
+    singular = torch.zeros(2, 7, dtype=torch.float64)
+    singular[1, 1] = 0.7
+    near = singular.repeat(100, 1) + 1e-3 * random(200, 7, rng=rng) ** 3
+    J = panda.jacobian(torch.cat([anywhere, singular, near]))
+    smallest = torch.linalg.svdvals(J)[:, -1]
+    assert (smallest < 0.05).sum() > 500
+    assert (smallest < 1e-9).any()
+    wish = random(len(J), 7, rng=rng)
+    _, null = resolved_rate(J, torch.zeros(len(J), 6, dtype=torch.float64), wish)
+    moved = (J @ null[..., None])[..., 0].norm(dim=-1)
+    assert (moved <= 1e-12 * wish.norm(dim=-1)).all()
+    assert null.norm(dim=-1).median() > 0.3
+
+
 def test_damping_is_zero_away_from_singularities_and_bounds_the_gain_at_them():
     rng = sampling.generator(2)
     U, V = torch.linalg.qr(random(6, 6, rng=rng))[0], torch.linalg.qr(random(7, 7, rng=rng))[0]

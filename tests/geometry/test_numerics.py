@@ -11,9 +11,11 @@ from hrc_learn.geometry.numerics import (
     Constant,
     inverse_norm,
     matmul,
+    null_projection,
     solve_positive,
     unrolled_inverse_norm,
     unrolled_matmul,
+    unrolled_null_projection,
     unrolled_solve,
 )
 
@@ -58,6 +60,30 @@ def test_a_nearly_singular_matrix_loses_no_more_digits_than_it_must():
     assert (error <= 10 * torch.finfo(DOUBLE).eps * torch.linalg.cond(A)).all()
 
 
+PROJECTIONS = [null_projection, unrolled_null_projection]
+
+
+@pytest.mark.parametrize("project", PROJECTIONS)
+@pytest.mark.parametrize("batch", BATCHES)
+@pytest.mark.parametrize(("m", "n"), [(6, 7), (3, 7), (6, 6), (1, 2)])
+def test_the_projection_is_that_of_the_svd(project, batch, m, n):
+    J, w = normal(*batch, m, n), normal(*batch, n, seed=1)
+    basis = torch.linalg.svd(J).Vh[..., m:, :]
+    expected = (basis.mT @ (basis @ w[..., None]))[..., 0]
+    torch.testing.assert_close(project(J, w), expected, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("project", PROJECTIONS)
+@pytest.mark.parametrize("rank", [0, 1, 4, 5])
+def test_a_singular_matrix_maps_its_null_space_to_zero_all_the_same(project, rank):
+    J, w = normal(50, 6, rank) @ normal(50, rank, 7, seed=1), normal(50, 7, seed=2)
+    left = project(J, w)
+    assert (J @ left[..., None]).abs().max() < 1e-12
+    assert (left.norm(dim=-1) <= w.norm(dim=-1) * (1 + 1e-12)).all()
+    torch.testing.assert_close(project(J, left), left, rtol=0, atol=1e-12)
+    assert left.norm(dim=-1).min() > 1e-4  # something of it is left
+
+
 @pytest.mark.parametrize("batch", BATCHES)
 def test_products_are_those_of_blas_and_broadcast(batch):
     A, B = normal(*batch, 3, 4), normal(4, 2, seed=1)
@@ -79,7 +105,8 @@ def test_gradients_are_exact_to_second_order():
 def test_what_is_traced_is_written_out():
     class All(torch.nn.Module):
         def forward(self, A: Tensor, B: Tensor) -> tuple[Tensor, ...]:
-            return matmul(A, B), solve_positive(A, B), inverse_norm(A)
+            null = null_projection(A[:3], B[:, 0])
+            return matmul(A, B), solve_positive(A, B), inverse_norm(A), null
 
     A, B = positive(6), normal(6, 2)
     with shapes_unchecked():

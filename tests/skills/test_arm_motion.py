@@ -30,6 +30,14 @@ def test_the_hand_moves_as_asked_and_the_body_as_far_as_it_can(batch):
     torch.testing.assert_close((null @ (wanted - u)[..., None])[..., 0], torch.zeros_like(u))
 
 
+def test_the_body_moves_without_the_hand_near_singularities_too():
+    J = panda.jacobian(random_configurations(500, seed=1))
+    assert (torch.linalg.svdvals(J)[:, -1] < 0.05).sum() > 50
+    u = resolved_rate(J, torch.zeros(500, 6, dtype=torch.float64), torch.ones_like(J[:, 0]))
+    assert (J @ u[..., None]).abs().max() < 1e-12
+    assert u.norm(dim=-1).median() > 0.1
+
+
 def test_near_a_singularity_velocities_stay_bounded():
     stretched = torch.tensor([0.0, 0.0, 0.0, -0.07, 0.0, 0.07, 0.0], dtype=torch.float64)
     pull = torch.tensor([0.0, 0.0, 1.0, 0.0, 0.0, 0.0], dtype=torch.float64)

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 _PATIENCE = 5.0
 """How long the last stop is tried [s]; each velocity ends by itself long before."""
+# From reading the joints to the arm following [s], as `Imperfections.nominal()`; not measured.
+_DELAY = 0.030
 
 
 @RobotConfig.register_subclass("franka_panda")
@@ -117,7 +119,7 @@ class FrankaPanda(PandaRobot):
         else:
             self._arm = open_arm()
             self.watchdog = Watchdog(config.timeout, self._arm.stop)
-        safety = SafetyConfig(tcp_speed=config.tcp_speed)
+        safety = SafetyConfig(tcp_speed=config.tcp_speed, braking=config.dynamics, delay=_DELAY)
         self._servo = PositionServo(
             panda, self._arm, self.dt, PositionServoConfig(safety=safety)
         )
