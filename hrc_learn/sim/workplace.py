@@ -21,6 +21,10 @@ def _vector(*values: float) -> Float[Tensor, " n"]:
 _LEANING_FORWARD = _vector(1.0, 0.3, -1.2, -1.8, 0.3, 1.9, -1.0)
 
 
+# Half the hand's thickness, and what is left under it for errors of base and encoders [m].
+_HAND_HALF, _OVER_BOARD = 0.030, 0.006
+
+
 @dataclass(frozen=True, kw_only=True)
 class Workplace:
     """Poses of the task in a scene. All in the base frame, gripper closing along x."""
@@ -164,6 +168,14 @@ class Workplace:
         height = cabinet.shelves[name] + b + self.clearance
         position = _vector(self.shelf_x, cabinet.front - self.shelf_depth, height)
         return Pose(position, coarse_orientation(position))
+
+    def lowering(self, half_size: tuple[float, float, float]) -> float:
+        """How far an object may be let down until the hand itself would be near the board [m].
+
+        Args:
+            half_size: Of the object, which lies on its side [m].
+        """
+        return max(half_size[1] + self.clearance - _HAND_HALF - _OVER_BOARD, 0.0)
 
     def shelf_front(self, name: str) -> Pose:
         """End effector in front of a shelf, at the height of the release."""

@@ -119,8 +119,6 @@ INTERACT, HOME, TRANSFER, RELEASE = Phase.INTERACT, Phase.HOME, Phase.TRANSFER, 
 # Delays and occlusions up to this are no recovery [s]: a few lost images, or a blink.
 _NEGLIGIBLE = 0.3
 # Time for the fingers to open and for the released object to come to rest [s].
-# How far below its goal an object is let down until it meets the board [m].
-_LOWERING = 0.02
 _RELEASE_TIME = 0.8
 
 
@@ -343,7 +341,7 @@ class PickAndPlace:
     def _release(self, job: PickPlaceJob) -> Phase:
         self._cell.begin_phase(Phase.RELEASE)
         below = Pose(job.goal.position.clone(), job.goal.orientation)
-        below.position[2] -= _LOWERING
+        below.position[2] -= self._workplace.lowering(job.item.half_size)
         self._cell.move_until_contact(below)
         job.release = self._cell.pose
         self._cell.gripper.move(OPEN)

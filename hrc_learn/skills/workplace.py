@@ -55,6 +55,13 @@ class Workplace(Protocol):
         """How far the palm stands back from the tool centre point [m]."""
         ...
 
+    def lowering(self, half_size: tuple[float, float, float]) -> float:
+        """How far an object of a size [m] may be let down from where it is released [m].
+
+        Further, the hand itself would meet the board.
+        """
+        ...
+
     @property
     def hover_turns(self) -> tuple[float, float]:
         """Least and greatest turn of the end effector about the vertical there [rad]."""

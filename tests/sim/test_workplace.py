@@ -53,3 +53,16 @@ def test_an_unreachable_pose_is_told_with_its_numbers():
     far = Pose(torch.tensor([0.4, -1.6, 0.4]).double(), WORKPLACE.shelf("middle").orientation)
     with pytest.raises(UnreachableError, match=r"-1\.600"):
         nearest_configuration(far, near=WORKPLACE.home_joints())
+
+
+def test_an_object_is_let_down_no_further_than_the_hand_is_clear_of_the_board():
+    workplace, hand = Workplace(), 0.030  # half as thick as the model's hand
+    for half in (0.034, 0.036, 0.040):
+        size = (0.022, half, 0.030)
+        release = (
+            workplace.shelf("middle", size).position[2]
+            - workplace.scene.cabinet.shelves["middle"]
+        )
+        left = float(release) - workplace.lowering(size) - hand
+        assert 0.005 < left < 0.0061
+    assert workplace.lowering((0.022, 0.020, 0.030)) == 0.0
