@@ -44,8 +44,9 @@ _PLATE_CLEARANCE = 0.06
 _CHECK_EVERY = 5
 # Largest distance of a joint from home that still counts as at home [rad].
 _AT_HOME = 0.05
-# By how much the table may be higher or lower than believed [m].
-_TABLE_RANGE = 0.05
+# By how much the table may be higher or lower than believed, and how far what stands on it may be
+# from where the object before it says [m].
+_TABLE_RANGE, _OBJECT_RANGE = 0.05, 0.015
 # Time for the fingers to close and for the grip to settle [s].
 _CLOSING_TIME = 0.7
 
@@ -135,7 +136,7 @@ class Grasping:
         self._lines = (lambda _: UP) if skill.target is None else skill.target.line
         self._config = config = config or GraspingConfig()
         self._check = check
-        self._table: float | None = None
+        self._table, self._table_range = 0.0, _TABLE_RANGE
         controller = AdaptiveController(
             cell.chain,
             estimator or from_learned(skill.jacobian),
@@ -247,9 +248,9 @@ class Grasping:
         """
         self._cell.begin_phase("grasp")
         self._cell.tracked_markers = ()
-        if self._table is None:
-            self._table = self._touch_table(item)
-        self._cell.move_straight(self._grasp_pose(item), speed=DESCENT_SPEED)
+        self._feel(item)
+        height = self._table + item.half_size[2]
+        self._cell.move_straight(self._at_height(height), speed=DESCENT_SPEED)
         self._cell.gripper.move(CLOSED)
         self._cell.hold_pose(_CLOSING_TIME)
         if not holds(self._cell, item):
@@ -257,21 +258,20 @@ class Grasping:
                 f"grasp: the fingers closed on nothing. Is {item.name!r} where its marker says?"
             )
 
-    def _touch_table(self, item: GraspObject) -> float:
-        """Height of the table [m], felt with the fingers about an object that stands on it.
+    def _feel(self, item: GraspObject) -> None:
+        """Feel, with the fingers about an object, how high what it stands on seems to be.
 
-        Its believed height where nothing is felt.
+        An object that is taller than believed makes the table seem higher, and is grasped as far
+        below its top as it should be. What is believed remains where nothing is felt.
         """
         # What is met first: the table by the fingers, or a tall object's top by the palm.
         reach = max(self._workplace.fingertip, 2 * item.half_size[2] - self._workplace.palm)
-        self._cell.move_straight(self._at_height(reach + _TABLE_RANGE), speed=DESCENT_SPEED)
-        met = self._cell.move_until_contact(self._at_height(reach - _TABLE_RANGE))
-        return 0.0 if met is None else float(met.position[2]) - reach
-
-    def _grasp_pose(self, item: GraspObject) -> Pose:
-        """Fingers around the object, from here along the end effector's own direction."""
-        assert self._table is not None
-        return self._at_height(self._table + item.half_size[2])
+        expected, margin = self._table + reach, self._table_range
+        self._cell.move_straight(self._at_height(expected + margin), speed=DESCENT_SPEED)
+        met = self._cell.move_until_contact(self._at_height(expected - margin))
+        if met is not None:
+            self._table = float(met.position[2]) - reach
+            self._table_range = _OBJECT_RANGE
 
     def _at_height(self, height: float) -> Pose:
         """The end effector at a height [m], from here along its own direction."""
