@@ -175,7 +175,8 @@ def assert_recovered(
         assert 0.5 < speed < 2, (name, speed)
         ends = scene.start[0] + DT * torch.stack([velocities[:, arm], clean]).sum(1)
         apart = panda.forward(ends[0]).twist_to(panda.forward(ends[1])).norm()
-        assert apart < 0.01, (name, apart)
+        # The box is 0.24 m wide: an arm that approaches anew may end elsewhere in it.
+        assert apart < 0.03, (name, apart)
 
 
 @pytest.mark.parametrize("tick", [0, 30])
