@@ -1,6 +1,7 @@
 """A program that moves an arm: `loop_on_stubborn_arm.py KIND LOG HOLD`."""
 
 import ctypes
+import signal
 import sys
 import time
 from functools import partial
@@ -12,6 +13,10 @@ from stubborn_arm import StubbornArm
 from hrc_learn.hardware import ArmProcess, ending_at_rest
 
 PERIOD, TIMEOUT = 0.01, 0.2
+
+# As at a terminal: shells start jobs in the background deaf to these.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 def drive(arm, hold: float) -> None:

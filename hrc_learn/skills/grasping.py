@@ -44,8 +44,8 @@ _PLATE_CLEARANCE = 0.06
 _CHECK_EVERY = 5
 # Largest distance of a joint from home that still counts as at home [rad].
 _AT_HOME = 0.05
-# By how much the table may be higher or lower than believed, and how far what stands on it may be
-# from where the object before it says [m].
+# By how much the table may be higher or lower than believed, and, once it was felt, than the
+# object before said [m].
 _TABLE_RANGE, _OBJECT_RANGE = 0.05, 0.015
 # Time for the fingers to close and for the grip to settle [s].
 _CLOSING_TIME = 0.7
@@ -261,8 +261,8 @@ class Grasping:
     def _feel(self, item: GraspObject) -> None:
         """Feel, with the fingers about an object, how high what it stands on seems to be.
 
-        An object that is taller than believed makes the table seem higher, and is grasped as far
-        below its top as it should be. What is believed remains where nothing is felt.
+        An object that is taller than believed makes the table seem higher, and is grasped as
+        far below its top as it should be. What is believed remains where nothing is felt.
         """
         # What is met first: the table by the fingers, or a tall object's top by the palm.
         reach = max(self._workplace.fingertip, 2 * item.half_size[2] - self._workplace.palm)

@@ -7,8 +7,11 @@ import sys
 import pytest
 
 PROGRAM = """
-import sys, time
+import signal, sys, time
 from hrc_learn.cli._run import status_of
+
+# As at a terminal: shells start jobs in the background deaf to it.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 def work():
     try:

@@ -201,7 +201,9 @@ def test_home_begins_the_scenario_anew(simulated, served):
 @pytest.fixture
 def franka(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "franky", fake_franky)
-    config = FrankaPandaConfig(calibration_dir=tmp_path, ip="x", fps=20.0, timeout=600.0)
+    config = FrankaPandaConfig(
+        calibration_dir=tmp_path, ip="x", fps=20.0, timeout=600.0, own_process=False
+    )
     robot = make_robot_from_config(config)
     robot.connect()
     return robot
