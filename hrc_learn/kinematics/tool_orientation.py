@@ -18,7 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.store import new_file
+from hrc_learn.store import write_text
 
 NEAR = 0.05
 """Length of the last stretch of a path, whose direction is its tangent there [m]."""
@@ -132,8 +132,7 @@ class Approach:
             "spread_rad": self.spread,
             "turned_rad": self.turned,
         }
-        with new_file(path) as part:
-            part.write_text(json.dumps(content, indent=2), encoding="utf-8")
+        write_text(path, json.dumps(content, indent=2))
 
     @classmethod
     def load(cls, path: Path) -> "Approach":

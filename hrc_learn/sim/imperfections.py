@@ -178,7 +178,6 @@ class DrawnImperfections:
     """Rotation vector in the hand's frame [rad]."""
     table_height: float
     """Height of the table's top above where it is believed to be [m]."""
-
     object_heights: Float[np.ndarray, " objects"]
     """By which each object is higher than believed [m]."""
 

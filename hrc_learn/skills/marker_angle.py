@@ -22,8 +22,9 @@ from torch import Tensor
 
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import KalmanConfig, KalmanEstimator, Measurement, RBFImageJacobian
+from hrc_learn.jacobian.learning_estimators import RecursiveState
 from hrc_learn.kinematics.tool_orientation import turn_about_vertical
-from hrc_learn.store import new_file
+from hrc_learn.store import write_text
 
 HALF_TURN = math.pi
 """Turns of the gripper that a parallel grasp cannot tell apart [rad]."""
@@ -77,11 +78,9 @@ class MarkerAngle:
         for demonstration in demonstrations:
             state = estimator.resumed(state, 0.0)
             for k in torch.isfinite(demonstration.tool).nonzero()[:, 0]:
-                # Differences are what is learned from: the key frame's turn is the reference.
-                seen = demonstration.tool[k]
-                if bool(state.key.present):
-                    seen = _nearest(seen, state.key.feature[0], 2 * math.pi)
-                state = estimator.update(state, _measured(demonstration.pose[k], seen, 0.0))
+                state = _updated(
+                    estimator, state, demonstration.pose[k], demonstration.tool[k], 0.0
+                )
         learned = _guess()
         learned.weight.data = state.weight
         differences = np.array([d.final - d.item for d in demonstrations])
@@ -95,8 +94,7 @@ class MarkerAngle:
         """Write `folder/angle` and `folder/angle.json`."""
         self.jacobian.save(folder / "angle")
         content = {"version": 1, "offset_rad": self.offset, "spread_rad": self.spread}
-        with new_file(folder / "angle.json") as part:
-            part.write_text(json.dumps(content, indent=2), encoding="utf-8")
+        write_text(folder / "angle.json", json.dumps(content, indent=2))
 
     @classmethod
     def load(cls, folder: Path) -> MarkerAngle:
@@ -138,9 +136,7 @@ class AngleServo:
             dt: Time since the image before [s].
         """
         seen = torch.tensor(angle, dtype=torch.float64)
-        if bool(self._state.key.present):
-            seen = _nearest(seen, self._state.key.feature[0], 2 * math.pi)
-        self._state = self._estimator.update(self._state, _measured(pose, seen, dt))
+        self._state = _updated(self._estimator, self._state, pose, seen, dt)
 
     def turned(
         self,
@@ -187,10 +183,6 @@ def _wrapped(angle: float) -> float:
     return float((angle + HALF_TURN / 2) % HALF_TURN - HALF_TURN / 2)
 
 
-def _nearest(angle: Tensor, reference: Tensor, period: float) -> Tensor:
-    return reference + torch.remainder(angle - reference + period / 2, period) - period / 2
-
-
 def _guess() -> RBFImageJacobian:
     row = torch.tensor([[0.0, 0, 0, 0, 0, _FROM_ABOVE]], dtype=torch.float64)
     centre = torch.zeros(1, 2, dtype=torch.float64)
@@ -212,8 +204,15 @@ def _estimator(network: RBFImageJacobian) -> KalmanEstimator:
     return KalmanEstimator(network, config)
 
 
-def _measured(pose: Pose, angle: Tensor, dt: float) -> Measurement:
-    return Measurement(
+def _updated(
+    estimator: KalmanEstimator, state: RecursiveState, pose: Pose, angle: Tensor, dt: float
+) -> RecursiveState:
+    """State of the estimator after an image."""
+    if bool(state.key.present):
+        # Differences to the key frame are what is learned from: less than half a turn each.
+        before = state.key.feature[0]
+        angle = before + torch.remainder(angle - before + math.pi, 2 * math.pi) - math.pi
+    measured = Measurement(
         pose=pose,
         feature=angle.reshape(1),
         valid=torch.tensor(True),
@@ -221,3 +220,4 @@ def _measured(pose: Pose, angle: Tensor, dt: float) -> Measurement:
         xi_x=torch.zeros(1, dtype=torch.float64),
         xi_r=torch.zeros(6, dtype=torch.float64),
     )
+    return estimator.update(state, measured)

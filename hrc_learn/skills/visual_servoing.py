@@ -1,7 +1,7 @@
 """Image-based visual servoing to an object with an uncalibrated camera.
 
-`VisualServo` runs the adaptive controller in a work cell; `VisualServoSkill` is what it needs
-from demonstrations: the image Jacobian, the visual target and the approach direction.
+`VisualServo` runs the adaptive controller in a work cell until the marker is at its target, and
+turns the gripper for the object. What it needs from demonstrations is in `visual_skill`.
 """
 
 import math
@@ -218,7 +218,9 @@ class VisualServo:
             reached = self._converge(target, config.tolerance, start)
             if config.probe == 0:
                 break
-            if target.deviation(self._cell.pose, above) < config.probe_reach:
+            # Along the line of the turned tool, which leads elsewhere than when not turned.
+            turned = replace(target, orientation=self._turned)
+            if turned.deviation(self._cell.pose, above) < config.probe_reach:
                 break
         return reached - start
 

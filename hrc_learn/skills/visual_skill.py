@@ -34,7 +34,7 @@ from hrc_learn.jacobian import (
 )
 from hrc_learn.kinematics.tool_orientation import Approach
 from hrc_learn.skills.marker_angle import MarkerAngle
-from hrc_learn.store import new_file
+from hrc_learn.store import write_text
 
 OBJECT_FEATURE = "observation.object_feature"
 """Column of a dataset with the object's marker in the image."""
@@ -124,8 +124,7 @@ class VisualTarget:
         """Write to a JSON file, whole or not at all."""
         error = None if np.isnan(self.error) else self.error
         content = {"version": 2, "offset_m": self.offset.tolist(), "error_px": error}
-        with new_file(path) as part:
-            part.write_text(json.dumps(content, indent=2), encoding="utf-8")
+        write_text(path, json.dumps(content, indent=2))
 
     @classmethod
     def load(cls, path: Path) -> "VisualTarget":

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import panda
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills import MarkerObservation, ServoTarget, VisualServo, VisualServoConfig
@@ -72,3 +73,44 @@ def test_a_probe_comes_down_at_its_speed_from_where_it_begins():
     assert heights[0] == CONFIG.probe
     np.testing.assert_allclose(np.diff(heights), -CONFIG.probe_speed * 0.01)
     assert 0 < heights[-1] <= CONFIG.probe_speed * 0.01 * (1 + 1e-9)
+
+
+@pytest.mark.parametrize(("astray", "probes"), [(0.0, 1), (0.03, CONFIG.max_probes)])
+def test_a_turned_tool_that_stays_on_its_own_line_is_not_probed_again(astray, probes):
+    """The line leads elsewhere for a turned tool; only what leaves that one counts."""
+    above = Workplace().hover()
+    about = quaternion.exp(torch.tensor([0.0, 0.0, 1.2], dtype=torch.float64))
+    turned = quaternion.multiply(about, above.orientation)
+
+    def line(orientation):
+        """Leans by 45 degrees to the side on which the tool carries its marker."""
+        side = quaternion.to_matrix(orientation)[:, 1].numpy()
+        return np.add(side, [0.0, 0.0, 1.0]) / np.sqrt(2)
+
+    servo, descents = VisualServo.__new__(VisualServo), []
+    servo._config, servo._turned, servo._resume = CONFIG, turned, lambda: None
+    servo._cell = SimpleNamespace(time=0.0, pose=above)
+    along = torch.from_numpy(line(turned) / line(turned)[2])
+    start = Pose(above.position + CONFIG.probe * along, turned)
+    aside = torch.tensor([astray, 0.0, 0.0], dtype=torch.float64)
+
+    def descend(_target):
+        descents.append(servo._cell.pose)
+        servo._cell.pose = Pose(above.position + aside, turned)
+
+    def converge(target, *_):
+        if target.raised:
+            servo._cell.pose = start
+        return 0.0
+
+    servo._descend, servo._converge = descend, converge
+    servo.servo_to(
+        ServoTarget(
+            config=CONFIG,
+            above=above,
+            posture=None,
+            target=lambda J, orientation: J,
+            lines=line,
+        )
+    )
+    assert len(descents) == probes
