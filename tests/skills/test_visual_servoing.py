@@ -88,22 +88,22 @@ def test_a_turned_tool_that_stays_on_its_own_line_is_not_probed_again(astray, pr
         return np.add(side, [0.0, 0.0, 1.0]) / np.sqrt(2)
 
     servo, descents = VisualServo.__new__(VisualServo), []
-    servo._config, servo._turned, servo._resume = CONFIG, turned, lambda: None
-    servo._cell = SimpleNamespace(time=0.0, pose=above)
+    cell = SimpleNamespace(time=0.0, pose=above)
     along = torch.from_numpy(line(turned) / line(turned)[2])
     start = Pose(above.position + CONFIG.probe * along, turned)
     aside = torch.tensor([astray, 0.0, 0.0], dtype=torch.float64)
 
     def descend(_target):
-        descents.append(servo._cell.pose)
-        servo._cell.pose = Pose(above.position + aside, turned)
+        descents.append(cell.pose)
+        cell.pose = Pose(above.position + aside, turned)
 
     def converge(target, *_):
         if target.raised:
-            servo._cell.pose = start
+            cell.pose = start
         return 0.0
 
-    servo._descend, servo._converge = descend, converge
+    vars(servo).update(_config=CONFIG, _turned=turned, _cell=cell, _resume=lambda: None)
+    vars(servo).update(_descend=descend, _converge=converge)
     servo.servo_to(
         ServoTarget(
             config=CONFIG,
