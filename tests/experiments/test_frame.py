@@ -152,7 +152,7 @@ def test_a_missed_bound_and_a_task_given_up_are_failures_with_reasons(work):
     status, values, _, shown = work(ThrowExperiment(bound=1e-6))
     assert status == 1
     assert values["success_rate"] == 0
-    assert "error: 1.26 mm, but ≤ 1e-06 mm is wanted (it landed at 1.00 m)" in shown.err
+    assert "error: 1.3 mm, but ≤ 1e-06 mm is wanted (it landed at 1.00 m)" in shown.err
     status, values, _, shown = work(ThrowExperiment(gives_up=True), "other")
     assert (status, values["success_rate"]) == (1, 0)
     assert shown.err == "failed: the ball was dropped\n"
@@ -251,6 +251,34 @@ def test_a_metric_of_a_part_keeps_its_bound_unless_it_is_only_compared():
     assert evaluation.values == {"error_mm": 2.0, "theirs_error_mm": 3.0}
     assert [m.ok for m in evaluation.table] == [False, None]
     assert len(evaluation.faults) == 1
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "shown"),
+    [
+        (0.0283, "mm", "< 0.1 mm"),
+        (-0.0283, "mm", "< 0.1 mm"),
+        (6.564, "mm", "6.6 mm"),
+        (116.2, "mm", "116 mm"),
+        (0.00052, "deg", "< 0.02 deg"),
+        (0.5712, "deg", "0.57 deg"),
+        (0.0259, "px", "< 0.1 px"),
+        (math.nan, "mm", "nan mm"),
+        (0.000459, "", "0.000459"),
+    ],
+)
+def test_no_digits_below_the_resolution_are_shown_but_all_are_kept(value, unit, shown):
+    metric = Metric("error", lambda x: x, unit).of_part(lambda x: x)
+    evaluation = evaluate([metric], value)
+    assert [m.shown for m in evaluation.table] == [shown]
+    assert list(evaluation.values.values()) == pytest.approx([value], abs=0, nan_ok=True)
+
+
+def test_a_bound_missed_by_less_than_the_resolution_does_not_look_kept():
+    metric = Metric("error", lambda x: x, "mm", at_most=2.0)
+    assert [m.shown for m in evaluate([metric], 2.04).table] == ["2.04 mm"]
+    coarse = Metric("error", lambda x: x, "mm", resolution=0.5)
+    assert [m.shown for m in evaluate([coarse], 0.4).table] == ["< 0.5 mm"]
 
 
 def test_rows_that_are_not_listed_are_measured_and_nan_keeps_no_bound():
