@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hrc_learn.kinematics import panda
+from hrc_learn.vision import ImageNoise
 
 # pyright: reportAttributeAccessIssue=false
 # MuJoCo ships no type stubs; its names come from a compiled module.
@@ -74,6 +75,8 @@ class Imperfections:
     """Range of the height of each object [m]. Nominal 5 mm."""
     object_yaw: float = 0.0
     """Range of the yaw of objects on the table [rad]. Nominal: any."""
+    teaching_error: float = 0.0
+    """Range of a place to which a person leads the arm, along each axis [m]. Nominal 0.5 mm."""
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -116,6 +119,7 @@ class Imperfections:
             table_height=0.02,
             object_height=0.005,
             object_yaw=math.pi,
+            teaching_error=5e-4,
         )
 
     def scaled(self, factor: float) -> Imperfections:
@@ -129,6 +133,13 @@ class Imperfections:
         values["slowness"] = min(values["slowness"], 0.9)
         values["object_yaw"] = min(values["object_yaw"], math.pi)
         return Imperfections(**values)
+
+    @property
+    def camera_noise(self) -> ImageNoise:
+        """Of images, the camera's own included."""
+        return ImageNoise(
+            blur=ImageNoise.blur + self.image_blur, noise=ImageNoise.noise + self.image_noise
+        )
 
     def draw(self, rng: np.random.Generator, joints: int = 7) -> DrawnImperfections:
         """What they are in one run.
