@@ -161,7 +161,9 @@ def simulate_collaboration(
         delay=max(cell_config.latency.delay, sizes.image_delay),
         frame_loss=max(cell_config.latency.frame_loss, sizes.image_loss),
     )
-    cell_config = replace(cell_config, latency=latency)
+    safety = sizes.plant(cell_config.safety)
+    cell_config = replace(cell_config, latency=latency, safety=safety)
+    config = _on_plant(config or PickAndPlaceConfig(), sizes)
     noise = ImageNoise(
         blur=ImageNoise.blur + sizes.image_blur, noise=ImageNoise.noise + sizes.image_noise
     )
@@ -229,6 +231,13 @@ def simulate_collaboration(
         cameras=tuple(eyes.history),
         disturbances=disturbances,
     )
+
+
+def _on_plant(config: PickAndPlaceConfig, sizes: Imperfections) -> PickAndPlaceConfig:
+    """The controller's safety filter is told what the arm can do, too."""
+    law = config.grasping.controller
+    law = replace(law, safety=sizes.plant(law.safety))
+    return replace(config, grasping=replace(config.grasping, controller=law))
 
 
 def with_objects(workplace: Workplace, items: Sequence[ObjectConfig]) -> Workplace:
