@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from hrc_learn.controller import SafetyConfig
 from hrc_learn.kinematics import panda
 from hrc_learn.vision import ImageNoise
 
@@ -140,6 +141,12 @@ class Imperfections:
         return ImageNoise(
             blur=ImageNoise.blur + self.image_blur, noise=ImageNoise.noise + self.image_noise
         )
+
+    def plant(self, safety: SafetyConfig) -> SafetyConfig:
+        """Settings of a safety filter that is told what this arm's driver does."""
+        # Of normally distributed delays one in 700 is more than three deviations late.
+        delay = self.command_delay + 3 * self.command_jitter + self.servo_lag
+        return replace(safety, braking=1 - self.slowness, delay=delay)
 
     def draw(self, rng: np.random.Generator, joints: int = 7) -> DrawnImperfections:
         """What they are in one run.

@@ -299,6 +299,9 @@ def simulate_grasp(
     sizes = world.imperfections.sizes
     eye = open_camera(world, camera, rng=rng, noise=sizes.camera_noise)
     latency = LatencyConfig(delay=sizes.image_delay, frame_loss=sizes.image_loss)
+    config = config or GraspingConfig()
+    law = replace(config.controller, safety=sizes.plant(config.controller.safety))
+    config = replace(config, controller=law)
 
     def check(plan: Plan) -> None:
         check_plan(plan, world, item.name if world.holds(item.name) else None)
@@ -312,7 +315,7 @@ def simulate_grasp(
             sensor=MarkerSensor(eye, workplace.scene.marker_ids),
             human=ScriptedPerturbation(panda, (), begin=None),
             advance=motion.advance,
-            config=WorkCellConfig(latency=latency),
+            config=WorkCellConfig(latency=latency, safety=sizes.plant(WorkCellConfig().safety)),
             rng=rng,
         )
         above = scene.above()

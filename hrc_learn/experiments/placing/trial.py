@@ -31,7 +31,7 @@ from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.arm_motion import nearest_configuration
 from hrc_learn.skills.grasping import OPEN
 from hrc_learn.skills.placing import PlaceCorrection, PlacingSkill, Plan, PlanningSpace
-from hrc_learn.skills.work_cell import TaskFailedError, WorkCell
+from hrc_learn.skills.work_cell import TaskFailedError, WorkCell, WorkCellConfig
 from hrc_learn.teleoperation import ScriptedPerturbation
 
 TRANSFER, RELEASE, RETREAT = "transfer", "release", "retreat"
@@ -129,6 +129,9 @@ def place(
         gripper=world.arm,
         human=ScriptedPerturbation(panda, ()),
         advance=motion.advance,
+        config=WorkCellConfig(
+            safety=world.imperfections.sizes.plant(WorkCellConfig().safety),
+        ),
     )
     with torch.inference_mode(), view(cell, world, motion):
         plan = skill.plan(cell.joints, read, space=space, dt=cell.config.dt, speed=speed)
