@@ -66,12 +66,13 @@ def true_image_jacobian(
 
 def true_tool(motion: MotionLog, world: World, steps: int) -> Pose:
     """Poses of the tool as the simulator knows them, whatever the encoders say, (time,)."""
-    hand = _body(motion, "hand", steps)
+    hand = body_poses(motion, "hand", steps)
     # The hand itself may be mounted askew; the tool centre point lies along its axis.
     return Pose(hand.apply(torch.from_numpy(world.arm.tool_offset)), hand.orientation)
 
 
-def _body(motion: MotionLog, name: str, steps: int) -> Pose:
+def body_poses(motion: MotionLog, name: str, steps: int) -> Pose:
+    """Poses of a link or an object in the first steps of a run, (time,)."""
     (body,) = (body for body in motion.bodies(steps) if body.name == name)
     return Pose(torch.from_numpy(body.position), torch.from_numpy(body.orientation))
 
@@ -109,7 +110,7 @@ class Deviation:
         rows = within & (np.arange(len(time)) >= first) & bool(pushed.any())
         tool = true_tool(motion, world, len(time))
         # The frame of joint 4 is where the elbow is.
-        elbow = _body(motion, f"link{ELBOW + 1}", len(time))
+        elbow = body_poses(motion, f"link{ELBOW + 1}", len(time))
 
         def distance(pose: Pose) -> Float[np.ndarray, " time"]:
             away = (pose.position - pose.position[first]).norm(dim=-1).numpy()
@@ -135,12 +136,15 @@ def limit_violations(cell: WorkCell) -> int:
 
 
 def unwanted_contacts(
-    world: World, released: Mapping[str, float] | None = None
+    world: World, log: LoggedSteps, released: Mapping[str, float] | None = None
 ) -> dict[str, tuple[Touch, ...]]:
     """Contacts of the arm and of what it carried, by what was met.
 
+    The fingertips may touch the table while the arm feels how high it is.
+
     Args:
         world: As the run left it.
+        log: The run's.
         released: When each object was let go on its shelf [s]: what it touches from then on is
             wanted.
     """
@@ -150,9 +154,18 @@ def unwanted_contacts(
         for touch in world.object_contacts.touches
         if touch.start < released.get(touch.first, math.inf)
     ]
+    grasps = spans(log, "grasp")
+    hit = (
+        touch
+        for touch in world.table_contacts.touches
+        if not (
+            touch.first.startswith("finger")
+            and any(start <= touch.start < end for start, end in grasps)
+        )
+    )
     return {
         "cabinet": (*world.cabinet_contacts.touches, *carried),
-        "table": tuple(world.table_contacts.touches),
+        "table": tuple(hit),
         "arm itself": tuple(world.self_contacts.touches),
     }
 

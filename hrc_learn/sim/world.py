@@ -1,5 +1,6 @@
 """The workplace in motion: a MuJoCo world to reset, to advance and to ask who touches whom."""
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
@@ -102,6 +103,11 @@ class ContactMonitor:
         return found
 
 
+_PADS = ("finger_left_pad", "finger_right_pad")
+# A tenth of a millimetre apart still counts as touching [m].
+_TOUCHING = 1e-4
+# Cosine of the angle between the normal of a contact and that of a flat face: of 3 degrees.
+_FLAT = math.cos(math.radians(3.0))
 _ARM_BODIES = ("link1",)  # the tree from link 1 on, hand and fingers included
 
 
@@ -245,7 +251,24 @@ class World:
 
     def holds(self, name: str) -> bool:
         """Whether both finger pads touch an object."""
-        return {"finger_left_pad", "finger_right_pad"} <= self._partners(name)
+        return self._partners(name) >= {*_PADS}
+
+    def holds_flat(self, name: str) -> bool:
+        """Whether the pads press on opposite faces of an object, those that its x axis leads
+        out of: not on its edges, nor across it.
+        """
+        item, axis = self.model.geom(name).id, self.object_pose(name)[:3, 0]
+        pads = {self.model.geom(pad).id: set() for pad in _PADS}
+        for contact in self.data.contact:
+            pair = contact.geom.tolist()
+            if item not in pair or contact.dist >= _TOUCHING:
+                continue
+            (other,) = {*pair} - {item}
+            if other in pads:
+                # MuJoCo's normals point from the first geom to the second.
+                out = 1 if pair[0] == item else -1
+                pads[other].add(_face(out * float(contact.frame[:3] @ axis)))
+        return sorted(tuple(faces) for faces in pads.values()) == [(-1,), (1,)]
 
     def rests_on(self, name: str, board: str) -> bool:
         """Whether an object touches a piece of furniture and nothing of the arm."""
@@ -255,8 +278,7 @@ class World:
     def _partners(self, name: str) -> set[str]:
         """Geoms that touch an object's."""
         target = self.model.geom(name).id
-        # A tenth of a millimetre apart still counts as touching.
-        pairs = self.data.contact.geom[self.data.contact.dist < 1e-4]
+        pairs = self.data.contact.geom[self.data.contact.dist < _TOUCHING]
         return {
             self.model.geom(int(g)).name for pair in pairs if target in pair for g in pair
         } - {name}
@@ -318,6 +340,11 @@ class World:
             for monitor in monitors:
                 monitor.update(data)
         return [touch for monitor in monitors for touch in monitor.touches]
+
+
+def _face(along: float) -> int:
+    """Which face a contact lies on, by the cosine of its normal: 1, -1, or 0 for neither."""
+    return 0 if abs(along) < _FLAT else int(math.copysign(1, along))
 
 
 def _put(data: mujoco.MjData, name: str, pose: Float[np.ndarray, "4 4"]) -> None:

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -96,6 +98,28 @@ def test_a_held_object_stays_in_the_hand_while_the_arm_swings(world, workplace):
     after = np.linalg.inv(world.arm.tcp_pose()) @ world.object_pose("box")
     assert world.holds("box")
     assert np.linalg.norm(after[:3, 3] - before[:3, 3]) < 2e-3
+
+
+@pytest.mark.parametrize(
+    ("yaw", "flat"), [(0, True), (180, True), (2, True), (45, False), (90, False)]
+)
+def test_only_a_grip_by_the_faces_across_the_x_axis_is_flat(workplace, yaw, flat):
+    """Slight turns are straightened by the closing pads; a diagonal grip hangs by its edges, and
+    at a quarter turn the pads press on the other faces."""
+    item = replace(workplace.scene.objects[0], half_size=(0.018, 0.030, 0.030))
+    world = World(replace(workplace.scene, objects=(item,)))
+    world.model.body_gravcomp[world.model.body("box").id] = 1.0  # it floats until it is held
+    home = workplace.home_joints().numpy()
+    world.reset(home)
+    c, s = np.cos(np.deg2rad(yaw)), np.sin(np.deg2rad(yaw))
+    in_hand = np.array([[s, c, 0, 0], [c, -s, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
+    world.reset(home, {"box": world.arm.tcp_pose() @ in_hand})
+    assert not world.holds("box")
+    assert not world.holds_flat("box")
+    world.arm.move(0.0)
+    world.advance(1.0)
+    assert world.holds("box")
+    assert world.holds_flat("box") == flat
 
 
 def test_an_object_let_go_above_a_board_comes_to_rest_on_it(world, workplace):

@@ -4,25 +4,21 @@ Success is read from the simulator's contacts and poses, not from what the task 
 """
 
 from collections import Counter
-from collections.abc import Callable, Sequence
-from typing import NamedTuple, get_args
+from collections.abc import Callable, Collection, Sequence
+from typing import get_args
 
 import numpy as np
-import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from hrc_learn.experiments.collaboration.trial import CollaborationRun
+from hrc_learn.experiments.grip import Hold, grasp_offset, hold, place_angle
 from hrc_learn.experiments.metric_table import Metric, median, p95, success_rate
 from hrc_learn.experiments.monte_carlo import Trial
 from hrc_learn.experiments.run_recording import (
     Deviation,
     limit_violations,
     spans,
-    true_tool,
     unwanted_contacts,
 )
-from hrc_learn.geometry import quaternion
 from hrc_learn.sim import Touch
 from hrc_learn.skills.pick_and_place import HOME, RELEASE, Mishap, PickPlaceJob
 
@@ -56,9 +52,26 @@ def collaboration_metrics(
             "px",
             at_most=5.0,
         ),
-        Metric("grasp offset", _grasp_offset, "mm"),
-        Metric("object tilt in the hand", lambda run: _held(run).tilt, "deg", at_most=3.0),
-        Metric("slip in the hand", lambda run: _held(run).slip, "mm", at_most=3.0),
+        Metric("grasp offset", lambda run: max(_grasp_offsets(run), default=None), "mm"),
+        Metric(
+            "object tilt in the hand",
+            lambda run: max((np.rad2deg(h.tilt) for h in _holds(run)), default=None),
+            "deg",
+            at_most=3.0,
+        ),
+        Metric(
+            "slip in the hand",
+            lambda run: max((1e3 * h.slip for h in _holds(run)), default=None),
+            "mm",
+            at_most=3.0,
+        ),
+        Metric(
+            "objects held flat between both pads",
+            lambda run: len(run.held_flat),
+            at_least=objects,
+            essential=True,
+            detail=lambda run: _all_but(run, run.held_flat),
+        ),
         Metric("place error", lambda run: _placed(run)[0], "mm", at_most=5.0),
         Metric("place tilt", lambda run: _placed(run)[1], "deg", at_most=3.0),
         Metric(
@@ -98,7 +111,7 @@ def collaboration_metrics(
             at_least=objects,
             claim="three objects, one after the other (Experiment 3)",
             essential=True,
-            detail=_fallen,
+            detail=lambda run: _all_but(run, _standing(run)),
         ),
         Metric(
             "end effector deviation",
@@ -153,61 +166,29 @@ def _pushed(run: CollaborationRun, of: Callable[[Deviation], np.ndarray]) -> flo
     return float(np.nan_to_num(of(deviation)).max())
 
 
-def _grasp_offset(run: CollaborationRun) -> float | None:
-    """Horizontal distance of end effector and object at the last descent, worst object [mm]."""
+def _grasp_offsets(run: CollaborationRun) -> list[float]:
+    """Horizontal distance of end effector and object at the last descent, each object [mm]."""
     log, offsets = run.cell.log, []
-    bodies = {body.name: body.position for body in run.motion.bodies()}
-    tool = true_tool(run.motion, run.world, len(log)).position.numpy()
     for pick in run.picks:
         begin, end = pick.span
         descents = [t for t, _ in spans(log, "grasp") if begin <= t < end]
-        if pick.release is None or not descents:
-            continue
-        # The last attempt: earlier ones missed the object or lost it.
-        step = int(np.searchsorted(log["time"], descents[-1]))
-        offsets.append(np.linalg.norm((tool[step] - bodies[pick.item.name][step])[:2]))
-    return 1e3 * float(max(offsets)) if offsets else None
+        if pick.release is not None and descents:
+            # The last attempt: earlier ones missed the object or lost it.
+            offset = grasp_offset(log, run.motion, run.world, pick.item.name, descents[-1])
+            offsets.append(1e3 * offset)
+    return offsets
 
 
-class _Hold(NamedTuple):
-    """How objects hung in the hand, the worst of them; None where none was carried."""
-
-    tilt: float | None
-    """Angle from how they were to be held [deg]."""
-    slip: float | None
-    """How far one moved between the fingers while it was carried [mm]."""
-
-
-# How an object is to be held: its x axis along the fingers' line of closing, which is the
-# hand's y axis, its top towards the palm.
-_IN_HAND = quaternion.from_matrix(
-    torch.tensor([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]], dtype=torch.float64)
-)
-
-
-def _held(run: CollaborationRun) -> _Hold:
-    """From the end of the lift until the transfer is over."""
-    log, tilts, slips = run.cell.log, [], []
-    tool = true_tool(run.motion, run.world, len(log))
-    bodies = {body.name: body for body in run.motion.bodies()}
+def _holds(run: CollaborationRun) -> list[Hold]:
+    """How each object hung in the hand, from the end of the lift until it was released."""
+    log, holds = run.cell.log, []
     for pick in run.picks:
         carried = [s for s in spans(log, HOME) if pick.span[0] <= s[0] < pick.span[1]]
         released = [t for t, _ in spans(log, RELEASE) if pick.span[0] <= t < pick.span[1]]
-        if not carried or not released:
-            continue
-        steps = np.searchsorted(log["time"], [carried[-1][0], released[-1]])
-        body = bodies[pick.item.name]
-        q = torch.from_numpy(body.orientation[steps])
-        hand = tool[torch.from_numpy(steps)]
-        away = torch.from_numpy(body.position[steps]) - hand.position
-        away = quaternion.rotate(quaternion.conjugate(hand.orientation), away)
-        held = quaternion.multiply(quaternion.conjugate(hand.orientation), q)
-        tilts.append(float(_symmetric_angle(held, _IN_HAND).max()))
-        slips.append(float((away[1] - away[0]).norm()))
-    return _Hold(
-        tilt=float(np.rad2deg(max(tilts))) if tilts else None,
-        slip=1e3 * max(slips) if slips else None,
-    )
+        if carried and released:
+            times = carried[-1][0], released[-1]
+            holds.append(hold(log, run.motion, run.world, pick.item.name, *times))
+    return holds
 
 
 def _placed(run: CollaborationRun) -> tuple[float | None, float | None]:
@@ -219,21 +200,10 @@ def _placed(run: CollaborationRun) -> tuple[float | None, float | None]:
         pose = run.world.object_pose(pick.item.name)
         errors.append(np.linalg.norm(pose[:2, 3] - pick.goal.position[:2].numpy()))
         # The world's own errors of the base apart: the shelf is where it is.
-        q = quaternion.from_matrix(torch.from_numpy(pose[:3, :3].copy()))
-        goal = quaternion.multiply(pick.goal.orientation, _IN_HAND)
-        angles.append(float(_symmetric_angle(q, goal)))
+        angles.append(place_angle(pose, pick.goal.orientation))
     if not errors:
         return None, None
     return 1e3 * float(max(errors)), float(np.rad2deg(max(angles)))
-
-
-def _symmetric_angle(
-    q: Float[Tensor, "*batch 4"], goal: Float[Tensor, "4"]
-) -> Float[Tensor, "*batch"]:
-    """Angle between orientations of a box that may be turned by half about its z axis."""
-    half = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
-    other = quaternion.multiply(q, half)
-    return torch.minimum(quaternion.angle(q, goal), quaternion.angle(other, goal))
 
 
 def _standing(run: CollaborationRun) -> list[str]:
@@ -242,16 +212,16 @@ def _standing(run: CollaborationRun) -> list[str]:
     return [name for name, place in places.items() if run.world.rests_on(name, place)]
 
 
-def _fallen(run: CollaborationRun) -> str:
-    names, standing = [item.name for item in run.workplace.scene.objects], _standing(run)
-    return f"not {', '.join(name for name in names if name not in standing)}"
+def _all_but(run: CollaborationRun, names: Collection[str]) -> str:
+    objects = [item.name for item in run.workplace.scene.objects]
+    return f"not {', '.join(name for name in objects if name not in names)}"
 
 
 def _contacts(run: CollaborationRun) -> dict[str, tuple[Touch, ...]]:
     """Contacts that there should not have been, by what was met."""
     names = [pick.item.name for pick in run.picks if pick.release is not None]
     begun = [start for start, _ in spans(run.cell.log, RELEASE)]
-    return unwanted_contacts(run.world, dict(zip(names, begun, strict=True)))
+    return unwanted_contacts(run.world, run.cell.log, dict(zip(names, begun, strict=True)))
 
 
 def _recoveries(run: CollaborationRun) -> Counter[str]:

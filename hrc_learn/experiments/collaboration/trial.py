@@ -25,7 +25,9 @@ from hrc_learn.sim.imperfections import Imperfections
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.marker_sensor import LatencyConfig, MarkerSensor
 from hrc_learn.skills.pick_and_place import (
+    HOME,
     INTERACT,
+    RELEASE,
     PickAndPlace,
     PickAndPlaceConfig,
     PickPlaceJob,
@@ -98,6 +100,8 @@ class CollaborationRun:
     cameras: tuple[tuple[float, CameraModel], ...]
     """The true cameras, and from when on each watched [s]."""
     disturbances: Disturbances = field(default_factory=Disturbances)
+    held_flat: frozenset[str] = frozenset()
+    """Objects that both pads held on opposite faces, when lifted and still at the release."""
 
     @property
     def failure(self) -> str:
@@ -182,8 +186,12 @@ def simulate_collaboration(
         motion.advance(duration)
         occluder.update()
 
+    flat: dict[str, set[str]] = {HOME: set(), RELEASE: set()}
+
     def enter(phase: str, time: float) -> None:
         on_phase(phase, time)
+        if phase in flat:
+            flat[phase] |= {item.name for item in items if world.holds_flat(item.name)}
         if phase == INTERACT:
             person.begin(time)
 
@@ -228,6 +236,7 @@ def simulate_collaboration(
         picks=tuple(picks),
         cameras=tuple(eyes.history),
         disturbances=disturbances,
+        held_flat=frozenset(flat[HOME] & flat[RELEASE]),
     )
 
 

@@ -62,7 +62,7 @@ class Descent:
 
 
 def _contacts(run: SimulatedGrasp) -> tuple[Touch, ...]:
-    return sum(unwanted_contacts(run.world).values(), ())
+    return sum(unwanted_contacts(run.world, run.cell.log).values(), ())
 
 
 def lift(run: SimulatedGrasp) -> float:

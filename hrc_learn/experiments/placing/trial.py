@@ -136,7 +136,9 @@ def place(
         cell=cell,
         motion=motion,
         released=released,
-        contacts=sum(unwanted_contacts(world, {item.name: release_time}).values(), ()),
+        contacts=sum(
+            unwanted_contacts(world, cell.log, {item.name: release_time}).values(), ()
+        ),
         placed=world.rests_on(item.name, f"board_{shelf}"),
     )
 
