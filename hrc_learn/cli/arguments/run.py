@@ -221,7 +221,8 @@ class Sweep(Written):
     only: More[tuple[Experiment, ...]] = ()
     """Names of single experiments, instead of a suite."""
     trials: int = 1000
-    """Trials of near, global and fixed, of the law as printed, and of each stress test."""
+    """Trials of near, global, fixed, literal, unmixed, printed, printed_box and each stress
+    test."""
     variants: int = 400
     """Trials of each of the others."""
     seed: int = 0

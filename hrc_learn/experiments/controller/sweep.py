@@ -81,7 +81,7 @@ def _printed(
     **changes: Any,
 ) -> BatchedTrials:
     """The paper's regions and gains, without a planned approach, behind the safety filter."""
-    settings = {"suite": "paper", "main": True, "law": "printed", "duration": 12.0} | changes
+    settings = {"suite": "paper", "law": "printed", "duration": 12.0} | changes
     return _grasp(label, estimator, **settings)
 
 
@@ -91,7 +91,7 @@ def _in_mujoco(
     """The same in the simulator, whose images have noise of their own."""
     images = replace(TrialConfig().imperfections, noise=0.0)
     settings: dict[str, Any] = {"imperfections": images, "contacts": True} | changes
-    return experiment(*args, suite="mujoco", main=False, mujoco=True, **settings)
+    return experiment(*args, suite="mujoco", mujoco=True, **settings)
 
 
 def _rows_right(network: RBFImageJacobian) -> PrintedEstimator:
@@ -170,25 +170,24 @@ EXPERIMENTS: Mapping[str, BatchedTrials] = {
         feature="corners",
     ),
     "paper": _grasp("the paper's adaptation in our loop", PaperEstimator, suite="paper"),
-    "literal": _printed("all as printed", PrintedEstimator),
-    "unmixed": _printed("the same with the image rows of J_s0 not mixed", _rows_right),
-    "printed": _printed("and with normalised neurons", PaperEstimator),
-    "printed_fixed": _printed("and with L = 0", FixedEstimator, main=False),
-    "printed_kalman": _printed("and with our estimator", KalmanEstimator),
+    "literal": _printed("the paper's law, all as printed", PrintedEstimator, main=True),
+    "unmixed": _printed("literal, the image rows of J_s0 not mixed", _rows_right, main=True),
+    "printed": _printed("unmixed, neurons normalised", PaperEstimator, main=True),
+    "printed_fixed": _printed("printed, L = 0", FixedEstimator),
+    "printed_kalman": _printed("printed, our estimator", KalmanEstimator),
     "printed_z": _printed(
-        "normalised neurons, k_c = 4e-4 in z too", PaperEstimator, stiffness=(4e-4,) * 3
+        "printed, k_c = 4e-4 in z too", PaperEstimator, stiffness=(4e-4, 4e-4, 4e-4)
     ),
-    "literal_box": _printed("all as printed but k_c = 4e-3", PrintedEstimator, **_FIRM_BOX),
-    "unmixed_box": _printed("and the image rows not mixed", _rows_right, **_FIRM_BOX),
-    "printed_box": _printed("and normalised neurons", PaperEstimator, **_FIRM_BOX),
-    "box_fixed": _printed("and with L = 0", FixedEstimator, main=False, **_FIRM_BOX),
-    "box_gain_1e7": _printed("and with L = 1e7 I", _with_gain(1e7), main=False, **_FIRM_BOX),
-    "box_gain_1e8": _printed("and with L = 1e8 I", _with_gain(1e8), main=False, **_FIRM_BOX),
-    "box_kalman": _printed("and with our estimator", KalmanEstimator, main=False, **_FIRM_BOX),
+    "literal_box": _printed("literal, k_c = 4e-3", PrintedEstimator, **_FIRM_BOX),
+    "unmixed_box": _printed("unmixed, k_c = 4e-3", _rows_right, **_FIRM_BOX),
+    "printed_box": _printed("printed, k_c = 4e-3", PaperEstimator, main=True, **_FIRM_BOX),
+    "box_fixed": _printed("printed_box, L = 0", FixedEstimator, **_FIRM_BOX),
+    "box_gain_1e7": _printed("printed_box, L = 1e7 I", _with_gain(1e7), **_FIRM_BOX),
+    "box_gain_1e8": _printed("printed_box, L = 1e8 I", _with_gain(1e8), **_FIRM_BOX),
+    "box_kalman": _printed("printed_box, our estimator", KalmanEstimator, **_FIRM_BOX),
     "box_global": _printed(
-        "printed_box from starts anywhere within the limits",
+        "printed_box, starts anywhere within the limits",
         PaperEstimator,
-        main=False,
         starts="global",
         **_FIRM_BOX,
     ),
