@@ -39,8 +39,9 @@ class LimitBarrier(nn.Module):
         Q(v_hat - A dt) = Q(v_hat) - v_hat dt - A dt (1/rate - dt/2) <= delta - v_k dt,
 
     while below A dt the joint gets no further than v_hat dt <= rate dt delta <= delta. So a
-    step that keeps all limits always exists. It takes equal steps, in which the joint moves
-    by v dt, and a start inside the set. At rest v_hat = A^2/(2 j), so that is
+    step that keeps all limits always exists. dt is the time between both steps, so steps of
+    any length keep the limits where it is the time that has passed since the last. It takes
+    joints that move by v dt, and a start inside the set. At rest v_hat = A^2/(2 j), so that is
 
         delta >= A^3/(8 j^2) + A^2/(2 j rate),
 
@@ -56,7 +57,8 @@ class LimitBarrier(nn.Module):
     Joints that do what they are told T late go on with the speed of then, v + A T at most,
     while they brake. A wall that recedes by T v_hat, which braking lowers by T A dt in a step,
     makes up for it: Q(v_hat) + T v_hat <= delta, which is 1/rate + T in place of 1/rate. In
-    steps that take (1 + jitter) dt, A dt brakes with A/(1 + jitter): so much for A in Q.
+    steps that take (1 + jitter) of the dt that is told, A dt brakes with A/(1 + jitter): so
+    much for A in Q.
     """
 
     velocity: Tensor

@@ -57,7 +57,8 @@ class SafetyConfig:
     delay: float = 0.0
     """Longest time from a joint position read to the arm doing what was made of it [s]."""
     jitter: float = 0.0
-    """Largest fraction by which steps are longer or shorter than their `dt`, 0 to below 1."""
+    """Largest fraction by which steps are longer or shorter than their `dt`, 0 to below 1. Zero
+    where dt is the time measured since the last step: all limits then hold as they are."""
     tcp_speed: float = 1.0
     """Cap on the speed of the tool centre point [m/s]; acts where a Jacobian is given."""
     separation: SeparationConfig = field(default_factory=SeparationConfig)
@@ -137,8 +138,9 @@ class SafetyFilter(nn.Module):
     forgotten: neither a command nor a state is ever NaN or infinite.
 
     Velocity, tool speed, acceleration and jerk are limited by scaling the whole vector, which
-    keeps its direction; only the barrier cuts single joints. The acceleration fades in time
-    for the velocity to arrive without overshoot, so stops and resumes are smooth.
+    keeps its direction; only the barrier cuts single joints. Where the others would then move
+    the tool faster than its cap, all brake as for a stop, as far as it takes. The acceleration
+    fades in time for the velocity to arrive without overshoot, so stops and resumes are smooth.
     """
 
     def __init__(self, limits: JointLimits, config: SafetyConfig | None = None):
@@ -222,8 +224,8 @@ class SafetyFilter(nn.Module):
             state: Of the step before.
             joint_position: Measured [rad]. Not finite: brake to rest.
             joint_velocity_command: Wanted [rad/s]. Not finite: brake to rest.
-            dt: Time until the next step [s]. A tensor outside (0, longest_step]: brake to
-                rest, by the last step that was within.
+            dt: Time until the next step [s], or since the last where steps are irregular. A
+                tensor outside (0, longest_step]: brake to rest, by the last that was within.
             jacobian: Of the tool centre point, linear rows first: enables its speed cap. Not
                 finite: brake to rest.
             human_distance: Of the nearest person [m], who slows the tool down and stops it;
@@ -262,9 +264,15 @@ class SafetyFilter(nn.Module):
         u = u / excess.clamp(min=1)
         inside = u.clamp(*bounds)
         cut = torch.linalg.vector_norm(inside - u, math.inf, dim=-1, keepdim=True) > _REPORTED
-        target, speeding, near = self._cap_tcp_speed(inside, jacobian, human_distance)
+        target, cap, speeding, near = self._cap_tcp_speed(inside, jacobian, human_distance)
         limit = self._limit_jerk if self.config.jerk_limited else self._limit_acceleration
         v, acceleration, excess_a, excess_j = limit(state, target, bounds, dt)
+        if jacobian is not None:
+            stopping = limit(state, torch.zeros_like(v), bounds, dt)
+            fraction = _blend_to_cap(_linear(jacobian, v), _linear(jacobian, stopping[0]), cap)
+            # Between two that are within the limits, so within them as well.
+            v = torch.lerp(v, stopping[0], fraction)
+            acceleration = torch.lerp(acceleration, stopping[1], fraction)
 
         a_acts, j_acts = _acts(excess_a), _acts(excess_j)
         flags = [_acts(excess), cut, a_acts, j_acts, speeding, near, invalid, stopped]
@@ -301,8 +309,8 @@ class SafetyFilter(nn.Module):
 
     def _cap_tcp_speed(
         self, u: Tensor, jacobian: Tensor | None, human_distance: Tensor | None
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """The command slowed down, and the flags `tcp_speed` and `separation`."""
+    ) -> tuple[Tensor, Tensor | float, Tensor, Tensor]:
+        """The command slowed down, the cap, and the flags `tcp_speed` and `separation`."""
         never = torch.zeros_like(u[..., :1], dtype=torch.bool)
         if jacobian is None:
             if human_distance is not None:
@@ -310,18 +318,17 @@ class SafetyFilter(nn.Module):
                     "human_distance limits the speed of the tool, which needs its Jacobian: "
                     "pass jacobian as well"
                 )
-            return u, never, never
-        linear = torch.linalg.vecdot(jacobian[..., :3, :], u.unsqueeze(-2))
-        speed = torch.linalg.vector_norm(linear, dim=-1, keepdim=True)
+            return u, math.inf, never, never
+        speed = torch.linalg.vector_norm(_linear(jacobian, u), dim=-1, keepdim=True)
         excess = speed / self.config.tcp_speed
         speeding = _acts(excess)
         if human_distance is None:
-            return u / excess.clamp(min=1), speeding, never
+            return u / excess.clamp(min=1), self.config.tcp_speed, speeding, never
         safe = self.config.separation.highest_speed(human_distance).unsqueeze(-1)
         cap = safe.clamp(max=self.config.tcp_speed)
         # At a cap of zero everything rests, also what does not move the tool.
         factor = cap / torch.maximum(speed, cap).clamp(min=torch.finfo(u.dtype).tiny)
-        return factor * u, speeding, (speed > (1 + _REPORTED) * safe) | (safe == 0)
+        return factor * u, cap, speeding, (speed > (1 + _REPORTED) * safe) | (safe == 0)
 
     def _limit_acceleration(
         self,
@@ -371,6 +378,27 @@ class SafetyFilter(nn.Module):
             acceleration, state.acceleration, state.velocity, bounds, dt
         )
         return state.velocity + acceleration * dt, acceleration, excess_a, excess_j
+
+
+def _linear(jacobian: Tensor, joint_velocity: Tensor) -> Tensor:
+    """Linear velocity of the tool [m/s]."""
+    return torch.linalg.vecdot(jacobian[..., :3, :], joint_velocity.unsqueeze(-2))
+
+
+def _blend_to_cap(wanted: Tensor, stopping: Tensor, cap: Tensor | float) -> Tensor:
+    """Fraction of the way from one tool velocity to another at which the speed is the cap.
+
+    Zero where the first keeps it; where the whole way does not reach it, that of least speed.
+    """
+    change = stopping - wanted
+    # |wanted + s change|^2 = cap^2, a quadratic in s. Changes that count for nothing are no
+    # divisor, and a root of zero has no derivative.
+    a = torch.linalg.vecdot(change, change).clamp(min=_REPORTED**2)
+    b = torch.linalg.vecdot(wanted, change)
+    c = torch.linalg.vecdot(wanted, wanted).unsqueeze(-1) - cap**2
+    a, b = a.unsqueeze(-1), b.unsqueeze(-1)
+    root = (b * b - a * c).clamp(min=torch.finfo(a.dtype).tiny).sqrt()
+    return torch.where(c > 0, (-b - root) / a, 0.0).clamp(0, 1)
 
 
 def _excess(vector: Tensor, limit: Tensor) -> Tensor:

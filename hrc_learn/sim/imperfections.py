@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from hrc_learn.controller import SafetyConfig
 from hrc_learn.kinematics import panda
 
 # pyright: reportAttributeAccessIssue=false
@@ -129,6 +130,12 @@ class Imperfections:
         values["slowness"] = min(values["slowness"], 0.9)
         values["object_yaw"] = min(values["object_yaw"], math.pi)
         return Imperfections(**values)
+
+    def plant(self, safety: SafetyConfig) -> SafetyConfig:
+        """Settings of a safety filter that is told what this arm's driver does."""
+        # Of normally distributed delays one in 700 is more than three deviations late.
+        delay = self.command_delay + 3 * self.command_jitter + self.servo_lag
+        return replace(safety, braking=1 - self.slowness, delay=delay)
 
     def draw(self, rng: np.random.Generator, joints: int = 7) -> DrawnImperfections:
         """What they are in one run.

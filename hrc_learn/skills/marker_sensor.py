@@ -129,3 +129,54 @@ def longest_occlusion(log: StepLog, middle: Pose, since: float) -> float:
     steps = edges[1::2] - edges[::2]
     dt = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
     return float(steps.max()) * dt if len(steps) else 0.0
+
+
+class HeldMarker:
+    """Tells a marker that something half hides from one that moves with the end effector.
+
+    Its corners are then found where the edge of what hides it is, by some pixels elsewhere.
+    """
+
+    # Images that are averaged for where it is: half a second of them.
+    _IMAGES = 12
+
+    def __init__(self, tolerance: float):
+        self._tolerance = tolerance
+        self._before: Pose | None = None
+        self._pixel, self._images = np.zeros(2), 0
+        self._time, self._fits = -np.inf, False
+
+    def fits(
+        self,
+        time: float,
+        pixel: Float[np.ndarray, "2"],
+        pose: Pose,
+        jacobian: Float[np.ndarray, "2 6"],
+    ) -> bool:
+        """Whether a marker is seen where the end effector has taken it since the first image.
+
+        Args:
+            time: When the newest image was taken [s].
+            pixel: Of the marker in it [px]; NaN if it is not seen.
+            pose: Of the end effector then.
+            jacobian: Image Jacobian there [px/m, px/rad].
+        """
+        if time > self._time:
+            self._time, self._fits = time, self._agrees(pixel, pose, jacobian)
+        return self._fits
+
+    def _agrees(
+        self,
+        pixel: Float[np.ndarray, "2"],
+        pose: Pose,
+        jacobian: Float[np.ndarray, "2 6"],
+    ) -> bool:
+        if not np.isfinite(pixel).all():
+            return False
+        if self._before is None:
+            self._before = pose
+        rest = pixel - jacobian @ self._before.twist_to(pose).numpy()
+        if self._images < self._IMAGES:
+            self._images += 1
+            self._pixel += (rest - self._pixel) / self._images
+        return bool(np.linalg.norm(rest - self._pixel) <= self._tolerance)

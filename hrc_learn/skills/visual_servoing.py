@@ -17,6 +17,7 @@ from hrc_learn.controller import AdaptiveController, ControllerState, Goals, Obs
 from hrc_learn.controller.interface import IMAGE_SIZE
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.skills.marker_angle import AngleServo, MarkerAngle
+from hrc_learn.skills.marker_sensor import HeldMarker
 from hrc_learn.skills.work_cell import MissedGraspError, WorkCell
 
 
@@ -51,8 +52,20 @@ class VisualServoConfig:
     the new place [m]: the line looks different there, and one motion may not tell it well."""
     max_probes: int = 3
     """Descents at most."""
-    border: float = 50.0
-    """Distance that the target keeps from the edge of the image [px]."""
+    border: float = 80.0
+    """Distance that the target keeps from the edge of the image [px]: within 50 px
+    a marker is cut off."""
+    turn_border: float = 60.0
+    """The same of the marker while the gripper is turned [px]; nearer, the turn waits."""
+    turn_rate: float = 0.8
+    """Fastest turn of the gripper for the object [rad/s]. The marker swings by 0.15 m a radian,
+    and the camera, which is late, has to lead it meanwhile."""
+    half_hidden: float = 1.5
+    """How far from where the joints tell that it is a marker may be seen while the end effector
+    is held, before it counts as half hidden [px]: three times the noise of both."""
+    lost_after: float = 1.0
+    """Time after which a marker that was last seen near the edge of the image counts as out of
+    view, not as occluded: the end effector returns to the middle of the box [s]."""
     half_size: tuple[float, float, float] = (0.12, 0.12, 0.003)
     """Box in which the camera takes over [m]. Flat: the image tells little about height, and
     an object has to be met at the height of the demonstrations."""
@@ -192,8 +205,12 @@ class VisualServo:
         self._cached = (np.nan, np.zeros((2, 6)))  # time of an image, and the Jacobian at it
         self._detected = False
         self._angle = None if angle is None else AngleServo(angle)
+        # Orientation wanted by the newest image, and the goal now, on the way there.
         self._turned: Tensor | None = None
+        self._turning: Tensor | None = None
+        self._last_pixel = np.full(2, np.nan)
         self._arrived = False
+        self._held: HeldMarker | None = None
         self.state: ControllerState = controller.initial_state(cell.joints)
 
     def servo_to(self, target: ServoTarget) -> float:
@@ -233,12 +250,14 @@ class VisualServo:
             self.state = replace(self.state, estimator=resumed)
         if self._angle is not None:
             self._angle.restart()
-        self._turned = None
+        self._turned = self._turning = None
 
     def _converge(self, target: ServoTarget, tolerance: float, start: float) -> float:
         """Step until marker and height have stayed at the target; when they got there [s]."""
         reached = self._last_detection = self._cell.time
         while self._cell.time - reached < self._config.dwell:
+            if self._out_of_view():
+                self._detected = False
             self.step(target)
             height = float(self._cell.pose.position[2] - target.above.position[2])
             at_height = abs(height - target.raised) < self._config.height_tolerance
@@ -260,12 +279,15 @@ class VisualServo:
         does to the null space.
         """
         end = self._cell.time + duration
-        # What is learned meanwhile of the image Jacobian must not move the target.
+        # What is learned meanwhile of image Jacobian and turn must not move the target.
+        self._turned = self._turning
         upright = replace(target, orientation=self._turned).upright
         pixel = target.target(self._image_jacobian(), upright)
         held = replace(target, target=lambda jacobian, orientation: pixel)
+        self._held = HeldMarker(self._config.half_hidden)
         while self._cell.time < end:
             self.step(held)
+        self._held = None
 
     def error(self, target: ServoTarget) -> float:
         """Distance of the feature from its target [px]; NaN if it is not detected."""
@@ -277,11 +299,19 @@ class VisualServo:
         """One step of the controller."""
         observation = self._cell.observation
         feature = torch.from_numpy(self._feature())
+        if self._held is not None and not self._held.fits(
+            observation.time,
+            feature.numpy(),
+            self._cell.chain.forward(self._joints()),
+            self._image_jacobian(),
+        ):
+            feature = torch.full_like(feature, torch.nan)
         visible = torch.tensor(bool(torch.isfinite(feature).all()))
         new = torch.tensor(observation.time > self._last_image)
-        if new:
-            self._turn(target)
-        target = replace(target, orientation=self._turned)
+        if new and self._held is None:
+            self._find_turn(target)
+        self._turn_on(target, feature.numpy())
+        target = replace(target, orientation=self._turning)
         if self._arrived:
             # A person's pull or a turn for the object takes the joints far from the posture:
             # that must not call the arm back, not even while the marker is out of sight.
@@ -289,6 +319,7 @@ class VisualServo:
         self._last_image = observation.time
         if visible:
             self._last_detection, self._detected = observation.time, True
+            self._last_pixel = feature.numpy()
         goals = target.goals(self._image_jacobian(), self._cell.pose, detected=self._detected)
         age = torch.tensor(self._cell.time - observation.time, dtype=torch.float64)
         command, self.state = self._controller.step(
@@ -310,14 +341,33 @@ class VisualServo:
         pixel = goals.vision.target.numpy()
         self._cell.execute(command, pixel, feature.numpy(), approach)
 
-    def _turn(self, target: ServoTarget) -> None:
+    def _out_of_view(self) -> bool:
+        """Whether the marker has left the image, rather than being occluded."""
+        missing = self._cell.time - self._last_detection
+        border = 2 * self._config.border
+        inside = (self._last_pixel > border) & (
+            self._last_pixel < np.array(IMAGE_SIZE) - border
+        )
+        return missing > self._config.lost_after and not inside.all()
+
+    def _turn_on(self, target: ServoTarget, feature: Float[np.ndarray, "2"]) -> None:
+        """Turn the goal a little further, while the marker is well within the image [px]."""
+        border = self._config.turn_border
+        within = (feature >= border) & (feature <= np.array(IMAGE_SIZE) - 1 - border)
+        if self._turned is None or not within.all():
+            return
+        now = target.above.orientation if self._turning is None else self._turning
+        most = self._config.turn_rate * self._cell.config.dt
+        share = most / quaternion.angle(now, self._turned).clamp(min=most)
+        self._turning = quaternion.slerp(now, self._turned, share)
+
+    def _find_turn(self, target: ServoTarget) -> None:
         """Find from a new image how the gripper has to be turned for the object."""
         observation = self._cell.observation
         angle = observation.angles.get(self._marker)
         if self._angle is None or target.angle is None or angle is None:
             return
-        joints = self._cell.joints if observation.joints is None else observation.joints
-        pose = self._cell.chain.forward(joints)
+        pose = self._cell.chain.forward(self._joints())
         elapsed = observation.time - self._last_image
         self._angle.update(pose, angle, elapsed if math.isfinite(elapsed) else 0.0)
         self._turned = self._angle.turned(
@@ -338,11 +388,15 @@ class VisualServo:
         """Estimate at the pose of the newest image [px/m, px/rad], computed once an image."""
         observation = self._cell.observation
         if observation.time != self._cached[0]:
-            joints = self._cell.joints if observation.joints is None else observation.joints
-            pose = self._cell.chain.forward(joints)
+            pose = self._cell.chain.forward(self._joints())
             estimate = self._controller.estimator.jacobian(self.state.estimator, pose)
             self._cached = observation.time, estimate.numpy()
         return self._cached[1]
+
+    def _joints(self) -> Float[Tensor, " joints"]:
+        """Joint positions when the newest image was taken [rad]."""
+        joints = self._cell.observation.joints
+        return self._cell.joints if joints is None else joints
 
     def _check_timeouts(self, target: ServoTarget, spent: float) -> None:
         if self._cell.time - self._last_detection > self._config.occlusion_timeout:

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from hrc_learn.controller import INTERVENTIONS, Command, SafetyFilter
+from hrc_learn.controller import INTERVENTIONS, Command, SafetyConfig, SafetyFilter
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.protocols import Arm, ArmState, Gripper, Human, HumanInput
@@ -82,6 +82,8 @@ class WorkCellConfig:
     """Time constant with which the null-space input is smoothed [s]."""
     pose_gain: float = 4.0
     """Decay rate of the pose error on given motions [1/s]."""
+    safety: SafetyConfig = field(default_factory=SafetyConfig)
+    """Of the safety filter, which is told what the arm's driver can do."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -144,7 +146,7 @@ class WorkCell:
         self.images: list[KeptImage] = []
         self._arm, self._sensor, self._human = arm, sensor, human
         self._advance, self._on_phase = advance, on_phase
-        self._safety = SafetyFilter(chain.limits)
+        self._safety = SafetyFilter(chain.limits, self.config.safety)
         self._ticks = 0
         self.state: ArmState = arm.read()
         self.human_input: HumanInput = human.read(self.state)

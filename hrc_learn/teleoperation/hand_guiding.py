@@ -6,14 +6,14 @@ mapped to the joints by the pseudo-inverse of that joint's Jacobian (section VII
 end effector's gizmo guides the end effector.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 import torch
 from jaxtyping import Float
 
-from hrc_learn.controller import SafetyFilter, SafetyState
+from hrc_learn.controller import SafetyConfig, SafetyFilter, SafetyState
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import SerialChain, coarse_orientation
 from hrc_learn.protocols import Arm, ArmState, Human, HumanInput
@@ -197,10 +197,12 @@ class HandGuidingConfig:
     """Largest speed towards a region or a target [m/s]."""
     approach_rate: float = 1.5
     """Decay rate of the distance to a target [1/s]."""
+    safety: SafetyConfig = field(default_factory=SafetyConfig)
+    """Of the safety filter, which is told what the arm's driver can do."""
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            if not value > 0:
+            if isinstance(value, float | int) and not value > 0:
                 raise ValueError(f"{name} must be positive, but is {value}.")
 
 
@@ -260,7 +262,7 @@ class HandGuidedArm:
         """
         self.config = config or HandGuidingConfig()
         self._chain, self._arm, self._human = chain, arm, human
-        self._filter = SafetyFilter(chain.limits)
+        self._filter = SafetyFilter(chain.limits, self.config.safety)
         self.safety: SafetyState
         self.restart()
 

@@ -21,8 +21,6 @@ from hrc_learn.controller import (
     SafetyFilter,
 )
 from hrc_learn.deploy import EagerRunner
-from hrc_learn.deploy.export import trace
-from hrc_learn.deploy.package import PackedStep, Vectors
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import (
     CompositeEstimator,
@@ -32,10 +30,9 @@ from hrc_learn.jacobian import (
     RecursiveLeastSquaresEstimator,
 )
 from hrc_learn.kinematics import panda
-from hrc_learn.regions import PostureRegion
 
 POISONS = {"nan": torch.nan, "inf": torch.inf, "-inf": -torch.inf}
-DT = 0.01
+DT = 0.02
 ESTIMATORS = [
     FixedEstimator,
     PaperEstimator,
@@ -120,14 +117,16 @@ class Case(NamedTuple):
     where: str
     name: str
     value: float
+    tick: int
 
 
-def cases(scene: Scene) -> list[Case]:
-    """Every number of state and observation but the step, which all arms share."""
+def cases(scene: Scene, ticks: tuple[int, ...]) -> list[Case]:
+    """Every number of state and observation but the step, which arms share, at each tick."""
     state = scene.controller.initial_state(scene.start)
     trees = {"state": state, "observation": scene.observe(scene.start)}
     return [
-        Case(where, name, value)
+        Case(where, name, value, tick)
+        for tick in ticks
         for where, tree in trees.items()
         for name, x in numbers(tree)
         if x.dim() > 0
@@ -136,9 +135,18 @@ def cases(scene: Scene) -> list[Case]:
 
 
 def run(
-    scene: Scene, tick: int, injected: list[Case], dt: float | None = None, steps: int = 320
+    scene: Scene,
+    steps: int,
+    injected: list[Case] | None = None,
+    dt: dict[int, float] | None = None,
 ) -> tuple[Tensor, Tensor, list[Tensor]]:
-    """One tick of poison: arm k has case k, the arms after them none.
+    """A tick of poison for each arm: arm k has case k, the arms after them none.
+
+    Args:
+        scene: With an arm for each case at least.
+        steps: How many.
+        injected: What, and when.
+        dt: Other steps, by tick.
 
     Returns:
         Velocities and invalid flags at every step, and where the state was finite after it.
@@ -147,14 +155,15 @@ def run(
     velocities, invalid, healthy = [], [], []
     for k in range(steps):
         observation = scene.observe(q)
-        if k == tick:
-            for arm, case in enumerate(injected):
-                if case.where == "state":
-                    state = poisoned(state, case.name, arm, case.value)
-                else:
-                    observation = poisoned(observation, case.name, arm, case.value)
-            if dt is not None:
-                observation = replace(observation, dt=torch.tensor(dt, dtype=DOUBLE))
+        for arm, case in enumerate(injected or ()):
+            if case.tick != k:
+                continue
+            if case.where == "state":
+                state = poisoned(state, case.name, arm, case.value)
+            else:
+                observation = poisoned(observation, case.name, arm, case.value)
+        if dt is not None and k in dt:
+            observation = replace(observation, dt=torch.tensor(dt[k], dtype=DOUBLE))
         command, state = scene.controller.step(state, observation)
         q = q + DT * command.joint_velocity
         velocities.append(command.joint_velocity)
@@ -163,49 +172,50 @@ def run(
     return torch.stack(velocities), torch.stack(invalid), healthy
 
 
-def assert_recovered(
-    scene: Scene, tick: int, velocities: Tensor, invalid: Tensor, names
-) -> None:
-    clean = velocities[:, -1]
-    assert velocities.isfinite().all()
-    for arm, name in enumerate(names):
-        assert not invalid[tick + 1 :, arm].any(), name
-        # Half a second later it moves as ever, and ends where the others do.
-        speed = velocities[tick + 50, arm].norm() / clean[tick + 50].norm()
-        assert 0.5 < speed < 2, (name, speed)
-        ends = scene.start[0] + DT * torch.stack([velocities[:, arm], clean]).sum(1)
-        apart = panda.forward(ends[0]).twist_to(panda.forward(ends[1])).norm()
-        # The box is 0.24 m wide: an arm that approaches anew may end elsewhere in it.
-        assert apart < 0.03, (name, apart)
-
-
-@pytest.mark.parametrize("tick", [0, 30])
 @pytest.mark.parametrize("estimator", ESTIMATORS)
-def test_one_tick_of_poison_leaves_the_next_healthy(estimator, tick):
-    injected = cases(Scene(estimator, 1))
+def test_one_tick_of_poison_leaves_the_next_healthy(estimator):
+    """At the start and under way."""
+    injected = cases(Scene(estimator, 1), (0, 15))
     assert {"goals.orientation.goal", "target", "feature_age"} <= {c.name for c in injected}
     scene = Scene(estimator, len(injected) + 1)
-    velocities, invalid, healthy = run(scene, tick, injected)
+    velocities, invalid, healthy = run(scene, 160, injected)
+    clean = velocities[:, -1]
     for k, known in enumerate(healthy):
         assert known.all(), (k, [c for c, ok in zip(injected, known, strict=False) if not ok])
-    assert invalid[tick].any()
-    assert_recovered(scene, tick, velocities, invalid, injected)
+    assert velocities.isfinite().all()
+    for tick in (0, 15):
+        assert invalid[tick].any()
+    for arm, case in enumerate(injected):
+        assert not invalid[case.tick + 1 :, arm].any(), case
+        # Half a second later it moves as ever, and ends where the others do.
+        later = case.tick + 25
+        speed = velocities[later, arm].norm() / clean[later].norm()
+        assert 0.5 < speed < 2, (case, speed)
+    ends = panda.forward(scene.start + DT * velocities.sum(0))
+    apart = ends[:-1].twist_to(ends[-1:]).norm(dim=-1)
+    # The box is 0.24 m wide: an arm that approaches anew may end elsewhere in it.
+    assert (apart < 0.03).all(), [
+        c for c, far in zip(injected, apart >= 0.03, strict=True) if far
+    ]
 
 
-@pytest.mark.parametrize("value", [*POISONS.values(), 0.0, -0.01, 0.3])
-@pytest.mark.parametrize("tick", [0, 30])
-def test_a_step_of_no_length_brakes_for_one_tick(tick, value):
-    """By the last length that was valid: within the limits of acceleration and jerk."""
+def test_steps_of_no_length_brake_for_one_tick_each():
+    """By the last length that was valid: within the limits of acceleration."""
     scene = Scene(KalmanEstimator, 1)
-    velocities, invalid, healthy = run(scene, tick, [], dt=value, steps=120)
-    usual, _, _ = run(scene, -1, [], steps=120)
-    assert invalid[:, 0].nonzero().flatten().tolist() == [tick]
+    bad = dict(zip(range(0, 72, 12), [*POISONS.values(), 0.0, -0.01, 0.3], strict=True))
+    velocities, invalid, healthy = run(scene, 100, dt=bad)
+    usual, _, _ = run(scene, 100)
+    assert invalid[:, 0].nonzero().flatten().tolist() == list(bad)
     assert torch.stack(healthy).all()
     change = velocities[:, 0].diff(dim=0, prepend=torch.zeros(1, 7, dtype=DOUBLE)) / DT
     assert (change.abs() <= LIMITS.acceleration * (1 + 1e-9)).all()
-    if tick > 0:
-        assert velocities[tick, 0].norm() < velocities[tick - 1, 0].norm()
-    assert_recovered(scene, tick, torch.cat([velocities, usual], dim=1), invalid, [value])
+    speed = velocities[:, 0].norm(dim=-1)
+    for tick in list(bad)[1:]:
+        assert speed[tick] < speed[tick - 1]
+        assert speed[tick + 11] > 0.5 * usual[tick + 11].norm()
+    ends = [panda.forward(scene.start[0] + DT * v[:, 0].sum(0)) for v in (velocities, usual)]
+    # It is up to six ticks behind.
+    assert ends[0].twist_to(ends[1]).norm() < 0.03
 
 
 FILTER_ARGUMENTS = {
@@ -264,92 +274,3 @@ def test_a_runner_that_reads_nothing_but_nan_recovers():
     velocities = [runner.step().copy() for _ in range(50)]
     assert np.isfinite(velocities).all()
     assert np.linalg.norm(velocities[-1]) > 0.5 * np.linalg.norm(healthy)
-
-
-def test_a_traced_step_takes_poison_as_the_eager_one_does():
-    """Any number of the observation, the step among them, in the graph that is exported."""
-    controller, observation = controller_and_observation()
-    observation = replace(observation, dt=torch.tensor(0.002, dtype=DOUBLE))
-    step = PackedStep(controller, observation)
-    program = trace(step, observation).module()
-    vectors = step.example(observation)
-    for _ in range(20):
-        program(*vectors)
-    usual = vectors.command[step.layouts.command.rows["joint_velocity"]].norm()
-    assert usual > 0.05
-    for field in step.layouts.observation.fields:
-        for value in POISONS.values() if field.dtype.is_floating_point else ():
-            example = step.example(observation)
-            seen = vectors._replace(observation=example.observation.clone())
-            seen.observation[step.layouts.observation.rows[field.name]] = value
-            expected = Vectors(*(x.clone() for x in seen))
-            program(*seen)
-            step(*expected)
-            for got, wanted in zip(seen, expected, strict=True):
-                torch.testing.assert_close(got, wanted, rtol=1e-9, atol=1e-9, equal_nan=True)
-            velocity = seen.command[step.layouts.command.rows["joint_velocity"]]
-            assert velocity.isfinite().all(), field.name
-            assert seen.state.isfinite().all(), field.name
-            for _ in range(20):
-                program(seen.state, example.observation, seen.command)
-            assert 0.5 * usual < velocity.norm() < 2 * usual, field.name
-
-
-@pytest.mark.parametrize(
-    "ticks", [10_000, pytest.param(100_000, marks=pytest.mark.slow)], ids=str
-)
-def test_hostile_ticks_break_no_limit_and_leave_an_arm_that_moves(ticks):
-    """A third of the ticks of each arm have a number that is none, or far off, somewhere in
-    state or observation; a tenth a step of no length; goals jump, people come and go."""
-    arms = 50
-    scene, rng = Scene(CompositeEstimator, arms), sampling.generator(8)
-    injected = cases(Scene(CompositeEstimator, 1))
-    # Where an arm is told to be somewhere else it can keep no limits.
-    memory = ("safety.velocity", "safety.acceleration")
-    injected = [c for c in injected if c.name not in memory]
-    values = [*POISONS.values(), 1e300, -1e30]
-
-    def draw(below: int) -> int:
-        return int(torch.randint(below, (1,), generator=rng))
-
-    q, state = scene.start, scene.controller.initial_state(scene.start)
-    scene.goals = scene.goals.approached_by(None)
-    before = torch.zeros_like(q)
-    for k in range(ticks // arms):
-        if k % 50 == 0:
-            jump = 0.3 * torch.randn(arms, 3, generator=rng, dtype=DOUBLE)
-            scene.goals = scene.goals.moved_to(CENTRE + jump)
-            scene.pull = 10 * torch.randn(arms, 7, generator=rng, dtype=DOUBLE)
-        observation = scene.observe(q)
-        near = torch.rand(arms, generator=rng, dtype=DOUBLE) < 0.05
-        distance = 3.0 - 2.7 * near.double()
-        observation = replace(observation, human_distance=distance)
-        for arm in range(arms):
-            if draw(3) == 0:
-                case, value = injected[draw(len(injected))], values[draw(len(values))]
-                if case.where == "state":
-                    state = poisoned(state, case.name, arm, value)
-                else:
-                    observation = poisoned(observation, case.name, arm, value)
-        if draw(10) == 0:
-            dt = torch.tensor([*POISONS.values(), -0.01, 5.0][draw(5)], dtype=DOUBLE)
-            observation = replace(observation, dt=dt)
-        command, state = scene.controller.step(state, observation)
-        v = command.joint_velocity
-        q = q + DT * v
-        assert finite(state).all()
-        assert LIMITS.contain(q).all()
-        assert (v.abs() <= LIMITS.velocity).all()
-        assert ((v - before).abs() <= DT * LIMITS.acceleration * (1 + 1e-9)).all()
-        before = v
-    # Healthy again: each arm goes where it is told to.
-    ready = PostureRegion(goal=panda.ready.expand_as(q), tolerance=0.05)
-    scene.goals = replace(scene.goals, posture=ready)
-    scene.pull = torch.zeros_like(q)
-    away = (panda.ready - q).norm(dim=-1)
-    assert away.median() > 0.5
-    for _ in range(500):
-        command, state = scene.controller.step(state, scene.observe(q))
-        assert not command.safety.acted("invalid").any()
-        q = q + DT * command.joint_velocity
-    assert ((panda.ready - q).norm(dim=-1) < 0.3).all()

@@ -134,6 +134,31 @@ def test_the_arm_rests_before_a_person_who_comes_running():
     assert max(speeds[-200:]) > 0.3  # it has resumed
 
 
+def test_above_its_cap_the_tool_brakes_as_for_a_stop():
+    """Joints that brake before their limits, each by itself, would leave it faster."""
+    rng, safety, dt = sampling.generator(4), SafetyFilter(panda.limits), 0.01
+    lower, upper = panda.limits.lower, panda.limits.upper
+    q = sampling.within(lower, upper, 200, rng=rng, margin=0.1)
+    state, beyond, u = safety.initial_state(q), 0, q
+    distance = torch.full((200,), 0.8, dtype=torch.float64)
+    cap = SeparationConfig().highest_speed(distance)
+    with shapes_unchecked():
+        for k in range(240):
+            if k % 30 == 0:
+                u = 3 * torch.randn(200, 7, generator=rng, dtype=torch.float64)
+            J = panda.jacobian(q)
+            v, after, _ = safety.step(state, q, u, dt, jacobian=J, human_distance=distance)
+            stopping, _, _ = safety.step(
+                state, q, u, dt, jacobian=J, stop=torch.ones(200, dtype=torch.bool)
+            )
+            speed, least = ((J @ x[..., None])[:, :3, 0].norm(dim=-1) for x in (v, stopping))
+            assert (speed <= torch.maximum(cap, least) * (1 + 1e-9)).all()
+            beyond += int((speed > 1.01 * cap).sum())
+            state, q = after, q + v * dt
+    # 3 in 1000 if each joint braked by itself.
+    assert beyond < 5e-4 * 240 * 200
+
+
 def test_a_distance_without_a_jacobian_is_refused():
     safety = SafetyFilter(panda.limits)
     with pytest.raises(ValueError, match="pass jacobian as well"):

@@ -18,12 +18,12 @@ from step_equality import assert_equal_steps, controller_and_observation
 from torch import Tensor
 from unchecked import shapes_unchecked
 
-from hrc_learn.controller import Observation
+from hrc_learn.controller import AdaptiveController, Observation
 from hrc_learn.deploy import EagerRunner, NoCompilerError, PackageRunner, export_step, open_step
 from hrc_learn.deploy import export as export_module
 from hrc_learn.deploy import package as package_module
 from hrc_learn.deploy.export import trace
-from hrc_learn.deploy.package import PackedStep, load, tensors_of
+from hrc_learn.deploy.package import PackedStep, Vectors, load, tensors_of
 from hrc_learn.kinematics import panda
 
 ROOT = Path(__file__).parents[2]
@@ -37,12 +37,54 @@ def _no_shape_checks() -> Iterator[None]:
         yield
 
 
-def test_the_traced_step_equals_the_eager_one_and_is_written_out():
+@pytest.fixture(scope="module")
+def observed() -> tuple[AdaptiveController, Observation]:
     controller, observation = controller_and_observation()
-    traced = trace(PackedStep(controller, observation), observation)
-    assert not library_calls(traced)
-    program = traced.module()
-    assert_equal_steps(controller, observation, lambda vectors: program(*vectors), 40)
+    return controller, replace(observation, dt=torch.tensor(0.002, dtype=DOUBLE))
+
+
+@pytest.fixture(scope="module")
+def traced(observed) -> torch.export.ExportedProgram:
+    with shapes_unchecked():
+        return trace(PackedStep(*observed), observed[1])
+
+
+class TestTraced:
+    """The graph that is exported."""
+
+    def test_it_equals_the_eager_step_and_is_written_out(self, observed, traced):
+        assert not library_calls(traced)
+        program = traced.module()
+        assert_equal_steps(*observed, lambda vectors: program(*vectors), 40)
+
+    def test_it_takes_poison_as_the_eager_one_does(self, observed, traced):
+        """In any number of the observation, the step among them."""
+        program, step = traced.module(), PackedStep(*observed)
+        vectors = step.example(observed[1])
+        velocity = step.layouts.command.rows["joint_velocity"]
+        for _ in range(20):
+            program(*vectors)
+        usual = vectors.command[velocity].norm()
+        assert usual > 0.05
+        healthy = vectors.observation.clone()
+        for field in step.layouts.observation.fields:
+            if not field.dtype.is_floating_point:
+                continue
+            for value in (torch.nan, torch.inf, -torch.inf):
+                vectors.observation[step.layouts.observation.rows[field.name]] = value
+                expected = Vectors(*(x.clone() for x in vectors))
+                program(*vectors)
+                step(*expected)
+                for got, wanted in zip(vectors, expected, strict=True):
+                    torch.testing.assert_close(
+                        got, wanted, rtol=1e-9, atol=1e-9, equal_nan=True
+                    )
+                assert vectors.command[velocity].isfinite().all(), field.name
+                assert vectors.state.isfinite().all(), field.name
+                vectors.observation.copy_(healthy)
+        for _ in range(20):
+            program(*vectors)
+        assert 0.5 * usual < vectors.command[velocity].norm() < 2 * usual
 
 
 class TestArrays:

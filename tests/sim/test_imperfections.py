@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from hrc_learn.controller import SafetyConfig
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import CommandChannel, Imperfections, World
 from hrc_learn.sim.workplace import Workplace
@@ -184,3 +185,12 @@ def test_the_same_seed_draws_the_same():
     first, again = draw(3, encoder_offset=1e-3), draw(3, encoder_offset=1e-3)
     np.testing.assert_array_equal(first.encoder_offset, again.encoder_offset)
     assert (draw(4, encoder_offset=1e-3).encoder_offset != first.encoder_offset).all()
+
+
+def test_a_safety_filter_is_told_what_the_driver_does():
+    safety = SafetyConfig(tcp_speed=0.5)
+    assert Imperfections.ideal().plant(safety) == safety
+    told = Imperfections.nominal().plant(safety)
+    assert (told.braking, told.tcp_speed) == (0.7, 0.5)
+    # 20 ms, 3 deviations of 2 ms, and a lag of 10 ms.
+    assert told.delay == pytest.approx(0.036)

@@ -104,8 +104,8 @@ def test_a_held_object_stays_in_the_hand_while_the_arm_swings(world, workplace):
     ("yaw", "flat"), [(0, True), (180, True), (2, True), (45, False), (90, False)]
 )
 def test_only_a_grip_by_the_faces_across_the_x_axis_is_flat(workplace, yaw, flat):
-    """Slight turns are straightened by the closing pads; a diagonal grip hangs by its edges, and
-    at a quarter turn the pads press on the other faces."""
+    """Slight turns are straightened by the closing pads. A diagonal grip hangs by its edges; at
+    a quarter turn the pads press on the other faces."""
     item = replace(workplace.scene.objects[0], half_size=(0.018, 0.030, 0.030))
     world = World(replace(workplace.scene, objects=(item,)))
     world.model.body_gravcomp[world.model.body("box").id] = 1.0  # it floats until it is held

@@ -1,9 +1,13 @@
 import numpy as np
 import pytest
+import torch
 
+from hrc_learn.geometry import Pose
+from hrc_learn.kinematics import panda
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.marker_sensor import (
     DelayedChannel,
+    HeldMarker,
     LatencyConfig,
     MarkerObservation,
     longest_occlusion,
@@ -75,3 +79,40 @@ def test_a_log_of_one_step_tells_of_no_occlusion():
     log = StepLog()
     log.append(time=0.0, joint_position=WORKPLACE.hover_joints().numpy(), feature=np.ones(2))
     assert longest_occlusion(log, WORKPLACE.hover(), 0.0) == 0.0
+
+
+def seen_held(pixels, poses, jacobian, tolerance=1.5):
+    held = HeldMarker(tolerance)
+    return [
+        held.fits(0.04 * k, pixel, pose, jacobian)
+        for k, (pixel, pose) in enumerate(zip(pixels, poses, strict=True))
+    ]
+
+
+def test_a_marker_that_moves_with_the_end_effector_is_believed_a_half_hidden_one_not():
+    """Pulled by millimetres, the end effector takes its marker along; what creeps over a marker
+    moves its corners alone."""
+    rng = np.random.default_rng(0)
+    jacobian = np.concatenate([1500 * np.eye(2), np.zeros((2, 4))], axis=1)
+    shift = 4e-3 * np.sin(np.linspace(0, 6, 100))
+    positions = [(0.4 + s, 0.1, 0.3) for s in shift]
+    level = panda.forward(panda.ready).orientation
+    poses = [Pose(torch.tensor(p, dtype=torch.float64), level) for p in positions]
+    pixels = 500 + 1500 * np.stack([shift, 0 * shift], axis=-1)
+    pixels = pixels + 0.2 * rng.standard_normal(pixels.shape)
+    assert all(seen_held(pixels, poses, jacobian))
+    creeping = np.zeros_like(pixels)
+    creeping[30:60, 1] = np.linspace(0, 6, 30)
+    fits = np.array(seen_held(pixels + creeping, poses, jacobian))
+    bias = creeping[:, 1]
+    assert fits[bias < 0.7].all()
+    assert not fits[bias > 2.3].any()
+    assert not any(seen_held(np.full_like(pixels, np.nan), poses, jacobian))
+
+
+def test_an_image_is_judged_once():
+    held = HeldMarker(1.5)
+    pose, jacobian = panda.forward(panda.ready), np.zeros((2, 6))
+    assert held.fits(0.0, np.array([5.0, 5.0]), pose, jacobian)
+    assert held.fits(0.0, np.array([50.0, 50.0]), pose, jacobian)
+    assert not held.fits(0.1, np.array([50.0, 50.0]), pose, jacobian)

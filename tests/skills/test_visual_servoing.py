@@ -114,3 +114,62 @@ def test_a_turned_tool_that_stays_on_its_own_line_is_not_probed_again(astray, pr
         )
     )
     assert len(descents) == probes
+
+
+def unturned_target():
+    return ServoTarget(
+        config=CONFIG,
+        above=Workplace().hover(),
+        posture=None,
+        target=lambda J, orientation: np.zeros(2),
+        lines=lambda orientation: np.array([0.0, 0.0, 1.0]),
+    )
+
+
+def turning_servo(wanted, now=None):
+    servo, _ = servo_in(StillCell(None))
+    vars(servo).update(_turned=wanted, _turning=now)
+    return servo
+
+
+def about_vertical(angle):
+    turn = quaternion.exp(torch.tensor([0.0, 0.0, angle], dtype=torch.float64))
+    return quaternion.multiply(turn, Workplace().hover().orientation)
+
+
+def test_the_goal_turns_no_faster_than_the_camera_can_lead_the_marker():
+    servo, middle = turning_servo(about_vertical(0.5)), np.array([700.0, 500.0])
+    goals = [Workplace().hover().orientation]
+    for _ in range(100):
+        servo._turn_on(unturned_target(), middle)
+        goals.append(servo._turning)
+    goals = torch.stack(goals)
+    steps = quaternion.angle(goals[1:], goals[:-1])
+    assert steps.max() <= CONFIG.turn_rate * 0.01 + 1e-12
+    taken = int(np.ceil(0.5 / CONFIG.turn_rate / 0.01))
+    assert quaternion.angle(goals[taken], about_vertical(0.5)) < 1e-7
+    assert quaternion.angle(goals[taken - 2], about_vertical(0.5)) > 1e-3
+
+
+@pytest.mark.parametrize("pixel", [(np.nan, np.nan), (30.0, 500.0), (700.0, 1060.0)])
+def test_a_turn_waits_while_the_marker_is_at_the_edge_of_the_image(pixel):
+    servo = turning_servo(about_vertical(0.5), about_vertical(0.1))
+    servo._turn_on(unturned_target(), np.array(pixel))
+    assert quaternion.angle(servo._turning, about_vertical(0.1)) < 1e-7
+
+
+@pytest.mark.parametrize(
+    ("pixel", "missing", "out"),
+    [
+        ((700.0, 500.0), 5.0, False),
+        ((700.0, 1000.0), 0.5, False),
+        ((700.0, 1000.0), 1.5, True),
+        ((100.0, 500.0), 1.5, True),
+        ((np.nan, np.nan), 1.5, True),
+    ],
+)
+def test_only_a_marker_last_seen_near_the_edge_has_left_the_image(pixel, missing, out):
+    """What vanishes in the middle is occluded: the end effector waits for it where it is."""
+    servo, _ = servo_in(StillCell(None))
+    vars(servo).update(_last_pixel=np.array(pixel), _last_detection=servo._cell.time - missing)
+    assert servo._out_of_view() == out

@@ -69,6 +69,9 @@ Experiment = Literal[
     "stress_late",
     "stress_lost",
     "stress_1khz",
+    "stress_poison",
+    "stress_plant",
+    "stress_plant_worse",
 ]
 """Keys of `hrc_learn.experiments.controller.sweep.EXPERIMENTS`."""
 

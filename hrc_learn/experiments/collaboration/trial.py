@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 
 from hrc_learn.experiments.run_recording import LiveView, no_live_view
+from hrc_learn.geometry import quaternion
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import (
     CameraChange,
@@ -165,7 +166,9 @@ def simulate_collaboration(
         delay=max(cell_config.latency.delay, sizes.image_delay),
         frame_loss=max(cell_config.latency.frame_loss, sizes.image_loss),
     )
-    cell_config = replace(cell_config, latency=latency)
+    safety = sizes.plant(cell_config.safety)
+    cell_config = replace(cell_config, latency=latency, safety=safety)
+    config = _on_plant(config or PickAndPlaceConfig(), sizes)
     noise = ImageNoise(
         blur=ImageNoise.blur + sizes.image_blur, noise=ImageNoise.noise + sizes.image_noise
     )
@@ -238,6 +241,13 @@ def simulate_collaboration(
         disturbances=disturbances,
         held_flat=frozenset(flat[HOME] & flat[RELEASE]),
     )
+
+
+def _on_plant(config: PickAndPlaceConfig, sizes: Imperfections) -> PickAndPlaceConfig:
+    """The controller's safety filter is told what the arm can do, too."""
+    law = config.grasping.controller
+    law = replace(law, safety=sizes.plant(law.safety))
+    return replace(config, grasping=replace(config.grasping, controller=law))
 
 
 def with_objects(workplace: Workplace, items: Sequence[ObjectConfig]) -> Workplace:
@@ -336,11 +346,16 @@ def _pose_on_table(
 
 
 def _watched(workplace: Workplace, world: World) -> Float[np.ndarray, "points 3"]:
-    """What a camera has to see: where objects lie, and the gripper's marker above them."""
+    """What a camera has to see: where objects lie, and the marker of a gripper above them."""
     reach = np.array([*OBJECTS_REACH, 0.0])
-    signs = np.array([[a, b, 0.0] for a in (-1, 1) for b in (-1, 1)])
-    hover = workplace.hover()
-    marker = hover.apply(torch.from_numpy(world.hand_marker_offset())).numpy()
+    corners = np.array([[a, b, 0.0] for a in (-1, 1) for b in (-1, 1)])
+    hover, offset = workplace.hover(), torch.from_numpy(world.hand_marker_offset())
+    turns = torch.linspace(*workplace.hover_turns, 7, dtype=torch.float64)
+    about = torch.stack([0 * turns, 0 * turns, turns], dim=-1)
+    turned = quaternion.multiply(quaternion.exp(about), hover.orientation)
+    markers = (hover.position + quaternion.rotate(turned, offset)).numpy()
     on_table = np.array([*workplace.table_centre, workplace.scene.objects[0].half_size[2]])
     # A marker's plate reaches 3 cm from its centre; the rest is margin.
-    return np.concatenate([middle + signs * (reach + 0.05) for middle in (on_table, marker)])
+    return np.concatenate(
+        [middle + corners * (reach + 0.05) for middle in (on_table, *markers)]
+    )

@@ -6,6 +6,7 @@ goals, cameras, null-space inputs and faults.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -18,7 +19,13 @@ from hrc_learn.controller import AdaptiveController, Goals, Observation
 from hrc_learn.controller.monitors import LimitMonitor
 from hrc_learn.experiments.controller.grasp_trials import MARKER
 from hrc_learn.geometry import quaternion
-from hrc_learn.jacobian import CompositeEstimator, FixedEstimator, RBFImageJacobian, paper_grid
+from hrc_learn.jacobian import (
+    CompositeEstimator,
+    FixedEstimator,
+    ImageJacobianEstimator,
+    RBFImageJacobian,
+    paper_grid,
+)
 from hrc_learn.kinematics import panda
 from hrc_learn.sim.closed_loop import (
     Imperfections,
@@ -197,8 +204,8 @@ def run_stress_trials(config: StressConfig) -> StressResult:
     """Run all trials: starts anywhere within the limits, at rest."""
     rng = torch.Generator().manual_seed(config.seed)
     limits, count = panda.limits, config.count
-    q = limits.lower + (limits.upper - limits.lower) * _uniform(rng, count, 7)
-    controller, camera = _controller(count, rng)
+    q = limits.lower + (limits.upper - limits.lower) * uniform(rng, count, 7)
+    controller, camera = random_controller(count, rng)
     virtual = VirtualCamera(camera=camera, imperfections=config.imperfections(), generator=rng)
     state = controller.initial_state(q)
     watch = LimitMonitor(limits, state.safety.velocity, config.dt)
@@ -222,38 +229,43 @@ def run_stress_trials(config: StressConfig) -> StressResult:
             command, state = controller.step(state, observation)
             q = q + config.dt * command.joint_velocity
             beyond += watch.violations(q, command.joint_velocity)
-            unknown += _unknown((q, command, state))
+            unknown += ~all_finite((q, command, state))
     return StressResult(beyond=beyond, unknown=unknown, interventions=state.safety.counts)
 
 
-def _unknown(everything: object) -> Bool[Tensor, "trials"]:
-    """Where any tensor holds a NaN or an infinity."""
+def all_finite(everything: object) -> Bool[Tensor, "trials"]:
+    """Where no tensor of a tree with the trials before holds a NaN or an infinity."""
     leaves = [leaf for leaf in _pytree.tree_leaves(everything) if leaf.dim() > 1]
-    return ~torch.stack([leaf.isfinite().flatten(1).all(-1) for leaf in leaves]).all(0)
+    return torch.stack([leaf.isfinite().flatten(1).all(-1) for leaf in leaves]).all(0)
 
 
-def _uniform(rng: torch.Generator, *shape: int) -> Tensor:
-    return torch.rand(*shape, generator=rng, dtype=torch.float64)
+def uniform(rng: torch.Generator, *shape: int) -> Tensor:
+    """Numbers from 0 to 1."""
+    return torch.rand(shape, generator=rng, dtype=torch.float64)
 
 
-def _controller(count: int, rng: torch.Generator) -> tuple[AdaptiveController, PinholeCamera]:
+def random_controller(
+    count: int,
+    rng: torch.Generator,
+    estimator: Callable[[RBFImageJacobian], ImageJacobianEstimator] = CompositeEstimator,
+) -> tuple[AdaptiveController, PinholeCamera]:
     """Cameras over the workspace, goals anywhere, within reach or not."""
-    turn = 2 * torch.pi * _uniform(rng, count)
+    turn = 2 * torch.pi * uniform(rng, count)
     middle = torch.tensor((0.3, 0.4, 0.3), dtype=torch.float64)
     camera = PinholeCamera.above(
         middle.expand(count, 3),
-        height=0.8 + 0.6 * _uniform(rng, count),
+        height=0.8 + 0.6 * uniform(rng, count),
         roll=turn,
-        tilt=0.5 * _uniform(rng, count),
+        tilt=0.5 * uniform(rng, count),
         bearing=turn,
         marker=middle.new_tensor(MARKER),
     )
     position, orientation = (
         torch.randn(count, size, generator=rng, dtype=torch.float64) for size in (3, 4)
     )
-    target = 100 + 800 * _uniform(rng, count, 2)
+    target = 100 + 800 * uniform(rng, count, 2)
     goals = Goals.at(position, quaternion.normalize(orientation), target)
-    return AdaptiveController(panda, CompositeEstimator(guessed_network()), goals), camera
+    return AdaptiveController(panda, estimator(guessed_network()), goals), camera
 
 
 class _JointReadings:
@@ -267,10 +279,10 @@ class _JointReadings:
         self, q: Float[Tensor, "trials n"]
     ) -> tuple[Float[Tensor, "trials n"], Bool[Tensor, "trials"] | None]:
         if self.fault == "nan":
-            broken = _uniform(self.rng, *q.shape) < 0.01 / q.shape[-1]
+            broken = uniform(self.rng, *q.shape) < 0.01 / q.shape[-1]
             return torch.where(broken, torch.nan, q), None
         if self.fault == "late":
-            begins = _uniform(self.rng, len(q)) < 0.5 * self.dt
+            begins = uniform(self.rng, len(q)) < 0.5 * self.dt
             self.away = torch.where(begins, _LATE, self.away - self.dt)
             return q, self.away > 0
         return q, None

@@ -16,6 +16,12 @@ from hrc_learn.experiments.controller.disturbance_trials import (
     run_stress_trials,
 )
 from hrc_learn.experiments.controller.grasp_trials import TrialConfig, TrialResult, run_trials
+from hrc_learn.experiments.controller.hostile_trials import (
+    PlantConfig,
+    PoisonConfig,
+    run_plant_trials,
+    run_poison_trials,
+)
 from hrc_learn.experiments.metric_table import Metric
 from hrc_learn.jacobian import (
     BroydenEstimator,
@@ -118,6 +124,13 @@ def _stress(label: str, **changes: Any) -> BatchedTrials:
     )
 
 
+def _plant(label: str, **changes: Any) -> BatchedTrials:
+    config = PlantConfig(**changes)
+    return BatchedTrials(
+        label=label, config=config, run=run_plant_trials, suite="stress", main=True
+    )
+
+
 def flip_row(J: Tensor) -> Tensor:
     """The sign of the first image row turned round."""
     return J * J.new_tensor([[-1.0], [1.0]])
@@ -200,6 +213,17 @@ EXPERIMENTS: Mapping[str, BatchedTrials] = {
     "stress_late": _stress("the same, images and joint states late by 0.1 s", fault="late"),
     "stress_lost": _stress("the same with the marker lost at random", fault="lost"),
     "stress_1khz": _stress("the same at 1 kHz, where jerk is limited", dt=0.001, duration=1.5),
+    "stress_poison": BatchedTrials(
+        label="NaN and infinity in any input, 400 ticks a trial, and whether arms move again",
+        config=PoisonConfig(),
+        run=run_poison_trials,
+        suite="stress",
+        main=True,
+    ),
+    "stress_plant": _plant(
+        "hostile commands to plants as slow, late and irregular as declared"
+    ),
+    "stress_plant_worse": _plant("the same half as much again as was declared", worse=1.5),
 }
 """What can be run."""
 
@@ -265,6 +289,8 @@ _SAFE = {"violations": 0.0}
 _NO_VIOLATION: dict[str, float] = dict.fromkeys(
     ("beyond_position", "beyond_velocity", "beyond_acceleration", "beyond_jerk", "nan"), 0.0
 )
+_MOVES_AGAIN = {"stuck": 0.0}
+_IRREGULAR = {"beyond_position": 0.0, "beyond_velocity": 0.0, "nan": 0.0} | _MOVES_AGAIN
 _GUESSES = ("jacobian_0.3", "jacobian_3", "row_flipped", "rows_swapped")
 _CAMERAS = ("noise", "latency", "slow_camera", "tilt")
 _STRESSES = ("stress", "stress_nan", "stress_late", "stress_lost", "stress_1khz")
@@ -314,6 +340,9 @@ CRITERIA: tuple[Criterion, ...] = (
         for name in _STRESSES
         for criterion in _criteria("limits", name, at_most=_NO_VIOLATION)
     ),
+    *_criteria("limits", "stress_poison", at_most=_NO_VIOLATION | _MOVES_AGAIN),
+    *_criteria("limits", "stress_plant", at_most=_IRREGULAR | {"beyond_acceleration": 0.0}),
+    *_criteria("limits", "stress_plant_worse", at_most=_IRREGULAR),
 )
 """All bounds. Figures 6 and 8, placing and the whole pipeline, need the simulator."""
 
