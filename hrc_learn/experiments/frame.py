@@ -8,10 +8,11 @@ import shlex
 import shutil
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
+from hrc_learn.experiments.imperfection_curve import curve_section
 from hrc_learn.experiments.metric_table import Evaluation, Metric, Summary, evaluate
 from hrc_learn.experiments.monte_carlo import Run as TrialRun
 from hrc_learn.experiments.monte_carlo import Trial, repeat
@@ -21,7 +22,7 @@ from hrc_learn.experiments.run_recording import (
     live_view,
     no_live_view,
 )
-from hrc_learn.sim import PhysicsError
+from hrc_learn.sim import Imperfections, PhysicsError
 from hrc_learn.skills.work_cell import TaskFailedError
 from hrc_learn.store import new_folder, write_json
 from hrc_learn.viz import LoggedSteps, RunRecording
@@ -68,6 +69,39 @@ class Study:
     """How the trials differ."""
     pictures: Callable[[Sequence[Trial]], Sequence[Picture]] = lambda trials: ()
     """Figures of the trials."""
+    size: float | None = None
+    """Of the imperfections, in multiples of the nominal ones: studies that have one are drawn
+    against it."""
+    shown: Mapping[str, str] = field(default_factory=dict)
+    """Values to be drawn against it: labels by their keys."""
+
+    def at_sizes(self, sizes: Sequence[float]) -> dict[str, "Study"]:
+        """The same, repeated with each size of the imperfections.
+
+        Args:
+            sizes: In multiples of the nominal ones; none for this study alone.
+
+        Returns:
+            This study under the name `TRIALS`, those with sizes that differ from its own as
+            `imperfections_2` and so on.
+        """
+        studies = {TRIALS: self}
+        for size in sizes:
+            trial: Any = self.trial
+            imperfections = Imperfections.nominal().scaled(size)
+            if imperfections == trial.experiment.imperfections:
+                studies[TRIALS] = replace(self, size=size)
+                continue
+            changed = replace(trial.experiment, imperfections=imperfections)
+            studies[f"imperfections_{size:g}"] = replace(
+                self,
+                title=f"{self.title}, imperfections {size:g} times nominal",
+                trial=replace(trial, experiment=changed),
+                metrics=(),
+                pictures=lambda trials: (),
+                size=size,
+            )
+        return studies
 
     def section(self, trials: Sequence[Trial]) -> Section:
         """The study in the report: success rate, failures, statistics, figures."""
@@ -255,12 +289,14 @@ def _conduct[Run](
 ) -> int:
     from rich.console import Console
 
-    counts = {TRIALS: options.trials, **(counts or {})}
+    studies = experiment.studies()
+    by_size = [name for name, study in studies.items() if study.size is not None]
+    counts = dict.fromkeys([TRIALS, *by_size], options.trials) | dict(counts or {})
     if negative := [name for name, count in counts.items() if count < 0]:
         raise ValueError(f"--{negative[0]} must not be negative, but is {counts[negative[0]]}.")
     if configuration is None:
         configuration = asdict(options) | asdict(experiment)  # pyright: ignore[reportArgumentType]
-    console, view, studies = Console(), no_live_view, experiment.studies()
+    console, view = Console(), no_live_view
     if options.serve:
         view = live_view(
             experiment.title, options.serving, lambda at: console.print(f"Dashboard at {at}")
@@ -290,6 +326,7 @@ def _conduct[Run](
                 sections=(
                     *experiment.sections(run, recordings),
                     *(studies[name].section(known) for name, known in trials.items()),
+                    *_curve(studies, trials),
                 ),
                 configuration=configuration,
                 versions=software_versions(),
@@ -311,6 +348,18 @@ def _conduct[Run](
     console.print(f"Recordings rerun {options.out / '*.rrd'}")
     console.print(f"Report     {options.out / 'report.html'}")
     return 0 if results.ok else 1
+
+
+def _curve(
+    studies: Mapping[str, Study], trials: Mapping[str, Sequence[Trial]]
+) -> Sequence[Section]:
+    """The section about the sizes of imperfections, of two or more."""
+    sized = {
+        size: known
+        for name, known in trials.items()
+        if (size := studies[name].size) is not None
+    }
+    return [curve_section(sized, studies[TRIALS].shown)] if len(sized) > 1 else []
 
 
 def _repeat(study: Study, count: int, file: Path, options: RunOptions) -> list[Trial]:

@@ -18,6 +18,19 @@ from hrc_learn.viz.report import Measurement
 if TYPE_CHECKING:
     from rich.table import Table
 
+RESOLUTIONS = {
+    # Encoder noise of 1e-4 rad moves the tool by 0.1 to 0.2 mm; MuJoCo's contacts give way by
+    # about as much.
+    "mm": 0.1,
+    # The same noise of seven joints: sqrt(7) * 1e-4 rad.
+    "deg": 0.02,
+    # Noise of a detected marker's centre is 0.08 px a coordinate (docs/training.md).
+    "px": 0.1,
+    # The control step.
+    "s": 0.01,
+}
+"""Smallest values that measurements tell from zero, by unit; others are shown as they are."""
+
 
 @dataclass(frozen=True)
 class Metric[Run]:
@@ -45,6 +58,9 @@ class Metric[Run]:
     """Whether the report's table has the row; the JSON file has it in any case."""
     detail: Callable[[Run], str] = lambda run: ""
     """What to add to the reason when an essential bound was missed."""
+    resolution: float | None = None
+    """Below which the value is not shown, nor digits finer than it; None: that of its unit in
+    `RESOLUTIONS`. Files hold the value in full."""
 
     def __post_init__(self) -> None:
         if self.at_most is not None and self.at_least is not None:
@@ -62,6 +78,9 @@ class Metric[Run]:
             target=self.at_most if self.at_least is None else self.at_least,
             at_least=self.at_least is not None,
             claim=self.claim,
+            resolution=(
+                RESOLUTIONS.get(self.unit, 0.0) if self.resolution is None else self.resolution
+            ),
         )
 
     def of_part[Whole](
@@ -84,6 +103,7 @@ class Metric[Run]:
             essential=self.essential and bounded,
             listed=self.listed,
             detail=lambda whole: self.detail(part(whole)),
+            resolution=self.resolution,
         )
 
 

@@ -92,6 +92,20 @@ class ImageJacobianEstimator(nn.Module, ABC):
         """
         return state
 
+    def compared(self, state: Any, before: Measurement, now: Measurement) -> Any:
+        """State that has learned from two frames which the caller chose.
+
+        Neighbouring pairs of a motion have the noise of the frame between them in common, of
+        which a filter knows nothing. Means over many images at rest at both ends, one pair,
+        tell more than all pairs of the motion.
+
+        Args:
+            state: Before.
+            before: First frame.
+            now: Second frame; its `dt` should be 0 where time passed in `update`.
+        """
+        return state
+
     def jacobian(
         self, state: Any, r: Pose | Float[Tensor, "*batch 6"]
     ) -> Float[Tensor, "*batch rows 6"]:
@@ -256,6 +270,17 @@ class KeyFrameEstimator[Config: LearningConfig](ImageJacobianEstimator):
         """The same weights, and no key frame."""
         batch = state.weight.shape[:-2]
         return replace(state, key=KeyFrame.absent(self.network, *batch))
+
+    def compared(self, state: Any, before: Measurement, now: Measurement) -> Any:
+        """One more pair; the key frame stays."""
+        first = KeyFrame(
+            pose=before.pose,
+            feature=before.feature,
+            theta=self.network.basis(before.pose),
+            present=before.valid,
+        )
+        learned = self.update(replace(state, key=first), now)
+        return replace(learned, key=state.key)
 
     def advance(
         self,

@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from hrc_learn.controller import SafetyConfig
 from hrc_learn.kinematics import panda
+from hrc_learn.vision import ImageNoise
 
 # pyright: reportAttributeAccessIssue=false
 # MuJoCo ships no type stubs; its names come from a compiled module.
@@ -75,6 +76,8 @@ class Imperfections:
     """Range of the height of each object [m]. Nominal 5 mm."""
     object_yaw: float = 0.0
     """Range of the yaw of objects on the table [rad]. Nominal: any."""
+    teaching_error: float = 0.0
+    """Range of a place to which a person leads the arm, along each axis [m]. Nominal 0.5 mm."""
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -117,6 +120,7 @@ class Imperfections:
             table_height=0.02,
             object_height=0.005,
             object_yaw=math.pi,
+            teaching_error=5e-4,
         )
 
     def scaled(self, factor: float) -> Imperfections:
@@ -130,6 +134,13 @@ class Imperfections:
         values["slowness"] = min(values["slowness"], 0.9)
         values["object_yaw"] = min(values["object_yaw"], math.pi)
         return Imperfections(**values)
+
+    @property
+    def camera_noise(self) -> ImageNoise:
+        """Of images, the camera's own included."""
+        return ImageNoise(
+            blur=ImageNoise.blur + self.image_blur, noise=ImageNoise.noise + self.image_noise
+        )
 
     def plant(self, safety: SafetyConfig) -> SafetyConfig:
         """Settings of a safety filter that is told what this arm's driver does."""

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.dmp import JointDMP, PoseDMP
-from hrc_learn.geometry import Pose
+from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import (
     SerialChain,
     UnreachableError,
@@ -57,6 +57,35 @@ class Plan:
     def duration(self) -> float:
         """[s]"""
         return self.dt * (len(self.path) - 1)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PlaceCorrection:
+    """How an arm's own readings differ from where places are said to be.
+
+    Errors of base, tool and encoders are nearly the same at all places in one orientation. Read
+    once at a place that is known, to which a person leads the arm, they can be taken out: what
+    remains is the arm's repeatability.
+    """
+
+    shift: Float[Tensor, "3"]
+    """Of positions, base frame [m]."""
+    turn: Float[Tensor, "4"]
+    """Of orientations, in the tool's frame."""
+
+    @classmethod
+    def of(cls, read: Pose, place: Pose) -> "PlaceCorrection":
+        """From the pose that the arm reads where its tool is at a known place."""
+        back = quaternion.conjugate(place.orientation)
+        return cls(
+            shift=read.position - place.position,
+            turn=quaternion.multiply(back, read.orientation),
+        )
+
+    def apply(self, place: Pose) -> Pose:
+        """What the arm will read with its tool at another place."""
+        turned = quaternion.multiply(place.orientation, self.turn)
+        return Pose(place.position + self.shift, turned)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,7 +5,7 @@ turns the gripper for the object. What it needs from demonstrations is in `visua
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,6 +16,7 @@ from torch import Tensor
 from hrc_learn.controller import AdaptiveController, ControllerState, Goals, Observation
 from hrc_learn.controller.interface import IMAGE_SIZE
 from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.jacobian import Measurement
 from hrc_learn.skills.marker_angle import AngleServo, MarkerAngle
 from hrc_learn.skills.marker_sensor import HeldMarker
 from hrc_learn.skills.work_cell import MissedGraspError, WorkCell
@@ -47,10 +48,10 @@ class VisualServoConfig:
     """Speed of that descent [m/s]: no faster than the camera can guide it along the line."""
     probe_tolerance: float = 10.0
     """Distance of the feature from the target at which the descent begins [px]."""
-    probe_reach: float = 0.015
+    probe_reach: float = 0.005
     """Sideways deviation from the line after the descent above which the probe is repeated from
     the new place [m]: the line looks different there, and one motion may not tell it well."""
-    max_probes: int = 3
+    max_probes: int = 5
     """Descents at most."""
     border: float = 80.0
     """Distance that the target keeps from the edge of the image [px]: within 50 px
@@ -152,7 +153,9 @@ class ServoTarget:
         self, image_jacobian: Float[np.ndarray, "2 6"], pose: Pose
     ) -> Float[np.ndarray, "2"]:
         """Where the marker should be for the end effector to be on the line at its height."""
-        height = float(pose.position[2] - self.above.position[2])
+        # Within the box the gripper goes on straight down, not along the line: a few
+        # millimetres that are left of the height must not lead aside.
+        height = float(pose.position[2] - self.above.position[2]) - self.config.half_size[2]
         offset = self._offset(min(max(height, 0.0), self.config.probe))
         pixel = self.target(image_jacobian, self.upright) + image_jacobian[:, :3] @ offset
         return self.config.within(pixel) if self.raised else pixel
@@ -210,6 +213,7 @@ class VisualServo:
         self._turning: Tensor | None = None
         self._last_pixel = np.full(2, np.nan)
         self._arrived = False
+        self._at_rest: Measurement | None = None  # mean of what was seen at the last rest
         self._held: HeldMarker | None = None
         self.state: ControllerState = controller.initial_state(cell.joints)
 
@@ -230,11 +234,17 @@ class VisualServo:
             if config.probe > 0:
                 raised = replace(target, raised=config.probe)
                 self._converge(raised, config.probe_tolerance, start)
-                above = self._cell.pose
+                above, high = self._cell.pose, self._at_rest
                 self._descend(target)
             reached = self._converge(target, config.tolerance, start)
             if config.probe == 0:
                 break
+            if high is not None and self._at_rest is not None:
+                estimator = self._controller.estimator
+                learned = estimator.compared(self.state.estimator, high, self._at_rest)
+                self.state = replace(self.state, estimator=learned)
+                self._cached = (np.nan, self._cached[1])
+                reached = self._converge(target, config.tolerance, start)
             # Along the line of the turned tool, which leads elsewhere than when not turned.
             turned = replace(target, orientation=self._turned)
             if turned.deviation(self._cell.pose, above) < config.probe_reach:
@@ -255,6 +265,7 @@ class VisualServo:
     def _converge(self, target: ServoTarget, tolerance: float, start: float) -> float:
         """Step until marker and height have stayed at the target; when they got there [s]."""
         reached = self._last_detection = self._cell.time
+        seen: dict[float, tuple[Pose, Tensor]] = {}
         while self._cell.time - reached < self._config.dwell:
             if self._out_of_view():
                 self._detected = False
@@ -264,7 +275,12 @@ class VisualServo:
             turned = self.turn_error(target) < self._config.turn_tolerance
             if not (self.error(target) < tolerance and at_height and turned):
                 reached = self._cell.time
+                seen.clear()
+            elif (image := self._cell.observation).joints is not None:
+                feature = torch.from_numpy(self._feature())
+                seen[image.time] = self._cell.chain.forward(image.joints), feature
             self._check_timeouts(target, self._cell.time - start)
+        self._at_rest = _mean(list(seen.values()))
         return reached
 
     def _descend(self, target: ServoTarget) -> None:
@@ -413,3 +429,22 @@ class VisualServo:
 
     def _feature(self) -> Float[np.ndarray, "2"]:
         return self._cell.observation.pixels.get(self._marker, np.full(2, np.nan))
+
+
+def _mean(seen: Sequence[tuple[Pose, Float[Tensor, "2"]]]) -> Measurement | None:
+    """Of frames at rest; None where the feature was not seen in one."""
+    known = [(pose, feature) for pose, feature in seen if bool(feature.isfinite().all())]
+    if not known:
+        return None
+    poses, features = zip(*known, strict=True)
+    # At rest the orientations differ by less than their noise matters.
+    pose = Pose(torch.stack([p.position for p in poses]).mean(0), poses[-1].orientation)
+    none = torch.zeros(6, dtype=pose.position.dtype)
+    return Measurement(
+        pose=pose,
+        feature=torch.stack(features).mean(0),
+        valid=torch.tensor(True),
+        dt=0.0,
+        xi_x=none[:2],
+        xi_r=none,
+    )

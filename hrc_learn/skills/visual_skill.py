@@ -48,9 +48,12 @@ LONGEST_OFFSET = 0.3
 the image Jacobian knows little about height: without this bound the least-squares offset can be
 metres long."""
 
-POSE_NOISE = 2e-4
+POSE_NOISE = 1.5e-4
 """Standard deviation of a pose by encoders with noise of 1e-4 rad, on levers of up to 0.8 m, as
 the estimator of the image Jacobian has to expect it [m]."""
+PIXEL_NOISE = 0.15
+"""The same of a marker's centre [px]: 0.08 px of the detector (docs/training.md), more in
+images that are noisy and blurred."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -300,7 +303,8 @@ def from_learned(learned: RBFImageJacobian) -> KalmanEstimator:
     """
     network = copy.deepcopy(learned).double()
     network.covariance = None
-    return KalmanEstimator(network, KalmanConfig(pose_noise=POSE_NOISE, watched_drift=10.0))
+    config = KalmanConfig(pose_noise=POSE_NOISE, pixel_noise=PIXEL_NOISE, watched_drift=10.0)
+    return KalmanEstimator(network, config)
 
 
 def guessed_network() -> RBFImageJacobian:

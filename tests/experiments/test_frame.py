@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 from typing import ClassVar
 
@@ -23,7 +23,7 @@ from hrc_learn.experiments.frame import (
 )
 from hrc_learn.experiments.metric_table import Metric, evaluate, p95
 from hrc_learn.experiments.monte_carlo import Trial
-from hrc_learn.sim import PhysicsError
+from hrc_learn.sim import Imperfections, PhysicsError
 from hrc_learn.viz import LoggedSteps, RunRecording, StepLog
 from hrc_learn.viz.report import Picture, Section, read_report
 
@@ -152,7 +152,7 @@ def test_a_missed_bound_and_a_task_given_up_are_failures_with_reasons(work):
     status, values, _, shown = work(ThrowExperiment(bound=1e-6))
     assert status == 1
     assert values["success_rate"] == 0
-    assert "error: 1.26 mm, but ≤ 1e-06 mm is wanted (it landed at 1.00 m)" in shown.err
+    assert "error: 1.3 mm, but ≤ 1e-06 mm is wanted (it landed at 1.00 m)" in shown.err
     status, values, _, shown = work(ThrowExperiment(gives_up=True), "other")
     assert (status, values["success_rate"]) == (1, 0)
     assert shown.err == "failed: the ball was dropped\n"
@@ -253,6 +253,34 @@ def test_a_metric_of_a_part_keeps_its_bound_unless_it_is_only_compared():
     assert len(evaluation.faults) == 1
 
 
+@pytest.mark.parametrize(
+    ("value", "unit", "shown"),
+    [
+        (0.0283, "mm", "< 0.1 mm"),
+        (-0.0283, "mm", "< 0.1 mm"),
+        (6.564, "mm", "6.6 mm"),
+        (116.2, "mm", "116 mm"),
+        (0.00052, "deg", "< 0.02 deg"),
+        (0.5712, "deg", "0.57 deg"),
+        (0.0259, "px", "< 0.1 px"),
+        (math.nan, "mm", "nan mm"),
+        (0.000459, "", "0.000459"),
+    ],
+)
+def test_no_digits_below_the_resolution_are_shown_but_all_are_kept(value, unit, shown):
+    metric = Metric("error", lambda x: x, unit).of_part(lambda x: x)
+    evaluation = evaluate([metric], value)
+    assert [m.shown for m in evaluation.table] == [shown]
+    assert list(evaluation.values.values()) == pytest.approx([value], abs=0, nan_ok=True)
+
+
+def test_a_bound_missed_by_less_than_the_resolution_does_not_look_kept():
+    metric = Metric("error", lambda x: x, "mm", at_most=2.0)
+    assert [m.shown for m in evaluate([metric], 2.04).table] == ["2.04 mm"]
+    coarse = Metric("error", lambda x: x, "mm", resolution=0.5)
+    assert [m.shown for m in evaluate([coarse], 0.4).table] == ["< 0.5 mm"]
+
+
 def test_rows_that_are_not_listed_are_measured_and_nan_keeps_no_bound():
     hidden = Metric("hidden", lambda x: x, at_least=1.0, listed=False, essential=True)
     evaluation = evaluate([hidden], math.nan)
@@ -261,3 +289,49 @@ def test_rows_that_are_not_listed_are_measured_and_nan_keeps_no_bound():
     assert evaluation.faults[0].startswith("hidden: nan")
     with pytest.raises(ValueError, match="both sides"):
         Metric("both", lambda x: x, at_most=1.0, at_least=0.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImperfectThrow(ThrowExperiment):
+    """Thrown the further off the larger the imperfections are."""
+
+    imperfections: Imperfections = field(default_factory=Imperfections.nominal)
+    curve: tuple[float, ...] = ()
+
+    def run(self, seed: int, observer: Observer = UNOBSERVED) -> Throw:
+        size = self.imperfections.encoder_noise / Imperfections.nominal().encoder_noise
+        return Throw(self.target + 0.03 * size * np.random.default_rng(seed).uniform())
+
+    def studies(self) -> Mapping[str, Study]:
+        study = Study(
+            title="Throws",
+            trial=RepeatedRun(replace(self, curve=())),
+            metrics=[Metric("throws, error (95 %)", p95("error_mm"), "mm")],
+            shown={"error_mm": "error [mm]"},
+        )
+        return study.at_sizes(self.curve)
+
+
+def test_success_is_drawn_against_the_size_of_the_imperfections(work):
+    """The size that the run itself has is not run twice; the others count as many trials."""
+    _, values, folder, _ = work(ImperfectThrow(curve=(0.0, 1.0, 4.0)), trials=8)
+    drawn = [np.random.default_rng(seed).uniform() for seed in range(8)]
+    assert values["success_rate"] == 1.0
+    assert values["error_max_mm"] == pytest.approx(30 * max(drawn))
+    assert values["imperfections_0_success_rate"] == 1.0
+    assert values["imperfections_4_success_rate"] == np.mean([120 * u < 50 for u in drawn])
+    assert values["imperfections_4_error_max_mm"] == pytest.approx(120 * max(drawn))
+    assert not any(key.startswith("imperfections_1_") for key in values)
+    section = read_report(folder).sections[-1]
+    assert section.heading == "Success against imperfections"
+    assert [line.split(":")[0] for line in section.text.split("\n\n")] == [
+        "0 times nominal",
+        "1 times nominal",
+        "4 times nominal",
+    ]
+    assert (folder / "figures" / "imperfections.png").stat().st_size > 5000
+
+
+def test_one_size_is_no_curve(work):
+    _, _, folder, _ = work(ImperfectThrow(curve=(1.0,)), trials=2)
+    assert "Success against" not in (folder / "report.json").read_text(encoding="utf-8")

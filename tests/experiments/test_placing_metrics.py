@@ -23,6 +23,7 @@ from hrc_learn.skills.work_cell import TaskFailedError
 
 WORKPLACE = Workplace()
 SHELVES = WORKPLACE.shelf_names()
+WITHIN = "fraction within 3 mm and 3 deg of its place"
 GOOD = PlacingOutcome(
     deviation=2e-3,
     place_error=1e-4,
@@ -66,8 +67,8 @@ TOUCH = Touch(first="box", second="board_middle", start=6.1, end=6.2, depth=0.01
     ("changes", "words"),
     [
         ({"deviation": 0.0121}, "upper shelf, approach-path deviation: 12.1 mm"),
-        ({"place_error": 0.0025}, "place error: 2.5 mm"),
-        ({"place_tilt": 0.01}, "place tilt: 0.573 deg"),
+        ({"place_error": 0.0035}, "place error: 3.5 mm"),
+        ({"place_tilt": 0.1}, "place tilt: 5.73 deg"),
         ({"violations": 3}, "joint limit violations: 3"),
         ({"contacts": (TOUCH,)}, "upper shelf: box met board_middle at 6.10 s, 12.1 mm deep"),
         ({"placed": False}, "objects that stand on their shelf: 2"),
@@ -104,7 +105,15 @@ def test_one_contact_in_fifty_placings_is_allowed_and_two_are_not():
 
 def test_a_trial_that_was_given_up_keeps_no_target():
     trials = [trial(0), Trial(seed=1, values={}, failure="no free start")]
-    assert "largest place error" in missed(random_starts(trials))
+    assert WITHIN in missed(random_starts(trials))
+
+
+def test_one_place_in_fifty_may_be_missed_and_two_may_not():
+    good = [trial(k) for k in range(20)]
+    for changes in ({"place_error": 0.0031}, {"place_tilt": 0.06}):
+        off = [trial(20 + k, **changes) for k in range(2)]
+        assert missed(random_starts([*good, off[0]])) == set()
+        assert missed(random_starts([*good, *off])) == {WITHIN}
 
 
 def test_the_arm_may_hit_the_cabinet_without_the_posture_but_not_with_it():

@@ -169,8 +169,8 @@ def test_an_executed_placing_ends_on_the_shelf_as_demonstrated(skill, demos):
     assert evaluate(placing_metrics(["middle"]), {"middle": outcome}).faults == ()
     assert outcome.placed
     assert outcome.jerk < 1e-2
-    # Measured by the simulator, so not exactly what was planned.
-    assert 0 < outcome.place_error < 5e-4
+    # Measured by the simulator, of an object let down until the arm feels the board.
+    assert 0 < outcome.place_error < 1.5e-3
     np.testing.assert_allclose(run.path[-1], run.plan.goal.position.numpy(), atol=1e-3)
     assert [event.text for event in run.cell.log.events] == [
         "transfer",

@@ -103,7 +103,7 @@ def test_a_turned_tool_that_stays_on_its_own_line_is_not_probed_again(astray, pr
         return 0.0
 
     vars(servo).update(_config=CONFIG, _turned=turned, _cell=cell, _resume=lambda: None)
-    vars(servo).update(_descend=descend, _converge=converge)
+    vars(servo).update(_descend=descend, _converge=converge, _at_rest=None)
     servo.servo_to(
         ServoTarget(
             config=CONFIG,

@@ -20,7 +20,17 @@ from hrc_learn.cli.arguments import (
 
 
 @dataclass(frozen=True, kw_only=True)
-class Demo(Measured):
+class Imperfect:
+    """What all that run in the simulated work cell have in common."""
+
+    imperfections: float = 1.0
+    """Errors of arm, camera, calibration and objects, so many times their nominal size."""
+    ideal: bool = False
+    """Without any: --imperfections 0."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Demo(Imperfect, Measured):
     """Do the whole main job in simulation: demonstrate, learn, grasp, place.
 
     Records demonstrations of placing and of servoing, fits a movement primitive and an image
@@ -38,14 +48,10 @@ class Demo(Measured):
     """Where to put the object; the middle shelf is the demonstrated one."""
     seed: int = 0
     """Seed of where the object lies and of image noise."""
-    imperfections: float = 1.0
-    """Errors of arm, camera, calibration and objects, so many times their nominal size."""
-    ideal: bool = False
-    """Without any: --imperfections 0."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunExperiment(Written):
+class RunExperiment(Imperfect, Written):
     """What the paper's three experiments have in common."""
 
     out: Path
@@ -98,6 +104,9 @@ class RunPlacing(RunExperiment):
     """Random starts from which to place on each shelf besides."""
     noise: float = 0.1
     """Standard deviation of each joint at these starts, about home [rad]."""
+    taught: bool = True
+    """Lead the arm once to the place on the demonstrated shelf, and correct all places by what
+    its encoders read there: else its calibration counts."""
     ablation: int = 0
     """Further demonstrations with and without the null-space posture."""
     pictures: bool = True
@@ -162,10 +171,6 @@ class RunCollaboration(RunServoing):
     """How far behind the board's front edge [m]."""
     occlusion: More[tuple[tuple[float, float], ...]] = ()
     """Intervals in which a board occludes the marker: start and duration [s]."""
-    imperfections: float = 1.0
-    """Errors of arm, camera, calibration and objects, so many times their nominal size."""
-    ideal: bool = False
-    """Without any: --imperfections 0."""
     camera_moved: bool = False
     """Move and turn the camera between two objects."""
     camera_change: Configuration = Detail("hrc_learn.sim", "CameraChange")

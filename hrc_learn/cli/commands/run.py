@@ -18,6 +18,7 @@ from hrc_learn.cli.arguments.learn import FitImageJacobian, FitPrimitives
 from hrc_learn.cli.arguments.record import RecordPlacing, RecordServoing
 from hrc_learn.cli.arguments.run import (
     Demo,
+    Imperfect,
     RunCollaboration,
     RunExperiment,
     RunGrasping,
@@ -50,6 +51,8 @@ def run_placing(args: RunPlacing) -> int:
         demonstrations=dataset.resolve(),
         speed=args.speed,
         noise=args.noise,
+        imperfections=_imperfections(args),
+        taught=args.taught,
         snapshots=args.pictures,
     )
     return _conduct(experiment, args, counts={ABLATION: args.ablation})
@@ -66,6 +69,7 @@ def run_grasping(args: RunGrasping) -> int:
         scene=GraspingSceneConfig(
             camera_roll=math.radians(args.camera_roll), random_camera=args.random_camera
         ),
+        imperfections=_imperfections(args),
         camera=args.camera,
         config=replace(args.config, controller=controller),
     )
@@ -101,7 +105,7 @@ def run_collaboration(args: RunCollaboration) -> int:
     return _conduct(experiment, args)
 
 
-def _imperfections(args: RunCollaboration) -> Imperfections:
+def _imperfections(args: Imperfect) -> Imperfections:
     if args.imperfections < 0:
         raise ValueError(f"--imperfections must not be negative, but is {args.imperfections}.")
     return Imperfections.nominal().scaled(0.0 if args.ideal else args.imperfections)

@@ -7,7 +7,11 @@ from pathlib import Path
 from typing import ClassVar
 
 from hrc_learn.demos import Demonstration, load_demos
-from hrc_learn.experiments.collaboration.metrics import TRIAL_METRICS, collaboration_metrics
+from hrc_learn.experiments.collaboration.metrics import (
+    CURVES,
+    TRIAL_METRICS,
+    collaboration_metrics,
+)
 from hrc_learn.experiments.collaboration.report import SUMMARY, collaboration_sections
 from hrc_learn.experiments.collaboration.trial import (
     NULL_SPACE_FORCES,
@@ -16,7 +20,7 @@ from hrc_learn.experiments.collaboration.trial import (
     simulate_collaboration,
     workplace_for,
 )
-from hrc_learn.experiments.frame import TRIALS, UNOBSERVED, Observer, RepeatedRun, Study
+from hrc_learn.experiments.frame import UNOBSERVED, Observer, RepeatedRun, Study
 from hrc_learn.experiments.metric_table import Metric
 from hrc_learn.experiments.run_recording import record
 from hrc_learn.geometry import Box
@@ -54,6 +58,8 @@ class CollaborationExperiment:
     disturbances: Disturbances = field(default_factory=Disturbances)
     imperfections: Imperfections = field(default_factory=Imperfections.nominal)
     """Of arm, calibration, camera and objects."""
+    curve: tuple[float, ...] = ()
+    """Sizes of the imperfections with which to repeat it, in multiples of the nominal ones."""
     cell: WorkCellConfig = field(default_factory=WorkCellConfig)
     config: PickAndPlaceConfig = field(default_factory=PickAndPlaceConfig)
     camera: CameraKind = "auto"
@@ -119,16 +125,16 @@ class CollaborationExperiment:
         return collaboration_sections(run, recordings["run"])
 
     def studies(self) -> Mapping[str, Study]:
-        """Other poses of the objects and other noise, with the synthetic camera."""
+        """Other poses of the objects and other noise, with each size of the imperfections."""
         cell = replace(self.cell, keep_image_every=0)
-        trial = replace(self, camera="synthetic", cell=cell, page=None)
         study = Study(
             title="Collaborations with other seeds",
-            trial=RepeatedRun(trial),
+            trial=RepeatedRun(replace(self, cell=cell, page=None, curve=())),
             metrics=TRIAL_METRICS,
-            text="Other poses of the objects and other image noise.",
+            text="Other imperfections, poses of the objects and image noise.",
+            shown=CURVES,
         )
-        return {TRIALS: study}
+        return study.at_sizes(self.curve)
 
     def _demonstration(self) -> Demonstration | None:
         """The first one that the placing motion was learned from, if it is still there."""

@@ -150,6 +150,13 @@ TRIAL_METRICS: Sequence[Metric[Sequence[Trial]]] = (
 )
 """Rows of the table that repetitions add."""
 
+CURVES = {
+    "end_effector_deviation_mm": "moved by the person [mm]",
+    "grasp_offset_mm": "grasp offset [mm]",
+    "place_error_mm": "place error [mm]",
+}
+"""Drawn against the size of the imperfections: labels by the keys of values."""
+
 
 def _worst(run: CollaborationRun, measured: Callable[[PickPlaceJob], float]) -> float | None:
     """Over the objects that were released on a shelf; None if it never came to that."""

@@ -39,7 +39,7 @@ from hrc_learn.skills.work_cell import WorkCell, WorkCellConfig
 from hrc_learn.teleoperation import ScriptedForce, ScriptedPerturbation
 from hrc_learn.teleoperation.page import PageConfig
 from hrc_learn.teleoperation.page_session import task_page
-from hrc_learn.vision import CameraModel, ImageNoise, Marker
+from hrc_learn.vision import CameraModel, Marker
 
 THREE_OBJECTS = (
     ObjectConfig(),
@@ -169,9 +169,6 @@ def simulate_collaboration(
     safety = sizes.plant(cell_config.safety)
     cell_config = replace(cell_config, latency=latency, safety=safety)
     config = _on_plant(config or PickAndPlaceConfig(), sizes)
-    noise = ImageNoise(
-        blur=ImageNoise.blur + sizes.image_blur, noise=ImageNoise.noise + sizes.image_noise
-    )
     items = workplace.scene.objects
     _check_shelves(workplace, shelves)
     world = World(workplace.scene, sizes.draw(rng))
@@ -182,7 +179,7 @@ def simulate_collaboration(
     occluder = ScriptedOcclusion(world, disturbances.occlusions)
     eyes = ChangingCamera(
         workplace.scene.camera,
-        lambda model: open_camera(world, camera, model, rng=rng, noise=noise),
+        lambda model: open_camera(world, camera, model, rng=rng, noise=sizes.camera_noise),
     )
 
     def advance(duration: float) -> None:

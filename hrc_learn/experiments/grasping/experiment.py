@@ -21,7 +21,7 @@ from hrc_learn.experiments.grasping.trial import (
 )
 from hrc_learn.experiments.metric_table import Metric
 from hrc_learn.experiments.run_recording import LiveView, no_live_view
-from hrc_learn.sim import CameraKind
+from hrc_learn.sim import CameraKind, Imperfections
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.grasping import GraspingConfig
 from hrc_learn.skills.visual_skill import VisualServoSkill
@@ -48,6 +48,8 @@ class GraspingExperiment:
         default_factory=lambda: GraspingSceneConfig(random_camera=True)
     )
     """How camera, start and object are drawn."""
+    imperfections: Imperfections = field(default_factory=Imperfections.nominal)
+    """Of arm, calibration, camera and object."""
     camera: CameraKind = "synthetic"
     config: GraspingConfig = field(default_factory=GraspingConfig)
 
@@ -56,7 +58,10 @@ class GraspingExperiment:
             raise ValueError(f"no variant {unknown[0]!r}; there are {', '.join(VARIANTS)}.")
 
     def run(self, seed: int, observer: Observer = UNOBSERVED) -> GraspingRun:
-        """The grasp, then the comparison; the seed draws the scene and the image noise."""
+        """The grasp, then the comparison.
+
+        The seed draws the scene, the imperfections and the image noise.
+        """
         observer.tell("The whole grasp")
         grasp, compared = self._grasp(seed, DEFAULT, view=observer.view), {}
         for name in dict.fromkeys(self.variants):
@@ -75,7 +80,7 @@ class GraspingExperiment:
         skill, rng = VisualServoSkill.load(self.aiming), np.random.default_rng(seed)
         return simulate_grasp(
             skill,
-            GraspingScene.draw(Workplace(), self.scene, rng, self.camera),
+            GraspingScene.draw(Workplace(), self.scene, rng, self.camera, self.imperfections),
             estimator=VARIANTS[variant].estimator(skill.jacobian),
             told_target=compared,
             camera=self.camera,

@@ -8,11 +8,17 @@ import numpy as np
 import torch
 
 from hrc_learn.experiments.grasping.trial import VARIANTS, GraspingRun, SimulatedGrasp
+from hrc_learn.experiments.grip import Hold, grasp_offset, hold
 from hrc_learn.experiments.metric_table import Metric, median, p95, success_rate
 from hrc_learn.experiments.monte_carlo import Trial
-from hrc_learn.experiments.run_recording import limit_violations, span, unwanted_contacts
-from hrc_learn.geometry import Pose
-from hrc_learn.kinematics import panda
+from hrc_learn.experiments.run_recording import (
+    limit_violations,
+    span,
+    spans,
+    true_tool,
+    unwanted_contacts,
+)
+from hrc_learn.geometry import quaternion
 from hrc_learn.sim import Touch
 
 LIFTED = 0.10
@@ -35,7 +41,7 @@ class Descent:
     offset: float = math.nan
     """From the end effector to right above the object, horizontally [m]."""
     angle: float = math.nan
-    """Between the end effector and the demonstrated approach [rad]."""
+    """Between where the end effector points and where it was demonstrated to [rad]."""
 
     @classmethod
     def of(cls, run: SimulatedGrasp) -> "Descent":
@@ -46,18 +52,19 @@ class Descent:
             return cls()
         servoing, time = span(log, "servo"), log["time"]
         last = int(np.searchsorted(time, descents[-1])) - 1
-        tool = panda.forward(torch.from_numpy(log["joint_position"][last]))
-        above = Pose(tool.position, run.scene.workplace.hover().orientation)
+        tool = true_tool(run.motion, run.world, len(log))[last]
+        down, shown = (
+            quaternion.rotate(q, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+            for q in (tool.orientation, run.scene.workplace.hover().orientation)
+        )
         led = (time >= servoing[0]) & (log["vision_activation"] > 0)
         taken_over = time[led][0] if led.any() else math.nan
-        target = log["target"][last] - run.scene.true_target(run.world)
+        target = log["target"][last] - run.scene.true_target(run.world, tool)
         return cls(
             vision_time=float(min(servoing[1], descents[-1]) - taken_over),
             target_error=float(np.linalg.norm(target)),
-            offset=float(
-                np.linalg.norm(tool.position[:2].numpy() - run.scene.object_pose[:2, 3])
-            ),
-            angle=float(tool.twist_to(above)[3:].norm()),
+            offset=grasp_offset(log, run.motion, run.world, run.item.name, descents[-1]),
+            angle=float(torch.atan2(torch.linalg.cross(down, shown).norm(), down @ shown)),
         )
 
 
@@ -72,6 +79,15 @@ def lift(run: SimulatedGrasp) -> float:
     return float(run.world.object_pose(run.item.name)[2, 3] - run.scene.object_pose[2, 3])
 
 
+def _hold(run: SimulatedGrasp) -> Hold | None:
+    """How the object hung in the hand from the end of the lift on; None if it never was."""
+    homes = [t for t, _ in spans(run.cell.log, "home")]
+    if run.result is None or not homes:
+        return None
+    log, item = run.cell.log, run.item.name
+    return hold(log, run.motion, run.world, item, homes[-1], math.inf)
+
+
 def jacobian_errors(run: SimulatedGrasp) -> tuple[float, float]:
     """Relative error of the image Jacobian's linear part, as vision takes over and at descent.
 
@@ -82,7 +98,7 @@ def jacobian_errors(run: SimulatedGrasp) -> tuple[float, float]:
     if not len(led):
         return math.nan, math.nan
     ends = led[[0, -1]]
-    tool = panda.forward(torch.from_numpy(log["joint_position"][ends]))
+    tool = true_tool(run.motion, run.world, len(log))[torch.from_numpy(ends)]
     marker = tool.apply(torch.from_numpy(run.world.hand_marker_offset())).numpy()
     true = run.world.config.camera.image_jacobian(marker)[..., :3]
     wrong = np.linalg.norm(log["image_jacobian"][ends, :, :3] - true, axis=(1, 2))
@@ -99,7 +115,12 @@ def arrival(run: SimulatedGrasp) -> float:
     led = np.flatnonzero(log["vision_activation"] > 0)
     if not len(led):
         return math.inf
-    error = np.linalg.norm(log["feature"] - run.scene.true_target(run.world), axis=1)
+    tool = true_tool(run.motion, run.world, len(log))
+    marker = tool.apply(torch.from_numpy(run.world.hand_marker_offset())).numpy()
+    seen = run.world.config.camera.project(marker)
+    # Where it truly was: images are late and noisy. NaN as long as it was out of sight.
+    seen[~np.isfinite(log["feature"]).all(axis=1)] = np.nan
+    error = np.linalg.norm(seen - run.scene.true_target(run.world), axis=1)
     servoed = np.flatnonzero(np.isfinite(log["target"]).all(axis=1))
     # Not `error <= REACHED`: a marker that is hidden for a moment (NaN) has not gone away.
     within = ~(error[servoed] > REACHED)
@@ -125,6 +146,12 @@ def grasp_metrics() -> list[Metric[SimulatedGrasp]]:
             claim="the robot grasped the object (Experiment 2)",
             essential=True,
         ),
+        Metric(
+            "object held flat between both pads",
+            lambda run: int(run.world.holds_flat(run.item.name)),
+            at_least=1,
+            essential=True,
+        ),
         Metric("attempts", lambda run: getattr(run.result, "attempts", 0)),
         Metric(
             "servoing time, from the remote start",
@@ -146,6 +173,18 @@ def grasp_metrics() -> list[Metric[SimulatedGrasp]]:
         Metric("target error at descent", lambda run: Descent.of(run).target_error, "px"),
         Metric(
             "grasp offset", lambda run: 1e3 * Descent.of(run).offset, "mm", at_most=GRASP_OFFSET
+        ),
+        Metric(
+            "object tilt in the hand",
+            lambda run: None if (held := _hold(run)) is None else math.degrees(held.tilt),
+            "deg",
+            at_most=3.0,
+        ),
+        Metric(
+            "slip in the hand",
+            lambda run: None if (held := _hold(run)) is None else 1e3 * held.slip,
+            "mm",
+            at_most=3.0,
         ),
         Metric(
             "angle to the demonstrated approach at descent",
@@ -216,6 +255,13 @@ TRIAL_METRICS: Sequence[Metric[Sequence[Trial]]] = (
     Metric("grasps, pixel error (median)", median(_PIXELS), "px"),
     Metric("grasps, pixel error (95 %)", p95(_PIXELS), "px"),
     Metric("grasps, grasp offset (median)", median("grasp_offset_mm"), "mm"),
-    Metric("grasps, grasp offset (95 %)", p95("grasp_offset_mm"), "mm"),
+    Metric("grasps, grasp offset (95 %)", p95("grasp_offset_mm"), "mm", at_most=6.0),
+    Metric(
+        "grasps, object tilt in the hand (95 %)",
+        p95("object_tilt_in_the_hand_deg"),
+        "deg",
+        at_most=3.0,
+    ),
+    Metric("grasps, slip in the hand (95 %)", p95("slip_in_the_hand_mm"), "mm", at_most=3.0),
 )
 """Rows of the table that grasps in random scenes add."""

@@ -1,6 +1,7 @@
 """One grasp in simulation: a random scene, and a choice of image-Jacobian estimators."""
 
 import copy
+import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
@@ -10,29 +11,38 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.experiments.run_recording import LiveView, no_live_view
-from hrc_learn.geometry import quaternion
+from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import (
     CompositeEstimator,
     FixedEstimator,
     ImageJacobianEstimator,
-    KalmanEstimator,
     PaperEstimator,
     RBFImageJacobian,
 )
 from hrc_learn.kinematics import panda
-from hrc_learn.sim import CameraKind, MotionLog, ObjectConfig, World, open_camera
+from hrc_learn.sim import (
+    CameraKind,
+    Imperfections,
+    MotionLog,
+    ObjectConfig,
+    World,
+    open_camera,
+)
+from hrc_learn.sim.imperfections import DrawnImperfections
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.arm_motion import joint_line
 from hrc_learn.skills.grasping import Grasping, GraspingConfig, GraspResult
-from hrc_learn.skills.marker_sensor import MarkerSensor
+from hrc_learn.skills.marker_sensor import LatencyConfig, MarkerSensor
 from hrc_learn.skills.placing import Plan, check_plan
 from hrc_learn.skills.visual_skill import VisualServoSkill, from_learned, guessed_network
-from hrc_learn.skills.work_cell import TaskFailedError, WorkCell
+from hrc_learn.skills.work_cell import TaskFailedError, WorkCell, WorkCellConfig
 from hrc_learn.teleoperation import ScriptedPerturbation
 from hrc_learn.vision import CameraModel
 
 # Of the approach that is checked for contacts: joint speed [rad/s], time between samples [s].
 _APPROACH_SPEED, _PATH_STEP = 0.6, 0.05
+# Yaw of objects in a scene without imperfections, either way [rad]: as people lay them down.
+_ALONG_EDGES = 0.06
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,17 +76,37 @@ class GraspingScene:
     start: Float[np.ndarray, "7"]
     """Joint positions [rad]."""
     object_pose: Float[np.ndarray, "4 4"]
+    imperfections: DrawnImperfections | None = None
+    """Of arm, calibration, camera and object; None: none."""
 
     def world(self) -> World:
         """A simulated world with this scene, at rest."""
-        world = World(self.workplace.scene)
+        world = World(self.workplace.scene, self.imperfections)
         world.reset(self.start, {self.workplace.scene.objects[0].name: self.object_pose})
         return world
 
-    def true_target(self, world: World) -> Float[np.ndarray, "2"]:
-        """Pixel of the gripper's marker with the end effector right above the object [px]."""
-        above = self.workplace.hover()
-        above.position[:2] = torch.from_numpy(self.object_pose[:2, 3])
+    def above(self) -> Pose:
+        """The end effector right above the object, turned to grasp it."""
+        hover, (least, _) = self.workplace.hover(), self.workplace.hover_turns
+        yaw = math.atan2(self.object_pose[1, 0], self.object_pose[0, 0])
+        # Half a turn looks the same to a parallel gripper.
+        turn = least + (yaw - least) % math.pi
+        about = quaternion.exp(torch.tensor([0.0, 0.0, turn], dtype=torch.float64))
+        position = hover.position.clone()
+        position[:2] = torch.from_numpy(self.object_pose[:2, 3])
+        return Pose(position, quaternion.multiply(about, hover.orientation))
+
+    def true_target(self, world: World, tool: Pose | None = None) -> Float[np.ndarray, "2"]:
+        """True pixel of the gripper's marker with the end effector right above the object.
+
+        Args:
+            world: Knows where the marker is on the gripper.
+            tool: Its height and orientation are taken; None: those of `above`.
+        """
+        above = self.above()
+        if tool is not None:
+            position = torch.cat([above.position[:2], tool.position[2:]])
+            above = Pose(position, tool.orientation)
         marker = above.apply(torch.from_numpy(world.hand_marker_offset()))
         return self.workplace.scene.camera.project(marker.numpy())
 
@@ -87,6 +117,7 @@ class GraspingScene:
         config: GraspingSceneConfig,
         rng: np.random.Generator,
         camera: CameraKind = "synthetic",
+        imperfections: Imperfections | None = None,
     ) -> "GraspingScene":
         """Draw a scene.
 
@@ -98,19 +129,27 @@ class GraspingScene:
             config: How.
             rng: Source of chance.
             camera: Kind of camera that checks whether the object is hidden.
+            imperfections: Of arm, calibration, camera and object; None: none.
         """
-        scene = workplace.scene
-        pose = workplace.random_object_pose(config.object_reach, rng)
+        scene, sizes = workplace.scene, imperfections or Imperfections.ideal()
+        # A stream of its own: the same scenes whatever the imperfections.
+        drawn = sizes.draw(rng.spawn(1)[0])
+        yaw = max(_ALONG_EDGES, sizes.object_yaw)
+        pose = workplace.random_object_pose(config.object_reach, rng, yaw)
         workplace = replace(
             workplace, scene=replace(scene, camera=_camera(workplace, config, rng))
         )
         item = scene.objects[0]
-        world = World(workplace.scene)
-        sensor = MarkerSensor(open_camera(world, camera, rng=rng), workplace.scene.marker_ids)
+        world = World(workplace.scene, drawn)
+        pose[2, 3] = world.table_top + world.config.objects[0].half_size[2]
+        eye = open_camera(world, camera, rng=rng, noise=sizes.camera_noise)
+        sensor = MarkerSensor(eye, workplace.scene.marker_ids)
         for start in _starts(workplace, config, rng):
             world.reset(start, {item.name: pose})
             if item.marker.id in sensor.detect() and _has_free_path(world, workplace, start):
-                return cls(workplace=workplace, start=start, object_pose=pose)
+                return cls(
+                    workplace=workplace, start=start, object_pose=pose, imperfections=drawn
+                )
         raise AssertionError("starts never end")
 
 
@@ -188,7 +227,9 @@ DEFAULT = "learned"
 
 VARIANTS: Mapping[str, Variant] = {
     DEFAULT: Variant("Kalman filter from the learned Jacobian", from_learned),
-    "kalman": Variant("Kalman filter from the paper's guess", _from_guess(KalmanEstimator)),
+    "kalman": Variant(
+        "Kalman filter from the paper's guess", lambda _: from_learned(guessed_network())
+    ),
     "composite": Variant(
         "composite law from the paper's guess", _from_guess(CompositeEstimator)
     ),
@@ -248,13 +289,19 @@ def simulate_grasp(
             estimators are then compared on nothing but how they get there.
         camera: Which kind of camera watches.
         config: How objects are grasped.
-        rng: Source of image noise.
+        rng: Source of image noise, and of which images are lost.
         view: Dashboard of the run while it goes on.
     """
     workplace = scene.workplace.approached(aiming.approach)
     scene = replace(scene, workplace=workplace)
     world = scene.world()
     item, motion = workplace.scene.objects[0], MotionLog(world)
+    sizes = world.imperfections.sizes
+    eye = open_camera(world, camera, rng=rng, noise=sizes.camera_noise)
+    latency = LatencyConfig(delay=sizes.image_delay, frame_loss=sizes.image_loss)
+    config = config or GraspingConfig()
+    law = replace(config.controller, safety=sizes.plant(config.controller.safety))
+    config = replace(config, controller=law)
 
     def check(plan: Plan) -> None:
         check_plan(plan, world, item.name if world.holds(item.name) else None)
@@ -265,20 +312,24 @@ def simulate_grasp(
             chain=panda,
             arm=world.arm,
             gripper=world.arm,
-            sensor=MarkerSensor(
-                open_camera(world, camera, rng=rng), workplace.scene.marker_ids
-            ),
+            sensor=MarkerSensor(eye, workplace.scene.marker_ids),
             human=ScriptedPerturbation(panda, (), begin=None),
             advance=motion.advance,
+            config=WorkCellConfig(latency=latency, safety=sizes.plant(WorkCellConfig().safety)),
+            rng=rng,
         )
-        target = scene.true_target(world)
+        above = scene.above()
+
+        def told(pixel, jacobian, orientation: Float[Tensor, "4"]) -> Float[np.ndarray, "2"]:
+            return scene.true_target(world, Pose(above.position, orientation))
+
         task = Grasping(
             cell,
             workplace,
             aiming,
             config,
             estimator=estimator,
-            target=(lambda pixel, jacobian, orientation: target) if told_target else None,
+            target=told if told_target else None,
             check=check,
         )
         try:

@@ -6,7 +6,7 @@ null-space posture.
 
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -40,10 +40,11 @@ from hrc_learn.experiments.placing.trial import (
     demonstrated_path,
     place,
     random_start,
+    taught_correction,
 )
 from hrc_learn.experiments.run_recording import no_live_view
 from hrc_learn.kinematics import UnreachableError, panda
-from hrc_learn.sim import RenderingUnavailableError, World
+from hrc_learn.sim import Imperfections, RenderingUnavailableError, World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.placing import PlacingSkill, PlanningSpace, check_plan
 from hrc_learn.skills.work_cell import BlockedPathError
@@ -73,6 +74,11 @@ class PlacingExperiment:
     """How many times faster than demonstrated."""
     noise: float = 0.1
     """Standard deviation of each joint at random starts, about home [rad]."""
+    imperfections: Imperfections = field(default_factory=Imperfections.nominal)
+    """Of arm, calibration and objects."""
+    taught: bool = True
+    """Whether a person leads the arm once to the place on the demonstrated shelf, and what its
+    encoders read there corrects all goals."""
     snapshots: bool = True
     """Whether to render pictures of the arm, where this machine can."""
 
@@ -84,7 +90,9 @@ class PlacingExperiment:
             )
 
     def run(self, seed: int, observer: Observer = UNOBSERVED) -> PlacingRun:
-        """All placings from the demonstration's start; the seed is that of the ablation.
+        """All placings from the demonstration's start.
+
+        The seed draws the imperfections, and the demonstrations of the ablation.
 
         Raises:
             ValueError: If the demonstration is not of this arm or ends at none of the shelves.
@@ -94,6 +102,11 @@ class PlacingExperiment:
         goal_shelf = demonstrated_shelf(demonstrated_path(demonstration)[-1], workplace)
         assert demonstration.joint_position is not None
         start = torch.from_numpy(demonstration.joint_position[0])
+        rng = np.random.default_rng(seed)
+        world = World(workplace.scene, self.imperfections.draw(rng))
+        correction = None
+        if self.taught:
+            correction = taught_correction(skill, world, workplace.shelf(goal_shelf), rng)
         placings: dict[tuple[PlanningSpace, str], SimulatedPlacing] = {}
         outcomes: dict[PlanningSpace, dict[str, PlacingOutcome]] = {s: {} for s in SPACES}
         for space, label in SPACES.items():
@@ -102,7 +115,15 @@ class PlacingExperiment:
                 viewed = (space, shelf) == ("joint", goal_shelf)
                 view = observer.view if viewed else no_live_view
                 placed = place(
-                    skill, workplace, shelf, start, space=space, speed=self.speed, view=view
+                    skill,
+                    workplace,
+                    shelf,
+                    start,
+                    space=space,
+                    speed=self.speed,
+                    world=world,
+                    correction=correction,
+                    view=view,
                 )
                 placings[space, shelf] = placed
                 outcomes[space][shelf] = PlacingOutcome.of(placed, workplace, demonstration)
@@ -159,6 +180,8 @@ class PlacingExperiment:
             demonstrations=self.demonstrations,
             speed=self.speed,
             noise=self.noise,
+            imperfections=self.imperfections,
+            taught=self.taught,
         )
         end = demonstrated_path(self._demonstration())[-1]
         return {
@@ -240,13 +263,20 @@ class RandomStart:
     speed: float
     noise: float
     """Standard deviation of each joint about home [rad]."""
+    imperfections: Imperfections
+    taught: bool
 
     def __call__(self, seed: int) -> Mapping[str, Any]:
         """Metrics of placings in task space, and how many joint-space plans are blocked."""
         skill = PlacingSkill.load(self.placing)
         demonstration = load_demos(self.demonstrations, episodes=[0])[0]
         workplace, rng = Workplace(), np.random.default_rng(seed)
-        world, item = World(workplace.scene), workplace.scene.objects[0].name
+        world = World(workplace.scene, self.imperfections.draw(rng))
+        item = workplace.scene.objects[0].name
+        correction = None
+        if self.taught:
+            known = demonstrated_shelf(demonstrated_path(demonstration)[-1], workplace)
+            correction = taught_correction(skill, world, workplace.shelf(known), rng)
         outcomes, blocked = {}, 0
         for shelf in workplace.shelf_names():
             start = random_start(world, workplace, self.noise, rng)
@@ -258,7 +288,14 @@ class RandomStart:
             except BlockedPathError:
                 blocked += 1
             run = place(
-                skill, workplace, shelf, start, space="pose", speed=self.speed, world=world
+                skill,
+                workplace,
+                shelf,
+                start,
+                space="pose",
+                speed=self.speed,
+                world=world,
+                correction=correction,
             )
             outcomes[shelf] = PlacingOutcome.of(run, workplace, demonstration)
         evaluation = evaluate(placing_metrics(workplace.shelf_names()), outcomes)

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 
 import numpy as np
-import torch
 
 from hrc_learn.demos import Demonstration
 from hrc_learn.experiments.metric_table import column
@@ -32,7 +31,7 @@ from hrc_learn.experiments.placing.trial import (
     demonstrated_approach,
     demonstrated_path,
 )
-from hrc_learn.experiments.run_recording import PANDA_LIMITS, demonstrated_joints
+from hrc_learn.experiments.run_recording import PANDA_LIMITS, demonstrated_joints, true_tool
 from hrc_learn.geometry import Box
 from hrc_learn.kinematics import panda
 from hrc_learn.skills.work_cell import SAFETY_COLUMNS
@@ -63,6 +62,7 @@ def record_placing(
     """
     log = run.cell.log
     joints, safety = log["joint_position"], log["safety"]
+    tool = true_tool(run.motion, run.world, len(log))
     demonstrated = np.full_like(joints, np.nan)
     demonstrated[run.transfer] = demonstrated_joints(demonstration, run.time / run.time[-1])
     return RunRecording(
@@ -72,7 +72,7 @@ def record_placing(
         joint_position=joints,
         joint_limits=PANDA_LIMITS,
         demo_joint_position=demonstrated,
-        position=panda.forward(torch.from_numpy(joints)).position.numpy(),
+        position=tool.position.numpy(),
         demo_path=demonstrated_path(demonstration),
         plan_path=run.plan.tool_pose.position.numpy(),
         bodies=run.motion.bodies(),
@@ -176,7 +176,7 @@ def _approach(run: PlacingRun) -> Section:
     reference = demonstrated_approach(run.demonstration, run.workplace)
     distances: dict[str, dict[str, ApproachDistance]] = {}
     for (space, shelf), placing in run.placings.items():
-        approach = approach_path(placing.path, placing.plan.goal, run.workplace)
+        approach = approach_path(placing.path, placing.goal, run.workplace)
         distances.setdefault(SPACES[space], {})[shelf] = ApproachDistance(
             remaining=approach.remaining, distance=approach.distance(reference)
         )

@@ -14,11 +14,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.demos import Demonstration
+from hrc_learn.experiments.grip import place_angle
 from hrc_learn.experiments.placing.arm_angle_ablation import Ablation
 from hrc_learn.experiments.run_recording import (
     LiveView,
     limit_violations,
     no_live_view,
+    true_tool,
     unwanted_contacts,
 )
 from hrc_learn.geometry import Pose, quaternion
@@ -26,14 +28,14 @@ from hrc_learn.kinematics import panda
 from hrc_learn.learning.channels import dimensionless_jerk
 from hrc_learn.sim import MotionLog, Touch, World
 from hrc_learn.sim.workplace import Workplace
+from hrc_learn.skills.arm_motion import nearest_configuration
 from hrc_learn.skills.grasping import OPEN
-from hrc_learn.skills.placing import PlacingSkill, Plan, PlanningSpace
-from hrc_learn.skills.work_cell import TaskFailedError, WorkCell
+from hrc_learn.skills.placing import PlaceCorrection, PlacingSkill, Plan, PlanningSpace
+from hrc_learn.skills.work_cell import TaskFailedError, WorkCell, WorkCellConfig
 from hrc_learn.teleoperation import ScriptedPerturbation
 
 TRANSFER, RELEASE, RETREAT = "transfer", "release", "retreat"
 
-_SETTLE = 0.4  # rest before the fingers open, so that the object is not thrown [s]
 _OPENING = 0.8  # time the fingers take [s]
 _CLEARANCE = 0.08  # way back, until nothing of the object is between the fingers [m]
 _RETREAT_SPEED = 0.08  # at the usual one, the shoulder comes close to its limits [m/s]
@@ -47,12 +49,17 @@ class SimulatedPlacing:
     """One placing, from the start of the transfer until the retreat is over."""
 
     shelf: str
+    goal: Pose
+    """Where the end effector should truly release the object."""
     space: PlanningSpace
     plan: Plan
+    """To what the arm should read there."""
+    world: World
+    """Maybe used again since."""
     cell: WorkCell
     motion: MotionLog
-    released: Pose
-    """True pose of the end effector at the release."""
+    object_pose: Float[np.ndarray, "4 4"]
+    """In the end."""
     contacts: tuple[Touch, ...]
     """Of the arm with cabinet, table or itself, and of what it carried with the cabinet."""
     placed: bool
@@ -65,8 +72,9 @@ class SimulatedPlacing:
 
     @property
     def joint_position(self) -> Float[np.ndarray, "steps 7"]:
-        """Measured during the transfer [rad]."""
-        return self.cell.log["joint_position"][self.transfer]
+        """True ones during the transfer, but for the encoders' noise [rad]."""
+        offset = self.world.imperfections.encoder_offset
+        return self.cell.log["joint_position"][self.transfer] - offset
 
     @property
     def time(self) -> Float[np.ndarray, " steps"]:
@@ -76,8 +84,8 @@ class SimulatedPlacing:
 
     @property
     def path(self) -> Float[np.ndarray, "steps 3"]:
-        """Of the tool centre point during the transfer [m]."""
-        return panda.forward(torch.from_numpy(self.joint_position)).position.numpy()
+        """True path of the tool centre point during the transfer [m]."""
+        return true_tool(self.motion, self.world, len(self.plan.path)).position.numpy()
 
 
 def place(
@@ -89,6 +97,7 @@ def place(
     space: PlanningSpace,
     speed: float = 1.5,
     world: World | None = None,
+    correction: PlaceCorrection | None = None,
     view: LiveView = no_live_view,
 ) -> SimulatedPlacing:
     """Carry the scene's first object, already in the gripper, to a shelf and release it.
@@ -97,16 +106,19 @@ def place(
         skill: Learned placing motion.
         workplace: Where.
         shelf: Which.
-        start: Joint positions at the start [rad].
+        start: True joint positions at the start [rad].
         space: Follow the primitive of the joints, as the paper does, or that of the pose.
         speed: How many times faster than demonstrated.
-        world: Of that workplace, to be used again; a new one if None.
+        world: Of that workplace, to be used again, with its imperfections; a new one without
+            any if None.
+        correction: Of the arm's readings; None: the arm believes them.
         view: Dashboard of the run while it goes on.
 
     Raises:
         ValueError: If there is no such shelf, or the arm cannot reach it.
     """
     goal = workplace.shelf(shelf)
+    read = goal if correction is None else correction.apply(goal)
     item = workplace.scene.objects[0]
     world = world or World(workplace.scene)
     world.hold(item.name, start.numpy())
@@ -117,25 +129,34 @@ def place(
         gripper=world.arm,
         human=ScriptedPerturbation(panda, ()),
         advance=motion.advance,
+        config=WorkCellConfig(
+            safety=world.imperfections.sizes.plant(WorkCellConfig().safety),
+        ),
     )
     with torch.inference_mode(), view(cell, world, motion):
-        plan = skill.plan(cell.joints, goal, space=space, dt=cell.config.dt, speed=speed)
+        plan = skill.plan(cell.joints, read, space=space, dt=cell.config.dt, speed=speed)
         cell.begin_phase(TRANSFER)
         cell.follow_path(plan.path)
-        cell.hold_pose(_SETTLE)
+        # The arm follows late: at the end of the path it is not quite there.
+        cell.move_straight(read)
         cell.begin_phase(RELEASE)
-        released, release_time = _tool(world), world.time
+        release_time = world.time
+        below = Pose(read.position.clone(), read.orientation)
+        below.position[2] -= workplace.lowering(item.half_size)
+        cell.move_until_contact(below)
         world.arm.move(OPEN)
         cell.hold_pose(_OPENING)
         cell.begin_phase(RETREAT)
-        cell.move_straight(_back(released), speed=_RETREAT_SPEED)
+        cell.move_straight(_back(read), speed=_RETREAT_SPEED)
     return SimulatedPlacing(
         shelf=shelf,
+        goal=goal,
         space=space,
         plan=plan,
+        world=world,
         cell=cell,
         motion=motion,
-        released=released,
+        object_pose=world.object_pose(item.name),
         contacts=sum(
             unwanted_contacts(world, cell.log, {item.name: release_time}).values(), ()
         ),
@@ -143,16 +164,49 @@ def place(
     )
 
 
-def _tool(world: World) -> Pose:
-    """True pose of the tool centre point."""
-    matrix = torch.from_numpy(world.arm.tcp_pose())
-    return Pose(matrix[:3, 3], quaternion.from_matrix(matrix[:3, :3]))
-
-
-def _back(released: Pose) -> Pose:
+def _back(release: Pose) -> Pose:
     """Clear of the object: straight back along the end effector's own axis."""
-    offset = released.position.new_tensor([0.0, 0.0, -_CLEARANCE])
-    return Pose(released.apply(offset), released.orientation)
+    offset = release.position.new_tensor([0.0, 0.0, -_CLEARANCE])
+    return Pose(release.apply(offset), release.orientation)
+
+
+_SHOWN_ITERATIONS = 4
+"""Errors of milliradians shrink a thousandfold in each."""
+
+
+def taught_correction(
+    skill: PlacingSkill, world: World, place: Pose, rng: np.random.Generator
+) -> PlaceCorrection:
+    """What the arm reads where a person has led its tool to a known place.
+
+    Resets the world.
+
+    Args:
+        skill: Tells the posture in which the arm is led there.
+        world: With the arm's imperfections.
+        place: The place.
+        rng: Of the person's error.
+
+    Raises:
+        UnreachableError: If the arm cannot reach it.
+    """
+    errors = world.imperfections
+    aside = errors.sizes.teaching_error * torch.from_numpy(rng.uniform(-1, 1, 3))
+    led = Pose(place.position + aside, place.orientation)
+    read = led
+    for _ in range(_SHOWN_ITERATIONS):
+        # Where the tool truly is, and by how much it misses.
+        joints = nearest_configuration(read, near=skill.joint.goal).numpy()
+        world.reset(joints - errors.encoder_offset)
+        matrix = torch.from_numpy(world.arm.tcp_pose())
+        tool = Pose(matrix[:3, 3], quaternion.from_matrix(matrix[:3, :3]))
+        missed = quaternion.multiply(quaternion.conjugate(tool.orientation), led.orientation)
+        read = Pose(
+            read.position + led.position - tool.position,
+            quaternion.multiply(read.orientation, missed),
+        )
+    measured = panda.forward(torch.from_numpy(world.arm.read().joint_position))
+    return PlaceCorrection.of(measured, place)
 
 
 _DRAWS = 100
@@ -282,9 +336,9 @@ class PlacingOutcome:
     deviation: float
     """Of the approach path from the demonstrated one, moved to the goal [m]."""
     place_error: float
-    """Distance of the end effector from its goal at the release [m]."""
+    """Horizontal distance of the object on its board from where it should stand [m]."""
     place_tilt: float
-    """The same, of its orientation [rad]."""
+    """Its angle from how it should stand [rad]."""
     violations: int
     """Steps in which a joint was outside its range of position or velocity."""
     contacts: tuple[Touch, ...]
@@ -301,8 +355,8 @@ class PlacingOutcome:
         cls, run: SimulatedPlacing, workplace: Workplace, demonstration: Demonstration
     ) -> "PlacingOutcome":
         """Measure a placing against a demonstration for any shelf."""
-        approach = approach_path(run.path, run.plan.goal, workplace)
-        miss = run.released.twist_to(run.plan.goal)
+        approach = approach_path(run.path, run.goal, workplace)
+        aside = run.object_pose[:3, 3] - run.goal.position.numpy()
         speed = np.abs(run.cell.log["joint_velocity"]) / panda.limits.velocity.numpy()
         done, demonstrated = (
             dimensionless_jerk(torch.from_numpy(time), torch.from_numpy(path))
@@ -313,8 +367,8 @@ class PlacingOutcome:
         )
         return cls(
             deviation=approach.deviation(demonstrated_approach(demonstration, workplace)),
-            place_error=float(miss[:3].norm()),
-            place_tilt=float(miss[3:].norm()),
+            place_error=float(np.linalg.norm(aside[:2])),
+            place_tilt=place_angle(run.object_pose, run.goal.orientation),
             violations=limit_violations(run.cell),
             contacts=run.contacts,
             peak_speed=float(speed.max()),

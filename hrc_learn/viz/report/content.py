@@ -1,9 +1,10 @@
 """What a report holds: text, measured values beside their targets, pictures, versions."""
 
+import math
 import platform
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.metadata import PackageNotFoundError, version
 from io import BytesIO
 from typing import TYPE_CHECKING
@@ -31,6 +32,8 @@ class Measurement:
     """Whether the target is a lower bound; it is an upper one otherwise."""
     claim: str = ""
     """What the paper states about it, in words; empty where it says nothing."""
+    resolution: float = 0.0
+    """Smallest value that the measurement tells from zero; no finer digits are shown."""
 
     @property
     def ok(self) -> bool | None:
@@ -42,8 +45,13 @@ class Measurement:
 
     @property
     def shown(self) -> str:
-        """Value and unit, as a reader wants them."""
-        return f"{short(self.value)} {self.unit}".rstrip()
+        """Value and unit, as a reader wants them: no digits below the resolution."""
+        if abs(self.value) < self.resolution:
+            return f"< {short(self.resolution)} {self.unit}".rstrip()
+        rounded = replace(self, value=_rounded(self.value, self.resolution))
+        # A bound that was missed by less than the resolution must not look kept.
+        value = rounded.value if rounded.ok is self.ok else self.value
+        return f"{short(value)} {self.unit}".rstrip()
 
     @property
     def bound(self) -> str:
@@ -141,6 +149,13 @@ class Report:
     def pictures(self) -> tuple[Picture, ...]:
         """Those of all sections, in order."""
         return tuple(picture for section in self.sections for picture in section.figures)
+
+
+def _rounded(value: float | int, resolution: float) -> float | int:
+    """To the last decimal that a resolution justifies; 0 justifies all."""
+    if resolution == 0 or not math.isfinite(value):
+        return value
+    return round(value, math.ceil(-math.log10(resolution)))
 
 
 def short(value: float | int) -> str:
