@@ -217,7 +217,17 @@ def test_the_program_grasps_and_compares(skill, tmp_path):
     skill.save(tmp_path / "aiming")
     command = [sys.executable, "control/run_grasping.py", "--camera", "synthetic"]
     command += ["--aiming", tmp_path / "aiming", "--out", tmp_path / "run"]
-    command += ["--camera-roll", "100", "--variants", "learned", "fixed", "--trials", "1"]
+    # This skill knows nothing of directions: objects lie as they were demonstrated.
+    command += [
+        "--ideal",
+        "--camera-roll",
+        "100",
+        "--variants",
+        "learned",
+        "fixed",
+        "--trials",
+        "1",
+    ]
     done = subprocess.run(
         [str(c) for c in command], capture_output=True, text=True, check=False
     )
