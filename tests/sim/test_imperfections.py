@@ -181,6 +181,36 @@ def test_a_contact_is_felt_in_the_joints():
     assert force > 20.0  # pushed up, away from the table
 
 
+def test_what_is_drawn_fills_its_range_to_both_sides_and_no_more():
+    """Of each quantity, and of each of its components, in 300 runs."""
+    sizes = {
+        "encoder_offset": 0.4,
+        "gravity_error": 0.5,
+        "base_shift": 0.6,
+        "base_turn": 0.7,
+        "tool_shift": 0.8,
+        "tool_turn": 0.9,
+        "table_height": 1.1,
+        "object_heights": 1.2,
+    }
+    # The quantities that are drawn have names of their own.
+    named = {"base_shift": "base_error", "tool_shift": "tool_error"}
+    named |= {"object_heights": "object_height"}
+    given = Imperfections(
+        payload=0.3, **{named.get(name, name): most for name, most in sizes.items()}
+    )
+    rng = np.random.default_rng(0)
+    runs = [given.draw(rng) for _ in range(300)]
+    for name, most in sizes.items():
+        values = np.array([getattr(run, name) for run in runs])
+        assert (np.abs(values) <= most).all(), name
+        assert (values.max(axis=0) > 0.9 * most).all(), name
+        assert (values.min(axis=0) < -0.9 * most).all(), name
+    payloads = np.array([run.payload for run in runs])
+    assert 0 <= payloads.min() < 0.03
+    assert 0.27 < payloads.max() <= 0.3
+
+
 def test_the_same_seed_draws_the_same():
     first, again = draw(3, encoder_offset=1e-3), draw(3, encoder_offset=1e-3)
     np.testing.assert_array_equal(first.encoder_offset, again.encoder_offset)
