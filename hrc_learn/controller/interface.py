@@ -208,6 +208,7 @@ def paper_goals(
     centre: Float[Tensor, "*#batch 3"],
     half_size: Float[Tensor, "*#batch 3"],
     target: Float[Tensor, "*#batch 2"],
+    stiffness: tuple[float, float, float] = (4e-4, 4e-4, 4e-5),
 ) -> Goals:
     """The paper's regions with their printed gains and gradients.
 
@@ -215,12 +216,11 @@ def paper_goals(
         centre: Of the box, which the paper leaves to the expert [m].
         half_size: Of the box, which the paper leaves to the expert [m].
         target: In the image [px].
+        stiffness: k_c of the box; default: as printed.
     """
     goal = quaternion.normalize(centre.new_tensor(GRIPPER_DOWN))
     return Goals(
-        position=PositionRegion(
-            centre=centre, half_size=half_size, stiffness=(4e-4, 4e-4, 4e-5)
-        ),
+        position=PositionRegion(centre=centre, half_size=half_size, stiffness=stiffness),
         orientation=OrientationRegion(goal=goal, stiffness=1.0, formulation="paper"),
         vision=VisionRegion(
             target=target,

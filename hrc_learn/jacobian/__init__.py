@@ -17,6 +17,7 @@ from hrc_learn.jacobian.learning_estimators import KalmanConfig as KalmanConfig
 from hrc_learn.jacobian.learning_estimators import KalmanEstimator as KalmanEstimator
 from hrc_learn.jacobian.learning_estimators import LeastSquaresConfig as LeastSquaresConfig
 from hrc_learn.jacobian.learning_estimators import PaperEstimator as PaperEstimator
+from hrc_learn.jacobian.learning_estimators import PrintedEstimator as PrintedEstimator
 from hrc_learn.jacobian.learning_estimators import (
     RecursiveLeastSquaresEstimator as RecursiveLeastSquaresEstimator,
 )

@@ -62,6 +62,51 @@ class PaperEstimator(ImageJacobianEstimator):
         return WeightState(weight=state.weight + measurement.dt * rate)
 
 
+class PrintedEstimator(PaperEstimator):
+    """The paper's law from its initial weights as printed, set when the feature is first seen.
+
+        W(i, j) = vec(J_s0)(i) / sum_k theta_k(r_t0)      (eq_w0)
+
+    Until then the weights are zero. Away from r_t0 the estimate grows or fades with the sum of
+    the neurons, which nothing keeps at its first value.
+    """
+
+    column: Tensor
+    """vec(J_s0), the same for all neurons, (12, 1)."""
+
+    def __init__(self, network: RBFImageJacobian, gain: float = 0.25, *, mixed: bool = True):
+        """Set up the law.
+
+        Args:
+            network: Neurons, and in the first column of its weights vec(J_s0^T), as
+                `RBFImageJacobian.from_jacobian` leaves it there.
+            gain: Diagonal of L.
+            mixed: vec(J_s0) as printed, which mixes the two image rows; False: vec(J_s0^T), as
+                (approxNN_vec) needs it.
+        """
+        neurons = RBFImageJacobian(
+            network.centers,
+            float(network.width),
+            input_indices=network.input_indices,
+            reference=network.reference,
+            normalized=False,
+        )
+        super().__init__(neurons, gain)
+        column = network.weight.detach()[:, 0]
+        if mixed:
+            column = column.unflatten(0, (-1, 6)).mT.flatten()
+        self.register_buffer("column", column[:, None].clone())
+
+    def update(self, state: WeightState, measurement: Measurement) -> WeightState:
+        """The initial weights where the feature is seen for the first time, then the law."""
+        total = self.network.basis(measurement.pose).sum(-1)[..., None, None]
+        waiting = (state.weight == 0).all(-1, keepdim=True).all(-2, keepdim=True)
+        begins = waiting & measurement.valid[..., None, None]
+        weight = torch.where(begins, self.column / total, state.weight)
+        moved = super().update(WeightState(weight=weight), measurement).weight
+        return WeightState(weight=torch.where(waiting & ~begins, weight, moved))
+
+
 def paper_rate(
     weight: Float[Tensor, "*batch entries K"],
     theta: Float[Tensor, "*batch K"],

@@ -216,6 +216,7 @@ def simulate_closed_loop(
     nullspace_input: Callable[[int, Tensor], Tensor] | None = None,
     goals: Callable[[int], Goals] | None = None,
     on_step: Callable[[int, Tensor, Observation, Command, ControllerState], None] | None = None,
+    advance: Callable[[Tensor, Tensor, float], Tensor] | None = None,
 ) -> Float[Tensor, "*batch n"]:
     """Run the closed loop.
 
@@ -229,6 +230,8 @@ def simulate_closed_loop(
         goals: Goals from the step number; default: those of the controller.
         on_step: Called after each step with its number, the joint position it started from,
             observation, command and new state.
+        advance: Joint position [rad] after a step [s], from that before it and the commanded
+            velocity [rad/s]; default: the arm moves as it is told.
 
     Returns:
         Joint position at the end [rad].
@@ -245,5 +248,6 @@ def simulate_closed_loop(
         command, state = controller.step(state, observation)
         if on_step is not None:
             on_step(k, q, observation, command, state)
-        q = q + command.joint_velocity * dt
+        v = command.joint_velocity
+        q = q + v * dt if advance is None else advance(q, v, dt)
     return q

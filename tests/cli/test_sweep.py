@@ -69,7 +69,12 @@ def test_a_figure_that_is_broken_off_leaves_the_older_one(tmp_path, monkeypatch)
         raise KeyboardInterrupt
 
     monkeypatch.setattr("matplotlib.figure.Figure.savefig", break_off)
+    trials = SimpleNamespace(
+        time=torch.tensor([1.0, 2.0]),
+        success=torch.tensor([True, False]),
+        roll_class=torch.tensor([0, 4]),
+    )
     with pytest.raises(KeyboardInterrupt):
-        command._draw(path, {"near": SimpleNamespace(time=torch.tensor([1.0, 2.0]))})
+        command._draw(path, {"near": trials})
     assert path.read_text() == "older"
     assert list(tmp_path.iterdir()) == [path]

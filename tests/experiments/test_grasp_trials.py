@@ -9,14 +9,16 @@ from hrc_learn.controller import GRIPPER_DOWN
 from hrc_learn.experiments.controller.disturbance_trials import EffortConfig, run_effort_trials
 from hrc_learn.experiments.controller.grasp_trials import (
     CENTRE,
+    MARKER,
     TrialConfig,
     TrialResult,
-    _draw,
     clearance,
+    draw_scene,
     run_trials,
 )
+from hrc_learn.experiments.controller.mujoco_trials import build_plant
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.jacobian import FixedEstimator, KalmanEstimator
+from hrc_learn.jacobian import FixedEstimator, KalmanEstimator, PaperEstimator
 from hrc_learn.kinematics import (
     UnreachableError,
     clear_posture,
@@ -43,6 +45,15 @@ def test_adaptation_succeeds_where_the_fixed_jacobian_cannot():
     assert (adaptive.vision_time[adaptive.success] <= adaptive.time[adaptive.success]).all()
 
 
+@shapes_unchecked()  # for speed
+def test_with_the_printed_pull_of_the_box_the_image_alone_judges_kindly():
+    """Table I's 4e-5 for z leaves the tool above or below the box, the marker on target."""
+    result = run_trials(PaperEstimator, replace(QUICK, count=10, law="printed", duration=8.0))
+    assert (result.on_target | ~result.success).all()
+    assert not result.on_target[result.roll_class == 4].any()
+    assert result.success.sum() < result.on_target.sum()
+
+
 def test_the_same_seed_draws_the_same_trials():
     short = replace(QUICK, duration=0.2)
     one, same = run_trials(KalmanEstimator, short), run_trials(KalmanEstimator, short)
@@ -55,7 +66,8 @@ def test_a_run_that_left_the_target_again_is_no_success():
     """The summary counts what held to the end."""
     result = TrialResult(
         roll_class=torch.tensor([0, 1, 2, 3, 4]),
-        success=torch.tensor([True, True, False, True, True]),
+        on_target=torch.tensor([True, True, False, True, True]),
+        success=torch.tensor([False, True, False, True, True]),
         time=torch.tensor([1.0, 2.0, math.inf, 3.0, 4.0], dtype=torch.float64),
         vision_time=torch.tensor([0.5, 0.5, math.nan, 1.0, 1.0], dtype=torch.float64),
         violations=torch.tensor([0, 0, 2, 0, 0]),
@@ -64,8 +76,9 @@ def test_a_run_that_left_the_target_again_is_no_success():
         hand_overs=torch.ones(5, dtype=torch.int64),
     )
     summary = result.summary()
-    assert summary["success"] == 0.8
-    assert summary["free_success"] == 0.6
+    assert summary["on_target"] == 0.8
+    assert summary["success"] == 0.6
+    assert summary["free_success"] == 0.4
     assert summary["touched"] == 0.2
     assert summary["t50"] == 3.0
     assert summary["t95"] == math.inf
@@ -73,7 +86,8 @@ def test_a_run_that_left_the_target_again_is_no_success():
     assert summary["vision_phase"] == 1.0
     assert summary["vision_phase_roll_60_90"] == math.inf
     assert summary["success_roll_60_90"] == 0
-    assert summary["success_roll_0_30"] == 1
+    assert summary["success_roll_0_30"] == 0
+    assert summary["on_target_roll_0_30"] == 1
 
 
 def test_a_comfortable_posture_reaches_the_pose_far_from_trouble():
@@ -110,7 +124,7 @@ def test_a_path_that_would_touch_is_not_taken():
     """A start from which the straight way to the most comfortable posture meets the arm."""
     rng = torch.Generator().manual_seed(0)
     config = TrialConfig(count=250, starts="global")
-    starts = _draw(config, rng).start
+    starts = draw_scene(config, rng).start
     assert (clearance(starts) > 0).all()
     down = quaternion.normalize(torch.tensor(GRIPPER_DOWN, dtype=torch.float64))
     pose = Pose(torch.tensor(CENTRE, dtype=torch.float64), down)
@@ -139,3 +153,36 @@ def test_a_pull_moves_the_elbow_far_and_the_tool_hardly():
     assert summary["elbow_mm"] > 100
     assert summary["deviation_p95_mm"] < 0.2
     assert summary["turn_p95_deg"] < 0.05
+
+
+def test_the_plant_in_mujoco_sees_and_moves_as_the_trials_say():
+    """The marker is found where the pinhole has it, and arms do as they are told."""
+    down = quaternion.normalize(torch.tensor(GRIPPER_DOWN, dtype=torch.float64))
+    posture = comfortable_posture(panda, Pose(torch.tensor(CENTRE, dtype=torch.float64), down))
+    scene = draw_scene(TrialConfig(count=2), torch.Generator().manual_seed(0))
+    scene = replace(scene, start=posture.expand(2, 7).clone())
+    plant, scene = build_plant(scene, seed=0)
+    tool = panda.forward(scene.start)
+    feature, seen = plant.project(tool)
+    assert seen.all()
+    assert (feature - scene.camera.project(tool)[0]).abs().max() < 1  # centres of found markers
+    away = Pose(tool.position + torch.tensor([0.0, 0.0, 5.0]).double(), tool.orientation)
+    assert not plant.project(away)[1].any()
+
+    v = torch.tensor([0.1, -0.1, 0.1, 0.1, -0.1, 0.1, 0.1]).double().expand(2, 7)
+    q = scene.start
+    for _ in range(50):
+        q = plant.advance(q, v, 0.008)
+    assert (q - (scene.start + 0.4 * v)).abs().max() < 2e-3  # the lag of the servos
+    assert not plant.touched().any()
+
+
+def test_the_camera_in_mujoco_has_moved_with_the_marker():
+    scene = draw_scene(TrialConfig(count=3), torch.Generator().manual_seed(1))
+    _, moved = build_plant(scene, seed=0)
+    assert (moved.camera.marker - torch.tensor(MARKER)).norm() > 0.1
+    down = quaternion.normalize(torch.tensor(GRIPPER_DOWN, dtype=torch.float64))
+    tool = Pose(torch.tensor([[0.25, 0.45, 0.32]]).double(), down[None])
+    for mine, its in zip(moved.camera.project(tool), scene.camera.project(tool), strict=True):
+        torch.testing.assert_close(mine, its)
+    assert moved.target is scene.target

@@ -23,6 +23,7 @@ from hrc_learn.jacobian import (
     LeastSquaresConfig,
     Measurement,
     PaperEstimator,
+    PrintedEstimator,
     RBFImageJacobian,
     RecursiveLeastSquaresEstimator,
     paper_grid,
@@ -216,6 +217,48 @@ def test_paper_law_entry_by_entry():
     W_dot = -((0.25 * np.eye(9)) @ theta @ s.T @ xi_prime).T
     W = network.weight.detach().numpy() + 0.01 * W_dot
     np.testing.assert_allclose(state.weight.numpy(), W, rtol=1e-14, atol=0)
+
+
+def test_printed_weights_are_those_of_where_the_feature_is_first_seen():
+    """(eq_w0) at the first valid measurement of each robot, and (update) from then on."""
+    poses = wander(3, 2, rng=generator(16))
+    printed = PrintedEstimator(guess())
+    state = printed.initial_state(2)
+    assert not printed.jacobian(state, poses[:, 0]).any()
+    # The second robot sees the feature a step later.
+    for t, valid in enumerate([[False, False], [True, False], [True, True]]):
+        m = measurement(poses[:, t], torch.zeros(2, 2).double(), seed=t, dt=0.01)
+        state = printed.update(state, replace(m, valid=torch.tensor(valid)))
+        if t == 0:
+            assert not state.weight.any()
+    for robot, first in enumerate((1, 2)):
+        start = poses[robot, first]
+        network = RBFImageJacobian.from_jacobian(
+            J0, paper_grid(), 0.1, formulation="paper", start=start.vector()
+        )
+        law = PaperEstimator(network)
+        expected = law.initial_state()
+        for t in range(first, 3):
+            m = measurement(poses[:, t], torch.zeros(2, 2).double(), seed=t, dt=0.01)
+            mine = Measurement(
+                pose=poses[robot, t],
+                feature=m.feature[robot],
+                valid=m.valid[robot],
+                dt=0.01,
+                xi_x=m.xi_x[robot],
+                xi_r=m.xi_r[robot],
+            )
+            expected = law.update(expected, mine)
+        assert_close(state.weight[robot], expected.weight, rtol=1e-12, atol=0)
+
+
+def test_rows_that_are_not_mixed_are_the_guess_where_it_began():
+    pose = wander(1, rng=generator(17))[0]
+    printed = PrintedEstimator(guess(), gain=0.0, mixed=False)
+    state = printed.update(printed.initial_state(), measurement(pose, torch.zeros(2).double()))
+    assert_close(printed.jacobian(state, pose), J0, rtol=1e-12, atol=1e-9)
+    away = Pose(pose.position + torch.tensor([0.5, 0.0, 0.0]).double(), pose.orientation)
+    assert float(printed.jacobian(state, away).norm()) < 0.5 * float(J0.norm())
 
 
 def test_paper_law_is_a_gradient_step_on_the_task_energy():

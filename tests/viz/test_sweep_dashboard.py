@@ -3,6 +3,7 @@ import pytest
 from rrd_reading import Rrd
 
 from hrc_learn.viz import SweepRecording, SweptTrials
+from hrc_learn.viz.figures import arrival_figure
 from hrc_learn.viz.sweep_dashboard import record_sweep
 
 GROUPS = ("0-90 deg", "90-180 deg")
@@ -64,6 +65,21 @@ def test_the_table_says_it_in_numbers(sweep, rrd):
     assert cells[-2] == f"{median:.2f}"
     (line,) = [line for line in text.splitlines() if line.startswith("| row")]
     assert "never" in line
+
+
+def test_the_figure_has_a_panel_for_each_and_ends_in_its_shares(sweep):
+    panels = [axes for axes in arrival_figure(sweep).axes if axes.axison]
+    assert [axes.get_title(loc="left") for axes in panels] == ["near", "row flipped"]
+    for axes, trials in zip(panels, sweep.experiments.values(), strict=True):
+        curves = [line for line in axes.get_lines() if line.get_label() in GROUPS]
+        dots = [line for line in axes.get_lines() if line.get_label() not in GROUPS]
+        for group in range(2):
+            chosen = trials.group == group
+            shares = np.asarray(curves[group].get_ydata())
+            assert shares[-1] == pytest.approx(100 * np.isfinite(trials.arrival[chosen]).mean())
+            assert np.asarray(dots[group].get_ydata()) == pytest.approx(
+                100 * trials.success[chosen].mean()
+            )
 
 
 @pytest.mark.parametrize(

@@ -217,13 +217,17 @@ class Sweep(Written):
     Exit status 1 if a target was missed.
     """
 
-    suite: Literal["acceptance", "estimators", "stress", "all"] = "acceptance"
-    """Which experiments: those of the acceptance figures; rival estimators; random runs that
-    look for broken limits alone."""
+    suite: Literal["acceptance", "estimators", "paper", "mujoco", "stress", "all"] = (
+        "acceptance"
+    )
+    """Which experiments: those of the acceptance figures; rival estimators; the paper's law as
+    printed, and what each of its faults costs; both laws in MuJoCo; random runs that look for
+    broken limits alone."""
     only: More[tuple[Experiment, ...]] = ()
     """Names of single experiments, instead of a suite."""
     trials: int = 1000
-    """Trials of the experiments near, global, fixed and of each stress test."""
+    """Trials of near, global, fixed, literal, unmixed, printed, printed_box and each stress
+    test."""
     variants: int = 400
     """Trials of each of the others."""
     seed: int = 0

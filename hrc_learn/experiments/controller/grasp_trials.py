@@ -102,6 +102,10 @@ class TrialConfig:
     """Of the marker: the paper's single point, or the four corners."""
     law: Literal["recommended", "printed"] = "recommended"
     """The paper's law as printed has Table I's gains and no joint-space approach."""
+    half_size: tuple[float, float, float] = HALF_SIZE
+    """Half edges of the box [m], which the paper leaves to the expert."""
+    stiffness: tuple[float, float, float] = (4e-4, 4e-4, 4e-5)
+    """k_c of the law as printed."""
     initial_jacobian: Callable[[Tensor], Tensor] = lambda J: J
     """Change of the paper's initial image Jacobian."""
     contacts: bool = False
@@ -114,6 +118,9 @@ class TrialResult:
     """Results, one entry for each trial."""
 
     roll_class: Int[Tensor, "trials"]
+    on_target: Bool[Tensor, "trials"]
+    """Final pixel error below 5 px, wherever the tool is: what a person sees who looks at the
+    image alone."""
     success: Bool[Tensor, "trials"]
     """Final pixel error below 5 px with the tool in the region, no limit broken. Of corners the
     mean counts: the law turns the tool into its orientation cone, not further."""
@@ -133,6 +140,7 @@ class TrialResult:
     def summary(self) -> dict[str, float]:
         """Rates, medians and totals, by name."""
         figures = {
+            "on_target": _rate(self.on_target),
             "success": _rate(self.success),
             "free_success": _rate(self.success & ~self.touched),
             "touched": _rate(self.touched),
@@ -145,6 +153,7 @@ class TrialResult:
         }
         for k, (low, high) in enumerate(ROLL_CLASSES):
             members = self.roll_class == k
+            figures[f"on_target_roll_{low}_{high}"] = _rate(self.on_target[members])
             figures[f"success_roll_{low}_{high}"] = _rate(self.success[members])
             figures[f"vision_phase_roll_{low}_{high}"] = _median(self.vision_time[members])
         return figures
@@ -161,7 +170,7 @@ def _median(times: Tensor) -> float:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Scene:
+class TrialScene:
     """Random initial conditions of all trials."""
 
     camera: PinholeCamera
@@ -180,9 +189,9 @@ def run_trials(
         config: What to draw and how long to run.
     """
     rng = torch.Generator().manual_seed(config.seed)
-    scene = _draw(config, rng)
-    controller = _controller(make_estimator, config, scene)
-    judge = _Judge(scene, controller, config)
+    scene = draw_scene(config, rng)
+    controller = grasp_controller(make_estimator, config, scene)
+    judge = Judge(scene, controller, config)
     with torch.inference_mode():
         simulate_closed_loop(
             controller,
@@ -197,7 +206,9 @@ def run_trials(
     return judge.result()
 
 
-def _draw(config: TrialConfig, rng: torch.Generator) -> _Scene:
+def draw_scene(config: TrialConfig, rng: torch.Generator) -> TrialScene:
+    """Draw cameras, targets and starts."""
+
     def uniform(low: float, high: float, *shape: int) -> Tensor:
         unit = torch.rand(config.count, *shape, generator=rng, dtype=torch.float64)
         return low + (high - low) * unit
@@ -218,7 +229,7 @@ def _draw(config: TrialConfig, rng: torch.Generator) -> _Scene:
     spread = centre.new_tensor((0.08, 0.08, 0.05))
     down = quaternion.normalize(centre.new_tensor(GRIPPER_DOWN))
     tool = Pose(centre + spread * uniform(-1.0, 1.0, 3), down.expand(config.count, 4))
-    return _Scene(
+    return TrialScene(
         camera=camera,
         target=camera.project(tool)[0],
         start=_starts(config, panda.limits, rng),
@@ -241,24 +252,26 @@ def _starts(config: TrialConfig, limits: JointLimits, rng: torch.Generator) -> T
     return torch.cat(free)[: config.count]
 
 
-def _controller(
+def grasp_controller(
     make_estimator: Callable[[RBFImageJacobian], ImageJacobianEstimator],
     config: TrialConfig,
-    scene: _Scene,
+    scene: TrialScene,
 ) -> AdaptiveController:
+    """The controller of all trials, with the law and the goals of the configuration."""
     J = config.initial_jacobian(torch.tensor(INITIAL_IMAGE_JACOBIAN, dtype=torch.float64))
     J = J.repeat(scene.target.shape[-1] // 2, 1)
     network = RBFImageJacobian.from_jacobian(J, paper_grid(), 0.1)
     centre = torch.tensor(CENTRE, dtype=torch.float64)
-    half_size = centre.new_tensor(HALF_SIZE)
     if config.law == "printed":
-        goals = paper_goals(centre, half_size, scene.target)
+        box = centre.new_tensor(config.half_size)
+        goals = paper_goals(centre, box, scene.target, config.stiffness)
         settings, region = ControllerConfig.paper(), paper_joint_region(panda.limits)
     else:
         down = quaternion.normalize(centre.new_tensor(GRIPPER_DOWN))
         postures = comfortable_postures(panda, Pose(centre, down))
         posture = clear_posture(postures, scene.start, clearance)
-        goals = Goals.at(centre, down, scene.target).approached_by(posture)
+        goals = Goals.at(centre, down, scene.target, half_size=config.half_size)
+        goals = goals.approached_by(posture)
         settings = ControllerConfig()
         region = JointRegion.from_limits(panda.limits.lower, panda.limits.upper)
     return AdaptiveController(
@@ -266,10 +279,10 @@ def _controller(
     )
 
 
-class _Judge:
+class Judge:
     """Watches the closed loops and keeps what the result needs."""
 
-    def __init__(self, scene: _Scene, controller: AdaptiveController, config: TrialConfig):
+    def __init__(self, scene: TrialScene, controller: AdaptiveController, config: TrialConfig):
         self.scene, self.controller, self.dt = scene, controller, config.dt
         self.contact_steps = 0
         if config.contacts:
@@ -319,6 +332,7 @@ class _Judge:
     def result(self) -> TrialResult:
         return TrialResult(
             roll_class=self.scene.roll_class,
+            on_target=self.entered.isfinite(),
             success=self.entered.isfinite() & self.in_box & (self.violations == 0),
             time=self.entered,
             vision_time=self.entered - self.taken_over,

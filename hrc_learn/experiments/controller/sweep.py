@@ -30,6 +30,7 @@ from hrc_learn.jacobian import (
     ImageJacobianEstimator,
     KalmanEstimator,
     PaperEstimator,
+    PrintedEstimator,
     RBFImageJacobian,
     RecursiveLeastSquaresEstimator,
 )
@@ -65,14 +66,46 @@ def _grasp(
     *,
     suite: str = "acceptance",
     main: bool = False,
+    mujoco: bool = False,
     **changes: Any,
 ) -> BatchedTrials:
     def run(config: TrialConfig) -> TrialResult:
+        if mujoco:  # whose import takes a second
+            from hrc_learn.experiments.controller.mujoco_trials import run_mujoco_trials
+
+            return run_mujoco_trials(estimator, config)
         return run_trials(estimator, config)
 
     settings: dict[str, Any] = {"duration": 8.0} | changes
     config = TrialConfig(**settings)
     return BatchedTrials(label=label, config=config, run=run, suite=suite, main=main)
+
+
+def _printed(
+    label: str,
+    estimator: Callable[[RBFImageJacobian], ImageJacobianEstimator],
+    **changes: Any,
+) -> BatchedTrials:
+    """The paper's regions and gains, without a planned approach, behind the safety filter."""
+    settings = {"suite": "paper", "law": "printed", "duration": 12.0} | changes
+    return _grasp(label, estimator, **settings)
+
+
+def _in_mujoco(
+    experiment: Callable[..., BatchedTrials], *args: Any, **changes: Any
+) -> BatchedTrials:
+    """The same in the simulator, whose images have noise of their own."""
+    images = replace(TrialConfig().imperfections, noise=0.0)
+    settings: dict[str, Any] = {"imperfections": images, "contacts": True} | changes
+    return experiment(*args, suite="mujoco", mujoco=True, **settings)
+
+
+def _rows_right(network: RBFImageJacobian) -> PrintedEstimator:
+    return PrintedEstimator(network, mixed=False)
+
+
+def _with_gain(gain: float) -> Callable[[RBFImageJacobian], ImageJacobianEstimator]:
+    return lambda network: PaperEstimator(network, gain)
 
 
 def _imperfect(**changes: Any) -> dict[str, Any]:
@@ -103,6 +136,10 @@ def flip_row(J: Tensor) -> Tensor:
     return J * J.new_tensor([[-1.0], [1.0]])
 
 
+_FIRM_BOX = {"stiffness": (4e-3, 4e-3, 4e-3)}
+"""The k_c of our own regions, ten times Table I's, and a hundred times in z."""
+
+
 EXPERIMENTS: Mapping[str, BatchedTrials] = {
     "near": _grasp("starts near the ready posture", main=True, contacts=True),
     "global": _grasp(
@@ -113,13 +150,6 @@ EXPERIMENTS: Mapping[str, BatchedTrials] = {
         duration=12.0,
     ),
     "fixed": _grasp("no adaptation", FixedEstimator, main=True),
-    "paper": _grasp("the paper's adaptation in our loop", PaperEstimator),
-    "printed": _grasp(
-        "the paper's law and Table I as printed, behind the safety filter",
-        PaperEstimator,
-        law="printed",
-        duration=12.0,
-    ),
     "jacobian_0.3": _grasp("initial Jacobian times 0.3", initial_jacobian=lambda J: 0.3 * J),
     "jacobian_3": _grasp("initial Jacobian times 3", initial_jacobian=lambda J: 3 * J),
     "row_flipped": _grasp(
@@ -152,6 +182,32 @@ EXPERIMENTS: Mapping[str, BatchedTrials] = {
         suite="estimators",
         feature="corners",
     ),
+    "paper": _grasp("the paper's adaptation in our loop", PaperEstimator, suite="paper"),
+    "literal": _printed("the paper's law, all as printed", PrintedEstimator, main=True),
+    "unmixed": _printed("literal, the image rows of J_s0 not mixed", _rows_right, main=True),
+    "printed": _printed("unmixed, neurons normalised", PaperEstimator, main=True),
+    "printed_fixed": _printed("printed, L = 0", FixedEstimator),
+    "printed_kalman": _printed("printed, our estimator", KalmanEstimator),
+    "printed_z": _printed(
+        "printed, k_c = 4e-4 in z too", PaperEstimator, stiffness=(4e-4, 4e-4, 4e-4)
+    ),
+    "literal_box": _printed("literal, k_c = 4e-3", PrintedEstimator, **_FIRM_BOX),
+    "unmixed_box": _printed("unmixed, k_c = 4e-3", _rows_right, **_FIRM_BOX),
+    "printed_box": _printed("printed, k_c = 4e-3", PaperEstimator, main=True, **_FIRM_BOX),
+    "box_fixed": _printed("printed_box, L = 0", FixedEstimator, **_FIRM_BOX),
+    "box_gain_1e7": _printed("printed_box, L = 1e7 I", _with_gain(1e7), **_FIRM_BOX),
+    "box_gain_1e8": _printed("printed_box, L = 1e8 I", _with_gain(1e8), **_FIRM_BOX),
+    "box_kalman": _printed("printed_box, our estimator", KalmanEstimator, **_FIRM_BOX),
+    "box_global": _printed(
+        "printed_box, starts anywhere within the limits",
+        PaperEstimator,
+        starts="global",
+        **_FIRM_BOX,
+    ),
+    "mujoco_near": _in_mujoco(_grasp, "near, in MuJoCo"),
+    "mujoco_literal": _in_mujoco(_printed, "literal, in MuJoCo", PrintedEstimator),
+    "mujoco_printed": _in_mujoco(_printed, "printed, in MuJoCo", PaperEstimator),
+    "mujoco_kalman": _in_mujoco(_printed, "printed_kalman, in MuJoCo", KalmanEstimator),
     "stress": _stress("random goals, cameras and efforts"),
     "stress_nan": _stress("the same with 1 % of measurements NaN", fault="nan"),
     "stress_late": _stress("the same, images and joint states late by 0.1 s", fault="late"),
