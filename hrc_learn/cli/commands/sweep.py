@@ -27,7 +27,7 @@ from hrc_learn.viz import SweepRecording, SweptTrials
 CHUNK = 250
 """Trials in one batch: their tensors stay in the cache."""
 # Of the tables: a log file has no width of its own.
-_WIDTH = 124
+_WIDTH = 132
 
 
 def sweep(args: Sweep) -> int:
@@ -185,6 +185,7 @@ def _grasp_table(names: list[str], figures: dict[str, float]) -> Table:
         "t50\n[s]",
         "t95\n[s]",
         "vision\n[s]",
+        "J err\n[%]",
         "viol.",
     )
     for column in columns:
@@ -203,6 +204,7 @@ def _grasp_table(names: list[str], figures: dict[str, float]) -> Table:
             *shares("success"),
             f"{100 * figures[f'{name}_touched']:.1f}" if looked else "",
             *(f"{figures[f'{name}_{key}']:.2f}" for key in ("t50", "t95", "vision_phase")),
+            f"{100 * figures[f'{name}_jacobian_error']:.0f}",
             f"{figures[f'{name}_violations']:.0f}",
         )
     return table
