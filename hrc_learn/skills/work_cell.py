@@ -374,20 +374,28 @@ class WorkCell:
     def _track_joints(
         self, goal: Float[Tensor, " joints"], velocity: Float[Tensor, " joints"]
     ) -> None:
-        """One step along a path of the joints, or of the end effector if they are aside."""
-        config, joints = self.config, self.joints
-        away = null_projection(self.chain.jacobian(joints), goal - joints)
-        distance = float(away.norm())
-        self._aside = self._pushed() or distance > (_BACK if self._aside else _ASIDE)
-        if not self._aside:
-            self.step(velocity + config.pose_gain * (goal - joints))
+        """One step along a path of the joints, or of the end effector while they are aside."""
+        error = goal - self.joints
+        away = self._away(error)
+        if away is None:
+            self.step(velocity + self.config.pose_gain * error)
             return
         back = torch.zeros_like(away)
-        if config.after_push == "return":
-            speed = min(config.pose_gain, config.return_speed / max(distance, 1e-9))
-            back = speed * away
+        if self.config.after_push == "return":
+            fastest = self.config.return_speed / float(away.norm().clamp(min=1e-9))
+            back = min(self.config.pose_gain, fastest) * away
         pose, J = self.chain.forward_and_jacobian(goal)
         self.track_pose(pose, J @ velocity, velocity + back)
+
+    def _away(self, error: Float[Tensor, " joints"]) -> Float[Tensor, " joints"] | None:
+        """Null-space part of the way back to a path [rad]; None if nobody pushed the arm off."""
+        pushed, limit = self._pushed(), _BACK if self._aside else _ASIDE
+        if not pushed and float(error.norm()) <= limit:  # and so is its part
+            self._aside = False
+            return None
+        away = null_projection(self.chain.jacobian(self.joints), error)
+        self._aside = pushed or float(away.norm()) > limit
+        return away if self._aside else None
 
     def _pushed(self) -> bool:
         """Whether a person pushes at the null space now."""
