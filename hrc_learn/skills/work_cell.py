@@ -388,7 +388,7 @@ class WorkCell:
         self.track_pose(pose, J @ velocity, velocity + back)
 
     def _away(self, error: Float[Tensor, " joints"]) -> Float[Tensor, " joints"] | None:
-        """Null-space part of the way back to a path [rad]; None if nobody pushed the arm off."""
+        """Null-space part of the way back to a path [rad]; None if nobody pushed it off."""
         pushed, limit = self._pushed(), _BACK if self._aside else _ASIDE
         if not pushed and float(error.norm()) <= limit:  # and so is its part
             self._aside = False
