@@ -88,15 +88,17 @@ class Study:
         studies = {TRIALS: self}
         for size in sizes:
             trial: Any = self.trial
+            repeated = isinstance(trial, RepeatedRun)
+            settings = trial.experiment if repeated else trial
             imperfections = Imperfections.nominal().scaled(size)
-            if imperfections == trial.experiment.imperfections:
+            if imperfections == settings.imperfections:
                 studies[TRIALS] = replace(self, size=size)
                 continue
-            changed = replace(trial.experiment, imperfections=imperfections)
+            changed = replace(settings, imperfections=imperfections)
             studies[f"imperfections_{size:g}"] = replace(
                 self,
                 title=f"{self.title}, imperfections {size:g} times nominal",
-                trial=replace(trial, experiment=changed),
+                trial=RepeatedRun(changed) if repeated else changed,
                 metrics=(),
                 pictures=lambda trials: (),
                 size=size,

@@ -10,6 +10,7 @@ from hrc_learn.experiments.grasping import experiment
 from hrc_learn.experiments.grasping.experiment import GraspingExperiment
 from hrc_learn.experiments.grasping.trial import SimulatedGrasp
 from hrc_learn.jacobian import RBFImageJacobian, paper_grid
+from hrc_learn.sim import Imperfections
 from hrc_learn.skills.visual_skill import VisualServoSkill
 
 
@@ -19,13 +20,13 @@ def asked(monkeypatch):
     asked = []
 
     def fake_grasp(skill, scene, **settings):
-        asked.append(SimpleNamespace(**settings))
+        asked.append(SimpleNamespace(imperfections=scene, **settings))
         return object.__new__(SimulatedGrasp)  # nothing of it is looked at
 
     jacobian = RBFImageJacobian.from_jacobian(torch.rand(2, 6) + 1.0, paper_grid(), 0.1)
     skill = VisualServoSkill(jacobian=jacobian, target=None)
     monkeypatch.setattr(experiment.VisualServoSkill, "load", lambda folder: skill)
-    monkeypatch.setattr(experiment.GraspingScene, "draw", lambda *arguments: None)
+    monkeypatch.setattr(experiment.GraspingScene, "draw", lambda *drawn: drawn[-1])
     monkeypatch.setattr(experiment, "simulate_grasp", fake_grasp)
     return asked
 
@@ -38,8 +39,10 @@ def test_variants_are_compared_by_servoing_alone(asked):
     whole, *compared = asked
     assert whole.config == grasping.config
     assert not whole.told_target
+    assert whole.imperfections == Imperfections.nominal()
     for settings in compared:
         assert settings.told_target
+        assert settings.imperfections == whole.imperfections
         assert settings.config.attempts == 1
         assert settings.config.servo.probe == 0.0
         assert settings.config.servo.timeout > 0

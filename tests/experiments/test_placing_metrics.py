@@ -1,24 +1,33 @@
 """What counts as a good placing, and how trials are summed up."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from hrc_learn.experiments.frame import TRIALS, Study
 from hrc_learn.experiments.metric_table import evaluate
 from hrc_learn.experiments.monte_carlo import Trial
 from hrc_learn.experiments.placing import arm_angle_ablation
-from hrc_learn.experiments.placing.experiment import demonstrated_shelf
+from hrc_learn.experiments.placing.experiment import RandomStart, demonstrated_shelf
 from hrc_learn.experiments.placing.metrics import (
     BLOCKED,
     placing_metrics,
     random_start_metrics,
 )
-from hrc_learn.experiments.placing.trial import PlacingOutcome, random_start
+from hrc_learn.experiments.placing.trial import (
+    PlacingOutcome,
+    random_start,
+    taught_correction,
+)
+from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import panda
-from hrc_learn.sim import Touch, World
+from hrc_learn.sim import Imperfections, Touch, World
 from hrc_learn.sim.workplace import Workplace
+from hrc_learn.skills.arm_motion import nearest_configuration
+from hrc_learn.skills.placing import PlaceCorrection
 from hrc_learn.skills.work_cell import TaskFailedError
 
 WORKPLACE = Workplace()
@@ -144,6 +153,61 @@ def test_random_starts_are_free_and_each_another():
     for start in starts:
         assert panda.limits.contain(start)
         assert float((start - WORKPLACE.home_joints()).abs().max()) < 0.5
+
+
+def true_tool(world, read):
+    """Where the tool is when the arm reads a pose."""
+    joints = nearest_configuration(read, near=WORKPLACE.home_joints()).numpy()
+    world.reset(joints - world.imperfections.encoder_offset)
+    return world.arm.tcp_pose()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_place_shown_once_takes_the_calibration_out_of_all_places(seed):
+    rng = np.random.default_rng(seed)
+    sizes = replace(Imperfections.nominal(), encoder_noise=0.0, teaching_error=0.0)
+    world = World(WORKPLACE.scene, sizes.draw(rng))
+    near = WORKPLACE.home_joints()
+    correction = taught_correction(world, WORKPLACE.shelf("middle"), near, rng)
+    for shelf in SHELVES:
+        goal = WORKPLACE.shelf(shelf)
+        misses = [
+            np.linalg.norm(true_tool(world, read)[:3, 3] - goal.position.numpy())
+            for read in (goal, correction.apply(goal))
+        ]
+        believed, corrected = 1e3 * np.array(misses)
+        assert corrected < (1e-6 if shelf == "middle" else min(1.5, believed))
+        assert believed > 0.3
+
+
+def test_a_correction_shifts_and_turns_in_the_frame_of_the_tool():
+    place = WORKPLACE.shelf("middle")
+    turn = quaternion.exp(torch.tensor([0.02, 0.0, -0.01], dtype=torch.float64))
+    shift = torch.tensor([1e-3, -2e-3, 3e-3], dtype=torch.float64)
+    read = Pose(place.position + shift, quaternion.multiply(place.orientation, turn))
+    other = WORKPLACE.shelf("upper")
+    corrected = PlaceCorrection.of(read, place).apply(other)
+    torch.testing.assert_close(corrected.position - other.position, shift)
+    back = quaternion.multiply(quaternion.conjugate(other.orientation), corrected.orientation)
+    torch.testing.assert_close(back, turn)
+
+
+def test_random_starts_are_repeated_with_each_size_of_the_imperfections():
+    start = RandomStart(
+        placing=Path("skill"),
+        demonstrations=Path("demos"),
+        speed=1.5,
+        noise=0.1,
+        imperfections=Imperfections.nominal(),
+        taught=True,
+    )
+    studies = Study(title="", trial=start).at_sizes((0.0, 1.0, 2.0))
+    sizes = {name: study.trial.imperfections for name, study in studies.items()}
+    assert sizes == {
+        TRIALS: Imperfections.nominal(),
+        "imperfections_0": Imperfections.ideal(),
+        "imperfections_2": Imperfections.nominal().scaled(2.0),
+    }
 
 
 def test_starts_that_cannot_be_free_are_given_up():

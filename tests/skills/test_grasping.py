@@ -150,6 +150,29 @@ def test_a_scene_is_remote_unhurt_and_seen():
     assert 0 < tilt < 0.25
 
 
+@pytest.mark.parametrize("yaw", [-3.0, -1.4, 0.0, 0.9, 1.9, 3.1])
+def test_the_gripper_closes_across_the_object_at_any_yaw(yaw):
+    """Turned no further than it may be, its marker where the simulator has it."""
+    pose = np.eye(4)
+    c, s = math.cos(yaw), math.sin(yaw)
+    pose[:2, :2], pose[:3, 3] = [[c, -s], [s, c]], (0.2, 0.5, 0.03)
+    start = WORKPLACE.home_joints().numpy()
+    scene = GraspingScene(workplace=WORKPLACE, start=start, object_pose=pose)
+    above, hover = scene.above(), WORKPLACE.hover()
+    closing, across = (
+        quaternion.to_matrix(q)[:, 1].numpy() for q in (above.orientation, hover.orientation)
+    )
+    assert abs(closing @ pose[:3, 0]) == pytest.approx(1.0)
+    turn = math.atan2(np.cross(across, closing)[2], across @ closing)
+    least, most = WORKPLACE.hover_turns
+    assert least <= turn <= most
+    world = scene.world()
+    q = panda.inverse(above, WORKPLACE.hover_q7 - turn, near=WORKPLACE.hover_joints())
+    world.reset(q.numpy())
+    seen = WORKPLACE.scene.camera.project(world.marker_poses()[WORKPLACE.tool_marker][:3, 3])
+    np.testing.assert_allclose(scene.true_target(world), seen, atol=1e-3)
+
+
 def test_a_roll_turns_the_image_about_its_middle(grasp):
     camera, shown = grasp.scene.workplace.scene.camera, WORKPLACE.scene.camera
     point = WORKPLACE.hover().position.numpy()

@@ -75,6 +75,25 @@ def test_a_probe_comes_down_at_its_speed_from_where_it_begins():
     assert 0 < heights[-1] <= CONFIG.probe_speed * 0.01 * (1 + 1e-9)
 
 
+@pytest.mark.parametrize("height", [-0.004, 0.0, 0.002, 0.013])
+def test_within_the_box_the_gripper_is_led_straight_down(height):
+    """Above it along the line, which leans."""
+    above, line = Workplace().hover(), np.array([0.6, 0.0, 0.8])
+    target = ServoTarget(
+        config=CONFIG,
+        above=above,
+        posture=None,
+        target=lambda J, orientation: np.zeros(2),
+        lines=lambda orientation: line,
+    )
+    jacobian = np.zeros((2, 6))
+    jacobian[:, :2] = 1000.0 * np.eye(2)
+    up = torch.tensor([0.0, 0.0, height], dtype=torch.float64)
+    pixel = target.pixel(jacobian, Pose(above.position + up, above.orientation))
+    aside = 0.75 * max(height - CONFIG.half_size[2], 0.0)
+    np.testing.assert_allclose(pixel, [1000.0 * aside, 0.0], atol=1e-9)
+
+
 @pytest.mark.parametrize(("astray", "probes"), [(0.0, 1), (0.03, CONFIG.max_probes)])
 def test_a_turned_tool_that_stays_on_its_own_line_is_not_probed_again(astray, probes):
     """The line leads elsewhere for a turned tool; only what leaves that one counts."""

@@ -62,6 +62,9 @@ class RunExperiment(Imperfect, Written):
     """Repeat with so many seeds besides, and sum up."""
     processes: int = 1
     """Of the repetitions, at once."""
+    curve: More[tuple[float, ...]] = ()
+    """Repeat with these sizes of the imperfections besides, in multiples of the nominal ones,
+    and draw success and errors against them."""
     robot: Robot = "panda"
     """Arm that does it."""
     serve: bool = False

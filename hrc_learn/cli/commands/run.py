@@ -52,6 +52,7 @@ def run_placing(args: RunPlacing) -> int:
         speed=args.speed,
         noise=args.noise,
         imperfections=_imperfections(args),
+        curve=args.curve,
         taught=args.taught,
         snapshots=args.pictures,
     )
@@ -70,6 +71,7 @@ def run_grasping(args: RunGrasping) -> int:
             camera_roll=math.radians(args.camera_roll), random_camera=args.random_camera
         ),
         imperfections=_imperfections(args),
+        curve=args.curve,
         camera=args.camera,
         config=replace(args.config, controller=controller),
     )
@@ -91,6 +93,7 @@ def run_collaboration(args: RunCollaboration) -> int:
         shelf_depth=args.shelf_depth,
         person=args.person,
         imperfections=_imperfections(args),
+        curve=args.curve,
         disturbances=Disturbances(
             occlusions=tuple(OcclusionInterval(start=s, duration=d) for s, d in args.occlusion),
             camera_change=args.camera_change if args.camera_moved else None,

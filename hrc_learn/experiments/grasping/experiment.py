@@ -7,8 +7,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from hrc_learn.experiments.frame import TRIALS, UNOBSERVED, Observer, RepeatedRun, Study
-from hrc_learn.experiments.grasping.metrics import TRIAL_METRICS, grasping_metrics
+from hrc_learn.experiments.frame import UNOBSERVED, Observer, RepeatedRun, Study
+from hrc_learn.experiments.grasping.metrics import CURVES, TRIAL_METRICS, grasping_metrics
 from hrc_learn.experiments.grasping.report import SUMMARY, grasping_sections, record_grasp
 from hrc_learn.experiments.grasping.trial import (
     DEFAULT,
@@ -50,6 +50,8 @@ class GraspingExperiment:
     """How camera, start and object are drawn."""
     imperfections: Imperfections = field(default_factory=Imperfections.nominal)
     """Of arm, calibration, camera and object."""
+    curve: tuple[float, ...] = ()
+    """Sizes of the imperfections to repeat with, in multiples of the nominal ones."""
     camera: CameraKind = "synthetic"
     config: GraspingConfig = field(default_factory=GraspingConfig)
 
@@ -118,13 +120,17 @@ class GraspingExperiment:
         return grasping_sections(run, recordings, self.config.servo)
 
     def studies(self) -> Mapping[str, Study]:
-        """Grasps by the default alone, in random scenes, with the synthetic camera."""
+        """Grasps by the default alone, in random scenes, with the synthetic camera.
+
+        With each size of the imperfections.
+        """
         scene = replace(self.scene, random_camera=True)
-        trial = replace(self, variants=(), scene=scene, camera="synthetic")
+        trial = replace(self, variants=(), scene=scene, camera="synthetic", curve=())
         study = Study(
             title="Grasps in random scenes",
             trial=RepeatedRun(trial),
             metrics=TRIAL_METRICS,
-            text="Another camera pose, start and object pose for each seed.",
+            text="For each seed other imperfections, another camera, start and object pose.",
+            shown=CURVES,
         )
-        return {TRIALS: study}
+        return study.at_sizes(self.curve)

@@ -265,3 +265,10 @@ TRIAL_METRICS: Sequence[Metric[Sequence[Trial]]] = (
     Metric("grasps, slip in the hand (95 %)", p95("slip_in_the_hand_mm"), "mm", at_most=3.0),
 )
 """Rows of the table that grasps in random scenes add."""
+
+CURVES = {
+    "servoing_time_from_the_remote_start_s": "servoing time [s]",
+    "grasp_offset_mm": "grasp offset [mm]",
+    "object_tilt_in_the_hand_deg": "tilt in the hand [deg]",
+}
+"""Drawn against the size of the imperfections: labels by the keys of values."""

@@ -15,13 +15,14 @@ import torch
 from jaxtyping import Float
 
 from hrc_learn.demos import Demonstration, load_demos
-from hrc_learn.experiments.frame import TRIALS, UNOBSERVED, Observer, Study
+from hrc_learn.experiments.frame import UNOBSERVED, Observer, Study
 from hrc_learn.experiments.metric_table import Metric, evaluate
 from hrc_learn.experiments.placing import arm_angle_ablation
 from hrc_learn.experiments.placing.arm_angle_ablation import Ablation, AblationTrial
 from hrc_learn.experiments.placing.figures import take_snapshots
 from hrc_learn.experiments.placing.metrics import (
     BLOCKED,
+    CURVES,
     placing_metrics,
     random_start_metrics,
     run_metrics,
@@ -76,6 +77,8 @@ class PlacingExperiment:
     """Standard deviation of each joint at random starts, about home [rad]."""
     imperfections: Imperfections = field(default_factory=Imperfections.nominal)
     """Of arm, calibration and objects."""
+    curve: tuple[float, ...] = ()
+    """Sizes of the imperfections to repeat random starts with, in multiples of the nominal."""
     taught: bool = True
     """Whether a person leads the arm once to the place on the demonstrated shelf, and what its
     encoders read there corrects all goals."""
@@ -106,7 +109,9 @@ class PlacingExperiment:
         world = World(workplace.scene, self.imperfections.draw(rng))
         correction = None
         if self.taught:
-            correction = taught_correction(skill, world, workplace.shelf(goal_shelf), rng)
+            correction = taught_correction(
+                world, workplace.shelf(goal_shelf), skill.joint.goal, rng
+            )
         placings: dict[tuple[PlanningSpace, str], SimulatedPlacing] = {}
         outcomes: dict[PlanningSpace, dict[str, PlacingOutcome]] = {s: {} for s in SPACES}
         for space, label in SPACES.items():
@@ -173,7 +178,10 @@ class PlacingExperiment:
         return placing_sections(run, snapshots)
 
     def studies(self) -> Mapping[str, Study]:
-        """Placings from random starts, and further paired demonstrations."""
+        """Placings from random starts, and further paired demonstrations.
+
+        The first with each size of the imperfections.
+        """
         shelves = Workplace().shelf_names()
         starts = RandomStart(
             placing=self.placing,
@@ -184,14 +192,16 @@ class PlacingExperiment:
             taught=self.taught,
         )
         end = demonstrated_path(self._demonstration())[-1]
+        study = Study(
+            title="Placing on each shelf from random starts",
+            trial=starts,
+            metrics=random_start_metrics(shelves),
+            text="Every joint of the start is drawn about home; planned in task space.",
+            pictures=lambda trials: random_start_pictures(trials, shelves),
+            shown=CURVES,
+        )
         return {
-            TRIALS: Study(
-                title="Placing on each shelf from random starts",
-                trial=starts,
-                metrics=random_start_metrics(shelves),
-                text="Every joint of the start is drawn about home; planned in task space.",
-                pictures=lambda trials: random_start_pictures(trials, shelves),
-            ),
+            **study.at_sizes(self.curve),
             ABLATION: Study(
                 title="Paired demonstrations with and without null-space posture",
                 trial=AblationTrial(shelf=demonstrated_shelf(end, Workplace())),
@@ -276,7 +286,7 @@ class RandomStart:
         correction = None
         if self.taught:
             known = demonstrated_shelf(demonstrated_path(demonstration)[-1], workplace)
-            correction = taught_correction(skill, world, workplace.shelf(known), rng)
+            correction = taught_correction(world, workplace.shelf(known), skill.joint.goal, rng)
         outcomes, blocked = {}, 0
         for shelf in workplace.shelf_names():
             start = random_start(world, workplace, self.noise, rng)

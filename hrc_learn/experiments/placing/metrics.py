@@ -140,6 +140,13 @@ BLOCKED = "joint_space_plans_blocked"
 """Value of a trial from random starts: how many of the paper's plans are not free."""
 
 
+CURVES = {
+    "place_error_mm": "place error [mm]",
+    "place_tilt_deg": "place tilt [deg]",
+}
+"""Drawn against the size of the imperfections, the worst of the shelves: labels by keys."""
+
+
 def random_start_metrics(shelves: Sequence[str]) -> list[Metric[Sequence[Trial]]]:
     """Rows of the table that placings from random starts add."""
 

@@ -175,16 +175,16 @@ _SHOWN_ITERATIONS = 4
 
 
 def taught_correction(
-    skill: PlacingSkill, world: World, place: Pose, rng: np.random.Generator
+    world: World, place: Pose, near: Float[Tensor, "7"], rng: np.random.Generator
 ) -> PlaceCorrection:
     """What the arm reads where a person has led its tool to a known place.
 
     Resets the world.
 
     Args:
-        skill: Tells the posture in which the arm is led there.
         world: With the arm's imperfections.
         place: The place.
+        near: Joint positions near which the arm is led there [rad].
         rng: Of the person's error.
 
     Raises:
@@ -196,7 +196,7 @@ def taught_correction(
     read = led
     for _ in range(_SHOWN_ITERATIONS):
         # Where the tool truly is, and by how much it misses.
-        joints = nearest_configuration(read, near=skill.joint.goal).numpy()
+        joints = nearest_configuration(read, near=near).numpy()
         world.reset(joints - errors.encoder_offset)
         matrix = torch.from_numpy(world.arm.tcp_pose())
         tool = Pose(matrix[:3, 3], quaternion.from_matrix(matrix[:3, :3]))
