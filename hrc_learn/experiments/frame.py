@@ -85,11 +85,10 @@ class Study:
             This study under the name `TRIALS`, those with sizes that differ from its own as
             `imperfections_2` and so on.
         """
-        studies = {TRIALS: self}
+        studies: dict[str, Study] = {TRIALS: self}
         for size in sizes:
-            trial: Any = self.trial
-            repeated = isinstance(trial, RepeatedRun)
-            settings = trial.experiment if repeated else trial
+            repeated = isinstance(self.trial, RepeatedRun)
+            settings: Any = self.trial.experiment if repeated else self.trial
             imperfections = Imperfections.nominal().scaled(size)
             if imperfections == settings.imperfections:
                 studies[TRIALS] = replace(self, size=size)
