@@ -34,6 +34,8 @@ class Args:
     """Folder of `hrc run grasping`, likewise."""
     collaboration: Path | None = None
     """Folder of `hrc run collaboration`, likewise."""
+    curve: Path | None = None
+    """Folder of a run with `--curve`, likewise: success against the size of imperfections."""
     page: Path = PAGE
     """The page; its pictures are in images/ beside it."""
 
@@ -43,10 +45,11 @@ def main(args: Args) -> None:
         "placing": args.placing,
         "grasping": args.grasping,
         "collaboration": args.collaboration,
+        "curve": args.curve,
     }
     reports = {kind: read_report(run) for kind, run in runs.items() if run is not None}
     if not reports:
-        raise ValueError("no run: give --placing, --grasping or --collaboration")
+        raise ValueError("no run: give --placing, --grasping, --collaboration or --curve")
     text = args.page.read_text()
     pictures: dict[str, bytes] = {}
     for kind, report in reports.items():

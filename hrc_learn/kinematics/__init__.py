@@ -9,6 +9,7 @@ from hrc_learn.kinematics.franka import LINK_CAPSULES as LINK_CAPSULES
 from hrc_learn.kinematics.franka import FrankaArm as FrankaArm
 from hrc_learn.kinematics.franka import UnreachableError as UnreachableError
 from hrc_learn.kinematics.franka import panda as panda
+from hrc_learn.kinematics.franka import panda_body as panda_body
 from hrc_learn.kinematics.franka import panda_capsules as panda_capsules
 from hrc_learn.kinematics.interchange import from_pytorch_kinematics as from_pytorch_kinematics
 from hrc_learn.kinematics.interchange import to_pytorch_kinematics as to_pytorch_kinematics

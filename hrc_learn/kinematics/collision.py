@@ -94,20 +94,21 @@ class CapsuleArm:
     def box_distance(
         self,
         q: Float[Tensor, "*batch joints"],
-        centre: Float[Tensor, "3"],
-        half_size: Float[Tensor, "3"],
+        centre: Float[Tensor, "*boxes 3"],
+        half_size: Float[Tensor, "*boxes 3"],
     ) -> Float[Tensor, "*batch"]:
-        """Distance of the nearest moving link from a box along the base axes [m].
+        """Distance of the nearest moving link from boxes along the base axes [m].
 
-        Inside the box it counts from the segment, not from the nearest wall.
+        Inside a box it counts from the segment, not from the nearest wall.
 
         Args:
             q: Joint position [rad].
-            centre: Of the box [m].
+            centre: Of the box, or of each of several [m].
             half_size: Half of its edges [m].
         """
-        ends = self.segments(q)[..., self._moving, :, :]
-        distance = segment_box_distance(ends, centre.to(q), half_size.to(q))
+        ends = self.segments(q)[..., self._moving, None, :, :]
+        boxes = (side.to(q).reshape(-1, 3) for side in (centre, half_size))
+        distance = segment_box_distance(ends, *boxes).amin(-1)
         return (distance - self._radius.to(q)[self._moving]).amin(-1)
 
 
@@ -133,9 +134,9 @@ def segment_distance(
 
 
 def segment_box_distance(
-    segment: Float[Tensor, "*batch 2 3"],
-    centre: Float[Tensor, "3"],
-    half_size: Float[Tensor, "3"],
+    segment: Float[Tensor, "*#batch 2 3"],
+    centre: Float[Tensor, "*#batch 3"],
+    half_size: Float[Tensor, "*#batch 3"],
 ) -> Float[Tensor, "*batch"]:
     """Smallest distance between points of a segment and a box; zero where they meet.
 
@@ -148,7 +149,8 @@ def segment_box_distance(
         offset = start + t.unsqueeze(-1) * along - centre
         return offset - offset.clamp(-half_size, half_size)
 
-    low, high = torch.zeros_like(start[..., 0]), torch.ones_like(start[..., 0])
+    low = torch.zeros_like((start - centre)[..., 0])
+    high = torch.ones_like(low)
     for _ in range(_HALVINGS):
         middle = (low + high) / 2
         rising = (outside(middle) * along).sum(-1) > 0

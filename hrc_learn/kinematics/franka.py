@@ -222,3 +222,6 @@ _OVERLAPPING = ((0, 2), (1, 3), (3, 5), (5, 7), (6, _TCP), (7, _TCP))
 
 panda_capsules = CapsuleArm(panda, LINK_CAPSULES + _HAND_CAPSULES, _OVERLAPPING)
 """The Panda with its hand."""
+
+panda_body = CapsuleArm(panda, LINK_CAPSULES, _OVERLAPPING)
+"""Without the hand, which a task takes near to things on purpose."""

@@ -136,7 +136,7 @@ class ProjectiveCamera(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class Imperfections:
-    """What a real camera does to the measurement."""
+    """What a real camera and real encoders do to the measurement."""
 
     frame_steps: int = 1
     """Control steps from one image to the next."""
@@ -150,11 +150,13 @@ class Imperfections:
     """How often the marker gets covered [1/s]."""
     loss_time: float = 3.0
     """Longest time it stays covered [s]; the mean is half of it."""
+    encoder_noise: float = 0.0
+    """Standard deviation of each joint position reading [rad]."""
 
 
 @dataclass(kw_only=True)
 class VirtualCamera:
-    """Turns tool poses into measurements, with the imperfections of a camera.
+    """Turns tool poses into measurements, with the imperfections of camera and encoders.
 
     It remembers the last images, for their latency, and how long the marker stays covered.
     """
@@ -179,6 +181,14 @@ class VirtualCamera:
             "feature_new": torch.full_like(visible, new),
             "image_joint_position": q,
         }
+
+    def read_encoders(self, joint_position: Tensor) -> Tensor:
+        """A reading of joint positions [rad]."""
+        size = self.imperfections.encoder_noise
+        if size == 0:
+            return joint_position
+        noise = torch.randn(joint_position.shape, generator=self.generator, dtype=torch.float64)
+        return joint_position + size * noise
 
     def _take_image(self, tool: Pose, joint_position: Tensor, frame_time: float) -> None:
         imperfections = self.imperfections
@@ -238,9 +248,10 @@ def simulate_closed_loop(
     """
     q, state = joint_position, controller.initial_state(joint_position)
     for k in range(steps):
+        read = camera.read_encoders(q)
         observation = Observation(
-            **camera.observe(controller.chain.forward(q), q, dt),
-            joint_position=q,
+            **camera.observe(controller.chain.forward(q), read, dt),
+            joint_position=read,
             dt=dt,
             nullspace_input=None if nullspace_input is None else nullspace_input(k, q),
             goals=None if goals is None else goals(k),

@@ -8,7 +8,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.geometry import Pose
-from hrc_learn.kinematics import coarse_orientation, comfortable_postures, gripper_down, panda
+from hrc_learn.kinematics import (
+    coarse_orientation,
+    comfortable_postures,
+    gripper_down,
+    panda,
+    panda_body,
+    panda_capsules,
+)
 from hrc_learn.kinematics.tool_orientation import Approach
 from hrc_learn.sim.scene import HAND_MARKER, SceneConfig
 
@@ -115,6 +122,17 @@ class Workplace:
         highest = 2 * max(item.half_size[2] for item in self.scene.objects)
         half = _vector(*self.table_reach, highest / 2)
         return _vector(*self.table_centre, highest / 2), half
+
+    def arm_clearance(self, q: Float[Tensor, "*batch 7"]) -> Float[Tensor, "*batch"]:
+        """Distance of the arm from the furniture, its hand apart, and from itself [m].
+
+        Args:
+            q: Joint position [rad].
+        """
+        boxes = [(*box.centre, *box.half_size) for box in self.scene.boxes()]
+        centre, half_size = q.new_tensor(boxes).split(3, dim=-1)
+        furniture = panda_body.box_distance(q, centre, half_size)
+        return torch.minimum(furniture, panda_capsules.self_distance(q))
 
     def random_object_pose(
         self, reach: tuple[float, float, float], rng: np.random.Generator, yaw: float = 0.06

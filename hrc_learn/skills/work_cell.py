@@ -3,6 +3,7 @@
 from collections import deque
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 import torch
@@ -11,9 +12,10 @@ from torch import Tensor
 
 from hrc_learn.controller import INTERVENTIONS, Command, SafetyConfig, SafetyFilter
 from hrc_learn.geometry import Pose
+from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.protocols import Arm, ArmState, Gripper, Human, HumanInput
-from hrc_learn.skills.arm_motion import resolved_rate, straight_line
+from hrc_learn.skills.arm_motion import kept_clear, resolved_rate, straight_line
 from hrc_learn.skills.marker_sensor import (
     DelayedChannel,
     LatencyConfig,
@@ -45,6 +47,11 @@ SAFETY_COLUMNS = INTERVENTIONS
 _SETTLING_TIME = 0.4
 # Null-space input below which one that has ended is over [N m].
 _LEAST_INPUT = 0.05
+# How far the null space is from a planned path for the arm to have been pushed aside, and to be
+# back [rad]: servos lag by 0.03 rad at the speed of transfers.
+_ASIDE, _BACK = 0.1, 0.03
+# Time to go back at the end of a path [s].
+_LONGEST_RETURN = 5.0
 # Readings of the torque that are averaged, and steps in which an arm gets under way: friction
 # keeps it back at first.
 _FELT = 5
@@ -82,6 +89,14 @@ class WorkCellConfig:
     """Time constant with which the null-space input is smoothed [s]."""
     pose_gain: float = 4.0
     """Decay rate of the pose error on given motions [1/s]."""
+    after_push: Literal["return", "stay"] = "return"
+    """Whether the joints go back to a planned path, or on beside it, when a person who pushed
+    them aside lets go."""
+    return_speed: float = 0.4
+    """Fastest way back, of all joints together [rad/s]."""
+    clearance: float = 0.03
+    """Distance from what is around that nobody can push the arm below [m]: three times the
+    errors of base and table."""
     safety: SafetyConfig = field(default_factory=SafetyConfig)
     """Of the safety filter, which is told what the arm's driver can do."""
 
@@ -124,6 +139,8 @@ class WorkCell:
         config: WorkCellConfig | None = None,
         on_phase: Callable[[str, float], None] = lambda phase, time: None,
         rng: np.random.Generator | None = None,
+        clearance: Callable[[Float[Tensor, "*batch joints"]], Float[Tensor, "*batch"]]
+        | None = None,
     ):
         """Connect the parts.
 
@@ -137,6 +154,8 @@ class WorkCell:
             config: How the loop runs.
             on_phase: Called with the name of each phase of the task and its start time [s].
             rng: Decides which images are lost.
+            clearance: Distance of an arm at given joint positions from itself and from what
+                stands around [m]; None: people can push it anywhere within its limits.
         """
         self.config = config or WorkCellConfig()
         self.chain = chain
@@ -146,6 +165,7 @@ class WorkCell:
         self.images: list[KeptImage] = []
         self._arm, self._sensor, self._human = arm, sensor, human
         self._advance, self._on_phase = advance, on_phase
+        self._clearance, self._aside = clearance, False
         self._safety = SafetyFilter(chain.limits, self.config.safety)
         self._ticks = 0
         self.state: ArmState = arm.read()
@@ -237,12 +257,30 @@ class WorkCell:
             approach=approach,
         )
 
-    def track_pose(self, goal: Pose, twist: Float[Tensor, "6"]) -> None:
-        """One step of tracking a moving pose; the null space yields to the person."""
-        pose, J = self.chain.forward_and_jacobian(self.joints)
+    def track_pose(
+        self,
+        goal: Pose,
+        twist: Float[Tensor, "6"],
+        drift: Float[Tensor, " joints"] | None = None,
+    ) -> None:
+        """One step of tracking a moving pose; the null space yields to the person.
+
+        Args:
+            goal: Where the end effector should be.
+            twist: Its velocity (linear [m/s], angular [rad/s]).
+            drift: Joint velocity whose null-space part is wanted besides [rad/s].
+        """
+        joints = self.joints
+        pose, J = self.chain.forward_and_jacobian(joints)
         correction = self.config.pose_gain * pose.twist_to(goal)
         null_velocity = torch.from_numpy(self.human_input.nullspace_input) / self.config.damping
-        self.step(resolved_rate(J, twist + correction, null_velocity))
+        if drift is not None:
+            null_velocity = null_velocity + drift
+        task = resolved_rate(J, twist + correction, torch.zeros_like(joints))
+        null = null_projection(J, null_velocity)
+        if self._clearance is not None and bool(null.any()):
+            null = kept_clear(joints, task, null, self._clearance, self.config.clearance)
+        self.step(task + null)
 
     def hold_pose(self, duration: float) -> None:
         """Keep the end effector where it is for a while [s], yielding to the person."""
@@ -307,10 +345,11 @@ class WorkCell:
     def follow_path(
         self, path: Float[np.ndarray, "steps joints"], until: Callable[[], bool] = lambda: False
     ) -> int:
-        """Move the joints along a path sampled at the control step.
+        """Move the joints along a path sampled at the control step, yielding to the person.
 
-        The null-space input is ignored meanwhile: a planned path avoids obstacles only as it
-        was planned.
+        While a person pushes, the end effector keeps to the poses of the path, and the null
+        space yields. When they let go the joints go back to the path, at the end of it too, or
+        stay beside it (`WorkCellConfig.after_push`).
 
         Args:
             path: Joint positions [rad].
@@ -324,9 +363,43 @@ class WorkCell:
         for k, q in enumerate(path):
             if until():
                 return k
-            error = torch.from_numpy(q) - self.joints
-            self.step(torch.from_numpy(velocity[k]) + self.config.pose_gain * error)
+            self._track_joints(torch.from_numpy(q), torch.from_numpy(velocity[k]))
+        if len(path) and self.config.after_push == "return":
+            end = torch.from_numpy(path[-1])
+            deadline = self.time + _LONGEST_RETURN
+            while self._aside and not self._pushed() and self.time < deadline:
+                self._track_joints(end, torch.zeros_like(end))
         return len(path)
+
+    def _track_joints(
+        self, goal: Float[Tensor, " joints"], velocity: Float[Tensor, " joints"]
+    ) -> None:
+        """One step along a path of the joints, or of the end effector while they are aside."""
+        error = goal - self.joints
+        away = self._away(error)
+        if away is None:
+            self.step(velocity + self.config.pose_gain * error)
+            return
+        back = torch.zeros_like(away)
+        if self.config.after_push == "return":
+            fastest = self.config.return_speed / float(away.norm().clamp(min=1e-9))
+            back = min(self.config.pose_gain, fastest) * away
+        pose, J = self.chain.forward_and_jacobian(goal)
+        self.track_pose(pose, J @ velocity, velocity + back)
+
+    def _away(self, error: Float[Tensor, " joints"]) -> Float[Tensor, " joints"] | None:
+        """Null-space part of the way back to a path [rad]; None if nobody pushed it off."""
+        pushed, limit = self._pushed(), _BACK if self._aside else _ASIDE
+        if not pushed and float(error.norm()) <= limit:  # and so is its part
+            self._aside = False
+            return None
+        away = null_projection(self.chain.jacobian(self.joints), error)
+        self._aside = pushed or float(away.norm()) > limit
+        return away if self._aside else None
+
+    def _pushed(self) -> bool:
+        """Whether a person pushes at the null space now."""
+        return bool(self.human_input.nullspace_input.any())
 
     def _settle(self, goal: Pose, duration: float) -> None:
         still = torch.zeros(6, dtype=torch.float64)

@@ -53,6 +53,18 @@ def test_it_writes_one_flat_object_of_figures(tmp_path: Path, coarse):
     assert (tmp_path / "times.png").stat().st_size > 1000
 
 
+def test_a_sweep_without_grasps_has_figures_but_no_picture(tmp_path: Path, coarse):
+    one = ("sweep", "--only", "stress_late", "--trials", "2")
+    outcome = hrc(*one, "--out", str(tmp_path / "stress"))
+    assert outcome.status == 0, outcome.error
+    names = {path.name for path in (tmp_path / "stress").iterdir()}
+    assert "metrics.json" in names
+    assert not names & {"times.png", "sweep.rrd"}
+    outcome = hrc(*one, "--recording", str(tmp_path / "sweep.rrd"))
+    assert outcome.status == 2
+    assert "--recording shows grasps, but stress_late are none" in outcome.error
+
+
 def test_an_unknown_experiment_ends_in_one_line():
     outcome = hrc("sweep", "--only", "far")
     assert outcome.status == 2

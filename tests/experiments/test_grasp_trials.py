@@ -18,7 +18,7 @@ from hrc_learn.experiments.controller.grasp_trials import (
 )
 from hrc_learn.experiments.controller.mujoco_trials import build_plant
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.jacobian import FixedEstimator, KalmanEstimator, PaperEstimator
+from hrc_learn.jacobian import FixedEstimator, KalmanConfig, KalmanEstimator, PaperEstimator
 from hrc_learn.kinematics import (
     UnreachableError,
     clear_posture,
@@ -54,6 +54,20 @@ def test_with_the_printed_pull_of_the_box_the_image_alone_judges_kindly():
     assert result.success.sum() < result.on_target.sum()
 
 
+@shapes_unchecked()  # for speed
+def test_a_filter_that_knows_the_noise_of_poses_keeps_the_better_image_jacobian():
+    """At rest encoders that jitter seem to move the tool, and the image does not follow."""
+    noisy = replace(QUICK.imperfections, encoder_noise=1e-4)
+    config = replace(QUICK, count=10, duration=12.0, imperfections=noisy)
+    ideal = run_trials(KalmanEstimator, replace(config, imperfections=QUICK.imperfections))
+    unaware = run_trials(KalmanEstimator, config)
+    aware = run_trials(lambda n: KalmanEstimator(n, KalmanConfig(pose_noise=1.5e-4)), config)
+    errors = [result.jacobian_error.median() for result in (ideal, aware, unaware)]
+    assert errors[0] < 0.2
+    assert errors[1] < 1.5 * errors[0] + 0.1
+    assert errors[2] > 1.3 * errors[1]
+
+
 def test_the_same_seed_draws_the_same_trials():
     short = replace(QUICK, duration=0.2)
     one, same = run_trials(KalmanEstimator, short), run_trials(KalmanEstimator, short)
@@ -74,6 +88,7 @@ def test_a_run_that_left_the_target_again_is_no_success():
         touched=torch.tensor([False, True, False, False, False]),
         peak_speed=torch.full((5,), 0.7, dtype=torch.float64),
         hand_overs=torch.ones(5, dtype=torch.int64),
+        jacobian_error=torch.tensor([0.1, 0.2, 0.9, 0.3, 0.4], dtype=torch.float64),
     )
     summary = result.summary()
     assert summary["on_target"] == 0.8
@@ -83,6 +98,7 @@ def test_a_run_that_left_the_target_again_is_no_success():
     assert summary["t50"] == 3.0
     assert summary["t95"] == math.inf
     assert summary["violations"] == 2
+    assert summary["jacobian_error"] == 0.9
     assert summary["vision_phase"] == 1.0
     assert summary["vision_phase_roll_60_90"] == math.inf
     assert summary["success_roll_60_90"] == 0

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from hrc_learn.geometry import Pose
+from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import panda
 from hrc_learn.protocols import ArmState, HumanInput
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills import WorkCell, joint_line
+from hrc_learn.skills import WorkCell, WorkCellConfig, joint_line
 from hrc_learn.teleoperation import ScriptedPerturbation
 
 
@@ -148,3 +148,79 @@ def test_a_jump_of_the_null_space_input_comes_smoothly(cell):
     assert np.abs(np.diff(d)).max() < 0.3
     assert d.max() > 2.8
     assert d[-1] == 0.0
+
+
+def pushed_along(path, push, seconds, **options):
+    """A cell that follows a path while a person pushes from its first to its last second."""
+    arm = ObedientArm(path[0])
+
+    class Person:
+        def read(self, state):
+            d = push if seconds[0] <= state.time < seconds[1] else np.zeros(7)
+            return HumanInput(nullspace_input=d)
+
+    cell = WorkCell(
+        chain=panda, arm=arm, gripper=arm, human=Person(), advance=arm.advance, **options
+    )
+    cell.follow_path(path)
+    return cell
+
+
+PUSH = np.array([4.0, 0.0, -4.0, 0.0, 3.0, 0.0, 0.0])
+
+
+def transfer():
+    far = torch.tensor([-0.9, 0.3, 0.1, 0.3, -0.1, 0.3, -0.3], dtype=torch.float64)
+    return joint_line(panda.ready, panda.ready + far, speed=0.4, dt=0.01).numpy()
+
+
+def hand_off(cell, path):
+    """Largest distance of the end effector from its poses on the path [m, rad]."""
+    joints = torch.from_numpy(cell.log["joint_position"][: len(path)])
+    hand, planned = panda.forward(joints), panda.forward(torch.from_numpy(path))
+    turn = quaternion.angle(hand.orientation, planned.orientation)
+    return float((hand.position - planned.position).norm(dim=-1).max()), float(turn.max())
+
+
+def test_a_person_pushes_the_elbow_aside_during_a_planned_motion_and_the_hand_goes_on():
+    path = transfer()
+    free, pushed = (pushed_along(path, push, (0.5, 2.5)) for push in (0 * PUSH, PUSH))
+    elbows = [
+        panda.link_poses(torch.from_numpy(cell.log["joint_position"][: len(path)])).position
+        for cell in (free, pushed)
+    ]
+    aside = (elbows[1] - elbows[0])[:, 3].norm(dim=-1)
+    assert aside.max() > 0.15
+    lag, off = hand_off(free, path)[0], hand_off(pushed, path)
+    assert off[0] < lag + 1e-3
+    assert off[1] < 5e-3
+    # Two seconds after they let go the joints are on their way back, at the end they are there.
+    np.testing.assert_allclose(pushed.joints, path[-1], atol=0.04)
+    speed = np.abs(pushed.log["joint_velocity"][260:]).max()
+    assert speed < np.abs(free.log["joint_velocity"]).max() + 0.4
+
+
+def test_joints_stay_beside_the_path_if_wanted():
+    path, config = transfer(), WorkCellConfig(after_push="stay")
+    cell = pushed_along(path, PUSH, (0.5, 2.5), config=config)
+    assert np.abs(cell.joints.numpy() - path[-1]).max() > 0.2
+    assert hand_off(cell, path)[0] < 4e-3
+    assert len(cell.log) == len(path)
+
+
+def test_nobody_pushes_the_arm_into_what_is_around_it():
+    """A wall where the elbow would be pushed to; the hand goes on all the same."""
+    path = transfer()
+    free = pushed_along(path, PUSH, (0.5, 2.5))
+    reached = panda.link_poses(torch.from_numpy(free.log["joint_position"])).position[:, 3]
+    middle, start = reached[reached[:, 1].argmax()], reached[0]
+
+    def clearance(q):
+        elbow = panda.link_poses(q).position[..., 3, :]
+        return ((start + middle) / 2 - elbow)[..., 1] + 0.03
+
+    kept = pushed_along(path, PUSH, (0.5, 2.5), clearance=clearance)
+    distance = clearance(torch.from_numpy(kept.log["joint_position"]))
+    assert clearance(torch.from_numpy(free.log["joint_position"])).min() < 0
+    assert distance.min() > 0.02
+    assert hand_off(kept, path)[0] < 4e-3

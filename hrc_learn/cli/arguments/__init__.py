@@ -41,6 +41,8 @@ Experiment = Literal[
     "effort",
     "effort_noise",
     "faulty_images",
+    "encoder_noise",
+    "encoder_noise_unknown",
     "composite",
     "least_squares",
     "broyden",

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from hrc_learn.cli._run import configuration, refuse_existing, write_values
 from hrc_learn.cli.arguments.run import Sweep
-from hrc_learn.experiments.controller.grasp_trials import ROLL_CLASSES
+from hrc_learn.experiments.controller.grasp_trials import ROLL_CLASSES, TrialConfig
 from hrc_learn.experiments.controller.sweep import (
     CRITERIA,
     EXPERIMENTS,
@@ -27,7 +27,7 @@ from hrc_learn.viz import SweepRecording, SweptTrials
 CHUNK = 250
 """Trials in one batch: their tensors stay in the cache."""
 # Of the tables: a log file has no width of its own.
-_WIDTH = 124
+_WIDTH = 132
 
 
 def sweep(args: Sweep) -> int:
@@ -35,6 +35,12 @@ def sweep(args: Sweep) -> int:
     if args.out is not None:
         refuse_existing(args.out, args.overwrite)
     names = _chosen(args)
+    for option in ("figure", "recording"):
+        if getattr(args, option) is not None and not any(map(_is_grasp, names)):
+            raise ValueError(
+                f"--{option} shows grasps, but {', '.join(names)} are none: choose one of them "
+                "too, or leave it out."
+            )
     torch.set_num_threads(1)
     jobs = [
         job
@@ -52,14 +58,20 @@ def sweep(args: Sweep) -> int:
     if args.out is not None:
         with new_folder(args.out, configuration(args), args.overwrite) as folder:
             write_json(folder / "metrics.json", figures)
-            _draw(folder / "times.png", results)
-            _record(folder / "sweep.rrd", results)
+            if any(map(_is_grasp, names)):
+                _draw(folder / "times.png", results)
+                _record(folder / "sweep.rrd", results)
     write_values(args.json, figures)
     if args.figure is not None:
         _draw(args.figure, results)
     if args.recording is not None:
         _record(args.recording, results)
     return 1 if missed else 0
+
+
+def _is_grasp(name: str) -> bool:
+    """Whether an experiment is about reaching a target, which pictures and recordings show."""
+    return isinstance(EXPERIMENTS[name].config, TrialConfig)
 
 
 def _grasps(results: dict[str, Any]) -> SweepRecording:
@@ -185,6 +197,7 @@ def _grasp_table(names: list[str], figures: dict[str, float]) -> Table:
         "t50\n[s]",
         "t95\n[s]",
         "vision\n[s]",
+        "J err\n[%]",
         "viol.",
     )
     for column in columns:
@@ -203,6 +216,7 @@ def _grasp_table(names: list[str], figures: dict[str, float]) -> Table:
             *shares("success"),
             f"{100 * figures[f'{name}_touched']:.1f}" if looked else "",
             *(f"{figures[f'{name}_{key}']:.2f}" for key in ("t50", "t95", "vision_phase")),
+            f"{100 * figures[f'{name}_jacobian_error']:.0f}",
             f"{figures[f'{name}_violations']:.0f}",
         )
     return table

@@ -221,6 +221,7 @@ def simulate_collaboration(
             config=cell_config,
             on_phase=enter,
             rng=rng,
+            clearance=workplace.arm_clearance,
         )
         if beside is not None:
             beside.follow(cell)

@@ -136,6 +136,8 @@ class TrialResult:
     """Largest joint velocity over its limit."""
     hand_overs: Int[Tensor, "trials"]
     """How often the camera took over or let go."""
+    jacobian_error: Float[Tensor, "trials"]
+    """Of the linear part of the image Jacobian's estimate at the end, relative."""
 
     def summary(self) -> dict[str, float]:
         """Rates, medians and totals, by name."""
@@ -149,6 +151,7 @@ class TrialResult:
             "vision_phase": _median(self.vision_time),
             "violations": float(self.violations.sum()),
             "peak_speed": self.peak_speed.max().item(),
+            "jacobian_error": self.jacobian_error.quantile(0.95, interpolation="higher").item(),
             "hand_overs": self.hand_overs.double().mean().item(),
         }
         for k, (low, high) in enumerate(ROLL_CLASSES):
@@ -298,6 +301,7 @@ class Judge:
         self.touched = torch.zeros(count, dtype=torch.bool)
         self.active = torch.zeros(count, dtype=torch.bool)
         self.in_box = torch.zeros(count, dtype=torch.bool)
+        self.last: tuple[Tensor, ControllerState] | None = None
 
     def __call__(
         self,
@@ -308,6 +312,7 @@ class Judge:
         state: ControllerState,
     ) -> None:
         now = torch.tensor(step * self.dt, dtype=torch.float64)
+        self.last = q, state
         tool = panda.forward(q)
         error = self.scene.camera.project(tool)[0] - self.scene.target
         centre = error.unflatten(-1, (-1, 2)).mean(-2)
@@ -340,4 +345,13 @@ class Judge:
             touched=self.touched,
             peak_speed=self.peak_speed,
             hand_overs=self.hand_overs,
+            jacobian_error=self._jacobian_error(),
         )
+
+    def _jacobian_error(self) -> Float[Tensor, "trials"]:
+        assert self.last is not None
+        q, state = self.last
+        tool, estimator = panda.forward(q), self.controller.estimator
+        true = self.scene.camera.image_jacobian(tool)[..., :3]
+        wrong = estimator.jacobian(state.estimator, tool)[..., :3] - true
+        return wrong.flatten(-2).norm(dim=-1) / true.flatten(-2).norm(dim=-1)
