@@ -57,7 +57,8 @@ class VisualServoConfig:
     """Distance that the target keeps from the edge of the image [px]: within 50 px
     a marker is cut off."""
     turn_border: float = 60.0
-    """The same of the marker while the gripper is turned [px]; nearer, the turn waits."""
+    """The same of the marker while the gripper is turned [px]; nearer, a turn that takes it
+    still nearer waits."""
     turn_rate: float = 0.8
     """Fastest turn of the gripper for the object [rad/s]. The marker swings by 0.15 m a radian,
     and the camera, which is late, has to lead it meanwhile."""
@@ -367,14 +368,20 @@ class VisualServo:
         return missing > self._config.lost_after and not inside.all()
 
     def _turn_on(self, target: ServoTarget, feature: Float[np.ndarray, "2"]) -> None:
-        """Turn the goal a little further, while the marker is well within the image [px]."""
-        border = self._config.turn_border
-        within = (feature >= border) & (feature <= np.array(IMAGE_SIZE) - 1 - border)
-        if self._turned is None or not within.all():
+        """Turn the goal a little further, unless the marker would leave the image [px]."""
+        if self._turned is None or not np.isfinite(feature).all():
             return
         now = target.above.orientation if self._turning is None else self._turning
+        turn = Pose(target.above.position, now).twist_to(
+            Pose(target.above.position, self._turned)
+        )
+        swing, border = self._image_jacobian() @ turn.numpy(), self._config.turn_border
+        leaves = (feature < border) & (swing < 0)
+        leaves |= (feature > np.array(IMAGE_SIZE) - 1 - border) & (swing > 0)
+        if leaves.any():
+            return
         most = self._config.turn_rate * self._cell.config.dt
-        share = most / quaternion.angle(now, self._turned).clamp(min=most)
+        share = most / turn.norm().clamp(min=most)
         self._turning = quaternion.slerp(now, self._turned, share)
 
     def _find_turn(self, target: ServoTarget) -> None:

@@ -170,11 +170,26 @@ def test_the_goal_turns_no_faster_than_the_camera_can_lead_the_marker():
     assert quaternion.angle(goals[taken - 2], about_vertical(0.5)) > 1e-3
 
 
-@pytest.mark.parametrize("pixel", [(np.nan, np.nan), (30.0, 500.0), (700.0, 1060.0)])
-def test_a_turn_waits_while_the_marker_is_at_the_edge_of_the_image(pixel):
+@pytest.mark.parametrize(
+    ("pixel", "waits"),
+    [
+        ((np.nan, np.nan), True),
+        ((30.0, 500.0), False),
+        ((1400.0, 500.0), True),
+        ((700.0, 1060.0), False),
+        ((700.0, 20.0), True),
+        ((700.0, 500.0), False),
+    ],
+)
+def test_a_turn_waits_where_it_would_take_the_marker_out_of_the_image(pixel, waits):
+    """It swings the marker to the right and up here."""
     servo = turning_servo(about_vertical(0.5), about_vertical(0.1))
+    jacobian = np.zeros((2, 6))
+    jacobian[:, 5] = 200.0, -100.0
+    servo._image_jacobian = lambda: jacobian
     servo._turn_on(unturned_target(), np.array(pixel))
-    assert quaternion.angle(servo._turning, about_vertical(0.1)) < 1e-7
+    turned = float(quaternion.angle(servo._turning, about_vertical(0.1)))
+    assert turned == pytest.approx(0.0 if waits else CONFIG.turn_rate * 0.01, abs=1e-7)
 
 
 @pytest.mark.parametrize(
