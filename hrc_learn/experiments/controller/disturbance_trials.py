@@ -191,13 +191,20 @@ class StressResult:
 
     def summary(self) -> dict[str, float]:
         """Totals by name."""
-        names = ("position", "velocity", "acceleration", "jerk")
-        totals = zip(names, self.beyond.sum(0).tolist(), strict=True)
         return {
-            "rollouts": float(len(self.beyond)),
-            **{f"beyond_{name}": float(total) for name, total in totals},
+            **ticks_beyond(self.beyond),
             "nan": float(self.unknown.sum()),
         }
+
+
+def ticks_beyond(beyond: Int[Tensor, "trials kinds"]) -> dict[str, float]:
+    """Number of trials, and by kind of limit that of the ticks beyond it, by name."""
+    names = ("position", "velocity", "acceleration", "jerk")
+    totals = zip(names, beyond.sum(0).tolist(), strict=False)
+    return {
+        "rollouts": float(len(beyond)),
+        **{f"beyond_{name}": float(total) for name, total in totals},
+    }
 
 
 def run_stress_trials(config: StressConfig) -> StressResult:

@@ -27,6 +27,7 @@ from hrc_learn.controller.monitors import LimitMonitor
 from hrc_learn.experiments.controller.disturbance_trials import (
     all_finite,
     random_controller,
+    ticks_beyond,
     uniform,
 )
 from hrc_learn.jacobian import (
@@ -76,13 +77,10 @@ class HostileResult:
 
     def summary(self) -> dict[str, float]:
         """Totals by name, and the furthest position in mrad."""
-        names = ("position", "velocity", "acceleration", "jerk")
-        totals = zip(names, self.beyond.sum(0).tolist(), strict=False)
         return {
-            "rollouts": float(len(self.beyond)),
+            **ticks_beyond(self.beyond),
             "ticks": float(self.ticks.sum()),
             "poisoned": float(self.poisoned.sum()),
-            **{f"beyond_{name}": float(total) for name, total in totals},
             "furthest_mrad": 1e3 * self.furthest.max().item(),
             "nan": float(self.unknown.sum()),
             "stuck": float(self.stuck.sum()),
