@@ -101,8 +101,9 @@ class ImageJacobianEstimator(nn.Module, ABC):
 
         Args:
             state: Before.
-            before: First frame.
-            now: Second frame; its `dt` should be 0 where time passed in `update`.
+            before: First frame; what perspective adds to the way between both is taken off.
+            now: Second frame, at which the Jacobian is learned; its `dt` should be 0 where
+                time passed in `update`.
         """
         return state
 
@@ -276,7 +277,7 @@ class KeyFrameEstimator[Config: LearningConfig](ImageJacobianEstimator):
         first = KeyFrame(
             pose=before.pose,
             feature=before.feature,
-            theta=self.network.basis(before.pose),
+            theta=self.network.basis(now.pose),
             present=before.valid,
         )
         learned = self.update(replace(state, key=first), now)

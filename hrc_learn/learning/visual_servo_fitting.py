@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from hrc_learn.controller.interface import IMAGE_SIZE
 from hrc_learn.demos import Demonstration, DemonstrationSet, DemonstrationSource
 from hrc_learn.geometry import Pose
 from hrc_learn.jacobian import (
@@ -24,6 +25,7 @@ from hrc_learn.jacobian import (
     RBFCenters,
     RBFImageJacobian,
     cross_validate,
+    fit_focal_length,
     maximize_evidence,
 )
 from hrc_learn.kinematics import panda
@@ -78,9 +80,10 @@ def fit_visual_servo(
     network = RBFImageJacobian.fit_demonstrations(camera, neurons, config)
     cells = cross_validate(camera, network, config).by_cell()
     ends = _ends(demos, network)
+    focal = fit_focal_length(camera, copy.deepcopy(network).double(), IMAGE_SIZE)
     return VisualServoSkill(
         jacobian=network,
-        target=_visual_target(ends) if ends else None,
+        target=_visual_target(ends, focal) if ends else None,
         approach=Approach.fit([end.path for end in ends]) if ends else None,
         angle=_marker_angle([end.angle for end in ends if end.angle is not None]),
         learned=learned,
@@ -187,12 +190,13 @@ def _marker_angle(demonstrations: Sequence[AngleDemonstration]) -> MarkerAngle |
     return MarkerAngle.fit(demonstrations) if demonstrations else None
 
 
-def _visual_target(ends: Sequence[_End]) -> VisualTarget:
+def _visual_target(ends: Sequence[_End], focal: float) -> VisualTarget:
     return VisualTarget.fit(
         np.array([end.object_pixel for end in ends]),
         np.array([end.hand_pixel for end in ends]),
         np.array([end.jacobian for end in ends]),
         torch.stack([end.orientation for end in ends]),
+        focal,
     )
 
 

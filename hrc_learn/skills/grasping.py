@@ -21,7 +21,12 @@ from hrc_learn.jacobian import ImageJacobianEstimator
 from hrc_learn.kinematics import panda_capsules
 from hrc_learn.skills.arm_motion import joint_line
 from hrc_learn.skills.placing import Plan
-from hrc_learn.skills.visual_servoing import ServoTarget, VisualServo, VisualServoConfig
+from hrc_learn.skills.visual_servoing import (
+    ServoTarget,
+    VisualServo,
+    VisualServoConfig,
+    no_perspective,
+)
 from hrc_learn.skills.visual_skill import UP, VisualServoSkill, from_learned
 from hrc_learn.skills.work_cell import (
     BlockedPathError,
@@ -51,11 +56,16 @@ _TABLE_RANGE, _OBJECT_RANGE = 0.05, 0.015
 _CLOSING_TIME = 0.7
 
 type TargetLaw = Callable[
-    [Float[np.ndarray, "2"], Float[np.ndarray, "2 6"], Float[Tensor, "4"]],
+    [
+        Float[np.ndarray, "2"],
+        Float[np.ndarray, "2 6"],
+        Float[Tensor, "4"],
+        Float[np.ndarray, "3"],
+    ],
     Float[np.ndarray, "2"],
 ]
-"""From the object's marker [px], the image Jacobian and the end effector's orientation to the
-target of the end effector's marker [px]."""
+"""From the object's marker [px], the image Jacobian, the end effector's orientation, and how
+far it is to be from right above the object [m], to the target of its marker [px]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,7 +143,9 @@ class Grasping:
         self._cell = cell
         self._workplace = workplace
         self._target = target or skill.target_of
-        self._lines = (lambda _: UP) if skill.target is None else skill.target.line
+        learned = skill.target
+        self._lines = (lambda _: UP) if learned is None else learned.line
+        self._depth_gradient = no_perspective if learned is None else learned.depth_gradient
         self._config = config = config or GraspingConfig()
         self._check = check
         self._table, self._table_range = 0.0, _TABLE_RANGE
@@ -201,6 +213,7 @@ class Grasping:
             posture=self._posture() if self._config.approach else None,
             target=partial(self._target, pixel),
             lines=self._lines,
+            depth_gradient=self._depth_gradient,
             angle=angle,
             allowed=self._workplace.hover_turns,
         )

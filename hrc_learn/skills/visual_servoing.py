@@ -38,19 +38,19 @@ class VisualServoConfig:
     """After which servoing is given up [s]."""
     occlusion_timeout: float = 10.0
     """How long the end effector's marker may stay undetected [s]."""
-    probe: float = 0.03
+    probe: float = 0.06
     """Height above the box from which the end effector descends into it, along the line from
     the object's marker to its own [m]. From this motion the controller learns how that line
-    looks to a camera that may have been moved, and so where on it the marker has to be. A
-    longer probe is less sensitive to noise and more to perspective, which makes the line look
-    longer from nearer to the camera. 0: none."""
+    looks to a camera that may have been moved, and so where on it the marker has to be. Four
+    times as long a way leads on to the object, and what the probe errs by counts as often.
+    0: none."""
     probe_speed: float = 0.05
     """Speed of that descent [m/s]: no faster than the camera can guide it along the line."""
     probe_tolerance: float = 10.0
     """Distance of the feature from the target at which the descent begins [px]."""
-    probe_reach: float = 0.005
-    """Sideways deviation from the line after the descent above which the probe is repeated from
-    the new place [m]: the line looks different there, and one motion may not tell it well."""
+    probe_reach: float = 0.003
+    """How far what was learned from a descent moves the end effector for the probe to be
+    repeated from there [m]: half the error of the hand above an object that is asked for."""
     max_probes: int = 5
     """Descents at most."""
     border: float = 80.0
@@ -116,6 +116,13 @@ class VisualServoConfig:
         )
 
 
+def no_perspective(
+    jacobian: Float[np.ndarray, "2 6"], pixel: Float[np.ndarray, "2"]
+) -> Float[np.ndarray, "3"]:
+    """Depth is taken to be the same everywhere: its gradient is zero [1/m]."""
+    return np.zeros(3)
+
+
 @dataclass(frozen=True, kw_only=True)
 class ServoTarget:
     """What to servo to. Where that is in the image depends on what is known of the camera."""
@@ -126,12 +133,20 @@ class ServoTarget:
     posture: Float[Tensor, " joints"] | None
     """Joint positions there, approached in joint space [rad]; None: approached by the
     Cartesian regions."""
-    target: Callable[[Float[np.ndarray, "2 6"], Float[Tensor, "4"]], Float[np.ndarray, "2"]]
-    """Where the end effector's marker should be [px], given the image Jacobian there and the
-    end effector's orientation."""
+    target: Callable[
+        [Float[np.ndarray, "2 6"], Float[Tensor, "4"], Float[np.ndarray, "3"]],
+        Float[np.ndarray, "2"],
+    ]
+    """Where the end effector's marker should be [px], given the image Jacobian there, the end
+    effector's orientation, and how far it is to be from right above the object [m]."""
     lines: Callable[[Float[Tensor, "4"]], Float[np.ndarray, "3"]]
     """From the end effector's orientation to the direction from the object's marker to the end
     effector's, base frame; it leads up."""
+    depth_gradient: Callable[
+        [Float[np.ndarray, "2 6"], Float[np.ndarray, "2"]], Float[np.ndarray, "3"]
+    ] = no_perspective
+    """From image Jacobian and pixel of the end effector's marker to the relative change of its
+    depth with its place [1/m]; none: perspective is left out."""
     angle: float | None = None
     """Direction of the object's marker in the image [rad]; None: the gripper does not turn."""
     allowed: tuple[float, float] = (0.0, 0.0)
@@ -158,13 +173,8 @@ class ServoTarget:
         # millimetres that are left of the height must not lead aside.
         height = float(pose.position[2] - self.above.position[2]) - self.config.half_size[2]
         offset = self._offset(min(max(height, 0.0), self.config.probe))
-        pixel = self.target(image_jacobian, self.upright) + image_jacobian[:, :3] @ offset
+        pixel = self.target(image_jacobian, self.upright, offset)
         return self.config.within(pixel) if self.raised else pixel
-
-    def deviation(self, pose: Pose, before: Pose) -> float:
-        """Sideways distance of a pose from the line through an earlier one [m]."""
-        moved = (pose.position - before.position).numpy()
-        return float(np.linalg.norm((moved - self._offset(moved[2]))[:2]))
 
     @property
     def upright(self) -> Float[Tensor, "4"]:
@@ -230,27 +240,35 @@ class VisualServo:
         start, config = self._cell.time, self._config
         self._detected = self._arrived = False
         self._resume()
-        reached, above = start, self._cell.pose
-        for _ in range(config.max_probes if config.probe > 0 else 1):
-            if config.probe > 0:
-                raised = replace(target, raised=config.probe)
-                self._converge(raised, config.probe_tolerance, start)
-                above, high = self._cell.pose, self._at_rest
-                self._descend(target)
+        if config.probe == 0:
+            return self._converge(target, config.tolerance, start) - start
+        reached = start
+        for _ in range(config.max_probes):
+            raised = replace(target, raised=config.probe)
+            self._converge(raised, config.probe_tolerance, start)
+            high = self._at_rest
+            self._descend(target)
+            self._converge(target, config.tolerance, start)
+            before, low = self._cell.pose, self._at_rest
+            if high is not None and low is not None:
+                self._learn(target, high, low)
             reached = self._converge(target, config.tolerance, start)
-            if config.probe == 0:
-                break
-            if high is not None and self._at_rest is not None:
-                estimator = self._controller.estimator
-                learned = estimator.compared(self.state.estimator, high, self._at_rest)
-                self.state = replace(self.state, estimator=learned)
-                self._cached = (np.nan, self._cached[1])
-                reached = self._converge(target, config.tolerance, start)
-            # Along the line of the turned tool, which leads elsewhere than when not turned.
-            turned = replace(target, orientation=self._turned)
-            if turned.deviation(self._cell.pose, above) < config.probe_reach:
+            moved = self._cell.pose.position - before.position
+            if float(moved[:2].norm()) < config.probe_reach:
                 break
         return reached - start
+
+    def _learn(self, target: ServoTarget, high: Measurement, low: Measurement) -> None:
+        """How the line looks at its lower end, from both ends of a descent."""
+        way = (high.pose.position - low.pose.position).numpy()
+        gradient = target.depth_gradient(self._image_jacobian(), low.feature.numpy())
+        # As far apart as both would be seen without perspective.
+        apart = (1 + float(gradient @ way)) * (high.feature - low.feature)
+        high = replace(high, feature=low.feature + apart)
+        estimator = self._controller.estimator
+        learned = estimator.compared(self.state.estimator, high, low)
+        self.state = replace(self.state, estimator=learned)
+        self._cached = (np.nan, self._cached[1])
 
     def _resume(self) -> None:
         """Tell the estimator how long no image was taken: the camera may have been moved."""
@@ -299,8 +317,8 @@ class VisualServo:
         # What is learned meanwhile of image Jacobian and turn must not move the target.
         self._turned = self._turning
         upright = replace(target, orientation=self._turned).upright
-        pixel = target.target(self._image_jacobian(), upright)
-        held = replace(target, target=lambda jacobian, orientation: pixel)
+        pixel = target.target(self._image_jacobian(), upright, np.zeros(3))
+        held = replace(target, target=lambda jacobian, orientation, further: pixel)
         self._held = HeldMarker(self._config.half_hidden)
         while self._cell.time < end:
             self.step(held)

@@ -8,7 +8,9 @@ the object's pixel. With an uncalibrated camera the offset has to be learned: ea
 ends with the end effector right above an object, and gives one pair of pixels.
 
 The offset is one in space, fixed to the tool that turns with the object. The image Jacobian,
-which adapts to a camera that has been moved, projects it into the image.
+which adapts to a camera that has been moved, projects it into the image: with the perspective
+of a camera whose focal length was learned, without which the offset looks a few percent longer
+or shorter once the camera has been turned by 10 degrees.
 """
 
 import copy
@@ -23,6 +25,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.controller import INITIAL_IMAGE_JACOBIAN
+from hrc_learn.controller.interface import IMAGE_SIZE
 from hrc_learn.geometry import quaternion
 from hrc_learn.jacobian import (
     CellErrors,
@@ -30,6 +33,7 @@ from hrc_learn.jacobian import (
     KalmanConfig,
     KalmanEstimator,
     RBFImageJacobian,
+    depth_gradient,
     paper_grid,
 )
 from hrc_learn.kinematics.tool_orientation import Approach
@@ -48,6 +52,10 @@ LONGEST_OFFSET = 0.3
 the image Jacobian knows little about height: without this bound the least-squares offset can be
 metres long."""
 
+_MOST_NEARER = 1.5
+"""How much nearer to the camera than the object the end effector's marker may be believed, as a
+ratio: a bound for as long as the image Jacobian is not known yet."""
+
 POSE_NOISE = 1.5e-4
 """Standard deviation of a pose by encoders with noise of 1e-4 rad, on levers of up to 0.8 m, as
 the estimator of the image Jacobian has to expect it [m]."""
@@ -61,10 +69,12 @@ class VisualTarget:
     """Offset from the object's marker to the end effector's right above it."""
 
     offset: Float[np.ndarray, "3"]
-    """In the tool's frame, by the image Jacobian there [m]: shorter than the true one, as
-    perspective shrinks what is further away."""
+    """In the tool's frame [m]; without a focal length the one that an image without perspective
+    would show, shorter for an object further away."""
     error: float
     """Leave-one-out error, root mean square [px]; NaN from fewer than five demonstrations."""
+    focal: float | None = None
+    """Focal length of the camera [px]; None: perspective is left out."""
 
     @classmethod
     def fit(
@@ -73,6 +83,7 @@ class VisualTarget:
         tools: Float[np.ndarray, "demos 2"],
         jacobians: Float[np.ndarray, "demos 2 6"],
         orientations: Float[Tensor, "demos 4"],
+        focal: float | None = None,
     ) -> "VisualTarget":
         """Fit to the ends of demonstrations.
 
@@ -81,6 +92,7 @@ class VisualTarget:
             tools: Pixels of the end effector's marker right above it [px].
             jacobians: Image Jacobians of that marker there [px/m, px/rad].
             orientations: Of the end effector there.
+            focal: Focal length of the camera [px]; None leaves perspective out.
 
         Raises:
             ValueError: If there are fewer than three demonstrations.
@@ -90,15 +102,20 @@ class VisualTarget:
                 f"{len(objects)} demonstrations do not determine the visual target: at least "
                 "three are needed."
             )
-        design = jacobians[..., :3] @ quaternion.to_matrix(orientations).numpy()
-        offset, error = _solved(design.reshape(-1, 3), tools - objects, LONGEST_OFFSET)
-        return cls(offset=offset, error=error)
+        apart, rows = tools - objects, jacobians[..., :3]
+        if focal is not None:
+            # apart = J o / (1 - g o) is linear in the offset o as well.
+            rows = rows + apart[..., :, None] * _gradient(rows, tools, focal)[..., None, :]
+        design = rows @ quaternion.to_matrix(orientations).numpy()
+        offset, error = _solved(design.reshape(-1, 3), apart, LONGEST_OFFSET)
+        return cls(offset=offset, error=error, focal=focal)
 
     def __call__(
         self,
         pixel: Float[np.ndarray, "2"],
         jacobian: Float[np.ndarray, "2 6"],
         orientation: Float[Tensor, "4"],
+        further: Float[np.ndarray, "3"] | None = None,
     ) -> Float[np.ndarray, "2"]:
         """Where the end effector's marker should be for an object's marker at `pixel` [px].
 
@@ -107,8 +124,31 @@ class VisualTarget:
             jacobian: Estimate of the image Jacobian of the end effector's marker
                 [px/m, px/rad].
             orientation: Of the end effector when it is there.
+            further: Way from there, base frame [m]; none when None.
         """
-        return pixel + jacobian[:, :3] @ self._in_base(orientation)
+        offset = self._in_base(orientation)
+        if further is not None:
+            offset = offset + further
+        apart = jacobian[:, :3] @ offset
+        seen = pixel + apart
+        # Depth changes with where it is seen, a little: twice is within a tenth of a pixel.
+        for _ in range(2):
+            nearer = 1 - float(self.depth_gradient(jacobian, seen) @ offset)
+            seen = pixel + apart / min(max(nearer, 1 / _MOST_NEARER), _MOST_NEARER)
+        return seen
+
+    def depth_gradient(
+        self, jacobian: Float[np.ndarray, "2 6"], pixel: Float[np.ndarray, "2"]
+    ) -> Float[np.ndarray, "3"]:
+        """Relative change of the marker's depth with its place [1/m]; 0 without a focal length.
+
+        Args:
+            jacobian: Image Jacobian of the end effector's marker [px/m, px/rad].
+            pixel: Where it is seen [px].
+        """
+        if self.focal is None:
+            return np.zeros(3)
+        return _gradient(jacobian[:, :3], pixel, self.focal)
 
     def line(self, orientation: Float[Tensor, "4"]) -> Float[np.ndarray, "3"]:
         """Direction from the object's marker to the end effector's above it, base frame.
@@ -126,7 +166,12 @@ class VisualTarget:
     def save(self, path: Path) -> None:
         """Write to a JSON file, whole or not at all."""
         error = None if np.isnan(self.error) else self.error
-        content = {"version": 2, "offset_m": self.offset.tolist(), "error_px": error}
+        content = {
+            "version": 2,
+            "offset_m": self.offset.tolist(),
+            "error_px": error,
+            "focal_px": self.focal,
+        }
         write_text(path, json.dumps(content, indent=2))
 
     @classmethod
@@ -144,7 +189,17 @@ class VisualTarget:
         return cls(
             offset=np.array(content["offset_m"]),
             error=float("nan") if error is None else float(error),
+            focal=content.get("focal_px"),
         )
+
+
+def _gradient(
+    jacobian: Float[np.ndarray, "*batch 2 3"],
+    pixel: Float[np.ndarray, "*batch 2"],
+    focal: float,
+) -> Float[np.ndarray, "*batch 3"]:
+    """Relative change of depth with place [1/m] of a camera that looks through its middle."""
+    return depth_gradient(jacobian, pixel, focal, np.array(IMAGE_SIZE) / 2)
 
 
 def _solved(
@@ -239,6 +294,7 @@ class VisualServoSkill:
         pixel: Float[np.ndarray, "2"],
         jacobian: Float[np.ndarray, "2 6"],
         orientation: Float[Tensor, "4"],
+        further: Float[np.ndarray, "3"] | None = None,
     ) -> Float[np.ndarray, "2"]:
         """Where the marker should be for the end effector to be above an object at a pixel.
 
@@ -247,6 +303,7 @@ class VisualServoSkill:
             jacobian: Estimate of the image Jacobian of the end effector's marker
                 [px/m, px/rad].
             orientation: Of the end effector there.
+            further: Way from there, base frame [m]; none when None.
 
         Raises:
             ValueError: If no object was observed in the demonstrations.
@@ -255,7 +312,7 @@ class VisualServoSkill:
             raise ValueError(
                 f"the skill knows no visual target: its demonstrations lack {OBJECT_FEATURE}."
             )
-        return self.target(pixel, jacobian, orientation)
+        return self.target(pixel, jacobian, orientation, further)
 
     def metrics(self) -> dict[str, float]:
         """How well image motion and visual targets are predicted.
@@ -303,7 +360,9 @@ def from_learned(learned: RBFImageJacobian) -> KalmanEstimator:
     """
     network = copy.deepcopy(learned).double()
     network.covariance = None
-    config = KalmanConfig(pose_noise=POSE_NOISE, pixel_noise=PIXEL_NOISE, watched_drift=10.0)
+    config = KalmanConfig(
+        pose_noise=POSE_NOISE, pixel_noise=PIXEL_NOISE, watched_drift=10.0, max_step=0.1
+    )
     return KalmanEstimator(network, config)
 
 

@@ -1,9 +1,11 @@
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
+from hrc_learn.controller.interface import IMAGE_SIZE
 from hrc_learn.geometry import quaternion
 from hrc_learn.jacobian.fitting import ImageJacobianFitReport
 from hrc_learn.kinematics import gripper_down
@@ -42,6 +44,52 @@ def test_the_offset_is_found_whatever_way_camera_and_tool_are_turned(n):
     np.testing.assert_allclose(
         target(pixel, jacobian, turn), pixel + jacobian[:, :3] @ in_base, atol=1e-6
     )
+
+
+def looked_at(turn, shift, focal=1900.0):
+    """Pixels and image Jacobians of a pinhole camera, about a metre above."""
+    (rotation,) = quaternion.to_matrix(quaternion.exp(torch.tensor([turn]).double())).numpy()
+    rotation = rotation @ np.diag([1.0, -1.0, -1.0])
+
+    def see(points):
+        *aside, depth = (points @ rotation.T + shift).T
+        xi = np.stack(aside, -1) / depth[:, None]
+        rows = rotation[:2] - xi[:, :, None] * rotation[2]
+        jacobians = np.zeros((len(points), 2, 6))
+        jacobians[..., :3] = focal / depth[:, None, None] * rows
+        return focal * xi + np.array(IMAGE_SIZE) / 2, jacobians
+
+    return see
+
+
+def test_with_a_focal_length_the_target_holds_for_a_camera_that_was_moved():
+    rng = np.random.default_rng(5)
+    turns = random_turns(8, rng)
+    in_base = quaternion.rotate(turns, torch.from_numpy(OFFSET)).numpy()
+    objects = rng.uniform(-0.1, 0.1, (8, 3)) * [1, 1, 0]
+    see = looked_at((0.05, 0.02, 0.3), (0.03, 0.0, 1.1))
+    (pixels, _), (hands, jacobians) = see(objects), see(objects + in_base)
+    target = VisualTarget.fit(pixels, hands, jacobians, turns, focal=1900.0)
+    np.testing.assert_allclose(target.offset, OFFSET, atol=1e-9)
+    without = VisualTarget.fit(pixels, hands, jacobians, turns)
+
+    see, further = looked_at((0.2, -0.1, 0.3), (-0.05, 0.02, 1.0)), np.array([0.01, 0.0, 0.03])
+    (pixels, _), (hands, jacobians) = see(objects), see(objects + in_base + further)
+    for pixel, hand, jacobian, turn in zip(pixels, hands, jacobians, turns, strict=True):
+        seen = target(pixel, jacobian, turn, further)
+        np.testing.assert_allclose(seen, hand, atol=0.2)
+        assert np.linalg.norm(without(pixel, jacobian, turn, further) - hand) > 4
+
+
+def test_a_wild_image_jacobian_does_not_turn_the_offset_round():
+    target = VisualTarget(offset=OFFSET, error=0.0, focal=1900.0)
+    plain = VisualTarget(offset=OFFSET, error=0.0)
+    rng = np.random.default_rng(6)
+    for turn in random_turns(50, rng):
+        jacobian, pixel = rng.normal(0, 20_000, (2, 6)), np.array([700.0, 500.0])
+        apart, affine = (t(pixel, jacobian, turn) - pixel for t in (target, plain))
+        ratio = (apart @ affine) / (affine @ affine)
+        assert 0.6 < ratio < 1.51
 
 
 def test_the_line_leads_up_along_the_offset_and_turns_with_the_tool():
@@ -102,6 +150,9 @@ def test_it_survives_the_disk(tmp_path, n):
     loaded = VisualTarget.load(tmp_path / "target.json")
     np.testing.assert_array_equal(loaded.offset, target.offset)
     np.testing.assert_equal(loaded.error, target.error)
+    assert loaded.focal is None
+    replace(target, focal=1900.0).save(tmp_path / "target.json")
+    assert VisualTarget.load(tmp_path / "target.json").focal == 1900.0
     assert [path.name for path in tmp_path.iterdir()] == ["target.json"]
 
 

@@ -320,8 +320,11 @@ def simulate_grasp(
         )
         above = scene.above()
 
-        def told(pixel, jacobian, orientation: Float[Tensor, "4"]) -> Float[np.ndarray, "2"]:
-            return scene.true_target(world, Pose(above.position, orientation))
+        def told(
+            pixel, jacobian, orientation: Float[Tensor, "4"], further: Float[np.ndarray, "3"]
+        ) -> Float[np.ndarray, "2"]:
+            target = scene.true_target(world, Pose(above.position, orientation))
+            return target + jacobian[:, :3] @ further
 
         task = Grasping(
             cell,
