@@ -67,7 +67,7 @@ def kept_clear(
     null: Float[Tensor, " joints"],
     clearance: Callable[[Float[Tensor, "*batch joints"]], Float[Tensor, "*batch"]],
     margin: float,
-) -> Float[Tensor, " joints"]:
+) -> tuple[Float[Tensor, " joints"], bool]:
     """As much of a null-space motion as keeps the arm clear of what is around it.
 
     Args:
@@ -77,19 +77,25 @@ def kept_clear(
         clearance: Distance of an arm at given joint positions from what it must not meet [m].
         margin: Distance to keep [m]. Where the task alone leaves less, the null space takes
             no more of it.
+
+    Returns:
+        The part of the null-space motion, and whether the task alone takes the arm nearer than
+        the margin: then it has to wait.
     """
     shares = _SHARES.to(null)
     ahead = joint_position + _AHEAD * (task + shares[:, None] * null)
-    distance = clearance(ahead)
+    now, *_ = every = clearance(torch.cat([joint_position[None], ahead]))
+    distance = every[1:]
     least = distance[0].clamp(max=margin)
+    waits = bool(distance[0] < torch.clamp(now, max=margin))
     close = (distance < least).nonzero().flatten()
     if not len(close):
-        return null
+        return null, waits
     # Between the last that is clear and the first that is not.
     k = int(close[0])
     clear, blocked = distance[k - 1] - least, least - distance[k]
     share = torch.lerp(shares[k - 1], shares[k], clear / (clear + blocked))
-    return share * null
+    return share * null, waits
 
 
 def straight_line(

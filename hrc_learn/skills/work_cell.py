@@ -1,5 +1,6 @@
 """A work cell: the place skills work in; arm, gripper, camera and person under one clock."""
 
+import math
 from collections import deque
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, replace
@@ -7,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from hrc_learn.controller import INTERVENTIONS, Command, SafetyConfig, SafetyFilter
@@ -52,12 +53,24 @@ _LEAST_INPUT = 0.05
 _ASIDE, _BACK = 0.1, 0.03
 # Time to go back at the end of a path [s].
 _LONGEST_RETURN = 5.0
+# Smallest singular value of the Jacobian of a path below which the arm cannot follow beside it,
+# as damping begins at 0.05.
+_NARROW = 0.07
+# Distance of the end effector from its path for the path to wait, and time by which servos lag
+# [m, s]: half the deviation that a push may cause, and twice the lag of an arm 20 ms late.
+_ON_PATH, _SERVO_LAG = 0.001, 0.06
+# Metres that a radian of the end effector counts for: a length of hand and object.
+_METRES_PER_RADIAN = 0.1
+# In which a path stops, and goes on [s].
+_CHANGE_OF_RATE = 0.2
 # Readings of the torque that are averaged, and steps in which an arm gets under way: friction
 # keeps it back at first.
 _FELT = 5
 _GETTING_UNDER_WAY = 25
 
 _NAN = float("nan")
+# Logged as the goal of steps without a path.
+_NOWHERE = np.full(3, _NAN)
 # Logged by steps in which no camera is in the loop.
 _NO_VISION = {
     "feature": np.full(2, _NAN),
@@ -162,6 +175,9 @@ class WorkCell:
         self.gripper = gripper
         self.tracked_markers: Collection[int] = ()
         self.log = StepLog()
+        # Of the path that the next step follows; of most steps none.
+        self._back = torch.zeros(len(chain.joint_names), dtype=torch.float64)
+        self._path_joints = self._no_path = np.full(len(chain.joint_names), _NAN)
         self.images: list[KeptImage] = []
         self._arm, self._sensor, self._human = arm, sensor, human
         self._advance, self._on_phase = advance, on_phase
@@ -216,8 +232,13 @@ class WorkCell:
             self.detect()
         return self.observation
 
-    def step(self, joint_velocity: Float[Tensor, " joints"]) -> None:
-        """Send a command through the safety filter, and let one step pass [rad/s]."""
+    def step(self, joint_velocity: Float[Tensor, " joints"], goal: Pose | None = None) -> None:
+        """Send a command through the safety filter, and let one step pass.
+
+        Args:
+            joint_velocity: The command [rad/s].
+            goal: Where the end effector should be now, for the log.
+        """
         joints = self.joints
         safe, self._guard, report = self._safety.step(
             self._guard,
@@ -226,7 +247,8 @@ class WorkCell:
             self.config.dt,
             jacobian=self.chain.jacobian(joints),
         )
-        self._send(safe, safety=report.flags.numpy(), **_NO_VISION)
+        position = _NOWHERE if goal is None else goal.position.numpy()
+        self._send(safe, safety=report.flags.numpy(), goal_position=position, **_NO_VISION)
 
     def execute(
         self,
@@ -255,6 +277,7 @@ class WorkCell:
             potential_rate=float(command.potential_rate),
             vision_activation=float(command.vision_level),
             approach=approach,
+            goal_position=_NOWHERE,
         )
 
     def track_pose(
@@ -262,13 +285,16 @@ class WorkCell:
         goal: Pose,
         twist: Float[Tensor, "6"],
         drift: Float[Tensor, " joints"] | None = None,
-    ) -> None:
+    ) -> bool:
         """One step of tracking a moving pose; the null space yields to the person.
 
         Args:
             goal: Where the end effector should be.
             twist: Its velocity (linear [m/s], angular [rad/s]).
             drift: Joint velocity whose null-space part is wanted besides [rad/s].
+
+        Returns:
+            Whether the arm, pushed aside, would meet something if the pose went on.
         """
         joints = self.joints
         pose, J = self.chain.forward_and_jacobian(joints)
@@ -278,9 +304,11 @@ class WorkCell:
             null_velocity = null_velocity + drift
         task = resolved_rate(J, twist + correction, torch.zeros_like(joints))
         null = null_projection(J, null_velocity)
+        waits = False
         if self._clearance is not None and bool(null.any()):
-            null = kept_clear(joints, task, null, self._clearance, self.config.clearance)
-        self.step(task + null)
+            null, waits = kept_clear(joints, task, null, self._clearance, self.config.clearance)
+        self.step(task + null, goal)
+        return waits
 
     def hold_pose(self, duration: float) -> None:
         """Keep the end effector where it is for a while [s], yielding to the person."""
@@ -348,8 +376,10 @@ class WorkCell:
         """Move the joints along a path sampled at the control step, yielding to the person.
 
         While a person pushes, the end effector keeps to the poses of the path, and the null
-        space yields. When they let go the joints go back to the path, at the end of it too, or
-        stay beside it (`WorkCellConfig.after_push`).
+        space yields. Where the arm, pushed aside, cannot follow, the path waits: where it would
+        meet something, and before a singularity of the path, at which nobody can push the arm
+        off it. When they let go the joints go back to the path, at the end of it too, or stay
+        beside it (`WorkCellConfig.after_push`).
 
         Args:
             path: Joint positions [rad].
@@ -360,10 +390,20 @@ class WorkCell:
         """
         dt = self.config.dt
         velocity = np.gradient(path, dt, axis=0) if len(path) > 1 else np.zeros_like(path)
-        for k, q in enumerate(path):
+        narrow = self._narrow(path)
+        progress, rate = 0.0, 1.0
+        while progress <= len(path) - 1:
             if until():
-                return k
-            self._track_joints(torch.from_numpy(q), torch.from_numpy(velocity[k]))
+                return int(progress)
+            goal, wanted = _between(path, progress), rate * _between(velocity, progress)
+            here, ahead = int(progress), int(progress + _CHANGE_OF_RATE / dt)
+            behind = self._track_joints(goal, wanted, yields=not narrow[here])
+            if self._aside and narrow[here : ahead + 1].any():
+                behind = math.inf
+            # Without jumps, as every change of speed is one of the end effector's.
+            change = dt / _CHANGE_OF_RATE
+            rate += min(max(min(max(2.0 - behind, 0.0), 1.0) - rate, -change), change)
+            progress += rate
         if len(path) and self.config.after_push == "return":
             end = torch.from_numpy(path[-1])
             deadline = self.time + _LONGEST_RETURN
@@ -371,31 +411,60 @@ class WorkCell:
                 self._track_joints(end, torch.zeros_like(end))
         return len(path)
 
+    def _narrow(self, path: Float[np.ndarray, "steps joints"]) -> Bool[np.ndarray, " steps"]:
+        """Where a path of the joints is so near a singularity that the arm cannot follow it
+        beside it.
+        """
+        if not len(path):
+            return np.zeros(0, dtype=bool)
+        jacobians = self.chain.jacobian(torch.from_numpy(path.copy()))
+        return (torch.linalg.svdvals(jacobians)[..., -1] < _NARROW).numpy()
+
     def _track_joints(
-        self, goal: Float[Tensor, " joints"], velocity: Float[Tensor, " joints"]
-    ) -> None:
-        """One step along a path of the joints, or of the end effector while they are aside."""
+        self,
+        goal: Float[Tensor, " joints"],
+        velocity: Float[Tensor, " joints"],
+        yields: bool = True,
+    ) -> float:
+        """One step along a path of the joints, or of the end effector while they are aside.
+
+        Args:
+            goal: Where on the path [rad].
+            velocity: Along it [rad/s].
+            yields: Whether the person can push the joints off it here.
+
+        Returns:
+            How far the end effector then is from its goal, as a ratio to what is allowed;
+            above 1 the path has to wait.
+        """
         error = goal - self.joints
-        away = self._away(error)
+        self._path_joints = goal.numpy()
+        away = self._away(error) if yields or self._aside else None
+        pose, J = self.chain.forward_and_jacobian(goal)
         if away is None:
-            self.step(velocity + self.config.pose_gain * error)
-            return
+            self._back = torch.zeros_like(error)
+            self.step(velocity + self.config.pose_gain * error, pose)
+            return 0.0
         back = torch.zeros_like(away)
         if self.config.after_push == "return":
             fastest = self.config.return_speed / float(away.norm().clamp(min=1e-9))
             back = min(self.config.pose_gain, fastest) * away
-        pose, J = self.chain.forward_and_jacobian(goal)
-        self.track_pose(pose, J @ velocity, velocity + back)
+        # A jump of the null-space motion would move the end effector.
+        share = min(self.config.dt / self.config.nullspace_rise, 1.0)
+        self._back = self._back + share * (back - self._back)
+        twist = J @ velocity
+        if self.track_pose(pose, twist, velocity + self._back):
+            return math.inf
+        return _size(self.pose.twist_to(pose)) / (_ON_PATH + _SERVO_LAG * _size(twist))
 
     def _away(self, error: Float[Tensor, " joints"]) -> Float[Tensor, " joints"] | None:
         """Null-space part of the way back to a path [rad]; None if nobody pushed it off."""
-        pushed, limit = self._pushed(), _BACK if self._aside else _ASIDE
-        if not pushed and float(error.norm()) <= limit:  # and so is its part
+        limit = _BACK if self._aside else _ASIDE
+        if not self._pushed() and float(error.norm()) <= limit:
             self._aside = False
             return None
-        away = null_projection(self.chain.jacobian(self.joints), error)
-        self._aside = pushed or float(away.norm()) > limit
-        return away if self._aside else None
+        self._aside = True
+        return null_projection(self.chain.jacobian(self.joints), error)
 
     def _pushed(self) -> bool:
         """Whether a person pushes at the null space now."""
@@ -413,9 +482,11 @@ class WorkCell:
             joint_velocity=self.state.joint_velocity,
             command_velocity=velocity.numpy(),
             nullspace_input=self.human_input.nullspace_input,
+            path_joints=self._path_joints,
             gripper=self.state.gripper_width,
             **columns,
         )
+        self._path_joints = self._no_path
         self._arm.command(velocity.numpy())
         self._advance(self.config.dt)
         self._ticks += 1
@@ -443,3 +514,15 @@ class WorkCell:
 
     def _receive(self) -> None:
         self.observation = self._channel.newest(self.time) or self.observation
+
+
+def _between(samples: Float[np.ndarray, "steps joints"], at: float) -> Float[Tensor, " joints"]:
+    """A path between two of its samples, or at its end."""
+    k = min(int(at), len(samples) - 1)
+    following = samples[min(k + 1, len(samples) - 1)]
+    return torch.from_numpy(samples[k] + (at - k) * (following - samples[k]))
+
+
+def _size(twist: Float[Tensor, "6"]) -> float:
+    """Of a motion, its turn counted in metres [m]."""
+    return float(twist[:3].norm() + _METRES_PER_RADIAN * twist[3:].norm())

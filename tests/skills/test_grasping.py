@@ -58,7 +58,11 @@ def skill():
         torch.from_numpy(jacobians[0]), paper_grid().double(), 0.1
     )
     target = VisualTarget.fit(
-        camera.project(on_top), camera.project(marker), jacobians, hand.orientation
+        camera.project(on_top),
+        camera.project(marker),
+        jacobians,
+        hand.orientation,
+        focal=camera.focal[0],
     )
     return VisualServoSkill(jacobian=network, target=target)
 
@@ -287,11 +291,11 @@ def test_the_arm_comes_to_the_table_clear_of_what_lies_there(skill):
 
 
 @pytest.mark.slow
-def test_coming_down_again_finds_the_object_by_any_camera(skill):
+def test_coming_down_along_the_line_finds_the_object_by_any_camera(skill):
     """Cameras moved, tilted and turned by any angle."""
 
-    def runs(max_probes):
-        grasping = GraspingConfig(servo=VisualServoConfig(max_probes=max_probes))
+    def runs(**servo):
+        grasping = GraspingConfig(servo=VisualServoConfig(**servo))
         for seed in (1, 12, 19, 27):
             rng = np.random.default_rng(seed)
             trial = simulate_grasp(
@@ -305,8 +309,8 @@ def test_coming_down_again_finds_the_object_by_any_camera(skill):
 
     config = GraspingSceneConfig(random_camera=True)
     with shapes_unchecked():
-        again, once = list(runs(3)), list(runs(1))
-    assert all(succeeded(run) for run in again)
-    error = max(Descent.of(run).offset for run in again)
-    assert error < 0.01
-    assert error < 0.5 * max(Descent.of(run).offset for run in once)
+        descended, straight = list(runs()), list(runs(probe=0.0))
+    assert all(succeeded(run) for run in descended)
+    error = max(Descent.of(run).offset for run in descended)
+    assert error < 0.005
+    assert error < 0.5 * max(Descent.of(run).offset for run in straight)

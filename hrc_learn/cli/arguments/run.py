@@ -184,6 +184,9 @@ class RunCollaboration(RunServoing):
     """Share of the images that are lost."""
     person: bool = True
     """Whether the scripted person pulls the elbow."""
+    any_time: bool = False
+    """The person pulls at random moments of the whole job, whatever the robot does; otherwise
+    while it waits for them above the object."""
     page: bool = False
     """Serve a page in the browser, from which people watch and pull at the elbow too. The
     run takes as long as it would on a real arm then."""

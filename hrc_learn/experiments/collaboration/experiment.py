@@ -4,7 +4,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 from hrc_learn.demos import Demonstration, load_demos
 from hrc_learn.experiments.collaboration.metrics import (
@@ -31,6 +31,7 @@ from hrc_learn.skills.placing import PlacingSkill
 from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.skills.work_cell import WorkCellConfig
 from hrc_learn.store import read_made_by
+from hrc_learn.teleoperation import ScriptedForce
 from hrc_learn.teleoperation.page import PageConfig
 from hrc_learn.viz import LoggedSteps, RunRecording
 from hrc_learn.viz.report import Section
@@ -54,7 +55,9 @@ class CollaborationExperiment:
     shelf_depth: float = Workplace.shelf_depth
     """How far behind the boards' front edge [m]."""
     person: bool = True
-    """Whether the scripted person pushes the elbow."""
+    """Whether the scripted person pulls the elbow."""
+    any_time: bool = False
+    """They pull at random moments of the whole job, not only where the robot waits for it."""
     disturbances: Disturbances = field(default_factory=Disturbances)
     imperfections: Imperfections = field(default_factory=Imperfections.nominal)
     """Of arm, calibration, camera and objects."""
@@ -76,7 +79,7 @@ class CollaborationExperiment:
             self.shelves,
             workplace=workplace_for(self.shelves, self.shelf_x, self.shelf_depth),
             camera=self.camera,
-            forces=NULL_SPACE_FORCES if self.person else (),
+            forces=self._forces(),
             disturbances=self.disturbances,
             config=self.config,
             imperfections=self.imperfections,
@@ -135,6 +138,12 @@ class CollaborationExperiment:
             shown=CURVES,
         )
         return study.at_sizes(self.curve)
+
+    def _forces(self) -> Sequence[ScriptedForce] | Literal["any time"]:
+        """Of the person on the elbow."""
+        if not self.person:
+            return ()
+        return "any time" if self.any_time else NULL_SPACE_FORCES
 
     def _demonstration(self) -> Demonstration | None:
         """The first one that the placing motion was learned from, if it is still there."""

@@ -9,6 +9,7 @@ from typing import get_args
 
 import numpy as np
 
+from hrc_learn.experiments.collaboration.pulls import PullEffect, pull_effects
 from hrc_learn.experiments.collaboration.trial import CollaborationRun
 from hrc_learn.experiments.grip import Hold, grasp_offset, hold, place_angle
 from hrc_learn.experiments.metric_table import Metric, median, p95, success_rate
@@ -135,7 +136,29 @@ def collaboration_metrics(
             at_least=100.0,
             claim="joint 4 dragged forward for 7 s, backward for 4 s",
         ),
+        Metric(
+            "pulls at any time, hand off its path (95 %)",
+            lambda run: _pulls(run, lambda effect: effect.hand, 0.95),
+            "mm",
+            at_most=2.0,
+            claim="an expert gets involved at any time",
+        ),
+        Metric(
+            "pulls at any time, elbow moved (median)",
+            lambda run: _pulls(run, lambda effect: effect.elbow, 0.5),
+            "mm",
+            at_least=100.0,
+        ),
     ]
+
+
+def _pulls(
+    run: CollaborationRun, of: Callable[[PullEffect], float], share: float
+) -> float | None:
+    """Quantile over the pulls at any time, in mm; None of a run without."""
+    effects = pull_effects(run.cell.log, run.pulls) if run.pulls else []
+    values = [v for v in map(of, effects) if np.isfinite(v)]
+    return 1e3 * float(np.quantile(values, share)) if values else None
 
 
 TRIAL_METRICS: Sequence[Metric[Sequence[Trial]]] = (

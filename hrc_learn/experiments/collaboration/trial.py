@@ -3,11 +3,13 @@
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 import torch
 from jaxtyping import Float
 
+from hrc_learn.experiments.collaboration.pulls import random_pulls
 from hrc_learn.experiments.run_recording import LiveView, no_live_view
 from hrc_learn.geometry import quaternion
 from hrc_learn.kinematics import panda
@@ -101,6 +103,8 @@ class CollaborationRun:
     cameras: tuple[tuple[float, CameraModel], ...]
     """The true cameras, and from when on each watched [s]."""
     disturbances: Disturbances = field(default_factory=Disturbances)
+    pulls: tuple[ScriptedForce, ...] = ()
+    """Of the person on the elbow, in the time of the run, where they do not wait to be let."""
     held_flat: frozenset[str] = frozenset()
     """Objects that both pads held on opposite faces, when lifted and still at the release."""
 
@@ -120,7 +124,7 @@ def simulate_collaboration(
     *,
     workplace: Workplace | None = None,
     camera: CameraKind = "auto",
-    forces: Sequence[ScriptedForce] = NULL_SPACE_FORCES,
+    forces: Sequence[ScriptedForce] | Literal["any time"] = NULL_SPACE_FORCES,
     disturbances: Disturbances | None = None,
     config: PickAndPlaceConfig | None = None,
     cell_config: WorkCellConfig | None = None,
@@ -140,7 +144,8 @@ def simulate_collaboration(
         shelves: Where to put each of the scene's objects, in turn.
         workplace: Where.
         camera: Which kind of camera watches.
-        forces: Of the person on the elbow, in time since the robot waits for them.
+        forces: Of the person on the elbow, in time since the robot waits for them; or at
+            random moments from the beginning on, whatever the robot does.
         disturbances: What happens to camera and images during the job.
         config: How the job is done.
         cell_config: How the loop runs; images may be late or lost.
@@ -175,7 +180,15 @@ def simulate_collaboration(
     world.reset(
         workplace.home_joints().numpy(), _object_poses(workplace, world, sizes.object_yaw, rng)
     )
-    person, motion = ScriptedPerturbation(panda, forces, begin=None), MotionLog(world)
+    pulls: tuple[ScriptedForce, ...] = ()
+    if forces == "any time":
+        # Drawn apart, so that runs with and without pulls are alike but for them.
+        pulls = random_pulls(np.random.default_rng([seed, 1]))
+        config = replace(config, interactions=0)
+        person = ScriptedPerturbation(panda, pulls, begin=0.0)
+    else:
+        person = ScriptedPerturbation(panda, forces, begin=None)
+    motion = MotionLog(world)
     occluder = ScriptedOcclusion(world, disturbances.occlusions)
     eyes = ChangingCamera(
         workplace.scene.camera,
@@ -192,7 +205,7 @@ def simulate_collaboration(
         on_phase(phase, time)
         if phase in flat:
             flat[phase] |= {item.name for item in items if world.holds_flat(item.name)}
-        if phase == INTERACT:
+        if phase == INTERACT and not pulls:
             person.begin(time)
 
     def check(plan: Plan) -> None:
@@ -237,6 +250,7 @@ def simulate_collaboration(
         picks=tuple(picks),
         cameras=tuple(eyes.history),
         disturbances=disturbances,
+        pulls=pulls,
         held_flat=frozenset(flat[HOME] & flat[RELEASE]),
     )
 

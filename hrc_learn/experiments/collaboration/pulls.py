@@ -1,0 +1,176 @@
+"""A person who pulls at the elbow at any moment of a job, and what each pull does.
+
+In motions and while the end effector is held, its path is known, and so is how far it was off
+it. Visual servoing has no path: there the offset of the hand from the object tells.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from hrc_learn.kinematics import SerialChain, arm_angle, panda
+from hrc_learn.teleoperation import ScriptedForce
+from hrc_learn.viz import LoggedSteps
+
+_PAUSE, _DURATION = (1.0, 6.0), (2.0, 4.5)
+"""Between two pulls, and of a pull [s]: as long as the paper's drags of joint 4, 4 to 7 s, or
+half that."""
+_HAND = ((-0.1, 0.5), (-0.4, 0.4), (0.3, 0.8))
+"""Where the person's hand may be, along x, y and z [m]: all about an elbow above the table."""
+_FORCE = 60.0
+"""Largest force [N], as where the person is waited for."""
+_AFTER = 1.0
+"""How long a pull counts on after its end [s]: while the arm goes back."""
+_LAG = 0.5
+"""How long ago a goal may have been for the end effector to be still on its path [s]: servos
+lag, and a motion that waits for a limit lags further."""
+_LEAST_WAY = 0.002
+"""Way of the goal in that time from which on it has a direction [m]."""
+
+
+def random_pulls(
+    rng: np.random.Generator, duration: float = 600.0
+) -> tuple[ScriptedForce, ...]:
+    """Pulls at random moments, each from another side.
+
+    Args:
+        rng: Source of moments, durations and sides.
+        duration: How long they go on [s].
+    """
+    pulls, time = [], float(rng.uniform(0.0, _PAUSE[1]))
+    while time < duration:
+        low, high = np.array(_HAND).T
+        x, y, z = rng.uniform(low, high)
+        length = float(rng.uniform(*_DURATION))
+        pulls.append(
+            ScriptedForce(start=time, duration=length, towards=(x, y, z), max_force=_FORCE)
+        )
+        time += length + float(rng.uniform(*_PAUSE))
+    return tuple(pulls)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PullEffect:
+    """What one pull did in one phase of the task, by the arm's own encoders."""
+
+    phase: str
+    start: float
+    """[s]"""
+    elbow: float
+    """How far the elbow was moved aside, at most [m]."""
+    hand: float
+    """How far the end effector was off its path, at most [m]; NaN where it had none."""
+
+
+def pull_effects(
+    log: LoggedSteps, pulls: Sequence[ScriptedForce], chain: SerialChain = panda
+) -> list[PullEffect]:
+    """Effects of the pulls of a run, one for each phase that a pull reaches into.
+
+    Args:
+        log: Of a work cell.
+        pulls: In the time of the log [s].
+        chain: The arm.
+    """
+    time, joints = log["time"], torch.from_numpy(log["joint_position"])
+    hand = chain.forward(joints).position.numpy()
+    off_path = path_distance(hand, log["goal_position"], time)
+    effects = []
+    for phase, begin, end in _phases(log):
+        for pull in pulls:
+            rows = (time >= max(pull.start, begin)) & (time < min(pull.end + _AFTER, end))
+            if not (log["nullspace_input"][rows] != 0).any():
+                continue
+            planned = torch.from_numpy(log["path_joints"][rows])
+            seen = off_path[rows][np.isfinite(off_path[rows])]
+            effects.append(
+                PullEffect(
+                    phase=phase,
+                    start=max(pull.start, begin),
+                    elbow=float(_elbow_moved(chain, joints[rows], planned).max()),
+                    hand=float(seen.max()) if len(seen) else math.nan,
+                )
+            )
+    return effects
+
+
+def path_distance(
+    position: Float[np.ndarray, "time 3"],
+    goal: Float[np.ndarray, "time 3"],
+    time: Float[np.ndarray, " time"],
+) -> Float[np.ndarray, " time"]:
+    """Distance of each position from the path of the goals [m]; NaN where there was none.
+
+    The end effector may be anywhere along the path: behind, as servos lag, or ahead, where it
+    stops. So the distance counts from the nearest of the goals shortly before, and from the
+    line on which the goal moved last.
+
+    Args:
+        position: Of the end effector [m].
+        goal: Where it was to be; NaN where there was no path [m].
+        time: Of both [s].
+    """
+    nearest = _beside(position - goal, goal, time)
+    start, way = goal[:-1], np.diff(goal, axis=0)
+    length = (way**2).sum(axis=1)
+    for lag in range(_samples(time)):
+        here = position[lag + 1 :]
+        a, d, square = start[: len(here)], way[: len(here)], length[: len(here)]
+        share = ((here - a) * d).sum(axis=1) / np.maximum(square, 1e-12)
+        away = np.linalg.norm(here - a - np.clip(share, 0, 1)[:, None] * d, axis=1)
+        # NaN of a segment that does not exist is no distance.
+        nearest[lag + 1 :] = np.fmin(nearest[lag + 1 :], away)
+    return np.where(np.isfinite(goal).all(axis=1), nearest, np.nan)
+
+
+def _beside(
+    error: Float[np.ndarray, "time 3"],
+    goal: Float[np.ndarray, "time 3"],
+    time: Float[np.ndarray, " time"],
+) -> Float[np.ndarray, " time"]:
+    """Part of an error that is across the direction in which the goal moved last [m]."""
+    lag = min(_samples(time), len(time))
+    way = np.full_like(goal, np.nan)
+    way[lag:] = goal[lag:] - goal[: len(goal) - lag]
+    length = np.linalg.norm(way, axis=1, keepdims=True)
+    # A goal that hardly moved has no direction.
+    direction = np.where(length > _LEAST_WAY, way / np.maximum(length, _LEAST_WAY), 0.0)
+    along = (error * direction).sum(axis=1, keepdims=True) * direction
+    return np.linalg.norm(error - along, axis=1)
+
+
+def _samples(time: Float[np.ndarray, " time"]) -> int:
+    """Of the time by which an end effector lags."""
+    return round(_LAG / float(np.median(np.diff(time)))) if len(time) > 1 else 0
+
+
+def _elbow_moved(
+    chain: SerialChain,
+    joints: Float[torch.Tensor, "time joints"],
+    planned: Float[torch.Tensor, "time joints"],
+) -> Float[torch.Tensor, " time"]:
+    """Distance of the elbow from where it would be without the person [m].
+
+    On its circle about the line from shoulder to wrist: from where a path has it, or else from
+    where it was when the pull began.
+    """
+    angle = arm_angle(chain, joints)
+    on_path = planned.isfinite().all(-1)
+    path = torch.where(on_path[:, None], planned, joints[:1])
+    undisturbed = torch.where(on_path, arm_angle(chain, path), angle[0])
+    points = chain.joint_origins(joints)
+    shoulder, elbow, wrist = (points[:, k] for k in (1, 3, 5))
+    axis = torch.nn.functional.normalize(wrist - shoulder, dim=-1)
+    radius = torch.linalg.cross(axis, elbow - shoulder).norm(dim=-1)
+    return 2 * radius * torch.sin((angle - undisturbed) / 2).abs()
+
+
+def _phases(log: LoggedSteps) -> list[tuple[str, float, float]]:
+    """Name, start and end of every phase [s]."""
+    starts = [event.time for event in log.events]
+    ends = [*starts[1:], math.inf]
+    return [(e.text, e.time, end) for e, end in zip(log.events, ends, strict=True)]
