@@ -21,6 +21,9 @@ from hrc_learn.skills.marker_angle import AngleServo, MarkerAngle
 from hrc_learn.skills.marker_sensor import HeldMarker
 from hrc_learn.skills.work_cell import MissedGraspError, WorkCell
 
+# Parts of a probe's height that are tried until its upper end is well within the image.
+_PROBE_SHARES = np.array([1.0, 0.75, 0.5])
+
 
 @dataclass(frozen=True, kw_only=True)
 class VisualServoConfig:
@@ -51,6 +54,9 @@ class VisualServoConfig:
     probe_reach: float = 0.003
     """How far what was learned from a descent moves the end effector for the probe to be
     repeated from there [m]: half the error of the hand above an object that is asked for."""
+    probe_aside: float = 0.012
+    """The same of the first descent's sideways deviation from the line [m]: a motion in another
+    direction tells less of how the line looks."""
     max_probes: int = 5
     """Descents at most."""
     border: float = 80.0
@@ -160,7 +166,8 @@ class ServoTarget:
         self, image_jacobian: Float[np.ndarray, "2 6"], pose: Pose, *, detected: bool = True
     ) -> Goals:
         """Goals by an estimate of the image Jacobian, at a pose of the end effector."""
-        offset = torch.from_numpy(self._offset(self.raised))
+        # A camera that was moved may not see as far up; where it was watching before, it does.
+        offset = torch.from_numpy(self._offset(self.raised if detected else 0.0))
         above = Pose(self.above.position + offset, self.upright)
         goals = self.config.goals(above, self.pixel(image_jacobian, pose), detected=detected)
         return goals.approached_by(self.posture)
@@ -172,9 +179,19 @@ class ServoTarget:
         # Within the box the gripper goes on straight down, not along the line: a few
         # millimetres that are left of the height must not lead aside.
         height = float(pose.position[2] - self.above.position[2]) - self.config.half_size[2]
-        offset = self._offset(min(max(height, 0.0), self.config.probe))
-        pixel = self.target(image_jacobian, self.upright, offset)
+        pixel = self.raised_pixel(image_jacobian, min(max(height, 0.0), self.config.probe))
         return self.config.within(pixel) if self.raised else pixel
+
+    def raised_pixel(
+        self, image_jacobian: Float[np.ndarray, "2 6"], height: float
+    ) -> Float[np.ndarray, "2"]:
+        """Where the marker should be for the end effector to be on the line at a height [m]."""
+        return self.target(image_jacobian, self.upright, self._offset(height))
+
+    def deviation(self, pose: Pose, before: Pose) -> float:
+        """Sideways distance of a pose from the line through an earlier one [m]."""
+        moved = (pose.position - before.position).numpy()
+        return float(np.linalg.norm((moved - self._offset(moved[2]))[:2]))
 
     @property
     def upright(self) -> Float[Tensor, "4"]:
@@ -243,18 +260,21 @@ class VisualServo:
         if config.probe == 0:
             return self._converge(target, config.tolerance, start) - start
         reached = start
-        for _ in range(config.max_probes):
-            raised = replace(target, raised=config.probe)
+        for probe in range(config.max_probes):
+            raised = replace(target, raised=self._probe_height(target))
             self._converge(raised, config.probe_tolerance, start)
-            high = self._at_rest
-            self._descend(target)
+            above, high = self._cell.pose, self._at_rest
+            self._descend(raised)
             self._converge(target, config.tolerance, start)
             before, low = self._cell.pose, self._at_rest
             if high is not None and low is not None:
                 self._learn(target, high, low)
             reached = self._converge(target, config.tolerance, start)
+            # Along the line of the turned tool, which leads elsewhere than when not turned.
+            turned = replace(target, orientation=self._turned)
             moved = self._cell.pose.position - before.position
-            if float(moved[:2].norm()) < config.probe_reach:
+            along = probe > 0 or turned.deviation(before, above) < config.probe_aside
+            if along and float(moved[:2].norm()) < config.probe_reach:
                 break
         return reached - start
 
@@ -302,11 +322,19 @@ class VisualServo:
         self._at_rest = _mean(list(seen.values()))
         return reached
 
+    def _probe_height(self, target: ServoTarget) -> float:
+        """From as high up as the marker is expected well within the image [m]."""
+        config, turned = self._config, replace(target, orientation=self._turned)
+        for height in config.probe * _PROBE_SHARES:
+            pixel = turned.raised_pixel(self._image_jacobian(), float(height))
+            if np.array_equal(config.within(pixel), pixel):
+                return float(height)
+        return float(config.probe * _PROBE_SHARES[-1])
+
     def _descend(self, target: ServoTarget) -> None:
-        """Along the line, from as high up as a probe begins."""
-        config = self._config
-        step = config.probe_speed * self._cell.config.dt
-        for height in np.arange(config.probe, 0.0, -step):
+        """Along the line, from as high up as it is raised."""
+        step = self._config.probe_speed * self._cell.config.dt
+        for height in np.arange(target.raised, 0.0, -step):
             self.step(replace(target, raised=float(height)))
 
     def hold(self, target: ServoTarget, duration: float) -> None:

@@ -397,7 +397,7 @@ class WorkCell:
                 return int(progress)
             goal, wanted = _between(path, progress), rate * _between(velocity, progress)
             here, ahead = int(progress), int(progress + _CHANGE_OF_RATE / dt)
-            behind = self._track_joints(goal, wanted, yields=not narrow[here])
+            behind = self._track_joints(goal, wanted, yields=not bool(narrow[here]))
             if self._aside and narrow[here : ahead + 1].any():
                 behind = math.inf
             # Without jumps, as every change of speed is one of the end effector's.

@@ -35,7 +35,7 @@ from hrc_learn.sim import World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.arm_motion import joint_line
 from hrc_learn.skills.grasping import GraspingConfig
-from hrc_learn.skills.visual_servoing import VisualServoConfig
+from hrc_learn.skills.visual_servoing import ServoTarget, VisualServoConfig
 from hrc_learn.skills.visual_skill import VisualServoSkill, VisualTarget
 
 WORKPLACE = Workplace()
@@ -198,15 +198,15 @@ def test_a_missed_grasp_is_begun_anew(skill):
     class Astray(VisualTarget):
         """Misses the object by a hand's breadth until it has looked twice."""
 
-        def __call__(self, pixel, jacobian, orientation):
-            seen = super().__call__(pixel, jacobian, orientation)
+        def __call__(self, pixel, jacobian, orientation, further=None):
+            seen = super().__call__(pixel, jacobian, orientation, further)
             if not tries or np.allclose(pixel, tries[0], atol=1e-12):
                 tries[:] = [pixel]
                 return seen + np.array([0.0, 150.0])
             return seen
 
     known = skill.target
-    target = Astray(error=known.error, offset=known.offset)
+    target = Astray(error=known.error, offset=known.offset, focal=known.focal)
     with shapes_unchecked():
         run = grasped(replace(skill, target=target), turned(0.0))
     assert run.result is not None
@@ -314,3 +314,25 @@ def test_coming_down_along_the_line_finds_the_object_by_any_camera(skill):
     error = max(Descent.of(run).offset for run in descended)
     assert error < 0.005
     assert error < 0.5 * max(Descent.of(run).offset for run in straight)
+
+
+def test_a_hand_that_comes_down_along_the_line_stays_on_it():
+    line = np.array([0.3, -0.2, 1.0])
+    line /= np.linalg.norm(line)
+    hover = WORKPLACE.hover()
+    target = ServoTarget(
+        config=VisualServoConfig(),
+        above=hover,
+        posture=None,
+        target=lambda J, orientation, further: J,
+        lines=lambda orientation: line,
+    )
+
+    def hand(along, aside=(0.0, 0.0, 0.0)):
+        moved = along * line + np.array(aside)
+        return Pose(hover.position + torch.from_numpy(moved), hover.orientation)
+
+    assert target.deviation(hand(0.0), hand(0.03)) == pytest.approx(0.0, abs=1e-12)
+    assert target.deviation(hand(0.04), hand(0.01)) == pytest.approx(0.0, abs=1e-12)
+    there = hand(0.0, (0.012, 0.005, 0.0))
+    assert target.deviation(there, hand(0.03)) == pytest.approx(0.013, abs=1e-12)
