@@ -1,12 +1,15 @@
 """Steps of visual servoing that a whole grasp would hide."""
 
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
+from hrc_learn.controller.interface import IMAGE_SIZE
 from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.jacobian import Measurement
 from hrc_learn.kinematics import panda
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills import MarkerObservation, ServoTarget, VisualServo, VisualServoConfig
@@ -55,6 +58,78 @@ def test_the_image_jacobian_is_estimated_once_an_image_where_that_was_taken(know
     torch.testing.assert_close(pose.position, there.position)
 
 
+@pytest.mark.parametrize(("top", "share"), [(1.0, 1.0), (0.75, 0.75), (0.5, 0.5), (0.3, 0.5)])
+def test_a_probe_begins_no_higher_than_where_the_marker_stays_in_the_image(top, share):
+    """A camera above whose image the marker leaves at a part of the probe's height."""
+    servo, _ = servo_in(StillCell(None))
+    servo._turned = None
+    edge = IMAGE_SIZE[1] - 1 - CONFIG.border
+    rise = 200.0 / (top * CONFIG.probe)  # pixels a metre
+    target = replace(
+        unturned_target(),
+        target=lambda J, orientation, further: np.array(
+            [700.0, edge - 200.0 + rise * further[2] * (1 - 1e-9)]
+        ),
+    )
+    assert servo._probe_height(target) == pytest.approx(share * CONFIG.probe)
+
+
+def test_the_hand_is_raised_only_once_its_marker_was_seen():
+    """Where a moved camera sees it for sure is in the box, not above."""
+    target, jacobian = replace(unturned_target(), raised=0.05), np.zeros((2, 6))
+    pose = target.above
+    for detected, raised in ((True, 0.05), (False, 0.0)):
+        position = target.goals(jacobian, pose, detected=detected).position.centre
+        expected = pose.position + torch.tensor([0.0, 0.0, raised], dtype=torch.float64)
+        torch.testing.assert_close(position, expected)
+
+
+@dataclass(frozen=True)
+class Estimated:
+    estimator: object
+
+
+def pinhole(height):
+    """Image Jacobian and pixel of a point so far under a camera of 1000 px that looks down."""
+    xi = np.array([0.2, -0.1]) / height
+    jacobian = np.zeros((2, 6))
+    jacobian[:, :3] = 1000 / height * np.column_stack([np.eye(2), xi])
+    return jacobian, 1000 * xi
+
+
+def test_what_is_learned_from_a_descent_holds_at_its_lower_end():
+    """Both ends seen by a camera straight above, whose depth changes by 1 / z a metre."""
+    servo, learned = servo_in(StillCell(None))[0], []
+    servo._controller.estimator.compared = lambda state, *pair: learned.append(pair)
+    low, high = 1.2, 1.12
+    jacobian, pixel = pinhole(low)
+    servo._cached = (0.9, jacobian)
+    servo._cell.observation = MarkerObservation(time=0.9, joints=panda.ready)
+    servo.state = Estimated(estimator=None)
+
+    def at(depth):
+        upright = panda.forward(panda.ready).orientation
+        none = torch.zeros(6, dtype=torch.float64)
+        return Measurement(
+            pose=Pose(torch.tensor([0.2, -0.1, -depth]).double(), upright),
+            feature=torch.from_numpy(pinhole(depth)[1]),
+            valid=torch.tensor(True),
+            dt=0.0,
+            xi_x=none[:2],
+            xi_r=none,
+        )
+
+    target = replace(
+        unturned_target(), depth_gradient=lambda J, x: np.array([0.0, 0.0, -1 / low])
+    )
+    servo._learn(target, at(high), at(low))
+    ((above, below),) = learned
+    way = above.pose.position - below.pose.position
+    expected = torch.from_numpy(jacobian[:, :3]) @ way
+    torch.testing.assert_close(above.feature - below.feature, expected, rtol=1e-5, atol=0)
+    torch.testing.assert_close(below.feature, torch.from_numpy(pixel))
+
+
 def test_a_probe_comes_down_at_its_speed_from_where_it_begins():
     servo, _ = servo_in(StillCell(None))
     heights = []
@@ -66,11 +141,12 @@ def test_a_probe_comes_down_at_its_speed_from_where_it_begins():
             config=CONFIG,
             above=above,
             posture=None,
-            target=lambda J, orientation: J,
+            target=lambda J, orientation, further: J,
             lines=lambda orientation: up,
+            raised=0.045,
         )
     )
-    assert heights[0] == CONFIG.probe
+    assert heights[0] == 0.045
     np.testing.assert_allclose(np.diff(heights), -CONFIG.probe_speed * 0.01)
     assert 0 < heights[-1] <= CONFIG.probe_speed * 0.01 * (1 + 1e-9)
 
@@ -83,7 +159,7 @@ def test_within_the_box_the_gripper_is_led_straight_down(height):
         config=CONFIG,
         above=above,
         posture=None,
-        target=lambda J, orientation: np.zeros(2),
+        target=lambda J, orientation, further: J[:, :3] @ further,
         lines=lambda orientation: line,
     )
     jacobian = np.zeros((2, 6))
@@ -94,8 +170,16 @@ def test_within_the_box_the_gripper_is_led_straight_down(height):
     np.testing.assert_allclose(pixel, [1000.0 * aside, 0.0], atol=1e-9)
 
 
-@pytest.mark.parametrize(("astray", "probes"), [(0.0, 1), (0.03, CONFIG.max_probes)])
-def test_a_turned_tool_that_stays_on_its_own_line_is_not_probed_again(astray, probes):
+@pytest.mark.parametrize(
+    ("astray", "moves", "probes"),
+    [
+        (0.0, [0.0], 1),
+        (0.03, [0.0, 0.0], 2),  # the first descent led aside: once more, from there
+        (0.0, [0.01, 0.01, 0.001], 3),  # until what is learned changes nothing
+        (0.0, [0.01] * 9, CONFIG.max_probes),
+    ],
+)
+def test_a_descent_is_repeated_until_it_teaches_nothing_new(astray, moves, probes):
     """The line leads elsewhere for a turned tool; only what leaves that one counts."""
     above = Workplace().hover()
     about = quaternion.exp(torch.tensor([0.0, 0.0, 1.2], dtype=torch.float64))
@@ -110,25 +194,29 @@ def test_a_turned_tool_that_stays_on_its_own_line_is_not_probed_again(astray, pr
     cell = SimpleNamespace(time=0.0, pose=above)
     along = torch.from_numpy(line(turned) / line(turned)[2])
     start = Pose(above.position + CONFIG.probe * along, turned)
-    aside = torch.tensor([astray, 0.0, 0.0], dtype=torch.float64)
+    low = []
 
     def descend(_target):
         descents.append(cell.pose)
-        cell.pose = Pose(above.position + aside, turned)
+        low[:] = [torch.tensor([astray, 0.0, 0.0], dtype=torch.float64)]
 
     def converge(target, *_):
         if target.raised:
             cell.pose = start
+        else:
+            cell.pose = Pose(above.position + low[0], turned)
+            low[:] = [low[0] + torch.tensor([0.0, moves[len(descents) - 1], 0.0]).double()]
         return 0.0
 
     vars(servo).update(_config=CONFIG, _turned=turned, _cell=cell, _resume=lambda: None)
     vars(servo).update(_descend=descend, _converge=converge, _at_rest=None)
+    servo._probe_height = lambda target: CONFIG.probe
     servo.servo_to(
         ServoTarget(
             config=CONFIG,
             above=above,
             posture=None,
-            target=lambda J, orientation: J,
+            target=lambda J, orientation, further: J,
             lines=line,
         )
     )
@@ -140,7 +228,7 @@ def unturned_target():
         config=CONFIG,
         above=Workplace().hover(),
         posture=None,
-        target=lambda J, orientation: np.zeros(2),
+        target=lambda J, orientation, further: np.zeros(2),
         lines=lambda orientation: np.array([0.0, 0.0, 1.0]),
     )
 

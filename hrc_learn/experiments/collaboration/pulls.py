@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from hrc_learn.kinematics import SerialChain, arm_angle, panda
+from hrc_learn.kinematics import SerialChain, panda
 from hrc_learn.teleoperation import ScriptedForce
 from hrc_learn.viz import LoggedSteps
 
@@ -23,6 +23,8 @@ _HAND = ((-0.1, 0.5), (-0.4, 0.4), (0.3, 0.8))
 """Where the person's hand may be, along x, y and z [m]: all about an elbow above the table."""
 _FORCE = 60.0
 """Largest force [N], as where the person is waited for."""
+_ELBOW = 3
+"""Joint at the elbow, from 0."""
 _AFTER = 1.0
 """How long a pull counts on after its end [s]: while the arm goes back."""
 _LAG = 0.5
@@ -155,18 +157,14 @@ def _elbow_moved(
 ) -> Float[torch.Tensor, " time"]:
     """Distance of the elbow from where it would be without the person [m].
 
-    On its circle about the line from shoulder to wrist: from where a path has it, or else from
-    where it was when the pull began.
+    That is where a path has it, or else where it was when the pull began, moved along with the
+    end effector.
     """
-    angle = arm_angle(chain, joints)
-    on_path = planned.isfinite().all(-1)
-    path = torch.where(on_path[:, None], planned, joints[:1])
-    undisturbed = torch.where(on_path, arm_angle(chain, path), angle[0])
-    points = chain.joint_origins(joints)
-    shoulder, elbow, wrist = (points[:, k] for k in (1, 3, 5))
-    axis = torch.nn.functional.normalize(wrist - shoulder, dim=-1)
-    radius = torch.linalg.cross(axis, elbow - shoulder).norm(dim=-1)
-    return 2 * radius * torch.sin((angle - undisturbed) / 2).abs()
+    on_path = planned.isfinite().all(-1, keepdim=True)
+    elbow, hand = chain.joint_origins(joints)[:, _ELBOW], chain.forward(joints).position
+    path = chain.joint_origins(torch.where(on_path, planned, joints))[:, _ELBOW]
+    undisturbed = torch.where(on_path, path, elbow[0] + hand - hand[0])
+    return (elbow - undisturbed).norm(dim=-1)
 
 
 def _phases(log: LoggedSteps) -> list[tuple[str, float, float]]:
