@@ -31,6 +31,7 @@ lenses of 30 to 80 degrees are within one of it."""
 _PIXEL_NOISE = 1.0
 """Residual beyond which a frame counts less [px]: several times a detector's noise, about what
 the calibration of an arm leaves."""
+_TINY = 1e-12
 _FRAMES = 2000
 """About so many are fitted to: the noise averages out long before."""
 
@@ -62,12 +63,14 @@ def _camera(
     """First two rows of the rotation, depth, and third row, of a camera of focal length 1."""
     square = 1 + (xi**2).sum(-1)
     # trace(J J^T) z^2 = 2 + |xi|^2
-    depth = np.asarray(np.sqrt((1 + square) / (jacobian**2).sum((-2, -1))))
+    # A Jacobian of zeros, of which nothing is known, is one of a camera far away.
+    size = np.maximum((jacobian**2).sum((-2, -1)), _TINY)
+    depth = np.asarray(np.sqrt((1 + square) / size))
     rows = depth[..., None, None] * jacobian
     # The rows' cross product is along the ray, r_3 + xi_1 r_1 + xi_2 r_2.
     ray = np.cross(rows[..., 0, :], rows[..., 1, :])
     axis = (ray - (xi[..., None, :] @ rows)[..., 0, :]) / square[..., None]
-    axis = axis / np.linalg.norm(axis, axis=-1, keepdims=True)
+    axis = axis / np.maximum(np.linalg.norm(axis, axis=-1, keepdims=True), _TINY)
     return rows + xi[..., :, None] * axis[..., None, :], depth, axis
 
 

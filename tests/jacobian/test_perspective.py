@@ -50,6 +50,11 @@ def test_the_depth_gradient_predicts_points_far_away(seed):
     assert np.abs(pixels + jacobians @ offset - expected).max() > 5
 
 
+def test_of_an_unknown_camera_depth_is_the_same_everywhere():
+    gradient = depth_gradient(np.zeros((2, 3)), CENTER, 1700.0, CENTER)
+    np.testing.assert_array_equal(gradient, np.zeros(3))
+
+
 def demonstration(rng, rotation, shift, focal, marker, frames=200, noise=0.1):
     """A tool that moves and turns before a camera, its marker unseen now and then."""
     along = np.linspace(0, 1, frames)[:, None]

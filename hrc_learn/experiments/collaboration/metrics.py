@@ -9,7 +9,7 @@ from typing import get_args
 
 import numpy as np
 
-from hrc_learn.experiments.collaboration.pulls import PullEffect, pull_effects
+from hrc_learn.experiments.collaboration.pulls import pull_effects
 from hrc_learn.experiments.collaboration.trial import CollaborationRun
 from hrc_learn.experiments.grip import Hold, grasp_offset, hold, place_angle
 from hrc_learn.experiments.metric_table import Metric, median, p95, success_rate
@@ -138,27 +138,34 @@ def collaboration_metrics(
         ),
         Metric(
             "pulls at any time, hand off its path (95 %)",
-            lambda run: _pulls(run, lambda effect: effect.hand, 0.95),
+            lambda run: _off_path(run, 0.95),
             "mm",
             at_most=2.0,
             claim="an expert gets involved at any time",
         ),
         Metric(
             "pulls at any time, elbow moved (median)",
-            lambda run: _pulls(run, lambda effect: effect.elbow, 0.5),
+            lambda run: _elbow_pulled(run, 0.5),
             "mm",
             at_least=100.0,
         ),
     ]
 
 
-def _pulls(
-    run: CollaborationRun, of: Callable[[PullEffect], float], share: float
-) -> float | None:
-    """Quantile over the pulls at any time, in mm; None of a run without."""
+def _off_path(run: CollaborationRun, share: float) -> float | None:
+    """Quantile over phases and the pulls in them; None of a run without [mm]."""
     effects = pull_effects(run.cell.log, run.pulls) if run.pulls else []
-    values = [v for v in map(of, effects) if np.isfinite(v)]
-    return 1e3 * float(np.quantile(values, share)) if values else None
+    off = [effect.hand for effect in effects if np.isfinite(effect.hand)]
+    return 1e3 * float(np.quantile(off, share)) if off else None
+
+
+def _elbow_pulled(run: CollaborationRun, share: float) -> float | None:
+    """Quantile over the pulls; None of a run without [mm]."""
+    moved: dict[float, float] = {}
+    for effect in pull_effects(run.cell.log, run.pulls) if run.pulls else []:
+        start = effect.pull.start
+        moved[start] = max(moved.get(start, 0.0), effect.elbow)
+    return 1e3 * float(np.quantile(list(moved.values()), share)) if moved else None
 
 
 TRIAL_METRICS: Sequence[Metric[Sequence[Trial]]] = (

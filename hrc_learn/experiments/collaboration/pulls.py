@@ -60,8 +60,7 @@ class PullEffect:
     """What one pull did in one phase of the task, by the arm's own encoders."""
 
     phase: str
-    start: float
-    """[s]"""
+    pull: ScriptedForce
     elbow: float
     """How far the elbow was moved aside, at most [m]."""
     hand: float
@@ -87,13 +86,14 @@ def pull_effects(
             rows = (time >= max(pull.start, begin)) & (time < min(pull.end + _AFTER, end))
             if not (log["nullspace_input"][rows] != 0).any():
                 continue
-            planned = torch.from_numpy(log["path_joints"][rows])
+            during = torch.from_numpy(rows)
+            planned = torch.from_numpy(log["path_joints"])[during]
             seen = off_path[rows][np.isfinite(off_path[rows])]
             effects.append(
                 PullEffect(
                     phase=phase,
-                    start=max(pull.start, begin),
-                    elbow=float(_elbow_moved(chain, joints[rows], planned).max()),
+                    pull=pull,
+                    elbow=float(_elbow_moved(chain, joints[during], planned).max()),
                     hand=float(seen.max()) if len(seen) else math.nan,
                 )
             )
@@ -124,7 +124,7 @@ def path_distance(
         a, d, square = start[: len(here)], way[: len(here)], length[: len(here)]
         share = ((here - a) * d).sum(axis=1) / np.maximum(square, 1e-12)
         away = np.linalg.norm(here - a - np.clip(share, 0, 1)[:, None] * d, axis=1)
-        # NaN of a segment that does not exist is no distance.
+        # A segment of which an end is not known is none: fmin leaves NaN out.
         nearest[lag + 1 :] = np.fmin(nearest[lag + 1 :], away)
     return np.where(np.isfinite(goal).all(axis=1), nearest, np.nan)
 
