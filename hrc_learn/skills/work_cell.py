@@ -16,7 +16,7 @@ from hrc_learn.geometry import Pose
 from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.protocols import Arm, ArmState, Gripper, Human, HumanInput
-from hrc_learn.skills.arm_motion import kept_clear, resolved_rate, straight_line
+from hrc_learn.skills.arm_motion import joint_line, kept_clear, resolved_rate, straight_line
 from hrc_learn.skills.marker_sensor import (
     DelayedChannel,
     LatencyConfig,
@@ -61,6 +61,8 @@ _NARROW = 0.07
 _ON_PATH, _SERVO_LAG = 0.001, 0.06
 # Metres that a radian of the end effector counts for: a length of hand and object.
 _METRES_PER_RADIAN = 0.1
+# Postures on the straight way back to a path that are checked: 0.1 rad apart at most.
+_CHECKED = 50
 # In which a path stops, and goes on [s].
 _CHANGE_OF_RATE = 0.2
 # Readings of the torque that are averaged, and steps in which an arm gets under way: friction
@@ -387,17 +389,26 @@ class WorkCell:
 
         Returns:
             Number of samples that were tracked.
+
+        Raises:
+            BlockedPathError: If the arm, pushed aside, does not find back to a path that waits.
         """
         dt = self.config.dt
         velocity = np.gradient(path, dt, axis=0) if len(path) > 1 else np.zeros_like(path)
         narrow = self._narrow(path)
-        progress, rate = 0.0, 1.0
+        progress, rate, left = 0.0, 1.0, self.time
         while progress <= len(path) - 1:
             if until():
                 return int(progress)
             goal, wanted = _between(path, progress), rate * _between(velocity, progress)
             here, ahead = int(progress), int(progress + _CHANGE_OF_RATE / dt)
-            behind = self._track_joints(goal, wanted, yields=not bool(narrow[here]))
+            if rate > 0 or self._pushed():
+                left = self.time
+            if self.time - left > _LONGEST_RETURN:
+                self._go_straight_back(goal)
+            behind = self._track_joints(
+                goal, wanted, yields=not bool(narrow[here]), returns=rate == 0
+            )
             if self._aside and narrow[here : ahead + 1].any():
                 behind = math.inf
             # Without jumps, as every change of speed is one of the end effector's.
@@ -410,6 +421,29 @@ class WorkCell:
             while self._aside and not self._pushed() and self.time < deadline:
                 self._track_joints(end, torch.zeros_like(end))
         return len(path)
+
+    def _go_straight_back(self, goal: Float[Tensor, " joints"]) -> None:
+        """To a path that waits, where no motion of the null space leads.
+
+        Another posture for the same pose may lie between. The end effector leaves its path.
+
+        Raises:
+            BlockedPathError: If the arm would meet something.
+        """
+        way = joint_line(self.joints, goal, self.config.return_speed, self.config.dt)
+        if self._clearance is not None:
+            distance = self._clearance(way[:: max(1, len(way) // _CHECKED)])
+            if bool(
+                (distance < distance[[0, -1]].min().clamp(max=self.config.clearance)).any()
+            ):
+                raise BlockedPathError(
+                    "path: the arm was pushed aside and finds no way back that is clear of what "
+                    "is around it."
+                )
+        self._aside = False
+        for q in way:
+            self._path_joints = q.numpy()
+            self.step(self.config.pose_gain * (q - self.joints))
 
     def _narrow(self, path: Float[np.ndarray, "steps joints"]) -> Bool[np.ndarray, " steps"]:
         """Where a path of the joints is so near a singularity that the arm cannot follow it
@@ -425,6 +459,7 @@ class WorkCell:
         goal: Float[Tensor, " joints"],
         velocity: Float[Tensor, " joints"],
         yields: bool = True,
+        returns: bool = False,
     ) -> float:
         """One step along a path of the joints, or of the end effector while they are aside.
 
@@ -432,6 +467,7 @@ class WorkCell:
             goal: Where on the path [rad].
             velocity: Along it [rad/s].
             yields: Whether the person can push the joints off it here.
+            returns: Whether joints that were pushed off it go back in any case.
 
         Returns:
             How far the end effector then is from its goal, as a ratio to what is allowed;
@@ -446,7 +482,7 @@ class WorkCell:
             self.step(velocity + self.config.pose_gain * error, pose)
             return 0.0
         back = torch.zeros_like(away)
-        if self.config.after_push == "return":
+        if returns or self.config.after_push == "return":
             fastest = self.config.return_speed / float(away.norm().clamp(min=1e-9))
             back = min(self.config.pose_gain, fastest) * away
         # A jump of the null-space motion would move the end effector.

@@ -11,7 +11,7 @@ from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import panda
 from hrc_learn.protocols import ArmState, HumanInput
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills import WorkCell, WorkCellConfig, joint_line
+from hrc_learn.skills import BlockedPathError, WorkCell, WorkCellConfig, joint_line
 from hrc_learn.teleoperation import ScriptedPerturbation
 
 
@@ -254,6 +254,44 @@ def test_a_path_waits_before_its_singularity_while_a_person_holds_the_elbow_asid
     assert np.abs(cell.log["joint_position"] - followed)[at].max() < 0.03
     np.testing.assert_allclose(cell.joints, path[-1], atol=0.03)
     assert time[-1] > 4.0 + len(path) * 0.01 / 4
+
+
+def test_joints_that_stay_beside_a_path_come_back_to_it_before_its_singularity():
+    path, _ = along_a_singularity()
+    config = WorkCellConfig(after_push="stay")
+    cell = pushed_along(path, 0.5 * PUSH, (0.2, 1.0), config=config)
+    np.testing.assert_allclose(cell.joints, path[-1], atol=0.03)
+
+
+@pytest.mark.parametrize("distance", [0.5, -0.5])
+def test_an_arm_that_finds_no_way_back_goes_straight_or_says_so(distance):
+    goal = panda.ready
+    away = goal + torch.tensor([0.0, 0.3, 0.0, 0.3, 0.0, 0.0, 0.0], dtype=torch.float64)
+    arm = ObedientArm(away.numpy())
+
+    def clearance(q):
+        # Clear at both ends; in between as given.
+        ends = torch.stack([goal, away])
+        near = (q[..., None, :] - ends).norm(dim=-1).amin(-1)
+        return torch.where(near < 0.05, 0.5, distance)
+
+    cell = WorkCell(
+        chain=panda,
+        arm=arm,
+        gripper=arm,
+        human=ScriptedPerturbation(panda, ()),
+        advance=arm.advance,
+        clearance=clearance,
+    )
+    with shapes_unchecked():
+        if distance < 0:
+            with pytest.raises(BlockedPathError, match="pushed aside"):
+                cell._go_straight_back(goal)
+        else:
+            cell._go_straight_back(goal)
+            np.testing.assert_allclose(cell.joints, goal, atol=0.03)
+            speed = np.linalg.norm(cell.log["joint_velocity"], axis=1).max()
+            assert speed < 2 * cell.config.return_speed
 
 
 def test_at_a_singularity_of_the_path_nobody_pushes_the_arm_off_it():
