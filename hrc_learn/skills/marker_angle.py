@@ -29,6 +29,10 @@ from hrc_learn.store import write_text
 HALF_TURN = math.pi
 """Turns of the gripper that a parallel grasp cannot tell apart [rad]."""
 
+# How far out of the range a turn once chosen is kept [rad]: the error of its estimate before
+# the tool has turned, some 5 %, of up to half a turn.
+_KEPT = 0.15
+
 # A marker's direction is measured to some 0.1 px over 50 px of its edge [rad].
 _ANGLE_NOISE = 5e-3
 # Before any demonstration: a camera that looks down sees the opposite of each turn [rad/rad].
@@ -122,10 +126,12 @@ class AngleServo:
         self._offset = learned.offset
         self._estimator = _estimator(learned.jacobian)
         self._state = self._estimator.initial_state()
+        self.restart()
 
     def restart(self) -> None:
         """Begin another motion: the camera may have been moved since the last."""
         self._state = self._estimator.resumed(self._state, 0.0)
+        self._chosen: float | None = None
 
     def update(self, pose: Pose, angle: float, dt: float) -> None:
         """Learn from an image.
@@ -154,7 +160,9 @@ class AngleServo:
             item: Direction of the object's marker [rad].
             reference: Orientation of a tool that is not turned.
             allowed: Least and greatest turn of the tool from there about the vertical [rad].
-                Of those that differ by half turns the nearest within is taken.
+                Of those that differ by half turns the nearest within is taken, and kept to
+                for as long as it is not far out of the range: near either end of it noise
+                would turn the tool to and fro.
         """
         row = self._estimator.jacobian(self._state, pose)[0]
         rate = float(row[5])
@@ -162,13 +170,22 @@ class AngleServo:
         rate = math.copysign(min(max(abs(rate), 0.5), 2.0), rate)
         now = turn_about_vertical(pose.orientation, reference)
         missing = _wrapped(item + self._offset - angle) / rate
-        return _turned(reference, _within(now + missing, now, allowed))
+        self._chosen = _within(now + missing, now, allowed, self._chosen)
+        return _turned(reference, self._chosen)
 
 
-def _within(turn: float, now: float, allowed: tuple[float, float]) -> float:
-    """The turn, by half turns into the range, as near to the present one as can be."""
+def _within(
+    turn: float, now: float, allowed: tuple[float, float], chosen: float | None
+) -> float:
+    """The turn, by half turns into the range, as near to the present one as can be; the one
+    chosen before if it is nearly in the range.
+    """
     low, high = allowed
     candidates = [turn + k * HALF_TURN for k in range(-3, 4)]
+    if chosen is not None:
+        same = min(candidates, key=lambda c: abs(c - chosen))
+        if low - _KEPT <= same <= high + _KEPT:
+            return same
     inside = [c for c in candidates if low <= c <= high]
     return min(inside or [min(max(turn, low), high)], key=lambda c: abs(c - now))
 

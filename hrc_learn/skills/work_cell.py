@@ -433,9 +433,8 @@ class WorkCell:
         way = joint_line(self.joints, goal, self.config.return_speed, self.config.dt)
         if self._clearance is not None:
             distance = self._clearance(way[:: max(1, len(way) // _CHECKED)])
-            if bool(
-                (distance < distance[[0, -1]].min().clamp(max=self.config.clearance)).any()
-            ):
+            ends = distance[[0, -1]].min()
+            if bool((distance < ends.clamp(max=self.config.clearance)).any()):
                 raise BlockedPathError(
                     "path: the arm was pushed aside and finds no way back that is clear of what "
                     "is around it."

@@ -87,6 +87,25 @@ def converged(skill, made, yaw, start=0.3, images=6):
     return turn_about_vertical(pose.orientation, gripper_down())
 
 
+@pytest.mark.parametrize("end", [0, 1])
+def test_near_an_end_of_the_range_the_tool_is_not_turned_to_and_fro(end):
+    """Directions that differ by noise; half a turn further is as good a turn."""
+    made, rng, goals = camera(), np.random.default_rng(end), []
+    servo, pose = AngleServo(learned()), Pose(ABOVE, turned(0.3))
+    direction, item = of_tool(made, pose), of_object(made, ALLOWED[end])
+    for noise in rng.normal(0, 0.03, 30):
+        goal = servo.turned(pose, direction, item + noise, gripper_down(), ALLOWED)
+        goals.append(turn_about_vertical(goal, gripper_down()))
+    assert np.ptp(goals) < 0.3
+    # Another motion may choose anew, and far out of the range nothing is kept.
+    beyond = item + (
+        -0.4 if goals[-1] > 0 else 0.4
+    )  # the image shows turns the other way round
+    far = servo.turned(pose, direction, beyond, gripper_down(), ALLOWED)
+    assert ALLOWED[0] < turn_about_vertical(far, gripper_down()) < ALLOWED[1]
+    assert abs(turn_about_vertical(far, gripper_down()) - goals[-1]) > 1.0
+
+
 def test_the_turn_about_the_vertical_is_that_of_the_rotation():
     for yaw in (-2.5, -0.3, 0.0, 1.2, 3.0):
         lean = quaternion.exp(torch.tensor([0.1, -0.2, 0.0], dtype=torch.float64))
