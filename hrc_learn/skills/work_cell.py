@@ -436,8 +436,8 @@ class WorkCell:
             ends = distance[[0, -1]].min()
             if bool((distance < ends.clamp(max=self.config.clearance)).any()):
                 raise BlockedPathError(
-                    "path: the arm was pushed aside and finds no way back that is clear of what "
-                    "is around it."
+                    "path: the arm was pushed aside and finds no way back that is clear of "
+                    "what is around it."
                 )
         self._aside = False
         for q in way:
