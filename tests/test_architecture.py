@@ -100,6 +100,7 @@ LIBRARIES: dict[str, set[str]] = {
 
 LAZY_LIBRARIES: dict[str, set[str]] = {
     "kinematics": {"pytorch_kinematics", "frankik"},
+    "jacobian": {"scipy"},
     "cli": {"ray"},
     "demos": {"av", "scipy"},
     "vision": {"cv2"},
