@@ -330,6 +330,11 @@ class MujocoArm:
         self._data.ctrl[self._velocity_servos] = velocity
 
     @property
+    def encoder_offset(self) -> Float[np.ndarray, " joints"]:
+        """What the encoders read too much, which no program is told [rad]."""
+        return self._errors.encoder_offset
+
+    @property
     def tool_offset(self) -> Float[np.ndarray, "3"]:
         """Position of the tool centre point in the hand's frame [m]."""
         return self._model.site("tcp").pos.copy()

@@ -91,6 +91,18 @@ def test_the_elbow_moved_as_far_as_it_is_from_where_it_was(planned):
     hand = panda.forward(torch.from_numpy(log["joint_position"])).position.numpy()
     away = np.linalg.norm(hand - log["goal_position"], axis=1)
     assert effects[1].hand == pytest.approx(away.max(), rel=1e-6)
+    # Joints pushed aside have another error at the end effector than those of the path.
+    offset = np.array([2.0, -1.0, 1.5, 0.5, -2.0, 1.0, 0.0]) * 1e-2
+    unseen = [
+        panda.forward(torch.from_numpy(log["joint_position"]) - zero).position
+        for zero in (torch.zeros(7), torch.from_numpy(offset))
+    ]
+    shift = (unseen[1] - unseen[0]).numpy()
+    away = np.linalg.norm(hand + shift - shift[0] - log["goal_position"], axis=1)
+    assert np.linalg.norm(shift - shift[0], axis=1).max() > 1e-3
+    true = pull_effects(log, [pull], encoder_offset=offset)
+    assert true[1].hand == pytest.approx(away[transfer].max(), rel=1e-3)
+    assert true[1].elbow == effects[1].elbow
     assert not pull_effects(
         log, [ScriptedForce(start=2.5, duration=0.2, towards=(0.0, 0.0, 0.0))]
     )

@@ -182,11 +182,9 @@ class RunCollaboration(RunServoing):
     """From an image being taken until its markers are known [s]; more than by imperfections."""
     frame_loss: More[float] = 0.0
     """Share of the images that are lost."""
-    person: bool = True
-    """Whether the scripted person pulls the elbow."""
-    any_time: bool = False
-    """The person pulls at random moments of the whole job, whatever the robot does; otherwise
-    while it waits for them above the object."""
+    pulls: Literal["scripted", "random", "none"] = "scripted"
+    """When the scripted person pulls the elbow: while the robot waits for them above the
+    object, at random moments of the whole job whatever it does, or never."""
     page: bool = False
     """Serve a page in the browser, from which people watch and pull at the elbow too. The
     run takes as long as it would on a real arm then."""

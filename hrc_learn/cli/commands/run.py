@@ -91,8 +91,7 @@ def run_collaboration(args: RunCollaboration) -> int:
         shelves=args.shelves or (args.shelf,),
         shelf_x=args.shelf_x,
         shelf_depth=args.shelf_depth,
-        person=args.person,
-        any_time=args.any_time,
+        pulls=args.pulls,
         imperfections=_imperfections(args),
         curve=args.curve,
         disturbances=Disturbances(

@@ -17,6 +17,7 @@ from hrc_learn.experiments.collaboration.trial import (
     NULL_SPACE_FORCES,
     CollaborationRun,
     Disturbances,
+    Pulls,
     simulate_collaboration,
     workplace_for,
 )
@@ -54,10 +55,8 @@ class CollaborationExperiment:
     """Where along the boards objects are placed [m]."""
     shelf_depth: float = Workplace.shelf_depth
     """How far behind the boards' front edge [m]."""
-    person: bool = True
-    """Whether the scripted person pulls the elbow."""
-    any_time: bool = False
-    """They pull at random moments of the whole job, not only where the robot waits for it."""
+    pulls: Pulls = "scripted"
+    """When the scripted person pulls the elbow."""
     disturbances: Disturbances = field(default_factory=Disturbances)
     imperfections: Imperfections = field(default_factory=Imperfections.nominal)
     """Of arm, calibration, camera and objects."""
@@ -139,11 +138,9 @@ class CollaborationExperiment:
         )
         return study.at_sizes(self.curve)
 
-    def _forces(self) -> Sequence[ScriptedForce] | Literal["any time"]:
+    def _forces(self) -> Sequence[ScriptedForce] | Literal["random"]:
         """Of the person on the elbow."""
-        if not self.person:
-            return ()
-        return "any time" if self.any_time else NULL_SPACE_FORCES
+        return {"none": (), "random": "random", "scripted": NULL_SPACE_FORCES}[self.pulls]
 
     def _demonstration(self) -> Demonstration | None:
         """The first one that the placing motion was learned from, if it is still there."""

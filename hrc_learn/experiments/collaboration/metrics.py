@@ -9,7 +9,6 @@ from typing import get_args
 
 import numpy as np
 
-from hrc_learn.experiments.collaboration.pulls import pull_effects
 from hrc_learn.experiments.collaboration.trial import CollaborationRun
 from hrc_learn.experiments.grip import Hold, grasp_offset, hold, place_angle
 from hrc_learn.experiments.metric_table import Metric, median, p95, success_rate
@@ -29,6 +28,9 @@ _CONTACTS = {
     "arm itself": "contacts of the arm with itself",
 }
 """Names of metrics, by what was met."""
+
+_FAR = 0.15
+"""Elbow moved by a pull that got its way [m]."""
 
 
 def collaboration_metrics(
@@ -116,56 +118,59 @@ def collaboration_metrics(
         ),
         Metric(
             "end effector deviation",
-            lambda run: _pushed(run, lambda d: 1e3 * d.position),
+            lambda run: (
+                _off_path(run) if run.pulls else _pushed(run, lambda d: 1e3 * d.position)
+            ),
             "mm",
             at_most=2.0,
             claim="main task not affected (Experiment 3)",
         ),
         Metric(
             "end effector rotation",
-            lambda run: _pushed(run, lambda d: np.rad2deg(d.rotation)),
+            lambda run: None if run.pulls else _pushed(run, lambda d: np.rad2deg(d.rotation)),
             "deg",
             at_most=0.5,
             claim="main task not affected (Experiment 3)",
         ),
         Metric(
             "elbow moved",
-            lambda run: _pushed(run, lambda d: 1e3 * d.elbow),
+            lambda run: (
+                _elbow_pulled(run) if run.pulls else _pushed(run, lambda d: 1e3 * d.elbow)
+            ),
             "mm",
             # Enough to reach under the arm; without it the deviation above would prove nothing.
             at_least=100.0,
             claim="joint 4 dragged forward for 7 s, backward for 4 s",
         ),
+        Metric("pulls", lambda run: len(_elbows_pulled(run)) or None),
         Metric(
-            "pulls at any time, hand off its path (95 %)",
-            lambda run: _off_path(run, 0.95),
-            "mm",
-            at_most=2.0,
-            claim="an expert gets involved at any time",
-        ),
-        Metric(
-            "pulls at any time, elbow moved (median)",
-            lambda run: _elbow_pulled(run, 0.5),
-            "mm",
-            at_least=100.0,
+            "pulls that moved the elbow by 150 mm or more",
+            lambda run: (
+                sum(moved >= _FAR for moved in _elbows_pulled(run)) if run.pulls else None
+            ),
         ),
     ]
 
 
-def _off_path(run: CollaborationRun, share: float) -> float | None:
-    """Quantile over phases and the pulls in them; None of a run without [mm]."""
-    effects = pull_effects(run.cell.log, run.pulls) if run.pulls else []
-    off = [effect.hand for effect in effects if np.isfinite(effect.hand)]
-    return 1e3 * float(np.quantile(off, share)) if off else None
+def _off_path(run: CollaborationRun) -> float | None:
+    """Largest distance of the end effector from its path in phases that pulls reached [mm]."""
+    off = [1e3 * effect.hand for effect in run.pull_effects if np.isfinite(effect.hand)]
+    return max(off, default=None)
 
 
-def _elbow_pulled(run: CollaborationRun, share: float) -> float | None:
-    """Quantile over the pulls; None of a run without [mm]."""
+def _elbow_pulled(run: CollaborationRun) -> float | None:
+    """Median over the pulls at random moments [mm]."""
+    moved = _elbows_pulled(run)
+    return 1e3 * float(np.median(moved)) if moved else None
+
+
+def _elbows_pulled(run: CollaborationRun) -> list[float]:
+    """How far each pull at a random moment moved the elbow, at most [m]."""
     moved: dict[float, float] = {}
-    for effect in pull_effects(run.cell.log, run.pulls) if run.pulls else []:
+    for effect in run.pull_effects:
         start = effect.pull.start
         moved[start] = max(moved.get(start, 0.0), effect.elbow)
-    return 1e3 * float(np.quantile(list(moved.values()), share)) if moved else None
+    return list(moved.values())
 
 
 TRIAL_METRICS: Sequence[Metric[Sequence[Trial]]] = (

@@ -57,7 +57,7 @@ def random_pulls(
 
 @dataclass(frozen=True, kw_only=True)
 class PullEffect:
-    """What one pull did in one phase of the task, by the arm's own encoders."""
+    """What one pull did in one phase of the task."""
 
     phase: str
     pull: ScriptedForce
@@ -68,7 +68,10 @@ class PullEffect:
 
 
 def pull_effects(
-    log: LoggedSteps, pulls: Sequence[ScriptedForce], chain: SerialChain = panda
+    log: LoggedSteps,
+    pulls: Sequence[ScriptedForce],
+    chain: SerialChain = panda,
+    encoder_offset: Float[np.ndarray, " joints"] | None = None,
 ) -> list[PullEffect]:
     """Effects of the pulls of a run, one for each phase that a pull reaches into.
 
@@ -76,9 +79,14 @@ def pull_effects(
         log: Of a work cell.
         pulls: In the time of the log [s].
         chain: The arm.
+        encoder_offset: What its encoders read too much, constantly [rad]: then distances are
+            true ones, also where an arm pushed aside takes other joints for the same pose.
+            None: they are what the encoders say.
     """
     time, joints = log["time"], torch.from_numpy(log["joint_position"])
     hand = chain.forward(joints).position.numpy()
+    if encoder_offset is not None:
+        hand = hand + _moved_unseen(chain, log, torch.from_numpy(encoder_offset))
     off_path = path_distance(hand, log["goal_position"], time)
     effects = []
     for phase, begin, end in _phases(log):
@@ -148,6 +156,27 @@ def _beside(
 def _samples(time: Float[np.ndarray, " time"]) -> int:
     """Of the time by which an end effector lags."""
     return round(_LAG / float(np.median(np.diff(time)))) if len(time) > 1 else 0
+
+
+def _moved_unseen(
+    chain: SerialChain, log: LoggedSteps, offset: Float[torch.Tensor, " joints"]
+) -> Float[np.ndarray, "time 3"]:
+    """How far a push moved the end effector without the encoders showing it [m].
+
+    That is by how much their error at the end effector differs from what it would be without
+    the push: on the path, or else as it was when no input moved the null space last.
+    """
+    joints = torch.from_numpy(log["joint_position"])
+    path = torch.from_numpy(log["path_joints"])
+    pushed = (log["nullspace_input"] != 0).any(axis=1)
+    rows = np.arange(len(joints))
+    last = np.maximum.accumulate(np.where(pushed, 0, rows))
+    undisturbed = torch.where(path.isfinite().all(-1, keepdim=True), path, joints[last])
+
+    def unseen(q: Float[torch.Tensor, "time joints"]) -> Float[torch.Tensor, "time 3"]:
+        return chain.forward(q - offset).position - chain.forward(q).position
+
+    return (unseen(joints) - unseen(undisturbed)).numpy()
 
 
 def _elbow_moved(

@@ -3,13 +3,18 @@
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
 import torch
 from jaxtyping import Float
 
-from hrc_learn.experiments.collaboration.pulls import random_pulls
+from hrc_learn.experiments.collaboration.pulls import (
+    PullEffect,
+    pull_effects,
+    random_pulls,
+)
 from hrc_learn.experiments.run_recording import LiveView, no_live_view
 from hrc_learn.geometry import quaternion
 from hrc_learn.kinematics import panda
@@ -73,6 +78,10 @@ NULL_SPACE_FORCES = (
 """A worker reaches under the arm: the elbow is pushed aside and back. A force of 60 N moves it
 by 0.2 to 0.4 m within the 4.5 s of an interval."""
 
+Pulls = Literal["scripted", "random", "none"]
+"""When a scripted person pulls the elbow: while the robot waits for them above the first
+object, at random moments of the whole job, or never."""
+
 OBJECT_REACH = (0.10, 0.08, 0.0)
 """Largest distance of a single object from the middle of the table [m]."""
 OBJECTS_REACH = (0.12, 0.10)
@@ -108,6 +117,14 @@ class CollaborationRun:
     held_flat: frozenset[str] = frozenset()
     """Objects that both pads held on opposite faces, when lifted and still at the release."""
 
+    @cached_property
+    def pull_effects(self) -> list[PullEffect]:
+        """What each pull at a random moment did in each phase that it reached into."""
+        if not self.pulls:
+            return []
+        offset = self.world.arm.encoder_offset
+        return pull_effects(self.cell.log, self.pulls, encoder_offset=offset)
+
     @property
     def failure(self) -> str:
         """Why objects were not delivered, as the robot sees it; empty if all were."""
@@ -124,7 +141,7 @@ def simulate_collaboration(
     *,
     workplace: Workplace | None = None,
     camera: CameraKind = "auto",
-    forces: Sequence[ScriptedForce] | Literal["any time"] = NULL_SPACE_FORCES,
+    forces: Sequence[ScriptedForce] | Literal["random"] = NULL_SPACE_FORCES,
     disturbances: Disturbances | None = None,
     config: PickAndPlaceConfig | None = None,
     cell_config: WorkCellConfig | None = None,
@@ -181,7 +198,7 @@ def simulate_collaboration(
         workplace.home_joints().numpy(), _object_poses(workplace, world, sizes.object_yaw, rng)
     )
     pulls: tuple[ScriptedForce, ...] = ()
-    if forces == "any time":
+    if forces == "random":
         # Drawn apart, so that runs with and without pulls are alike but for them.
         pulls = random_pulls(np.random.default_rng([seed, 1]))
         config = replace(config, interactions=0)
