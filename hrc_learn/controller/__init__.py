@@ -21,6 +21,7 @@ from hrc_learn.controller.monitors import LimitMonitor as LimitMonitor
 from hrc_learn.controller.monitors import lyapunov_function as lyapunov_function
 from hrc_learn.controller.monitors import lyapunov_rate as lyapunov_rate
 from hrc_learn.controller.motion_barriers import SeparationConfig as SeparationConfig
+from hrc_learn.controller.resolved_rate import scale_null_space as scale_null_space
 from hrc_learn.controller.safety_filter import INTERVENTIONS as INTERVENTIONS
 from hrc_learn.controller.safety_filter import SafetyConfig as SafetyConfig
 from hrc_learn.controller.safety_filter import SafetyFilter as SafetyFilter

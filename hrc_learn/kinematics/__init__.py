@@ -14,6 +14,7 @@ from hrc_learn.kinematics.franka import panda_capsules as panda_capsules
 from hrc_learn.kinematics.interchange import from_pytorch_kinematics as from_pytorch_kinematics
 from hrc_learn.kinematics.interchange import to_pytorch_kinematics as to_pytorch_kinematics
 from hrc_learn.kinematics.interchange import to_urdf as to_urdf
+from hrc_learn.kinematics.redundancy import SINGULAR_BELOW as SINGULAR_BELOW
 from hrc_learn.kinematics.redundancy import arm_angle as arm_angle
 from hrc_learn.kinematics.redundancy import arm_angle_and_motion as arm_angle_and_motion
 from hrc_learn.kinematics.redundancy import clear_posture as clear_posture

@@ -21,6 +21,7 @@ from hrc_learn.controller import (
 from hrc_learn.geometry import Pose, minimum_jerk, quaternion
 from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import (
+    SINGULAR_BELOW,
     SerialChain,
     UnreachableError,
     panda,
@@ -55,10 +56,123 @@ def resolved_rate(
     return task + null_projection(jacobian, null_velocity)
 
 
-# Parts of a null-space motion that are tried, and how far ahead [s]: an elbow at 1 m/s stops
-# within 0.1 s.
-_SHARES = torch.linspace(0.0, 1.0, 6, dtype=torch.float64)
+# What a null-space motion may ask of the arm: acceleration of the end effector that has to be
+# made up for [m/s^2], a radian counting for 0.1 m; and fraction of its joints' acceleration.
+# Servos that are 10 ms later than known, pulled back with 4 1/s, leave 0.5 mm of the former.
+_BENDING, _METRES_PER_RADIAN, _BENDING_EFFORT = 0.2, 0.1, 0.3
+_TINY_STEP = 1e-4
+# Fastest that a person moves the elbow [m/s]: the reduced speed of ISO 10218-1:2011, 3.23.
+_GUIDED_SPEED = 0.25
+# How far ahead of a null-space motion to look [s]: an elbow at 1 m/s stops within 0.1 s.
 _AHEAD = 0.15
+
+
+def null_space_slowdown(
+    chain: SerialChain,
+    joint_position: Float[Tensor, " joints"],
+    null_velocity: Float[Tensor, " joints"],
+) -> float:
+    """Fraction of a null-space motion at which the arm can keep its end effector in place.
+
+    The null space bends: a motion along it at the speed s asks the joints for an acceleration
+    of s^2 J^+ c, with c the change of J along the motion times the motion, to keep the end
+    effector where it is. The joints have that only within limits, and follow late; near
+    singularities, where the null space bends most, it would leave its place by centimetres.
+
+    Args:
+        chain: The arm.
+        joint_position: [rad]
+        null_velocity: In the null space of the Jacobian there [rad/s].
+
+    Returns:
+        At most 1.
+    """
+    # Now, and where the arm will be once it could have slowed down.
+    times = null_velocity.new_tensor([0.0, _AHEAD])
+    steps = torch.stack([times, times + _TINY_STEP])[..., None] * null_velocity
+    J, beyond = chain.jacobian(joint_position + steps)
+    bending = ((beyond - J) @ null_velocity / _TINY_STEP).unsqueeze(-1)
+    scale = bending.new_tensor([1.0] * 3 + [_METRES_PER_RADIAN] * 3).unsqueeze(-1)
+    joints = torch.linalg.lstsq(J, bending, driver="gelsd").solution.squeeze(-1)
+    effort = (joints / (_BENDING_EFFORT * chain.limits.acceleration)).abs().amax()
+    excess = torch.maximum((scale * bending).norm(dim=-2).amax() / _BENDING, effort)
+    origins = chain.joint_origins(joint_position + steps[:, 0])
+    fastest = (origins[1] - origins[0]).norm(dim=-1).max() / _TINY_STEP
+    return float(
+        torch.minimum(excess.clamp(min=1.0) ** -0.5, _GUIDED_SPEED / fastest).clamp(max=1.0)
+    )
+
+
+# Smallest singular values between which a null-space motion towards a singularity fades: below
+# the lower one the task itself is damped.
+_SINGULAR, _REGULAR = SINGULAR_BELOW, 1.6 * SINGULAR_BELOW
+
+
+def singularity_fade(
+    chain: SerialChain,
+    joint_position: Float[Tensor, " joints"],
+    null_velocity: Float[Tensor, " joints"],
+) -> float:
+    """Fraction of a null-space motion that does not take an arm into a singularity.
+
+    Args:
+        chain: The arm.
+        joint_position: [rad]
+        null_velocity: In the null space of the Jacobian there [rad/s].
+
+    Returns:
+        1 away from singularities and on the way out of one, 0 on the way into one.
+    """
+    ahead = torch.stack([torch.zeros_like(null_velocity), _AHEAD * null_velocity])
+    now, later = torch.linalg.svdvals(chain.jacobian(joint_position + ahead))[:, -1].tolist()
+    if later >= now:
+        return 1.0
+    return min(max((later - _SINGULAR) / (_REGULAR - _SINGULAR), 0.0), 1.0)
+
+
+# Part of a correction below which it does not lie in the null space [rad/s].
+_NOTHING = 1e-6
+
+
+def null_space_giving_way(
+    jacobian: Float[Tensor, "6 joints"],
+    task: Float[Tensor, " joints"],
+    null: Float[Tensor, " joints"],
+    lower: Float[Tensor, " joints"],
+    upper: Float[Tensor, " joints"],
+) -> Float[Tensor, " joints"]:
+    """The null-space velocity nearest to a given one with which no joint leaves its bounds.
+
+    A person who pushes an arm to a limit would else leave its task no room: the null space
+    gives way to the task. Along one direction of the null space, which for seven joints is all
+    of it. Where none fits, what exceeds the bounds least.
+
+    Args:
+        jacobian: Of the end effector.
+        task: Joint velocity of the task, which goes on in any case [rad/s].
+        null: Wanted joint velocity in the null space [rad/s].
+        lower: Lowest velocity [rad/s].
+        upper: Highest velocity [rad/s].
+    """
+    velocity = task + null
+    missing = velocity.clamp(lower, upper) - velocity
+    along = null_projection(jacobian, missing)
+    if float(along.norm()) < _NOTHING:
+        return null
+    moving = along.abs() > _NOTHING * along.abs().max()
+    at_lower = ((lower - velocity) / along)[moving]
+    at_upper = ((upper - velocity) / along)[moving]
+    least = float(torch.minimum(at_lower, at_upper).max())
+    most = float(torch.maximum(at_lower, at_upper).min())
+    share = min(max(0.0, least), most) if least <= most else (least + most) / 2
+    return null + share * along
+
+
+# Parts of a null-space motion that are tried.
+_SHARES = torch.linspace(0.0, 1.0, 6, dtype=torch.float64)
+# At which an arm at the margin may still close in [m/s], down to so far within [m]: one that
+# slides along what is around it would else stop and go with every reading, its task as well.
+_SLIDING, _DEEPEST = 0.002, 0.005
 
 
 def kept_clear(
@@ -84,17 +198,13 @@ def kept_clear(
     """
     shares = _SHARES.to(null)
     ahead = joint_position + _AHEAD * (task + shares[:, None] * null)
-    now, *_ = every = clearance(torch.cat([joint_position[None], ahead]))
-    distance = every[1:]
-    least = distance[0].clamp(max=margin)
-    waits = bool(distance[0] < torch.clamp(now, max=margin))
-    close = (distance < least).nonzero().flatten()
-    if not len(close):
-        return null, waits
-    # Between the last that is clear and the first that is not.
-    k = int(close[0])
-    clear, blocked = distance[k - 1] - least, least - distance[k]
-    share = torch.lerp(shares[k - 1], shares[k], clear / (clear + blocked))
+    now, without, *_ = every = clearance(torch.cat([joint_position[None], ahead]))
+    waits = bool(without < torch.clamp(now, max=margin))
+    closing = (without - every[2:]).clamp(min=1e-9)
+    room = without - margin
+    allowed = room.clamp(min=0.0) + _AHEAD * _SLIDING * (1.0 + room / _DEEPEST).clamp(0.0, 1.0)
+    # Closing in grows with the share: where it is too fast, so much less of it.
+    share = (shares[1:] * allowed / closing).where(closing > allowed, 1.0).min()
     return share * null, waits
 
 

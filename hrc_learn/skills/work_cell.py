@@ -11,12 +11,26 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from hrc_learn.controller import INTERVENTIONS, Command, SafetyConfig, SafetyFilter
+from hrc_learn.controller import (
+    INTERVENTIONS,
+    Command,
+    SafetyConfig,
+    SafetyFilter,
+    scale_null_space,
+)
 from hrc_learn.geometry import Pose
 from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.protocols import Arm, ArmState, Gripper, Human, HumanInput
-from hrc_learn.skills.arm_motion import joint_line, kept_clear, resolved_rate, straight_line
+from hrc_learn.skills.arm_motion import (
+    joint_line,
+    kept_clear,
+    null_space_giving_way,
+    null_space_slowdown,
+    resolved_rate,
+    singularity_fade,
+    straight_line,
+)
 from hrc_learn.skills.marker_sensor import (
     DelayedChannel,
     LatencyConfig,
@@ -48,11 +62,15 @@ SAFETY_COLUMNS = INTERVENTIONS
 _SETTLING_TIME = 0.4
 # Null-space input below which one that has ended is over [N m].
 _LEAST_INPUT = 0.05
+# Fraction of the joints' acceleration that a push may use: the rest is for the task, which is
+# slowed down as well where both together need more than the arm has.
+_PUSHED_EFFORT = 0.3
 # How far the null space is from a planned path for the arm to have been pushed aside, and to be
 # back [rad]: servos lag by 0.03 rad at the speed of transfers.
 _ASIDE, _BACK = 0.1, 0.03
-# Time to go back at the end of a path [s].
-_LONGEST_RETURN = 5.0
+# Time to go back at the end of a path; that after which a path that waits for the joints is
+# gone back, and that after which they go back straight [s].
+_LONGEST_RETURN, _STUCK, _LONGEST_WAIT = 5.0, 2.0, 20.0
 # Smallest singular value of the Jacobian of a path below which the arm cannot follow beside it,
 # as damping begins at 0.05.
 _NARROW = 0.07
@@ -104,11 +122,18 @@ class WorkCellConfig:
     """Time constant with which the null-space input is smoothed [s]."""
     pose_gain: float = 4.0
     """Decay rate of the pose error on given motions [1/s]."""
+    command_delay: float = 0.01
+    """From a command until the arm follows it, its servos' lag included [s]: velocities along a
+    path are those of then. By default that of the simulated servos; real arms are later, by a
+    network and a kernel's scheduler."""
     after_push: Literal["return", "stay"] = "return"
     """Whether the joints go back to a planned path, or on beside it, when a person who pushed
     them aside lets go."""
     return_speed: float = 0.4
     """Fastest way back, of all joints together [rad/s]."""
+    limit_room: float = 0.1
+    """Distance from the margin of the joints' limits beyond which nobody can push the arm
+    [rad]: of some centimetres of the end effector, which the task may need."""
     clearance: float = 0.03
     """Distance from what is around that nobody can push the arm below [m]: three times the
     errors of base and table."""
@@ -184,7 +209,11 @@ class WorkCell:
         self._arm, self._sensor, self._human = arm, sensor, human
         self._advance, self._on_phase = advance, on_phase
         self._clearance, self._aside = clearance, False
-        self._safety = SafetyFilter(chain.limits, self.config.safety)
+        safety = self.config.safety
+        self._safety = SafetyFilter(chain.limits, safety)
+        self._room = SafetyFilter(
+            chain.limits, replace(safety, margin=safety.margin + self.config.limit_room)
+        )
         self._ticks = 0
         self.state: ArmState = arm.read()
         self.human_input: HumanInput = human.read(self.state)
@@ -299,8 +328,9 @@ class WorkCell:
             Whether the arm, pushed aside, would meet something if the pose went on.
         """
         joints = self.joints
-        pose, J = self.chain.forward_and_jacobian(joints)
-        correction = self.config.pose_gain * pose.twist_to(goal)
+        # Where the arm will be when it follows: the null space is that of then.
+        J = self.chain.jacobian(joints + self.config.command_delay * self._guard.velocity)
+        correction = self.config.pose_gain * self.pose.twist_to(goal)
         null_velocity = torch.from_numpy(self.human_input.nullspace_input) / self.config.damping
         if drift is not None:
             null_velocity = null_velocity + drift
@@ -309,8 +339,22 @@ class WorkCell:
         waits = False
         if self._clearance is not None and bool(null.any()):
             null, waits = kept_clear(joints, task, null, self._clearance, self.config.clearance)
+        null = self._within_limits(J, task, null)
         self.step(task + null, goal)
         return waits
+
+    def _within_limits(
+        self,
+        J: Float[Tensor, "6 joints"],
+        task: Float[Tensor, " joints"],
+        null: Float[Tensor, " joints"],
+    ) -> Float[Tensor, " joints"]:
+        """The null-space velocity with which the task has room before the joints' limits."""
+        room = self._room.velocity_bounds(self.joints)
+        gives_way = null_space_giving_way(J, task, null, *room)
+        if not torch.equal(gives_way, null):
+            gives_way = gives_way * null_space_slowdown(self.chain, self.joints, gives_way)
+        return scale_null_space(task, gives_way, *self._safety.velocity_bounds(self.joints))
 
     def hold_pose(self, duration: float) -> None:
         """Keep the end effector where it is for a while [s], yielding to the person."""
@@ -323,7 +367,10 @@ class WorkCell:
             goal: Where to.
             speed: Mean speed [m/s].
         """
-        for pose, twist in straight_line(self.pose, goal, speed, self.config.dt):
+        line = list(straight_line(self.pose, goal, speed, self.config.dt))
+        ahead = round(self.config.command_delay / self.config.dt)
+        for k, (pose, _) in enumerate(line):
+            _, twist = line[min(k + ahead, len(line) - 1)]
             self.track_pose(pose, twist)
         self._settle(goal, _SETTLING_TIME)
 
@@ -396,25 +443,32 @@ class WorkCell:
         dt = self.config.dt
         velocity = np.gradient(path, dt, axis=0) if len(path) > 1 else np.zeros_like(path)
         narrow = self._narrow(path)
-        progress, rate, left = 0.0, 1.0, self.time
+        progress, rate, waited = 0.0, 1.0, 0.0
         while progress <= len(path) - 1:
             if until():
                 return int(progress)
-            goal, wanted = _between(path, progress), rate * _between(velocity, progress)
+            later = progress + rate * self.config.command_delay / dt
+            goal, wanted = _between(path, progress), rate * _between(velocity, later)
             here, ahead = int(progress), int(progress + _CHANGE_OF_RATE / dt)
-            if rate > 0 or self._pushed():
-                left = self.time
-            if self.time - left > _LONGEST_RETURN:
-                self._go_straight_back(goal)
             behind = self._track_joints(
-                goal, wanted, yields=not bool(narrow[here]), returns=rate == 0
+                goal, wanted, yields=not bool(narrow[here]), returns=rate <= 0
             )
-            if self._aside and narrow[here : ahead + 1].any():
+            if not self._aside:
+                waited = 0.0
+            elif not self._pushed():  # who pushes again and again must not hold it up for good
+                waited = max(waited + (1.0 - 2.0 * max(rate, 0.0)) * dt, 0.0)
+            # The null space that led aside further back leads back there as well.
+            backs = waited > _STUCK and progress > 0
+            if not backs and self._aside and narrow[here : ahead + 1].any():
                 behind = math.inf
             # Without jumps, as every change of speed is one of the end effector's.
-            change = dt / _CHANGE_OF_RATE
-            rate += min(max(min(max(2.0 - behind, 0.0), 1.0) - rate, -change), change)
-            progress += rate
+            change, wanted_rate = dt / _CHANGE_OF_RATE, min(max(2.0 - behind, 0.0), 1.0)
+            wanted_rate *= -1 if backs else 1
+            rate += min(max(wanted_rate - rate, -change), change)
+            progress = max(progress + rate, 0.0)
+            if waited > _LONGEST_WAIT:
+                self._go_straight_back(_between(path, progress))
+                waited = 0.0
         if len(path) and self.config.after_push == "return":
             end = torch.from_numpy(path[-1])
             deadline = self.time + _LONGEST_RETURN
@@ -439,10 +493,10 @@ class WorkCell:
                     "path: the arm was pushed aside and finds no way back that is clear of "
                     "what is around it."
                 )
-        self._aside = False
+        self._aside, pose = False, self.chain.forward(goal)
         for q in way:
             self._path_joints = q.numpy()
-            self.step(self.config.pose_gain * (q - self.joints))
+            self.step(self.config.pose_gain * (q - self.joints), pose)
 
     def _narrow(self, path: Float[np.ndarray, "steps joints"]) -> Bool[np.ndarray, " steps"]:
         """Where a path of the joints is so near a singularity that the arm cannot follow it
@@ -475,19 +529,20 @@ class WorkCell:
         error = goal - self.joints
         self._path_joints = goal.numpy()
         away = self._away(error) if yields or self._aside else None
-        pose, J = self.chain.forward_and_jacobian(goal)
+        pose = self.chain.forward(goal)
         if away is None:
             self._back = torch.zeros_like(error)
             self.step(velocity + self.config.pose_gain * error, pose)
             return 0.0
         back = torch.zeros_like(away)
-        if returns or self.config.after_push == "return":
+        # Not against the person while they push.
+        if returns or (self.config.after_push == "return" and not self._pushed()):
             fastest = self.config.return_speed / float(away.norm().clamp(min=1e-9))
             back = min(self.config.pose_gain, fastest) * away
         # A jump of the null-space motion would move the end effector.
         share = min(self.config.dt / self.config.nullspace_rise, 1.0)
         self._back = self._back + share * (back - self._back)
-        twist = J @ velocity
+        twist = self.chain.jacobian(goal + self.config.command_delay * velocity) @ velocity
         if self.track_pose(pose, twist, velocity + self._back):
             return math.inf
         return _size(self.pose.twist_to(pose)) / (_ON_PATH + _SERVO_LAG * _size(twist))
@@ -535,14 +590,25 @@ class WorkCell:
             self.images.append(KeptImage(time=self.time, image=self._sensor.read()))
 
     def _smoothed(self, asked: HumanInput) -> HumanInput:
-        """What a person asks for, the null-space input without jumps.
+        """What a person asks for, its null-space input as the arm can follow it.
 
-        An arm follows late and with limited acceleration, each joint in its own way. A jump of
-        its null-space motion would therefore move the end effector.
+        An arm follows late and with limited acceleration. A jump of its null-space motion, or
+        one that is too fast, would therefore move the end effector.
         """
-        share = min(self.config.dt / self.config.nullspace_rise, 1.0)
-        before = self.human_input.nullspace_input
-        smooth = before + share * (asked.nullspace_input - before)
+        before = torch.from_numpy(self.human_input.nullspace_input) / self.config.damping
+        wanted = torch.from_numpy(asked.nullspace_input) / self.config.damping
+        if not (before.any() or wanted.any()):
+            return asked
+        J = self.chain.jacobian(self.joints)
+        wanted, before = null_projection(J, torch.stack([wanted, before]))
+        wanted = wanted * null_space_slowdown(self.chain, self.joints, wanted)
+        wanted = wanted * singularity_fade(self.chain, self.joints, wanted)
+        room = self._room.velocity_bounds(self.joints)
+        wanted = scale_null_space(torch.zeros_like(wanted), wanted, *room)
+        change = min(self.config.dt / self.config.nullspace_rise, 1.0) * (wanted - before)
+        reach = _PUSHED_EFFORT * self.config.dt * self.chain.limits.acceleration
+        velocity = before + change / (change.abs() / reach).max().clamp(min=1.0)
+        smooth = (self.config.damping * velocity).numpy()
         if not asked.nullspace_input.any() and np.abs(smooth).max() < _LEAST_INPUT:
             smooth = asked.nullspace_input
         return replace(asked, nullspace_input=smooth)

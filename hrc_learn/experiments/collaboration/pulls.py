@@ -19,8 +19,10 @@ from hrc_learn.viz import LoggedSteps
 _PAUSE, _DURATION = (1.0, 6.0), (2.0, 4.5)
 """Between two pulls, and of a pull [s]: as long as the paper's drags of joint 4, 4 to 7 s, or
 half that."""
-_HAND = ((-0.1, 0.5), (-0.4, 0.4), (0.3, 0.8))
-"""Where the person's hand may be, along x, y and z [m]: all about an elbow above the table."""
+_FAR_AWAY = 10.0
+"""Distance of the point towards which a pull goes [m]: its direction stays."""
+_SLOPE = math.radians(30.0)
+"""Of a pull against the horizontal, at most [rad]: who makes room draws an elbow aside."""
 _FORCE = 60.0
 """Largest force [N], as where the person is waited for."""
 _ELBOW = 3
@@ -37,7 +39,7 @@ _LEAST_WAY = 0.002
 def random_pulls(
     rng: np.random.Generator, duration: float = 600.0
 ) -> tuple[ScriptedForce, ...]:
-    """Pulls at random moments, each from another side.
+    """Pulls at random moments, each to another side.
 
     Args:
         rng: Source of moments, durations and sides.
@@ -45,11 +47,16 @@ def random_pulls(
     """
     pulls, time = [], float(rng.uniform(0.0, _PAUSE[1]))
     while time < duration:
-        low, high = np.array(_HAND).T
-        x, y, z = rng.uniform(low, high)
+        heading, slope = rng.uniform(-np.pi, np.pi), rng.uniform(-_SLOPE, _SLOPE)
+        along = _FAR_AWAY * math.cos(slope)
+        towards = (
+            along * math.cos(heading),
+            along * math.sin(heading),
+            _FAR_AWAY * math.sin(slope),
+        )
         length = float(rng.uniform(*_DURATION))
         pulls.append(
-            ScriptedForce(start=time, duration=length, towards=(x, y, z), max_force=_FORCE)
+            ScriptedForce(start=time, duration=length, towards=towards, max_force=_FORCE)
         )
         time += length + float(rng.uniform(*_PAUSE))
     return tuple(pulls)

@@ -189,7 +189,9 @@ def simulate_collaboration(
         frame_loss=max(cell_config.latency.frame_loss, sizes.image_loss),
     )
     safety = sizes.plant(cell_config.safety)
-    cell_config = replace(cell_config, latency=latency, safety=safety)
+    cell_config = replace(
+        cell_config, latency=latency, safety=safety, command_delay=sizes.following_delay
+    )
     config = _on_plant(config or PickAndPlaceConfig(), sizes)
     items = workplace.scene.objects
     _check_shelves(workplace, shelves)

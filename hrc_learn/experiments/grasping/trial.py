@@ -315,7 +315,11 @@ def simulate_grasp(
             sensor=MarkerSensor(eye, workplace.scene.marker_ids),
             human=ScriptedPerturbation(panda, (), begin=None),
             advance=motion.advance,
-            config=WorkCellConfig(latency=latency, safety=sizes.plant(WorkCellConfig().safety)),
+            config=WorkCellConfig(
+                latency=latency,
+                safety=sizes.plant(WorkCellConfig().safety),
+                command_delay=sizes.following_delay,
+            ),
             rng=rng,
         )
         above = scene.above()

@@ -122,7 +122,7 @@ def place(
     item = workplace.scene.objects[0]
     world = world or World(workplace.scene)
     world.hold(item.name, start.numpy())
-    motion = MotionLog(world)
+    motion, sizes = MotionLog(world), world.imperfections.sizes
     cell = WorkCell(
         chain=panda,
         arm=world.arm,
@@ -130,7 +130,8 @@ def place(
         human=ScriptedPerturbation(panda, ()),
         advance=motion.advance,
         config=WorkCellConfig(
-            safety=world.imperfections.sizes.plant(WorkCellConfig().safety),
+            safety=sizes.plant(WorkCellConfig().safety),
+            command_delay=sizes.following_delay,
         ),
     )
     with torch.inference_mode(), view(cell, world, motion):
