@@ -200,11 +200,11 @@ def kept_clear(
     ahead = joint_position + _AHEAD * (task + shares[:, None] * null)
     now, without, *_ = every = clearance(torch.cat([joint_position[None], ahead]))
     waits = bool(without < torch.clamp(now, max=margin))
-    closing = (without - every[2:]).clamp(min=1e-9)
+    closing = without - every[2:]
     room = without - margin
     allowed = room.clamp(min=0.0) + _AHEAD * _SLIDING * (1.0 + room / _DEEPEST).clamp(0.0, 1.0)
     # Closing in grows with the share: where it is too fast, so much less of it.
-    share = (shares[1:] * allowed / closing).where(closing > allowed, 1.0).min()
+    share = torch.where(closing > allowed, shares[1:] * allowed / closing, 1.0).min()
     return share * null, waits
 
 

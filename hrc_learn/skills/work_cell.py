@@ -600,7 +600,7 @@ class WorkCell:
         if not (before.any() or wanted.any()):
             return asked
         J = self.chain.jacobian(self.joints)
-        wanted, before = null_projection(J, torch.stack([wanted, before]))
+        wanted, before = null_projection(J, wanted), null_projection(J, before)
         wanted = wanted * null_space_slowdown(self.chain, self.joints, wanted)
         wanted = wanted * singularity_fade(self.chain, self.joints, wanted)
         room = self._room.velocity_bounds(self.joints)

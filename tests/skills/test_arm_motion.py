@@ -1,11 +1,17 @@
+import numpy as np
 import pytest
 import torch
 
 from hrc_learn.geometry import Pose, minimum_jerk, quaternion
+from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import panda
 from hrc_learn.skills.arm_motion import (
     joint_line,
+    kept_clear,
+    null_space_giving_way,
+    null_space_slowdown,
     resolved_rate,
+    singularity_fade,
     straight_line,
 )
 
@@ -83,3 +89,117 @@ def test_a_line_in_joint_space_keeps_its_speed():
     assert 0.45 < float(speed) < 0.51
     same = joint_line(start, start, speed=0.5, dt=0.01)
     torch.testing.assert_close(same, start.expand_as(same))
+
+
+def regular_configurations(n, seed):
+    q = random_configurations(8 * n, seed)
+    return q[torch.linalg.svdvals(panda.jacobian(q))[:, -1] > 0.1][:n]
+
+
+def self_motion(q, speed):
+    """Unit vector of the null space, times a speed."""
+    unit = np.linalg.svd(panda.jacobian(q).numpy())[2][6]
+    return speed * torch.from_numpy(unit)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_null_space_motion_is_slowed_down_to_what_keeps_the_hand_in_place(seed):
+    (q,) = regular_configurations(1, seed)
+    null = self_motion(q, 3.0)
+    fraction = null_space_slowdown(panda, q, null)
+    assert 0 < fraction <= 1
+    assert null_space_slowdown(panda, q, 1e-3 * null) == 1.0
+
+    # The joints' acceleration of the true self-motion, by integrating it both ways.
+    def along(time, steps=200):
+        here, before = q, null
+        for _ in range(steps):
+            ahead = null_projection(panda.jacobian(here), before)
+            ahead = ahead * null.norm() / ahead.norm()
+            middle = here + 0.5 * time / steps * ahead
+            ahead = null_projection(panda.jacobian(middle), ahead)
+            ahead = ahead * null.norm() / ahead.norm()
+            here, before = here + time / steps * ahead, ahead
+        return here
+
+    h = 1e-3
+    acceleration = (along(h) - 2 * q + along(-h)) / h**2
+    effort = float((acceleration.abs() / (0.3 * panda.limits.acceleration)).max())
+    # Slower by the root of what is too much; elsewhere on its way it may bend more.
+    assert fraction <= max(effort, 1.0) ** -0.5 + 1e-3
+    elbow = panda.joint_origins(torch.stack([q, along(h)]))
+    assert fraction * float((elbow[1] - elbow[0]).norm(dim=-1).max()) / h < 0.25 + 2e-3
+
+
+def test_nobody_moves_an_arm_into_a_singularity_but_out_of_one():
+    q = regular_configurations(40, seed=5)
+    faded = 0
+    for joints in q:
+        for speed in (-2.0, 2.0):
+            null = self_motion(joints, speed)
+            ends = torch.stack([joints, joints + 0.15 * null])
+            now, later = torch.linalg.svdvals(panda.jacobian(ends))[:, -1]
+            fraction = singularity_fade(panda, joints, null)
+            if later > now or later > 0.08:
+                assert fraction == 1.0
+            else:
+                faded += 1
+                assert fraction == pytest.approx(max(float(later) - 0.05, 0.0) / 0.03)
+    assert faded > 2
+
+
+def test_the_null_space_gives_way_by_as_little_as_lets_the_task_go_on():
+    rng = np.random.default_rng(2)
+    given, compromises = 0, 0
+    for q in regular_configurations(60, seed=3):
+        J = panda.jacobian(q)
+        task = torch.from_numpy(rng.normal(0, 0.3, 7))
+        null = self_motion(q, float(rng.normal(0, 0.5)))
+        lower, upper = (
+            -torch.from_numpy(rng.uniform(0, 1, 7)),
+            torch.from_numpy(rng.uniform(0, 1, 7)),
+        )
+        result = null_space_giving_way(J, task, null, lower, upper)
+        assert float((J @ result).norm()) < 1e-9
+        # Every null-space velocity there is, on a grid.
+        unit = self_motion(q, 1.0)
+        grid = torch.linspace(-6, 6, 24001, dtype=torch.float64)
+        velocities = task + grid[:, None] * unit
+        excess = torch.maximum(velocities - upper, lower - velocities).amax(-1)
+        mine = float(torch.maximum(task + result - upper, lower - task - result).max())
+        if bool((excess <= 0).any()):
+            wanted = null @ unit
+            nearest = grid[excess <= 0][(grid[excess <= 0] - wanted).abs().argmin()]
+            assert float(result @ unit) == pytest.approx(float(nearest), abs=6e-4)
+            assert mine < 1e-9
+            given += abs(float(nearest - wanted)) > 1e-3
+        elif not torch.equal(result, null):
+            before = float(torch.maximum(task + null - upper, lower - task - null).max())
+            compromises += mine <= before + 1e-9
+    assert given > 5
+    assert compromises > 5
+
+
+def test_an_arm_slides_along_what_is_around_it_and_stops_before_it():
+    q, task = panda.ready, torch.zeros(7, dtype=torch.float64)
+    null = self_motion(q, 0.5)
+    along = null / null.norm()
+
+    def wall(at):
+        return lambda joints: at - (joints - q) @ along
+
+    def kept(at):
+        part, waits = kept_clear(q, task, null, wall(at), margin=0.03)
+        assert not waits
+        return float(part @ along)
+
+    assert kept(1.0) == pytest.approx(0.5)
+    # At the margin 2 mm/s, 5 mm within it nothing; continuous in between and beyond.
+    assert kept(0.03) == pytest.approx(0.002, rel=1e-3)
+    assert kept(0.0275) == pytest.approx(0.001, rel=1e-3)
+    assert kept(0.025) == pytest.approx(0.0, abs=1e-9)
+    assert kept(0.03 + 0.15 * 0.1) == pytest.approx(0.102, rel=1e-3)
+    # Away from the wall, or along it, it is free.
+    assert float(kept_clear(q, task, -null, wall(0.0), 0.03)[0] @ along) == pytest.approx(-0.5)
+    aside = kept_clear(q, task, null, lambda joints: 0.02 + 0 * joints[..., 0], 0.03)[0]
+    torch.testing.assert_close(aside, null)

@@ -139,16 +139,82 @@ def test_where_nothing_is_met_it_ends_at_the_goal():
 
 
 def test_a_jump_of_the_null_space_input_comes_smoothly(cell):
+    pull = np.array([0.6, 0.0, -0.6, 0.0, 0.5, 0.0, 0.0])
+
     class Jump:
         def read(self, state):
-            return HumanInput(nullspace_input=np.full(7, 3.0 if state.time < 0.5 else 0.0))
+            return HumanInput(nullspace_input=pull * (state.time < 0.5))
 
     cell._human = Jump()
     cell.hold_pose(1.5)
-    d = cell.log["nullspace_input"][:, 0]
-    assert np.abs(np.diff(d)).max() < 0.3
-    assert d.max() > 2.8
-    assert d[-1] == 0.0
+    d = cell.log["nullspace_input"]
+    acceleration = np.diff(d, axis=0) / cell.config.damping / cell.config.dt
+    assert (np.abs(acceleration) <= 0.3 * panda.limits.acceleration.numpy() + 1e-9).all()
+    assert np.abs(acceleration[0]).max() > 0.2
+    # All of it that is in the null space, in the end.
+    _, _, V = np.linalg.svd(panda.jacobian(panda.ready).numpy())
+    np.testing.assert_allclose(d[48], V[6] * (V[6] @ pull), atol=0.08)
+    assert (d[-1] == 0.0).all()
+
+
+class LateArm(ObedientArm):
+    """Does what it is told some steps later."""
+
+    def __init__(self, q, late):
+        super().__init__(q)
+        self._told = [0 * q] * late
+
+    def command(self, joint_velocity):
+        self._told.append(joint_velocity.copy())
+        self.velocity = self._told.pop(0)
+
+
+@pytest.mark.parametrize("straight", [True, False])
+def test_an_arm_whose_delay_is_known_keeps_to_its_path(straight):
+    def lag(told):
+        arm = LateArm(panda.ready.numpy(), late=3)
+        cell = WorkCell(
+            chain=panda,
+            arm=arm,
+            gripper=arm,
+            human=ScriptedPerturbation(panda, ()),
+            advance=arm.advance,
+            config=WorkCellConfig(command_delay=told),
+        )
+        with shapes_unchecked():
+            if straight:
+                here = cell.pose
+                up = torch.tensor([0.05, 0.1, 0.1], dtype=torch.float64)
+                cell.move_straight(Pose(here.position + up, here.orientation))
+            else:
+                cell.follow_path(transfer())
+        hand = panda.forward(torch.from_numpy(cell.log["joint_position"])).position
+        away = hand - torch.from_numpy(cell.log["goal_position"])
+        return float(away.norm(dim=-1).max())
+
+    # Three steps of delay, and the one that a velocity takes to become a position.
+    assert lag(0.03) < 1e-3
+    assert lag(0.0) > 4 * lag(0.03)
+
+
+def test_the_null_space_gives_way_to_a_task_that_needs_the_room():
+    """A joint at the edge of the room left to the task, which a push had moved it to."""
+    q = panda.ready.clone()
+    arm = ObedientArm(q.numpy())
+    cell = cell_with(arm)
+    lower, upper = cell._room.velocity_bounds(q)
+    direction = np.linalg.svd(panda.jacobian(q).numpy())[2][6]
+    k = int(np.abs(direction).argmax())
+    task = torch.zeros(7, dtype=torch.float64)
+    task[k] = 0.2
+    cell._room.velocity_bounds = lambda joints: (
+        lower,
+        upper.clone().index_fill(0, torch.tensor(k), 0.0),
+    )
+    J, still = panda.jacobian(q), torch.zeros(7, dtype=torch.float64)
+    null = cell._within_limits(J, task, still)
+    assert float((J @ null).norm()) < 1e-9
+    assert float((task + null)[k]) == pytest.approx(0.0, abs=1e-9)
 
 
 def pushed_along(path, push, seconds, **options):
