@@ -5,12 +5,14 @@ import pytest
 import torch
 
 from hrc_learn.experiments.collaboration.pulls import (
+    elbow_room,
     path_distance,
     pull_effects,
     random_pulls,
 )
 from hrc_learn.geometry.numerics import null_projection
-from hrc_learn.kinematics import panda
+from hrc_learn.kinematics import UnreachableError, panda
+from hrc_learn.sim.workplace import Workplace
 from hrc_learn.teleoperation import ScriptedForce
 from hrc_learn.viz import StepLog
 
@@ -103,9 +105,52 @@ def test_the_elbow_moved_as_far_as_it_is_from_where_it_was(planned):
     true = pull_effects(log, [pull], encoder_offset=offset)
     assert true[1].hand == pytest.approx(away[transfer].max(), rel=1e-3)
     assert true[1].elbow == effects[1].elbow
-    assert not pull_effects(
-        log, [ScriptedForce(start=2.5, duration=0.2, towards=(0.0, 0.0, 0.0))]
+    # A pull that is not followed counts as well.
+    refused = ScriptedForce(start=2.5, duration=0.2, towards=(0.0, 0.0, 0.0))
+    assert [effect.phase for effect in pull_effects(log, [refused])] == ["transfer"]
+    after = ScriptedForce(start=3.5, duration=0.2, towards=(0.0, 0.0, 0.0))
+    assert not pull_effects(log, [after])
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_the_room_of_an_elbow_is_what_the_analytic_self_motion_has(side):
+    q = Workplace().hover_joints()
+    pose, elbow = panda.forward(q), panda.joint_origins(q)[3]
+    # The side of the elbow that its circle goes to.
+    J = panda.joint_jacobian(q, 4)[:3]
+    unit = torch.from_numpy(np.linalg.svd(panda.jacobian(q).numpy())[2][6])
+    way = side * (J @ unit) / (J @ unit).norm()
+    towards = (elbow + 10.0 * way).tolist()
+    pull = ScriptedForce(start=0.0, duration=2.0, towards=tuple(towards), max_force=60.0)
+    room = elbow_room(q, pull)
+    # By the analytic inverse along joint 7, both ways, as far as the pull goes with it.
+    reached = []
+    for step in (-0.005, 0.005):
+        other, progress = q, 0.0
+        for k in range(1, 1200):
+            try:
+                other = panda.inverse(pose, q[6] + k * step, near=other)
+            except UnreachableError:
+                break
+            limits = panda.limits
+            inside = torch.minimum(other - limits.lower, limits.upper - other).min() > 0.1
+            offset = panda.joint_origins(other)[3] - elbow
+            regular = torch.linalg.svdvals(panda.jacobian(other))[-1] > 0.05
+            if not (inside and regular and offset @ way > progress):
+                break
+            progress = float(offset @ way)
+            reached.append(float(offset.norm()))
+    assert room > 0.05
+    # Where joint 7 hardly turns, the inverse ends before the self-motion does.
+    if side > 0:
+        assert room == pytest.approx(max(reached), abs=0.015)
+    else:
+        assert max(reached) - 0.015 < room < 0.3
+    # Something in the way ends it.
+    short = elbow_room(
+        q, pull, clearance=lambda joints: 0.08 - (panda.joint_origins(joints)[3] - elbow).norm()
     )
+    assert short == pytest.approx(0.05, abs=0.012)
 
 
 def test_random_pulls_come_one_after_the_other_from_all_sides():

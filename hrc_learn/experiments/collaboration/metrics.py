@@ -142,11 +142,17 @@ def collaboration_metrics(
             at_least=100.0,
             claim="joint 4 dragged forward for 7 s, backward for 4 s",
         ),
-        Metric("pulls", lambda run: len(_elbows_pulled(run)) or None),
+        Metric("pulls", lambda run: len(_pulled(run)) or None),
         Metric(
-            "pulls that moved the elbow by 150 mm or more",
+            "pulls with room for 150 mm",
+            lambda run: sum(room >= _FAR for _, room in _pulled(run)) if run.pulls else None,
+        ),
+        Metric(
+            "pulls with room for 150 mm that moved the elbow so far",
             lambda run: (
-                sum(moved >= _FAR for moved in _elbows_pulled(run)) if run.pulls else None
+                sum(moved >= _FAR for moved, room in _pulled(run) if room >= _FAR)
+                if run.pulls
+                else None
             ),
         ),
     ]
@@ -160,17 +166,17 @@ def _off_path(run: CollaborationRun) -> float | None:
 
 def _elbow_pulled(run: CollaborationRun) -> float | None:
     """Median over the pulls at random moments [mm]."""
-    moved = _elbows_pulled(run)
+    moved = [moved for moved, _ in _pulled(run)]
     return 1e3 * float(np.median(moved)) if moved else None
 
 
-def _elbows_pulled(run: CollaborationRun) -> list[float]:
-    """How far each pull at a random moment moved the elbow, at most [m]."""
-    moved: dict[float, float] = {}
+def _pulled(run: CollaborationRun) -> list[tuple[float, float]]:
+    """How far each pull at a random moment moved the elbow, and had room to [m]."""
+    pulled: dict[float, tuple[float, float]] = {}
     for effect in run.pull_effects:
-        start = effect.pull.start
-        moved[start] = max(moved.get(start, 0.0), effect.elbow)
-    return list(moved.values())
+        moved, room = pulled.get(effect.pull.start, (0.0, effect.room))
+        pulled[effect.pull.start] = max(moved, effect.elbow), room
+    return list(pulled.values())
 
 
 TRIAL_METRICS: Sequence[Metric[Sequence[Trial]]] = (

@@ -5,16 +5,20 @@ it. Visual servoing has no path: there the offset of the hand from the object te
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from jaxtyping import Float
 
-from hrc_learn.kinematics import SerialChain, panda
+from hrc_learn.geometry.numerics import null_projection
+from hrc_learn.kinematics import SINGULAR_BELOW, SerialChain, panda
 from hrc_learn.teleoperation import ScriptedForce
 from hrc_learn.viz import LoggedSteps
+
+type Clearance = Callable[[Float[torch.Tensor, "*batch joints"]], Float[torch.Tensor, "*batch"]]
+"""Distance of an arm at given joint positions [rad] from what is around it [m]."""
 
 _PAUSE, _DURATION = (1.0, 6.0), (2.0, 4.5)
 """Between two pulls, and of a pull [s]: as long as the paper's drags of joint 4, 4 to 7 s, or
@@ -25,6 +29,14 @@ _SLOPE = math.radians(30.0)
 """Of a pull against the horizontal, at most [rad]: who makes room draws an elbow aside."""
 _FORCE = 60.0
 """Largest force [N], as where the person is waited for."""
+_STEP, _STEP_JOINTS, _MOST_STEPS = 0.005, 0.05, 300
+"""Of a self-motion that is followed [m, rad], and how many at most."""
+_STILL = 5e-4
+"""Motion of the elbow by a pull, per force, from which on it goes no further [m/s/N]: a few per
+cent of that of an elbow that is free."""
+_NEAR_LIMIT, _NEAR = 0.1, 0.03
+"""Where the room for a pull ends: a joint so near its limit, the arm so near what is around it
+[rad, m]."""
 _ELBOW = 3
 """Joint at the elbow, from 0."""
 _AFTER = 1.0
@@ -70,6 +82,8 @@ class PullEffect:
     pull: ScriptedForce
     elbow: float
     """How far the elbow was moved aside, at most [m]."""
+    room: float
+    """How far it could be moved where the pull began there (`elbow_room`) [m]."""
     hand: float
     """How far the end effector was off its path, at most [m]; NaN where it had none."""
 
@@ -79,6 +93,7 @@ def pull_effects(
     pulls: Sequence[ScriptedForce],
     chain: SerialChain = panda,
     encoder_offset: Float[np.ndarray, " joints"] | None = None,
+    clearance: Clearance | None = None,
 ) -> list[PullEffect]:
     """Effects of the pulls of a run, one for each phase that a pull reaches into.
 
@@ -89,6 +104,7 @@ def pull_effects(
         encoder_offset: What its encoders read too much, constantly [rad]: then distances are
             true ones, also where an arm pushed aside takes other joints for the same pose.
             None: they are what the encoders say.
+        clearance: Distance of an arm from what is around it [m]; None: nothing is.
     """
     time, joints = log["time"], torch.from_numpy(log["joint_position"])
     hand = chain.forward(joints).position.numpy()
@@ -99,7 +115,7 @@ def pull_effects(
     for phase, begin, end in _phases(log):
         for pull in pulls:
             rows = (time >= max(pull.start, begin)) & (time < min(pull.end + _AFTER, end))
-            if not (log["nullspace_input"][rows] != 0).any():
+            if not (rows & (time < pull.end)).any():
                 continue
             during = torch.from_numpy(rows)
             planned = torch.from_numpy(log["path_joints"])[during]
@@ -109,10 +125,52 @@ def pull_effects(
                     phase=phase,
                     pull=pull,
                     elbow=float(_elbow_moved(chain, joints[during], planned).max()),
+                    room=elbow_room(joints[during][0], pull, chain, clearance),
                     hand=float(seen.max()) if len(seen) else math.nan,
                 )
             )
     return effects
+
+
+def elbow_room(
+    joint_position: Float[torch.Tensor, " joints"],
+    pull: ScriptedForce,
+    chain: SerialChain = panda,
+    clearance: Clearance | None = None,
+) -> float:
+    """How far a pull can move the elbow of an arm whose end effector stays [m].
+
+    Along the self-motion of the arm, as far as the pull goes with it: until a joint is near its
+    limit, the arm near what is around it, or near a singularity.
+
+    Args:
+        joint_position: Where the pull begins [rad].
+        pull: Where to.
+        chain: The arm.
+        clearance: Distance of an arm from what is around it [m]; None: nothing is.
+    """
+    q, limits = joint_position, chain.limits
+    pose, first = chain.forward(q), chain.joint_origins(q)[_ELBOW]
+    furthest, time = 0.0, (pull.start + pull.end) / 2
+    for _ in range(_MOST_STEPS):
+        elbow = chain.joint_origins(q)[_ELBOW]
+        furthest = max(furthest, float((elbow - first).norm()))
+        J, J_elbow = chain.jacobian(q), chain.joint_jacobian(q, pull.joint)[:3]
+        force = torch.from_numpy(pull.force(time, elbow.numpy()))
+        along = null_projection(J, J_elbow.mT @ force)
+        speed = float((J_elbow @ along).norm())
+        near = torch.minimum(q - limits.lower, limits.upper - q).min() < _NEAR_LIMIT
+        if (
+            speed < _STILL * float(force.norm())
+            or near
+            or float(torch.linalg.svdvals(J)[-1]) < SINGULAR_BELOW
+            or (clearance is not None and float(clearance(q)) < _NEAR)
+        ):
+            break
+        step = along * min(_STEP / speed, _STEP_JOINTS / float(along.norm()))
+        q = q + step
+        q = q + torch.linalg.pinv(chain.jacobian(q)) @ chain.forward(q).twist_to(pose)
+    return furthest
 
 
 def path_distance(

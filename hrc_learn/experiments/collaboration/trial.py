@@ -123,7 +123,12 @@ class CollaborationRun:
         if not self.pulls:
             return []
         offset = self.world.arm.encoder_offset
-        return pull_effects(self.cell.log, self.pulls, encoder_offset=offset)
+        return pull_effects(
+            self.cell.log,
+            self.pulls,
+            encoder_offset=offset,
+            clearance=self.workplace.arm_clearance,
+        )
 
     @property
     def failure(self) -> str:
