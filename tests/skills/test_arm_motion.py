@@ -102,6 +102,29 @@ def self_motion(q, speed):
     return speed * torch.from_numpy(unit)
 
 
+def test_the_slowdown_is_that_of_the_bending_of_the_null_space():
+    bent = dict.fromkeys(("hand", "joints", "elbow", "nothing"), 0)
+    for q, speed in zip(regular_configurations(60, seed=8), 20 * [0.3, 1.0, 3.0], strict=True):
+        null = self_motion(q, speed)
+        allowed = {"nothing": 1.0}
+        for here in (q, q + 0.15 * null):
+            # The change of the Jacobian along the motion, by automatic differentiation.
+            J, change = torch.func.jvp(panda.jacobian, (here,), (null,))
+            bending = change @ null
+            joints = torch.linalg.pinv(J) @ bending
+            scale = torch.tensor([1.0, 1.0, 1.0, 0.1, 0.1, 0.1], dtype=torch.float64)
+            hand = (0.2 / float((scale * bending).norm())) ** 0.5
+            effort = float((joints.abs() / panda.limits.acceleration).max()) / 0.3
+            allowed["hand"] = min(allowed.get("hand", 1.0), hand)
+            allowed["joints"] = min(allowed.get("joints", 1.0), effort**-0.5)
+        _, moved = torch.func.jvp(panda.joint_origins, (q,), (null,))
+        allowed["elbow"] = 0.25 / float(moved.norm(dim=-1).max())
+        least = min(allowed, key=allowed.__getitem__)
+        bent[least] += 1
+        assert null_space_slowdown(panda, q, null) == pytest.approx(allowed[least], rel=2e-3)
+    assert min(bent["hand"], bent["elbow"], bent["nothing"]) > 3, bent
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_a_null_space_motion_is_slowed_down_to_what_keeps_the_hand_in_place(seed):
     (q,) = regular_configurations(1, seed)
@@ -151,7 +174,7 @@ def test_nobody_moves_an_arm_into_a_singularity_but_out_of_one():
 def test_the_null_space_gives_way_by_as_little_as_lets_the_task_go_on():
     rng = np.random.default_rng(2)
     given, compromises = 0, 0
-    for q in regular_configurations(60, seed=3):
+    for q in regular_configurations(250, seed=3):
         J = panda.jacobian(q)
         task = torch.from_numpy(rng.normal(0, 0.3, 7))
         null = self_motion(q, float(rng.normal(0, 0.5)))
@@ -199,6 +222,13 @@ def test_an_arm_slides_along_what_is_around_it_and_stops_before_it():
     assert kept(0.0275) == pytest.approx(0.001, rel=1e-3)
     assert kept(0.025) == pytest.approx(0.0, abs=1e-9)
     assert kept(0.03 + 0.15 * 0.1) == pytest.approx(0.102, rel=1e-3)
+
+    # What is met half-way and left behind again ends the way there.
+    def post(joints):
+        return 0.031 - 0.02 * torch.exp(-((((joints - q) @ along) / 0.03 - 1) ** 2) / 0.05)
+
+    half_way = float(kept_clear(q, task, null, post, margin=0.03)[0] @ along)
+    assert 0 < half_way < 0.2 + 1e-6
     # Away from the wall, or along it, it is free.
     assert float(kept_clear(q, task, -null, wall(0.0), 0.03)[0] @ along) == pytest.approx(-0.5)
     aside = kept_clear(q, task, null, lambda joints: 0.02 + 0 * joints[..., 0], 0.03)[0]
