@@ -17,6 +17,7 @@ from hrc_learn.sim.moving_bodies import MovingBodies as MovingBodies
 from hrc_learn.sim.panda_model import FINGER_STROKE as FINGER_STROKE
 from hrc_learn.sim.panda_model import PandaModelConfig as PandaModelConfig
 from hrc_learn.sim.panda_model import Plate as Plate
+from hrc_learn.sim.panda_model import whole_arm as whole_arm
 from hrc_learn.sim.physics_watch import PhysicsError as PhysicsError
 from hrc_learn.sim.scene import HAND_MARKER as HAND_MARKER
 from hrc_learn.sim.scene import NOWHERE as NOWHERE
