@@ -25,6 +25,13 @@ from hrc_learn.sim.scene import CabinetConfig as CabinetConfig
 from hrc_learn.sim.scene import ObjectConfig as ObjectConfig
 from hrc_learn.sim.scene import SceneConfig as SceneConfig
 from hrc_learn.sim.scene import build_scene as build_scene
+from hrc_learn.sim.worker import Worker as Worker
+from hrc_learn.sim.worker import WorkerConfig as WorkerConfig
+from hrc_learn.sim.worker_distance import NearestPair as NearestPair
+from hrc_learn.sim.worker_distance import WorkerDistance as WorkerDistance
+from hrc_learn.sim.worker_visit import HumanSpeeds as HumanSpeeds
+from hrc_learn.sim.worker_visit import WorkerVisit as WorkerVisit
+from hrc_learn.sim.worker_visit import random_visit as random_visit
 from hrc_learn.sim.world import ContactMonitor as ContactMonitor
 from hrc_learn.sim.world import MujocoArm as MujocoArm
 from hrc_learn.sim.world import Touch as Touch

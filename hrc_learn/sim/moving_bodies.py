@@ -5,7 +5,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hrc_learn.geometry import Body, Box, Capsule
-from hrc_learn.sim.scene import OCCLUDER
+from hrc_learn.sim.scene import OCCLUDER, WORKER_BODIES, WORKER_ITEM
 from hrc_learn.sim.world import World, body_geoms
 from hrc_learn.viz.arm_bodies import panda_mesh
 
@@ -21,7 +21,8 @@ class MovingBodies:
         model = world.model
         obstacles = (box.name for box in world.config.obstacles)
         objects = (item.name for item in world.config.objects)
-        movers = ["link0", *objects, *obstacles, OCCLUDER]
+        worker = () if world.config.worker is None else (*WORKER_BODIES, WORKER_ITEM)
+        movers = ["link0", *objects, *obstacles, *worker, OCCLUDER]
         geoms = body_geoms(model, movers)
         self._indices = sorted({int(b) for b in model.geom_bodyid[geoms]})
         self.names = tuple(model.body(b).name for b in self._indices)
