@@ -29,6 +29,7 @@ from hrc_learn.sim.worker import Worker as Worker
 from hrc_learn.sim.worker import WorkerConfig as WorkerConfig
 from hrc_learn.sim.worker_distance import NearestPair as NearestPair
 from hrc_learn.sim.worker_distance import WorkerDistance as WorkerDistance
+from hrc_learn.sim.worker_sensor import WorkerSensor as WorkerSensor
 from hrc_learn.sim.worker_visit import HumanSpeeds as HumanSpeeds
 from hrc_learn.sim.worker_visit import WorkerVisit as WorkerVisit
 from hrc_learn.sim.worker_visit import random_visit as random_visit
