@@ -288,6 +288,10 @@ class World:
         """Whether both finger pads touch an object."""
         return self._partners(name) >= {*_PADS}
 
+    def held(self) -> tuple[str, ...]:
+        """Names of the objects that both finger pads touch."""
+        return tuple(item.name for item in self.config.objects if self.holds(item.name))
+
     def holds_flat(self, name: str) -> bool:
         """Whether the pads press on opposite faces of an object, those that its x axis leads
         out of: not on its edges, nor across it.

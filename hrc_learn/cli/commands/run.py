@@ -93,6 +93,7 @@ def run_collaboration(args: RunCollaboration) -> int:
         shelf_depth=args.shelf_depth,
         person=args.person,
         any_time=args.any_time,
+        worker=args.worker,
         imperfections=_imperfections(args),
         curve=args.curve,
         disturbances=Disturbances(

@@ -11,6 +11,7 @@ import numpy as np
 
 from hrc_learn.experiments.collaboration.pulls import pull_effects
 from hrc_learn.experiments.collaboration.trial import CollaborationRun
+from hrc_learn.experiments.collaboration.worker import worker_contacts
 from hrc_learn.experiments.grip import Hold, grasp_offset, hold, place_angle
 from hrc_learn.experiments.metric_table import Metric, median, p95, success_rate
 from hrc_learn.experiments.monte_carlo import Trial
@@ -19,6 +20,7 @@ from hrc_learn.experiments.run_recording import (
     limit_violations,
     spans,
     unwanted_contacts,
+    worker_distance,
 )
 from hrc_learn.sim import Touch
 from hrc_learn.skills.pick_and_place import HOME, RELEASE, Mishap, PickPlaceJob
@@ -93,6 +95,8 @@ def collaboration_metrics(
         ),
         # Not listed, as the rows above tell what was met.
         Metric("contacts", lambda run: sum(map(len, _contacts(run).values())), listed=False),
+        Metric("contacts with the worker", _met_worker),
+        Metric("min distance", _min_distance, "mm"),
         Metric(
             "cycle time",
             lambda run: run.cell.time,
@@ -152,6 +156,19 @@ def collaboration_metrics(
     ]
 
 
+def _met_worker(run: CollaborationRun) -> int | None:
+    """None of a run without a worker."""
+    if run.world.config.worker is None:
+        return None
+    return len(worker_contacts(run.world, run.cell.log, run.motion))
+
+
+def _min_distance(run: CollaborationRun) -> float | None:
+    """True one of the worker from the robot and its load; None of a run without [mm]."""
+    distance = worker_distance(run.motion, len(run.cell.log))
+    return 1e3 * float(distance.min()) if len(distance) else None
+
+
 def _off_path(run: CollaborationRun, share: float) -> float | None:
     """Quantile over phases and the pulls in them; None of a run without [mm]."""
     effects = pull_effects(run.cell.log, run.pulls) if run.pulls else []
@@ -177,6 +194,7 @@ TRIAL_METRICS: Sequence[Metric[Sequence[Trial]]] = (
     Metric("trials, place error (95 %)", p95("place_error_mm"), "mm"),
     Metric("trials, place tilt (95 %)", p95("place_tilt_deg"), "deg"),
     Metric("trials, cycle time (median)", median("cycle_time_s"), "s"),
+    Metric("trials, min distance (median)", median("min_distance_mm"), "mm"),
 )
 """Rows of the table that repetitions add."""
 
