@@ -22,6 +22,8 @@ _HALF_STEP = 1e-4
 _STEP = 0.40
 # Where a hand is that puts down or takes what stands on the bench [m].
 _HAND_OVER_BENCH = 2 * WORKER_ITEM_HALF_SIZE[2]
+# How far markers are to the sides of what the arm is at work above [m].
+_BESIDE_GRIPPER = (0.11, 0.22)
 # A minimum-jerk motion is at its fastest this many times as fast as on average.
 _PEAK = 1.875
 # How far the head of a leaning person is from the hip, fraction of the stature.
@@ -291,8 +293,9 @@ def _marker(
 ) -> np.ndarray:
     """A place around what is under the arm that he can reach, low over the bench [m]."""
     for _ in range(1000):
-        aside = rng.uniform((-0.16, -0.10), (0.16, 0.12))
-        point = under + np.array([*aside, _HAND_OVER_BENCH])
+        # To either side of the gripper that hovers there: nobody reaches through it.
+        x = rng.choice([-1, 1]) * rng.uniform(*_BESIDE_GRIPPER)
+        point = under + np.array([x, rng.uniform(-0.10, 0.12), _HAND_OVER_BENCH])
         target = own(point)
         if worker.lean_to(target, _hand_for(target)) is not None:
             return point

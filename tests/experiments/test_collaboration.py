@@ -275,7 +275,9 @@ def test_what_the_camera_cannot_see_is_reported(skills, shift, reason):
     # There is a report of it all the same.
     recording = record("failed", job.cell, job.world, job.motion, cameras=job.cameras)
     figures = [f for s in collaboration_sections(job, recording) for f in s.figures]
-    assert {"timeline", "marker", "person", "trajectories"} <= {f.name for f in figures}
+    names = {figure.name for figure in figures}
+    assert {"timeline", "marker", "person", "trajectories"} <= names
+    assert "worker" not in names
 
 
 def test_a_worker_is_measured_logged_and_shown(skills):
@@ -296,6 +298,8 @@ def test_a_worker_is_measured_logged_and_shown(skills):
     np.testing.assert_array_equal(run.worker_distance["true"], distance)
     gap = np.linalg.norm(run.worker_nearest[:, 1] - run.worker_nearest[:, 0], axis=-1)
     np.testing.assert_allclose(gap, distance, atol=1e-6)
+    figures = [f.name for section in collaboration_sections(job, run) for f in section.figures]
+    assert "worker" in figures
     # Somebody else comes with another seed, nobody without the option.
     other = provoked(skills, moved_camera(1.5, 0.0), HASTY, worker=True, seed=1)
     assert other.world.config.worker != job.world.config.worker

@@ -72,7 +72,7 @@ def test_he_reaches_every_marker_and_leaves_what_he_brought(seed):
     assert 2 <= len(visit.markers) <= 4
     for marker in visit.markers:
         assert np.linalg.norm(grips - marker, axis=-1).min() < 1e-3
-        assert np.abs(marker[:2] - UNDER).max() <= 0.16
+        assert np.abs(marker[:2] - UNDER).max() <= 0.22
     x, y, z = visit.item_at(visit.end)
     a, b, c = WORKER_ITEM_HALF_SIZE
     assert z - c == pytest.approx(TABLE.centre[2] + TABLE.half_size[2], abs=1e-9)
