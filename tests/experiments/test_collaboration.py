@@ -309,16 +309,9 @@ def test_a_worker_is_measured_logged_and_shown(skills):
 @pytest.mark.slow
 def test_a_job_beside_a_worker_goes_on_as_it_would_without(skills):
     """He makes no way, and nobody reacts: the arm is near him or meets him, and goes on."""
-    job = simulate_collaboration(
-        *skills,
-        ("middle",),
-        camera="synthetic",
-        forces=FORCE,
-        config=PickAndPlaceConfig(interaction=2.5),
-        cell_config=WorkCellConfig(keep_image_every=0),
-        imperfections=Imperfections.nominal(),
-        worker=True,
-        seed=0,
+    config = PickAndPlaceConfig(interaction=6.0)
+    job = provoked(
+        skills, config=config, imperfections=Imperfections.nominal(), worker=True, seed=0
     )
     assert verdict(job) == ""
     distance = worker_distance(job.motion, len(job.cell.log))

@@ -94,6 +94,7 @@ def test_what_the_robot_holds_can_meet_the_worker_what_lies_about_cannot(held):
     counted = [t for t in worker_contacts(world, log, motion) if t.first == "box"]
     assert counted == (boxes if held else [])
     assert motion.held("box").all() == held
+    assert (motion.nearest()[0].arm_geom == "box") == held
     assert [pair.distance > 1 for pair in motion.nearest()] == [False, False, True]
     assert len(motion.nearest(2)) == 2
 

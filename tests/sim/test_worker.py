@@ -1,5 +1,7 @@
 """The worker's body: sizes of people, rigid parts that hang together, hands in their places."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -65,14 +67,8 @@ def test_parts_are_rigid_and_hang_together():
 def test_hands_are_where_they_are_wanted():
     worker = Worker(WorkerConfig(stature=1.6))
     postures = random_postures(worker, 100)
-    still = Posture(
-        **{
-            **vars(postures),
-            "place": np.zeros((100, 2)),
-            "heading": np.zeros(100),
-            "stride": np.zeros(100),
-        }
-    )
+    zero = np.zeros(100)
+    still = replace(postures, place=np.zeros((100, 2)), heading=zero, stride=zero)
     ends = worker.ends(still)
     for k, side in enumerate(("left", "right")):
         wanted = still.hands[:, k] + [0, 0, FLOOR]
@@ -90,20 +86,40 @@ def test_hands_are_where_they_are_wanted():
 
 def test_elbows_bend_backwards_and_knees_forwards():
     worker = Worker()
-    ends = worker.ends(random_postures(worker, 50))
-    for k in range(50):
-        posture = random_postures(worker, 50)
-        c, s = np.cos(posture.heading[k]), np.sin(posture.heading[k])
-        thigh, shank = part(ends, "thigh_left")[k], part(ends, "shank_left")[k]
-        chord = shank[1] - thigh[0]
-        out = thigh[1] - thigh[0] - chord * ((thigh[1] - thigh[0]) @ chord) / (chord @ chord)
-        assert out @ [c, s, 0.0] > 0
+    posture = random_postures(worker, 50)
+    c, s = np.cos(posture.heading), np.sin(posture.heading)
+    forward = np.stack([c, s, 0 * c], axis=-1)
+    ends = worker.ends(posture)
+    # Arms that hang: raised ones bend their elbows downwards.
+    hanging = worker.ends(replace(posture, hands=np.tile(worker.hanging_hands(), (50, 1, 1))))
+    for side in ("left", "right"):
+        knee = bend(part(ends, f"thigh_{side}"), part(ends, f"shank_{side}"))
+        assert ((knee * forward).sum(-1) > 0).all()
+        elbow = bend(part(hanging, f"upper_arm_{side}"), part(hanging, f"forearm_{side}"))
+        upright = posture.lean < 0.3
+        assert ((elbow * forward).sum(-1) < 0)[upright].all()
+
+
+def bend(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """From the straight line between the ends of two links to their joint, (n, 3)."""
+    chord, out = second[:, 1] - first[:, 0], first[:, 1] - first[:, 0]
+    along = (out * chord).sum(-1) / (chord * chord).sum(-1)
+    return out - along[:, None] * chord
+
+
+def test_the_hips_go_back_as_the_trunk_leans_forward():
+    worker = Worker()
+    standing = worker.standing()
+    leaning = worker.ends(replace(standing, lean=np.array(0.8)))
+    feet = part(leaning, "foot_left").mean(axis=0)[0]
+    assert part(leaning, "pelvis")[0, 0] < -0.05 < 0 < feet < 0.1
+    assert part(leaning, "head")[0, 0] > 0.4
 
 
 def test_he_turns_and_walks_as_a_whole():
     worker = Worker()
     here = worker.standing()
-    there = Posture(**{**vars(here), "place": np.array([1.0, 2.0]), "heading": np.array(0.7)})
+    there = replace(here, place=np.array([1.0, 2.0]), heading=np.array(0.7))
     c, s = np.cos(0.7), np.sin(0.7)
     R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
     np.testing.assert_allclose(
@@ -125,9 +141,7 @@ def test_he_leans_no_more_than_he_must(side):
             if angle is not None:
                 hands = worker.hanging_hands()
                 hands[side] = target
-                posture = Posture(
-                    **{**vars(worker.standing()), "lean": np.array(angle), "hands": hands}
-                )
+                posture = replace(worker.standing(), lean=np.array(angle), hands=hands)
                 grip = worker.grip(worker.ends(posture), side) - [0, 0, FLOOR]
                 # What is left for comfort is 3 % of the arm, so 3 cm less of lean may do.
                 miss = np.linalg.norm(grip - target)
