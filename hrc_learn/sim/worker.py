@@ -163,8 +163,9 @@ class Worker:
 
     def hanging_hands(self) -> Float[np.ndarray, "2 3"]:
         """Where the hands of a standing person are, in his own frame [m]."""
-        down = _SHOULDER_HEIGHT * self._size - 0.98 * self.arm_length
-        return _both(0.03 * self._size, _SHOULDER_HALF * self._size + 0.02, down)
+        x, y = 0.03 * self._size, _SHOULDER_HALF * self._size + 0.02
+        z = _SHOULDER_HEIGHT * self._size - 0.98 * self.arm_length
+        return np.array([[x, y, z], [x, -y, z]])
 
     def standing(self) -> Posture:
         """Upright at the origin, the arms hanging."""
@@ -181,7 +182,7 @@ class Worker:
     def ends(self, posture: Posture) -> Float[np.ndarray, "*time parts 2 3"]:
         """Ends of the axes of all capsules in the base frame [m]."""
         h, own = self._size, {}
-        pelvis, up = self._trunk(posture)
+        pelvis, up = self._trunk(posture.lean, posture.stride)
         left = np.array([0.0, 1.0, 0.0])
         forward = np.cross(left, up)
         neck = pelvis + _TRUNK * h * up
@@ -226,16 +227,7 @@ class Worker:
             The least angle of the trunk [rad]; None if he cannot reach it.
         """
         lean = np.linspace(0.0, 1.2, 61)
-        zero = np.zeros_like(lean)
-        tall = Posture(
-            place=np.zeros((len(lean), 2)),
-            heading=zero,
-            lean=lean,
-            stride=zero,
-            swing=zero,
-            hands=np.zeros((len(lean), 2, 3)),
-        )
-        pelvis, up = self._trunk(tall)
+        pelvis, up = self._trunk(lean, np.zeros_like(lean))
         aside = (1.0, -1.0)[side] * _SHOULDER_HALF * self._size
         shoulder = pelvis + _TRUNK * self._size * up + np.array([0.0, aside, 0.0])
         far = np.linalg.norm(hand - shoulder, axis=-1)
@@ -252,12 +244,11 @@ class Worker:
         wrist, tip = np.moveaxis(ends[..., _HANDS[side], :, :], -2, 0)
         return wrist + _GRIP * _HAND / (_HAND - _RADII["hand"]) * (tip - wrist)
 
-    def _trunk(self, posture: Posture) -> tuple[np.ndarray, np.ndarray]:
+    def _trunk(self, lean: np.ndarray, stride: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Middle of the pelvis and direction of the spine, in the worker's frame."""
-        h = self._size
-        back = _BALANCE * h * np.sin(posture.lean)
-        pelvis = _vector(-back, 0.0, self._hip_height(np.abs(posture.stride) + np.abs(back)))
-        return pelvis, _vector(np.sin(posture.lean), 0.0, np.cos(posture.lean))
+        back = _BALANCE * self._size * np.sin(lean)
+        pelvis = _vector(-back, 0.0, self._hip_height(np.abs(stride) + np.abs(back)))
+        return pelvis, _vector(np.sin(lean), 0.0, np.cos(lean))
 
     def _hip_height(self, stride: float | np.ndarray) -> float | np.ndarray:
         """As high as straight legs let it be whose feet are so far before or behind it [m]."""
@@ -323,11 +314,6 @@ def _two_links(
     bent_to = bent_to - (bent_to * towards).sum(-1, keepdims=True) * towards
     out = np.sqrt(np.maximum(first**2 - along**2, 0.0))
     return start + along * towards + out * _unit(bent_to), start + distance * towards
-
-
-def _both(x: float, y: float, z: float) -> Float[np.ndarray, "2 3"]:
-    """Mirrored to the left and to the right."""
-    return np.array([[x, y, z], [x, -y, z]])
 
 
 def _vector(x, y, z) -> np.ndarray:

@@ -185,11 +185,11 @@ class RunCollaboration(RunServoing):
     person: bool = True
     """Whether the scripted person pulls the elbow."""
     any_time: bool = False
-    """The person pulls at random moments of the whole job, whatever the robot does; otherwise
-    while it waits for them above the object."""
+    """The person pulls at random moments of the whole job, whatever the robot does. Otherwise
+    they pull while it waits for them above the object."""
     worker: bool = False
-    """A worker comes to the table, puts something down, reaches under the arm and leaves. He
-    makes no way for the robot; how near he comes is measured."""
+    """Whether a worker comes and reaches under the arm. He puts something on the table first,
+    leaves again, and makes no way for the robot; how near he comes is measured."""
     page: bool = False
     """Serve a page in the browser, from which people watch and pull at the elbow too. The
     run takes as long as it would on a real arm then."""
