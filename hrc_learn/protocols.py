@@ -102,3 +102,29 @@ class Human(Protocol):
     def read(self, state: ArmState) -> HumanInput:
         """Return what the person asks for, now that the arm is in `state`."""
         ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class PersonObservation:
+    """Where a person's body was, as capsules: all points within a radius of a segment."""
+
+    time: float
+    """When they were there: of the image, not of its arrival [s]."""
+    ends: Float[np.ndarray, "parts 2 3"]
+    """Of the segments, in the base frame [m]."""
+    radius: Float[np.ndarray, " parts"]
+    """[m]"""
+    velocity: Float[np.ndarray, "parts 2 3"]
+    """Of the ends; zero as long as only one image is known [m/s]."""
+
+
+@runtime_checkable
+class PersonTracker(Protocol):
+    """Sees where the people beside an arm are."""
+
+    def read(self) -> PersonObservation | None:
+        """Return the newest observation that has arrived; None: none has, for whatever reason.
+
+        Who relies on it allows for what a person can do since its time.
+        """
+        ...

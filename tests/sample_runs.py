@@ -23,6 +23,7 @@ OPTIONAL = (
     "rotation_deviation",
     "true_image_jacobian",
     "weight_norm",
+    "worker_nearest",
 )
 """Fields of a run that may be None."""
 NAMES = tuple(f"joint{i}" for i in range(1, 8))
@@ -83,6 +84,8 @@ def sample_run(**changes) -> RunRecording:
         "elbow_motion": 0.1 * effort[:, 3],
         "position_deviation": 1e-4 * effort[:, 3],
         "rotation_deviation": np.radians(0.01) * effort[:, 3],
+        "worker_distance": {"true": 0.2 + 0.1 * time, "seen": 0.25 + 0.1 * time},
+        "worker_nearest": np.stack([position, position + 0.2], axis=1),
         "safety": {"velocity limit": time > 3.0},
         "phases": (Event(0.0, "Approach"), Event(1.0, "Servo")),
     }
@@ -93,7 +96,7 @@ def until(run: RunRecording, steps: int) -> RunRecording:
     """The first steps of a run, as it was recorded while it still went on."""
     now = run.time[steps - 1]
     changes = _cut(run, steps) | {"demo_path": run.demo_path, "plan_path": run.plan_path}
-    for name in ("potentials", "safety"):
+    for name in ("potentials", "safety", "worker_distance"):
         changes[name] = {key: values[:steps] for key, values in changes[name].items()}
     changes["bodies"] = tuple(Body(**_cut(body, steps)) for body in run.bodies)
     changes["phases"] = tuple(phase for phase in run.phases if phase.time <= now)

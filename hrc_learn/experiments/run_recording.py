@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -184,6 +185,7 @@ def record(
     cameras: Sequence[tuple[float, CameraModel]] = (),
     region: Box | None = None,
     demonstration: Demonstration | None = None,
+    sensed: LoggedSteps | None = None,
 ) -> RunRecording:
     """Record a run of a work cell, finished or still going on.
 
@@ -196,6 +198,7 @@ def record(
         cameras: The true cameras, and from when on each watched [s]; the world's when none.
         region: Box above the table in which the vision region takes over.
         demonstration: One that the motion was learned from.
+        sensed: Column "distance": how near the robot believed the worker to be, each step [m].
     """
     # Another thread may ask while the loop goes on: take the steps that both logs have.
     log = cell.log.snapshot(len(motion))
@@ -235,9 +238,27 @@ def record(
         elbow_motion=deviation.elbow,
         position_deviation=deviation.position,
         rotation_deviation=deviation.rotation,
+        **_worker(motion, len(log), sensed),
         safety={name: safety[:, i] for i, name in enumerate(SAFETY_COLUMNS)},
         phases=tuple(log.events),
     )
+
+
+def worker_distance(motion: MotionLog, steps: int) -> Float[np.ndarray, " time"]:
+    """True smallest distance between worker and robot in the first steps [m]; none: no rows."""
+    return np.array([pair.distance for pair in motion.nearest(steps)])
+
+
+def _worker(motion: MotionLog, steps: int, sensed: LoggedSteps | None) -> dict[str, Any]:
+    """Fields of a recording about the worker, if there was one."""
+    nearest = motion.nearest(steps)
+    if not nearest:
+        return {}
+    distance = {"true": worker_distance(motion, steps)}
+    if sensed is not None:
+        distance["seen by the robot"] = sensed["distance"][:steps]
+    points = np.stack([pair.points for pair in nearest])
+    return {"worker_distance": distance, "worker_nearest": points}
 
 
 def _matching_demonstration(

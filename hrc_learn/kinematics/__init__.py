@@ -6,6 +6,7 @@ from hrc_learn.kinematics.chain import SerialChain as SerialChain
 from hrc_learn.kinematics.collision import CapsuleArm as CapsuleArm
 from hrc_learn.kinematics.collision import LinkCapsule as LinkCapsule
 from hrc_learn.kinematics.franka import LINK_CAPSULES as LINK_CAPSULES
+from hrc_learn.kinematics.franka import TOOL_LINK as TOOL_LINK
 from hrc_learn.kinematics.franka import FrankaArm as FrankaArm
 from hrc_learn.kinematics.franka import UnreachableError as UnreachableError
 from hrc_learn.kinematics.franka import panda as panda
@@ -23,5 +24,8 @@ from hrc_learn.kinematics.redundancy import comfortable_postures as comfortable_
 from hrc_learn.kinematics.redundancy import null_space_projector as null_space_projector
 from hrc_learn.kinematics.redundancy import pseudo_inverse as pseudo_inverse
 from hrc_learn.kinematics.redundancy import singularity_damping as singularity_damping
+from hrc_learn.kinematics.separation import GraspedBox as GraspedBox
+from hrc_learn.kinematics.separation import Separation as Separation
+from hrc_learn.kinematics.separation import separation as separation
 from hrc_learn.kinematics.tool_orientation import coarse_orientation as coarse_orientation
 from hrc_learn.kinematics.tool_orientation import gripper_down as gripper_down

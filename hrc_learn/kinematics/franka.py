@@ -186,8 +186,8 @@ def _panda() -> FrankaArm:
 panda = _panda()
 """The Panda with its hand; a Cartesian limit of 1.7 m/s and 2.5 rad/s is the controller's."""
 
-# Number of the tool centre point's frame, on which the hand is mounted.
-_TCP = 9
+TOOL_LINK = 9
+"""Number of the tool centre point's frame, on which the hand is mounted."""
 
 # (link, start [m], end [m], radius [m]) in the frame of the link.
 LINK_CAPSULES = tuple(
@@ -213,12 +213,16 @@ LINK_CAPSULES = tuple(
 
 # The hand is a box of 60 x 200 x 66 mm, which this contains, and so are the open fingers.
 _HAND_CAPSULES = (
-    LinkCapsule(link=_TCP, start=(0.0, -0.08, -0.0704), end=(0.0, 0.08, -0.0704), radius=0.05),
-    LinkCapsule(link=_TCP, start=(0.0, -0.035, -0.01), end=(0.0, 0.035, -0.01), radius=0.028),
+    LinkCapsule(
+        link=TOOL_LINK, start=(0.0, -0.08, -0.0704), end=(0.0, 0.08, -0.0704), radius=0.05
+    ),
+    LinkCapsule(
+        link=TOOL_LINK, start=(0.0, -0.035, -0.01), end=(0.0, 0.035, -0.01), radius=0.028
+    ),
 )
 # Links whose capsules overlap by design although they are no neighbours. The flange (8) has
 # none, so the hand follows link 7.
-_OVERLAPPING = ((0, 2), (1, 3), (3, 5), (5, 7), (6, _TCP), (7, _TCP))
+_OVERLAPPING = ((0, 2), (1, 3), (3, 5), (5, 7), (6, TOOL_LINK), (7, TOOL_LINK))
 
 panda_capsules = CapsuleArm(panda, LINK_CAPSULES + _HAND_CAPSULES, _OVERLAPPING)
 """The Panda with its hand."""

@@ -17,6 +17,7 @@ from hrc_learn.sim.moving_bodies import MovingBodies as MovingBodies
 from hrc_learn.sim.panda_model import FINGER_STROKE as FINGER_STROKE
 from hrc_learn.sim.panda_model import PandaModelConfig as PandaModelConfig
 from hrc_learn.sim.panda_model import Plate as Plate
+from hrc_learn.sim.panda_model import whole_arm as whole_arm
 from hrc_learn.sim.physics_watch import PhysicsError as PhysicsError
 from hrc_learn.sim.scene import HAND_MARKER as HAND_MARKER
 from hrc_learn.sim.scene import NOWHERE as NOWHERE
@@ -24,6 +25,14 @@ from hrc_learn.sim.scene import CabinetConfig as CabinetConfig
 from hrc_learn.sim.scene import ObjectConfig as ObjectConfig
 from hrc_learn.sim.scene import SceneConfig as SceneConfig
 from hrc_learn.sim.scene import build_scene as build_scene
+from hrc_learn.sim.worker import Worker as Worker
+from hrc_learn.sim.worker import WorkerConfig as WorkerConfig
+from hrc_learn.sim.worker_distance import NearestPair as NearestPair
+from hrc_learn.sim.worker_distance import WorkerDistance as WorkerDistance
+from hrc_learn.sim.worker_sensor import WorkerSensor as WorkerSensor
+from hrc_learn.sim.worker_visit import HumanSpeeds as HumanSpeeds
+from hrc_learn.sim.worker_visit import WorkerVisit as WorkerVisit
+from hrc_learn.sim.worker_visit import random_visit as random_visit
 from hrc_learn.sim.world import ContactMonitor as ContactMonitor
 from hrc_learn.sim.world import MujocoArm as MujocoArm
 from hrc_learn.sim.world import Touch as Touch

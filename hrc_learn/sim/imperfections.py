@@ -25,6 +25,7 @@ _MOST_OBJECTS = 8
 # By which the simulated servos follow late, whatever else is [s]: with it a path is kept to
 # 0.4 mm, without to 1.5 mm.
 _SIMULATED_SERVOS = 0.01
+_FRACTIONS, _LARGEST_FRACTION = ("image_loss", "person_loss", "slowness"), 0.9
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,15 +83,23 @@ class Imperfections:
     teaching_error: float = 0.0
     """Range of a place to which a person leads the arm, along each axis [m]. Nominal 0.5 mm."""
 
+    person_noise: float = 0.0
+    """Standard deviation of where a person is seen, along each axis [m]. Nominal 1 cm."""
+    person_delay: float = 0.0
+    """From an image of a person being taken until it is known where they were [s]. Nominal
+    80 ms."""
+    person_loss: float = 0.0
+    """Fraction of the images in which nobody is found. Nominal 20 %."""
+
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
             if not (math.isfinite(value) and value >= 0):
                 raise ValueError(f"{field.name} must not be negative, but is {value}.")
-        for name, most in (("image_loss", 0.9), ("slowness", 0.9)):
-            if getattr(self, name) > most:
+        for name in _FRACTIONS:
+            if getattr(self, name) > _LARGEST_FRACTION:
                 raise ValueError(
-                    f"{name} must be at most {most}, but is {getattr(self, name)}."
+                    f"{name} must be at most {_LARGEST_FRACTION}, but is {getattr(self, name)}."
                 )
 
     @classmethod
@@ -124,6 +133,9 @@ class Imperfections:
             object_height=0.005,
             object_yaw=math.pi,
             teaching_error=5e-4,
+            person_noise=0.01,
+            person_delay=0.080,
+            person_loss=0.20,
         )
 
     def scaled(self, factor: float) -> Imperfections:
@@ -133,8 +145,8 @@ class Imperfections:
             ValueError: If the factor is negative.
         """
         values = {f.name: factor * getattr(self, f.name) for f in fields(self)}
-        values["image_loss"] = min(values["image_loss"], 0.9)
-        values["slowness"] = min(values["slowness"], 0.9)
+        for name in _FRACTIONS:
+            values[name] = min(values[name], _LARGEST_FRACTION)
         values["object_yaw"] = min(values["object_yaw"], math.pi)
         return Imperfections(**values)
 

@@ -2,10 +2,11 @@
 
 import mujoco
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from hrc_learn.geometry import Body, Box, Capsule
-from hrc_learn.sim.scene import OCCLUDER
+from hrc_learn.sim.scene import OCCLUDER, WORKER_BODIES, WORKER_ITEM
+from hrc_learn.sim.worker_distance import NearestPair, WorkerDistance
 from hrc_learn.sim.world import World, body_geoms
 from hrc_learn.viz.arm_bodies import panda_mesh
 
@@ -21,7 +22,8 @@ class MovingBodies:
         model = world.model
         obstacles = (box.name for box in world.config.obstacles)
         objects = (item.name for item in world.config.objects)
-        movers = ["link0", *objects, *obstacles, OCCLUDER]
+        worker = () if world.config.worker is None else (*WORKER_BODIES, WORKER_ITEM)
+        movers = ["link0", *objects, *obstacles, *worker, OCCLUDER]
         geoms = body_geoms(model, movers)
         self._indices = sorted({int(b) for b in model.geom_bodyid[geoms]})
         self.names = tuple(model.body(b).name for b in self._indices)
@@ -89,19 +91,25 @@ def _triple(vector: np.ndarray) -> tuple[float, float, float]:
 
 
 class MotionLog:
-    """Remembers where everything that moves was after each step."""
+    """Remembers where everything that moves was at each step, and how near the worker was."""
 
     def __init__(self, world: World):
         self._world = world
         self._bodies = MovingBodies(world)
+        self._distance = None if world.config.worker is None else WorkerDistance(world)
         self._positions: list[np.ndarray] = []
         self._orientations: list[np.ndarray] = []
+        self._nearest: list[NearestPair] = []
+        self._held: list[tuple[str, ...]] = []
 
     def __len__(self) -> int:
         return len(self._orientations)
 
     def advance(self, duration: float) -> None:
         """Note where everything is, then let the world go on [s]."""
+        if self._distance is not None:
+            self._held.append(self._world.held())
+            self._nearest.append(self._distance.now(self._held[-1]))
         position, orientation = self._bodies.poses()
         self._positions.append(position)
         self._orientations.append(orientation)
@@ -115,3 +123,17 @@ class MotionLog:
         """
         positions = np.stack(self._positions[:steps])
         return self._bodies.drawn(positions, np.stack(self._orientations[:steps]))
+
+    def nearest(self, steps: int | None = None) -> tuple[NearestPair, ...]:
+        """Where worker and robot, with what it held, were nearest to each other at each step.
+
+        Empty in a world without a worker.
+
+        Args:
+            steps: The first steps only.
+        """
+        return tuple(self._nearest[:steps])
+
+    def held(self, name: str) -> Bool[np.ndarray, " steps"]:
+        """Whether the robot held an object, at each step in a world with a worker."""
+        return np.array([name in held for held in self._held], dtype=bool)

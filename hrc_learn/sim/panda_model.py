@@ -13,7 +13,14 @@ import torch
 from jaxtyping import Float
 
 from hrc_learn.geometry import quaternion
-from hrc_learn.kinematics import LINK_CAPSULES, panda
+from hrc_learn.kinematics import (
+    LINK_CAPSULES,
+    TOOL_LINK,
+    CapsuleArm,
+    LinkCapsule,
+    panda,
+    panda_capsules,
+)
 from hrc_learn.protocols import ArmState
 from hrc_learn.sim.imperfections import CommandChannel, DrawnImperfections, Imperfections
 from hrc_learn.vision import Marker, marker_texture
@@ -166,6 +173,34 @@ def add_panda(spec: mujoco.MjSpec, config: PandaModelConfig) -> None:
     _add_hand(spec, hand, config)
     for a, b in _OVERLAPPING:
         spec.add_exclude(bodyname1=a, bodyname2=b)
+
+
+# Capsules side by side that cover a plate: each sticks out by a sixth of the plate's edge.
+_STRIPS = 3
+
+
+def whole_arm(config: PandaModelConfig) -> CapsuleArm:
+    """Capsules that contain all of the modelled arm: links, hand, fingers and plate.
+
+    The fingers are within the hand's capsules at any opening. Geoms of the simulator stick out
+    by 0.1 mm at most. The other way, capsules reach beyond the hand by up to 30 mm, beyond
+    closed fingers by up to 43 mm and beyond the plate by 11 mm.
+    """
+    plate = config.marker
+    if plate is None:
+        return panda_capsules
+    R = quaternion.to_matrix(torch.tensor(plate.orientation, dtype=torch.float64)).numpy()
+    half = plate.marker.plate_size / 2
+    across = half / _STRIPS
+    radius = float(np.hypot(across, _THICKNESS))
+    # From the hand's frame, at the flange, to that of the tool.
+    centre = np.array(plate.position) - [0.0, 0.0, float(panda.tcp[2, 3])]
+    capsules = []
+    for k in range(_STRIPS):
+        x = -half + (2 * k + 1) * across
+        start, end = (tuple((centre + R @ [x, y, -_THICKNESS]).tolist()) for y in (-half, half))
+        capsules.append(LinkCapsule(link=TOOL_LINK, start=start, end=end, radius=radius))
+    return panda_capsules.with_capsules(capsules)
 
 
 def _add_body(parent, name: str, transform: np.ndarray):

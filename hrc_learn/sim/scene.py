@@ -20,6 +20,7 @@ from hrc_learn.sim.panda_model import (
     add_panda,
     add_plate,
 )
+from hrc_learn.sim.worker import COLOURS, PARTS, WORKER_ITEM_HALF_SIZE, Worker, WorkerConfig
 from hrc_learn.vision import CameraModel, Marker
 
 # pyright: reportAttributeAccessIssue=false
@@ -34,6 +35,10 @@ OCCLUDER = "occluder"
 OCCLUDER_HALF_SIZE = (0.07, 0.09, 0.004)
 """[m]"""
 OCCLUDER_COLOUR = (0.55, 0.36, 0.30, 1.0)
+WORKER_BODIES = tuple(f"worker_{part}" for part in PARTS)
+"""Names of the bodies, and of the capsules, that a worker is made of."""
+WORKER_ITEM = "worker_item"
+"""Name of what the worker puts on the table: seen, but nothing can touch it."""
 NOWHERE = (0.0, 0.0, -5.0)
 """Where objects are that are not in the scene: far below the floor [m]."""
 
@@ -145,6 +150,8 @@ class SceneConfig:
     camera: CameraModel = field(default_factory=overhead_camera)
     obstacles: tuple[Box, ...] = ()
     """Obstacles that people put in the way and take away again (`World.move_obstacle`)."""
+    worker: WorkerConfig | None = None
+    """Who works at the table beside the robot (`World.move_worker`); None: nobody."""
     timestep: float = 0.002
     """Physics step [s]."""
 
@@ -174,6 +181,8 @@ def build_scene(config: SceneConfig) -> mujoco.MjSpec:
     # A board that may be held in front of the camera; nothing can touch it.
     board = spec.worldbody.add_body(name=OCCLUDER, pos=NOWHERE, mocap=True)
     add_box(board, OCCLUDER, OCCLUDER_HALF_SIZE, OCCLUDER_COLOUR, contype=0, conaffinity=0)
+    if config.worker is not None:
+        _add_worker(spec, Worker(config.worker), config.objects)
     return spec
 
 
@@ -236,3 +245,42 @@ def _add_object(spec: mujoco.MjSpec, item: ObjectConfig) -> None:
         marker=item.marker, position=(0.0, 0.0, item.half_size[2] + 0.0005), solid=False
     )
     add_plate(spec, body, f"{item.name}_marker", top)
+
+
+# Bit of what touches a worker. Furniture lacks it: he leans on the table as he likes.
+_FEELS_WORKER = 2
+
+
+def _add_worker(spec: mujoco.MjSpec, worker: Worker, objects: tuple[ObjectConfig, ...]) -> None:
+    """Add a person whom arm and objects touch without a force: he yields to nobody here, and a
+    body that is moved by hand would push with any.
+    """
+    for mover in ("link0", *(item.name for item in objects)):
+        for geom in spec.body(mover).find_all(mujoco.mjtObj.mjOBJ_GEOM):
+            if geom.contype:
+                geom.conaffinity |= _FEELS_WORKER
+    lengths, radii = worker.lengths.tolist(), worker.radius.tolist()
+    for name, length, radius, colour in zip(
+        WORKER_BODIES, lengths, radii, COLOURS, strict=True
+    ):
+        body = spec.worldbody.add_body(name=name, pos=NOWHERE, mocap=True)
+        body.add_geom(
+            name=name,
+            type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+            size=(radius, length / 2, 0),
+            rgba=colour,
+            contype=_FEELS_WORKER,
+            conaffinity=0,
+            # Contacts are found as ever, but exert a force from a depth of 1 m on only.
+            margin=-1.0,
+            gap=1.0,
+        )
+    item = spec.worldbody.add_body(name=WORKER_ITEM, pos=NOWHERE, mocap=True)
+    add_box(
+        item,
+        WORKER_ITEM,
+        WORKER_ITEM_HALF_SIZE,
+        (0.62, 0.20, 0.22, 1.0),
+        contype=0,
+        conaffinity=0,
+    )

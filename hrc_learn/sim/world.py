@@ -11,7 +11,13 @@ from jaxtyping import Float
 from hrc_learn.sim.imperfections import DrawnImperfections, Imperfections
 from hrc_learn.sim.panda_model import FINGER_STROKE, MujocoArm, frame_of
 from hrc_learn.sim.physics_watch import PhysicsWatch
-from hrc_learn.sim.scene import HAND_MARKER, SceneConfig, build_scene
+from hrc_learn.sim.scene import (
+    HAND_MARKER,
+    WORKER_BODIES,
+    WORKER_ITEM,
+    SceneConfig,
+    build_scene,
+)
 
 # pyright: reportAttributeAccessIssue=false
 # MuJoCo ships no type stubs; its names come from a compiled module.
@@ -121,6 +127,7 @@ class World:
         object_contacts: Touches of objects with them.
         table_contacts: Touches of the arm or its hand with the table.
         self_contacts: Touches of the arm with itself.
+        worker_contacts: Touches of the arm, and of objects, with the worker.
     """
 
     def __init__(
@@ -148,12 +155,16 @@ class World:
         self.object_contacts = ContactMonitor(self.model, objects, cabinet)
         self.table_contacts = ContactMonitor(self.model, _ARM_BODIES, [self.config.table.name])
         self.self_contacts = ContactMonitor(self.model, _ARM_BODIES, _ARM_BODIES)
+        workers = WORKER_BODIES if self.config.worker is not None else ()
+        self.worker_contacts = ContactMonitor(self.model, (*_ARM_BODIES, *objects), workers)
         self._monitors = (
             self.cabinet_contacts,
             self.object_contacts,
             self.table_contacts,
             self.self_contacts,
+            self.worker_contacts,
         )
+        self._worker = np.array([self.model.body(name).mocapid[0] for name in workers], int)
 
     @property
     def time(self) -> float:
@@ -237,6 +248,30 @@ class World:
         self.data.mocap_pos[self.model.body(name).mocapid[0]] = centre
         mujoco.mj_kinematics(self.model, self.data)
 
+    def move_worker(
+        self,
+        ends: Float[np.ndarray, "parts 2 3"],
+        item: Float[np.ndarray, "3"] | None = None,
+    ) -> None:
+        """Put the worker somewhere at once.
+
+        Args:
+            ends: Of the axes of his capsules, in the order of `PARTS` [m].
+            item: Where the thing is that he puts on the table [m]; None: it stays.
+
+        Raises:
+            ValueError: If there is no worker in the scene.
+        """
+        if not len(self._worker):
+            raise ValueError("there is no worker in this scene: give it a WorkerConfig.")
+        axes = ends[:, 1] - ends[:, 0]
+        self.data.mocap_pos[self._worker] = ends.mean(axis=1)
+        for mocap, axis in zip(self._worker, axes, strict=True):
+            mujoco.mju_quatZ2Vec(self.data.mocap_quat[mocap], axis)
+        if item is not None:
+            self.data.mocap_pos[self.model.body(WORKER_ITEM).mocapid[0]] = item
+        mujoco.mj_kinematics(self.model, self.data)
+
     def _object(self, name: str):
         for item in self.config.objects:
             if item.name == name:
@@ -252,6 +287,10 @@ class World:
     def holds(self, name: str) -> bool:
         """Whether both finger pads touch an object."""
         return self._partners(name) >= {*_PADS}
+
+    def held(self) -> tuple[str, ...]:
+        """Names of the objects that both finger pads touch."""
+        return tuple(item.name for item in self.config.objects if self.holds(item.name))
 
     def holds_flat(self, name: str) -> bool:
         """Whether the pads press on opposite faces of an object, those that its x axis leads
@@ -278,7 +317,9 @@ class World:
     def _partners(self, name: str) -> set[str]:
         """Geoms that touch an object's."""
         target = self.model.geom(name).id
-        pairs = self.data.contact.geom[self.data.contact.dist < _TOUCHING]
+        # Contacts without a force are those with the worker.
+        touching = (self.data.contact.dist < _TOUCHING) & (self.data.contact.exclude == 0)
+        pairs = self.data.contact.geom[touching]
         return {
             self.model.geom(int(g)).name for pair in pairs if target in pair for g in pair
         } - {name}

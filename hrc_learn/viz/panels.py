@@ -55,6 +55,7 @@ def run_tabs(run: RunRecording) -> list[Tab]:
         _regions(run),
         _image_jacobian(run),
         _person(run),
+        _worker(run),
         _joints(run),
         _safety(run),
     ]
@@ -142,6 +143,21 @@ def _person(run: RunRecording) -> Tab:
             curve = single(f"person/{path}", path.split("_")[0], unit * values, colour)
             plots.append(Plot(title=title, curves=(curve,)))
     return Tab(title="Person", plots=tuple(plots))
+
+
+def _worker(run: RunRecording) -> Tab:
+    if not run.worker_distance:
+        return Tab(title="Worker", plots=())
+    values = 1e3 * np.column_stack(list(run.worker_distance.values()))
+    distance = several("worker/distance", run.worker_distance, values)
+    title = "Distance of the worker from the robot and its load [mm]"
+    # What matters are the last few centimetres.
+    near = several("worker/near", run.worker_distance, np.where(values < 300, values, np.nan))
+    plots = (
+        Plot(title=title, curves=(distance,), legend=True),
+        Plot(title=f"{title}, below 300", curves=(near,), range=(-50.0, 300.0)),
+    )
+    return Tab(title="Worker", plots=plots)
 
 
 def _joints(run: RunRecording) -> Tab:

@@ -107,6 +107,12 @@ class RunRecording:
     rotation_deviation: Float[np.ndarray, " time"] | None = None
     """The same for its orientation [rad]."""
 
+    worker_distance: Mapping[str, Float[np.ndarray, " time"]] = field(default_factory=dict)
+    """Smallest distance between a worker and the robot with its load, as it is and as it is
+    seen, by name [m]; NaN while it is not known."""
+    worker_nearest: Float[np.ndarray, "time 2 3"] | None = None
+    """Points of the robot and of the worker that are the nearest to each other [m]."""
+
     safety: Mapping[str, Float[np.ndarray, " time"] | Bool[np.ndarray, " time"]] = field(
         default_factory=dict
     )
@@ -117,7 +123,9 @@ class RunRecording:
     def __post_init__(self) -> None:
         series: dict[str, np.ndarray | None] = {name: getattr(self, name) for name in _SERIES}
         series |= {f"potentials[{name!r}]": value for name, value in self.potentials.items()}
-        series |= {f"safety[{name!r}]": value for name, value in self.safety.items()}
+        for field_name in ("safety", "worker_distance"):
+            named = getattr(self, field_name)
+            series |= {f"{field_name}[{name!r}]": value for name, value in named.items()}
         for body in self.bodies:
             series[f"bodies: {body.name}.position"] = body.position
             series[f"bodies: {body.name}.orientation"] = body.orientation
@@ -139,6 +147,7 @@ _SERIES = (
     "elbow_motion",
     "position_deviation",
     "rotation_deviation",
+    "worker_nearest",
 )
 
 

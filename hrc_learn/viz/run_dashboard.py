@@ -16,7 +16,7 @@ from urllib.parse import quote
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-from jaxtyping import Int, Shaped
+from jaxtyping import Float, Int, Shaped
 
 from hrc_learn.viz import palette
 from hrc_learn.viz.panels import Plot, run_tabs, several
@@ -149,6 +149,8 @@ class RunStream:
         for body in run.bodies:
             send_poses(self._stream, time, body, at)
         self._send_path(run, ends)
+        if run.worker_nearest is not None:
+            self._send_nearest(time, run.worker_nearest, at)
         if run.camera is not None:
             self._camera.send_overlays(time, run.camera, at, ends)
         for tab in run_tabs(run):
@@ -166,6 +168,21 @@ class RunStream:
         strips = [thin(run.position[: end + 1]) for end in ends]
         columns = rr.LineStrips3D.columns(strips=strips)
         self._stream.send_columns(path, seconds(run.time[ends]), columns)
+
+    def _send_nearest(
+        self,
+        time: Float[np.ndarray, " time"],
+        nearest: Float[np.ndarray, "time 2 3"],
+        at: Int[np.ndarray, " chosen"],
+    ) -> None:
+        """The line between the points of robot and worker that are nearest to each other."""
+        path, colours = "world/worker_distance", [palette.rgba(palette.LIMIT)]
+        self._still.send(
+            path, None, lambda: rr.LineStrips3D.from_fields(radii=[0.004], colors=colours)
+        )
+        known = np.isfinite(nearest[at]).all(axis=(1, 2))
+        columns = rr.LineStrips3D.columns(strips=list(nearest[at][known]))
+        self._stream.send_columns(path, seconds(time[at]), columns.partition(known.astype(int)))
 
     def _send_phases(self, run: RunRecording) -> None:
         new = run.phases[self._phases :]

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Shaped
 
 from hrc_learn.store import new_file
 
@@ -66,6 +67,23 @@ class LoggedSteps:
             before += len(block)
             if before > start:
                 yield rows
+
+    def with_columns(self, **columns: Shaped[np.ndarray, "rows ..."]) -> "LoggedSteps":
+        """The same rows with further columns, copied.
+
+        Raises:
+            ValueError: If a column has another number of rows.
+        """
+        wrong = {
+            name: len(values) for name, values in columns.items() if len(values) != len(self)
+        }
+        if wrong:
+            raise ValueError(f"the log has {len(self)} rows, but new columns have {wrong}.")
+        every = {name: self[name] for name in self.names} | columns
+        rows = np.zeros(len(self), [(n, v.dtype, v.shape[1:]) for n, v in every.items()])
+        for name, values in every.items():
+            rows[name] = values
+        return LoggedSteps([rows], len(self), self.events)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write columns and events as one .npz file, which appears only when complete."""

@@ -24,7 +24,13 @@ from hrc_learn.experiments.collaboration.trial import (
     with_objects,
 )
 from hrc_learn.experiments.metric_table import evaluate
-from hrc_learn.experiments.run_recording import Deviation, record, span, true_image_jacobian
+from hrc_learn.experiments.run_recording import (
+    Deviation,
+    record,
+    span,
+    true_image_jacobian,
+    worker_distance,
+)
 from hrc_learn.geometry import Box
 from hrc_learn.sim import NOWHERE, CameraChange, Imperfections, OcclusionInterval
 from hrc_learn.sim.workplace import Workplace
@@ -113,16 +119,19 @@ def test_the_command_asks_for_the_job_and_reports_it(models, job, monkeypatch, t
         *("--aiming", models / "aiming", "--out", out, "--shelf", "upper"),
         *("--camera", "synthetic", "--seed", 3, "--json", figures, "--occlusion", 0, 3),
         *("--config.interaction", 2.5, "--latency", 0.04, "--frame-loss", 0.1),
-        *("--imperfections", 0.5),
+        *("--imperfections", 0.5, "--worker"),
     )
     ((shelves, options),) = asked
     assert (shelves, options["camera"], options["seed"]) == (("upper",), "synthetic", 3)
     assert options["forces"] == NULL_SPACE_FORCES
+    assert options["worker"] is True
     assert options["disturbances"] == Disturbances(occlusions=OCCLUDED)
     assert options["cell_config"].latency == LATE
     assert options["config"].interaction == 2.5
     assert options["imperfections"] == Imperfections.nominal().scaled(0.5)
     assert "missed" not in outcome.output
+    # Nobody was there in the run that was reported.
+    assert "worker" not in outcome.output
     measured = json.loads(figures.read_text())
     assert measured["objects_that_stand_on_their_shelf"] == 1
     assert measured["recovered_from_marker_occluded"] == 1
@@ -266,7 +275,53 @@ def test_what_the_camera_cannot_see_is_reported(skills, shift, reason):
     # There is a report of it all the same.
     recording = record("failed", job.cell, job.world, job.motion, cameras=job.cameras)
     figures = [f for s in collaboration_sections(job, recording) for f in s.figures]
-    assert {"timeline", "marker", "person", "trajectories"} <= {f.name for f in figures}
+    names = {figure.name for figure in figures}
+    assert {"timeline", "marker", "person", "trajectories"} <= names
+    assert "worker" not in names
+
+
+def test_a_worker_is_measured_logged_and_shown(skills):
+    job = provoked(skills, moved_camera(1.5, 0.0), HASTY, worker=True)
+    steps = len(job.cell.log)
+    distance = worker_distance(job.motion, steps)
+    values = evaluated(job).values
+    assert values["min_distance_mm"] == pytest.approx(1e3 * distance.min())
+    assert values["contacts_with_the_worker"] == 0
+    assert 0.3 < distance.min() < 3.0
+    log = experiment.CollaborationExperiment.log(None, job)
+    np.testing.assert_array_equal(log["worker_distance"], distance)
+    assert np.isfinite(log["worker_distance_sensed"]).all()
+    assert (log["worker_age"] >= 0).all()
+    np.testing.assert_array_equal(log["time"], job.cell.log["time"])
+    run = record("test", job.cell, job.world, job.motion, sensed=job.sensed)
+    assert {"worker_head", "worker_hand_left", "worker_item"} <= {b.name for b in run.bodies}
+    np.testing.assert_array_equal(run.worker_distance["true"], distance)
+    gap = np.linalg.norm(run.worker_nearest[:, 1] - run.worker_nearest[:, 0], axis=-1)
+    np.testing.assert_allclose(gap, distance, atol=1e-6)
+    figures = [f.name for section in collaboration_sections(job, run) for f in section.figures]
+    assert "worker" in figures
+    # Somebody else comes with another seed, nobody without the option.
+    other = provoked(skills, moved_camera(1.5, 0.0), HASTY, worker=True, seed=1)
+    assert other.world.config.worker != job.world.config.worker
+    assert provoked(skills, moved_camera(1.5, 0.0), HASTY).sensed is None
+
+
+@pytest.mark.slow
+def test_a_job_beside_a_worker_goes_on_as_it_would_without(skills):
+    """He makes no way, and nobody reacts: the arm is near him or meets him, and goes on."""
+    config = PickAndPlaceConfig(interaction=6.0)
+    job = provoked(
+        skills, config=config, imperfections=Imperfections.nominal(), worker=True, seed=0
+    )
+    assert verdict(job) == ""
+    distance = worker_distance(job.motion, len(job.cell.log))
+    assert distance.min() < 0.05
+    assert distance.max() > 1.0
+    sensed = job.sensed["distance"]
+    error = sensed[np.isfinite(sensed)] - distance[np.isfinite(sensed)]
+    assert np.abs(np.median(error)) < 0.03
+    # 80 ms late and then some, of a person who walks at up to 1.6 m/s.
+    assert np.abs(error).max() < 0.4
 
 
 def test_an_unknown_shelf_is_refused_before_anything_moves(skills):

@@ -7,8 +7,9 @@ import sampling
 import torch
 
 from hrc_learn.experiments.controller.grasp_trials import PEDESTAL, TABLE
-from hrc_learn.kinematics import LINK_CAPSULES, panda, panda_capsules
-from hrc_learn.sim import SceneConfig, build_scene
+from hrc_learn.kinematics import LINK_CAPSULES, CapsuleArm, panda, panda_capsules
+from hrc_learn.sim import FINGER_STROKE, SceneConfig, build_scene, whole_arm
+from hrc_learn.sim.world import body_geoms
 
 FAR = 3.0
 
@@ -72,28 +73,43 @@ def test_the_distance_from_the_table_is_that_of_the_simulator(model):
     assert touched > 0
 
 
-def test_the_hand_lies_within_its_capsules(model):
+HAND = ("hand", *(f"finger_{side}{pad}" for side in ("left", "right") for pad in ("", "_pad")))
+
+
+@pytest.mark.parametrize(
+    ("arm", "geoms"),
+    [(panda_capsules, HAND), (whole_arm(SceneConfig().arm), (*HAND, "hand_marker_plate"))],
+    ids=["hand", "hand and plate"],
+)
+@pytest.mark.parametrize("opening", [0.0, 0.02, FINGER_STROKE])
+def test_the_hand_lies_within_its_capsules(model, arm, geoms, opening):
     """So a hand that touches something there touches it here."""
-    geoms = [model.geom(name) for name in ("hand", "finger_left", "finger_left_pad")]
     corners = np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, -1).T
     for q in postures(5):
         data = place(model, q)
-        data.joint("finger_left").qpos[0] = 0.02
+        for finger in ("finger_left", "finger_right"):
+            data.joint(finger).qpos[0] = opening
         mujoco.mj_kinematics(model, data)
-        ends = panda_capsules.segments(q)[len(LINK_CAPSULES) :]
-        for geom in geoms:
-            pose = data.geom(geom.name)
+        for name in geoms:
+            geom, pose = model.geom(name), data.geom(name)
             points = pose.xpos + (corners * geom.size) @ pose.xmat.reshape(3, 3).T
-            assert (outside(torch.from_numpy(points), ends) < 1e-3).all()
+            assert (outside(arm, q, torch.from_numpy(points)) < 1e-3).all()
 
 
-def outside(points: torch.Tensor, ends: torch.Tensor) -> torch.Tensor:
-    """How far points lie out of the hand's capsules [m]."""
-    radius = torch.tensor([c.radius for c in panda_capsules.capsules[len(LINK_CAPSULES) :]])
+def test_the_whole_arm_is_all_that_can_touch(model):
+    """Links, hand, fingers and plate: there is no other geom of the arm that collides."""
+    arm = body_geoms(model, ["link0"]) & (model.geom_contype != 0)
+    names = {model.geom(int(g)).name for g in np.flatnonzero(arm)}
+    assert names == {*geom_names(), *HAND, "hand_marker_plate"}
+
+
+def outside(arm: CapsuleArm, q: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
+    """How far points lie out of an arm's capsules [m]."""
+    ends = arm.segments(q)
     start, along = ends[:, 0], ends[:, 1] - ends[:, 0]
     offset = points[:, None] - start
     t = ((offset * along).sum(-1) / (along * along).sum(-1)).clamp(0, 1)
-    return ((offset - t[..., None] * along).norm(dim=-1) - radius).amin(-1)
+    return ((offset - t[..., None] * along).norm(dim=-1) - arm.radius).amin(-1)
 
 
 def test_the_trials_have_the_table_and_the_pedestal_of_the_simulator(model):

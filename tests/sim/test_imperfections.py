@@ -44,6 +44,9 @@ def test_the_nominal_ones_have_at_least_the_sizes_that_were_asked_for():
     assert nominal.joint_friction >= 1.0
     assert nominal.image_delay >= 0.080
     assert nominal.image_loss >= 0.20
+    assert nominal.person_noise >= 0.01
+    assert nominal.person_delay >= 0.080
+    assert nominal.person_loss >= 0.20
     assert nominal.payload >= 0.5
     assert nominal.object_yaw == math.pi
 
@@ -58,12 +61,19 @@ def test_scaling_multiplies_all_but_keeps_fractions_and_turns_possible():
         assert getattr(twice, field.name) == pytest.approx(expected)
     assert nominal.scaled(0.0) == Imperfections.ideal()
     assert nominal.scaled(9.0).image_loss == 0.9
+    assert nominal.scaled(9.0).person_loss == 0.9
     assert nominal.scaled(9.0).slowness == 0.9
 
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("payload", -0.1), ("encoder_noise", math.nan), ("image_loss", 0.95), ("slowness", 1.0)],
+    [
+        ("payload", -0.1),
+        ("encoder_noise", math.nan),
+        ("image_loss", 0.95),
+        ("person_loss", 1.0),
+        ("slowness", 1.0),
+    ],
 )
 def test_impossible_sizes_are_refused(name, value):
     with pytest.raises(ValueError, match=name):

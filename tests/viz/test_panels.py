@@ -8,6 +8,7 @@ FIELDS = {
     "camera": "Pixel error",
     "potentials": "Regions",
     "safety": "Safety",
+    "worker_distance": "Worker",
 }
 
 
@@ -26,7 +27,7 @@ def test_absent_fields_drop_their_tab(field):
 
 def test_a_bare_run_shows_its_joints():
     bare = dict.fromkeys(OPTIONAL)
-    (tab,) = run_tabs(sample_run(**bare, potentials={}, safety={}))
+    (tab,) = run_tabs(sample_run(**bare, potentials={}, safety={}, worker_distance={}))
     assert tab.title == "Joints: position blue"
     assert [plot.title for plot in tab.plots] == [f"joint{i} [rad]" for i in range(1, 8)]
 
@@ -66,6 +67,18 @@ def test_lengths_are_shown_in_millimetres_and_angles_in_degrees():
     assert shown["person/elbow"].values.max() == pytest.approx(100.0)
     assert shown["person/position_deviation"].values.max() == pytest.approx(0.1)
     assert shown["person/rotation_deviation"].values.max() == pytest.approx(0.01)
+
+
+def test_the_distance_of_a_worker_is_shown_twice_the_second_time_from_near():
+    run = sample_run()
+    shown = curves(run_tabs(run))
+    far, near = shown["worker/distance"], shown["worker/near"]
+    assert far.names == near.names == ("true", "seen")
+    np.testing.assert_allclose(far.values[:, 0], 1e3 * run.worker_distance["true"])
+    close = far.values < 300
+    assert 0 < close.sum() < close.size
+    np.testing.assert_array_equal(near.values[close], far.values[close])
+    assert np.isnan(near.values[~close]).all()
 
 
 def test_names_with_blanks_and_slashes_make_plain_paths():

@@ -71,6 +71,22 @@ def test_bodies_move_as_they_did(run, rrd):
     np.testing.assert_allclose(quaternion[:, [3, 0, 1, 2]], body.orientation[at], atol=1e-6)
 
 
+def test_a_line_joins_worker_and_robot_where_they_are_nearest(tmp_path):
+    nearest = sample_run().worker_nearest.copy()
+    nearest[:50] = np.nan
+    path = tmp_path / "run.rrd"
+    record_run(path, sample_run(worker_nearest=nearest))
+    rrd = Rrd(path)
+    time = rrd.time("world/worker_distance")
+    lines = rrd.column("world/worker_distance", "LineStrips3D:strips")
+    at = np.searchsorted(sample_run().time, time - 1e-9)
+    assert any(at < 50)
+    for k, strips in zip(at, lines, strict=True):
+        assert len(strips) == (k >= 50)
+        for strip in strips:
+            np.testing.assert_allclose(strip, nearest[k], atol=1e-6)
+
+
 def test_the_path_of_the_run_grows_to_its_end(run, rrd):
     strips = [row[0] for row in rrd.column("world/paths/run", "LineStrips3D:strips")]
     lengths = [len(strip) for strip in strips]
@@ -127,8 +143,9 @@ def test_phases_are_logged_at_their_times(rrd):
 
 def test_a_run_without_extras_is_recorded_too(tmp_path):
     fields = dict.fromkeys(OPTIONAL)
-    empty = {"potentials": {}, "safety": {}, "bodies": (), "boxes": (), "phases": ()}
-    record_run(tmp_path / "bare.rrd", sample_run(**fields, **empty))
+    mappings = {name: {} for name in ("potentials", "safety", "worker_distance")}
+    empty = {"bodies": (), "boxes": (), "phases": ()}
+    record_run(tmp_path / "bare.rrd", sample_run(**fields, **mappings, **empty))
     moving = {e for e in Rrd(tmp_path / "bare.rrd").entities if not e.startswith("__")}
     joints = {f"joints/joint{i}/position" for i in range(1, 8)}
     assert moving == joints | {"world", "world/paths/run"}

@@ -53,6 +53,24 @@ def test_prepared_and_plain_rows_share_columns():
         log.prepare(time=0.0, J=np.zeros((2, 6)), pushed=False)
 
 
+@pytest.mark.parametrize("steps", [1, 8, 17])
+def test_columns_can_be_added_to_what_was_logged(steps, tmp_path):
+    log = filled(steps, block=8)
+    log.event(0.1, "begun")
+    far = np.arange(2.0 * steps).reshape(steps, 2)
+    more = log.with_columns(far=far, seen=np.ones(steps, bool))
+    assert more.names == (*log.names, "far", "seen")
+    for name in log.names:
+        np.testing.assert_array_equal(more[name], log[name])
+    np.testing.assert_array_equal(more["far"], far)
+    assert more["seen"].dtype == bool
+    more.save(tmp_path / "log.npz")
+    assert StepLog.load(tmp_path / "log.npz").events == log.events
+    assert "far" not in log
+    with pytest.raises(ValueError, match="new columns"):
+        log.with_columns(far=np.zeros(steps + 1))
+
+
 def test_a_column_is_a_copy():
     log = filled(3)
     log["joint"][:] = 99

@@ -185,6 +185,9 @@ class RunCollaboration(RunServoing):
     pulls: Literal["scripted", "random", "none"] = "scripted"
     """When the scripted person pulls the elbow: while the robot waits for them above the
     object, at random moments of the whole job whatever it does, or never."""
+    worker: bool = False
+    """Whether a worker comes and reaches under the arm. He puts something on the table first,
+    leaves again, and makes no way for the robot; how near he comes is measured."""
     page: bool = False
     """Serve a page in the browser, from which people watch and pull at the elbow too. The
     run takes as long as it would on a real arm then."""

@@ -92,6 +92,7 @@ def run_collaboration(args: RunCollaboration) -> int:
         shelf_x=args.shelf_x,
         shelf_depth=args.shelf_depth,
         pulls=args.pulls,
+        worker=args.worker,
         imperfections=_imperfections(args),
         curve=args.curve,
         disturbances=Disturbances(

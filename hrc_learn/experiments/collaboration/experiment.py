@@ -23,7 +23,7 @@ from hrc_learn.experiments.collaboration.trial import (
 )
 from hrc_learn.experiments.frame import UNOBSERVED, Observer, RepeatedRun, Study
 from hrc_learn.experiments.metric_table import Metric
-from hrc_learn.experiments.run_recording import record
+from hrc_learn.experiments.run_recording import record, worker_distance
 from hrc_learn.geometry import Box
 from hrc_learn.sim import CameraKind, Imperfections
 from hrc_learn.sim.workplace import Workplace
@@ -57,6 +57,8 @@ class CollaborationExperiment:
     """How far behind the boards' front edge [m]."""
     pulls: Pulls = "scripted"
     """When the scripted person pulls the elbow."""
+    worker: bool = False
+    """Whether a worker comes to the table, another one each time, and reaches under the arm."""
     disturbances: Disturbances = field(default_factory=Disturbances)
     imperfections: Imperfections = field(default_factory=Imperfections.nominal)
     """Of arm, calibration, camera and objects."""
@@ -82,6 +84,7 @@ class CollaborationExperiment:
             disturbances=self.disturbances,
             config=self.config,
             imperfections=self.imperfections,
+            worker=self.worker,
             cell_config=replace(self.cell, keep_image_every=keep_every),
             seed=seed,
             page=self.page,
@@ -113,12 +116,20 @@ class CollaborationExperiment:
             cameras=run.cameras,
             region=region,
             demonstration=self._demonstration(),
+            sensed=run.sensed,
         )
         return {"run": recording}
 
     def log(self, run: CollaborationRun) -> LoggedSteps:
-        """Of the whole job."""
-        return run.cell.log
+        """Of the whole job; with a worker, how near he was and was believed to be [m]."""
+        log = run.cell.log
+        if run.sensed is None:
+            return log
+        return log.with_columns(
+            worker_distance=worker_distance(run.motion, len(log)),
+            worker_distance_sensed=run.sensed["distance"][: len(log)],
+            worker_age=run.sensed["age"][: len(log)],
+        )
 
     def sections(
         self, run: CollaborationRun, recordings: Mapping[str, RunRecording]

@@ -10,6 +10,7 @@ from typing import get_args
 import numpy as np
 
 from hrc_learn.experiments.collaboration.trial import CollaborationRun
+from hrc_learn.experiments.collaboration.worker import worker_contacts
 from hrc_learn.experiments.grip import Hold, grasp_offset, hold, place_angle
 from hrc_learn.experiments.metric_table import Metric, median, p95, success_rate
 from hrc_learn.experiments.monte_carlo import Trial
@@ -18,6 +19,7 @@ from hrc_learn.experiments.run_recording import (
     limit_violations,
     spans,
     unwanted_contacts,
+    worker_distance,
 )
 from hrc_learn.sim import Touch
 from hrc_learn.skills.pick_and_place import HOME, RELEASE, Mishap, PickPlaceJob
@@ -95,6 +97,8 @@ def collaboration_metrics(
         ),
         # Not listed, as the rows above tell what was met.
         Metric("contacts", lambda run: sum(map(len, _contacts(run).values())), listed=False),
+        Metric("contacts with the worker", _met_worker),
+        Metric("min distance", _min_distance, "mm"),
         Metric(
             "cycle time",
             lambda run: run.cell.time,
@@ -158,6 +162,19 @@ def collaboration_metrics(
     ]
 
 
+def _met_worker(run: CollaborationRun) -> int | None:
+    """None of a run without a worker."""
+    if run.world.config.worker is None:
+        return None
+    return len(worker_contacts(run.world, run.cell.log, run.motion))
+
+
+def _min_distance(run: CollaborationRun) -> float | None:
+    """True one of the worker from the robot and its load; None of a run without [mm]."""
+    distance = worker_distance(run.motion, len(run.cell.log))
+    return 1e3 * float(distance.min()) if len(distance) else None
+
+
 def _off_path(run: CollaborationRun) -> float | None:
     """Largest distance of the end effector from its path in phases that pulls reached [mm]."""
     off = [1e3 * effect.hand for effect in run.pull_effects if np.isfinite(effect.hand)]
@@ -188,6 +205,7 @@ TRIAL_METRICS: Sequence[Metric[Sequence[Trial]]] = (
     Metric("trials, place error (95 %)", p95("place_error_mm"), "mm"),
     Metric("trials, place tilt (95 %)", p95("place_tilt_deg"), "deg"),
     Metric("trials, cycle time (median)", median("cycle_time_s"), "s"),
+    Metric("trials, min distance (median)", median("min_distance_mm"), "mm"),
 )
 """Rows of the table that repetitions add."""
 

@@ -44,7 +44,7 @@ SUMMARY = (
 
 
 def collaboration_sections(run: CollaborationRun, recording: RunRecording) -> list[Section]:
-    """Timeline, grasping, person, placing."""
+    """Timeline, grasping, person, worker where one came, placing."""
     objects: Spans = {pick.item.name: pick.span for pick in run.picks}
     notes = [
         f"{note.time:.1f} s, {pick.item.name}: {note.mishap}: {note.what}."
@@ -102,6 +102,7 @@ def collaboration_sections(run: CollaborationRun, recording: RunRecording) -> li
                 ),
             ),
         ),
+        *_worker_sections(recording),
         Section(
             heading="Carrying and placing",
             text="The demonstration, and the arm's motion with every object.",
@@ -115,6 +116,37 @@ def collaboration_sections(run: CollaborationRun, recording: RunRecording) -> li
             ),
         ),
     ]
+
+
+def _worker_sections(recording: RunRecording) -> list[Section]:
+    """One; none where nobody came."""
+    if not recording.worker_distance:
+        return []
+    text = (
+        "A worker comes to the table, puts something down, reaches under the arm and leaves. "
+        "He makes no way for the robot, and it does not react to him yet. It sees him late and "
+        "with noise, as capsules. Its own contain arm and tool: it errs to the safe side."
+    )
+    caption = "Smallest distance from the robot and its load, as it is and as it is seen."
+    picture = Picture("worker", worker_figure(recording), caption)
+    return [Section(heading="The worker", text=text, figures=(picture,))]
+
+
+def worker_figure(run: RunRecording) -> Figure:
+    """Distance of the worker from the robot over time, the last 30 cm enlarged."""
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(WIDTH, 3.8))
+        far, near = figure.subplots(2, 1, sharex=True)
+        for axes in (far, near):
+            for name, distance in run.worker_distance.items():
+                axes.plot(run.time, distance, label=name, lw=0.9)
+            axes.axhline(0.0, color=palette.LIMIT, lw=0.8)
+            axes.set_ylabel("distance [m]")
+            axes.margins(x=0)
+        far.legend(loc="center right")
+        far.set_title("Distance of the worker from the robot and its load", loc="left")
+        near.set(ylim=(-0.05, 0.30), xlabel="time [s] (red: contact)")
+    return figure
 
 
 def trajectories_figure(run: RunRecording, objects: Spans) -> Figure:

@@ -15,6 +15,11 @@ from hrc_learn.experiments.collaboration.pulls import (
     pull_effects,
     random_pulls,
 )
+from hrc_learn.experiments.collaboration.worker import (
+    SensedDistance,
+    move_worker,
+    somebody_comes,
+)
 from hrc_learn.experiments.run_recording import LiveView, no_live_view
 from hrc_learn.geometry import quaternion
 from hrc_learn.kinematics import panda
@@ -26,8 +31,10 @@ from hrc_learn.sim import (
     ObjectConfig,
     OcclusionInterval,
     ScriptedOcclusion,
+    WorkerSensor,
     World,
     open_camera,
+    whole_arm,
 )
 from hrc_learn.sim.imperfections import Imperfections
 from hrc_learn.sim.workplace import Workplace
@@ -47,6 +54,7 @@ from hrc_learn.teleoperation import ScriptedForce, ScriptedPerturbation
 from hrc_learn.teleoperation.page import PageConfig
 from hrc_learn.teleoperation.page_session import task_page
 from hrc_learn.vision import CameraModel, Marker
+from hrc_learn.viz import LoggedSteps
 
 THREE_OBJECTS = (
     ObjectConfig(),
@@ -114,6 +122,9 @@ class CollaborationRun:
     disturbances: Disturbances = field(default_factory=Disturbances)
     pulls: tuple[ScriptedForce, ...] = ()
     """Of the person on the elbow, in the time of the run, where they do not wait to be let."""
+    sensed: LoggedSteps | None = None
+    """How near the robot believed the worker to be (`SensedDistance.log`); None: nobody was
+    there."""
     held_flat: frozenset[str] = frozenset()
     """Objects that both pads held on opposite faces, when lifted and still at the release."""
 
@@ -151,6 +162,7 @@ def simulate_collaboration(
     config: PickAndPlaceConfig | None = None,
     cell_config: WorkCellConfig | None = None,
     imperfections: Imperfections | None = None,
+    worker: bool = False,
     seed: int = 0,
     page: PageConfig | None = None,
     view: LiveView = no_live_view,
@@ -172,6 +184,7 @@ def simulate_collaboration(
         config: How the job is done.
         cell_config: How the loop runs; images may be late or lost.
         imperfections: Of arm, calibration, camera and objects; None: none.
+        worker: Whether a worker comes to the table, whom nobody expects.
         seed: Of the objects' poses and of image noise.
         page: Serve a page from which people push the elbow too, and let the world go on in
             real time; None: no page.
@@ -200,7 +213,11 @@ def simulate_collaboration(
     config = _on_plant(config or PickAndPlaceConfig(), sizes)
     items = workplace.scene.objects
     _check_shelves(workplace, shelves)
-    world = World(workplace.scene, sizes.draw(rng))
+    # Drawn apart, so that runs with and without the worker are alike but for him.
+    chance = np.random.default_rng([seed, 2])
+    visit = somebody_comes(workplace, chance) if worker else None
+    scene = replace(workplace.scene, worker=None if visit is None else visit.worker.config)
+    world = World(scene, sizes.draw(rng))
     world.reset(
         workplace.home_joints().numpy(), _object_poses(workplace, world, sizes.object_yaw, rng)
     )
@@ -212,6 +229,11 @@ def simulate_collaboration(
         person = ScriptedPerturbation(panda, pulls, begin=0.0)
     else:
         person = ScriptedPerturbation(panda, forces, begin=None)
+    sensed = None
+    if visit is not None:
+        tracker = WorkerSensor(visit, lambda: world.time, sizes, chance)
+        sensed = SensedDistance(tracker, whole_arm(scene.arm), items)
+        move_worker(world, visit)
     motion = MotionLog(world)
     occluder = ScriptedOcclusion(world, disturbances.occlusions)
     eyes = ChangingCamera(
@@ -220,8 +242,12 @@ def simulate_collaboration(
     )
 
     def advance(duration: float) -> None:
+        if sensed is not None:
+            sensed.note(world.time, cell.state.joint_position, world.held())
         motion.advance(duration)
         occluder.update()
+        if visit is not None:
+            move_worker(world, visit)
 
     flat: dict[str, set[str]] = {HOME: set(), RELEASE: set()}
 
@@ -275,6 +301,7 @@ def simulate_collaboration(
         cameras=tuple(eyes.history),
         disturbances=disturbances,
         pulls=pulls,
+        sensed=None if sensed is None else sensed.log,
         held_flat=frozenset(flat[HOME] & flat[RELEASE]),
     )
 

@@ -1,0 +1,81 @@
+"""How the robot sees the worker: late, with noise, and not in every image."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+
+import numpy as np
+
+from hrc_learn.protocols import PersonObservation
+from hrc_learn.sim.imperfections import Imperfections
+from hrc_learn.sim.worker_visit import WorkerVisit
+
+# Time over which velocities are averaged, noise against lag [s]: three images.
+_SPAN = 0.1
+
+
+class WorkerSensor:
+    """Implements the `PersonTracker` protocol: a body tracker on an RGB-D camera.
+
+    Each end of a capsule has noise of its own in each image. Velocities come from these
+    positions alone, so they have noise as well, and lag behind by half of 0.1 s.
+    """
+
+    def __init__(
+        self,
+        visit: WorkerVisit,
+        clock: Callable[[], float],
+        sizes: Imperfections,
+        rng: np.random.Generator,
+        *,
+        rate: float = 30.0,
+    ):
+        """Begin to watch now.
+
+        Args:
+            visit: Where the worker truly is.
+            clock: Tells the time [s].
+            sizes: Of noise, delay and loss.
+            rng: Source of noise and loss.
+            rate: Images a second.
+
+        Raises:
+            ValueError: If the rate is not positive.
+        """
+        if not rate > 0:
+            raise ValueError(f"rate must be positive, but is {rate}.")
+        self._visit, self._clock, self._sizes, self._rng = visit, clock, sizes, rng
+        self._rate, self._first, self._taken = rate, clock(), 0
+        self._pending: deque[PersonObservation] = deque()
+        self._before: deque[PersonObservation] = deque()
+        self._newest: PersonObservation | None = None
+
+    def read(self) -> PersonObservation | None:
+        """The newest observation that has arrived by now."""
+        # Clocks add up steps of rounded length: a nanosecond early still counts as in time.
+        now = self._clock() + 1e-9
+        while (time := self._first + self._taken / self._rate) <= now:
+            self._take(time)
+        while self._pending and self._pending[0].time + self._sizes.person_delay <= now:
+            self._newest = self._pending.popleft()
+        return self._newest
+
+    def _take(self, time: float) -> None:
+        """One image."""
+        self._taken += 1
+        capsules = self._visit.capsules_at(time)
+        noise = self._sizes.person_noise * self._rng.standard_normal(capsules.ends.shape)
+        if self._rng.uniform() < self._sizes.person_loss:
+            return
+        ends, velocity = capsules.ends + noise, np.zeros_like(noise)
+        while len(self._before) > 1 and self._before[1].time <= time - _SPAN + 1e-9:
+            self._before.popleft()
+        if self._before:
+            old = self._before[0]
+            velocity = (ends - old.ends) / (time - old.time)
+        seen = PersonObservation(
+            time=time, ends=ends, radius=capsules.radius, velocity=velocity
+        )
+        self._before.append(seen)
+        self._pending.append(seen)

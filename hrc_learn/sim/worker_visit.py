@@ -1,0 +1,320 @@
+"""What a worker does at the table (the paper's Experiment 3), as a function of time.
+
+He walks in, puts something on the bench, reaches for markers that lie under the arm, and walks
+away. He does not look at the robot and makes no way for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from hrc_learn.geometry import Box
+from hrc_learn.sim.worker import WORKER_ITEM_HALF_SIZE, Posture, Worker
+
+# Half of the step by which velocities are taken [s]: they err by 0.1 mm/s at most.
+_HALF_STEP = 1e-4
+# Step of a person who walks, fraction of the stature: two in a stride of 0.8 of it.
+_STEP = 0.40
+# Where a hand is that puts down or takes what stands on the bench [m].
+_HAND_OVER_BENCH = 2 * WORKER_ITEM_HALF_SIZE[2]
+# How far markers are to the sides of what the arm is at work above [m].
+_BESIDE_GRIPPER = (0.11, 0.22)
+# A minimum-jerk motion is at its fastest this many times as fast as on average.
+_PEAK = 1.875
+# How far the head of a leaning person is from the hip, fraction of the stature.
+_HEAD_FROM_HIP = 0.47
+
+
+@dataclass(frozen=True, kw_only=True)
+class HumanSpeeds:
+    """How fast he is at most; ISO 13855 takes these of people who approach a machine."""
+
+    walking: float = 1.6
+    """Of the body [m/s]."""
+    reaching: float = 2.0
+    """Of a hand [m/s]."""
+    turning: float = 2.5
+    """About the vertical [rad/s]."""
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            if not getattr(self, field.name) > 0:
+                raise ValueError(
+                    f"{field.name} must be positive, but is {getattr(self, field.name)}."
+                )
+
+
+class _Pose(NamedTuple):
+    """What is given of a posture at the ends of a movement."""
+
+    place: np.ndarray
+    heading: float
+    lean: float
+    hands: np.ndarray
+
+    def row(self) -> np.ndarray:
+        return np.concatenate([self.place, [self.heading, self.lean], self.hands.ravel()])
+
+
+class WorkerCapsules(NamedTuple):
+    """A worker's body at any number of times."""
+
+    ends: Float[np.ndarray, "*time parts 2 3"]
+    """Of the axes of his capsules, in the base frame [m]."""
+    radius: Float[np.ndarray, " parts"]
+    """[m]"""
+    velocity: Float[np.ndarray, "*time parts 2 3"]
+    """Of the ends [m/s]."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class WorkerVisit:
+    """Postures between which he moves with the least jerk."""
+
+    worker: Worker
+    """Whose body it is."""
+    time: Float[np.ndarray, " poses"]
+    """When he is in each [s]; he rests before the first and after the last."""
+    poses: Float[np.ndarray, "poses 10"]
+    """Place [m], heading and lean [rad], and both hands in his own frame [m]."""
+    step: float
+    """Length of his steps [m]."""
+    side: int
+    """Of the hand that carries something for the bench: 0 left, 1 right."""
+    released: float
+    """When he lets go of it there [s]."""
+    markers: Float[np.ndarray, "markers 3"]
+    """What he reaches for [m]."""
+
+    @property
+    def begin(self) -> float:
+        """When he comes in [s]."""
+        return float(self.time[0])
+
+    @property
+    def end(self) -> float:
+        """When he has left [s]."""
+        return float(self.time[-1])
+
+    def posture(self, time: Float[np.ndarray, "*time"]) -> Posture:
+        """How and where he stands at given times [s]."""
+        k = np.clip(np.searchsorted(self.time, time, side="right") - 1, 0, len(self.time) - 2)
+        u = np.clip((time - self.time[k]) / (self.time[k + 1] - self.time[k]), 0.0, 1.0)
+        progress = u**3 * (10 - 15 * u + 6 * u**2)
+        change = self.poses[k + 1] - self.poses[k]
+        row = self.poses[k] + progress[..., None] * change
+        # Steps grow and shrink with the speed.
+        vigour = 16 * u**2 * (1 - u) ** 2
+        length = np.linalg.norm(change[..., :2], axis=-1)
+        steps = np.maximum(np.round(length / self.step), 1.0)
+        phase = np.pi * steps * progress
+        walks = vigour * np.minimum(length / self.step, 1.0)
+        turns = vigour * np.minimum(np.abs(change[..., 2]), 1.0)
+        stride = walks * self.step / 2 * np.sin(phase)
+        hands = row[..., 4:].reshape(*row.shape[:-1], 2, 3).copy()
+        # Arms swing against the legs, by little: one of them may carry something.
+        hands[..., 0, 0] -= 0.15 * stride
+        hands[..., 1, 0] += 0.15 * stride
+        return Posture(
+            place=row[..., :2],
+            heading=np.asarray(row[..., 2]),
+            lean=np.asarray(row[..., 3]),
+            stride=np.asarray(stride),
+            # Squared: a knee that begins to bend would jump.
+            swing=np.asarray(np.maximum(walks, turns) * np.cos(phase) * np.abs(np.cos(phase))),
+            hands=hands,
+        )
+
+    def capsules_at(self, time: float | Float[np.ndarray, "*time"]) -> WorkerCapsules:
+        """Where all of him is, and how fast it moves.
+
+        Args:
+            time: One or several times [s].
+        """
+        at = np.asarray(time, dtype=float)
+        around = at[..., None] + np.array([-_HALF_STEP, 0.0, _HALF_STEP])
+        ends = self.worker.ends(self.posture(around))
+        before, now, after = np.moveaxis(ends, at.ndim, 0)
+        velocity = (after - before) / (2 * _HALF_STEP)
+        return WorkerCapsules(now, self.worker.radius, velocity)
+
+    def item_at(self, time: float) -> Float[np.ndarray, "3"]:
+        """Where the thing is that he puts on the bench: in his hand, then where he left it [m].
+
+        Args:
+            time: [s]
+        """
+        then = np.array(min(time, self.released))
+        hangs = np.array([0.0, 0.0, -WORKER_ITEM_HALF_SIZE[2]])
+        return self.worker.grip(self.worker.ends(self.posture(then)), self.side) + hangs
+
+
+class _Writer:
+    """Adds pose after pose, each as soon as his speeds allow."""
+
+    def __init__(self, start: _Pose, begin: float, speeds: HumanSpeeds, stature: float):
+        self.now, self._speeds, self._stature = start, speeds, stature
+        self.times, self.rows = [begin], [start.row()]
+
+    def wait(self, duration: float) -> None:
+        self._add(self.now, duration)
+
+    def go(self, **changes) -> None:
+        """Change some of the pose at the fastest that all speeds allow."""
+        following = self.now._replace(**changes)
+        limits = self._speeds
+        walked = np.linalg.norm(following.place - self.now.place) / limits.walking
+        leaned = abs(following.lean - self.now.lean) * _HEAD_FROM_HIP * self._stature
+        turned = abs(following.heading - self.now.heading) / limits.turning
+        moved = np.linalg.norm(following.hands - self.now.hands, axis=-1).max()
+        fastest = max(walked, leaned / limits.walking, turned, moved / limits.reaching)
+        self._add(following, max(_PEAK * float(fastest), 0.3))
+
+    def _add(self, following: _Pose, duration: float) -> None:
+        self.times.append(self.times[-1] + duration)
+        self.rows.append(following.row())
+        self.now = following
+
+
+def random_visit(
+    worker: Worker,
+    rng: np.random.Generator,
+    *,
+    bench: Box,
+    under: tuple[float, float],
+    begin: tuple[float, float] = (1.0, 8.0),
+    reaches: tuple[int, int] = (2, 4),
+    speeds: HumanSpeeds | None = None,
+) -> WorkerVisit:
+    """Draw a visit to the side of the bench that is opposite to the robot.
+
+    Args:
+        worker: Who comes.
+        rng: Source of chance.
+        bench: The table, whose far side (+y) is free.
+        under: What the arm is at work above, x and y [m]: markers lie around it.
+        begin: When he comes in, earliest and latest [s].
+        reaches: How many markers he reaches for, least and most.
+        speeds: How fast he is at most; each visit takes 50 to 95 % of it.
+    """
+    most = speeds or HumanSpeeds()
+    pace = HumanSpeeds(
+        # The body sways up and down besides, and elbows may be faster than the hands.
+        walking=rng.uniform(0.6, 0.9) * most.walking,
+        reaching=rng.uniform(0.5, 0.85) * most.reaching,
+        turning=rng.uniform(0.6, 0.95) * most.turning,
+    )
+    h, side = worker.config.stature, int(rng.uniform() < 0.8)  # most people are right-handed
+    top = bench.centre[2] + bench.half_size[2]
+    edge = bench.centre[1] + bench.half_size[1]
+    # As near to the bench as the body lets him, a little to one side of what is under the arm.
+    stand = np.array(
+        [under[0] + rng.uniform(-0.18, 0.18), edge + 0.1 * h + rng.uniform(0, 0.05)]
+    )
+    facing = -np.pi / 2 + rng.uniform(-0.15, 0.15)
+    entrance, leaving = (
+        np.array([rng.uniform(-1.0, 1.4), edge + rng.uniform(1.2, 1.5)]) for _ in range(2)
+    )
+
+    def own(point: np.ndarray) -> np.ndarray:
+        """A point in the frame of the worker who stands there."""
+        c, s = np.cos(facing), np.sin(facing)
+        x, y = point[:2] - stand
+        return np.array([c * x + s * y, c * y - s * x, point[2] - worker.config.floor])
+
+    def hand(point: np.ndarray, which: int) -> np.ndarray:
+        hands = ready.copy()
+        hands[which] = point
+        return hands
+
+    hanging = worker.hanging_hands()
+    ready = np.array(
+        [[0.16 * h, s * 0.13 * h, top + 0.12 - worker.config.floor] for s in (1, -1)]
+    )
+    carrying = hanging.copy()
+    carrying[side] = [0.20 * h, (0.05, -0.05)[side] * h, 0.63 * h]
+
+    inwards, outwards = (_direction(b - a) for a, b in ((entrance, stand), (stand, leaving)))
+    start = _Pose(entrance, _near(inwards, facing), 0.0, carrying)
+    script = _Writer(start, rng.uniform(*begin), pace, h)
+    script.go(place=stand)
+    script.go(heading=facing)
+    # Down on the bench, near its edge, and away from what is under the arm.
+    spot = np.array(
+        [
+            stand[0] + rng.uniform(-0.2, 0.2),
+            edge - rng.uniform(0.10, 0.16),
+            top + _HAND_OVER_BENCH,
+        ]
+    )
+    above = own(spot + np.array([0.0, 0.0, 0.12]))
+    script.go(hands=hand(above, side), lean=_lean(worker, above, side))
+    script.go(hands=hand(own(spot), side), lean=_lean(worker, own(spot), side))
+    script.wait(rng.uniform(0.2, 0.5))
+    released = script.times[-1]
+    script.go(hands=ready, lean=0.05)
+    markers = []
+    for _ in range(rng.integers(reaches[0], reaches[1] + 1)):
+        markers.append(_marker(worker, rng, own, np.array([*under, top])))
+        target = own(markers[-1])
+        which = _hand_for(target)
+        script.go(hands=hand(target, which), lean=_lean(worker, target, which))
+        script.wait(rng.uniform(0.3, 1.2))
+        script.go(hands=ready, lean=rng.uniform(0.0, 0.15))
+    script.go(hands=hanging, lean=0.0)
+    script.go(heading=_near(outwards, facing))
+    script.go(place=leaving)
+    return WorkerVisit(
+        worker=worker,
+        time=np.array(script.times),
+        poses=np.array(script.rows),
+        step=_STEP * h,
+        side=side,
+        released=released,
+        markers=np.array(markers),
+    )
+
+
+def _hand_for(target: np.ndarray) -> int:
+    """The one on the side of what he reaches for."""
+    return int(target[1] < 0)
+
+
+def _marker(
+    worker: Worker,
+    rng: np.random.Generator,
+    own: Callable[[np.ndarray], np.ndarray],
+    under: np.ndarray,
+) -> np.ndarray:
+    """A place around what is under the arm that he can reach, low over the bench [m]."""
+    for _ in range(1000):
+        # To either side of the gripper that hovers there: nobody reaches through it.
+        x = rng.choice([-1, 1]) * rng.uniform(*_BESIDE_GRIPPER)
+        point = under + np.array([x, rng.uniform(-0.10, 0.12), _HAND_OVER_BENCH])
+        target = own(point)
+        if worker.lean_to(target, _hand_for(target)) is not None:
+            return point
+    raise ValueError(
+        f"a worker of {worker.config.stature:.2f} m cannot reach under the arm at "
+        f"({under[0]:g}, {under[1]:g}) m over the bench: choose a nearer point."
+    )
+
+
+def _lean(worker: Worker, target: np.ndarray, side: int) -> float:
+    lean = worker.lean_to(target, side)
+    assert lean is not None  # places are drawn within reach
+    return lean
+
+
+def _direction(vector: np.ndarray) -> float:
+    return float(np.arctan2(vector[1], vector[0]))
+
+
+def _near(angle: float, other: float) -> float:
+    """The same direction, half a turn from another one at most."""
+    return other + (angle - other + np.pi) % (2 * np.pi) - np.pi
