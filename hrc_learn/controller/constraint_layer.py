@@ -135,7 +135,8 @@ def constrained_velocity(
 
     Args:
         wanted: Joint velocity of task and null space together [rad/s].
-        task: That of the task, along which it may slow down [rad/s].
+        task: That of the task, along which it may slow down [rad/s]. What of it leaves the tool
+            at rest counts as the null space's.
         jacobian: Of the tool, with at most as many rows as joints; singular ones too.
         lower: Lowest joint velocity allowed, now and with a view to position, acceleration and
             jerk [rad/s]. Not above `upper`.
@@ -171,8 +172,9 @@ def constrained_velocity(
     slack = off_path * config.distance_weight
     # Joint velocities of one unit of cost each: off the path, along it, in the null space.
     basis = orthonormal_basis(jacobian).mT
-    parts = [basis[..., :m, :] / off_path, task.unsqueeze(-2) / along, basis[..., m:, :]]
-    basis = torch.cat(parts, dim=-2)
+    null, path = basis[..., m:, :], task.unsqueeze(-2)
+    path = path - matmul(matmul(path, null.mT), null)
+    basis = torch.cat([basis[..., :m, :] / off_path, path / along, null], dim=-2)
     # Rows of the limits, of joints, task and distances, and what they leave, counted from the
     # wanted velocity.
     joints = torch.cat([basis, torch.zeros_like(basis[..., :1, :])], dim=-2)

@@ -135,8 +135,6 @@ class _Motion(NamedTuple):
     """Joint velocity of the law before the safety filter, and how it came about."""
 
     joint_velocity: Tensor
-    task_velocity: Tensor | None
-    """None: nobody asks what the task's part is."""
     null_velocity: Tensor
     twist: Tensor
     """Of the tool: the task's, and the correction of the pose drift."""
@@ -291,7 +289,6 @@ class AdaptiveController(nn.Module):
             stop=stop,
             stale=stale | ~sound,
             bounds=motion.bounds,
-            task=motion.task_velocity,
             # Those by which the arm makes way need not be kept.
             distances=observation.distances
             if constrained or self.config.way_making is None
@@ -376,19 +373,9 @@ class AdaptiveController(nn.Module):
             task = torch.lerp(approach, task, task_level.unsqueeze(-1))
         bounds = self.safety.velocity_bounds(q)
         # Constraints let it yield better.
-        constrained = self.config.safety.constraints is not None
-        if self.config.null_space_yields and not constrained:
+        if self.config.null_space_yields and self.config.safety.constraints is None:
             null = scale_null_space(task, null, *bounds)
-        return _Motion(
-            joint_velocity=task + null,
-            task_velocity=task if constrained else None,
-            null_velocity=null,
-            twist=twist,
-            task_twist=task_twist,
-            xi_q=xi_q,
-            bounds=bounds,
-            pose_drift=pose_drift,
-        )
+        return _Motion(task + null, null, twist, task_twist, xi_q, bounds, pose_drift)
 
     def _nullspace_input(self, observation: Observation) -> Tensor | None:
         """The person's, and the effort that would make the arm make way by itself."""

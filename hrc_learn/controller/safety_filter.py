@@ -241,7 +241,6 @@ class SafetyFilter(nn.Module):
         stop: Bool[Tensor, "*batch"] | None = None,
         stale: Bool[Tensor, "*batch"] | None = None,
         bounds: tuple[Tensor, Tensor] | None = None,
-        task: Float[Tensor, "*batch n"] | None = None,
         distances: Distances | None = None,
     ) -> tuple[Float[Tensor, "*batch n"], SafetyState, SafetyReport]:
         """Velocity to send for the next `dt` seconds.
@@ -260,9 +259,7 @@ class SafetyFilter(nn.Module):
             stale: The joint position is too old to be used: brake to rest.
             bounds: `velocity_bounds` of a trusted joint position, where they are known.
                 Not finite: brake to rest, as hard as the arm can.
-            task: The part of the command that is the task's, for `SafetyConfig.constraints`
-                [rad/s]; None: all of it. The rest is the null space's, which yields first.
-            distances: To keep. Not finite: brake to rest.
+            distances: To keep, by `SafetyConfig.constraints`. Not finite: brake to rest.
 
         Returns:
             The velocity (*batch, n) [rad/s], the next state, and what was done.
@@ -285,12 +282,9 @@ class SafetyFilter(nn.Module):
         given = [joint_position, joint_velocity_command]
         if jacobian is not None:
             given.append(jacobian.flatten(-2))
-        if task is not None:
-            given.append(task)
         invalid = invalid | ~is_number(torch.cat(given, dim=-1)).all(-1, keepdim=True)
         if distances is not None:
             invalid = invalid | ~distances.known().unsqueeze(-1)
-            distances = distances.where(~invalid.squeeze(-1))
         if bounds is not None:
             unknown = ~is_number(torch.cat(bounds, dim=-1)).all(-1, keepdim=True)
             invalid = invalid | unknown
@@ -321,8 +315,7 @@ class SafetyFilter(nn.Module):
         if jacobian is not None:
             stopping = limit(state, torch.zeros_like(v), bounds, dt)
             if layer is not None:
-                task = joint_velocity_command if task is None else task
-                kept = self._constrained(state, v, task, jacobian, bounds, distances, dt)
+                kept = self._constrained(state, v, u, jacobian, bounds, distances, dt)
                 braking = invalid | stopped
                 v = torch.where(
                     braking | ~kept.solved.unsqueeze(-1), stopping[0], kept.joint_velocity
@@ -377,22 +370,20 @@ class SafetyFilter(nn.Module):
         self,
         state: SafetyState,
         wanted: Tensor,
-        task: Tensor,
+        command: Tensor,
         jacobian: Tensor,
         bounds: tuple[Tensor, Tensor],
         distances: Distances | None,
         dt: float | Tensor,
     ) -> ConstrainedVelocity:
         """The velocity nearest to the wanted one with which limits and distances are kept."""
-        known = is_number(task).all(-1, keepdim=True)
-        task = task.masked_fill(~known, 0)
-        # A wanted velocity has the part of the task that the arm has picked up.
-        square = torch.linalg.vecdot(task, task)
-        along = torch.linalg.vecdot(task, wanted)
+        # A wanted velocity has the part of the command that the arm has picked up.
+        square = torch.linalg.vecdot(command, command)
+        along = torch.linalg.vecdot(command, wanted)
         share = torch.where(square > 0, along / torch.where(square > 0, square, 1.0), 0.0)
         return constrained_velocity(
             wanted,
-            task,
+            command,
             jacobian,
             *self.barrier.reachable_velocity(state.velocity, state.acceleration, bounds, dt),
             distances,

@@ -87,10 +87,9 @@ def least_change(
     for _ in range(steps):
         now = _next(now, rows, lower, upper)
     below, above = _violations(now, rows, lower, upper)
+    # A limit that is still being taken in is one that is violated.
     violation = torch.where(now.side == 0, torch.maximum(below, above), 0.0).amax(-1)
-    return LeastChange(
-        now.y, now.side * now.dual, (violation <= _TOLERANCE) & ~now.pending.squeeze(-1)
-    )
+    return LeastChange(now.y, now.side * now.dual, violation <= _TOLERANCE)
 
 
 def _violations(

@@ -67,13 +67,12 @@ def way_making_velocity(
         config: Default: the recommended settings.
     """
     config = config or WayMakingConfig()
-    known = distances.known()
-    distances = distances.where(known)
+    distances = distances.where(distances.known())
     ratio = -distances.distance / config.smoothing
     least = -config.smoothing * torch.logsumexp(ratio, -1)
     gradient = (torch.softmax(ratio, -1).unsqueeze(-1) * distances.gradient).sum(-2)
     level = ((config.far - least) / (config.far - config.near)).clamp(0, 1)
-    speed = config.speed * level * level * (3 - 2 * level) * known
+    speed = config.speed * level * level * (3 - 2 * level)
     length = safe_norm(gradient)
     direction = gradient / torch.where(length > 0, length, 1.0).unsqueeze(-1)
     return speed.unsqueeze(-1) * direction

@@ -181,6 +181,17 @@ def test_a_task_that_is_under_way_is_given_up_by_no_more_than_its_share():
     found = constrained_velocity(0.25 * task, task, J, stop, stop, share=share)
     assert found.slowed == pytest.approx(0.25, abs=1e-6)
     assert not found.joint_velocity.any()
+    # Nor does it run backwards before a person who comes towards it.
+    ahead = Distances(
+        distance=torch.tensor([0.03], dtype=DOUBLE),
+        gradient=-task.unsqueeze(0),
+        approach_speed=torch.tensor([0.1], dtype=DOUBLE),
+    )
+    wide = torch.full((7,), 9.0, dtype=DOUBLE)
+    found = constrained_velocity(0.25 * task, task, J, -wide, wide, ahead, share=share)
+    assert found.slowed == pytest.approx(0.25, abs=1e-9)
+    assert found.violation < 1e-3
+    assert (ahead.gradient @ found.joint_velocity).item() == pytest.approx(0.1, abs=1e-3)
 
 
 @pytest.mark.parametrize("value", [torch.nan, torch.inf, 1e300])
@@ -304,6 +315,7 @@ class TestInTheFilter:
         offset = 0.1 + 0.1 * torch.rand(count, 3, generator=rng, dtype=DOUBLE)
         offset = offset - moved(gradient, q)
         state, before, unsolved = safety.initial_state(q), safety.initial_state(q), 0
+        last = torch.zeros_like(q)
         with shapes_unchecked():
             for k in range(80):
                 if k % 10 == 0:
@@ -323,10 +335,11 @@ class TestInTheFilter:
                 assert (v.abs() <= limits.velocity).all()
                 assert (q >= limits.lower).all()
                 assert (q <= limits.upper).all()
+                acceleration = (v - before.velocity) / dt
                 if jerk_limited:
-                    change = (state.acceleration - before.acceleration).abs()
+                    change = (acceleration - last).abs()
                     assert (change <= limits.jerk * dt * (1 + 1e-9)).all()
-                before = state
+                before, last = state, acceleration
         assert unsolved <= 0.001 * count * 80
         assert (moved(gradient, q) + offset).min() > 0.02
 
@@ -348,11 +361,50 @@ class TestInTheFilter:
             safety = SafetyFilter(limits, config)
             state = safety.initial_state(q)
             for _ in range(40):  # until the joints have got under way, nobody moves on
-                v, state, _ = safety.step(state, q, task + null, 0.01, jacobian=J, task=task)
+                v, state, _ = safety.step(state, q, task + null, 0.01, jacobian=J)
             speeds.append(J @ v)
         wanted = J @ task
         assert (speeds[0] - wanted).norm() > 0.02
         torch.testing.assert_close(speeds[1], wanted, rtol=0, atol=2e-3)
+
+    def test_it_gives_up_no_more_of_a_task_than_the_arm_has_picked_up(self):
+        """In the first step a small part of it, whoever comes."""
+        safety, q = SafetyFilter(panda.limits, self.config), panda.ready
+        J = panda.jacobian(q)
+        task = 0.3 * torch.linalg.pinv(J)[:, 0]
+        ahead = Distances(
+            distance=torch.tensor([0.03], dtype=DOUBLE),
+            gradient=-task.unsqueeze(0),
+            approach_speed=torch.tensor([0.5], dtype=DOUBLE),
+        )
+        start = safety.initial_state(q)
+        v, _, _ = safety.step(start, q, task, 0.01, jacobian=J)
+        _, _, report = safety.step(start, q, task, 0.01, jacobian=J, distances=ahead)
+        share = float((v @ task) / (task @ task))
+        assert 0 < share < 0.5
+        assert float(report.constraints.slowed) == pytest.approx(share)
+
+    def test_a_task_that_slows_down_leaves_the_null_space_as_it_is(self):
+        """Somebody ahead of the tool whom the null space cannot avoid."""
+        safety, q = SafetyFilter(panda.limits, self.config), panda.ready
+        J = panda.jacobian(q)
+        task = 0.2 * torch.linalg.pinv(J)[:, 0]
+        null = 0.3 * null_projection(J, torch.eye(7, dtype=DOUBLE)[2])
+        ahead = Distances(
+            distance=torch.tensor([0.03], dtype=DOUBLE) + (task @ task) / 10,
+            gradient=-task.unsqueeze(0),
+            approach_speed=torch.zeros(1, dtype=DOUBLE),
+        )
+        v, _, report = safety.step(
+            safety.initial_state(q, task + null),
+            q,
+            task + null,
+            0.1,
+            jacobian=J,
+            distances=ahead,
+        )
+        assert float(report.constraints.slowed) == pytest.approx(0.5, abs=1e-6)
+        torch.testing.assert_close(v, 0.5 * task + null, rtol=0, atol=1e-6)
 
     def test_a_stop_stays_a_stop_whoever_comes(self):
         safety, q = SafetyFilter(panda.limits, self.config), panda.ready

@@ -56,6 +56,8 @@ def test_it_is_written_out_and_does_what_the_eager_one_does(observed, tmp_path: 
     assert not library_calls(trace(PackedStep(law, observation), observation))
     eager = EagerRunner(law, observation)
     compiled = PackageRunner(export_step(law, observation, tmp_path))
+    for runner in (eager, compiled):
+        runner.observe(observation)
     rng, bound = np.random.default_rng(0), 0
     q = panda.ready.numpy().copy()
     for k in range(500):
