@@ -317,9 +317,7 @@ class SafetyFilter(nn.Module):
             if layer is not None:
                 kept = self._constrained(state, v, u, jacobian, bounds, distances, dt)
                 braking = invalid | stopped
-                v = torch.where(
-                    braking | ~kept.solved.unsqueeze(-1), stopping[0], kept.joint_velocity
-                )
+                v = torch.where(braking, stopping[0], kept.joint_velocity)
                 if self.config.jerk_limited:
                     acceleration = (v - state.velocity) / dt
                 idle = braking.squeeze(-1)

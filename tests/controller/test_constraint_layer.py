@@ -379,7 +379,9 @@ class TestInTheFilter:
         )
         start = safety.initial_state(q)
         v, _, _ = safety.step(start, q, task, 0.01, jacobian=J)
-        _, _, report = safety.step(start, q, task, 0.01, jacobian=J, distances=ahead)
+        w, after, report = safety.step(start, q, task, 0.01, jacobian=J, distances=ahead)
+        assert (w - v).norm() > 1e-3
+        torch.testing.assert_close(after.acceleration, w / 0.01)  # not that of the command
         share = float((v @ task) / (task @ task))
         assert 0 < share < 0.5
         assert float(report.constraints.slowed) == pytest.approx(share)
