@@ -131,20 +131,14 @@ def _single_calls(args: Args, console: Console) -> dict[str, Callable[[], object
 
     safety = SafetyFilter(panda.limits)
     safe = safety.initial_state(q)
-    controller, observation = _servoing(KalmanEstimator, 9, q)
-    observation = replace(
-        observation,
-        feature_new=torch.tensor(True),
-        image_joint_position=q.clone(),
-        nullspace_input=effort,
-    )
+    controller, observation = usual_step(q)
     calls: dict[str, Callable[[], object]] = {
         "kinematics": lambda: panda.transform_and_jacobian(q),
         "floor": floor,
         "filter": lambda: safety.step(safe, q, effort, 0.001),
-        "eager": _settled(EagerRunner(controller, observation)),
-        "eager_fixed": _settled(EagerRunner(*_servoing(FixedEstimator, 9, q))),
-        "eager_composite": _settled(EagerRunner(*_servoing(CompositeEstimator, 9, q))),
+        "eager": settled(EagerRunner(controller, observation)),
+        "eager_fixed": settled(EagerRunner(*_servoing(FixedEstimator, 9, q))),
+        "eager_composite": settled(EagerRunner(*_servoing(CompositeEstimator, 9, q))),
     }
     if args.compile:
         with warnings.catch_warnings(record=True) as caught:
@@ -152,7 +146,7 @@ def _single_calls(args: Args, console: Console) -> dict[str, Callable[[], object
         for warning in caught:
             console.print(str(warning.message), style="yellow")
         if not isinstance(runner, EagerRunner):
-            calls["exported"] = _settled(runner)
+            calls["exported"] = settled(runner)
     if importlib.util.find_spec("mink") is not None:
         calls["mink"] = _mink_call()
     else:
@@ -160,7 +154,18 @@ def _single_calls(args: Args, console: Console) -> dict[str, Callable[[], object
     return calls
 
 
-def _settled(runner: StepRunner) -> Callable[[], object]:
+def usual_step(q: Tensor) -> tuple[AdaptiveController, Observation]:
+    """The recommended step with all it can do, for one arm or many."""
+    controller, observation = _servoing(KalmanEstimator, 9, q)
+    return controller, replace(
+        observation,
+        feature_new=torch.ones(q.shape[:-1], dtype=torch.bool),
+        image_joint_position=q.clone(),
+        nullspace_input=torch.full_like(q, 0.1),
+    )
+
+
+def settled(runner: StepRunner) -> Callable[[], object]:
     """A step once vision feedback has faded in."""
     for _ in range(400):
         runner.step()

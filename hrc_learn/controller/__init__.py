@@ -4,6 +4,14 @@ from hrc_learn.controller.action_chunk_filter import LIMIT_KINDS as LIMIT_KINDS
 from hrc_learn.controller.action_chunk_filter import ActionChunkFilter as ActionChunkFilter
 from hrc_learn.controller.action_chunk_filter import ActionChunkReport as ActionChunkReport
 from hrc_learn.controller.action_chunk_filter import ActionChunkState as ActionChunkState
+from hrc_learn.controller.constraint_layer import (
+    ConstrainedVelocity as ConstrainedVelocity,
+)
+from hrc_learn.controller.constraint_layer import ConstraintConfig as ConstraintConfig
+from hrc_learn.controller.constraint_layer import Distances as Distances
+from hrc_learn.controller.constraint_layer import (
+    constrained_velocity as constrained_velocity,
+)
 from hrc_learn.controller.controller import AdaptiveController as AdaptiveController
 from hrc_learn.controller.controller import ControllerConfig as ControllerConfig
 from hrc_learn.controller.controller import ControllerState as ControllerState
@@ -23,9 +31,12 @@ from hrc_learn.controller.monitors import lyapunov_rate as lyapunov_rate
 from hrc_learn.controller.motion_barriers import SeparationConfig as SeparationConfig
 from hrc_learn.controller.resolved_rate import scale_null_space as scale_null_space
 from hrc_learn.controller.safety_filter import INTERVENTIONS as INTERVENTIONS
+from hrc_learn.controller.safety_filter import ConstraintReport as ConstraintReport
 from hrc_learn.controller.safety_filter import SafetyConfig as SafetyConfig
 from hrc_learn.controller.safety_filter import SafetyFilter as SafetyFilter
 from hrc_learn.controller.safety_filter import SafetyReport as SafetyReport
 from hrc_learn.controller.safety_filter import SafetyState as SafetyState
+from hrc_learn.controller.way_making import WayMakingConfig as WayMakingConfig
+from hrc_learn.controller.way_making import way_making_velocity as way_making_velocity
 from hrc_learn.watchdog import Watchdog as Watchdog
 from hrc_learn.watchdog import WatchdogError as WatchdogError

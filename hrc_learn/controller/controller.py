@@ -37,6 +37,7 @@ from hrc_learn.controller.resolved_rate import (
     scale_null_space,
 )
 from hrc_learn.controller.safety_filter import SafetyConfig, SafetyFilter, SafetyState
+from hrc_learn.controller.way_making import WayMakingConfig, way_making_velocity
 from hrc_learn.geometry import Pose
 from hrc_learn.geometry.numerics import is_number
 from hrc_learn.jacobian import ImageJacobianEstimator, Measurement
@@ -74,6 +75,9 @@ class ControllerConfig:
     drift_compensation_rate: float = 2.0
     """Rate at which the tool returns to its place while a person acts [1/s]; 0: it does not."""
     blending: BlendingConfig = field(default_factory=BlendingConfig)
+    way_making: WayMakingConfig | None = None
+    """Whether the null space makes way by itself where distances are told; None: it does not,
+    and follows the person."""
     safety: SafetyConfig = field(default_factory=SafetyConfig)
 
     def __post_init__(self):
@@ -274,6 +278,7 @@ class AdaptiveController(nn.Module):
         sound = timed & is_number(asked).all(-1)
         if observation.stop is not None:
             stop = observation.stop if stop is None else stop | observation.stop
+        constrained = self.config.safety.constraints is not None
         v, safety, report = self.safety.step(
             state.safety,
             q,
@@ -284,6 +289,10 @@ class AdaptiveController(nn.Module):
             stop=stop,
             stale=stale | ~sound,
             bounds=motion.bounds,
+            # Those by which the arm makes way need not be kept.
+            distances=observation.distances
+            if constrained or self.config.way_making is None
+            else None,
         )
         # What the filter left of the task's motion is what the tool ought to do until the next
         # step: whatever else it does is drift.
@@ -342,7 +351,7 @@ class AdaptiveController(nn.Module):
         descent: Tensor,
     ) -> _Motion:
         """Joint velocity of the law, with the pose drift compensated while a person acts."""
-        d, rate = observation.nullspace_input, self.config.drift_compensation_rate
+        d, rate = self._nullspace_input(observation), self.config.drift_compensation_rate
         xi_q = self.joint_region.gradient(q)
         null = (-xi_q if d is None else d - xi_q) / self.config.null_damping
 
@@ -363,9 +372,22 @@ class AdaptiveController(nn.Module):
             approach = approach_velocity(goals.posture, q, J, self.caps[1])
             task = torch.lerp(approach, task, task_level.unsqueeze(-1))
         bounds = self.safety.velocity_bounds(q)
-        if self.config.null_space_yields:
+        # Constraints let it yield better.
+        if self.config.null_space_yields and self.config.safety.constraints is None:
             null = scale_null_space(task, null, *bounds)
         return _Motion(task + null, null, twist, task_twist, xi_q, bounds, pose_drift)
+
+    def _nullspace_input(self, observation: Observation) -> Tensor | None:
+        """The person's, and the effort that would make the arm make way by itself."""
+        d, way = observation.nullspace_input, self.config.way_making
+        if way is None:
+            return d
+        if not way.expert:
+            d = None
+        if not way.automatic or observation.distances is None:
+            return d
+        push = self.config.null_damping * way_making_velocity(observation.distances, way)
+        return push if d is None else d + push
 
     def _adapted(
         self,

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from hrc_learn.controller.constraint_layer import Distances
 from hrc_learn.controller.safety_filter import SafetyReport
 from hrc_learn.geometry import quaternion
 from hrc_learn.kinematics import JointLimits
@@ -148,6 +149,9 @@ class Observation:
     human_distance: Float[Tensor, "*batch"] | None = None
     """Distance of the nearest person from the arm [m], by which the tool slows down and stops;
     NaN: not known, stop. None: nobody is watched for."""
+    distances: Distances | None = None
+    """Of the arm from itself, the scene and a worker, which `SafetyConfig.constraints` keep;
+    None: none is."""
     stop: Bool[Tensor, "*batch"] | None = None
     """Whether to brake to rest and stay there, as a watchdog or a person asks; None: no."""
 

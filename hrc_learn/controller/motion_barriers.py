@@ -185,6 +185,34 @@ class LimitBarrier(nn.Module):
             torch.minimum(last + reach, self.acceleration),
         )
 
+    def reachable_velocity(
+        self,
+        velocity: Float[Tensor, "*batch n"],
+        acceleration: Float[Tensor, "*batch n"],
+        bounds: tuple[Tensor, Tensor],
+        dt: float | Float[Tensor, ""],
+    ) -> tuple[Float[Tensor, "*batch n"], Float[Tensor, "*batch n"]]:
+        """Lowest and highest velocity of the next step with which all limits are kept [rad/s].
+
+        Where those of position and velocity ask for more than the others allow, the nearest
+        that is allowed.
+
+        Args:
+            velocity: Of the last step [rad/s].
+            acceleration: Of the last step [rad/s^2].
+            bounds: `velocity_bounds` now.
+            dt: Step [s].
+        """
+        A = self.acceleration
+        if self.jerk_limited:
+            lowest, highest = (
+                velocity + dt * self.nearest_acceleration(a, acceleration, velocity, bounds, dt)
+                for a in (-A.expand_as(velocity), A.expand_as(velocity))
+            )
+            return lowest, highest
+        lower, upper = velocity - A * dt, velocity + A * dt
+        return bounds[0].clamp(lower, upper), bounds[1].clamp(lower, upper)
+
 
 @dataclass(frozen=True, kw_only=True)
 class SeparationConfig:

@@ -14,6 +14,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from hrc_learn.controller.constraint_layer import (
+    ConstrainedVelocity,
+    ConstraintConfig,
+    Distances,
+    constrained_velocity,
+)
 from hrc_learn.controller.motion_barriers import LimitBarrier, SeparationConfig
 from hrc_learn.geometry.numerics import is_number
 from hrc_learn.kinematics import JointLimits
@@ -63,6 +69,9 @@ class SafetyConfig:
     """Cap on the speed of the tool centre point [m/s]; acts where a Jacobian is given."""
     separation: SeparationConfig = field(default_factory=SeparationConfig)
     """Lowers that cap where the distance to a person is given."""
+    constraints: ConstraintConfig | None = None
+    """Keeps limits and distances by one program, in which the null space yields to the task;
+    None: joints brake before their limits each by itself, and no distance is kept."""
 
     def __post_init__(self):
         for name in ("rate", "tcp_speed"):
@@ -107,11 +116,26 @@ class SafetyState:
 
 @pytree
 @dataclass(frozen=True, kw_only=True)
+class ConstraintReport:
+    """What it took to keep all limits at once (`ConstrainedVelocity`)."""
+
+    slowed: Float[Tensor, "*batch"]
+    """Part of the task that was given up in this step, 0 to 1."""
+    violation: Float[Tensor, "*batch"]
+    """By how much distances shrink faster than they may [m/s]."""
+    solved: Bool[Tensor, "*batch"]
+    """False: the arm brakes, for the solver was not given steps enough."""
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
 class SafetyReport:
     """What the filter did in this step."""
 
     flags: Bool[Tensor, "*batch kinds"]
     """Whether each of `INTERVENTIONS` was needed, by more than rounding."""
+    constraints: ConstraintReport | None = None
+    """What keeping distances took, where the filter does that."""
 
     def acted(self, kind: str) -> Bool[Tensor, "*batch"]:
         """Whether one kind of intervention was needed."""
@@ -217,6 +241,7 @@ class SafetyFilter(nn.Module):
         stop: Bool[Tensor, "*batch"] | None = None,
         stale: Bool[Tensor, "*batch"] | None = None,
         bounds: tuple[Tensor, Tensor] | None = None,
+        distances: Distances | None = None,
     ) -> tuple[Float[Tensor, "*batch n"], SafetyState, SafetyReport]:
         """Velocity to send for the next `dt` seconds.
 
@@ -234,19 +259,32 @@ class SafetyFilter(nn.Module):
             stale: The joint position is too old to be used: brake to rest.
             bounds: `velocity_bounds` of a trusted joint position, where they are known.
                 Not finite: brake to rest, as hard as the arm can.
+            distances: To keep, by `SafetyConfig.constraints`. Not finite: brake to rest.
 
         Returns:
             The velocity (*batch, n) [rad/s], the next state, and what was done.
 
         Raises:
             ValueError: A number dt is not in (0, longest_step], or a distance comes without a
-                Jacobian.
+                Jacobian or without the constraints that would keep it.
         """
+        layer = self.config.constraints
+        if layer is None and distances is not None:
+            raise ValueError(
+                "distances are kept by SafetyConfig.constraints, which is None: give it a "
+                "ConstraintConfig"
+            )
+        if layer is not None and jacobian is None:
+            raise ValueError(
+                "constraints tell the null space by the Jacobian of the tool: pass jacobian"
+            )
         state, dt, invalid = self._validated_state(state, dt)
         given = [joint_position, joint_velocity_command]
         if jacobian is not None:
             given.append(jacobian.flatten(-2))
         invalid = invalid | ~is_number(torch.cat(given, dim=-1)).all(-1, keepdim=True)
+        if distances is not None:
+            invalid = invalid | ~distances.known().unsqueeze(-1)
         if bounds is not None:
             unknown = ~is_number(torch.cat(bounds, dim=-1)).all(-1, keepdim=True)
             invalid = invalid | unknown
@@ -261,14 +299,33 @@ class SafetyFilter(nn.Module):
         bounds = bounds or self.velocity_bounds(q)
 
         excess = _excess(u, self.barrier.velocity)
-        u = u / excess.clamp(min=1)
+        if layer is None:
+            u = u / excess.clamp(min=1)
         inside = u.clamp(*bounds)
         cut = torch.linalg.vector_norm(inside - u, math.inf, dim=-1, keepdim=True) > _REPORTED
-        target, cap, speeding, near = self._cap_tcp_speed(inside, jacobian, human_distance)
+        # Constraints cut no joint by itself: the null space may make way for all of the task.
+        target, cap, speeding, near = self._cap_tcp_speed(
+            inside if layer is None else u, jacobian, human_distance
+        )
         limit = self._limit_jerk if self.config.jerk_limited else self._limit_acceleration
-        v, acceleration, excess_a, excess_j = limit(state, target, bounds, dt)
+        v, acceleration, excess_a, excess_j = limit(
+            state, target, bounds if layer is None else None, dt
+        )
+        report = None
         if jacobian is not None:
             stopping = limit(state, torch.zeros_like(v), bounds, dt)
+            if layer is not None:
+                kept = self._constrained(state, v, u, jacobian, bounds, distances, dt)
+                braking = invalid | stopped
+                v = torch.where(braking, stopping[0], kept.joint_velocity)
+                if self.config.jerk_limited:
+                    acceleration = (v - state.velocity) / dt
+                idle = braking.squeeze(-1)
+                report = ConstraintReport(
+                    slowed=kept.slowed.masked_fill(idle, 0),
+                    violation=kept.violation.masked_fill(idle, 0),
+                    solved=kept.solved | idle,
+                )
             fraction = _blend_to_cap(_linear(jacobian, v), _linear(jacobian, stopping[0]), cap)
             # Between two that are within the limits, so within them as well.
             v = torch.lerp(v, stopping[0], fraction)
@@ -286,7 +343,7 @@ class SafetyFilter(nn.Module):
                 dt=state.dt,
                 counts=state.counts + flags,
             ),
-            SafetyReport(flags=flags),
+            SafetyReport(flags=flags, constraints=report),
         )
 
     def _validated_state(
@@ -306,6 +363,31 @@ class SafetyFilter(nn.Module):
                 f"guarantee the limits, but got {dt:g} s; step faster or lower its rate"
             )
         return replace(state, dt=torch.full_like(state.dt, dt)), dt, invalid
+
+    def _constrained(
+        self,
+        state: SafetyState,
+        wanted: Tensor,
+        command: Tensor,
+        jacobian: Tensor,
+        bounds: tuple[Tensor, Tensor],
+        distances: Distances | None,
+        dt: float | Tensor,
+    ) -> ConstrainedVelocity:
+        """The velocity nearest to the wanted one with which limits and distances are kept."""
+        # A wanted velocity has the part of the command that the arm has picked up.
+        square = torch.linalg.vecdot(command, command)
+        along = torch.linalg.vecdot(command, wanted)
+        share = torch.where(square > 0, along / torch.where(square > 0, square, 1.0), 0.0)
+        return constrained_velocity(
+            wanted,
+            command,
+            jacobian,
+            *self.barrier.reachable_velocity(state.velocity, state.acceleration, bounds, dt),
+            distances,
+            self.config.constraints,
+            share.clamp(0, 1),
+        )
 
     def _cap_tcp_speed(
         self, u: Tensor, jacobian: Tensor | None, human_distance: Tensor | None
@@ -334,10 +416,12 @@ class SafetyFilter(nn.Module):
         self,
         state: SafetyState,
         target: Tensor,
-        bounds: tuple[Tensor, Tensor],
+        bounds: tuple[Tensor, Tensor] | None,
         dt: float | Tensor,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Velocity as near to the target as the acceleration limit lets it come.
+
+        Without `bounds` those of position and velocity are left to whoever keeps them.
 
         Returns:
             Velocity, acceleration, and by how much acceleration and jerk were too large.
@@ -346,6 +430,8 @@ class SafetyFilter(nn.Module):
         change = target - state.velocity
         excess_a = _excess(change, reach)
         v = torch.addcdiv(state.velocity, change, excess_a.clamp(min=1))
+        if bounds is None:
+            return v, state.acceleration, excess_a, torch.zeros_like(excess_a)
         # Last the bounds that no scaling may loosen. Should both exclude each other, the arm
         # could not brake harder anyway.
         v = v.clamp(*bounds).clamp(state.velocity - reach, state.velocity + reach)
@@ -355,7 +441,7 @@ class SafetyFilter(nn.Module):
         self,
         state: SafetyState,
         target: Tensor,
-        bounds: tuple[Tensor, Tensor],
+        bounds: tuple[Tensor, Tensor] | None,
         dt: float | Tensor,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """The same under a jerk limit.
@@ -374,9 +460,10 @@ class SafetyFilter(nn.Module):
         step = wanted - state.acceleration
         excess_j = _excess(step, reach)
         acceleration = torch.addcdiv(state.acceleration, step, excess_j.clamp(min=1))
-        acceleration = barrier.nearest_acceleration(
-            acceleration, state.acceleration, state.velocity, bounds, dt
-        )
+        if bounds is not None:
+            acceleration = barrier.nearest_acceleration(
+                acceleration, state.acceleration, state.velocity, bounds, dt
+            )
         return state.velocity + acceleration * dt, acceleration, excess_a, excess_j
 
 

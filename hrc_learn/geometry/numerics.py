@@ -180,6 +180,19 @@ def null_projection(
     return unrolled_null_projection(J, w)
 
 
+def orthonormal_basis(J: Float[Tensor, "*batch m n"]) -> Float[Tensor, "*batch n n"]:
+    """An orthogonal matrix Q whose last n - m columns J maps to zero, to rounding.
+
+    The first m span the range of J^T, and where its rank is below m some of the null space.
+
+    Args:
+        J: With at least as many columns as rows.
+    """
+    if not torch.compiler.is_compiling():
+        return torch.linalg.qr(J.mT, mode="complete").Q
+    return unrolled_orthonormal_basis(J)
+
+
 def unrolled_matmul(
     A: Float[Tensor, "*#batch m k"], B: Float[Tensor, "*#batch k n"]
 ) -> Float[Tensor, "*batch m n"]:
@@ -225,9 +238,29 @@ def unrolled_null_projection(
 ) -> Float[Tensor, "*batch n"]:
     """`null_projection` by the reflections that make J^T triangular, there and back."""
     m = J.shape[-2]
+    reflections = _reflections(J)
+    for k, (v, factor) in enumerate(reflections):
+        w = _reflected(w, k, v, factor)
+    w = torch.cat([torch.zeros_like(w[..., :m]), w[..., m:]], dim=-1)
+    for k in reversed(range(m)):
+        w = _reflected(w, k, *reflections[k])
+    return w
+
+
+def unrolled_orthonormal_basis(J: Float[Tensor, "*batch m n"]) -> Float[Tensor, "*batch n n"]:
+    """`orthonormal_basis` by the same reflections."""
+    n = J.shape[-1]
+    Q = torch.eye(n, dtype=J.dtype, device=J.device).expand(*J.shape[:-2], n, n)
+    for k, (v, factor) in enumerate(_reflections(J)):
+        Q = _reflected(Q, k, v.unsqueeze(-2), factor.unsqueeze(-1))
+    return Q
+
+
+def _reflections(J: Tensor) -> list[tuple[Tensor, Tensor]]:
+    """Vectors and factors of the reflections that make J^T triangular, one a row of J."""
     columns = list(J.unbind(-2))
     reflections: list[tuple[Tensor, Tensor]] = []
-    for k in range(m):
+    for k in range(len(columns)):
         x = columns[k][..., k:]
         norm = (x * x).sum(-1, keepdim=True).sqrt()
         # Away from zero: no digits cancel.
@@ -236,14 +269,9 @@ def unrolled_null_projection(
         # A column of zeros needs no reflection.
         factor = torch.where(square > 0, 2 / torch.where(square > 0, square, 1.0), 0.0)
         reflections.append((v, factor))
-        for i in range(k + 1, m):
+        for i in range(k + 1, len(columns)):
             columns[i] = _reflected(columns[i], k, v, factor)
-    for k, (v, factor) in enumerate(reflections):
-        w = _reflected(w, k, v, factor)
-    w = torch.cat([torch.zeros_like(w[..., :m]), w[..., m:]], dim=-1)
-    for k in reversed(range(m)):
-        w = _reflected(w, k, *reflections[k])
-    return w
+    return reflections
 
 
 def _reflected(x: Tensor, k: int, v: Tensor, factor: Tensor) -> Tensor:
