@@ -197,6 +197,45 @@ def test_an_arm_whose_delay_is_known_keeps_to_its_path(straight):
     assert lag(0.0) > 4 * lag(0.03)
 
 
+@pytest.mark.parametrize("side", [-1, 1])
+def test_however_hard_and_long_a_person_pushes_the_task_keeps_its_place_and_room(side):
+    q = np.array([0.4, 0.2, -0.3, -2.2, 0.1, 2.4, 0.6])
+    direction = np.linalg.svd(panda.jacobian(torch.from_numpy(q)).numpy())[2][6]
+    arm = LateArm(q, late=2)
+
+    class Person:
+        def read(self, state):
+            # Along the way the arm has taken so far: on and on.
+            J = panda.jacobian(torch.from_numpy(state.joint_position)).numpy()
+            unit = np.linalg.svd(J)[2][6]
+            moved = direction if state.time < 0.3 else state.joint_position - q
+            return HumanInput(
+                nullspace_input=12.0 * unit * np.sign(unit @ moved) * side_of(state)
+            )
+
+    def side_of(state):
+        return side if state.time < 0.3 else 1
+
+    cell = WorkCell(
+        chain=panda,
+        arm=arm,
+        gripper=arm,
+        human=Person(),
+        advance=arm.advance,
+        config=WorkCellConfig(command_delay=0.02),
+    )
+    with shapes_unchecked():
+        cell.hold_pose(5.0)
+    joints = torch.from_numpy(cell.log["joint_position"])
+    moved = (joints[-1] - joints[0]).abs().max()
+    hand = panda.forward(joints).position
+    room = torch.minimum(joints - panda.limits.lower, panda.limits.upper - joints).min()
+    assert moved > 0.3
+    assert (hand - hand[0]).norm(dim=-1).max() < 1.5e-3
+    assert room > 0.1
+    assert torch.linalg.svdvals(panda.jacobian(joints))[:, -1].min() > 0.045
+
+
 def test_the_null_space_gives_way_to_a_task_that_needs_the_room():
     """A joint at the edge of the room left to the task, which a push had moved it to."""
     q = panda.ready.clone()

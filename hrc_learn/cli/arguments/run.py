@@ -183,8 +183,8 @@ class RunCollaboration(RunServoing):
     frame_loss: More[float] = 0.0
     """Share of the images that are lost."""
     pulls: Literal["scripted", "random", "none"] = "scripted"
-    """When the scripted person pulls the elbow: while the robot waits for them above the
-    object, at random moments of the whole job whatever it does, or never."""
+    """When a scripted person pulls the elbow: where the robot waits for them, at random moments
+    of the whole job, or never."""
     worker: bool = False
     """Whether a worker comes and reaches under the arm. He puts something on the table first,
     leaves again, and makes no way for the robot; how near he comes is measured."""
