@@ -1,0 +1,169 @@
+"""How the null space yields to a person who pushes the joints off their path, and how they go
+back when the person lets go.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from hrc_learn.geometry.numerics import null_projection
+from hrc_learn.kinematics import SerialChain
+
+# Null-space input below which one that has ended is over [N m].
+_LEAST_INPUT = 0.05
+# How far the null space is from a planned path for the arm to have been pushed aside, and to be
+# back [rad]: servos lag by 0.03 rad at the speed of transfers.
+_ASIDE, _BACK = 0.1, 0.03
+# Time to go back at the end of a path, or while it waits [s].
+LONGEST_RETURN = 5.0
+# Smallest singular value of the Jacobian of a path below which the arm cannot follow beside it,
+# as damping begins at 0.05.
+_NARROW = 0.07
+# In which a path stops, and goes on [s].
+CHANGE_OF_RATE = 0.2
+
+
+@dataclass(frozen=True, kw_only=True)
+class YieldingConfig:
+    """How the null space yields, and how the joints go back."""
+
+    damping: float = 3.0
+    """c_d: null-space input per unit of joint velocity (paper, Table I) [N m s/rad]."""
+    nullspace_rise: float = 0.15
+    """Time constant with which the null-space input is smoothed [s]."""
+    pose_gain: float = 4.0
+    """Decay rate of the pose error on given motions [1/s]."""
+    after_push: Literal["return", "stay"] = "return"
+    """Whether the joints go back to a planned path, or on beside it, when a person who pushed
+    them aside lets go."""
+    return_speed: float = 0.4
+    """Fastest way back, of all joints together [rad/s]."""
+    clearance: float = 0.03
+    """Distance from what is around that nobody can push the arm below [m]: three times the
+    errors of base and table."""
+
+
+class NullSpaceYielding:
+    """Whether a person has pushed the joints off their path, and the way back to it.
+
+    Attributes:
+        nullspace_input: What the person asks for, without jumps [N m].
+        aside: Whether the joints are off their path.
+    """
+
+    def __init__(
+        self,
+        chain: SerialChain,
+        dt: float,
+        config: YieldingConfig,
+        nullspace_input: Float[np.ndarray, " joints"],
+    ):
+        """Begin on the path.
+
+        Args:
+            chain: Kinematics of the arm.
+            dt: Control step [s].
+            config: How it yields.
+            nullspace_input: What the person asks for at first [N m].
+        """
+        self._chain, self._dt, self._config = chain, dt, config
+        self.nullspace_input, self.aside = nullspace_input, False
+        self._back = torch.zeros(len(chain.joint_names), dtype=torch.float64)
+
+    @property
+    def pushed(self) -> bool:
+        """Whether a person pushes at the null space now."""
+        return bool(self.nullspace_input.any())
+
+    @property
+    def null_velocity(self) -> Float[Tensor, " joints"]:
+        """Joint velocity whose null-space part the person asks for [rad/s]."""
+        return torch.from_numpy(self.nullspace_input) / self._config.damping
+
+    def feel(self, asked: Float[np.ndarray, " joints"]) -> Float[np.ndarray, " joints"]:
+        """Take in what a person asks for now; the null-space input without jumps [N m].
+
+        An arm follows late and with limited acceleration, each joint in its own way. A jump of
+        its null-space motion would therefore move the end effector.
+        """
+        share = min(self._dt / self._config.nullspace_rise, 1.0)
+        before = self.nullspace_input
+        smooth = before + share * (asked - before)
+        if not asked.any() and np.abs(smooth).max() < _LEAST_INPUT:
+            smooth = asked
+        self.nullspace_input = smooth
+        return smooth
+
+    def way_back(
+        self,
+        joints: Float[Tensor, " joints"],
+        error: Float[Tensor, " joints"],
+        *,
+        yields: bool = True,
+        returns: bool = False,
+    ) -> Float[Tensor, " joints"] | None:
+        """Velocity of the joints back to their path, without jumps.
+
+        Args:
+            joints: Where they are [rad].
+            error: From there to the path [rad].
+            yields: Whether the person can push the joints off it here.
+            returns: Whether joints that were pushed off it go back in any case.
+
+        Returns:
+            The velocity, in the null space [rad/s]; None of joints on their path.
+        """
+        away = self._away(joints, error) if yields or self.aside else None
+        if away is None:
+            self._back = torch.zeros_like(error)
+            return None
+        back = torch.zeros_like(away)
+        if returns or self._config.after_push == "return":
+            fastest = self._config.return_speed / float(away.norm().clamp(min=1e-9))
+            back = min(self._config.pose_gain, fastest) * away
+        # A jump of the null-space motion would move the end effector.
+        share = min(self._dt / self._config.nullspace_rise, 1.0)
+        self._back = self._back + share * (back - self._back)
+        return self._back
+
+    def _away(
+        self, joints: Float[Tensor, " joints"], error: Float[Tensor, " joints"]
+    ) -> Float[Tensor, " joints"] | None:
+        """Null-space part of the way back to a path [rad]; None if nobody pushed it off."""
+        limit = _BACK if self.aside else _ASIDE
+        if not self.pushed and float(error.norm()) <= limit:
+            self.aside = False
+            return None
+        self.aside = True
+        return null_projection(self._chain.jacobian(joints), error)
+
+
+def near_singularity(
+    chain: SerialChain, joint_position: Float[Tensor, "*batch joints"]
+) -> Bool[np.ndarray, "*batch"]:
+    """Where a path of the joints is so near a singularity that the arm cannot follow it
+    beside it.
+
+    Args:
+        chain: Kinematics of the arm.
+        joint_position: Along the path [rad].
+    """
+    smallest = torch.linalg.svdvals(chain.jacobian(joint_position))[..., -1]
+    return (smallest < _NARROW).numpy()
+
+
+def changed_rate(rate: float, wanted: float, dt: float) -> float:
+    """The rate of a path a step later: without jumps, as every change of speed is one of the
+    end effector's.
+
+    Args:
+        rate: Share of the path's own speed, 0 to 1.
+        wanted: That it should have.
+        dt: Control step [s].
+    """
+    change = dt / CHANGE_OF_RATE
+    return rate + min(max(min(max(wanted, 0.0), 1.0) - rate, -change), change)
