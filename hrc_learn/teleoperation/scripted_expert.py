@@ -54,6 +54,36 @@ class ScriptedForce:
         return pull * self.strength(time) * min(1.0, self.max_force / max(size, TINY))
 
 
+_PAUSE, _DURATION = (1.0, 6.0), (2.0, 4.5)
+"""Between two pulls, and of a pull [s]: as long as the paper's drags of joint 4, 4 to 7 s, or
+half that."""
+_HAND = ((-0.1, 0.5), (-0.4, 0.4), (0.3, 0.8))
+"""Where the person's hand may be, along x, y and z [m]: all about an elbow above the table."""
+_FORCE = 60.0
+"""Largest force [N], as where the person is waited for."""
+
+
+def random_pulls(
+    rng: np.random.Generator, duration: float = 600.0
+) -> tuple[ScriptedForce, ...]:
+    """Pulls at random moments, each from another side.
+
+    Args:
+        rng: Source of moments, durations and sides.
+        duration: How long they go on [s].
+    """
+    pulls, time = [], float(rng.uniform(0.0, _PAUSE[1]))
+    while time < duration:
+        low, high = np.array(_HAND).T
+        x, y, z = rng.uniform(low, high)
+        length = float(rng.uniform(*_DURATION))
+        pulls.append(
+            ScriptedForce(start=time, duration=length, towards=(x, y, z), max_force=_FORCE)
+        )
+        time += length + float(rng.uniform(*_PAUSE))
+    return tuple(pulls)
+
+
 class ScriptedPerturbation:
     """A person who pulls at the arm at given times, and does nothing else."""
 

@@ -1,4 +1,4 @@
-"""A person who pulls at the elbow at any moment of a job, and what each pull does.
+"""What a person who pulls at the elbow at any moment of a job does to the motion.
 
 In motions and while the end effector is held, its path is known, and so is how far it was off
 it. Visual servoing has no path: there the offset of the hand from the object tells.
@@ -16,13 +16,6 @@ from hrc_learn.kinematics import SerialChain, panda
 from hrc_learn.teleoperation import ScriptedForce
 from hrc_learn.viz import LoggedSteps
 
-_PAUSE, _DURATION = (1.0, 6.0), (2.0, 4.5)
-"""Between two pulls, and of a pull [s]: as long as the paper's drags of joint 4, 4 to 7 s, or
-half that."""
-_HAND = ((-0.1, 0.5), (-0.4, 0.4), (0.3, 0.8))
-"""Where the person's hand may be, along x, y and z [m]: all about an elbow above the table."""
-_FORCE = 60.0
-"""Largest force [N], as where the person is waited for."""
 _ELBOW = 3
 """Joint at the elbow, from 0."""
 _AFTER = 1.0
@@ -32,27 +25,6 @@ _LAG = 0.5
 lag, and a motion that waits for a limit lags further."""
 _LEAST_WAY = 0.002
 """Way of the goal in that time from which on it has a direction [m]."""
-
-
-def random_pulls(
-    rng: np.random.Generator, duration: float = 600.0
-) -> tuple[ScriptedForce, ...]:
-    """Pulls at random moments, each from another side.
-
-    Args:
-        rng: Source of moments, durations and sides.
-        duration: How long they go on [s].
-    """
-    pulls, time = [], float(rng.uniform(0.0, _PAUSE[1]))
-    while time < duration:
-        low, high = np.array(_HAND).T
-        x, y, z = rng.uniform(low, high)
-        length = float(rng.uniform(*_DURATION))
-        pulls.append(
-            ScriptedForce(start=time, duration=length, towards=(x, y, z), max_force=_FORCE)
-        )
-        time += length + float(rng.uniform(*_PAUSE))
-    return tuple(pulls)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,0 +1,267 @@
+"""A policy leads the end effector while a person leads the body: at the same time, without a
+pause or a handover.
+"""
+
+import math
+from collections import deque
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hrc_learn.geometry.numerics import null_projection
+from hrc_learn.kinematics import MotionLimits, SerialChain
+from hrc_learn.protocols import ArmState, Human
+from hrc_learn.skills.arm_motion import joints_near, kept_clear, resolved_rate
+from hrc_learn.skills.null_space_yielding import (
+    CHANGE_OF_RATE,
+    LONGEST_RETURN,
+    NullSpaceYielding,
+    YieldingConfig,
+    changed_rate,
+    near_singularity,
+)
+
+# Of the limits of acceleration, what the null space may take: the path needs the rest.
+_SHARE_OF_ACCELERATION = 0.4
+# Distance kept from a joint limit, and decay rate of the remaining one [rad, 1/s]: within the
+# margins of the servo, which would stop single joints and so move the end effector.
+_FROM_LIMIT, _LIMIT_RATE = 0.05, 5.0
+# Joints as far from their posture are on it [rad].
+_SAME = 1e-6
+# Deviation of the end effector, a radian counted as a decimetre, that no step leaves [m]; if
+# one does, the arm aside cannot reach where the policy wants the end effector.
+_REACHED, _METRES_PER_RADIAN = 5e-4, 0.1
+# By which the arm may be nearer to what is around it than the policy's own posture [m]: rounding
+# must not stop it.
+_NO_NEARER = 1e-3
+# Postures that are as near are the same, for a motion that waits [rad].
+_MET_AGAIN = 0.02
+
+
+class ComplementaryMotion:
+    """Joint positions with the end effector where a policy wants it, the body as a person does.
+
+    The policy, of any kind, asks for joint positions, its own posture. As long as nobody pushes
+    they are handed on as they are. Pushed aside, the joints keep the end effector where the
+    policy's posture has it and move in its null space, within their limits and clear of what
+    is around them. When the person lets go they return to the policy's posture, or stay beside
+    it (`YieldingConfig.after_push`). Where the arm, aside, cannot follow, the motion waits and
+    goes on from there, as on planned paths (`WorkCell.follow_path`).
+
+    Attributes:
+        posture: Joint positions that the policy has now, as without the person [rad]; None
+            before the first step.
+        joints: Those commanded instead [rad].
+        offset_velocity: How fast they part [rad/s].
+        nullspace_input: What the person asks for, without jumps [N m].
+        waits: Whether the motion waits, or has yet to regain its own speed.
+    """
+
+    posture: Float[Tensor, " joints"] | None
+    joints: Float[Tensor, " joints"] | None
+
+    def __init__(
+        self,
+        chain: SerialChain,
+        human: Human,
+        dt: float,
+        limits: MotionLimits,
+        config: YieldingConfig | None = None,
+        clearance: Callable[[Float[Tensor, "*batch joints"]], Float[Tensor, "*batch"]]
+        | None = None,
+    ):
+        """Begin where the first step is.
+
+        Args:
+            chain: Kinematics of the arm.
+            human: Who pushes it.
+            dt: Time from one step to the next [s].
+            limits: Within which whoever follows the positions can do so exactly.
+            config: How the null space yields.
+            clearance: Distance of an arm at given joint positions from itself and from what
+                stands around [m]; None: people can push it anywhere within its limits.
+        """
+        self._chain, self._human, self._dt = chain, human, dt
+        self._limits, self._clearance = limits, clearance
+        self._config = config or YieldingConfig()
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin anew: nobody has pushed, and the next step is the first."""
+        n = len(self._chain.joint_names)
+        self._yielding = NullSpaceYielding(self._chain, self._dt, self._config, np.zeros(n))
+        self.posture = self.joints = None
+        self.offset_velocity = self._null = torch.zeros(n, dtype=torch.float64)
+        self._rate, self._waited = 1.0, 0.0
+        # What the policy wants, from where the motion is; of more than one when it waits.
+        self._wishes: deque[tuple[Tensor, float]] = deque()
+        self._progress = 0.0
+
+    @property
+    def nullspace_input(self) -> Float[np.ndarray, " joints"]:
+        return self._yielding.nullspace_input
+
+    @property
+    def waits(self) -> bool:
+        return self._rate < 1.0
+
+    @property
+    def offset(self) -> Float[np.ndarray, " joints"]:
+        """From the policy's posture to the commanded joints [rad]."""
+        if self.posture is None or self.joints is None:
+            return np.zeros(len(self._chain.joint_names))
+        return (self.joints - self.posture).numpy()
+
+    def next(
+        self, state: ArmState, wish: Float[np.ndarray, " joints"], width: float = math.nan
+    ) -> tuple[Float[np.ndarray, " joints"], float]:
+        """The joint positions to be reached when the next step is due.
+
+        Args:
+            state: Newest reading of the arm, for the person to see.
+            wish: Joint positions that the policy wants then [rad].
+            width: Opening of the gripper that it wants [m]; waits with the motion.
+
+        Returns:
+            Joint positions [rad] and opening of the gripper [m].
+        """
+        self._yielding.feel(self._human.read(state).nullspace_input)
+        posture, width = self._followed(torch.from_numpy(np.array(wish, dtype=float)), width)
+        if self.posture is None or self.joints is None:
+            self.posture = self.joints = posture
+        before = self.joints - self.posture
+        if self._yielding.pushed or bool(before.any()):
+            joints, clear = self._beside(posture, self.posture, self.joints)
+        else:
+            joints, clear = posture, True
+        self._rate = changed_rate(self._rate, 1.0 if clear else 0.0, self._dt)
+        held_back = self._rate == 0 and not self._yielding.pushed
+        self._waited = self._waited + self._dt if held_back else 0.0
+        self.offset_velocity = (joints - posture - before) / self._dt
+        self.posture, self.joints = posture, joints
+        return joints.numpy(), width
+
+    def _followed(
+        self, wish: Float[Tensor, " joints"], width: float
+    ) -> tuple[Float[Tensor, " joints"], float]:
+        """The wish now followed: the newest, or of a motion that waited one from before."""
+        wishes = self._wishes
+        if wishes and float((wish - wishes[0][0]).norm()) < _MET_AGAIN and self._rate == 1.0:
+            # The policy is where the motion is: it has waited too, or come to its end.
+            wishes.clear()
+        wishes.append((wish, width))
+        self._progress = self._progress + self._rate if len(wishes) > 1 else 0.0
+        while self._progress >= 1.0 and len(wishes) > 1:
+            wishes.popleft()
+            self._progress -= 1.0
+        joints, width = wishes[0]
+        if self._progress and len(wishes) > 1:
+            joints = torch.lerp(joints, wishes[1][0], self._progress)
+        return joints, width
+
+    def _beside(
+        self,
+        posture: Float[Tensor, " joints"],
+        before: Float[Tensor, " joints"],
+        joints: Float[Tensor, " joints"],
+    ) -> tuple[Float[Tensor, " joints"], bool]:
+        """Joint positions beside the policy's posture, and whether they can go on like that."""
+        dt, moved = self._dt, posture - before
+        ahead = torch.stack([posture, posture + CHANGE_OF_RATE / dt * moved])
+        narrow = near_singularity(self._chain, ahead)
+        back = self._yielding.way_back(
+            joints, before - joints, yields=not narrow[0], returns=self._rate == 0
+        )
+        if self._waited > LONGEST_RETURN:
+            return self._straight_back(posture, joints), False
+        wanted = self._config.pose_gain * (before - joints)
+        if back is not None:
+            wanted = self._yielding.null_velocity + back
+        goal = self._chain.forward(posture)
+        here, J = self._chain.forward_and_jacobian(joints)
+        task = resolved_rate(J, here.twist_to(goal) / dt, torch.zeros_like(joints))
+        null = self._feasible(J, joints, posture, task, moved / dt + wanted)
+        waits = False
+        if self._clearance is not None:
+            # Where the policy itself leads the arm nearer, people may as well.
+            own = float(self._clearance(ahead).min()) - _NO_NEARER
+            margin = min(self._config.clearance, own)
+            null, waits = kept_clear(joints, task, null, self._clearance, margin)
+            if waits:
+                # Against the person, as it would stop the end effector otherwise.
+                wanted = self._yielding.fastest_back(null_projection(J, before - joints))
+                null = self._feasible(J, joints, posture, task, moved / dt + wanted)
+                then = joints + CHANGE_OF_RATE * (task + null)
+                now, soon = self._clearance(torch.stack([joints, then])).tolist()
+                waits = soon < min(now, margin)
+        self._null = null
+        reached = joints_near(self._chain, goal, joints + dt * (task + null))
+        off = self._chain.forward(reached).twist_to(goal)
+        far = float(off[:3].norm() + _METRES_PER_RADIAN * off[3:].norm()) > _REACHED
+        if back is None and float((reached - posture).norm()) < _SAME:
+            return posture, True
+        return reached, not (waits or far or (back is not None and bool(narrow.any())))
+
+    def _feasible(
+        self,
+        J: Float[Tensor, "6 joints"],
+        joints: Float[Tensor, " joints"],
+        posture: Float[Tensor, " joints"],
+        task: Float[Tensor, " joints"],
+        wanted: Float[Tensor, " joints"],
+    ) -> Float[Tensor, " joints"]:
+        """The null-space part of a velocity, as far as the arm can do it."""
+        null = self._gently(J, null_projection(J, wanted))
+        return self._within_limits(joints, posture, task, null)
+
+    def _gently(
+        self, J: Float[Tensor, "6 joints"], null: Float[Tensor, " joints"]
+    ) -> Float[Tensor, " joints"]:
+        """A null-space motion with a limited change since the last one.
+
+        Scaled as a whole: joints that follow late, each in its own way, would move the end
+        effector.
+        """
+        change = null - self._null
+        most = _SHARE_OF_ACCELERATION * self._dt * self._limits.acceleration
+        share = float((most / change.abs().clamp(min=1e-12)).min().clamp(max=1.0))
+        return null_projection(J, self._null + share * change)
+
+    def _within_limits(
+        self,
+        joints: Float[Tensor, " joints"],
+        posture: Float[Tensor, " joints"],
+        task: Float[Tensor, " joints"],
+        null: Float[Tensor, " joints"],
+    ) -> Float[Tensor, " joints"]:
+        """As much of a null-space motion as the limits of joints and their speeds leave."""
+        limits, rate = self._limits, min(_LIMIT_RATE, 1 / self._dt)
+        # Where the policy itself goes nearer to a limit, that is the limit.
+        upper = torch.maximum(limits.upper - _FROM_LIMIT, posture)
+        lower = torch.minimum(limits.lower + _FROM_LIMIT, posture)
+        up = torch.minimum(rate * (upper - joints), limits.velocity) - task
+        down = torch.maximum(rate * (lower - joints), -limits.velocity) - task
+        room = torch.where(null > 0, up, down) / torch.where(null == 0, 1.0, null)
+        share = torch.where(null == 0, 1.0, room).clamp(0.0, 1.0).min()
+        return share * null
+
+    def _straight_back(
+        self, posture: Float[Tensor, " joints"], joints: Float[Tensor, " joints"]
+    ) -> Float[Tensor, " joints"]:
+        """A step to the policy's posture, where no motion of the null space leads there.
+
+        Another posture for the same pose may lie between. The end effector leaves its path.
+        """
+        way = posture - joints
+        longest = self._config.return_speed * self._dt
+        following = joints + way * min(1.0, longest / max(float(way.norm()), 1e-12))
+        if self._clearance is not None:
+            now, then = self._clearance(torch.stack([joints, following])).tolist()
+            if then < min(now, self._config.clearance):
+                return joints  # nothing is left but to be pushed clear
+        if float((following - posture).norm()) < _SAME:
+            self._yielding.aside, self._waited = False, 0.0
+        return following
