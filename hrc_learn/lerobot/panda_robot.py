@@ -272,11 +272,16 @@ class PandaRobot(Device, Robot):
 
     @property
     def observation_features(self) -> dict[str, Any]:
-        return dict.fromkeys((*self._names, *self._person_config.names), float)
+        return dict.fromkeys((*self._names, *self.person_names), float)
 
     @property
     def action_features(self) -> dict[str, Any]:
         return dict.fromkeys(action_names(self.space), float)
+
+    @property
+    def person_names(self) -> tuple[str, ...]:
+        """Names of what is observed of the person."""
+        return self._person_config.names
 
     def connect(self, calibrate: bool = True) -> None:
         super().connect(calibrate)
@@ -303,8 +308,8 @@ class PandaRobot(Device, Robot):
             joints = [name for name in names if name not in HAND]
             values |= observed(seen, joints)
             told = (*self.complement.nullspace_input, *self.complement.offset)
-            names = self._person_config.names
-            values |= zip(names, map(float, told[: len(names)]), strict=True)
+            if self.person_names:
+                values |= zip(self.person_names, map(float, told), strict=True)
         return values
 
     def send_action(self, action: dict[str, Any]) -> dict[str, float]:

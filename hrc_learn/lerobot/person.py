@@ -13,6 +13,7 @@ from hrc_learn.protocols import ArmState, Human, HumanInput
 if TYPE_CHECKING:
     from hrc_learn.lerobot.panda_robot import PandaRobot
     from hrc_learn.lerobot.robot_page import RobotPage
+    from hrc_learn.teleoperation import ScriptedForce
 
 PersonKind = Literal["none", "scripted", "page", "gamepad", "keyboard"]
 """No person, a script that pulls the elbow at random moments of a simulation, or the device of
@@ -21,6 +22,12 @@ NULLSPACE_INPUTS = tuple(f"{name}.human_torque" for name in panda.joint_names)
 """Names of what the person asks of the joints [N m]."""
 OFFSETS = tuple(f"{name}.pushed_aside" for name in panda.joint_names)
 """Names of how far the joints are from where the actions have them [rad]."""
+
+COLUMNS = {
+    "observation.human_effort": NULLSPACE_INPUTS,
+    "observation.pushed_aside": OFFSETS,
+}
+"""Columns of their own, where those are to be had."""
 
 
 @dataclass
@@ -46,6 +53,14 @@ class PersonConfig:
     def names(self) -> tuple[str, ...]:
         """Of what is observed of the person."""
         return (*NULLSPACE_INPUTS, *OFFSETS) if self.record and self.kind != "none" else ()
+
+
+def scripted_pulls(seed: int) -> tuple[ScriptedForce, ...]:
+    """Of the scripted person, as a seed has them."""
+    from hrc_learn.teleoperation.scripted_expert import HAND_FAR_OUT, random_pulls
+
+    # Drawn apart, so that runs with and without pulls are alike but for them.
+    return random_pulls(np.random.default_rng([seed, 1]), hand=HAND_FAR_OUT)
 
 
 class Person:
@@ -80,13 +95,10 @@ class Person:
 
     def begin(self, seed: int) -> None:
         """The simulation begins anew: a scripted person pulls as the seed has it."""
-        from hrc_learn.teleoperation.scripted_expert import ScriptedPerturbation, random_pulls
+        from hrc_learn.teleoperation.scripted_expert import ScriptedPerturbation
 
         if isinstance(self._human, ScriptedPerturbation):
-            # Drawn apart, so that runs with and without pulls are alike but for them.
-            self._human = ScriptedPerturbation(
-                panda, random_pulls(np.random.default_rng([seed, 1]))
-            )
+            self._human = ScriptedPerturbation(panda, scripted_pulls(seed))
 
     def read(self, state: ArmState) -> HumanInput:
         """What the person asks for."""

@@ -18,14 +18,18 @@ from hrc_learn.skills.arm_motion import joints_near, kept_clear, resolved_rate
 from hrc_learn.skills.null_space_yielding import (
     CHANGE_OF_RATE,
     LONGEST_RETURN,
+    NARROW,
     NullSpaceYielding,
     YieldingConfig,
     changed_rate,
-    near_singularity,
+    smallest_singular_value,
 )
 
 # Of the limits of acceleration, what the null space may take: the path needs the rest.
 _SHARE_OF_ACCELERATION = 0.4
+# Fastest joint of a null-space motion [rad/s]: at 20 actions a second it turns by 0.05 rad in
+# one, on a chord of whose arc an elbow of 0.3 m and a hand at 0.8 m are 0.3 mm off.
+_FASTEST = 1.0
 # Distance kept from a joint limit, and decay rate of the remaining one [rad, 1/s]: within the
 # margins of the servo, which would stop single joints and so move the end effector.
 _FROM_LIMIT, _LIMIT_RATE = 0.05, 5.0
@@ -34,9 +38,11 @@ _SAME = 1e-6
 # Deviation of the end effector, a radian counted as a decimetre, that no step leaves [m]; if
 # one does, the arm aside cannot reach where the policy wants the end effector.
 _REACHED, _METRES_PER_RADIAN = 5e-4, 0.1
-# By which the arm may be nearer to what is around it than the policy's own posture [m]: rounding
-# must not stop it.
+# By which the arm may be nearer to what is around it than the policy's own posture [m]:
+# rounding must not stop it.
 _NO_NEARER = 1e-3
+# Up to which the null-space part of the way back in joint space leads back [rad].
+_NEARBY = 0.5
 # Postures that are as near are the same, for a motion that waits [rad].
 _MET_AGAIN = 0.02
 
@@ -62,6 +68,7 @@ class ComplementaryMotion:
 
     posture: Float[Tensor, " joints"] | None
     joints: Float[Tensor, " joints"] | None
+    _last: Float[Tensor, " joints"] | None
 
     def __init__(
         self,
@@ -95,6 +102,7 @@ class ComplementaryMotion:
         self._yielding = NullSpaceYielding(self._chain, self._dt, self._config, np.zeros(n))
         self.posture = self.joints = None
         self.offset_velocity = self._null = torch.zeros(n, dtype=torch.float64)
+        self._toward, self._last = torch.zeros(n, dtype=torch.float64), None
         self._rate, self._waited = 1.0, 0.0
         # What the policy wants, from where the motion is; of more than one when it waits.
         self._wishes: deque[tuple[Tensor, float]] = deque()
@@ -152,6 +160,7 @@ class ComplementaryMotion:
         if wishes and float((wish - wishes[0][0]).norm()) < _MET_AGAIN and self._rate == 1.0:
             # The policy is where the motion is: it has waited too, or come to its end.
             wishes.clear()
+        self._last = wishes[-1][0] if wishes else None
         wishes.append((wish, width))
         self._progress = self._progress + self._rate if len(wishes) > 1 else 0.0
         while self._progress >= 1.0 and len(wishes) > 1:
@@ -170,33 +179,34 @@ class ComplementaryMotion:
     ) -> tuple[Float[Tensor, " joints"], bool]:
         """Joint positions beside the policy's posture, and whether they can go on like that."""
         dt, moved = self._dt, posture - before
-        ahead = torch.stack([posture, posture + CHANGE_OF_RATE / dt * moved])
-        narrow = near_singularity(self._chain, ahead)
+        ahead = torch.stack([posture, posture + CHANGE_OF_RATE / dt * self._coming()])
+        narrow = smallest_singular_value(self._chain, ahead) < NARROW
+        goal = self._chain.forward(posture)
+        here, J = self._chain.forward_and_jacobian(joints)
+        way = self._way_to(before, joints, J)
         back = self._yielding.way_back(
-            joints, before - joints, yields=not narrow[0], returns=self._rate == 0
+            joints, way, yields=not bool(narrow[0]), returns=self._rate == 0
         )
         if self._waited > LONGEST_RETURN:
             return self._straight_back(posture, joints), False
-        wanted = self._config.pose_gain * (before - joints)
+        wanted = self._config.pose_gain * way
         if back is not None:
             wanted = self._yielding.null_velocity + back
-        goal = self._chain.forward(posture)
-        here, J = self._chain.forward_and_jacobian(joints)
         task = resolved_rate(J, here.twist_to(goal) / dt, torch.zeros_like(joints))
-        null = self._feasible(J, joints, posture, task, moved / dt + wanted)
-        waits = False
-        if self._clearance is not None:
-            # Where the policy itself leads the arm nearer, people may as well.
-            own = float(self._clearance(ahead).min()) - _NO_NEARER
-            margin = min(self._config.clearance, own)
-            null, waits = kept_clear(joints, task, null, self._clearance, margin)
-            if waits:
-                # Against the person, as it would stop the end effector otherwise.
-                wanted = self._yielding.fastest_back(null_projection(J, before - joints))
-                null = self._feasible(J, joints, posture, task, moved / dt + wanted)
-                then = joints + CHANGE_OF_RATE * (task + null)
-                now, soon = self._clearance(torch.stack([joints, then])).tolist()
-                waits = soon < min(now, margin)
+
+        def feasible(velocity: Float[Tensor, " joints"]) -> Float[Tensor, " joints"]:
+            null = self._gently(J, null_projection(J, moved / dt + velocity))
+            return self._within_limits(joints, posture, task, null)
+
+        coming = self._chain.jacobian(posture) @ self._coming() / dt
+        going = resolved_rate(J, coming, torch.zeros_like(joints))
+        # Where the policy itself leads the arm nearer, people may as well.
+        margin = min(self._config.clearance, float(self._room(ahead).min()) - _NO_NEARER)
+        null, waits = kept_clear(joints, going, feasible(wanted), self._room, margin)
+        if waits:
+            # Against the person, as the end effector would have to stop otherwise.
+            retreat = feasible(self._yielding.fastest_back(way))
+            null, waits = self._retreat(joints, going, retreat, feasible(wanted), margin)
         self._null = null
         reached = joints_near(self._chain, goal, joints + dt * (task + null))
         off = self._chain.forward(reached).twist_to(goal)
@@ -205,17 +215,61 @@ class ComplementaryMotion:
             return posture, True
         return reached, not (waits or far or (back is not None and bool(narrow.any())))
 
-    def _feasible(
+    def _room(self, joints: Float[Tensor, "*batch joints"]) -> Float[Tensor, "*batch"]:
+        """Distance of the arm from what it must not meet [m], and from its singularities.
+
+        Beyond a singularity another way would lead back, if any. So it counts as an obstacle,
+        which begins where an arm can no longer follow beside its path.
+        """
+        smallest = smallest_singular_value(self._chain, joints)
+        room = smallest - NARROW + self._config.clearance
+        if self._clearance is None:
+            return room
+        return torch.minimum(room, self._clearance(joints))
+
+    def _coming(self) -> Float[Tensor, " joints"]:
+        """How the policy's posture changes in a step at its own speed [rad]."""
+        (first, _), (second, _) = self._wishes[0], self._wishes[min(1, len(self._wishes) - 1)]
+        if len(self._wishes) > 1:
+            return second - first
+        return first - self._last if self._last is not None else torch.zeros_like(first)
+
+    def _way_to(
         self,
-        J: Float[Tensor, "6 joints"],
-        joints: Float[Tensor, " joints"],
         posture: Float[Tensor, " joints"],
-        task: Float[Tensor, " joints"],
-        wanted: Float[Tensor, " joints"],
+        joints: Float[Tensor, " joints"],
+        J: Float[Tensor, "6 joints"],
     ) -> Float[Tensor, " joints"]:
-        """The null-space part of a velocity, as far as the arm can do it."""
-        null = self._gently(J, null_projection(J, wanted))
-        return self._within_limits(joints, posture, task, null)
+        """The way back to a posture through the null space, as long as the one in joint space.
+
+        Far from it another posture for the same pose may be nearer than the way there. But the
+        null space has only two directions: the one that led back before still does.
+        """
+        error = posture - joints
+        null = null_projection(J, error)
+        if float(error.norm()) > _NEARBY:
+            null = null_projection(J, self._toward)
+        self._toward = null / null.norm().clamp(min=1e-12)
+        return error.norm() * self._toward
+
+    def _retreat(
+        self,
+        joints: Float[Tensor, " joints"],
+        going: Float[Tensor, " joints"],
+        back: Float[Tensor, " joints"],
+        wanted: Float[Tensor, " joints"],
+        margin: float,
+    ) -> tuple[Float[Tensor, " joints"], bool]:
+        """Null-space motion of an arm aside that would meet something, and whether it waits."""
+        ahead = torch.stack([joints, joints + CHANGE_OF_RATE * (going + back)])
+        now, then = self._room(ahead).tolist()
+        if then >= min(now, margin):
+            return back, False
+        still = torch.zeros_like(joints)
+        null, _ = kept_clear(joints, still, back, self._room, margin)
+        if not bool(null.any()):
+            null, _ = kept_clear(joints, still, wanted, self._room, margin)
+        return null, True
 
     def _gently(
         self, J: Float[Tensor, "6 joints"], null: Float[Tensor, " joints"]
@@ -246,6 +300,7 @@ class ComplementaryMotion:
         down = torch.maximum(rate * (lower - joints), -limits.velocity) - task
         room = torch.where(null > 0, up, down) / torch.where(null == 0, 1.0, null)
         share = torch.where(null == 0, 1.0, room).clamp(0.0, 1.0).min()
+        share = min(share, _FASTEST / null.abs().max().clamp(min=_FASTEST))
         return share * null
 
     def _straight_back(

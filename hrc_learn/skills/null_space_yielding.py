@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.geometry.numerics import null_projection
@@ -22,7 +22,7 @@ _ASIDE, _BACK = 0.1, 0.03
 LONGEST_RETURN = 5.0
 # Smallest singular value of the Jacobian of a path below which the arm cannot follow beside it,
 # as damping begins at 0.05.
-_NARROW = 0.07
+NARROW = 0.07
 # In which a path stops, and goes on [s].
 CHANGE_OF_RATE = 0.2
 
@@ -146,18 +146,16 @@ class NullSpaceYielding:
         return null_projection(self._chain.jacobian(joints), error)
 
 
-def near_singularity(
+def smallest_singular_value(
     chain: SerialChain, joint_position: Float[Tensor, "*batch joints"]
-) -> Bool[np.ndarray, "*batch"]:
-    """Where a path of the joints is so near a singularity that the arm cannot follow it
-    beside it.
+) -> Float[Tensor, "*batch"]:
+    """Of the Jacobian of the end effector, metres and radians as they are: see `NARROW`.
 
     Args:
         chain: Kinematics of the arm.
-        joint_position: Along the path [rad].
+        joint_position: [rad]
     """
-    smallest = torch.linalg.svdvals(chain.jacobian(joint_position))[..., -1]
-    return (smallest < _NARROW).numpy()
+    return torch.linalg.svdvals(chain.jacobian(joint_position))[..., -1]
 
 
 def changed_rate(rate: float, wanted: float, dt: float) -> float:

@@ -25,10 +25,11 @@ from hrc_learn.skills.marker_sensor import (
 from hrc_learn.skills.null_space_yielding import (
     CHANGE_OF_RATE,
     LONGEST_RETURN,
+    NARROW,
     NullSpaceYielding,
     YieldingConfig,
     changed_rate,
-    near_singularity,
+    smallest_singular_value,
 )
 from hrc_learn.vision import angle, centre
 from hrc_learn.viz import StepLog
@@ -378,7 +379,7 @@ class WorkCell:
         """
         dt = self.config.dt
         velocity = np.gradient(path, dt, axis=0) if len(path) > 1 else np.zeros_like(path)
-        narrow = near_singularity(self.chain, torch.from_numpy(path.copy()))
+        narrow = smallest_singular_value(self.chain, torch.from_numpy(path.copy())) < NARROW
         progress, rate, left = 0.0, 1.0, self.time
         while progress <= len(path) - 1:
             if until():

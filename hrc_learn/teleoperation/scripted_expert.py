@@ -57,24 +57,29 @@ class ScriptedForce:
 _PAUSE, _DURATION = (1.0, 6.0), (2.0, 4.5)
 """Between two pulls, and of a pull [s]: as long as the paper's drags of joint 4, 4 to 7 s, or
 half that."""
-_HAND = ((-0.1, 0.5), (-0.4, 0.4), (0.3, 0.8))
+HAND_AT_ELBOW = ((-0.1, 0.5), (-0.4, 0.4), (0.3, 0.8))
 """Where the person's hand may be, along x, y and z [m]: all about an elbow above the table."""
+HAND_FAR_OUT = ((-0.8, 0.8), (-0.8, 0.8), (0.0, 0.9))
+"""The same of one who pulls as far as it goes: out of reach of the elbow on most sides."""
 _FORCE = 60.0
 """Largest force [N], as where the person is waited for."""
 
 
 def random_pulls(
-    rng: np.random.Generator, duration: float = 600.0
+    rng: np.random.Generator,
+    duration: float = 600.0,
+    hand: Sequence[tuple[float, float]] = HAND_AT_ELBOW,
 ) -> tuple[ScriptedForce, ...]:
     """Pulls at random moments, each from another side.
 
     Args:
         rng: Source of moments, durations and sides.
         duration: How long they go on [s].
+        hand: Where the person's hand may be, along x, y and z [m].
     """
     pulls, time = [], float(rng.uniform(0.0, _PAUSE[1]))
     while time < duration:
-        low, high = np.array(_HAND).T
+        low, high = np.array(hand).T
         x, y, z = rng.uniform(low, high)
         length = float(rng.uniform(*_DURATION))
         pulls.append(
