@@ -41,8 +41,14 @@ _REACHED, _METRES_PER_RADIAN = 5e-4, 0.1
 # By which the arm may be nearer to what is around it than the policy's own posture [m]:
 # rounding must not stop it.
 _NO_NEARER = 1e-3
-# Up to which the null-space part of the way back in joint space leads back [rad].
-_NEARBY = 0.5
+# Cosines between the null space and the way back in joint space, of which the one may lead
+# elsewhere than the other: below the first the motion waits, below the second people have less
+# and less of a say. An elbow that has gone a quarter of its circle has 0.7, one of half of it
+# none. Nearer than so much the null space does lead back [rad].
+_STRAIGHT, _NEARBY = (0.65, 0.8), 0.3
+# Share of the room that is missing which has to be regained in the time looked ahead, or the
+# motion waits: predictions err as much.
+_REGAINED = 0.3
 # Postures that are as near are the same, for a motion that waits [rad].
 _MET_AGAIN = 0.02
 
@@ -102,11 +108,11 @@ class ComplementaryMotion:
         self._yielding = NullSpaceYielding(self._chain, self._dt, self._config, np.zeros(n))
         self.posture = self.joints = None
         self.offset_velocity = self._null = torch.zeros(n, dtype=torch.float64)
-        self._toward, self._last = torch.zeros(n, dtype=torch.float64), None
+        self._last = None
         self._rate, self._waited = 1.0, 0.0
         # What the policy wants, from where the motion is; of more than one when it waits.
         self._wishes: deque[tuple[Tensor, float]] = deque()
-        self._progress = 0.0
+        self._progress, self._width = 0.0, math.nan
 
     @property
     def nullspace_input(self) -> Float[np.ndarray, " joints"]:
@@ -137,19 +143,26 @@ class ComplementaryMotion:
             Joint positions [rad] and opening of the gripper [m].
         """
         self._yielding.feel(self._human.read(state).nullspace_input)
+        was = deque(self._wishes), self._progress
         posture, width = self._followed(torch.from_numpy(np.array(wish, dtype=float)), width)
         if self.posture is None or self.joints is None:
             self.posture = self.joints = posture
         before = self.joints - self.posture
+        joints, clear = posture, True
         if self._yielding.pushed or bool(before.any()):
             joints, clear = self._beside(posture, self.posture, self.joints)
-        else:
-            joints, clear = posture, True
+        if joints is None:
+            # Nothing else keeps it clear: stop at once, as if this step had not been asked for.
+            (wishes, self._progress), newest = was, self._wishes[-1]
+            self._wishes = deque([*wishes, newest])
+            self._rate, self._null = 0.0, torch.zeros_like(self._null)
+            posture, joints, width = self.posture, self.joints, self._width
         self._rate = changed_rate(self._rate, 1.0 if clear else 0.0, self._dt)
-        held_back = self._rate == 0 and not self._yielding.pushed
+        moves = float((joints - self.joints).abs().max()) > _SAME
+        held_back = self._rate == 0 and not (self._yielding.pushed or moves)
         self._waited = self._waited + self._dt if held_back else 0.0
         self.offset_velocity = (joints - posture - before) / self._dt
-        self.posture, self.joints = posture, joints
+        self.posture, self.joints, self._width = posture, joints, width
         return joints.numpy(), width
 
     def _followed(
@@ -176,20 +189,30 @@ class ComplementaryMotion:
         posture: Float[Tensor, " joints"],
         before: Float[Tensor, " joints"],
         joints: Float[Tensor, " joints"],
-    ) -> tuple[Float[Tensor, " joints"], bool]:
-        """Joint positions beside the policy's posture, and whether they can go on like that."""
+    ) -> tuple[Float[Tensor, " joints"] | None, bool]:
+        """Joint positions beside the policy's posture, None if there are none that are clear,
+        and whether the motion can go on.
+        """
         dt, moved = self._dt, posture - before
         ahead = torch.stack([posture, posture + CHANGE_OF_RATE / dt * self._coming()])
         narrow = smallest_singular_value(self._chain, ahead) < NARROW
         goal = self._chain.forward(posture)
         here, J = self._chain.forward_and_jacobian(joints)
-        way = self._way_to(before, joints, J)
+        error = before - joints
         back = self._yielding.way_back(
-            joints, way, yields=not bool(narrow[0]), returns=self._rate == 0
+            joints, error, yields=not bool(narrow[0]), returns=self._rate == 0
         )
         if self._waited > LONGEST_RETURN:
             return self._straight_back(posture, joints), False
-        wanted = self._config.pose_gain * way
+        goal = self._chain.forward(posture)
+        here, J = self._chain.forward_and_jacobian(joints)
+        error = before - joints
+        back = self._yielding.way_back(
+            joints, error, yields=not bool(narrow[0]), returns=self._rate == 0
+        )
+        if self._waited > LONGEST_RETURN:
+            return self._straight_back(posture, joints), False
+        wanted = self._config.pose_gain * error
         if back is not None:
             wanted = self._yielding.null_velocity + back
         task = resolved_rate(J, here.twist_to(goal) / dt, torch.zeros_like(joints))
@@ -201,31 +224,50 @@ class ComplementaryMotion:
         coming = self._chain.jacobian(posture) @ self._coming() / dt
         going = resolved_rate(J, coming, torch.zeros_like(joints))
         # Where the policy itself leads the arm nearer, people may as well.
-        margin = min(self._config.clearance, float(self._room(ahead).min()) - _NO_NEARER)
+        away = null_projection(J, error)
+        faster = _FASTEST / float(away.norm().clamp(min=1e-9))
+        retreat = min(self._config.pose_gain, faster) * away
+        wanted, straight = self._config.pose_gain * error, _straightness(away, error)
+        if back is not None:
+            # Far aside the null space may lead elsewhere than back: nobody gets that far.
+            share = min(
+                max((straight - _STRAIGHT[0]) / (_STRAIGHT[1] - _STRAIGHT[0]), 0.0), 1.0
+            )
+            wanted = torch.lerp(retreat, self._yielding.null_velocity + back, share)
+        # Where the policy itself leads the arm nearer, people may as well.
+        own = float(self._room(ahead).min()) - _NO_NEARER
+        margin = min(self._config.clearance, own)
         null, waits = kept_clear(joints, going, feasible(wanted), self._room, margin)
         if waits:
             # Against the person, as the end effector would have to stop otherwise.
-            retreat = feasible(self._yielding.fastest_back(way))
-            null, waits = self._retreat(joints, going, retreat, feasible(wanted), margin)
+            null, waits = self._retreat(
+                joints, going, feasible(retreat), feasible(wanted), margin
+            )
+        waits = waits or straight < _STRAIGHT[0]
         self._null = null
         reached = joints_near(self._chain, goal, joints + dt * (task + null))
         off = self._chain.forward(reached).twist_to(goal)
         far = float(off[:3].norm() + _METRES_PER_RADIAN * off[3:].norm()) > _REACHED
         if back is None and float((reached - posture).norm()) < _SAME:
             return posture, True
+        now, then = self._clear(torch.stack([joints, reached])).tolist()
+        if then < min(now, margin) - _NO_NEARER:
+            return None, False
         return reached, not (waits or far or (back is not None and bool(narrow.any())))
 
     def _room(self, joints: Float[Tensor, "*batch joints"]) -> Float[Tensor, "*batch"]:
         """Distance of the arm from what it must not meet [m], and from its singularities.
 
-        Beyond a singularity another way would lead back, if any. So it counts as an obstacle,
-        which begins where an arm can no longer follow beside its path.
+        Those count as obstacles that begin where an arm can no longer follow beside its path.
         """
-        smallest = smallest_singular_value(self._chain, joints)
-        room = smallest - NARROW + self._config.clearance
+        room = smallest_singular_value(self._chain, joints) - NARROW + self._config.clearance
+        return torch.minimum(room, self._clear(joints))
+
+    def _clear(self, joints: Float[Tensor, "*batch joints"]) -> Float[Tensor, "*batch"]:
+        """Distance of the arm from what it must not meet [m]."""
         if self._clearance is None:
-            return room
-        return torch.minimum(room, self._clearance(joints))
+            return torch.full_like(joints[..., 0], math.inf)
+        return self._clearance(joints)
 
     def _coming(self) -> Float[Tensor, " joints"]:
         """How the policy's posture changes in a step at its own speed [rad]."""
@@ -233,24 +275,6 @@ class ComplementaryMotion:
         if len(self._wishes) > 1:
             return second - first
         return first - self._last if self._last is not None else torch.zeros_like(first)
-
-    def _way_to(
-        self,
-        posture: Float[Tensor, " joints"],
-        joints: Float[Tensor, " joints"],
-        J: Float[Tensor, "6 joints"],
-    ) -> Float[Tensor, " joints"]:
-        """The way back to a posture through the null space, as long as the one in joint space.
-
-        Far from it another posture for the same pose may be nearer than the way there. But the
-        null space has only two directions: the one that led back before still does.
-        """
-        error = posture - joints
-        null = null_projection(J, error)
-        if float(error.norm()) > _NEARBY:
-            null = null_projection(J, self._toward)
-        self._toward = null / null.norm().clamp(min=1e-12)
-        return error.norm() * self._toward
 
     def _retreat(
         self,
@@ -263,10 +287,11 @@ class ComplementaryMotion:
         """Null-space motion of an arm aside that would meet something, and whether it waits."""
         ahead = torch.stack([joints, joints + CHANGE_OF_RATE * (going + back)])
         now, then = self._room(ahead).tolist()
-        if then >= min(now, margin):
+        if then >= min(now + _REGAINED * (margin - now), margin):
             return back, False
         still = torch.zeros_like(joints)
-        null, _ = kept_clear(joints, still, back, self._room, margin)
+        # The way back may pass a singularity.
+        null, _ = kept_clear(joints, still, back, self._clear, margin)
         if not bool(null.any()):
             null, _ = kept_clear(joints, still, wanted, self._room, margin)
         return null, True
@@ -313,10 +338,15 @@ class ComplementaryMotion:
         way = posture - joints
         longest = self._config.return_speed * self._dt
         following = joints + way * min(1.0, longest / max(float(way.norm()), 1e-12))
-        if self._clearance is not None:
-            now, then = self._clearance(torch.stack([joints, following])).tolist()
-            if then < min(now, self._config.clearance):
-                return joints  # nothing is left but to be pushed clear
+        now, then = self._clear(torch.stack([joints, following])).tolist()
+        if then < min(now, self._config.clearance):
+            return joints  # nothing is left but to be pushed clear
         if float((following - posture).norm()) < _SAME:
             self._yielding.aside, self._waited = False, 0.0
         return following
+
+
+def _straightness(away: Float[Tensor, " joints"], error: Float[Tensor, " joints"]) -> float:
+    """Cosine between the null-space part of a way back and all of it; 1 of a short one."""
+    size = float(error.norm())
+    return float(away.norm()) / size if size > _NEARBY else 1.0

@@ -123,16 +123,12 @@ class NullSpaceYielding:
             return None
         back = torch.zeros_like(away)
         if returns or self._config.after_push == "return":
-            back = self.fastest_back(away)
+            fastest = self._config.return_speed / float(away.norm().clamp(min=1e-9))
+            back = min(self._config.pose_gain, fastest) * away
         # A jump of the null-space motion would move the end effector.
         share = min(self._dt / self._config.nullspace_rise, 1.0)
         self._back = self._back + share * (back - self._back)
         return self._back
-
-    def fastest_back(self, away: Float[Tensor, " joints"]) -> Float[Tensor, " joints"]:
-        """Velocity [rad/s] over a way back [rad]: in proportion to it, but not too fast."""
-        fastest = self._config.return_speed / float(away.norm().clamp(min=1e-9))
-        return min(self._config.pose_gain, fastest) * away
 
     def _away(
         self, joints: Float[Tensor, " joints"], error: Float[Tensor, " joints"]
