@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from lerobot.configs import PreTrainedConfig
@@ -27,6 +27,7 @@ from hrc_learn.lerobot.robots import MujocoPanda, MujocoPandaConfig
 _MORE_TIME = 1.5
 
 
+@runtime_checkable
 class Leader(Protocol):
     """Whatever leads a robot by actions: a policy, a replay."""
 
