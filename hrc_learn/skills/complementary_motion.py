@@ -233,12 +233,15 @@ class ComplementaryMotion:
             share = min(
                 max((straight - _STRAIGHT[0]) / (_STRAIGHT[1] - _STRAIGHT[0]), 0.0), 1.0
             )
-            wanted = torch.lerp(retreat, self._yielding.null_velocity + back, share)
+            # While they push nothing pulls the joints back.
+            yielding = self._yielding
+            push = yielding.null_velocity if yielding.pushed else back
+            wanted = torch.lerp(retreat, push, share)
         # Where the policy itself leads the arm nearer, people may as well.
         own = float(self._room(ahead).min()) - _NO_NEARER
         margin = min(self._config.clearance, own)
         null, waits = kept_clear(joints, going, feasible(wanted), self._room, margin)
-        if waits:
+        if waits or straight < _STRAIGHT[0]:
             # Against the person, as the end effector would have to stop otherwise.
             null, waits = self._retreat(
                 joints, going, feasible(retreat), feasible(wanted), margin
