@@ -1,6 +1,7 @@
 """A policy's posture and a person's push, on an arm that goes where it is sent."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -34,9 +35,11 @@ def line(seconds=4.0, still=6.0):
     return np.concatenate([path, np.repeat(path[-1:], round(still / DT), axis=0)])
 
 
-def followed(wishes, human, widths=None, before=lambda k, motion: None, **options):
+def followed(
+    wishes, human, widths=None, before=lambda k, motion: None, limits=panda.limits, **options
+):
     """Postures and joints of every step, and the gripper's openings."""
-    motion = ComplementaryMotion(panda, human, DT, panda.limits, **options)
+    motion = ComplementaryMotion(panda, human, DT, limits, **options)
     postures, joints, openings = [], [], []
     with shapes_unchecked():
         for k, wish in enumerate(wishes):
@@ -116,6 +119,16 @@ def test_a_push_ends_where_limits_and_singularities_begin(sign):
     assert (joints - postures).abs().max() > 1.0
     assert hand_off(postures, joints)[0] < 1e-6
     np.testing.assert_allclose(joints[-1], postures[-1], atol=1e-3)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_the_null_space_stops_before_a_limit_that_would_move_the_hand(sign):
+    limits = replace(panda.limits, lower=panda.ready - 0.4, upper=panda.ready + 0.4)
+    wishes = np.repeat(panda.ready.numpy()[None], round(2.5 / DT), axis=0)
+    postures, joints, _ = followed(wishes, Pusher(sign * 3 * SIDEWAYS, 0.1, 2.5), limits=limits)
+    moved = (joints - panda.ready).abs().max()
+    assert 0.3 < moved < 0.4
+    assert hand_off(postures, joints)[0] < 1e-6
 
 
 def test_nobody_pushes_the_arm_into_what_is_around_it():
