@@ -204,17 +204,6 @@ class ComplementaryMotion:
         )
         if self._waited > LONGEST_RETURN:
             return self._straight_back(posture, joints), False
-        goal = self._chain.forward(posture)
-        here, J = self._chain.forward_and_jacobian(joints)
-        error = before - joints
-        back = self._yielding.way_back(
-            joints, error, yields=not bool(narrow[0]), returns=self._rate == 0
-        )
-        if self._waited > LONGEST_RETURN:
-            return self._straight_back(posture, joints), False
-        wanted = self._config.pose_gain * error
-        if back is not None:
-            wanted = self._yielding.null_velocity + back
         task = resolved_rate(J, here.twist_to(goal) / dt, torch.zeros_like(joints))
 
         def feasible(velocity: Float[Tensor, " joints"]) -> Float[Tensor, " joints"]:
@@ -223,16 +212,14 @@ class ComplementaryMotion:
 
         coming = self._chain.jacobian(posture) @ self._coming() / dt
         going = resolved_rate(J, coming, torch.zeros_like(joints))
-        # Where the policy itself leads the arm nearer, people may as well.
         away = null_projection(J, error)
         faster = _FASTEST / float(away.norm().clamp(min=1e-9))
         retreat = min(self._config.pose_gain, faster) * away
         wanted, straight = self._config.pose_gain * error, _straightness(away, error)
         if back is not None:
             # Far aside the null space may lead elsewhere than back: nobody gets that far.
-            share = min(
-                max((straight - _STRAIGHT[0]) / (_STRAIGHT[1] - _STRAIGHT[0]), 0.0), 1.0
-            )
+            least, enough = _STRAIGHT
+            share = min(max((straight - least) / (enough - least), 0.0), 1.0)
             # While they push nothing pulls the joints back.
             yielding = self._yielding
             push = yielding.null_velocity if yielding.pushed else back

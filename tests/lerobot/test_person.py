@@ -17,6 +17,7 @@ from hrc_learn.lerobot.panda_robot import GRIPPER, HAND, JOINTS, VELOCITIES
 from hrc_learn.lerobot.person import NULLSPACE_INPUTS, OFFSETS, PersonConfig
 from hrc_learn.lerobot.policy.closed_form import read_episodes
 from hrc_learn.lerobot.robots import FrankaPandaConfig
+from hrc_learn.lerobot.teleoperators.panda_teleoperators import GuidedRobot
 from hrc_learn.teleoperation import ScriptedForce
 
 FPS = 20.0
@@ -35,7 +36,8 @@ def pulled(simulated, monkeypatch):
             if name in settings
         }
         who = PersonConfig(kind="scripted", **extra)
-        return simulated(scenario="grasping", fps=FPS, person=who, **settings)
+        settings = {"scenario": "grasping"} | settings
+        return simulated(fps=FPS, person=who, **settings)
 
     return robot
 
@@ -185,3 +187,33 @@ def test_the_real_panda_yields_to_a_device_too(tmp_path, monkeypatch):
     assert device.shown is robot
     robot.disconnect()
     assert device.closed
+
+
+@pytest.mark.slow
+def test_an_elbow_that_is_pulled_over_its_pole_on_the_way_comes_back(pulled):
+    """On the way to the shelf the null space comes to lead elsewhere than back."""
+    hand_of = ScriptedForce(
+        start=0.5, duration=4.4, towards=(-0.33, -0.51, 0.41), max_force=60.0
+    )
+    robot = pulled(scenario="placing")
+    actions = []
+    with shapes_unchecked():
+        expert = GuidedRobot(robot, robot.run.expert)
+        for _ in range(round(11 * FPS)):
+            actions.append(expert.next()[0])
+            robot.send_action(actions[-1])
+        robot.disconnect()
+        robot = pulled(hand_of, scenario="placing")
+        wished, read = [], []
+        for action in actions:
+            robot.send_action(action)
+            wished.append(robot.complement.posture.numpy().copy())
+            read.append(robot.arm.read().joint_position)
+    wished, read = (torch.from_numpy(np.array(rows)) for rows in (wished, read))
+    aside = (elbow(read) - elbow(wished)).norm(dim=-1)
+    assert aside.max() > 0.15
+    assert aside[-1] < 0.01
+    assert not robot.complement.waits
+    off = panda.forward(read).position - panda.forward(wished).position
+    assert off.norm(dim=-1).quantile(0.95) < 6e-3  # servos lag by half a step
+    assert not robot.world.cabinet_contacts.touches
