@@ -7,11 +7,10 @@ import torch
 from hrc_learn.experiments.collaboration.pulls import (
     path_distance,
     pull_effects,
-    random_pulls,
 )
 from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import panda
-from hrc_learn.teleoperation import ScriptedForce
+from hrc_learn.teleoperation import ScriptedForce, random_pulls
 from hrc_learn.viz import StepLog
 
 TIME = 0.01 * np.arange(300)
