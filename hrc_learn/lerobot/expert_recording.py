@@ -1,17 +1,77 @@
-"""Recording the scripted expert in simulated time, as lerobot-record does by the clock."""
+"""Recording in simulated time, as lerobot-record does by the clock; of the scripted expert."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from lerobot.datasets import LeRobotDataset
 from lerobot.utils.constants import ACTION, OBS_STR
 from lerobot.utils.feature_utils import build_dataset_frame, hw_to_dataset_features
 
+from hrc_learn.lerobot.panda_robot import PandaRobot
+from hrc_learn.lerobot.person import COLUMNS
 from hrc_learn.lerobot.robots import MujocoPanda, MujocoPandaConfig
 from hrc_learn.lerobot.teleoperators import PandaExpert, PandaExpertConfig
 from hrc_learn.store import DATASET, replacing
+
+
+def observation_features(robot: PandaRobot) -> dict[str, dict]:
+    """Features of what a robot observes in a dataset: what concerns the person in columns of
+    its own, the rest as LeRobot has it.
+    """
+    own = {key: names for key, names in COLUMNS.items() if names[0] in robot.person_names}
+    rest = {
+        name: shape
+        for name, shape in robot.observation_features.items()
+        if name not in robot.person_names
+    }
+    return hw_to_dataset_features(rest, OBS_STR) | {
+        key: {"dtype": "float32", "shape": (len(names),), "names": list(names)}
+        for key, names in own.items()
+    }
+
+
+@contextmanager
+def new_dataset(folder: Path, robot: PandaRobot) -> Iterator[LeRobotDataset]:
+    """A dataset of what a robot observes and is sent, whole at the end or not there.
+
+    Args:
+        folder: Of the new dataset; must not exist.
+        robot: Whose it is.
+    """
+    features = hw_to_dataset_features(robot.action_features, ACTION)
+    with replacing(folder, DATASET) as new:
+        dataset = LeRobotDataset.create(
+            f"local/{folder.name}",
+            round(1 / robot.dt),
+            root=new,
+            robot_type=robot.name,
+            features=features | observation_features(robot),
+            video_backend="pyav",
+        )
+        try:
+            yield dataset
+        finally:
+            dataset.finalize()
+
+
+def add_frame(
+    dataset: LeRobotDataset,
+    observation: Mapping[str, Any],
+    action: Mapping[str, float],
+    task: str,
+) -> None:
+    """Keep what was observed, and what was sent then, in the dataset's buffer."""
+    dataset.add_frame(
+        {
+            **build_dataset_frame(dataset.features, dict(observation), prefix=OBS_STR),
+            **build_dataset_frame(dataset.features, dict(action), prefix=ACTION),
+            "task": task,
+        }
+    )
 
 
 def record_expert(
@@ -36,18 +96,7 @@ def record_expert(
         RuntimeError: More demonstrations fail than succeed.
     """
     robot, expert = MujocoPanda(config), PandaExpert(PandaExpertConfig())
-    features = hw_to_dataset_features(robot.action_features, ACTION) | hw_to_dataset_features(
-        robot.observation_features, OBS_STR
-    )
-    with replacing(folder, DATASET) as new:
-        dataset = LeRobotDataset.create(
-            f"local/{folder.name}",
-            round(config.fps),
-            root=new,
-            robot_type=robot.name,
-            features=features,
-            video_backend="pyav",
-        )
+    with new_dataset(folder, robot) as dataset:
         robot.connect()
         expert.connect()
         try:
@@ -66,7 +115,6 @@ def record_expert(
                 if failed > max(3, written):
                     raise RuntimeError(f"{failed} of {failed + written} demonstrations failed.")
         finally:
-            dataset.finalize()
             expert.disconnect()
             robot.disconnect()
 
@@ -77,11 +125,5 @@ def _show(robot: MujocoPanda, expert: PandaExpert, dataset: LeRobotDataset) -> b
     for _ in range(round(scenario.duration / robot.dt)):
         observation, action = robot.get_observation(), expert.get_action()
         robot.send_action(action)
-        dataset.add_frame(
-            {
-                **build_dataset_frame(dataset.features, observation, prefix=OBS_STR),
-                **build_dataset_frame(dataset.features, action, prefix=ACTION),
-                "task": scenario.task,
-            }
-        )
+        add_frame(dataset, observation, action, scenario.task)
     return robot.run.succeeded()

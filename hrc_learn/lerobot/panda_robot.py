@@ -8,19 +8,26 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cache
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from lerobot.robots import Robot, RobotConfig
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
+from torch import Tensor
 
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.kinematics import gripper_down, panda
+from hrc_learn.kinematics import gripper_down, panda, panda_capsules
+from hrc_learn.lerobot.person import Person, PersonConfig
 from hrc_learn.protocols import Arm, ArmState
+
+if TYPE_CHECKING:
+    from hrc_learn.sim import World
+    from hrc_learn.skills.arm_motion import PositionServo
+    from hrc_learn.skills.complementary_motion import ComplementaryMotion
 
 JOINTS = tuple(f"{name}.pos" for name in panda.joint_names)
 VELOCITIES = tuple(f"{name}.vel" for name in panda.joint_names)
@@ -224,6 +231,8 @@ class PandaRobotConfig(RobotConfig):
     """Whether joint velocities are observed."""
     hand: bool = False
     """Whether the pose of the end effector is observed; it is where actions give it."""
+    person: PersonConfig = field(default_factory=PersonConfig)
+    """Who leads the body while actions lead the end effector."""
 
 
 class PandaRobot(Device, Robot):
@@ -233,12 +242,18 @@ class PandaRobot(Device, Robot):
     lerobot-rollout's way back to the first position works as well. What an action asks for is
     done within the limits of the joints only; `send_action` returns what was done.
 
+    With a person beside it (`PandaRobotConfig.person`) actions lead the end effector only, and
+    the person the body, at the same time (`ComplementaryMotion`).
+
     Attributes:
         space: Of the actions that it declares.
         dt: Time between actions [s].
         initial_configurations: How often everything has been put in place, which only a
             simulation can.
+        complement: Lets a person lead the body, while connected; None: there is none.
     """
+
+    complement: ComplementaryMotion | None = None
 
     def __init__(self, config: PandaRobotConfig):
         super().__init__(config)
@@ -253,35 +268,56 @@ class PandaRobot(Device, Robot):
             GRIPPER,
         )
         self._rotation = DOWN
+        self._person_config = config.person
 
     @property
     def observation_features(self) -> dict[str, Any]:
-        return dict.fromkeys(self._names, float)
+        return dict.fromkeys((*self._names, *self.person_names), float)
 
     @property
     def action_features(self) -> dict[str, Any]:
         return dict.fromkeys(action_names(self.space), float)
 
+    @property
+    def person_names(self) -> tuple[str, ...]:
+        """Names of what is observed of the person."""
+        return self._person_config.names
+
     def connect(self, calibrate: bool = True) -> None:
         super().connect(calibrate)
+        if self._person_config.kind != "none":
+            self._invite(self._person_config)
         robot_registry().add(self)
 
     def disconnect(self) -> None:
         self._need_connection()
         robot_registry().remove(self)
+        if self.complement is not None:
+            self.complement = None
+            self._person.close()
         super().disconnect()
 
     def get_observation(self) -> dict[str, Any]:
         self._need_connection()
-        values = observed(self.arm.read(), self._names, self._rotation)
+        state, names = self.arm.read(), self._names
+        values = observed(state, names, self._rotation)
         if HAND[0] in values:
             self._rotation = np.array([values[name] for name in HAND[3:]])
+        if self.complement is not None:
+            seen = self._seen(state)
+            joints = [name for name in names if name not in HAND]
+            values |= observed(seen, joints)
+            told = (*self.complement.nullspace_input, *self.complement.offset)
+            if self.person_names:
+                values |= zip(self.person_names, map(float, told), strict=True)
         return values
 
     def send_action(self, action: dict[str, Any]) -> dict[str, float]:
         self._need_connection()
         where, width = target_of(action)
         joints = self._joints_at(where) if isinstance(where, Pose) else where
+        if self.complement is not None:
+            joints, width = self._beside_person(self.complement, where, joints, width)
         sent = self._command(joints, width)
         return action_of(self.space, sent, width, self._rotation)
 
@@ -298,7 +334,66 @@ class PandaRobot(Device, Robot):
     def _command(self, joints: Float[np.ndarray, "7"], width: float) -> Float[np.ndarray, "7"]:
         """Send joints [rad] and gripper [m]; where the joints are really sent [rad]."""
 
+    @property
+    @abstractmethod
+    def servo(self) -> PositionServo:
+        """Which leads the arm by positions."""
+
+    @property
+    def world(self) -> World | None:
+        """The simulated world that it is in; None for a real one."""
+        return None
+
     def read_state(self) -> ArmState:
         """The newest reading of the arm, for whoever leads it."""
         self._need_connection()
-        return self.arm.read()
+        return self._seen(self.arm.read())
+
+    def clearance(self, joint_position: Float[Tensor, "*batch 7"]) -> Float[Tensor, "*batch"]:
+        """Distance of the arm from what it must not meet, as far as that is known [m].
+
+        A real arm knows of itself only.
+        """
+        return panda_capsules.self_distance(joint_position)
+
+    def _invite(self, config: PersonConfig) -> None:
+        """Let a person lead the body."""
+        from hrc_learn.skills.complementary_motion import ComplementaryMotion
+        from hrc_learn.skills.null_space_yielding import YieldingConfig
+
+        self._person = Person(config)
+        self.complement = ComplementaryMotion(
+            panda,
+            self._person,
+            self.dt,
+            self.servo.limits,
+            YieldingConfig(after_push=config.after_push),
+            self.clearance,
+        )
+
+    def _beside_person(
+        self,
+        complement: ComplementaryMotion,
+        where: Float[np.ndarray, "7"] | Pose,
+        joints: Float[np.ndarray, "7"],
+        width: float,
+    ) -> tuple[Float[np.ndarray, "7"], float]:
+        """Joints and gripper, with the body where the person wants it."""
+        from hrc_learn.skills.arm_motion import joints_near
+
+        with torch.inference_mode():
+            if isinstance(where, Pose) and complement.posture is not None:
+                joints = joints_near(panda, where, complement.posture).numpy()
+            joints, width = complement.next(self.arm.read(), joints, width)
+        self._person.show(self)
+        return joints, width
+
+    def _seen(self, state: ArmState) -> ArmState:
+        """What is told of a reading: the policy's own posture, if that is what it observes."""
+        if self.complement is None or self._person_config.observed == "joints":
+            return state
+        return replace(
+            state,
+            joint_position=state.joint_position - self.complement.offset,
+            joint_velocity=state.joint_velocity - self.complement.offset_velocity.numpy(),
+        )

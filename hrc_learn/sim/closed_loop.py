@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -168,7 +168,7 @@ class VirtualCamera:
     _images: list[tuple[Tensor, Tensor, Tensor]] = field(default_factory=list)
     _covered: Tensor | None = None
 
-    def observe(self, tool: Pose, joint_position: Tensor, dt: float) -> dict[str, Tensor]:
+    def observe(self, tool: Pose, joint_position: Tensor, dt: float) -> dict[str, Any]:
         """Fields of an observation that come from the camera."""
         new = self._steps % self.imperfections.frame_steps == 0
         if new:

@@ -6,6 +6,7 @@ from hrc_learn.skills.arm_motion import joint_line as joint_line
 from hrc_learn.skills.arm_motion import nearest_configuration as nearest_configuration
 from hrc_learn.skills.arm_motion import resolved_rate as resolved_rate
 from hrc_learn.skills.arm_motion import straight_line as straight_line
+from hrc_learn.skills.complementary_motion import ComplementaryMotion as ComplementaryMotion
 from hrc_learn.skills.grasping import Grasping as Grasping
 from hrc_learn.skills.grasping import GraspingConfig as GraspingConfig
 from hrc_learn.skills.grasping import GraspResult as GraspResult
@@ -13,6 +14,7 @@ from hrc_learn.skills.marker_sensor import DelayedChannel as DelayedChannel
 from hrc_learn.skills.marker_sensor import LatencyConfig as LatencyConfig
 from hrc_learn.skills.marker_sensor import MarkerObservation as MarkerObservation
 from hrc_learn.skills.marker_sensor import MarkerSensor as MarkerSensor
+from hrc_learn.skills.null_space_yielding import YieldingConfig as YieldingConfig
 from hrc_learn.skills.pick_and_place import Phase as Phase
 from hrc_learn.skills.pick_and_place import PickAndPlace as PickAndPlace
 from hrc_learn.skills.pick_and_place import PickAndPlaceConfig as PickAndPlaceConfig

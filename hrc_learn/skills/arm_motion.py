@@ -289,6 +289,23 @@ def nearest_configuration(
     return best
 
 
+def joints_near(
+    chain: SerialChain, pose: Pose, near: Float[Tensor, " joints"]
+) -> Float[Tensor, " joints"]:
+    """Joint positions with the end effector at a pose, as near as can be to given ones [rad].
+
+    Args:
+        chain: Kinematics of the arm.
+        pose: Of the end effector. Out of reach: positions that come closer.
+        near: Joint positions, a centimetre or so away [rad].
+    """
+    q, still = near, torch.zeros_like(near)
+    for _ in range(_ITERATIONS):
+        now, J = chain.forward_and_jacobian(q)
+        q = q + resolved_rate(J, now.twist_to(pose), still)
+    return q
+
+
 @dataclass(frozen=True, kw_only=True)
 class PositionServoConfig:
     """How positions are tracked."""
@@ -315,6 +332,7 @@ class PositionServo:
 
     Attributes:
         safety: State of the safety filter, with its counts of interventions.
+        limits: Within which positions are reached when the next one is due.
     """
 
     def __init__(
@@ -341,16 +359,14 @@ class PositionServo:
             )
         # Within the limits of the safety filter, which then has nothing to do.
         limits, margin = chain.limits, 1.5 * config.safety.margin
-        self._smoother = ActionChunkFilter(
-            replace(
-                limits,
-                lower=limits.lower + margin,
-                upper=limits.upper - margin,
-                acceleration=self._filter.barrier.acceleration,
-                jerk=self._filter.barrier.jerk,
-            ),
-            dt,
+        self.limits = replace(
+            limits,
+            lower=limits.lower + margin,
+            upper=limits.upper - margin,
+            acceleration=self._filter.barrier.acceleration,
+            jerk=self._filter.barrier.jerk,
         )
+        self._smoother = ActionChunkFilter(self.limits, dt)
         self.safety: SafetyState
         self._motion: ActionChunkState
         self.restart()
@@ -393,9 +409,4 @@ class PositionServo:
         Args:
             pose: Of the end effector. Out of reach: positions that come closer.
         """
-        q = self._motion.position
-        still = torch.zeros_like(q)
-        for _ in range(_ITERATIONS):
-            now, J = self._chain.forward_and_jacobian(q)
-            q = q + resolved_rate(J, now.twist_to(pose), still)
-        return q.numpy()
+        return joints_near(self._chain, pose, self._motion.position).numpy()

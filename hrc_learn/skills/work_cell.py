@@ -4,11 +4,10 @@ import math
 from collections import deque
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, replace
-from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from hrc_learn.controller import (
@@ -28,7 +27,6 @@ from hrc_learn.skills.arm_motion import (
     null_space_giving_way,
     null_space_slowdown,
     resolved_rate,
-    singularity_fade,
     straight_line,
 )
 from hrc_learn.skills.marker_sensor import (
@@ -36,6 +34,15 @@ from hrc_learn.skills.marker_sensor import (
     LatencyConfig,
     MarkerObservation,
     MarkerSensor,
+)
+from hrc_learn.skills.null_space_yielding import (
+    CHANGE_OF_RATE,
+    LONGEST_RETURN,
+    NARROW,
+    NullSpaceYielding,
+    YieldingConfig,
+    changed_rate,
+    smallest_singular_value,
 )
 from hrc_learn.vision import angle, centre
 from hrc_learn.viz import StepLog
@@ -60,20 +67,9 @@ SAFETY_COLUMNS = INTERVENTIONS
 
 # At the end of a straight line, for the pose error to decay by pose_gain [s].
 _SETTLING_TIME = 0.4
-# Null-space input below which one that has ended is over [N m].
-_LEAST_INPUT = 0.05
-# Fraction of the joints' acceleration that a push may use: the rest is for the task, which is
-# slowed down as well where both together need more than the arm has.
-_PUSHED_EFFORT = 0.3
-# How far the null space is from a planned path for the arm to have been pushed aside, and to be
-# back [rad]: servos lag by 0.03 rad at the speed of transfers.
-_ASIDE, _BACK = 0.1, 0.03
-# Time to go back at the end of a path; that after which a path that waits for the joints is
-# gone back, and that after which they go back straight [s].
-_LONGEST_RETURN, _STUCK, _LONGEST_WAIT = 5.0, 2.0, 20.0
-# Smallest singular value of the Jacobian of a path below which the arm cannot follow beside it,
-# as damping begins at 0.05.
-_NARROW = 0.07
+# Time after which a path that waits for the joints is gone back, and after which they go back
+# straight [s].
+_STUCK, _LONGEST_WAIT = 2.0, 20.0
 # Distance of the end effector from its path for the path to wait, and time by which servos lag
 # [m, s]: half the deviation that a push may cause, and twice the lag of an arm 20 ms late.
 _ON_PATH, _SERVO_LAG = 0.001, 0.06
@@ -81,8 +77,6 @@ _ON_PATH, _SERVO_LAG = 0.001, 0.06
 _METRES_PER_RADIAN = 0.1
 # Postures on the straight way back to a path that are checked: 0.1 rad apart at most.
 _CHECKED = 50
-# In which a path stops, and goes on [s].
-_CHANGE_OF_RATE = 0.2
 # Readings of the torque that are averaged, and steps in which an arm gets under way: friction
 # keeps it back at first.
 _FELT = 5
@@ -105,7 +99,7 @@ _NO_VISION = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class WorkCellConfig:
+class WorkCellConfig(YieldingConfig):
     """How the loop runs."""
 
     dt: float = 0.01
@@ -116,27 +110,13 @@ class WorkCellConfig:
     """Control steps from one image kept for the recording to the next; 0: none is kept."""
     latency: LatencyConfig = field(default_factory=LatencyConfig)
     """Delay and loss of the camera's images."""
-    damping: float = 3.0
-    """c_d: null-space input per unit of joint velocity (paper, Table I) [N m s/rad]."""
-    nullspace_rise: float = 0.15
-    """Time constant with which the null-space input is smoothed [s]."""
-    pose_gain: float = 4.0
-    """Decay rate of the pose error on given motions [1/s]."""
     command_delay: float = 0.01
     """From a command until the arm follows it, its servos' lag included [s]: velocities along a
     path are those of then. By default that of the simulated servos; real arms are later, by a
     network and a kernel's scheduler."""
-    after_push: Literal["return", "stay"] = "return"
-    """Whether the joints go back to a planned path, or on beside it, when a person who pushed
-    them aside lets go."""
-    return_speed: float = 0.4
-    """Fastest way back, of all joints together [rad/s]."""
     limit_room: float = 0.1
     """Distance from the margin of the joints' limits beyond which nobody can push the arm
     [rad]: of some centimetres of the end effector, which the task may need."""
-    clearance: float = 0.03
-    """Distance from what is around that nobody can push the arm below [m]: three times the
-    errors of base and table."""
     safety: SafetyConfig = field(default_factory=SafetyConfig)
     """Of the safety filter, which is told what the arm's driver can do."""
 
@@ -203,12 +183,11 @@ class WorkCell:
         self.tracked_markers: Collection[int] = ()
         self.log = StepLog()
         # Of the path that the next step follows; of most steps none.
-        self._back = torch.zeros(len(chain.joint_names), dtype=torch.float64)
         self._path_joints = self._no_path = np.full(len(chain.joint_names), _NAN)
         self.images: list[KeptImage] = []
         self._arm, self._sensor, self._human = arm, sensor, human
         self._advance, self._on_phase = advance, on_phase
-        self._clearance, self._aside = clearance, False
+        self._clearance = clearance
         safety = self.config.safety
         self._safety = SafetyFilter(chain.limits, safety)
         self._room = SafetyFilter(
@@ -217,6 +196,9 @@ class WorkCell:
         self._ticks = 0
         self.state: ArmState = arm.read()
         self.human_input: HumanInput = human.read(self.state)
+        self._yielding = NullSpaceYielding(
+            chain, self.config.dt, self.config, self.human_input.nullspace_input
+        )
         self.observation = MarkerObservation()
         self._channel = DelayedChannel(self.config.latency, rng or np.random.default_rng(0))
         self._guard = self._safety.initial_state(self.joints)
@@ -331,7 +313,7 @@ class WorkCell:
         # Where the arm will be when it follows: the null space is that of then.
         J = self.chain.jacobian(joints + self.config.command_delay * self._guard.velocity)
         correction = self.config.pose_gain * self.pose.twist_to(goal)
-        null_velocity = torch.from_numpy(self.human_input.nullspace_input) / self.config.damping
+        null_velocity = self._yielding.null_velocity
         if drift is not None:
             null_velocity = null_velocity + drift
         task = resolved_rate(J, twist + correction, torch.zeros_like(joints))
@@ -442,37 +424,36 @@ class WorkCell:
         """
         dt = self.config.dt
         velocity = np.gradient(path, dt, axis=0) if len(path) > 1 else np.zeros_like(path)
-        narrow = self._narrow(path)
+        narrow = smallest_singular_value(self.chain, torch.from_numpy(path.copy())) < NARROW
         progress, rate, waited = 0.0, 1.0, 0.0
         while progress <= len(path) - 1:
             if until():
                 return int(progress)
             later = progress + rate * self.config.command_delay / dt
             goal, wanted = _between(path, progress), rate * _between(velocity, later)
-            here, ahead = int(progress), int(progress + _CHANGE_OF_RATE / dt)
+            here, ahead = int(progress), int(progress + CHANGE_OF_RATE / dt)
             behind = self._track_joints(
                 goal, wanted, yields=not bool(narrow[here]), returns=rate <= 0
             )
-            if not self._aside:
+            if not self._yielding.aside:
                 waited = 0.0
-            elif not self._pushed():  # who pushes again and again must not hold it up for good
+            # Who pushes again and again must not hold it up for good.
+            elif not self._yielding.pushed:
                 waited = max(waited + (1.0 - 2.0 * max(rate, 0.0)) * dt, 0.0)
             # The null space that led aside further back leads back there as well.
             backs = waited > _STUCK and progress > 0
-            if not backs and self._aside and narrow[here : ahead + 1].any():
+            if not backs and self._yielding.aside and narrow[here : ahead + 1].any():
                 behind = math.inf
-            # Without jumps, as every change of speed is one of the end effector's.
-            change, wanted_rate = dt / _CHANGE_OF_RATE, min(max(2.0 - behind, 0.0), 1.0)
-            wanted_rate *= -1 if backs else 1
-            rate += min(max(wanted_rate - rate, -change), change)
+            rate = changed_rate(rate, 2.0 - behind, dt, direction=-1 if backs else 1)
             progress = max(progress + rate, 0.0)
             if waited > _LONGEST_WAIT:
                 self._go_straight_back(_between(path, progress))
                 waited = 0.0
         if len(path) and self.config.after_push == "return":
             end = torch.from_numpy(path[-1])
-            deadline = self.time + _LONGEST_RETURN
-            while self._aside and not self._pushed() and self.time < deadline:
+            deadline = self.time + LONGEST_RETURN
+            yielding = self._yielding
+            while yielding.aside and not yielding.pushed and self.time < deadline:
                 self._track_joints(end, torch.zeros_like(end))
         return len(path)
 
@@ -493,19 +474,10 @@ class WorkCell:
                     "path: the arm was pushed aside and finds no way back that is clear of "
                     "what is around it."
                 )
-        self._aside, pose = False, self.chain.forward(goal)
+        self._yielding.aside, pose = False, self.chain.forward(goal)
         for q in way:
             self._path_joints = q.numpy()
             self.step(self.config.pose_gain * (q - self.joints), pose)
-
-    def _narrow(self, path: Float[np.ndarray, "steps joints"]) -> Bool[np.ndarray, " steps"]:
-        """Where a path of the joints is so near a singularity that the arm cannot follow it
-        beside it.
-        """
-        if not len(path):
-            return np.zeros(0, dtype=bool)
-        jacobians = self.chain.jacobian(torch.from_numpy(path.copy()))
-        return (torch.linalg.svdvals(jacobians)[..., -1] < _NARROW).numpy()
 
     def _track_joints(
         self,
@@ -528,37 +500,15 @@ class WorkCell:
         """
         error = goal - self.joints
         self._path_joints = goal.numpy()
-        away = self._away(error) if yields or self._aside else None
+        back = self._yielding.way_back(self.joints, error, yields=yields, returns=returns)
         pose = self.chain.forward(goal)
-        if away is None:
-            self._back = torch.zeros_like(error)
+        if back is None:
             self.step(velocity + self.config.pose_gain * error, pose)
             return 0.0
-        back = torch.zeros_like(away)
-        # Not against the person while they push.
-        if returns or (self.config.after_push == "return" and not self._pushed()):
-            fastest = self.config.return_speed / float(away.norm().clamp(min=1e-9))
-            back = min(self.config.pose_gain, fastest) * away
-        # A jump of the null-space motion would move the end effector.
-        share = min(self.config.dt / self.config.nullspace_rise, 1.0)
-        self._back = self._back + share * (back - self._back)
         twist = self.chain.jacobian(goal + self.config.command_delay * velocity) @ velocity
-        if self.track_pose(pose, twist, velocity + self._back):
+        if self.track_pose(pose, twist, velocity + back):
             return math.inf
         return _size(self.pose.twist_to(pose)) / (_ON_PATH + _SERVO_LAG * _size(twist))
-
-    def _away(self, error: Float[Tensor, " joints"]) -> Float[Tensor, " joints"] | None:
-        """Null-space part of the way back to a path [rad]; None if nobody pushed it off."""
-        limit = _BACK if self._aside else _ASIDE
-        if not self._pushed() and float(error.norm()) <= limit:
-            self._aside = False
-            return None
-        self._aside = True
-        return null_projection(self.chain.jacobian(self.joints), error)
-
-    def _pushed(self) -> bool:
-        """Whether a person pushes at the null space now."""
-        return bool(self.human_input.nullspace_input.any())
 
     def _settle(self, goal: Pose, duration: float) -> None:
         still = torch.zeros(6, dtype=torch.float64)
@@ -581,37 +531,16 @@ class WorkCell:
         self._advance(self.config.dt)
         self._ticks += 1
         self.state = self._arm.read()
-        self.human_input = self._smoothed(self._human.read(self.state))
+        asked = self._human.read(self.state)
+        room = self._room.velocity_bounds(self.joints)
+        smooth = self._yielding.feel(asked.nullspace_input, self.joints, room)
+        self.human_input = replace(asked, nullspace_input=smooth)
         self._receive()
         if self.tracked_markers and self._ticks % self.config.detect_every == 0:
             self.detect(self.tracked_markers)
         every = self.config.keep_image_every
         if self._sensor is not None and every and self._ticks % every == 0:
             self.images.append(KeptImage(time=self.time, image=self._sensor.read()))
-
-    def _smoothed(self, asked: HumanInput) -> HumanInput:
-        """What a person asks for, its null-space input as the arm can follow it.
-
-        An arm follows late and with limited acceleration. A jump of its null-space motion, or
-        one that is too fast, would therefore move the end effector.
-        """
-        before = torch.from_numpy(self.human_input.nullspace_input) / self.config.damping
-        wanted = torch.from_numpy(asked.nullspace_input) / self.config.damping
-        if not (before.any() or wanted.any()):
-            return asked
-        J = self.chain.jacobian(self.joints)
-        wanted, before = null_projection(J, wanted), null_projection(J, before)
-        wanted = wanted * null_space_slowdown(self.chain, self.joints, wanted)
-        wanted = wanted * singularity_fade(self.chain, self.joints, wanted)
-        room = self._room.velocity_bounds(self.joints)
-        wanted = scale_null_space(torch.zeros_like(wanted), wanted, *room)
-        change = min(self.config.dt / self.config.nullspace_rise, 1.0) * (wanted - before)
-        reach = _PUSHED_EFFORT * self.config.dt * self.chain.limits.acceleration
-        velocity = before + change / (change.abs() / reach).max().clamp(min=1.0)
-        smooth = (self.config.damping * velocity).numpy()
-        if not asked.nullspace_input.any() and np.abs(smooth).max() < _LEAST_INPUT:
-            smooth = asked.nullspace_input
-        return replace(asked, nullspace_input=smooth)
 
     def _receive(self) -> None:
         self.observation = self._channel.newest(self.time) or self.observation

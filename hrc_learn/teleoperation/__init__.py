@@ -23,3 +23,4 @@ from hrc_learn.teleoperation.scripted_expert import ScriptedExpert as ScriptedEx
 from hrc_learn.teleoperation.scripted_expert import ScriptedForce as ScriptedForce
 from hrc_learn.teleoperation.scripted_expert import ScriptedPerturbation as ScriptedPerturbation
 from hrc_learn.teleoperation.scripted_expert import Tremor as Tremor
+from hrc_learn.teleoperation.scripted_expert import random_pulls as random_pulls

@@ -20,7 +20,13 @@ from jaxtyping import Float
 
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.protocols import ArmState, Human, HumanInput, Request
-from hrc_learn.teleoperation.hand_guiding import InteractionForceConfig, capped, leading_twist
+from hrc_learn.teleoperation.hand_guiding import (
+    InteractionForceConfig,
+    bounded,
+    capped,
+    force_to_nullspace_input,
+    leading_twist,
+)
 
 
 class CombinedInput:
@@ -50,6 +56,45 @@ class CombinedInput:
             region=next((i.region for i in inputs if i.region is not None), None),
             target=next((i.target for i in inputs if i.target is not None), None),
             requests=tuple(request for i in inputs for request in i.requests),
+        )
+
+
+class LinkGuide:
+    """Leads a link in the null space by a device that leads the end effector elsewhere.
+
+    The device's speed, as a fraction of its largest, is that fraction of the largest force on
+    the link. The end effector is left alone.
+    """
+
+    def __init__(
+        self,
+        human: Human,
+        chain: SerialChain,
+        joint: int = 4,
+        config: InteractionForceConfig | None = None,
+    ):
+        """Take a device.
+
+        Args:
+            human: The device, with speeds of the same `config`.
+            chain: The arm.
+            joint: Whose origin is pulled, counted from 1; the elbow by default.
+            config: Largest speed and force.
+        """
+        self._human, self._chain, self._joint = human, chain, joint
+        self._config = config or InteractionForceConfig()
+
+    def read(self, state: ArmState) -> HumanInput:
+        """The null-space input now."""
+        asked, config = self._human.read(state), self._config
+        force = config.max_force / config.speed * asked.twist[:3]
+        d = force_to_nullspace_input(
+            self._chain, state.joint_position, self._joint, capped(force, config.max_force)
+        )
+        return replace(
+            asked,
+            nullspace_input=bounded(asked.nullspace_input + d, config.max_nullspace_input),
+            twist=np.zeros(6),
         )
 
 

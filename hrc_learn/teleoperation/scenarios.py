@@ -13,11 +13,16 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
+from hrc_learn.controller import SafetyConfig
 from hrc_learn.kinematics import gripper_down, panda
 from hrc_learn.protocols import ArmState, Human, HumanInput
-from hrc_learn.sim import CameraKind, World, open_camera
+from hrc_learn.sim import CameraKind, Imperfections, World, open_camera
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.arm_motion import PositionServo, nearest_configuration
+from hrc_learn.skills.arm_motion import (
+    PositionServo,
+    PositionServoConfig,
+    nearest_configuration,
+)
 from hrc_learn.skills.grasping import CLOSED, OPEN
 from hrc_learn.skills.marker_sensor import MarkerSensor
 from hrc_learn.teleoperation.scripted_demonstrations import (
@@ -123,6 +128,8 @@ class Grasping(Scenario):
     def begin(self, world: World, rng: np.random.Generator) -> Human:
         item = self.workplace.scene.objects[0]
         pose = self.workplace.random_object_pose(self.reach, rng)
+        # On the table as it is, of an object as tall as it is.
+        pose[2, 3] = world.table_top + world.config.objects[0].half_size[2]
         hover = self.workplace.hover()
         joints = nearest_configuration(hover, near=self.workplace.hover_joints())
         world.reset(joints.numpy(), {item.name: pose})
@@ -186,26 +193,43 @@ class ScenarioRun:
 
     expert: Human
 
-    def __init__(self, scenario: Scenario, fps: float, *, seed: int = 0):
+    def __init__(
+        self,
+        scenario: Scenario,
+        fps: float,
+        *,
+        seed: int = 0,
+        imperfections: Imperfections | None = None,
+    ):
         """Begin.
 
         Args:
             scenario: What is to be done.
             fps: Commands a second of the world's time.
             seed: Of the first initial configuration.
+            imperfections: Of arm, calibration and workplace, drawn anew from each seed; None:
+                none.
         """
         self.scenario, self.dt = scenario, 1.0 / fps
-        self.world = World(scenario.workplace.scene)
-        self.servo = PositionServo(panda, self.world.arm, self.dt)
+        self._sizes = imperfections or Imperfections.ideal()
+        self._build(np.random.default_rng(0))
         self._noise = np.random.default_rng(0)
         self.begin(seed)
 
     def begin(self, seed: int) -> None:
         """Put everything in place as a seed has it."""
         self.seed, self.commands = seed, 0
+        if self._sizes != Imperfections.ideal():
+            self._build(np.random.default_rng([seed, 2]))
         self.expert = self.scenario.begin(self.world, np.random.default_rng(seed))
         self.servo.restart()
         self._pixel: np.ndarray | None = None
+
+    def _build(self, rng: np.random.Generator) -> None:
+        """The world with imperfections as they are drawn, and who leads the arm in it."""
+        self.world = World(self.scenario.workplace.scene, self._sizes.draw(rng))
+        config = PositionServoConfig(safety=self._sizes.plant(SafetyConfig()))
+        self.servo = PositionServo(panda, self.world.arm, self.dt, config)
 
     def command(self, joints: Float[np.ndarray, "7"], width: float) -> np.ndarray:
         """Send the joints and the gripper on their way, and let time pass.
@@ -278,14 +302,23 @@ class ScenarioView:
         Raises:
             RenderingUnavailableError: `kind` is "egl" and this machine cannot render.
         """
-        rng, noise = np.random.default_rng(0), ImageNoise()
         model = overview(width, height)
         if kind == "synthetic":
             model = _scaled(run.scenario.workplace.scene.camera, width, height)
-        self._camera = open_camera(run.world, kind, model, rng=rng, noise=noise)
+        self._run, self._model = run, model
+        self._kind: CameraKind = kind
+        self._open()
+
+    def _open(self) -> None:
+        self._world, rng = self._run.world, np.random.default_rng(0)
+        self._camera = open_camera(
+            self._world, self._kind, self._model, rng=rng, noise=ImageNoise()
+        )
 
     def read(self) -> UInt8[np.ndarray, "height width 3"]:
         """The image now, RGB."""
+        if self._world is not self._run.world:  # built anew, with other imperfections
+            self._open()
         return self._camera.read()
 
 

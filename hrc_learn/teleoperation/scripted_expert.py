@@ -2,6 +2,7 @@
 end effector along way points.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -52,6 +53,43 @@ class ScriptedForce:
         pull = self.stiffness * (np.array(self.towards) - origin)
         size = float(np.linalg.norm(pull))
         return pull * self.strength(time) * min(1.0, self.max_force / max(size, TINY))
+
+
+_PAUSE, _DURATION = (1.0, 6.0), (2.0, 4.5)
+"""Between two pulls, and of a pull [s]: as long as the paper's drags of joint 4, 4 to 7 s, or
+half that."""
+_FAR_AWAY = 10.0
+"""Distance of the point towards which a pull goes [m]: its direction stays."""
+_SLOPE = math.radians(30.0)
+"""Of a pull against the horizontal, at most [rad]: who makes room draws an elbow aside."""
+_FORCE = 60.0
+"""Largest force [N], as where the person is waited for."""
+
+
+def random_pulls(
+    rng: np.random.Generator, duration: float = 600.0
+) -> tuple[ScriptedForce, ...]:
+    """Pulls at random moments, each to another side.
+
+    Args:
+        rng: Source of moments, durations and sides.
+        duration: How long they go on [s].
+    """
+    pulls, time = [], float(rng.uniform(0.0, _PAUSE[1]))
+    while time < duration:
+        heading, slope = rng.uniform(-np.pi, np.pi), rng.uniform(-_SLOPE, _SLOPE)
+        along = _FAR_AWAY * math.cos(slope)
+        towards = (
+            along * math.cos(heading),
+            along * math.sin(heading),
+            _FAR_AWAY * math.sin(slope),
+        )
+        length = float(rng.uniform(*_DURATION))
+        pulls.append(
+            ScriptedForce(start=time, duration=length, towards=towards, max_force=_FORCE)
+        )
+        time += length + float(rng.uniform(*_PAUSE))
+    return tuple(pulls)
 
 
 class ScriptedPerturbation:

@@ -8,12 +8,11 @@ from hrc_learn.experiments.collaboration.pulls import (
     elbow_room,
     path_distance,
     pull_effects,
-    random_pulls,
 )
 from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import UnreachableError, panda
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.teleoperation import ScriptedForce
+from hrc_learn.teleoperation import ScriptedForce, random_pulls
 from hrc_learn.viz import StepLog
 
 TIME = 0.01 * np.arange(300)

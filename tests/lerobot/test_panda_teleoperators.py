@@ -137,7 +137,7 @@ class Page:
 
     requests = ()
 
-    def __init__(self, chain, bodies, boxes, config):
+    def __init__(self, chain, bodies, boxes, config, *, guides):
         self.config, self.open, self.human = config, False, self
         self.places = []
 

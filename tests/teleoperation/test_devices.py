@@ -12,6 +12,7 @@ from hrc_learn.teleoperation.devices import (
     Gamepad,
     GamepadConfig,
     KeyboardState,
+    LinkGuide,
     TerminalKeyboard,
     deflection,
 )
@@ -269,3 +270,20 @@ def test_a_clock_that_is_set_back_stops_nothing_and_starts_nothing():
 def test_an_acceleration_that_is_none_is_refused(name):
     with pytest.raises(ValueError, match=f"{name} must be positive"):
         InputFilterConfig(**{name: 0.0})
+
+
+@pytest.mark.parametrize("way", [(0.25, 0, 0), (0, -0.1, 0), (0, 0.9, 0.9)])
+def test_a_device_leads_the_elbow_instead_of_the_hand(way):
+    class Device:
+        def read(self, state):
+            return HumanInput(twist=np.array([*way, 0.1, 0.2, 0.3]), requests=("stop",))
+
+    asked = LinkGuide(Device(), panda).read(STATE)
+    assert not asked.twist.any()
+    assert asked.requests == ("stop",)
+    # The torques of a force along the way, as strong as the device is pushed, 45 N at most.
+    J = panda.joint_jacobian(torch.from_numpy(Q), 4)[:3].numpy()
+    force = np.array(way) / 0.25 * 45
+    force *= min(1.0, 45 / np.linalg.norm(force))
+    expected = J.T @ force
+    np.testing.assert_allclose(asked.nullspace_input, expected, atol=1e-9)

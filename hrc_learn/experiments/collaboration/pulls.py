@@ -1,4 +1,4 @@
-"""A person who pulls at the elbow at any moment of a job, and what each pull does.
+"""What a person who pulls at the elbow at any moment of a job does to the motion.
 
 In motions and while the end effector is held, its path is known, and so is how far it was off
 it. Visual servoing has no path: there the offset of the hand from the object tells.
@@ -20,15 +20,6 @@ from hrc_learn.viz import LoggedSteps
 type Clearance = Callable[[Float[torch.Tensor, "*batch joints"]], Float[torch.Tensor, "*batch"]]
 """Distance of an arm at given joint positions [rad] from what is around it [m]."""
 
-_PAUSE, _DURATION = (1.0, 6.0), (2.0, 4.5)
-"""Between two pulls, and of a pull [s]: as long as the paper's drags of joint 4, 4 to 7 s, or
-half that."""
-_FAR_AWAY = 10.0
-"""Distance of the point towards which a pull goes [m]: its direction stays."""
-_SLOPE = math.radians(30.0)
-"""Of a pull against the horizontal, at most [rad]: who makes room draws an elbow aside."""
-_FORCE = 60.0
-"""Largest force [N], as where the person is waited for."""
 _STEP, _STEP_JOINTS, _MOST_STEPS = 0.005, 0.05, 300
 """Of a self-motion that is followed [m, rad], and how many at most."""
 _STILL = 5e-4
@@ -46,32 +37,6 @@ _LAG = 0.5
 lag, and a motion that waits for a limit lags further."""
 _LEAST_WAY = 0.002
 """Way of the goal in that time from which on it has a direction [m]."""
-
-
-def random_pulls(
-    rng: np.random.Generator, duration: float = 600.0
-) -> tuple[ScriptedForce, ...]:
-    """Pulls at random moments, each to another side.
-
-    Args:
-        rng: Source of moments, durations and sides.
-        duration: How long they go on [s].
-    """
-    pulls, time = [], float(rng.uniform(0.0, _PAUSE[1]))
-    while time < duration:
-        heading, slope = rng.uniform(-np.pi, np.pi), rng.uniform(-_SLOPE, _SLOPE)
-        along = _FAR_AWAY * math.cos(slope)
-        towards = (
-            along * math.cos(heading),
-            along * math.sin(heading),
-            _FAR_AWAY * math.sin(slope),
-        )
-        length = float(rng.uniform(*_DURATION))
-        pulls.append(
-            ScriptedForce(start=time, duration=length, towards=towards, max_force=_FORCE)
-        )
-        time += length + float(rng.uniform(*_PAUSE))
-    return tuple(pulls)
 
 
 @dataclass(frozen=True, kw_only=True)

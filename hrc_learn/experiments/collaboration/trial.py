@@ -10,11 +10,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from hrc_learn.experiments.collaboration.pulls import (
-    PullEffect,
-    pull_effects,
-    random_pulls,
-)
+from hrc_learn.experiments.collaboration.pulls import PullEffect, pull_effects
 from hrc_learn.experiments.collaboration.worker import (
     SensedDistance,
     move_worker,
@@ -50,7 +46,7 @@ from hrc_learn.skills.pick_and_place import (
 from hrc_learn.skills.placing import PlacingSkill, Plan, check_plan
 from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.skills.work_cell import WorkCell, WorkCellConfig
-from hrc_learn.teleoperation import ScriptedForce, ScriptedPerturbation
+from hrc_learn.teleoperation import ScriptedForce, ScriptedPerturbation, random_pulls
 from hrc_learn.teleoperation.page import PageConfig
 from hrc_learn.teleoperation.page_session import task_page
 from hrc_learn.vision import CameraModel, Marker

@@ -57,6 +57,10 @@ class FrankaPandaConfig(PandaRobotConfig):
         super().__post_init__()
         if not 5 <= self.fps <= 1000:
             raise ValueError(f"fps must be from 5 to 1000, but is {self.fps}.")
+        if self.person.kind == "scripted":
+            raise ValueError(
+                "person.kind: a script pushes simulated arms only, not a real one."
+            )
         if not 0 < self.dynamics <= 1:
             raise ValueError(f"dynamics must be in (0, 1], but is {self.dynamics}.")
         if not self.timeout > 1.5 / self.fps:
@@ -101,6 +105,10 @@ class FrankaPanda(PandaRobot):
     @property
     def arm(self) -> Arm:
         return self._arm
+
+    @property
+    def servo(self) -> PositionServo:
+        return self._servo
 
     def _open(self) -> None:
         from hrc_learn.skills.arm_motion import PositionServo, PositionServoConfig

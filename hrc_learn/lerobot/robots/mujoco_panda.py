@@ -9,13 +9,17 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from jaxtyping import Float
 from lerobot.robots import RobotConfig
+from torch import Tensor
 
 from hrc_learn.geometry import Pose
 from hrc_learn.lerobot.panda_robot import DOWN, PIXELS, PandaRobot, PandaRobotConfig
+from hrc_learn.lerobot.person import PersonConfig
 from hrc_learn.protocols import Arm
 from hrc_learn.teleoperation.scenarios import check_scenario, make_scenario
 
 if TYPE_CHECKING:
+    from hrc_learn.sim import World
+    from hrc_learn.skills.arm_motion import PositionServo
     from hrc_learn.teleoperation.scenarios import ScenarioRun
 
 
@@ -51,6 +55,9 @@ class MujocoPandaConfig(PandaRobotConfig):
     what a policy needs to grasp without images."""
     images: ImagesConfig = field(default_factory=ImagesConfig)
     """Images to be observed."""
+    imperfections: float = 0.0
+    """Size of the errors of arm, calibration and workplace, in multiples of the nominal ones;
+    each seed draws its own. 0: there are none."""
     episode_time: float = 0.0
     """Begin anew when this much time [s] has passed, as `--dataset.episode_time_s` says when
     lerobot-record ends an episode, of which it tells a robot nothing; 0: never."""
@@ -60,8 +67,9 @@ class MujocoPandaConfig(PandaRobotConfig):
         check_scenario(self.scenario, self.shelf, self.pixels)
         if not 5 <= self.fps <= 500:
             raise ValueError(f"fps must be from 5 to 500, but is {self.fps}.")
-        if self.episode_time < 0:
-            raise ValueError("episode_time must not be negative.")
+        for name in ("episode_time", "imperfections"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} must not be negative.")
 
 
 CAMERA = "front"
@@ -100,12 +108,29 @@ class MujocoPanda(PandaRobot):
     def arm(self) -> Arm:
         return self.run.world.arm
 
+    @property
+    def servo(self) -> PositionServo:
+        return self.run.servo
+
+    @property
+    def world(self) -> World:
+        return self.run.world
+
+    def clearance(self, joint_position: Float[Tensor, "*batch 7"]) -> Float[Tensor, "*batch"]:
+        return self.run.scenario.workplace.arm_clearance(joint_position)
+
+    def _invite(self, config: PersonConfig) -> None:
+        super()._invite(config)
+        self._person.begin(self.run.seed)
+
     def _open(self) -> None:
+        from hrc_learn.sim import Imperfections
         from hrc_learn.teleoperation.scenarios import ScenarioRun, ScenarioView
 
         config, images = self.config, self.config.images
         scenario = make_scenario(config.scenario, config.shelf)
-        self.run = ScenarioRun(scenario, config.fps, seed=config.seed)
+        sizes = Imperfections.nominal().scaled(config.imperfections)
+        self.run = ScenarioRun(scenario, config.fps, seed=config.seed, imperfections=sizes)
         if images.kind != "none":
             self.cameras = {
                 CAMERA: ScenarioView(self.run, images.width, images.height, images.kind)
@@ -140,6 +165,9 @@ class MujocoPanda(PandaRobot):
     def begin(self, seed: int) -> None:
         """Put everything in place as a seed has it."""
         self.run.begin(seed)
+        if self.complement is not None:
+            self.complement.restart()
+            self._person.begin(seed)
         self.initial_configurations += 1
         self._rotation = DOWN
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -24,11 +24,11 @@ from hrc_learn.lerobot.panda_robot import (
     action_of,
     robot_registry,
 )
+from hrc_learn.lerobot.robot_page import RobotPage
 from hrc_learn.lerobot.robots import MujocoPanda
 from hrc_learn.protocols import ArmState, Human, HumanInput
 
 if TYPE_CHECKING:
-    from hrc_learn.sim import MovingBodies, World
     from hrc_learn.teleoperation.page import Page
 
 
@@ -185,49 +185,26 @@ class PandaPage(PandaTeleoperator):
     config_class = PandaPageConfig
     name = "panda_page"
     page: Page
-    _bodies: MovingBodies
-    _ghost: World
-    _shown: World
+    _shown: RobotPage
 
     def __init__(self, config: PandaPageConfig):
         super().__init__(config)
         self.config = config
-        self._served = ExitStack()
 
     def _open(self) -> None:
-        from hrc_learn.sim import MovingBodies, World
-        from hrc_learn.teleoperation.page import Page, PageConfig, PageStatus
-
-        self._ghost = self._shown = World()
-        self._bodies = MovingBodies(self._ghost)
-        drawn = self._bodies.drawn(*(poses[None] for poses in self._bodies.poses()))
-        config = PageConfig(host=self.config.host, port=self.config.port)
-        page = Page(panda, drawn, self._ghost.config.boxes(), config)
-        self.page = self._served.enter_context(page)
         note = "LeRobot records: its own keys begin and end episodes"
-        self.page.show(PageStatus(title="LeRobot", note=note))
+        self._shown = RobotPage(self.config.host, self.config.port, note)
+        self.page = self._shown.page
 
     def _close(self) -> None:
         super()._close()
-        self._served.close()
+        self._shown.close()
 
     def get_action(self) -> dict[str, float]:
         self._need_connection()
         robot = self._find()
         action, asked = self._guided_robot(robot, lambda: self.page.human).next()
-        self._show(robot)
+        self._shown.show(robot)
         if "home" in asked.requests and isinstance(robot, MujocoPanda):
             robot.begin(robot.run.seed + 1)
         return action
-
-    def _show(self, robot: PandaRobot) -> None:
-        """Show where the arm is, and in simulation everything else as well."""
-        from hrc_learn.sim import MovingBodies
-
-        world = robot.run.world if isinstance(robot, MujocoPanda) else self._ghost
-        if world is self._ghost:
-            state = robot.read_state()
-            self._ghost.reset(state.joint_position, gripper_width=state.gripper_width)
-        if world is not self._shown:
-            self._shown, self._bodies = world, MovingBodies(world)
-        self.page.place(*self._bodies.poses())

@@ -1,0 +1,115 @@
+"""The person beside a robot of LeRobot's, who leads its body while actions lead its hand."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from hrc_learn.kinematics import panda
+from hrc_learn.protocols import ArmState, Human, HumanInput
+
+if TYPE_CHECKING:
+    from hrc_learn.lerobot.panda_robot import PandaRobot
+    from hrc_learn.lerobot.robot_page import RobotPage
+    from hrc_learn.teleoperation import ScriptedForce
+
+PersonKind = Literal["none", "scripted", "page", "gamepad", "keyboard"]
+"""No person, a script that pulls the elbow at random moments of a simulation, or the device of
+a real one. Gamepad and keyboard, which lead an end effector elsewhere, lead the elbow here."""
+NULLSPACE_INPUTS = tuple(f"{name}.human_torque" for name in panda.joint_names)
+"""Names of what the person asks of the joints [N m]."""
+OFFSETS = tuple(f"{name}.pushed_aside" for name in panda.joint_names)
+"""Names of how far the joints are from where the actions have them [rad]."""
+
+COLUMNS = {
+    "observation.human_effort": NULLSPACE_INPUTS,
+    "observation.pushed_aside": OFFSETS,
+}
+"""Columns of their own, where those are to be had."""
+
+
+@dataclass
+class PersonConfig:
+    """A person who leads the body while actions, of any policy, lead the end effector."""
+
+    kind: PersonKind = "none"
+    """How they do so: "page", "gamepad", "keyboard", "scripted"; "none": nobody does."""
+    after_push: Literal["return", "stay"] = "return"
+    """Whether the joints go back to where actions have them, or on beside them, when the person
+    lets go."""
+    observed: Literal["posture", "joints"] = "posture"
+    """What is observed as the joints' positions and velocities: those of the policy's own
+    posture, as without the person; or the joints' as they are."""
+    record: bool = False
+    """Whether the null-space input, and how far it has moved the joints, is observed too."""
+    host: str = "127.0.0.1"
+    """Address to serve the page at. Whoever reaches it can move the arm."""
+    port: int = 8080
+    """Port to serve it at; the next free one is taken if it is in use."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of what is observed of the person."""
+        return (*NULLSPACE_INPUTS, *OFFSETS) if self.record and self.kind != "none" else ()
+
+
+def scripted_pulls(seed: int) -> tuple[ScriptedForce, ...]:
+    """Of the scripted person, as a seed has them."""
+    from hrc_learn.teleoperation import random_pulls
+
+    # Drawn apart, so that runs with and without pulls are alike but for them.
+    return random_pulls(np.random.default_rng([seed, 1]))
+
+
+class Person:
+    """Reads the device of a person, shows them the arm, and gives the device back."""
+
+    def __init__(self, config: PersonConfig):
+        """Open the device.
+
+        Raises:
+            ValueError: There is none.
+        """
+        self._page: RobotPage | None = None
+        self._human = self._opened(config)
+
+    def _opened(self, config: PersonConfig) -> Human:
+        from hrc_learn.teleoperation.devices import Gamepad, LinkGuide, TerminalKeyboard
+        from hrc_learn.teleoperation.scripted_expert import ScriptedPerturbation
+
+        match config.kind:
+            case "page":
+                from hrc_learn.lerobot.robot_page import RobotPage
+
+                note = "A policy leads the end effector. Pull at a link or a knob."
+                self._page = RobotPage(config.host, config.port, note, guides=False)
+                return self._page.page.human
+            case "gamepad":
+                return LinkGuide(Gamepad.open(panda), panda)
+            case "keyboard":
+                return LinkGuide(TerminalKeyboard.open(panda), panda)
+            case _:
+                return ScriptedPerturbation(panda, ())
+
+    def begin(self, seed: int) -> None:
+        """The simulation begins anew: a scripted person pulls as the seed has it."""
+        from hrc_learn.teleoperation.scripted_expert import ScriptedPerturbation
+
+        if isinstance(self._human, ScriptedPerturbation):
+            self._human = ScriptedPerturbation(panda, scripted_pulls(seed))
+
+    def read(self, state: ArmState) -> HumanInput:
+        """What the person asks for."""
+        return self._human.read(state)
+
+    def show(self, robot: PandaRobot) -> None:
+        """Show the person where the arm is."""
+        if self._page is not None:
+            self._page.show(robot)
+
+    def close(self) -> None:
+        """Give the device back."""
+        if self._page is not None:
+            self._page.close()

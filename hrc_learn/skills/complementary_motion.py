@@ -1,0 +1,342 @@
+"""A policy leads the end effector while a person leads the body: at the same time, without a
+pause or a handover.
+"""
+
+import math
+from collections import deque
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hrc_learn.geometry.numerics import null_projection
+from hrc_learn.kinematics import MotionLimits, SerialChain
+from hrc_learn.protocols import ArmState, Human
+from hrc_learn.skills.arm_motion import joints_near, kept_clear, resolved_rate
+from hrc_learn.skills.null_space_yielding import (
+    CHANGE_OF_RATE,
+    LONGEST_RETURN,
+    NARROW,
+    NullSpaceYielding,
+    YieldingConfig,
+    changed_rate,
+    smallest_singular_value,
+)
+
+# Of the limits of acceleration, what the null space may take: the path needs the rest.
+_SHARE_OF_ACCELERATION = 0.4
+# Fastest joint of a null-space motion [rad/s]: at 20 actions a second it turns by 0.05 rad in
+# one, on a chord of whose arc an elbow of 0.3 m and a hand at 0.8 m are 0.3 mm off.
+_FASTEST = 1.0
+# Distance kept from a joint limit, and decay rate of the remaining one [rad, 1/s]: within the
+# margins of the servo, which would stop single joints and so move the end effector.
+_FROM_LIMIT, _LIMIT_RATE = 0.05, 5.0
+# Joints as far from their posture are on it [rad].
+_SAME = 1e-6
+# Deviation of the end effector, a radian counted as a decimetre, that no step leaves [m]; if
+# one does, the arm aside cannot reach where the policy wants the end effector.
+_REACHED, _METRES_PER_RADIAN = 5e-4, 0.1
+# By which the arm may be nearer to what is around it than the policy's own posture [m]:
+# rounding must not stop it.
+_NO_NEARER = 1e-3
+# Cosines between the null space and the way back in joint space, of which the one may lead
+# elsewhere than the other: below the first the motion waits, below the second people have less
+# and less of a say. An elbow that has gone a quarter of its circle has 0.7, one of half of it
+# none. Nearer than so much the null space does lead back [rad].
+_STRAIGHT, _NEARBY = (0.65, 0.8), 0.3
+# Share of the room that is missing which has to be regained in the time looked ahead, or the
+# motion waits: predictions err as much.
+_REGAINED = 0.3
+# Postures that are as near are the same, for a motion that waits [rad].
+_MET_AGAIN = 0.02
+
+
+class ComplementaryMotion:
+    """Joint positions with the end effector where a policy wants it, the body as a person does.
+
+    The policy, of any kind, asks for joint positions, its own posture. As long as nobody pushes
+    they are handed on as they are. Pushed aside, the joints keep the end effector where the
+    policy's posture has it and move in its null space, within their limits and clear of what
+    is around them. When the person lets go they return to the policy's posture, or stay beside
+    it (`YieldingConfig.after_push`). Where the arm, aside, cannot follow, the motion waits and
+    goes on from there, as on planned paths (`WorkCell.follow_path`).
+
+    Attributes:
+        posture: Joint positions that the policy has now, as without the person [rad]; None
+            before the first step.
+        joints: Those commanded instead [rad].
+        offset_velocity: How fast they part [rad/s].
+        nullspace_input: What the person asks for, without jumps [N m].
+        waits: Whether the motion waits, or has yet to regain its own speed.
+    """
+
+    posture: Float[Tensor, " joints"] | None
+    joints: Float[Tensor, " joints"] | None
+    _last: Float[Tensor, " joints"] | None
+
+    def __init__(
+        self,
+        chain: SerialChain,
+        human: Human,
+        dt: float,
+        limits: MotionLimits,
+        config: YieldingConfig | None = None,
+        clearance: Callable[[Float[Tensor, "*batch joints"]], Float[Tensor, "*batch"]]
+        | None = None,
+    ):
+        """Begin where the first step is.
+
+        Args:
+            chain: Kinematics of the arm.
+            human: Who pushes it.
+            dt: Time from one step to the next [s].
+            limits: Within which whoever follows the positions can do so exactly.
+            config: How the null space yields.
+            clearance: Distance of an arm at given joint positions from itself and from what
+                stands around [m]; None: people can push it anywhere within its limits.
+        """
+        self._chain, self._human, self._dt = chain, human, dt
+        self._limits, self._clearance = limits, clearance
+        self._config = config or YieldingConfig()
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin anew: nobody has pushed, and the next step is the first."""
+        n = len(self._chain.joint_names)
+        self._yielding = NullSpaceYielding(self._chain, self._dt, self._config, np.zeros(n))
+        self.posture = self.joints = None
+        self.offset_velocity = self._null = torch.zeros(n, dtype=torch.float64)
+        self._last = None
+        self._rate, self._waited = 1.0, 0.0
+        # What the policy wants, from where the motion is; of more than one when it waits.
+        self._wishes: deque[tuple[Tensor, float]] = deque()
+        self._progress, self._width = 0.0, math.nan
+
+    @property
+    def nullspace_input(self) -> Float[np.ndarray, " joints"]:
+        return self._yielding.nullspace_input
+
+    @property
+    def waits(self) -> bool:
+        return self._rate < 1.0
+
+    @property
+    def offset(self) -> Float[np.ndarray, " joints"]:
+        """From the policy's posture to the commanded joints [rad]."""
+        if self.posture is None or self.joints is None:
+            return np.zeros(len(self._chain.joint_names))
+        return (self.joints - self.posture).numpy()
+
+    def next(
+        self, state: ArmState, wish: Float[np.ndarray, " joints"], width: float = math.nan
+    ) -> tuple[Float[np.ndarray, " joints"], float]:
+        """The joint positions to be reached when the next step is due.
+
+        Args:
+            state: Newest reading of the arm, for the person to see.
+            wish: Joint positions that the policy wants then [rad].
+            width: Opening of the gripper that it wants [m]; waits with the motion.
+
+        Returns:
+            Joint positions [rad] and opening of the gripper [m].
+        """
+        self._yielding.feel(self._human.read(state).nullspace_input)
+        was = deque(self._wishes), self._progress
+        posture, width = self._followed(torch.from_numpy(np.array(wish, dtype=float)), width)
+        if self.posture is None or self.joints is None:
+            self.posture = self.joints = posture
+        before = self.joints - self.posture
+        joints, clear = posture, True
+        if self._yielding.pushed or bool(before.any()):
+            joints, clear = self._beside(posture, self.posture, self.joints)
+        if joints is None:
+            # Nothing else keeps it clear: stop at once, as if this step had not been asked for.
+            (wishes, self._progress), newest = was, self._wishes[-1]
+            self._wishes = deque([*wishes, newest])
+            self._rate, self._null = 0.0, torch.zeros_like(self._null)
+            posture, joints, width = self.posture, self.joints, self._width
+        self._rate = changed_rate(self._rate, 1.0 if clear else 0.0, self._dt)
+        moves = float((joints - self.joints).abs().max()) > _SAME
+        held_back = self._rate == 0 and not (self._yielding.pushed or moves)
+        self._waited = self._waited + self._dt if held_back else 0.0
+        self.offset_velocity = (joints - posture - before) / self._dt
+        self.posture, self.joints, self._width = posture, joints, width
+        return joints.numpy(), width
+
+    def _followed(
+        self, wish: Float[Tensor, " joints"], width: float
+    ) -> tuple[Float[Tensor, " joints"], float]:
+        """The wish now followed: the newest, or of a motion that waited one from before."""
+        wishes = self._wishes
+        if wishes and float((wish - wishes[0][0]).norm()) < _MET_AGAIN and self._rate == 1.0:
+            # The policy is where the motion is: it has waited too, or come to its end.
+            wishes.clear()
+        self._last = wishes[-1][0] if wishes else None
+        wishes.append((wish, width))
+        self._progress = self._progress + self._rate if len(wishes) > 1 else 0.0
+        while self._progress >= 1.0 and len(wishes) > 1:
+            wishes.popleft()
+            self._progress -= 1.0
+        joints, width = wishes[0]
+        if self._progress and len(wishes) > 1:
+            joints = torch.lerp(joints, wishes[1][0], self._progress)
+        return joints, width
+
+    def _beside(
+        self,
+        posture: Float[Tensor, " joints"],
+        before: Float[Tensor, " joints"],
+        joints: Float[Tensor, " joints"],
+    ) -> tuple[Float[Tensor, " joints"] | None, bool]:
+        """Joint positions beside the policy's posture, None if there are none that are clear,
+        and whether the motion can go on.
+        """
+        dt, moved = self._dt, posture - before
+        ahead = torch.stack([posture, posture + CHANGE_OF_RATE / dt * self._coming()])
+        narrow = smallest_singular_value(self._chain, ahead) < NARROW
+        goal = self._chain.forward(posture)
+        here, J = self._chain.forward_and_jacobian(joints)
+        error = before - joints
+        back = self._yielding.way_back(
+            joints, error, yields=not bool(narrow[0]), returns=self._rate == 0
+        )
+        if self._waited > LONGEST_RETURN:
+            return self._straight_back(posture, joints), False
+        task = resolved_rate(J, here.twist_to(goal) / dt, torch.zeros_like(joints))
+
+        def feasible(velocity: Float[Tensor, " joints"]) -> Float[Tensor, " joints"]:
+            null = self._gently(J, null_projection(J, moved / dt + velocity))
+            return self._within_limits(joints, posture, task, null)
+
+        coming = self._chain.jacobian(posture) @ self._coming() / dt
+        going = resolved_rate(J, coming, torch.zeros_like(joints))
+        away = null_projection(J, error)
+        faster = _FASTEST / float(away.norm().clamp(min=1e-9))
+        retreat = min(self._config.pose_gain, faster) * away
+        wanted, straight = self._config.pose_gain * error, _straightness(away, error)
+        if back is not None:
+            # Far aside the null space may lead elsewhere than back: nobody gets that far.
+            least, enough = _STRAIGHT
+            share = min(max((straight - least) / (enough - least), 0.0), 1.0)
+            # While they push nothing pulls the joints back.
+            yielding = self._yielding
+            push = yielding.null_velocity if yielding.pushed else back
+            wanted = torch.lerp(retreat, push, share)
+        # Where the policy itself leads the arm nearer, people may as well.
+        own = float(self._room(ahead).min()) - _NO_NEARER
+        margin = min(self._config.clearance, own)
+        null, waits = kept_clear(joints, going, feasible(wanted), self._room, margin)
+        if waits or straight < _STRAIGHT[0]:
+            # Against the person, as the end effector would have to stop otherwise.
+            null, waits = self._retreat(
+                joints, going, feasible(retreat), feasible(wanted), margin
+            )
+        waits = waits or straight < _STRAIGHT[0]
+        self._null = null
+        reached = joints_near(self._chain, goal, joints + dt * (task + null))
+        off = self._chain.forward(reached).twist_to(goal)
+        far = float(off[:3].norm() + _METRES_PER_RADIAN * off[3:].norm()) > _REACHED
+        if back is None and float((reached - posture).norm()) < _SAME:
+            return posture, True
+        now, then = self._clear(torch.stack([joints, reached])).tolist()
+        if then < min(now, margin) - _NO_NEARER:
+            return None, False
+        return reached, not (waits or far or (back is not None and bool(narrow.any())))
+
+    def _room(self, joints: Float[Tensor, "*batch joints"]) -> Float[Tensor, "*batch"]:
+        """Distance of the arm from what it must not meet [m], and from its singularities.
+
+        Those count as obstacles that begin where an arm can no longer follow beside its path.
+        """
+        room = smallest_singular_value(self._chain, joints) - NARROW + self._config.clearance
+        return torch.minimum(room, self._clear(joints))
+
+    def _clear(self, joints: Float[Tensor, "*batch joints"]) -> Float[Tensor, "*batch"]:
+        """Distance of the arm from what it must not meet [m]."""
+        if self._clearance is None:
+            return torch.full_like(joints[..., 0], math.inf)
+        return self._clearance(joints)
+
+    def _coming(self) -> Float[Tensor, " joints"]:
+        """How the policy's posture changes in a step at its own speed [rad]."""
+        (first, _), (second, _) = self._wishes[0], self._wishes[min(1, len(self._wishes) - 1)]
+        if len(self._wishes) > 1:
+            return second - first
+        return first - self._last if self._last is not None else torch.zeros_like(first)
+
+    def _retreat(
+        self,
+        joints: Float[Tensor, " joints"],
+        going: Float[Tensor, " joints"],
+        back: Float[Tensor, " joints"],
+        wanted: Float[Tensor, " joints"],
+        margin: float,
+    ) -> tuple[Float[Tensor, " joints"], bool]:
+        """Null-space motion of an arm aside that would meet something, and whether it waits."""
+        ahead = torch.stack([joints, joints + CHANGE_OF_RATE * (going + back)])
+        now, then = self._room(ahead).tolist()
+        if then >= min(now + _REGAINED * (margin - now), margin):
+            return back, False
+        still = torch.zeros_like(joints)
+        # The way back may pass a singularity.
+        null, _ = kept_clear(joints, still, back, self._clear, margin)
+        if not bool(null.any()):
+            null, _ = kept_clear(joints, still, wanted, self._room, margin)
+        return null, True
+
+    def _gently(
+        self, J: Float[Tensor, "6 joints"], null: Float[Tensor, " joints"]
+    ) -> Float[Tensor, " joints"]:
+        """A null-space motion with a limited change since the last one.
+
+        Scaled as a whole: joints that follow late, each in its own way, would move the end
+        effector.
+        """
+        change = null - self._null
+        most = _SHARE_OF_ACCELERATION * self._dt * self._limits.acceleration
+        share = float((most / change.abs().clamp(min=1e-12)).min().clamp(max=1.0))
+        return null_projection(J, self._null + share * change)
+
+    def _within_limits(
+        self,
+        joints: Float[Tensor, " joints"],
+        posture: Float[Tensor, " joints"],
+        task: Float[Tensor, " joints"],
+        null: Float[Tensor, " joints"],
+    ) -> Float[Tensor, " joints"]:
+        """As much of a null-space motion as the limits of joints and their speeds leave."""
+        limits, rate = self._limits, min(_LIMIT_RATE, 1 / self._dt)
+        # Where the policy itself goes nearer to a limit, that is the limit.
+        upper = torch.maximum(limits.upper - _FROM_LIMIT, posture)
+        lower = torch.minimum(limits.lower + _FROM_LIMIT, posture)
+        up = torch.minimum(rate * (upper - joints), limits.velocity) - task
+        down = torch.maximum(rate * (lower - joints), -limits.velocity) - task
+        room = torch.where(null > 0, up, down) / torch.where(null == 0, 1.0, null)
+        share = torch.where(null == 0, 1.0, room).clamp(0.0, 1.0).min()
+        share = min(share, _FASTEST / null.abs().max().clamp(min=_FASTEST))
+        return share * null
+
+    def _straight_back(
+        self, posture: Float[Tensor, " joints"], joints: Float[Tensor, " joints"]
+    ) -> Float[Tensor, " joints"]:
+        """A step to the policy's posture, where no motion of the null space leads there.
+
+        Another posture for the same pose may lie between. The end effector leaves its path.
+        """
+        way = posture - joints
+        longest = self._config.return_speed * self._dt
+        following = joints + way * min(1.0, longest / max(float(way.norm()), 1e-12))
+        now, then = self._clear(torch.stack([joints, following])).tolist()
+        if then < min(now, self._config.clearance):
+            return joints  # nothing is left but to be pushed clear
+        if float((following - posture).norm()) < _SAME:
+            self._yielding.aside, self._waited = False, 0.0
+        return following
+
+
+def _straightness(away: Float[Tensor, " joints"], error: Float[Tensor, " joints"]) -> float:
+    """Cosine between the null-space part of a way back and all of it; 1 of a short one."""
+    size = float(error.norm())
+    return float(away.norm()) / size if size > _NEARBY else 1.0

@@ -1,0 +1,198 @@
+"""How the null space yields to a person who pushes the joints off their path, and how they go
+back when the person lets go.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hrc_learn.controller import scale_null_space
+from hrc_learn.geometry.numerics import null_projection
+from hrc_learn.kinematics import SerialChain
+from hrc_learn.skills.arm_motion import null_space_slowdown, singularity_fade
+
+# Null-space input below which one that has ended is over [N m].
+_LEAST_INPUT = 0.05
+# Fraction of the joints' acceleration that a push may use: the rest is for the task, which is
+# slowed down as well where both together need more than the arm has.
+_PUSHED_EFFORT = 0.3
+# How far the null space is from a planned path for the arm to have been pushed aside, and to be
+# back [rad]: servos lag by 0.03 rad at the speed of transfers.
+_ASIDE, _BACK = 0.1, 0.03
+# Time to go back at the end of a path, or while it waits [s].
+LONGEST_RETURN = 5.0
+# Smallest singular value of the Jacobian of a path below which the arm cannot follow beside it,
+# as damping begins at 0.05.
+NARROW = 0.07
+# In which a path stops, and goes on [s].
+CHANGE_OF_RATE = 0.2
+
+
+@dataclass(frozen=True, kw_only=True)
+class YieldingConfig:
+    """How the null space yields, and how the joints go back."""
+
+    damping: float = 3.0
+    """c_d: null-space input per unit of joint velocity (paper, Table I) [N m s/rad]."""
+    nullspace_rise: float = 0.15
+    """Time constant with which the null-space input is smoothed [s]."""
+    pose_gain: float = 4.0
+    """Decay rate of the pose error on given motions [1/s]."""
+    after_push: Literal["return", "stay"] = "return"
+    """Whether the joints go back to a planned path, or on beside it, when a person who pushed
+    them aside lets go."""
+    return_speed: float = 0.4
+    """Fastest way back, of all joints together [rad/s]."""
+    clearance: float = 0.03
+    """Distance from what is around that nobody can push the arm below [m]: three times the
+    errors of base and table."""
+
+
+class NullSpaceYielding:
+    """Whether a person has pushed the joints off their path, and the way back to it.
+
+    Attributes:
+        nullspace_input: What the person asks for, without jumps [N m].
+        aside: Whether the joints are off their path.
+    """
+
+    def __init__(
+        self,
+        chain: SerialChain,
+        dt: float,
+        config: YieldingConfig,
+        nullspace_input: Float[np.ndarray, " joints"],
+    ):
+        """Begin on the path.
+
+        Args:
+            chain: Kinematics of the arm.
+            dt: Control step [s].
+            config: How it yields.
+            nullspace_input: What the person asks for at first [N m].
+        """
+        self._chain, self._dt, self._config = chain, dt, config
+        self.nullspace_input, self.aside = nullspace_input, False
+        self._back = torch.zeros(len(chain.joint_names), dtype=torch.float64)
+
+    @property
+    def pushed(self) -> bool:
+        """Whether a person pushes at the null space now."""
+        return bool(self.nullspace_input.any())
+
+    @property
+    def null_velocity(self) -> Float[Tensor, " joints"]:
+        """Joint velocity whose null-space part the person asks for [rad/s]."""
+        return torch.from_numpy(self.nullspace_input) / self._config.damping
+
+    def feel(
+        self,
+        asked: Float[np.ndarray, " joints"],
+        joints: Float[Tensor, " joints"] | None = None,
+        bounds: tuple[Float[Tensor, " joints"], Float[Tensor, " joints"]] | None = None,
+    ) -> Float[np.ndarray, " joints"]:
+        """Take in what a person asks for now; the null-space input without jumps [N m].
+
+        An arm follows late and with limited acceleration. A jump of its null-space motion, or
+        one that is too fast, would therefore move the end effector.
+
+        Args:
+            asked: Null-space input [N m].
+            joints: Where they are [rad]; with them what is left is as much as the arm can
+                follow, in its null space. None: whoever follows limits it.
+            bounds: Lowest and highest velocities that leave the task its room [rad/s].
+        """
+        share = min(self._dt / self._config.nullspace_rise, 1.0)
+        if joints is None or bounds is None:
+            smooth = self.nullspace_input + share * (asked - self.nullspace_input)
+        elif not (self.pushed or asked.any()):
+            smooth = asked
+        else:
+            J, damping = self._chain.jacobian(joints), self._config.damping
+            before = null_projection(J, self.null_velocity)
+            wanted = null_projection(J, torch.from_numpy(asked) / damping)
+            wanted = wanted * null_space_slowdown(self._chain, joints, wanted)
+            wanted = wanted * singularity_fade(self._chain, joints, wanted)
+            wanted = scale_null_space(torch.zeros_like(wanted), wanted, *bounds)
+            change = share * (wanted - before)
+            reach = _PUSHED_EFFORT * self._dt * self._chain.limits.acceleration
+            velocity = before + change / (change.abs() / reach).max().clamp(min=1.0)
+            smooth = (damping * velocity).numpy()
+        if not asked.any() and np.abs(smooth).max() < _LEAST_INPUT:
+            smooth = asked
+        self.nullspace_input = smooth
+        return smooth
+
+    def way_back(
+        self,
+        joints: Float[Tensor, " joints"],
+        error: Float[Tensor, " joints"],
+        *,
+        yields: bool = True,
+        returns: bool = False,
+    ) -> Float[Tensor, " joints"] | None:
+        """Velocity of the joints back to their path, without jumps.
+
+        Args:
+            joints: Where they are [rad].
+            error: From there to the path [rad].
+            yields: Whether the person can push the joints off it here.
+            returns: Whether joints that were pushed off it go back in any case.
+
+        Returns:
+            The velocity, in the null space [rad/s]; None of joints on their path.
+        """
+        away = self._away(joints, error) if yields or self.aside else None
+        if away is None:
+            self._back = torch.zeros_like(error)
+            return None
+        back = torch.zeros_like(away)
+        # Not against the person while they push.
+        if returns or (self._config.after_push == "return" and not self.pushed):
+            fastest = self._config.return_speed / float(away.norm().clamp(min=1e-9))
+            back = min(self._config.pose_gain, fastest) * away
+        # A jump of the null-space motion would move the end effector.
+        share = min(self._dt / self._config.nullspace_rise, 1.0)
+        self._back = self._back + share * (back - self._back)
+        return self._back
+
+    def _away(
+        self, joints: Float[Tensor, " joints"], error: Float[Tensor, " joints"]
+    ) -> Float[Tensor, " joints"] | None:
+        """Null-space part of the way back to a path [rad]; None if nobody pushed it off."""
+        limit = _BACK if self.aside else _ASIDE
+        if not self.pushed and float(error.norm()) <= limit:
+            self.aside = False
+            return None
+        self.aside = True
+        return null_projection(self._chain.jacobian(joints), error)
+
+
+def smallest_singular_value(
+    chain: SerialChain, joint_position: Float[Tensor, "*batch joints"]
+) -> Float[Tensor, "*batch"]:
+    """Of the Jacobian of the end effector, metres and radians as they are: see `NARROW`.
+
+    Args:
+        chain: Kinematics of the arm.
+        joint_position: [rad]
+    """
+    return torch.linalg.svdvals(chain.jacobian(joint_position))[..., -1]
+
+
+def changed_rate(rate: float, wanted: float, dt: float, direction: int = 1) -> float:
+    """The rate of a path a step later: without jumps, as every change of speed is one of the
+    end effector's.
+
+    Args:
+        rate: Share of the path's own speed, -1 to 1.
+        wanted: Its size that it should have, cut to between 0 and 1.
+        dt: Control step [s].
+        direction: 1 for on, -1 for back.
+    """
+    change, goal = dt / CHANGE_OF_RATE, direction * min(max(wanted, 0.0), 1.0)
+    return rate + min(max(goal - rate, -change), change)

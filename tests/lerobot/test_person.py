@@ -1,0 +1,219 @@
+"""A person who leads the body of a LeRobot arm while actions lead its hand."""
+
+import sys
+
+import fake_franky
+import numpy as np
+import pytest
+import torch
+from lerobot.robots import make_robot_from_config
+from unchecked import shapes_unchecked
+
+from hrc_learn.demos import load_demos
+from hrc_learn.kinematics import panda
+from hrc_learn.lerobot import person
+from hrc_learn.lerobot.expert_recording import add_frame, new_dataset
+from hrc_learn.lerobot.panda_robot import GRIPPER, HAND, JOINTS, VELOCITIES
+from hrc_learn.lerobot.person import NULLSPACE_INPUTS, OFFSETS, PersonConfig
+from hrc_learn.lerobot.policy.closed_form import read_episodes
+from hrc_learn.lerobot.robots import FrankaPandaConfig
+from hrc_learn.lerobot.teleoperators.panda_teleoperators import GuidedRobot
+from hrc_learn.teleoperation import ScriptedForce
+
+FPS = 20.0
+PULL = ScriptedForce(start=0.5, duration=2.5, towards=(-0.4, 0.6, 0.2), max_force=60.0)
+
+
+@pytest.fixture
+def pulled(simulated, monkeypatch):
+    """A simulated arm whose elbow is pulled aside, or not at all."""
+
+    def robot(*pulls, **settings):
+        monkeypatch.setattr(person, "scripted_pulls", lambda seed: pulls)
+        extra = {
+            name: settings.pop(name)
+            for name in ("observed", "record", "after_push")
+            if name in settings
+        }
+        who = PersonConfig(kind="scripted", **extra)
+        settings = {"scenario": "grasping"} | settings
+        return simulated(fps=FPS, person=who, **settings)
+
+    return robot
+
+
+def wishes(robot, seconds):
+    """Actions along a line of the joints, there and back, from where the arm is."""
+    start = robot.arm.read().joint_position
+    far = np.array([0.3, 0.1, 0.0, 0.1, 0.0, 0.1, 0.0])
+    steps = round(seconds * FPS)
+    for k in range(steps):
+        q = start + 0.5 * (1 - np.cos(2 * np.pi * k / steps)) * far
+        yield q, dict(zip(JOINTS, q.tolist(), strict=True)) | {GRIPPER: 0.06}
+
+
+def carried_out(robot, seconds=8.0):
+    """Wished and read joints, and what was observed, of every step."""
+    wished, read, seen = [], [], []
+    with shapes_unchecked():
+        for q, action in wishes(robot, seconds):
+            seen.append(robot.get_observation())
+            robot.send_action(action)
+            wished.append(q)
+            read.append(robot.arm.read().joint_position)
+    return torch.tensor(np.array(wished)), torch.tensor(np.array(read)), seen
+
+
+def values_of(seen, names):
+    return torch.tensor(
+        [[values[name] for name in names] for values in seen], dtype=torch.float64
+    )
+
+
+def elbow(joints):
+    return panda.joint_origins(joints)[:, 3]
+
+
+def test_with_a_person_who_does_nothing_the_robot_does_as_without(simulated, pulled):
+    alone = carried_out(simulated(scenario="grasping", fps=FPS), seconds=1.0)
+    beside = carried_out(pulled(), seconds=1.0)
+    assert torch.equal(alone[1], beside[1])
+    assert alone[2] == beside[2]
+
+
+def test_the_elbow_goes_aside_and_back_while_the_hand_follows_the_actions(pulled):
+    robot = pulled(PULL)
+    wished, read, seen = carried_out(robot)
+    aside = (elbow(read) - elbow(wished)).norm(dim=-1)
+    assert aside.max() > 0.15
+    assert aside[-1] < 0.02
+    off = panda.forward(read).position - panda.forward(wished).position
+    assert off.norm(dim=-1).max() < 2e-3
+    # The policy sees its own posture, and the hand where it is.
+    observed = values_of(seen, JOINTS)
+    assert (observed[1:] - wished[:-1]).abs().max() < 0.02
+    assert not robot.world.self_contacts.touches
+    assert not robot.world.cabinet_contacts.touches
+    robot.begin(5)
+    assert not robot.complement.offset.any()
+
+
+def test_joints_as_they_are_are_observed_if_wanted(pulled):
+    robot = pulled(PULL, observed="joints", velocity=True)
+    wished, read, seen = carried_out(robot, seconds=2.0)
+    observed = values_of(seen, JOINTS)
+    assert (observed[1:] - read[:-1]).abs().max() < 1e-12
+    assert (observed[1:] - wished[:-1]).abs().max() > 0.2
+    assert values_of(seen, VELOCITIES).abs().max() > 0.3
+
+
+def test_poses_of_the_hand_are_followed_likewise(pulled):
+    robot = pulled(PULL, action_space="ee")
+    start = robot.get_observation()
+    with shapes_unchecked():
+        for k in range(round(3 * FPS)):
+            action = {name: start[name] for name in HAND} | {GRIPPER: 0.06}
+            action["ee.x.pos"] += 0.02 * k / FPS
+            robot.send_action(action)
+    there = robot.get_observation()
+    for name in HAND:
+        assert there[name] == pytest.approx(action[name], abs=5e-3)
+    assert np.abs(robot.complement.offset).max() > 0.2
+
+
+def test_what_the_person_does_is_recorded_in_columns_of_its_own(pulled, tmp_path):
+    robot = pulled(PULL, record=True)
+    names = [*NULLSPACE_INPUTS, *OFFSETS]
+    assert list(robot.observation_features) == [*JOINTS, GRIPPER, *names]
+    # Those lerobot-rollout hands on to a policy, which knows nothing of the person.
+    assert not any(name.endswith((".pos", ".vel")) for name in names)
+    folder, inputs, offsets = tmp_path / "set", [], []
+    with shapes_unchecked(), new_dataset(folder, robot) as dataset:
+        for _, action in wishes(robot, 2.0):
+            seen = robot.get_observation()
+            inputs.append([seen[name] for name in NULLSPACE_INPUTS])
+            offsets.append([seen[name] for name in OFFSETS])
+            robot.send_action(action)
+            add_frame(dataset, seen, action, "go there and back")
+        dataset.save_episode()
+    keys = ["observation.human_effort", "observation.pushed_aside", "observation.state"]
+    (episode,) = read_episodes(folder, keys)
+    assert episode["observation.state"].shape == (40, 8)
+    np.testing.assert_allclose(episode[keys[0]], inputs, atol=1e-5)
+    np.testing.assert_allclose(episode[keys[1]], offsets, atol=1e-6)
+    (demo,) = load_demos(folder)
+    assert np.abs(demo.human_effort).max() > 1.0
+
+
+def test_a_person_who_is_not_recorded_adds_nothing(pulled):
+    assert list(pulled(PULL).get_observation()) == [*JOINTS, GRIPPER]
+
+
+def test_the_real_panda_yields_to_a_device_too(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "franky", fake_franky)
+    settings = {"calibration_dir": tmp_path, "ip": "x", "fps": FPS, "timeout": 600.0}
+    with pytest.raises(ValueError, match="person"):
+        FrankaPandaConfig(person=PersonConfig(kind="scripted"), **settings)
+
+    class Device:
+        def __init__(self, config):
+            self.closed = False
+
+        def read(self, state):
+            return person.HumanInput(nullspace_input=np.array([4.0, 0, -4, 0, 3, 0, 0]))
+
+        def show(self, robot):
+            self.shown = robot
+
+        def close(self):
+            self.closed = True
+
+    monkeypatch.setattr("hrc_learn.lerobot.panda_robot.Person", Device)
+    config = FrankaPandaConfig(
+        person=PersonConfig(kind="gamepad"), own_process=False, **settings
+    )
+    robot = make_robot_from_config(config)
+    robot.connect()
+    device, start = robot._person, robot.arm.read().joint_position
+    action = dict(zip(JOINTS, start.tolist(), strict=True))
+    with shapes_unchecked():
+        for _ in range(40):
+            robot.send_action(action)
+            robot.arm._robot.run(1 / FPS)
+    read = torch.from_numpy(np.stack([start, robot.arm.read().joint_position]))
+    assert (elbow(read)[1] - elbow(read)[0]).norm() > 0.1
+    hand = panda.forward(read).position
+    assert (hand[1] - hand[0]).norm() < 2e-3
+    assert device.shown is robot
+    robot.disconnect()
+    assert device.closed
+
+
+@pytest.mark.slow
+def test_an_elbow_that_is_pulled_over_its_pole_on_the_way_comes_back(pulled):
+    """On the way to the shelf the null space comes to lead elsewhere than back."""
+    hand_of = ScriptedForce(
+        start=0.5, duration=4.4, towards=(-0.33, -0.51, 0.41), max_force=60.0
+    )
+    robot = pulled(scenario="placing")
+    actions = []
+    with shapes_unchecked():
+        expert = GuidedRobot(robot, robot.run.expert)
+        for _ in range(round(11 * FPS)):
+            actions.append(expert.next()[0])
+            robot.send_action(actions[-1])
+        robot.disconnect()
+        robot = pulled(hand_of, scenario="placing")
+        wished, read = [], []
+        for action in actions:
+            robot.send_action(action)
+            wished.append(robot.complement.posture.numpy().copy())
+            read.append(robot.arm.read().joint_position)
+    wished, read = (torch.from_numpy(np.array(rows)) for rows in (wished, read))
+    aside = (elbow(read) - elbow(wished)).norm(dim=-1)
+    assert aside.max() > 0.15
+    assert aside[-1] < 0.01
+    assert not robot.complement.waits
+    off = panda.forward(read).position - panda.forward(wished).position
+    assert off.norm(dim=-1).quantile(0.95) < 6e-3  # servos lag by half a step
+    assert not robot.world.cabinet_contacts.touches

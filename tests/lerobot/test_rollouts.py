@@ -1,0 +1,78 @@
+"""Rolling out a checkpoint in simulated time, with a person beside it."""
+
+import numpy as np
+import pytest
+import torch
+from unchecked import shapes_unchecked
+
+from hrc_learn.lerobot import person
+from hrc_learn.lerobot.expert_recording import add_frame, new_dataset
+from hrc_learn.lerobot.panda_robot import GRIPPER, JOINTS
+from hrc_learn.lerobot.person import PersonConfig
+from hrc_learn.lerobot.policy.closed_form import read_episodes
+from hrc_learn.lerobot.policy.modeling_dmp import write_closed_form_policy
+from hrc_learn.lerobot.robots import MujocoPandaConfig
+from hrc_learn.lerobot.rollouts import CheckpointPolicy, record_rollouts
+from hrc_learn.teleoperation import ScriptedForce
+from hrc_learn.teleoperation.scenarios import Grasping
+
+FPS = 20.0
+PULL = ScriptedForce(start=0.2, duration=0.6, towards=(-0.4, 0.6, 0.2), max_force=60.0)
+FAR = np.array([0.3, 0.1, 0.0, 0.1, 0.0, 0.1, 0.0])
+
+
+@pytest.fixture(scope="module")
+def policy(tmp_path_factory):
+    """Fitted to two motions along a line."""
+    from hrc_learn.lerobot.robots import MujocoPanda
+
+    home = tmp_path_factory.mktemp("home")
+    robot = MujocoPanda(MujocoPandaConfig(calibration_dir=home, scenario="grasping", fps=FPS))
+    robot.connect()
+    with shapes_unchecked(), new_dataset(home / "set", robot) as dataset:
+        for seed in (0, 1):
+            robot.begin(seed)
+            start = robot.arm.read().joint_position
+            for k in range(30):
+                q = start + 0.5 * (1 - np.cos(np.pi * k / 29)) * FAR
+                action = dict(zip(JOINTS, q.tolist(), strict=True)) | {GRIPPER: 0.06}
+                seen = robot.get_observation()
+                robot.send_action(action)
+                add_frame(dataset, seen, action, "go there")
+            dataset.save_episode()
+    robot.disconnect()
+    (home / "policy").mkdir()
+    write_closed_form_policy(home / "set", home / "policy", n_basis=12)
+    return home / "policy"
+
+
+def test_a_checkpoint_is_rolled_out_and_recorded_with_what_the_person_does(
+    policy, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(person, "scripted_pulls", lambda seed: (PULL,) if seed == 8 else ())
+    monkeypatch.setattr(Grasping, "duration", 1.0)
+    who = PersonConfig(kind="scripted", record=True)
+    config = MujocoPandaConfig(
+        calibration_dir=tmp_path, scenario="grasping", fps=FPS, seed=7, person=who
+    )
+    with shapes_unchecked():
+        done = list(record_rollouts(tmp_path / "set", policy, config, episodes=2))
+    assert done == [False, False]  # it has learned to move, not to grasp
+    keys = ["action", "observation.state", "observation.human_effort"]
+    free, beside = read_episodes(tmp_path / "set", [*keys, "observation.pushed_aside"])
+    assert len(free["action"]) == len(beside["action"]) == 30
+    assert not free["observation.human_effort"].any()
+    assert beside["observation.human_effort"].abs().max() > 1.0
+    assert beside["observation.pushed_aside"].abs().max() > 0.05
+    # Both do what was learned: the policy saw its own posture.
+    for episode in (free, beside):
+        way = episode["action"][-1, :7] - episode["observation.state"][0, :7]
+        np.testing.assert_allclose(way, FAR, atol=0.03)
+    torch.testing.assert_close(
+        free["observation.state"], beside["observation.state"], rtol=0, atol=0.02
+    )
+
+
+def test_without_a_checkpoint_the_cure_is_named(simulated, tmp_path):
+    with pytest.raises(FileNotFoundError, match="pretrained_model"):
+        CheckpointPolicy(tmp_path, simulated(scenario="grasping", fps=FPS))

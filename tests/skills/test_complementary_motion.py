@@ -1,0 +1,194 @@
+"""A policy's posture and a person's push, on an arm that goes where it is sent."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from unchecked import shapes_unchecked
+
+from hrc_learn.kinematics import panda
+from hrc_learn.protocols import ArmState, HumanInput
+from hrc_learn.skills import ComplementaryMotion, YieldingConfig, joint_line
+
+DT = 0.05
+SIDEWAYS = np.array([4.0, 0.0, -4.0, 0.0, 3.0, 0.0, 0.0])
+
+
+class Pusher:
+    """Pushes with given efforts from one time to another."""
+
+    def __init__(self, push, start, end):
+        self.push, self.start, self.end = np.asarray(push, dtype=float), start, end
+
+    def read(self, state):
+        on = self.start <= state.time < self.end
+        return HumanInput(nullspace_input=self.push if on else np.zeros(7))
+
+
+def line(seconds=4.0, still=6.0):
+    """A policy's postures: a transfer, and then rest."""
+    far = torch.tensor([-0.9, 0.3, 0.1, 0.3, -0.1, 0.3, -0.3], dtype=torch.float64)
+    speed = 1.875 * 0.9 / seconds
+    path = joint_line(panda.ready, panda.ready + far, speed=speed, dt=DT).numpy()
+    return np.concatenate([path, np.repeat(path[-1:], round(still / DT), axis=0)])
+
+
+def followed(
+    wishes, human, widths=None, before=lambda k, motion: None, limits=panda.limits, **options
+):
+    """Postures and joints of every step, and the gripper's openings."""
+    motion = ComplementaryMotion(panda, human, DT, limits, **options)
+    postures, joints, openings = [], [], []
+    with shapes_unchecked():
+        for k, wish in enumerate(wishes):
+            before(k, motion)
+            state = ArmState(
+                time=k * DT,
+                joint_position=wish,
+                joint_velocity=np.zeros(7),
+                gripper_width=0.0,
+            )
+            q, width = motion.next(state, wish, math.nan if widths is None else widths[k])
+            assert motion.posture is not None
+            postures.append(motion.posture.clone())
+            joints.append(torch.from_numpy(q.copy()))
+            openings.append(width)
+    return torch.stack(postures), torch.stack(joints), openings
+
+
+def elbow(joints):
+    return panda.joint_origins(joints)[:, 3]
+
+
+def hand_off(postures, joints):
+    """Distance of the end effector from where the policy has it [m], and its turn [rad]."""
+    twist = panda.forward(joints).twist_to(panda.forward(postures))
+    return float(twist[:, :3].norm(dim=-1).max()), float(twist[:, 3:].norm(dim=-1).max())
+
+
+def test_what_nobody_pushes_is_handed_on_as_it_is():
+    wishes, widths = line(still=0.2), np.linspace(0.08, 0.0, len(line(still=0.2)))
+    _, joints, openings = followed(wishes, Pusher(SIDEWAYS, 1e9, 1e9), widths)
+    np.testing.assert_array_equal(joints.numpy(), wishes)
+    assert openings == widths.tolist()
+
+
+@pytest.mark.parametrize("strength", [1.0, -2.0])
+def test_the_elbow_goes_aside_and_back_while_the_hand_goes_on(strength):
+    wishes = line(still=6.0)
+    postures, joints, _ = followed(wishes, Pusher(strength * SIDEWAYS, 0.6, 3.0))
+    np.testing.assert_array_equal(postures.numpy(), wishes)  # without a pause
+    aside = (elbow(joints) - elbow(postures)).norm(dim=-1)
+    assert aside.max() > 0.15
+    off, turn = hand_off(postures, joints)
+    assert off < 1e-6
+    assert turn < 1e-6
+    assert aside[-1] < 1e-3
+    step = joints.diff(dim=0).abs().amax(dim=0) / DT
+    assert (step <= panda.limits.velocity).all()
+    # Smoothly: each joint's speed changes by no more than its limit.
+    assert (joints.diff(n=2, dim=0).abs() / DT**2 <= panda.limits.acceleration).all()
+
+
+def test_joints_that_are_back_are_the_policys_own_to_the_last_digit():
+    postures, joints, _ = followed(
+        line(seconds=1.5, still=6.5), Pusher(0.7 * SIDEWAYS, 0.2, 0.8)
+    )
+    assert torch.equal(joints[-1], postures[-1])
+    assert not torch.equal(joints[30], postures[30])
+
+
+def test_joints_stay_aside_if_wanted():
+    config = YieldingConfig(after_push="stay")
+    wishes = line(seconds=3.0, still=1.0)
+    postures, joints, _ = followed(wishes, Pusher(SIDEWAYS, 0.6, 2.0), config=config)
+    aside = (elbow(joints) - elbow(postures)).norm(dim=-1)
+    assert aside[-1] > 0.1
+    assert hand_off(postures, joints)[0] < 1e-6
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_push_ends_where_limits_and_singularities_begin(sign):
+    """However long and hard: the hand stays, no joint passes its limit, and they come back."""
+    wishes = np.repeat(panda.ready.numpy()[None], round(16.0 / DT), axis=0)
+    postures, joints, _ = followed(wishes, Pusher(sign * 4 * SIDEWAYS, 0.2, 5.0))
+    assert ((joints > panda.limits.lower) & (joints < panda.limits.upper)).all()
+    assert torch.linalg.svdvals(panda.jacobian(joints))[:, -1].min() > 0.05
+    assert (joints - postures).abs().max() > 1.0
+    assert hand_off(postures, joints)[0] < 1e-6
+    np.testing.assert_allclose(joints[-1], postures[-1], atol=1e-3)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_the_null_space_stops_before_a_limit_that_would_move_the_hand(sign):
+    limits = replace(panda.limits, lower=panda.ready - 0.4, upper=panda.ready + 0.4)
+    wishes = np.repeat(panda.ready.numpy()[None], round(2.5 / DT), axis=0)
+    postures, joints, _ = followed(wishes, Pusher(sign * 3 * SIDEWAYS, 0.1, 2.5), limits=limits)
+    moved = (joints - panda.ready).abs().max()
+    assert 0.3 < moved < 0.4
+    assert hand_off(postures, joints)[0] < 1e-6
+
+
+def test_nobody_pushes_the_arm_into_what_is_around_it():
+    """A wall across the way of the elbow: it slides along, and the hand goes on."""
+    wishes = line(still=0.5)
+    human = Pusher(1.2 * SIDEWAYS, 0.6, 3.0)
+    postures, free, _ = followed(wishes, human)
+    way = elbow(free) - elbow(postures)
+    farthest = int(way.norm(dim=-1).argmax())
+    out, start = way[farthest] / way[farthest].norm(), elbow(postures)[farthest]
+
+    def clearance(q):
+        return 0.12 - ((panda.joint_origins(q)[..., 3, :] - start) * out).sum(-1)
+
+    assert clearance(free).min() < 0.0 < clearance(postures).min()
+    postures, kept, _ = followed(wishes, human, clearance=clearance)
+    assert clearance(kept).min() > 0.01  # of 0.03; this wall bounds one point alone
+    assert (elbow(kept) - elbow(postures)).norm(dim=-1).max() > 0.05
+    assert hand_off(postures, kept)[0] < 1e-6
+
+
+def test_where_an_arm_aside_cannot_go_on_it_waits_and_then_does_everything_that_was_asked():
+    wishes, blocked = line(seconds=3.0), {}
+    widths = np.arange(len(wishes), dtype=float)
+
+    def before(k, motion):
+        if k == 40:
+            blocked["at"] = motion.joints.clone()
+        if k == 90:
+            blocked.clear()
+
+    def clearance(q):
+        free = torch.full(q.shape[:-1], 0.5, dtype=torch.float64)
+        if not blocked:
+            return free
+        away = (q - blocked["at"]).norm(dim=-1)
+        return torch.where(away < 0.3, 0.02 - 0.1 * away, free)
+
+    human = Pusher(SIDEWAYS, 0.2, 2.2)
+    postures, joints, openings = followed(wishes, human, widths, before, clearance=clearance)
+    assert (joints[88] - joints[60]).abs().max() < 1e-2  # it waits
+    assert hand_off(postures, joints)[0] < 1e-6
+    assert (np.diff(openings) >= 0).all()  # the gripper waits too, and skips nothing until
+    jumps = np.flatnonzero(np.diff(openings) > 1)  # the policy and the arm are at rest together
+    assert all(np.abs(wishes[-1] - postures[k].numpy()).max() < 0.02 for k in jumps)
+    np.testing.assert_allclose(postures[-1], wishes[-1], atol=1e-9)
+    # On its way through the policy's postures, none cut short.
+    nearest = np.linalg.norm(postures.numpy()[:, None] - wishes[None], axis=-1).min(axis=1)
+    assert nearest.max() < 0.03
+
+
+def test_beginning_anew_forgets_the_push():
+    motion = ComplementaryMotion(panda, Pusher(SIDEWAYS, 0.0, 1.0), DT, panda.limits)
+    q = panda.ready.numpy()
+    state = ArmState(time=0.5, joint_position=q, joint_velocity=np.zeros(7), gripper_width=0.0)
+    for _ in range(10):
+        motion.next(state, q)
+    assert np.abs(motion.offset).max() > 0.01
+    assert motion.nullspace_input.any()
+    motion.restart()
+    assert not motion.offset.any()
+    assert not motion.nullspace_input.any()
+    assert not motion.waits
