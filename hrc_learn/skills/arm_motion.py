@@ -61,10 +61,13 @@ def resolved_rate(
 # Servos that are 10 ms later than known, pulled back with 4 1/s, leave 0.5 mm of the former.
 _BENDING, _METRES_PER_RADIAN, _BENDING_EFFORT = 0.2, 0.1, 0.3
 _TINY_STEP = 1e-4
-# Fastest that a person moves the elbow [m/s]: the reduced speed of ISO 10218-1:2011, 3.23.
-_GUIDED_SPEED = 0.25
-# How far ahead of a null-space motion to look [s]: an elbow at 1 m/s stops within 0.1 s.
+# Fastest that a person moves the elbow [m/s], the reduced speed of ISO 10218-1:2011, 3.23; and
+# a joint [rad/s]: it stops within 0.2 rad, by the part of its acceleration that a push may use.
+_GUIDED_SPEED, _GUIDED_JOINT = 0.25, 1.0
+# How far ahead of a null-space motion to look [s]: an elbow at 1 m/s stops within 0.1 s. And
+# which parts of the motion, or of the way, are tried.
 _AHEAD = 0.15
+_SHARES = torch.linspace(0.0, 1.0, 6, dtype=torch.float64)
 
 
 def null_space_slowdown(
@@ -97,10 +100,9 @@ def null_space_slowdown(
     effort = (joints / (_BENDING_EFFORT * chain.limits.acceleration)).abs().amax()
     excess = torch.maximum((scale * bending).norm(dim=-2).amax() / _BENDING, effort)
     origins = chain.joint_origins(joint_position + steps[:, 0])
-    fastest = (origins[1] - origins[0]).norm(dim=-1).max() / _TINY_STEP
-    return float(
-        torch.minimum(excess.clamp(min=1.0) ** -0.5, _GUIDED_SPEED / fastest).clamp(max=1.0)
-    )
+    fastest = (origins[1] - origins[0]).norm(dim=-1).max() / _TINY_STEP / _GUIDED_SPEED
+    fastest = torch.maximum(fastest, null_velocity.abs().max() / _GUIDED_JOINT)
+    return float(torch.minimum(excess.clamp(min=1.0) ** -0.5, 1 / fastest).clamp(max=1.0))
 
 
 # Smallest singular values between which a null-space motion towards a singularity fades: below
@@ -123,11 +125,12 @@ def singularity_fade(
     Returns:
         1 away from singularities and on the way out of one, 0 on the way into one.
     """
-    ahead = torch.stack([torch.zeros_like(null_velocity), _AHEAD * null_velocity])
-    now, later = torch.linalg.svdvals(chain.jacobian(joint_position + ahead))[:, -1].tolist()
-    if later >= now:
+    # On the way too: beyond a singularity it is regular again.
+    ahead = joint_position + 2 * _AHEAD * _SHARES.to(null_velocity)[:, None] * null_velocity
+    now, *later = torch.linalg.svdvals(chain.jacobian(ahead))[:, -1].tolist()
+    if min(later) >= now:
         return 1.0
-    return min(max((later - _SINGULAR) / (_REGULAR - _SINGULAR), 0.0), 1.0)
+    return min(max((min(later) - _SINGULAR) / (_REGULAR - _SINGULAR), 0.0), 1.0)
 
 
 # Part of a correction below which it does not lie in the null space [rad/s].
@@ -168,8 +171,6 @@ def null_space_giving_way(
     return null + share * along
 
 
-# Parts of a null-space motion that are tried.
-_SHARES = torch.linspace(0.0, 1.0, 6, dtype=torch.float64)
 # At which an arm at the margin may still close in [m/s], down to so far within [m]: one that
 # slides along what is around it would else stop and go with every reading, its task as well.
 _SLIDING, _DEEPEST = 0.002, 0.005

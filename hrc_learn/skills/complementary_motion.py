@@ -105,7 +105,7 @@ class ComplementaryMotion:
     def restart(self) -> None:
         """Begin anew: nobody has pushed, and the next step is the first."""
         n = len(self._chain.joint_names)
-        self._yielding = NullSpaceYielding(self._chain, self._dt, self._config, np.zeros(n))
+        self._yielding = NullSpaceYielding(self._chain, self._dt, self._config)
         self.posture = self.joints = None
         self.offset_velocity = self._null = torch.zeros(n, dtype=torch.float64)
         self._last = None

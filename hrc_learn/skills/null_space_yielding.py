@@ -17,9 +17,11 @@ from hrc_learn.skills.arm_motion import null_space_slowdown, singularity_fade
 
 # Null-space input below which one that has ended is over [N m].
 _LEAST_INPUT = 0.05
-# Fraction of the joints' acceleration that a push may use: the rest is for the task, which is
-# slowed down as well where both together need more than the arm has.
-_PUSHED_EFFORT = 0.3
+# Fractions of the joints' acceleration that a push and its end may use: the rest is for the
+# task, which is slowed down as well where both together need more than the arm has.
+_PUSHED_EFFORT, _STOPPING_EFFORT = 0.3, 0.6
+# At which an arm at rest looks ahead [rad/s].
+_SLOW = 0.2
 # How far the null space is from a planned path for the arm to have been pushed aside, and to be
 # back [rad]: servos lag by 0.03 rad at the speed of transfers.
 _ASIDE, _BACK = 0.1, 0.03
@@ -60,24 +62,17 @@ class NullSpaceYielding:
         aside: Whether the joints are off their path.
     """
 
-    def __init__(
-        self,
-        chain: SerialChain,
-        dt: float,
-        config: YieldingConfig,
-        nullspace_input: Float[np.ndarray, " joints"],
-    ):
-        """Begin on the path.
+    def __init__(self, chain: SerialChain, dt: float, config: YieldingConfig):
+        """Begin on the path, with nobody pushing.
 
         Args:
             chain: Kinematics of the arm.
             dt: Control step [s].
             config: How it yields.
-            nullspace_input: What the person asks for at first [N m].
         """
         self._chain, self._dt, self._config = chain, dt, config
-        self.nullspace_input, self.aside = nullspace_input, False
         self._back = torch.zeros(len(chain.joint_names), dtype=torch.float64)
+        self.nullspace_input, self.aside = self._back.numpy(), False
 
     @property
     def pushed(self) -> bool:
@@ -116,10 +111,14 @@ class NullSpaceYielding:
             before = null_projection(J, self.null_velocity)
             wanted = null_projection(J, torch.from_numpy(asked) / damping)
             wanted = wanted * null_space_slowdown(self._chain, joints, wanted)
-            wanted = wanted * singularity_fade(self._chain, joints, wanted)
+            # As far ahead as the arm gets while it slows down.
+            speed = before.norm().clamp(min=_SLOW) / wanted.norm().clamp(min=1e-9)
+            wanted = wanted * singularity_fade(self._chain, joints, speed * wanted)
             wanted = scale_null_space(torch.zeros_like(wanted), wanted, *bounds)
-            change = share * (wanted - before)
-            reach = _PUSHED_EFFORT * self._dt * self._chain.limits.acceleration
+            slows = bool(wanted.norm() < before.norm())
+            change = (1.0 if slows else share) * (wanted - before)
+            effort = _STOPPING_EFFORT if slows else _PUSHED_EFFORT
+            reach = effort * self._dt * self._chain.limits.acceleration
             velocity = before + change / (change.abs() / reach).max().clamp(min=1.0)
             smooth = (damping * velocity).numpy()
         if not asked.any() and np.abs(smooth).max() < _LEAST_INPUT:

@@ -20,7 +20,7 @@ from hrc_learn.controller import (
 from hrc_learn.geometry import Pose
 from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import SerialChain
-from hrc_learn.protocols import Arm, ArmState, Gripper, Human, HumanInput
+from hrc_learn.protocols import Arm, ArmState, Gripper, Human
 from hrc_learn.skills.arm_motion import (
     joint_line,
     kept_clear,
@@ -195,10 +195,9 @@ class WorkCell:
         )
         self._ticks = 0
         self.state: ArmState = arm.read()
-        self.human_input: HumanInput = human.read(self.state)
-        self._yielding = NullSpaceYielding(
-            chain, self.config.dt, self.config, self.human_input.nullspace_input
-        )
+        self._yielding = NullSpaceYielding(chain, self.config.dt, self.config)
+        asked = human.read(self.state)
+        self.human_input = replace(asked, nullspace_input=self._yielding.nullspace_input)
         self.observation = MarkerObservation()
         self._channel = DelayedChannel(self.config.latency, rng or np.random.default_rng(0))
         self._guard = self._safety.initial_state(self.joints)
