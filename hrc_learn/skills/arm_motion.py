@@ -57,9 +57,9 @@ def resolved_rate(
 
 
 # What a null-space motion may ask of the arm: acceleration of the end effector that has to be
-# made up for [m/s^2], a radian counting for 0.1 m; and fraction of its joints' acceleration.
-# Servos that are 10 ms later than known, pulled back with 4 1/s, leave 0.5 mm of the former.
-_BENDING, _METRES_PER_RADIAN, _BENDING_EFFORT = 0.2, 0.1, 0.3
+# made up for [m/s^2], a radian counting for 0.1 m. Servos that are 10 ms later than known,
+# pulled back with 4 1/s, leave 0.5 mm of it.
+_BENDING, _METRES_PER_RADIAN = 0.2, 0.1
 _TINY_STEP = 1e-4
 # Fastest that a person moves the elbow [m/s], the reduced speed of ISO 10218-1:2011, 3.23; and
 # a joint [rad/s]: it stops within 0.2 rad, by the part of its acceleration that a push may use.
@@ -77,10 +77,10 @@ def null_space_slowdown(
 ) -> float:
     """Fraction of a null-space motion at which the arm can keep its end effector in place.
 
-    The null space bends: a motion along it at the speed s asks the joints for an acceleration
-    of s^2 J^+ c, with c the change of J along the motion times the motion, to keep the end
-    effector where it is. The joints have that only within limits, and follow late; near
-    singularities, where the null space bends most, it would leave its place by centimetres.
+    The null space bends: a motion along it at the speed s takes the end effector along with
+    the acceleration s^2 c, with c the change of J along the motion times the motion, which the
+    joints make up for, late as they are. Besides, neither the elbow nor a joint is fast: near
+    singularities, where self-motions are, joints could turn far before they stop.
 
     Args:
         chain: The arm.
@@ -94,11 +94,9 @@ def null_space_slowdown(
     times = null_velocity.new_tensor([0.0, _AHEAD])
     steps = torch.stack([times, times + _TINY_STEP])[..., None] * null_velocity
     J, beyond = chain.jacobian(joint_position + steps)
-    bending = ((beyond - J) @ null_velocity / _TINY_STEP).unsqueeze(-1)
-    scale = bending.new_tensor([1.0] * 3 + [_METRES_PER_RADIAN] * 3).unsqueeze(-1)
-    joints = torch.linalg.lstsq(J, bending, driver="gelsd").solution.squeeze(-1)
-    effort = (joints / (_BENDING_EFFORT * chain.limits.acceleration)).abs().amax()
-    excess = torch.maximum((scale * bending).norm(dim=-2).amax() / _BENDING, effort)
+    bending = (beyond - J) @ null_velocity / _TINY_STEP
+    scale = bending.new_tensor([1.0] * 3 + [_METRES_PER_RADIAN] * 3)
+    excess = (scale * bending).norm(dim=-1).max() / _BENDING
     origins = chain.joint_origins(joint_position + steps[:, 0])
     fastest = (origins[1] - origins[0]).norm(dim=-1).max() / _TINY_STEP / _GUIDED_SPEED
     fastest = torch.maximum(fastest, null_velocity.abs().max() / _GUIDED_JOINT)
@@ -167,7 +165,7 @@ def null_space_giving_way(
     at_upper = ((upper - velocity) / along)[moving]
     least = float(torch.minimum(at_lower, at_upper).max())
     most = float(torch.maximum(at_lower, at_upper).min())
-    share = min(max(0.0, least), most) if least <= most else (least + most) / 2
+    share = least if least <= most else (least + most) / 2
     return null + share * along
 
 

@@ -3,7 +3,6 @@ import pytest
 import torch
 
 from hrc_learn.geometry import Pose, minimum_jerk, quaternion
-from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import panda
 from hrc_learn.skills.arm_motion import (
     joint_line,
@@ -103,56 +102,24 @@ def self_motion(q, speed):
 
 
 def test_the_slowdown_is_that_of_the_bending_of_the_null_space():
-    bent = dict.fromkeys(("hand", "joints", "elbow", "joint speed", "nothing"), 0)
+    bent = dict.fromkeys(("hand", "elbow", "joint speed", "nothing"), 0)
     for q, speed in zip(regular_configurations(60, seed=8), 20 * [0.3, 1.0, 3.0], strict=True):
         null = self_motion(q, speed)
         allowed = {"nothing": 1.0}
         for here in (q, q + 0.15 * null):
             # The change of the Jacobian along the motion, by automatic differentiation.
-            J, change = torch.func.jvp(panda.jacobian, (here,), (null,))
+            _, change = torch.func.jvp(panda.jacobian, (here,), (null,))
             bending = change @ null
-            joints = torch.linalg.pinv(J) @ bending
             scale = torch.tensor([1.0, 1.0, 1.0, 0.1, 0.1, 0.1], dtype=torch.float64)
             hand = (0.2 / float((scale * bending).norm())) ** 0.5
-            effort = float((joints.abs() / panda.limits.acceleration).max()) / 0.3
             allowed["hand"] = min(allowed.get("hand", 1.0), hand)
-            allowed["joints"] = min(allowed.get("joints", 1.0), effort**-0.5)
         _, moved = torch.func.jvp(panda.joint_origins, (q,), (null,))
         allowed["elbow"] = 0.25 / float(moved.norm(dim=-1).max())
         allowed["joint speed"] = 1.0 / float(null.abs().max())
         least = min(allowed, key=allowed.__getitem__)
         bent[least] += 1
         assert null_space_slowdown(panda, q, null) == pytest.approx(allowed[least], rel=2e-3)
-    assert min(bent["hand"], bent["elbow"], bent["nothing"]) > 3, bent
-
-
-@pytest.mark.parametrize("seed", range(6))
-def test_a_null_space_motion_is_slowed_down_to_what_keeps_the_hand_in_place(seed):
-    (q,) = regular_configurations(1, seed)
-    null = self_motion(q, 3.0)
-    fraction = null_space_slowdown(panda, q, null)
-    assert 0 < fraction <= 1
-    assert null_space_slowdown(panda, q, 1e-3 * null) == 1.0
-
-    # The joints' acceleration of the true self-motion, by integrating it both ways.
-    def along(time, steps=200):
-        here, before = q, null
-        for _ in range(steps):
-            ahead = null_projection(panda.jacobian(here), before)
-            ahead = ahead * null.norm() / ahead.norm()
-            middle = here + 0.5 * time / steps * ahead
-            ahead = null_projection(panda.jacobian(middle), ahead)
-            ahead = ahead * null.norm() / ahead.norm()
-            here, before = here + time / steps * ahead, ahead
-        return here
-
-    h = 1e-3
-    acceleration = (along(h) - 2 * q + along(-h)) / h**2
-    effort = float((acceleration.abs() / (0.3 * panda.limits.acceleration)).max())
-    # Slower by the root of what is too much; elsewhere on its way it may bend more.
-    assert fraction <= max(effort, 1.0) ** -0.5 + 1e-3
-    elbow = panda.joint_origins(torch.stack([q, along(h)]))
-    assert fraction * float((elbow[1] - elbow[0]).norm(dim=-1).max()) / h < 0.25 + 2e-3
+    assert min(bent.values()) > 0, bent
 
 
 def test_nobody_moves_an_arm_into_a_singularity_but_out_of_one():
@@ -230,7 +197,8 @@ def test_an_arm_slides_along_what_is_around_it_and_stops_before_it():
         return 0.031 - 0.02 * torch.exp(-((((joints - q) @ along) / 0.03 - 1) ** 2) / 0.05)
 
     half_way = float(kept_clear(q, task, null, post, margin=0.03)[0] @ along)
-    assert 0 < half_way < 0.2 + 1e-6
+    # 20 mm nearer where 1.3 mm are allowed, at 0.4 of the way.
+    assert half_way == pytest.approx(0.5 * 0.4 * 1.3 / 20, rel=0.02)
     # Away from the wall, or along it, it is free.
     assert float(kept_clear(q, task, -null, wall(0.0), 0.03)[0] @ along) == pytest.approx(-0.5)
     aside = kept_clear(q, task, null, lambda joints: 0.02 + 0 * joints[..., 0], 0.03)[0]
