@@ -159,12 +159,16 @@ class NullSpaceYielding:
         self._back = self._back + share * (back - self._back)
         return self._back
 
+    def begin(self, error: Float[Tensor, " joints"]) -> None:
+        """Begin a path; joints that are far from its start [rad] were pushed aside before."""
+        self.aside = float(error.norm()) > _ASIDE
+
     def _away(
         self, joints: Float[Tensor, " joints"], error: Float[Tensor, " joints"]
     ) -> Float[Tensor, " joints"] | None:
         """Null-space part of the way back to a path [rad]; None if nobody pushed it off."""
-        limit = _BACK if self.aside else _ASIDE
-        if not self.pushed and float(error.norm()) <= limit:
+        # An arm that nobody pushed and that is behind meets something: it goes on.
+        if not self.pushed and (not self.aside or float(error.norm()) <= _BACK):
             self.aside = False
             return None
         self.aside = True

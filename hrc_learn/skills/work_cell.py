@@ -425,6 +425,8 @@ class WorkCell:
         velocity = np.gradient(path, dt, axis=0) if len(path) > 1 else np.zeros_like(path)
         narrow = smallest_singular_value(self.chain, torch.from_numpy(path.copy())) < NARROW
         progress, rate, waited = 0.0, 1.0, 0.0
+        if len(path):
+            self._yielding.begin(torch.from_numpy(path[0]) - self.joints)
         while progress <= len(path) - 1:
             if until():
                 return int(progress)

@@ -324,6 +324,20 @@ def test_a_person_pushes_the_elbow_aside_during_a_planned_motion_and_the_hand_go
     assert speed < np.abs(free.log["joint_velocity"]).max() + 0.4
 
 
+def test_an_arm_that_meets_something_is_not_one_that_was_pushed():
+    class Stuck(ObedientArm):
+        def advance(self, duration):
+            first = self.q[0]
+            super().advance(duration)
+            self.q[0] = first
+
+    cell, path = cell_with(Stuck(panda.ready.numpy())), transfer()
+    with shapes_unchecked():
+        assert cell.follow_path(path, until=lambda: len(cell.log) > 2 * len(path)) == len(path)
+    assert abs(float(cell.joints[0]) - path[-1, 0]) > 0.5
+    assert len(cell.log) == len(path)
+
+
 def test_joints_stay_beside_the_path_if_wanted():
     path, config = transfer(), WorkCellConfig(after_push="stay")
     cell = pushed_along(path, PUSH, (0.5, 2.5), config=config)
