@@ -27,8 +27,7 @@ from rich.progress import track
 from rich.table import Table
 
 from hrc_learn import cli
-from hrc_learn.experiments.collaboration.pulls import path_distance
-from hrc_learn.geometry.numerics import null_projection
+from hrc_learn.experiments.collaboration.pulls import elbow_room, path_distance
 from hrc_learn.kinematics import panda
 
 # LeRobot takes ten seconds to import: only once there is something to do.
@@ -200,7 +199,9 @@ def _effects(run: Done, pulls: Sequence[ScriptedForce], robot: MujocoPanda) -> l
         if pull.end > run.time[-1]:
             continue
         during = posture[torch.from_numpy(rows)]
-        rooms = [_room(q, pull, robot) for q in during[:: len(during) // 3]]
+        rooms = [
+            elbow_room(q, pull, clearance=robot.clearance) for q in during[:: len(during) // 3]
+        ]
         effects.append(
             Pulled(
                 elbow=float(elbow[torch.from_numpy(rows)].norm(dim=-1).max()),
@@ -212,31 +213,6 @@ def _effects(run: Done, pulls: Sequence[ScriptedForce], robot: MujocoPanda) -> l
 
 def _elbow(joints: Float[torch.Tensor, "*T 7"]) -> Float[torch.Tensor, "*T 3"]:
     return panda.joint_origins(joints)[..., _ELBOW, :]
-
-
-def _room(posture: Float[torch.Tensor, "7"], pull: ScriptedForce, robot: MujocoPanda) -> float:
-    """How far the elbow gets while the end effector is held, along the null space as long as
-    that leads towards the person's hand, within limits, furniture and off singularities [m].
-    """
-    from hrc_learn.skills.arm_motion import joints_near
-    from hrc_learn.skills.null_space_yielding import NARROW, smallest_singular_value
-
-    goal, towards = panda.forward(posture), torch.tensor(pull.towards, dtype=torch.float64)
-    q, start, far = posture, _elbow(posture), 0.0
-    limits, step = panda.limits, 0.05
-    for _ in range(60):
-        ahead = towards - _elbow(q)
-        J = panda.joint_jacobian(q, pull.joint)[:3]
-        null = null_projection(panda.jacobian(q), J.mT @ ahead)
-        if float(null.norm()) < 0.02 * float(ahead.norm()):
-            break
-        q = joints_near(panda, goal, q + step * null / null.norm())
-        inside = ((q > limits.lower + 0.05) & (q < limits.upper - 0.05)).all()
-        clear = float(robot.clearance(q)) > 0.03
-        if not (inside and clear and float(smallest_singular_value(panda, q)) > NARROW):
-            break
-        far = max(far, float((_elbow(q) - start).norm()))
-    return far
 
 
 def _figures(
