@@ -8,7 +8,7 @@ import torch
 from scipy.optimize import linprog, nnls
 from torch import Tensor
 
-from hrc_learn.controller import ConstraintConfig, Distances, SafetyFilter
+from hrc_learn.controller import ConstraintConfig, Distances, SafetyFilter, SeparationConfig
 from hrc_learn.geometry.numerics import null_projection, orthonormal_basis
 from hrc_learn.kinematics import panda
 
@@ -82,14 +82,28 @@ def _of(J: Tensor, pairs: int, rng: torch.Generator) -> State:
             distance=0.3 * torch.rand(count, pairs, generator=rng, dtype=DOUBLE),
             gradient=0.3 * noise(pairs, joints),
             approach_speed=torch.where(comes, 0.5 * noise(pairs).abs(), 0.0),
+            person=torch.rand(count, pairs, generator=rng) < 0.3,
         ),
     )
 
 
 def allowed(state: State, config: ConstraintConfig) -> Tensor:
     """How fast each distance may shrink by the arm's own motion [m/s]."""
-    d = state.distances
-    return config.rate * (d.distance - config.clearance) - d.approach_speed
+    d, s = state.distances, SeparationConfig()
+    thing = config.rate * (d.distance - config.clearance) - d.approach_speed
+    # Of a person v with  v^2/(2 a) + v (T_r + v_h/a) = d - v_h T_r - C, as a root of NumPy's.
+    person = [
+        max(np.roots([0.5 / s.deceleration, s.reaction_time + v_h / s.deceleration, -spare]))
+        if spare > 0
+        else 0.0
+        for v_h, spare in zip(
+            d.approach_speed.flatten().tolist(),
+            (d.distance - d.approach_speed * s.reaction_time - s.clearance).flatten().tolist(),
+            strict=True,
+        )
+    ]
+    assert d.person is not None
+    return torch.where(d.person, torch.tensor(person, dtype=DOUBLE).view_as(thing), thing)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -239,17 +239,41 @@ class SeparationConfig:
         if not self.deceleration > 0:
             raise ValueError(f"deceleration must be positive, but is {self.deceleration}")
 
-    def highest_speed(self, distance: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-        """Tool speed that keeps the protective separation distance [m/s].
+    def protective_distance(
+        self,
+        speed: Float[Tensor, "*batch"],
+        human_speed: Float[Tensor, "*batch"] | None = None,
+    ) -> Float[Tensor, "*batch"]:
+        """S_p = v_h (T_r + v/a) + v T_r + v^2/(2 a) + C + Z_d + Z_r [m].
 
-        The root v of  d = v_h (T_r + v/a) + v T_r + v^2/(2 a) + C + Z_d + Z_r,  zero where the
-        person is too close for any motion. A distance of NaN is not known and counts as zero.
+        Args:
+            speed: v, at which the arm closes in [m/s]; one that moves away counts as at rest.
+            human_speed: v_h, as for `highest_speed`.
+        """
+        v = speed.clamp(min=0)
+        v_h = self.human_speed if human_speed is None else human_speed.clamp(min=0)
+        stopping = v / self.deceleration
+        arm = v * (self.reaction_time + stopping / 2)
+        return v_h * (self.reaction_time + stopping) + arm + self.clearance
+
+    def highest_speed(
+        self,
+        distance: Float[Tensor, "*batch"],
+        human_speed: Float[Tensor, "*batch"] | None = None,
+    ) -> Float[Tensor, "*batch"]:
+        """Speed towards a person that keeps the protective separation distance [m/s].
+
+        The root v of  d = S_p(v),  see `protective_distance`; zero where the person is too
+        close for any motion. A distance of NaN is not known and counts as zero.
 
         Args:
             distance: Between the person and the arm [m]; infinite: nobody is there.
+            human_speed: v_h of this person towards the arm, where it is measured, with what
+                they may gain meanwhile [m/s]. Who goes away counts as at rest.
         """
         a = self.deceleration
-        spare = distance - self.human_speed * self.reaction_time - self.clearance
+        v_h = self.human_speed if human_speed is None else human_speed.clamp(min=0)
+        spare = distance - v_h * self.reaction_time - self.clearance
         spare = torch.where(spare > 0, spare, 0.0)  # NaN compares false: too close
-        delay = self.reaction_time + self.human_speed / a
+        delay = self.reaction_time + v_h / a
         return a * (torch.sqrt(delay**2 + (2 / a) * spare) - delay)

@@ -68,7 +68,8 @@ class SafetyConfig:
     tcp_speed: float = 1.0
     """Cap on the speed of the tool centre point [m/s]; acts where a Jacobian is given."""
     separation: SeparationConfig = field(default_factory=SeparationConfig)
-    """Lowers that cap where the distance to a person is given."""
+    """How near to a person, by the speeds of both: lowers that cap where the distance of the
+    tool is given, and is kept by all of the arm where those of its links are."""
     constraints: ConstraintConfig | None = None
     """Keeps limits and distances by one program, in which the null space yields to the task;
     None: joints brake before their limits each by itself, and no distance is kept."""
@@ -387,6 +388,7 @@ class SafetyFilter(nn.Module):
             distances,
             self.config.constraints,
             share.clamp(0, 1),
+            self.config.separation,
         )
 
     def _cap_tcp_speed(

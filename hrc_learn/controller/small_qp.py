@@ -58,6 +58,8 @@ def least_change(
     lower: Float[Tensor, "*batch rows"],
     upper: Float[Tensor, "*batch rows"],
     steps: int,
+    *,
+    early_exit: bool = False,
 ) -> LeastChange:
     """Solve  min |y|^2 / 2  subject to  lower <= C y <= upper.
 
@@ -71,6 +73,8 @@ def least_change(
         upper: Infinity where there is none.
         steps: To be made. It takes one for each limit that binds, and two for each that is
             taken in on the way and let go again.
+        early_exit: Make no more steps than it takes, by a branch on the data, which neither
+            compiles nor maps over batches.
     """
     *batch, p, _ = rows.shape
     nothing = torch.zeros_like(lower)
@@ -85,11 +89,17 @@ def least_change(
         share=nothing[..., :1],
     )
     for _ in range(steps):
+        if early_exit and bool(_solved(now, rows, lower, upper).all()):
+            break
         now = _next(now, rows, lower, upper)
+    return LeastChange(now.y, now.side * now.dual, _solved(now, rows, lower, upper))
+
+
+def _solved(now: _Step, rows: Tensor, lower: Tensor, upper: Tensor) -> Bool[Tensor, "*batch"]:
     below, above = _violations(now, rows, lower, upper)
     # A limit that is still being taken in is one that is violated.
     violation = torch.where(now.side == 0, torch.maximum(below, above), 0.0).amax(-1)
-    return LeastChange(now.y, now.side * now.dual, violation <= _TOLERANCE)
+    return violation <= _TOLERANCE
 
 
 def _violations(

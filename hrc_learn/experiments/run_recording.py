@@ -185,7 +185,6 @@ def record(
     cameras: Sequence[tuple[float, CameraModel]] = (),
     region: Box | None = None,
     demonstration: Demonstration | None = None,
-    sensed: LoggedSteps | None = None,
 ) -> RunRecording:
     """Record a run of a work cell, finished or still going on.
 
@@ -198,7 +197,6 @@ def record(
         cameras: The true cameras, and from when on each watched [s]; the world's when none.
         region: Box above the table in which the vision region takes over.
         demonstration: One that the motion was learned from.
-        sensed: Column "distance": how near the robot believed the worker to be, each step [m].
     """
     # Another thread may ask while the loop goes on: take the steps that both logs have.
     log = cell.log.snapshot(len(motion))
@@ -238,7 +236,7 @@ def record(
         elbow_motion=deviation.elbow,
         position_deviation=deviation.position,
         rotation_deviation=deviation.rotation,
-        **_worker(motion, len(log), sensed),
+        **_worker(motion, log),
         safety={name: safety[:, i] for i, name in enumerate(SAFETY_COLUMNS)},
         phases=tuple(log.events),
     )
@@ -249,14 +247,15 @@ def worker_distance(motion: MotionLog, steps: int) -> Float[np.ndarray, " time"]
     return np.array([pair.distance for pair in motion.nearest(steps)])
 
 
-def _worker(motion: MotionLog, steps: int, sensed: LoggedSteps | None) -> dict[str, Any]:
+def _worker(motion: MotionLog, log: LoggedSteps) -> dict[str, Any]:
     """Fields of a recording about the worker, if there was one."""
-    nearest = motion.nearest(steps)
+    nearest = motion.nearest(len(log))
     if not nearest:
         return {}
-    distance = {"true": worker_distance(motion, steps)}
-    if sensed is not None:
-        distance["seen by the robot"] = sensed["distance"][:steps]
+    distance = {"true": worker_distance(motion, len(log))}
+    if "person_distance" in log:
+        distance["seen by the robot"] = log["person_distance"]
+        distance["to be kept"] = log["protective_distance"]
     points = np.stack([pair.points for pair in nearest])
     return {"worker_distance": distance, "worker_nearest": points}
 

@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from hrc_learn.controller import SafetyConfig
+from hrc_learn.controller import SafetyConfig, SeparationConfig
 from hrc_learn.kinematics import panda
 from hrc_learn.vision import ImageNoise
 
@@ -25,6 +25,9 @@ _MOST_OBJECTS = 8
 # By which the simulated servos follow late, whatever else is [s]: with it a path is kept to
 # 0.4 mm, without to 1.5 mm.
 _SIMULATED_SERVOS = 0.01
+# From a control step to the arm braking as hard as it does [s]; and what may stand out from the
+# capsules of a person and an arm, with the error of its calibration [m].
+_RAMP, _BEYOND_CAPSULES = 0.02, 0.05
 _FRACTIONS, _LARGEST_FRACTION = ("image_loss", "person_loss", "slowness"), 0.9
 
 
@@ -158,10 +161,14 @@ class Imperfections:
         )
 
     def plant(self, safety: SafetyConfig) -> SafetyConfig:
-        """Settings of a safety filter that is told what this arm's driver does."""
+        """Settings of a safety filter that is told what this arm's driver and tracker do."""
         # Of normally distributed delays one in 700 is more than three deviations late.
         delay = self.command_delay + 3 * self.command_jitter + self.servo_lag
-        return replace(safety, braking=1 - self.slowness, delay=delay)
+        separation = SeparationConfig(
+            reaction_time=max(delay, _SIMULATED_SERVOS) + _RAMP,
+            clearance=_BEYOND_CAPSULES + 3 * self.person_noise,
+        )
+        return replace(safety, braking=1 - self.slowness, delay=delay, separation=separation)
 
     @property
     def following_delay(self) -> float:

@@ -2,10 +2,10 @@
 
 from hrc_learn.skills.arm_motion import PositionServo as PositionServo
 from hrc_learn.skills.arm_motion import PositionServoConfig as PositionServoConfig
+from hrc_learn.skills.arm_motion import StraightLine as StraightLine
 from hrc_learn.skills.arm_motion import joint_line as joint_line
 from hrc_learn.skills.arm_motion import nearest_configuration as nearest_configuration
 from hrc_learn.skills.arm_motion import resolved_rate as resolved_rate
-from hrc_learn.skills.arm_motion import straight_line as straight_line
 from hrc_learn.skills.complementary_motion import ComplementaryMotion as ComplementaryMotion
 from hrc_learn.skills.grasping import Grasping as Grasping
 from hrc_learn.skills.grasping import GraspingConfig as GraspingConfig

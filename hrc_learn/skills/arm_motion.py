@@ -3,7 +3,7 @@ policies and teleoperators command positions, which are tracked by velocities.
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -207,28 +207,34 @@ def kept_clear(
     return share * null, waits
 
 
-def straight_line(
-    start: Pose, goal: Pose, speed: float, dt: float
-) -> Iterator[tuple[Pose, Float[Tensor, "6"]]]:
-    """Poses and twists along a straight line, from rest to rest.
+class StraightLine:
+    """A motion of the end effector on a straight line, from rest to rest.
 
-    Args:
-        start: First pose.
-        goal: Last pose.
-        speed: Mean speed of the end effector [m/s].
-        dt: Time between samples [s].
-
-    Yields:
-        Pose and twist (linear [m/s], angular [rad/s]) at each sample, the last at rest.
+    Attributes:
+        duration: [s]
     """
-    twist = start.twist_to(goal)
-    distance, turn = float(twist[:3].norm()), float(twist[3:].norm())
-    # Not below 0.3 s: a short motion would need accelerations beyond the safety filter's.
-    duration = max(distance / speed, turn / _TURNING_SPEED, 0.3)
-    for k in range(1, math.ceil(duration / dt) + 1):
-        s, slope = minimum_jerk(k * dt / duration)
-        turned = quaternion.multiply(quaternion.exp(s * twist[3:]), start.orientation)
-        yield Pose(start.position + s * twist[:3], turned), twist * (slope / duration)
+
+    def __init__(self, start: Pose, goal: Pose, speed: float):
+        """Plan it.
+
+        Args:
+            start: First pose.
+            goal: Last pose.
+            speed: Mean speed of the end effector [m/s].
+        """
+        self._start, self._twist = start, start.twist_to(goal)
+        distance, turn = float(self._twist[:3].norm()), float(self._twist[3:].norm())
+        # Not below 0.3 s: a short motion would need accelerations beyond the safety filter's.
+        self.duration = max(distance / speed, turn / _TURNING_SPEED, 0.3)
+
+    def at(self, time: float) -> tuple[Pose, Float[Tensor, "6"]]:
+        """Pose and twist (linear [m/s], angular [rad/s]) at a time since the start [s]."""
+        s, slope = minimum_jerk(time / self.duration)
+        turned = quaternion.multiply(
+            quaternion.exp(s * self._twist[3:]), self._start.orientation
+        )
+        pose = Pose(self._start.position + s * self._twist[:3], turned)
+        return pose, self._twist * (slope / self.duration)
 
 
 def joint_line(

@@ -7,7 +7,7 @@ everything starts again from home.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -18,7 +18,7 @@ from torch import Tensor
 from hrc_learn.controller import AdaptiveController, ControllerConfig, Goals
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import ImageJacobianEstimator
-from hrc_learn.kinematics import panda_capsules
+from hrc_learn.kinematics import GraspedBox, panda_capsules
 from hrc_learn.skills.arm_motion import joint_line
 from hrc_learn.skills.placing import Plan
 from hrc_learn.skills.visual_servoing import (
@@ -153,7 +153,7 @@ class Grasping:
             cell.chain,
             estimator or from_learned(skill.jacobian),
             Goals.at(workplace.hover().position, workplace.hover().orientation),
-            config=config.controller,
+            config=replace(config.controller, safety=cell.watchful(config.controller.safety)),
         )
         self.servo = VisualServo(
             cell, controller, workplace.tool_marker, config.servo, skill.angle
@@ -270,6 +270,7 @@ class Grasping:
             raise MissedGraspError(
                 f"grasp: the fingers closed on nothing. Is {item.name!r} where its marker says?"
             )
+        self._cell.load = as_load(item)
 
     def _feel(self, item: GraspObject) -> None:
         """Feel, with the fingers about an object, how high what it stands on seems to be.
@@ -345,6 +346,7 @@ class Grasping:
         """Open the fingers and go home, clear of the table and of the camera's view."""
         self._cell.tracked_markers = ()
         self._cell.gripper.move(OPEN)
+        self._cell.load = None
         self._cell.hold_pose(0.3)  # time for the fingers to open
         if self._cell.pose.position[2] < self._workplace.hover_height:
             self.lift()
@@ -358,6 +360,12 @@ def joint_plan(
     dt = cell.config.dt
     path = joint_line(start, goal, speed=JOINT_SPEED, dt=dt)
     return Plan(goal=cell.chain.forward(goal), dt=dt, path=path.numpy())
+
+
+def as_load(item: GraspObject) -> GraspedBox:
+    """An object in the hand: gripped along its x, with its top towards the palm."""
+    x, y, z = item.half_size
+    return GraspedBox(half_size=(y, x, z))
 
 
 def holds(cell: WorkCell, item: GraspObject) -> bool:

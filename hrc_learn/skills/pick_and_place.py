@@ -345,6 +345,7 @@ class PickAndPlace:
         self._cell.move_until_contact(below)
         job.release = self._cell.pose
         self._cell.gripper.move(OPEN)
+        self._cell.load = None
         self._cell.hold_pose(_RELEASE_TIME)
         return Phase.RETREAT
 

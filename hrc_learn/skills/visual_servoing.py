@@ -254,12 +254,12 @@ class VisualServo:
         Raises:
             MissedGraspError: If it takes too long, or the marker stays undetected.
         """
-        start, config = self._cell.time, self._config
+        begun, start, config = self._cell.time, self._cell.task_time, self._config
         self._detected = self._arrived = False
         self._resume()
         if config.probe == 0:
-            return self._converge(target, config.tolerance, start) - start
-        reached = start
+            return self._converge(target, config.tolerance, start) - begun
+        reached = begun
         for probe in range(config.max_probes):
             raised = replace(target, raised=self._probe_height(target))
             self._converge(raised, config.probe_tolerance, start)
@@ -276,7 +276,7 @@ class VisualServo:
             along = probe > 0 or turned.deviation(before, above) < config.probe_aside
             if along and float(moved[:2].norm()) < config.probe_reach:
                 break
-        return reached - start
+        return reached - begun
 
     def _learn(self, target: ServoTarget, high: Measurement, low: Measurement) -> None:
         """How the line looks at its lower end, from both ends of a descent."""
@@ -318,7 +318,7 @@ class VisualServo:
             elif (image := self._cell.observation).joints is not None:
                 feature = torch.from_numpy(self._feature())
                 seen[image.time] = self._cell.chain.forward(image.joints), feature
-            self._check_timeouts(target, self._cell.time - start)
+            self._check_timeouts(target, self._cell.task_time - start)
         self._at_rest = _mean(list(seen.values()))
         return reached
 
@@ -333,9 +333,9 @@ class VisualServo:
 
     def _descend(self, target: ServoTarget) -> None:
         """Along the line, from as high up as it is raised."""
-        step = self._config.probe_speed * self._cell.config.dt
-        for height in np.arange(target.raised, 0.0, -step):
-            self.step(replace(target, raised=float(height)))
+        begun, speed = self._cell.task_time, self._config.probe_speed
+        while (height := target.raised - speed * (self._cell.task_time - begun)) > 0:
+            self.step(replace(target, raised=height))
 
     def hold(self, target: ServoTarget, duration: float) -> None:
         """Keep the end effector where it is in the image for a while [s], whatever the person
@@ -397,6 +397,7 @@ class VisualServo:
                 nullspace_input=torch.from_numpy(self._cell.human_input.nullspace_input),
                 goals=goals,
                 dt=self._cell.config.dt,
+                distances=self._cell.distances,
             ),
         )
         self._arrived = self._arrived or float(self.state.task_level) == 1.0

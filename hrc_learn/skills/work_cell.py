@@ -13,21 +13,26 @@ from torch import Tensor
 from hrc_learn.controller import (
     INTERVENTIONS,
     Command,
+    ConstraintConfig,
+    Distances,
     SafetyConfig,
     SafetyFilter,
+    SafetyReport,
+    WayMakingConfig,
     scale_null_space,
+    way_making_velocity,
 )
 from hrc_learn.geometry import Pose
 from hrc_learn.geometry.numerics import null_projection
-from hrc_learn.kinematics import SerialChain
+from hrc_learn.kinematics import GraspedBox, SerialChain
 from hrc_learn.protocols import Arm, ArmState, Gripper, Human
 from hrc_learn.skills.arm_motion import (
+    StraightLine,
     joint_line,
     kept_clear,
     null_space_giving_way,
     null_space_slowdown,
     resolved_rate,
-    straight_line,
 )
 from hrc_learn.skills.marker_sensor import (
     DelayedChannel,
@@ -44,6 +49,7 @@ from hrc_learn.skills.null_space_yielding import (
     changed_rate,
     smallest_singular_value,
 )
+from hrc_learn.skills.person_watch import PersonWatch
 from hrc_learn.vision import angle, centre
 from hrc_learn.viz import StepLog
 
@@ -80,6 +86,9 @@ _CHECKED = 50
 # Readings of the torque that are averaged, and steps in which an arm gets under way: friction
 # keeps it back at first.
 _FELT = 5
+# Part of the task that constraints take beyond rounding; and motion of the end effector, metres
+# and radians as they are, below which nothing waits [1/s].
+_SLOWED, _AT_REST = 1e-3, 1e-3
 _GETTING_UNDER_WAY = 25
 
 _NAN = float("nan")
@@ -119,6 +128,9 @@ class WorkCellConfig(YieldingConfig):
     [rad]: of some centimetres of the end effector, which the task may need."""
     safety: SafetyConfig = field(default_factory=SafetyConfig)
     """Of the safety filter, which is told what the arm's driver can do."""
+    way_making: WayMakingConfig | None = None
+    """Whether the null space makes way by itself for people who are watched for; None: it
+    does not, and follows the person who pushes it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -141,6 +153,9 @@ class WorkCell:
         gripper: Its gripper's driver.
         state: Newest reading of the arm.
         observation: Newest detection of markers that has arrived.
+        watched: Where people beside the arm may be; None: nobody watches for them.
+        load: What the arm holds, which people must not be hit with either.
+        task_time: The clock without what the task waited for people [s].
         human_input: What the person asks for now.
         tracked_markers: Markers detected every `detect_every` steps; empty: no image is taken.
         log: Columns of every step so far, and the phases of the task.
@@ -161,6 +176,7 @@ class WorkCell:
         rng: np.random.Generator | None = None,
         clearance: Callable[[Float[Tensor, "*batch joints"]], Float[Tensor, "*batch"]]
         | None = None,
+        watch: PersonWatch | None = None,
     ):
         """Connect the parts.
 
@@ -176,6 +192,8 @@ class WorkCell:
             rng: Decides which images are lost.
             clearance: Distance of an arm at given joint positions from itself and from what
                 stands around [m]; None: people can push it anywhere within its limits.
+            watch: For people, before whom the arm slows down, waits, and goes on where it
+                was; None: nobody does.
         """
         self.config = config or WorkCellConfig()
         self.chain = chain
@@ -189,7 +207,8 @@ class WorkCell:
         self._advance, self._on_phase = advance, on_phase
         self._clearance = clearance
         safety = self.config.safety
-        self._safety = SafetyFilter(chain.limits, safety)
+        self._watch, self.load = watch, None
+        self._safety = SafetyFilter(chain.limits, self.watchful(safety))
         self._room = SafetyFilter(
             chain.limits, replace(safety, margin=safety.margin + self.config.limit_room)
         )
@@ -201,6 +220,11 @@ class WorkCell:
         self.observation = MarkerObservation()
         self._channel = DelayedChannel(self.config.latency, rng or np.random.default_rng(0))
         self._guard = self._safety.initial_state(self.joints)
+        # Share of the wanted motion that people beside the arm leave, and the sum of it.
+        self._pace, self.task_time = 1.0, self.time
+        self._look()
+
+    load: GraspedBox | None
 
     @property
     def joints(self) -> Float[Tensor, " joints"]:
@@ -258,7 +282,9 @@ class WorkCell:
             joint_velocity,
             self.config.dt,
             jacobian=self.chain.jacobian(joints),
+            distances=self.distances,
         )
+        self._keep_pace(self.chain.jacobian(joints) @ joint_velocity, safe, report)
         position = _NOWHERE if goal is None else goal.position.numpy()
         self._send(safe, safety=report.flags.numpy(), goal_position=position, **_NO_VISION)
 
@@ -278,6 +304,7 @@ class WorkCell:
             approach: Fraction of a joint-space approach in the command, 0 to 1.
         """
         self._guard = self._safety.initial_state(self.joints, command.joint_velocity)
+        self._keep_pace(command.twist, command.joint_velocity, command.safety)
         self._send(
             command.joint_velocity,
             safety=command.safety.flags.numpy(),
@@ -348,12 +375,17 @@ class WorkCell:
             goal: Where to.
             speed: Mean speed [m/s].
         """
-        line = list(straight_line(self.pose, goal, speed, self.config.dt))
-        ahead = round(self.config.command_delay / self.config.dt)
-        for k, (pose, _) in enumerate(line):
-            _, twist = line[min(k + ahead, len(line) - 1)]
-            self.track_pose(pose, twist)
+        line, begun = StraightLine(self.pose, goal, speed), self.task_time
+        while (passed := self.task_time - begun) < line.duration:
+            self._track_line(line, passed)
         self._settle(goal, _SETTLING_TIME)
+
+    def _track_line(self, line: StraightLine, passed: float) -> None:
+        """One step along a line of which so much time has passed [s]."""
+        now = min(passed + self.config.dt, line.duration)
+        pose, _ = line.at(now)
+        _, twist = line.at(min(now + self.config.command_delay, line.duration))
+        self.track_pose(pose, twist)
 
     def move_until_contact(
         self, goal: Pose, speed: float = 0.02, force: float = 12.0
@@ -374,14 +406,16 @@ class WorkCell:
         along = (along / along.norm().clamp(min=1e-9)).numpy()
         felt: deque[float] = deque(maxlen=_FELT)
         before: deque[Pose] = deque(maxlen=_FELT)
-        free = None
-        for k, (pose, twist) in enumerate(
-            straight_line(self.pose, goal, speed, self.config.dt)
-        ):
-            self.track_pose(pose, twist)
+        free, moving = None, 0
+        line, begun = StraightLine(self.pose, goal, speed), self.task_time
+        while (passed := self.task_time - begun) < line.duration:
+            self._track_line(line, passed)
             felt.append(-float(self._contact_force() @ along))
             before.append(self.pose)
-            if k < _FELT + _GETTING_UNDER_WAY:
+            # An arm that waits for somebody gets under way anew.
+            moving = moving + 1 if self._pace == 1 else 0
+            if moving <= _FELT + _GETTING_UNDER_WAY:
+                free = None
                 continue
             # Friction turns with the motion: what is felt under way is the reference.
             now = float(np.mean(felt))
@@ -439,14 +473,14 @@ class WorkCell:
             if not self._yielding.aside:
                 waited = 0.0
             # Who pushes again and again must not hold it up for good.
-            elif not self._yielding.pushed:
+            elif not self._yielding.pushed and self._pace == 1:
                 waited = max(waited + (1.0 - 2.0 * max(rate, 0.0)) * dt, 0.0)
             # The null space that led aside further back leads back there as well.
             backs = waited > _STUCK and progress > 0
             if not backs and self._yielding.aside and narrow[here : ahead + 1].any():
                 behind = math.inf
             rate = changed_rate(rate, 2.0 - behind, dt, direction=-1 if backs else 1)
-            progress = max(progress + rate, 0.0)
+            progress = max(progress + rate * self._pace, 0.0)
             if waited > _LONGEST_WAIT:
                 self._go_straight_back(_between(path, progress))
                 waited = 0.0
@@ -516,6 +550,43 @@ class WorkCell:
         for _ in range(round(duration / self.config.dt)):
             self.track_pose(goal, still)
 
+    def watchful(self, safety: SafetyConfig) -> SafetyConfig:
+        """Settings of a safety filter that keeps its distance from the people watched for."""
+        if self._watch is None:
+            return safety
+        # Steps run one by one, and most bind nothing.
+        constraints = safety.constraints or ConstraintConfig(early_exit=True)
+        separation = self.config.safety.separation
+        return replace(safety, constraints=constraints, separation=separation)
+
+    @property
+    def distances(self) -> Distances | None:
+        """From people, for a safety filter to keep; None: nobody watches for them."""
+        return None if self.watched is None else self.watched.distances
+
+    def _look(self) -> None:
+        """Where people may be now."""
+        if self._watch is None:
+            self.watched = None
+        else:
+            self.watched = self._watch.look(self.time, self.joints, self.load)
+
+    def _keep_pace(
+        self,
+        asked: Float[Tensor, "6"],
+        sent: Float[Tensor, " joints"],
+        report: SafetyReport,
+    ) -> None:
+        """Note how much of its twist the task was left."""
+        kept, pace = report.constraints, 1.0
+        if kept is not None and (float(kept.slowed) > _SLOWED or not bool(kept.solved)):
+            done = self.chain.jacobian(self.joints) @ sent
+            if float(asked.norm()) > _AT_REST:
+                pace = min(max(float(asked @ done) / float(asked @ asked), 0.0), 1.0)
+        # It may drop at once; it rises as paths get under way.
+        self._pace = min(pace, self._pace + self.config.dt / CHANGE_OF_RATE)
+        self.task_time += self._pace * self.config.dt
+
     def _send(self, velocity: Float[Tensor, " joints"], **columns) -> None:
         self.log.append(
             time=self.time,
@@ -525,6 +596,7 @@ class WorkCell:
             nullspace_input=self.human_input.nullspace_input,
             path_joints=self._path_joints,
             gripper=self.state.gripper_width,
+            **self._watched_columns(velocity),
             **columns,
         )
         self._path_joints = self._no_path
@@ -532,9 +604,11 @@ class WorkCell:
         self._advance(self.config.dt)
         self._ticks += 1
         self.state = self._arm.read()
+        self._look()
         asked = self._human.read(self.state)
         room = self._room.velocity_bounds(self.joints)
-        smooth = self._yielding.feel(asked.nullspace_input, self.joints, room)
+        push = asked.nullspace_input + self._way_making()
+        smooth = self._yielding.feel(push, self.joints, room)
         self.human_input = replace(asked, nullspace_input=smooth)
         self._receive()
         if self.tracked_markers and self._ticks % self.config.detect_every == 0:
@@ -542,6 +616,30 @@ class WorkCell:
         every = self.config.keep_image_every
         if self._sensor is not None and every and self._ticks % every == 0:
             self.images.append(KeptImage(time=self.time, image=self._sensor.read()))
+
+    def _way_making(self) -> Float[np.ndarray, " joints"]:
+        """Null-space input by which the arm makes way by itself [N m]."""
+        way = self.config.way_making
+        if way is None or not way.automatic or self.distances is None:
+            return np.zeros(len(self.chain.joint_names))
+        return self.config.damping * way_making_velocity(self.distances, way).numpy()
+
+    def _watched_columns(self, velocity: Float[Tensor, " joints"]) -> dict[str, float]:
+        """For the log: the sensed distance of people, and the protective one at this speed."""
+        if self.watched is None:
+            return {}
+        near, separation = self.watched.distances, self.config.safety.separation
+        needed = separation.protective_distance(
+            -(near.gradient @ velocity), near.approach_speed
+        )
+        tightest = (near.distance - needed).argmin()
+        return {
+            "person_distance": self.watched.nearest,
+            "person_age": self.watched.age,
+            "protective_distance": float(needed[tightest]),
+            "separation_margin": float((near.distance - needed)[tightest]),
+            "pace": self._pace,
+        }
 
     def _receive(self) -> None:
         self.observation = self._channel.newest(self.time) or self.observation

@@ -87,8 +87,9 @@ def test_the_order_is_strict_to_the_weight_of_the_task():
         # W^2 sigma^2 + z^2 is the least, and so not above that of the fastest task.
         most = 2 * (state.upper - state.lower)[k].norm() + state.null[k].norm()
         slack = float(most) / ENOUGH.task_weight
-        # Off the path goes 1 / path_weight^2 of what else is given up.
-        assert best - 1e-5 <= float(found.slowed[k]) <= np.hypot(best, slack) + 1e-6
+        # Off the path goes 1 / path_weight^2 of what else is given up, which spares a slow
+        # task a little more.
+        assert best - 1e-4 <= float(found.slowed[k]) <= np.hypot(best, slack) + 1e-6
         assert off < 2e-5
         assert found.violation[k] < 1e-6
     assert kept > 40
@@ -203,6 +204,8 @@ def test_what_is_no_number_brakes_one_element_alone(value: float):
     inputs = {"wanted": wanted, "task": task, "J": J, "lower": lower, "upper": upper}
     inputs |= {name: getattr(near, name) for name in names}
     for name, x in inputs.items():
+        if x.dtype == torch.bool:
+            continue
         bad = x.clone()
         bad[1].view(-1)[0] = value
         given = inputs | {name: bad}
@@ -223,7 +226,7 @@ def test_what_is_no_number_brakes_one_element_alone(value: float):
 def test_single_precision_is_computed_in_double():
     state = constraint_states.of_panda(100, seed=6)
     single = [
-        Distances(**{k: v.float() for k, v in vars(x).items()})
+        Distances(**{k: v.float() if v.is_floating_point() else v for k, v in vars(x).items()})
         if isinstance(x, Distances)
         else x.float()
         for x in state.arguments
@@ -237,12 +240,13 @@ def test_single_precision_is_computed_in_double():
 def test_the_exported_layer_is_the_eager_one():
     state = constraint_states.of_panda(1, seed=7)
     arguments = [x[0] for x in state.arguments[:5]]
-    near = [getattr(state.distances, f.name)[0] for f in dataclasses.fields(Distances)]
+    names = [f.name for f in dataclasses.fields(Distances)]
+    near = [getattr(state.distances, name)[0] for name in names]
     config = ConstraintConfig(steps=2)
 
     class Layer(torch.nn.Module):
-        def forward(self, wanted, task, J, lower, upper, distance, gradient, approach):
-            distances = Distances(distance=distance, gradient=gradient, approach_speed=approach)
+        def forward(self, wanted, task, J, lower, upper, *near):
+            distances = Distances(**dict(zip(names, near, strict=True)))
             return tuple(constrained_velocity(wanted, task, J, lower, upper, distances, config))
 
     with shapes_unchecked():

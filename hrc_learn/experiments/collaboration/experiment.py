@@ -116,20 +116,15 @@ class CollaborationExperiment:
             cameras=run.cameras,
             region=region,
             demonstration=self._demonstration(),
-            sensed=run.sensed,
         )
         return {"run": recording}
 
     def log(self, run: CollaborationRun) -> LoggedSteps:
         """Of the whole job; with a worker, how near he was and was believed to be [m]."""
         log = run.cell.log
-        if run.sensed is None:
+        if run.visit is None:
             return log
-        return log.with_columns(
-            worker_distance=worker_distance(run.motion, len(log)),
-            worker_distance_sensed=run.sensed["distance"][: len(log)],
-            worker_age=run.sensed["age"][: len(log)],
-        )
+        return log.with_columns(person_distance_true=worker_distance(run.motion, len(log)))
 
     def sections(
         self, run: CollaborationRun, recordings: Mapping[str, RunRecording]

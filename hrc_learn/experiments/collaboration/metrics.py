@@ -100,6 +100,17 @@ def collaboration_metrics(
         Metric("contacts with the worker", _met_worker),
         Metric("min distance", _min_distance, "mm"),
         Metric(
+            "separation violations",
+            lambda run: (
+                None
+                if run.separation_margin is None
+                else int((run.separation_margin < 0).sum())
+            ),
+            at_most=0,
+            essential=True,
+        ),
+        Metric("waited for the worker", _waited, "s"),
+        Metric(
             "cycle time",
             lambda run: run.cell.time,
             "s",
@@ -173,6 +184,13 @@ def _min_distance(run: CollaborationRun) -> float | None:
     """True one of the worker from the robot and its load; None of a run without [mm]."""
     distance = worker_distance(run.motion, len(run.cell.log))
     return 1e3 * float(distance.min()) if len(distance) else None
+
+
+def _waited(run: CollaborationRun) -> float | None:
+    """Time that the task did not go on before him [s]; None of a run without a worker."""
+    if run.visit is None:
+        return None
+    return float((1.0 - run.cell.log["pace"]).sum() * run.cell.config.dt)
 
 
 def _off_path(run: CollaborationRun) -> float | None:

@@ -12,8 +12,8 @@ from jaxtyping import Float
 
 from hrc_learn.experiments.collaboration.pulls import PullEffect, pull_effects
 from hrc_learn.experiments.collaboration.worker import (
-    SensedDistance,
     move_worker,
+    separation_margin,
     somebody_comes,
 )
 from hrc_learn.experiments.run_recording import LiveView, no_live_view
@@ -28,13 +28,16 @@ from hrc_learn.sim import (
     OcclusionInterval,
     ScriptedOcclusion,
     WorkerSensor,
+    WorkerVisit,
     World,
     open_camera,
     whole_arm,
 )
 from hrc_learn.sim.imperfections import Imperfections
 from hrc_learn.sim.workplace import Workplace
+from hrc_learn.skills.grasping import as_load
 from hrc_learn.skills.marker_sensor import LatencyConfig, MarkerSensor
+from hrc_learn.skills.person_watch import PersonWatch
 from hrc_learn.skills.pick_and_place import (
     HOME,
     INTERACT,
@@ -50,7 +53,6 @@ from hrc_learn.teleoperation import ScriptedForce, ScriptedPerturbation, random_
 from hrc_learn.teleoperation.page import PageConfig
 from hrc_learn.teleoperation.page_session import task_page
 from hrc_learn.vision import CameraModel, Marker
-from hrc_learn.viz import LoggedSteps
 
 THREE_OBJECTS = (
     ObjectConfig(),
@@ -118,9 +120,8 @@ class CollaborationRun:
     disturbances: Disturbances = field(default_factory=Disturbances)
     pulls: tuple[ScriptedForce, ...] = ()
     """Of the person on the elbow, in the time of the run, where they do not wait to be let."""
-    sensed: LoggedSteps | None = None
-    """How near the robot believed the worker to be (`SensedDistance.log`); None: nobody was
-    there."""
+    visit: WorkerVisit | None = None
+    """Where the worker truly was; None: nobody was there."""
     held_flat: frozenset[str] = frozenset()
     """Objects that both pads held on opposite faces, when lifted and still at the release."""
 
@@ -135,6 +136,24 @@ class CollaborationRun:
             self.pulls,
             encoder_offset=offset,
             clearance=self.workplace.arm_clearance,
+        )
+
+    @cached_property
+    def separation_margin(self) -> Float[np.ndarray, " steps"] | None:
+        """Of the worker, at each step (`separation_margin`) [m]; None: nobody was there."""
+        if self.visit is None:
+            return None
+        log = self.cell.log
+        return separation_margin(
+            log,
+            self.visit,
+            whole_arm(self.world.config.arm),
+            self.cell.config.safety.separation,
+            encoder_offset=self.world.arm.encoder_offset,
+            loads={
+                item.name: (as_load(item), self.motion.held(item.name)[: len(log)])
+                for item in self.workplace.scene.objects
+            },
         )
 
     @property
@@ -225,10 +244,10 @@ def simulate_collaboration(
         person = ScriptedPerturbation(panda, pulls, begin=0.0)
     else:
         person = ScriptedPerturbation(panda, forces, begin=None)
-    sensed = None
+    watch = None
     if visit is not None:
         tracker = WorkerSensor(visit, lambda: world.time, sizes, chance)
-        sensed = SensedDistance(tracker, whole_arm(scene.arm), items)
+        watch = PersonWatch(tracker, whole_arm(scene.arm), safety.separation)
         move_worker(world, visit)
     motion = MotionLog(world)
     occluder = ScriptedOcclusion(world, disturbances.occlusions)
@@ -238,8 +257,6 @@ def simulate_collaboration(
     )
 
     def advance(duration: float) -> None:
-        if sensed is not None:
-            sensed.note(world.time, cell.state.joint_position, world.held())
         motion.advance(duration)
         occluder.update()
         if visit is not None:
@@ -281,6 +298,7 @@ def simulate_collaboration(
             on_phase=enter,
             rng=rng,
             clearance=workplace.arm_clearance,
+            watch=watch,
         )
         if beside is not None:
             beside.follow(cell)
@@ -297,7 +315,7 @@ def simulate_collaboration(
         cameras=tuple(eyes.history),
         disturbances=disturbances,
         pulls=pulls,
-        sensed=None if sensed is None else sensed.log,
+        visit=visit,
         held_flat=frozenset(flat[HOME] & flat[RELEASE]),
     )
 

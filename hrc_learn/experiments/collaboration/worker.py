@@ -1,16 +1,16 @@
-"""A worker beside the robot in a run: who comes, what the robot sees of him, how near he is."""
+"""A worker beside the robot in a run: who comes, and whom he touches."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 import torch
 from jaxtyping import Float
 
+from hrc_learn.controller import SeparationConfig
 from hrc_learn.kinematics import CapsuleArm, GraspedBox, separation
-from hrc_learn.protocols import PersonTracker
 from hrc_learn.sim import (
     MotionLog,
-    ObjectConfig,
     Touch,
     Worker,
     WorkerConfig,
@@ -19,7 +19,7 @@ from hrc_learn.sim import (
     random_visit,
 )
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.viz import LoggedSteps, StepLog
+from hrc_learn.viz import LoggedSteps
 
 
 def somebody_comes(workplace: Workplace, rng: np.random.Generator) -> WorkerVisit:
@@ -42,55 +42,6 @@ def move_worker(world: World, visit: WorkerVisit) -> None:
     world.move_worker(visit.capsules_at(world.time).ends, visit.item_at(world.time))
 
 
-class SensedDistance:
-    """Notes how near the robot believes the worker to be: from its own joints and its tracker.
-
-    Attributes:
-        log: Columns "distance" to the nearest [m] and "age" of the observation [s], a row a
-            step; NaN as long as there is no observation.
-    """
-
-    def __init__(self, tracker: PersonTracker, arm: CapsuleArm, items: Sequence[ObjectConfig]):
-        """Begin with an empty log.
-
-        Args:
-            tracker: Sees the worker.
-            arm: Capsules of arm and tool.
-            items: What the robot may hold.
-        """
-        self._tracker, self._arm = tracker, arm
-        self._items = {item.name: item for item in items}
-        self.log = StepLog()
-
-    def note(
-        self, time: float, joint_position: Float[np.ndarray, " joints"], held: Sequence[str]
-    ) -> None:
-        """Look now.
-
-        Args:
-            time: Now [s].
-            joint_position: As the arm reads it [rad].
-            held: Names of the objects between the fingers; of several the first counts.
-        """
-        seen = self._tracker.read()
-        if seen is None:
-            self.log.append(distance=np.nan, age=np.nan)
-            return
-        grasped = None
-        if held:
-            # Objects are gripped along their x, with their tops towards the palm.
-            a, b, c = self._items[held[0]].half_size
-            grasped = GraspedBox(half_size=(b, a, c))
-        found = separation(
-            self._arm,
-            torch.from_numpy(joint_position),
-            torch.from_numpy(seen.ends),
-            torch.from_numpy(seen.radius),
-            grasped,
-        )
-        self.log.append(distance=float(found.distance.min()), age=time - seen.time)
-
-
 def worker_contacts(world: World, log: LoggedSteps, motion: MotionLog) -> tuple[Touch, ...]:
     """Touches of the worker and the robot, or what it held then.
 
@@ -111,3 +62,59 @@ def worker_contacts(world: World, log: LoggedSteps, motion: MotionLog) -> tuple[
         return bool((during & motion.held(touch.first)[: len(time)]).any())
 
     return tuple(touch for touch in world.worker_contacts.touches if counts(touch))
+
+
+# Speed up to which a part of the arm is at rest: servos that hold a pose against a push creep
+# [m/s].
+_AT_REST = 0.01
+# Steps that are computed at once: some 100 MB.
+_AT_ONCE = 250
+
+
+def separation_margin(
+    log: LoggedSteps,
+    visit: WorkerVisit,
+    arm: CapsuleArm,
+    config: SeparationConfig,
+    *,
+    encoder_offset: Float[np.ndarray, " joints"],
+    loads: Mapping[str, tuple[GraspedBox, Float[np.ndarray, " steps"]]],
+) -> Float[np.ndarray, " steps"]:
+    """By how much the worker truly was further away than the arm needed to stop before him [m].
+
+    That is the protective distance of what is true, with nothing unknown and nothing to wait
+    for: v_h v/a + v^2/(2 a), for each part of the arm that closes in on one of his with the
+    speed v while he comes with v_h. The least over all of them; infinite while none closes in.
+
+    Args:
+        log: Of the run.
+        visit: Where he was.
+        arm: Capsules of arm and tool.
+        config: With the deceleration of the arm.
+        encoder_offset: What the joint positions of the log are too large by [rad].
+        loads: What the arm held at times, and when.
+    """
+    stop = replace(config, reaction_time=0.0, clearance=0.0)
+    time = log["time"]
+    q = torch.from_numpy(log["joint_position"] - encoder_offset)
+    v = torch.from_numpy(log["joint_velocity"])
+    margin = np.full(len(time), np.inf)
+
+    def measure(steps: np.ndarray, load: GraspedBox | None) -> None:
+        there = visit.capsules_at(time[steps])
+        ends, speed = torch.from_numpy(there.ends), torch.from_numpy(there.velocity)
+        radius = torch.from_numpy(there.radius).expand(len(steps), -1)
+        found = separation(arm, q[steps], ends, radius, load)
+        closing = -found.rate(v[steps], torch.zeros_like(speed))
+        coming = -found.rate(torch.zeros_like(v[steps]), speed)
+        spare = found.distance - stop.protective_distance(closing, coming)
+        spare = torch.where(closing > _AT_REST, spare, torch.inf)
+        margin[steps] = spare.amin((-2, -1)).numpy()
+
+    rest = np.ones(len(time), dtype=bool)
+    for load, held in [*loads.values(), (None, rest)]:
+        steps = np.flatnonzero(held & rest)
+        rest[steps] = False
+        for k in range(0, len(steps), _AT_ONCE):
+            measure(steps[k : k + _AT_ONCE], load)
+    return margin

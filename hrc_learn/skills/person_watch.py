@@ -1,0 +1,114 @@
+"""How far every part of an arm is from the people beside it, as far as a tracker tells."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hrc_learn.controller import Distances, SeparationConfig
+from hrc_learn.kinematics import CapsuleArm, GraspedBox, separation
+from hrc_learn.protocols import PersonTracker
+
+_NAN = math.nan
+
+
+@dataclass(frozen=True, kw_only=True)
+class PersonWatchConfig:
+    """What is assumed of people between two observations, and how much is told of them."""
+
+    acceleration: float = 3.0
+    """At which a person may get faster than they were seen to be [m/s^2]; people begin a step
+    with 1 to 2 m/s^2, and a hand that reaches is seen to after the delay of the tracker."""
+    pairs: int = 8
+    """Of parts of the arm and of a person, the most urgent ones, that are kept apart: others
+    are told of once they are among them."""
+
+    def __post_init__(self) -> None:
+        if self.acceleration < 0:
+            raise ValueError(f"acceleration must not be negative, but is {self.acceleration}.")
+        if self.pairs < 1:
+            raise ValueError(f"pairs must be at least 1, but is {self.pairs}.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class WatchedPeople:
+    """Where people may be by now, seen from the arm."""
+
+    distances: Distances
+    """Of the most urgent pairs, smaller than seen by as much as people may have come nearer
+    since. NaN, for which the arm brakes, as long as nothing is known."""
+    nearest: float = _NAN
+    """Smallest distance when they were seen, from the arm as it is now [m]."""
+    age: float = _NAN
+    """Of the observation [s]."""
+
+
+class PersonWatch:
+    """Turns what a tracker sees into distances that a safety filter keeps."""
+
+    def __init__(
+        self,
+        tracker: PersonTracker,
+        arm: CapsuleArm,
+        separation: SeparationConfig | None = None,
+        config: PersonWatchConfig | None = None,
+    ):
+        """Begin to watch.
+
+        Args:
+            tracker: Sees the people.
+            arm: Capsules of arm and tool.
+            separation: Of the protective distance: by it pairs are the more or less urgent.
+            config: What is assumed of people.
+        """
+        self._tracker, self._arm = tracker, arm
+        self._separation = separation or SeparationConfig()
+        self._config = config or PersonWatchConfig()
+
+    def look(
+        self, time: float, joints: Float[Tensor, " joints"], load: GraspedBox | None = None
+    ) -> WatchedPeople:
+        """Where they may be now.
+
+        Args:
+            time: Now [s].
+            joints: Joint positions now [rad].
+            load: What the arm holds; None: nothing.
+        """
+        seen, number = self._tracker.read(), self._config.pairs
+        if seen is None:
+            unknown = joints.new_full((number,), _NAN)
+            return WatchedPeople(
+                distances=Distances(
+                    distance=unknown,
+                    gradient=unknown[:, None].expand(number, len(joints)),
+                    approach_speed=unknown,
+                    person=torch.ones_like(unknown, dtype=torch.bool),
+                )
+            )
+        ends, radius, velocity = (
+            torch.from_numpy(x).to(joints) for x in (seen.ends, seen.radius, seen.velocity)
+        )
+        found, age = separation(self._arm, joints, ends, radius, load), time - seen.time
+        # What they may have gained since, and gain until the arm reacts.
+        gain = self._config.acceleration * (age + self._separation.reaction_time)
+        towards = (gain - found.rate(torch.zeros_like(joints), velocity)).clamp(min=0).flatten()
+        distance = found.distance.flatten()
+        distance = distance - age * towards
+        allowed = self._separation.highest_speed(distance, towards)
+        # Of pairs that allow nothing the nearest ones: they may open again.
+        _, urgent = (allowed + 1e-3 * distance).topk(min(number, len(distance)), largest=False)
+        return WatchedPeople(
+            distances=Distances(
+                distance=distance[urgent],
+                gradient=found.gradient.flatten(0, 1)[urgent],
+                approach_speed=towards[urgent],
+                person=torch.ones_like(urgent, dtype=torch.bool),
+            ),
+            nearest=float(found.distance.min()),
+            age=age,
+        )
