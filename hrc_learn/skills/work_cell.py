@@ -344,6 +344,9 @@ class WorkCell:
             null_velocity = null_velocity + drift
         task = resolved_rate(J, twist + correction, torch.zeros_like(joints))
         null = null_projection(J, null_velocity)
+        if drift is not None:
+            # A person may push the way that the path leads: both together bend the null space.
+            null = null * null_space_slowdown(self.chain, joints, null)
         waits = False
         if self._clearance is not None and bool(null.any()):
             null, waits = kept_clear(joints, task, null, self._clearance, self.config.clearance)
