@@ -169,13 +169,17 @@ def optimum(p: Program, size: float) -> np.ndarray:
     return p.wanted + p.directions @ (y / p.weights)
 
 
-def least_slowing(p: Program) -> float | None:
+def least_slowing(p: Program, off_path: float = 0.0) -> float | None:
     """Part of the task that has to be given up on its path, by linear programming; None where
     no velocity on the path is allowed.
+
+    Args:
+        p: The program.
+        off_path: How far off the path each direction may lead [rad/s].
     """
     m, columns = p.paths, len(p.weights)
     cost = np.zeros(columns)
     cost[m] = -1.0
-    fixed = [(0.0, 0.0)] * m + [(None, None)] * (columns - m - 1) + [(0.0, 0.0)]
+    fixed = [(-off_path, off_path)] * m + [(None, None)] * (columns - m - 1) + [(0.0, 0.0)]
     found = linprog(cost, A_ub=p.matrix, b_ub=p.bound, bounds=fixed, method="highs")
     return None if found.status != 0 else float(found.fun)

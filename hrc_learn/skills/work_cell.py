@@ -25,7 +25,7 @@ from hrc_learn.controller import (
 from hrc_learn.geometry import Pose
 from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import GraspedBox, SerialChain
-from hrc_learn.protocols import Arm, ArmState, Gripper, Human
+from hrc_learn.protocols import Arm, ArmState, Gripper, Human, HumanInput
 from hrc_learn.skills.arm_motion import (
     StraightLine,
     joint_line,
@@ -89,6 +89,9 @@ _FELT = 5
 # Part of the task that constraints take beyond rounding; and motion of the end effector, metres
 # and radians as they are, below which nothing waits [1/s].
 _SLOWED, _AT_REST = 1e-3, 1e-3
+# How much faster the arm might close in on people who do not hold it back [m/s]: what the
+# program leaves unused is rounding. And pace below which it stands still.
+_SPARE, _STANDS = 1e-3, 0.01
 _GETTING_UNDER_WAY = 25
 
 _NAN = float("nan")
@@ -126,11 +129,14 @@ class WorkCellConfig(YieldingConfig):
     limit_room: float = 0.1
     """Distance from the margin of the joints' limits beyond which nobody can push the arm
     [rad]: of some centimetres of the end effector, which the task may need."""
+    longest_wait: float = 300.0
+    """For which the arm stands still before somebody until the task is given up [s]; of people
+    who share a table, who go away some time."""
     safety: SafetyConfig = field(default_factory=SafetyConfig)
     """Of the safety filter, which is told what the arm's driver can do."""
     way_making: WayMakingConfig | None = None
-    """Whether the null space makes way by itself for people who are watched for; None: it
-    does not, and follows the person who pushes it."""
+    """Whether the null space makes way by itself for people who are watched for, follows the
+    person who pushes it, or both; None: it follows the person."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -222,6 +228,8 @@ class WorkCell:
         self._guard = self._safety.initial_state(self.joints)
         # Share of the wanted motion that people beside the arm leave, and the sum of it.
         self._pace, self.task_time = 1.0, self.time
+        # For how long it has stood still before somebody [s].
+        self._stood = 0.0
         self._look()
 
     load: GraspedBox | None
@@ -580,15 +588,43 @@ class WorkCell:
         sent: Float[Tensor, " joints"],
         report: SafetyReport,
     ) -> None:
-        """Note how much of its twist the task was left."""
-        kept, pace = report.constraints, 1.0
-        if kept is not None and (float(kept.slowed) > _SLOWED or not bool(kept.solved)):
+        """Note how much of its twist people beside the arm left the task.
+
+        Raises:
+            TaskFailedError: Somebody has been in the way for too long.
+        """
+        pace = 1.0
+        if self._people_bind(sent, report):
             done = self.chain.jacobian(self.joints) @ sent
             if float(asked.norm()) > _AT_REST:
                 pace = min(max(float(asked @ done) / float(asked @ asked), 0.0), 1.0)
         # It may drop at once; it rises as paths get under way.
         self._pace = min(pace, self._pace + self.config.dt / CHANGE_OF_RATE)
         self.task_time += self._pace * self.config.dt
+        self._stood = self._stood + self.config.dt if self._pace < _STANDS else 0.0
+        if self._stood > self.config.longest_wait:
+            raise TaskFailedError(
+                f"somebody has been in the way of the arm for {self._stood:.0f} s: free its "
+                "way, or let it wait longer (longest_wait)."
+            )
+
+    def _people_bind(self, sent: Float[Tensor, " joints"], report: SafetyReport) -> bool:
+        """Whether the arm was slowed down as it came as near to people as it may, or as it does
+        not know where they are.
+
+        Where only its own limits hold it back, a path must go on: it would wait for ever.
+        """
+        distances, kept = self.distances, report.constraints
+        if distances is None or kept is None:
+            return False
+        if not bool(distances.known()) or not bool(kept.solved):
+            return True
+        if float(kept.slowed) <= _SLOWED:
+            return False
+        config = self._safety.config
+        assert config.constraints is not None  # without them nothing is reported
+        allowed = distances.closing_speed(config.constraints, config.separation)
+        return bool((allowed + distances.gradient @ sent <= _SPARE).any())
 
     def _send(self, velocity: Float[Tensor, " joints"], **columns) -> None:
         self.log.append(
@@ -610,7 +646,7 @@ class WorkCell:
         self._look()
         asked = self._human.read(self.state)
         room = self._room.velocity_bounds(self.joints)
-        push = asked.nullspace_input + self._way_making()
+        push = self._nullspace_input(asked)
         smooth = self._yielding.feel(push, self.joints, room)
         self.human_input = replace(asked, nullspace_input=smooth)
         self._receive()
@@ -620,12 +656,15 @@ class WorkCell:
         if self._sensor is not None and every and self._ticks % every == 0:
             self.images.append(KeptImage(time=self.time, image=self._sensor.read()))
 
-    def _way_making(self) -> Float[np.ndarray, " joints"]:
-        """Null-space input by which the arm makes way by itself [N m]."""
-        way = self.config.way_making
-        if way is None or not way.automatic or self.distances is None:
-            return np.zeros(len(self.chain.joint_names))
-        return self.config.damping * way_making_velocity(self.distances, way).numpy()
+    def _nullspace_input(self, asked: HumanInput) -> Float[np.ndarray, " joints"]:
+        """Of the person who pushes, and by which the arm makes way by itself [N m]."""
+        way, distances = self.config.way_making, self.distances
+        if way is None:
+            return asked.nullspace_input
+        push = asked.nullspace_input if way.expert else np.zeros_like(asked.nullspace_input)
+        if way.automatic and distances is not None:
+            push = push + self.config.damping * way_making_velocity(distances, way).numpy()
+        return push
 
     def _watched_columns(self, velocity: Float[Tensor, " joints"]) -> dict[str, float]:
         """For the log: the sensed distance of people, and the protective one at this speed."""

@@ -28,6 +28,36 @@ def test_the_speed_solves_the_equation_of_the_standard():
     torch.testing.assert_close(human + arm + config.clearance, distance)
 
 
+@pytest.mark.parametrize(("v", "v_h"), [(0.0, 1.6), (0.4, 0.0), (0.7, 0.9), (0.3, -0.5)])
+def test_the_protective_distance_is_what_both_go_until_the_arm_stands(v, v_h):
+    """By steps of a millisecond: the arm goes on while it reacts, and brakes."""
+    config = SeparationConfig(reaction_time=0.12, deceleration=2.5, clearance=0.07)
+    dt, gone, speed, time = 1e-4, 0.0, v, 0.0
+    while speed > 0 or time < config.reaction_time:
+        if time >= config.reaction_time:
+            speed = max(speed - config.deceleration * dt, 0.0)
+        gone += dt * (speed + max(v_h, 0.0))
+        time += dt
+    needed = config.protective_distance(tensor(v), tensor(v_h))
+    assert float(needed) == pytest.approx(gone + config.clearance, abs=5e-4)
+    # What goes away counts as at rest.
+    away = config.protective_distance(tensor(-v), tensor(v_h))
+    torch.testing.assert_close(away, config.protective_distance(tensor(0.0), tensor(v_h)))
+    # And the speed that keeps it is the one it was computed for.
+    torch.testing.assert_close(config.highest_speed(needed, tensor(v_h)), tensor(v))
+
+
+def test_a_measured_speed_takes_the_place_of_the_assumed_one():
+    config, distance = SeparationConfig(human_speed=1.1), tensor(0.5, 1.0)
+    assumed = config.highest_speed(distance)
+    torch.testing.assert_close(config.highest_speed(distance, tensor(1.1, 1.1)), assumed)
+    assert (config.highest_speed(distance, tensor(0.2, 0.2)) > assumed).all()
+    v = tensor(0.3)
+    torch.testing.assert_close(
+        config.protective_distance(v), config.protective_distance(v, tensor(1.1))
+    )
+
+
 def test_a_person_too_close_or_lost_stops_and_nobody_hinders_nobody():
     config = SeparationConfig()
     speeds = config.highest_speed(tensor(0.0, 0.36, math.nan, -1.0, math.inf))

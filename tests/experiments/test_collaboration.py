@@ -288,12 +288,14 @@ def test_a_worker_is_measured_logged_and_shown(skills):
     assert values["min_distance_mm"] == pytest.approx(1e3 * distance.min())
     assert values["contacts_with_the_worker"] == 0
     assert 0.3 < distance.min() < 3.0
+    assert values["separation_violations"] == 0
     log = experiment.CollaborationExperiment.log(None, job)
-    np.testing.assert_array_equal(log["worker_distance"], distance)
-    assert np.isfinite(log["worker_distance_sensed"]).all()
-    assert (log["worker_age"] >= 0).all()
+    np.testing.assert_array_equal(log["person_distance_true"], distance)
+    assert np.isfinite(log["person_distance"]).all()
+    assert (log["person_age"] >= 0).all()
     np.testing.assert_array_equal(log["time"], job.cell.log["time"])
-    run = record("test", job.cell, job.world, job.motion, sensed=job.sensed)
+    assert job.separation_margin.shape == (steps,)
+    run = record("test", job.cell, job.world, job.motion)
     assert {"worker_head", "worker_hand_left", "worker_item"} <= {b.name for b in run.bodies}
     np.testing.assert_array_equal(run.worker_distance["true"], distance)
     gap = np.linalg.norm(run.worker_nearest[:, 1] - run.worker_nearest[:, 0], axis=-1)
@@ -303,22 +305,27 @@ def test_a_worker_is_measured_logged_and_shown(skills):
     # Somebody else comes with another seed, nobody without the option.
     other = provoked(skills, moved_camera(1.5, 0.0), HASTY, worker=True, seed=1)
     assert other.world.config.worker != job.world.config.worker
-    assert provoked(skills, moved_camera(1.5, 0.0), HASTY).sensed is None
+    alone = provoked(skills, moved_camera(1.5, 0.0), HASTY)
+    assert alone.visit is None
+    assert alone.separation_margin is None
+    assert "separation_violations" not in evaluated(alone).values
 
 
 @pytest.mark.slow
-def test_a_job_beside_a_worker_goes_on_as_it_would_without(skills):
-    """He makes no way, and nobody reacts: the arm is near him or meets him, and goes on."""
+def test_a_job_beside_a_worker_keeps_its_distance_and_is_done(skills):
+    """He makes no way: the arm slows down, waits, and goes on."""
     config = PickAndPlaceConfig(interaction=6.0)
     job = provoked(
         skills, config=config, imperfections=Imperfections.nominal(), worker=True, seed=0
     )
     assert verdict(job) == ""
     distance = worker_distance(job.motion, len(job.cell.log))
-    assert distance.min() < 0.05
     assert distance.max() > 1.0
-    sensed = job.sensed["distance"]
-    error = sensed[np.isfinite(sensed)] - distance[np.isfinite(sensed)]
+    assert job.separation_margin.min() > 0
+    assert job.cell.log["pace"].min() < 0.5
+    assert job.cell.time > job.cell.task_time + 0.5
+    seen = job.cell.log["person_distance"]
+    error = seen[np.isfinite(seen)] - distance[np.isfinite(seen)]
     assert np.abs(np.median(error)) < 0.03
     # 80 ms late and then some, of a person who walks at up to 1.6 m/s.
     assert np.abs(error).max() < 0.4

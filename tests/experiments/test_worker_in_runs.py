@@ -1,23 +1,23 @@
-"""How near a worker is believed to be, and which of his touches count."""
+"""How far a worker was from an arm that moved, and which of his touches count."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
+from hrc_learn.controller import SeparationConfig
 from hrc_learn.experiments.collaboration.worker import (
-    SensedDistance,
     move_worker,
+    separation_margin,
     somebody_comes,
     worker_contacts,
 )
-from hrc_learn.kinematics import GraspedBox, separation
-from hrc_learn.protocols import PersonObservation
-from hrc_learn.sim import MotionLog, WorkerDistance, World, whole_arm
+from hrc_learn.kinematics import separation
+from hrc_learn.sim import MotionLog, World, whole_arm
 from hrc_learn.sim.worker import PARTS
 from hrc_learn.sim.workplace import Workplace
+from hrc_learn.skills.grasping import as_load
 from hrc_learn.viz import StepLog
 
 WORKPLACE = Workplace()
@@ -26,51 +26,52 @@ SCENE = replace(WORKPLACE.scene, worker=VISIT.worker.config)
 HAND = PARTS.index("hand_right")
 
 
-def observed(time: float = 1.0, hand_at: np.ndarray | None = None) -> PersonObservation:
-    """As he puts down what he brought; or his right hand alone, the rest of him far away."""
-    capsules = VISIT.capsules_at(VISIT.released)
-    ends = capsules.ends
-    if hand_at is not None:
-        hand = ends[HAND] - ends[HAND].mean(axis=0) + hand_at
-        ends = ends + 5.0
-        ends[HAND] = hand
-    return PersonObservation(
-        time=time, ends=ends, radius=capsules.radius, velocity=capsules.velocity
+def ends_with_hand_at(place):
+    """His right hand alone, the rest of him far away."""
+    ends = VISIT.capsules_at(VISIT.released).ends
+    hand = ends[HAND] - ends[HAND].mean(axis=0) + place
+    ends = ends + 5.0
+    ends[HAND] = hand
+    return ends
+
+
+def distances_at(arm, q, time, load):
+    there = VISIT.capsules_at(time)
+    ends, radius = torch.from_numpy(there.ends), torch.from_numpy(there.radius)
+    return separation(arm, torch.from_numpy(q), ends, radius, load).distance.numpy()
+
+
+def test_the_margin_is_what_both_would_still_go_while_the_arm_stops():
+    """By differences of distances alone, with the arm's joints where they really are."""
+    arm, config, rng = whole_arm(SCENE.arm), SeparationConfig(), np.random.default_rng(0)
+    steps, h = 12, 1e-6
+    time = VISIT.begin + np.linspace(1.0, 8.0, steps)
+    q = WORKPLACE.hover_joints().numpy() + 0.3 * rng.standard_normal((steps, 7))
+    v = 0.4 * rng.standard_normal((steps, 7))
+    v[3] = 0.0
+    offset, box = rng.normal(0, 0.01, 7), as_load(SCENE.objects[0])
+    held = np.arange(steps) >= 7
+    log = StepLog()
+    for k in range(steps):
+        log.append(time=time[k], joint_position=q[k] + offset, joint_velocity=v[k])
+    found = separation_margin(
+        log, VISIT, arm, config, encoder_offset=offset, loads={"box": (box, held)}
     )
-
-
-def test_the_robot_knows_no_more_than_its_tracker_and_its_joints():
-    arm, q = whole_arm(SCENE.arm), WORKPLACE.hover_joints()
-    tracker = SimpleNamespace(read=lambda: None)
-    sensed = SensedDistance(tracker, arm, SCENE.objects)
-    sensed.note(0.0, q.numpy(), ())
-    tracker.read = observed
-    sensed.note(1.1, q.numpy(), ())
-    sensed.note(1.2, q.numpy(), ("box",))
-    seen = observed()
-    ends, radius = torch.from_numpy(seen.ends), torch.from_numpy(seen.radius)
-    # Gripped along its x, which is the line of closing, the tool's y.
-    a, b, c = SCENE.objects[0].half_size
-    with_box = separation(arm, q, ends, radius, GraspedBox(half_size=(b, a, c))).distance
-    np.testing.assert_allclose(
-        sensed.log["distance"],
-        [np.nan, with_box[:-1].min().item(), with_box.min().item()],
-    )
-    np.testing.assert_allclose(sensed.log["age"], [np.nan, 0.1, 0.2])
-
-
-def test_a_held_box_is_where_it_is_believed_to_be():
-    """To the millimetres by which it is gripped: the simulator's own distance of the box."""
-    world = World(SCENE)
-    world.hold("box", WORKPLACE.home_joints().numpy())
-    below = world.object_pose("box")[:3, 3] - [0.01, 0.02, 0.2]
-    world.move_worker(observed(hand_at=below).ends)
-    true = WorkerDistance(world).now(world.held())
-    assert true.arm_geom == "box"
-    tracker = SimpleNamespace(read=lambda: observed(hand_at=below))
-    sensed = SensedDistance(tracker, whole_arm(SCENE.arm), SCENE.objects)
-    sensed.note(1.0, world.arm.read().joint_position, world.held())
-    assert sensed.log["distance"][0] == pytest.approx(true.distance, abs=2e-3)
+    expected = []
+    for k in range(steps):
+        load = box if held[k] else None
+        now = distances_at(arm, q[k], time[k], load)
+        later = distances_at(arm, q[k] + h * v[k], time[k], load)
+        closing = np.maximum((now - later) / h, 0.0)
+        gone = distances_at(arm, q[k], time[k] - 1e-4, load)
+        come = distances_at(arm, q[k], time[k] + 1e-4, load)
+        coming = np.maximum((gone - come) / 2e-4, 0.0)
+        stopping = closing / config.deceleration
+        needed = coming * stopping + closing * stopping / 2
+        expected.append(np.where(closing > 0.01, now - needed, np.inf).min())
+    np.testing.assert_allclose(found, expected, atol=1e-3)
+    assert np.isinf(found[3])  # who rests closes in on nobody
+    assert np.isfinite(found).sum() > 8
 
 
 @pytest.mark.parametrize("held", [True, False])
@@ -86,7 +87,7 @@ def test_what_the_robot_holds_can_meet_the_worker_what_lies_about_cannot(held):
     motion, log = MotionLog(world), StepLog()
     below = world.object_pose("box")[:3, 3] - [0.0, 0.0, 0.04]
     for place in (below, below, below + 5.0):
-        world.move_worker(observed(hand_at=place).ends)
+        world.move_worker(ends_with_hand_at(place))
         log.append(time=world.time)
         motion.advance(0.01)
     boxes = [touch for touch in world.worker_contacts.touches if touch.first == "box"]

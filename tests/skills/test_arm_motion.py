@@ -5,13 +5,13 @@ import torch
 from hrc_learn.geometry import Pose, minimum_jerk, quaternion
 from hrc_learn.kinematics import panda
 from hrc_learn.skills.arm_motion import (
+    StraightLine,
     joint_line,
     kept_clear,
     null_space_giving_way,
     null_space_slowdown,
     resolved_rate,
     singularity_fade,
-    straight_line,
 )
 
 
@@ -66,7 +66,10 @@ def test_a_straight_line_ends_at_its_goal_and_its_twists_integrate_to_it():
         quaternion.multiply(turn, start.orientation),
     )
     dt = 0.005
-    samples = list(straight_line(start, goal, speed=0.2, dt=dt))
+    line = StraightLine(start, goal, speed=0.2)
+    steps = round(line.duration / dt)
+    assert 0.2 * line.duration == pytest.approx(float((goal.position - start.position).norm()))
+    samples = [line.at(k * dt) for k in range(1, steps + 1)]
     last, twist = samples[-1]
     torch.testing.assert_close(last.position, goal.position, atol=1e-4, rtol=0)
     assert float(quaternion.angle(last.orientation, goal.orientation)) < 1e-3

@@ -21,7 +21,7 @@ class StillCell:
     """A work cell at rest, whose newest image was taken elsewhere."""
 
     chain, config = panda, SimpleNamespace(dt=0.01)
-    joints, time = panda.ready + 0.2, 1.0
+    joints, time, task_time = panda.ready + 0.2, 1.0, 1.0
 
     def __init__(self, image_joints):
         self.observation = MarkerObservation(time=0.9, joints=image_joints)
@@ -133,7 +133,13 @@ def test_what_is_learned_from_a_descent_holds_at_its_lower_end():
 def test_a_probe_comes_down_at_its_speed_from_where_it_begins():
     servo, _ = servo_in(StillCell(None))
     heights = []
-    servo.step = lambda target: heights.append(target.raised)
+
+    def step(target):
+        heights.append(target.raised)
+        # Every other step the arm waits for somebody.
+        servo._cell.task_time += 0.01 * (len(heights) % 2)
+
+    servo.step = step
     above = Workplace().hover()
     up = np.array([0.0, 0.0, 1.0])
     servo._descend(
@@ -147,7 +153,9 @@ def test_a_probe_comes_down_at_its_speed_from_where_it_begins():
         )
     )
     assert heights[0] == 0.045
-    np.testing.assert_allclose(np.diff(heights), -CONFIG.probe_speed * 0.01)
+    lowered = np.diff(heights)
+    np.testing.assert_allclose(lowered[::2], -CONFIG.probe_speed * 0.01)
+    np.testing.assert_allclose(lowered[1::2], 0.0)
     assert 0 < heights[-1] <= CONFIG.probe_speed * 0.01 * (1 + 1e-9)
 
 
@@ -191,7 +199,7 @@ def test_a_descent_is_repeated_until_it_teaches_nothing_new(astray, moves, probe
         return np.add(side, [0.0, 0.0, 1.0]) / np.sqrt(2)
 
     servo, descents = VisualServo.__new__(VisualServo), []
-    cell = SimpleNamespace(time=0.0, pose=above)
+    cell = SimpleNamespace(time=0.0, task_time=0.0, pose=above)
     along = torch.from_numpy(line(turned) / line(turned)[2])
     start = Pose(above.position + CONFIG.probe * along, turned)
     low = []

@@ -5,36 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from obedient_arm import ObedientArm
 from unchecked import shapes_unchecked
 
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import panda
-from hrc_learn.protocols import ArmState, HumanInput
+from hrc_learn.protocols import HumanInput
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills import BlockedPathError, WorkCell, WorkCellConfig, joint_line
 from hrc_learn.teleoperation import ScriptedPerturbation
-
-
-class ObedientArm:
-    def __init__(self, q):
-        self.q, self.velocity, self.time = q.copy(), np.zeros_like(q), 0.0
-
-    def read(self):
-        return ArmState(
-            time=self.time,
-            joint_position=self.q.copy(),
-            joint_velocity=self.velocity,
-            gripper_width=0.08,
-        )
-
-    def command(self, joint_velocity):
-        self.velocity = joint_velocity.copy()
-
-    def move(self, width):
-        raise AssertionError("no path opens the gripper")
-
-    def advance(self, duration):
-        self.q, self.time = self.q + duration * self.velocity, self.time + duration
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from hrc_learn.controller import SeparationConfig
 from hrc_learn.kinematics import CapsuleArm, GraspedBox, separation
@@ -78,7 +78,7 @@ def separation_margin(
     config: SeparationConfig,
     *,
     encoder_offset: Float[np.ndarray, " joints"],
-    loads: Mapping[str, tuple[GraspedBox, Float[np.ndarray, " steps"]]],
+    loads: Mapping[str, tuple[GraspedBox, Bool[np.ndarray, " steps"]]],
 ) -> Float[np.ndarray, " steps"]:
     """By how much the worker truly was further away than the arm needed to stop before him [m].
 

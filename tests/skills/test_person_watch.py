@@ -1,0 +1,141 @@
+"""What the arm takes people's distances for, between two observations of them."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from hrc_learn.controller import SeparationConfig
+from hrc_learn.experiments.collaboration.worker import somebody_comes
+from hrc_learn.kinematics import GraspedBox, separation
+from hrc_learn.protocols import PersonObservation
+from hrc_learn.sim import WorkerDistance, World, whole_arm
+from hrc_learn.sim.worker import PARTS
+from hrc_learn.sim.workplace import Workplace
+from hrc_learn.skills.grasping import as_load
+from hrc_learn.skills.person_watch import PersonWatch, PersonWatchConfig
+
+WORKPLACE = Workplace()
+VISIT = somebody_comes(WORKPLACE, np.random.default_rng(5))
+SCENE = replace(WORKPLACE.scene, worker=VISIT.worker.config)
+ARM = whole_arm(SCENE.arm)
+HAND = PARTS.index("hand_right")
+SEPARATION = SeparationConfig(reaction_time=0.03, clearance=0.05)
+ALL = 10_000
+
+
+def observed(time=1.0, at=VISIT.released - 0.4, velocity=True):
+    """On the way down to the bench, his hand and all of him in motion."""
+    capsules = VISIT.capsules_at(at)
+    moving = capsules.velocity if velocity else np.zeros_like(capsules.velocity)
+    return PersonObservation(
+        time=time, ends=capsules.ends, radius=capsules.radius, velocity=moving
+    )
+
+
+def watch(observation, *, acceleration=0.0, pairs=ALL):
+    tracker = SimpleNamespace(read=lambda: observation)
+    config = PersonWatchConfig(acceleration=acceleration, pairs=pairs)
+    return PersonWatch(tracker, ARM, SEPARATION, config)
+
+
+def distances_of(ends, radius, q, load=None):
+    found = separation(ARM, q, torch.from_numpy(ends), torch.from_numpy(radius), load)
+    return found.distance.flatten()
+
+
+def test_nothing_seen_is_nothing_known():
+    found = watch(None, pairs=8).look(0.0, WORKPLACE.hover_joints())
+    assert not found.distances.known()
+    assert found.distances.distance.shape == (8,)
+    assert found.distances.person.all()
+    assert np.isnan([found.nearest, found.age]).all()
+
+
+def test_people_who_keep_their_speed_are_nowhere_nearer_than_thought():
+    """Of an observation that is 0.2 s old, against where he really is by then."""
+    q, age, reaction = WORKPLACE.hover_joints(), 0.2, 0.03
+    seen = observed()
+    found = watch(seen).look(seen.time + age, q)
+    assert found.age == pytest.approx(age)
+    assert found.nearest == pytest.approx(float(distances_of(seen.ends, seen.radius, q).min()))
+    h = 1e-6
+    before, after = (
+        distances_of(seen.ends + s * seen.velocity, seen.radius, q) for s in (-h, h)
+    )
+    coming = ((before - after) / (2 * h)).clamp(min=0)
+    now = distances_of(seen.ends, seen.radius, q)
+    told = found.distances
+    order = told.distance.argsort()
+    expected, by = (now - age * coming).sort()
+    torch.testing.assert_close(told.distance[order], expected, rtol=0, atol=1e-6)
+    torch.testing.assert_close(told.approach_speed[order], coming[by], rtol=0, atol=1e-5)
+    # Also of who gets faster at once, as fast as it is said to be possible.
+    hasty = watch(seen, acceleration=3.0).look(seen.time + age, q).distances
+    gained = 3.0 * (age + reaction)
+    assert hasty.approach_speed.max() == pytest.approx(float(coming.max()) + gained, abs=1e-5)
+    assert (hasty.distance.sort().values <= expected + 1e-9).all()
+
+
+def test_gradients_are_those_of_the_distances():
+    q, seen = WORKPLACE.hover_joints(), observed(velocity=False)
+    told = watch(seen).look(seen.time, q).distances
+    h, rng = 1e-6, torch.Generator().manual_seed(0)
+    way = torch.randn(7, generator=rng, dtype=torch.float64)
+    plus, minus = (
+        distances_of(seen.ends, seen.radius, q + s * way).sort().values for s in (h, -h)
+    )
+    order = told.distance.argsort()
+    torch.testing.assert_close(
+        told.gradient[order] @ way, (plus - minus) / (2 * h), rtol=0, atol=1e-5
+    )
+
+
+@pytest.mark.parametrize("step", range(4))
+def test_told_are_the_pairs_that_allow_the_least(step):
+    q = WORKPLACE.hover_joints() + 0.2 * step
+    seen = observed(at=VISIT.begin + 2.0 + 1.5 * step)
+    few, every = (
+        watch(seen, acceleration=3.0, pairs=n).look(seen.time + 0.1, q).distances
+        for n in (8, ALL)
+    )
+    assert few.distance.shape == (8,)
+    allowed = SEPARATION.highest_speed(every.distance, every.approach_speed)
+    told = SEPARATION.highest_speed(few.distance, few.approach_speed)
+    torch.testing.assert_close(told.sort().values, allowed.sort().values[:8])
+    # Of those that allow nothing the nearest.
+    if float(told.max()) == 0.0:
+        assert few.distance.max() <= every.distance[allowed == 0].sort().values[8]
+
+
+def test_a_held_box_is_kept_apart_too():
+    """To the millimetres by which it is gripped: the simulator's own distance of the box."""
+    world = World(SCENE)
+    world.hold("box", WORKPLACE.home_joints().numpy())
+    ends = VISIT.capsules_at(VISIT.released).ends
+    below = world.object_pose("box")[:3, 3] - [0.01, 0.02, 0.2]
+    hand = ends[HAND] - ends[HAND].mean(axis=0) + below
+    ends = ends + 5.0
+    ends[HAND] = hand
+    world.move_worker(ends)
+    true = WorkerDistance(world).now(world.held())
+    assert true.arm_geom == "box"
+    seen = PersonObservation(
+        time=0.0, ends=ends, radius=VISIT.worker.radius, velocity=np.zeros_like(ends)
+    )
+    joints = torch.from_numpy(world.arm.read().joint_position)
+    load = as_load(SCENE.objects[0])
+    # Gripped along its x, which is the line of closing, the tool's y.
+    a, b, c = SCENE.objects[0].half_size
+    assert load == GraspedBox(half_size=(b, a, c))
+    found = watch(seen).look(0.0, joints, load)
+    assert found.nearest == pytest.approx(true.distance, abs=2e-3)
+    assert watch(seen).look(0.0, joints).nearest > found.nearest + 5e-3
+
+
+@pytest.mark.parametrize("wrong", [{"acceleration": -1.0}, {"pairs": 0}])
+def test_settings_that_make_no_sense_are_refused(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        PersonWatchConfig(**wrong)
