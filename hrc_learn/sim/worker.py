@@ -77,12 +77,22 @@ PARTS = tuple(name for name, _, _ in _PARTS)
 """Names of the body's capsules, in the order of all arrays."""
 COLOURS = tuple(colour for _, _, colour in _PARTS)
 """Of the capsules."""
-_HANDS = (PARTS.index("hand_left"), PARTS.index("hand_right"))
+# Numbers of the parts that come in pairs, left and right.
+_PAIRS = {
+    kind: [PARTS.index(f"{kind}_{side}") for side in ("left", "right")]
+    for kind in ("upper_arm", "forearm", "hand", "thigh", "shank", "foot")
+}
+# On which side of the body the parts of a pair are, along y.
+_SIDES = np.array([[1.0], [-1.0]])
 
 # How much of an arm or leg is stretched at most: a straight one has no bend to speak of.
 _STRETCHED = 0.995
 # To which side elbows and knees point, in the worker's frame; the sign of y is the side's.
-_ELBOW, _KNEE = np.array([-0.8, 0.2, -0.7]), np.array([1.0, 0.1, 0.0])
+_ELBOW, _KNEE = (-0.8, 0.2, -0.7), (1.0, 0.1, 0.0)
+# Of both arms and both legs, the left ones first: that, and lengths of their two links.
+_BENT_TO = np.array([(x, side * y, z) for x, y, z in (_ELBOW, _KNEE) for side in (1, -1)])
+_FIRST = np.array([[_UPPER_ARM], [_UPPER_ARM], [_THIGH], [_THIGH]])
+_SECOND = np.array([[_FOREARM], [_FOREARM], [_SHANK], [_SHANK]])
 # Fraction of the hand's length at which things are held.
 _GRIP = 0.9
 # The pelvis goes back as the trunk leans forward, or he would fall over: fraction of stature.
@@ -181,40 +191,30 @@ class Worker:
 
     def ends(self, posture: Posture) -> Float[np.ndarray, "*time parts 2 3"]:
         """Ends of the axes of all capsules in the base frame [m]."""
-        h, own = self._size, {}
-        pelvis, up = self._trunk(posture.lean, posture.stride)
+        h, lean, stride = self._size, posture.lean, posture.stride
+        own = np.empty((*lean.shape, len(PARTS), 2, 3))
+        pelvis, up = self._trunk(lean, stride)
         left = np.array([0.0, 1.0, 0.0])
-        forward = np.cross(left, up)
+        forward = _vector(np.cos(lean), 0.0, -np.sin(lean))
         neck = pelvis + _TRUNK * h * up
-        own["pelvis"] = _pair(
-            pelvis + _PELVIS_HALF * h * left, pelvis - _PELVIS_HALF * h * left
-        )
-        own["shoulders"] = _pair(
-            neck + _SHOULDER_HALF * h * left, neck - _SHOULDER_HALF * h * left
-        )
-        for side, sign in (("left", 1.0), ("right", -1.0)):
-            aside = sign * _CHEST_HALF * h * left
-            # The round top of the chest ends a little above the shoulders' joints.
-            top = neck + (0.015 - _RADII["chest"]) * h * up + aside
-            own[f"chest_{side}"] = _pair(pelvis + 0.05 * h * up + aside, top)
-        lean = _HEAD_LEANS * posture.lean
-        head_up = _vector(np.sin(lean), 0.0, np.cos(lean))
+        _put(own, "pelvis", pelvis + _PELVIS_HALF * h * left, pelvis - _PELVIS_HALF * h * left)
+        shoulders = neck + _SHOULDER_HALF * h * left, neck - _SHOULDER_HALF * h * left
+        _put(own, "shoulders", *shoulders)
+        # The round top of the chest ends a little above the shoulders' joints.
+        low, top = pelvis + 0.05 * h * up, neck + (0.015 - _RADII["chest"]) * h * up
+        aside = _CHEST_HALF * h * left
+        _put(own, "chest_left", low + aside, top + aside)
+        _put(own, "chest_right", low - aside, top - aside)
+        head = _HEAD_LEANS * lean
+        head_up = _vector(np.sin(head), 0.0, np.cos(head))
         chin = neck + (_CHIN_HEIGHT - _SHOULDER_HEIGHT) * h * head_up
-        own["neck"] = _pair(neck, chin)
+        _put(own, "neck", neck, chin)
         # The face is before the spine.
         low = chin + 0.02 * h * forward + _RADII["head"] * h * head_up
-        own["head"] = _pair(low, low + (1 - _CHIN_HEIGHT - 2 * _RADII["head"]) * h * head_up)
-        sinks = _vector(0.0, 0.0, self._hip_height(posture.stride) - self._hip_height(0.0))
-        for k, (side, sign) in enumerate((("left", 1.0), ("right", -1.0))):
-            mirror = np.array([1.0, sign, 1.0])
-            shoulder = neck + sign * _SHOULDER_HALF * h * left
-            hand = posture.hands[..., k, :] + sinks
-            self._add_arm(own, side, shoulder, hand, _ELBOW * mirror)
-            hip = pelvis + sign * _PELVIS_HALF * h * left
-            lifted = _LIFT * h * np.maximum(sign * posture.swing, 0.0)
-            ankle = _vector(sign * posture.stride, hip[..., 1], _ANKLE_HEIGHT * h + lifted)
-            self._add_leg(own, side, hip, ankle, _KNEE * mirror)
-        return self._placed(np.stack([own[name] for name in PARTS], axis=-3), posture)
+        high = low + (1 - _CHIN_HEIGHT - 2 * _RADII["head"]) * h * head_up
+        _put(own, "head", low, high)
+        self._add_limbs(own, posture, pelvis, neck)
+        return self._placed(own, posture)
 
     def lean_to(self, hand: Float[np.ndarray, "3"], side: int) -> float | None:
         """How far he has to lean for a hand to be somewhere.
@@ -241,7 +241,7 @@ class Worker:
             ends: Of the axes of the capsules [m].
             side: Of the hand.
         """
-        wrist, tip = np.moveaxis(ends[..., _HANDS[side], :, :], -2, 0)
+        wrist, tip = np.moveaxis(ends[..., _PAIRS["hand"][side], :, :], -2, 0)
         return wrist + _GRIP * _HAND / (_HAND - _RADII["hand"]) * (tip - wrist)
 
     def _trunk(self, lean: np.ndarray, stride: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -256,60 +256,70 @@ class Worker:
         reach = np.minimum(np.abs(stride), 0.8 * leg)
         return _ANKLE_HEIGHT * self._size + np.sqrt(leg**2 - reach**2)
 
-    def _add_arm(
-        self,
-        own: dict[str, np.ndarray],
-        side: str,
-        shoulder: np.ndarray,
-        hand: np.ndarray,
-        elbow_to: np.ndarray,
+    def _add_limbs(
+        self, own: np.ndarray, posture: Posture, pelvis: np.ndarray, neck: np.ndarray
     ) -> None:
-        h = self._size
+        """Arms and legs, those of both sides at once."""
+        h, sides = self._size, _SIDES * np.array([0.0, 1.0, 0.0])
+        shoulder = neck[..., None, :] + _SHOULDER_HALF * h * sides
+        hip = pelvis[..., None, :] + _PELVIS_HALF * h * sides
+        hand = posture.hands.copy()
+        sinks = self._hip_height(posture.stride) - self._hip_height(0.0)
+        hand[..., 2] += np.asarray(sinks)[..., None]
         # The hand continues the line from the shoulder, so the wrist lies on it, too.
         towards = _unit(hand - shoulder)
         wrist = hand - _GRIP * _HAND * h * towards
-        elbow, wrist = _two_links(shoulder, wrist, _UPPER_ARM * h, _FOREARM * h, elbow_to)
-        own[f"upper_arm_{side}"] = _pair(shoulder, elbow)
-        own[f"forearm_{side}"] = _pair(elbow, wrist)
+        ankle = np.empty_like(hip)
+        ankle[..., 0] = _SIDES[:, 0] * posture.stride[..., None]
+        ankle[..., 1] = hip[..., 1]
+        lifted = np.maximum(_SIDES[:, 0] * posture.swing[..., None], 0.0)
+        ankle[..., 2] = _ANKLE_HEIGHT * h + _LIFT * h * lifted
+        start = np.concatenate([shoulder, hip], axis=-2)
+        joint, end = _two_links(
+            start, np.concatenate([wrist, ankle], axis=-2), h * _FIRST, h * _SECOND, _BENT_TO
+        )
+        wrist, ankle = end[..., :2, :], end[..., 2:, :]
         tips = (_HAND - _RADII["hand"]) * h
-        own[f"hand_{side}"] = _pair(wrist, wrist + tips * towards)
-
-    def _add_leg(
-        self,
-        own: dict[str, np.ndarray],
-        side: str,
-        hip: np.ndarray,
-        ankle: np.ndarray,
-        knee_to: np.ndarray,
-    ) -> None:
-        h = self._size
-        knee, ankle = _two_links(hip, ankle, _THIGH * h, _SHANK * h, knee_to)
-        own[f"thigh_{side}"] = _pair(hip, knee)
-        own[f"shank_{side}"] = _pair(knee, ankle)
         # A quarter of the foot is behind the ankle.
         heel, toe = -_FOOT / 4 + _RADII["foot"], 3 * _FOOT / 4 - _RADII["foot"]
         down = _RADII["foot"] - _ANKLE_HEIGHT
-        offsets = h * np.array([[heel, 0.0, down], [toe, 0.0, down]])
-        own[f"foot_{side}"] = ankle[..., None, :] + offsets
+        back, front = h * np.array([[heel, 0.0, down], [toe, 0.0, down]])
+        for kind, first, second in (
+            ("upper_arm", shoulder, joint[..., :2, :]),
+            ("forearm", joint[..., :2, :], wrist),
+            ("hand", wrist, wrist + tips * towards),
+            ("thigh", hip, joint[..., 2:, :]),
+            ("shank", joint[..., 2:, :], ankle),
+            ("foot", ankle + back, ankle + front),
+        ):
+            parts = _PAIRS[kind]
+            own[..., parts, 0, :], own[..., parts, 1, :] = first, second
 
     def _placed(self, own: np.ndarray, posture: Posture) -> np.ndarray:
         """From the worker's frame into the base frame."""
-        angle = posture.heading[..., None, None]
+        angle, place = posture.heading[..., None, None], posture.place[..., None, None, :]
         c, s = np.cos(angle), np.sin(angle)
-        x, y, z = own[..., 0], own[..., 1], own[..., 2]
-        turned = _vector(c * x - s * y, s * x + c * y, z + self.config.floor)
-        turned[..., :2] += posture.place[..., None, None, :]
+        x, y = own[..., 0], own[..., 1]
+        turned = np.empty_like(own)
+        turned[..., 0] = c * x - s * y + place[..., 0]
+        turned[..., 1] = s * x + c * y + place[..., 1]
+        turned[..., 2] = own[..., 2] + self.config.floor
         return turned
 
 
 def _two_links(
-    start: np.ndarray, end: np.ndarray, first: float, second: float, bent_to: np.ndarray
+    start: np.ndarray,
+    end: np.ndarray,
+    first: np.ndarray,
+    second: np.ndarray,
+    bent_to: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Joint and end of two links that lead from a start to an end, or as near as they can."""
-    distance = np.linalg.norm(end - start, axis=-1, keepdims=True)
-    towards = (end - start) / distance
+    way = end - start
+    distance = np.linalg.norm(way, axis=-1, keepdims=True)
+    towards = way / distance
     most = _STRETCHED * (first + second)
-    distance = np.clip(distance, abs(first - second) + 0.05 * most, most)
+    distance = np.minimum(np.maximum(distance, abs(first - second) + 0.05 * most), most)
     along = (first**2 - second**2 + distance**2) / (2 * distance)
     bent_to = bent_to - (bent_to * towards).sum(-1, keepdims=True) * towards
     out = np.sqrt(np.maximum(first**2 - along**2, 0.0))
@@ -317,11 +327,14 @@ def _two_links(
 
 
 def _vector(x, y, z) -> np.ndarray:
-    return np.stack(np.broadcast_arrays(x, y, z), axis=-1)
+    vector = np.empty((*x.shape, 3))
+    vector[..., 0], vector[..., 1], vector[..., 2] = x, y, z
+    return vector
 
 
-def _pair(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    return np.stack(np.broadcast_arrays(first, second), axis=-2)
+def _put(own: np.ndarray, part: str, first: np.ndarray, second: np.ndarray) -> None:
+    k = PARTS.index(part)
+    own[..., k, 0, :], own[..., k, 1, :] = first, second
 
 
 def _unit(vector: np.ndarray) -> np.ndarray:

@@ -64,18 +64,17 @@ class WorkerSensor:
     def _take(self, time: float) -> None:
         """One image."""
         self._taken += 1
-        capsules = self._visit.capsules_at(time)
-        noise = self._sizes.person_noise * self._rng.standard_normal(capsules.ends.shape)
+        ends = self._visit.ends_at(time)
+        noise = self._sizes.person_noise * self._rng.standard_normal(ends.shape)
         if self._rng.uniform() < self._sizes.person_loss:
             return
-        ends, velocity = capsules.ends + noise, np.zeros_like(noise)
+        ends, velocity = ends + noise, np.zeros_like(noise)
         while len(self._before) > 1 and self._before[1].time <= time - _SPAN + 1e-9:
             self._before.popleft()
         if self._before:
             old = self._before[0]
             velocity = (ends - old.ends) / (time - old.time)
-        seen = PersonObservation(
-            time=time, ends=ends, radius=capsules.radius, velocity=velocity
-        )
+        radius = self._visit.worker.radius
+        seen = PersonObservation(time=time, ends=ends, radius=radius, velocity=velocity)
         self._before.append(seen)
         self._pending.append(seen)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -101,17 +102,25 @@ class WorkerVisit:
         """When he has left [s]."""
         return float(self.time[-1])
 
+    @cached_property
+    def _movements(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Change from each pose to the next, how far it leads [m], and in how many steps."""
+        change = np.diff(self.poses, axis=0)
+        length = np.linalg.norm(change[:, :2], axis=-1)
+        return change, length, np.maximum(np.round(length / self.step), 1.0)
+
     def posture(self, time: Float[np.ndarray, "*time"]) -> Posture:
         """How and where he stands at given times [s]."""
-        k = np.clip(np.searchsorted(self.time, time, side="right") - 1, 0, len(self.time) - 2)
-        u = np.clip((time - self.time[k]) / (self.time[k + 1] - self.time[k]), 0.0, 1.0)
+        change, length, steps = self._movements
+        k = np.searchsorted(self.time, time, side="right") - 1
+        k = np.minimum(np.maximum(k, 0), len(change) - 1)
+        u = (time - self.time[k]) / (self.time[k + 1] - self.time[k])
+        u = np.minimum(np.maximum(u, 0.0), 1.0)
         progress = u**3 * (10 - 15 * u + 6 * u**2)
-        change = self.poses[k + 1] - self.poses[k]
+        change, length, steps = change[k], length[k], steps[k]
         row = self.poses[k] + progress[..., None] * change
         # Steps grow and shrink with the speed.
         vigour = 16 * u**2 * (1 - u) ** 2
-        length = np.linalg.norm(change[..., :2], axis=-1)
-        steps = np.maximum(np.round(length / self.step), 1.0)
         phase = np.pi * steps * progress
         walks = vigour * np.minimum(length / self.step, 1.0)
         turns = vigour * np.minimum(np.abs(change[..., 2]), 1.0)
@@ -130,6 +139,16 @@ class WorkerVisit:
             hands=hands,
         )
 
+    def ends_at(
+        self, time: float | Float[np.ndarray, "*time"]
+    ) -> Float[np.ndarray, "*time parts 2 3"]:
+        """Ends of the axes of his capsules in the base frame [m].
+
+        Args:
+            time: One or several times [s].
+        """
+        return self.worker.ends(self.posture(np.asarray(time, dtype=float)))
+
     def capsules_at(self, time: float | Float[np.ndarray, "*time"]) -> WorkerCapsules:
         """Where all of him is, and how fast it moves.
 
@@ -138,20 +157,32 @@ class WorkerVisit:
         """
         at = np.asarray(time, dtype=float)
         around = at[..., None] + np.array([-_HALF_STEP, 0.0, _HALF_STEP])
-        ends = self.worker.ends(self.posture(around))
+        ends = self.ends_at(around)
         before, now, after = np.moveaxis(ends, at.ndim, 0)
         velocity = (after - before) / (2 * _HALF_STEP)
         return WorkerCapsules(now, self.worker.radius, velocity)
 
-    def item_at(self, time: float) -> Float[np.ndarray, "3"]:
+    def item_at(
+        self, time: float, ends: Float[np.ndarray, "parts 2 3"] | None = None
+    ) -> Float[np.ndarray, "3"]:
         """Where the thing is that he puts on the bench: in his hand, then where he left it [m].
 
         Args:
             time: [s]
+            ends: `ends_at` that time, where they are known.
         """
-        then = np.array(min(time, self.released))
-        hangs = np.array([0.0, 0.0, -WORKER_ITEM_HALF_SIZE[2]])
-        return self.worker.grip(self.worker.ends(self.posture(then)), self.side) + hangs
+        if time >= self.released:
+            return self._left_there
+        return self._in_hand(self.ends_at(time) if ends is None else ends)
+
+    @cached_property
+    def _left_there(self) -> np.ndarray:
+        """Where he leaves what he carries [m]."""
+        return self._in_hand(self.ends_at(self.released))
+
+    def _in_hand(self, ends: np.ndarray) -> np.ndarray:
+        """Where the thing is that he holds [m]."""
+        return self.worker.grip(ends, self.side) - np.array([0, 0, WORKER_ITEM_HALF_SIZE[2]])
 
 
 class _Writer:

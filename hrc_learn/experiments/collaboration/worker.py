@@ -39,7 +39,8 @@ def somebody_comes(workplace: Workplace, rng: np.random.Generator) -> WorkerVisi
 
 def move_worker(world: World, visit: WorkerVisit) -> None:
     """Put the worker where he is now."""
-    world.move_worker(visit.capsules_at(world.time).ends, visit.item_at(world.time))
+    ends = visit.ends_at(world.time)
+    world.move_worker(ends, visit.item_at(world.time, ends))
 
 
 def worker_contacts(world: World, log: LoggedSteps, motion: MotionLog) -> tuple[Touch, ...]:
