@@ -216,9 +216,19 @@ class SerialChain:
         Returns:
             Pose with batch shape (*batch, joints + 2); index it as `poses[..., i]`.
         """
+        return Pose.from_matrix(self.link_frames(q))
+
+    def link_frames(
+        self, q: Float[Tensor, "*batch joints"]
+    ) -> Float[Tensor, "*batch links 3 4"]:
+        """`link_poses` left as matrices (R | p): no quaternion made.
+
+        Args:
+            q: Joint positions [rad].
+        """
         frames = self._joint_frames(q)
         tips = [frames[-1] @ self._flange.like(q), frames[-1] @ self._tip.like(q)]
-        return Pose.from_matrix(torch.stack([*frames, *tips], dim=-3))
+        return torch.stack([*frames, *tips], dim=-3)
 
     def joint_origins(
         self, q: Float[Tensor, "*batch joints"]

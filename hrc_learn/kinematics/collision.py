@@ -11,10 +11,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from hrc_learn.geometry.numerics import Constant
 from hrc_learn.kinematics.chain import SerialChain
 
 # Halvings of a segment in the search for its point nearest to a box: 1e-6 of its length.
 _HALVINGS = 20
+# By which a bound on a distance may be wrong by rounding [m]: that of float32 within reach.
+_ROUNDING = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,7 +66,9 @@ class CapsuleArm:
         self._overlapping = tuple(overlapping)
         self.links = tuple(capsule.link for capsule in capsules)
         ends = [[capsule.start, capsule.end] for capsule in capsules]
-        self._ends = torch.tensor(ends, dtype=torch.float64)
+        self._ends = Constant(torch.tensor(ends, dtype=torch.float64))
+        self._links = Constant(torch.tensor(self.links))
+        self._base = Constant(torch.eye(3, 4, dtype=torch.float64))
         self.radius = torch.tensor([c.radius for c in capsules], dtype=torch.float64)
         apart = {frozenset(pair) for pair in overlapping}
         pairs = [
@@ -73,54 +78,104 @@ class CapsuleArm:
             and frozenset((self.links[i], self.links[k])) not in apart
         ]
         self._pairs = torch.tensor(pairs).mT
-        self._moving = [i for i, link in enumerate(self.links) if link > 0]
+        first, second = self._pairs
+        self._first, self._second = Constant(first), Constant(second)
+        self._reach = Constant(self.radius[first] + self.radius[second])
+        moving = torch.tensor([i for i, link in enumerate(self.links) if link > 0])
+        self._moving, self._moving_radius = Constant(moving), Constant(self.radius[moving])
 
     def with_capsules(self, more: Sequence[LinkCapsule]) -> CapsuleArm:
         """The same arm with further capsules, such as of what is mounted on its hand."""
         return CapsuleArm(self.chain, (*self.capsules, *more), self._overlapping)
 
-    def segments(self, q: Float[Tensor, "*batch joints"]) -> Float[Tensor, "*batch C 2 3"]:
-        """Ends of all capsules in the base frame [m]."""
-        frames = self.chain.link_poses(q).matrix()
-        base = torch.eye(4, dtype=q.dtype, device=q.device).expand_as(frames[..., :1, :, :])
-        frames = torch.cat([base, frames], dim=-3)[..., self.links, :, :]
-        return self._ends.to(q) @ frames[..., :3, :3].mT + frames[..., None, :3, 3]
+    def segments(
+        self,
+        q: Float[Tensor, "*batch joints"],
+        frames: Float[Tensor, "*batch links 3 4"] | None = None,
+    ) -> Float[Tensor, "*batch C 2 3"]:
+        """Ends of all capsules in the base frame [m].
 
-    def pair_distances(self, q: Float[Tensor, "*batch joints"]) -> Float[Tensor, "*batch P"]:
-        """Distance of each pair of capsules that should not touch [m], see `pairs`."""
-        first, second = self._pairs
-        ends, radius = self.segments(q), self.radius.to(q)
-        distance = segment_distance(ends[..., first, :, :], ends[..., second, :, :])
-        return distance - radius[first] - radius[second]
+        Args:
+            q: Joint positions [rad].
+            frames: `SerialChain.link_frames` there, where they are known.
+        """
+        if frames is None:
+            frames = self.chain.link_frames(q)
+        base = self._base.like(q).expand_as(frames[..., :1, :, :])
+        frames = torch.cat([base, frames], dim=-3).index_select(-3, self._links.like(q))
+        R, p = frames[..., :3], frames[..., None, :, 3]
+        return self._ends.like(q) @ R.mT + p
+
+    def pair_distances(
+        self,
+        q: Float[Tensor, "*batch joints"],
+        frames: Float[Tensor, "*batch links 3 4"] | None = None,
+    ) -> Float[Tensor, "*batch P"]:
+        """Distance of each pair of capsules that should not touch [m], see `pairs`.
+
+        Args:
+            q: Joint positions [rad].
+            frames: `SerialChain.link_frames` there, where they are known.
+        """
+        ends = self.segments(q, frames)
+        first, second = (ends.index_select(-3, i.like(q)) for i in (self._first, self._second))
+        return segment_distance(first, second) - self._reach.like(q)
 
     @property
     def pairs(self) -> list[tuple[int, int]]:
         """Numbers of the two capsules of each pair."""
         return [(int(i), int(k)) for i, k in self._pairs.mT]
 
-    def self_distance(self, q: Float[Tensor, "*batch joints"]) -> Float[Tensor, "*batch"]:
-        """Distance of the two nearest capsules that should not touch [m]."""
-        return self.pair_distances(q).amin(-1)
+    def self_distance(
+        self,
+        q: Float[Tensor, "*batch joints"],
+        frames: Float[Tensor, "*batch links 3 4"] | None = None,
+    ) -> Float[Tensor, "*batch"]:
+        """Distance of the two nearest capsules that should not touch [m].
+
+        Args:
+            q: Joint positions [rad].
+            frames: `SerialChain.link_frames` there, where they are known.
+        """
+        return self.pair_distances(q, frames).amin(-1)
 
     def box_distance(
         self,
         q: Float[Tensor, "*batch joints"],
         centre: Float[Tensor, "*boxes 3"],
         half_size: Float[Tensor, "*boxes 3"],
+        frames: Float[Tensor, "*batch links 3 4"] | None = None,
     ) -> Float[Tensor, "*batch"]:
         """Distance of the nearest moving link from boxes along the base axes [m].
 
-        Inside a box it counts from the segment, not from the nearest wall.
+        Inside a box it counts from the segment, not from the nearest wall. Pairs of a link and
+        a box that are too far apart to be the nearest are left out by a branch on the data,
+        which neither compiles nor maps over batches.
 
         Args:
             q: Joint position [rad].
             centre: Of the box, or of each of several [m].
             half_size: Half of its edges [m].
+            frames: `SerialChain.link_frames` there, where they are known.
         """
-        ends = self.segments(q)[..., self._moving, None, :, :]
-        boxes = (side.to(q).reshape(-1, 3) for side in (centre, half_size))
-        distance = segment_box_distance(ends, *boxes).amin(-1)
-        return (distance - self.radius.to(q)[self._moving]).amin(-1)
+        ends = self.segments(q, frames).index_select(-3, self._moving.like(q))
+        batch, ends = ends.shape[:-3], ends.reshape(-1, *ends.shape[-3:])
+        radius = self._moving_radius.like(q)
+        centre, half_size = (side.to(q).reshape(-1, 3) for side in (centre, half_size))
+        start, end = ends.unbind(-2)
+        offset = ((start + end) / 2).unsqueeze(-2) - centre
+        outside = offset - offset.clamp(-half_size, half_size)
+        # Nothing of a capsule is further from its middle than half of its axis and its radius.
+        middle = torch.linalg.vector_norm(outside, dim=-1) - radius.unsqueeze(-1)
+        half_axis = torch.linalg.vector_norm(end - start, dim=-1, keepdim=True) / 2
+        least = middle.amin((-2, -1), keepdim=True) + _ROUNDING
+        # Written so that what is not a number stays.
+        near = ~(middle - half_axis > least)
+        posture, link, box = near.nonzero(as_tuple=True)
+        distance = segment_box_distance(ends[posture, link], centre[box], half_size[box])
+        far = torch.full_like(start[:, 0, 0], torch.inf)
+        nearest = far.scatter_reduce(0, posture, distance - radius[link], "amin")
+        return nearest.reshape(batch)
 
 
 def segment_distance(
@@ -180,18 +235,14 @@ def nearest_on_segment_and_box(
         The point of the box, and the point of the segment as a fraction of its length.
     """
     start, along = segment[..., 0, :], segment[..., 1, :] - segment[..., 0, :]
-
-    def nearest(t: Tensor) -> tuple[Tensor, Tensor]:
-        """The point at t, and that of the box nearest to it, both from the box's centre."""
-        offset = start + t.unsqueeze(-1) * along - centre
-        return offset, offset.clamp(-half_size, half_size)
-
-    low = torch.zeros_like((start - centre)[..., 0])
-    high = torch.ones_like(low)
-    for _ in range(_HALVINGS):
-        middle = (low + high) / 2
-        point, inside = nearest(middle)
-        rising = ((point - inside) * along).sum(-1) > 0
-        low, high = torch.where(rising, low, middle), torch.where(rising, middle, high)
-    fraction = (low + high) / 2
-    return nearest(fraction)[1] + centre, fraction
+    shift, opposite = start - centre, -half_size
+    low = torch.zeros_like(shift[..., 0])
+    for k in range(_HALVINGS):
+        middle = low + 0.5 ** (k + 1)
+        offset = torch.addcmul(shift, middle.unsqueeze(-1), along)
+        outside = offset - offset.clamp(opposite, half_size)
+        rising = torch.linalg.vecdot(outside, along) > 0
+        low = torch.where(rising, low, middle)
+    fraction = low + 0.5 ** (_HALVINGS + 1)
+    offset = start + fraction.unsqueeze(-1) * along - centre
+    return offset.clamp(opposite, half_size) + centre, fraction

@@ -11,9 +11,10 @@ with v the velocity of the person's nearest point.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache, cached_property
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from hrc_learn.geometry.numerics import safe_norm
@@ -43,18 +44,72 @@ class Separation:
 
     distance: Float[Tensor, "*batch C H"]
     """Between the surfaces; negative is the depth to which two capsules overlap [m]."""
-    on_arm: Float[Tensor, "*batch C H 3"]
-    """Nearest point on the arm's surface, in the base frame [m]."""
-    on_person: Float[Tensor, "*batch C H 3"]
-    """Nearest point on the person's surface [m]."""
     direction: Float[Tensor, "*batch C H 3"]
     """Unit vector from the arm to the person; zero where the axes of two capsules meet, or the
     axis of one a box: there no direction leads out."""
     fraction: Float[Tensor, "*batch C H"]
     """Where on the axis of the person's capsule its nearest point lies, 0 to 1 from its first
     end."""
-    gradient: Float[Tensor, "*batch C H joints"]
-    """Of the distance with respect to the joint positions [m/rad]."""
+    arm_point: Float[Tensor, "*batch C H 3"]
+    """Nearest point on the axis of the arm's capsule, or on the held box, in the base frame
+    [m]."""
+    person_point: Float[Tensor, "*batch C H 3"]
+    """Nearest point on the axis of the person's capsule [m]."""
+    arm_radius: Float[Tensor, " C"]
+    """Of the arm's capsules; zero of the held box [m]."""
+    person_radius: Float[Tensor, "*#batch H"]
+    """[m]"""
+    joint_axes: Float[Tensor, "*#batch joints 3"]
+    """Of the arm, in the base frame."""
+    joint_origins: Float[Tensor, "*#batch joints 3"]
+    """[m]"""
+    moved: Bool[Tensor, "C joints"]
+    """Which joints move which of the arm's capsules."""
+
+    @property
+    def on_arm(self) -> Float[Tensor, "*batch C H 3"]:
+        """Nearest point on the arm's surface, in the base frame [m]."""
+        return self.arm_point + self.arm_radius[:, None, None] * self.direction
+
+    @property
+    def on_person(self) -> Float[Tensor, "*batch C H 3"]:
+        """Nearest point on the person's surface [m]."""
+        return self.person_point - self.person_radius[..., None, :, None] * self.direction
+
+    @cached_property
+    def gradient(self) -> Float[Tensor, "*batch C H joints"]:
+        """Of the distance with respect to the joint positions [m/rad]."""
+        shape = self.distance.shape[-2:]
+        every = torch.arange(shape.numel(), device=self.distance.device)
+        return self.gradient_of(every).unflatten(-2, shape)
+
+    def gradient_of(self, pairs: Int[Tensor, " pairs"]) -> Float[Tensor, "*batch pairs joints"]:
+        """Some rows of the gradient [m/rad].
+
+        Args:
+            pairs: Numbers c H + h of the pairs of a capsule c of the arm and h of the person.
+        """
+        direction, point = (
+            x.flatten(-3, -2).index_select(-2, pairs) for x in (self.direction, self.arm_point)
+        )
+        z, origin = self.joint_axes, self.joint_origins
+        # - direction . (z x (p - o)) for the axis z through o of every joint.
+        turning = torch.linalg.cross(direction, point) @ z.mT
+        shift = direction @ torch.linalg.cross(z, origin).mT
+        moved = self.moved[pairs // self.distance.shape[-1]]
+        return torch.where(moved, turning + shift, 0.0)
+
+    def person_rate(
+        self, person_velocity: Float[Tensor, "*#batch H 2 3"]
+    ) -> Float[Tensor, "*batch C H"]:
+        """How fast the distances change while the arm rests [m/s].
+
+        Args:
+            person_velocity: Of both ends of the person's capsules [m/s].
+        """
+        first, second = person_velocity[..., None, :, :, :].unbind(-2)
+        velocity = first + self.fraction[..., None] * (second - first)
+        return (self.direction * velocity).sum(-1)
 
     def rate(
         self,
@@ -67,10 +122,8 @@ class Separation:
             joint_velocity: Of the arm [rad/s].
             person_velocity: Of both ends of the person's capsules [m/s].
         """
-        first, second = person_velocity[..., None, :, :, :].unbind(-2)
-        velocity = first + self.fraction[..., None] * (second - first)
-        along = (self.direction * velocity).sum(-1)
-        return (self.gradient @ joint_velocity[..., None, :, None]).squeeze(-1) + along
+        by_arm = (self.gradient @ joint_velocity[..., None, :, None]).squeeze(-1)
+        return by_arm + self.person_rate(person_velocity)
 
 
 def separation(
@@ -99,38 +152,40 @@ def separation(
     if not bool((radius >= 0).all() & torch.isfinite(radius).all()):
         raise ValueError(f"radius must be finite and not negative, but is {radius.tolist()}.")
     joints = len(arm.chain.joint_names)
-    frames = arm.chain.link_poses(q).matrix()
-    axis, other = arm.segments(q)[..., :, None, :, :], ends[..., None, :, :, :]
+    frames = arm.chain.link_frames(q)
+    axis, other = arm.segments(q, frames)[..., :, None, :, :], ends[..., None, :, :, :]
     s, t = nearest_on_segments(axis, other)
-    on_arm, on_person = _between(axis, s), _between(other, t)
-    arm_radius = arm.radius.to(q)[:, None]
-    links = arm.links
+    arm_point, person_point = _between(axis, s), _between(other, t)
+    arm_radius, links = arm.radius.to(q), arm.links
     if grasped is not None:
         box, fraction = _nearest_on_box(frames[..., -1, :, :], ends, grasped)
-        on_arm = _stacked(on_arm, box)
+        arm_point = _stacked(arm_point, box)
         t = torch.cat([t, fraction[..., None, :].expand(*t.shape[:-2], 1, -1)], dim=-2)
-        on_person = _between(other.expand(*t.shape, 2, 3), t)
-        arm_radius = torch.nn.functional.pad(arm_radius, (0, 0, 0, 1))
+        person_point = _between(other.expand(*t.shape, 2, 3), t)
+        arm_radius = torch.nn.functional.pad(arm_radius, (0, 1))
         links = (*links, frames.shape[-3])
-    gap = on_person - on_arm
+    gap = person_point - arm_point
     length = safe_norm(gap)
     apart = length > 0
-    direction = gap / torch.where(apart, length, 1.0).unsqueeze(-1)
-    person_radius = radius[..., None, :]
-    # The joints that carry a link are those up to its own number.
-    moved = torch.tensor([[i < link for i in range(joints)] for link in links], device=q.device)
-    z, origin = frames[..., :joints, :3, 2], frames[..., :joints, :3, 3]
-    # - direction . (z x (p - o)) for the axis z through o of every joint.
-    turning = torch.linalg.cross(direction, on_arm) @ z[..., None, :, :].mT
-    shift = direction @ torch.linalg.cross(z, origin)[..., None, :, :].mT
     return Separation(
-        distance=length - arm_radius - person_radius,
-        on_arm=on_arm + arm_radius.unsqueeze(-1) * direction,
-        on_person=on_person - person_radius.unsqueeze(-1) * direction,
-        direction=direction,
+        distance=length - arm_radius[:, None] - radius[..., None, :],
+        direction=gap / torch.where(apart, length, 1.0).unsqueeze(-1),
         fraction=t,
-        gradient=torch.where(moved[:, None, :], turning + shift, 0.0),
+        arm_point=arm_point,
+        person_point=person_point,
+        arm_radius=arm_radius,
+        person_radius=radius,
+        joint_axes=frames[..., :joints, :, 2],
+        joint_origins=frames[..., :joints, :, 3],
+        moved=_moved(links, joints).to(q.device),
     )
+
+
+@cache
+def _moved(links: tuple[int, ...], joints: int) -> Bool[Tensor, "links joints"]:
+    """Which joints carry a link: those up to its own number."""
+    with torch.inference_mode(False):
+        return torch.arange(joints) < torch.tensor(links)[:, None]
 
 
 def _between(segment: Tensor, fraction: Tensor) -> Tensor:
@@ -146,7 +201,7 @@ def _stacked(points: Tensor, last: Tensor) -> Tensor:
 
 def _nearest_on_box(tool: Tensor, ends: Tensor, box: GraspedBox) -> tuple[Tensor, Tensor]:
     """Points of a held box nearest to segments, and where on these the nearest points lie."""
-    R, p = tool[..., :3, :3], tool[..., None, :3, 3]
+    R, p = tool[..., :3], tool[..., None, :, 3]
     local = (ends - p[..., None, :]) @ R[..., None, :, :]
     centre, half_size = local.new_tensor(box.centre), local.new_tensor(box.half_size)
     point, fraction = nearest_on_segment_and_box(local, centre, half_size)

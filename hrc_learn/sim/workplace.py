@@ -1,6 +1,7 @@
 """Poses of the task in the simulated scene: home, table, shelves."""
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -8,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.geometry import Pose
+from hrc_learn.geometry.numerics import Constant
 from hrc_learn.kinematics import (
     coarse_orientation,
     comfortable_postures,
@@ -129,10 +131,18 @@ class Workplace:
         Args:
             q: Joint position [rad].
         """
+        centre, half_size = self._furniture.like(q).split(3, dim=-1)
+        frames = panda.link_frames(q)
+        furniture = panda_body.box_distance(q, centre, half_size, frames)
+        return torch.minimum(furniture, panda_capsules.self_distance(q, frames))
+
+    @cached_property
+    def _furniture(self) -> Constant:
+        """Centre and half edges of the boxes that stand around [m]."""
         boxes = [(*box.centre, *box.half_size) for box in self.scene.boxes()]
-        centre, half_size = q.new_tensor(boxes).split(3, dim=-1)
-        furniture = panda_body.box_distance(q, centre, half_size)
-        return torch.minimum(furniture, panda_capsules.self_distance(q))
+        # Once kept, it must serve autograd as well.
+        with torch.inference_mode(False):
+            return Constant(torch.tensor(boxes, dtype=torch.float64))
 
     def random_object_pose(
         self, reach: tuple[float, float, float], rng: np.random.Generator, yaw: float = 0.06

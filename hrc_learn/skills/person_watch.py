@@ -96,7 +96,7 @@ class PersonWatch:
         found, age = separation(self._arm, joints, ends, radius, load), time - seen.time
         # What they may have gained since, and gain until the arm reacts.
         gain = self._config.acceleration * (age + self._separation.reaction_time)
-        towards = (gain - found.rate(torch.zeros_like(joints), velocity)).clamp(min=0).flatten()
+        towards = (gain - found.person_rate(velocity)).clamp(min=0).flatten()
         distance = found.distance.flatten()
         distance = distance - age * towards
         allowed = self._separation.highest_speed(distance, towards)
@@ -105,7 +105,7 @@ class PersonWatch:
         return WatchedPeople(
             distances=Distances(
                 distance=distance[urgent],
-                gradient=found.gradient.flatten(0, 1)[urgent],
+                gradient=found.gradient_of(urgent),
                 approach_speed=towards[urgent],
                 person=torch.ones_like(urgent, dtype=torch.bool),
             ),

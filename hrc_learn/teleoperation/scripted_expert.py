@@ -122,7 +122,7 @@ class ScriptedPerturbation:
         active = [force for force in self.forces if force.strength(time) > 0.0]
         if active:
             q = torch.from_numpy(state.joint_position)
-            origins = self._chain.link_poses(q).position.numpy()
+            origins = self._chain.joint_origins(q).numpy()
             for scripted in active:
                 force = scripted.force(time, origins[scripted.joint - 1])
                 d += force_to_nullspace_input(
