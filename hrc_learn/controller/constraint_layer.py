@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hrc_learn.controller.motion_barriers import SeparationConfig
-from hrc_learn.controller.small_qp import least_change
+from hrc_learn.controller.small_qp import least_change, none_binds
 from hrc_learn.geometry.numerics import is_number, matmul, orthonormal_basis
 from hrc_learn.pytree import pytree
 
@@ -192,6 +192,24 @@ def constrained_velocity(
     bounded = is_number(torch.cat([lower, upper], dim=-1)).all(-1, keepdim=True)
     lower, upper = lower.masked_fill(~bounded, 0), upper.masked_fill(~bounded, 0)
 
+    # What the limits leave, of joints, task and distances, counted from the wanted velocity.
+    zero = torch.zeros_like(share)
+    least = [lower - wanted, -share.unsqueeze(-1)]
+    most = [upper - wanted, zero.unsqueeze(-1)]
+    if distances is not None:
+        allowed = distances.closing_speed(config, separation or SeparationConfig())
+        least.append(torch.full_like(allowed, -torch.inf))
+        most.append(allowed + torch.linalg.vecdot(distances.gradient, wanted.unsqueeze(-2)))
+    least, most = torch.cat(least, dim=-1), torch.cat(most, dim=-1)
+    if config.early_exit and bool(none_binds(least, most).all()):
+        u = wanted.clamp(lower, upper).to(dtype)
+        return ConstrainedVelocity(
+            joint_velocity=u,
+            slowed=torch.where(known, zero, share).to(dtype),
+            violation=zero.to(dtype),
+            solved=known,
+        )
+
     m, along = jacobian.shape[-2], config.task_weight
     off_path = along * config.path_weight
     slack = off_path * config.distance_weight
@@ -200,26 +218,16 @@ def constrained_velocity(
     null, path = basis[..., m:, :], task.unsqueeze(-2)
     path = path - matmul(matmul(path, null.mT), null)
     basis = torch.cat([basis[..., :m, :] / off_path, path / along, null], dim=-2)
-    # Rows of the limits, of joints, task and distances, and what they leave, counted from the
-    # wanted velocity.
+    # Rows of the limits.
     joints = torch.cat([basis, torch.zeros_like(basis[..., :1, :])], dim=-2)
     slower = torch.zeros_like(joints[..., :1])
     slower[..., m, :] = 1 / along
-    rows, zero = [joints, slower], torch.zeros_like(share).unsqueeze(-1)
-    least, most = [lower - wanted, -share.unsqueeze(-1)], [upper - wanted, zero]
+    rows = [joints, slower]
     if distances is not None:
-        g = distances.gradient
         each = torch.full_like(distances.distance, 1 / slack).unsqueeze(-2)
-        rows.append(-torch.cat([matmul(basis, g.mT), each], dim=-2))
-        allowed = distances.closing_speed(config, separation or SeparationConfig())
-        least.append(torch.full_like(allowed, -torch.inf))
-        most.append(allowed + torch.linalg.vecdot(g, wanted.unsqueeze(-2)))
+        rows.append(-torch.cat([matmul(basis, distances.gradient.mT), each], dim=-2))
     change = least_change(
-        torch.cat(rows, dim=-1),
-        torch.cat(least, dim=-1),
-        torch.cat(most, dim=-1),
-        config.steps,
-        early_exit=config.early_exit,
+        torch.cat(rows, dim=-1), least, most, config.steps, early_exit=config.early_exit
     )
 
     y, solved = change.point, known & change.solved

@@ -95,6 +95,13 @@ def least_change(
     return LeastChange(now.y, now.side * now.dual, _solved(now, rows, lower, upper))
 
 
+def none_binds(
+    lower: Float[Tensor, "*batch rows"], upper: Float[Tensor, "*batch rows"]
+) -> Bool[Tensor, "*batch"]:
+    """Whether the origin is within the limits of `least_change`, whatever their rows are."""
+    return torch.maximum(lower, -upper).amax(-1) <= _TOLERANCE
+
+
 def _solved(now: _Step, rows: Tensor, lower: Tensor, upper: Tensor) -> Bool[Tensor, "*batch"]:
     below, above = _violations(now, rows, lower, upper)
     # A limit that is still being taken in is one that is violated.
