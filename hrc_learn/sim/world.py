@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from hrc_learn.sim.imperfections import DrawnImperfections, Imperfections
 from hrc_learn.sim.panda_model import FINGER_STROKE, MujocoArm, frame_of
@@ -80,6 +80,11 @@ class ContactMonitor:
         self.touches = []
         self._running = {}
 
+    @property
+    def watched(self) -> Bool[np.ndarray, "geoms geoms"]:
+        """Which pairs of geoms it watches."""
+        return self._matters
+
     def update(self, data: mujoco.MjData) -> None:
         """Look at the contacts of one step."""
         running = {}
@@ -97,6 +102,10 @@ class ContactMonitor:
                 self.touches[k] = replace(old, end=data.time, depth=max(old.depth, depth))
             running[pair] = k
         self._running = running
+
+    def pause(self) -> None:
+        """Take note of a step in which nothing that it watches touches."""
+        self._running = {}
 
     def _current(self, data: mujoco.MjData) -> dict[tuple[int, int], float]:
         geoms = data.contact.geom
@@ -164,7 +173,9 @@ class World:
             self.self_contacts,
             self.worker_contacts,
         )
+        self._watched = np.logical_or.reduce([monitor.watched for monitor in self._monitors])
         self._worker = np.array([self.model.body(name).mocapid[0] for name in workers], int)
+        self._item = self.model.body(WORKER_ITEM).mocapid[0] if workers else None
 
     @property
     def time(self) -> float:
@@ -212,11 +223,20 @@ class World:
             self.arm.drive()
             mujoco.mj_step(self.model, self.data)
             self._watch.after_step()
-            for monitor in self._monitors:
-                monitor.update(self.data)
+            self._look_at_contacts()
         self._watch.check()
         # A step leaves the poses of bodies as they were before it: bring them up to date.
         mujoco.mj_kinematics(self.model, self.data)
+
+    def _look_at_contacts(self) -> None:
+        """Of one step; none of most steps is one that any monitor watches."""
+        geoms = self.data.contact.geom
+        if self._watched[geoms[:, 0], geoms[:, 1]].any():
+            for monitor in self._monitors:
+                monitor.update(self.data)
+        else:
+            for monitor in self._monitors:
+                monitor.pause()
 
     def hold(self, name: str, joint_position: Float[np.ndarray, "7"]) -> None:
         """Reset with an object between the fingers, the grip settled.
@@ -269,7 +289,7 @@ class World:
         for mocap, axis in zip(self._worker, axes, strict=True):
             mujoco.mju_quatZ2Vec(self.data.mocap_quat[mocap], axis)
         if item is not None:
-            self.data.mocap_pos[self.model.body(WORKER_ITEM).mocapid[0]] = item
+            self.data.mocap_pos[self._item] = item
         mujoco.mj_kinematics(self.model, self.data)
 
     def _object(self, name: str):
