@@ -89,6 +89,7 @@ class NullSpaceYielding:
         asked: Float[np.ndarray, " joints"],
         joints: Float[Tensor, " joints"] | None = None,
         bounds: tuple[Float[Tensor, " joints"], Float[Tensor, " joints"]] | None = None,
+        jacobian: Float[Tensor, "6 joints"] | None = None,
     ) -> Float[np.ndarray, " joints"]:
         """Take in what a person asks for now; the null-space input without jumps [N m].
 
@@ -100,6 +101,7 @@ class NullSpaceYielding:
             joints: Where they are [rad]; with them what is left is as much as the arm can
                 follow, in its null space. None: whoever follows limits it.
             bounds: Lowest and highest velocities that leave the task its room [rad/s].
+            jacobian: Of the end effector there, where it is known.
         """
         share = min(self._dt / self._config.nullspace_rise, 1.0)
         if joints is None or bounds is None:
@@ -107,7 +109,8 @@ class NullSpaceYielding:
         elif not (self.pushed or asked.any()):
             smooth = asked
         else:
-            J, damping = self._chain.jacobian(joints), self._config.damping
+            J = self._chain.jacobian(joints) if jacobian is None else jacobian
+            damping = self._config.damping
             before = null_projection(J, self.null_velocity)
             wanted = null_projection(J, torch.from_numpy(asked) / damping)
             wanted = wanted * null_space_slowdown(self._chain, joints, wanted)

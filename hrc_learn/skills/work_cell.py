@@ -4,6 +4,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -148,6 +149,28 @@ class KeptImage:
     image: UInt8[np.ndarray, "height width 3"]
 
 
+class _Reading:
+    """Kinematics of one reading of the arm, computed when they are first asked for."""
+
+    def __init__(self, chain: SerialChain, state: ArmState):
+        self._chain, self.state = chain, state
+        self.joints = torch.from_numpy(state.joint_position)
+
+    @cached_property
+    def _transform_and_jacobian(self) -> tuple[Tensor, Tensor]:
+        return self._chain.transform_and_jacobian(self.joints)
+
+    @cached_property
+    def pose(self) -> Pose:
+        """Of the end effector."""
+        return Pose.from_matrix(self._transform_and_jacobian[0])
+
+    @property
+    def jacobian(self) -> Float[Tensor, "6 joints"]:
+        """Of the end effector."""
+        return self._transform_and_jacobian[1]
+
+
 class WorkCell:
     """Runs the control loop: read the human input, command, let time pass, detect, log.
 
@@ -157,7 +180,6 @@ class WorkCell:
     Attributes:
         chain: Kinematics of the arm.
         gripper: Its gripper's driver.
-        state: Newest reading of the arm.
         observation: Newest detection of markers that has arrived.
         watched: Where people beside the arm may be; None: nobody watches for them.
         load: What the arm holds, which people must not be hit with either.
@@ -219,7 +241,7 @@ class WorkCell:
             chain.limits, replace(safety, margin=safety.margin + self.config.limit_room)
         )
         self._ticks = 0
-        self.state: ArmState = arm.read()
+        self._reading = _Reading(chain, arm.read())
         self._yielding = NullSpaceYielding(chain, self.config.dt, self.config)
         asked = human.read(self.state)
         self.human_input = replace(asked, nullspace_input=self._yielding.nullspace_input)
@@ -237,12 +259,22 @@ class WorkCell:
     @property
     def joints(self) -> Float[Tensor, " joints"]:
         """Measured joint positions [rad]."""
-        return torch.from_numpy(self.state.joint_position)
+        return self._reading.joints
 
     @property
     def pose(self) -> Pose:
         """Pose of the end effector, from the measured joints."""
-        return self.chain.forward(self.joints)
+        return self._reading.pose
+
+    @property
+    def jacobian(self) -> Float[Tensor, "6 joints"]:
+        """Geometric Jacobian of the end effector, at the measured joints."""
+        return self._reading.jacobian
+
+    @property
+    def state(self) -> ArmState:
+        """Newest reading of the arm."""
+        return self._reading.state
 
     @property
     def time(self) -> float:
@@ -283,16 +315,15 @@ class WorkCell:
             joint_velocity: The command [rad/s].
             goal: Where the end effector should be now, for the log.
         """
-        joints = self.joints
         safe, self._guard, report = self._safety.step(
             self._guard,
-            joints,
+            self.joints,
             joint_velocity,
             self.config.dt,
-            jacobian=self.chain.jacobian(joints),
+            jacobian=self.jacobian,
             distances=self.distances,
         )
-        self._keep_pace(self.chain.jacobian(joints) @ joint_velocity, safe, report)
+        self._keep_pace(self.jacobian @ joint_velocity, safe, report)
         position = _NOWHERE if goal is None else goal.position.numpy()
         self._send(safe, safety=report.flags.numpy(), goal_position=position, **_NO_VISION)
 
@@ -442,7 +473,7 @@ class WorkCell:
         torque = self.state.external_torque
         if torque is None:
             return np.zeros(3)
-        J = self.chain.jacobian(self.joints).numpy()
+        J = self.jacobian.numpy()
         return np.linalg.lstsq(J.T, torque, rcond=None)[0][:3]
 
     def follow_path(
@@ -595,7 +626,7 @@ class WorkCell:
         """
         pace = 1.0
         if self._people_bind(sent, report):
-            done = self.chain.jacobian(self.joints) @ sent
+            done = self.jacobian @ sent
             if float(asked.norm()) > _AT_REST:
                 pace = min(max(float(asked @ done) / float(asked @ asked), 0.0), 1.0)
         # It may drop at once; it rises as paths get under way.
@@ -642,12 +673,13 @@ class WorkCell:
         self._arm.command(velocity.numpy())
         self._advance(self.config.dt)
         self._ticks += 1
-        self.state = self._arm.read()
+        self._reading = _Reading(self.chain, self._arm.read())
         self._look()
         asked = self._human.read(self.state)
-        room = self._room.velocity_bounds(self.joints)
-        push = self._nullspace_input(asked)
-        smooth = self._yielding.feel(push, self.joints, room)
+        push = smooth = self._nullspace_input(asked)
+        if push.any() or self._yielding.pushed:
+            room = self._room.velocity_bounds(self.joints)
+            smooth = self._yielding.feel(push, self.joints, room, self.jacobian)
         self.human_input = replace(asked, nullspace_input=smooth)
         self._receive()
         if self.tracked_markers and self._ticks % self.config.detect_every == 0:
