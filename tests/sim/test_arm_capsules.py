@@ -8,6 +8,7 @@ import torch
 
 from hrc_learn.experiments.controller.grasp_trials import PEDESTAL, TABLE
 from hrc_learn.kinematics import LINK_CAPSULES, CapsuleArm, panda, panda_capsules
+from hrc_learn.kinematics.collision import segment_box_distance
 from hrc_learn.sim import FINGER_STROKE, SceneConfig, build_scene, whole_arm
 from hrc_learn.sim.world import body_geoms
 
@@ -71,6 +72,29 @@ def test_the_distance_from_the_table_is_that_of_the_simulator(model):
             touched += 1
             assert distance <= 1e-3
     assert touched > 0
+
+
+def test_no_box_that_is_left_out_is_the_nearest():
+    """Several at once: the least of what each gives by itself, the links one by one."""
+    rng = sampling.generator(3)
+    centre = 1.6 * torch.rand(9, 3, generator=rng, dtype=torch.float64) - 0.8
+    half_size = 0.02 + 0.3 * torch.rand(9, 3, generator=rng, dtype=torch.float64)
+    q = postures(50)
+    ends = panda_capsules.segments(q)
+    each = torch.stack(
+        [
+            segment_box_distance(ends[:, k], centre[b], half_size[b]) - panda_capsules.radius[k]
+            for k, link in enumerate(panda_capsules.links)
+            for b in range(9)
+            if link > 0
+        ]
+    )
+    ours = panda_capsules.box_distance(q, centre, half_size)
+    torch.testing.assert_close(ours, each.amin(0), atol=1e-12, rtol=0)
+    # A posture that is not known is at no distance.
+    q[7, 2] = torch.nan
+    unknown = panda_capsules.box_distance(q.reshape(5, 10, 7), centre, half_size).isnan()
+    assert unknown.nonzero().tolist() == [[0, 7]]
 
 
 HAND = ("hand", *(f"finger_{side}{pad}" for side in ("left", "right") for pad in ("", "_pad")))

@@ -5,11 +5,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import sampling
 import torch
 
 from hrc_learn.controller import SeparationConfig
 from hrc_learn.experiments.collaboration.worker import somebody_comes
-from hrc_learn.kinematics import GraspedBox, separation
+from hrc_learn.kinematics import GraspedBox, panda, panda_capsules, separation
 from hrc_learn.protocols import PersonObservation
 from hrc_learn.sim import WorkerDistance, World, whole_arm
 from hrc_learn.sim.worker import PARTS
@@ -93,23 +94,6 @@ def test_gradients_are_those_of_the_distances():
     )
 
 
-@pytest.mark.parametrize("step", range(4))
-def test_told_are_the_pairs_that_allow_the_least(step):
-    q = WORKPLACE.hover_joints() + 0.2 * step
-    seen = observed(at=VISIT.begin + 2.0 + 1.5 * step)
-    few, every = (
-        watch(seen, acceleration=3.0, pairs=n).look(seen.time + 0.1, q).distances
-        for n in (8, ALL)
-    )
-    assert few.distance.shape == (8,)
-    allowed = SEPARATION.highest_speed(every.distance, every.approach_speed)
-    told = SEPARATION.highest_speed(few.distance, few.approach_speed)
-    torch.testing.assert_close(told.sort().values, allowed.sort().values[:8])
-    # Of those that allow nothing the nearest.
-    if float(told.max()) == 0.0:
-        assert few.distance.max() <= every.distance[allowed == 0].sort().values[8]
-
-
 def test_a_held_box_is_kept_apart_too():
     """To the millimetres by which it is gripped: the simulator's own distance of the box."""
     world = World(SCENE)
@@ -133,6 +117,62 @@ def test_a_held_box_is_kept_apart_too():
     found = watch(seen).look(0.0, joints, load)
     assert found.nearest == pytest.approx(true.distance, abs=2e-3)
     assert watch(seen).look(0.0, joints).nearest > found.nearest + 5e-3
+
+
+def somebody(seed: int) -> PersonObservation:
+    """Capsules anywhere around the arm, at the speeds of people."""
+    rng = sampling.generator(seed)
+    low, high = torch.tensor([[-0.8, -0.8, 0.0], [0.8, 0.8, 1.2]], dtype=torch.float64)
+    start = sampling.within(low, high, 12, rng=rng)
+    end = start + 0.4 * sampling.directions(12, rng=rng)
+    velocity = torch.randn(12, 2, 3, generator=rng, dtype=torch.float64)
+    radius = 0.03 + 0.1 * torch.rand(12, generator=rng, dtype=torch.float64)
+    return PersonObservation(
+        time=2.0,
+        ends=torch.stack([start, end], dim=1).numpy(),
+        radius=radius.numpy(),
+        velocity=velocity.numpy(),
+    )
+
+
+@pytest.mark.parametrize("load", [None, GraspedBox(half_size=(0.02, 0.03, 0.03))])
+@pytest.mark.parametrize("seed", range(5))
+def test_the_most_urgent_pairs_are_told_of_with_their_exact_distances(seed, load):
+    person = somebody(seed)
+    q = sampling.within(
+        panda.limits.lower, panda.limits.upper, rng=sampling.generator(seed), margin=0.1
+    )
+    watch = PersonWatch(SimpleNamespace(read=lambda: person), panda_capsules)
+    told = watch.look(2.13, q, load)
+
+    ends, radius, v = (
+        torch.from_numpy(x) for x in (person.ends, person.radius, person.velocity)
+    )
+    every = separation(panda_capsules, q, ends, radius, load)
+    age = 2.13 - 2.0
+    gain = PersonWatchConfig().acceleration * (age + SeparationConfig().reaction_time)
+    pairs = []
+    for c, h in torch.cartesian_prod(*(torch.arange(n) for n in every.distance.shape)).tolist():
+        t = every.fraction[c, h]
+        along = every.direction[c, h] @ ((1 - t) * v[h, 0] + t * v[h, 1])
+        towards = (gain - along).clamp(min=0)
+        distance = every.distance[c, h] - age * towards
+        allowed = SeparationConfig().highest_speed(distance, towards)
+        urgency = float(allowed + 1e-3 * distance)
+        pairs.append((urgency, float(distance), float(towards), every.gradient[c, h]))
+    pairs.sort(key=lambda pair: pair[0])
+    _, distance, towards, gradient = zip(*pairs[: PersonWatchConfig().pairs], strict=True)
+
+    order = told.distances.distance.argsort()
+    expected = torch.tensor(distance, dtype=torch.float64).argsort()
+    for ours, theirs in (
+        (told.distances.distance, torch.tensor(distance, dtype=torch.float64)),
+        (told.distances.approach_speed, torch.tensor(towards, dtype=torch.float64)),
+        (told.distances.gradient, torch.stack(gradient)),
+    ):
+        torch.testing.assert_close(ours[order], theirs[expected], atol=1e-12, rtol=0)
+    assert told.nearest == pytest.approx(float(every.distance.min()), abs=1e-12)
+    assert told.age == pytest.approx(age)
 
 
 @pytest.mark.parametrize("wrong", [{"acceleration": -1.0}, {"pairs": 0}])
