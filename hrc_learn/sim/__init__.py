@@ -1,5 +1,6 @@
 """The workplace in MuJoCo: arm, furniture, objects, cameras, contacts."""
 
+from hrc_learn.sim.cameras import Arrow as Arrow
 from hrc_learn.sim.cameras import CameraChange as CameraChange
 from hrc_learn.sim.cameras import CameraKind as CameraKind
 from hrc_learn.sim.cameras import ChangingCamera as ChangingCamera

@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float, UInt8
 
 from hrc_learn.geometry import quaternion
+from hrc_learn.geometry.shapes import Colour
 from hrc_learn.protocols import Camera
 from hrc_learn.sim.scene import (
     HAND_MARKER,
@@ -43,6 +44,40 @@ class RenderingUnavailableError(RuntimeError):
     """This machine cannot render without a screen."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class Arrow:
+    """An arrow, or a line, in a picture."""
+
+    start: tuple[float, float, float]
+    """[m]"""
+    end: tuple[float, float, float]
+    """[m]"""
+    colour: Colour
+    """RGBA, 0 to 1."""
+    width: float = 0.012
+    """Of its shaft [m]."""
+    head: bool = True
+    """Without one it is a line."""
+
+    def add_to(self, scene: mujoco.MjvScene) -> None:
+        """Draw it into a scene, as far as there is room for it."""
+        if scene.ngeom == scene.maxgeom:
+            return
+        kind = mujoco.mjtGeom.mjGEOM_ARROW if self.head else mujoco.mjtGeom.mjGEOM_CAPSULE
+        geom = scene.geoms[scene.ngeom]
+        nothing = np.zeros(3)
+        mujoco.mjv_initGeom(
+            geom,
+            kind,
+            nothing,
+            nothing,
+            np.eye(3).ravel(),
+            np.array(self.colour, dtype=np.float32),
+        )
+        mujoco.mjv_connector(geom, kind, self.width, np.array(self.start), np.array(self.end))
+        scene.ngeom += 1
+
+
 class OffscreenRenderer:
     """Renders a world from ideal pinhole cameras into arrays."""
 
@@ -65,8 +100,15 @@ class OffscreenRenderer:
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
         self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
 
-    def render(self, camera: CameraModel) -> UInt8[np.ndarray, "height width 3"]:
-        """The image of an undistorted camera of the renderer's size, RGB."""
+    def render(
+        self, camera: CameraModel, arrows: Sequence[Arrow] = ()
+    ) -> UInt8[np.ndarray, "height width 3"]:
+        """The image of an undistorted camera of the renderer's size, RGB.
+
+        Args:
+            camera: Where from.
+            arrows: Drawn besides what is in the world.
+        """
         width, height = self._size
         self._gl.make_current()
         mujoco.mjv_updateScene(
@@ -78,6 +120,8 @@ class OffscreenRenderer:
             mujoco.mjtCatBit.mjCAT_ALL,
             self._scene,
         )
+        for arrow in arrows:
+            arrow.add_to(self._scene)
         for view in self._scene.camera:
             _set_view(view, camera)
         viewport = mujoco.MjrRect(0, 0, width, height)

@@ -7,7 +7,7 @@ away. He does not look at the robot and makes no way for it.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -25,6 +25,8 @@ _STEP = 0.40
 _HAND_OVER_BENCH = 2 * WORKER_ITEM_HALF_SIZE[2]
 # How far markers are to the sides of what the arm is at work above [m].
 _BESIDE_GRIPPER = (0.11, 0.22)
+# Places for a marker that are tried: of ten one may be within reach where an arm hinders.
+_MARKERS_TRIED = 200
 # A minimum-jerk motion is at its fastest this many times as fast as on average.
 _PEAK = 1.875
 # How far the head of a leaning person is from the hip, fraction of the stature.
@@ -91,6 +93,8 @@ class WorkerVisit:
     """When he lets go of it there [s]."""
     markers: Float[np.ndarray, "markers 3"]
     """What he reaches for [m]."""
+    reaches: Float[np.ndarray, "markers 2"]
+    """From when to when a hand is at each of them [s]."""
 
     @property
     def begin(self) -> float:
@@ -108,6 +112,12 @@ class WorkerVisit:
         change = np.diff(self.poses, axis=0)
         length = np.linalg.norm(change[:, :2], axis=-1)
         return change, length, np.maximum(np.round(length / self.step), 1.0)
+
+    def turned(self, angle: float) -> WorkerVisit:
+        """The same visit, all of it turned about the vertical through the base [rad]."""
+        poses = turned_about_base(self.poses, angle)
+        poses[:, 2] += angle
+        return replace(self, poses=poses, markers=turned_about_base(self.markers, angle))
 
     def posture(self, time: Float[np.ndarray, "*time"]) -> Posture:
         """How and where he stands at given times [s]."""
@@ -185,6 +195,16 @@ class WorkerVisit:
         return self.worker.grip(ends, self.side) - np.array([0, 0, WORKER_ITEM_HALF_SIZE[2]])
 
 
+def turned_about_base(
+    points: Float[np.ndarray, "*points columns"], angle: float
+) -> Float[np.ndarray, "*points columns"]:
+    """Points whose first two columns are x and y [m], turned about the vertical [rad]."""
+    c, s = np.cos(angle), np.sin(angle)
+    turned = points.copy()
+    turned[..., :2] = points[..., :2] @ np.array([[c, s], [-s, c]])
+    return turned
+
+
 class _Writer:
     """Adds pose after pose, each as soon as his speeds allow."""
 
@@ -221,6 +241,7 @@ def random_visit(
     begin: tuple[float, float] = (1.0, 8.0),
     reaches: tuple[int, int] = (2, 4),
     speeds: HumanSpeeds | None = None,
+    is_clear: Callable[[Float[np.ndarray, "*time parts 2 3"]], bool] = lambda ends: True,
 ) -> WorkerVisit:
     """Draw a visit to the side of the bench that is opposite to the robot.
 
@@ -232,6 +253,11 @@ def random_visit(
         begin: When he comes in, earliest and latest [s].
         reaches: How many markers he reaches for, least and most.
         speeds: How fast he is at most; each visit takes 50 to 95 % of it.
+        is_clear: Of postures, whether they leave alone what he sees there: he reaches for what
+            he can reach in such a way.
+
+    Raises:
+        ValueError: There is nothing under there that he can reach.
     """
     most = speeds or HumanSpeeds()
     pace = HumanSpeeds(
@@ -289,13 +315,29 @@ def random_visit(
     script.wait(rng.uniform(0.2, 0.5))
     released = script.times[-1]
     script.go(hands=ready, lean=0.05)
-    markers = []
+
+    def is_reached(target: np.ndarray, which: int, lean: float) -> bool:
+        """Whether he can go there from where he stands, and leaves alone what is there."""
+        way = np.linspace(0.4, 1.0, 4)[:, None, None]
+        leans = way[:, 0, 0] * lean
+        posture = Posture(
+            place=np.repeat(stand[None], len(way), axis=0),
+            heading=np.full(len(way), facing),
+            lean=leans,
+            stride=np.zeros(len(way)),
+            swing=np.zeros(len(way)),
+            hands=ready + way * (hand(target, which) - ready),
+        )
+        return is_clear(worker.ends(posture))
+
+    markers, spans = [], []
     for _ in range(rng.integers(reaches[0], reaches[1] + 1)):
-        markers.append(_marker(worker, rng, own, np.array([*under, top])))
+        markers.append(_marker(worker, rng, own, np.array([*under, top]), is_reached))
         target = own(markers[-1])
         which = _hand_for(target)
         script.go(hands=hand(target, which), lean=_lean(worker, target, which))
         script.wait(rng.uniform(0.3, 1.2))
+        spans.append(script.times[-2:])
         script.go(hands=ready, lean=rng.uniform(0.0, 0.15))
     script.go(hands=hanging, lean=0.0)
     script.go(heading=_near(outwards, facing))
@@ -308,6 +350,7 @@ def random_visit(
         side=side,
         released=released,
         markers=np.array(markers),
+        reaches=np.array(spans),
     )
 
 
@@ -321,14 +364,17 @@ def _marker(
     rng: np.random.Generator,
     own: Callable[[np.ndarray], np.ndarray],
     under: np.ndarray,
+    is_reached: Callable[[np.ndarray, int, float], bool],
 ) -> np.ndarray:
     """A place around what is under the arm that he can reach, low over the bench [m]."""
-    for _ in range(1000):
+    for _ in range(_MARKERS_TRIED):
         # To either side of the gripper that hovers there: nobody reaches through it.
         x = rng.choice([-1, 1]) * rng.uniform(*_BESIDE_GRIPPER)
         point = under + np.array([x, rng.uniform(-0.10, 0.12), _HAND_OVER_BENCH])
         target = own(point)
-        if worker.lean_to(target, _hand_for(target)) is not None:
+        which = _hand_for(target)
+        lean = worker.lean_to(target, which)
+        if lean is not None and is_reached(target, which, lean):
             return point
     raise ValueError(
         f"a worker of {worker.config.stature:.2f} m cannot reach under the arm at "

@@ -85,14 +85,6 @@ def test_a_tremor_shows_in_the_jerk_and_speed_or_size_do_not():
     np.testing.assert_allclose(again["demonstration"], again["reproduction"], rtol=1e-4)
 
 
-def test_snapshots_keep_their_order_and_titles():
-    pictures = [(name, np.full((30, 40, 3), 80 * k, np.uint8)) for k, name in enumerate("abc")]
-    figure = draw.snapshots_figure(pictures)
-    assert [axes.get_title(loc="left") for axes in figure.axes] == ["a", "b", "c", ""]
-    shown = [np.asarray(axes.get_images()[0].get_array()) for axes in figure.axes[:3]]
-    assert [image.max() for image in shown] == [0, 80, 160]
-
-
 def test_every_trial_is_a_dot():
     values = {"place error [mm]": {shelf: np.linspace(0.1, 1, 50) for shelf in SHELVES}}
     (axes,) = draw.trials_figure(values, {"place error [mm]": 2.0}).axes

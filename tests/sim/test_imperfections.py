@@ -1,7 +1,9 @@
+from dataclasses import replace
+
 """What an imperfect cell does to what is commanded and read, against first principles."""
 
 import math
-from dataclasses import fields, replace
+from dataclasses import fields
 
 import mujoco
 import numpy as np
@@ -229,8 +231,15 @@ def test_the_same_seed_draws_the_same():
 
 def test_a_safety_filter_is_told_what_the_driver_does():
     safety = SafetyConfig(tcp_speed=0.5)
-    assert Imperfections.ideal().plant(safety) == safety
+    ideal = Imperfections.ideal().plant(safety)
+    assert replace(ideal, separation=safety.separation) == safety
     told = Imperfections.nominal().plant(safety)
     assert (told.braking, told.tcp_speed) == (0.7, 0.5)
     # 20 ms, 3 deviations of 2 ms, and a lag of 10 ms.
     assert told.delay == pytest.approx(0.036)
+    # It reacts to people as late, and 20 ms more until it brakes; where they are is known to
+    # three deviations of 1 cm, and 5 cm of what capsules leave out.
+    assert told.separation.reaction_time == pytest.approx(0.056)
+    assert told.separation.clearance == pytest.approx(0.08)
+    assert ideal.separation.reaction_time == pytest.approx(0.03)
+    assert ideal.separation.clearance == pytest.approx(0.05)

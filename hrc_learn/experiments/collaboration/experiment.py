@@ -1,6 +1,7 @@
 """Experiment 3 of the paper: objects grasped beside a person and placed on shelves."""
 
 import json
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,7 +14,9 @@ from hrc_learn.experiments.collaboration.metrics import (
     collaboration_metrics,
 )
 from hrc_learn.experiments.collaboration.report import SUMMARY, collaboration_sections
+from hrc_learn.experiments.collaboration.snapshots import take_snapshots
 from hrc_learn.experiments.collaboration.trial import (
+    DRAGS_BESIDE_WORKER,
     NULL_SPACE_FORCES,
     CollaborationRun,
     Disturbances,
@@ -25,7 +28,7 @@ from hrc_learn.experiments.frame import UNOBSERVED, Observer, RepeatedRun, Study
 from hrc_learn.experiments.metric_table import Metric
 from hrc_learn.experiments.run_recording import record, worker_distance
 from hrc_learn.geometry import Box
-from hrc_learn.sim import CameraKind, Imperfections
+from hrc_learn.sim import CameraKind, Imperfections, RenderingUnavailableError
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.pick_and_place import PickAndPlaceConfig
 from hrc_learn.skills.placing import PlacingSkill
@@ -36,6 +39,9 @@ from hrc_learn.teleoperation import ScriptedForce
 from hrc_learn.teleoperation.page import PageConfig
 from hrc_learn.viz import LoggedSteps, RunRecording
 from hrc_learn.viz.report import Section
+
+# Time for the elbow to come to rest after the last drag [s], as after the two without a worker.
+_AFTER_DRAGS = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,7 +88,7 @@ class CollaborationExperiment:
             camera=self.camera,
             forces=self._forces(),
             disturbances=self.disturbances,
-            config=self.config,
+            config=self._job(),
             imperfections=self.imperfections,
             worker=self.worker,
             cell_config=replace(self.cell, keep_image_every=keep_every),
@@ -129,8 +135,14 @@ class CollaborationExperiment:
     def sections(
         self, run: CollaborationRun, recordings: Mapping[str, RunRecording]
     ) -> Sequence[Section]:
-        """Timeline, grasping, person, placing."""
-        return collaboration_sections(run, recordings["run"])
+        """Timeline, grasping, person, worker, placing."""
+        snapshots = []
+        if run.visit is not None and len(run.cell.log):
+            try:
+                snapshots = take_snapshots(run)
+            except RenderingUnavailableError as error:
+                print(f"note: no pictures of the worker, as {error}", file=sys.stderr)
+        return collaboration_sections(run, recordings["run"], snapshots)
 
     def studies(self) -> Mapping[str, Study]:
         """Other poses of the objects and other noise, with each size of the imperfections."""
@@ -146,7 +158,15 @@ class CollaborationExperiment:
 
     def _forces(self) -> Sequence[ScriptedForce] | Literal["random"]:
         """Of the person on the elbow."""
-        return {"none": (), "random": "random", "scripted": NULL_SPACE_FORCES}[self.pulls]
+        drags = DRAGS_BESIDE_WORKER if self.worker else NULL_SPACE_FORCES
+        return {"none": (), "random": "random", "scripted": drags}[self.pulls]
+
+    def _job(self) -> PickAndPlaceConfig:
+        """With the time that the drags take, also where nobody drags: runs can be compared."""
+        if not self.worker:
+            return self.config
+        end = DRAGS_BESIDE_WORKER[-1].end + _AFTER_DRAGS
+        return replace(self.config, interaction=max(self.config.interaction, end))
 
     def _demonstration(self) -> Demonstration | None:
         """The first one that the placing motion was learned from, if it is still there."""

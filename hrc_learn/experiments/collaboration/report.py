@@ -3,7 +3,7 @@
 Each figure takes the recording of the run and the time interval of each object, by its name.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import matplotlib
 import numpy as np
@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from matplotlib.figure import Figure
 
 from hrc_learn.experiments.collaboration.trial import CollaborationRun
+from hrc_learn.experiments.snapshots import Image, snapshots_figure
 from hrc_learn.viz import Event, RunRecording, palette
 from hrc_learn.viz.figure_parts import (
     STYLE,
@@ -43,8 +44,19 @@ SUMMARY = (
 )
 
 
-def collaboration_sections(run: CollaborationRun, recording: RunRecording) -> list[Section]:
-    """Timeline, grasping, person, worker where one came, placing."""
+def collaboration_sections(
+    run: CollaborationRun,
+    recording: RunRecording,
+    snapshots: Sequence[tuple[str, Image]] = (),
+) -> list[Section]:
+    """Timeline, grasping, person, worker where one came, placing.
+
+    Args:
+        run: The run.
+        recording: Of it.
+        snapshots: Pictures of the job beside the worker, with their titles; empty where there
+            was none, or this machine cannot render.
+    """
     objects: Spans = {pick.item.name: pick.span for pick in run.picks}
     notes = [
         f"{note.time:.1f} s, {pick.item.name}: {note.mishap}: {note.what}."
@@ -102,7 +114,7 @@ def collaboration_sections(run: CollaborationRun, recording: RunRecording) -> li
                 ),
             ),
         ),
-        *_worker_sections(recording),
+        *_worker_sections(recording, snapshots),
         Section(
             heading="Carrying and placing",
             text="The demonstration, and the arm's motion with every object.",
@@ -118,18 +130,31 @@ def collaboration_sections(run: CollaborationRun, recording: RunRecording) -> li
     ]
 
 
-def _worker_sections(recording: RunRecording) -> list[Section]:
+def _worker_sections(
+    recording: RunRecording, snapshots: Sequence[tuple[str, Image]]
+) -> list[Section]:
     """One; none where nobody came."""
     if not recording.worker_distance:
         return []
     text = (
-        "A worker comes to the table, puts something down, reaches under the arm and leaves. "
-        "He makes no way for the robot, and it does not react to him yet. It sees him late and "
-        "with noise, as capsules. Its own contain arm and tool: it errs to the safe side."
+        "A worker comes to the table, puts something down, reaches for markers under the arm "
+        "and leaves. He makes no way for the robot. It sees him late and with noise, keeps the "
+        "protective distance of ISO/TS 15066 from all of him, waits where it has to, and goes "
+        "on. The expert drags joint 4 forward and back twice to give him room."
     )
-    caption = "Smallest distance from the robot and its load, as it is and as it is seen."
-    picture = Picture("worker", worker_figure(recording), caption)
-    return [Section(heading="The worker", text=text, figures=(picture,))]
+    figures = []
+    if snapshots:
+        caption = (
+            "The job, after the paper's snapshots of Experiment 3. Violet: the smallest "
+            "distance. Orange: where the expert drags the elbow."
+        )
+        figures.append(Picture("worker_snapshots", snapshots_figure(snapshots), caption))
+    caption = (
+        "Smallest distance from the robot and its load, as it is, as it is seen, and as it has "
+        "to be for the part that is nearest to what it has to keep."
+    )
+    figures.append(Picture("worker", worker_figure(recording), caption))
+    return [Section(heading="The worker", text=text, figures=tuple(figures))]
 
 
 def worker_figure(run: RunRecording) -> Figure:

@@ -16,6 +16,11 @@ from hrc_learn.experiments.collaboration.worker import (
     separation_margin,
     somebody_comes,
 )
+from hrc_learn.experiments.collaboration.worker_room import (
+    ReachRoom,
+    over_bench,
+    reach_rooms,
+)
 from hrc_learn.experiments.run_recording import LiveView, no_live_view
 from hrc_learn.geometry import quaternion
 from hrc_learn.kinematics import panda
@@ -83,6 +88,11 @@ NULL_SPACE_FORCES = (
 )
 """A worker reaches under the arm: the elbow is pushed aside and back. A force of 60 N moves it
 by 0.2 to 0.4 m within the 4.5 s of an interval."""
+
+DRAGS_BESIDE_WORKER = NULL_SPACE_FORCES + tuple(
+    replace(force, start=force.start + 10.0) for force in NULL_SPACE_FORCES
+)
+"""Forward and back twice, as the paper's expert drags joint 4 while a worker reaches."""
 
 Pulls = Literal["scripted", "random", "none"]
 """When a scripted person pulls the elbow: while the robot waits for them above the first
@@ -154,6 +164,20 @@ class CollaborationRun:
                 item.name: (as_load(item), self.motion.held(item.name)[: len(log)])
                 for item in self.workplace.scene.objects
             },
+        )
+
+    @cached_property
+    def reach_rooms(self) -> list[ReachRoom]:
+        """What room the arm left the worker at each marker; empty if nobody was there."""
+        if self.visit is None:
+            return []
+        x, y, _ = self.visit.markers.mean(axis=0).tolist()
+        return reach_rooms(
+            self.cell.log,
+            self.visit,
+            whole_arm(self.world.config.arm),
+            over_bench((x, y), self.world.table_top),
+            self.world.arm.encoder_offset,
         )
 
     @property
@@ -230,7 +254,7 @@ def simulate_collaboration(
     _check_shelves(workplace, shelves)
     # Drawn apart, so that runs with and without the worker are alike but for him.
     chance = np.random.default_rng([seed, 2])
-    visit = somebody_comes(workplace, chance) if worker else None
+    visit = somebody_comes(workplace, chance, beside_elbow=True) if worker else None
     scene = replace(workplace.scene, worker=None if visit is None else visit.worker.config)
     world = World(scene, sizes.draw(rng))
     world.reset(

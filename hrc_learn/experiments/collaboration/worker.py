@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 
 from hrc_learn.controller import SeparationConfig
-from hrc_learn.kinematics import CapsuleArm, GraspedBox, separation
+from hrc_learn.kinematics import CapsuleArm, GraspedBox, panda, separation
 from hrc_learn.sim import (
     MotionLog,
     Touch,
@@ -17,23 +17,73 @@ from hrc_learn.sim import (
     WorkerVisit,
     World,
     random_visit,
+    whole_arm,
 )
+from hrc_learn.sim.worker_visit import turned_about_base
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.viz import LoggedSteps
 
+# When he comes beside the elbow [s] and how often he reaches: a robot waits above the first
+# object 11 s after it began, and he is to reach under it then.
+_COMES, _REACHES = (4.0, 9.0), (3, 5)
+# Distance that people keep from an arm at rest which they see, as far as a sleeve stands out
+# [m]; how often that is looked at [s]; and how many are drawn until one can reach like that.
+_KEPT_CLEAR, _LOOKED_AT, _DRAWS = 0.03, 0.05, 200
+# Joints at the ends of the forearm, from 0.
+_FOREARM = slice(3, 5)
 
-def somebody_comes(workplace: Workplace, rng: np.random.Generator) -> WorkerVisit:
+
+def somebody_comes(
+    workplace: Workplace, rng: np.random.Generator, *, beside_elbow: bool = False
+) -> WorkerVisit:
     """A visit of somebody to the table.
 
     Args:
         workplace: Whose table, and where the arm works.
         rng: Source of chance: who, when, and what they do.
+        beside_elbow: Whether they come to the side of the table where the elbow is, while the
+            robot waits above its first object, and reach under the forearm, as in the paper's
+            Experiment 3. Else they come to the far side, and reach beside the end effector.
     """
-    return random_visit(
-        Worker(WorkerConfig.draw(rng)),
-        rng,
-        bench=workplace.scene.table,
-        under=workplace.table_centre,
+    table = workplace.scene.table
+    if not beside_elbow:
+        worker = Worker(WorkerConfig.draw(rng))
+        return random_visit(worker, rng, bench=table, under=workplace.table_centre)
+    # Visits are to the side of +y: drawn as if the side of -x were there.
+    arm, waiting = whole_arm(workplace.scene.arm), workplace.hover_joints()
+    elbow, wrist = panda.joint_origins(waiting)[_FOREARM].tolist()
+    x, y = (elbow[0] + wrist[0]) / 2, (elbow[1] + wrist[1]) / 2
+    (a, b, c), (half_a, half_b, half_c) = table.centre, table.half_size
+    bench = replace(table, centre=(b, -a, c), half_size=(half_b, half_a, half_c))
+    for _ in range(_DRAWS):
+        worker = Worker(WorkerConfig.draw(rng))
+        radius = torch.from_numpy(worker.radius)
+
+        def is_clear(ends: Float[np.ndarray, "time parts 2 3"], radius=radius) -> bool:
+            """Of the arm that waits: nobody leans into steel, however awkward it gets."""
+            there = torch.from_numpy(turned_about_base(ends, np.pi / 2))
+            found = separation(arm, waiting, there, radius)
+            return bool((found.distance >= _KEPT_CLEAR).all())
+
+        try:
+            visit = random_visit(
+                worker,
+                rng,
+                bench=bench,
+                under=(y, -x),
+                begin=_COMES,
+                reaches=_REACHES,
+                is_clear=is_clear,
+            )
+        except ValueError:
+            continue  # a small person who stands where the arm hinders them
+        on_the_way = np.arange(visit.begin, visit.end, _LOOKED_AT)
+        if is_clear(visit.capsules_at(on_the_way).ends):
+            return visit.turned(np.pi / 2)
+    raise ValueError(
+        f"none of {_DRAWS} workers can reach under the arm that waits over "
+        f"({workplace.table_centre[0]:g}, {workplace.table_centre[1]:g}) m: move the table's "
+        "centre away from the arm's base."
     )
 
 

@@ -10,18 +10,18 @@ from dataclasses import dataclass
 import matplotlib
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullFormatter, StrMethodFormatter
 
 from hrc_learn.experiments.placing.arm_angle_ablation import SimulatedDemonstration
 from hrc_learn.experiments.placing.trial import PlacingRun
+from hrc_learn.experiments.snapshots import Image, viewpoint
 from hrc_learn.geometry import Box
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import OffscreenRenderer, World
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.vision import CameraModel
 from hrc_learn.viz import JointLimits, palette
 from hrc_learn.viz.figure_parts import (
     STYLE,
@@ -34,12 +34,9 @@ from hrc_learn.viz.figure_parts import (
     space,
 )
 
-Image = UInt8[np.ndarray, "height width 3"]
-
 type Snapshots = Mapping[str, Sequence[tuple[str, Image]]]
 """Rendered pictures with their titles, by what they show."""
 
-_WIDTH, _HEIGHT = 1200, 900
 _EYE, _TOWARDS = (1.30, 0.95, 1.10), (0.24, -0.30, 0.30)
 _TOUCHING = (0.84, 0.37, 0.0, 1.0)  # colour of a link that touches something
 # The object's x lies along the fingers' line of closing, its top towards the palm.
@@ -235,24 +232,6 @@ def _scaled_derivatives(motion: Motion) -> tuple[np.ndarray, np.ndarray, np.ndar
     return fraction, sizes[0], sizes[2]
 
 
-def snapshots_figure(
-    pictures: Sequence[tuple[str, UInt8[np.ndarray, "height width 3"]]], columns: int = 2
-) -> Figure:
-    """Pictures side by side, each with its title above."""
-    rows = -(-len(pictures) // columns)
-    height, width = pictures[0][1].shape[:2]
-    with matplotlib.rc_context(STYLE):
-        each = WIDTH / columns
-        figure = Figure(figsize=(WIDTH, rows * (each * height / width + 0.28)))
-        grid = figure.subplots(rows, columns, squeeze=False).ravel()
-        for axes in grid:
-            axes.set_axis_off()
-        for axes, (title, picture) in zip(grid, pictures, strict=False):
-            axes.imshow(picture, interpolation="lanczos")
-            axes.set_title(title, fontsize=9)
-    return figure
-
-
 def trials_figure(
     values: Mapping[str, Mapping[str, Float[np.ndarray, " trials"]]],
     bounds: Mapping[str, float],
@@ -295,14 +274,8 @@ class Photographer:
         """
         self._world = World(workplace.scene)
         self._item = workplace.scene.objects[0]
-        upright = CameraModel(
-            width=_WIDTH,
-            height=_HEIGHT,
-            focal=(1.2 * _HEIGHT, 1.2 * _HEIGHT),
-            principal=((_WIDTH - 1) / 2, (_HEIGHT - 1) / 2),
-        )
-        self._camera = upright.look_at(np.array(_EYE), np.array(_TOWARDS))
-        self._renderer = OffscreenRenderer(self._world, _WIDTH, _HEIGHT)
+        self._camera = viewpoint(_EYE, _TOWARDS)
+        self._renderer = OffscreenRenderer(self._world, self._camera.width, self._camera.height)
 
     def picture(self, joints: Float[np.ndarray, "7"], touching: Iterable[str] = ()) -> Image:
         """The arm there; geoms that touch something stand out.

@@ -15,7 +15,6 @@ from hrc_learn.experiments.placing.figures import (
     shelf_joints_figure,
     shelf_paths_figure,
     smoothness_figure,
-    snapshots_figure,
     trials_figure,
 )
 from hrc_learn.experiments.placing.metrics import (
@@ -32,6 +31,7 @@ from hrc_learn.experiments.placing.trial import (
     demonstrated_path,
 )
 from hrc_learn.experiments.run_recording import PANDA_LIMITS, demonstrated_joints, true_tool
+from hrc_learn.experiments.snapshots import snapshots_figure
 from hrc_learn.geometry import Box
 from hrc_learn.kinematics import panda
 from hrc_learn.skills.work_cell import SAFETY_COLUMNS
