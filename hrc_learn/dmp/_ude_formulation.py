@@ -25,7 +25,7 @@ from hrc_learn.dmp import orientation_error
 from hrc_learn.dmp._arguments import Samples, Scalars, Times, to_tensor
 from hrc_learn.dmp._closed_loop_step import DMPState
 from hrc_learn.dmp._fitting import ridge_inverse
-from hrc_learn.dmp._system.response import Trajectory
+from hrc_learn.dmp._system.response import Trajectory, broadcast_shapes
 from hrc_learn.dmp.linear_primitive import ColumnEnds, LinearPrimitive
 from hrc_learn.dmp.orientation_dmp import FORMULATIONS, OrientationCoordinates
 from hrc_learn.geometry.quaternion import axis_drift, drift_free_rate, drift_free_slope
@@ -156,7 +156,7 @@ class UdeMotion:
         self._duration = duration[..., None, None]
         self._start = start
         self._first = drift_free_rate(start, per_s)
-        self._batch = torch.broadcast_shapes(
+        self._batch = broadcast_shapes(
             motion.weights.shape[:-2], start.shape[:-1], duration.shape, s.shape[:-1]
         )
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from hrc_learn.dmp._arguments import Mask, Points, Times, Vectors, check_samples, to_tensor
 from hrc_learn.dmp._closed_loop_step import DMPState
 from hrc_learn.dmp._fitting import FitOptions, fit_motion
-from hrc_learn.dmp._system.response import Trajectory
+from hrc_learn.dmp._system.response import Trajectory, broadcast_shapes
 from hrc_learn.dmp.coordinate_adapter import ColumnPoints, CoordinateAdapter, Ends, Retargeted
 from hrc_learn.dmp.forcing_scale import Scaling, find_scaling
 from hrc_learn.dmp.linear_primitive import ColumnEnds, LinearPrimitive, check_names
@@ -153,7 +153,7 @@ def given_points(
     tensor = to_tensor(value, torch.float64, like.device)
     if tensor.ndim < 2 or tensor.shape[-2:] != shape[-2:]:
         raise ValueError(f"{name} must have shape {shape}, got {tuple(tensor.shape)}")
-    return tensor.expand(torch.broadcast_shapes(tensor.shape, shape))
+    return tensor.expand(broadcast_shapes(tensor.shape, shape))
 
 
 TOLERANCE = 1.05

@@ -27,7 +27,7 @@ from hrc_learn.dmp._closed_loop_step import DMPState
 from hrc_learn.dmp._serialization import TENSORS, basis_config, linear_arguments
 from hrc_learn.dmp._system.bases import Basis
 from hrc_learn.dmp._system.closed_forms import SpringDamper
-from hrc_learn.dmp._system.response import Response, Trajectory, response_of
+from hrc_learn.dmp._system.response import Response, Trajectory, broadcast_shapes, response_of
 from hrc_learn.dmp.forcing_scale import Demonstrated, NoScaling, Scaling, find_scaling
 from hrc_learn.model_files import SavedModel
 
@@ -204,7 +204,7 @@ class LinearPrimitive(nn.Module):
             weights = weights * self._as_tensor(forcing_gain)[..., None, None]
         shape = weights.shape[:-1]
         if not rate.shape == start.shape == goal.shape == shape:
-            shape = torch.broadcast_shapes(shape, *(x.shape for x in columns))
+            shape = broadcast_shapes(shape, *(x.shape for x in columns))
             weights, columns = weights.expand(*shape, -1), [x.expand(shape) for x in columns]
         return Trajectory(
             coordinates=torch.cat([weights, torch.stack(columns, dim=-1)], dim=-1),

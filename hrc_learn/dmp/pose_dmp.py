@@ -20,7 +20,7 @@ from hrc_learn.dmp._arguments import (
 )
 from hrc_learn.dmp._closed_loop_step import DMPState
 from hrc_learn.dmp._fitting import FitOptions
-from hrc_learn.dmp._system.response import Trajectory
+from hrc_learn.dmp._system.response import Trajectory, broadcast_shapes
 from hrc_learn.dmp.coordinate_adapter import ColumnPoints, CoordinateAdapter, Ends, Retargeted
 from hrc_learn.dmp.forcing_scale import find_scaling
 from hrc_learn.dmp.joint_dmp import JointDMP, given_points
@@ -416,7 +416,7 @@ def demonstrated_columns(
 def joined(position: Tensor, error: Tensor, body: Vectors, like: Tensor) -> Tensor:
     """The columns of a linear primitive, broadcast and side by side."""
     columns = [to_tensor(part, like.dtype, like.device) for part in (position, error, body)]
-    batch = torch.broadcast_shapes(*(column.shape[:-1] for column in columns))
+    batch = broadcast_shapes(*(column.shape[:-1] for column in columns))
     return torch.cat([column.expand(*batch, -1) for column in columns], dim=-1)
 
 

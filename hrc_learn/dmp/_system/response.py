@@ -395,6 +395,12 @@ class Trajectory:
 
 
 def broadcast_shapes(*shapes: tuple[int, ...]) -> tuple[int, ...]:
-    """As `torch.broadcast_shapes`, which takes longer than a rollout of shapes all alike."""
+    """As `torch.broadcast_shapes`, which takes longer than a rollout of shapes all alike, and
+    imports sympy when it is first called, which takes longer than a thousand of them.
+    """
     first = shapes[0]
-    return first if all(shape == first for shape in shapes) else torch.broadcast_shapes(*shapes)
+    if all(shape == first for shape in shapes):
+        return first
+    if torch.compiler.is_compiling():
+        return torch.broadcast_shapes(*shapes)
+    return np.broadcast_shapes(*shapes)
