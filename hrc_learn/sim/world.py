@@ -173,6 +173,7 @@ class World:
             self.self_contacts,
             self.worker_contacts,
         )
+        self._pads = {self.model.geom(pad).id for pad in _PADS}
         self._watched = np.logical_or.reduce([monitor.watched for monitor in self._monitors])
         self._worker = np.array([self.model.body(name).mocapid[0] for name in workers], int)
         self._item = self.model.body(WORKER_ITEM).mocapid[0] if workers else None
@@ -306,7 +307,7 @@ class World:
 
     def holds(self, name: str) -> bool:
         """Whether both finger pads touch an object."""
-        return self._partners(name) >= {*_PADS}
+        return self._touched(name) >= self._pads
 
     def held(self) -> tuple[str, ...]:
         """Names of the objects that both finger pads touch."""
@@ -336,13 +337,15 @@ class World:
 
     def _partners(self, name: str) -> set[str]:
         """Geoms that touch an object's."""
-        target = self.model.geom(name).id
+        return {self.model.geom(g).name for g in self._touched(name)}
+
+    def _touched(self, name: str) -> set[int]:
+        """Numbers of the geoms that touch an object's."""
+        target, contact = self.model.geom(name).id, self.data.contact
         # Contacts without a force are those with the worker.
-        touching = (self.data.contact.dist < _TOUCHING) & (self.data.contact.exclude == 0)
-        pairs = self.data.contact.geom[touching]
-        return {
-            self.model.geom(int(g)).name for pair in pairs if target in pair for g in pair
-        } - {name}
+        touching = (contact.dist < _TOUCHING) & (contact.exclude == 0)
+        touching &= (contact.geom == target).any(axis=-1)
+        return {*contact.geom[touching].ravel().tolist()} - {target}
 
     def marker_poses(self) -> dict[int, Float[np.ndarray, "4 4"]]:
         """Pose of every marker's face in the base frame, by ArUco number."""

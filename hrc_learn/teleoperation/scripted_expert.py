@@ -119,7 +119,7 @@ class ScriptedPerturbation:
         if self._begin is None:
             return HumanInput(nullspace_input=d, twist=np.zeros(6))
         time = state.time - self._begin
-        active = [force for force in self.forces if force.strength(time) > 0.0]
+        active = [force for force in self.forces if force.start < time < force.end]
         if active:
             q = torch.from_numpy(state.joint_position)
             origins = self._chain.joint_origins(q).numpy()
