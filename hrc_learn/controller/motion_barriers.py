@@ -177,10 +177,16 @@ class LimitBarrier(nn.Module):
             bounds: `velocity_bounds` now.
             dt: Step [s].
         """
-        inside = wanted.clamp(*self.acceleration_bounds(velocity, bounds, dt))
         # Last what the arm cannot exceed: outside its set the barrier may ask for more.
+        inside = wanted.clamp(*self.acceleration_bounds(velocity, bounds, dt))
+        return inside.clamp(*self._reachable_acceleration(last, dt))
+
+    def _reachable_acceleration(
+        self, last: Tensor, dt: float | Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Lowest and highest acceleration of the next step that the jerk leaves [rad/s^2]."""
         reach = self.jerk * dt
-        return inside.clamp(
+        return (
             torch.maximum(last - reach, -self.acceleration),
             torch.minimum(last + reach, self.acceleration),
         )
@@ -205,11 +211,10 @@ class LimitBarrier(nn.Module):
         """
         A = self.acceleration
         if self.jerk_limited:
-            lowest, highest = (
-                velocity + dt * self.nearest_acceleration(a, acceleration, velocity, bounds, dt)
-                for a in (-A.expand_as(velocity), A.expand_as(velocity))
-            )
-            return lowest, highest
+            allowed = self.acceleration_bounds(velocity, bounds, dt)
+            reachable = self._reachable_acceleration(acceleration, dt)
+            lowest, highest = (a.clamp(*allowed).clamp(*reachable) for a in (-A, A))
+            return velocity + dt * lowest, velocity + dt * highest
         lower, upper = velocity - A * dt, velocity + A * dt
         return bounds[0].clamp(lower, upper), bounds[1].clamp(lower, upper)
 

@@ -314,11 +314,13 @@ class SafetyFilter(nn.Module):
         )
         report = None
         if jacobian is not None:
-            stopping = limit(state, torch.zeros_like(v), bounds, dt)
+            stopping, braking = None, invalid | stopped
             if layer is not None:
                 kept = self._constrained(state, v, u, jacobian, bounds, distances, dt)
-                braking = invalid | stopped
-                v = torch.where(braking, stopping[0], kept.joint_velocity)
+                v = kept.joint_velocity
+                if not layer.early_exit or bool(braking.any()):
+                    stopping = limit(state, torch.zeros_like(v), bounds, dt)
+                    v = torch.where(braking, stopping[0], v)
                 if self.config.jerk_limited:
                     acceleration = (v - state.velocity) / dt
                 idle = braking.squeeze(-1)
@@ -327,10 +329,15 @@ class SafetyFilter(nn.Module):
                     violation=kept.violation.masked_fill(idle, 0),
                     solved=kept.solved | idle,
                 )
-            fraction = _blend_to_cap(_linear(jacobian, v), _linear(jacobian, stopping[0]), cap)
-            # Between two that are within the limits, so within them as well.
-            v = torch.lerp(v, stopping[0], fraction)
-            acceleration = torch.lerp(acceleration, stopping[1], fraction)
+            tool = _linear(jacobian, v)
+            early = layer is not None and layer.early_exit
+            if not early or _too_fast(tool, cap):
+                if stopping is None:
+                    stopping = limit(state, torch.zeros_like(v), bounds, dt)
+                fraction = _blend_to_cap(tool, _linear(jacobian, stopping[0]), cap)
+                # Between two that are within the limits, so within them as well.
+                v = torch.lerp(v, stopping[0], fraction)
+                acceleration = torch.lerp(acceleration, stopping[1], fraction)
 
         a_acts, j_acts = _acts(excess_a), _acts(excess_j)
         flags = [_acts(excess), cut, a_acts, j_acts, speeding, near, invalid, stopped]
@@ -488,6 +495,11 @@ def _blend_to_cap(wanted: Tensor, stopping: Tensor, cap: Tensor | float) -> Tens
     a, b = a.unsqueeze(-1), b.unsqueeze(-1)
     root = (b * b - a * c).clamp(min=torch.finfo(a.dtype).tiny).sqrt()
     return torch.where(c > 0, (-b - root) / a, 0.0).clamp(0, 1)
+
+
+def _too_fast(velocity: Tensor, cap: Tensor | float) -> bool:
+    """Whether any tool is faster than its cap."""
+    return bool((torch.linalg.vecdot(velocity, velocity).unsqueeze(-1) > cap**2).any())
 
 
 def _excess(vector: Tensor, limit: Tensor) -> Tensor:
