@@ -240,6 +240,16 @@ class SerialChain:
         """
         return torch.stack([frame[..., 3] for frame in self._joint_frames(q)], dim=-2)
 
+    def joint_origins_and_jacobian(
+        self, q: Float[Tensor, "*batch joints"]
+    ) -> tuple[Float[Tensor, "*batch joints 3"], Float[Tensor, "*batch 6 joints"]]:
+        """`joint_origins` and `jacobian` for little more than the price of one."""
+        frames = self._joint_frames(q)
+        tip = frames[-1] @ self._tip.like(q)
+        frames = torch.stack(frames, dim=-3)
+        axis, origin = frames[..., 2], frames[..., 3]
+        return origin, _screw_jacobian(axis, origin, tip[..., None, :, 3])
+
     def jacobian(self, q: Float[Tensor, "*batch joints"]) -> Float[Tensor, "*batch 6 joints"]:
         """Geometric Jacobian of the tool centre point.
 

@@ -14,8 +14,10 @@ from torch import Tensor
 from hrc_learn.geometry.numerics import Constant
 from hrc_learn.kinematics.chain import SerialChain
 
-# Halvings of a segment in the search for its point nearest to a box: 1e-6 of its length.
-_HALVINGS = 20
+# Rounds of the search for the point of a segment nearest to a box, each of which tells the
+# sixteenth of what the one before told: 1e-6 of its length.
+_ROUNDS = 5
+_SIXTEENTHS = Constant(torch.arange(1, 16, dtype=torch.float64) / 16)
 # By which a bound on a distance may be wrong by rounding [m]: that of float32 within reach.
 _ROUNDING = 1e-6
 
@@ -229,20 +231,21 @@ def nearest_on_segment_and_box(
 ) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch"]]:
     """Where a segment and a box with edges along the axes are nearest to each other.
 
-    The distance from a convex set is convex along a line: its slope is bisected.
+    The distance from a convex set is convex along a line: the root of its slope is sought.
 
     Returns:
         The point of the box, and the point of the segment as a fraction of its length.
     """
     start, along = segment[..., 0, :], segment[..., 1, :] - segment[..., 0, :]
-    shift, opposite = start - centre, -half_size
-    low = torch.zeros_like(shift[..., 0])
-    for k in range(_HALVINGS):
-        middle = low + 0.5 ** (k + 1)
-        offset = torch.addcmul(shift, middle.unsqueeze(-1), along)
-        outside = offset - offset.clamp(opposite, half_size)
-        rising = torch.linalg.vecdot(outside, along) > 0
-        low = torch.where(rising, low, middle)
-    fraction = low + 0.5 ** (_HALVINGS + 1)
+    shift, way = (start - centre).unsqueeze(-2), along.unsqueeze(-2)
+    lowest, highest = -half_size.unsqueeze(-2), half_size.unsqueeze(-2)
+    low, width, tried = torch.zeros_like(shift[..., 0]), 1.0, _SIXTEENTHS.like(segment)
+    for _ in range(_ROUNDS):
+        offset = torch.addcmul(shift, (low + width * tried).unsqueeze(-1), way)
+        outside = offset - offset.clamp(lowest, highest)
+        falling = torch.linalg.vecdot(outside, way) <= 0
+        width = width / 16
+        low = low + width * falling.sum(-1, keepdim=True, dtype=low.dtype)
+    fraction = low.squeeze(-1) + width / 2
     offset = start + fraction.unsqueeze(-1) * along - centre
-    return offset.clamp(opposite, half_size) + centre, fraction
+    return offset.clamp(-half_size, half_size) + centre, fraction
