@@ -51,9 +51,20 @@ def resolved_rate(
         twist: Linear [m/s] and angular [rad/s] velocity of the end effector.
         null_velocity: Desired joint velocities; only their null-space part acts [rad/s].
     """
+    return task_rate(jacobian, twist) + null_projection(jacobian, null_velocity)
+
+
+def task_rate(
+    jacobian: Float[Tensor, "*batch 6 joints"], twist: Float[Tensor, "*batch 6"]
+) -> Float[Tensor, "*batch joints"]:
+    """`resolved_rate` of the task alone: the least joint velocity for a twist [rad/s].
+
+    Args:
+        jacobian: Geometric Jacobian of the end effector.
+        twist: Linear [m/s] and angular [rad/s] velocity of the end effector.
+    """
     J_pinv = pseudo_inverse(jacobian, singularity_damping(jacobian))
-    task = (J_pinv @ twist.unsqueeze(-1)).squeeze(-1)
-    return task + null_projection(jacobian, null_velocity)
+    return (J_pinv @ twist.unsqueeze(-1)).squeeze(-1)
 
 
 # What a null-space motion may ask of the arm: acceleration of the end effector that has to be
@@ -93,12 +104,12 @@ def null_space_slowdown(
     # Now, and where the arm will be once it could have slowed down.
     times = null_velocity.new_tensor([0.0, _AHEAD])
     steps = torch.stack([times, times + _TINY_STEP])[..., None] * null_velocity
-    J, beyond = chain.jacobian(joint_position + steps)
+    origins, (J, beyond) = chain.joint_origins_and_jacobian(joint_position + steps)
     bending = (beyond - J) @ null_velocity / _TINY_STEP
     scale = bending.new_tensor([1.0] * 3 + [_METRES_PER_RADIAN] * 3)
-    excess = (scale * bending).norm(dim=-1).max() / _BENDING
-    origins = chain.joint_origins(joint_position + steps[:, 0])
-    fastest = (origins[1] - origins[0]).norm(dim=-1).max() / _TINY_STEP / _GUIDED_SPEED
+    excess = torch.linalg.vector_norm(scale * bending, dim=-1).max() / _BENDING
+    moved = torch.linalg.vector_norm(origins[1, 0] - origins[0, 0], dim=-1)
+    fastest = moved.max() / _TINY_STEP / _GUIDED_SPEED
     fastest = torch.maximum(fastest, null_velocity.abs().max() / _GUIDED_JOINT)
     return float(torch.minimum(excess.clamp(min=1.0) ** -0.5, 1 / fastest).clamp(max=1.0))
 
@@ -304,10 +315,10 @@ def joints_near(
         pose: Of the end effector. Out of reach: positions that come closer.
         near: Joint positions, a centimetre or so away [rad].
     """
-    q, still = near, torch.zeros_like(near)
+    q = near
     for _ in range(_ITERATIONS):
         now, J = chain.forward_and_jacobian(q)
-        q = q + resolved_rate(J, now.twist_to(pose), still)
+        q = q + task_rate(J, now.twist_to(pose))
     return q
 
 

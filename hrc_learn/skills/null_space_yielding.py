@@ -133,6 +133,7 @@ class NullSpaceYielding:
         self,
         joints: Float[Tensor, " joints"],
         error: Float[Tensor, " joints"],
+        jacobian: Float[Tensor, "6 joints"] | None = None,
         *,
         yields: bool = True,
         returns: bool = False,
@@ -142,13 +143,14 @@ class NullSpaceYielding:
         Args:
             joints: Where they are [rad].
             error: From there to the path [rad].
+            jacobian: Of the end effector there, where it is known.
             yields: Whether the person can push the joints off it here.
             returns: Whether joints that were pushed off it go back in any case.
 
         Returns:
             The velocity, in the null space [rad/s]; None of joints on their path.
         """
-        away = self._away(joints, error) if yields or self.aside else None
+        away = self._away(joints, error, jacobian) if yields or self.aside else None
         if away is None:
             self._back = torch.zeros_like(error)
             return None
@@ -167,7 +169,10 @@ class NullSpaceYielding:
         self.aside = float(error.norm()) > _ASIDE
 
     def _away(
-        self, joints: Float[Tensor, " joints"], error: Float[Tensor, " joints"]
+        self,
+        joints: Float[Tensor, " joints"],
+        error: Float[Tensor, " joints"],
+        jacobian: Float[Tensor, "6 joints"] | None,
     ) -> Float[Tensor, " joints"] | None:
         """Null-space part of the way back to a path [rad]; None if nobody pushed it off."""
         # An arm that nobody pushed and that is behind meets something: it goes on.
@@ -175,7 +180,8 @@ class NullSpaceYielding:
             self.aside = False
             return None
         self.aside = True
-        return null_projection(self._chain.jacobian(joints), error)
+        J = self._chain.jacobian(joints) if jacobian is None else jacobian
+        return null_projection(J, error)
 
 
 def smallest_singular_value(

@@ -33,7 +33,7 @@ from hrc_learn.skills.arm_motion import (
     kept_clear,
     null_space_giving_way,
     null_space_slowdown,
-    resolved_rate,
+    task_rate,
 )
 from hrc_learn.skills.marker_sensor import (
     DelayedChannel,
@@ -381,7 +381,7 @@ class WorkCell:
         null_velocity = self._yielding.null_velocity
         if drift is not None:
             null_velocity = null_velocity + drift
-        task = resolved_rate(J, twist + correction, torch.zeros_like(joints))
+        task = task_rate(J, twist + correction)
         null = null_projection(J, null_velocity)
         if drift is not None:
             # A person may push the way that the path leads: both together bend the null space.
@@ -577,7 +577,9 @@ class WorkCell:
         """
         error = goal - self.joints
         self._path_joints = goal.numpy()
-        back = self._yielding.way_back(self.joints, error, yields=yields, returns=returns)
+        back = self._yielding.way_back(
+            self.joints, error, self.jacobian, yields=yields, returns=returns
+        )
         pose = self.chain.forward(goal)
         if back is None:
             self.step(velocity + self.config.pose_gain * error, pose)
