@@ -294,19 +294,19 @@ class SerialChain:
         count = len(self.joint_names)
         if not 1 <= joint <= count:
             raise ValueError(f"joint must be 1 to {count}, counted from the base, not {joint}.")
-        frames = torch.stack(self._joint_frames(q)[:joint], dim=-3)
+        frames = torch.stack(self._joint_frames(q, joint), dim=-3)
         origin = frames[..., -1:, :, 3]
         J = _screw_jacobian(frames[..., 2], frames[..., 3], origin)
         return torch.nn.functional.pad(J, (0, count - joint))
 
-    def _joint_frames(self, q: Tensor) -> list[Tensor]:
-        """(R | p) of each joint frame in the base frame, each (*batch, 3, 4)."""
+    def _joint_frames(self, q: Tensor, count: int | None = None) -> list[Tensor]:
+        """(R | p) of the first joint frames in the base frame, each (*batch, 3, 4)."""
         angle = q[..., None, None]
         steps = torch.addcmul(self._fixed.like(q), self._sine.like(q), torch.sin(angle))
         steps = torch.addcmul(steps, self._cosine.like(q), torch.cos(angle))
         first, *rest = steps.unbind(-3)
         frames = [first[..., :3, :]]
-        for step in rest:
+        for step in rest[: None if count is None else count - 1]:
             frames.append(frames[-1] @ step)
         return frames
 

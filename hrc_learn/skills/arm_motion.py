@@ -168,6 +168,8 @@ def null_space_giving_way(
     """
     velocity = task + null
     missing = velocity.clamp(lower, upper) - velocity
+    if not bool(missing.any()):
+        return null
     along = null_projection(jacobian, missing)
     if float(along.norm()) < _NOTHING:
         return null

@@ -404,6 +404,8 @@ class WorkCell:
         gives_way = null_space_giving_way(J, task, null, *room)
         if not torch.equal(gives_way, null):
             gives_way = gives_way * null_space_slowdown(self.chain, self.joints, gives_way)
+        if not bool(gives_way.any()):
+            return gives_way
         return scale_null_space(task, gives_way, *self._safety.velocity_bounds(self.joints))
 
     def hold_pose(self, duration: float) -> None:
