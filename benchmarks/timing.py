@@ -11,6 +11,7 @@ class Timing:
     """CPU seconds of one thread per call."""
 
     median: float
+    p95: float
     p99: float
     least: float
 
@@ -33,7 +34,12 @@ def time_calls(calls: dict[str, Callable[[], object]], repeats: int) -> dict[str
         name: Timing(
             median=statistics.median(values),
             least=min(values),
-            p99=sorted(values)[min(int(0.99 * len(values)), len(values) - 1)],
+            p95=_percentile(values, 0.95),
+            p99=_percentile(values, 0.99),
         )
         for name, values in seconds.items()
     }
+
+
+def _percentile(values: list[float], share: float) -> float:
+    return sorted(values)[min(int(share * len(values)), len(values) - 1)]

@@ -1,0 +1,142 @@
+"""What a step of the simulated work cell costs: alone, pulled at, beside a worker, and both.
+
+The arm holds its pose with the imperfections of an ordinary laboratory, while the simulated
+world, the worker in it and his sensor go on and all is logged, as in `hrc run collaboration`
+between its servoing. The floor is a step of the same world by itself. Medians and 95th
+percentiles of CPU time on one thread, of steps made in turn, and how many operations PyTorch is
+asked for in a step, which no load on the machine changes.
+"""
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from bench_dmp import read_figures
+from operations import count_operations
+from rich.console import Console
+from rich.table import Table
+from timing import time_calls
+
+from hrc_learn import cli
+from hrc_learn.experiments.collaboration.worker import move_worker, somebody_comes
+from hrc_learn.kinematics import panda
+from hrc_learn.sim import Imperfections, MotionLog, WorkerSensor, World, whole_arm
+from hrc_learn.sim.workplace import Workplace
+from hrc_learn.skills import WorkCell, WorkCellConfig
+from hrc_learn.skills.person_watch import PersonWatch
+from hrc_learn.teleoperation import ScriptedForce, ScriptedPerturbation
+
+_CASES = {"alone": (), "pulled": ("pulls",), "worker": ("worker",), "both": ("pulls", "worker")}
+# To either side in turn, each for a second: the elbow never comes to rest.
+_PULLS = tuple(
+    ScriptedForce(
+        start=k, duration=1.2, towards=(0.4, (-10.0, 10.0)[k % 2], 0.5), max_force=60.0
+    )
+    for k in range(600)
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args:
+    repeats: int = 300
+    """Steps timed of each kind."""
+    seed: int = 0
+    """Of the worker, his visit and all errors."""
+    save: Path | None = None
+    """Keeps the figures for a later --compare."""
+    compare: Path | None = None
+    """Figures of an earlier --save to show beside these."""
+    json: Path | None = None
+    """Receives the figures as one flat object."""
+
+
+def main(args: Args) -> None:
+    """Measure, print a table, write the figures."""
+    torch.set_num_threads(1)
+    earlier = read_figures(args.compare) if args.compare else {}
+    with torch.inference_mode():
+        steps = {name: work_cell_step(args.seed, *parts) for name, parts in _CASES.items()}
+        operations = {name: count_operations(step) for name, step in steps.items()}
+        timings = time_calls({"physics": bare_step(args.seed), **steps}, args.repeats)
+    floor, figures = timings["physics"].median, {}
+    for name, timing in timings.items():
+        figures[f"{name}_median_ms"] = 1e3 * timing.median
+        figures[f"{name}_p95_ms"] = 1e3 * timing.p95
+        if name in operations:
+            figures[f"{name}_over_physics"] = timing.median / floor
+            figures[f"{name}_operations"] = float(operations[name])
+    table = Table("figure", "now", *(["earlier"] if earlier else []))
+    for name, value in figures.items():
+        before = [f"{earlier[name]:.3g}" if name in earlier else ""] if earlier else []
+        table.add_row(name, f"{value:.4g}", *before)
+    Console().print(table)
+    for path in (args.json, args.save):
+        if path is not None:
+            cli.write_json(path, figures)
+
+
+def bare_step(seed: int) -> Callable[[], None]:
+    """A step of the world alone."""
+    world = _world(Workplace(), seed)
+    return lambda: world.advance(WorkCellConfig().dt)
+
+
+def work_cell_step(seed: int, *parts: str) -> Callable[[], None]:
+    """A step of the work cell, with the worker, if he comes, as he puts down what he brought.
+
+    Args:
+        seed: Of the worker, his visit and all errors.
+        parts: What goes on in it: "pulls", "worker".
+    """
+    workplace, sizes = Workplace(), Imperfections.nominal()
+    rng = np.random.default_rng([seed, 2])
+    visit = somebody_comes(workplace, rng) if "worker" in parts else None
+    if visit is not None:
+        person = visit.worker.config
+        workplace = replace(workplace, scene=replace(workplace.scene, worker=person))
+    world = _world(workplace, seed)
+    config = WorkCellConfig(command_delay=sizes.following_delay)
+    config = replace(config, safety=sizes.plant(config.safety))
+    watch = None
+    if visit is not None:
+        # There at once: two seconds before he lets go of it.
+        world.data.time = visit.released - 2.0
+        tracker = WorkerSensor(visit, lambda: world.time, sizes, rng)
+        watch = PersonWatch(tracker, whole_arm(workplace.scene.arm), config.safety.separation)
+    motion = MotionLog(world)
+
+    def advance(duration: float) -> None:
+        motion.advance(duration)
+        if visit is not None:
+            move_worker(world, visit)
+
+    cell = WorkCell(
+        chain=panda,
+        arm=world.arm,
+        gripper=world.arm,
+        human=ScriptedPerturbation(panda, _PULLS if "pulls" in parts else ()),
+        advance=advance,
+        config=config,
+        clearance=workplace.arm_clearance,
+        watch=watch,
+    )
+    cell.hold_pose(0.5)  # until he is seen, and the first pull is under way
+    return lambda: cell.hold_pose(config.dt)
+
+
+def _world(workplace: Workplace, seed: int) -> World:
+    """At home, as a laboratory has it."""
+    errors = Imperfections.nominal().draw(np.random.default_rng(seed))
+    world = World(workplace.scene, errors)
+    world.reset(workplace.home_joints().numpy())
+    return world
+
+
+if __name__ == "__main__":
+    cli.run(main, Args)
