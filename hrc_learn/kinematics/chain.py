@@ -240,6 +240,17 @@ class SerialChain:
         """
         return torch.stack([frame[..., 3] for frame in self._joint_frames(q)], dim=-2)
 
+    def joint_origin(
+        self, q: Float[Tensor, "*batch joints"], joint: int
+    ) -> Float[Tensor, "*batch 3"]:
+        """Origin of the frame of one joint in the base frame [m].
+
+        Args:
+            q: Joint positions [rad].
+            joint: Number of the joint, from 1.
+        """
+        return self._joint_frames(q, joint)[-1][..., 3]
+
     def joint_origins_and_jacobian(
         self, q: Float[Tensor, "*batch joints"]
     ) -> tuple[Float[Tensor, "*batch joints 3"], Float[Tensor, "*batch 6 joints"]]:

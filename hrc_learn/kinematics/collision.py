@@ -14,10 +14,13 @@ from torch import Tensor
 from hrc_learn.geometry.numerics import Constant
 from hrc_learn.kinematics.chain import SerialChain
 
-# Rounds of the search for the point of a segment nearest to a box, each of which tells the
-# sixteenth of what the one before told: 1e-6 of its length.
-_ROUNDS = 5
-_SIXTEENTHS = Constant(torch.arange(1, 16, dtype=torch.float64) / 16)
+# Rounds of the search for the point of a segment nearest to a box, in each of which 31 points
+# tell the part of what the one before told: 1e-6 of its length.
+_PARTS, _ROUNDS = 32, 4
+_TRIED = [
+    Constant(torch.arange(1, _PARTS, dtype=torch.float64) / _PARTS ** (k + 1))
+    for k in range(_ROUNDS)
+]
 # By which a bound on a distance may be wrong by rounding [m]: that of float32 within reach.
 _ROUNDING = 1e-6
 
@@ -239,13 +242,13 @@ def nearest_on_segment_and_box(
     start, along = segment[..., 0, :], segment[..., 1, :] - segment[..., 0, :]
     shift, way = (start - centre).unsqueeze(-2), along.unsqueeze(-2)
     lowest, highest = -half_size.unsqueeze(-2), half_size.unsqueeze(-2)
-    low, width, tried = torch.zeros_like(shift[..., 0]), 1.0, _SIXTEENTHS.like(segment)
-    for _ in range(_ROUNDS):
-        offset = torch.addcmul(shift, (low + width * tried).unsqueeze(-1), way)
+    low, width = torch.zeros_like(shift[..., 0]), 1.0
+    for tried in _TRIED:
+        offset = torch.addcmul(shift, (low + tried.like(low)).unsqueeze(-1), way)
         outside = offset - offset.clamp(lowest, highest)
         falling = torch.linalg.vecdot(outside, way) <= 0
-        width = width / 16
-        low = low + width * falling.sum(-1, keepdim=True, dtype=low.dtype)
+        width = width / _PARTS
+        low = torch.add(low, falling.sum(-1, keepdim=True, dtype=low.dtype), alpha=width)
     fraction = low.squeeze(-1) + width / 2
     offset = start + fraction.unsqueeze(-1) * along - centre
     return offset.clamp(-half_size, half_size) + centre, fraction

@@ -211,6 +211,8 @@ def kept_clear(
     shares = _SHARES.to(null)
     ahead = joint_position + _AHEAD * (task + shares[:, None] * null)
     now, without, *_ = every = clearance(torch.cat([joint_position[None], ahead]))
+    if bool((every >= margin).all()):
+        return null, False
     waits = bool(without < torch.clamp(now, max=margin))
     closing = without - every[2:]
     room = without - margin

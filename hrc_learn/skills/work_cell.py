@@ -152,8 +152,8 @@ class KeptImage:
 class _Reading:
     """Kinematics of one reading of the arm, computed when they are first asked for."""
 
-    def __init__(self, chain: SerialChain, state: ArmState):
-        self._chain, self.state = chain, state
+    def __init__(self, chain: SerialChain, limits: SafetyFilter, state: ArmState):
+        self._chain, self._limits, self.state = chain, limits, state
         self.joints = torch.from_numpy(state.joint_position)
 
     @cached_property
@@ -169,6 +169,11 @@ class _Reading:
     def jacobian(self) -> Float[Tensor, "6 joints"]:
         """Of the end effector."""
         return self._transform_and_jacobian[1]
+
+    @cached_property
+    def room(self) -> tuple[Float[Tensor, " joints"], Float[Tensor, " joints"]]:
+        """Lowest and highest velocities that leave the task its room [rad/s]."""
+        return self._limits.velocity_bounds(self.joints)
 
 
 class WorkCell:
@@ -241,7 +246,7 @@ class WorkCell:
             chain.limits, replace(safety, margin=safety.margin + self.config.limit_room)
         )
         self._ticks = 0
-        self._reading = _Reading(chain, arm.read())
+        self._reading = _Reading(chain, self._room, arm.read())
         self._yielding = NullSpaceYielding(chain, self.config.dt, self.config)
         asked = human.read(self.state)
         self.human_input = replace(asked, nullspace_input=self._yielding.nullspace_input)
@@ -400,8 +405,7 @@ class WorkCell:
         null: Float[Tensor, " joints"],
     ) -> Float[Tensor, " joints"]:
         """The null-space velocity with which the task has room before the joints' limits."""
-        room = self._room.velocity_bounds(self.joints)
-        gives_way = null_space_giving_way(J, task, null, *room)
+        gives_way = null_space_giving_way(J, task, null, *self._reading.room)
         if not torch.equal(gives_way, null):
             gives_way = gives_way * null_space_slowdown(self.chain, self.joints, gives_way)
         if not bool(gives_way.any()):
@@ -677,13 +681,12 @@ class WorkCell:
         self._arm.command(velocity.numpy())
         self._advance(self.config.dt)
         self._ticks += 1
-        self._reading = _Reading(self.chain, self._arm.read())
+        self._reading = _Reading(self.chain, self._room, self._arm.read())
         self._look()
         asked = self._human.read(self.state)
         push = smooth = self._nullspace_input(asked)
         if push.any() or self._yielding.pushed:
-            room = self._room.velocity_bounds(self.joints)
-            smooth = self._yielding.feel(push, self.joints, room, self.jacobian)
+            smooth = self._yielding.feel(push, self.joints, self._reading.room, self.jacobian)
         self.human_input = replace(asked, nullspace_input=smooth)
         self._receive()
         if self.tracked_markers and self._ticks % self.config.detect_every == 0:

@@ -122,9 +122,9 @@ class ScriptedPerturbation:
         active = [force for force in self.forces if force.start < time < force.end]
         if active:
             q = torch.from_numpy(state.joint_position)
-            origins = self._chain.joint_origins(q).numpy()
             for scripted in active:
-                force = scripted.force(time, origins[scripted.joint - 1])
+                origin = self._chain.joint_origin(q, scripted.joint)
+                force = scripted.force(time, origin.numpy())
                 d += force_to_nullspace_input(
                     self._chain, state.joint_position, scripted.joint, force
                 )
