@@ -1,9 +1,8 @@
-from dataclasses import replace
 
 """What an imperfect cell does to what is commanded and read, against first principles."""
 
 import math
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import mujoco
 import numpy as np
