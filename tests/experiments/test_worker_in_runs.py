@@ -13,8 +13,8 @@ from hrc_learn.experiments.collaboration.worker import (
     somebody_comes,
     worker_contacts,
 )
-from hrc_learn.kinematics import separation
-from hrc_learn.sim import MotionLog, World, whole_arm
+from hrc_learn.kinematics import panda, separation
+from hrc_learn.sim import MotionLog, WorkerDistance, World, whole_arm
 from hrc_learn.sim.worker import PARTS
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.grasping import as_load
@@ -118,3 +118,25 @@ def test_a_world_without_a_worker_keeps_no_distances():
     motion = MotionLog(world)
     motion.advance(0.01)
     assert motion.nearest() == ()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_beside_the_elbow_nobody_leans_into_the_arm_that_waits(seed):
+    visit = somebody_comes(WORKPLACE, np.random.default_rng(seed), beside_elbow=True)
+    waiting, world = WORKPLACE.hover_joints().numpy(), World(SCENE)
+    world.reset(waiting)
+    distance = WorkerDistance(world)
+    apart = []
+    for time in np.arange(visit.begin, visit.end, 0.1):
+        world.move_worker(visit.capsules_at(time).ends)
+        apart.append(distance.now().distance)
+    # The capsules that he is drawn by contain the arm, so it is further away than they say.
+    assert min(apart) > 0.03
+    # He stands at the side of the elbow, before the robot's, and reaches under the forearm.
+    x, y = visit.posture(np.array(visit.released)).place
+    table = WORKPLACE.scene.table
+    assert x < table.centre[0] - table.half_size[0]
+    elbow, wrist = panda.joint_origins(torch.from_numpy(waiting))[3:5, :2].numpy()
+    beside = np.abs(visit.markers[:, :2] - (elbow + wrist) / 2)
+    assert beside.max() < 0.25
+    assert 2.0 < visit.reaches[0, 0] - visit.begin < 9.0

@@ -1,4 +1,3 @@
-
 """What an imperfect cell does to what is commanded and read, against first principles."""
 
 import math

@@ -124,3 +124,43 @@ def test_what_is_out_of_reach_is_refused():
 def test_nobody_stands_still_for_ever():
     with pytest.raises(ValueError, match="walking"):
         HumanSpeeds(walking=0.0)
+
+
+def test_a_turned_visit_is_the_same_seen_from_elsewhere():
+    visit, angle = drawn(4), 0.7
+    turned = visit.turned(angle)
+    c, s = np.cos(angle), np.sin(angle)
+    about = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    time = every(visit, 0.2)
+    here, there = visit.capsules_at(time), turned.capsules_at(time)
+    np.testing.assert_allclose(there.ends, here.ends @ about.T, atol=1e-9)
+    np.testing.assert_allclose(there.velocity, here.velocity @ about.T, atol=1e-5)
+    np.testing.assert_allclose(turned.markers, visit.markers @ about.T, atol=1e-12)
+    item = visit.item_at(visit.released)
+    np.testing.assert_allclose(turned.item_at(visit.released), about @ item, atol=1e-9)
+
+
+def test_a_hand_is_at_each_marker_as_long_as_he_reaches():
+    visit = drawn(5)
+    assert visit.reaches.shape == (len(visit.markers), 2)
+    for marker, (begin, end) in zip(visit.markers, visit.reaches, strict=True):
+        ends = visit.capsules_at(np.linspace(begin, end, 5)).ends
+        hands = np.stack([visit.worker.grip(ends, side) for side in (0, 1)])
+        off = np.linalg.norm(hands - marker, axis=-1).min(axis=0)
+        assert off.max() < 1e-6
+    assert (visit.reaches[1:, 0] > visit.reaches[:-1, 1]).all()
+
+
+def test_he_reaches_only_where_he_leaves_alone_what_he_sees():
+    """A wall above the bench beyond which his hands must not come."""
+    wall = 0.57
+
+    def is_clear(ends):
+        return bool((ends[..., 1] > wall).all())
+
+    touching = drawn(1).reaches
+    assert not is_clear(drawn(1).capsules_at(touching.mean(axis=1)).ends)
+    careful = drawn(1, is_clear=is_clear)
+    assert is_clear(careful.capsules_at(careful.reaches.mean(axis=1)).ends)
+    with pytest.raises(ValueError, match="cannot reach"):
+        drawn(1, is_clear=lambda ends: False)
