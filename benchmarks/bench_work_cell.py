@@ -36,7 +36,7 @@ _CASES = {"alone": (), "pulled": ("pulls",), "worker": ("worker",), "both": ("pu
 # To either side in turn, each for a second: the elbow never comes to rest.
 _PULLS = tuple(
     ScriptedForce(
-        start=k, duration=1.2, towards=(0.4, (-10.0, 10.0)[k % 2], 0.5), max_force=60.0
+        start=float(k), duration=1.2, towards=(0.4, (-10.0, 10.0)[k % 2], 0.5), max_force=60.0
     )
     for k in range(600)
 )
