@@ -5,7 +5,7 @@ Arrays are NumPy float64: that is what drivers and simulators speak.
 """
 
 from dataclasses import dataclass, field
-from typing import Literal, Protocol, runtime_checkable
+from typing import Literal, Protocol, get_args, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -95,6 +95,63 @@ class HumanInput:
     """Asked for since the last reading, in this order."""
 
 
+Hindrance = Literal[
+    "joint_limit",
+    "singularity",
+    "obstacle",
+    "speed",
+    "task",
+    "narrow_path",
+    "too_far",
+    "task_waits",
+    "person",
+    "stopped",
+]
+"""What keeps an arm from following the person who leads it: a joint near its limit; a
+singularity ahead; something it would meet; the speed that people may lead it with; the task,
+whose end effector would have to move; a path that nobody can push it off; a posture that it
+would not come back from; a task that waits until it is back; somebody near it; the safety
+filter, which brakes it."""
+HINDRANCES: tuple[Hindrance, ...] = get_args(Hindrance)
+"""All of them, in the order of the log's column "hindered"."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reason:
+    """Why an arm does not follow, or only in part."""
+
+    hindrance: Hindrance
+    text: str
+    """In words, such as "joint 4 is at its limit"."""
+    kept: float = 1.0
+    """Share of the motion that it leaves, 0 to 1; 1 of what only goes along with the push."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Feedback:
+    """What an arm tells the person who leads it."""
+
+    pushed: bool = False
+    """Whether the person asks for a motion now."""
+    followed: float = 1.0
+    """Share of what is asked that the arm follows, 0 to 1; 1 while nothing is. Of a push that
+    is of the motion that it would have in the null space. The time that an arm needs to get
+    under way takes nothing from it."""
+    reasons: tuple[Reason, ...] = ()
+    """Why that is less, what takes the most first; none while nothing is asked."""
+    contact_force: Float[np.ndarray, "3"] | None = None
+    """Force that the external torques amount to at the end effector, in the base frame [N];
+    None: the arm tells none."""
+    near_limits: tuple[str, ...] = ()
+    """Names of the joints that are near their limits."""
+    person_distance: float | None = None
+    """Of the nearest person [m], NaN while it is not known; None: nobody watches for them."""
+    pace: float = 1.0
+    """Share of its speed that people near it leave the task, 0 to 1."""
+    slip: float = 0.0
+    """By how much the gripper's opening has changed since it holds its object [m]."""
+
+
 @runtime_checkable
 class Human(Protocol):
     """A person beside the arm: scripted, at a gamepad, or in a browser."""
@@ -102,6 +159,13 @@ class Human(Protocol):
     def read(self, state: ArmState) -> HumanInput:
         """Return what the person asks for, now that the arm is in `state`."""
         ...
+
+    def tell(self, feedback: Feedback) -> None:
+        """Tell the person what the arm feels, and how far it follows.
+
+        Called at each step, by the control loop: devices that take their time do so elsewhere.
+        One by which nothing is felt ignores it, as this does for all that derive from it.
+        """
 
 
 @dataclass(frozen=True, kw_only=True)

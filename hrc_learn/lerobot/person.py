@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from hrc_learn.kinematics import panda
-from hrc_learn.protocols import ArmState, Human, HumanInput
+from hrc_learn.protocols import ArmState, Feedback, Human, HumanInput
 
 if TYPE_CHECKING:
     from hrc_learn.lerobot.panda_robot import PandaRobot
@@ -63,7 +63,7 @@ def scripted_pulls(seed: int) -> tuple[ScriptedForce, ...]:
     return random_pulls(np.random.default_rng([seed, 1]))
 
 
-class Person:
+class Person(Human):
     """Reads the device of a person, shows them the arm, and gives the device back."""
 
     def __init__(self, config: PersonConfig):
@@ -103,6 +103,10 @@ class Person:
     def read(self, state: ArmState) -> HumanInput:
         """What the person asks for."""
         return self._human.read(state)
+
+    def tell(self, feedback: Feedback) -> None:
+        """Tell the person at their device."""
+        self._human.tell(feedback)
 
     def show(self, robot: PandaRobot) -> None:
         """Show the person where the arm is."""

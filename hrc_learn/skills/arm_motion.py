@@ -5,6 +5,7 @@ policies and teleoperators command positions, which are tracked by velocities.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -187,13 +188,24 @@ def null_space_giving_way(
 _SLIDING, _DEEPEST = 0.002, 0.005
 
 
+class ClearMotion(NamedTuple):
+    """A null-space motion that keeps an arm clear of what is around it."""
+
+    null: Float[Tensor, " joints"]
+    """[rad/s]"""
+    waits: bool
+    """Whether the task alone takes the arm nearer than the margin: then it has to wait."""
+    distance: float
+    """Of the arm as it is now from what it must not meet [m]."""
+
+
 def kept_clear(
     joint_position: Float[Tensor, " joints"],
     task: Float[Tensor, " joints"],
     null: Float[Tensor, " joints"],
     clearance: Callable[[Float[Tensor, "*batch joints"]], Float[Tensor, "*batch"]],
     margin: float,
-) -> tuple[Float[Tensor, " joints"], bool]:
+) -> ClearMotion:
     """As much of a null-space motion as keeps the arm clear of what is around it.
 
     Args:
@@ -203,10 +215,6 @@ def kept_clear(
         clearance: Distance of an arm at given joint positions from what it must not meet [m].
         margin: Distance to keep [m]. Where the task alone leaves less, the null space takes
             no more of it.
-
-    Returns:
-        The part of the null-space motion, and whether the task alone takes the arm nearer than
-        the margin: then it has to wait.
     """
     shares = _SHARES.to(null)
     ahead = joint_position + _AHEAD * (task + shares[:, None] * null)
@@ -219,7 +227,7 @@ def kept_clear(
     allowed = room.clamp(min=0.0) + _AHEAD * _SLIDING * (1.0 + room / _DEEPEST).clamp(0.0, 1.0)
     # Closing in grows with the share: where it is too fast, so much less of it.
     share = torch.where(closing > allowed, shares[1:] * allowed / closing, 1.0).min()
-    return share * null, waits
+    return ClearMotion(share * null, waits, float(now))
 
 
 class StraightLine:

@@ -24,6 +24,7 @@ from hrc_learn.skills.null_space_yielding import (
     changed_rate,
     smallest_singular_value,
 )
+from hrc_learn.skills.person_feedback import PersonFeedback, share_kept
 
 # Of the limits of acceleration, what the null space may take: the path needs the rest.
 _SHARE_OF_ACCELERATION = 0.4
@@ -105,7 +106,10 @@ class ComplementaryMotion:
     def restart(self) -> None:
         """Begin anew: nobody has pushed, and the next step is the first."""
         n = len(self._chain.joint_names)
-        self._yielding = NullSpaceYielding(self._chain, self._dt, self._config)
+        self._feedback = PersonFeedback(self._chain)
+        self._yielding = NullSpaceYielding(
+            self._chain, self._dt, self._config, self._feedback.hindrances
+        )
         self.posture = self.joints = None
         self.offset_velocity = self._null = torch.zeros(n, dtype=torch.float64)
         self._last = None
@@ -142,7 +146,8 @@ class ComplementaryMotion:
         Returns:
             Joint positions [rad] and opening of the gripper [m].
         """
-        self._yielding.feel(self._human.read(state).nullspace_input)
+        asked = self._human.read(state).nullspace_input
+        self._yielding.feel(asked)
         was = deque(self._wishes), self._progress
         posture, width = self._followed(torch.from_numpy(np.array(wish, dtype=float)), width)
         if self.posture is None or self.joints is None:
@@ -153,16 +158,21 @@ class ComplementaryMotion:
             joints, clear = self._beside(posture, self.posture, self.joints)
         if joints is None:
             # Nothing else keeps it clear: stop at once, as if this step had not been asked for.
+            distance = 100 * float(self._clear(self.joints))
+            self._feedback.hindrances.note("obstacle", 0.0, distance=distance)
             (wishes, self._progress), newest = was, self._wishes[-1]
             self._wishes = deque([*wishes, newest])
             self._rate, self._null = 0.0, torch.zeros_like(self._null)
             posture, joints, width = self.posture, self.joints, self._width
         self._rate = changed_rate(self._rate, 1.0 if clear else 0.0, self._dt)
+        if self._rate == 0:
+            self._feedback.hindrances.mention("task_waits")
         moves = float((joints - self.joints).abs().max()) > _SAME
         held_back = self._rate == 0 and not (self._yielding.pushed or moves)
         self._waited = self._waited + self._dt if held_back else 0.0
         self.offset_velocity = (joints - posture - before) / self._dt
         self.posture, self.joints, self._width = posture, joints, width
+        self._human.tell(self._feedback.told(state, pushed=bool(asked.any())))
         return joints.numpy(), width
 
     def _followed(
@@ -216,7 +226,10 @@ class ComplementaryMotion:
         faster = _FASTEST / float(away.norm().clamp(min=1e-9))
         retreat = min(self._config.pose_gain, faster) * away
         wanted, straight = self._config.pose_gain * error, _straightness(away, error)
-        if back is not None:
+        hindrances = self._feedback.hindrances
+        if back is None:
+            hindrances.note("narrow_path", 0.0)
+        else:
             # Far aside the null space may lead elsewhere than back: nobody gets that far.
             least, enough = _STRAIGHT
             share = min(max((straight - least) / (enough - least), 0.0), 1.0)
@@ -224,15 +237,24 @@ class ComplementaryMotion:
             yielding = self._yielding
             push = yielding.null_velocity if yielding.pushed else back
             wanted = torch.lerp(retreat, push, share)
+            hindrances.note_across(push, null_projection(J, push))
+            hindrances.note("too_far", share)
         # Where the policy itself leads the arm nearer, people may as well.
         own = float(self._room(ahead).min()) - _NO_NEARER
         margin = min(self._config.clearance, own)
-        null, waits = kept_clear(joints, going, feasible(wanted), self._room, margin)
+        led = feasible(wanted)
+        null, waits, distance = kept_clear(joints, going, led, self._room, margin)
         if waits or straight < _STRAIGHT[0]:
             # Against the person, as the end effector would have to stop otherwise.
-            null, waits = self._retreat(
-                joints, going, feasible(retreat), feasible(wanted), margin
-            )
+            null, waits = self._retreat(joints, going, feasible(retreat), led, margin)
+        if self._yielding.pushed:
+            # Of what is asked, not of what the arm has picked up of it by now.
+            asked = null_projection(J, moved / dt + wanted)
+            possible = self._within_limits(joints, posture, task, asked, told=True)
+            if share_kept(led, null) < 1 and straight >= _STRAIGHT[0]:
+                stretched = distance < float(self._clear(joints))
+                cause = "singularity" if stretched else "obstacle"
+                hindrances.note(cause, share_kept(possible, null), distance=100 * distance)
         waits = waits or straight < _STRAIGHT[0]
         self._null = null
         reached = joints_near(self._chain, goal, joints + dt * (task + null))
@@ -281,9 +303,9 @@ class ComplementaryMotion:
             return back, False
         still = torch.zeros_like(joints)
         # The way back may pass a singularity.
-        null, _ = kept_clear(joints, still, back, self._clear, margin)
+        null, *_ = kept_clear(joints, still, back, self._clear, margin)
         if not bool(null.any()):
-            null, _ = kept_clear(joints, still, wanted, self._room, margin)
+            null, *_ = kept_clear(joints, still, wanted, self._room, margin)
         return null, True
 
     def _gently(
@@ -305,8 +327,12 @@ class ComplementaryMotion:
         posture: Float[Tensor, " joints"],
         task: Float[Tensor, " joints"],
         null: Float[Tensor, " joints"],
+        told: bool = False,
     ) -> Float[Tensor, " joints"]:
-        """As much of a null-space motion as the limits of joints and their speeds leave."""
+        """As much of a null-space motion as the limits of joints and their speeds leave.
+
+        What they take from it is noted where the person is `told`.
+        """
         limits, rate = self._limits, min(_LIMIT_RATE, 1 / self._dt)
         # Where the policy itself goes nearer to a limit, that is the limit.
         upper = torch.maximum(limits.upper - _FROM_LIMIT, posture)
@@ -314,9 +340,13 @@ class ComplementaryMotion:
         up = torch.minimum(rate * (upper - joints), limits.velocity) - task
         down = torch.maximum(rate * (lower - joints), -limits.velocity) - task
         room = torch.where(null > 0, up, down) / torch.where(null == 0, 1.0, null)
-        share = torch.where(null == 0, 1.0, room).clamp(0.0, 1.0).min()
-        share = min(share, _FASTEST / null.abs().max().clamp(min=_FASTEST))
-        return share * null
+        share, joint = torch.where(null == 0, 1.0, room).clamp(0.0, 1.0).min(dim=0)
+        slower = _FASTEST / null.abs().max().clamp(min=_FASTEST)
+        if told and slower < share:
+            self._feedback.hindrances.note("speed", float(slower))
+        elif told:
+            self._feedback.hindrances.note("joint_limit", float(share), joint=int(joint) + 1)
+        return min(share, slower) * null
 
     def _straight_back(
         self, posture: Float[Tensor, " joints"], joints: Float[Tensor, " joints"]

@@ -14,6 +14,7 @@ from hrc_learn.controller import scale_null_space
 from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.skills.arm_motion import null_space_slowdown, singularity_fade
+from hrc_learn.skills.person_feedback import Hindrances
 
 # Null-space input below which one that has ended is over [N m].
 _LEAST_INPUT = 0.05
@@ -60,17 +61,26 @@ class NullSpaceYielding:
     Attributes:
         nullspace_input: What the person asks for, without jumps [N m].
         aside: Whether the joints are off their path.
+        hindrances: What keeps the arm from following; whoever tells the person empties it.
     """
 
-    def __init__(self, chain: SerialChain, dt: float, config: YieldingConfig):
+    def __init__(
+        self,
+        chain: SerialChain,
+        dt: float,
+        config: YieldingConfig,
+        hindrances: Hindrances | None = None,
+    ):
         """Begin on the path, with nobody pushing.
 
         Args:
             chain: Kinematics of the arm.
             dt: Control step [s].
             config: How it yields.
+            hindrances: Take what limits a push; None: nobody is told.
         """
         self._chain, self._dt, self._config = chain, dt, config
+        self.hindrances = hindrances or Hindrances()
         self._back = torch.zeros(len(chain.joint_names), dtype=torch.float64)
         self.nullspace_input, self.aside = self._back.numpy(), False
 
@@ -112,12 +122,19 @@ class NullSpaceYielding:
             J = self._chain.jacobian(joints) if jacobian is None else jacobian
             damping = self._config.damping
             before = null_projection(J, self.null_velocity)
-            wanted = null_projection(J, torch.from_numpy(asked) / damping)
-            wanted = wanted * null_space_slowdown(self._chain, joints, wanted)
+            push = torch.from_numpy(asked) / damping
+            wanted = null_projection(J, push)
+            self.hindrances.note_across(push, wanted)
+            slowdown = null_space_slowdown(self._chain, joints, wanted)
+            self.hindrances.note("speed", slowdown)
+            wanted = wanted * slowdown
             # As far ahead as the arm gets while it slows down.
             speed = before.norm().clamp(min=_SLOW) / wanted.norm().clamp(min=1e-9)
-            wanted = wanted * singularity_fade(self._chain, joints, speed * wanted)
-            wanted = scale_null_space(torch.zeros_like(wanted), wanted, *bounds)
+            fade = singularity_fade(self._chain, joints, speed * wanted)
+            self.hindrances.note("singularity", fade)
+            faded = wanted * fade
+            wanted = scale_null_space(torch.zeros_like(faded), faded, *bounds)
+            self.hindrances.note_limits(faded, wanted, faded, bounds)
             slows = bool(wanted.norm() < before.norm())
             change = (1.0 if slows else share) * (wanted - before)
             effort = _STOPPING_EFFORT if slows else _PUSHED_EFFORT

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from hrc_learn.controller import (
@@ -26,7 +26,15 @@ from hrc_learn.controller import (
 from hrc_learn.geometry import Pose
 from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import GraspedBox, SerialChain
-from hrc_learn.protocols import Arm, ArmState, Gripper, Human, HumanInput
+from hrc_learn.protocols import (
+    HINDRANCES,
+    Arm,
+    ArmState,
+    Feedback,
+    Gripper,
+    Human,
+    HumanInput,
+)
 from hrc_learn.skills.arm_motion import (
     StraightLine,
     joint_line,
@@ -50,6 +58,12 @@ from hrc_learn.skills.null_space_yielding import (
     changed_rate,
     smallest_singular_value,
 )
+from hrc_learn.skills.person_feedback import (
+    PersonFeedback,
+    contact_force,
+    filter_hindrance,
+    share_kept,
+)
 from hrc_learn.skills.person_watch import PersonWatch
 from hrc_learn.vision import angle, centre
 from hrc_learn.viz import StepLog
@@ -68,6 +82,9 @@ class MissedGraspError(TaskFailedError):
 class BlockedPathError(TaskFailedError):
     """A planned motion would collide or leave the limits of the arm."""
 
+
+HINDRANCE_COLUMNS = HINDRANCES
+"""Names of the components of the log's column "hindered"."""
 
 SAFETY_COLUMNS = INTERVENTIONS
 """Names of the components of the log's column "safety"."""
@@ -98,6 +115,8 @@ _GETTING_UNDER_WAY = 25
 _NAN = float("nan")
 # Logged as the goal of steps without a path.
 _NOWHERE = np.full(3, _NAN)
+# Logged while the arm follows whoever leads it, or nobody does.
+_UNHINDERED = np.zeros(len(HINDRANCE_COLUMNS), dtype=bool)
 # Logged by steps in which no camera is in the loop.
 _NO_VISION = {
     "feature": np.full(2, _NAN),
@@ -247,7 +266,10 @@ class WorkCell:
         )
         self._ticks = 0
         self._reading = _Reading(chain, self._room, arm.read())
-        self._yielding = NullSpaceYielding(chain, self.config.dt, self.config)
+        self._feedback, self._pushing = PersonFeedback(chain), False
+        self._yielding = NullSpaceYielding(
+            chain, self.config.dt, self.config, self._feedback.hindrances
+        )
         asked = human.read(self.state)
         self.human_input = replace(asked, nullspace_input=self._yielding.nullspace_input)
         self.observation = MarkerObservation()
@@ -329,6 +351,7 @@ class WorkCell:
             distances=self.distances,
         )
         self._keep_pace(self.jacobian @ joint_velocity, safe, report)
+        self._note_filter(joint_velocity, safe, report)
         position = _NOWHERE if goal is None else goal.position.numpy()
         self._send(safe, safety=report.flags.numpy(), goal_position=position, **_NO_VISION)
 
@@ -349,6 +372,7 @@ class WorkCell:
         """
         self._guard = self._safety.initial_state(self.joints, command.joint_velocity)
         self._keep_pace(command.twist, command.joint_velocity, command.safety)
+        self._note_controller(command, approach)
         self._send(
             command.joint_velocity,
             safety=command.safety.flags.numpy(),
@@ -390,10 +414,15 @@ class WorkCell:
         null = null_projection(J, null_velocity)
         if drift is not None:
             # A person may push the way that the path leads: both together bend the null space.
-            null = null * null_space_slowdown(self.chain, joints, null)
+            slowdown = null_space_slowdown(self.chain, joints, null)
+            self._feedback.hindrances.note("speed", slowdown)
+            null = null * slowdown
         waits = False
         if self._clearance is not None and bool(null.any()):
-            null, waits = kept_clear(joints, task, null, self._clearance, self.config.clearance)
+            clear = kept_clear(joints, task, null, self._clearance, self.config.clearance)
+            distance, kept = 100 * clear.distance, share_kept(null, clear.null)
+            self._feedback.hindrances.note("obstacle", kept, distance=distance)
+            null, waits = clear.null, clear.waits
         null = self._within_limits(J, task, null)
         self.step(task + null, goal)
         return waits
@@ -408,9 +437,14 @@ class WorkCell:
         gives_way = null_space_giving_way(J, task, null, *self._reading.room)
         if not torch.equal(gives_way, null):
             gives_way = gives_way * null_space_slowdown(self.chain, self.joints, gives_way)
-        if not bool(gives_way.any()):
-            return gives_way
-        return scale_null_space(task, gives_way, *self._safety.velocity_bounds(self.joints))
+        kept = gives_way
+        if bool(gives_way.any()):
+            bounds = self._safety.velocity_bounds(self.joints)
+            kept = scale_null_space(task, gives_way, *bounds)
+        if self._pushing:
+            room = self._reading.room
+            self._feedback.hindrances.note_limits(null, kept, task + null, room)
+        return kept
 
     def hold_pose(self, duration: float) -> None:
         """Keep the end effector where it is for a while [s], yielding to the person."""
@@ -476,11 +510,8 @@ class WorkCell:
 
     def _contact_force(self) -> Float[np.ndarray, "3"]:
         """Estimate of the force on the end effector [N]; zero if the arm tells none."""
-        torque = self.state.external_torque
-        if torque is None:
-            return np.zeros(3)
-        J = self.jacobian.numpy()
-        return np.linalg.lstsq(J.T, torque, rcond=None)[0][:3]
+        force = contact_force(self.jacobian, self.state)
+        return np.zeros(3) if force is None else force
 
     def follow_path(
         self, path: Float[np.ndarray, "steps joints"], until: Callable[[], bool] = lambda: False
@@ -528,6 +559,8 @@ class WorkCell:
             if not backs and self._yielding.aside and narrow[here : ahead + 1].any():
                 behind = math.inf
             rate = changed_rate(rate, 2.0 - behind, dt, direction=-1 if backs else 1)
+            if rate <= 0:
+                self._feedback.hindrances.mention("task_waits")
             progress = max(progress + rate * self._pace, 0.0)
             if waited > _LONGEST_WAIT:
                 self._go_straight_back(_between(path, progress))
@@ -560,6 +593,7 @@ class WorkCell:
         self._yielding.aside, pose = False, self.chain.forward(goal)
         for q in way:
             self._path_joints = q.numpy()
+            self._feedback.hindrances.note("too_far", 0.0)
             self.step(self.config.pose_gain * (q - self.joints), pose)
 
     def _track_joints(
@@ -588,6 +622,8 @@ class WorkCell:
         )
         pose = self.chain.forward(goal)
         if back is None:
+            if not yields:
+                self._feedback.hindrances.note("narrow_path", 0.0)
             self.step(velocity + self.config.pose_gain * error, pose)
             return 0.0
         twist = self.chain.jacobian(goal + self.config.command_delay * velocity) @ velocity
@@ -660,12 +696,56 @@ class WorkCell:
             return True
         if float(kept.slowed) <= _SLOWED:
             return False
-        config = self._safety.config
-        assert config.constraints is not None  # without them nothing is reported
+        return self._at_people(sent)
+
+    def _at_people(self, sent: Float[Tensor, " joints"]) -> bool:
+        """Whether a velocity takes the arm towards people as fast as it may [rad/s]."""
+        config, distances = self._safety.config, self.distances
+        if distances is None or config.constraints is None:
+            return False
         allowed = distances.closing_speed(config.constraints, config.separation)
         return bool((allowed + distances.gradient @ sent <= _SPARE).any())
 
+    def _note_filter(
+        self,
+        wanted: Float[Tensor, " joints"],
+        sent: Float[Tensor, " joints"],
+        report: SafetyReport,
+    ) -> None:
+        """Note what the safety filter takes from the null-space part of a velocity [rad/s]."""
+        if not self._pushing:
+            return
+        cause = "person" if self._at_people(sent) else filter_hindrance(report)
+        if cause is not None:
+            J = self.jacobian
+            kept = share_kept(null_projection(J, wanted), null_projection(J, sent))
+            self._feedback.hindrances.note(cause, kept)
+
+    def _note_controller(self, command: Command, approach: float) -> None:
+        """Note what the adaptive controller takes from a push, beside its own gradient."""
+        if not self._pushing:
+            return
+        wanted = self._yielding.null_velocity - command.xi_q / self.config.damping
+        wanted = null_projection(self.jacobian, wanted)
+        bounds = self._safety.velocity_bounds(self.joints)
+        self._feedback.hindrances.note_limits(wanted, command.null_velocity, wanted, bounds)
+        # A joint-space approach moves the null space as well, by an unknown part of it.
+        if approach == 0:
+            self._note_filter(command.null_velocity, command.joint_velocity, command.safety)
+
+    def _told(self) -> Feedback:
+        """What the person is told of this step."""
+        return self._feedback.told(
+            self.state,
+            self.jacobian,
+            pushed=self._pushing,
+            person_distance=None if self.watched is None else self.watched.nearest,
+            pace=self._pace,
+            load=self.load,
+        )
+
     def _send(self, velocity: Float[Tensor, " joints"], **columns) -> None:
+        told = self._told()
         self.log.append(
             time=self.time,
             joint_position=self.state.joint_position,
@@ -674,16 +754,21 @@ class WorkCell:
             nullspace_input=self.human_input.nullspace_input,
             path_joints=self._path_joints,
             gripper=self.state.gripper_width,
+            followed=told.followed if told.pushed else _NAN,
+            hindered=_hindered(told),
             **self._watched_columns(velocity),
             **columns,
         )
         self._path_joints = self._no_path
         self._arm.command(velocity.numpy())
+        self._human.tell(told)
         self._advance(self.config.dt)
         self._ticks += 1
         self._reading = _Reading(self.chain, self._room, self._arm.read())
         self._look()
         asked = self._human.read(self.state)
+        way = self.config.way_making
+        self._pushing = bool(asked.nullspace_input.any()) and (way is None or way.expert)
         push = smooth = self._nullspace_input(asked)
         if push.any() or self._yielding.pushed:
             smooth = self._yielding.feel(push, self.joints, self._reading.room, self.jacobian)
@@ -724,6 +809,14 @@ class WorkCell:
 
     def _receive(self) -> None:
         self.observation = self._channel.newest(self.time) or self.observation
+
+
+def _hindered(told: Feedback) -> Bool[np.ndarray, " hindrances"]:
+    """What keeps the arm from following the person, in the order of `HINDRANCE_COLUMNS`."""
+    if not told.reasons:
+        return _UNHINDERED
+    reasons = {reason.hindrance for reason in told.reasons}
+    return np.array([hindrance in reasons for hindrance in HINDRANCE_COLUMNS])
 
 
 def _between(samples: Float[np.ndarray, "steps joints"], at: float) -> Float[Tensor, " joints"]:

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hrc_learn.kinematics import SerialChain
-from hrc_learn.protocols import ArmState, Human, HumanInput, Request
+from hrc_learn.protocols import ArmState, Feedback, Human, HumanInput, Request
 from hrc_learn.teleoperation.hand_guiding import (
     InteractionForceConfig,
     bounded,
@@ -29,7 +29,7 @@ from hrc_learn.teleoperation.hand_guiding import (
 )
 
 
-class CombinedInput:
+class CombinedInput(Human):
     """Joins several sources, as the paper's mixed interface has a haptic device and a headset.
 
     Null-space inputs and twists add up. Of gripper, region and target the first source that
@@ -58,8 +58,13 @@ class CombinedInput:
             requests=tuple(request for i in inputs for request in i.requests),
         )
 
+    def tell(self, feedback: Feedback) -> None:
+        """Tell all sources."""
+        for source in self._sources:
+            source.tell(feedback)
 
-class LinkGuide:
+
+class LinkGuide(Human):
     """Leads a link in the null space by a device that leads the end effector elsewhere.
 
     The device's speed, as a fraction of its largest, is that fraction of the largest force on
@@ -97,6 +102,10 @@ class LinkGuide:
             twist=np.zeros(6),
         )
 
+    def tell(self, feedback: Feedback) -> None:
+        """Tell the person at the device."""
+        self._human.tell(feedback)
+
 
 @dataclass(frozen=True, kw_only=True)
 class InputFilterConfig:
@@ -113,7 +122,7 @@ class InputFilterConfig:
                 raise ValueError(f"{name} must be positive, but is {value}.")
 
 
-class InputFilter:
+class InputFilter(Human):
     """Passes human input on with the acceleration of the end effector bounded.
 
     A key that is pressed asks for full speed at once, and a gizmo that is released for none:
@@ -142,6 +151,10 @@ class InputFilter:
         )
         return replace(human_input, twist=self._twist)
 
+    def tell(self, feedback: Feedback) -> None:
+        """Tell the person whose input it is."""
+        self._human.tell(feedback)
+
 
 # SDL's layout of a game controller, the same for every make (CONTROLLER_AXIS_*, _BUTTON_*).
 _LEFT_X, _LEFT_Y, _RIGHT_Y = 0, 1, 3
@@ -162,6 +175,48 @@ class Controller(Protocol):
     def get_axis(self, axis: int) -> int: ...
     def get_button(self, button: int) -> bool: ...
     def attached(self) -> bool: ...
+    def rumble(self, low_frequency: float, high_frequency: float, duration: int) -> bool: ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class RumbleConfig:
+    """How a gamepad tells what the arm feels: slow shaking for what is met or near, a quick
+    one for a push that is not followed. Both in pulses, which a hand tells from motors that
+    run on.
+    """
+
+    every: float = 0.25
+    """Time from one pulse to the next [s]."""
+    pulse: float = 0.12
+    """Length of a pulse [s]."""
+    least: float = 0.1
+    """Strength below which there is no pulse, of 1: motors hardly turn."""
+    contact: tuple[float, float] = (20.0, 60.0)
+    """Contact force from which on there are pulses, and that of the strongest [N]. Friction of
+    the simulated joints feels like 17 N; a scripted person pulls with 60 N at most."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.pulse <= self.every:
+            raise ValueError(
+                "pulse must be positive and no longer than every, but they are "
+                f"{self.pulse} and {self.every} s."
+            )
+        if not 0 <= self.contact[0] < self.contact[1]:
+            raise ValueError(f"contact must be two rising forces, but is {self.contact}.")
+
+
+def rumble_strength(feedback: Feedback, config: RumbleConfig) -> tuple[float, float]:
+    """Strengths of the slow and of the quick motor of a gamepad, 0 to 1.
+
+    Args:
+        feedback: Of the arm.
+        config: From which forces on.
+    """
+    met, (least, most) = 0.0, config.contact
+    if feedback.contact_force is not None:
+        met = (float(np.linalg.norm(feedback.contact_force)) - least) / (most - least)
+    slow = min(max(met, 1.0 - feedback.pace, 0.0), 1.0)
+    return slow, 1.0 - feedback.followed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -176,6 +231,8 @@ class GamepadConfig:
     """Fastest motion of the end effector, and how it turns."""
     opening: float = 0.08
     """Width of the open gripper [m]."""
+    rumble: RumbleConfig = field(default_factory=RumbleConfig)
+    """How it shakes."""
 
     def __post_init__(self) -> None:
         if not (0 <= self.dead_zone < 1 and self.curve > 0):
@@ -205,11 +262,12 @@ def deflection(
     return stick / length * beyond**curve
 
 
-class Gamepad:
+class Gamepad(Human):
     """Moves the end effector by the sticks: left one level, right one up and down.
 
     Shoulder buttons open and close the gripper, the others ask what `BUTTONS` says. The end
     effector turns by the coarse orientation rule. A gamepad that is unplugged asks for nothing.
+    It rumbles where the arm meets something, slows down for people or does not follow.
     """
 
     def __init__(
@@ -218,6 +276,7 @@ class Gamepad:
         controller: Controller,
         update: Callable[[], None] = lambda: None,
         config: GamepadConfig | None = None,
+        clock: Callable[[], float] = time.monotonic,
     ):
         """Take an open controller; `Gamepad.open` finds one.
 
@@ -225,9 +284,11 @@ class Gamepad:
             chain: The arm that is guided.
             controller: The gamepad.
             update: Lets the library read the device.
-            config: How sticks act.
+            config: How sticks act, and how it rumbles.
+            clock: Tells the time [s].
         """
         self._chain, self._controller, self._update = chain, controller, update
+        self._clock, self._next_pulse = clock, float("-inf")
         self._config = config or GamepadConfig()
         self._held: set[int] = set()
         self._gripper: float | None = None
@@ -278,6 +339,16 @@ class Gamepad:
             gripper=self._gripper,
             requests=tuple(BUTTONS[b] for b in sorted(pressed & BUTTONS.keys())),
         )
+
+    def tell(self, feedback: Feedback) -> None:
+        """Rumble, a pulse every now and then; a gamepad without motors stays still."""
+        config, now = self._config.rumble, self._clock()
+        if now < self._next_pulse:
+            return
+        slow, quick = rumble_strength(feedback, config)
+        if max(slow, quick) >= config.least and self._controller.attached():
+            self._controller.rumble(slow, quick, round(1000 * config.pulse))
+            self._next_pulse = now + config.every
 
     def _twist(self, state: ArmState) -> Float[np.ndarray, "6"]:
         config = self._config
@@ -357,7 +428,7 @@ KEYS: MappingProxyType[str, Request] = MappingProxyType(
 _GRIPPER = {"[": 0.08, "]": 0.0}
 
 
-class TerminalKeyboard:
+class TerminalKeyboard(Human):
     """Moves the end effector by keys: i k away and back, j l left and right, u o up and down.
 
     [ opens the gripper, ] closes it; `KEYS` has the rest. The end effector turns by the

@@ -15,10 +15,12 @@ from jaxtyping import Float
 
 from hrc_learn.controller import SafetyConfig, SafetyFilter, SafetyState
 from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import SerialChain, coarse_orientation
 from hrc_learn.protocols import Arm, ArmState, Human, HumanInput
 from hrc_learn.regions import PositionRegion
 from hrc_learn.skills.arm_motion import resolved_rate
+from hrc_learn.skills.person_feedback import PersonFeedback, filter_hindrance, share_kept
 
 ForceMapping = Literal["transpose", "pinv"]
 
@@ -263,6 +265,7 @@ class HandGuidedArm:
         self.config = config or HandGuidingConfig()
         self._chain, self._arm, self._human = chain, arm, human
         self._filter = SafetyFilter(chain.limits, self.config.safety)
+        self._feedback = PersonFeedback(chain)
         self.safety: SafetyState
         self.restart()
 
@@ -283,11 +286,18 @@ class HandGuidedArm:
             twist[:3] = self._attraction(human_input, pose.position)
         null_velocity = torch.from_numpy(human_input.nullspace_input / self.config.damping)
         desired = resolved_rate(J, twist, null_velocity)
-        velocity, self.safety, _ = self._filter.step(
+        velocity, self.safety, report = self._filter.step(
             self.safety, q, desired, self.config.dt, jacobian=J
         )
         command = velocity.numpy()
         self._arm.command(command)
+        hindrances, pushed = self._feedback.hindrances, bool(human_input.twist.any())
+        if human_input.nullspace_input.any():
+            pushed = True
+            hindrances.note_across(null_velocity, null_projection(J, null_velocity))
+        if (cause := filter_hindrance(report)) is not None:
+            hindrances.note(cause, share_kept(desired, velocity))
+        self._human.tell(self._feedback.told(state, J, pushed=pushed))
         return GuidedStep(state=state, human_input=human_input, pose=pose, command=command)
 
     def _attraction(

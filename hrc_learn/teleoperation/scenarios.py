@@ -15,7 +15,7 @@ from jaxtyping import Float, UInt8
 
 from hrc_learn.controller import SafetyConfig
 from hrc_learn.kinematics import gripper_down, panda
-from hrc_learn.protocols import ArmState, Human, HumanInput
+from hrc_learn.protocols import ArmState, Feedback, Human, HumanInput
 from hrc_learn.sim import CameraKind, Imperfections, World, open_camera
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.arm_motion import (
@@ -158,7 +158,7 @@ class Grasping(Scenario):
         return world.holds(item.name) and bool(bottom > 0.5 * self.height)
 
 
-class SequencedInput:
+class SequencedInput(Human):
     """People who lead the arm one after the other, each with the gripper's opening."""
 
     def __init__(self, turns: list[tuple[float, Human, float]]):
@@ -167,13 +167,17 @@ class SequencedInput:
         Args:
             turns: When each begins [s], who leads, and how far the gripper opens [m].
         """
-        self._turns = turns
+        self._turns, self._leads = turns, turns[0][1]
 
     def read(self, state: ArmState) -> HumanInput:
         """What the one asks for whose turn it is."""
         begun = [turn for turn in self._turns if turn[0] <= state.time]
-        _, human, width = begun[-1] if begun else self._turns[0]
-        return replace(human.read(state), gripper=width)
+        _, self._leads, width = begun[-1] if begun else self._turns[0]
+        return replace(self._leads.read(state), gripper=width)
+
+    def tell(self, feedback: Feedback) -> None:
+        """Tell the one whose turn it is."""
+        self._leads.tell(feedback)
 
 
 class ScenarioRun:

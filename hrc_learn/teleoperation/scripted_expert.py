@@ -13,7 +13,7 @@ from scipy.interpolate import PchipInterpolator
 
 from hrc_learn.geometry import Pose, minimum_jerk
 from hrc_learn.kinematics import SerialChain, coarse_orientation
-from hrc_learn.protocols import ArmState, HumanInput
+from hrc_learn.protocols import ArmState, Human, HumanInput
 from hrc_learn.teleoperation.hand_guiding import TINY, force_to_nullspace_input
 
 
@@ -92,7 +92,7 @@ def random_pulls(
     return tuple(pulls)
 
 
-class ScriptedPerturbation:
+class ScriptedPerturbation(Human):
     """A person who pulls at the arm at given times, and does nothing else."""
 
     def __init__(
@@ -213,7 +213,7 @@ def _by_the_rule(position: Float[torch.Tensor, "3"], _time: float) -> Float[torc
     return coarse_orientation(position)
 
 
-class ScriptedExpert:
+class ScriptedExpert(Human):
     """Teaches a motion in task space and null-space posture at once, with an unsteady hand.
 
     Position follows a guided path, corrected by eye; orientation follows a rule; meanwhile the

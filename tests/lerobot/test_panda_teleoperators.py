@@ -16,7 +16,7 @@ from hrc_learn.lerobot.panda_robot import GRIPPER, HAND, JOINTS
 from hrc_learn.lerobot.robots import FrankaPandaConfig
 from hrc_learn.lerobot.teleoperators import PandaExpertConfig, PandaPageConfig
 from hrc_learn.lerobot.teleoperators.panda_teleoperators import GuidedRobot
-from hrc_learn.protocols import ArmState, HumanInput
+from hrc_learn.protocols import ArmState, Human, HumanInput
 from hrc_learn.teleoperation import hand_guiding, page
 
 READY = panda.ready.numpy()
@@ -132,7 +132,7 @@ def torch_of(robot):
     return torch.from_numpy(robot.read_state().joint_position)
 
 
-class Page:
+class Page(Human):
     """Stands for the page in a browser: what it was shown, and what a person there asks for."""
 
     requests = ()

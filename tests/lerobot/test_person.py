@@ -155,7 +155,7 @@ def test_the_real_panda_yields_to_a_device_too(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="person"):
         FrankaPandaConfig(person=PersonConfig(kind="scripted"), **settings)
 
-    class Device:
+    class Device(person.Human):
         def __init__(self, config):
             self.closed = False
 

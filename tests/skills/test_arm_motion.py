@@ -184,8 +184,9 @@ def test_an_arm_slides_along_what_is_around_it_and_stops_before_it():
         return lambda joints: at - (joints - q) @ along
 
     def kept(at):
-        part, waits = kept_clear(q, task, null, wall(at), margin=0.03)
+        part, waits, distance = kept_clear(q, task, null, wall(at), margin=0.03)
         assert not waits
+        assert distance == pytest.approx(at)
         return float(part @ along)
 
     assert kept(1.0) == pytest.approx(0.5)

@@ -9,22 +9,30 @@ import torch
 from unchecked import shapes_unchecked
 
 from hrc_learn.kinematics import panda
-from hrc_learn.protocols import ArmState, HumanInput
+from hrc_learn.protocols import ArmState, Human, HumanInput
 from hrc_learn.skills import ComplementaryMotion, YieldingConfig, joint_line
 
 DT = 0.05
 SIDEWAYS = np.array([4.0, 0.0, -4.0, 0.0, 3.0, 0.0, 0.0])
 
 
-class Pusher:
+class Pusher(Human):
     """Pushes with given efforts from one time to another."""
 
     def __init__(self, push, start, end):
         self.push, self.start, self.end = np.asarray(push, dtype=float), start, end
+        self.told = []
 
     def read(self, state):
         on = self.start <= state.time < self.end
         return HumanInput(nullspace_input=self.push if on else np.zeros(7))
+
+    def tell(self, feedback):
+        self.told.append(feedback)
+
+    def reasons(self):
+        """Hindrances told of at each step."""
+        return [{reason.hindrance for reason in told.reasons} for told in self.told]
 
 
 def line(seconds=4.0, still=6.0):
@@ -70,7 +78,9 @@ def hand_off(postures, joints):
 
 def test_what_nobody_pushes_is_handed_on_as_it_is():
     wishes, widths = line(still=0.2), np.linspace(0.08, 0.0, len(line(still=0.2)))
-    _, joints, openings = followed(wishes, Pusher(SIDEWAYS, 1e9, 1e9), widths)
+    human = Pusher(SIDEWAYS, 1e9, 1e9)
+    _, joints, openings = followed(wishes, human, widths)
+    assert not any(told.pushed or told.reasons for told in human.told)
     np.testing.assert_array_equal(joints.numpy(), wishes)
     assert openings == widths.tolist()
 
@@ -109,6 +119,19 @@ def test_joints_stay_aside_if_wanted():
     assert hand_off(postures, joints)[0] < 1e-6
 
 
+@pytest.mark.parametrize("strength", [0.3, 3.0])
+def test_the_share_followed_is_the_null_velocity_reached_over_the_one_asked(strength):
+    wishes = np.repeat(panda.ready.numpy()[None], 12, axis=0)
+    human = Pusher(strength * SIDEWAYS, 0.0, 9.0)
+    _, joints, _ = followed(wishes, human)
+    half_way = (joints[-1] + joints[-2]) / 2
+    n = torch.linalg.svd(panda.jacobian(half_way))[2][6].numpy()
+    reached = n @ (joints[-1] - joints[-2]).numpy() / DT
+    asked = n @ human.push / YieldingConfig().damping
+    assert human.told[-1].followed == pytest.approx(reached / asked, rel=0.06)
+    assert human.reasons()[-1] == ({"speed"} if strength > 1 else set())
+
+
 @pytest.mark.parametrize("sign", [1, -1])
 def test_a_push_ends_where_limits_and_singularities_begin(sign):
     """However long and hard: the hand stays, no joint passes its limit, and they come back."""
@@ -125,9 +148,14 @@ def test_a_push_ends_where_limits_and_singularities_begin(sign):
 def test_the_null_space_stops_before_a_limit_that_would_move_the_hand(sign):
     limits = replace(panda.limits, lower=panda.ready - 0.4, upper=panda.ready + 0.4)
     wishes = np.repeat(panda.ready.numpy()[None], round(2.5 / DT), axis=0)
-    postures, joints, _ = followed(wishes, Pusher(sign * 3 * SIDEWAYS, 0.1, 2.5), limits=limits)
-    moved = (joints - panda.ready).abs().max()
-    assert 0.3 < moved < 0.4
+    human = Pusher(sign * 3 * SIDEWAYS, 0.1, 2.5)
+    postures, joints, _ = followed(wishes, human, limits=limits)
+    moved = (joints - panda.ready).abs()
+    assert 0.3 < moved.max() < 0.4
+    # The person is told of the joint that really is there.
+    told, joint = human.told[-1], int(moved[-1].argmax()) + 1
+    assert told.followed < 0.05
+    assert told.reasons[0].text == f"joint {joint} is at its limit"
     assert hand_off(postures, joints)[0] < 1e-6
 
 
@@ -147,6 +175,13 @@ def test_nobody_pushes_the_arm_into_what_is_around_it():
     postures, kept, _ = followed(wishes, human, clearance=clearance)
     assert clearance(kept).min() > 0.01  # of 0.03; this wall bounds one point alone
     assert (elbow(kept) - elbow(postures)).norm(dim=-1).max() > 0.05
+    # Both runs told of, one after the other; the second person of the wall.
+    reasons, near = human.reasons(), clearance(kept) < 0.035
+    assert not any("obstacle" in told for told in reasons[: len(wishes)])
+    pushed = torch.tensor([told.pushed for told in human.told[len(wishes) :]])
+    hindered = torch.tensor(["obstacle" in told for told in reasons[len(wishes) :]])
+    assert hindered[near & pushed].float().mean() > 0.8
+    assert clearance(kept)[hindered].max() < 0.15
     assert hand_off(postures, kept)[0] < 1e-6
 
 

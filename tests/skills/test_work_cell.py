@@ -10,7 +10,7 @@ from unchecked import shapes_unchecked
 
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import panda
-from hrc_learn.protocols import HumanInput
+from hrc_learn.protocols import HINDRANCES, Human, HumanInput
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills import BlockedPathError, WorkCell, WorkCellConfig, joint_line
 from hrc_learn.teleoperation import ScriptedPerturbation
@@ -120,7 +120,7 @@ def test_where_nothing_is_met_it_ends_at_the_goal():
 def test_a_jump_of_the_null_space_input_comes_smoothly(cell):
     pull = np.array([0.6, 0.0, -0.6, 0.0, 0.5, 0.0, 0.0])
 
-    class Jump:
+    class Jump(Human):
         def read(self, state):
             return HumanInput(nullspace_input=pull * (state.time < 0.5))
 
@@ -196,17 +196,21 @@ def test_however_hard_and_long_a_person_pushes_the_task_keeps_its_place_and_room
     arm = LateArm(np.array(start), late=2)
     way = side * self_motion(start)
 
-    class Person:
+    class Person(Human):
         def read(self, state):
             unit = self_motion(state.joint_position)
             way[:] = unit * np.sign(unit @ way)
             return HumanInput(nullspace_input=12.0 * way)
 
+        def tell(self, feedback):
+            self.told = feedback
+
+    person = Person()
     cell = WorkCell(
         chain=panda,
         arm=arm,
         gripper=arm,
-        human=Person(),
+        human=person,
         advance=arm.advance,
         config=WorkCellConfig(command_delay=0.02),
     )
@@ -217,14 +221,24 @@ def test_however_hard_and_long_a_person_pushes_the_task_keeps_its_place_and_room
     assert (joints - joints[0]).abs().max() > 0.2
     assert (hand - hand[0]).norm(dim=-1).max() < 1.5e-3
     limits = panda.limits
-    room = torch.minimum(joints - limits.lower, limits.upper - joints).min(-1).values
+    room_of_each = torch.minimum(joints - limits.lower, limits.upper - joints)
+    room = room_of_each.min(-1).values
     singular = torch.linalg.svdvals(panda.jacobian(joints))[:, -1]
     assert room.min() > 0.1
     assert singular.min() > 0.049
+    (reason, *_), joint = person.told.reasons, int(room_of_each[-1].argmin())
+    assert person.told.followed < 0.1
     if ends_at == "limit":
         assert room[-1] < 0.14
+        # The one that really is the nearest to its limit.
+        assert (reason.hindrance, reason.text) == (
+            "joint_limit",
+            f"joint {joint + 1} is at its limit",
+        )
+        assert panda.joint_names[joint] in person.told.near_limits
     else:
         assert singular[-1] < 0.07
+        assert reason.hindrance == "singularity"
 
 
 def self_motion(q):
@@ -256,7 +270,7 @@ def pushed_along(path, push, seconds, **options):
     """A cell that follows a path while a person pushes from its first to its last second."""
     arm = ObedientArm(path[0])
 
-    class Person:
+    class Person(Human):
         def read(self, state):
             d = push if seconds[0] <= state.time < seconds[1] else np.zeros(7)
             return HumanInput(nullspace_input=d)
@@ -343,6 +357,11 @@ def test_nobody_pushes_the_arm_into_what_is_around_it():
     assert hand_off(kept, path)[0] < 4e-3
 
 
+def hindered(cell, hindrance):
+    """In which steps the person was told of a hindrance."""
+    return cell.log["hindered"][:, HINDRANCES.index(hindrance)].astype(bool)
+
+
 def along_a_singularity():
     """A path on which the shoulder is stretched half-way."""
     start = torch.tensor([-0.3, 0.7, 1.5, -1.9, -0.1, 2.0, -0.3], dtype=torch.float64)
@@ -365,6 +384,8 @@ def test_a_path_waits_before_its_singularity_while_a_person_holds_the_elbow_asid
     q = torch.from_numpy(cell.log["joint_position"])
     off = panda.forward(q).position - torch.from_numpy(cell.log["goal_position"])
     assert off.norm(dim=-1).max() < 6e-3
+    assert hindered(cell, "task_waits").sum() > 100
+    assert not hindered(cell, "task_waits")[~released].any()
     at = reached == narrow
     assert np.abs(cell.log["joint_position"] - followed)[at].max() < 0.03
     np.testing.assert_allclose(cell.joints, path[-1], atol=0.03)
@@ -416,6 +437,10 @@ def test_at_a_singularity_of_the_path_nobody_pushes_the_arm_off_it():
     off = np.abs(cell.log["joint_position"] - cell.log["path_joints"])
     assert off.max() < 0.05
     assert len(cell.log) <= len(path) + 30
+    pushed = np.isfinite(cell.log["followed"])
+    assert pushed.sum() == 10
+    assert hindered(cell, "narrow_path")[pushed].all()
+    assert (cell.log["followed"][pushed] == 0).all()
 
 
 def test_the_path_waits_where_the_arm_aside_would_meet_something():

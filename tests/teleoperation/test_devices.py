@@ -1,20 +1,27 @@
 """Keys and gamepads, with a terminal and a controller that the tests play; several at once."""
 
+import ctypes
+from pathlib import Path
+from typing import ClassVar
+
 import numpy as np
 import pytest
 import torch
 
 from hrc_learn.kinematics import coarse_orientation, panda
-from hrc_learn.protocols import ArmState, Human, HumanInput
+from hrc_learn.protocols import ArmState, Feedback, Human, HumanInput
 from hrc_learn.teleoperation import InputFilter, InputFilterConfig, InteractionForceConfig
 from hrc_learn.teleoperation.devices import (
     DIRECTIONS,
+    CombinedInput,
     Gamepad,
     GamepadConfig,
     KeyboardState,
     LinkGuide,
+    RumbleConfig,
     TerminalKeyboard,
     deflection,
+    rumble_strength,
 )
 
 Q = panda.ready.numpy()
@@ -34,6 +41,7 @@ class Pad:
 
     def __init__(self, axes=None, buttons=()):
         self.axes, self.buttons, self.plugged = axes or {}, set(buttons), True
+        self.pulses = []
 
     def get_axis(self, axis):
         return self.axes.get(axis, 0)
@@ -44,13 +52,17 @@ class Pad:
     def attached(self):
         return self.plugged
 
+    def rumble(self, low_frequency, high_frequency, duration):
+        self.pulses.append((low_frequency, high_frequency, duration))
+        return True
+
 
 def test_the_numbers_are_those_of_the_library():
     pygame = pytest.importorskip("pygame", reason="the extra `gamepad` is not installed")
     controller = pytest.importorskip("pygame._sdl2.controller")
     from hrc_learn.teleoperation import devices as gamepad
 
-    for name in ("get_axis", "get_button", "attached"):
+    for name in ("get_axis", "get_button", "attached", "rumble"):
         assert callable(getattr(controller.Controller, name))
     assert gamepad._LEFT_X == pygame.CONTROLLER_AXIS_LEFTX
     assert gamepad._LEFT_Y == pygame.CONTROLLER_AXIS_LEFTY
@@ -212,7 +224,7 @@ CONFIG = InputFilterConfig(linear=1.5, angular=5.0)
 LED = np.array([0.25, 0.0, 0.0, 0.0, 0.4, 0.3])
 
 
-class Person:
+class Person(Human):
     twist = LED
 
     def read(self, state):
@@ -274,7 +286,7 @@ def test_an_acceleration_that_is_none_is_refused(name):
 
 @pytest.mark.parametrize("way", [(0.25, 0, 0), (0, -0.1, 0), (0, 0.9, 0.9)])
 def test_a_device_leads_the_elbow_instead_of_the_hand(way):
-    class Device:
+    class Device(Human):
         def read(self, state):
             return HumanInput(twist=np.array([*way, 0.1, 0.2, 0.3]), requests=("stop",))
 
@@ -287,3 +299,101 @@ def test_a_device_leads_the_elbow_instead_of_the_hand(way):
     force *= min(1.0, 45 / np.linalg.norm(force))
     expected = J.T @ force
     np.testing.assert_allclose(asked.nullspace_input, expected, atol=1e-9)
+
+
+def feedback(followed=1.0, force=0.0, pace=1.0):
+    return Feedback(
+        pushed=followed < 1,
+        followed=followed,
+        contact_force=np.array([0.0, 0.6 * force, -0.8 * force]),
+        pace=pace,
+    )
+
+
+@pytest.mark.parametrize(
+    ("told", "slow", "quick"),
+    [
+        (feedback(), 0.0, 0.0),
+        (feedback(followed=0.25), 0.0, 0.75),
+        (feedback(force=20.0), 0.0, 0.0),
+        (feedback(force=40.0), 0.5, 0.0),
+        (feedback(force=500.0, followed=0.0), 1.0, 1.0),
+        (feedback(pace=0.2), 0.8, 0.0),
+        (feedback(force=40.0, pace=0.9), 0.5, 0.0),
+        (Feedback(), 0.0, 0.0),  # an arm that feels nothing
+    ],
+)
+def test_what_a_hand_at_the_gamepad_feels(told, slow, quick):
+    assert rumble_strength(told, RumbleConfig()) == pytest.approx((slow, quick))
+
+
+def test_a_gamepad_rumbles_in_pulses_while_there_is_something_to_tell():
+    pad, clock, config = Pad(), Clock(), RumbleConfig(every=0.25, pulse=0.12)
+    gamepad = Gamepad(panda, pad, config=GamepadConfig(rumble=config), clock=clock)
+    for k in range(300):  # at 100 Hz: a second each of nothing, a hindrance, a contact
+        clock.time = 0.01 * k
+        gamepad.tell((feedback(), feedback(followed=0.3), feedback(force=60.0))[k // 100])
+    assert pad.pulses == 4 * [(0.0, pytest.approx(0.7), 120)] + 4 * [(1.0, 0.0, 120)]
+    pad.plugged = False
+    clock.time = 9.0
+    gamepad.tell(feedback(followed=0.0))
+    assert len(pad.pulses) == 8
+
+
+def test_a_motor_that_would_hardly_turn_is_left_alone():
+    pad = Pad()
+    Gamepad(panda, pad).tell(feedback(followed=0.95))
+    assert pad.pulses == []
+
+
+class VirtualJoystick(ctypes.Structure):
+    """SDL_VirtualJoystickDesc of SDL 2.24 and later."""
+
+    _fields_: ClassVar = [
+        *((name, ctypes.c_uint16) for name in ("version", "type", "axes", "buttons", "hats")),
+        *((name, ctypes.c_uint16) for name in ("vendor", "product", "padding")),
+        *((name, ctypes.c_uint32) for name in ("button_mask", "axis_mask")),
+        *((name, ctypes.c_void_p) for name in ("name", "userdata", "update", "player")),
+        *((name, ctypes.c_void_p) for name in ("rumble", "triggers", "led", "effect")),
+    ]
+
+
+def test_the_motors_of_a_gamepad_of_the_librarys_own_turn(monkeypatch):
+    """SDL itself makes the gamepad, and tells what its motors were asked for."""
+    pytest.importorskip("pygame", reason="the extra `gamepad` is not installed")
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    with pytest.raises(ValueError, match="no gamepad 63"):  # which starts the library
+        Gamepad.open(panda, index=63)
+    maps = Path("/proc/self/maps")
+    lines = maps.read_text().splitlines() if maps.exists() else []
+    loaded = [line.split()[-1] for line in lines if "libSDL2-2" in line]
+    if not loaded:
+        pytest.skip("pygame's SDL is not to be found among the loaded libraries")
+    sdl, asked = ctypes.CDLL(loaded[0]), []
+    kind = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_uint16, ctypes.c_uint16)
+    rumble = kind(lambda _, slow, quick: asked.append((slow, quick)) or 0)
+    pad = VirtualJoystick(
+        version=1, type=1, axes=6, buttons=15, rumble=ctypes.cast(rumble, ctypes.c_void_p)
+    )
+    index = sdl.SDL_JoystickAttachVirtualEx(ctypes.byref(pad))
+    assert index >= 0
+    try:
+        gamepad = Gamepad.open(panda, index)
+        assert not gamepad.read(STATE).twist.any()
+        gamepad.tell(feedback(followed=0.5, force=60.0))
+        assert asked == [(65535, 32767)]
+    finally:
+        sdl.SDL_JoystickDetachVirtual(index)
+
+
+@pytest.mark.parametrize("wrong", [{"pulse": 0.3}, {"pulse": 0.0}, {"contact": (20.0, 20.0)}])
+def test_pulses_without_sense_are_refused(wrong):
+    with pytest.raises(ValueError, match="must be"):
+        RumbleConfig(**wrong)
+
+
+def test_all_that_lies_between_hands_on_what_the_arm_tells():
+    pads, told = [Pad(), Pad()], feedback(followed=0.0)
+    guide = LinkGuide(Gamepad(panda, pads[0]), panda)
+    InputFilter(CombinedInput(guide, Gamepad(panda, pads[1]), Person())).tell(told)
+    assert [len(pad.pulses) for pad in pads] == [1, 1]

@@ -6,7 +6,7 @@ import torch
 
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import panda
-from hrc_learn.protocols import ArmState, DrawnRegion, HumanInput
+from hrc_learn.protocols import ArmState, DrawnRegion, Human, HumanInput
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.teleoperation import (
     InteractionForceConfig,
@@ -42,11 +42,14 @@ class IdealArm:
         return panda.forward(torch.from_numpy(self.q))
 
 
-class Wish:
+class Wish(Human):
     """A person who always asks for the same."""
 
     def __init__(self, **asked):
-        self.asked = HumanInput(**asked)
+        self.asked, self.told = HumanInput(**asked), []
+
+    def tell(self, feedback):
+        self.told.append(feedback)
 
     def read(self, state):
         return self.asked
@@ -112,6 +115,45 @@ def test_limits_hold_whatever_is_asked():
     )
     assert (arm.q >= panda.limits.lower.numpy()).all()
     assert (arm.q <= panda.limits.upper.numpy()).all()
+
+
+@pytest.mark.parametrize("speed", [0.1, 4.0])
+def test_who_leads_the_hand_too_fast_is_told_so(speed):
+    arm, twist = IdealArm(), np.array([0.0, 0.0, speed, 0.0, 0.0, 0.0])
+    person = Wish(twist=twist)
+    led = HandGuidedArm(panda, arm, person, HandGuidingConfig(dt=0.01))
+    for _ in range(40):
+        step = led.step()
+        arm.q += 0.01 * arm.velocity
+        arm.time += 0.01
+    # The joint velocity sent, over the one that the hand would need.
+    J = panda.jacobian(torch.from_numpy(step.state.joint_position)).numpy()
+    needed = np.linalg.pinv(J) @ twist
+    told = person.told[-1]
+    assert told.pushed
+    assert told.followed == pytest.approx(step.command @ needed / (needed @ needed), abs=1e-3)
+    assert [reason.hindrance for reason in told.reasons] == ["speed"] * (speed > 1)
+    assert (told.followed < 0.5) == (speed > 1)
+
+
+def test_who_pulls_where_only_the_hand_could_follow_is_told_so():
+    arm = IdealArm()
+    J = panda.jacobian(torch.from_numpy(arm.q)).numpy()
+    n = np.linalg.svd(J)[2][6]
+    for push, reasons in ((J.T @ np.array([9.0, 0, 0, 0, 0, 0]), ["task"]), (n, [])):
+        person = Wish(nullspace_input=push)
+        HandGuidedArm(panda, arm, person).step()
+        (told,) = person.told
+        assert told.pushed
+        assert [reason.hindrance for reason in told.reasons] == reasons
+        assert told.followed == pytest.approx(abs(n @ push) / np.linalg.norm(push), abs=1e-6)
+
+
+def test_who_asks_for_nothing_is_told_nothing():
+    person = Wish(region=DrawnRegion(centre=(0.45, 0.25, 0.35), half_size=(0.1, 0.1, 0.1)))
+    HandGuidedArm(panda, IdealArm(), person).step()
+    (told,) = person.told
+    assert (told.pushed, told.followed, told.reasons) == (False, 1.0, ())
 
 
 @pytest.mark.parametrize("name", ["dt", "damping", "attraction", "approach_rate"])

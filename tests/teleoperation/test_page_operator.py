@@ -8,7 +8,7 @@ import torch
 
 from hrc_learn.geometry import quaternion
 from hrc_learn.kinematics import coarse_orientation, panda
-from hrc_learn.protocols import ArmState, DrawnRegion, HumanInput
+from hrc_learn.protocols import ArmState, DrawnRegion, Human, HumanInput
 from hrc_learn.teleoperation import CombinedInput, InteractionForceConfig, gizmo_nullspace_input
 from hrc_learn.teleoperation.page import PageHuman
 from hrc_learn.teleoperation.page.page_operator import HeldGizmo, HeldGizmos, gizmo_command
@@ -144,7 +144,7 @@ def test_nobody_asks_for_nothing():
     assert asked.arrows.shape == (0, 2, 3)
 
 
-class Source:
+class Source(Human):
     def __init__(self, **asked):
         self._asked = HumanInput(**asked)
 

@@ -6,7 +6,7 @@ import torch
 from unchecked import shapes_unchecked
 
 from hrc_learn.kinematics import panda
-from hrc_learn.protocols import ArmState, HumanInput
+from hrc_learn.protocols import ArmState, Human, HumanInput
 from hrc_learn.sim import World
 from hrc_learn.skills.arm_motion import PositionServo, PositionServoConfig
 from hrc_learn.teleoperation.hand_guiding import HandGuidedArm, HandGuidingConfig
@@ -172,7 +172,7 @@ def test_a_box_in_the_hand_is_not_placed():
 
 
 def test_turns_follow_each_other():
-    class Still:
+    class Still(Human):
         def read(self, state):
             return HumanInput()
 

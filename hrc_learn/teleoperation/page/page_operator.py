@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import SerialChain, coarse_orientation
-from hrc_learn.protocols import ArmState, HumanInput, Request
+from hrc_learn.protocols import ArmState, Feedback, Human, HumanInput, Request
 from hrc_learn.teleoperation.hand_guiding import (
     InteractionForceConfig,
     bounded,
@@ -124,7 +124,7 @@ class HeldGizmos:
             del self._held[key]
 
 
-class PageHuman:
+class PageHuman(Human):
     """Hands what a person asks for from the page's thread to the loop, without a lock.
 
     `read` costs the loop about a microsecond: references are exchanged, nothing is computed.
@@ -157,6 +157,12 @@ class PageHuman:
         self._posted = (self._idle, self._idle, float("-inf"))
         self._requests: deque[Request] = deque()
         self._state: ArmState | None = None
+        self._feedback = Feedback()
+
+    @property
+    def feedback(self) -> Feedback:
+        """The newest that the arm has told."""
+        return self._feedback
 
     @property
     def state(self) -> ArmState | None:
@@ -184,6 +190,10 @@ class PageHuman:
         requests = tuple(self._requests.popleft() for _ in range(len(self._requests)))
         return replace(asked, requests=requests)
 
+    def tell(self, feedback: Feedback) -> None:
+        """Hand over what the arm tells, for the page's thread to show."""
+        self._feedback = feedback
+
 
 def _locked(asked: HumanInput) -> HumanInput:
     for array in (asked.nullspace_input, asked.twist):
@@ -201,6 +211,8 @@ class GizmoCommand:
     """Of the end effector, linear [m/s] and angular [rad/s]."""
     arrows: Float[np.ndarray, "gizmos 2 3"]
     """From the point held to the pointer, in the base frame [m]."""
+    held: tuple[int | None, ...] = ()
+    """Joints that are held, counted from 1; None: the end effector."""
 
 
 def gizmo_command(
@@ -245,6 +257,7 @@ def gizmo_command(
         nullspace_input=bounded(d, config.max_nullspace_input),
         twist=guiding_twist(tool, velocity, orientation, config) if guided else np.zeros(6),
         arrows=arrows,
+        held=tuple(gizmo.joint for gizmo in gizmos),
     )
 
 
