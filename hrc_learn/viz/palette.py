@@ -39,6 +39,16 @@ def rgba(colour: str) -> tuple[int, int, int, int]:
     return r, g, b, 255
 
 
+def followed_colour(share: float) -> str:
+    """Of a push of which an arm follows a share, 0 to 1: green all, vermilion nothing of it.
+
+    In five steps, each of which can be told from the next.
+    """
+    return (VERMILION, "#DE8000", ORANGE, "#A0A030", GREEN)[
+        round(4 * min(max(share, 0.0), 1.0))
+    ]
+
+
 def lighten(colour: str) -> tuple[int, int, int, int]:
     """A colour mixed with white, for the curve that lies behind."""
     r, g, b, a = rgba(colour)

@@ -7,16 +7,18 @@ import pytest
 import torch
 
 from hrc_learn.kinematics import panda
-from hrc_learn.protocols import HumanInput
+from hrc_learn.protocols import Feedback, Human, HumanInput, Reason
 from hrc_learn.sim import World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.work_cell import WorkCell
 from hrc_learn.teleoperation import ScriptedPerturbation
 from hrc_learn.teleoperation.page import PageConfig
+from hrc_learn.teleoperation.page.page_operator import HeldGizmo
 from hrc_learn.teleoperation.page_session import task_page
+from hrc_learn.viz.palette import PERSON, VERMILION, rgba
 
 
-class Pulling:
+class Pulling(Human):
     """Asks for the same effort as long as it is allowed to."""
 
     def read(self, state):
@@ -84,3 +86,45 @@ def test_the_page_tells_what_the_task_and_its_safety_filter_do(world, beside):
     assert status.interventions["invalid"] == 0
     cell.begin_phase("grasp")
     assert beside.status(cell).note == ""
+
+
+def test_the_page_shows_how_far_a_held_elbow_follows_and_why_not_further(world, beside):
+    page = beside._page
+    human, advance = beside.joined(ScriptedPerturbation(panda, ()), world.advance)
+    cell = WorkCell(chain=panda, arm=world.arm, gripper=world.arm, human=human, advance=advance)
+    elbow, wrist = page._scene._knobs[4], page._scene._knobs[6]
+    far = panda.link_poses(cell.joints).position[3].numpy() + np.array([0.0, 1.0, 0.0])
+    held = HeldGizmo(joint=4, held_at=np.zeros(3), pointer=far)
+
+    def until(condition, holds=True):
+        end = time.monotonic() + 60
+        while not condition():
+            assert time.monotonic() < end
+            if holds:  # nobody's browser does, so it is soon let go
+                page._held_gizmos.take(1, "elbow", held)
+            time.sleep(0.02)
+
+    def arrow_colour():
+        arrows = page._scene._arrows  # drawn anew now and then, by another thread
+        return None if arrows is None else tuple(np.ravel(arrows.colors)[:3])
+
+    until(lambda: human.read(cell.state).nullspace_input.any())
+    told = Feedback(
+        pushed=True,
+        followed=0.0,
+        reasons=(Reason(hindrance="joint_limit", text="joint 4 is at its limit"),),
+    )
+    human.tell(told)
+    until(lambda: elbow.color == rgba(VERMILION)[:3])
+    assert page._scene._twin_knobs[4].color == elbow.color
+    assert wrist.color == rgba(PERSON)[:3]
+    until(lambda: "joint 4 is at its limit" in page._panel._told.content)
+    until(lambda: arrow_colour() == rgba(VERMILION)[:3])
+    # What the loop itself tells takes its place, until nobody holds on.
+    until(lambda: cell.hold_pose(0.01) or beside.human.feedback.pushed)
+    assert beside.human.feedback is not told
+    assert beside.human.feedback.followed > 0.5
+    until(lambda: "follows by 100 %" in page._panel._told.content)
+    until(lambda: cell.hold_pose(0.01) or not beside.human.feedback.pushed, holds=False)
+    until(lambda: elbow.color == rgba(PERSON)[:3], holds=False)
+    until(lambda: page._panel._told.content == "", holds=False)

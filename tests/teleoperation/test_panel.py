@@ -4,12 +4,15 @@ import re
 
 import numpy as np
 
+from hrc_learn.protocols import Feedback, Reason
 from hrc_learn.teleoperation.page import PageStatus
 from hrc_learn.teleoperation.page.panel import (
+    feedback_html,
     interventions_html,
     nullspace_input_html,
     state_html,
 )
+from hrc_learn.viz.palette import GREEN, VERMILION
 
 
 def bars(html):
@@ -60,3 +63,46 @@ def test_an_arm_that_works_by_itself_says_what_it_does_and_records_nothing():
     assert "12.3 s" in html
     assert "saved" not in html
     assert "ready" not in html
+
+
+def words(feedback):
+    return re.sub(r"<.*?>", " ", feedback_html(feedback)).replace("&ensp;", " ").split()
+
+
+def test_how_far_a_push_is_followed_is_said_in_words_and_by_colour():
+    reasons = (
+        Reason(hindrance="joint_limit", kept=0.0, text="joint 4 is at its limit"),
+        Reason(hindrance="person", kept=1.0, text="somebody is 0.4 m <b>away"),
+    )
+    html = feedback_html(Feedback(pushed=True, followed=0.02, reasons=reasons))
+    assert f"background:{VERMILION}" in html
+    assert "follows by 0 %" in html
+    assert "joint 4 is at its limit; somebody is 0.4 m &lt;b&gt;away" in html
+    assert f"background:{GREEN}" in feedback_html(Feedback(pushed=True))
+
+
+def test_what_the_arm_feels_is_said_while_nobody_pushes():
+    assert feedback_html(Feedback()) == ""
+    felt = Feedback(
+        contact_force=np.array([0.0, 18.0, 24.0]),
+        near_limits=("joint4",),
+        person_distance=0.42,
+        pace=0.31,
+        slip=0.0042,
+    )
+    told = " ".join(words(felt))
+    assert told == (
+        "contact: 30 N near their limits: joint4 the object held slips: 4 mm "
+        "nearest person: 0.4 m away, pace 30 %"
+    )
+    # Friction feels like a small force; unknown people are said to be.
+    assert feedback_html(Feedback(contact_force=np.array([0.0, 15.0, 0.0]))) == ""
+    assert "nobody knows where" in feedback_html(Feedback(person_distance=float("nan")))
+
+
+def test_numbers_are_shown_as_far_as_they_are_steady():
+    a, b = (
+        Feedback(contact_force=np.array([0, 0, f]), person_distance=d)
+        for f, d in ((29.0, 0.41), (31.5, 0.44))
+    )
+    assert feedback_html(a) == feedback_html(b)

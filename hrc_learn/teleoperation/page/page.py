@@ -25,6 +25,7 @@ from hrc_learn.teleoperation.page.page_operator import (
 )
 from hrc_learn.teleoperation.page.page_scene import Gizmos, PageScene
 from hrc_learn.teleoperation.page.panel import PageStatus, Panel
+from hrc_learn.viz.palette import followed_colour
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -182,15 +183,18 @@ class Page:
                 continue
             command = self._command(state)
             links = self._chain.link_poses(_joints(state))
+            feedback = self.human.feedback
+            colour = followed_colour(feedback.followed)
             with self._server.atomic():
                 self._scene.move(*self._poses, links.position.numpy())
-                self._scene.point(command.arrows)
+                self._scene.point(command.arrows, colour, command.held)
                 self._gizmos.follow(links[-1])
                 if ticks % _PANEL_EVERY == 0:
                     people = len(self._server.get_clients())
                     self._panel.refresh(
                         self._status, command.nullspace_input, self._rate(), people
                     )
+                    self._panel.tell(feedback)
             ticks += 1
 
     def _rate(self) -> float:

@@ -5,7 +5,7 @@ them: links, knobs and the end effector's gizmo.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -139,6 +139,7 @@ class PageScene:
             self._draw_box(box)
         self._surroundings(server)
         self._arrows = None
+        self._knob_colours = dict.fromkeys(_KNOBS, PERSON)
 
     def holdables(self) -> Iterator[tuple[Holdable, int | None, np.ndarray]]:
         """All that can be held: node, joint (None: end effector), offset from the arm [m]."""
@@ -183,8 +184,25 @@ class PageScene:
             if node is not None:
                 node.visible = visible
 
-    def point(self, arrows: Float[np.ndarray, "arrows 2 3"]) -> None:
-        """Show where from and where to the arm is pulled."""
+    def point(
+        self,
+        arrows: Float[np.ndarray, "arrows 2 3"],
+        colour: str = PERSON,
+        held: Collection[int | None] = (),
+    ) -> None:
+        """Show where from and where to the arm is pulled, and how far it follows.
+
+        Args:
+            arrows: From the points held to the pointers, in the base frame [m].
+            colour: Of the arrows and of the knobs held.
+            held: Joints that are held, counted from 1; None: the end effector.
+        """
+        for joint, before in self._knob_colours.items():
+            now = colour if joint in held else PERSON
+            if now != before:
+                self._knob_colours[joint] = now
+                for knobs in (self._knobs, self._twin_knobs):
+                    knobs[joint].color = rgba(now)[:3]
         if self._arrows is not None:
             self._arrows.remove()
             self._arrows = None
@@ -192,7 +210,7 @@ class PageScene:
             self._arrows = self._scene.add_arrows(
                 "/pull",
                 arrows,
-                _PERSON,
+                rgba(colour)[:3],
                 shaft_radius=0.008,
                 head_radius=0.022,
                 head_length=0.05,

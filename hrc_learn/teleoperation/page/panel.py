@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
@@ -11,12 +12,12 @@ import numpy as np
 from jaxtyping import Float
 
 from hrc_learn.geometry import Box
-from hrc_learn.protocols import DrawnRegion, Request
+from hrc_learn.protocols import DrawnRegion, Feedback, Request
 from hrc_learn.teleoperation.devices import DIRECTIONS, KeyboardState
 from hrc_learn.teleoperation.hand_guiding import InteractionForceConfig
 from hrc_learn.teleoperation.page.page_scene import ViserServer
 from hrc_learn.teleoperation.page.region_editor import RegionEditor
-from hrc_learn.viz.palette import BLUE, GREEN, GREY, PERSON, VERMILION
+from hrc_learn.viz.palette import BLUE, GREEN, GREY, PERSON, VERMILION, followed_colour
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,6 +97,41 @@ def nullspace_input_html(d: Float[np.ndarray, " joints"], largest: float) -> str
             f'<span style="width:3.4em;text-align:right">{value:+.1f}</span></div>'
         )
     return _block("Null-space input d [N m]", "".join(rows))
+
+
+# Below which a contact is not told [N]: friction of the simulated joints feels like 17 N. And
+# the least change of a gripper's opening that is a slip rather than noise [m].
+_LEAST_CONTACT, _LEAST_SLIP = 20.0, 0.001
+
+
+def feedback_html(feedback: Feedback) -> str:
+    """How far the arm follows, why not further, and what it feels; empty if there is nothing.
+
+    Numbers are rounded as far as they are steady: what is shown changes when something does.
+
+    Args:
+        feedback: That the arm has told.
+    """
+    rows = []
+    if feedback.pushed:
+        share = round(10 * feedback.followed) * 10
+        badge = _badge(followed_colour(feedback.followed), f"follows by {share} %")
+        why = "; ".join(html.escape(reason.text) for reason in feedback.reasons)
+        rows.append(f"{badge}&ensp;{why}")
+    force, felt = feedback.contact_force, []
+    if force is not None and (size := float(np.linalg.norm(force))) >= _LEAST_CONTACT:
+        felt.append(f"contact: {5 * round(size / 5)} N")
+    if feedback.near_limits:
+        felt.append(f"near their limits: {', '.join(feedback.near_limits)}")
+    if feedback.slip >= _LEAST_SLIP:
+        felt.append(f"the object held slips: {1e3 * feedback.slip:.0f} mm")
+    distance = feedback.person_distance
+    if distance is not None:
+        known = math.isfinite(distance)
+        where = f"{max(distance, 0.0):.1f} m away" if known else "nobody knows where"
+        felt.append(f"nearest person: {where}, pace {10 * round(10 * feedback.pace)} %")
+    rows += [f'<div style="opacity:.75">{html.escape(words)}</div>' for words in felt]
+    return f'<div style="padding:.2em .9em .4em">{"".join(rows)}</div>' if rows else ""
 
 
 def interventions_html(status: PageStatus, more: Sequence[str], latest: str) -> str:
@@ -186,7 +222,7 @@ class Panel:
         self._next: Request = "start"
         self._keys = KeyboardState()
         self.gripper: float | None = None
-        self._state = gui.add_html("")
+        self._state, self._told = gui.add_html(""), gui.add_html("")
         if guides:
             with gui.add_folder("Demonstration"):
                 self._add_recording(request, task)
@@ -284,6 +320,12 @@ class Panel:
     def direction(self) -> Float[np.ndarray, "3"]:
         """Where keys move the end effector: a unit vector, or zero."""
         return self._keys.direction()
+
+    def tell(self, feedback: Feedback) -> None:
+        """Show what the arm tells, where that has changed."""
+        words = feedback_html(feedback)
+        if words != self._told.content:
+            self._told.content = words
 
     def refresh(
         self,
