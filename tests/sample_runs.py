@@ -14,6 +14,7 @@ OPTIONAL = (
     "demo_joint_position",
     "demo_path",
     "elbow_motion",
+    "followed",
     "nullspace_input",
     "image_jacobian",
     "joint_limits",
@@ -81,6 +82,8 @@ def sample_run(**changes) -> RunRecording:
         "weight_norm": 5.0 + time,
         "potentials": {"vision": np.exp(-time), "Cartesian box": 2 * np.exp(-time)},
         "nullspace_input": effort,
+        "followed": np.where(time > 2.0, 0.4, np.nan),
+        "hindered": {"joint_limit": time > 3.0, "person": time > 4.0},
         "elbow_motion": 0.1 * effort[:, 3],
         "position_deviation": 1e-4 * effort[:, 3],
         "rotation_deviation": np.radians(0.01) * effort[:, 3],
@@ -96,7 +99,7 @@ def until(run: RunRecording, steps: int) -> RunRecording:
     """The first steps of a run, as it was recorded while it still went on."""
     now = run.time[steps - 1]
     changes = _cut(run, steps) | {"demo_path": run.demo_path, "plan_path": run.plan_path}
-    for name in ("potentials", "safety", "worker_distance"):
+    for name in ("potentials", "safety", "worker_distance", "hindered"):
         changes[name] = {key: values[:steps] for key, values in changes[name].items()}
     changes["bodies"] = tuple(Body(**_cut(body, steps)) for body in run.bodies)
     changes["phases"] = tuple(phase for phase in run.phases if phase.time <= now)

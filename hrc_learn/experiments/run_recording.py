@@ -20,7 +20,7 @@ from hrc_learn.kinematics import panda
 from hrc_learn.sim import MotionLog, Touch, World
 from hrc_learn.skills.pick_and_place import INTERACT, TRANSFER
 from hrc_learn.skills.placing import Plan
-from hrc_learn.skills.work_cell import SAFETY_COLUMNS, WorkCell
+from hrc_learn.skills.work_cell import HINDRANCE_COLUMNS, SAFETY_COLUMNS, WorkCell
 from hrc_learn.vision import CameraModel
 from hrc_learn.viz import CameraRecording, JointLimits, LoggedSteps, RunRecording
 
@@ -233,6 +233,8 @@ def record(
         potentials={"task space": log["potential"]},
         potential_rate=log["potential_rate"],
         nullspace_input=log["nullspace_input"],
+        followed=log["followed"],
+        hindered={name: log["hindered"][:, i] for i, name in enumerate(HINDRANCE_COLUMNS)},
         elbow_motion=deviation.elbow,
         position_deviation=deviation.position,
         rotation_deviation=deviation.rotation,

@@ -126,6 +126,16 @@ def _person(run: RunRecording) -> Tab:
         effort = several("person/effort", run.joint_names, run.nullspace_input)
         title = "Null-space effort d of the person, by joint [N m]"
         plots.append(Plot(title=title, curves=(effort,), legend=True, share=2.0))
+    if run.followed is not None:
+        share = single("person/followed", "share", run.followed, palette.TARGET)
+        title = "Share of the push that the arm follows [-]"
+        plots.append(Plot(title=title, curves=(share,), range=(-0.05, 1.05)))
+    if run.hindered:
+        # A line at a height of its own for each, where it acts.
+        rows = [np.where(on, k + 1.0, np.nan) for k, on in enumerate(run.hindered.values())]
+        reasons = several("person/hindered", run.hindered, np.column_stack(rows), width=4.0)
+        extent, title = (0.0, len(rows) + 1.0), "Why it does not follow, or only in part"
+        plots.append(Plot(title=title, curves=(reasons,), range=extent, legend=True))
     moved, turned = run.position_deviation, run.rotation_deviation
     blue, deviation = palette.RUN_ON_DARK, "Deviation of the end effector"
     for path, values, unit, colour, title in (

@@ -100,6 +100,10 @@ class RunRecording:
 
     nullspace_input: Float[np.ndarray, "time joints"] | None = None
     """Null-space input d of the person, on each joint [N m]."""
+    followed: Float[np.ndarray, " time"] | None = None
+    """Share of the push that the arm follows, 0 to 1; NaN while nobody pushes."""
+    hindered: Mapping[str, Bool[np.ndarray, " time"]] = field(default_factory=dict)
+    """Whether each hindrance keeps it from following, by name."""
     elbow_motion: Float[np.ndarray, " time"] | None = None
     """How far the elbow is from where it would be undisturbed [m]."""
     position_deviation: Float[np.ndarray, " time"] | None = None
@@ -123,7 +127,7 @@ class RunRecording:
     def __post_init__(self) -> None:
         series: dict[str, np.ndarray | None] = {name: getattr(self, name) for name in _SERIES}
         series |= {f"potentials[{name!r}]": value for name, value in self.potentials.items()}
-        for field_name in ("safety", "worker_distance"):
+        for field_name in ("safety", "worker_distance", "hindered"):
             named = getattr(self, field_name)
             series |= {f"{field_name}[{name!r}]": value for name, value in named.items()}
         for body in self.bodies:
@@ -144,6 +148,7 @@ _SERIES = (
     "weight_norm",
     "potential_rate",
     "nullspace_input",
+    "followed",
     "elbow_motion",
     "position_deviation",
     "rotation_deviation",

@@ -27,7 +27,8 @@ def test_absent_fields_drop_their_tab(field):
 
 def test_a_bare_run_shows_its_joints():
     bare = dict.fromkeys(OPTIONAL)
-    (tab,) = run_tabs(sample_run(**bare, potentials={}, safety={}, worker_distance={}))
+    none = {name: {} for name in ("potentials", "safety", "worker_distance", "hindered")}
+    (tab,) = run_tabs(sample_run(**bare, **none))
     assert tab.title == "Joints: position blue"
     assert [plot.title for plot in tab.plots] == [f"joint{i} [rad]" for i in range(1, 8)]
 
@@ -93,3 +94,15 @@ def test_guards_that_never_acted_lie_at_the_bottom_of_their_plot():
     ranges = {plot.title: plot.range for plot in tabs[-1].plots}
     assert ranges["Safety filter: never"] == (-0.05, 1.05)
     assert ranges["Safety filter: often"] == pytest.approx((-9.95, 208.95))
+
+
+def test_hindrances_are_lines_at_heights_of_their_own_while_they_act():
+    run = sample_run()
+    shown = curves(run_tabs(run))
+    np.testing.assert_array_equal(shown["person/followed"].values[:, 0], run.followed)
+    reasons = shown["person/hindered"]
+    assert reasons.names == ("joint_limit", "person")
+    for k, name in enumerate(reasons.names):
+        drawn = np.isfinite(reasons.values[:, k])
+        np.testing.assert_array_equal(drawn, run.hindered[name])
+        assert (reasons.values[drawn, k] == k + 1).all()

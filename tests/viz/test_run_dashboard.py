@@ -143,7 +143,7 @@ def test_phases_are_logged_at_their_times(rrd):
 
 def test_a_run_without_extras_is_recorded_too(tmp_path):
     fields = dict.fromkeys(OPTIONAL)
-    mappings = {name: {} for name in ("potentials", "safety", "worker_distance")}
+    mappings = {name: {} for name in ("potentials", "safety", "worker_distance", "hindered")}
     empty = {"bodies": (), "boxes": (), "phases": ()}
     record_run(tmp_path / "bare.rrd", sample_run(**fields, **mappings, **empty))
     moving = {e for e in Rrd(tmp_path / "bare.rrd").entities if not e.startswith("__")}
