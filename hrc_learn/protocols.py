@@ -91,6 +91,9 @@ class HumanInput:
     """Where the end effector should be; None: anywhere."""
     target: tuple[float, float, float] | None = None
     """Point marked for the end effector, in the base frame [m]; None: none is."""
+    turn: tuple[float, float, float] | None = None
+    """Rotation added to the orientation that a rule or a task has for the end effector, as a
+    rotation vector in the base frame [rad]; None: none is."""
     requests: tuple[Request, ...] = ()
     """Asked for since the last reading, in this order."""
 

@@ -46,6 +46,11 @@ class Region(ABC):
         return self.feedback(x)[1]
 
 
+# Region function of the position, twice the half size out, from which on the pull of the
+# saturated form grows no faster than the distance.
+_FAR_OUT = 3.0
+
+
 @pytree
 @dataclass(frozen=True, kw_only=True)
 class PositionRegion(Region):
@@ -56,6 +61,13 @@ class PositionRegion(Region):
 
     k_c has the unit of a potential: the speed it asks for, 2 k_c f (r - c)/h^2, grows as the
     box shrinks, and near a wall the excess decays at the rate 4 k_c/h^2 [1/s].
+
+    Far from a small box that pull grows with the cube of the distance: the axis that is
+    furthest out leads alone, and a cap on the twist leaves nothing for the turn.
+    `formulation="saturated"` is the same up to twice the half size, f = 3; beyond, the pull
+    grows with the distance, and so leads straight to a box that is small:
+
+    P = sum_i k_c 3 (f_i - 3/2),   f_i > 3
     """
 
     centre: Float[Tensor, "*#batch 3"]
@@ -67,6 +79,7 @@ class PositionRegion(Region):
     stiffness: float | tuple[float, float, float] = static(4e-3)
     """k_c, one for all or one for each axis of the box. Ten times that of Table I: there the
     excess near a wall of 0.12 m decays in 9 s, which leaves the tool outside for long."""
+    formulation: Literal["paper", "saturated"] = static("paper")
 
     def value(self, x: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*both 3"]:
         """Region function f of each pair of walls at the position x [m]."""
@@ -81,8 +94,14 @@ class PositionRegion(Region):
         f = (scaled * scaled - 1).clamp(min=0)
         k_c = self.stiffness
         # One for each axis of the box, or one for all.
-        pull = (f.new_tensor(k_c) if isinstance(k_c, tuple) else k_c) * f
-        P = 0.5 * (pull * f).sum(-1)
+        k_c = f.new_tensor(k_c) if isinstance(k_c, tuple) else k_c
+        if self.formulation == "saturated":
+            near = f.clamp(max=_FAR_OUT)
+            pull = k_c * near
+            P = (pull * (f - 0.5 * near)).sum(-1)
+        else:
+            pull = k_c * f
+            P = 0.5 * (pull * f).sum(-1)
         gradient = 2 * pull * scaled / self.half_size
         if self.rotation is not None:
             gradient = quaternion.rotate(self.rotation, gradient)

@@ -220,7 +220,7 @@ def kept_clear(
     ahead = joint_position + _AHEAD * (task + shares[:, None] * null)
     now, without, *_ = every = clearance(torch.cat([joint_position[None], ahead]))
     if bool((every >= margin).all()):
-        return null, False
+        return ClearMotion(null, False, float(now))
     waits = bool(without < torch.clamp(now, max=margin))
     closing = without - every[2:]
     room = without - margin

@@ -18,8 +18,8 @@ from torch import Tensor
 from hrc_learn.controller import AdaptiveController, ControllerConfig, Goals
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import ImageJacobianEstimator
-from hrc_learn.kinematics import GraspedBox, panda_capsules
-from hrc_learn.skills.arm_motion import joint_line
+from hrc_learn.kinematics import GraspedBox, UnreachableError, panda_capsules
+from hrc_learn.skills.arm_motion import joint_line, nearest_configuration
 from hrc_learn.skills.placing import Plan
 from hrc_learn.skills.visual_servoing import (
     ServoTarget,
@@ -47,6 +47,8 @@ DESCENT_SPEED = 0.08
 _PLATE_CLEARANCE = 0.06
 # Clearance is checked at one of so many samples: at JOINT_SPEED the arm moves 3 cm in between.
 _CHECK_EVERY = 5
+# Values of joint 7 at which a pose that a person asks for is tried: each takes a millisecond.
+_POSTURES = 9
 # Largest distance of a joint from home that still counts as at home [rad].
 _AT_HOME = 0.05
 # By how much the table may be higher or lower than believed, and, once it was felt, than the
@@ -156,7 +158,7 @@ class Grasping:
             config=replace(config.controller, safety=cell.watchful(config.controller.safety)),
         )
         self.servo = VisualServo(
-            cell, controller, workplace.tool_marker, config.servo, skill.angle
+            cell, controller, workplace.tool_marker, config.servo, skill.angle, self.refusal
         )
 
     def grasp(self, item: GraspObject) -> GraspResult:
@@ -252,6 +254,26 @@ class Grasping:
         self._cell.begin_phase("servo")
         self._cell.tracked_markers = (self._workplace.tool_marker,)
         return self.servo.servo_to(target)
+
+    def refusal(self, pose: Pose) -> str:
+        """Why the end effector cannot be led to a pose from here; empty if it can.
+
+        Args:
+            pose: Where a person wants it.
+        """
+        here = self._cell.joints
+        try:
+            posture = nearest_configuration(pose, near=here, samples=_POSTURES)
+        except UnreachableError:
+            return "the arm does not reach there with this orientation"
+        table = panda_capsules.box_distance(posture, *self._workplace.object_region())
+        if float(table) < _PLATE_CLEARANCE:
+            return "too near to what may stand on the table"
+        try:
+            self._check(joint_plan(self._cell, here, posture))
+        except BlockedPathError as error:
+            return f"on the way there, {str(error).rstrip('.')}"
+        return ""
 
     def close_on(self, item: GraspObject) -> None:
         """Descend and close the fingers.

@@ -6,7 +6,7 @@ turns the gripper for the object. What it needs from demonstrations is in `visua
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -17,12 +17,14 @@ from hrc_learn.controller import AdaptiveController, ControllerState, Goals, Obs
 from hrc_learn.controller.interface import IMAGE_SIZE
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import Measurement
+from hrc_learn.skills.drawn_goals import DrawnGoals, DrawnGoalsConfig
 from hrc_learn.skills.marker_angle import AngleServo, MarkerAngle
 from hrc_learn.skills.marker_sensor import HeldMarker
 from hrc_learn.skills.work_cell import MissedGraspError, WorkCell
 
 # Parts of a probe's height that are tried until its upper end is well within the image.
 _PROBE_SHARES = np.array([1.0, 0.75, 0.5])
+_NO_TURN = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,6 +87,8 @@ class VisualServoConfig:
     would leave the marker 1 cm off its demonstrated place."""
     rate: float = 4.0
     """How fast the end effector returns into the box vertically, and into the cone [1/s]."""
+    drawn: DrawnGoalsConfig = field(default_factory=DrawnGoalsConfig)
+    """How what a person draws acts on the goals."""
 
     def within(self, pixel: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
         """A pixel, or the nearest one that keeps its distance from the edge of the image."""
@@ -218,6 +222,7 @@ class VisualServo:
         marker: int,
         config: VisualServoConfig | None = None,
         angle: MarkerAngle | None = None,
+        refusal: Callable[[Pose], str] = lambda pose: "",
     ):
         """Prepare.
 
@@ -227,6 +232,8 @@ class VisualServo:
             marker: ArUco number of the end effector's marker.
             config: When the target counts as reached.
             angle: How the marker turns in the image; None: the gripper is not turned.
+            refusal: Why the arm cannot go to a pose that a person asks for, in words for them;
+                empty if it can.
         """
         self._cell = cell
         self._controller = controller
@@ -243,6 +250,9 @@ class VisualServo:
         self._arrived = False
         self._at_rest: Measurement | None = None  # mean of what was seen at the last rest
         self._held: HeldMarker | None = None
+        self._drawn = DrawnGoals(self._config.drawn, refusal, cell.tell)
+        self._led = 0.0  # time for which a person has led the end effector [s]
+        self._above = _NO_TURN  # orientation of the last target that is not turned
         self.state: ControllerState = controller.initial_state(cell.joints)
 
     def servo_to(self, target: ServoTarget) -> float:
@@ -254,7 +264,7 @@ class VisualServo:
         Raises:
             MissedGraspError: If it takes too long, or the marker stays undetected.
         """
-        begun, start, config = self._cell.time, self._cell.task_time, self._config
+        begun, start, config = self._cell.time, self._clock, self._config
         self._detected = self._arrived = False
         self._resume()
         if config.probe == 0:
@@ -271,7 +281,7 @@ class VisualServo:
                 self._learn(target, high, low)
             reached = self._converge(target, config.tolerance, start)
             # Along the line of the turned tool, which leads elsewhere than when not turned.
-            turned = replace(target, orientation=self._turned)
+            turned = self._turned_by_person(target, self._turned)
             moved = self._cell.pose.position - before.position
             along = probe > 0 or turned.deviation(before, above) < config.probe_aside
             if along and float(moved[:2].norm()) < config.probe_reach:
@@ -300,6 +310,7 @@ class VisualServo:
         if self._angle is not None:
             self._angle.restart()
         self._turned = self._turning = None
+        self._drawn.restart()
 
     def _converge(self, target: ServoTarget, tolerance: float, start: float) -> float:
         """Step until marker and height have stayed at the target; when they got there [s]."""
@@ -312,19 +323,21 @@ class VisualServo:
             height = float(self._cell.pose.position[2] - target.above.position[2])
             at_height = abs(height - target.raised) < self._config.height_tolerance
             turned = self.turn_error(target) < self._config.turn_tolerance
-            if not (self.error(target) < tolerance and at_height and turned):
+            on_target = self.error(target) < tolerance and self._drawn.leads.target is None
+            if not (on_target and at_height and turned):
                 reached = self._cell.time
                 seen.clear()
             elif (image := self._cell.observation).joints is not None:
                 feature = torch.from_numpy(self._feature())
                 seen[image.time] = self._cell.chain.forward(image.joints), feature
-            self._check_timeouts(target, self._cell.task_time - start)
+            self._check_timeouts(target, self._clock - start)
         self._at_rest = _mean(list(seen.values()))
         return reached
 
     def _probe_height(self, target: ServoTarget) -> float:
         """From as high up as the marker is expected well within the image [m]."""
-        config, turned = self._config, replace(target, orientation=self._turned)
+        config = self._config
+        turned = self._turned_by_person(target, self._turned)
         for height in config.probe * _PROBE_SHARES:
             pixel = turned.raised_pixel(self._image_jacobian(), float(height))
             if np.array_equal(config.within(pixel), pixel):
@@ -333,8 +346,8 @@ class VisualServo:
 
     def _descend(self, target: ServoTarget) -> None:
         """Along the line, from as high up as it is raised."""
-        begun, speed = self._cell.task_time, self._config.probe_speed
-        while (height := target.raised - speed * (self._cell.task_time - begun)) > 0:
+        begun, speed = self._clock, self._config.probe_speed
+        while (height := target.raised - speed * (self._clock - begun)) > 0:
             self.step(replace(target, raised=height))
 
     def hold(self, target: ServoTarget, duration: float) -> None:
@@ -344,9 +357,14 @@ class VisualServo:
         end = self._cell.time + duration
         # What is learned meanwhile of image Jacobian and turn must not move the target.
         self._turned = self._turning
-        upright = replace(target, orientation=self._turned).upright
-        pixel = target.target(self._image_jacobian(), upright, np.zeros(3))
-        held = replace(target, target=lambda jacobian, orientation, further: pixel)
+        image_jacobian = self._image_jacobian()
+        # What the person adds to the turn must.
+        held = replace(
+            target,
+            target=lambda _, orientation, further: target.target(
+                image_jacobian, orientation, np.zeros(3)
+            ),
+        )
         self._held = HeldMarker(self._config.half_hidden)
         while self._cell.time < end:
             self.step(held)
@@ -354,7 +372,7 @@ class VisualServo:
 
     def error(self, target: ServoTarget) -> float:
         """Distance of the feature from its target [px]; NaN if it is not detected."""
-        target = replace(target, orientation=self._turned)
+        target = self._turned_by_person(target, self._turned)
         pixel = target.pixel(self._image_jacobian(), self._cell.pose)
         return float(np.linalg.norm(self._feature() - pixel))
 
@@ -374,7 +392,10 @@ class VisualServo:
         if new and self._held is None:
             self._find_turn(target)
         self._turn_on(target, feature.numpy())
-        target = replace(target, orientation=self._turning)
+        asked, clock = self._cell.human_input, self._cell.task_time
+        self._drawn.turn_on(asked.turn, self._config.turn_rate * self._cell.config.dt)
+        self._above = target.above.orientation
+        target = self._turned_by_person(target, self._turning)
         if self._arrived:
             # A person's pull or a turn for the object takes the joints far from the posture:
             # that must not call the arm back, not even while the marker is out of sight.
@@ -383,7 +404,9 @@ class VisualServo:
         if visible:
             self._last_detection, self._detected = observation.time, True
             self._last_pixel = feature.numpy()
-        goals = target.goals(self._image_jacobian(), self._cell.pose, detected=self._detected)
+        planned = target.goals(self._image_jacobian(), self._cell.pose, detected=self._detected)
+        self._drawn.read(asked, planned, self._cell.time)
+        goals = self._drawn.applied(planned, self._cell.pose.position)
         age = torch.tensor(self._cell.time - observation.time, dtype=torch.float64)
         command, self.state = self._controller.step(
             self.state,
@@ -401,9 +424,20 @@ class VisualServo:
             ),
         )
         self._arrived = self._arrived or float(self.state.task_level) == 1.0
-        approach = 0.0 if target.posture is None else 1.0 - float(self.state.task_level)
-        pixel = goals.vision.target.numpy()
-        self._cell.execute(command, pixel, feature.numpy(), approach)
+        approach = 0.0 if goals.posture is None else 1.0 - float(self.state.task_level)
+        self._cell.execute(
+            command,
+            goals.vision.target.numpy(),
+            feature.numpy(),
+            approach,
+            region=goals.position,
+            drawn=bool(self._drawn.leads),
+            turn=quaternion.log(self._drawn.turn).numpy(),
+        )
+        if self._drawn.leads:
+            self._led += self._cell.task_time - clock
+            if self._held is not None:  # the marker goes with an end effector that is led
+                self._held = HeldMarker(self._config.half_hidden)
 
     def _out_of_view(self) -> bool:
         """Whether the marker has left the image, rather than being occluded."""
@@ -446,13 +480,30 @@ class VisualServo:
 
     def turn_error(self, target: ServoTarget) -> float:
         """Angle between the end effector's orientation and the one it should have [rad]."""
-        goal = target.above.orientation if self._turned is None else self._turned
+        goal = self._turned_by_person(target, self._turned).upright
         return float(quaternion.angle(self._cell.pose.orientation, goal))
 
     @property
     def orientation(self) -> Float[Tensor, "4"] | None:
-        """Of the end effector above the object, as far as images have told; else None."""
-        return self._turned
+        """Of the end effector above the object, as images and people have it; else None."""
+        if self._turned is None and float(quaternion.angle(self._drawn.turn, _NO_TURN)) == 0:
+            return None
+        return self._with_turn(self._above if self._turned is None else self._turned)
+
+    def _turned_by_person(
+        self, target: ServoTarget, orientation: Float[Tensor, "4"] | None
+    ) -> ServoTarget:
+        """The target in an orientation, by default its own, and with the person's turn."""
+        upright = replace(target, orientation=orientation).upright
+        return replace(target, orientation=self._with_turn(upright))
+
+    def _with_turn(self, orientation: Float[Tensor, "4"]) -> Float[Tensor, "4"]:
+        return quaternion.multiply(self._drawn.turn, orientation)
+
+    @property
+    def _clock(self) -> float:
+        """Time of the task without that in which a person led the end effector [s]."""
+        return self._cell.task_time - self._led
 
     def _image_jacobian(self) -> Float[np.ndarray, "2 6"]:
         """Estimate at the pose of the newest image [px/m, px/rad], computed once an image."""
@@ -469,6 +520,9 @@ class VisualServo:
         return self._cell.joints if joints is None else joints
 
     def _check_timeouts(self, target: ServoTarget, spent: float) -> None:
+        if self._drawn.leads:
+            self._last_detection = self._cell.time
+            return
         if self._cell.time - self._last_detection > self._config.occlusion_timeout:
             raise MissedGraspError(
                 f"visual servoing: the end effector's marker {self._marker} was not detected "

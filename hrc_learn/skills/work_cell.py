@@ -35,6 +35,7 @@ from hrc_learn.protocols import (
     Human,
     HumanInput,
 )
+from hrc_learn.regions import PositionRegion
 from hrc_learn.skills.arm_motion import (
     StraightLine,
     joint_line,
@@ -66,7 +67,7 @@ from hrc_learn.skills.person_feedback import (
 )
 from hrc_learn.skills.person_watch import PersonWatch
 from hrc_learn.vision import angle, centre
-from hrc_learn.viz import StepLog
+from hrc_learn.viz import Event, StepLog
 
 # What skills ask of the place they work in, whether simulated or real.
 
@@ -127,6 +128,9 @@ _NO_VISION = {
     "potential_rate": _NAN,
     "vision_activation": _NAN,
     "approach": _NAN,
+    "region": np.full(6, _NAN),
+    "drawn": False,
+    "turn": np.full(3, _NAN),
 }
 
 
@@ -211,6 +215,9 @@ class WorkCell:
         human_input: What the person asks for now.
         tracked_markers: Markers detected every `detect_every` steps; empty: no image is taken.
         log: Columns of every step so far, and the phases of the task.
+        remarks: What was said to the person beside the arm, and when [s].
+        region: To which the last command of a controller led the end effector; None: the last
+            command was of no controller.
         images: Images kept for the recording.
     """
 
@@ -255,6 +262,8 @@ class WorkCell:
         # Of the path that the next step follows; of most steps none.
         self._path_joints = self._no_path = np.full(len(chain.joint_names), _NAN)
         self.images: list[KeptImage] = []
+        self.remarks: list[Event] = []
+        self.region: PositionRegion | None = None
         self._arm, self._sensor, self._human = arm, sensor, human
         self._advance, self._on_phase = advance, on_phase
         self._clearance = clearance
@@ -313,6 +322,10 @@ class WorkCell:
         self.log.event(self.time, phase)
         self._on_phase(phase, self.time)
 
+    def tell(self, words: str) -> None:
+        """Say something to the person beside the arm."""
+        self.remarks.append(Event(self.time, words))
+
     def detect(self, ids: Collection[int] | None = None) -> None:
         """Take an image and detect markers in it, all by default; it may be late, or lost."""
         found = {} if self._sensor is None else self._sensor.corners(ids)
@@ -353,6 +366,7 @@ class WorkCell:
         self._keep_pace(self.jacobian @ joint_velocity, safe, report)
         self._note_filter(joint_velocity, safe, report)
         position = _NOWHERE if goal is None else goal.position.numpy()
+        self.region = None
         self._send(safe, safety=report.flags.numpy(), goal_position=position, **_NO_VISION)
 
     def execute(
@@ -361,6 +375,10 @@ class WorkCell:
         target: Float[np.ndarray, "2"],
         feature: np.ndarray,
         approach: float = 0.0,
+        *,
+        region: PositionRegion,
+        drawn: bool = False,
+        turn: Float[np.ndarray, "3"] | None = None,
     ) -> None:
         """Execute one command of the adaptive controller, which has its own safety filter.
 
@@ -369,8 +387,13 @@ class WorkCell:
             target: Where the feature should be [px].
             feature: Where it is; NaN if it is not detected [px].
             approach: Fraction of a joint-space approach in the command, 0 to 1.
+            region: Of the end effector's position.
+            drawn: Whether a person has drawn that region, or a target in it.
+            turn: What a person has added to the planned orientation, as a rotation vector
+                [rad]; None: nothing.
         """
         self._guard = self._safety.initial_state(self.joints, command.joint_velocity)
+        self.region = region
         self._keep_pace(command.twist, command.joint_velocity, command.safety)
         self._note_controller(command, approach)
         self._send(
@@ -385,6 +408,9 @@ class WorkCell:
             vision_activation=float(command.vision_level),
             approach=approach,
             goal_position=_NOWHERE,
+            region=torch.cat([region.centre, region.half_size]).numpy(),
+            drawn=drawn,
+            turn=np.zeros(3) if turn is None else turn,
         )
 
     def track_pose(

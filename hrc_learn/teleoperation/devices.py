@@ -32,8 +32,8 @@ from hrc_learn.teleoperation.hand_guiding import (
 class CombinedInput(Human):
     """Joins several sources, as the paper's mixed interface has a haptic device and a headset.
 
-    Null-space inputs and twists add up. Of gripper, region and target the first source that
-    sets them is used; requests of all are passed on.
+    Null-space inputs and twists add up. Of gripper, region, target and turn the first source
+    that sets them is used; requests of all are passed on.
     """
 
     def __init__(self, *sources: Human):
@@ -55,6 +55,7 @@ class CombinedInput(Human):
             gripper=next((i.gripper for i in inputs if i.gripper is not None), None),
             region=next((i.region for i in inputs if i.region is not None), None),
             target=next((i.target for i in inputs if i.target is not None), None),
+            turn=next((i.turn for i in inputs if i.turn is not None), None),
             requests=tuple(request for i in inputs for request in i.requests),
         )
 

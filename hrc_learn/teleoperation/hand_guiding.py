@@ -170,6 +170,7 @@ def leading_twist(
     config: InteractionForceConfig,
     *,
     coarse: bool = True,
+    turn: Float[torch.Tensor, "4"] | None = None,
 ) -> Float[np.ndarray, "6"]:
     """Twist of an end effector that a device leads; zero while it leads nowhere.
 
@@ -179,11 +180,14 @@ def leading_twist(
         way: Where to, as a fraction of the largest speed, in the base frame.
         config: Speeds.
         coarse: Whether the end effector turns by the coarse orientation rule.
+        turn: Rotation added to that rule (wxyz); None: none.
     """
     if not way.any():
         return np.zeros(6)
     tool = chain.forward(torch.from_numpy(joint_position))
     orientation = coarse_orientation(tool.position) if coarse else None
+    if orientation is not None and turn is not None:
+        orientation = quaternion.multiply(turn, orientation)
     return guiding_twist(tool, config.speed * way, orientation, config)
 
 

@@ -14,7 +14,7 @@ from hrc_learn.controller import INTERVENTIONS
 from hrc_learn.deploy import Rate
 from hrc_learn.geometry import Box
 from hrc_learn.kinematics import panda
-from hrc_learn.protocols import Human, Request
+from hrc_learn.protocols import DrawnRegion, Human, Request
 from hrc_learn.sim import MovingBodies, World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.pick_and_place import INTERACT
@@ -34,6 +34,8 @@ from hrc_learn.viz.palette import GREEN, rgba
 _THICKNESS = 0.002
 # Control steps from one status shown beside a job to the next: ten times a second at 10 ms.
 _SHOW_EVERY = 10
+# How long what the arm says to the person is shown [s]: two lines are read in half of that.
+_REMARK_STAYS = 6.0
 _INVITATION = "Pull at a link or a knob: the end effector keeps servoing."
 
 FEATURES = {
@@ -220,14 +222,16 @@ class TaskPage:
 
     human: PageHuman
 
-    def __init__(self, world: World, page: Page, dt: float):
+    def __init__(self, world: World, page: Page, dt: float, title: str):
         """Connect page and world.
 
         Args:
             world: That is shown.
             page: Open.
             dt: Control step of the task [s].
+            title: What is done, in words.
         """
+        self._title = title
         self.human = page.human
         self._world, self._page, self._bodies = world, page, MovingBodies(world)
         self._rate, self._ticks = Rate(dt), 0
@@ -265,20 +269,36 @@ class TaskPage:
         """What the page says of a task that runs on a work cell."""
         world, log = self._world, cell.log
         phase = log.events[-1].text if log.events else "getting ready"
+        note = _INVITATION if phase == INTERACT else ""
+        if cell.remarks and cell.time - cell.remarks[-1].time < _REMARK_STAYS:
+            note = cell.remarks[-1].text
         acted = log["safety"].sum(axis=0) if len(log) else [0] * len(SAFETY_COLUMNS)
         return PageStatus(
-            title="Pick and place",
+            title=self._title,
             doing=phase,
             seconds=cell.time,
-            note=_INVITATION if phase == INTERACT else "",
+            note=note,
+            region=_followed(cell),
             interventions=dict(zip(SAFETY_COLUMNS, map(int, acted), strict=True)),
             contacts=len(world.cabinet_contacts.touches) + len(world.table_contacts.touches),
         )
 
 
+def _followed(cell: WorkCell) -> DrawnRegion | None:
+    """The region to which the controller took the end effector in the last step, if any."""
+    if cell.region is None:
+        return None
+    (x, y, z), (a, b, c) = cell.region.centre.tolist(), cell.region.half_size.tolist()
+    return DrawnRegion(centre=(x, y, z), half_size=(a, b, c))
+
+
 @contextmanager
 def task_page(
-    world: World, dt: float, config: PageConfig, on_open: Callable[[str], None]
+    world: World,
+    dt: float,
+    config: PageConfig,
+    on_open: Callable[[str], None],
+    title: str = "Pick and place",
 ) -> Iterator[TaskPage]:
     """Serve a page on a world that a task moves.
 
@@ -287,9 +307,11 @@ def task_page(
         dt: Control step of the task [s].
         config: Of the page.
         on_open: Told the address of the page.
+        title: What is done, in words.
     """
     bodies = MovingBodies(world)
     drawn = bodies.drawn(*(poses[None] for poses in bodies.poses()))
-    with Page(panda, drawn, world.config.boxes(), config, guides=False) as page:
+    boxes = world.config.boxes()
+    with Page(panda, drawn, boxes, config, guides=False, draws=True) as page:
         on_open(page.url)
-        yield TaskPage(world, page, dt)
+        yield TaskPage(world, page, dt, title)

@@ -60,18 +60,20 @@ def joint(formulation: str) -> Case:
     return Case(make, lambda *b, rng: -3 + 6 * rand(*b, 7, rng=rng), delicate, 7)
 
 
-def position(rotated: bool, stiffness=4e-3) -> Case:
+def position(rotated: bool, stiffness=4e-3, formulation="paper") -> Case:
     def make(*batch: int, rng: torch.Generator) -> PositionRegion:
         return PositionRegion(
             centre=rand(*batch, 3, rng=rng),
             half_size=0.05 + 0.1 * rand(*batch, 3, rng=rng),
             rotation=sampling.quaternions(*batch, rng=rng) if rotated else None,
             stiffness=stiffness,
+            formulation=formulation,
         )
 
     def delicate() -> Tensor:
         region = make(rng=sampling.generator())
-        return torch.stack([region.centre, region.centre + region.half_size])
+        edges = [region.centre + k * region.half_size for k in range(3)]
+        return torch.stack(edges)
 
     return Case(make, lambda *b, rng: rand(*b, 3, rng=rng), delicate, 3)
 
@@ -133,6 +135,9 @@ CASES = {
     "position": position(rotated=False),
     "position-rotated": position(rotated=True),
     "position-per-axis": position(rotated=True, stiffness=(4e-3, 4e-3, 4e-4)),
+    "position-saturated": position(
+        rotated=True, stiffness=(4e-3, 4e-3, 4e-4), formulation="saturated"
+    ),
     "orientation": orientation("exact"),
     "orientation-paper": orientation("paper"),
     "orientation-vector": orientation("exact", "rotation_vector"),

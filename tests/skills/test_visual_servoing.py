@@ -13,6 +13,7 @@ from hrc_learn.jacobian import Measurement
 from hrc_learn.kinematics import panda
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills import MarkerObservation, ServoTarget, VisualServo, VisualServoConfig
+from hrc_learn.skills.drawn_goals import DrawnGoals
 
 CONFIG = VisualServoConfig()
 
@@ -43,6 +44,7 @@ def servo_in(cell):
     servo._cell, servo._config = cell, CONFIG
     servo._controller = SimpleNamespace(estimator=estimator)
     servo._cached = (np.nan, np.zeros((2, 6)))
+    servo._drawn, servo._led = DrawnGoals(CONFIG.drawn), 0.0
     servo.state = SimpleNamespace(estimator=None)
     return servo, estimator
 
@@ -198,8 +200,8 @@ def test_a_descent_is_repeated_until_it_teaches_nothing_new(astray, moves, probe
         side = quaternion.to_matrix(orientation)[:, 1].numpy()
         return np.add(side, [0.0, 0.0, 1.0]) / np.sqrt(2)
 
-    servo, descents = VisualServo.__new__(VisualServo), []
     cell = SimpleNamespace(time=0.0, task_time=0.0, pose=above)
+    servo, descents = servo_in(cell)[0], []
     along = torch.from_numpy(line(turned) / line(turned)[2])
     start = Pose(above.position + CONFIG.probe * along, turned)
     low = []

@@ -73,6 +73,10 @@ class RunExperiment(Imperfect, Written):
     """Where, with --serve."""
 
 
+type MarkedPoint = tuple[float, float, float, float, float]
+type DrawnBox = tuple[float, float, float, float, float, float, float, float]
+
+
 @dataclass(frozen=True, kw_only=True)
 class RunServoing(RunExperiment):
     """What those with a camera have in common."""
@@ -82,6 +86,20 @@ class RunServoing(RunExperiment):
     it can."""
     gains: More[Path | None] = None
     """gains.json of `hrc tune`, in place of those of the controller."""
+    page: bool = False
+    """Serve a page in the browser, from which people watch, draw the Cartesian region, mark a
+    target, turn the end effector and pull at the elbow while the arm servoes. The run takes as
+    long as it would on a real arm then."""
+    port: int = 8080
+    """Port of that page."""
+    draw_region: More[tuple[DrawnBox, ...]] = ()
+    """Regions that a scripted person draws while the arm servoes: start and duration [s], x y z
+    of the centre and of the half edges [m]."""
+    mark_target: More[tuple[MarkedPoint, ...]] = ()
+    """Targets that they mark: start and duration [s], x y z [m]."""
+    turn_tool: More[tuple[MarkedPoint, ...]] = ()
+    """How they turn the end effector on top of the planned orientation: start and duration [s],
+    rotation vector [deg]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -188,11 +206,6 @@ class RunCollaboration(RunServoing):
     worker: bool = False
     """Whether a worker comes and reaches under the arm. He puts something on the table first,
     leaves again, and makes no way for the robot; how near he comes is measured."""
-    page: bool = False
-    """Serve a page in the browser, from which people watch and pull at the elbow too. The
-    run takes as long as it would on a real arm then."""
-    port: int = 8080
-    """Port of that page."""
     config: Configuration = Detail("hrc_learn.skills.pick_and_place", "PickAndPlaceConfig")
     """How the job is done."""
 

@@ -23,6 +23,7 @@ from hrc_learn.cli.arguments.run import (
     RunExperiment,
     RunGrasping,
     RunPlacing,
+    RunServoing,
 )
 from hrc_learn.experiments.collaboration.experiment import CollaborationExperiment
 from hrc_learn.experiments.collaboration.trial import Disturbances
@@ -31,10 +32,12 @@ from hrc_learn.experiments.grasping.experiment import GraspingExperiment
 from hrc_learn.experiments.grasping.trial import GraspingSceneConfig
 from hrc_learn.experiments.placing.experiment import ABLATION, PlacingExperiment, dataset_of
 from hrc_learn.learning.tuning import with_gains
+from hrc_learn.protocols import DrawnRegion
 from hrc_learn.sim import Imperfections, OcclusionInterval
 from hrc_learn.skills.marker_sensor import LatencyConfig
 from hrc_learn.skills.work_cell import WorkCellConfig
 from hrc_learn.store import write_text
+from hrc_learn.teleoperation import DrawnInterval
 from hrc_learn.teleoperation.page import PageConfig
 
 MODELS = Path("outputs/demo")
@@ -74,6 +77,8 @@ def run_grasping(args: RunGrasping) -> int:
         curve=args.curve,
         camera=args.camera,
         config=replace(args.config, controller=controller),
+        drawings=_drawings(args),
+        page=PageConfig(port=args.port) if args.page else None,
     )
     return _conduct(experiment, args)
 
@@ -104,9 +109,35 @@ def run_collaboration(args: RunCollaboration) -> int:
         ),
         config=replace(args.config, grasping=grasping),
         camera=args.camera,
+        drawings=_drawings(args),
         page=PageConfig(port=args.port) if args.page else None,
     )
     return _conduct(experiment, args)
+
+
+def _drawings(args: RunServoing) -> tuple[DrawnInterval, ...]:
+    """What the scripted person draws, marks and turns."""
+    regions = (
+        DrawnInterval(
+            start=start,
+            duration=duration,
+            region=DrawnRegion(centre=(x, y, z), half_size=(a, b, c)),
+        )
+        for start, duration, x, y, z, a, b, c in args.draw_region
+    )
+    targets = (
+        DrawnInterval(start=start, duration=duration, target=(x, y, z))
+        for start, duration, x, y, z in args.mark_target
+    )
+    turns = (
+        DrawnInterval(
+            start=start,
+            duration=duration,
+            turn=(math.radians(a), math.radians(b), math.radians(c)),
+        )
+        for start, duration, a, b, c in args.turn_tool
+    )
+    return (*regions, *targets, *turns)
 
 
 def _imperfections(args: Imperfect) -> Imperfections:

@@ -35,7 +35,7 @@ from hrc_learn.skills.placing import PlacingSkill
 from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.skills.work_cell import WorkCellConfig
 from hrc_learn.store import read_made_by
-from hrc_learn.teleoperation import ScriptedForce
+from hrc_learn.teleoperation import DrawnInterval, ScriptedForce
 from hrc_learn.teleoperation.page import PageConfig
 from hrc_learn.viz import LoggedSteps, RunRecording
 from hrc_learn.viz.report import Section
@@ -73,8 +73,11 @@ class CollaborationExperiment:
     cell: WorkCellConfig = field(default_factory=WorkCellConfig)
     config: PickAndPlaceConfig = field(default_factory=PickAndPlaceConfig)
     camera: CameraKind = "auto"
+    drawings: tuple[DrawnInterval, ...] = ()
+    """What a scripted person draws, in the time of the run."""
     page: PageConfig | None = None
-    """Serve a page from which people push the elbow too; the run takes real time then."""
+    """Serve a page from which people push the elbow and draw too; the run takes real time
+    then."""
 
     def run(self, seed: int, observer: Observer = UNOBSERVED) -> CollaborationRun:
         """The whole job once; the seed draws the objects' poses and the image noise."""
@@ -92,6 +95,7 @@ class CollaborationExperiment:
             imperfections=self.imperfections,
             worker=self.worker,
             cell_config=replace(self.cell, keep_image_every=keep_every),
+            drawings=self.drawings,
             seed=seed,
             page=self.page,
             view=observer.view,

@@ -54,7 +54,14 @@ from hrc_learn.skills.pick_and_place import (
 from hrc_learn.skills.placing import PlacingSkill, Plan, check_plan
 from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.skills.work_cell import WorkCell, WorkCellConfig
-from hrc_learn.teleoperation import ScriptedForce, ScriptedPerturbation, random_pulls
+from hrc_learn.teleoperation import (
+    CombinedInput,
+    DrawnInterval,
+    ScriptedDrawing,
+    ScriptedForce,
+    ScriptedPerturbation,
+    random_pulls,
+)
 from hrc_learn.teleoperation.page import PageConfig
 from hrc_learn.teleoperation.page_session import task_page
 from hrc_learn.vision import CameraModel, Marker
@@ -202,6 +209,7 @@ def simulate_collaboration(
     cell_config: WorkCellConfig | None = None,
     imperfections: Imperfections | None = None,
     worker: bool = False,
+    drawings: Sequence[DrawnInterval] = (),
     seed: int = 0,
     page: PageConfig | None = None,
     view: LiveView = no_live_view,
@@ -224,9 +232,10 @@ def simulate_collaboration(
         cell_config: How the loop runs; images may be late or lost.
         imperfections: Of arm, calibration, camera and objects; None: none.
         worker: Whether a worker comes to the table, whom nobody expects.
+        drawings: What a scripted person draws, in the time of the run.
         seed: Of the objects' poses and of image noise.
-        page: Serve a page from which people push the elbow too, and let the world go on in
-            real time; None: no page.
+        page: Serve a page from which people push the elbow and draw too, and let the world
+            go on in real time; None: no page.
         view: Dashboard of the run while it goes on.
         on_start: Given world and cell before the job begins.
         on_phase: Told the name of each phase of the task, and when it begins [s].
@@ -307,10 +316,12 @@ def simulate_collaboration(
 
     with torch.inference_mode(), ExitStack() as stack:
         human, passing, beside = person, advance, None
+        if drawings:
+            human = CombinedInput(person, ScriptedDrawing(drawings))
         if page is not None:
             opened = task_page(world, cell_config.dt, page, on_page)
             beside = stack.enter_context(opened)
-            human, passing = beside.joined(person, advance)
+            human, passing = beside.joined(human, advance)
         cell = WorkCell(
             chain=panda,
             arm=world.arm,

@@ -20,11 +20,12 @@ from hrc_learn.experiments.grasping.trial import (
     simulate_grasp,
 )
 from hrc_learn.experiments.metric_table import Metric
-from hrc_learn.experiments.run_recording import LiveView, no_live_view
 from hrc_learn.sim import CameraKind, Imperfections
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.grasping import GraspingConfig
 from hrc_learn.skills.visual_skill import VisualServoSkill
+from hrc_learn.teleoperation import DrawnInterval
+from hrc_learn.teleoperation.page import PageConfig
 from hrc_learn.viz import LoggedSteps, RunRecording
 from hrc_learn.viz.report import Section
 
@@ -54,6 +55,11 @@ class GraspingExperiment:
     """Sizes of the imperfections to repeat with, in multiples of the nominal ones."""
     camera: CameraKind = "synthetic"
     config: GraspingConfig = field(default_factory=GraspingConfig)
+    drawings: tuple[DrawnInterval, ...] = ()
+    """What a scripted person draws during the grasp, not what it is compared with."""
+    page: PageConfig | None = None
+    """Serve a page from which people draw and pull the arm too; the grasp takes real time
+    then."""
 
     def __post_init__(self) -> None:
         if unknown := [name for name in self.variants if name not in VARIANTS]:
@@ -65,17 +71,24 @@ class GraspingExperiment:
         The seed draws the scene, the imperfections and the image noise.
         """
         observer.tell("The whole grasp")
-        grasp, compared = self._grasp(seed, DEFAULT, view=observer.view), {}
+        grasp, compared = self._grasp(seed, DEFAULT, observer), {}
         for name in dict.fromkeys(self.variants):
             observer.tell(f"Comparison: {VARIANTS[name].label}")
-            compared[name] = self._grasp(seed, name, compared=True)
+            compared[name] = self._grasp(seed, name)
         return GraspingRun(grasp=grasp, compared=compared)
 
     def _grasp(
-        self, seed: int, variant: str, *, compared: bool = False, view: LiveView = no_live_view
+        self, seed: int, variant: str, observer: Observer | None = None
     ) -> SimulatedGrasp:
-        """One grasp; for comparison it knows the target, goes straight there and tries once."""
-        config = self.config
+        """One grasp; for comparison it knows the target, goes straight there and tries once.
+
+        Args:
+            seed: Of the scene.
+            variant: Of `VARIANTS`.
+            observer: Of the grasp itself; None: it is done for comparison.
+        """
+        config, compared = self.config, observer is None
+        observer = observer or UNOBSERVED
         if compared:
             servo = replace(config.servo, probe=0.0, timeout=_COMPARED_TIMEOUT)
             config = replace(config, servo=servo, attempts=1)
@@ -88,7 +101,10 @@ class GraspingExperiment:
             camera=self.camera,
             config=config,
             rng=np.random.default_rng([seed, 1]),
-            view=view,
+            drawings=() if compared else self.drawings,
+            page=None if compared else self.page,
+            view=observer.view,
+            on_page=lambda address: observer.tell(f"Page at {address}"),
         )
 
     def failure(self, run: GraspingRun) -> str:
@@ -125,7 +141,7 @@ class GraspingExperiment:
         With each size of the imperfections.
         """
         scene = replace(self.scene, random_camera=True)
-        trial = replace(self, variants=(), scene=scene, camera="synthetic", curve=())
+        trial = replace(self, variants=(), scene=scene, camera="synthetic", curve=(), page=None)
         study = Study(
             title="Grasps in random scenes",
             trial=RepeatedRun(trial),

@@ -2,7 +2,8 @@
 
 import copy
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -36,7 +37,9 @@ from hrc_learn.skills.marker_sensor import LatencyConfig, MarkerSensor
 from hrc_learn.skills.placing import Plan, check_plan
 from hrc_learn.skills.visual_skill import VisualServoSkill, from_learned, guessed_network
 from hrc_learn.skills.work_cell import TaskFailedError, WorkCell, WorkCellConfig
-from hrc_learn.teleoperation import ScriptedPerturbation
+from hrc_learn.teleoperation import DrawnInterval, ScriptedDrawing
+from hrc_learn.teleoperation.page import PageConfig
+from hrc_learn.teleoperation.page_session import task_page
 from hrc_learn.vision import CameraModel
 
 # Of the approach that is checked for contacts: joint speed [rad/s], time between samples [s].
@@ -277,7 +280,10 @@ def simulate_grasp(
     camera: CameraKind = "auto",
     config: GraspingConfig | None = None,
     rng: np.random.Generator,
+    drawings: Sequence[DrawnInterval] = (),
+    page: PageConfig | None = None,
     view: LiveView = no_live_view,
+    on_page: Callable[[str], None] = lambda address: None,
 ) -> SimulatedGrasp:
     """Grasp an object and carry it home, in MuJoCo.
 
@@ -290,7 +296,11 @@ def simulate_grasp(
         camera: Which kind of camera watches.
         config: How objects are grasped.
         rng: Source of image noise, and of which images are lost.
+        drawings: What a scripted person draws, in the time of the run.
+        page: Serve a page from which people draw and pull the arm too, and let the world go
+            on in real time; None: no page.
         view: Dashboard of the run while it goes on.
+        on_page: Told the address of the page.
     """
     workplace = scene.workplace.approached(aiming.approach)
     scene = replace(scene, workplace=workplace)
@@ -307,21 +317,30 @@ def simulate_grasp(
         check_plan(plan, world, item.name if world.holds(item.name) else None)
 
     result, failure = None, ""
-    with torch.inference_mode():
+    dt = WorkCellConfig().dt
+    with torch.inference_mode(), ExitStack() as stack:
+        human, passing, beside = ScriptedDrawing(drawings), motion.advance, None
+        if page is not None:
+            opened = task_page(world, dt, page, on_page, title="Grasping")
+            beside = stack.enter_context(opened)
+            human, passing = beside.joined(human, motion.advance)
         cell = WorkCell(
             chain=panda,
             arm=world.arm,
             gripper=world.arm,
             sensor=MarkerSensor(eye, workplace.scene.marker_ids),
-            human=ScriptedPerturbation(panda, (), begin=None),
-            advance=motion.advance,
+            human=human,
+            advance=passing,
             config=WorkCellConfig(
+                dt=dt,
                 latency=latency,
                 safety=sizes.plant(WorkCellConfig().safety),
                 command_delay=sizes.following_delay,
             ),
             rng=rng,
         )
+        if beside is not None:
+            beside.follow(cell)
         above = scene.above()
 
         def told(

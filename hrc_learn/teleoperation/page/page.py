@@ -18,6 +18,7 @@ from hrc_learn.kinematics import SerialChain
 from hrc_learn.protocols import ArmState, HumanInput
 from hrc_learn.teleoperation.hand_guiding import InteractionForceConfig, leading_twist
 from hrc_learn.teleoperation.page.page_operator import (
+    AddedTurn,
     GizmoCommand,
     HeldGizmos,
     PageHuman,
@@ -80,6 +81,7 @@ class Page:
         *,
         task: str = "",
         guides: bool = True,
+        draws: bool | None = None,
     ):
         """Serve the page; it follows the arm within the `with` block.
 
@@ -90,8 +92,10 @@ class Page:
             boxes: What stands.
             config: Of the page.
             task: What is to be demonstrated, in words.
-            guides: Whether the person guides the end effector, draws regions and records.
-                Beside an arm that works by itself, people pull in the null space only.
+            guides: Whether the person guides the end effector and records. Beside an arm that
+                works by itself they do not.
+            draws: Whether they draw regions, mark targets and turn the end effector; None: as
+                they guide. People pull in the null space in any case.
         """
         import viser
 
@@ -100,10 +104,17 @@ class Page:
         self.human = PageHuman(len(chain.joint_names))
         self._server = viser.ViserServer(config.host, config.port, verbose=False)
         self.url = f"http://{config.host}:{self._server.get_port()}"
-        self._held_gizmos = HeldGizmos(config.timeout)
+        self._held_gizmos, self._turn = HeldGizmos(config.timeout), AddedTurn()
+        draws = guides if draws is None else draws
         self._scene = PageScene(self._server, bodies, boxes, config.twin)
         self._gizmos = Gizmos(
-            self._server, self._scene, self._held_gizmos, self._links, guides=guides
+            self._server,
+            self._scene,
+            self._held_gizmos,
+            self._links,
+            self._turn,
+            guides=guides,
+            turns=draws,
         )
         self._panel = Panel(
             self._server,
@@ -113,7 +124,9 @@ class Page:
             self._scene.show_twin,
             self._gizmos.let_turn,
             task,
+            self._turn,
             guides=guides,
+            draws=draws,
         )
         self._poses = (
             np.stack([body.position[0] for body in bodies]),
@@ -188,6 +201,7 @@ class Page:
             with self._server.atomic():
                 self._scene.move(*self._poses, links.position.numpy())
                 self._scene.point(command.arrows, colour, command.held)
+                self._scene.show_region(self._status.region)
                 self._gizmos.follow(links[-1])
                 if ticks % _PANEL_EVERY == 0:
                     people = len(self._server.get_clients())
@@ -206,13 +220,16 @@ class Page:
     def _command(self, state: ArmState) -> GizmoCommand:
         panel, forces = self._panel, self._panel.forces
         gizmos = self._held_gizmos.held().values()
+        turn = self._turn.rotation
         command = gizmo_command(
-            self._chain, state.joint_position, gizmos, forces, coarse=panel.coarse
+            self._chain, state.joint_position, gizmos, forces, coarse=panel.coarse, turn=turn
         )
         twist = command.twist
         if not twist.any():
             way, joints = panel.direction(), state.joint_position
-            twist = leading_twist(self._chain, joints, way, forces, coarse=panel.coarse)
+            twist = leading_twist(
+                self._chain, joints, way, forces, coarse=panel.coarse, turn=turn
+            )
         self.human.post(
             HumanInput(
                 nullspace_input=command.nullspace_input,
@@ -220,6 +237,7 @@ class Page:
                 gripper=panel.gripper,
                 region=panel.region,
                 target=panel.target,
+                turn=self._turn.vector,
             )
         )
         return command

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from hrc_learn.geometry import Pose
+from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import SerialChain, coarse_orientation
 from hrc_learn.protocols import ArmState, Feedback, Human, HumanInput, Request
 from hrc_learn.teleoperation.hand_guiding import (
@@ -21,6 +21,8 @@ from hrc_learn.teleoperation.hand_guiding import (
     gizmo_nullspace_input,
     guiding_twist,
 )
+
+_NO_TURN = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -124,6 +126,63 @@ class HeldGizmos:
             del self._held[key]
 
 
+class AddedTurn:
+    """Rotation that people add to the end effector's orientation by the rings of its gizmo.
+
+    It stays when they let go, and the next one adds to it. Safe to use from several threads.
+
+    Attributes:
+        holder: Whose browser holds the rings; None: nobody's.
+    """
+
+    def __init__(self) -> None:
+        self._turn = self._before = self._taken = _NO_TURN
+        self._lock = Lock()
+        self.holder: int | None = None
+
+    def take(self, holder: int, orientation: Float[np.ndarray, "4"]) -> None:
+        """Begin to turn a gizmo whose orientation is this (wxyz)."""
+        with self._lock:
+            self._taken, self._before = torch.from_numpy(orientation), self._turn
+            self.holder = holder
+
+    def release(self, holder: int) -> None:
+        """Let go of it."""
+        with self._lock:
+            if self.holder == holder:
+                self.holder = None
+
+    def move(self, holder: int, orientation: Float[np.ndarray, "4"]) -> None:
+        """Turn it on, for who holds it."""
+        with self._lock:
+            if self.holder != holder:
+                return
+            now = quaternion.multiply(
+                torch.from_numpy(orientation), quaternion.conjugate(self._taken)
+            )
+            self._turn = quaternion.normalize(quaternion.multiply(now, self._before))
+
+    def clear(self) -> None:
+        """Take it back."""
+        with self._lock:
+            self._turn = self._before = _NO_TURN
+
+    @property
+    def rotation(self) -> Float[torch.Tensor, "4"]:
+        """As a unit quaternion (wxyz)."""
+        with self._lock:
+            return self._turn
+
+    @property
+    def vector(self) -> tuple[float, float, float] | None:
+        """As a rotation vector in the base frame [rad]; None: nothing was added."""
+        turn = self.rotation
+        if float(quaternion.angle(turn, _NO_TURN)) == 0.0:
+            return None
+        x, y, z = quaternion.log(turn).tolist()
+        return x, y, z
+
+
 class PageHuman(Human):
     """Hands what a person asks for from the page's thread to the loop, without a lock.
 
@@ -171,7 +230,7 @@ class PageHuman(Human):
 
     def post(self, asked: HumanInput) -> None:
         """Renew what the person asks for; its requests are left to `request`."""
-        still = replace(self._idle, region=asked.region, target=asked.target)
+        still = replace(self._idle, region=asked.region, target=asked.target, turn=asked.turn)
         deadline = self._clock() + self._holds_for
         self._posted = (_locked(asked), still, deadline)
 
@@ -222,6 +281,7 @@ def gizmo_command(
     config: InteractionForceConfig,
     *,
     coarse: bool = True,
+    turn: Float[torch.Tensor, "4"] | None = None,
 ) -> GizmoCommand:
     """The command of several held gizmos: their inputs add up, and are bounded as one is.
 
@@ -232,6 +292,7 @@ def gizmo_command(
         config: How strongly gizmos act.
         coarse: Whether a hand-guided end effector turns by the coarse orientation rule;
             otherwise it turns as its gizmo is turned, if it is.
+        turn: Rotation added to that rule (wxyz); None: none.
     """
     links = chain.link_poses(torch.as_tensor(joint_position, dtype=torch.float64))
     tool = links[-1]
@@ -253,6 +314,8 @@ def gizmo_command(
             orientation = torch.as_tensor(gizmo.orientation, dtype=torch.float64)
     if coarse:
         orientation = coarse_orientation(tool.position)
+        if turn is not None:
+            orientation = quaternion.multiply(turn, orientation)
     return GizmoCommand(
         nullspace_input=bounded(d, config.max_nullspace_input),
         twist=guiding_twist(tool, velocity, orientation, config) if guided else np.zeros(6),

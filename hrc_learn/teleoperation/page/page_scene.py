@@ -4,6 +4,7 @@ them: links, knobs and the end effector's gizmo.
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Callable, Collection, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -13,8 +14,9 @@ import torch
 from jaxtyping import Float, Int
 
 from hrc_learn.geometry import Body, Box, Capsule, Pose
-from hrc_learn.teleoperation.page.page_operator import HeldGizmo, HeldGizmos
-from hrc_learn.viz.palette import PERSON, SKY, rgba
+from hrc_learn.protocols import DrawnRegion
+from hrc_learn.teleoperation.page.page_operator import AddedTurn, HeldGizmo, HeldGizmos
+from hrc_learn.viz.palette import PERSON, SKY, TARGET, rgba
 
 # viser is imported when a page is opened, and not before.
 if TYPE_CHECKING:
@@ -96,6 +98,14 @@ def body_mesh(body: Body) -> Mesh:
     )
 
 
+def box_edges(half_size: tuple[float, float, float]) -> Float[np.ndarray, "12 2 3"]:
+    """Both ends of each edge of a box about the origin [m]."""
+    corners = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+    # An edge goes up along one axis, from -1 to 1.
+    pairs = [(a, b) for a in corners for b in corners if sorted(b - a) == [0, 0, 2]]
+    return np.array(pairs) * np.array(half_size)
+
+
 _KNOBS = (2, 4, 6)
 """Joints marked by a knob: shoulder, elbow, wrist. Between them the links are held."""
 _END_EFFECTOR_PARTS = ("link7", "hand", "finger_left", "finger_right")
@@ -140,6 +150,14 @@ class PageScene:
         self._surroundings(server)
         self._arrows = None
         self._knob_colours = dict.fromkeys(_KNOBS, PERSON)
+        self._region_shown: DrawnRegion | None = None
+        self._region = self._scene.add_line_segments(
+            "/active_region",
+            np.zeros((12, 2, 3)),
+            rgba(TARGET)[:3],
+            thickness=0.003,
+            visible=False,
+        )
 
     def holdables(self) -> Iterator[tuple[Holdable, int | None, np.ndarray]]:
         """All that can be held: node, joint (None: end effector), offset from the arm [m]."""
@@ -183,6 +201,15 @@ class PageScene:
         for node in (*self._copies, *self._twin_knobs.values()):
             if node is not None:
                 node.visible = visible
+
+    def show_region(self, region: DrawnRegion | None) -> None:
+        """Show the region to which a controller takes the end effector; None: there is none."""
+        if region == self._region_shown:
+            return
+        self._region_shown = region
+        self._region.visible = region is not None
+        if region is not None:
+            self._region.points = box_edges(region.half_size) + np.array(region.centre)
 
     def point(
         self,
@@ -285,8 +312,10 @@ class Gizmos:
         scene: PageScene,
         held_gizmos: HeldGizmos,
         links: Callable[[], Pose | None],
+        turn: AddedTurn,
         *,
         guides: bool = True,
+        turns: bool = False,
     ):
         """Connect.
 
@@ -296,34 +325,55 @@ class Gizmos:
             held_gizmos: Who holds what.
             links: Frames of the arm as they are now (see `SerialChain.link_poses`); None
                 before the arm is known.
+            turn: What the rings of the end effector's gizmo add to its orientation.
             guides: Whether the end effector can be held, too, and has a gizmo.
+            turns: Whether its gizmo has rings where it cannot be held.
         """
         self._held_gizmos, self._links, self._turns = held_gizmos, links, False
+        self._turn = turn
         for node, joint, offset in scene.holdables():
             if guides or joint is not None:
                 self._connect(node, joint, offset)
         self._gizmo = None
-        if guides:
+        if guides or turns:
             self._gizmo = server.scene.add_transform_controls(
-                "/end_effector", scale=0.2, disable_rotations=True, depth_test=False
+                "/end_effector",
+                scale=0.2,
+                disable_axes=not guides,
+                disable_sliders=not guides,
+                disable_rotations=guides,
+                depth_test=False,
             )
-            self._gizmo.on_update(self._gizmo_dragged)
-        server.on_client_disconnect(lambda client: held_gizmos.release_all(client.client_id))
+            self._gizmo.on_update(self._gizmo_dragged if guides else self._gizmo_turned)
+        server.on_client_disconnect(lambda client: self._release(client.client_id))
 
     def follow(self, pose: Pose) -> None:
         """Keep the end effector's gizmo at the end effector while nobody holds it."""
         gizmo = self._gizmo
-        if gizmo is None or any(name == gizmo.name for _, name in self._held_gizmos.held()):
+        if gizmo is None or self._turn.holder is not None:
+            return
+        if any(name == gizmo.name for _, name in self._held_gizmos.held()):
             return
         gizmo.position = pose.position.numpy()
         # Without rotation it moves along the axes of the base.
         gizmo.wxyz = pose.orientation.numpy() if self._turns else _BASE_AXES
 
-    def let_turn(self, turns: bool) -> None:
-        """Whether the end effector's gizmo has rings to turn it by."""
-        self._turns = turns
+    def let_turn(self, rings: bool, absolute: bool) -> None:
+        """Say what rings the end effector's gizmo has.
+
+        Args:
+            rings: Whether it has rings to turn it by.
+            absolute: Whether the end effector turns as its gizmo stands; otherwise what the
+                rings are turned by is added to its orientation.
+        """
+        self._turns = absolute
         if self._gizmo is not None:
-            self._gizmo.disable_rotations = not turns
+            self._gizmo.disable_rotations = not rings
+
+    def _release(self, holder: int) -> None:
+        """Forget somebody who has left."""
+        self._held_gizmos.release_all(holder)
+        self._turn.release(holder)
 
     def _connect(
         self, node: Holdable, joint: int | None, offset: Float[np.ndarray, "3"]
@@ -369,3 +419,15 @@ class Gizmos:
             self._held_gizmos.move(event.client_id, name, pointer, event.target.wxyz.copy())
         else:
             self._held_gizmos.release(event.client_id, name)
+        if not self._turns:
+            await self._gizmo_turned(event)
+
+    async def _gizmo_turned(self, event: Any) -> None:
+        if event.client_id is None:
+            return
+        if event.phase == "start":
+            self._turn.take(event.client_id, event.target.wxyz.copy())
+        elif event.phase == "update":
+            self._turn.move(event.client_id, event.target.wxyz.copy())
+        else:
+            self._turn.release(event.client_id)

@@ -15,6 +15,7 @@ from hrc_learn.geometry import Box
 from hrc_learn.protocols import DrawnRegion, Feedback, Request
 from hrc_learn.teleoperation.devices import DIRECTIONS, KeyboardState
 from hrc_learn.teleoperation.hand_guiding import InteractionForceConfig
+from hrc_learn.teleoperation.page.page_operator import AddedTurn
 from hrc_learn.teleoperation.page.page_scene import ViserServer
 from hrc_learn.teleoperation.page.region_editor import RegionEditor
 from hrc_learn.viz.palette import BLUE, GREEN, GREY, PERSON, VERMILION, followed_colour
@@ -40,6 +41,8 @@ class PageStatus:
     """Steps in which each kind of intervention of the safety filter was needed."""
     contacts: int = 0
     """Touches of the surroundings."""
+    region: DrawnRegion | None = None
+    """To which a controller takes the end effector; None: it follows no region."""
 
 
 def state_html(status: PageStatus, rate: float, people: int) -> str:
@@ -169,6 +172,14 @@ def _block(title: str, content: str) -> str:
     )
 
 
+def _turn_words(turn: tuple[float, float, float] | None) -> str:
+    """What is added to the orientation of the end effector."""
+    if turn is None:
+        return "Turned by its rings: not at all."
+    x, y, z = np.rad2deg(turn)
+    return f"Turned by its rings: {x:.0f}, {y:.0f}, {z:.0f} degrees about x, y, z."
+
+
 OPEN = 0.08
 """Width of the open gripper [m]."""
 
@@ -191,10 +202,12 @@ class Panel:
         forces: InteractionForceConfig,
         request: Callable[[Request], None],
         show_twin: Callable[[bool], None],
-        let_turn: Callable[[bool], None],
+        let_turn: Callable[[bool, bool], None],
         task: str,
+        turn: AddedTurn,
         *,
         guides: bool = True,
+        draws: bool = True,
     ):
         """Build the panel.
 
@@ -204,10 +217,12 @@ class Panel:
             forces: How strongly gizmos act to begin with.
             request: Receives what buttons ask for.
             show_twin: Shows or hides the twin.
-            let_turn: Whether the end effector's gizmo can be turned.
+            let_turn: Whether the end effector's gizmo can be turned, and whether the end
+                effector turns as it stands (see `Gizmos.let_turn`).
             task: What is to be demonstrated, in words.
-            guides: Whether the person guides the end effector, draws regions and records;
-                otherwise there are no controls but those of forces.
+            turn: What the rings of the end effector's gizmo add to its orientation.
+            guides: Whether the person guides the end effector and records.
+            draws: Whether they draw regions, mark targets and turn the end effector.
         """
         self._gui, self._initial_forces = server.gui, forces
         gui = server.gui
@@ -219,6 +234,7 @@ class Panel:
         )
         gui.main_panel.dock_right()
         self._task = self._switch = self._coarse = self._region = None
+        self._turn = turn
         self._next: Request = "start"
         self._keys = KeyboardState()
         self.gripper: float | None = None
@@ -238,9 +254,11 @@ class Panel:
             pulls = tuple(_MAPPINGS)
             self._mapping = gui.add_dropdown("A pull is a", pulls, initial_value=first)
             self._strength = gui.add_slider("Strength [%]", 20, 200, 10, 100)
-        if guides:
-            with gui.add_folder("Region and target"):
+        if draws:
+            with gui.add_folder("Region, target and turn"):
                 self._region = RegionEditor(server, boxes)
+                gui.add_button("Clear the turn", color="gray").on_click(lambda _: turn.clear())
+                self._turn_text = gui.add_markdown(_turn_words(None))
         self._seen: Mapping[str, int] = {}
         self._latest = ""
 
@@ -259,14 +277,23 @@ class Panel:
                 lambda event, requests=requests: request(requests[event.target.value])
             )
 
-    def _add_end_effector(self, let_turn: Callable[[bool], None]) -> None:
+    def _add_end_effector(self, let_turn: Callable[[bool, bool], None]) -> None:
         """Move the end effector by keys, turn it, open and close it."""
         coarse = self._coarse = self._gui.add_checkbox(
             "Coarse orientation rule",
             True,
             hint="Down in front of the robot, level at the end of its reach.",
         )
-        coarse.on_update(lambda _: let_turn(not coarse.value))
+        fine = self._gui.add_checkbox(
+            "Fine turn", False, hint="Rings turn the end effector on top of that rule."
+        )
+
+        def chosen(_: object) -> None:
+            fine.disabled = not coarse.value
+            let_turn(fine.value or not coarse.value, not coarse.value)
+
+        coarse.on_update(chosen)
+        fine.on_update(chosen)
         gripper = self._gui.add_button_group("Gripper", ("open", "close"))
         gripper.on_click(lambda _: self._move_gripper(gripper.value))
         for key in DIRECTIONS:
@@ -349,6 +376,8 @@ class Panel:
         largest = self._initial_forces.max_nullspace_input
         self._state.content = state_html(status, rate, people)
         self._bars.content = nullspace_input_html(nullspace_input, largest)
+        if self._region is not None:
+            self._turn_text.content = _turn_words(self._turn.vector)
         counts, seen = status.interventions, self._seen
         more = [name for name, count in counts.items() if count > seen.get(name, 0)]
         self._seen = dict(counts)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -17,6 +16,7 @@ from hrc_learn.teleoperation.page.page_scene import (
     SceneClickEvent,
     SceneRectSelectEvent,
     ViserServer,
+    box_edges,
 )
 from hrc_learn.viz.palette import GREEN, VERMILION, rgba
 
@@ -192,7 +192,7 @@ class RegionEditor:
             receive_shadow=False,
         )
         self._edges = scene.add_line_segments(
-            "/region/edges", _edges(region.half_size), _COLOUR, thickness=0.004
+            "/region/edges", box_edges(region.half_size), _COLOUR, thickness=0.004
         )
         self._corner = scene.add_icosphere(
             "/region/corner", radius=0.022, color=_COLOUR, position=region.half_size
@@ -234,7 +234,7 @@ class RegionEditor:
         self._gizmo.position = region.centre
         self._box.dimensions = _doubled(region.half_size)
         self._box.opacity = 0.3 if self._in_force.value else 0.12
-        self._edges.points = _edges(region.half_size)
+        self._edges.points = box_edges(region.half_size)
         self._corner.position = region.half_size
         for slider, half in zip(self._sizes, region.half_size, strict=True):
             slider.value = round(2 * half, 3)
@@ -293,11 +293,3 @@ class RegionEditor:
 def _doubled(half_size: tuple[float, float, float]) -> tuple[float, float, float]:
     x, y, z = half_size
     return 2 * x, 2 * y, 2 * z
-
-
-def _edges(half_size: tuple[float, float, float]) -> Float[np.ndarray, "12 2 3"]:
-    """Both ends of each edge of a box about the origin."""
-    corners = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
-    # An edge goes up along one axis, from -1 to 1.
-    pairs = [(a, b) for a in corners for b in corners if sorted(b - a) == [0, 0, 2]]
-    return np.array(pairs) * np.array(half_size)
