@@ -31,7 +31,7 @@ class DrawnGoalsConfig:
     """Half edges of the box round a marked target [m]: the flatness of the planned box."""
     wall: float = 0.02
     """Depth behind the walls of a region over which the camera takes over [m]: the way at full
-    speed, 0.25 m/s, in the time that images are late."""
+    speed, 0.25 m/s, within 80 ms, by which images and servos are late."""
     largest_turn: float = 0.5
     """Turn on top of the planned orientation, at most [rad]. The marker on the end effector
     is found in images up to about twice that tilt."""
@@ -72,52 +72,64 @@ def drawn_position(
 ) -> PositionRegion:
     """The region of the controller's position that a drawing asks for.
 
-    A region has the walls of the box that was drawn, but for its height: the image tells little
-    about that, so the box stays as flat as planned, at the planned height or the nearest to it
-    within the region. A target has a small box of its own, within the region.
+    A region has the upright walls of the box that was drawn, less a margin over which the
+    camera loses its share. The image tells little about height: so the box stays as flat as
+    planned, at the planned height or the nearest to it within the region. A target has a small
+    box of its own, within the region.
 
     Args:
         drawing: Of a region, a target or both.
         planned: Region without the person.
-        config: Rate and size.
+        config: Rate and sizes.
     """
-    low, high = (
-        planned.centre.new_full((3,), -torch.inf),
-        planned.centre.new_full((3,), torch.inf),
-    )
-    half_size, centre = planned.half_size, planned.centre
-    if (box := drawing.region) is not None:
+    centre, half_size = planned.centre, planned.half_size
+    box = drawing.region
+    if box is None:
+        low, high = torch.full_like(centre, -math.inf), torch.full_like(centre, math.inf)
+    else:
         middle, half = centre.new_tensor(box.centre), centre.new_tensor(box.half_size)
         low, high = middle - half, middle + half
         flat = torch.minimum(half_size[2], half[2])
         height = centre[2].clamp(low[2] + flat, high[2] - flat)
         centre = torch.cat([middle[:2], height[None]])
-        half_size = torch.cat([half[:2], flat[None]])
+        half_size = torch.cat([half[:2] - _margin(half, config), flat[None]])
     if drawing.target is not None:
-        centre = centre.new_tensor(drawing.target)
-        half_size = torch.minimum(
-            torch.full_like(centre, config.target_half_size), (high - low) / 2
-        )
-        centre = centre.clamp(low + half_size, high - half_size)
+        half_size = ((high - low) / 2).clamp(max=config.target_half_size)
+        target = centre.new_tensor(drawing.target)
+        centre = target.clamp(low + half_size, high - half_size)
     x, y, z = (config.rate / 4 * half_size.square()).tolist()
     return PositionRegion(
         centre=centre, half_size=half_size, stiffness=(x, y, z), formulation="saturated"
     )
 
 
-def depth_behind_walls(
-    region: PositionRegion, position: Float[Tensor, "3"], wall: float
+def camera_share(
+    box: DrawnRegion, position: Float[Tensor, "3"], config: DrawnGoalsConfig
 ) -> float:
-    """How deep a position lies within the upright walls of a region, 0 at a wall or outside.
+    """How much the camera takes part: not at all from the upright walls of a box on outwards.
+
+    So what it sees beyond them does not draw the end effector out of the box.
 
     Args:
-        region: Along the base axes.
+        box: As it was drawn.
         position: Of the end effector [m].
-        wall: Depth that counts as 1 [m].
+        config: Depth behind the walls from which on the camera has its full share.
     """
-    behind = region.half_size[:2] - (position - region.centre)[:2].abs()
-    # In a box that is narrower than two walls the middle counts as deep.
-    return float((behind / torch.clamp(region.half_size[:2], max=wall)).clamp(0, 1).min())
+    middle, half = position.new_tensor(box.centre), position.new_tensor(box.half_size)
+    behind = half[:2] - (position - middle)[:2].abs()
+    return float((behind / _margin(half, config)).clamp(0, 1).min())
+
+
+def _margin(half_size: Float[Tensor, "3"], config: DrawnGoalsConfig) -> Float[Tensor, "2"]:
+    """Between the upright walls of a box and of the controller's region in it [m]."""
+    # Half of a narrow box is left.
+    return (half_size[:2] / 2).clamp(max=config.wall)
+
+
+def _within(planned: PositionRegion, region: PositionRegion) -> bool:
+    """Whether the middle of the planned region is in another one."""
+    away = (planned.centre - region.centre).abs()
+    return bool((away <= region.half_size).all())
 
 
 class DrawnGoals:
@@ -125,6 +137,7 @@ class DrawnGoals:
 
     Attributes:
         leads: What leads the end effector now; empty where the plan does.
+        away: Whether that leads away from the planned region, so that the task waits.
         turn: Rotation that the person has added to the planned orientation (wxyz).
     """
 
@@ -148,7 +161,7 @@ class DrawnGoals:
 
     def restart(self) -> None:
         """Look anew at what is drawn: the arm begins to servo, maybe elsewhere."""
-        self._seen = self.leads = _NOTHING
+        self._seen, self.leads, self.away = _NOTHING, _NOTHING, False
         self._changed, self._checked = -math.inf, True
 
     def read(self, asked: HumanInput, planned: Goals, time: float) -> None:
@@ -172,21 +185,26 @@ class DrawnGoals:
     def applied(self, planned: Goals, position: Float[Tensor, "3"]) -> Goals:
         """The goals with what leads in the place of the planned region.
 
-        Within a region the camera takes part the more, the deeper the end effector is in it;
-        to a target the person leads without it.
+        Within a region the camera takes part (`camera_share`); to a target the person leads
+        without it. A joint-space approach that ends elsewhere is left out.
 
         Args:
             planned: Goals without the person.
             position: Of the end effector [m].
         """
+        self.away = False
         if not self.leads:
             return planned
+        box, target = self.leads
         region = drawn_position(self.leads, planned.position, self._config)
-        goals = replace(planned, position=region, posture=None)
-        if self.leads.target is not None:
+        goals = replace(planned, position=region)
+        self.away = target is not None or not _within(planned.position, region)
+        if self.away:
+            goals = goals.approached_by(None)
+        if target is not None or box is None:
             return goals.with_vision(False)
-        depth = depth_behind_walls(region, position, self._config.wall)
-        vision = replace(planned.vision, stiffness=depth * planned.vision.stiffness)
+        share = camera_share(box, position, self._config)
+        vision = replace(planned.vision, stiffness=share * planned.vision.stiffness)
         return replace(goals, vision=vision)
 
     def _take(self, planned: Goals) -> None:
@@ -202,8 +220,9 @@ class DrawnGoals:
             self.leads = _NOTHING
             self._tell(f"Refused {self._seen.words}: {why}.")
         else:
-            words = self._seen.words
-            self._tell(f"{words[0].upper()}{words[1:]} leads the end effector.")
+            self.applied(planned, where)
+            words, waits = self._seen.words, "; the task waits" if self.away else ""
+            self._tell(f"{words[0].upper()}{words[1:]} leads the end effector{waits}.")
 
     def turn_on(self, asked: tuple[float, float, float] | None, most: float) -> None:
         """Turn a little further towards what a person asks for, within the largest turn.

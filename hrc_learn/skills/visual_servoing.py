@@ -251,7 +251,7 @@ class VisualServo:
         self._at_rest: Measurement | None = None  # mean of what was seen at the last rest
         self._held: HeldMarker | None = None
         self._drawn = DrawnGoals(self._config.drawn, refusal, cell.tell)
-        self._led = 0.0  # time for which a person has led the end effector [s]
+        self._led = 0.0  # time for which a person has led the end effector away [s]
         self._above = _NO_TURN  # orientation of the last target that is not turned
         self.state: ControllerState = controller.initial_state(cell.joints)
 
@@ -323,7 +323,7 @@ class VisualServo:
             height = float(self._cell.pose.position[2] - target.above.position[2])
             at_height = abs(height - target.raised) < self._config.height_tolerance
             turned = self.turn_error(target) < self._config.turn_tolerance
-            on_target = self.error(target) < tolerance and self._drawn.leads.target is None
+            on_target = self.error(target) < tolerance and not self._drawn.away
             if not (on_target and at_height and turned):
                 reached = self._cell.time
                 seen.clear()
@@ -434,7 +434,7 @@ class VisualServo:
             drawn=bool(self._drawn.leads),
             turn=quaternion.log(self._drawn.turn).numpy(),
         )
-        if self._drawn.leads:
+        if self._drawn.away:
             self._led += self._cell.task_time - clock
             if self._held is not None:  # the marker goes with an end effector that is led
                 self._held = HeldMarker(self._config.half_hidden)
@@ -502,7 +502,7 @@ class VisualServo:
 
     @property
     def _clock(self) -> float:
-        """Time of the task without that in which a person led the end effector [s]."""
+        """Time of the task without that in which a person led the end effector away [s]."""
         return self._cell.task_time - self._led
 
     def _image_jacobian(self) -> Float[np.ndarray, "2 6"]:
@@ -520,7 +520,7 @@ class VisualServo:
         return self._cell.joints if joints is None else joints
 
     def _check_timeouts(self, target: ServoTarget, spent: float) -> None:
-        if self._drawn.leads:
+        if self._drawn.away:
             self._last_detection = self._cell.time
             return
         if self._cell.time - self._last_detection > self._config.occlusion_timeout:

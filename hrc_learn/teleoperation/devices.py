@@ -24,8 +24,8 @@ from hrc_learn.teleoperation.hand_guiding import (
     InteractionForceConfig,
     bounded,
     capped,
-    force_to_nullspace_input,
     leading_twist,
+    pull_to_nullspace_input,
 )
 
 
@@ -93,9 +93,10 @@ class LinkGuide(Human):
     def read(self, state: ArmState) -> HumanInput:
         """The null-space input now."""
         asked, config = self._human.read(state), self._config
-        force = config.max_force / config.speed * asked.twist[:3]
-        d = force_to_nullspace_input(
-            self._chain, state.joint_position, self._joint, capped(force, config.max_force)
+        # As a gizmo's displacement, whose largest force and speed are those of the device.
+        force = capped(config.max_force / config.speed * asked.twist[:3], config.max_force)
+        d = pull_to_nullspace_input(
+            self._chain, state.joint_position, self._joint, force, config
         )
         return replace(
             asked,

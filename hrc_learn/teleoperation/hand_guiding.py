@@ -2,8 +2,9 @@
 effector is led, and a hand-guided arm does what is asked.
 
 The paper's mixed interface: the displacement of a joint's gizmo is a velocity in proportion,
-mapped to the joints by the pseudo-inverse of that joint's Jacobian (section VII); that of the
-end effector's gizmo guides the end effector.
+mapped to the joints by the pseudo-inverse of that joint's Jacobian (section VII), which is
+"pinv" here; by default it is a force, mapped by the transpose. That of the end effector's gizmo
+guides the end effector.
 """
 
 from dataclasses import dataclass, field
@@ -23,6 +24,10 @@ from hrc_learn.skills.arm_motion import resolved_rate
 from hrc_learn.skills.person_feedback import PersonFeedback, filter_hindrance, share_kept
 
 ForceMapping = Literal["transpose", "pinv"]
+DEFAULT_MAPPING: ForceMapping = "transpose"
+"""How a pull acts wherever nothing else is asked for: as a force. After the projection into the
+null space the paper's pseudo-inverse moves the elbow a quarter to a third as fast, and in 6 to
+23 % of all directions against the pull (benchmarks/bench_pull_mapping.py)."""
 
 
 def force_to_nullspace_input(
@@ -30,7 +35,7 @@ def force_to_nullspace_input(
     joint_position: Float[np.ndarray, " joints"],
     joint: int,
     pull: Float[np.ndarray, "3"],
-    mapping: ForceMapping = "transpose",
+    mapping: ForceMapping = DEFAULT_MAPPING,
     point: Float[np.ndarray, "3"] | None = None,
 ) -> Float[np.ndarray, " joints"]:
     """Null-space input d from a pull at a joint, or at the link that it moves.
@@ -67,9 +72,9 @@ def force_to_nullspace_input(
 class InteractionForceConfig:
     """How strongly the displacement of a gizmo acts, and what bounds it."""
 
-    mapping: ForceMapping = "pinv"
-    """How a joint's gizmo acts: "pinv", the paper's, asks for a velocity; "transpose" is a
-    spring between joint and gizmo, and never moves the joint against the pull."""
+    mapping: ForceMapping = DEFAULT_MAPPING
+    """How a joint's gizmo acts: "transpose" is a spring between joint and gizmo, and never
+    moves the joint against the pull; "pinv", the paper's, asks for a velocity."""
     rate: float = 2.0
     """Speed per displacement [1/s]."""
     speed: float = 0.25
@@ -91,6 +96,14 @@ class InteractionForceConfig:
         for name, value in vars(self).items():
             if isinstance(value, float | int) and not value > 0:
                 raise ValueError(f"{name} must be positive, but is {value}.")
+
+    def velocity(self, force: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+        """Velocity that a gizmo asks for where it would be a spring of this force [m/s].
+
+        Args:
+            force: [N]
+        """
+        return capped(self.rate / self.stiffness * force, self.speed)
 
 
 # The floor only keeps a division by zero out; it is far below any length that matters.
@@ -117,8 +130,8 @@ def gizmo_nullspace_input(
 ) -> Float[np.ndarray, " joints"]:
     """Null-space input d from a gizmo on the arm.
 
-        d = c_d J^+ v,  v = rate * displacement      ("pinv", the paper's)
         d = J^T f,      f = stiffness * displacement ("transpose")
+        d = c_d J^+ v,  v = rate * displacement      ("pinv", the paper's)
 
     J is that of the point by which the link is held. v, f and d are bounded with their
     direction kept.
@@ -140,6 +153,30 @@ def gizmo_nullspace_input(
         pull = capped(config.stiffness * displacement, config.max_force)
     d = force_to_nullspace_input(chain, joint_position, joint, pull, config.mapping, point)
     return bounded(d, config.max_nullspace_input)
+
+
+def pull_to_nullspace_input(
+    chain: SerialChain,
+    joint_position: Float[np.ndarray, " joints"],
+    joint: int,
+    force: Float[np.ndarray, "3"],
+    config: InteractionForceConfig,
+) -> Float[np.ndarray, " joints"]:
+    """Null-space input d from a force at a joint, by either mapping.
+
+    Args:
+        chain: The arm.
+        joint_position: Joint positions [rad].
+        joint: Which joint is pulled, counted from 1.
+        force: In the base frame [N]; with "pinv" it stands for the velocity that a gizmo
+            displaced as far asks for.
+        config: The mapping.
+
+    Raises:
+        ValueError: If the arm has no such joint.
+    """
+    pull = force if config.mapping == "transpose" else config.damping * config.velocity(force)
+    return force_to_nullspace_input(chain, joint_position, joint, pull, config.mapping)
 
 
 def guiding_twist(

@@ -14,7 +14,11 @@ from scipy.interpolate import PchipInterpolator
 from hrc_learn.geometry import Pose, minimum_jerk
 from hrc_learn.kinematics import SerialChain, coarse_orientation
 from hrc_learn.protocols import ArmState, Human, HumanInput
-from hrc_learn.teleoperation.hand_guiding import TINY, force_to_nullspace_input
+from hrc_learn.teleoperation.hand_guiding import (
+    TINY,
+    InteractionForceConfig,
+    pull_to_nullspace_input,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,7 +100,11 @@ class ScriptedPerturbation(Human):
     """A person who pulls at the arm at given times, and does nothing else."""
 
     def __init__(
-        self, chain: SerialChain, forces: Sequence[ScriptedForce], begin: float | None = 0.0
+        self,
+        chain: SerialChain,
+        forces: Sequence[ScriptedForce],
+        begin: float | None = 0.0,
+        config: InteractionForceConfig | None = None,
     ):
         """Prepare the script.
 
@@ -104,7 +112,10 @@ class ScriptedPerturbation(Human):
             chain: The arm.
             forces: When and where it is pulled.
             begin: Time from which their intervals count [s]; None: once `begin` is called.
+            config: How a pull acts; with "pinv" a force asks for the velocity that a gizmo
+                displaced as far would ask for. None: as `InteractionForceConfig` has it.
         """
+        self._config = config or InteractionForceConfig()
         self._chain = chain
         self.forces = tuple(forces)
         self._begin = begin
@@ -125,8 +136,8 @@ class ScriptedPerturbation(Human):
             for scripted in active:
                 origin = self._chain.joint_origin(q, scripted.joint)
                 force = scripted.force(time, origin.numpy())
-                d += force_to_nullspace_input(
-                    self._chain, state.joint_position, scripted.joint, force
+                d += pull_to_nullspace_input(
+                    self._chain, state.joint_position, scripted.joint, force, self._config
                 )
         return HumanInput(nullspace_input=d, twist=np.zeros(6))
 

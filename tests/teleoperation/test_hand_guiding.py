@@ -162,7 +162,9 @@ def test_settings_that_make_no_sense_are_refused(name):
         HandGuidingConfig(**{name: 0.0})
 
 
-UNBOUNDED = InteractionForceConfig(speed=1e9, max_force=1e9, max_nullspace_input=1e9)
+UNBOUNDED = InteractionForceConfig(
+    mapping="pinv", speed=1e9, max_force=1e9, max_nullspace_input=1e9
+)
 
 
 def configurations(n, seed=0):

@@ -203,6 +203,9 @@ class RunCollaboration(RunServoing):
     pulls: Literal["scripted", "random", "none"] = "scripted"
     """When a scripted person pulls the elbow: where the robot waits for them, at random moments
     of the whole job, or never."""
+    mapping: More[Literal["transpose", "pinv"]] = "transpose"
+    """How these pulls act: as forces, by the transposed Jacobian of the joint pulled, or as the
+    paper's velocities, by its pseudo-inverse, which can move the joint against the pull."""
     worker: bool = False
     """Whether a worker comes and reaches under the arm. He puts something on the table first,
     leaves again, and makes no way for the robot; how near he comes is measured."""

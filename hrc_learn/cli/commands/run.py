@@ -97,6 +97,7 @@ def run_collaboration(args: RunCollaboration) -> int:
         shelf_x=args.shelf_x,
         shelf_depth=args.shelf_depth,
         pulls=args.pulls,
+        mapping=args.mapping,
         worker=args.worker,
         imperfections=_imperfections(args),
         curve=args.curve,

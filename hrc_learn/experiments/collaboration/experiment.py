@@ -35,7 +35,8 @@ from hrc_learn.skills.placing import PlacingSkill
 from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.skills.work_cell import WorkCellConfig
 from hrc_learn.store import read_made_by
-from hrc_learn.teleoperation import DrawnInterval, ScriptedForce
+from hrc_learn.teleoperation import DrawnInterval, ForceMapping, ScriptedForce
+from hrc_learn.teleoperation.hand_guiding import DEFAULT_MAPPING
 from hrc_learn.teleoperation.page import PageConfig
 from hrc_learn.viz import LoggedSteps, RunRecording
 from hrc_learn.viz.report import Section
@@ -63,6 +64,8 @@ class CollaborationExperiment:
     """How far behind the boards' front edge [m]."""
     pulls: Pulls = "scripted"
     """When the scripted person pulls the elbow."""
+    mapping: ForceMapping = DEFAULT_MAPPING
+    """How these pulls act."""
     worker: bool = False
     """Whether a worker comes to the table, another one each time, and reaches under the arm."""
     disturbances: Disturbances = field(default_factory=Disturbances)
@@ -95,6 +98,7 @@ class CollaborationExperiment:
             imperfections=self.imperfections,
             worker=self.worker,
             cell_config=replace(self.cell, keep_image_every=keep_every),
+            mapping=self.mapping,
             drawings=self.drawings,
             seed=seed,
             page=self.page,

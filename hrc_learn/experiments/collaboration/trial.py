@@ -57,11 +57,14 @@ from hrc_learn.skills.work_cell import WorkCell, WorkCellConfig
 from hrc_learn.teleoperation import (
     CombinedInput,
     DrawnInterval,
+    ForceMapping,
+    InteractionForceConfig,
     ScriptedDrawing,
     ScriptedForce,
     ScriptedPerturbation,
     random_pulls,
 )
+from hrc_learn.teleoperation.hand_guiding import DEFAULT_MAPPING
 from hrc_learn.teleoperation.page import PageConfig
 from hrc_learn.teleoperation.page_session import task_page
 from hrc_learn.vision import CameraModel, Marker
@@ -209,6 +212,7 @@ def simulate_collaboration(
     cell_config: WorkCellConfig | None = None,
     imperfections: Imperfections | None = None,
     worker: bool = False,
+    mapping: ForceMapping = DEFAULT_MAPPING,
     drawings: Sequence[DrawnInterval] = (),
     seed: int = 0,
     page: PageConfig | None = None,
@@ -232,6 +236,7 @@ def simulate_collaboration(
         cell_config: How the loop runs; images may be late or lost.
         imperfections: Of arm, calibration, camera and objects; None: none.
         worker: Whether a worker comes to the table, whom nobody expects.
+        mapping: How these forces act.
         drawings: What a scripted person draws, in the time of the run.
         seed: Of the objects' poses and of image noise.
         page: Serve a page from which people push the elbow and draw too, and let the world
@@ -270,13 +275,14 @@ def simulate_collaboration(
         workplace.home_joints().numpy(), _object_poses(workplace, world, sizes.object_yaw, rng)
     )
     pulls: tuple[ScriptedForce, ...] = ()
+    interaction = InteractionForceConfig(mapping=mapping)
     if forces == "random":
         # Drawn apart, so that runs with and without pulls are alike but for them.
         pulls = random_pulls(np.random.default_rng([seed, 1]))
         config = replace(config, interactions=0)
-        person = ScriptedPerturbation(panda, pulls, begin=0.0)
+        person = ScriptedPerturbation(panda, pulls, 0.0, interaction)
     else:
-        person = ScriptedPerturbation(panda, forces, begin=None)
+        person = ScriptedPerturbation(panda, forces, None, interaction)
     watch = None
     if visit is not None:
         tracker = WorkerSensor(visit, lambda: world.time, sizes, chance)
