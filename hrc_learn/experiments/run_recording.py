@@ -220,6 +220,8 @@ def record(
         bodies=motion.bodies(len(log)),
         boxes=tuple(world.config.boxes()),
         region=region,
+        active_region=log["region"],
+        drawn=log["drawn"],
         camera=CameraRecording(
             model=cameras[-1][1],
             feature=log["feature"],
@@ -241,6 +243,7 @@ def record(
         **_worker(motion, log),
         safety={name: safety[:, i] for i, name in enumerate(SAFETY_COLUMNS)},
         phases=tuple(log.events),
+        remarks=tuple(cell.remarks),
     )
 
 

@@ -84,6 +84,11 @@ class RunRecording:
     """Everything that stands still, in the base frame."""
     region: Box | None = None
     """The Cartesian region in which the camera takes over."""
+    active_region: Float[np.ndarray, "time 6"] | None = None
+    """Centre and half edges of the region of the controller's position at each step [m]; NaN
+    while no controller was in the loop."""
+    drawn: Bool[np.ndarray, " time"] | None = None
+    """Whether a person had drawn that."""
 
     camera: CameraRecording | None = None
     image_jacobian: Float[np.ndarray, "time 2 6"] | None = None
@@ -123,6 +128,8 @@ class RunRecording:
     """Whether, or how strongly, each guard of the safety filter acted, by name."""
     phases: tuple[Event, ...] = ()
     """When the task entered each of its phases."""
+    remarks: tuple[Event, ...] = ()
+    """What was said to the person beside the arm."""
 
     def __post_init__(self) -> None:
         series: dict[str, np.ndarray | None] = {name: getattr(self, name) for name in _SERIES}
@@ -153,6 +160,8 @@ _SERIES = (
     "position_deviation",
     "rotation_deviation",
     "worker_nearest",
+    "active_region",
+    "drawn",
 )
 
 

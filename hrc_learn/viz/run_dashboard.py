@@ -55,7 +55,7 @@ def run_layout(run: RunRecording) -> rrb.Blueprint:
     scene = rrb.Spatial3DView(
         origin="/world",
         contents=["+ /world/**", "- /world/camera/image/**"],
-        name="Robot: path of the run (blue), demonstration (grey), plan (orange)",
+        name="Robot: path of the run (blue), demonstration (grey), plan (orange), region",
         eye_controls=frame_view(np.concatenate([run.position, *eyes])),
     )
     left: list[rrb.View] = [scene]
@@ -96,7 +96,7 @@ class RunStream:
         """
         self._stream, self._still = stream, StaticShapes(stream)
         self._camera = CameraStream(stream, self._still)
-        self._rows = self._phases = 0
+        self._rows = self._phases = self._remarks = 0
         self._outline: tuple | None = None
 
     def send(self, run: RunRecording) -> None:
@@ -151,6 +151,8 @@ class RunStream:
         self._send_path(run, ends)
         if run.worker_nearest is not None:
             self._send_nearest(time, run.worker_nearest, at)
+        if run.active_region is not None:
+            self._send_region(run, run.active_region, first)
         if run.camera is not None:
             self._camera.send_overlays(time, run.camera, at, ends)
         for tab in run_tabs(run):
@@ -169,6 +171,28 @@ class RunStream:
         columns = rr.LineStrips3D.columns(strips=strips)
         self._stream.send_columns(path, seconds(run.time[ends]), columns)
 
+    def _send_region(
+        self, run: RunRecording, region: Float[np.ndarray, "time 6"], first: int
+    ) -> None:
+        """The region of the controller, where it changed, in another colour if it was drawn."""
+        drawn = np.zeros(len(region)) if run.drawn is None else run.drawn
+        state = np.column_stack([region, drawn])
+        same = (state[1:] == state[:-1]) | (np.isnan(state[1:]) & np.isnan(state[:-1]))
+        changed = np.flatnonzero(np.append(True, ~same.all(axis=1)))
+        at = changed[changed >= first]
+        if not len(at):
+            return
+        path, known = "world/active_region", np.isfinite(region[at]).all(axis=1)
+        self._still.send(path, None, lambda: rr.Boxes3D.from_fields(radii=[0.002]))
+        shown = at[known]
+        colours = [palette.rgba(palette.PERSON if d else palette.TARGET) for d in drawn[shown]]
+        columns = rr.Boxes3D.columns(
+            centers=region[shown, :3], half_sizes=region[shown, 3:], colors=colours
+        )
+        # A step without a region takes the box away.
+        counts = known.astype(int)
+        self._stream.send_columns(path, seconds(run.time[at]), columns.partition(counts))
+
     def _send_nearest(
         self,
         time: Float[np.ndarray, " time"],
@@ -185,8 +209,8 @@ class RunStream:
         self._stream.send_columns(path, seconds(time[at]), columns.partition(known.astype(int)))
 
     def _send_phases(self, run: RunRecording) -> None:
-        new = run.phases[self._phases :]
-        self._phases += len(new)
+        new = (*run.phases[self._phases :], *run.remarks[self._remarks :])
+        self._phases, self._remarks = len(run.phases), len(run.remarks)
         if new:
             when = seconds(np.array([phase.time for phase in new], dtype=float))
             # The viewer's own column of times is too narrow for decimals.

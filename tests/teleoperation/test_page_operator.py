@@ -11,7 +11,12 @@ from hrc_learn.kinematics import coarse_orientation, panda
 from hrc_learn.protocols import ArmState, DrawnRegion, Human, HumanInput
 from hrc_learn.teleoperation import CombinedInput, InteractionForceConfig, gizmo_nullspace_input
 from hrc_learn.teleoperation.page import PageHuman
-from hrc_learn.teleoperation.page.page_operator import HeldGizmo, HeldGizmos, gizmo_command
+from hrc_learn.teleoperation.page.page_operator import (
+    AddedTurn,
+    HeldGizmo,
+    HeldGizmos,
+    gizmo_command,
+)
 
 Q = panda.ready.numpy()
 STATE = ArmState(time=0.0, joint_position=Q, joint_velocity=0 * Q, gripper_width=0.08)
@@ -33,7 +38,8 @@ def test_a_wish_holds_for_a_moment_and_motion_ends_with_it():
     clock = Clock()
     human = PageHuman(7, holds_for=0.25, clock=clock)
     assert not human.read(STATE).nullspace_input.any()
-    human.post(pulling(region=REGION, target=(0.1, 0.2, 0.3), gripper=0.05))
+    drawn = {"region": REGION, "target": (0.1, 0.2, 0.3), "turn": (0.1, 0.0, 0.2)}
+    human.post(pulling(**drawn, gripper=0.05))
     clock.time = 0.25
     assert human.read(STATE).nullspace_input.any()
     clock.time = 0.26
@@ -43,6 +49,42 @@ def test_a_wish_holds_for_a_moment_and_motion_ends_with_it():
     # What was drawn has been drawn: it is no motion that a hand must keep up.
     assert asked.region == REGION
     assert asked.target == (0.1, 0.2, 0.3)
+    assert asked.turn == (0.1, 0.0, 0.2)
+
+
+def rotation(x, y, z):
+    return quaternion.exp(torch.tensor([x, y, z], dtype=torch.float64))
+
+
+def test_turns_of_the_rings_add_up_and_stay():
+    turn = AddedTurn()
+    assert turn.vector is None
+    # The gizmo may stand anyhow when it is taken: what counts is how far it is turned.
+    stood = rotation(0.3, 0.2, -0.9)
+    turn.take(1, stood.numpy())
+    turn.move(1, quaternion.multiply(rotation(0.2, 0.0, 0.0), stood).numpy())
+    turn.move(2, quaternion.multiply(rotation(0.9, 0.0, 0.0), stood).numpy())  # not the holder
+    turn.release(1)
+    turn.move(1, rotation(0.0, 1.0, 0.0).numpy())
+    np.testing.assert_allclose(turn.vector, [0.2, 0.0, 0.0], atol=1e-12)
+    turn.take(2, rotation(0.0, 0.0, 0.0).numpy())
+    turn.move(2, rotation(0.0, 0.3, 0.0).numpy())
+    expected = quaternion.multiply(rotation(0.0, 0.3, 0.0), rotation(0.2, 0.0, 0.0))
+    torch.testing.assert_close(turn.rotation, expected)
+    turn.clear()
+    assert turn.vector is None
+
+
+def test_a_turn_comes_on_top_of_the_coarse_rule():
+    config = InteractionForceConfig(turn_rate=1.0, turn_speed=10.0)
+    pose, turn = panda.forward(torch.from_numpy(Q)), rotation(0.1, -0.2, 0.05)
+    asked = gizmo_command(panda, Q, [grip(None, np.zeros(3))], config, turn=turn)
+    wanted = quaternion.multiply(turn, coarse_orientation(pose.position))
+    # An angular velocity of so much for a second turns there.
+    reached = quaternion.multiply(rotation(*asked.twist[3:]), pose.orientation)
+    assert float(quaternion.angle(reached, wanted)) < 1e-9
+    alone = gizmo_command(panda, Q, [grip(None, np.zeros(3))], config, coarse=False, turn=turn)
+    assert not alone.twist.any()
 
 
 def test_requests_come_once_each_and_in_order():

@@ -19,7 +19,7 @@ from rrd_reading import Rrd
 from sample_runs import OPTIONAL, sample_run, until
 
 from hrc_learn.geometry import Capsule
-from hrc_learn.viz import RunRecording, StepLog
+from hrc_learn.viz import Event, RunRecording, StepLog
 from hrc_learn.viz.panels import run_tabs
 from hrc_learn.viz.rerun_stream import capsules, samples, thin
 from hrc_learn.viz.run_dashboard import (
@@ -69,6 +69,30 @@ def test_bodies_move_as_they_did(run, rrd):
     np.testing.assert_allclose(translation, body.position[at], atol=1e-6)
     # Rerun writes x, y, z, w in single precision.
     np.testing.assert_allclose(quaternion[:, [3, 0, 1, 2]], body.orientation[at], atol=1e-6)
+
+
+def test_the_region_of_the_controller_is_drawn_where_it_changes(tmp_path):
+    run = sample_run()
+    steps = len(run.time)
+    region = np.full((steps, 6), np.nan)
+    region[20:60] = [0.3, 0.4, 0.2, 0.1, 0.1, 0.003]
+    region[60:90] = [0.4, 0.2, 0.4, 0.06, 0.08, 0.003]
+    drawn = (np.arange(steps) >= 60) & (np.arange(steps) < 90)
+    said = Event(float(run.time[60]), "The region drawn leads the end effector.")
+    path = tmp_path / "run.rrd"
+    record_run(path, sample_run(active_region=region, drawn=drawn, remarks=(said,)))
+    rrd = Rrd(path)
+    np.testing.assert_allclose(
+        rrd.time("world/active_region"), run.time[[0, 20, 60, 90]], atol=1e-9
+    )
+    boxes = rrd.column("world/active_region", "Boxes3D:centers")
+    assert [len(row) for row in boxes] == [0, 1, 1, 0]
+    np.testing.assert_allclose(boxes[2][0], [0.4, 0.2, 0.4], atol=1e-6)
+    halves = rrd.column("world/active_region", "Boxes3D:half_sizes")
+    np.testing.assert_allclose(halves[1][0], [0.1, 0.1, 0.003], atol=1e-6)
+    colours = rrd.column("world/active_region", "Boxes3D:colors")
+    assert colours[1] != colours[2]
+    assert any("region drawn" in text for (text,) in rrd.column("phases", "TextLog:text"))
 
 
 def test_a_line_joins_worker_and_robot_where_they_are_nearest(tmp_path):

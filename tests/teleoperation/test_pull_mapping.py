@@ -1,0 +1,92 @@
+"""How a pull acts where nothing else is asked for: code, command line and docs say the same."""
+
+import inspect
+import re
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from commands import done
+
+from hrc_learn.cli.arguments.run import RunCollaboration
+from hrc_learn.experiments.collaboration.experiment import CollaborationExperiment
+from hrc_learn.experiments.collaboration.trial import simulate_collaboration
+from hrc_learn.kinematics import panda
+from hrc_learn.protocols import ArmState
+from hrc_learn.teleoperation import (
+    InteractionForceConfig,
+    ScriptedForce,
+    ScriptedPerturbation,
+    force_to_nullspace_input,
+)
+from hrc_learn.teleoperation.devices import GamepadConfig
+from hrc_learn.teleoperation.hand_guiding import DEFAULT_MAPPING
+from hrc_learn.teleoperation.page import PageConfig
+
+DOCS = Path(__file__).parents[2] / "docs"
+
+
+def default_of(function, name):
+    return inspect.signature(function).parameters[name].default
+
+
+def field_default(cls, name):
+    return next(field.default for field in fields(cls) if field.name == name)
+
+
+def test_every_part_has_the_same_default():
+    assert default_of(force_to_nullspace_input, "mapping") == DEFAULT_MAPPING
+    assert default_of(simulate_collaboration, "mapping") == DEFAULT_MAPPING
+    assert field_default(CollaborationExperiment, "mapping") == DEFAULT_MAPPING
+    assert field_default(RunCollaboration, "mapping") == DEFAULT_MAPPING
+    for forces in (InteractionForceConfig(), PageConfig().forces, GamepadConfig().forces):
+        assert forces.mapping == DEFAULT_MAPPING
+
+
+def test_the_docs_tell_that_default():
+    (row,) = re.findall(
+        r"\| `force_to_nullspace_input`: (.+) \| `mapping=\"(\w+)\"` \|",
+        (DOCS / "notation.md").read_text(encoding="utf-8"),
+    )
+    assert (
+        row[0] == {"transpose": "d = J_joint^T f", "pinv": "d = J_joint^+ v"}[DEFAULT_MAPPING]
+    )
+    assert {row[1], DEFAULT_MAPPING} == {"transpose", "pinv"}
+    page = (DOCS / "teleoperation.md").read_text(encoding="utf-8")
+    assert f'`mapping="{DEFAULT_MAPPING}"` by default' in page
+
+
+@pytest.mark.parametrize(
+    ("command", "option"),
+    [
+        (("run", "collaboration"), "--mapping"),
+        (("page",), "--page.forces.mapping"),
+    ],
+)
+def test_the_help_tells_that_default(command, option):
+    text = " ".join(done(*command, "--help-all").output.replace("│", " ").split())
+    assert re.search(rf"{re.escape(option)} {{[a-z,]+}}.*?\(default: (\w+)\)", text)[1] == (
+        DEFAULT_MAPPING
+    )
+
+
+@pytest.mark.parametrize("mapping", ["transpose", "pinv"])
+def test_a_scripted_person_pulls_by_the_mapping_asked_for(mapping):
+    config = InteractionForceConfig(mapping=mapping)
+    pull = ScriptedForce(start=0.0, duration=4.0, towards=(0.4, 0.3, 0.9), max_force=10.0)
+    q = panda.ready.numpy()
+    state = ArmState(time=2.0, joint_position=q, joint_velocity=0 * q, gripper_width=0.08)
+    d = ScriptedPerturbation(panda, [pull], config=config).read(state).nullspace_input
+    elbow = panda.link_poses(panda.ready).position[3].numpy()
+    force = pull.force(2.0, elbow)
+    assert np.linalg.norm(force) == pytest.approx(10.0)
+    J = panda.joint_jacobian(torch.from_numpy(q), 4)[:3].numpy()
+    if mapping == "transpose":
+        np.testing.assert_allclose(d, J.T @ force, atol=1e-12)
+    else:
+        # The gizmo displaced as far as the spring's force has it asks for 2 1/s of that.
+        velocity = 2.0 * force / 150.0
+        expected, *_ = np.linalg.lstsq(J, velocity, rcond=1e-6)
+        np.testing.assert_allclose(d, 3.0 * expected, atol=1e-9)
