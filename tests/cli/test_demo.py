@@ -1,11 +1,13 @@
 """The demo as a chain of commands, and the models that other commands take from it."""
 
+import math
 from pathlib import Path
 
 import pytest
 from commands import done, hrc
 
 from hrc_learn.cli.commands import fit, record, run
+from hrc_learn.protocols import DrawnRegion
 
 STEPS = (
     (record, "record_placing"),
@@ -79,6 +81,25 @@ def test_models_that_are_not_given_are_those_of_the_demo(asked, conducted, tmp_p
     assert conducted[-1][0].placing == models / "placing"
     assert conducted[-1][0].aiming == tmp_path / "mine"
     assert len(asked) == 4
+
+
+def test_a_scripted_person_draws_as_the_command_says(asked, conducted):
+    drawn = (
+        *("--draw-region", 3, 7, 0.35, 0.3, 0.3, 0.06, 0.07, 0.05),
+        *("--mark-target", 4, 5, 0.37, 0.33, 0.32, "--turn-tool", 4, 5, 0, 0, 90),
+    )
+    for command in ("grasping", "collaboration"):
+        models = ("--aiming", "mine", "--placing", "mine")[: 2 if command == "grasping" else 4]
+        done("run", command, *drawn, *models, "--page")
+        experiment = conducted[-1][0]
+        region, target, turn = experiment.drawings
+        assert (region.start, region.duration) == (3, 7)
+        assert region.region == DrawnRegion(
+            centre=(0.35, 0.3, 0.3), half_size=(0.06, 0.07, 0.05)
+        )
+        assert (target.target, target.region) == ((0.37, 0.33, 0.32), None)
+        assert turn.turn == (0.0, 0.0, math.pi / 2)
+        assert experiment.page is not None
 
 
 def test_nothing_is_learned_for_a_run_that_finds_its_place_taken(asked, tmp_path):

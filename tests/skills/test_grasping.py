@@ -31,12 +31,16 @@ from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import RBFImageJacobian, paper_grid
 from hrc_learn.kinematics import panda, panda_capsules
 from hrc_learn.kinematics.tool_orientation import Approach
+from hrc_learn.protocols import DrawnRegion
 from hrc_learn.sim import World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.arm_motion import joint_line
-from hrc_learn.skills.grasping import GraspingConfig
+from hrc_learn.skills.grasping import Grasping, GraspingConfig
+from hrc_learn.skills.placing import check_plan
 from hrc_learn.skills.visual_servoing import ServoTarget, VisualServoConfig
 from hrc_learn.skills.visual_skill import VisualServoSkill, VisualTarget
+from hrc_learn.skills.work_cell import WorkCell
+from hrc_learn.teleoperation import DrawnInterval, ScriptedDrawing
 
 WORKPLACE = Workplace()
 
@@ -336,3 +340,59 @@ def test_a_hand_that_comes_down_along_the_line_stays_on_it():
     assert target.deviation(hand(0.04), hand(0.01)) == pytest.approx(0.0, abs=1e-12)
     there = hand(0.0, (0.012, 0.005, 0.0))
     assert target.deviation(there, hand(0.03)) == pytest.approx(0.013, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("place", "said"),
+    [
+        ((0.0, 0.0, 0.0), ""),
+        ((0.1, -0.15, 0.1), ""),
+        ((0.6, 0.5, 0.4), "does not reach"),
+        ((0.0, 0.0, -0.08), "on the table"),
+        ((0.2, -1.1, 0.15), "on the way there"),
+    ],
+)
+def test_a_person_is_told_where_the_arm_cannot_be_led(skill, place, said):
+    """Away from above the middle of the table [m]; the last is within the cabinet."""
+    world = World(WORKPLACE.scene)
+    world.reset(WORKPLACE.hover_joints().numpy())
+    cell = WorkCell(
+        chain=panda,
+        arm=world.arm,
+        gripper=world.arm,
+        human=ScriptedDrawing(()),
+        advance=world.advance,
+    )
+    task = Grasping(cell, WORKPLACE, skill, check=lambda plan: check_plan(plan, world))
+    hover = WORKPLACE.hover()
+    pose = Pose(hover.position + torch.tensor(place, dtype=torch.float64), hover.orientation)
+    words = task.refusal(pose)
+    assert said in words
+    assert bool(said) == bool(words)
+
+
+@pytest.mark.slow
+def test_an_object_is_grasped_within_the_region_that_a_person_has_drawn(skill):
+    """Experiment 2 of the paper: the expert draws it by the AR interface."""
+    box = DrawnRegion(centre=(0.24, 0.54, 0.22), half_size=(0.17, 0.17, 0.13))
+    aside = DrawnInterval(start=1.5, duration=4.0, target=(0.35, 0.35, 0.32))
+    over = DrawnInterval(start=0.0, duration=60.0, region=box)
+    with shapes_unchecked():
+        run = simulate_grasp(
+            skill,
+            turned(110.0),
+            camera="synthetic",
+            rng=np.random.default_rng(1),
+            drawings=(replace(over, start=6.0), aside),
+        )
+    assert succeeded(run)
+    log = run.cell.log
+    time, hand = log["time"], panda.forward(torch.from_numpy(log["joint_position"])).position
+    led = hand.numpy()[np.searchsorted(time, 5.4)]
+    # Encoders and servos are ideal here: what is left is the box of the target.
+    np.testing.assert_allclose(led, aside.target, atol=5e-3)
+    servoed = np.isfinite(log["region"]).all(axis=1)
+    assert log["drawn"][servoed & (time > 1.6) & (time < 5.4)].all()
+    assert log["drawn"][servoed & (time > 6.1)].all()
+    assert not log["drawn"][servoed & (time < 1.4)].any()
+    assert [remark.text.split()[0] for remark in run.cell.remarks] == ["The"] * 3

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from hrc_learn.kinematics import panda
-from hrc_learn.protocols import Feedback, Human, HumanInput, Reason
+from hrc_learn.protocols import DrawnRegion, Feedback, Human, HumanInput, Reason
+from hrc_learn.regions import PositionRegion
 from hrc_learn.sim import World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.work_cell import WorkCell
@@ -85,6 +86,23 @@ def test_the_page_tells_what_the_task_and_its_safety_filter_do(world, beside):
     assert status.interventions["velocity"] == 5
     assert status.interventions["invalid"] == 0
     cell.begin_phase("grasp")
+    assert beside.status(cell).note == ""
+    assert status.region is None  # no controller is at work
+
+
+def test_the_page_shows_the_region_that_a_controller_follows(world, beside):
+    human, advance = beside.joined(ScriptedPerturbation(panda, ()), world.advance)
+    cell = WorkCell(chain=panda, arm=world.arm, gripper=world.arm, human=human, advance=advance)
+    cell.region = PositionRegion(
+        centre=torch.tensor([0.3, 0.4, 0.2], dtype=torch.float64),
+        half_size=torch.tensor([0.1, 0.1, 0.003], dtype=torch.float64),
+    )
+    cell.tell("The region drawn leads the end effector.")
+    status = beside.status(cell)
+    assert status.region == DrawnRegion(centre=(0.3, 0.4, 0.2), half_size=(0.1, 0.1, 0.003))
+    assert status.note == "The region drawn leads the end effector."
+    cell.hold_pose(7.0)
+    assert beside.status(cell).region is None
     assert beside.status(cell).note == ""
 
 
