@@ -21,8 +21,8 @@ from hrc_learn.sim.worker import WORKER_ITEM_HALF_SIZE, Posture, Worker
 _HALF_STEP = 1e-4
 # Step of a person who walks, fraction of the stature: two in a stride of 0.8 of it.
 _STEP = 0.40
-# Where a hand is that puts down or takes what stands on the bench [m].
-_HAND_OVER_BENCH = 2 * WORKER_ITEM_HALF_SIZE[2]
+HAND_OVER_BENCH = 2 * WORKER_ITEM_HALF_SIZE[2]
+"""Height of a hand that puts down or takes what stands on the bench [m]."""
 # How far markers are to the sides of what the arm is at work above [m].
 _BESIDE_GRIPPER = (0.11, 0.22)
 # Places for a marker that are tried: of ten one may be within reach where an arm hinders.
@@ -306,7 +306,7 @@ def random_visit(
         [
             stand[0] + rng.uniform(-0.2, 0.2),
             edge - rng.uniform(0.10, 0.16),
-            top + _HAND_OVER_BENCH,
+            top + HAND_OVER_BENCH,
         ]
     )
     above = own(spot + np.array([0.0, 0.0, 0.12]))
@@ -370,7 +370,7 @@ def _marker(
     for _ in range(_MARKERS_TRIED):
         # To either side of the gripper that hovers there: nobody reaches through it.
         x = rng.choice([-1, 1]) * rng.uniform(*_BESIDE_GRIPPER)
-        point = under + np.array([x, rng.uniform(-0.10, 0.12), _HAND_OVER_BENCH])
+        point = under + np.array([x, rng.uniform(-0.10, 0.12), HAND_OVER_BENCH])
         target = own(point)
         which = _hand_for(target)
         lean = worker.lean_to(target, which)

@@ -52,6 +52,7 @@ from hrc_learn.skills.marker_sensor import (
 )
 from hrc_learn.skills.null_space_yielding import (
     CHANGE_OF_RATE,
+    FAR_ASIDE,
     LONGEST_RETURN,
     NARROW,
     NullSpaceYielding,
@@ -582,7 +583,8 @@ class WorkCell:
                 waited = max(waited + (1.0 - 2.0 * max(rate, 0.0)) * dt, 0.0)
             # The null space that led aside further back leads back there as well.
             backs = waited > _STUCK and progress > 0
-            if not backs and self._yielding.aside and narrow[here : ahead + 1].any():
+            far = float((goal - self.joints).norm()) > FAR_ASIDE
+            if not backs and self._yielding.aside and (far or narrow[here : ahead + 1].any()):
                 behind = math.inf
             rate = changed_rate(rate, 2.0 - behind, dt, direction=-1 if backs else 1)
             if rate <= 0:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hrc_learn.protocols import ArmState, DrawnRegion, HumanInput
+from hrc_learn.protocols import ArmState, DrawnRegion, Human, HumanInput
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,8 +33,8 @@ class DrawnInterval:
             raise ValueError(f"duration must be positive, but is {self.duration}.")
 
 
-class ScriptedDrawing:
-    """Draws by a script, and does nothing else: a `Human`, also beside others."""
+class ScriptedDrawing(Human):
+    """Draws by a script, and does nothing else; also beside others."""
 
     def __init__(self, script: Sequence[DrawnInterval], joints: int = 7):
         """Prepare.

@@ -133,7 +133,7 @@ def test_beside_the_elbow_nobody_leans_into_the_arm_that_waits(seed):
     # The capsules that he is drawn by contain the arm, so it is further away than they say.
     assert min(apart) > 0.03
     # He stands at the side of the elbow, before the robot's, and reaches under the forearm.
-    x, y = visit.posture(np.array(visit.released)).place
+    x = visit.posture(np.array(visit.released)).place[0]
     table = WORKPLACE.scene.table
     assert x < table.centre[0] - table.half_size[0]
     elbow, wrist = panda.joint_origins(torch.from_numpy(waiting))[3:5, :2].numpy()

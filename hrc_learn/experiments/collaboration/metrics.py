@@ -111,8 +111,7 @@ def collaboration_metrics(
         ),
         Metric("waited for the worker", _waited, "s"),
         Metric("free for his hands while he reaches", _free_volume, "l", resolution=0.1),
-        Metric("lean to reach", _lean, "deg", resolution=1.0),
-        Metric("reaches that keep him clear of the arm", _clear_reaches, "%"),
+        Metric("bench he reaches comfortably", _comfortable, "%"),
         Metric(
             "cycle time",
             lambda run: run.cell.time,
@@ -202,16 +201,10 @@ def _free_volume(run: CollaborationRun) -> float | None:
     return 1e3 * float(np.mean([room.free_volume for room in rooms])) if rooms else None
 
 
-def _lean(run: CollaborationRun) -> float | None:
-    """Mean over the reaches that keep him clear [deg]."""
-    leans = [room.lean for room in run.reach_rooms if np.isfinite(room.lean)]
-    return float(np.rad2deg(np.mean(leans))) if leans else None
-
-
-def _clear_reaches(run: CollaborationRun) -> float | None:
-    """Share of the reaches for which there is a posture that keeps him clear [%]."""
+def _comfortable(run: CollaborationRun) -> float | None:
+    """Mean over the reaches [%]."""
     rooms = run.reach_rooms
-    return 100.0 * float(np.mean([np.isfinite(r.lean) for r in rooms])) if rooms else None
+    return 100.0 * float(np.mean([room.comfortable for room in rooms])) if rooms else None
 
 
 def _off_path(run: CollaborationRun) -> float | None:

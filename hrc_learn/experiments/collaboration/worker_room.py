@@ -6,17 +6,18 @@ and how he leans is looked for anew, so that arms can be compared whatever he di
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from hrc_learn.geometry import Box
 from hrc_learn.kinematics import CapsuleArm, separation
 from hrc_learn.sim import WorkerVisit
 from hrc_learn.sim.worker import Posture
+from hrc_learn.sim.worker_visit import HAND_OVER_BENCH
 from hrc_learn.viz import LoggedSteps
 
 CLEAR = 0.05
@@ -31,10 +32,17 @@ _ABOVE = 0.40
 """Height over the bench up to which they are [m]: that of an elbow over a hand on the bench."""
 _AROUND = (0.25, 0.20)
 """How far they are around what the arm is at work above [m]: where the markers lie."""
-_ASIDE = np.linspace(-0.45, 0.45, 13)
+_ASIDE = np.linspace(-0.45, 0.45, 7)
 """Places along the bench that are tried, from where he stands [m]: a step to either side."""
-_LEANS = np.deg2rad(np.arange(0.0, 66.0, 3.0))
-"""Leans that are tried [rad], up to where only the pelvis bends any further."""
+_LEANS = np.deg2rad(np.arange(0.0, 61.0, 5.0))
+"""Leans that are tried [rad], up to what ergonomics take for the worst (RULA's last step)."""
+_COMFORTABLE = np.deg2rad(20.0)
+"""Lean up to which a posture is comfortable [rad]: RULA's first step (McAtamney and Corlett
+1993, "RULA: a survey method", Applied Ergonomics 24)."""
+_PLACES = 5
+"""On the bench, along either side of the box in which room is wanted, that he is to reach."""
+_AT_ONCE = 1000
+"""Postures that are measured at once: some 100 MB."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,11 +52,11 @@ class ReachRoom:
     time: float
     """[s]"""
     free_volume: float
-    """Over the bench around the marker, for a hand [m^3]."""
-    lean: float
-    """Of the trunk in the least awkward posture that reaches the marker and keeps clear of the
-    arm [rad]; NaN if none does. Ergonomics take up to 20 degrees for comfortable (RULA's first
-    step: McAtamney and Corlett 1993)."""
+    """Over the bench under the arm, for a hand [m^3]."""
+    comfortable: float
+    """Fraction of the bench there that he reaches clear of the arm without leaning far."""
+    reachable: float
+    """Fraction that he reaches clear of the arm at all."""
 
 
 def reach_rooms(
@@ -68,16 +76,19 @@ def reach_rooms(
         encoder_offset: What the joint positions of the log are too large by [rad].
     """
     rooms = []
-    for marker, (begin, end) in zip(visit.markers, visit.reaches, strict=True):
+    places = bench_places(over)
+    for begin, end in visit.reaches:
         k = int(np.searchsorted(log["time"], (begin + end) / 2))
         if k == len(log["time"]):
             continue
         q = torch.from_numpy(log["joint_position"][k] - encoder_offset)
+        leans = least_leans(arm, q, visit, places)
         rooms.append(
             ReachRoom(
                 time=float(log["time"][k]),
                 free_volume=free_volume(arm, q, over),
-                lean=least_lean(arm, q, visit, marker),
+                comfortable=float((leans <= _COMFORTABLE + 1e-9).mean()),
+                reachable=float(np.isfinite(leans).mean()),
             )
         )
     return rooms
@@ -112,13 +123,23 @@ def free_volume(arm: CapsuleArm, joint_position: Float[Tensor, " joints"], over:
     return float((distance.amin(0) >= _HAND).sum()) * _GRID**3
 
 
-def least_lean(
+def bench_places(over: Box) -> Float[np.ndarray, "places 3"]:
+    """Where markers may lie under a box: a grid on the bench, as high as a hand on it [m]."""
+    x, y = (
+        c + h * np.linspace(-1.0, 1.0, _PLACES)
+        for c, h in zip(over.centre[:2], over.half_size[:2], strict=True)
+    )
+    z = over.centre[2] - over.half_size[2] + HAND_OVER_BENCH
+    return np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def least_leans(
     arm: CapsuleArm,
     joint_position: Float[Tensor, " joints"],
     visit: WorkerVisit,
-    marker: Float[np.ndarray, "3"],
-) -> float:
-    """How far a worker has to lean to reach a marker and keep clear of an arm [rad].
+    markers: Float[np.ndarray, "markers 3"],
+) -> Float[np.ndarray, " markers"]:
+    """How far a worker has to lean to reach each marker and keep clear of an arm [rad].
 
     From the best place along the bench, with either hand; NaN if there is no such posture.
 
@@ -126,41 +147,58 @@ def least_lean(
         arm: Capsules of arm and tool.
         joint_position: [rad]
         visit: Who, and where he stands at the bench.
-        marker: Where a hand has to be [m].
+        markers: Where a hand has to be [m].
     """
+    which, postures = _reaching(visit, markers)
+    leans = np.full(len(markers), np.nan)
+    for first in range(0, len(which), _AT_ONCE):
+        some = slice(first, first + _AT_ONCE)
+        part = Posture(**{f.name: getattr(postures, f.name)[some] for f in fields(Posture)})
+        ends = torch.from_numpy(visit.worker.ends(part))
+        radius = torch.from_numpy(visit.worker.radius).expand(len(ends), -1)
+        q = joint_position.expand(len(ends), -1)
+        distance = separation(arm, q, ends, radius).distance.amin((-2, -1)).numpy()
+        clear = distance >= CLEAR
+        for marker, lean in zip(which[some][clear], part.lean[clear], strict=True):
+            leans[marker] = np.fmin(leans[marker], lean)
+    return leans
+
+
+def _reaching(
+    visit: WorkerVisit, markers: Float[np.ndarray, "markers 3"]
+) -> tuple[Int[np.ndarray, " postures"], Posture]:
+    """Postures that reach a marker, and which one each of them does."""
     worker = visit.worker
     standing = visit.posture(np.array(visit.released))
     heading = float(standing.heading)
     forward = np.array([np.cos(heading), np.sin(heading)])
     aside = np.array([-forward[1], forward[0]])
-    found = []
-    for step in _ASIDE:
-        place = standing.place + step * aside
-        relative = marker[:2] - place
-        own = np.array([relative @ forward, relative @ aside, marker[2] - worker.config.floor])
-        for side in (0, 1):
-            needed = worker.lean_to(own, side)
-            if needed is not None:
-                leans = _LEANS[needed <= _LEANS]
-                found += [(place, lean, side, own) for lean in leans]
-    if not found:
-        return float("nan")
-    places, leans, sides, hands = (np.array(each) for each in zip(*found, strict=True))
-    rest = worker.hanging_hands()
-    both = np.repeat(rest[None], len(found), axis=0)
-    both[np.arange(len(found)), sides] = hands
-    zero = np.zeros(len(found))
-    postures = Posture(
-        place=places,
-        heading=np.full(len(found), heading),
-        lean=leans,
+    rest, found = worker.hanging_hands(), []
+    for number, marker in enumerate(markers):
+        for step in _ASIDE:
+            place = standing.place + step * aside
+            x, y = (marker[:2] - place) @ np.stack([forward, aside], axis=1)
+            hand = np.array([x, y, marker[2] - worker.config.floor])
+            for side in (0, 1):
+                needed = worker.lean_to(hand, side)
+                if needed is None:
+                    continue
+                hands = rest.copy()
+                hands[side] = hand
+                found += [
+                    (number, place, lean, hands) for lean in _LEANS[needed <= _LEANS + 1e-9]
+                ]
+    number, place, lean, hands = (
+        (np.array(each) for each in zip(*found, strict=True))
+        if found
+        else (np.zeros(0, int), np.zeros((0, 2)), np.zeros(0), np.zeros((0, 2, 3)))
+    )
+    zero = np.zeros(len(number))
+    return number, Posture(
+        place=place,
+        heading=np.full(len(number), heading),
+        lean=lean,
         stride=zero,
         swing=zero,
-        hands=both,
+        hands=hands,
     )
-    ends = torch.from_numpy(worker.ends(postures))
-    radius = torch.from_numpy(worker.radius).expand(len(found), -1)
-    q = joint_position.expand(len(found), -1)
-    distance = separation(arm, q, ends, radius).distance.amin((-2, -1)).numpy()
-    clear = leans[distance >= CLEAR]
-    return float(clear.min()) if len(clear) else float("nan")
