@@ -31,9 +31,9 @@ LONGEST_RETURN = 5.0
 # Smallest singular value of the Jacobian of a path below which the arm cannot follow beside it,
 # as damping begins at 0.05.
 NARROW = 0.07
-# How far the joints may be from a path that goes on [rad]: an elbow aside by some 0.2 m. From
-# further away the null space may lead to another posture for the same pose by then.
-FAR_ASIDE = 1.2
+# How far the joints may be from a path that goes on [rad]: with 1.4 rad, an elbow aside by some
+# 0.2 m, all found back, with 2 rad not all.
+FAR_ASIDE = 1.8
 # In which a path stops, and goes on [s].
 CHANGE_OF_RATE = 0.2
 

@@ -583,9 +583,9 @@ class WorkCell:
                 waited = max(waited + (1.0 - 2.0 * max(rate, 0.0)) * dt, 0.0)
             # The null space that led aside further back leads back there as well.
             backs = waited > _STUCK and progress > 0
-            far = float((goal - self.joints).norm()) > FAR_ASIDE
-            if not backs and self._yielding.aside and (far or narrow[here : ahead + 1].any()):
-                behind = math.inf
+            if not backs and self._yielding.aside:
+                stops = bool(narrow[here : ahead + 1].any()) or self._astray(goal)
+                behind = math.inf if stops else behind
             rate = changed_rate(rate, 2.0 - behind, dt, direction=-1 if backs else 1)
             if rate <= 0:
                 self._feedback.hindrances.mention("task_waits")
@@ -600,6 +600,21 @@ class WorkCell:
             while yielding.aside and not yielding.pushed and self.time < deadline:
                 self._track_joints(end, torch.zeros_like(end))
         return len(path)
+
+    def _astray(self, goal: Float[Tensor, " joints"]) -> bool:
+        """Whether joints aside might not find back to a path that goes on.
+
+        The null space leads to another posture for the same pose, if that is nearer by then,
+        and no task is kept near a singularity that the path itself does not pass.
+        """
+        if (
+            self.config.after_push == "return"
+            and float((goal - self.joints).norm()) > FAR_ASIDE
+        ):
+            return True
+        ahead = self.joints + CHANGE_OF_RATE * self._guard.velocity
+        near = smallest_singular_value(self.chain, torch.stack([self.joints, ahead]))
+        return bool((near < NARROW).any())
 
     def _go_straight_back(self, goal: Float[Tensor, " joints"]) -> None:
         """To a path that waits, where no motion of the null space leads.

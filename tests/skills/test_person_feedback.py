@@ -282,7 +282,7 @@ def test_during_visual_servoing_it_is_told_as_well(room):
                     dt=cell.config.dt,
                 ),
             )
-            cell.execute(command, np.zeros(2), np.zeros(2))
+            cell.execute(command, np.zeros(2), np.zeros(2), region=controller.goals.position)
     # What the joints' own gradient adds counts neither for nor against the push.
     n, told = self_motion(cell.log["joint_position"][-1]), person.told[-1]
     own = -n @ command.xi_q.numpy() / cell.config.damping

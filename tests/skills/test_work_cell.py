@@ -13,6 +13,7 @@ from hrc_learn.kinematics import panda
 from hrc_learn.protocols import HINDRANCES, Human, HumanInput
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills import BlockedPathError, WorkCell, WorkCellConfig, joint_line
+from hrc_learn.skills.null_space_yielding import FAR_ASIDE
 from hrc_learn.teleoperation import ScriptedPerturbation
 
 
@@ -291,10 +292,12 @@ def transfer():
     return joint_line(panda.ready, panda.ready + far, speed=0.4, dt=0.01).numpy()
 
 
-def hand_off(cell, path):
-    """Largest distance of the end effector from its poses on the path [m, rad]."""
-    joints = torch.from_numpy(cell.log["joint_position"][: len(path)])
-    hand, planned = panda.forward(joints), panda.forward(torch.from_numpy(path))
+def hand_off(cell):
+    """Largest distance of the end effector from its poses on the path, which may wait [m, rad]."""
+    joints, path = (
+        torch.from_numpy(cell.log[name]) for name in ("joint_position", "path_joints")
+    )
+    hand, planned = panda.forward(joints), panda.forward(path)
     turn = quaternion.angle(hand.orientation, planned.orientation)
     return float((hand.position - planned.position).norm(dim=-1).max()), float(turn.max())
 
@@ -308,13 +311,39 @@ def test_a_person_pushes_the_elbow_aside_during_a_planned_motion_and_the_hand_go
     ]
     aside = (elbows[1] - elbows[0])[:, 3].norm(dim=-1)
     assert aside.max() > 0.15
-    lag, off = hand_off(free, path)[0], hand_off(pushed, path)
+    lag, off = hand_off(free)[0], hand_off(pushed)
     assert off[0] < lag + 1e-3
     assert off[1] < 5e-3
+    # So far aside that the null space might lead elsewhere by then, the path waits.
+    planned = pushed.log["path_joints"]
+    apart = np.linalg.norm(planned - pushed.log["joint_position"], axis=1)[1:]
+    moves = np.abs(np.diff(planned, axis=0)).max(axis=1) > 1e-3
+    assert apart.max() > FAR_ASIDE > apart[moves].max() - 0.1
     # Two seconds after they let go the joints are on their way back, at the end they are there.
     np.testing.assert_allclose(pushed.joints, path[-1], atol=0.04)
     speed = np.abs(pushed.log["joint_velocity"][260:]).max()
     assert speed < np.abs(free.log["joint_velocity"]).max() + 0.4
+
+
+def test_joints_are_astray_far_from_their_path_and_near_a_singularity(cell):
+    near = torch.full((7,), 0.9 * FAR_ASIDE / 7**0.5, dtype=torch.float64)
+    assert not cell._astray(cell.joints + near)
+    assert cell._astray(cell.joints + near * 1.2)
+    straight = torch.tensor([0.0, 0.0, 0.0, -0.1, 0.0, 0.1, 0.0], dtype=torch.float64)
+    stretched = cell_with(ObedientArm(straight.numpy()))
+    assert np.linalg.svd(panda.jacobian(straight).numpy())[1][-1] < 0.05
+    assert stretched._astray(stretched.joints)
+    # Whoever stays beside the path need not find back.
+    arm = ObedientArm(panda.ready.numpy())
+    stays = WorkCell(
+        chain=panda,
+        arm=arm,
+        gripper=arm,
+        human=ScriptedPerturbation(panda, ()),
+        advance=arm.advance,
+        config=WorkCellConfig(after_push="stay"),
+    )
+    assert not stays._astray(stays.joints + near * 1.2)
 
 
 def test_an_arm_that_meets_something_is_not_one_that_was_pushed():
@@ -335,7 +364,7 @@ def test_joints_stay_beside_the_path_if_wanted():
     path, config = transfer(), WorkCellConfig(after_push="stay")
     cell = pushed_along(path, PUSH, (0.5, 2.5), config=config)
     assert np.abs(cell.joints.numpy() - path[-1]).max() > 0.2
-    assert hand_off(cell, path)[0] < 4e-3
+    assert hand_off(cell)[0] < 4e-3
     assert len(cell.log) == len(path)
 
 
@@ -354,7 +383,7 @@ def test_nobody_pushes_the_arm_into_what_is_around_it():
     distance = clearance(torch.from_numpy(kept.log["joint_position"]))
     assert clearance(torch.from_numpy(free.log["joint_position"])).min() < 0
     assert distance.min() > 0.02
-    assert hand_off(kept, path)[0] < 4e-3
+    assert hand_off(kept)[0] < 4e-3
 
 
 def hindered(cell, hindrance):

@@ -111,7 +111,7 @@ def test_the_page_shows_how_far_a_held_elbow_follows_and_why_not_further(world, 
     human, advance = beside.joined(ScriptedPerturbation(panda, ()), world.advance)
     cell = WorkCell(chain=panda, arm=world.arm, gripper=world.arm, human=human, advance=advance)
     elbow, wrist = page._scene._knobs[4], page._scene._knobs[6]
-    far = panda.link_poses(cell.joints).position[3].numpy() + np.array([0.0, 1.0, 0.0])
+    far = panda.link_poses(cell.joints).position[3].numpy() + np.array([0.0, 0.02, 0.0])
     held = HeldGizmo(joint=4, held_at=np.zeros(3), pointer=far)
 
     def until(condition, holds=True):
