@@ -293,7 +293,7 @@ def transfer():
 
 
 def hand_off(cell):
-    """Largest distance of the end effector from its poses on the path, which may wait [m, rad]."""
+    """Largest distance of the end effector from its pose on the path, which may wait."""
     joints, path = (
         torch.from_numpy(cell.log[name]) for name in ("joint_position", "path_joints")
     )
@@ -331,7 +331,7 @@ def test_joints_are_astray_far_from_their_path_and_near_a_singularity(cell):
     assert cell._astray(cell.joints + near * 1.2)
     straight = torch.tensor([0.0, 0.0, 0.0, -0.1, 0.0, 0.1, 0.0], dtype=torch.float64)
     stretched = cell_with(ObedientArm(straight.numpy()))
-    assert np.linalg.svd(panda.jacobian(straight).numpy())[1][-1] < 0.05
+    assert np.linalg.svd(panda.jacobian(straight).numpy())[1][-1] < 0.06
     assert stretched._astray(stretched.joints)
     # Whoever stays beside the path need not find back.
     arm = ObedientArm(panda.ready.numpy())
