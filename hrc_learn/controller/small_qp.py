@@ -88,10 +88,11 @@ def least_change(
         index=torch.zeros_like(lower[..., :1], dtype=torch.int64),
         share=nothing[..., :1],
     )
-    for _ in range(steps):
-        if early_exit and bool(_solved(now, rows, lower, upper).all()):
-            break
-        now = _next(now, rows, lower, upper)
+    if early_exit:
+        now = _as_far_as_needed(now, rows, lower, upper, steps)
+    else:
+        for _ in range(steps):
+            now = _next(now, rows, lower, upper)
     return LeastChange(now.y, now.side * now.dual, _solved(now, rows, lower, upper))
 
 
@@ -100,6 +101,28 @@ def none_binds(
 ) -> Bool[Tensor, "*batch"]:
     """Whether the origin is within the limits of `least_change`, whatever their rows are."""
     return torch.maximum(lower, -upper).amax(-1) <= _TOLERANCE
+
+
+def _as_far_as_needed(
+    now: _Step, rows: Tensor, lower: Tensor, upper: Tensor, steps: int
+) -> _Step:
+    """Steps of those elements of a batch that are not solved yet."""
+    if steps == 0:
+        return now
+    waiting = ~_solved(now, rows, lower, upper)
+    if not bool(waiting.any()):
+        return now
+    if bool(waiting.all()):
+        return _as_far_as_needed(_next(now, rows, lower, upper), rows, lower, upper, steps - 1)
+    # A mask of the whole batch, so that of few elements that wait only those are computed.
+    part = _Step(**{name: value[waiting] for name, value in vars(now).items()})
+    limits = rows.expand(*now.operators.shape[:-1], -1)[waiting], lower[waiting], upper[waiting]
+    part = _as_far_as_needed(part, *limits, steps)
+    merged = {}
+    for name, value in vars(now).items():
+        merged[name] = value.clone()
+        merged[name][waiting] = getattr(part, name)
+    return _Step(**merged)
 
 
 def _solved(now: _Step, rows: Tensor, lower: Tensor, upper: Tensor) -> Bool[Tensor, "*batch"]:
