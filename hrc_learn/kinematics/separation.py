@@ -83,14 +83,18 @@ class Separation:
         every = torch.arange(shape.numel(), device=self.distance.device)
         return self.gradient_of(every).unflatten(-2, shape)
 
-    def gradient_of(self, pairs: Int[Tensor, " pairs"]) -> Float[Tensor, "*batch pairs joints"]:
+    def gradient_of(
+        self, pairs: Int[Tensor, "*#batch pairs"]
+    ) -> Float[Tensor, "*batch pairs joints"]:
         """Some rows of the gradient [m/rad].
 
         Args:
-            pairs: Numbers c H + h of the pairs of a capsule c of the arm and h of the person.
+            pairs: Numbers c H + h of the pairs of a capsule c of the arm and h of the person,
+                the same for all of a batch or of each element its own.
         """
+        index = pairs.unsqueeze(-1).expand(*self.direction.shape[:-3], -1, 3)
         direction, point = (
-            x.flatten(-3, -2).index_select(-2, pairs) for x in (self.direction, self.arm_point)
+            x.flatten(-3, -2).gather(-2, index) for x in (self.direction, self.arm_point)
         )
         z, origin = self.joint_axes, self.joint_origins
         # - direction . (z x (p - o)) for the axis z through o of every joint.

@@ -4,15 +4,33 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
+from jaxtyping import Float
 
 from hrc_learn.protocols import PersonObservation
 from hrc_learn.sim.imperfections import Imperfections
-from hrc_learn.sim.worker_visit import WorkerVisit
+from hrc_learn.sim.worker import Worker
 
 # Time over which velocities are averaged, noise against lag [s]: three images.
 _SPAN = 0.1
+IMAGE_RATE = 30.0
+"""Images a second of an ordinary depth camera."""
+
+
+@runtime_checkable
+class Seen(Protocol):
+    """Somebody's visit, as far as a tracker sees it."""
+
+    @property
+    def worker(self) -> Worker:
+        """Who it is."""
+        ...
+
+    def ends_at(self, time: float) -> Float[np.ndarray, "parts 2 3"]:
+        """Ends of the axes of all capsules at a time [s], in the base frame [m]."""
+        ...
 
 
 class WorkerSensor:
@@ -24,12 +42,12 @@ class WorkerSensor:
 
     def __init__(
         self,
-        visit: WorkerVisit,
+        visit: Seen,
         clock: Callable[[], float],
         sizes: Imperfections,
         rng: np.random.Generator,
         *,
-        rate: float = 30.0,
+        rate: float = IMAGE_RATE,
     ):
         """Begin to watch now.
 

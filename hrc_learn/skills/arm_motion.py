@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hrc_learn.controller import (
@@ -76,17 +76,17 @@ _TINY_STEP = 1e-4
 # Fastest that a person moves the elbow [m/s], the reduced speed of ISO 10218-1:2011, 3.23; and
 # a joint [rad/s]: it stops within 0.2 rad, by the part of its acceleration that a push may use.
 _GUIDED_SPEED, _GUIDED_JOINT = 0.25, 1.0
-# How far ahead of a null-space motion to look [s]: an elbow at 1 m/s stops within 0.1 s. And
-# which parts of the motion, or of the way, are tried.
-_AHEAD = 0.15
+LOOK_AHEAD = 0.15
+"""How far ahead of a null-space motion to look [s]: an elbow at 1 m/s stops within 0.1 s."""
+# Which parts of the motion, or of the way, are tried.
 _SHARES = torch.linspace(0.0, 1.0, 6, dtype=torch.float64)
 
 
 def null_space_slowdown(
     chain: SerialChain,
-    joint_position: Float[Tensor, " joints"],
-    null_velocity: Float[Tensor, " joints"],
-) -> float:
+    joint_position: Float[Tensor, "*batch joints"],
+    null_velocity: Float[Tensor, "*batch joints"],
+) -> Float[Tensor, "*batch"]:
     """Fraction of a null-space motion at which the arm can keep its end effector in place.
 
     The null space bends: a motion along it at the speed s takes the end effector along with
@@ -103,16 +103,17 @@ def null_space_slowdown(
         At most 1.
     """
     # Now, and where the arm will be once it could have slowed down.
-    times = null_velocity.new_tensor([0.0, _AHEAD])
-    steps = torch.stack([times, times + _TINY_STEP])[..., None] * null_velocity
+    times = null_velocity.new_tensor([0.0, LOOK_AHEAD])
+    times = torch.stack([times, times + _TINY_STEP])
+    steps = times.reshape(2, 2, *(1 for _ in null_velocity.shape)) * null_velocity
     origins, (J, beyond) = chain.joint_origins_and_jacobian(joint_position + steps)
-    bending = (beyond - J) @ null_velocity / _TINY_STEP
+    bending = ((beyond - J) @ null_velocity.unsqueeze(-1)).squeeze(-1) / _TINY_STEP
     scale = bending.new_tensor([1.0] * 3 + [_METRES_PER_RADIAN] * 3)
-    excess = torch.linalg.vector_norm(scale * bending, dim=-1).max() / _BENDING
+    excess = torch.linalg.vector_norm(scale * bending, dim=-1).amax(0) / _BENDING
     moved = torch.linalg.vector_norm(origins[1, 0] - origins[0, 0], dim=-1)
-    fastest = moved.max() / _TINY_STEP / _GUIDED_SPEED
-    fastest = torch.maximum(fastest, null_velocity.abs().max() / _GUIDED_JOINT)
-    return float(torch.minimum(excess.clamp(min=1.0) ** -0.5, 1 / fastest).clamp(max=1.0))
+    fastest = moved.amax(-1) / _TINY_STEP / _GUIDED_SPEED
+    fastest = torch.maximum(fastest, null_velocity.abs().amax(-1) / _GUIDED_JOINT)
+    return torch.minimum(excess.clamp(min=1.0) ** -0.5, 1 / fastest).clamp(max=1.0)
 
 
 # Smallest singular values between which a null-space motion towards a singularity fades: below
@@ -122,9 +123,9 @@ _SINGULAR, _REGULAR = SINGULAR_BELOW, 1.6 * SINGULAR_BELOW
 
 def singularity_fade(
     chain: SerialChain,
-    joint_position: Float[Tensor, " joints"],
-    null_velocity: Float[Tensor, " joints"],
-) -> float:
+    joint_position: Float[Tensor, "*batch joints"],
+    null_velocity: Float[Tensor, "*batch joints"],
+) -> Float[Tensor, "*batch"]:
     """Fraction of a null-space motion that does not take an arm into a singularity.
 
     Args:
@@ -136,11 +137,16 @@ def singularity_fade(
         1 away from singularities and on the way out of one, 0 on the way into one.
     """
     # On the way too: beyond a singularity it is regular again.
-    ahead = joint_position + 2 * _AHEAD * _SHARES.to(null_velocity)[:, None] * null_velocity
-    now, *later = torch.linalg.svdvals(chain.jacobian(ahead))[:, -1].tolist()
-    if min(later) >= now:
-        return 1.0
-    return min(max((min(later) - _SINGULAR) / (_REGULAR - _SINGULAR), 0.0), 1.0)
+    ahead = joint_position + 2 * LOOK_AHEAD * _shares_of(null_velocity)
+    now, *later = torch.linalg.svdvals(chain.jacobian(ahead))[..., -1]
+    least = torch.stack(later).amin(0)
+    fade = ((least - _SINGULAR) / (_REGULAR - _SINGULAR)).clamp(0, 1)
+    return torch.where(least >= now, 1.0, fade)
+
+
+def _shares_of(velocity: Float[Tensor, "*batch joints"]) -> Tensor:
+    """Parts of a motion, none and all among them: (shares, *batch, joints)."""
+    return _SHARES.to(velocity).reshape(-1, *(1 for _ in velocity.shape)) * velocity
 
 
 # Part of a correction below which it does not lie in the null space [rad/s].
@@ -148,12 +154,12 @@ _NOTHING = 1e-6
 
 
 def null_space_giving_way(
-    jacobian: Float[Tensor, "6 joints"],
-    task: Float[Tensor, " joints"],
-    null: Float[Tensor, " joints"],
-    lower: Float[Tensor, " joints"],
-    upper: Float[Tensor, " joints"],
-) -> Float[Tensor, " joints"]:
+    jacobian: Float[Tensor, "*batch 6 joints"],
+    task: Float[Tensor, "*batch joints"],
+    null: Float[Tensor, "*batch joints"],
+    lower: Float[Tensor, "*batch joints"],
+    upper: Float[Tensor, "*batch joints"],
+) -> Float[Tensor, "*batch joints"]:
     """The null-space velocity nearest to a given one with which no joint leaves its bounds.
 
     A person who pushes an arm to a limit would else leave its task no room: the null space
@@ -172,15 +178,15 @@ def null_space_giving_way(
     if not bool(missing.any()):
         return null
     along = null_projection(jacobian, missing)
-    if float(along.norm()) < _NOTHING:
-        return null
-    moving = along.abs() > _NOTHING * along.abs().max()
-    at_lower = ((lower - velocity) / along)[moving]
-    at_upper = ((upper - velocity) / along)[moving]
-    least = float(torch.minimum(at_lower, at_upper).max())
-    most = float(torch.maximum(at_lower, at_upper).min())
-    share = least if least <= most else (least + most) / 2
-    return null + share * along
+    size = along.abs()
+    moving = size > _NOTHING * size.amax(-1, keepdim=True)
+    slope = torch.where(moving, along, 1.0)
+    at_lower, at_upper = (lower - velocity) / slope, (upper - velocity) / slope
+    least = torch.where(moving, torch.minimum(at_lower, at_upper), -math.inf).amax(-1)
+    most = torch.where(moving, torch.maximum(at_lower, at_upper), math.inf).amin(-1)
+    share = torch.where(least <= most, least, (least + most) / 2)
+    share = torch.where(along.norm(dim=-1) < _NOTHING, 0.0, share)
+    return null + share.unsqueeze(-1) * along
 
 
 # At which an arm at the margin may still close in [m/s], down to so far within [m]: one that
@@ -191,18 +197,18 @@ _SLIDING, _DEEPEST = 0.002, 0.005
 class ClearMotion(NamedTuple):
     """A null-space motion that keeps an arm clear of what is around it."""
 
-    null: Float[Tensor, " joints"]
+    null: Float[Tensor, "*batch joints"]
     """[rad/s]"""
-    waits: bool
+    waits: Bool[Tensor, "*batch"]
     """Whether the task alone takes the arm nearer than the margin: then it has to wait."""
-    distance: float
+    distance: Float[Tensor, "*batch"]
     """Of the arm as it is now from what it must not meet [m]."""
 
 
 def kept_clear(
-    joint_position: Float[Tensor, " joints"],
-    task: Float[Tensor, " joints"],
-    null: Float[Tensor, " joints"],
+    joint_position: Float[Tensor, "*batch joints"],
+    task: Float[Tensor, "*batch joints"],
+    null: Float[Tensor, "*batch joints"],
     clearance: Callable[[Float[Tensor, "*batch joints"]], Float[Tensor, "*batch"]],
     margin: float,
 ) -> ClearMotion:
@@ -216,18 +222,20 @@ def kept_clear(
         margin: Distance to keep [m]. Where the task alone leaves less, the null space takes
             no more of it.
     """
-    shares = _SHARES.to(null)
-    ahead = joint_position + _AHEAD * (task + shares[:, None] * null)
+    ahead = joint_position + LOOK_AHEAD * (task + _shares_of(null))
     now, without, *_ = every = clearance(torch.cat([joint_position[None], ahead]))
+    waits = without < torch.clamp(now, max=margin)
     if bool((every >= margin).all()):
-        return ClearMotion(null, False, float(now))
-    waits = bool(without < torch.clamp(now, max=margin))
+        return ClearMotion(null, waits, now)
     closing = without - every[2:]
     room = without - margin
-    allowed = room.clamp(min=0.0) + _AHEAD * _SLIDING * (1.0 + room / _DEEPEST).clamp(0.0, 1.0)
+    allowed = room.clamp(min=0.0) + LOOK_AHEAD * _SLIDING * (1.0 + room / _DEEPEST).clamp(
+        0.0, 1.0
+    )
     # Closing in grows with the share: where it is too fast, so much less of it.
-    share = torch.where(closing > allowed, shares[1:] * allowed / closing, 1.0).min()
-    return ClearMotion(share * null, waits, float(now))
+    shares = _SHARES[1:].to(closing).reshape(-1, *(1 for _ in now.shape))
+    share = torch.where(closing > allowed, shares * allowed / closing, 1.0).amin(0)
+    return ClearMotion(share.unsqueeze(-1) * null, waits, now)
 
 
 class StraightLine:

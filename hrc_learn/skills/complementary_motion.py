@@ -164,7 +164,7 @@ class ComplementaryMotion:
             self._wishes = deque([*wishes, newest])
             self._rate, self._null = 0.0, torch.zeros_like(self._null)
             posture, joints, width = self.posture, self.joints, self._width
-        self._rate = changed_rate(self._rate, 1.0 if clear else 0.0, self._dt)
+        self._rate = float(changed_rate(self._rate, 1.0 if clear else 0.0, self._dt))
         if self._rate == 0:
             self._feedback.hindrances.mention("task_waits")
         moves = float((joints - self.joints).abs().max()) > _SAME
@@ -243,7 +243,8 @@ class ComplementaryMotion:
         own = float(self._room(ahead).min()) - _NO_NEARER
         margin = min(self._config.clearance, own)
         led = feasible(wanted)
-        null, waits, distance = kept_clear(joints, going, led, self._room, margin)
+        clear = kept_clear(joints, going, led, self._room, margin)
+        null, waits, distance = clear.null, bool(clear.waits), float(clear.distance)
         if waits or straight < _STRAIGHT[0]:
             # Against the person, as the end effector would have to stop otherwise.
             null, waits = self._retreat(joints, going, feasible(retreat), led, margin)

@@ -42,6 +42,8 @@ JOINT_SPEED = 0.6
 """Largest joint speed between postures [rad/s]: a quarter of the slowest joint's limit."""
 DESCENT_SPEED = 0.08
 """Mean speed of the last centimetres down to an object [m/s]."""
+CLOSING_TIME = 0.7
+"""For the fingers to close and for the grip to settle [s]."""
 
 # The marker plate stands out from the arm's capsules by up to this [m].
 _PLATE_CLEARANCE = 0.06
@@ -54,8 +56,6 @@ _AT_HOME = 0.05
 # By how much the table may be higher or lower than believed, and, once it was felt, than the
 # object before said [m].
 _TABLE_RANGE, _OBJECT_RANGE = 0.05, 0.015
-# Time for the fingers to close and for the grip to settle [s].
-_CLOSING_TIME = 0.7
 
 type TargetLaw = Callable[
     [
@@ -287,7 +287,7 @@ class Grasping:
         height = self._table + item.half_size[2]
         self._cell.move_straight(self._at_height(height), speed=DESCENT_SPEED)
         self._cell.gripper.move(CLOSED)
-        self._cell.hold_pose(_CLOSING_TIME)
+        self._cell.hold_pose(CLOSING_TIME)
         if not holds(self._cell, item):
             raise MissedGraspError(
                 f"grasp: the fingers closed on nothing. Is {item.name!r} where its marker says?"

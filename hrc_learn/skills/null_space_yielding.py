@@ -3,11 +3,11 @@ back when the person lets go.
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from hrc_learn.controller import scale_null_space
@@ -16,8 +16,8 @@ from hrc_learn.kinematics import SerialChain
 from hrc_learn.skills.arm_motion import null_space_slowdown, singularity_fade
 from hrc_learn.skills.person_feedback import Hindrances
 
-# Null-space input below which one that has ended is over [N m].
-_LEAST_INPUT = 0.05
+LEAST_INPUT = 0.05
+"""Null-space input below which one that has ended is over [N m]."""
 # Fractions of the joints' acceleration that a push and its end may use: the rest is for the
 # task, which is slowed down as well where both together need more than the arm has.
 _PUSHED_EFFORT, _STOPPING_EFFORT = 0.3, 0.6
@@ -34,6 +34,8 @@ NARROW = 0.07
 # How far the joints may be from a path that goes on [rad]: with 1.4 rad, an elbow aside by some
 # 0.2 m, all found back, with 2 rad not all.
 FAR_ASIDE = 1.8
+# Motion of the end effector, metres and radians as they are, below which nothing waits [1/s].
+_AT_REST = 1e-3
 # In which a path stops, and goes on [s].
 CHANGE_OF_RATE = 0.2
 
@@ -116,35 +118,25 @@ class NullSpaceYielding:
             bounds: Lowest and highest velocities that leave the task its room [rad/s].
             jacobian: Of the end effector there, where it is known.
         """
-        share = min(self._dt / self._config.nullspace_rise, 1.0)
         if joints is None or bounds is None:
+            share = min(self._dt / self._config.nullspace_rise, 1.0)
             smooth = self.nullspace_input + share * (asked - self.nullspace_input)
         elif not (self.pushed or asked.any()):
             smooth = asked
         else:
             J = self._chain.jacobian(joints) if jacobian is None else jacobian
             damping = self._config.damping
-            before = null_projection(J, self.null_velocity)
             push = torch.from_numpy(asked) / damping
-            wanted = null_projection(J, push)
-            self.hindrances.note_across(push, wanted)
-            slowdown = null_space_slowdown(self._chain, joints, wanted)
-            self.hindrances.note("speed", slowdown)
-            wanted = wanted * slowdown
-            # As far ahead as the arm gets while it slows down.
-            speed = before.norm().clamp(min=_SLOW) / wanted.norm().clamp(min=1e-9)
-            fade = singularity_fade(self._chain, joints, speed * wanted)
-            self.hindrances.note("singularity", fade)
-            faded = wanted * fade
-            wanted = scale_null_space(torch.zeros_like(faded), faded, *bounds)
-            self.hindrances.note_limits(faded, wanted, faded, bounds)
-            slows = bool(wanted.norm() < before.norm())
-            change = (1.0 if slows else share) * (wanted - before)
-            effort = _STOPPING_EFFORT if slows else _PUSHED_EFFORT
-            reach = effort * self._dt * self._chain.limits.acceleration
-            velocity = before + change / (change.abs() / reach).max().clamp(min=1.0)
+            eased = eased_null_velocity(
+                self._chain, joints, J, self.null_velocity, push, bounds, self._dt, self._config
+            )
+            self.hindrances.note_across(push, eased.felt)
+            self.hindrances.note("speed", float(eased.slowdown))
+            self.hindrances.note("singularity", float(eased.fade))
+            self.hindrances.note_limits(eased.wanted, eased.within, eased.wanted, bounds)
+            velocity = eased.velocity
             smooth = (damping * velocity).numpy()
-        if not asked.any() and np.abs(smooth).max() < _LEAST_INPUT:
+        if not asked.any() and np.abs(smooth).max() < LEAST_INPUT:
             smooth = asked
         self.nullspace_input = smooth
         return smooth
@@ -174,14 +166,10 @@ class NullSpaceYielding:
         if away is None:
             self._back = torch.zeros_like(error)
             return None
-        back = torch.zeros_like(away)
         # Not against the person while they push.
-        if returns or (self._config.after_push == "return" and not self.pushed):
-            fastest = self._config.return_speed / float(away.norm().clamp(min=1e-9))
-            back = min(self._config.pose_gain, fastest) * away
-        # A jump of the null-space motion would move the end effector.
-        share = min(self._dt / self._config.nullspace_rise, 1.0)
-        self._back = self._back + share * (back - self._back)
+        goes = returns or (self._config.after_push == "return" and not self.pushed)
+        away = away if goes else torch.zeros_like(away)
+        self._back = eased_way_back(self._back, away, self._dt, self._config)
         return self._back
 
     def begin(self, error: Float[Tensor, " joints"]) -> None:
@@ -195,13 +183,106 @@ class NullSpaceYielding:
         jacobian: Float[Tensor, "6 joints"] | None,
     ) -> Float[Tensor, " joints"] | None:
         """Null-space part of the way back to a path [rad]; None if nobody pushed it off."""
-        # An arm that nobody pushed and that is behind meets something: it goes on.
-        if not self.pushed and (not self.aside or float(error.norm()) <= _BACK):
-            self.aside = False
+        pushed, aside = torch.tensor(self.pushed), torch.tensor(self.aside)
+        self.aside = bool(stays_aside(pushed, aside, error))
+        if not self.aside:
             return None
-        self.aside = True
         J = self._chain.jacobian(joints) if jacobian is None else jacobian
         return null_projection(J, error)
+
+
+def stays_aside(
+    pushed: Bool[Tensor, "*batch"],
+    aside: Bool[Tensor, "*batch"],
+    error: Float[Tensor, "*batch joints"],
+) -> Bool[Tensor, "*batch"]:
+    """Whether joints are off their path because somebody pushes them, or did.
+
+    Those that nobody pushed and that are behind meet something: they go on.
+
+    Args:
+        pushed: Whether a person pushes at the null space now.
+        aside: Whether the joints were off their path a step before.
+        error: From the joints to the path [rad].
+    """
+    return pushed | (aside & (error.norm(dim=-1) > _BACK))
+
+
+class EasedVelocity(NamedTuple):
+    """What the null space takes of what a person wants, and why not all of it."""
+
+    velocity: Float[Tensor, "*batch joints"]
+    """[rad/s]"""
+    felt: Float[Tensor, "*batch joints"]
+    """The null-space part of what is wanted [rad/s]."""
+    slowdown: Float[Tensor, "*batch"]
+    """Share of it at which the end effector can be kept in place."""
+    fade: Float[Tensor, "*batch"]
+    """Share of that which does not lead into a singularity."""
+    wanted: Float[Tensor, "*batch joints"]
+    """What is left [rad/s]."""
+    within: Float[Tensor, "*batch joints"]
+    """The same within the bounds [rad/s]."""
+
+
+def eased_null_velocity(
+    chain: SerialChain,
+    joints: Float[Tensor, "*batch joints"],
+    jacobian: Float[Tensor, "*batch 6 joints"],
+    before: Float[Tensor, "*batch joints"],
+    wanted: Float[Tensor, "*batch joints"],
+    bounds: tuple[Float[Tensor, "*batch joints"], Float[Tensor, "*batch joints"]],
+    dt: float,
+    config: YieldingConfig,
+) -> EasedVelocity:
+    """The null-space velocity of a step in which a person wants another one.
+
+    As much of it as the arm can follow without moving its end effector, and without jumps.
+
+    Args:
+        chain: Kinematics of the arm.
+        joints: Where they are [rad].
+        jacobian: Of the end effector there.
+        before: Null-space velocity of the step before [rad/s].
+        wanted: Joint velocity whose null-space part is wanted [rad/s].
+        bounds: Lowest and highest velocities that leave the task its room [rad/s].
+        dt: Control step [s].
+        config: How it yields.
+    """
+    before, felt = null_projection(jacobian, before), null_projection(jacobian, wanted)
+    slowdown = null_space_slowdown(chain, joints, felt)
+    wanted = felt * slowdown.unsqueeze(-1)
+    # As far ahead as the arm gets while it slows down.
+    last, size = before.norm(dim=-1, keepdim=True), wanted.norm(dim=-1, keepdim=True)
+    speed = last.clamp(min=_SLOW) / size.clamp(min=1e-9)
+    fade = singularity_fade(chain, joints, speed * wanted)
+    wanted = wanted * fade.unsqueeze(-1)
+    within = scale_null_space(torch.zeros_like(wanted), wanted, *bounds)
+    slows = within.norm(dim=-1, keepdim=True) < last
+    change = torch.where(slows, 1.0, min(dt / config.nullspace_rise, 1.0)) * (within - before)
+    effort = torch.where(slows, _STOPPING_EFFORT, _PUSHED_EFFORT)
+    reach = effort * dt * chain.limits.acceleration
+    velocity = before + change / (change.abs() / reach).amax(-1, keepdim=True).clamp(min=1.0)
+    return EasedVelocity(velocity, felt, slowdown, fade, wanted, within)
+
+
+def eased_way_back(
+    before: Float[Tensor, "*batch joints"],
+    away: Float[Tensor, "*batch joints"],
+    dt: float,
+    config: YieldingConfig,
+) -> Float[Tensor, "*batch joints"]:
+    """Null-space velocity back to a path, without jumps that would move the end effector.
+
+    Args:
+        before: That of the step before [rad/s].
+        away: Null-space part of the way back [rad]; zero of who is not to go back.
+        dt: Control step [s].
+        config: How fast.
+    """
+    fastest = config.return_speed / away.norm(dim=-1, keepdim=True).clamp(min=1e-9)
+    back = fastest.clamp(max=config.pose_gain) * away
+    return before + min(dt / config.nullspace_rise, 1.0) * (back - before)
 
 
 def smallest_singular_value(
@@ -216,15 +297,34 @@ def smallest_singular_value(
     return torch.linalg.svdvals(chain.jacobian(joint_position))[..., -1]
 
 
-def changed_rate(rate: float, wanted: float, dt: float, direction: int = 1) -> float:
+def share_of_motion(
+    asked: Float[Tensor, "*batch 6"], done: Float[Tensor, "*batch 6"]
+) -> Float[Tensor, "*batch"]:
+    """How much of the motion that was asked for is done, 0 to 1; 1 where it is at rest.
+
+    Args:
+        asked: Twist of the end effector (linear [m/s], angular [rad/s]).
+        done: What the arm was left of it.
+    """
+    square, along = (asked * asked).sum(-1), (asked * done).sum(-1)
+    moves = square > _AT_REST**2
+    return torch.where(moves, along / torch.where(moves, square, 1.0), 1.0).clamp(0, 1)
+
+
+def changed_rate(
+    rate: float | Float[np.ndarray, " paths"],
+    wanted: float | Float[np.ndarray, " paths"],
+    dt: float,
+    direction: int | Int[np.ndarray, " paths"] = 1,
+) -> float | Float[np.ndarray, " paths"]:
     """The rate of a path a step later: without jumps, as every change of speed is one of the
     end effector's.
 
     Args:
-        rate: Share of the path's own speed, -1 to 1.
+        rate: Share of the path's own speed, -1 to 1; of one path or several.
         wanted: Its size that it should have, cut to between 0 and 1.
         dt: Control step [s].
         direction: 1 for on, -1 for back.
     """
-    change, goal = dt / CHANGE_OF_RATE, direction * min(max(wanted, 0.0), 1.0)
-    return rate + min(max(goal - rate, -change), change)
+    change, goal = dt / CHANGE_OF_RATE, direction * np.clip(wanted, 0.0, 1.0)
+    return rate + np.clip(goal - rate, -change, change)

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.controller import Distances, SeparationConfig
-from hrc_learn.kinematics import CapsuleArm, GraspedBox, separation
+from hrc_learn.kinematics import CapsuleArm, GraspedBox, Separation, separation
 from hrc_learn.protocols import PersonTracker
 
 _NAN = math.nan
@@ -94,21 +94,45 @@ class PersonWatch:
             torch.from_numpy(x).to(joints) for x in (seen.ends, seen.radius, seen.velocity)
         )
         found, age = separation(self._arm, joints, ends, radius, load), time - seen.time
-        # What they may have gained since, and gain until the arm reacts.
-        gain = self._config.acceleration * (age + self._separation.reaction_time)
-        towards = (gain - found.person_rate(velocity)).clamp(min=0).flatten()
-        distance = found.distance.flatten()
-        distance = distance - age * towards
-        allowed = self._separation.highest_speed(distance, towards)
-        # Of pairs that allow nothing the nearest ones: they may open again.
-        _, urgent = (allowed + 1e-3 * distance).topk(min(number, len(distance)), largest=False)
         return WatchedPeople(
-            distances=Distances(
-                distance=distance[urgent],
-                gradient=found.gradient_of(urgent),
-                approach_speed=towards[urgent],
-                person=torch.ones_like(urgent, dtype=torch.bool),
+            distances=urgent_distances(
+                found, velocity, joints.new_tensor(age), self._separation, self._config
             ),
             nearest=float(found.distance.min()),
             age=age,
         )
+
+
+def urgent_distances(
+    found: Separation,
+    velocity: Float[Tensor, "*batch H 2 3"],
+    age: Float[Tensor, "*batch"],
+    separation: SeparationConfig,
+    config: PersonWatchConfig,
+) -> Distances:
+    """The most urgent distances from people who were seen some time ago.
+
+    Args:
+        found: Distances of the arm as it is now from people as they were seen.
+        velocity: Of the ends of their capsules, as seen [m/s].
+        age: Of the observation [s].
+        separation: Of the protective distance: by it pairs are the more or less urgent.
+        config: What is assumed of people.
+
+    Returns:
+        The distances, smaller than seen by as much as people may have come nearer since.
+    """
+    # What they may have gained since, and gain until the arm reacts.
+    gain = (config.acceleration * (age + separation.reaction_time))[..., None, None]
+    towards = (gain - found.person_rate(velocity)).clamp(min=0).flatten(-2)
+    distance = found.distance.flatten(-2) - age.unsqueeze(-1) * towards
+    allowed = separation.highest_speed(distance, towards)
+    # Of pairs that allow nothing the nearest ones: they may open again.
+    number = min(config.pairs, distance.shape[-1])
+    _, urgent = (allowed + 1e-3 * distance).topk(number, dim=-1, largest=False)
+    return Distances(
+        distance=distance.gather(-1, urgent),
+        gradient=found.gradient_of(urgent),
+        approach_speed=towards.gather(-1, urgent),
+        person=torch.ones_like(urgent, dtype=torch.bool),
+    )

@@ -118,8 +118,8 @@ INTERACT, HOME, TRANSFER, RELEASE = Phase.INTERACT, Phase.HOME, Phase.TRANSFER, 
 
 # Delays and occlusions up to this are no recovery [s]: a few lost images, or a blink.
 _NEGLIGIBLE = 0.3
-# Time for the fingers to open and for the released object to come to rest [s].
-_RELEASE_TIME = 0.8
+RELEASE_TIME = 0.8
+"""For the fingers to open and for the released object to come to rest [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -346,7 +346,7 @@ class PickAndPlace:
         job.release = self._cell.pose
         self._cell.gripper.move(OPEN)
         self._cell.load = None
-        self._cell.hold_pose(_RELEASE_TIME)
+        self._cell.hold_pose(RELEASE_TIME)
         return Phase.RETREAT
 
     def _retreat(self, job: PickPlaceJob) -> Phase:

@@ -15,6 +15,7 @@ from hrc_learn.controller import (
     INTERVENTIONS,
     Command,
     ConstraintConfig,
+    ConstraintReport,
     Distances,
     SafetyConfig,
     SafetyFilter,
@@ -58,6 +59,7 @@ from hrc_learn.skills.null_space_yielding import (
     NullSpaceYielding,
     YieldingConfig,
     changed_rate,
+    share_of_motion,
     smallest_singular_value,
 )
 from hrc_learn.skills.person_feedback import (
@@ -93,9 +95,10 @@ SAFETY_COLUMNS = INTERVENTIONS
 
 # At the end of a straight line, for the pose error to decay by pose_gain [s].
 _SETTLING_TIME = 0.4
-# Time after which a path that waits for the joints is gone back, and after which they go back
-# straight [s].
-_STUCK, _LONGEST_WAIT = 2.0, 20.0
+STUCK = 2.0
+"""Time after which a path that waits for the joints is gone back [s]."""
+# After which they go back straight [s].
+_LONGEST_WAIT = 20.0
 # Distance of the end effector from its path for the path to wait, and time by which servos lag
 # [m, s]: half the deviation that a push may cause, and twice the lag of an arm 20 ms late.
 _ON_PATH, _SERVO_LAG = 0.001, 0.06
@@ -106,9 +109,8 @@ _CHECKED = 50
 # Readings of the torque that are averaged, and steps in which an arm gets under way: friction
 # keeps it back at first.
 _FELT = 5
-# Part of the task that constraints take beyond rounding; and motion of the end effector, metres
-# and radians as they are, below which nothing waits [1/s].
-_SLOWED, _AT_REST = 1e-3, 1e-3
+# Part of the task that constraints take beyond rounding.
+_SLOWED = 1e-3
 # How much faster the arm might close in on people who do not hold it back [m/s]: what the
 # program leaves unused is rounding. And pace below which it stands still.
 _SPARE, _STANDS = 1e-3, 0.01
@@ -442,14 +444,14 @@ class WorkCell:
         if drift is not None:
             # A person may push the way that the path leads: both together bend the null space.
             slowdown = null_space_slowdown(self.chain, joints, null)
-            self._feedback.hindrances.note("speed", slowdown)
+            self._feedback.hindrances.note("speed", float(slowdown))
             null = null * slowdown
         waits = False
         if self._clearance is not None and bool(null.any()):
             clear = kept_clear(joints, task, null, self._clearance, self.config.clearance)
-            distance, kept = 100 * clear.distance, share_kept(null, clear.null)
+            distance, kept = 100 * float(clear.distance), share_kept(null, clear.null)
             self._feedback.hindrances.note("obstacle", kept, distance=distance)
-            null, waits = clear.null, clear.waits
+            null, waits = clear.null, bool(clear.waits)
         null = self._within_limits(J, task, null)
         self.step(task + null, goal)
         return waits
@@ -582,11 +584,11 @@ class WorkCell:
             elif not self._yielding.pushed and self._pace == 1:
                 waited = max(waited + (1.0 - 2.0 * max(rate, 0.0)) * dt, 0.0)
             # The null space that led aside further back leads back there as well.
-            backs = waited > _STUCK and progress > 0
+            backs = waited > STUCK and progress > 0
             if not backs and self._yielding.aside:
                 stops = bool(narrow[here : ahead + 1].any()) or self._astray(goal)
                 behind = math.inf if stops else behind
-            rate = changed_rate(rate, 2.0 - behind, dt, direction=-1 if backs else 1)
+            rate = float(changed_rate(rate, 2.0 - behind, dt, -1 if backs else 1))
             if rate <= 0:
                 self._feedback.hindrances.mention("task_waits")
             progress = max(progress + rate * self._pace, 0.0)
@@ -672,7 +674,7 @@ class WorkCell:
         twist = self.chain.jacobian(goal + self.config.command_delay * velocity) @ velocity
         if self.track_pose(pose, twist, velocity + back):
             return math.inf
-        return _size(self.pose.twist_to(pose)) / (_ON_PATH + _SERVO_LAG * _size(twist))
+        return float(behind_path(self.pose.twist_to(pose), twist))
 
     def _settle(self, goal: Pose, duration: float) -> None:
         still = torch.zeros(6, dtype=torch.float64)
@@ -711,11 +713,13 @@ class WorkCell:
         Raises:
             TaskFailedError: Somebody has been in the way for too long.
         """
-        pace = 1.0
-        if self._people_bind(sent, report):
-            done = self.jacobian @ sent
-            if float(asked.norm()) > _AT_REST:
-                pace = min(max(float(asked @ done) / float(asked @ asked), 0.0), 1.0)
+        distances, kept, pace = self.distances, report.constraints, 1.0
+        if (
+            distances is not None
+            and kept is not None
+            and bool(people_bind(distances, sent, kept, self._safety.config))
+        ):
+            pace = float(share_of_motion(asked, self.jacobian @ sent))
         # It may drop at once; it rises as paths get under way.
         self._pace = min(pace, self._pace + self.config.dt / CHANGE_OF_RATE)
         self.task_time += self._pace * self.config.dt
@@ -726,28 +730,12 @@ class WorkCell:
                 "way, or let it wait longer (longest_wait)."
             )
 
-    def _people_bind(self, sent: Float[Tensor, " joints"], report: SafetyReport) -> bool:
-        """Whether the arm was slowed down as it came as near to people as it may, or as it does
-        not know where they are.
-
-        Where only its own limits hold it back, a path must go on: it would wait for ever.
-        """
-        distances, kept = self.distances, report.constraints
-        if distances is None or kept is None:
-            return False
-        if not bool(distances.known()) or not bool(kept.solved):
-            return True
-        if float(kept.slowed) <= _SLOWED:
-            return False
-        return self._at_people(sent)
-
     def _at_people(self, sent: Float[Tensor, " joints"]) -> bool:
         """Whether a velocity takes the arm towards people as fast as it may [rad/s]."""
         config, distances = self._safety.config, self.distances
         if distances is None or config.constraints is None:
             return False
-        allowed = distances.closing_speed(config.constraints, config.separation)
-        return bool((allowed + distances.gradient @ sent <= _SPARE).any())
+        return bool(at_people(distances, sent, config))
 
     def _note_filter(
         self,
@@ -869,6 +857,55 @@ def _between(samples: Float[np.ndarray, "steps joints"], at: float) -> Float[Ten
     return torch.from_numpy(samples[k] + (at - k) * (following - samples[k]))
 
 
-def _size(twist: Float[Tensor, "6"]) -> float:
+def people_bind(
+    distances: Distances,
+    sent: Float[Tensor, "*batch joints"],
+    kept: ConstraintReport,
+    safety: SafetyConfig,
+) -> Bool[Tensor, "*batch"]:
+    """Whether the arm was slowed down as it came as near to people as it may, or as it does not
+    know where they are.
+
+    Where only its own limits hold it back, a path must go on: it would wait for ever.
+
+    Args:
+        distances: From people.
+        sent: To the arm [rad/s].
+        kept: What keeping its limits took.
+        safety: Of the filter, with constraints.
+    """
+    near = at_people(distances, sent, safety)
+    return ~distances.known() | ~kept.solved | ((kept.slowed > _SLOWED) & near)
+
+
+def at_people(
+    distances: Distances, sent: Float[Tensor, "*batch joints"], safety: SafetyConfig
+) -> Bool[Tensor, "*batch"]:
+    """Whether a velocity takes the arm towards people as fast as it may.
+
+    Args:
+        distances: From people.
+        sent: To the arm [rad/s].
+        safety: Of the filter, with constraints.
+    """
+    assert safety.constraints is not None  # without them there are no limits to be met
+    allowed = distances.closing_speed(safety.constraints, safety.separation)
+    opening = torch.linalg.vecdot(distances.gradient, sent.unsqueeze(-2))
+    return (allowed + opening <= _SPARE).any(-1)
+
+
+def behind_path(
+    off: Float[Tensor, "*batch 6"], twist: Float[Tensor, "*batch 6"]
+) -> Float[Tensor, "*batch"]:
+    """How far the end effector is from its path, as a ratio to what is allowed.
+
+    Args:
+        off: Motion to where it should be (linear [m], angular [rad]).
+        twist: Of the path there (linear [m/s], angular [rad/s]).
+    """
+    return _size(off) / (_ON_PATH + _SERVO_LAG * _size(twist))
+
+
+def _size(twist: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch"]:
     """Of a motion, its turn counted in metres [m]."""
-    return float(twist[:3].norm() + _METRES_PER_RADIAN * twist[3:].norm())
+    return twist[..., :3].norm(dim=-1) + _METRES_PER_RADIAN * twist[..., 3:].norm(dim=-1)

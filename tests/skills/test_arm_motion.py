@@ -3,6 +3,7 @@ import pytest
 import torch
 
 from hrc_learn.geometry import Pose, minimum_jerk, quaternion
+from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import panda
 from hrc_learn.skills.arm_motion import (
     StraightLine,
@@ -207,3 +208,25 @@ def test_an_arm_slides_along_what_is_around_it_and_stops_before_it():
     assert float(kept_clear(q, task, -null, wall(0.0), 0.03)[0] @ along) == pytest.approx(-0.5)
     aside = kept_clear(q, task, null, lambda joints: 0.02 + 0 * joints[..., 0], 0.03)[0]
     torch.testing.assert_close(aside, null)
+
+
+def test_arms_of_a_batch_give_way_and_keep_clear_as_each_alone():
+    rng, q = torch.Generator().manual_seed(6), regular_configurations(30, seed=6)
+    J, bound = panda.jacobian(q), torch.full((30, 7), 0.4, dtype=torch.float64)
+    task, null = 0.3 * torch.randn(2, 30, 7, generator=rng, dtype=torch.float64)
+    null = null_projection(J, null)
+
+    def clearance(joints):
+        return 0.05 + 0.1 * torch.sin(5 * joints).amin(-1)
+
+    gives = null_space_giving_way(J, task, null, -bound, bound)
+    kept, waits, now = kept_clear(q, task, null, clearance, 0.03)
+    torch.testing.assert_close(now, clearance(q))
+    assert (gives != null).any()
+    assert 0 < waits.sum() < 30
+    for k in range(30):
+        alone = null_space_giving_way(J[k], task[k], null[k], -bound[k], bound[k])
+        torch.testing.assert_close(gives[k], alone)
+        part, waiting, _ = kept_clear(q[k], task[k], null[k], clearance, 0.03)
+        torch.testing.assert_close(kept[k], part)
+        assert waits[k] == waiting

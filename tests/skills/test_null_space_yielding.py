@@ -6,7 +6,11 @@ import torch
 
 from hrc_learn.kinematics import panda
 from hrc_learn.skills.arm_motion import null_space_slowdown
-from hrc_learn.skills.null_space_yielding import NullSpaceYielding, YieldingConfig
+from hrc_learn.skills.null_space_yielding import (
+    NullSpaceYielding,
+    YieldingConfig,
+    eased_null_velocity,
+)
 
 Q = torch.tensor([0.4, 0.2, -0.3, -2.2, 0.1, 2.4, 0.6], dtype=torch.float64)
 FREE = -torch.full((7,), 9.0, dtype=torch.float64), torch.full((7,), 9.0, dtype=torch.float64)
@@ -53,3 +57,24 @@ def test_one_who_limits_it_himself_gets_it_smooth_alone():
         d = yielding.feel(0 * asked)
     assert not d.any()
     assert not yielding.pushed
+
+
+def test_arms_of_a_batch_yield_as_each_alone():
+    rng = torch.Generator().manual_seed(5)
+    q = Q + 0.4 * torch.randn(12, 7, generator=rng, dtype=torch.float64)
+    before, wanted = 3 * torch.randn(2, 12, 7, generator=rng, dtype=torch.float64) ** 3
+    J, bounds = panda.jacobian(q), (FREE[0].expand(12, 7), FREE[1].expand(12, 7))
+    together = eased_null_velocity(panda, q, J, before, wanted, bounds, 0.01, YieldingConfig())
+    for k in range(12):
+        alone = eased_null_velocity(
+            panda,
+            q[k],
+            J[k],
+            before[k],
+            wanted[k],
+            (bounds[0][k], bounds[1][k]),
+            0.01,
+            YieldingConfig(),
+        )
+        for one, every in zip(alone, together, strict=True):
+            torch.testing.assert_close(every[k], one, rtol=0, atol=1e-9)

@@ -6,9 +6,10 @@ from dataclasses import replace
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from torch import Tensor
 
 from hrc_learn.controller import SeparationConfig
-from hrc_learn.kinematics import CapsuleArm, GraspedBox, panda, separation
+from hrc_learn.kinematics import CapsuleArm, GraspedBox, Separation, panda, separation
 from hrc_learn.sim import (
     MotionLog,
     Touch,
@@ -122,6 +123,31 @@ _AT_REST = 0.01
 _AT_ONCE = 250
 
 
+def margin_to_stop(
+    found: Separation,
+    joint_velocity: Float[Tensor, "*batch joints"],
+    person_velocity: Float[Tensor, "*batch H 2 3"],
+    config: SeparationConfig,
+) -> tuple[Float[Tensor, "*batch C H"], Bool[Tensor, "*batch C H"]]:
+    """What distances exceed the one by which the arm can stop before a person [m].
+
+    Args:
+        found: True distances.
+        joint_velocity: Of the arm [rad/s].
+        person_velocity: Of both ends of the person's capsules [m/s].
+        config: With the deceleration of the arm.
+
+    Returns:
+        d - v_h v/a - v^2/(2 a), infinite where the arm does not close in; and whether it does.
+    """
+    stop = replace(config, reaction_time=0.0, clearance=0.0)
+    closing = -found.rate(joint_velocity, torch.zeros_like(person_velocity))
+    coming = -found.person_rate(person_velocity)
+    spare = found.distance - stop.protective_distance(closing, coming)
+    moves = closing > _AT_REST
+    return torch.where(moves, spare, torch.inf), moves
+
+
 def separation_margin(
     log: LoggedSteps,
     visit: WorkerVisit,
@@ -145,7 +171,6 @@ def separation_margin(
         encoder_offset: What the joint positions of the log are too large by [rad].
         loads: What the arm held at times, and when.
     """
-    stop = replace(config, reaction_time=0.0, clearance=0.0)
     time = log["time"]
     q = torch.from_numpy(log["joint_position"] - encoder_offset)
     v = torch.from_numpy(log["joint_velocity"])
@@ -156,10 +181,7 @@ def separation_margin(
         ends, speed = torch.from_numpy(there.ends), torch.from_numpy(there.velocity)
         radius = torch.from_numpy(there.radius).expand(len(steps), -1)
         found = separation(arm, q[steps], ends, radius, load)
-        closing = -found.rate(v[steps], torch.zeros_like(speed))
-        coming = -found.rate(torch.zeros_like(v[steps]), speed)
-        spare = found.distance - stop.protective_distance(closing, coming)
-        spare = torch.where(closing > _AT_REST, spare, torch.inf)
+        spare, _ = margin_to_stop(found, v[steps], speed, config)
         margin[steps] = spare.amin((-2, -1)).numpy()
 
     rest = np.ones(len(time), dtype=bool)
