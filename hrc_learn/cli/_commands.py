@@ -126,6 +126,11 @@ COMMANDS: dict[str, Command] = {
     ),
     "report": Command("one page from the folders of several runs", "show.report", "run.Report"),
     "sweep": Command("thousands of simulated grasps as batches", "sweep.sweep", "run.Sweep"),
+    "sweep worker": Command(
+        "a thousand jobs beside a worker, who is waited for or made way for",
+        "sweep_worker.sweep_worker",
+        "run.SweepWorker",
+    ),
     "serve": Command(
         "the controller in a paced loop, and its latency", "serve.serve", "run.Serve"
     ),

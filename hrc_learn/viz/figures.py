@@ -292,3 +292,41 @@ def arrival_figure(sweep: SweepRecording) -> Figure:
         figure.supylabel("on target [%]", fontsize=9)
         figure.supxlabel("time [s]", fontsize=9)
     return figure
+
+
+def cycle_time_figure(
+    making_way: Mapping[str, tuple[float, float]],
+    stopping: Mapping[float, tuple[float, float]],
+    *,
+    undisturbed: float,
+) -> Figure:
+    """Cycle time over the smallest distance from a worker.
+
+    Args:
+        making_way: Smallest distance [m] and cycle time [s] of arms that keep the protective
+            distance, by who moves the null space.
+        stopping: Those of arms that stop and wait, by the distance within which they rest [m].
+        undisturbed: Cycle time without a worker [s].
+    """
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(WIDTH, 3.2))
+        axes = figure.subplots()
+        if stopping:
+            x, y = np.array(list(stopping.values())).T
+            axes.plot(1e3 * x, y, "o-", color=palette.GREY, ms=4, label="stops and waits")
+            for distance, (nearest, time) in stopping.items():
+                axes.annotate(
+                    f"{distance:g} m",
+                    (1e3 * nearest, time),
+                    xytext=(5, -9),
+                    textcoords="offset points",
+                    fontsize=7,
+                )
+        for k, (mode, (nearest, time)) in enumerate(making_way.items()):
+            colour = palette.SERIES[k % len(palette.SERIES)]
+            axes.plot(1e3 * nearest, time, "D", color=colour, label=f"null space: {mode}")
+        axes.axhline(undisturbed, color=palette.GREY, lw=0.8, ls=":", label="undisturbed")
+        axes.set_xlabel("smallest distance the arm closed in to, 5 % of the runs [mm]")
+        axes.set_ylabel("cycle time, median [s]")
+        axes.legend(loc="upper left", fontsize=8)
+    return figure

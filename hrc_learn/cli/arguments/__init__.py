@@ -25,6 +25,8 @@ Robot = Literal["panda"]
 """Arms that the simulated work cell has."""
 Variant = Literal["learned", "unadapted", "kalman", "composite", "paper", "fixed", "none"]
 """Keys of `hrc_learn.experiments.grasping.experiment.VARIANTS`, and none of them."""
+WayMaking = Literal["none", "expert", "automatic", "both"]
+"""`hrc_learn.experiments.collaboration.worker_study.MODES`."""
 Experiment = Literal[
     "near",
     "global",

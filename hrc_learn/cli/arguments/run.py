@@ -15,6 +15,7 @@ from hrc_learn.cli.arguments import (
     Robot,
     Shelf,
     Variant,
+    WayMaking,
     Written,
 )
 
@@ -263,6 +264,36 @@ class Sweep(Written):
     """Receives a picture of the times to the target by experiment, as .png or .svg."""
     recording: Path | None = None
     """Receives a Rerun recording: success by class of camera, and arrival over time."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepWorker(Imperfect, Written):
+    """Many arms at their job, each beside a worker who does not look at it.
+
+    Another worker comes in each run, puts something on the table, reaches for markers under the
+    arm and walks away. The arms keep the protective distance of ISO/TS 15066 from what a
+    tracker sees, and make way in several manners; others stop and wait while anybody is nearer
+    than a fixed distance. Exit status 1 if an arm that keeps the distance violated it.
+    """
+
+    placing: Path
+    """Folder of the placing skill."""
+    aiming: Path
+    """Folder of the visual-servoing skill, whose orientation above the table is taken."""
+    runs: int = 1000
+    """Of each manner, the same workers in all of them."""
+    seed: int = 0
+    """Of workers, trackers, encoders and objects."""
+    modes: tuple[WayMaking, ...] = ("none", "expert", "automatic", "both")
+    """Who moves the null space."""
+    stop_distances: tuple[float, ...] = (0.1, 0.2, 0.3, 0.5, 0.8)
+    """Of arms that stop and wait [m]."""
+    cycles: int = 24
+    """Different cycles of the job, to one shelf after the other; several arms do each."""
+    out: Path | None = None
+    """Folder for the figures and the picture."""
+    figure: Path | None = None
+    """Receives a picture of cycle times over smallest distances, as .png or .svg."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,0 +1,180 @@
+"""Visits of many workers as tables over time: where each is, and what a tracker tells of him.
+
+A batch of runs looks them up once a control step, where a simulator would compute each anew.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from hrc_learn.protocols import PersonObservation
+from hrc_learn.sim import Imperfections, WorkerSensor, WorkerVisit
+from hrc_learn.sim.worker import PARTS
+from hrc_learn.sim.worker_sensor import IMAGE_RATE
+
+# Worker that left stands still: of then the tables hold so much, and repeat the last part of
+# it, a whole number of images and of control steps [s].
+_AFTER, _REPEATED = 2.0, 1.0
+
+
+class Workers(NamedTuple):
+    """Bodies beside several arms at one time."""
+
+    ends: Float[Tensor, "runs H 2 3"]
+    """Of the axes of their capsules, in the base frame [m]."""
+    velocity: Float[Tensor, "runs H 2 3"]
+    """Of the ends [m/s]."""
+    radius: Float[Tensor, "runs H"]
+    """[m]"""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class WorkerTables:
+    """Of the visits beside several arms, one for each."""
+
+    dt: float
+    """Control step [s]."""
+    radius: Float[Tensor, "runs H"]
+    """Of the capsules [m]."""
+    first: Int[Tensor, " runs"]
+    """Control step of the first row of the truth."""
+    rows: Int[Tensor, " runs"]
+    """Rows that each has; he rests before and after."""
+    ends: Float[Tensor, "runs steps H 2 3"]
+    """Where he truly is [m]."""
+    velocity: Float[Tensor, "runs steps H 2 3"]
+    """[m/s]"""
+    seen_ends: Float[Tensor, "runs images H 2 3"]
+    """Where the tracker saw him [m]."""
+    seen_velocity: Float[Tensor, "runs images H 2 3"]
+    """[m/s]"""
+    seen_time: Float[Tensor, "runs images"]
+    """When [s]."""
+    newest: Int[Tensor, "runs steps"]
+    """Number of the newest image that has arrived by each control step; -1: none yet."""
+    observed: Int[Tensor, " runs"]
+    """Control steps from which on the last ones are repeated."""
+
+    @classmethod
+    def of(
+        cls,
+        visits: Sequence[WorkerVisit],
+        sizes: Imperfections,
+        chances: Sequence[np.random.Generator],
+        dt: float,
+    ) -> "WorkerTables":
+        """Compute the visits, each seen by a tracker of its own.
+
+        Args:
+            visits: Who comes, and when.
+            sizes: Of the tracker's noise, delay and loss.
+            chances: Sources of its noise, one for each visit.
+            dt: Control step, of which a second is a whole number [s].
+        """
+        truth, seen = [], []
+        for visit, chance in zip(visits, chances, strict=True):
+            first = int(visit.begin / dt)
+            steps = np.arange(first, int(np.ceil(visit.end / dt)) + 1)
+            there = visit.capsules_at(dt * steps)
+            truth.append((first, there.ends, there.velocity, there.radius))
+            seen.append(_images(visit, sizes, chance, dt))
+        return cls(
+            dt=dt,
+            radius=_padded([radius for *_, radius in truth]),
+            first=torch.tensor([first for first, *_ in truth]),
+            rows=torch.tensor([len(ends) for _, ends, *_ in truth]),
+            ends=_padded([ends for _, ends, *_ in truth]),
+            velocity=_padded([velocity for _, _, velocity, _ in truth]),
+            seen_ends=_padded([np.stack([i.ends for i in images]) for images, _ in seen]),
+            seen_velocity=_padded(
+                [np.stack([i.velocity for i in images]) for images, _ in seen]
+            ),
+            seen_time=_padded([np.array([i.time for i in images]) for images, _ in seen]),
+            newest=_padded([newest for _, newest in seen]),
+            observed=torch.tensor([len(newest) for _, newest in seen]),
+        )
+
+    @classmethod
+    def nobody(cls, runs: int, dt: float) -> "WorkerTables":
+        """As if each arm had somebody beside it who stands far away and is seen as he is."""
+        far = torch.full((runs, 1, len(PARTS), 2, 3), 1e3, dtype=torch.float64)
+        still, zero = torch.zeros_like(far), torch.zeros(runs, dtype=torch.int64)
+        return cls(
+            dt=dt,
+            radius=torch.full((runs, len(PARTS)), 0.1, dtype=torch.float64),
+            first=zero,
+            rows=zero + 1,
+            ends=far,
+            velocity=still,
+            seen_ends=far,
+            seen_velocity=still,
+            seen_time=torch.zeros(runs, 1, dtype=torch.float64),
+            newest=torch.zeros(runs, round(_REPEATED / dt), dtype=torch.int64),
+            observed=zero + round(_REPEATED / dt),
+        )
+
+    def truth(self, step: int, runs: Int[Tensor, " some"]) -> Workers:
+        """Where the workers beside some of the arms are at a control step."""
+        last = self.rows[runs] - 1
+        row = torch.minimum((step - self.first[runs]).clamp(min=0), last)
+        return Workers(self.ends[runs, row], self.velocity[runs, row], self.radius[runs])
+
+    def seen(
+        self, step: int, runs: Int[Tensor, " some"]
+    ) -> tuple[Workers, Float[Tensor, " some"]]:
+        """What the trackers beside some of the arms have told by a control step.
+
+        Returns:
+            The newest observation, and its age [s]; NaN as long as there is none.
+        """
+        until, period = self.observed[runs], round(_REPEATED / self.dt)
+        beyond = step - until
+        repeated = torch.where(beyond >= 0, until - period + beyond % period, step)
+        image = self.newest[runs, repeated]
+        known, image = image >= 0, image.clamp(min=0)
+        age = self.dt * repeated.double() - self.seen_time[runs, image]
+        workers = Workers(
+            self.seen_ends[runs, image], self.seen_velocity[runs, image], self.radius[runs]
+        )
+        return workers, torch.where(known, age, torch.nan)
+
+
+class _Computed:
+    """A visit whose capsules at the times of all images were computed at once."""
+
+    def __init__(self, visit: WorkerVisit, rate: float, duration: float):
+        self.worker, self._rate = visit.worker, rate
+        self._ends = visit.ends_at(np.arange(int(duration * rate) + 2) / rate)
+
+    def ends_at(self, time: float) -> Float[np.ndarray, "parts 2 3"]:
+        return self._ends[round(time * self._rate)]
+
+
+def _images(
+    visit: WorkerVisit, sizes: Imperfections, chance: np.random.Generator, dt: float
+) -> tuple[list[PersonObservation], Int[np.ndarray, " steps"]]:
+    """What a tracker sees of a visit, and the newest image at each control step."""
+    duration, now = visit.end + _AFTER, 0.0
+    computed = _Computed(visit, IMAGE_RATE, duration)
+    sensor = WorkerSensor(computed, lambda: now, sizes, chance)
+    images: list[PersonObservation] = []
+    newest = np.empty(int(duration / dt), dtype=np.int64)
+    for step in range(len(newest)):
+        now = step * dt
+        seen = sensor.read()
+        if seen is not None and (not images or seen is not images[-1]):
+            images.append(seen)
+        newest[step] = len(images) - 1
+    return images, newest
+
+
+def _padded(arrays: Sequence[np.ndarray]) -> Tensor:
+    """Arrays of different lengths side by side, the last row of each repeated."""
+    longest = max(len(array) for array in arrays)
+    rows = [array[np.minimum(np.arange(longest), len(array) - 1)] for array in arrays]
+    return torch.from_numpy(np.stack(rows))
