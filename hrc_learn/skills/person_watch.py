@@ -27,6 +27,10 @@ class PersonWatchConfig:
     """Of parts of the arm and of a person, the most urgent ones, that are kept apart: others
     are told of once they are among them."""
 
+    contact: float = 0.03
+    """Distance seen below which people may touch the arm [m], three deviations of a tracker's
+    noise: it stops, as which way leads away from them is not known."""
+
     def __post_init__(self) -> None:
         if self.acceleration < 0:
             raise ValueError(f"acceleration must not be negative, but is {self.acceleration}.")
@@ -40,7 +44,8 @@ class WatchedPeople:
 
     distances: Distances
     """Of the most urgent pairs, smaller than seen by as much as people may have come nearer
-    since. NaN, for which the arm brakes, as long as nothing is known."""
+    since. NaN, for which the arm brakes, as long as nothing is known, and where people may
+    touch it."""
     nearest: float = _NAN
     """Smallest distance when they were seen, from the arm as it is now [m]."""
     age: float = _NAN
@@ -120,7 +125,8 @@ def urgent_distances(
         config: What is assumed of people.
 
     Returns:
-        The distances, smaller than seen by as much as people may have come nearer since.
+        The distances, smaller than seen by as much as people may have come nearer since. NaN
+        where they may touch the arm.
     """
     # What they may have gained since, and gain until the arm reacts.
     gain = (config.acceleration * (age + separation.reaction_time))[..., None, None]
@@ -130,8 +136,9 @@ def urgent_distances(
     # Of pairs that allow nothing the nearest ones: they may open again.
     number = min(config.pairs, distance.shape[-1])
     _, urgent = (allowed + 1e-3 * distance).topk(number, dim=-1, largest=False)
+    touching = found.distance.flatten(-2).amin(-1, keepdim=True) < config.contact
     return Distances(
-        distance=distance.gather(-1, urgent),
+        distance=distance.gather(-1, urgent).masked_fill(touching, _NAN),
         gradient=found.gradient_of(urgent),
         approach_speed=towards.gather(-1, urgent),
         person=torch.ones_like(urgent, dtype=torch.bool),

@@ -1,5 +1,6 @@
 """What the arm takes people's distances for, between two observations of them."""
 
+import math
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -38,7 +39,7 @@ def observed(time=1.0, at=VISIT.released - 0.4, velocity=True):
 
 def watch(observation, *, acceleration=0.0, pairs=ALL):
     tracker = SimpleNamespace(read=lambda: observation)
-    config = PersonWatchConfig(acceleration=acceleration, pairs=pairs)
+    config = PersonWatchConfig(acceleration=acceleration, pairs=pairs, contact=-math.inf)
     return PersonWatch(tracker, ARM, SEPARATION, config)
 
 
@@ -142,7 +143,8 @@ def test_the_most_urgent_pairs_are_told_of_with_their_exact_distances(seed, load
     q = sampling.within(
         panda.limits.lower, panda.limits.upper, rng=sampling.generator(seed), margin=0.1
     )
-    watch = PersonWatch(SimpleNamespace(read=lambda: person), panda_capsules)
+    config = PersonWatchConfig(contact=-math.inf)
+    watch = PersonWatch(SimpleNamespace(read=lambda: person), panda_capsules, config=config)
     told = watch.look(2.13, q, load)
 
     ends, radius, v = (
@@ -173,6 +175,24 @@ def test_the_most_urgent_pairs_are_told_of_with_their_exact_distances(seed, load
         torch.testing.assert_close(ours[order], theirs[expected], atol=1e-12, rtol=0)
     assert told.nearest == pytest.approx(float(every.distance.min()), abs=1e-12)
     assert told.age == pytest.approx(age)
+
+
+def test_whoever_may_touch_the_arm_stops_it():
+    """A hand that comes nearer to the gripper, a centimetre at a time."""
+    q = WORKPLACE.hover_joints()
+    tip = panda.forward(q).position.numpy()
+    known = []
+    for gap in np.arange(-0.02, 0.10, 0.01):
+        ends = np.full((1, 2, 3), tip - np.array([0.0, 0.0, 0.06 + gap]))
+        seen = PersonObservation(
+            time=0.0, ends=ends, radius=np.array([0.05]), velocity=np.zeros_like(ends)
+        )
+        watch = PersonWatch(SimpleNamespace(read=lambda seen=seen: seen), ARM, SEPARATION)
+        found = watch.look(0.0, q)
+        known.append(found.distances.known().item())
+        assert known[-1] == (found.nearest >= PersonWatchConfig().contact)
+    assert {True, False} == set(known)
+    assert known == sorted(known)
 
 
 @pytest.mark.parametrize("wrong", [{"acceleration": -1.0}, {"pairs": 0}])
