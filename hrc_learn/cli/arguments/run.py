@@ -88,9 +88,8 @@ class RunServoing(RunExperiment):
     gains: More[Path | None] = None
     """gains.json of `hrc tune`, in place of those of the controller."""
     page: bool = False
-    """Serve a page in the browser, from which people watch, draw the Cartesian region, mark a
-    target, turn the end effector and pull at the elbow while the arm servoes. The run takes as
-    long as it would on a real arm then."""
+    """Serve a page in the browser, from which people watch, draw where to, and pull at the
+    elbow."""
     port: int = 8080
     """Port of that page."""
     draw_region: More[tuple[DrawnBox, ...]] = ()
