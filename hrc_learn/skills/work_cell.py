@@ -14,7 +14,6 @@ from torch import Tensor
 from hrc_learn.controller import (
     INTERVENTIONS,
     Command,
-    ConstraintConfig,
     ConstraintReport,
     Distances,
     SafetyConfig,
@@ -68,7 +67,7 @@ from hrc_learn.skills.person_feedback import (
     filter_hindrance,
     share_kept,
 )
-from hrc_learn.skills.person_watch import PersonWatch
+from hrc_learn.skills.person_watch import BESIDE_PEOPLE, PersonWatch
 from hrc_learn.vision import angle, centre
 from hrc_learn.viz import Event, StepLog
 
@@ -685,8 +684,7 @@ class WorkCell:
         """Settings of a safety filter that keeps its distance from the people watched for."""
         if self._watch is None:
             return safety
-        # Steps run one by one, and most bind nothing.
-        constraints = safety.constraints or ConstraintConfig(early_exit=True)
+        constraints = safety.constraints or BESIDE_PEOPLE
         separation = self.config.safety.separation
         return replace(safety, constraints=constraints, separation=separation)
 

@@ -24,7 +24,7 @@ _EYE, _TOWARDS = (1.55, 1.45, 1.25), (0.0, 0.25, 0.30)
 # Joint that the expert drags, from 1, and its origin's number.
 _DRAGGED, _ELBOW = 4, 3
 # Length of the arrow [m], and input below which nobody drags [N m].
-_LENGTH, _NOTHING = 0.30, 0.5
+_LENGTH, _NOTHING = 0.45, 0.5
 
 
 def moments(run: CollaborationRun) -> list[tuple[str, int]]:
@@ -94,7 +94,7 @@ def _matrix(body, step: int) -> Float[np.ndarray, "4 4"]:
 def _arrows(run: CollaborationRun, step: int) -> list[Arrow]:
     """To the nearest point of the worker, and where the elbow is dragged."""
     near, far = run.motion.nearest(step + 1)[step].points.tolist()
-    arrows = [Arrow(start=near, end=far, colour=_rgba(palette.PURPLE), width=0.006, head=False)]
+    arrows = [Arrow(start=near, end=far, colour=_rgba(palette.PURPLE), width=0.008, head=False)]
     log = run.cell.log
     q = torch.from_numpy(log["joint_position"][step])
     d = torch.from_numpy(log["nullspace_input"][step])
@@ -103,7 +103,11 @@ def _arrows(run: CollaborationRun, step: int) -> list[Arrow]:
         along = (panda.joint_jacobian(q, _DRAGGED)[:3] @ asked).numpy()
         elbow = panda.joint_origins(q)[_ELBOW].numpy()
         tip = elbow + _LENGTH * along / np.linalg.norm(along)
-        arrows.append(Arrow(start=_point(elbow), end=_point(tip), colour=_rgba(palette.PERSON)))
+        arrows.append(
+            Arrow(
+                start=_point(elbow), end=_point(tip), colour=_rgba(palette.PERSON), width=0.03
+            )
+        )
     return arrows
 
 

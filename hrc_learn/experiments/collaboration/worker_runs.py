@@ -18,7 +18,6 @@ from torch import Tensor
 from torch.utils import _pytree
 
 from hrc_learn.controller import (
-    ConstraintConfig,
     Distances,
     SafetyFilter,
     SafetyState,
@@ -58,7 +57,11 @@ from hrc_learn.skills.null_space_yielding import (
     smallest_singular_value,
     stays_aside,
 )
-from hrc_learn.skills.person_watch import PersonWatchConfig, urgent_distances
+from hrc_learn.skills.person_watch import (
+    BESIDE_PEOPLE,
+    PersonWatchConfig,
+    urgent_distances,
+)
 from hrc_learn.skills.work_cell import STUCK, WorkCellConfig, behind_path, people_bind
 from hrc_learn.teleoperation import ScriptedForce
 
@@ -247,7 +250,7 @@ class _Batch:
         self._separation = safety.separation
         constraints = None
         if reaction.stop_distance is None:
-            constraints = ConstraintConfig(early_exit=True)
+            constraints = BESIDE_PEOPLE
         self._safety = SafetyFilter(panda.limits, replace(safety, constraints=constraints))
         margin = safety.margin + config.limit_room
         self._room = SafetyFilter(panda.limits, replace(safety, margin=margin))
