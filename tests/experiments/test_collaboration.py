@@ -123,12 +123,19 @@ def test_the_command_asks_for_the_job_and_reports_it(models, job, monkeypatch, t
     )
     ((shelves, options),) = asked
     assert (shelves, options["camera"], options["seed"]) == (("upper",), "synthetic", 3)
-    assert options["forces"] == NULL_SPACE_FORCES
+    # Twice forward and back, with the time that takes: longer than asked for.
+    assert options["forces"][:2] == NULL_SPACE_FORCES
+    assert [force.towards for force in options["forces"]] == 2 * [
+        force.towards for force in NULL_SPACE_FORCES
+    ]
+    assert options["config"].interaction > options["forces"][-1].end
     assert options["worker"] is True
     assert options["disturbances"] == Disturbances(occlusions=OCCLUDED)
     assert options["cell_config"].latency == LATE
-    assert options["config"].interaction == 2.5
     assert options["imperfections"] == Imperfections.nominal().scaled(0.5)
+    assert experiment.CollaborationExperiment(
+        aiming=models, placing=models, config=PickAndPlaceConfig(interaction=2.5)
+    )._job() == PickAndPlaceConfig(interaction=2.5)
     assert "missed" not in outcome.output
     # Nobody was there in the run that was reported.
     assert "worker" not in outcome.output
