@@ -16,6 +16,12 @@ from unchecked import shapes_unchecked
 from hrc_learn.experiments.collaboration import experiment
 from hrc_learn.experiments.collaboration.metrics import collaboration_metrics
 from hrc_learn.experiments.collaboration.report import collaboration_sections
+from hrc_learn.experiments.collaboration.snapshots import (
+    EYE,
+    TOWARDS,
+    moments,
+    take_snapshots,
+)
 from hrc_learn.experiments.collaboration.trial import (
     NULL_SPACE_FORCES,
     THREE_OBJECTS,
@@ -31,6 +37,7 @@ from hrc_learn.experiments.run_recording import (
     true_image_jacobian,
     worker_distance,
 )
+from hrc_learn.experiments.snapshots import viewpoint
 from hrc_learn.geometry import Box
 from hrc_learn.sim import NOWHERE, CameraChange, Imperfections, OcclusionInterval
 from hrc_learn.sim.workplace import Workplace
@@ -287,8 +294,13 @@ def test_what_the_camera_cannot_see_is_reported(skills, shift, reason):
     assert "worker" not in names
 
 
-def test_a_worker_is_measured_logged_and_shown(skills):
-    job = provoked(skills, moved_camera(1.5, 0.0), HASTY, worker=True)
+@pytest.fixture(scope="module")
+def beside_worker(skills):
+    return provoked(skills, moved_camera(1.5, 0.0), HASTY, worker=True)
+
+
+def test_a_worker_is_measured_logged_and_shown(skills, beside_worker):
+    job = beside_worker
     steps = len(job.cell.log)
     distance = worker_distance(job.motion, steps)
     values = evaluated(job).values
@@ -309,6 +321,12 @@ def test_a_worker_is_measured_logged_and_shown(skills):
     np.testing.assert_allclose(gap, distance, atol=1e-6)
     figures = [f.name for section in collaboration_sections(job, run) for f in section.figures]
     assert "worker" in figures
+    # As many of the moments as there were, in their order.
+    shown = moments(job)
+    assert shown[0] == ("before he comes", 0)
+    assert shown[-1] == ("all is done", steps - 1)
+    at = [step for _, step in shown]
+    assert at == sorted(at)
     # Somebody else comes with another seed, nobody without the option.
     other = provoked(skills, moved_camera(1.5, 0.0), HASTY, worker=True, seed=1)
     assert other.world.config.worker != job.world.config.worker
@@ -316,6 +334,21 @@ def test_a_worker_is_measured_logged_and_shown(skills):
     assert alone.visit is None
     assert alone.separation_margin is None
     assert "separation_violations" not in evaluated(alone).values
+
+
+@pytest.mark.egl
+def test_pictures_show_the_worker_where_he_was_and_what_is_nearest(beside_worker):
+    job = beside_worker
+    pictures = take_snapshots(job)
+    assert [title[:3] for title, _ in pictures] == ["(a)", "(b)", "(c)"][: len(pictures)]
+    for (title, picture), (what, step) in zip(pictures, moments(job), strict=True):
+        assert title.endswith(f"t = {job.cell.log['time'][step]:.1f} s: {what}")
+        # The line to the nearest point is drawn where both ends are seen.
+        camera = viewpoint(EYE, TOWARDS)
+        ends = camera.project(job.motion.nearest(step + 1)[step].points)
+        x, y = np.round(ends.mean(axis=0)).astype(int)
+        violet = np.abs(picture[y - 4 : y + 5, x - 4 : x + 5].astype(int) - [204, 121, 167])
+        assert violet.sum(axis=-1).min() < 150
 
 
 @pytest.mark.slow

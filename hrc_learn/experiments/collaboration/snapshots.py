@@ -20,7 +20,8 @@ from hrc_learn.sim import Arrow, OffscreenRenderer, World
 from hrc_learn.skills.pick_and_place import INTERACT, RELEASE
 from hrc_learn.viz import palette
 
-_EYE, _TOWARDS = (1.55, 1.45, 1.25), (0.0, 0.25, 0.30)
+EYE, TOWARDS = (1.55, 1.45, 1.25), (0.0, 0.25, 0.30)
+"""Where the pictures are taken from, and what is in their middle [m]."""
 # Joint that the expert drags, from 1, and its origin's number.
 _DRAGGED, _ELBOW = 4, 3
 # Length of the arrow [m], and input below which nobody drags [N m].
@@ -56,7 +57,7 @@ def take_snapshots(run: CollaborationRun) -> list[tuple[str, Image]]:
         RenderingUnavailableError: If this machine cannot render without a screen.
     """
     assert run.visit is not None
-    world, camera = World(run.world.config), viewpoint(_EYE, _TOWARDS)
+    world, camera = World(run.world.config), viewpoint(EYE, TOWARDS)
     bodies = {body.name: body for body in run.motion.bodies()}
     log, items = run.cell.log, [item.name for item in run.workplace.scene.objects]
     pictures = []
@@ -93,7 +94,7 @@ def _matrix(body, step: int) -> Float[np.ndarray, "4 4"]:
 
 def _arrows(run: CollaborationRun, step: int) -> list[Arrow]:
     """To the nearest point of the worker, and where the elbow is dragged."""
-    near, far = run.motion.nearest(step + 1)[step].points.tolist()
+    near, far = map(_point, run.motion.nearest(step + 1)[step].points)
     arrows = [Arrow(start=near, end=far, colour=_rgba(palette.PURPLE), width=0.008, head=False)]
     log = run.cell.log
     q = torch.from_numpy(log["joint_position"][step])
