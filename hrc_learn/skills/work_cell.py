@@ -96,8 +96,8 @@ SAFETY_COLUMNS = INTERVENTIONS
 _SETTLING_TIME = 0.4
 STUCK = 2.0
 """Time after which a path that waits for the joints is gone back [s]."""
-# After which they go back straight [s].
-_LONGEST_WAIT = 20.0
+# After which they go back straight [s]; and to how many samples of the path that is tried.
+_LONGEST_WAIT, _OTHERS = 20.0, 20
 # Distance of the end effector from its path for the path to wait, and time by which servos lag
 # [m, s]: half the deviation that a push may cause, and twice the lag of an arm 20 ms late.
 _ON_PATH, _SERVO_LAG = 0.001, 0.06
@@ -592,7 +592,7 @@ class WorkCell:
                 self._feedback.hindrances.mention("task_waits")
             progress = max(progress + rate * self._pace, 0.0)
             if waited > _LONGEST_WAIT:
-                self._go_straight_back(_between(path, progress))
+                progress = self._go_straight_back(path, progress)
                 waited = 0.0
         if len(path) and self.config.after_push == "return":
             end = torch.from_numpy(path[-1])
@@ -617,28 +617,50 @@ class WorkCell:
         near = smallest_singular_value(self.chain, torch.stack([self.joints, ahead]))
         return bool((near < NARROW).any())
 
-    def _go_straight_back(self, goal: Float[Tensor, " joints"]) -> None:
+    def _go_straight_back(
+        self, path: Float[np.ndarray, "steps joints"], progress: float
+    ) -> float:
         """To a path that waits, where no motion of the null space leads.
 
         Another posture for the same pose may lie between. The end effector leaves its path.
 
+        Args:
+            path: Joint positions [rad].
+            progress: Sample at which it waits.
+
+        Returns:
+            The sample at which the arm is then: that one if its way there is clear of what is
+            around it, else the nearest to the arm of which it is.
+
         Raises:
-            BlockedPathError: If the arm would meet something.
+            BlockedPathError: If the arm would meet something on the way to any sample.
         """
-        way = joint_line(self.joints, goal, self.config.return_speed, self.config.dt)
-        if self._clearance is not None:
-            distance = self._clearance(way[:: max(1, len(way) // _CHECKED)])
-            ends = distance[[0, -1]].min()
-            if bool((distance < ends.clamp(max=self.config.clearance)).any()):
-                raise BlockedPathError(
-                    "path: the arm was pushed aside and finds no way back that is clear of "
-                    "what is around it."
-                )
+        others = range(0, len(path), max(1, len(path) // _OTHERS))
+        far = {k: float(np.linalg.norm(path[k] - self.joints.numpy())) for k in others}
+        for sample in (progress, *sorted(far, key=far.__getitem__)):
+            goal = _between(path, sample)
+            way = joint_line(self.joints, goal, self.config.return_speed, self.config.dt)
+            if self._is_clear(way):
+                break
+        else:
+            raise BlockedPathError(
+                "path: the arm was pushed aside and finds no way back that is clear of what is "
+                "around it."
+            )
         self._yielding.aside, pose = False, self.chain.forward(goal)
         for q in way:
             self._path_joints = q.numpy()
             self._feedback.hindrances.note("too_far", 0.0)
             self.step(self.config.pose_gain * (q - self.joints), pose)
+        return float(sample)
+
+    def _is_clear(self, way: Float[Tensor, "steps joints"]) -> bool:
+        """Whether the arm comes no nearer to what is around it than at the ends of a way."""
+        if self._clearance is None:
+            return True
+        distance = self._clearance(way[:: max(1, len(way) // _CHECKED)])
+        ends = distance[[0, -1]].min()
+        return not bool((distance < ends.clamp(max=self.config.clearance)).any())
 
     def _track_joints(
         self,

@@ -448,15 +448,44 @@ def test_an_arm_that_finds_no_way_back_goes_straight_or_says_so(distance):
         advance=arm.advance,
         clearance=clearance,
     )
+    path = goal[None].numpy()
     with shapes_unchecked():
         if distance < 0:
             with pytest.raises(BlockedPathError, match="pushed aside"):
-                cell._go_straight_back(goal)
+                cell._go_straight_back(path, 0.0)
         else:
-            cell._go_straight_back(goal)
+            assert cell._go_straight_back(path, 0.0) == 0.0
             np.testing.assert_allclose(cell.joints, goal, atol=0.03)
             speed = np.linalg.norm(cell.log["joint_velocity"], axis=1).max()
             assert speed < 2 * cell.config.return_speed
+
+
+def test_where_the_way_back_is_blocked_another_sample_of_the_path_is_as_good():
+    """A wall between the arm and where the path waits, but not where it began."""
+    start = panda.ready
+    waits = start + torch.tensor([0.0, 0.3, 0.0, 0.3, 0.0, 0.0, 0.0], dtype=torch.float64)
+    arm = ObedientArm((start + torch.tensor([0.2] + 6 * [0.0]).double()).numpy())
+
+    def clearance(q):
+        # A post halfway to the sample at which it waits.
+        middle = (torch.from_numpy(arm_began) + waits) / 2
+        return (q - middle).norm(dim=-1) - 0.15
+
+    arm_began = arm.q.copy()
+    cell = WorkCell(
+        chain=panda,
+        arm=arm,
+        gripper=arm,
+        human=ScriptedPerturbation(panda, ()),
+        advance=arm.advance,
+        clearance=clearance,
+    )
+    path = joint_line(start, waits, speed=0.5, dt=0.01).numpy()
+    with shapes_unchecked():
+        sample = cell._go_straight_back(path, float(len(path) - 1))
+    assert sample < len(path) / 2
+    np.testing.assert_allclose(cell.joints, path[int(sample)], atol=0.05)
+    assert clearance(torch.from_numpy(cell.log["joint_position"])).min() > 0
 
 
 def test_at_a_singularity_of_the_path_nobody_pushes_the_arm_off_it():

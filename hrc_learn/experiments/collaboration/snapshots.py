@@ -26,6 +26,8 @@ EYE, TOWARDS = (1.55, 1.45, 1.25), (0.0, 0.25, 0.30)
 _DRAGGED, _ELBOW = 4, 3
 # Length of the arrow [m], and input below which nobody drags [N m].
 _LENGTH, _NOTHING = 0.45, 0.5
+# Fraction of the way aside at which the drag is still on.
+_NEARLY = 0.9
 
 
 def moments(run: CollaborationRun) -> list[tuple[str, int]]:
@@ -74,14 +76,15 @@ def take_snapshots(run: CollaborationRun) -> list[tuple[str, Image]]:
 
 
 def _furthest_aside(run: CollaborationRun, begin: float, end: float) -> float | None:
-    """When the elbow is furthest from where it was at the beginning of a drag."""
+    """When the elbow is nearly as far aside as it gets, on the way there."""
     log = run.cell.log
     during = (log["time"] >= begin) & (log["time"] < end)
     during &= np.abs(log["nullspace_input"]).max(axis=1) > _NOTHING
     if not during.any():
         return None
     elbow = panda.joint_origins(torch.from_numpy(log["joint_position"][during]))[:, _ELBOW]
-    return float(log["time"][during][int((elbow - elbow[0]).norm(dim=-1).argmax())])
+    aside = (elbow - elbow[0]).norm(dim=-1)
+    return float(log["time"][during][int((aside >= _NEARLY * aside.max()).int().argmax())])
 
 
 def _matrix(body, step: int) -> Float[np.ndarray, "4 4"]:
