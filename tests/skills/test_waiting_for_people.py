@@ -123,6 +123,8 @@ def test_the_arm_waits_before_who_stands_in_its_way_and_goes_on_when_they_have_l
     assert cell.time > 4.0
     assert cell.log["pace"].min() < 0.01
     assert (free.log["pace"] == 1.0).all()
+    # It gets under way within 0.2 s, not at once.
+    assert np.diff(cell.log["pace"]).max() == pytest.approx(0.01 / 0.2)
     # Nobody was closed in on faster than the protective distance allows: people may set out
     # at any time, so fast within the time of reaction.
     closing = -np.diff(apart) / np.diff(time)
