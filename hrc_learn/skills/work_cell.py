@@ -107,13 +107,12 @@ _METRES_PER_RADIAN = 0.1
 _CHECKED = 50
 # Readings of the torque that are averaged, and steps in which an arm gets under way: friction
 # keeps it back at first.
-_FELT = 5
+_FELT, _GETTING_UNDER_WAY = 5, 25
 # Part of the task that constraints take beyond rounding.
 _SLOWED = 1e-3
 # How much faster the arm might close in on people who do not hold it back [m/s]: what the
 # program leaves unused is rounding. And pace below which it stands still.
 _SPARE, _STANDS = 1e-3, 0.01
-_GETTING_UNDER_WAY = 25
 
 _NAN = float("nan")
 # Logged as the goal of steps without a path.

@@ -92,13 +92,15 @@ def lowered(by):
     return Pose(start.position - torch.tensor([0, 0, by]).double(), start.orientation)
 
 
-def cell_with(arm):
+def cell_with(arm, **options):
+    """With nobody beside it."""
     return WorkCell(
         chain=panda,
         arm=arm,
         gripper=arm,
         human=ScriptedPerturbation(panda, ()),
         advance=arm.advance,
+        **options,
     )
 
 
@@ -335,14 +337,7 @@ def test_joints_are_astray_far_from_their_path_and_near_a_singularity(cell):
     assert stretched._astray(stretched.joints)
     # Whoever stays beside the path need not find back.
     arm = ObedientArm(panda.ready.numpy())
-    stays = WorkCell(
-        chain=panda,
-        arm=arm,
-        gripper=arm,
-        human=ScriptedPerturbation(panda, ()),
-        advance=arm.advance,
-        config=WorkCellConfig(after_push="stay"),
-    )
+    stays = cell_with(arm, config=WorkCellConfig(after_push="stay"))
     assert not stays._astray(stays.joints + near * 1.2)
 
 
@@ -440,14 +435,7 @@ def test_an_arm_that_finds_no_way_back_goes_straight_or_says_so(distance):
         near = (q[..., None, :] - ends).norm(dim=-1).amin(-1)
         return torch.where(near < 0.05, 0.5, distance)
 
-    cell = WorkCell(
-        chain=panda,
-        arm=arm,
-        gripper=arm,
-        human=ScriptedPerturbation(panda, ()),
-        advance=arm.advance,
-        clearance=clearance,
-    )
+    cell = cell_with(arm, clearance=clearance)
     path = goal[None].numpy()
     with shapes_unchecked():
         if distance < 0:
@@ -472,14 +460,7 @@ def test_where_the_way_back_is_blocked_another_sample_of_the_path_is_as_good():
         return (q - middle).norm(dim=-1) - 0.15
 
     arm_began = arm.q.copy()
-    cell = WorkCell(
-        chain=panda,
-        arm=arm,
-        gripper=arm,
-        human=ScriptedPerturbation(panda, ()),
-        advance=arm.advance,
-        clearance=clearance,
-    )
+    cell = cell_with(arm, clearance=clearance)
     path = joint_line(start, waits, speed=0.5, dt=0.01).numpy()
     with shapes_unchecked():
         sample = cell._go_straight_back(path, float(len(path) - 1))
