@@ -24,7 +24,7 @@ if command -v uv >/dev/null 2>&1; then
     say "Missing: Python 3.12, which uv could neither find nor fetch. Install it, then run make again."
     exit 1
   }
-  uv pip install --quiet --python .venv/bin/python --constraint constraints.txt --editable '.[all,dev,docs]'
+  uv pip install --quiet --python .venv/bin/python --constraint constraints.txt --editable '.[all,hardware,dev,docs]'
 else
   python=$(find_python) || {
     say "Missing: Python 3.12. Install it (Debian: python3.12 and python3.12-venv; or pyenv, or uv), then run make again."
@@ -36,6 +36,6 @@ else
   }
   say "Building .venv with $python and pip (some GB of PyTorch on a first run) ..."
   "$python" -m venv .venv
-  .venv/bin/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[all,dev,docs]'
+  .venv/bin/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[all,hardware,dev,docs]'
 fi
 say "Ready: .venv"

@@ -36,7 +36,9 @@ EXTRAS = {
     "pygame": "gamepad",
     "lerobot": "lerobot",
     "gymnasium": "lerobot",
-    "franky": "franky",
+    "franky": "hardware",
+    "pylibfranka": "hardware",
+    "franky_sim": "hardware",
     "example_robot_data": "meshes",
     "ray": "sweep",
 }
