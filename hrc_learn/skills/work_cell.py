@@ -359,7 +359,7 @@ class WorkCell:
         safe, self._guard, report = self._safety.step(
             self._guard,
             self.joints,
-            joint_velocity,
+            self._share * joint_velocity,
             self.config.dt,
             jacobian=self.jacobian,
             distances=self.distances,
@@ -714,6 +714,11 @@ class WorkCell:
         """From people, for a safety filter to keep; None: nobody watches for them."""
         return None if self.watched is None else self.watched.distances
 
+    @property
+    def _share(self) -> float:
+        """Of its speed that people who come towards the arm leave it."""
+        return 1.0 if self.watched is None else self.watched.share
+
     def _look(self) -> None:
         """Where people may be now."""
         if self._watch is None:
@@ -733,7 +738,7 @@ class WorkCell:
             TaskFailedError: Somebody has been in the way for too long.
         """
         distances, kept, pace = self.distances, report.constraints, 1.0
-        if (
+        if self._share < 1 or (
             distances is not None
             and kept is not None
             and bool(people_bind(distances, sent, kept, self._safety.config))
@@ -765,7 +770,8 @@ class WorkCell:
         """Note what the safety filter takes from the null-space part of a velocity [rad/s]."""
         if not self._pushing:
             return
-        cause = "person" if self._at_people(sent) else filter_hindrance(report)
+        slowed = self._share < 1 or self._at_people(sent)
+        cause = "person" if slowed else filter_hindrance(report)
         if cause is not None:
             J = self.jacobian
             kept = share_kept(null_projection(J, wanted), null_projection(J, sent))
@@ -834,11 +840,11 @@ class WorkCell:
         """Of the person who pushes, and by which the arm makes way by itself [N m]."""
         way, distances = self.config.way_making, self.distances
         if way is None:
-            return asked.nullspace_input
+            return self._share * asked.nullspace_input
         push = asked.nullspace_input if way.expert else np.zeros_like(asked.nullspace_input)
         if way.automatic and distances is not None:
             push = push + self.config.damping * way_making_velocity(distances, way).numpy()
-        return push
+        return self._share * push
 
     def _watched_columns(self, velocity: Float[Tensor, " joints"]) -> dict[str, float]:
         """For the log: the sensed distance of people, and the protective one at this speed."""

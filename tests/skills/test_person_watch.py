@@ -1,6 +1,5 @@
 """What the arm takes people's distances for, between two observations of them."""
 
-import math
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -26,6 +25,7 @@ ARM = whole_arm(SCENE.arm)
 HAND = PARTS.index("hand_right")
 SEPARATION = SeparationConfig(reaction_time=0.03, clearance=0.05)
 ALL = 10_000
+NOWHERE_NEAR = 1.0
 
 
 def observed(time=1.0, at=VISIT.released - 0.4, velocity=True):
@@ -39,7 +39,7 @@ def observed(time=1.0, at=VISIT.released - 0.4, velocity=True):
 
 def watch(observation, *, acceleration=0.0, pairs=ALL):
     tracker = SimpleNamespace(read=lambda: observation)
-    config = PersonWatchConfig(acceleration=acceleration, pairs=pairs, contact=-math.inf)
+    config = PersonWatchConfig(acceleration=acceleration, pairs=pairs, contact=-NOWHERE_NEAR)
     return PersonWatch(tracker, ARM, SEPARATION, config)
 
 
@@ -143,7 +143,7 @@ def test_the_most_urgent_pairs_are_told_of_with_their_exact_distances(seed, load
     q = sampling.within(
         panda.limits.lower, panda.limits.upper, rng=sampling.generator(seed), margin=0.1
     )
-    config = PersonWatchConfig(contact=-math.inf)
+    config = PersonWatchConfig(contact=-NOWHERE_NEAR)
     watch = PersonWatch(SimpleNamespace(read=lambda: person), panda_capsules, config=config)
     told = watch.look(2.13, q, load)
 
@@ -193,6 +193,34 @@ def test_whoever_may_touch_the_arm_stops_it():
         assert known[-1] == (found.nearest >= PersonWatchConfig().contact)
     assert {True, False} == set(known)
     assert known == sorted(known)
+
+
+@pytest.mark.parametrize("speed", [-0.6, 0.0, 0.4, 1.5])
+@pytest.mark.parametrize("distance", [0.0, 0.1, 0.2, 0.35, 0.6])
+def test_the_arm_rests_by_the_time_that_somebody_may_arrive(distance, speed):
+    """A ball below the gripper, against its way in small steps."""
+    config = PersonWatchConfig()
+    tip, age, radius = panda.forward(WORKPLACE.hover_joints()).position.numpy(), 0.1, 0.05
+    ends = np.full((1, 2, 3), tip - np.array([0.0, 0.0, distance + radius]))
+    velocity = np.broadcast_to([0.0, 0.0, speed], (1, 2, 3)).copy()
+    seen = PersonObservation(time=1.0, ends=ends, radius=np.array([radius]), velocity=velocity)
+    watch = PersonWatch(SimpleNamespace(read=lambda: seen), panda_capsules, SEPARATION, config)
+    found = watch.look(1.0 + age, WORKPLACE.hover_joints())
+
+    arrival, gap, coming, dt = 0.0, found.nearest - config.contact, speed, 1e-4
+    while gap > 0:
+        gap -= dt * (coming + dt * config.acceleration / 2)
+        coming += dt * config.acceleration
+        arrival += dt
+    # Late by the age and the reaction, and with 0.2 s to come to rest.
+    expected = np.clip((arrival - age - SEPARATION.reaction_time) / 0.2, 0.0, 1.0)
+    assert found.share == pytest.approx(expected, abs=2e-3)
+
+
+def test_nobody_who_stays_away_slows_the_arm_down():
+    found = watch(observed(), acceleration=3.0).look(1.0, WORKPLACE.home_joints())
+    assert found.nearest > 0.4
+    assert found.share == 1.0
 
 
 @pytest.mark.parametrize("wrong", [{"acceleration": -1.0}, {"pairs": 0}])

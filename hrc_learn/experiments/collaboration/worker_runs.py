@@ -60,6 +60,7 @@ from hrc_learn.skills.null_space_yielding import (
 from hrc_learn.skills.person_watch import (
     BESIDE_PEOPLE,
     PersonWatchConfig,
+    share_of_speed,
     urgent_distances,
 )
 from hrc_learn.skills.work_cell import STUCK, WorkCellConfig, behind_path, people_bind
@@ -270,7 +271,7 @@ class _Batch:
         self._guard = self._safety.initial_state(self._q.clone())
         zeros = torch.zeros(runs, dtype=torch.float64)
         self._progress, self._waiting = zeros.clone(), zeros.clone()
-        self._rate, self._pace = zeros + 1, zeros + 1
+        self._rate, self._pace, self._share = zeros + 1, zeros + 1, zeros + 1
         self._aside = torch.zeros(runs, dtype=torch.bool)
         self._null, self._back = torch.zeros_like(self._q), torch.zeros_like(self._q)
         far, count = zeros + _RANGE, torch.zeros(runs, dtype=torch.int64)
@@ -302,21 +303,21 @@ class _Batch:
         distances, stop, known = self._look(step, measured, holding)
         self._feel(step, measured, distances)
         command = self._command(measured, here)
-        guard = _taken(self._guard, live)
+        guard, share = _taken(self._guard, live), self._share[live]
         J = panda.jacobian(measured)
         safe, guard, report = self._safety.step(
             guard,
             measured,
-            command.joint_velocity,
+            share.unsqueeze(-1) * command.joint_velocity,
             config.dt,
             jacobian=J,
             distances=distances,
             stop=stop | ~known,
         )
         _put(self._guard, live, guard)
-        kept, held = report.constraints, stop
+        kept, held = report.constraints, stop | (share < 1)
         if distances is not None and kept is not None:
-            held = people_bind(distances, safe, kept, self._safety.config)
+            held = held | people_bind(distances, safe, kept, self._safety.config)
             self._found.unsolved[live] += ~kept.solved
         asked = (J @ command.joint_velocity.unsqueeze(-1)).squeeze(-1)
         done = (J @ safe.unsqueeze(-1)).squeeze(-1)
@@ -368,10 +369,14 @@ class _Batch:
             relevant |= bound < self._way.far + age.unsqueeze(-1) * towards
         shape = (len(known), self._watch.pairs)
         distance = measured.new_full(shape, _FAR)
+        self._share[self.live] = 1.0
         gradient, approach = measured.new_zeros(*shape, 7), measured.new_zeros(shape)
         for rows, found, columns in self._near(measured, holding, seen, bound, relevant):
             velocity = seen.velocity[rows.unsqueeze(-1), columns]
             part = urgent_distances(found, velocity, age[rows], self._separation, self._watch)
+            self._share[self.live[rows]] = share_of_speed(
+                found, velocity, age[rows], self._separation, self._watch
+            )
             distance[rows] = part.distance
             gradient[rows], approach[rows] = part.gradient, part.approach_speed
         person = torch.ones(shape, dtype=torch.bool)
@@ -438,6 +443,7 @@ class _Batch:
         if self._way.automatic and distances is not None:
             asked += way_making_velocity(distances, self._way)
         live = self.live
+        asked *= self._share[live].unsqueeze(-1)
         before = self._null[live]
         some = torch.nonzero((asked != 0).any(-1) | (before != 0).any(-1)).squeeze(-1)
         if not len(some):
