@@ -17,6 +17,9 @@ from hrc_learn.kinematics import MotionLimits
 
 # Fraction of v_max left unused: sums of rounded numbers must not exceed it in the last digit.
 _ROUNDING = 1e-12
+# What libfranka takes off velocity limits that depend on the position, for the same reason
+# (kJointVelocityLimitsTolerance, 0.21) [rad/s].
+_TOLERANCE = 1e-3
 
 
 @final
@@ -59,6 +62,17 @@ class LimitBarrier(nn.Module):
     makes up for it: Q(v_hat) + T v_hat <= delta, which is 1/rate + T in place of 1/rate. In
     steps that take (1 + jitter) of the dt that is told, A dt brakes with A/(1 + jitter): so
     much for A in Q.
+
+    Velocity limits that tighten towards those of position are, with o and d of
+    `MotionLimits.velocity_bounds` and the margin m, a curve of the same kind:
+
+        sqrt(2 d (delta + m)) - o >= sqrt(o^2 + 2 d delta) - o   if m >= o^2/(2 d).
+
+    The right-hand side falls as o grows, to h with the knee c >= o, and h grows with A. So the
+    limits hold at every position, and braking in time is what the set is about, if Q has
+    min(A, d) in place of A and at least o/d in place of 1/rate, and the margin is at least that.
+    To the offset o what libfranka takes off is added, to that of the margin also the speed
+    A^2/(2 j) of joints that come to rest there. Nothing of it is computed in a step.
     """
 
     velocity: Tensor
@@ -92,7 +106,8 @@ class LimitBarrier(nn.Module):
 
         Args:
             limits: Of the joints.
-            margin: Distance kept from every position limit [rad].
+            margin: Distance kept from every position limit [rad], more where the limits of
+                velocity ask for it.
             rate: Fastest decay of the remaining distance [1/s].
             jerk_limited: Whether the acceleration changes by at most j dt in a step.
             rests_outside: Whether a joint outside its limits may rest there.
@@ -103,18 +118,25 @@ class LimitBarrier(nn.Module):
         self.rests_outside = rests_outside
         self.jerk_limited = jerk_limited
         A, j = limits.acceleration, limits.jerk
-        rate, slowest = rate / (1 + rate * delay), A / (1 + jitter)
-        walls = torch.stack([-limits.lower - margin, limits.upper - margin])
+        reserve = A**2 / (2 * j) if jerk_limited else torch.zeros_like(A)
+        slowest, decay_time = A / (1 + jitter), torch.full_like(A, 1 / rate)
+        margins = torch.full_like(A, margin)
+        if limits.velocity_offset is not None and limits.deceleration is not None:
+            o, d = limits.velocity_offset + _TOLERANCE, limits.deceleration
+            slowest, decay_time = slowest.minimum(d), decay_time.maximum(o / d)
+            margins = margins.maximum((o + reserve) ** 2 / (2 * d))
+        knee = slowest * (decay_time + delay)
+        walls = torch.stack([-limits.lower - margins, limits.upper - margins])
         constants = {
             "velocity": limits.velocity * (1 - _ROUNDING),
             "acceleration": A.clone(),
             "jerk": j.clone(),
             "walls": walls,
             "sides": torch.tensor([[1.0], [-1.0]]).to(walls),
-            "knee": slowest / rate,
-            "knee_square": (slowest / rate) ** 2,
+            "knee": knee,
+            "knee_square": knee**2,
             "twice_acceleration": 2 * slowest,
-            "reserve": A**2 / (2 * j) if jerk_limited else torch.zeros_like(A),
+            "reserve": reserve,
         }
         for name, value in constants.items():
             self.register_buffer(name, value)

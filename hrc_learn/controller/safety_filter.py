@@ -40,6 +40,10 @@ INTERVENTIONS = (
 # Fraction of a limit, or joint velocity [rad/s], beyond which an intervention is reported.
 # Below is rounding, in float32 too: a command led along a limit would be flagged by chance.
 _REPORTED = 1e-6
+# Fraction of the limits of acceleration and jerk left unused: who checks what was sent divides
+# differences of rounded numbers by powers of a step, for the jerk of positions at 1 kHz by
+# 1e-9 s^3. Roundings of 4e-16 rad count for 2e-6 rad/s^3 then, of thousands.
+_ROUNDING = 1e-9
 # Step [s] to brake by while none has been valid: that of the fastest arms, so the gentlest.
 _SHORTEST_STEP = 1e-3
 
@@ -172,11 +176,10 @@ class SafetyFilter(nn.Module):
         super().__init__()
         self.config = config = config or SafetyConfig()
         # What a shorter step makes of a change of velocity must be in the driver's power.
-        usable = config.braking * (1 - config.jitter)
+        usable = (1 - _ROUNDING) * config.braking * (1 - config.jitter)
         self.barrier = LimitBarrier(
             replace(
-                limits,
-                velocity=(1 - config.velocity_margin) * limits.velocity,
+                limits.slowed(1 - config.velocity_margin),
                 acceleration=usable * limits.acceleration,
                 jerk=usable * limits.jerk,
             ),

@@ -1,4 +1,4 @@
-"""Serial arms: forward kinematics, Jacobians and their inverses; the Panda."""
+"""Serial arms: forward kinematics, Jacobians and their inverses; Franka's Panda and Research 3."""
 
 from hrc_learn.kinematics.chain import JointLimits as JointLimits
 from hrc_learn.kinematics.chain import MotionLimits as MotionLimits
@@ -9,9 +9,12 @@ from hrc_learn.kinematics.franka import LINK_CAPSULES as LINK_CAPSULES
 from hrc_learn.kinematics.franka import TOOL_LINK as TOOL_LINK
 from hrc_learn.kinematics.franka import FrankaArm as FrankaArm
 from hrc_learn.kinematics.franka import UnreachableError as UnreachableError
+from hrc_learn.kinematics.franka import fr3 as fr3
+from hrc_learn.kinematics.franka import franka_arm as franka_arm
 from hrc_learn.kinematics.franka import panda as panda
 from hrc_learn.kinematics.franka import panda_body as panda_body
 from hrc_learn.kinematics.franka import panda_capsules as panda_capsules
+from hrc_learn.kinematics.franka_limits import FR3_VINTAGES as FR3_VINTAGES
 from hrc_learn.kinematics.interchange import from_pytorch_kinematics as from_pytorch_kinematics
 from hrc_learn.kinematics.interchange import to_pytorch_kinematics as to_pytorch_kinematics
 from hrc_learn.kinematics.interchange import to_urdf as to_urdf

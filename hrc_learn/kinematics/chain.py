@@ -10,7 +10,7 @@ operations take far longer.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -25,6 +25,10 @@ class MotionLimits:
     """Limits of each joint's motion, float64; velocities and up are symmetric.
 
     Of whatever else is moved as well, in its own unit in place of radians.
+
+    Some arms lower their velocity limits towards the limits of position, to be able to stop:
+    there `velocity_offset` and `deceleration` are given, both or neither, and
+    `velocity_bounds` is what holds. Without them it is `velocity` everywhere.
     """
 
     lower: Float[Tensor, " joints"]
@@ -37,6 +41,54 @@ class MotionLimits:
     """[rad/s^2]"""
     jerk: Float[Tensor, " joints"]
     """[rad/s^3]"""
+    velocity_offset: Float[Tensor, " joints"] | None = None
+    """o of `velocity_bounds` [rad/s]; None: the limits of velocity are the same everywhere."""
+    deceleration: Float[Tensor, " joints"] | None = None
+    """d of `velocity_bounds` [rad/s^2]."""
+
+    def __post_init__(self):
+        if (self.velocity_offset is None) != (self.deceleration is None):
+            raise ValueError(
+                "velocity_offset and deceleration together tell how velocity limits depend on "
+                "the position: give both, or neither"
+            )
+
+    def slowed[Limits: MotionLimits](self: Limits, fraction: float) -> Limits:
+        """The same limits with velocities of at most a fraction of theirs, at each position."""
+        o, d = self.velocity_offset, self.deceleration
+        return replace(
+            self,
+            velocity=fraction * self.velocity,
+            velocity_offset=None if o is None else fraction * o,
+            deceleration=None if d is None else fraction**2 * d,
+        )
+
+    def velocity_bounds(
+        self, q: Float[Tensor, "*batch joints"]
+    ) -> tuple[Float[Tensor, "*batch joints"], Float[Tensor, "*batch joints"]]:
+        """Lowest and highest velocity [rad/s] allowed at a position.
+
+        With the distance x to the limit of position ahead it is
+
+            min(velocity, max(0, sqrt(2 d max(0, x)) - o)),
+
+        Franka's formula for the Research 3 ("Robot and interface specifications"): the speed
+        from which a joint stops before the limit with the deceleration d, less an offset. Zero
+        from o^2/(2 d) before the limit. Differentiable; at a limit the slope is zero, not
+        infinite.
+
+        Args:
+            q: Joint positions [rad].
+        """
+        velocity = self.velocity.to(q)
+        if self.velocity_offset is None or self.deceleration is None:
+            return (-velocity).expand(q.shape), velocity.expand(q.shape)
+        o, d = self.velocity_offset.to(q), self.deceleration.to(q)
+        ahead = torch.stack([q - self.lower.to(q), self.upper.to(q) - q])
+        # Nearer than that nothing is left, and the root has no slope at zero.
+        speed = (2 * d * ahead).maximum(o * o).sqrt() - o
+        lower, upper = speed.minimum(velocity)
+        return -lower, upper
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,6 +1,6 @@
-"""The Franka Emika Panda: published geometry and limits in one table, its inverse kinematics in
-closed form, and the capsules that stand for its links, to about a centimetre of their published
-shapes.
+"""Franka's arms, the Panda (FER) and the Research 3: their published geometry, which is the
+same, their inverse kinematics in closed form, and the capsules that stand for their links, to
+about a centimetre of the published shapes. `franka_limits` has what differs, the limits.
 
 The inverse is He and Liu 2021, "Analytical inverse kinematics for Franka Emika Panda", as
 `frankik` implements it: about 2 us a pose. It does not return the branch of the elbow with
@@ -18,20 +18,19 @@ from torch import Tensor
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics.chain import JointLimits, SerialChain
 from hrc_learn.kinematics.collision import CapsuleArm, LinkCapsule
+from hrc_learn.kinematics.franka_limits import FR3_LIMITS, PANDA_LIMITS
 from hrc_learn.kinematics.interchange import to_urdf
 
-# Craig's modified Denavit-Hartenberg parameters and joint limits, as published in
-# frankaemika's "Robot and interface specifications" for the Panda (FER).
-# a [m], d [m], alpha [rad]; then rad, rad/s, rad/s^2, rad/s^3, N m.
-_PANDA_JOINTS = (
-    #  a,      d,     alpha,    lower,   upper,  velocity, acceleration, jerk, torque
-    (0.0, 0.333, 0.0, -2.8973, 2.8973, 2.1750, 15.0, 7500.0, 87.0),
-    (0.0, 0.0, -pi / 2, -1.7628, 1.7628, 2.1750, 7.5, 3750.0, 87.0),
-    (0.0, 0.316, pi / 2, -2.8973, 2.8973, 2.1750, 10.0, 5000.0, 87.0),
-    (0.0825, 0.0, pi / 2, -3.0718, -0.0698, 2.1750, 12.5, 6250.0, 87.0),
-    (-0.0825, 0.384, -pi / 2, -2.8973, 2.8973, 2.6100, 15.0, 7500.0, 12.0),
-    (0.0, 0.0, pi / 2, -0.0175, 3.7525, 2.6100, 20.0, 10000.0, 12.0),
-    (0.088, 0.0, pi / 2, -2.8973, 2.8973, 2.6100, 20.0, 10000.0, 12.0),
+# Craig's modified Denavit-Hartenberg parameters, as published in Franka's "Robot and interface
+# specifications": a [m], d [m], alpha [rad].
+_JOINTS = (
+    (0.0, 0.333, 0.0),
+    (0.0, 0.0, -pi / 2),
+    (0.0, 0.316, pi / 2),
+    (0.0825, 0.0, pi / 2),
+    (-0.0825, 0.384, -pi / 2),
+    (0.0, 0.0, pi / 2),
+    (0.088, 0.0, pi / 2),
 )
 _FLANGE_OFFSET = 0.107  # along z of joint 7 [m]
 _HAND_ANGLE = -pi / 4  # the hand is bolted on turned about z of the flange [rad]
@@ -48,6 +47,29 @@ class UnreachableError(ValueError):
 
 class FrankaArm(SerialChain):
     """A Franka arm with the Franka hand: a serial chain with a closed-form inverse."""
+
+    def __init__(self, name: str, limits: JointLimits):
+        """Describe an arm.
+
+        Args:
+            name: With which those of its joints begin.
+            limits: Of its joints.
+        """
+        super().__init__(
+            joint_names=[f"{name}_joint{i}" for i in range(1, 8)],
+            mounts=torch.stack([_craig(*row) for row in _JOINTS]),
+            flange=_along_z(_FLANGE_OFFSET),
+            tcp=_along_z(_TCP_OFFSET, _HAND_ANGLE),
+            limits=limits,
+            ready=torch.tensor(
+                [0, -pi / 4, 0, -3 * pi / 4, 0, pi / 2, pi / 4], dtype=torch.float64
+            ),
+        )
+        self.name = name
+        # frankik drops branches outside the Panda's range or, asked for the FR3, outside the
+        # narrow one in which it needs no position-based velocity limits. The other joints' ranges
+        # of the FR3 are within the Panda's, to 20 mrad: both together leave out less.
+        self._frankik_ranges = (False,) if name == "panda" else (False, True)
 
     def inverse(
         self,
@@ -98,11 +120,13 @@ class FrankaArm(SerialChain):
         flanges = flange.expand(*shape, 4, 4).reshape(-1, 4, 4).numpy()
         angles = q7.expand(shape).reshape(-1).tolist()
         # The default only selects among branches when a joint is indeterminate.
-        branches = [
-            frankik.ik_full(T, frankik.kQDefault, angle, False)
-            for T, angle in zip(flanges, angles, strict=True)
-        ]
-        q = torch.from_numpy(np.stack(branches)).reshape(*shape, 4, 7)
+        branches = np.full((len(flanges), 4, 7), np.nan)
+        for is_fr3 in self._frankik_ranges:
+            for row, T, angle in zip(branches, flanges, angles, strict=True):
+                # A branch is in the same row of either answer, or NaN.
+                found = frankik.ik_full(T, frankik.kQDefault, angle, is_fr3)
+                np.copyto(row, found, where=np.isnan(row))
+        q = torch.from_numpy(branches).reshape(*shape, 4, 7)
         return self._keep_true_ones(q, tip.expand(*shape, 4, 4)).to(pose.position)
 
     def _keep_true_ones(
@@ -118,7 +142,7 @@ class FrankaArm(SerialChain):
 
     def urdf(self) -> str:
         """URDF text with the links, joints and limits of this arm, without meshes."""
-        return to_urdf(self, name="panda")
+        return to_urdf(self, name=self.name)
 
 
 def _explain(pose: Pose, q7: Tensor | float, missing: Tensor) -> str:
@@ -160,31 +184,25 @@ def _exact_cos_sin(angle: float) -> tuple[float, float]:
     return float(round(cos(angle))), float(round(sin(angle)))
 
 
-def _panda() -> FrankaArm:
-    table = torch.tensor(_PANDA_JOINTS, dtype=torch.float64)
-    lower, upper, velocity, acceleration, jerk, torque = table[:, 3:].unbind(-1)
-    return FrankaArm(
-        joint_names=[f"panda_joint{i}" for i in range(1, 8)],
-        mounts=torch.stack([_craig(*row[:3]) for row in _PANDA_JOINTS]),
-        flange=_along_z(_FLANGE_OFFSET),
-        tcp=_along_z(_TCP_OFFSET, _HAND_ANGLE),
-        limits=JointLimits(
-            lower=lower,
-            upper=upper,
-            velocity=velocity,
-            acceleration=acceleration,
-            jerk=jerk,
-            torque=torque,
-            vintage="Franka Emika Panda (FER), FCI documentation up to libfranka 0.9",
-        ),
-        ready=torch.tensor(
-            [0, -pi / 4, 0, -3 * pi / 4, 0, pi / 2, pi / 4], dtype=torch.float64
-        ),
-    )
-
-
-panda = _panda()
+panda = FrankaArm("panda", PANDA_LIMITS)
 """The Panda with its hand; a Cartesian limit of 1.7 m/s and 2.5 rad/s is the controller's."""
+
+fr3 = FrankaArm("fr3", FR3_LIMITS)
+"""The Research 3 with its hand; a Cartesian limit of 3 m/s and 2.5 rad/s is the controller's."""
+
+_ARMS = {arm.name: arm for arm in (panda, fr3)}
+
+
+def franka_arm(name: str) -> FrankaArm:
+    """One of Franka's arms by its name, `panda` or `fr3`.
+
+    Raises:
+        ValueError: There is no such arm.
+    """
+    if name not in _ARMS:
+        raise ValueError(f"no arm {name!r}; Franka's are {', '.join(_ARMS)}")
+    return _ARMS[name]
+
 
 TOOL_LINK = 9
 """Number of the tool centre point's frame, on which the hand is mounted."""
