@@ -69,10 +69,10 @@ class LimitBarrier(nn.Module):
         sqrt(2 d (delta + m)) - o >= sqrt(o^2 + 2 d delta) - o   if m >= o^2/(2 d).
 
     The right-hand side falls as o grows, to h with the knee c >= o, and h grows with A. So the
-    limits hold at every position, and braking in time is what the set is about, if Q has
-    min(A, d) in place of A and at least o/d in place of 1/rate, and the margin is at least that.
-    To the offset o what libfranka takes off is added, to that of the margin also the speed
-    A^2/(2 j) of joints that come to rest there. Nothing of it is computed in a step.
+    limits hold at every position, and joints brake in time, if Q has min(A, d) in place of A
+    and at least o/d in place of 1/rate, and the margin is wide enough. What libfranka takes off
+    its limits is added to the offset o and, where the margin is asked for, the A^2/(2 j) with
+    which joints may come to rest in it. All of that are constants: a step does nothing more.
     """
 
     velocity: Tensor

@@ -44,6 +44,8 @@ _REPORTED = 1e-6
 # differences of rounded numbers by powers of a step, for the jerk of positions at 1 kHz by
 # 1e-9 s^3. Roundings of 4e-16 rad count for 2e-6 rad/s^3 then, of thousands.
 _ROUNDING = 1e-9
+# Joint velocities below are rounding of rest [rad/s].
+_REST = 1e-15
 # Step [s] to brake by while none has been valid: that of the fastest arms, so the gentlest.
 _SHORTEST_STEP = 1e-3
 
@@ -321,6 +323,8 @@ class SafetyFilter(nn.Module):
             if layer is not None:
                 kept = self._constrained(state, v, u, jacobian, bounds, distances, dt)
                 v = kept.joint_velocity
+                # What a solver leaves of rest is a motion where a velocity limit is zero.
+                v = torch.where(v.abs() < _REST, 0, v)
                 if not layer.early_exit or bool(braking.any()):
                     stopping = limit(state, torch.zeros_like(v), bounds, dt)
                     v = torch.where(braking, stopping[0], v)

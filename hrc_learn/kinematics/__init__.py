@@ -1,4 +1,4 @@
-"""Serial arms: forward kinematics, Jacobians and their inverses; Franka's Panda and Research 3."""
+"""Serial arms: forward kinematics, Jacobians and inverses; Franka's Panda and FR3."""
 
 from hrc_learn.kinematics.chain import JointLimits as JointLimits
 from hrc_learn.kinematics.chain import MotionLimits as MotionLimits

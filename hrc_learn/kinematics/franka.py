@@ -67,8 +67,8 @@ class FrankaArm(SerialChain):
         )
         self.name = name
         # frankik drops branches outside the Panda's range or, asked for the FR3, outside the
-        # narrow one in which it needs no position-based velocity limits. The other joints' ranges
-        # of the FR3 are within the Panda's, to 20 mrad: both together leave out less.
+        # narrow one that Franka gives for velocity limits alike at all positions. The FR3's own
+        # is in neither: together they leave out least.
         self._frankik_ranges = (False,) if name == "panda" else (False, True)
 
     def inverse(
@@ -188,7 +188,7 @@ panda = FrankaArm("panda", PANDA_LIMITS)
 """The Panda with its hand; a Cartesian limit of 1.7 m/s and 2.5 rad/s is the controller's."""
 
 fr3 = FrankaArm("fr3", FR3_LIMITS)
-"""The Research 3 with its hand; a Cartesian limit of 3 m/s and 2.5 rad/s is the controller's."""
+"""The Research 3 with its hand; the Cartesian limits are 3 m/s and 2.5 rad/s."""
 
 _ARMS = {arm.name: arm for arm in (panda, fr3)}
 

@@ -1,4 +1,4 @@
-"""Limits of the joints of Franka's arms, as published, and the strictest where sources differ."""
+"""Limits of the joints of Franka's arms, as published; the strictest where sources differ."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ _STOPS = {
 }
 FR3_VINTAGES = {
     "libfranka": _limits(
-        "Franka Research 3, computeUpperLimitsJointVelocity and computeLowerLimitsJointVelocity "
-        "of libfranka 0.10 and later; so the robot's own URDF in franka-sim 1.1.7",
+        "Franka Research 3, compute{Upper,Lower}LimitsJointVelocity in rate_limiting.h of "
+        "libfranka 0.10 to 0.21, and the robot's URDF in franka-sim 1.1.7",
         lower=(-2.7501, -1.7918, -2.9065, -3.0481, -2.8101, 0.54092, -3.0196),
         upper=(2.7501, 1.7918, 2.9065, -0.1458, 2.8101, 4.5205, 3.0196),
         velocity_offset=(0.30, 0.20, 0.20, 0.30, 0.35, 0.35, 0.35),
