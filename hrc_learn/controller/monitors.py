@@ -78,16 +78,17 @@ class LimitMonitor:
         """Whether limits of position, velocity, acceleration and jerk are broken in a step.
 
         Args:
-            q: Joint position [rad].
+            q: Joint position, which limits of velocity may depend on [rad].
             velocity: Commanded for the step [rad/s].
         """
         limits = self._limits
+        slowest, fastest = limits.velocity_bounds(q)
         acceleration = (velocity - self._velocity) / self._dt
         jerk = (acceleration - self._acceleration) / self._dt
         self._velocity, self._acceleration = velocity, acceleration
         broken = [
             (q > limits.upper) | (q < limits.lower),
-            velocity.abs() > limits.velocity,
+            (velocity > fastest) | (velocity < slowest),
             acceleration.abs() > limits.acceleration * _ROUNDING,
             jerk.abs() > limits.jerk * _ROUNDING,
         ]

@@ -10,6 +10,7 @@ from hrc_learn.kinematics.franka import TOOL_LINK as TOOL_LINK
 from hrc_learn.kinematics.franka import FrankaArm as FrankaArm
 from hrc_learn.kinematics.franka import UnreachableError as UnreachableError
 from hrc_learn.kinematics.franka import fr3 as fr3
+from hrc_learn.kinematics.franka import fr3_capsules as fr3_capsules
 from hrc_learn.kinematics.franka import franka_arm as franka_arm
 from hrc_learn.kinematics.franka import panda as panda
 from hrc_learn.kinematics.franka import panda_body as panda_body

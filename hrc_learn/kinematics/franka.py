@@ -1,11 +1,19 @@
 """Franka's arms, the Panda (FER) and the Research 3: their published geometry, which is the
-same, their inverse kinematics in closed form, and the capsules that stand for their links, to
-about a centimetre of the published shapes. `franka_limits` has what differs, the limits.
+same, their inverse kinematics in closed form, and the capsules that stand for their links.
+`franka_limits` has what differs, the limits.
 
 The inverse is He and Liu 2021, "Analytical inverse kinematics for Franka Emika Panda", as
 `frankik` implements it: about 2 us a pose. It does not return the branch of the elbow with
 q4 > -0.467 rad, where the forearm folds to the other side, nor, in one pose of 300, a valid
 answer at the shoulder singularity (q2 = 0). What it returns is checked here.
+
+Of the Research 3 it returns none outside the Panda's range besides (q6 > 3.7525 rad,
+|q7| > 2.8973, |q2| > 1.7628), unless all joints are within the one that Franka gives for velocity
+limits alike at all positions: of configurations drawn from all of its range with q4 < -0.467,
+81 % are found again, and of those within the Panda's 99.8 %.
+
+Franka's meshes of both arms, alike to 2 mm, stick out of the capsules by 30 mm at most (that of
+link 2), those of the base by 46 mm, of the hand by 9 mm: distances to keep have to cover it.
 """
 
 from math import cos, pi, sin
@@ -227,7 +235,7 @@ LINK_CAPSULES = tuple(
         (7, (0.0, 0.0, -0.02), (0.0, 0.0, 0.062), 0.045),
     )
 )
-"""Of the links; the simulated arm is built from the same."""
+"""Of the links of either arm; the simulated one is built from the same."""
 
 # The hand is a box of 60 x 200 x 66 mm, which this contains, and so are the open fingers.
 _HAND_CAPSULES = (
@@ -247,3 +255,6 @@ panda_capsules = CapsuleArm(panda, LINK_CAPSULES + _HAND_CAPSULES, _OVERLAPPING)
 
 panda_body = CapsuleArm(panda, LINK_CAPSULES, _OVERLAPPING)
 """Without the hand, which a task takes near to things on purpose."""
+
+fr3_capsules = CapsuleArm(fr3, LINK_CAPSULES + _HAND_CAPSULES, _OVERLAPPING)
+"""The Research 3 with its hand."""

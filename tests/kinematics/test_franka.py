@@ -6,7 +6,7 @@ from sampling import generator, within
 from torch.testing import assert_close
 
 from hrc_learn.geometry import Pose
-from hrc_learn.kinematics import UnreachableError, panda
+from hrc_learn.kinematics import UnreachableError, fr3, franka_arm, panda
 
 
 def solvable_configurations(count, rng):
@@ -133,3 +133,42 @@ def test_contain_tells_inside_from_outside():
         outside[..., joint] = limits.upper[joint] + 1e-6
         assert not bool(limits.contain(outside).any())
     assert bool(limits.contain(limits.middle.float()))
+
+
+def research_3_configurations(count):
+    """Of the FR3 within the range of the Panda too, elbow and shoulder as for that."""
+    lower = fr3.limits.lower.maximum(panda.limits.lower)
+    upper = fr3.limits.upper.minimum(panda.limits.upper)
+    q = within(lower, upper, 2 * count + 20, rng=generator(6))
+    return q[(q[:, 3] < -0.48) & (q[:, 1].abs() > 0.02)][:count]
+
+
+def test_the_research_3_has_the_inverse_within_limits_of_its_own():
+    q = research_3_configurations(300)
+    pose = fr3.forward(q)
+    assert_close(fr3.inverse(pose, q[:, 6], near=q), q, rtol=0, atol=1e-6)
+    branches = fr3.inverse_all(pose, q[:, 6])
+    valid = ~branches.isnan().any(-1)
+    assert bool(fr3.limits.contain(branches[valid]).all())
+    wanted = pose.matrix()[:, None].expand(-1, 4, 4, 4)[valid]
+    assert_close(fr3.forward(branches[valid]).matrix(), wanted, rtol=0, atol=1e-9)
+
+
+def test_its_wrist_bends_further_than_the_pandas():
+    """Where all joints are in the narrow range of frankik's FR3."""
+    q = fr3.ready.clone()
+    q[5], q[6] = 4.0, 0.3
+    pose = fr3.forward(q)
+    assert_close(fr3.inverse(pose, q[6], near=q), q, rtol=0, atol=1e-6)
+    found = panda.inverse_all(pose, q[6])
+    assert not bool(((found - q).abs().amax(-1) < 1e-3).any())
+
+
+def test_arms_by_their_name():
+    assert franka_arm("panda") is panda
+    assert franka_arm("fr3") is fr3
+    assert fr3.joint_names[6] == "fr3_joint7"
+    assert '<robot name="fr3">' in fr3.urdf()
+    assert '<robot name="panda">' in panda.urdf()
+    with pytest.raises(ValueError, match=r"no arm 'ur5'; Franka's are panda, fr3"):
+        franka_arm("ur5")
