@@ -16,7 +16,7 @@ from hrc_learn.controller import (
 from hrc_learn.deploy.package import PackedStep, StepLayouts, Vectors
 from hrc_learn.geometry import quaternion
 from hrc_learn.jacobian import KalmanEstimator, RBFImageJacobian, paper_grid
-from hrc_learn.kinematics import panda
+from hrc_learn.kinematics import SerialChain, panda
 
 Arrays = dict[str, np.ndarray]
 
@@ -38,13 +38,14 @@ TOLERANCES = {
 
 def controller_and_observation(
     q: Tensor = panda.ready,
+    arm: SerialChain = panda,
 ) -> tuple[AdaptiveController, Observation]:
     """The recommended controller and all that it may be told but people's distances."""
     J = torch.tensor(INITIAL_IMAGE_JACOBIAN, dtype=torch.float64)
     network = RBFImageJacobian.from_jacobian(J, paper_grid(), 0.1)
     down = quaternion.normalize(q.new_tensor(GRIPPER_DOWN))
     goals = Goals.at(q.new_tensor((0.4, 0.1, 0.4)), down, q.new_tensor((700.0, 500.0)))
-    controller = AdaptiveController(panda, KalmanEstimator(network), goals)
+    controller = AdaptiveController(arm, KalmanEstimator(network), goals)
     batch = q.shape[:-1]
     observation = Observation(
         joint_position=q,

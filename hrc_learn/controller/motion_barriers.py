@@ -162,7 +162,7 @@ class LimitBarrier(nn.Module):
         self,
         velocity: Float[Tensor, "*batch n"],
         bounds: tuple[Tensor, Tensor],
-        dt: float | Float[Tensor, ""],
+        dt: float | Float[Tensor, "*#batch 1"],
     ) -> tuple[Float[Tensor, "*batch n"], Float[Tensor, "*batch n"]]:
         """Lowest and highest acceleration [rad/s^2] that stay inside the set.
 
@@ -171,7 +171,7 @@ class LimitBarrier(nn.Module):
         Args:
             velocity: Of the last step [rad/s].
             bounds: `velocity_bounds` now.
-            dt: Step [s].
+            dt: Step [s], which may differ between arms.
         """
         lower, upper = bounds
         slack = torch.stack([velocity - lower, upper - velocity], dim=-2)
@@ -188,7 +188,7 @@ class LimitBarrier(nn.Module):
         last: Float[Tensor, "*batch n"],
         velocity: Float[Tensor, "*batch n"],
         bounds: tuple[Tensor, Tensor],
-        dt: float | Float[Tensor, ""],
+        dt: float | Float[Tensor, "*#batch 1"],
     ) -> Float[Tensor, "*batch n"]:
         """The nearest acceleration with which the limits are kept, now and later [rad/s^2].
 
@@ -197,7 +197,7 @@ class LimitBarrier(nn.Module):
             last: Acceleration of the last step [rad/s^2].
             velocity: Of the last step [rad/s].
             bounds: `velocity_bounds` now.
-            dt: Step [s].
+            dt: Step [s], which may differ between arms.
         """
         # Last what the arm cannot exceed: outside its set the barrier may ask for more.
         inside = wanted.clamp(*self.acceleration_bounds(velocity, bounds, dt))
@@ -218,7 +218,7 @@ class LimitBarrier(nn.Module):
         velocity: Float[Tensor, "*batch n"],
         acceleration: Float[Tensor, "*batch n"],
         bounds: tuple[Tensor, Tensor],
-        dt: float | Float[Tensor, ""],
+        dt: float | Float[Tensor, "*#batch 1"],
     ) -> tuple[Float[Tensor, "*batch n"], Float[Tensor, "*batch n"]]:
         """Lowest and highest velocity of the next step with which all limits are kept [rad/s].
 
@@ -229,7 +229,7 @@ class LimitBarrier(nn.Module):
             velocity: Of the last step [rad/s].
             acceleration: Of the last step [rad/s^2].
             bounds: `velocity_bounds` now.
-            dt: Step [s].
+            dt: Step [s], which may differ between arms.
         """
         A = self.acceleration
         if self.jerk_limited:

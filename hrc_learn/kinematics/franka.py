@@ -8,9 +8,9 @@ q4 > -0.467 rad, where the forearm folds to the other side, nor, in one pose of 
 answer at the shoulder singularity (q2 = 0). What it returns is checked here.
 
 Of the Research 3 it returns none outside the Panda's range besides (q6 > 3.7525 rad,
-|q7| > 2.8973, |q2| > 1.7628), unless all joints are within the one that Franka gives for velocity
-limits alike at all positions: of configurations drawn from all of its range with q4 < -0.467,
-81 % are found again, and of those within the Panda's 99.8 %.
+|q7| > 2.8973, |q2| > 1.7628), unless all joints are within the one that Franka gives for
+velocity limits alike at all positions: of configurations drawn from all of its range with
+q4 < -0.467, 81 % are found again, and of those within the Panda's 99.8 %.
 
 Franka's meshes of both arms, alike to 2 mm, stick out of the capsules by 30 mm at most (that of
 link 2), those of the base by 46 mm, of the hand by 9 mm: distances to keep have to cover it.

@@ -23,6 +23,8 @@ the other way as soon as the arm does what it was told; all of them, with number
 in a third of the ticks."""
 
 _POISONS = torch.tensor([torch.nan, torch.inf, -torch.inf, 1e300, -1e30], dtype=torch.float64)
+# Told for all arms at once; the time that passes is the control step.
+_STEPS = torch.cat([_POISONS, _POISONS.new_tensor([0.0, -1e-3, 5.0])])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +45,8 @@ class StreamConfig:
     poison: float = 1 / 3
     """Share of the ticks in which a number of a poisoned stream is none."""
     event: float = 2e-3
-    """Share of the ticks with a stop, a stale reading, or a person beside the tool; each."""
+    """Share of the ticks with a stop, a stale reading, a person beside the tool, or a step that
+    is none; each."""
     safety: SafetyConfig = field(default_factory=SafetyConfig)
 
 
@@ -90,6 +93,8 @@ def hostile_streams(config: StreamConfig, safety: SafetyFilter | None = None) ->
         u = command(k * dt, reading, v)
         J = arm.jacobian(reading).masked_fill(uncapped, 0)
         step = torch.tensor(dt, dtype=q.dtype)
+        if float(uniform(rng)) < config.event:
+            step = _STEPS[torch.randint(len(_STEPS), (), generator=rng)]
         hit = poisoned & (uniform(rng, count, 1) < config.poison)
         if bool(hit.any()):
             given = torch.cat([reading, u, J.flatten(-2)], dim=-1)
