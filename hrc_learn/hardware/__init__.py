@@ -3,4 +3,11 @@
 from hrc_learn.hardware.arm_process import ArmProcess as ArmProcess
 from hrc_learn.hardware.arm_process import DriverError as DriverError
 from hrc_learn.hardware.ending import ending_at_rest as ending_at_rest
+from hrc_learn.hardware.franky_arm import ArmFaultError as ArmFaultError
+from hrc_learn.hardware.franky_arm import CollisionConfig as CollisionConfig
 from hrc_learn.hardware.franky_arm import FrankyArm as FrankyArm
+from hrc_learn.hardware.franky_arm import FrankyConfig as FrankyConfig
+from hrc_learn.hardware.franky_arm import Load as Load
+from hrc_learn.hardware.franky_arm import RealtimeError as RealtimeError
+from hrc_learn.hardware.gripper import GripperError as GripperError
+from hrc_learn.hardware.gripper import GripperThread as GripperThread

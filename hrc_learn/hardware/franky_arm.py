@@ -1,94 +1,411 @@
-"""A Panda behind the `Arm` and `Gripper` protocols, by the driver package `franky`.
+"""A Franka arm behind the `Arm` and `Gripper` protocols, by the driver package `franky`.
 
-Written against the published interface of franky 2.0 (PyPI: franky-control), tested with a fake
-that speaks it. NOT RUN ON HARDWARE.
+Run with franky 2.0 (PyPI: franky-control) against simulators of the arm's network protocol; NOT
+RUN ON HARDWARE.
 """
 
 from __future__ import annotations
 
 import importlib
-import time
-from typing import Any
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal, get_args
 
 import numpy as np
 from jaxtyping import Float
 
+from hrc_learn.hardware.gripper import GripperError, GripperThread
 from hrc_learn.protocols import ArmState
 
-_NARROW = 0.005
-"""Openings below this are a wish to squeeze [m]."""
+Realtime = Literal["enforce", "ignore"]
+"""Whether a kernel without real-time scheduling is refused, or put up with."""
+
+_REALTIME_KERNEL = Path("/sys/kernel/realtime")
+"""Holds 1 under a kernel with PREEMPT_RT."""
+_ROUNDING = 1e-6
+"""Fraction of a limit by which a velocity may be beyond it, and is cut: a filter that leads
+along a limit rounds."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Load:
+    """What is mounted to the flange beyond the end effector that the arm is set up for."""
+
+    mass: float = 0.0
+    """[kg]"""
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Of mass, in the flange's frame [m]."""
+    inertia: tuple[tuple[float, float, float], ...] = ((0.0,) * 3,) * 3
+    """About that centre, along the flange's axes [kg m^2]."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.mass < float("inf"):
+            raise ValueError(f"mass of a load must not be negative, but is {self.mass} kg.")
+        if not np.isfinite(self.centre).all():
+            raise ValueError(f"centre of a load must be finite, but is {self.centre} m.")
+        tensor = np.array(self.inertia)
+        if tensor.shape != (3, 3) or not np.allclose(tensor, tensor.T, rtol=1e-9, atol=0):
+            raise ValueError(
+                f"inertia of a load must be a symmetric matrix, 3 by 3, but is {self.inertia}."
+            )
+        if np.linalg.eigvalsh(tensor).min() < 0:
+            raise ValueError(
+                f"inertia of a load must not be negative about any axis, but is {self.inertia}."
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class CollisionConfig:
+    """Estimated external load from which on the arm stops by a reflex.
+
+    By default that of the maker's own example of joint velocities (libfranka,
+    examples/generate_joint_velocity_motion.cpp), for contacts and collisions alike.
+    """
+
+    torque: tuple[float, ...] = (20.0, 20.0, 18.0, 18.0, 16.0, 14.0, 12.0)
+    """On each joint [N m]."""
+    force: tuple[float, ...] = (20.0, 20.0, 20.0, 25.0, 25.0, 25.0)
+    """At the end effector: along x, y, z [N], about them [N m]."""
+
+    def __post_init__(self) -> None:
+        for name, number in (("torque", 7), ("force", 6)):
+            values = getattr(self, name)
+            if len(values) != number or not all(0 < v < float("inf") for v in values):
+                raise ValueError(
+                    f"{name} of a collision must be {number} positive numbers, but is {values}."
+                )
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrankyConfig:
+    """How the driver leads the arm."""
+
+    dynamics: float = 0.3
+    """Fraction of the driver's own limits of acceleration and jerk, above 0 to 1. Velocities
+    reach the driver's limits whatever it is."""
+    timeout: float = 0.15
+    """How long a velocity holds [s]; then the driver brings the arm to rest."""
+    realtime: Realtime = "enforce"
+    """Whether a kernel without real-time scheduling is refused. Ignore it for simulators."""
+    grip_force: float = 20.0
+    """With which the gripper squeezes [N]."""
+    grip_speed: float = 0.1
+    """Of the fingers [m/s]."""
+    collision: CollisionConfig = field(default_factory=CollisionConfig)
+    """When the arm stops by a reflex."""
+    load: Load | None = None
+    """At the flange; None: as the arm has been told before."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.dynamics <= 1:
+            raise ValueError(f"dynamics must be in (0, 1], but is {self.dynamics}.")
+        for name in ("timeout", "grip_force", "grip_speed"):
+            if not 0 < getattr(self, name) < float("inf"):
+                raise ValueError(f"{name} must be positive, but is {getattr(self, name)}.")
+        if self.realtime not in get_args(Realtime):
+            raise ValueError(
+                f"realtime must be one of {', '.join(get_args(Realtime))}, but is "
+                f"{self.realtime!r}."
+            )
+
+
+class RealtimeError(RuntimeError):
+    """The machine has no real-time scheduling, and it is asked for."""
+
+
+class ArmFaultError(RuntimeError):
+    """The arm has stopped and takes no commands until `recover` is called."""
 
 
 class FrankyArm:
     """The arm and its gripper.
 
-    A velocity holds for `timeout` at most: the driver itself then brings the arm to rest, also
-    if this process has died.
+    A velocity holds for the config's `timeout` at most: the driver itself then brings the arm to
+    rest, also if this process has died. A command that comes later starts from rest, or from
+    whatever velocity is left.
+
+    After a reflex, a user stop or a lost connection every command raises `ArmFaultError`, until
+    `recover` has succeeded. The gripper has threads of its own (`GripperThread`): nothing here
+    waits for it, and what it fails at is told on stderr and by `gripper.check`.
+
+    Attributes:
+        gripper: On its threads.
     """
 
-    def __init__(
-        self,
-        ip: str,
-        *,
-        dynamics: float,
-        timeout: float,
-        grip_force: float,
-        grip_speed: float,
-    ):
+    def __init__(self, ip: str, config: FrankyConfig | None = None):
         """Connect.
 
         Args:
             ip: Address of the control box.
-            dynamics: Fraction of the driver's own limits.
-            timeout: How long a velocity holds [s].
-            grip_force: With which the gripper squeezes [N].
-            grip_speed: Of the fingers [m/s].
+            config: How the driver leads the arm.
 
         Raises:
             ImportError: The driver is not installed.
+            RealtimeError: The kernel has no real-time scheduling, and it is to be enforced.
+            ConnectionError: The arm cannot be reached.
+            ArmFaultError: It is stopped by its user stop or by an error that stays.
+            GripperError: Its gripper cannot be reached.
         """
-        self._franky = franky = _import_franky()
-        self._robot = franky.Robot(ip)
-        self._robot.recover_from_errors()
-        self._robot.relative_dynamics_factor = dynamics
-        self._gripper = franky.Gripper(ip)
-        self._hold = franky.Duration(round(1e3 * timeout))
-        self._force, self._speed = grip_force, grip_speed
-        self._width: float | None = None
+        self._ip, self.config = ip, config or FrankyConfig()
+        if self.config.realtime == "enforce":
+            require_realtime()
+        self._franky = _import_franky()
+        self._hold = self._franky.Duration(round(1e3 * self.config.timeout))
+        self._fault, self._lost = "", False
+        self._connect()
+        self.gripper = GripperThread(
+            partial(_FrankyGripper, self._franky, ip, self.config),
+        )
 
     def read(self) -> ArmState:
-        """Return the newest state."""
-        joints = self._robot.current_joint_state
+        """Return the newest state; `time` is the clock of the control box [s].
+
+        While the arm is at rest this waits for the next state, for a millisecond. After a
+        reflex it goes on, with the arm at rest.
+
+        Raises:
+            ArmFaultError: The connection is lost.
+        """
+        state = self._read()
         return ArmState(
-            time=time.monotonic(),
-            joint_position=np.array(joints.position, dtype=float),
-            joint_velocity=np.array(joints.velocity, dtype=float),
-            gripper_width=float(self._gripper.width),
+            time=state.time.to_sec(),
+            joint_position=np.array(state.q, dtype=float),
+            joint_velocity=np.array(state.dq, dtype=float),
+            gripper_width=self.gripper.width,
+            external_torque=np.array(state.tau_ext_hat_filtered, dtype=float),
         )
 
     def command(self, joint_velocity: Float[np.ndarray, "7"]) -> None:
-        """Set the joint velocities to hold [rad/s]."""
-        if not np.isfinite(joint_velocity).all():
-            raise ValueError(f"joint_velocity must be finite, but is {joint_velocity}.")
-        motion = self._franky.JointVelocityMotion(joint_velocity.tolist(), duration=self._hold)
-        self._robot.move(motion, asynchronous=True)
+        """Set the joint velocities to hold [rad/s].
+
+        Raises:
+            ValueError: They are not finite, or beyond the driver's limits.
+            ArmFaultError: The arm has stopped, or another one before this has been lost.
+        """
+        velocity = self._checked(joint_velocity)
+        self._raise_fault()
+        motion = self._franky.JointVelocityMotion(velocity.tolist(), duration=self._hold)
+        try:
+            # Raises what has ended the motion before, as does the next call after that.
+            running = self._robot.poll_motion()
+            if not running:
+                self._require_ready(self._read())
+            self._robot.move(motion, asynchronous=True)
+        except ArmFaultError:
+            raise
+        except Exception as error:
+            raise self._failed(error) from error
 
     def stop(self) -> None:
-        """Bring the arm to rest."""
-        self._robot.move(self._franky.JointVelocityStopMotion(), asynchronous=True)
+        """Bring the arm to rest.
+
+        Raises:
+            ArmFaultError: The connection is lost. The control box then brings it to rest.
+        """
+        if not self._fault:
+            try:
+                if self._robot.poll_motion():
+                    self._robot.move(self._franky.JointVelocityStopMotion(), asynchronous=True)
+            except Exception as error:
+                # What ended the motion: the arm is at rest already. The next command tells.
+                self._failed(error)
+        if self._lost:
+            self._raise_fault()
+
+    def recover(self) -> None:
+        """Make the arm ready again after a fault, once its cause is gone.
+
+        Connects anew where the connection was lost.
+
+        Raises:
+            ArmFaultError: The arm stays stopped; the message says by what.
+            ConnectionError: It cannot be reached.
+        """
+        try:
+            self._recover()
+        except self._franky.NetworkException:
+            del self._robot  # a control box takes one connection only
+            self._connect()
+        self._fault, self._lost = "", False
 
     def move(self, width: float) -> None:
         """Open the gripper to a width, or squeeze what is between its fingers [m].
 
-        Sent once for each new width: the gripper takes its time, and no stream of commands.
+        Returns at once; `gripper` tells what came of it.
         """
-        if self._width is not None and abs(width - self._width) < _NARROW:
-            return
-        self._width = width
-        if width < _NARROW:
-            self._gripper.grasp_async(0.0, self._speed, self._force, epsilon_outer=1.0)
+        self.gripper.move(width)
+
+    def close(self) -> None:
+        """Bring the arm to rest and disconnect.
+
+        Raises:
+            ArmFaultError: The connection is lost.
+        """
+        try:
+            self.stop()
+            self._robot.join_motion(timeout=1.0)
+        finally:
+            self.gripper.close()
+
+    def __enter__(self) -> FrankyArm:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _connect(self) -> None:
+        franky, config = self._franky, self.config
+        mode = {
+            "enforce": franky.RealtimeConfig.Enforce,
+            "ignore": franky.RealtimeConfig.Ignore,
+        }[config.realtime]
+        try:
+            self._robot = franky.Robot(self._ip, realtime_config=mode)
+        except franky.RealtimeException as error:
+            raise _no_realtime(str(error)) from error
+        except (franky.NetworkException, franky.IncompatibleVersionException) as error:
+            raise ConnectionError(
+                f"cannot connect to an arm at {self._ip} ({error}): check the cable and the "
+                "address, switch on the arm, release its joints and activate FCI on its desk, "
+                "and take the build of franky-control for its server version."
+            ) from error
+        self._newest: Any = None
+        self._recover()
+        robot, collision, load = self._robot, config.collision, config.load
+        robot.relative_dynamics_factor = franky.RelativeDynamicsFactor(
+            1.0, config.dynamics, config.dynamics
+        )
+        robot.set_collision_behavior(
+            collision.torque, collision.torque, collision.force, collision.force
+        )
+        if load is not None:
+            # By columns, which for a symmetric matrix is by rows.
+            robot.set_load(load.mass, load.centre, np.ravel(load.inertia).tolist())
+        self._fastest = np.array(robot.joint_velocity_limit.get(), dtype=float)
+
+    def _recover(self) -> None:
+        try:
+            self._robot.poll_motion()
+        except Exception:  # noqa: S110 - what ended the last motion is what is recovered from
+            pass
+        if not self._robot.recover_from_errors():
+            raise self._stopped(self._robot.state, "its error recovery failed")
+        self._require_ready(self._robot.state)
+
+    def _read(self) -> Any:
+        """Newest state of the driver."""
+        try:
+            state = self._robot.state
+        except Exception as error:
+            raise self._failed(error) from error
+        # As a motion begins, the driver has that of the end of the last one for a cycle.
+        if self._newest is None or state.time.to_msec() >= self._newest.time.to_msec():
+            self._newest = state
+        return self._newest
+
+    def _checked(self, velocity: Float[np.ndarray, "7"]) -> Float[np.ndarray, "7"]:
+        if not np.isfinite(velocity).all():
+            raise ValueError(f"joint_velocity must be finite, but is {velocity}.")
+        beyond = np.abs(velocity) > self._fastest * (1 + _ROUNDING)
+        if beyond.any():
+            k = int(beyond.argmax())
+            # The driver would refuse it too, but only to the command after this.
+            raise ValueError(
+                f"joint_velocity of joint {k + 1} must be at most {self._fastest[k]:g} rad/s, "
+                f"the driver's limit, but is {velocity[k]:g}."
+            )
+        return np.clip(velocity, -self._fastest, self._fastest)
+
+    def _require_ready(self, state: Any) -> None:
+        mode = self._franky.RobotMode
+        if state.robot_mode not in (mode.Idle, mode.Move):
+            raise self._stopped(state, "it takes no commands")
+
+    def _stopped(self, state: Any, what: str) -> ArmFaultError:
+        mode = self._franky.RobotMode
+        cure = {
+            mode.UserStopped: "release the user stop, then call recover()",
+            mode.Guiding: "let go of the guiding buttons, then call recover()",
+        }.get(state.robot_mode, "make room around the arm, then call recover()")
+        errors = ", ".join(map(str, _names(state.current_errors))) or "no error is told"
+        self._fault = (
+            f"the arm at {self._ip} is in mode {state.robot_mode.name} ({errors}), and {what}: "
+            f"{cure}."
+        )
+        return ArmFaultError(self._fault)
+
+    def _failed(self, error: Exception) -> ArmFaultError:
+        if self._fault:  # what follows from it tells less
+            return ArmFaultError(self._fault)
+        self._lost = isinstance(error, self._franky.NetworkException)
+        if self._lost:
+            cure = "the control box brings it to rest. Check the cable, then call recover()"
+        elif isinstance(error, self._franky.RealtimeException):
+            cure = str(_no_realtime("no permission to schedule in real time"))
         else:
-            self._gripper.move_async(width, self._speed)
+            cure = "it is at rest. Make room around it, then call recover()"
+        self._fault = (
+            f"the motion of the arm at {self._ip} ended by {type(error).__name__}: "
+            f"{str(error).rstrip('.')}; {cure}."
+        )
+        return ArmFaultError(self._fault)
+
+    def _raise_fault(self) -> None:
+        if self._fault:
+            raise ArmFaultError(self._fault)
+
+
+class _FrankyGripper:
+    """The arm's gripper, as `GripperThread` drives it."""
+
+    def __init__(self, franky: Any, ip: str, config: FrankyConfig):
+        self._config = config
+        try:
+            self._gripper = franky.Gripper(ip)
+        except franky.Exception as error:
+            raise GripperError(
+                f"the gripper at {ip} cannot be reached ({error}): it must be switched on in "
+                "the arm's settings as its end effector"
+            ) from error
+
+    def read_width(self) -> float:
+        return float(self._gripper.width)
+
+    def move(self, width: float) -> bool:
+        return self._gripper.move_async(width, self._config.grip_speed).get()
+
+    def squeeze(self) -> bool:
+        force, speed = self._config.grip_force, self._config.grip_speed
+        # Whatever its width, a thing between the fingers is a grasp.
+        return self._gripper.grasp_async(0.0, speed, force, epsilon_outer=1.0).get()
+
+
+def require_realtime() -> None:
+    """Check that this machine's kernel schedules in real time.
+
+    Raises:
+        RealtimeError: It does not.
+    """
+    try:
+        has = _REALTIME_KERNEL.read_text(encoding="utf-8").strip() == "1"
+    except OSError:
+        has = False
+    if not has:
+        raise _no_realtime("this kernel does not schedule in real time")
+
+
+def _no_realtime(why: str) -> RealtimeError:
+    return RealtimeError(
+        f"{why}: boot a kernel with PREEMPT_RT and allow the user rtprio 99 in "
+        "/etc/security/limits.d. Where late commands do no harm, as with a simulator, give "
+        "realtime='ignore'; a real arm then stops whenever the machine is late."
+    )
+
+
+def _names(errors: Any) -> list[str]:
+    """Of the errors that are set."""
+    return [name for name in dir(errors) if not name.startswith("_") and getattr(errors, name)]
 
 
 def _import_franky() -> Any:

@@ -1,0 +1,212 @@
+"""A real gripper on threads of its own: no loop ever waits for its fingers."""
+
+from __future__ import annotations
+
+import sys
+import threading
+from collections.abc import Callable
+from typing import Protocol, final, runtime_checkable
+
+_NARROW = 0.005
+"""Openings below this are a wish to squeeze, and such a difference is none [m]: a tenth of what
+an object that two fingers take is wide."""
+_BETWEEN_READINGS = 0.02
+"""From one reading of the width to the next [s]: skills look at it every 10 ms and act on
+differences of millimetres, which fingers at 0.1 m/s take 20 ms for."""
+_BEFORE_NEXT_TRY = 1.0
+"""After the connection failed [s]: a control box takes some seconds to start again."""
+
+
+class GripperError(RuntimeError):
+    """A gripper did not do what it was told, or cannot be reached."""
+
+
+@runtime_checkable
+class GripperDriver(Protocol):
+    """A gripper whose calls take as long as its fingers do.
+
+    The width is read by one thread while another waits in `move` or `squeeze`.
+    """
+
+    def read_width(self) -> float:
+        """Return the opening [m]; waits for the next reading."""
+        ...
+
+    def move(self, width: float) -> bool:
+        """Bring the fingers to an opening [m] and wait until they are there; False: they did
+        not get there."""
+        ...
+
+    def squeeze(self) -> bool:
+        """Close on whatever is between the fingers and wait until they press on it; False: they
+        do not."""
+        ...
+
+
+def report_failure(failure: GripperError) -> None:
+    """Tell on stderr what the gripper failed at."""
+    print(f"gripper: {failure}", file=sys.stderr)
+
+
+@final
+class GripperThread:
+    """A `Gripper` that neither waits nor raises in the middle of an arm's loop.
+
+    with GripperThread(open_driver) as gripper:
+        gripper.move(0.0)  # returns at once; 0 squeezes
+        gripper.width  # the newest known
+        gripper.check()  # raises what has failed since `move`
+
+    One thread reads the width, another one carries out moves: the newest one asked for, after
+    the one under way. A connection that falls is opened again. What fails is told to `report`
+    and kept until the next move, so that a task can look for it where it is ready to, and a
+    control loop goes on.
+    """
+
+    def __init__(
+        self,
+        open_driver: Callable[[], GripperDriver],
+        *,
+        startup: float = 5.0,
+        report: Callable[[GripperError], object] = report_failure,
+    ):
+        """Connect and wait for the first reading.
+
+        Args:
+            open_driver: Connects to the gripper.
+            startup: Longest that connecting may take [s].
+            report: Told of each failure, by the thread that met it.
+
+        Raises:
+            GripperError: It cannot be reached.
+        """
+        self._open, self._report = open_driver, report
+        self._width: float | None = None
+        self._failure: GripperError | None = None
+        self._driver: GripperDriver | None = None
+        self._wanted: float | None = None
+        self._last: float | None = None
+        self._news = threading.Condition()
+        self._closed = False
+        self._threads = [
+            threading.Thread(target=work, name=f"gripper {name}", daemon=True)
+            for name, work in (("reader", self._read), ("mover", self._carry_out))
+        ]
+        for thread in self._threads:
+            thread.start()
+        with self._news:
+            self._news.wait_for(lambda: self._width is not None or self._failure, startup)
+            if self._width is not None:
+                return
+            failure = self._failure
+        self.close()
+        raise failure or GripperError(
+            f"the gripper has not told its width for {startup:g} s: is it mounted, switched on "
+            "and homed?"
+        )
+
+    @property
+    def width(self) -> float:
+        """Newest opening known [m]."""
+        assert self._width is not None  # the constructor waits for the first
+        return self._width
+
+    @property
+    def failure(self) -> GripperError | None:
+        """What failed since the last new opening was asked for; None: nothing did."""
+        return self._failure
+
+    def check(self) -> None:
+        """Raise what failed since the last new opening was asked for.
+
+        Raises:
+            GripperError: A move failed, or the gripper cannot be reached.
+        """
+        with self._news:
+            failure = self._failure
+        if failure is not None:
+            raise failure
+
+    def move(self, width: float) -> None:
+        """Ask for an opening, or to squeeze what is between the fingers [m].
+
+        Taken once for each new opening, so that it may be asked for in every step of a loop. One
+        that failed is not tried again before another has been asked for: fingers that move by
+        themselves, once a connection is back, would surprise whoever went to look.
+
+        Raises:
+            ValueError: The opening is not finite, or negative.
+        """
+        if not 0 <= width < float("inf"):
+            raise ValueError(f"width must be finite and not negative [m], but is {width}.")
+        with self._news:
+            if self._last is not None and abs(width - self._last) < _NARROW:
+                return
+            self._last = self._wanted = width
+            if self._driver is not None:
+                self._failure = None
+            self._news.notify_all()
+
+    def close(self) -> None:
+        """End the threads, as soon as the driver returns to them; the fingers stay."""
+        with self._news:
+            self._closed = True
+            self._news.notify_all()
+
+    def __enter__(self) -> GripperThread:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _read(self) -> None:
+        while not self._closed:
+            pause = _BETWEEN_READINGS
+            try:
+                width = (self._driver or self._connect()).read_width()
+                with self._news:
+                    self._width = float(width)
+                    self._news.notify_all()
+            except Exception as error:  # a driver's, of whatever kind
+                self._driver = None
+                self._fail("cannot be reached, and is tried again", error)
+                pause = _BEFORE_NEXT_TRY
+            with self._news:
+                self._news.wait_for(lambda: self._closed, pause)
+
+    def _connect(self) -> GripperDriver:
+        driver = self._open()
+        with self._news:
+            self._driver = driver
+            self._news.notify_all()
+        return driver
+
+    def _carry_out(self) -> None:
+        while True:
+            with self._news:
+                self._news.wait_for(
+                    lambda: self._closed or not (self._wanted is None or self._driver is None)
+                )
+                if self._closed:
+                    return
+                driver, width, self._wanted = self._driver, self._wanted, None
+            assert driver is not None and width is not None
+            squeezes = width < _NARROW
+            what = "close on anything" if squeezes else f"open to {1e3 * width:.0f} mm"
+            try:
+                done = driver.squeeze() if squeezes else driver.move(width)
+                error = None
+            except Exception as raised:
+                done, error = False, raised
+            if not done:
+                self._fail(f"did not {what}", error)
+
+    def _fail(self, what: str, error: Exception | None) -> None:
+        because = "" if error is None else f" ({type(error).__name__}: {error})"
+        failure = GripperError(f"the gripper {what}{because}.")
+        with self._news:
+            told = str(self._failure) == str(failure)
+            self._failure = failure
+            self._news.notify_all()
+        if not told and not self._closed:
+            self._report(failure)
