@@ -6,6 +6,7 @@ RUN ON HARDWARE.
 
 from __future__ import annotations
 
+import atexit
 import importlib
 from dataclasses import dataclass, field
 from functools import partial
@@ -26,6 +27,10 @@ _REALTIME_KERNEL = Path("/sys/kernel/realtime")
 _ROUNDING = 1e-6
 """Fraction of a limit by which a velocity may be beyond it, and is cut: a filter that leads
 along a limit rounds."""
+
+_COMING_TO_REST = 2.0
+"""Longest wait for the arm to rest [s]: from the fastest velocity with 0.15 of the driver's
+acceleration."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,6 +162,8 @@ class FrankyArm:
         self.gripper = GripperThread(
             partial(_FrankyGripper, self._franky, ip, self.config),
         )
+        # The driver's destructor ends the process by a signal while a motion is under way.
+        atexit.register(self.close)
 
     def read(self) -> ArmState:
         """Return the newest state; `time` is the clock of the control box [s].
@@ -242,9 +249,10 @@ class FrankyArm:
         Raises:
             ArmFaultError: The connection is lost.
         """
+        atexit.unregister(self.close)
         try:
             self.stop()
-            self._robot.join_motion(timeout=1.0)
+            self._robot.join_motion(timeout=_COMING_TO_REST)
         finally:
             self.gripper.close()
 

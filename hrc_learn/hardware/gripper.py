@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import sys
 import threading
 from collections.abc import Callable
@@ -15,6 +16,9 @@ _BETWEEN_READINGS = 0.02
 differences of millimetres, which fingers at 0.1 m/s take 20 ms for."""
 _BEFORE_NEXT_TRY = 1.0
 """After the connection failed [s]: a control box takes some seconds to start again."""
+
+_ENDING = 2.0
+"""Longest wait for each thread to end [s]: twice what libfranka waits for a reading."""
 
 
 class GripperError(RuntimeError):
@@ -92,6 +96,9 @@ class GripperThread:
             threading.Thread(target=work, name=f"gripper {name}", daemon=True)
             for name, work in (("reader", self._read), ("mover", self._carry_out))
         ]
+        # A thread within a driver's own code must not be cut off by the end of the interpreter:
+        # that ends the whole process by a signal.
+        atexit.register(self.close)
         for thread in self._threads:
             thread.start()
         with self._news:
@@ -148,10 +155,13 @@ class GripperThread:
             self._news.notify_all()
 
     def close(self) -> None:
-        """End the threads, as soon as the driver returns to them; the fingers stay."""
+        """End the threads, once the driver returns to them; the fingers stay."""
+        atexit.unregister(self.close)
         with self._news:
             self._closed = True
             self._news.notify_all()
+        for thread in self._threads:
+            thread.join(_ENDING)
 
     def __enter__(self) -> GripperThread:
         return self

@@ -1,5 +1,7 @@
 """Everything that moves in a world, to be drawn: shapes, poses, and where they have been."""
 
+from collections.abc import Callable
+
 import mujoco
 import numpy as np
 from jaxtyping import Bool, Float
@@ -93,8 +95,15 @@ def _triple(vector: np.ndarray) -> tuple[float, float, float]:
 class MotionLog:
     """Remembers where everything that moves was at each step, and how near the worker was."""
 
-    def __init__(self, world: World):
+    def __init__(self, world: World, advance: Callable[[float], None] | None = None):
+        """Begin.
+
+        Args:
+            world: The world.
+            advance: Lets a time pass in it [s]; None: its own physics does.
+        """
         self._world = world
+        self._let_pass = advance or world.advance
         self._bodies = MovingBodies(world)
         self._distance = None if world.config.worker is None else WorkerDistance(world)
         self._positions: list[np.ndarray] = []
@@ -113,7 +122,7 @@ class MotionLog:
         position, orientation = self._bodies.poses()
         self._positions.append(position)
         self._orientations.append(orientation)
-        self._world.advance(duration)
+        self._let_pass(duration)
 
     def bodies(self, steps: int | None = None) -> tuple[Body, ...]:
         """Everything that moved, as it is to be drawn.

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from hrc_learn.experiments.arm_access import SIMULATED, ArmAccess
 from hrc_learn.experiments.collaboration.pulls import PullEffect, pull_effects
 from hrc_learn.experiments.collaboration.worker import (
     move_worker,
@@ -212,6 +213,7 @@ def simulate_collaboration(
     cell_config: WorkCellConfig | None = None,
     imperfections: Imperfections | None = None,
     worker: bool = False,
+    access: ArmAccess = SIMULATED,
     mapping: ForceMapping = DEFAULT_MAPPING,
     drawings: Sequence[DrawnInterval] = (),
     seed: int = 0,
@@ -236,6 +238,7 @@ def simulate_collaboration(
         cell_config: How the loop runs; images may be late or lost.
         imperfections: Of arm, calibration, camera and objects; None: none.
         worker: Whether a worker comes to the table, whom nobody expects.
+        access: How the arm is led.
         mapping: How these forces act.
         drawings: What a scripted person draws, in the time of the run.
         seed: Of the objects' poses and of image noise.
@@ -259,11 +262,12 @@ def simulate_collaboration(
         delay=max(cell_config.latency.delay, sizes.image_delay),
         frame_loss=max(cell_config.latency.frame_loss, sizes.image_loss),
     )
-    safety = sizes.plant(cell_config.safety)
+    plant = access.told(sizes)
+    safety = plant.plant(cell_config.safety)
     cell_config = replace(
-        cell_config, latency=latency, safety=safety, command_delay=sizes.following_delay
+        cell_config, latency=latency, safety=safety, command_delay=plant.following_delay
     )
-    config = _on_plant(config or PickAndPlaceConfig(), sizes)
+    config = _on_plant(config or PickAndPlaceConfig(), plant)
     items = workplace.scene.objects
     _check_shelves(workplace, shelves)
     # Drawn apart, so that runs with and without the worker are alike but for him.
@@ -288,18 +292,11 @@ def simulate_collaboration(
         tracker = WorkerSensor(visit, lambda: world.time, sizes, chance)
         watch = PersonWatch(tracker, whole_arm(scene.arm), safety.separation)
         move_worker(world, visit)
-    motion = MotionLog(world)
     occluder = ScriptedOcclusion(world, disturbances.occlusions)
     eyes = ChangingCamera(
         workplace.scene.camera,
         lambda model: open_camera(world, camera, model, rng=rng, noise=sizes.camera_noise),
     )
-
-    def advance(duration: float) -> None:
-        motion.advance(duration)
-        occluder.update()
-        if visit is not None:
-            move_worker(world, visit)
 
     flat: dict[str, set[str]] = {HOME: set(), RELEASE: set()}
 
@@ -321,6 +318,15 @@ def simulate_collaboration(
             eyes.change(world.time, model)
 
     with torch.inference_mode(), ExitStack() as stack:
+        driven = stack.enter_context(access.open(world))
+        motion = MotionLog(world, driven.advance)
+
+        def advance(duration: float) -> None:
+            motion.advance(duration)
+            occluder.update()
+            if visit is not None:
+                move_worker(world, visit)
+
         human, passing, beside = person, advance, None
         if drawings:
             human = CombinedInput(person, ScriptedDrawing(drawings))
@@ -330,8 +336,8 @@ def simulate_collaboration(
             human, passing = beside.joined(human, advance)
         cell = WorkCell(
             chain=panda,
-            arm=world.arm,
-            gripper=world.arm,
+            arm=driven.arm,
+            gripper=driven.gripper,
             sensor=MarkerSensor(eyes, workplace.scene.marker_ids),
             human=human,
             advance=passing,

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from hrc_learn.experiments.arm_access import SIMULATED, ArmAccess
 from hrc_learn.experiments.run_recording import LiveView, no_live_view
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import (
@@ -280,6 +281,7 @@ def simulate_grasp(
     camera: CameraKind = "auto",
     config: GraspingConfig | None = None,
     rng: np.random.Generator,
+    access: ArmAccess = SIMULATED,
     drawings: Sequence[DrawnInterval] = (),
     page: PageConfig | None = None,
     view: LiveView = no_live_view,
@@ -296,6 +298,7 @@ def simulate_grasp(
         camera: Which kind of camera watches.
         config: How objects are grasped.
         rng: Source of image noise, and of which images are lost.
+        access: How the arm is led.
         drawings: What a scripted person draws, in the time of the run.
         page: Serve a page from which people draw and pull the arm too, and let the world go
             on in real time; None: no page.
@@ -305,12 +308,12 @@ def simulate_grasp(
     workplace = scene.workplace.approached(aiming.approach)
     scene = replace(scene, workplace=workplace)
     world = scene.world()
-    item, motion = workplace.scene.objects[0], MotionLog(world)
-    sizes = world.imperfections.sizes
+    item, sizes = workplace.scene.objects[0], world.imperfections.sizes
+    plant = access.told(sizes)
     eye = open_camera(world, camera, rng=rng, noise=sizes.camera_noise)
     latency = LatencyConfig(delay=sizes.image_delay, frame_loss=sizes.image_loss)
     config = config or GraspingConfig()
-    law = replace(config.controller, safety=sizes.plant(config.controller.safety))
+    law = replace(config.controller, safety=plant.plant(config.controller.safety))
     config = replace(config, controller=law)
 
     def check(plan: Plan) -> None:
@@ -319,6 +322,8 @@ def simulate_grasp(
     result, failure = None, ""
     dt = WorkCellConfig().dt
     with torch.inference_mode(), ExitStack() as stack:
+        driven = stack.enter_context(access.open(world))
+        motion = MotionLog(world, driven.advance)
         human, passing, beside = ScriptedDrawing(drawings), motion.advance, None
         if page is not None:
             opened = task_page(world, dt, page, on_page, title="Grasping")
@@ -326,16 +331,16 @@ def simulate_grasp(
             human, passing = beside.joined(human, motion.advance)
         cell = WorkCell(
             chain=panda,
-            arm=world.arm,
-            gripper=world.arm,
+            arm=driven.arm,
+            gripper=driven.gripper,
             sensor=MarkerSensor(eye, workplace.scene.marker_ids),
             human=human,
             advance=passing,
             config=WorkCellConfig(
                 dt=dt,
                 latency=latency,
-                safety=sizes.plant(WorkCellConfig().safety),
-                command_delay=sizes.following_delay,
+                safety=plant.plant(WorkCellConfig().safety),
+                command_delay=plant.following_delay,
             ),
             rng=rng,
         )

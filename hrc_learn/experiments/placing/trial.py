@@ -6,6 +6,7 @@ The plan is carried out whether or not it is free: contacts are counted, not for
 """
 
 from collections.abc import Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.demos import Demonstration
+from hrc_learn.experiments.arm_access import SIMULATED, ArmAccess
 from hrc_learn.experiments.grip import place_angle
 from hrc_learn.experiments.placing.arm_angle_ablation import Ablation
 from hrc_learn.experiments.run_recording import (
@@ -98,6 +100,7 @@ def place(
     speed: float = 1.5,
     world: World | None = None,
     correction: PlaceCorrection | None = None,
+    access: ArmAccess = SIMULATED,
     view: LiveView = no_live_view,
 ) -> SimulatedPlacing:
     """Carry the scene's first object, already in the gripper, to a shelf and release it.
@@ -112,6 +115,7 @@ def place(
         world: Of that workplace, to be used again, with its imperfections; a new one without
             any if None.
         correction: Of the arm's readings; None: the arm believes them.
+        access: How the arm is led.
         view: Dashboard of the run while it goes on.
 
     Raises:
@@ -122,19 +126,22 @@ def place(
     item = workplace.scene.objects[0]
     world = world or World(workplace.scene)
     world.hold(item.name, start.numpy())
-    motion, sizes = MotionLog(world), world.imperfections.sizes
-    cell = WorkCell(
-        chain=panda,
-        arm=world.arm,
-        gripper=world.arm,
-        human=ScriptedPerturbation(panda, ()),
-        advance=motion.advance,
-        config=WorkCellConfig(
-            safety=sizes.plant(WorkCellConfig().safety),
-            command_delay=sizes.following_delay,
-        ),
-    )
-    with torch.inference_mode(), view(cell, world, motion):
+    plant = access.told(world.imperfections.sizes)
+    with torch.inference_mode(), ExitStack() as stack:
+        driven = stack.enter_context(access.open(world))
+        motion = MotionLog(world, driven.advance)
+        cell = WorkCell(
+            chain=panda,
+            arm=driven.arm,
+            gripper=driven.gripper,
+            human=ScriptedPerturbation(panda, ()),
+            advance=motion.advance,
+            config=WorkCellConfig(
+                safety=plant.plant(WorkCellConfig().safety),
+                command_delay=plant.following_delay,
+            ),
+        )
+        stack.enter_context(view(cell, world, motion))
         plan = skill.plan(cell.joints, read, space=space, dt=cell.config.dt, speed=speed)
         cell.begin_phase(TRANSFER)
         cell.follow_path(plan.path)
@@ -145,7 +152,7 @@ def place(
         below = Pose(read.position.clone(), read.orientation)
         below.position[2] -= workplace.lowering(item.half_size)
         cell.move_until_contact(below)
-        world.arm.move(OPEN)
+        cell.gripper.move(OPEN)
         cell.hold_pose(_OPENING)
         cell.begin_phase(RETREAT)
         cell.move_straight(_back(read), speed=_RETREAT_SPEED)

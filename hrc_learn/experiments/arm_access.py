@@ -1,0 +1,97 @@
+"""How a run leads the arm of its world: directly, or by the driver of the real one.
+
+    access = through_franky(FrankyConfig(dynamics=0.3, realtime="ignore"))
+    simulate_collaboration(aiming, placing, shelves, access=access)
+
+By the driver the same task goes through all that stands before a real arm: its package, its
+sockets, and the 1 ms cycles of its protocol, which the world answers.
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, closing, contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+from hrc_learn.hardware import FrankyArm, FrankyConfig
+from hrc_learn.protocols import Arm, Gripper
+from hrc_learn.sim import Imperfections, World
+from hrc_learn.sim.protocol_server import ServedArm, serve_world
+
+FRANKY_DELAY = 0.003
+"""From a command to franky until the arm's servos have it [s]: two cycles of the protocol, and
+one that the state read before is old. Measured with commands every 10 ms."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OpenedArm:
+    """The arm of a world, ready to be led."""
+
+    arm: Arm
+    gripper: Gripper
+    advance: Callable[[float], None]
+    """Lets a time pass in the world [s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArmAccess:
+    """How a run leads the arm of its world."""
+
+    open: Callable[[World], AbstractContextManager[OpenedArm]]
+    """Connects to the arm of a world that is at rest, until the run ends."""
+    delay: float = 0.0
+    """From a command until the arm's servos have it [s]."""
+    dynamics: float = 1.0
+    """Fraction of the arm's acceleration that the driver uses."""
+
+    def told(self, sizes: Imperfections) -> Imperfections:
+        """What a controller has to be told of the arm: its own imperfections and the driver's."""
+        return replace(
+            sizes,
+            command_delay=sizes.command_delay + self.delay,
+            slowness=max(sizes.slowness, 1 - self.dynamics),
+        )
+
+
+@contextmanager
+def _directly(world: World) -> Iterator[OpenedArm]:
+    yield OpenedArm(arm=world.arm, gripper=world.arm, advance=world.advance)
+
+
+SIMULATED = ArmAccess(open=_directly)
+"""The simulated arm itself."""
+
+
+def through_franky(config: FrankyConfig | None = None) -> ArmAccess:
+    """Over the network protocol, by the driver package franky.
+
+    Args:
+        config: How the driver leads the arm; None: as a real one, but for real time, which a
+            server that waits for each answer does not need, and the grip of the simulated hand.
+    """
+    config = config or FrankyConfig(realtime="ignore", grip_force=40.0)
+    return through_protocol(
+        partial(FrankyArm, config=config), delay=FRANKY_DELAY, dynamics=config.dynamics
+    )
+
+
+def through_protocol(
+    open_driver: Callable[[str], Any], *, delay: float, dynamics: float
+) -> ArmAccess:
+    """Over the network protocol, by any driver.
+
+    Args:
+        open_driver: Connects to the arm at an address: an `Arm` and a `Gripper` with `close`.
+        delay: From a command until the arm's servos have it [s].
+        dynamics: Fraction of the arm's acceleration that the driver uses.
+    """
+
+    @contextmanager
+    def open_arm(world: World) -> Iterator[OpenedArm]:
+        with serve_world(world) as server:
+            with server.running():
+                driver = open_driver(server.address)
+            with closing(ServedArm(driver, server)) as arm:
+                yield OpenedArm(arm=arm, gripper=arm, advance=server.advance)
+
+    return ArmAccess(open=open_arm, delay=delay, dynamics=dynamics)

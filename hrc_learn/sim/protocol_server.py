@@ -1,0 +1,371 @@
+"""The simulated workplace behind the network protocol of a Franka arm.
+
+A driver for the real arm connects to it over sockets and leads the arm of our scene in cycles of
+1 ms. The protocol is spoken by the package franky-sim, the physics is `World`'s. What there is
+differs from what is spoken about: a Panda with our limits answers as a Franka Research 3 (server
+version 10). For joint velocities and positions that is one and the same; the driver's limits
+are its own, and it gets no answer to commands of torque.
+"""
+
+from __future__ import annotations
+
+import random
+import threading
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, final
+
+import numpy as np
+from jaxtyping import Float
+
+from hrc_learn.protocols import ArmState
+from hrc_learn.sim.panda_model import FINGER_STROKE
+from hrc_learn.sim.world import World
+
+if TYPE_CHECKING:
+    from franky_sim.base_simulator import BaseSimulator
+
+CYCLE = 1e-3
+"""Of the protocol [s]."""
+_LATE = 0.01
+"""For which a cycle waits for the driver's answer [s]: ten times what it takes, on a machine
+that does something else besides."""
+_SIGN_OF_LIFE = 0.2
+"""A driver that has heard nothing for 1 s takes its connection for lost (libfranka). While
+whoever advances the time is busy, a cycle goes by after each of these [s]."""
+_CATCH_UP = 20.0
+"""Rate at which joints commanded by position approach it [1/s]: those of franky's motions move
+on by themselves, so this only takes away what rounding leaves."""
+
+
+class ArmServer:
+    """Lets a world go on in cycles of the arm's protocol, as one who drives it lets time pass.
+
+        with serve_world(world) as server:
+            arm = FrankyArm(server.address, FrankyConfig(realtime="ignore"))
+            with server.running():
+                arm.command(velocity)
+            server.advance(0.01)
+
+    The clock is the world's, and no faster or slower than the machine can answer: within
+    `advance` each cycle waits for the driver's answer to the last. Elsewhere the world stands
+    still, but for signs of life, so that it may be looked at; calls of the driver, which may
+    wait for the next cycle, belong within `running`.
+
+    Attributes:
+        world: The world.
+        address: Of the arm, for its driver.
+        cycles: How many have gone by.
+        missed: How many of them the driver had a motion in, and did not answer in time.
+    """
+
+    def __init__(self, world: World, addresses: Iterable[str]):
+        """Listen; `serve_world` does this and ends it.
+
+        Args:
+            world: The world. Its physics goes by steps of a cycle from now on.
+            addresses: Of this machine; the first one is taken that is free.
+
+        Raises:
+            ImportError: The package franky-sim is not installed.
+            OSError: None of the addresses is free.
+        """
+        self.world = world
+        self.cycles = self.missed = 0
+        simulator, self._robot, server = _protocol(world)
+        self._server = server(self._robot, list(addresses))
+        self._server.init()
+        self._simulator = simulator
+        self.address: str = self._server.hostname
+        simulator.init()
+        simulator.start()
+        self._server.process_commands()  # nobody's: a step wants a command before it
+        self._due = world.time
+        # Until when the thread may go on; None: as long as calls of the driver take.
+        self._until: float | None = world.time
+        self._sent = 0
+        self._error: BaseException | None = None
+        self._closed = False
+        self._turn = threading.Condition()
+        self._thread = threading.Thread(target=self._serve, name="arm server", daemon=True)
+        self._thread.start()
+
+    @property
+    def clock_offset(self) -> float:
+        """What the world's time is ahead of the arm's clock, which starts when a driver
+        connects [s]."""
+        # Cycles are numbered from 0, and the number of the last is the driver's time.
+        return self.world.time - (self._sent - 1) * CYCLE
+
+    def advance(self, duration: float) -> None:
+        """Let time pass: until so long after the last call has been over [s].
+
+        What the driver's calls took in between is part of it, as of a loop at a fixed rate.
+
+        Raises:
+            PhysicsError: The simulation diverged.
+        """
+        # Late by more than a period, a loop lets go what is lost.
+        self._due = max(self._due + duration, self.world.time)
+        with self._turn:
+            self._until = self._due
+            self._turn.notify_all()
+            self._turn.wait_for(self._has_paused)
+        self._raise_error()
+
+    @contextmanager
+    def running(self) -> Iterator[None]:
+        """Let the world go on in real time, at most, while the driver is called."""
+        with self._turn:
+            self._until = None
+            self._turn.notify_all()
+        try:
+            yield
+        finally:
+            with self._turn:
+                self._until = self.world.time
+                self._turn.notify_all()
+        self._raise_error()
+
+    def close(self) -> None:
+        """End all connections; the world stays as it is."""
+        with self._turn:
+            self._closed = True
+            self._turn.notify_all()
+        self._thread.join()
+        self._hang_up()
+        self._simulator.cleanup()
+
+    def _hang_up(self) -> None:
+        self._server.cleanup()
+        self._server.reset_state()
+        self._server.gripper_server.reset_state()
+
+    def _has_paused(self) -> bool:
+        return self._error is not None or (self._until is not None and not self._may_go_on())
+
+    def _may_go_on(self) -> bool:
+        # Times are sums of rounded cycles.
+        return self._until is None or self.world.time < self._until - CYCLE / 2
+
+    def _raise_error(self) -> None:
+        if self._error is not None:
+            raise self._error
+
+    def _serve(self) -> None:
+        while True:
+            started = time.monotonic()
+            with self._turn:
+                self._turn.wait_for(lambda: self._closed or self._may_go_on(), _SIGN_OF_LIFE)
+                if self._closed:
+                    return
+                try:
+                    self._cycle()
+                except Exception as error:  # of the physics, or a mode that is not served
+                    self._error = error
+                in_real_time = self._until is None
+                self._turn.notify_all()
+                if self._error is not None:
+                    self._hang_up()  # or its driver would wait for a minute
+                    return
+            if in_real_time:
+                time.sleep(max(0.0, CYCLE - (time.monotonic() - started)))
+
+    def _cycle(self) -> None:
+        """One step of the physics, told to the driver; its answer counts in the next."""
+        server = self._server
+        self._simulator.step()
+        connected = server.udp_connected
+        server.send_state()
+        self.cycles += 1
+        self._sent = self._sent + 1 if connected else 0
+        give_up = time.monotonic() + _LATE
+        self._robot.answered = False
+        while True:
+            server.process_commands()
+            if self._robot.answered or not server.current_motion_id:
+                return
+            if time.monotonic() > give_up:
+                self.missed += 1
+                return
+            time.sleep(0)
+
+
+@final
+class ServedArm:
+    """The driver of an arm whose server stands still while nobody calls it.
+
+    Its times are the world's.
+    """
+
+    def __init__(self, arm: Any, server: ArmServer):
+        """Wrap a driver.
+
+        Args:
+            arm: An `Arm` and a `Gripper` that is connected to the server.
+            server: The server.
+        """
+        self._arm, self._server = arm, server
+
+    def read(self) -> ArmState:
+        """Return the newest state."""
+        with self._server.running():
+            state = self._arm.read()
+        offset = self._server.clock_offset
+        return ArmState(**(vars(state) | {"time": state.time + offset}))
+
+    def command(self, joint_velocity: Float[np.ndarray, " joints"]) -> None:
+        """Set the joint velocities to hold [rad/s]."""
+        with self._server.running():
+            self._arm.command(joint_velocity)
+
+    def move(self, width: float) -> None:
+        """Set the opening of the gripper [m]."""
+        with self._server.running():
+            self._arm.move(width)
+
+    def close(self) -> None:
+        """Bring the arm to rest and disconnect."""
+        with self._server.running():
+            self._arm.close()
+
+
+def loopback_addresses(number: int = 50) -> list[str]:
+    """Some of this machine's own addresses, at random, so that servers do not meet."""
+    chance = random.Random()  # noqa: S311 - not for secrets
+    return [
+        f"127.{chance.randrange(1, 255)}.{chance.randrange(256)}.{chance.randrange(1, 255)}"
+        for _ in range(number)
+    ]
+
+
+@contextmanager
+def serve_world(world: World, addresses: Iterable[str] | None = None) -> Iterator[ArmServer]:
+    """A server of a world's arm, until the block ends.
+
+    Args:
+        world: The world, at rest, and not to be reset meanwhile. Its physics goes by steps of
+            1 ms meanwhile.
+        addresses: Of this machine; the first one is taken that is free. None: any.
+
+    Raises:
+        ImportError: The package franky-sim is not installed.
+        OSError: None of the addresses is free.
+    """
+    step = world.model.opt.timestep
+    world.model.opt.timestep = CYCLE
+    try:
+        server = ArmServer(world, loopback_addresses() if addresses is None else addresses)
+        try:
+            yield server
+        finally:
+            server.close()
+    finally:
+        world.model.opt.timestep = step
+
+
+def _protocol(world: World) -> tuple[BaseSimulator, Any, type]:
+    """Simulator, robot and class of the server, as franky-sim wants them."""
+    try:
+        from franky_sim.base_simulator import BaseRobot, BaseSimulator, InnerRobotState
+        from franky_sim.franka_robot_server import FrankaRobotServer
+    except ImportError as error:
+        raise ImportError(
+            "the protocol of the arm is spoken by the package franky-sim: pip install "
+            "'hrc-learn[hardware]'."
+        ) from error
+
+    class ServedRobot(BaseRobot):
+        """The world's arm and gripper, commanded by velocity or position in each cycle.
+
+        Its servos are the world's own, so commands of torque come to nothing.
+        """
+
+        def __init__(self) -> None:
+            super().__init__()
+            self.answered = False
+            self._target: np.ndarray | None = None
+            self._width_goal: float | None = None
+            self._finger_speed = 0.0
+            self._look()
+
+        def _look(self) -> None:
+            self._read = world.arm.read()
+
+        def _get_state(self) -> InnerRobotState:
+            read = self._read
+            assert read.external_torque is not None
+            # franky-sim tells of one kind of torque only: what drivers ask for is the external.
+            return InnerRobotState(
+                q=tuple(read.joint_position.tolist()),
+                dq=tuple(read.joint_velocity.tolist()),
+                tau_j=tuple(read.external_torque.tolist()),
+            )
+
+        def joint_velocity_control(self, target_dq: Any, has_new_command: bool = True) -> None:
+            self.answered |= has_new_command
+            super().joint_velocity_control(target_dq, has_new_command)
+
+        def joint_position_control(self, target_q: Any, has_new_command: bool = True) -> None:
+            self.answered |= has_new_command
+            super().joint_position_control(target_q, has_new_command)
+
+        def _joint_velocity_control(self, target_dq: np.ndarray) -> None:
+            self._target = None
+            self._drive(np.asarray(target_dq, dtype=float))
+
+        def _joint_position_control(self, target_q: np.ndarray) -> None:
+            if self.server is None or not self.server.current_motion_id:
+                # No motion: its own servos hold the arm where it is.
+                self._target = None
+                self._drive(np.zeros(7))
+                return
+            ahead = np.zeros(7) if self._target is None else target_q - self._target
+            self._target = target_q.copy()
+            behind = target_q - self._read.joint_position
+            self._drive(ahead / CYCLE + _CATCH_UP * behind)
+
+        def _drive(self, velocity: np.ndarray) -> None:
+            world.arm.command(velocity)
+            self.torque_control(np.zeros(7))  # what is told of commanded torques
+
+        def _torque_control(self, torques: np.ndarray) -> None:
+            pass
+
+        def set_hand_goal(self, width: float, max_velocity: float, max_force: float) -> None:
+            strongest = world.config.arm.grip_force
+            force = min(max_force, strongest)
+            for finger in ("finger_left", "finger_right"):
+                world.model.actuator(finger).forcerange[:] = (-force, force)
+            self._width_goal = width
+            self._finger_speed = max_velocity
+            self._width_now = self._get_hand_width()
+
+        def _get_hand_width(self) -> float:
+            return self._read.gripper_width
+
+        def _pre_step(self) -> None:
+            if self._width_goal is None:
+                return
+            # Both fingers move at the speed, so their distance changes by twice as much.
+            step = 2 * self._finger_speed * CYCLE
+            change = float(np.clip(self._width_goal - self._width_now, -step, step))
+            self._width_now = float(np.clip(self._width_now + change, 0.0, 2 * FINGER_STROKE))
+            world.arm.move(self._width_now)
+
+        def _post_step(self) -> None:
+            self._look()
+            super()._post_step()
+
+    class ServedSimulator(BaseSimulator):
+        """One robot in the world."""
+
+        def _get_robots(self) -> list[BaseRobot]:
+            return [robot]
+
+        def _step(self) -> None:
+            world.advance(CYCLE)
+
+    robot = ServedRobot()
+    return ServedSimulator(), robot, FrankaRobotServer
