@@ -104,6 +104,7 @@ LAZY_LIBRARIES: dict[str, set[str]] = {
     "cli": {"ray"},
     "demos": {"av", "scipy"},
     "vision": {"cv2"},
+    "sim": {"franky_sim"},
     "viz": {"rich"},
     "hardware": {"franky"},
     "teleoperation": {"viser", "pygame"},
@@ -116,6 +117,7 @@ DISTRIBUTIONS = {
     "pytorch_kinematics": "pytorch-kinematics",
     "cv2": "opencv-python-headless",
     "rerun": "rerun-sdk",
+    "franky_sim": "franky-sim",
     # Parts and requirements of matplotlib's own.
     "mpl_toolkits": "matplotlib",
     "cycler": "matplotlib",

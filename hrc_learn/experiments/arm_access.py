@@ -45,7 +45,7 @@ class ArmAccess:
     """Fraction of the arm's acceleration that the driver uses."""
 
     def told(self, sizes: Imperfections) -> Imperfections:
-        """What a controller has to be told of the arm: its own imperfections and the driver's."""
+        """What a controller has to be told of the arm: its imperfections and the driver's."""
         return replace(
             sizes,
             command_delay=sizes.command_delay + self.delay,

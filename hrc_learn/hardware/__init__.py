@@ -8,6 +8,7 @@ from hrc_learn.hardware.franky_arm import CollisionConfig as CollisionConfig
 from hrc_learn.hardware.franky_arm import FrankyArm as FrankyArm
 from hrc_learn.hardware.franky_arm import FrankyConfig as FrankyConfig
 from hrc_learn.hardware.franky_arm import Load as Load
+from hrc_learn.hardware.franky_arm import Realtime as Realtime
 from hrc_learn.hardware.franky_arm import RealtimeError as RealtimeError
 from hrc_learn.hardware.gripper import GripperError as GripperError
 from hrc_learn.hardware.gripper import GripperThread as GripperThread

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import atexit
 import importlib
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -41,7 +42,7 @@ class Load:
     """[kg]"""
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Of mass, in the flange's frame [m]."""
-    inertia: tuple[tuple[float, float, float], ...] = ((0.0,) * 3,) * 3
+    inertia: tuple[tuple[float, ...], ...] = ((0.0,) * 3,) * 3
     """About that centre, along the flange's axes [kg m^2]."""
 
     def __post_init__(self) -> None:
@@ -126,9 +127,9 @@ class ArmFaultError(RuntimeError):
 class FrankyArm:
     """The arm and its gripper.
 
-    A velocity holds for the config's `timeout` at most: the driver itself then brings the arm to
-    rest, also if this process has died. A command that comes later starts from rest, or from
-    whatever velocity is left.
+    A velocity holds for the config's `timeout` at most: the driver itself then brings the arm
+    to rest. If this process dies, its connection falls, which ends the motion at once. A
+    command that comes late starts from whatever velocity is left.
 
     After a reflex, a user stop or a lost connection every command raises `ArmFaultError`, until
     `recover` has succeeded. The gripper has threads of its own (`GripperThread`): nothing here
@@ -293,10 +294,8 @@ class FrankyArm:
         self._fastest = np.array(robot.joint_velocity_limit.get(), dtype=float)
 
     def _recover(self) -> None:
-        try:
+        with suppress(Exception):  # what ended the last motion is what is recovered from
             self._robot.poll_motion()
-        except Exception:  # noqa: S110 - what ended the last motion is what is recovered from
-            pass
         if not self._robot.recover_from_errors():
             raise self._stopped(self._robot.state, "its error recovery failed")
         self._require_ready(self._robot.state)

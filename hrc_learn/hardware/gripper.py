@@ -37,13 +37,11 @@ class GripperDriver(Protocol):
         ...
 
     def move(self, width: float) -> bool:
-        """Bring the fingers to an opening [m] and wait until they are there; False: they did
-        not get there."""
+        """Bring the fingers to an opening [m] and wait; False: they did not get there."""
         ...
 
     def squeeze(self) -> bool:
-        """Close on whatever is between the fingers and wait until they press on it; False: they
-        do not."""
+        """Close on what is between the fingers and wait; False: they do not press on it."""
         ...
 
 
@@ -137,9 +135,9 @@ class GripperThread:
     def move(self, width: float) -> None:
         """Ask for an opening, or to squeeze what is between the fingers [m].
 
-        Taken once for each new opening, so that it may be asked for in every step of a loop. One
-        that failed is not tried again before another has been asked for: fingers that move by
-        themselves, once a connection is back, would surprise whoever went to look.
+        Taken once for each new opening, so that it may be asked for in every step of a loop.
+        One that failed is not tried again before another has been asked for: fingers that move
+        by themselves, once a connection is back, would surprise whoever went to look.
 
         Raises:
             ValueError: The opening is not finite, or negative.
@@ -200,7 +198,8 @@ class GripperThread:
                 if self._closed:
                     return
                 driver, width, self._wanted = self._driver, self._wanted, None
-            assert driver is not None and width is not None
+            assert driver is not None
+            assert width is not None
             squeezes = width < _NARROW
             what = "close on anything" if squeezes else f"open to {1e3 * width:.0f} mm"
             try:

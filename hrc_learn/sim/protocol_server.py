@@ -1,10 +1,11 @@
 """The simulated workplace behind the network protocol of a Franka arm.
 
-A driver for the real arm connects to it over sockets and leads the arm of our scene in cycles of
-1 ms. The protocol is spoken by the package franky-sim, the physics is `World`'s. What there is
-differs from what is spoken about: a Panda with our limits answers as a Franka Research 3 (server
-version 10). For joint velocities and positions that is one and the same; the driver's limits
-are its own, and it gets no answer to commands of torque.
+A driver for the real arm connects to it over sockets and leads the arm of our scene in cycles
+of 1 ms. The protocol is spoken by the package franky-sim, the physics is `World`'s. What there
+is differs from what is spoken about: a Panda with our limits answers as a Franka Research 3
+(server version 10). For velocities and positions of the joints that is one and the same, as
+their limits are the driver's business here; poses are those of the other arm's model, dynamics
+are not told, and commands of torque come to nothing.
 """
 
 from __future__ import annotations
@@ -93,8 +94,7 @@ class ArmServer:
 
     @property
     def clock_offset(self) -> float:
-        """What the world's time is ahead of the arm's clock, which starts when a driver
-        connects [s]."""
+        """Of the arm's clock, which starts as a driver connects, from the world's [s]."""
         # Cycles are numbered from 0, and the number of the last is the driver's time.
         return self.world.time - (self._sent - 1) * CYCLE
 
@@ -233,7 +233,7 @@ class ServedArm:
 
 def loopback_addresses(number: int = 50) -> list[str]:
     """Some of this machine's own addresses, at random, so that servers do not meet."""
-    chance = random.Random()  # noqa: S311 - not for secrets
+    chance = random.Random()
     return [
         f"127.{chance.randrange(1, 255)}.{chance.randrange(256)}.{chance.randrange(1, 255)}"
         for _ in range(number)
@@ -328,7 +328,7 @@ def _protocol(world: World) -> tuple[BaseSimulator, Any, type]:
 
         def _drive(self, velocity: np.ndarray) -> None:
             world.arm.command(velocity)
-            self.torque_control(np.zeros(7))  # what is told of commanded torques
+            self.torque_control([0.0] * 7)  # what is told of commanded torques
 
         def _torque_control(self, torques: np.ndarray) -> None:
             pass

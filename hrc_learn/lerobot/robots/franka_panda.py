@@ -1,4 +1,7 @@
-"""The real Panda as a LeRobot robot. NOT RUN ON HARDWARE: tested with a fake driver only."""
+"""The real Panda as a LeRobot robot.
+
+Run with its driver against simulators of the arm's network protocol; NOT RUN ON HARDWARE.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,14 @@ from lerobot.robots import RobotConfig
 
 from hrc_learn.controller import SafetyConfig, Watchdog
 from hrc_learn.geometry import Pose
-from hrc_learn.hardware import ArmProcess, FrankyArm
+from hrc_learn.hardware import (
+    ArmProcess,
+    CollisionConfig,
+    FrankyArm,
+    FrankyConfig,
+    Load,
+    Realtime,
+)
 from hrc_learn.kinematics import panda
 from hrc_learn.lerobot.panda_robot import PandaRobot, PandaRobotConfig
 from hrc_learn.protocols import Arm
@@ -38,7 +48,7 @@ class FrankaPandaConfig(PandaRobotConfig):
     ip: str
     """Address of the control box."""
     dynamics: float = 0.3
-    """Share of the driver's own limits of velocity, acceleration and jerk."""
+    """Share of the driver's own limits of acceleration and jerk."""
     tcp_speed: float = 0.25
     """Cap on the speed of the tool centre point [m/s] (ISO 10218: reduced speed)."""
     timeout: float = 0.15
@@ -50,6 +60,12 @@ class FrankaPandaConfig(PandaRobotConfig):
     """With which the gripper squeezes [N]."""
     grip_speed: float = 0.1
     """Of the fingers [m/s]."""
+    realtime: Realtime = "enforce"
+    """Whether a kernel without real-time scheduling is refused. Ignore it for simulators."""
+    collision: CollisionConfig = field(default_factory=CollisionConfig)
+    """External load from which on the arm stops by a reflex."""
+    load: Load | None = None
+    """At the flange, beyond the end effector; None: as the arm has been told before."""
     cameras: dict[str, CameraConfig] = field(default_factory=dict)
     """Cameras of LeRobot, by name."""
 
@@ -61,13 +77,24 @@ class FrankaPandaConfig(PandaRobotConfig):
             raise ValueError(
                 "person.kind: a script pushes simulated arms only, not a real one."
             )
-        if not 0 < self.dynamics <= 1:
-            raise ValueError(f"dynamics must be in (0, 1], but is {self.dynamics}.")
         if not self.timeout > 1.5 / self.fps:
             raise ValueError(
                 f"timeout must be longer than an action and a half at {self.fps:g} fps, but is "
                 f"{self.timeout} s."
             )
+        self.driver()  # which checks the rest
+
+    def driver(self) -> FrankyConfig:
+        """How the driver leads the arm."""
+        return FrankyConfig(
+            dynamics=self.dynamics,
+            timeout=self.timeout,
+            realtime=self.realtime,
+            grip_force=self.grip_force,
+            grip_speed=self.grip_speed,
+            collision=self.collision,
+            load=self.load,
+        )
 
 
 class FrankaPanda(PandaRobot):
@@ -114,14 +141,7 @@ class FrankaPanda(PandaRobot):
         from hrc_learn.skills.arm_motion import PositionServo, PositionServoConfig
 
         config = self.config
-        open_arm = partial(
-            FrankyArm,
-            config.ip,
-            dynamics=config.dynamics,
-            timeout=config.timeout,
-            grip_force=config.grip_force,
-            grip_speed=config.grip_speed,
-        )
+        open_arm = partial(FrankyArm, config.ip, config.driver())
         if config.own_process:
             self._arm = self.watchdog = ArmProcess(open_arm, timeout=config.timeout)
         else:
@@ -142,6 +162,7 @@ class FrankaPanda(PandaRobot):
             self.watchdog.close()
             if isinstance(self._arm, FrankyArm):
                 bring_to_rest(self._arm.stop, _PATIENCE)
+                self._arm.close()
         finally:
             for camera in self.cameras.values():
                 camera.disconnect()
