@@ -159,6 +159,8 @@ class FrankyArm:
         self._franky = _import_franky()
         self._hold = self._franky.Duration(round(1e3 * self.config.timeout))
         self._fault, self._lost = "", False
+        self._robot: Any = None
+        self._closed = False
         self._connect()
         self.gripper = GripperThread(
             partial(_FrankyGripper, self._franky, ip, self.config),
@@ -218,7 +220,7 @@ class FrankyArm:
             except Exception as error:
                 # What ended the motion: the arm is at rest already. The next command tells.
                 self._failed(error)
-        if self._lost:
+        if self._lost and not self._closed:
             self._raise_fault()
 
     def recover(self) -> None:
@@ -230,10 +232,14 @@ class FrankyArm:
             ArmFaultError: The arm stays stopped; the message says by what.
             ConnectionError: It cannot be reached.
         """
+        if self._closed:
+            self._raise_fault()
         try:
-            self._recover()
+            if self._robot is not None:
+                self._recover()
         except self._franky.NetworkException:
-            del self._robot  # a control box takes one connection only
+            self._robot = None  # a control box takes one connection at a time
+        if self._robot is None:
             self._connect()
         self._fault, self._lost = "", False
 
@@ -251,11 +257,17 @@ class FrankyArm:
             ArmFaultError: The connection is lost.
         """
         atexit.unregister(self.close)
+        if self._closed:
+            return
         try:
             self.stop()
-            self._robot.join_motion(timeout=_COMING_TO_REST)
+            if not self._fault:
+                self._robot.join_motion(timeout=_COMING_TO_REST)
         finally:
             self.gripper.close()
+            # The control box takes one connection at a time: this one ends here.
+            self._robot, self._closed = None, True
+            self._fault = f"the arm at {self._ip} is closed: open it again."
 
     def __enter__(self) -> FrankyArm:
         return self
@@ -302,6 +314,8 @@ class FrankyArm:
 
     def _read(self) -> Any:
         """Newest state of the driver."""
+        if self._robot is None:
+            self._raise_fault()
         try:
             state = self._robot.state
         except Exception as error:

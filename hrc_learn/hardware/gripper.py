@@ -160,6 +160,7 @@ class GripperThread:
             self._news.notify_all()
         for thread in self._threads:
             thread.join(_ENDING)
+        self._driver = None  # which ends its connection
 
     def __enter__(self) -> GripperThread:
         return self

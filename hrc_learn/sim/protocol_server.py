@@ -32,7 +32,7 @@ CYCLE = 1e-3
 _LATE = 0.01
 """For which a cycle waits for the driver's answer [s]: ten times what it takes, on a machine
 that does something else besides."""
-_SIGN_OF_LIFE = 0.2
+_SIGN_OF_LIFE = 0.05
 """A driver that has heard nothing for 1 s takes its connection for lost (libfranka). While
 whoever advances the time is busy, a cycle goes by after each of these [s]."""
 _CATCH_UP = 20.0

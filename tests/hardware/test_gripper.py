@@ -1,0 +1,168 @@
+"""A gripper on its threads: what is asked for, told and waited for."""
+
+import threading
+
+import pytest
+
+from hrc_learn.hardware import GripperError, GripperThread
+
+PATIENCE = 20.0
+
+
+class SlowGripper:
+    """Moves as slowly as it is let, and breaks when it is told to."""
+
+    def __init__(self):
+        self.width, self.calls = 0.08, []
+        self.let = threading.Semaphore(0)
+        self.begun = threading.Semaphore(0)
+        self.readings = threading.Semaphore(0)
+        self.succeeds, self.broken = True, False
+
+    def read_width(self):
+        if self.broken:
+            raise OSError("no route to host")
+        self.readings.release()
+        return self.width
+
+    def move(self, width):
+        return self._go(("move", width), width)
+
+    def squeeze(self):
+        return self._go(("squeeze",), 0.03)
+
+    def _go(self, call, width):
+        self.calls.append(call)
+        self.begun.release()
+        assert self.let.acquire(timeout=PATIENCE)
+        if self.broken:
+            raise OSError("no route to host")
+        if self.succeeds:
+            self.width = width
+        return self.succeeds
+
+
+@pytest.fixture
+def driver():
+    return SlowGripper()
+
+
+@pytest.fixture
+def told():
+    return []
+
+
+@pytest.fixture
+def gripper(driver, told):
+    with GripperThread(lambda: driver, report=told.append) as gripper:
+        yield gripper
+        driver.let.release(100)
+
+
+def wait_until(condition):
+    for _ in range(2000):
+        if condition():
+            return
+        threading.Event().wait(0.01)
+    raise AssertionError("it never came")
+
+
+def settle(driver, gripper, width):
+    """Let the move under way end, and its result be read."""
+    driver.let.release()
+    wait_until(lambda: gripper.width == width)
+
+
+def test_nothing_waits_for_fingers_that_move(driver, gripper):
+    gripper.move(0.04)
+    assert driver.begun.acquire(timeout=PATIENCE)
+    assert gripper.width == 0.08  # while the move is held up
+    driver.width = 0.06  # half-way
+    wait_until(lambda: gripper.width == 0.06)
+    settle(driver, gripper, 0.04)
+    assert gripper.failure is None
+    gripper.check()
+
+
+def test_the_newest_opening_is_next_and_those_before_it_are_dropped(driver, gripper):
+    gripper.move(0.04)
+    assert driver.begun.acquire(timeout=PATIENCE)
+    for width in (0.05, 0.06, 0.0):
+        gripper.move(width)
+    driver.let.release()
+    assert driver.begun.acquire(timeout=PATIENCE)
+    assert driver.calls == [("move", 0.04), ("squeeze",)]
+
+
+def test_an_opening_that_is_asked_for_again_is_sent_once(driver, gripper):
+    for width in (0.04, 0.04, 0.0441, 0.036):
+        gripper.move(width)
+    assert driver.begun.acquire(timeout=PATIENCE)
+    settle(driver, gripper, 0.04)
+    gripper.move(0.046)
+    assert driver.begun.acquire(timeout=PATIENCE)
+    assert driver.calls == [("move", 0.04), ("move", 0.046)]
+
+
+def test_a_failed_grasp_is_told_once_and_kept_until_the_next_opening(driver, gripper, told):
+    driver.succeeds = False
+    gripper.move(0.0)
+    driver.let.release()
+    wait_until(lambda: gripper.failure)
+    with pytest.raises(GripperError, match="did not close on anything"):
+        gripper.check()
+    for _ in range(3):
+        gripper.move(0.0)  # of a loop that goes on: neither raises nor tries again
+    assert driver.calls == [("squeeze",)]
+    assert [str(failure) for failure in told] == [str(gripper.failure)]
+    driver.succeeds = True
+    gripper.move(0.05)
+    assert gripper.failure is None
+
+
+def test_a_driver_that_raises_is_told_with_its_words(driver, gripper, told):
+    driver.broken = True
+    gripper.move(0.05)
+    driver.let.release()
+    wait_until(lambda: any("open to 50 mm" in str(failure) for failure in told))
+    wait_until(lambda: any("cannot be reached" in str(failure) for failure in told))
+    assert all("OSError: no route to host" in str(failure) for failure in told)
+    assert gripper.width == 0.08  # the newest known
+    driver.broken, driver.width = False, 0.02
+    wait_until(lambda: gripper.width == 0.02)  # connected again
+    with pytest.raises(GripperError):
+        gripper.check()  # still: the move was lost
+
+
+def test_a_gripper_that_cannot_be_reached_is_an_error_at_once():
+    def refuse():
+        raise OSError("connection refused")
+
+    with pytest.raises(GripperError, match="cannot be reached.*connection refused"):
+        GripperThread(refuse, report=lambda failure: None)
+
+
+def test_a_gripper_that_tells_no_width_is_not_waited_for_for_ever():
+    silence = threading.Event()
+
+    class Silent(SlowGripper):
+        def read_width(self):
+            silence.wait(PATIENCE)
+            return 0.0
+
+    with pytest.raises(GripperError, match="has not told its width for 0.1 s"):
+        threading.Timer(0.5, silence.set).start()
+        GripperThread(Silent, startup=0.1)
+
+
+@pytest.mark.parametrize("width", [-0.01, float("nan"), float("inf")])
+def test_an_opening_must_be_a_width(gripper, width):
+    with pytest.raises(ValueError, match="width must be finite and not negative"):
+        gripper.move(width)
+
+
+def test_its_threads_end_with_it(driver):
+    gripper = GripperThread(lambda: driver)
+    threads = gripper._threads
+    gripper.close()
+    assert not any(thread.is_alive() for thread in threads)
