@@ -197,9 +197,7 @@ class FrankyArm:
         self._raise_fault()
         motion = self._franky.JointVelocityMotion(velocity.tolist(), duration=self._hold)
         try:
-            # Raises what has ended the motion before, as does the next call after that.
-            running = self._robot.poll_motion()
-            if not running:
+            if not self._is_moving():
                 self._require_ready(self._read())
             self._robot.move(motion, asynchronous=True)
         except ArmFaultError:
@@ -215,7 +213,7 @@ class FrankyArm:
         """
         if not self._fault:
             try:
-                if self._robot.poll_motion():
+                if self._is_moving():
                     self._robot.move(self._franky.JointVelocityStopMotion(), asynchronous=True)
             except Exception as error:
                 # What ended the motion: the arm is at rest already. The next command tells.
@@ -261,7 +259,7 @@ class FrankyArm:
             return
         try:
             self.stop()
-            if not self._fault:
+            with suppress(Exception):  # what ended the motion: the arm is at rest already
                 self._robot.join_motion(timeout=_COMING_TO_REST)
         finally:
             self.gripper.close()
@@ -311,6 +309,13 @@ class FrankyArm:
         if not self._robot.recover_from_errors():
             raise self._stopped(self._robot.state, "its error recovery failed")
         self._require_ready(self._robot.state)
+
+    def _is_moving(self) -> bool:
+        """Whether a motion is under way; raises what has ended the last one, once."""
+        # Its own result is no answer: it says True where nothing moves, against its
+        # documentation (franky 2.0).
+        self._robot.poll_motion()
+        return self._robot.is_in_control
 
     def _read(self) -> Any:
         """Newest state of the driver."""
@@ -368,7 +373,7 @@ class FrankyArm:
             cure = "it is at rest. Make room around it, then call recover()"
         self._fault = (
             f"the motion of the arm at {self._ip} ended by {type(error).__name__}: "
-            f"{str(error).rstrip('.')}; {cure}."
+            f"{' '.join(str(error).split()).rstrip('.')}; {cure}."
         )
         return ArmFaultError(self._fault)
 
