@@ -98,6 +98,10 @@ class ArmServer:
         # Cycles are numbered from 0, and the number of the last is the driver's time.
         return self.world.time - (self._sent - 1) * CYCLE
 
+    def begin(self) -> None:
+        """Count the time that `advance` lets pass from now on, not what connecting took."""
+        self._due = self.world.time
+
     def advance(self, duration: float) -> None:
         """Let time pass: until so long after the last call has been over [s].
 
@@ -207,6 +211,7 @@ class ServedArm:
             server: The server.
         """
         self._arm, self._server = arm, server
+        server.begin()
 
     def read(self) -> ArmState:
         """Return the newest state."""

@@ -1,0 +1,172 @@
+"""Our scene behind the arm's protocol: clock, motion, gripper, and a whole job through it."""
+
+import threading
+
+import numpy as np
+import pytest
+from franka_servers import READY, served_world
+
+from hrc_learn.experiments.arm_access import FRANKY_DELAY, SIMULATED, through_franky
+from hrc_learn.hardware import FrankyConfig
+from hrc_learn.sim import Imperfections, World
+from hrc_learn.sim.protocol_server import CYCLE, loopback_addresses, serve_world
+from hrc_learn.sim.workplace import Workplace
+
+pytest.importorskip("franky")
+pytest.importorskip("franky_sim")
+
+DT = 0.01
+
+
+@pytest.fixture
+def served():
+    with served_world() as served:
+        yield served
+
+
+def follow(served, velocity_of, steps):
+    """Command joint 1 in steps of DT; times, positions, velocities and commands."""
+    log = []
+    for k in range(steps):
+        state = served.arm.read()
+        velocity = velocity_of(k)
+        served.arm.command(velocity * np.eye(7)[0])
+        log.append((state.time, state.joint_position[0], state.joint_velocity[0], velocity))
+        served.server.advance(DT)
+    return np.array(log).T
+
+
+def test_the_clock_is_the_worlds_and_steps_keep_their_length(served):
+    before = served.world.time
+    times, *_ = follow(served, lambda k: 0.1, 50)
+    assert served.world.time - before == pytest.approx(50 * DT, abs=5 * CYCLE)
+    np.testing.assert_allclose(np.diff(times)[1:], DT, atol=2 * CYCLE)
+    now = served.arm.read().time
+    assert now == pytest.approx(served.world.time, abs=2 * CYCLE)
+
+
+def test_time_that_nobody_lets_pass_hardly_does(served):
+    follow(served, lambda k: 0.2, 5)
+    before, cycles = served.world.time, served.server.cycles
+    threading.Event().wait(1.3)  # longer than libfranka waits for a state
+    assert served.world.time - before < 0.1  # signs of life
+    assert served.server.cycles > cycles
+    follow(served, lambda k: 0.2, 5)  # the motion has gone on
+
+
+def test_a_velocity_is_followed_within_the_delay_told():
+    """By the best shift of the commands as they were held; beside it the shape must fit."""
+    with served_world() as served:
+        times, _, actual, commands = follow(
+            served, lambda k: 0.3 * np.sin(2 * np.pi * 0.8 * k * DT), 125
+        )
+
+        def held(at):
+            return commands[np.clip(np.searchsorted(times, at, side="right") - 1, 0, None)]
+
+        shifts = np.arange(0, 0.03, 0.001)
+        misfit = [np.sqrt(np.mean((held(times - s) - actual)[10:] ** 2)) for s in shifts]
+        assert shifts[np.argmin(misfit)] <= FRANKY_DELAY
+        assert min(misfit) < 0.01
+        # All cycles but the first of the motion are answered, unless the machine is too busy.
+        assert served.server.missed <= 0.05 * served.server.cycles
+
+
+def test_the_arm_moves_as_the_one_that_is_led_directly(served):
+    direct = World(served.world.config)
+    direct.reset(READY)
+    start, velocities = served.arm.read().joint_position, [0.2] * 30 + [0.0] * 20
+    for velocity in velocities:
+        direct.arm.command(velocity * np.eye(7)[0])
+        direct.advance(DT)
+    follow(served, lambda k: velocities[k], len(velocities))
+    moved = served.arm.read().joint_position - start
+    # Ramps of franky's begin late and end late, and leave the way as long as it is.
+    np.testing.assert_allclose(moved, direct.arm.read().joint_position - READY, atol=2e-3)
+
+
+def test_an_arm_that_rests_stays_where_it_is(served):
+    follow(served, lambda k: 0.2, 10)
+    served.server.advance(0.5)  # the velocity has run out
+    rest = served.arm.read()
+    served.server.advance(0.5)
+    np.testing.assert_allclose(served.arm.read().joint_position, rest.joint_position, atol=1e-4)
+    assert not served.driver._robot.is_in_control
+
+
+def test_a_motion_to_a_position_of_the_drivers_own_is_followed(served):
+    import franky
+
+    goal = READY + 0.1
+    with served.server.running():
+        motion = franky.JointMotion(goal.tolist())
+        served.driver._robot.move(motion, asynchronous=True)
+    served.server.advance(1.5)
+    np.testing.assert_allclose(served.world.arm.read().joint_position, goal, atol=2e-3)
+
+
+def test_the_gripper_closes_at_its_speed_on_what_is_there():
+    workplace = Workplace()
+    world, item = World(workplace.scene), workplace.scene.objects[0]
+    world.hold(item.name, workplace.home_joints().numpy())
+    config = FrankyConfig(realtime="ignore", grip_speed=0.02, grip_force=15.0)
+    with served_world(world, config) as served:
+        assert world.holds(item.name)  # as it did before
+        served.arm.move(0.08)
+        start, widths = served.arm.read(), []
+        for _ in range(20):
+            served.server.advance(0.02)
+            widths.append(served.arm.read().gripper_width)
+        # Both fingers at 0.02 m/s.
+        assert np.diff(widths[5:15]).mean() / 0.02 == pytest.approx(0.04, rel=0.2)
+        assert widths[-1] > start.gripper_width
+        assert not world.holds(item.name)
+        served.arm.move(0.0)
+        served.server.advance(2.0)
+        np.testing.assert_allclose(np.abs(world.model.actuator("finger_left").forcerange), 15.0)
+        assert served.driver.gripper.failure is None
+
+
+def test_physics_that_fails_is_told_to_whoever_lets_time_pass():
+    from hrc_learn.sim import PhysicsError
+
+    with pytest.raises(PhysicsError), served_world() as served:
+        served.world.data.qvel[0] = 1e6
+        with pytest.raises(PhysicsError):
+            served.server.advance(DT)
+        # Closing the arm meets it again.
+
+
+def test_servers_beside_each_other_take_addresses_of_their_own():
+    addresses = loopback_addresses(3)
+    first, second = World(), World()
+    step = first.model.opt.timestep
+    with serve_world(first, addresses) as one, serve_world(second, addresses) as other:
+        assert (one.address, other.address) == tuple(addresses[:2])
+        assert first.model.opt.timestep == CYCLE
+    assert first.model.opt.timestep == step
+    with serve_world(first, addresses[:1]) as again:  # given back
+        assert again.address == addresses[0]
+        with (
+            pytest.raises(OSError, match="available hostname"),
+            serve_world(second, addresses[:1]),
+        ):
+            pass
+
+
+def test_a_controller_is_told_of_the_drivers_delay_and_acceleration():
+    access = through_franky(FrankyConfig(dynamics=0.4, realtime="ignore"))
+    sizes = Imperfections(command_delay=0.02, slowness=0.3)
+    told = access.told(sizes)
+    assert told.command_delay == pytest.approx(0.02 + FRANKY_DELAY)
+    assert told.slowness == pytest.approx(0.6)
+    assert access.told(Imperfections(slowness=0.8)).slowness == 0.8
+    assert SIMULATED.told(sizes) == sizes
+
+
+def test_without_the_simulator_its_extra_is_named(monkeypatch):
+    import sys
+
+    monkeypatch.setitem(sys.modules, "franky_sim.base_simulator", None)
+    with pytest.raises(ImportError, match=r"hrc-learn\[hardware\]"), serve_world(World()):
+        pass
