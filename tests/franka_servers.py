@@ -1,4 +1,4 @@
-"""Simulators of a Franka arm's network protocol for tests, and a driver's connection to them."""
+"""Simulators of a Franka arm's network protocol for tests, and a driver connected to them."""
 
 from collections.abc import Iterator
 from contextlib import closing, contextmanager

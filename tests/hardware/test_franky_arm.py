@@ -26,11 +26,17 @@ pytest.importorskip("franky")
 pytest.importorskip("franky_sim")
 
 CONFIG = FrankyConfig(realtime="ignore", dynamics=1.0)
-PATIENCE = 20.0
 
 
 def pause(seconds=0.01):
     threading.Event().wait(seconds)
+
+
+def keep_going(arm):
+    """Command a velocity for as long as it takes the arm to tell of a fault."""
+    for _ in range(2000):
+        arm.command(0.1 * np.eye(7)[0])
+        pause()
 
 
 @pytest.fixture(scope="module")
@@ -179,9 +185,7 @@ def test_a_lost_connection_is_a_fault_until_it_is_recovered(simulator, capfd):
             with pytest.raises(
                 ArmFaultError, match=r"NetworkException.*Timeout.*call recover\(\)"
             ):
-                for _ in range(2000):
-                    arm.command(0.1 * np.eye(7)[0])
-                    pause()
+                keep_going(arm)
             for _ in range(3):  # the driver itself would begin a new motion each second time
                 with pytest.raises(ArmFaultError, match=r"NetworkException.*call recover\(\)"):
                     arm.command(np.zeros(7))
@@ -248,9 +252,7 @@ def test_a_reflex_ends_all_commands_until_it_is_recovered(reflexing):
     with pytest.raises(
         ArmFaultError, match=r"aborted by reflex.*joint_velocity_violation.*call recover\(\)"
     ):
-        for _ in range(500):
-            arm.command(0.1 * np.eye(7)[0])
-            pause()
+        keep_going(arm)
     for _ in range(3):
         with pytest.raises(ArmFaultError):
             arm.command(np.zeros(7))
@@ -276,7 +278,7 @@ def test_a_pressed_user_stop_says_what_to_release(reflexing):
     server.reflex("kUserStopped")
     pause(0.1)
     arm.read()
-    with pytest.raises(ArmFaultError, match="mode UserStopped.*release the user stop"):
+    with pytest.raises(ArmFaultError, match=r"mode UserStopped.*release the user stop"):
         arm.command(np.zeros(7))  # of an arm at rest: the first one knows
 
 
@@ -296,7 +298,7 @@ def test_external_torques_are_the_arms_own_estimate():
 
 def test_without_real_time_scheduling_the_cure_is_named(tmp_path, monkeypatch):
     monkeypatch.setattr(franky_arm, "_REALTIME_KERNEL", tmp_path / "realtime")
-    with pytest.raises(RealtimeError, match="PREEMPT_RT.*rtprio 99.*realtime='ignore'"):
+    with pytest.raises(RealtimeError, match=r"PREEMPT_RT.*rtprio 99.*realtime='ignore'"):
         FrankyArm("127.0.0.1")
     (tmp_path / "realtime").write_text("1\n")
     franky_arm.require_realtime()
@@ -314,7 +316,7 @@ def test_an_arm_without_its_gripper_says_so(simulator, monkeypatch):
         raise franky.NetworkException("libfranka gripper: Connection refused")
 
     monkeypatch.setattr(franky, "Gripper", refuse)
-    with pytest.raises(GripperError, match="Connection refused.*end effector"):
+    with pytest.raises(GripperError, match=r"Connection refused.*end effector"):
         FrankyArm(simulator.ip, CONFIG)
 
 

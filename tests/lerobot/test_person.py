@@ -1,12 +1,9 @@
 """A person who leads the body of a LeRobot arm while actions lead its hand."""
 
-import sys
-
-import fake_franky
 import numpy as np
 import pytest
 import torch
-from lerobot.robots import make_robot_from_config
+from served_franka import served_franka
 from unchecked import shapes_unchecked
 
 from hrc_learn.demos import load_demos
@@ -150,7 +147,6 @@ def test_a_person_who_is_not_recorded_adds_nothing(pulled):
 
 
 def test_the_real_panda_yields_to_a_device_too(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "franky", fake_franky)
     settings = {"calibration_dir": tmp_path, "ip": "x", "fps": FPS, "timeout": 600.0}
     with pytest.raises(ValueError, match="person"):
         FrankaPandaConfig(person=PersonConfig(kind="scripted"), **settings)
@@ -169,23 +165,16 @@ def test_the_real_panda_yields_to_a_device_too(tmp_path, monkeypatch):
             self.closed = True
 
     monkeypatch.setattr("hrc_learn.lerobot.panda_robot.Person", Device)
-    config = FrankaPandaConfig(
-        person=PersonConfig(kind="gamepad"), own_process=False, **settings
-    )
-    robot = make_robot_from_config(config)
-    robot.connect()
-    device, start = robot._person, robot.arm.read().joint_position
-    action = dict(zip(JOINTS, start.tolist(), strict=True))
-    with shapes_unchecked():
-        for _ in range(40):
-            robot.send_action(action)
-            robot.arm._robot.run(1 / FPS)
-    read = torch.from_numpy(np.stack([start, robot.arm.read().joint_position]))
-    assert (elbow(read)[1] - elbow(read)[0]).norm() > 0.1
-    hand = panda.forward(read).position
-    assert (hand[1] - hand[0]).norm() < 2e-3
-    assert device.shown is robot
-    robot.disconnect()
+    with served_franka(tmp_path, person=PersonConfig(kind="gamepad"), fps=FPS) as served:
+        robot = served.robot
+        device, start = robot._person, served.read().joint_position
+        with shapes_unchecked():
+            served.drive(dict(zip(JOINTS, start.tolist(), strict=True)), 40)
+        read = torch.from_numpy(np.stack([start, served.read().joint_position]))
+        assert (elbow(read)[1] - elbow(read)[0]).norm() > 0.1
+        hand = panda.forward(read).position
+        assert (hand[1] - hand[0]).norm() < 3e-3
+        assert device.shown is robot
     assert device.closed
 
 

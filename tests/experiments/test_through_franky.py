@@ -1,0 +1,86 @@
+"""The three experiments through the real arm's driver, its sockets and its 1 ms cycles."""
+
+import numpy as np
+import pytest
+from taught_models import teach
+from unchecked import shapes_unchecked
+
+from hrc_learn.experiments.arm_access import through_franky
+from hrc_learn.experiments.collaboration.trial import simulate_collaboration
+from hrc_learn.experiments.grasping.trial import (
+    GraspingScene,
+    GraspingSceneConfig,
+    simulate_grasp,
+)
+from hrc_learn.experiments.placing.trial import place
+from hrc_learn.hardware import FrankyConfig
+from hrc_learn.sim import Imperfections
+from hrc_learn.sim.workplace import Workplace
+from hrc_learn.skills.pick_and_place import PickAndPlaceConfig
+
+pytest.importorskip("franky")
+pytest.importorskip("franky_sim")
+
+pytestmark = pytest.mark.slow
+WORKPLACE = Workplace()
+
+
+@pytest.fixture(scope="module")
+def skills(tmp_path_factory):
+    return teach(tmp_path_factory.mktemp("models"))
+
+
+def untouched(world):
+    """Whether the arm met neither cabinet, table nor itself."""
+    return not any(
+        monitor.touches
+        for monitor in (world.cabinet_contacts, world.table_contacts, world.self_contacts)
+    )
+
+
+@shapes_unchecked()
+def test_a_whole_job_is_done_with_imperfections(skills):
+    job = simulate_collaboration(
+        *skills,
+        ("middle",),
+        camera="synthetic",
+        config=PickAndPlaceConfig(interaction=2.5, speed=2.0),
+        imperfections=Imperfections.nominal(),
+        access=through_franky(),
+        seed=3,
+    )
+    assert job.failure == ""
+    assert untouched(job.world)
+    assert job.world.rests_on(job.workplace.scene.objects[0].name, "board_middle")
+    # The clock of the robot: no step is missing, few are longer than they should be.
+    assert np.percentile(np.diff(job.cell.log["time"]), 95) == pytest.approx(0.01, abs=1e-3)
+
+
+@shapes_unchecked()
+def test_an_object_is_grasped(skills):
+    rng = np.random.default_rng(1)
+    scene = GraspingScene.draw(WORKPLACE, GraspingSceneConfig(), rng)
+    grasp = simulate_grasp(
+        skills[0], scene, camera="synthetic", rng=rng, access=through_franky()
+    )
+    assert grasp.failure == ""
+    assert grasp.world.holds(grasp.item.name)
+    assert untouched(grasp.world)
+
+
+@shapes_unchecked()
+@pytest.mark.parametrize("dynamics", [1.0, 0.3])
+def test_an_object_is_placed_also_by_a_gentle_driver(skills, dynamics):
+    config = FrankyConfig(realtime="ignore", grip_force=40.0, dynamics=dynamics)
+    run = place(
+        skills[1],
+        WORKPLACE,
+        "upper",
+        WORKPLACE.home_joints(),
+        space="pose",
+        speed=1.0,
+        access=through_franky(config),
+    )
+    assert run.placed
+    assert not run.contacts
+    np.testing.assert_allclose(run.object_pose[:2, 3], run.goal.position[:2], atol=5e-3)

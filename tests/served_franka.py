@@ -1,0 +1,69 @@
+"""LeRobot's real Panda, connected by its driver to a simulated arm behind the protocol."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from franka_servers import READY
+from lerobot.robots import make_robot_from_config
+
+from hrc_learn.lerobot.robots import FrankaPandaConfig
+from hrc_learn.lerobot.robots.franka_panda import FrankaPanda
+from hrc_learn.protocols import ArmState
+from hrc_learn.sim import SceneConfig, World
+from hrc_learn.sim.protocol_server import ArmServer, serve_world
+
+
+@dataclass
+class ServedFranka:
+    """The robot, and the server of its arm: time passes by actions only."""
+
+    robot: FrankaPanda
+    server: ArmServer
+    world: World
+
+    def drive(self, action: dict, steps: int) -> np.ndarray:
+        """Send an action again and again; joint velocities of the arm at each one's end."""
+        velocities = []
+        for _ in range(steps):
+            with self.server.running():
+                self.robot.send_action(action)
+            self.server.advance(1 / self.robot.config.fps)
+            velocities.append(self.read().joint_velocity)
+        return np.array(velocities)
+
+    def read(self) -> ArmState:
+        """Return the newest state."""
+        with self.server.running():
+            return self.robot.arm.read()
+
+
+@contextmanager
+def served_franka(folder: Path, joints=READY, **settings) -> Iterator[ServedFranka]:
+    """A connected robot, its driver in this process and its watchdog's silence of minutes.
+
+    Args:
+        folder: For LeRobot's calibration.
+        joints: Where the arm is [rad].
+        settings: Other ones of the robot.
+    """
+    world = World(SceneConfig(objects=()))
+    world.reset(joints)
+    settings = {"fps": 20.0, "timeout": 600.0, "own_process": False} | settings
+    with serve_world(world) as server:
+        config = FrankaPandaConfig(
+            calibration_dir=folder, ip=server.address, realtime="ignore", **settings
+        )
+        robot = make_robot_from_config(config)
+        assert isinstance(robot, FrankaPanda)
+        with server.running():
+            robot.connect()
+        server.begin()
+        try:
+            yield ServedFranka(robot=robot, server=server, world=world)
+        finally:
+            if robot.is_connected:
+                with server.running():
+                    robot.disconnect()
