@@ -28,6 +28,7 @@ def simulated_arm() -> Iterator[SimpleNamespace]:
 
             def pull_out() -> None:
                 server.running = False
+                assert server.async_thread is not None
                 server.async_thread.join()
 
             yield SimpleNamespace(

@@ -320,7 +320,7 @@ class FrankyArm:
     def _read(self) -> Any:
         """Newest state of the driver."""
         if self._robot is None:
-            self._raise_fault()
+            raise ArmFaultError(self._fault)
         try:
             state = self._robot.state
         except Exception as error:

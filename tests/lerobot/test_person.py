@@ -165,7 +165,9 @@ def test_the_real_panda_yields_to_a_device_too(tmp_path, monkeypatch):
             self.closed = True
 
     monkeypatch.setattr("hrc_learn.lerobot.panda_robot.Person", Device)
-    with served_franka(tmp_path, person=PersonConfig(kind="gamepad"), fps=FPS) as served:
+    with served_franka(
+        tmp_path, person=PersonConfig(kind="gamepad"), fps=FPS, dynamics=1.0
+    ) as served:
         robot = served.robot
         device, start = robot._person, served.read().joint_position
         with shapes_unchecked():

