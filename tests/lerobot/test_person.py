@@ -171,7 +171,7 @@ def test_the_real_panda_yields_to_a_device_too(tmp_path, monkeypatch):
         robot = served.robot
         device, start = robot._person, served.read().joint_position
         with shapes_unchecked():
-            served.drive(dict(zip(JOINTS, start.tolist(), strict=True)), 40)
+            served.drive(dict(zip(JOINTS, start.tolist(), strict=True)), 20)
         read = torch.from_numpy(np.stack([start, served.read().joint_position]))
         assert (elbow(read)[1] - elbow(read)[0]).norm() > 0.1
         hand = panda.forward(read).position
