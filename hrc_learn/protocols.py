@@ -58,6 +58,16 @@ class Camera(Protocol):
         ...
 
 
+@runtime_checkable
+class TimedCamera(Camera, Protocol):
+    """A camera that tells when its images were taken; those of others count as just taken."""
+
+    @property
+    def age(self) -> float:
+        """From the newest image that was read being taken until it was read [s]."""
+        ...
+
+
 @dataclass(frozen=True, kw_only=True)
 class DrawnRegion:
     """A box that a person has drawn for the end effector, along the axes of the base frame."""

@@ -2,6 +2,12 @@
 
 from hrc_learn.hardware.arm_process import ArmProcess as ArmProcess
 from hrc_learn.hardware.arm_process import DriverError as DriverError
+from hrc_learn.hardware.cameras import CameraError as CameraError
+from hrc_learn.hardware.cameras import CaptureCamera as CaptureCamera
+from hrc_learn.hardware.cameras import LeRobotCamera as LeRobotCamera
+from hrc_learn.hardware.cameras import VideoEndedError as VideoEndedError
+from hrc_learn.hardware.cameras import VideoFile as VideoFile
+from hrc_learn.hardware.cameras import open_camera as open_camera
 from hrc_learn.hardware.ending import ending_at_rest as ending_at_rest
 from hrc_learn.hardware.franky_arm import ArmFaultError as ArmFaultError
 from hrc_learn.hardware.franky_arm import CollisionConfig as CollisionConfig

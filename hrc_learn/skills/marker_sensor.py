@@ -11,7 +11,7 @@ from torch import Tensor
 
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import panda
-from hrc_learn.protocols import Camera
+from hrc_learn.protocols import Camera, TimedCamera
 from hrc_learn.vision import MarkerDetector, centre
 from hrc_learn.viz import StepLog
 
@@ -28,6 +28,11 @@ class MarkerSensor:
         """
         self._camera = camera
         self._detector = MarkerDetector(list(marker_ids))
+
+    @property
+    def age(self) -> float:
+        """Of the newest image when it was read, as far as the camera tells [s]."""
+        return self._camera.age if isinstance(self._camera, TimedCamera) else 0.0
 
     def read(self) -> UInt8[np.ndarray, "height width 3"]:
         """Take an image, RGB."""
@@ -66,7 +71,8 @@ class LatencyConfig:
     """Delay and loss of images between the camera and the controller."""
 
     delay: float = 0.0
-    """From an image being taken until its markers are known [s]."""
+    """From an image being taken until its markers are known [s]. Markers are held back until
+    then; those of a camera that tells its images' age (`TimedCamera`) come that late already."""
     frame_loss: float = 0.0
     """Fraction of the images that never arrive."""
 

@@ -110,6 +110,9 @@ _CHECKED = 50
 _FELT, _GETTING_UNDER_WAY = 5, 25
 # Part of the task that constraints take beyond rounding.
 _SLOWED = 1e-3
+# Images taken less than this apart are one image, whose age was read from another clock; and for
+# how long joint positions are remembered, longer than any camera's delay [s].
+_SAME_IMAGE, _REMEMBERED = 1e-3, 1.0
 # How much faster the arm might close in on people who do not hold it back [m/s]: what the
 # program leaves unused is rounding. And pace below which it stands still.
 _SPARE, _STANDS = 1e-3, 0.01
@@ -284,6 +287,10 @@ class WorkCell:
         self.human_input = replace(asked, nullspace_input=self._yielding.nullspace_input)
         self.observation = MarkerObservation()
         self._channel = DelayedChannel(self.config.latency, rng or np.random.default_rng(0))
+        # When the newest image was taken, and the joint positions of the time before now.
+        self._taken = -math.inf
+        remembered = round(_REMEMBERED / self.config.dt)
+        self._passed: deque[tuple[float, np.ndarray]] = deque(maxlen=remembered)
         self._guard = self._safety.initial_state(self.joints)
         # Share of the wanted motion that people beside the arm leave, and the sum of it.
         self._pace, self.task_time = 1.0, self.time
@@ -330,15 +337,27 @@ class WorkCell:
     def detect(self, ids: Collection[int] | None = None) -> None:
         """Take an image and detect markers in it, all by default; it may be late, or lost."""
         found = {} if self._sensor is None else self._sensor.corners(ids)
+        taken = self.time - (0.0 if self._sensor is None else self._sensor.age)
+        # A camera that is slower than the detection gives the same image again: no new one.
+        if abs(taken - self._taken) > _SAME_IMAGE:
+            self._taken = taken
         self._channel.send(
             MarkerObservation(
-                time=self.time,
-                joints=self.joints,
+                time=self._taken,
+                joints=self._joints_at(self._taken),
                 pixels={id: centre(corners) for id, corners in found.items()},
                 angles={id: angle(corners) for id, corners in found.items()},
             )
         )
         self._receive()
+
+    def _joints_at(self, time: float) -> Float[Tensor, " joints"]:
+        """Where the joints were at a time [s], as far back as is remembered [rad]."""
+        if time >= self.time or not self._passed:
+            return self.joints
+        times, joints = zip(*self._passed, (self.time, self.joints.numpy()), strict=True)
+        columns = np.stack(joints, axis=-1)
+        return torch.tensor([np.interp(time, times, column) for column in columns])
 
     def wait_for_detection(self) -> MarkerObservation:
         """Hold still until an image taken from now on has arrived; what was detected in it."""
@@ -820,6 +839,7 @@ class WorkCell:
         self._human.tell(told)
         self._advance(self.config.dt)
         self._ticks += 1
+        self._passed.append((self.time, self.state.joint_position))
         self._reading = _Reading(self.chain, self._room, self._arm.read())
         self._look()
         asked = self._human.read(self.state)

@@ -51,6 +51,8 @@ def test_a_path_is_left_when_its_end_is_told(cell):
 
 
 class CountingSensor:
+    age = 0.0
+
     def __init__(self):
         self.asked = []
 
@@ -66,6 +68,45 @@ def test_markers_are_detected_now_and_then_while_they_are_tracked(cell, tracked)
     assert cell._sensor.asked == []
     cell.hold_pose(0.10)  # twelve steps by now, with a detection at each fourth
     assert cell._sensor.asked == 3 * [tracked] * bool(tracked)
+
+
+class SlowCamera:
+    """Takes an image each 70 ms, which arrives 50 ms later, and tells how old it is.
+
+    Its only marker is seen at the column that the time says at which the image was taken.
+    """
+
+    def __init__(self, arm):
+        self._arm, self.age, self._images = arm, 0.0, []
+
+    def corners(self, ids):
+        now = self._arm.time
+        taken = 0.07 * np.floor((now - 0.05) / 0.07)
+        self.age = now - taken + 1e-4 * np.sin(1e3 * now)  # the clocks differ a little
+        square = 1e-3 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+        return {7: np.array([taken, 0.0]) + square}
+
+    def read(self):
+        return np.zeros((2, 2, 3), np.uint8)
+
+
+def test_an_image_counts_for_when_it_was_taken_and_once(cell):
+    arm = cell._arm
+    cell._sensor, cell.tracked_markers = SlowCamera(arm), (7,)
+    turning, seen = torch.zeros(7).double(), []
+    turning[0] = 0.2
+    for _ in range(100):
+        cell.step(turning)
+        observation = cell.observation
+        if observation.joints is not None and observation.time > 0.4:
+            seen.append(observation.time)
+            assert arm.time - 0.05 - 0.07 - 0.04 - 1e-3 <= observation.time <= arm.time - 0.049
+            assert observation.pixels[7][0] == pytest.approx(observation.time, abs=2e-4)
+            # Where the joint was then: it turns at 0.2 rad/s.
+            since = arm.q[0] - float(observation.joints[0])
+            assert since == pytest.approx(0.2 * (arm.time - observation.time), abs=1e-6)
+    times = np.unique(seen)
+    np.testing.assert_allclose(np.diff(times), 0.07, atol=3e-4)  # each but once
 
 
 class Wall(ObedientArm):

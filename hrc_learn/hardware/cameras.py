@@ -1,0 +1,461 @@
+"""Real cameras behind the protocol `Camera`: what OpenCV opens, and what LeRobot does.
+
+Nobody has to know a lens or where a camera stands. What an image needs is its time: by it the
+controller knows where the arm was when the image was taken.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import UInt8
+
+from hrc_learn.protocols import TimedCamera
+
+type RGB = UInt8[np.ndarray, "height width 3"]
+"""An image."""
+
+_FIRST_IMAGE = 5.0
+"""How much longer than later ones the first image may take [s]: cameras set their exposure, and
+streams come with a whole picture only now and then."""
+_CLOSING = 2.0
+"""How long closing waits for the thread that reads [s]."""
+
+
+class CameraError(RuntimeError):
+    """A camera cannot be opened, or sends no images or none that can be used."""
+
+
+class VideoEndedError(CameraError):
+    """A video file has no further image."""
+
+
+def open_camera(
+    source: int | str | Path,
+    *,
+    size: tuple[int, int] | None = None,
+    delay: float = 0.0,
+    timeout: float = 1.0,
+) -> CaptureCamera | VideoFile:
+    """Open a camera, a stream or a video file.
+
+    Args:
+        source: Number of a device ("0" too), path of one (/dev/video0), URL of a stream
+            (rtsp://..., http://...), or path of a video file, which is played at its own rate.
+        size: Width and height of its images [px], which a device is asked for; None: its own.
+        delay: From an image being taken until it arrives, beside what the backend tells; see
+            `measure_delay` [s].
+        timeout: Longest time without an image [s].
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        CameraError: It cannot be opened, or sends no image of this size.
+    """
+    name = str(source)
+    if name.isdecimal() or "://" in name or name.startswith("/dev/"):
+        return CaptureCamera(source, size=size, delay=delay, timeout=timeout)
+    return VideoFile(source, size=size)
+
+
+class CaptureCamera(TimedCamera):
+    """A camera or stream that OpenCV opens; a thread reads it and keeps the newest image only.
+
+    Its backend holds several images back: who reads them at a lower rate than they are taken
+    would see ever older ones.
+    """
+
+    def __init__(
+        self,
+        source: int | str | Path,
+        *,
+        size: tuple[int, int] | None = None,
+        delay: float = 0.0,
+        timeout: float = 1.0,
+    ):
+        """Open it, and wait for the first image; for the arguments see `open_camera`.
+
+        Raises:
+            CameraError: It cannot be opened, or sends no image of this size.
+            ValueError: The delay is negative, or the timeout is not positive.
+        """
+        _check_times(delay, timeout)
+        name = str(source)
+        self._name, self._size, self._delay = f"camera {name}", size, delay
+        self._timeout, self._age = timeout, 0.0
+        self._capture = _opened(int(name) if name.isdecimal() else name, self._name, timeout)
+        if size is not None:
+            _ask_for_size(self._capture, size)
+        self._arrived = threading.Condition()
+        # Time at which it was taken as far as is known [s], and the image, BGR.
+        self._newest: tuple[float, np.ndarray] | None = None
+        self._failure, self._closing = "", False
+        self._thread = threading.Thread(target=self._keep_newest, name=self._name, daemon=True)
+        self._thread.start()
+        try:
+            self._wait_for(timeout + _FIRST_IMAGE)
+            self.read()
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def age(self) -> float:
+        """From the newest image that was read being taken until it was read [s]."""
+        return self._age
+
+    def read(self) -> RGB:
+        """Return the newest image, RGB.
+
+        Raises:
+            CameraError: None has come for the timeout, or not one that can be used.
+        """
+        with self._arrived:
+            newest, failure = self._newest, self._failure
+        if newest is None:
+            raise CameraError(failure or f"{self._name} is closed: open it again.")
+        since = max(time.monotonic() - newest[0], 0.0)
+        if since > self._timeout:
+            raise CameraError(failure or _silent(self._name, since, self._timeout))
+        self._age = since + self._delay
+        return _as_rgb(newest[1], self._name, self._size)
+
+    def close(self) -> None:
+        """Give the camera back."""
+        self._closing = True
+        self._thread.join(_CLOSING)
+        # Of a backend that still waits for an image nothing may be taken away.
+        if not self._thread.is_alive():
+            self._capture.release()
+        with self._arrived:
+            self._newest = None
+
+    def __enter__(self) -> CaptureCamera:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _wait_for(self, longest: float) -> None:
+        """Wait for the first image, so long at most [s]."""
+        with self._arrived:
+            self._arrived.wait_for(lambda: self._newest or self._failure, longest)
+            if self._newest is None:
+                raise CameraError(
+                    self._failure or _silent(self._name, longest, self._timeout)
+                )
+
+    def _keep_newest(self) -> None:
+        """What runs in the thread."""
+        while not self._closing:
+            if not self._capture.grab():
+                self._fail(
+                    f"{self._name} has ended or does not answer: see that it is plugged in, or "
+                    "that its server runs, and open it again."
+                )
+                return
+            now = time.monotonic()
+            taken = taken_by(self._capture, now, self._timeout)
+            whole, image = self._capture.retrieve()
+            if whole:
+                with self._arrived:
+                    self._newest = taken, image
+                    self._arrived.notify_all()
+
+    def _fail(self, why: str) -> None:
+        with self._arrived:
+            self._failure = why
+            self._arrived.notify_all()
+
+
+def taken_by(capture: Any, now: float, oldest: float) -> float:
+    """When the image was taken that a capture has just grabbed, on `time.monotonic` [s].
+
+    Drivers of Linux stamp their buffers by that clock, and OpenCV tells the stamps as the
+    position of the video (CAP_PROP_POS_MSEC, its backend V4L2). Where the position is no time
+    shortly before now it is one since the stream began, or nothing: what counts is the arrival.
+
+    Args:
+        capture: Of OpenCV.
+        now: When it was grabbed [s].
+        oldest: From which age on it cannot be the image's [s].
+    """
+    import cv2
+
+    stamp = 1e-3 * capture.get(cv2.CAP_PROP_POS_MSEC)
+    return stamp if 0 <= now - stamp < oldest else now
+
+
+class VideoFile(TimedCamera):
+    """A video file as a camera; it begins with the first reading."""
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        size: tuple[int, int] | None = None,
+        pace: Literal["own", "read"] = "own",
+        clock: Callable[[], float] = time.monotonic,
+    ):
+        """Open it.
+
+        Args:
+            path: Of the file.
+            size: Width and height that its images should have [px]; None: any.
+            pace: Whether it is played at its own rate, or each reading is the next image.
+            clock: Tells the time [s].
+
+        Raises:
+            FileNotFoundError: There is none.
+            CameraError: It is no video that OpenCV reads.
+        """
+        if not Path(path).is_file():
+            raise FileNotFoundError(f"no video file {path}: give a path, a number or a URL.")
+        self._name, self._size, self._pace = f"video {path}", size, pace
+        self._clock, self._begun, self._age = clock, float("nan"), 0.0
+        self._capture = _opened(str(path), self._name, _FIRST_IMAGE)
+        self._number, self._ahead = 0, float("inf")
+        self._image: np.ndarray | None = None
+        self._shown, self._interval = 0.0, 0.0
+        self._look_ahead()
+
+    @property
+    def age(self) -> float:
+        """From when the newest image that was read was due until it was read [s]; 0 of one that
+        comes when it is read.
+        """
+        return self._age
+
+    @property
+    def number(self) -> int:
+        """How many images have been read or passed."""
+        return self._number
+
+    def read(self) -> RGB:
+        """Return the image that is due, RGB.
+
+        Raises:
+            VideoEndedError: The file has ended.
+            CameraError: The image is not one that can be used.
+        """
+        if self._pace == "read":
+            self._step()
+            return self._rgb()
+        now = self._clock()
+        if self._image is None:
+            self._begun = now - self._ahead
+            self._step()
+        passed = now - self._begun
+        while self._ahead <= passed:
+            self._step()
+        # The last image stands as long as the one before it did.
+        if self._ahead == float("inf") and passed >= self._shown + self._interval:
+            raise self._ended()
+        self._age = passed - self._shown
+        return self._rgb()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._capture.release()
+
+    def _step(self) -> None:
+        if self._ahead == float("inf"):
+            raise self._ended()
+        whole, self._image = self._capture.retrieve()
+        if not whole:
+            raise CameraError(f"{self._name} cannot be decoded after {self._shown:.2f} s.")
+        self._interval, self._shown = self._ahead - self._shown, self._ahead
+        self._number += 1
+        self._look_ahead()
+
+    def _look_ahead(self) -> None:
+        import cv2
+
+        more = self._capture.grab()
+        self._ahead = 1e-3 * self._capture.get(cv2.CAP_PROP_POS_MSEC) if more else float("inf")
+
+    def _ended(self) -> VideoEndedError:
+        return VideoEndedError(
+            f"{self._name} has ended after {self._number} images, at {self._shown:.2f} s."
+        )
+
+    def _rgb(self) -> RGB:
+        assert self._image is not None  # a step has been made
+        return _as_rgb(self._image, self._name, self._size)
+
+
+@runtime_checkable
+class ConnectedCamera(Protocol):
+    """What is used of the cameras of LeRobot, by `lerobot.cameras.Camera` of 0.6."""
+
+    @property
+    def is_connected(self) -> bool: ...
+    def connect(self, warmup: bool = True) -> None: ...
+    def read_latest(self, max_age_ms: int = 500) -> np.ndarray: ...
+    def disconnect(self) -> None: ...
+
+
+class LeRobotCamera(TimedCamera):
+    """A camera of LeRobot's: OpenCV, RealSense, ZMQ and others; its own thread reads it."""
+
+    def __init__(
+        self,
+        camera: ConnectedCamera,
+        *,
+        size: tuple[int, int] | None = None,
+        delay: float = 0.0,
+        timeout: float = 1.0,
+    ):
+        """Take it, and connect to it if nobody has.
+
+        Args:
+            camera: A `lerobot.cameras.Camera`.
+            size: Width and height that its images should have [px]; None: any.
+            delay: From an image being taken until it arrives; see `measure_delay` [s].
+            timeout: Longest time without an image [s].
+
+        Raises:
+            CameraError: It cannot be connected.
+            ValueError: The delay is negative, or the timeout is not positive.
+        """
+        _check_times(delay, timeout)
+        self._camera, self._name, self._size = camera, f"camera {camera}", size
+        self._delay, self._timeout, self._age = delay, timeout, 0.0
+        self._connected_here = not camera.is_connected
+        if self._connected_here:
+            try:
+                camera.connect()
+            except (OSError, RuntimeError, TimeoutError) as error:
+                raise CameraError(
+                    f"{self._name} cannot be connected: {error} (lerobot-find-cameras lists "
+                    "those that there are)."
+                ) from error
+
+    @property
+    def age(self) -> float:
+        """From the newest image that was read being taken until it was read [s]."""
+        return self._age
+
+    def read(self) -> RGB:
+        """Return the newest image, RGB.
+
+        Raises:
+            CameraError: None has come for the timeout, or not one that can be used.
+        """
+        # An image that comes in between counts as older than it is, by one at most; with the
+        # stamp read last it would count as younger.
+        arrived = self._stamp()
+        try:
+            image = self._camera.read_latest(max_age_ms=round(1e3 * self._timeout))
+        except (OSError, RuntimeError, TimeoutError) as error:
+            raise CameraError(
+                f"{self._name} has no image of the last {self._timeout:g} s: {error} Check it, "
+                "and connect again."
+            ) from error
+        since = 0.0 if arrived is None else max(time.perf_counter() - arrived, 0.0)
+        self._age = since + self._delay
+        # LeRobot gives either order of colours, by its camera's own setting.
+        mode = str(getattr(self._camera, "color_mode", "rgb")).lower()
+        return _as_rgb(image, self._name, self._size, bgr=mode.endswith("bgr"))
+
+    def close(self) -> None:
+        """Disconnect from it, if it was connected here."""
+        if self._connected_here:
+            self._camera.disconnect()
+
+    def _stamp(self) -> float | None:
+        """When the newest image came, on `time.perf_counter` [s]; None: it does not tell."""
+        stamp = getattr(self._camera, "latest_timestamp", None)
+        return stamp if isinstance(stamp, float) else None
+
+
+def _check_times(delay: float, timeout: float) -> None:
+    if not delay >= 0:
+        raise ValueError(f"delay must not be negative, but is {delay} s.")
+    if not timeout > 0:
+        raise ValueError(f"timeout must be positive, but is {timeout} s.")
+
+
+def _opened(source: int | str, name: str, timeout: float) -> Any:
+    """A capture of OpenCV's that is open.
+
+    Raises:
+        CameraError: It cannot be opened.
+    """
+    try:
+        import cv2
+    except ImportError as error:
+        raise ImportError(
+            f"{name} needs OpenCV: pip install opencv-python-headless, or hrc-learn[hardware]."
+        ) from error
+    if isinstance(source, str) and "://" in source:
+        longest = round(1e3 * (timeout + _FIRST_IMAGE))
+        capture = cv2.VideoCapture(
+            source,
+            cv2.CAP_FFMPEG,
+            [
+                cv2.CAP_PROP_OPEN_TIMEOUT_MSEC,
+                longest,
+                cv2.CAP_PROP_READ_TIMEOUT_MSEC,
+                round(1e3 * timeout),
+            ],
+        )
+        hint = "is its server running, and can this machine reach it?"
+    elif isinstance(source, int) or source.startswith("/dev/"):
+        capture = cv2.VideoCapture(source)
+        device = f"/dev/video{source}" if isinstance(source, int) else source
+        hint = (
+            f"is it plugged in (ls /dev/video*), does another program use it, and may this user "
+            f"read {device} (group video)?"
+        )
+    else:
+        capture, hint = cv2.VideoCapture(source), "is it a video, and whole?"
+    if not capture.isOpened():
+        raise CameraError(f"{name} cannot be opened: {hint}")
+    return capture
+
+
+def _ask_for_size(capture: Any, size: tuple[int, int]) -> None:
+    import cv2
+
+    capture.set(cv2.CAP_PROP_FRAME_WIDTH, size[0])
+    capture.set(cv2.CAP_PROP_FRAME_HEIGHT, size[1])
+
+
+def _silent(name: str, passed: float, timeout: float) -> str:
+    return (
+        f"{name} has sent no image for {passed:.1f} s (timeout: {timeout:g} s): check its cable, "
+        "its light and its rate."
+    )
+
+
+def _as_rgb(
+    image: np.ndarray, name: str, size: tuple[int, int] | None, *, bgr: bool = True
+) -> RGB:
+    """An image, RGB.
+
+    Raises:
+        CameraError: It is no colour image of 8 bits, or not of the size.
+    """
+    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
+        raise CameraError(
+            f"{name} sends images of shape {image.shape} and type {image.dtype}, and not of "
+            "(height, width, 3) and uint8: choose one of its colour streams."
+        )
+    height, width, _ = image.shape
+    if size is not None and (width, height) != size:
+        raise CameraError(
+            f"{name} sends images of {width} x {height} pixels instead of {size[0]} x {size[1]}: "
+            "ask for a size that it has."
+        )
+    return np.ascontiguousarray(image[..., ::-1]) if bgr else image
