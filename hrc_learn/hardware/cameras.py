@@ -1,4 +1,4 @@
-"""Real cameras behind the protocol `Camera`: what OpenCV opens, and what LeRobot does.
+"""Real cameras behind the protocol `Camera`: the devices, streams and files that OpenCV opens.
 
 Nobody has to know a lens or where a camera stands. What an image needs is its time: by it the
 controller knows where the arm was when the image was taken.
@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import UInt8
@@ -60,7 +60,7 @@ def open_camera(
     name = str(source)
     if name.isdecimal() or "://" in name or name.startswith("/dev/"):
         return CaptureCamera(source, size=size, delay=delay, timeout=timeout)
-    return VideoFile(source, size=size)
+    return VideoFile(name, size=size)
 
 
 class CaptureCamera(TimedCamera):
@@ -84,7 +84,7 @@ class CaptureCamera(TimedCamera):
             CameraError: It cannot be opened, or sends no image of this size.
             ValueError: The delay is negative, or the timeout is not positive.
         """
-        _check_times(delay, timeout)
+        check_times(delay, timeout)
         name = str(source)
         self._name, self._size, self._delay = f"camera {name}", size, delay
         self._timeout, self._age = timeout, 0.0
@@ -123,7 +123,7 @@ class CaptureCamera(TimedCamera):
         if since > self._timeout:
             raise CameraError(failure or _silent(self._name, since, self._timeout))
         self._age = since + self._delay
-        return _as_rgb(newest[1], self._name, self._size)
+        return as_rgb(newest[1], self._name, self._size)
 
     def close(self) -> None:
         """Give the camera back."""
@@ -151,9 +151,7 @@ class CaptureCamera(TimedCamera):
         with self._arrived:
             self._arrived.wait_for(lambda: self._newest or self._failure, longest)
             if self._newest is None:
-                raise CameraError(
-                    self._failure or _silent(self._name, longest, self._timeout)
-                )
+                raise CameraError(self._failure or _silent(self._name, longest, self._timeout))
 
     def _keep_newest(self) -> None:
         """What runs in the thread."""
@@ -291,95 +289,11 @@ class VideoFile(TimedCamera):
 
     def _rgb(self) -> RGB:
         assert self._image is not None  # a step has been made
-        return _as_rgb(self._image, self._name, self._size)
+        return as_rgb(self._image, self._name, self._size)
 
 
-@runtime_checkable
-class ConnectedCamera(Protocol):
-    """What is used of the cameras of LeRobot, by `lerobot.cameras.Camera` of 0.6."""
-
-    @property
-    def is_connected(self) -> bool: ...
-    def connect(self, warmup: bool = True) -> None: ...
-    def read_latest(self, max_age_ms: int = 500) -> np.ndarray: ...
-    def disconnect(self) -> None: ...
-
-
-class LeRobotCamera(TimedCamera):
-    """A camera of LeRobot's: OpenCV, RealSense, ZMQ and others; its own thread reads it."""
-
-    def __init__(
-        self,
-        camera: ConnectedCamera,
-        *,
-        size: tuple[int, int] | None = None,
-        delay: float = 0.0,
-        timeout: float = 1.0,
-    ):
-        """Take it, and connect to it if nobody has.
-
-        Args:
-            camera: A `lerobot.cameras.Camera`.
-            size: Width and height that its images should have [px]; None: any.
-            delay: From an image being taken until it arrives; see `measure_delay` [s].
-            timeout: Longest time without an image [s].
-
-        Raises:
-            CameraError: It cannot be connected.
-            ValueError: The delay is negative, or the timeout is not positive.
-        """
-        _check_times(delay, timeout)
-        self._camera, self._name, self._size = camera, f"camera {camera}", size
-        self._delay, self._timeout, self._age = delay, timeout, 0.0
-        self._connected_here = not camera.is_connected
-        if self._connected_here:
-            try:
-                camera.connect()
-            except (OSError, RuntimeError, TimeoutError) as error:
-                raise CameraError(
-                    f"{self._name} cannot be connected: {error} (lerobot-find-cameras lists "
-                    "those that there are)."
-                ) from error
-
-    @property
-    def age(self) -> float:
-        """From the newest image that was read being taken until it was read [s]."""
-        return self._age
-
-    def read(self) -> RGB:
-        """Return the newest image, RGB.
-
-        Raises:
-            CameraError: None has come for the timeout, or not one that can be used.
-        """
-        # An image that comes in between counts as older than it is, by one at most; with the
-        # stamp read last it would count as younger.
-        arrived = self._stamp()
-        try:
-            image = self._camera.read_latest(max_age_ms=round(1e3 * self._timeout))
-        except (OSError, RuntimeError, TimeoutError) as error:
-            raise CameraError(
-                f"{self._name} has no image of the last {self._timeout:g} s: {error} Check it, "
-                "and connect again."
-            ) from error
-        since = 0.0 if arrived is None else max(time.perf_counter() - arrived, 0.0)
-        self._age = since + self._delay
-        # LeRobot gives either order of colours, by its camera's own setting.
-        mode = str(getattr(self._camera, "color_mode", "rgb")).lower()
-        return _as_rgb(image, self._name, self._size, bgr=mode.endswith("bgr"))
-
-    def close(self) -> None:
-        """Disconnect from it, if it was connected here."""
-        if self._connected_here:
-            self._camera.disconnect()
-
-    def _stamp(self) -> float | None:
-        """When the newest image came, on `time.perf_counter` [s]; None: it does not tell."""
-        stamp = getattr(self._camera, "latest_timestamp", None)
-        return stamp if isinstance(stamp, float) else None
-
-
-def _check_times(delay: float, timeout: float) -> None:
+def check_times(delay: float, timeout: float) -> None:
+    """Raises a ValueError for a delay that is negative, or a timeout that is not positive."""
     if not delay >= 0:
         raise ValueError(f"delay must not be negative, but is {delay} s.")
     if not timeout > 0:
@@ -415,8 +329,8 @@ def _opened(source: int | str, name: str, timeout: float) -> Any:
         capture = cv2.VideoCapture(source)
         device = f"/dev/video{source}" if isinstance(source, int) else source
         hint = (
-            f"is it plugged in (ls /dev/video*), does another program use it, and may this user "
-            f"read {device} (group video)?"
+            "is it plugged in (ls /dev/video*), does another program use it, and may this "
+            f"user read {device} (group video)?"
         )
     else:
         capture, hint = cv2.VideoCapture(source), "is it a video, and whole?"
@@ -434,12 +348,12 @@ def _ask_for_size(capture: Any, size: tuple[int, int]) -> None:
 
 def _silent(name: str, passed: float, timeout: float) -> str:
     return (
-        f"{name} has sent no image for {passed:.1f} s (timeout: {timeout:g} s): check its cable, "
-        "its light and its rate."
+        f"{name} has sent no image for {passed:.1f} s (timeout: {timeout:g} s): check its "
+        "cable, its light and its rate."
     )
 
 
-def _as_rgb(
+def as_rgb(
     image: np.ndarray, name: str, size: tuple[int, int] | None, *, bgr: bool = True
 ) -> RGB:
     """An image, RGB.
@@ -455,7 +369,7 @@ def _as_rgb(
     height, width, _ = image.shape
     if size is not None and (width, height) != size:
         raise CameraError(
-            f"{name} sends images of {width} x {height} pixels instead of {size[0]} x {size[1]}: "
-            "ask for a size that it has."
+            f"{name} sends images of {width} x {height} pixels instead of {size[0]} x "
+            f"{size[1]}: ask for a size that it has."
         )
     return np.ascontiguousarray(image[..., ::-1]) if bgr else image

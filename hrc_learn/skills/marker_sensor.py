@@ -72,7 +72,7 @@ class LatencyConfig:
 
     delay: float = 0.0
     """From an image being taken until its markers are known [s]. Markers are held back until
-    then; those of a camera that tells its images' age (`TimedCamera`) come that late already."""
+    then; those of a camera that tells its images' age (`TimedCamera`) come that late."""
     frame_loss: float = 0.0
     """Fraction of the images that never arrive."""
 

@@ -110,8 +110,8 @@ _CHECKED = 50
 _FELT, _GETTING_UNDER_WAY = 5, 25
 # Part of the task that constraints take beyond rounding.
 _SLOWED = 1e-3
-# Images taken less than this apart are one image, whose age was read from another clock; and for
-# how long joint positions are remembered, longer than any camera's delay [s].
+# Images taken less than this apart are one image, whose age was read from another clock; and
+# for how long joint positions are remembered, longer than any camera's delay [s].
 _SAME_IMAGE, _REMEMBERED = 1e-3, 1.0
 # How much faster the arm might close in on people who do not hold it back [m/s]: what the
 # program leaves unused is rounding. And pace below which it stands still.

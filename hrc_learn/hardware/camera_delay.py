@@ -1,0 +1,213 @@
+"""How late a camera's images are, measured by the robot's own motion.
+
+A joint turns back and forth; where its marker is in the images is where the joint was some time
+before. No calibration is asked for: over so small a motion a pixel is a smooth function of one
+joint position, and it is fitted for each delay that is tried. The delay with the smallest rest
+is the camera's.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from hrc_learn.hardware.cameras import CameraError
+from hrc_learn.protocols import Arm, Camera, TimedCamera
+from hrc_learn.vision import MarkerDetector, centre
+
+# Rates at which the joint turns back and forth at the beginning and at the end [Hz]: of one
+# rate alone delays that are a period apart would fit alike.
+_SLOWEST, _FASTEST = 0.4, 1.0
+# Powers of the joint position in the fit of a pixel: perspective bends its line.
+_POWERS = 3
+# Between the delays that are tried [s]; the smallest rest is found between them.
+_STEP = 2e-3
+# Images and share of the pixels' motion that the fit must explain for a delay to be told.
+_FEWEST, _EXPLAINED = 30, 0.9
+# Decay rate of the way back to where the joint was, and what is left of it [1/s, rad].
+_RETURN, _BACK = 2.0, 1e-3
+
+
+@dataclass(frozen=True, kw_only=True)
+class DelayMotion:
+    """How the joint moves while a delay is measured."""
+
+    joint: int = 1
+    """Which turns, counted from 1: its motion must move the marker across the image."""
+    speed: float = 0.15
+    """Its fastest [rad/s]: of a hand at 0.5 m, 75 mm/s, by 3 cm to each side."""
+    duration: float = 8.0
+    """[s]"""
+    dt: float = 0.01
+    """Time from one reading of arm and camera to the next [s]."""
+    longest: float = 0.5
+    """Delays up to it are found [s]."""
+
+    def __post_init__(self) -> None:
+        for name in ("speed", "duration", "dt", "longest"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive, but is {getattr(self, name)}.")
+        if self.joint < 1:
+            raise ValueError(f"joint is counted from 1, but is {self.joint}.")
+
+    def velocity(self, passed: float) -> float:
+        """Of the joint after a time [s]: back and forth, ever faster, gently at its ends."""
+        share = passed / self.duration
+        turns = passed * (_SLOWEST + 0.5 * (_FASTEST - _SLOWEST) * share)
+        gentle = min(1.0, 8 * share, 8 * (1 - share))
+        return self.speed * gentle * math.sin(2 * math.pi * turns)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeasuredDelay:
+    """Of a camera."""
+
+    delay: float
+    """From an image being taken until it is read; of a camera that tells its images' age, what
+    that leaves out [s]."""
+    deviation: float
+    """Standard deviation of the delay, by the rest of the fit [s]."""
+    images: int
+    """In which the marker was seen."""
+
+
+def measure_delay(
+    arm: Arm,
+    camera: Camera,
+    marker: int,
+    *,
+    advance: Callable[[float], None],
+    motion: DelayMotion | None = None,
+) -> MeasuredDelay:
+    """Measure a camera's delay by moving the arm before it; it ends where it began.
+
+    What is measured belongs into the camera's `delay`, and with it into
+    `LatencyConfig(delay=...)` of the work cell.
+
+    Args:
+        arm: Moves a marker, alone: nothing else may move the camera or the marker.
+        camera: Looks at it, from anywhere.
+        marker: ArUco number on the arm.
+        advance: Lets a given time pass [s].
+        motion: Of the arm; its surroundings are not looked at.
+
+    Raises:
+        ValueError: The arm has no such joint.
+        CameraError: The marker is hardly seen, does not move with the joint, or the delay is
+            longer than looked for.
+    """
+    motion = motion or DelayMotion()
+    joint, joints = motion.joint - 1, len(arm.read().joint_position)
+    if joint >= joints:
+        raise ValueError(f"joint must be one of {joints}, but is {motion.joint}.")
+    detector, begun = MarkerDetector([marker]), arm.read()
+    home, times, positions = float(begun.joint_position[joint]), [], []
+    taken, pixels, last = [], [], None
+    try:
+        for k in range(round(motion.duration / motion.dt)):
+            velocity = np.zeros(joints)
+            velocity[joint] = motion.velocity(k * motion.dt)
+            arm.command(velocity)
+            advance(motion.dt)
+            state = arm.read()
+            times.append(state.time)
+            positions.append(float(state.joint_position[joint]))
+            image = camera.read()
+            # An image that is read again is no new one.
+            if last is not None and np.array_equal(image, last):
+                continue
+            last, seen = image, detector.detect(image).get(marker)
+            if seen is not None:
+                age = camera.age if isinstance(camera, TimedCamera) else 0.0
+                taken.append(state.time - age)
+                pixels.append(centre(seen))
+        _go_back(arm, joint, home, advance, motion.dt)
+    finally:
+        arm.command(np.zeros(joints))
+    if len(taken) < _FEWEST:
+        raise CameraError(
+            f"the camera saw marker {marker} in {len(taken)} different images, and at least "
+            f"{_FEWEST} are needed: put the arm where it is seen, and light it."
+        )
+    return fit_delay(
+        np.array(times), np.array(positions), np.array(taken), np.array(pixels), motion.longest
+    )
+
+
+def _go_back(
+    arm: Arm, joint: int, home: float, advance: Callable[[float], None], dt: float
+) -> None:
+    """Bring a joint back to where it was [rad]."""
+    for _ in range(round(3.0 / dt)):
+        state = arm.read()
+        velocity = np.zeros_like(state.joint_position)
+        velocity[joint] = _RETURN * (home - state.joint_position[joint])
+        if abs(velocity[joint]) < _RETURN * _BACK:
+            return
+        arm.command(velocity)
+        advance(dt)
+
+
+def fit_delay(
+    time: Float[np.ndarray, " readings"],
+    position: Float[np.ndarray, " readings"],
+    taken: Float[np.ndarray, " images"],
+    pixel: Float[np.ndarray, "images 2"],
+    longest: float,
+) -> MeasuredDelay:
+    """The delay by which pixels follow a joint.
+
+    Args:
+        time: Of the readings of the joint [s].
+        position: Of the joint [rad].
+        taken: When each image is believed to have been taken [s].
+        pixel: Of the marker in it [px].
+        longest: Delay tried [s].
+
+    Raises:
+        CameraError: The pixels do not follow the joint, or later than that.
+    """
+    # Of images of before the first reading nothing is known.
+    known = taken - longest >= time[0]
+    taken, pixel = taken[known], pixel[known]
+    delays = np.arange(-1, math.ceil(longest / _STEP) + 1) * _STEP
+    rest = np.array(
+        [_rest(np.interp(taken - delay, time, position), pixel) for delay in delays]
+    )
+    k = int(rest.argmin())
+    whole = ((pixel - pixel.mean(axis=0)) ** 2).sum()
+    if not rest[k] < (1 - _EXPLAINED) * whole:
+        raise CameraError(
+            f"the marker does not follow the joint: {100 * (1 - rest[k] / whole):.0f} % of its "
+            "motion in the image is explained. Does the camera stand still, and is the marker "
+            "on the arm?"
+        )
+    if not 0 < k < len(delays) - 1:
+        raise CameraError(
+            f"the delay is not between 0 and {longest:g} s: look for a longer one, or see "
+            "whether the arm's clock is that of its readings."
+        )
+    # A parabola through the smallest rest and its neighbours.
+    bend = rest[k - 1] - 2 * rest[k] + rest[k + 1]
+    between = 0.5 * (rest[k - 1] - rest[k + 1]) / bend
+    variance = rest[k] / (2 * len(pixel) - 2 * (_POWERS + 1) - 1)
+    return MeasuredDelay(
+        delay=float(delays[k] + _STEP * between),
+        # Of least squares: the inverse of half the curvature, times the variance of a pixel.
+        deviation=float(np.sqrt(2 * variance / bend) * _STEP),
+        images=len(pixel),
+    )
+
+
+def _rest(
+    position: Float[np.ndarray, " images"], pixel: Float[np.ndarray, "images 2"]
+) -> float:
+    """Squared distances of pixels from a polynomial of the joint's position [px^2]."""
+    centred = position - position.mean()
+    powers = np.vander(centred / max(float(np.abs(centred).max()), 1e-9), _POWERS + 1)
+    fitted, *_ = np.linalg.lstsq(powers, pixel, rcond=None)
+    return float(((pixel - powers @ fitted) ** 2).sum())
