@@ -60,6 +60,8 @@ class Imperfections:
     """Largest mass at the hand of which the arm does not know [kg]. Nominal 0.5 kg."""
     torque_noise: float = 0.0
     """Standard deviation of an estimated external joint torque [N m]. Nominal 0.2 N m."""
+    torque_lag: float = 0.0
+    """Time constant of the low-pass filter of that estimate [s]. Nominal 10 ms."""
     base_error: float = 0.0
     """Range of the position of the base along each axis [m]. Nominal 1 mm."""
     base_turn: float = 0.0
@@ -124,6 +126,7 @@ class Imperfections:
             gravity_error=0.02,
             payload=0.5,
             torque_noise=0.2,
+            torque_lag=0.010,
             base_error=1e-3,
             base_turn=1e-3,
             tool_error=1e-3,

@@ -5,6 +5,7 @@ one table of numbers. Capsules and boxes follow the published link shapes to abo
 centimetre: they render ten times faster than meshes without a GPU and give clean contacts.
 """
 
+import math
 from dataclasses import dataclass
 
 import mujoco
@@ -287,6 +288,32 @@ def _add_hand(spec: mujoco.MjSpec, hand, config: PandaModelConfig) -> None:
     coupling.data[:5] = (0.0, 1.0, 0.0, 0.0, 0.0)
 
 
+class _UnknownWeights:
+    """Weights that the arm does not compensate: of a load that nobody entered, and of its links
+    where its own model is wrong.
+    """
+
+    def __init__(self, model: mujoco.MjModel, joints: tuple[str, ...]):
+        self._joints = np.array([model.joint(name).id for name in joints])
+        self._links = links = model.jnt_bodyid[self._joints]
+        mass = model.body_mass * (1.0 - model.body_gravcomp)
+        carried = np.zeros((len(links), model.nbody), dtype=bool)
+        for body in range(1, model.nbody):  # parents come before children
+            carried[:, body] = carried[:, model.body_parentid[body]]
+            carried[links == body, body] = True
+        self._carried = carried * mass
+        self._any = bool((np.abs(self._carried) > 1e-9).any())
+        self._gravity = model.opt.gravity
+
+    def torque(self, data: mujoco.MjData) -> Float[np.ndarray, "7"]:
+        """Which they exert on the joints [N m]."""
+        if not self._any:
+            return np.zeros(len(self._links))
+        anchor, axis = data.xanchor[self._joints], data.xaxis[self._joints]
+        arm = self._carried @ data.xipos - self._carried.sum(axis=1)[:, None] * anchor
+        return (np.cross(arm, self._gravity) * axis).sum(axis=1)
+
+
 class MujocoArm:
     """The simulated Panda as an `Arm` and a `Gripper`."""
 
@@ -316,6 +343,9 @@ class MujocoArm:
         self._fingers = np.array([model.joint(n).qposadr[0] for n in fingers])
         self._finger_servos = np.array([model.actuator(n).id for n in fingers])
         self._reference = np.zeros(len(names))
+        self._weights = _UnknownWeights(model, names)
+        # Estimate of the external torques, as the filter has it [N m]; None: it starts anew.
+        self._felt: np.ndarray | None = None
         # Position errors [rad] from which on the servos pull no harder.
         strongest = model.actuator_forcerange[self._position_servos, 1]
         self._reach = strongest / model.actuator_gainprm[self._position_servos, 0]
@@ -327,8 +357,24 @@ class MujocoArm:
             joint_position=self._errors.encoders(self._data.qpos[self.joints]),
             joint_velocity=self._data.qvel[self._velocities].copy(),
             gripper_width=float(self._data.qpos[self._fingers].sum()),
-            external_torque=self._errors.torques(self._data.qfrc_constraint[self._velocities]),
+            external_torque=self._errors.torques(
+                self._external_torque() if self._felt is None else self._felt
+            ),
         )
+
+    def _external_torque(self) -> Float[np.ndarray, "7"]:
+        """What an arm takes for external torques that measures those of its joints [N m].
+
+        Contacts and forces from outside, friction, which no arm of this kind knows well, and
+        the weights that it was not told of.
+        """
+        data = self._data
+        torque = data.qfrc_constraint + data.qfrc_applied
+        for body in np.flatnonzero(data.xfrc_applied.any(axis=1)):
+            force, moment = np.split(data.xfrc_applied[body], 2)
+            at = data.xipos[body]
+            mujoco.mj_applyFT(self._model, data, force, moment, at, body, torque)
+        return torque[self._velocities] + self._weights.torque(data)
 
     def command(self, joint_velocity: Float[np.ndarray, "7"]) -> None:
         """Set the joint velocities to hold from now on [rad/s]."""
@@ -344,6 +390,7 @@ class MujocoArm:
         """Set the joints at once, at rest. For resets, not for control."""
         self._reference = np.array(joint_position, dtype=float)
         self._channel.rest()
+        self._felt = None
         self._data.qpos[self.joints] = self._reference
         self._data.qvel[self._velocities] = 0.0
         self._data.qpos[self._fingers] = gripper_width / 2
@@ -363,6 +410,13 @@ class MujocoArm:
         self._reference = np.clip(reference, q - self._reach, q + self._reach)
         self._data.ctrl[self._position_servos] = self._reference
         self._data.ctrl[self._velocity_servos] = velocity
+        self._feel(dt)
+
+    def _feel(self, dt: float) -> None:
+        """Filter the external torques of the last physics step."""
+        lag, torque = self._errors.sizes.torque_lag, self._external_torque()
+        share = 1.0 if self._felt is None or lag == 0 else -math.expm1(-dt / lag)
+        self._felt = torque if self._felt is None else self._felt + share * (torque - self._felt)
 
     @property
     def encoder_offset(self) -> Float[np.ndarray, " joints"]:

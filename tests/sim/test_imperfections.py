@@ -241,3 +241,30 @@ def test_a_safety_filter_is_told_what_the_driver_does():
     assert told.separation.clearance == pytest.approx(0.08)
     assert ideal.separation.reaction_time == pytest.approx(0.03)
     assert ideal.separation.clearance == pytest.approx(0.05)
+
+
+def test_estimated_torques_are_those_that_the_servos_have_to_balance():
+    """At rest: of a load and of weights that nobody entered, and of a push at the forearm."""
+    made = World(
+        replace(WORKPLACE.scene, objects=()), draw(payload=0.5, gravity_error=0.02)
+    )
+    made.reset(HOVER)
+    forearm = made.model.body("link4").id
+    for push in ((0.0, 0.0, 0.0, 0.0, 0.0, 0.0), (4.0, 20.0, -6.0, 0.0, 0.5, 0.0)):
+        made.data.xfrc_applied[forearm] = push
+        made.advance(1.0)
+        felt = made.arm.read().external_torque
+        np.testing.assert_allclose(felt, -made.data.qfrc_actuator[:7], atol=2e-3)
+    assert np.abs(felt[:4]).min() > 0.3
+
+
+def test_estimated_torques_come_through_a_filter_of_the_first_order():
+    made = World(replace(WORKPLACE.scene, objects=()), draw(torque_lag=0.05))
+    made.reset(HOVER)
+    made.advance(0.1)
+    made.data.xfrc_applied[made.model.body("link4").id, 1] = 20.0
+    made.advance(0.5)
+    made.data.xfrc_applied[:] = 0.0
+    whole = made.arm.read().external_torque[0]
+    made.advance(0.05)
+    assert made.arm.read().external_torque[0] == pytest.approx(whole / np.e, rel=0.05)
