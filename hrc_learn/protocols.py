@@ -106,6 +106,10 @@ class HumanInput:
     rotation vector in the base frame [rad]; None: none is."""
     requests: tuple[Request, ...] = ()
     """Asked for since the last reading, in this order."""
+    pause: bool = False
+    """Whether the task waits where it is, as long as this is asked for."""
+    stop: str = ""
+    """Why the arm comes to rest and the task is given up; empty: it goes on."""
 
 
 Hindrance = Literal[
@@ -163,6 +167,9 @@ class Feedback:
     """Share of its speed that people near it leave the task, 0 to 1."""
     slip: float = 0.0
     """By how much the gripper's opening has changed since it holds its object [m]."""
+    contact_expected: bool = False
+    """Whether the task feels its way or has just done so: what is met at the end effector is
+    part of it."""
 
 
 @runtime_checkable

@@ -416,7 +416,9 @@ class MujocoArm:
         """Filter the external torques of the last physics step."""
         lag, torque = self._errors.sizes.torque_lag, self._external_torque()
         share = 1.0 if self._felt is None or lag == 0 else -math.expm1(-dt / lag)
-        self._felt = torque if self._felt is None else self._felt + share * (torque - self._felt)
+        self._felt = (
+            torque if self._felt is None else self._felt + share * (torque - self._felt)
+        )
 
     @property
     def encoder_offset(self) -> Float[np.ndarray, " joints"]:

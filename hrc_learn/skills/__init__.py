@@ -30,6 +30,7 @@ from hrc_learn.skills.visual_skill import VisualServoSkill as VisualServoSkill
 from hrc_learn.skills.visual_skill import VisualTarget as VisualTarget
 from hrc_learn.skills.work_cell import BlockedPathError as BlockedPathError
 from hrc_learn.skills.work_cell import MissedGraspError as MissedGraspError
+from hrc_learn.skills.work_cell import StoppedByPersonError as StoppedByPersonError
 from hrc_learn.skills.work_cell import TaskFailedError as TaskFailedError
 from hrc_learn.skills.work_cell import WorkCell as WorkCell
 from hrc_learn.skills.work_cell import WorkCellConfig as WorkCellConfig

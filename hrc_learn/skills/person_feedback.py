@@ -238,6 +238,7 @@ class PersonFeedback:
         person_distance: float | None = None,
         pace: float = 1.0,
         load: GraspedBox | None = None,
+        contact_expected: bool = False,
     ) -> Feedback:
         """What is told of this step; the next one begins without hindrances.
 
@@ -249,6 +250,7 @@ class PersonFeedback:
                 watches for them.
             pace: Share of its speed that people near it leave the task.
             load: What the gripper holds; None: nothing.
+            contact_expected: Whether the task feels its way.
         """
         # A clock that is set back is that of a simulation that begins anew.
         if not 0 <= state.time - self._looked < _LOOK_EVERY:
@@ -273,6 +275,7 @@ class PersonFeedback:
             person_distance=person_distance,
             pace=pace,
             slip=0.0 if load is None else abs(state.gripper_width - self._width),
+            contact_expected=contact_expected,
         )
 
     def _look(self, state: ArmState, jacobian: Float[Tensor, "6 joints"] | None) -> None:

@@ -82,6 +82,10 @@ class MissedGraspError(TaskFailedError):
     """A grasp failed; another attempt may succeed."""
 
 
+class StoppedByPersonError(TaskFailedError):
+    """The person beside the arm has stopped it, or something has met it; it is at rest."""
+
+
 class BlockedPathError(TaskFailedError):
     """A planned motion would collide or leave the limits of the arm."""
 
@@ -110,6 +114,9 @@ _CHECKED = 50
 _FELT, _GETTING_UNDER_WAY = 5, 25
 # Part of the task that constraints take beyond rounding.
 _SLOWED = 1e-3
+# For which what was felt may still be met: the fingers open, the hand leaves it. And in which an
+# arm that is stopped comes to rest [s].
+_LEAVING, _COMES_TO_REST = 1.0, 1.0
 # Images taken less than this apart are one image, whose age was read from another clock; and
 # for how long joint positions are remembered, longer than any camera's delay [s].
 _SAME_IMAGE, _REMEMBERED = 1e-3, 1.0
@@ -215,7 +222,7 @@ class WorkCell:
         observation: Newest detection of markers that has arrived.
         watched: Where people beside the arm may be; None: nobody watches for them.
         load: What the arm holds, which people must not be hit with either.
-        task_time: The clock without what the task waited for people [s].
+        task_time: The clock without what the task waited for people, or was paused by them [s].
         human_input: What the person asks for now.
         tracked_markers: Markers detected every `detect_every` steps; empty: no image is taken.
         log: Columns of every step so far, and the phases of the task.
@@ -296,6 +303,11 @@ class WorkCell:
         self._pace, self.task_time = 1.0, self.time
         # For how long it has stood still before somebody [s].
         self._stood = 0.0
+        # Share of the task's motion that a person who pauses it leaves, and whether the arm
+        # comes to rest for good.
+        self._going, self._stopping = 1.0, False
+        # Until when something may be met that the task has felt for [s].
+        self._contact_expected = -math.inf
         self._look()
 
     load: GraspedBox | None
@@ -412,12 +424,13 @@ class WorkCell:
             turn: What a person has added to the planned orientation, as a rotation vector
                 [rad]; None: nothing.
         """
-        self._guard = self._safety.initial_state(self.joints, command.joint_velocity)
+        velocity = self._going * command.joint_velocity
+        self._guard = self._safety.initial_state(self.joints, velocity)
         self.region = region
         self._keep_pace(command.twist, command.joint_velocity, command.safety)
         self._note_controller(command, approach)
         self._send(
-            command.joint_velocity,
+            velocity,
             safety=command.safety.flags.numpy(),
             feature=feature,
             target=target,
@@ -513,7 +526,7 @@ class WorkCell:
         now = min(passed + self.config.dt, line.duration)
         pose, _ = line.at(now)
         _, twist = line.at(min(now + self.config.command_delay, line.duration))
-        self.track_pose(pose, twist)
+        self.track_pose(pose, self._going * twist)
 
     def move_until_contact(
         self, goal: Pose, speed: float = 0.02, force: float = 12.0
@@ -537,11 +550,12 @@ class WorkCell:
         free, moving = None, 0
         line, begun = StraightLine(self.pose, goal, speed), self.task_time
         while (passed := self.task_time - begun) < line.duration:
+            self._contact_expected = self.time + _LEAVING
             self._track_line(line, passed)
             felt.append(-float(self._contact_force() @ along))
             before.append(self.pose)
             # An arm that waits for somebody gets under way anew.
-            moving = moving + 1 if self._pace == 1 else 0
+            moving = moving + 1 if self._pace * self._going == 1 else 0
             if moving <= _FELT + _GETTING_UNDER_WAY:
                 free = None
                 continue
@@ -589,8 +603,9 @@ class WorkCell:
         while progress <= len(path) - 1:
             if until():
                 return int(progress)
-            later = progress + rate * self.config.command_delay / dt
-            goal, wanted = _between(path, progress), rate * _between(velocity, later)
+            now = rate * self._going
+            later = progress + now * self.config.command_delay / dt
+            goal, wanted = _between(path, progress), now * _between(velocity, later)
             here, ahead = int(progress), int(progress + CHANGE_OF_RATE / dt)
             behind = self._track_joints(
                 goal, wanted, yields=not bool(narrow[here]), returns=rate <= 0
@@ -598,7 +613,7 @@ class WorkCell:
             if not self._yielding.aside:
                 waited = 0.0
             # Who pushes again and again must not hold it up for good.
-            elif not self._yielding.pushed and self._pace == 1:
+            elif not self._yielding.pushed and self._pace * self._going == 1:
                 waited = max(waited + (1.0 - 2.0 * max(rate, 0.0)) * dt, 0.0)
             # The null space that led aside further back leads back there as well.
             backs = waited > STUCK and progress > 0
@@ -608,7 +623,7 @@ class WorkCell:
             rate = float(changed_rate(rate, 2.0 - behind, dt, -1 if backs else 1))
             if rate <= 0:
                 self._feedback.hindrances.mention("task_waits")
-            progress = max(progress + rate * self._pace, 0.0)
+            progress = max(progress + rate * self._pace * self._going, 0.0)
             if waited > _LONGEST_WAIT:
                 progress = self._go_straight_back(path, progress)
                 waited = 0.0
@@ -665,8 +680,10 @@ class WorkCell:
                 "path: the arm was pushed aside and finds no way back that is clear of what is "
                 "around it."
             )
-        self._yielding.aside, pose = False, self.chain.forward(goal)
-        for q in way:
+        self._yielding.aside, pose, passed = False, self.chain.forward(goal), 0.0
+        while passed <= len(way) - 1:
+            q = way[int(passed)]
+            passed += self._going
             self._path_joints = q.numpy()
             self._feedback.hindrances.note("too_far", 0.0)
             self.step(self.config.pose_gain * (q - self.joints), pose)
@@ -765,7 +782,7 @@ class WorkCell:
             pace = float(share_of_motion(asked, self.jacobian @ sent))
         # It may drop at once; it rises as paths get under way.
         self._pace = min(pace, self._pace + self.config.dt / CHANGE_OF_RATE)
-        self.task_time += self._pace * self.config.dt
+        self.task_time += self._pace * self._going * self.config.dt
         self._stood = self._stood + self.config.dt if self._pace < _STANDS else 0.0
         if self._stood > self.config.longest_wait:
             raise TaskFailedError(
@@ -815,8 +832,9 @@ class WorkCell:
             self.jacobian,
             pushed=self._pushing,
             person_distance=None if self.watched is None else self.watched.nearest,
-            pace=self._pace,
+            pace=self._pace * self._going,
             load=self.load,
+            contact_expected=self.time < self._contact_expected,
         )
 
     def _send(self, velocity: Float[Tensor, " joints"], **columns) -> None:
@@ -855,6 +873,30 @@ class WorkCell:
         every = self.config.keep_image_every
         if self._sensor is not None and every and self._ticks % every == 0:
             self.images.append(KeptImage(time=self.time, image=self._sensor.read()))
+        self._wait_or_stop(asked)
+
+    def _wait_or_stop(self, asked: HumanInput) -> None:
+        """Do what a person asks of the task as a whole.
+
+        Raises:
+            StoppedByPersonError: They stop it; the arm is at rest by then.
+        """
+        if self._stopping:
+            return
+        if asked.stop:
+            self._stopping, still = True, torch.zeros_like(self.joints)
+            deadline = self.time + _COMES_TO_REST
+            self.step(still)
+            while self._guard.velocity.any() and self.time < deadline:
+                self.step(still)
+            self._stopping = False
+            raise StoppedByPersonError(f"stopped: {asked.stop}")
+        if asked.pause and self._going == 1:
+            self.tell("The task waits.")
+        going = changed_rate(self._going, float(not asked.pause), self.config.dt)
+        if going == 1 and self._going < 1:
+            self.tell("The task goes on.")
+        self._going = float(going)
 
     def _nullspace_input(self, asked: HumanInput) -> Float[np.ndarray, " joints"]:
         """Of the person who pushes, and by which the arm makes way by itself [N m]."""

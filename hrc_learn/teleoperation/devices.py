@@ -33,7 +33,7 @@ class CombinedInput(Human):
     """Joins several sources, as the paper's mixed interface has a haptic device and a headset.
 
     Null-space inputs and twists add up. Of gripper, region, target and turn the first source
-    that sets them is used; requests of all are passed on.
+    that sets them is used; requests of all are passed on, and any of them pauses or stops.
     """
 
     def __init__(self, *sources: Human):
@@ -57,6 +57,8 @@ class CombinedInput(Human):
             target=next((i.target for i in inputs if i.target is not None), None),
             turn=next((i.turn for i in inputs if i.turn is not None), None),
             requests=tuple(request for i in inputs for request in i.requests),
+            pause=any(i.pause for i in inputs),
+            stop=next((i.stop for i in inputs if i.stop), ""),
         )
 
     def tell(self, feedback: Feedback) -> None:

@@ -1,0 +1,400 @@
+"""Touch: the person's hand on the arm itself, felt in the external torques of its joints.
+
+Who pushes the elbow moves the body in the null space, who pushes the hand pauses the task, and
+what meets the arm suddenly stops it. It takes no device but an arm that tells its torques.
+
+A wrench W at the end effector puts the torques J^T W on the joints, and these have no part in
+the null space: what the torques have there comes from further up. So the null-space part of
+what a person does is theirs alone, whatever the gripper holds, lifts or puts down.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from hrc_learn.kinematics import SerialChain
+from hrc_learn.protocols import ArmState, Feedback, Human, HumanInput
+
+Place = Literal["nothing", "elbow", "hand"]
+"""Where an arm is touched; the elbow stands for all links above the wrist."""
+
+# Joint whose origin is the elbow, counted from 1: joints after it feel nothing of it.
+_ELBOW = 4
+# Joint velocity from which on friction has its whole size [rad/s].
+_SLIDES = 0.01
+
+
+@dataclass(frozen=True, kw_only=True)
+class TouchConfig:
+    """What counts as a touch, and what is done about it.
+
+    Sizes are of the nominal imperfections of the simulated arm (docs/experiments.md), with which
+    `tests/teleoperation/test_touch.py` measures them.
+    """
+
+    elbow_force: float = 7.0
+    """Dead band of the elbow: force up to which it is not felt [N]. Half of it lets it go; twice
+    as much counts whole."""
+    evidence: float = 3.0
+    """By how much the logarithm of the evidence for a touch exceeds that for none."""
+    hand_force: float = 12.0
+    """Force at the hand from which on the task pauses [N]; half of it lets it go on."""
+    released: float = 0.4
+    """For which the hand must be let go until the task goes on [s]."""
+    resumes: Literal["release", "push"] = "release"
+    """Whether the task goes on when the hand is let go, or when it is pushed again."""
+    collision_rise: float = 30.0
+    """Change of the force within `collision_time` that no hand makes [N]."""
+    collision_time: float = 0.04
+    """[s]"""
+    collision_force: float = 110.0
+    """Force that stops the arm however slowly it came [N]: the smallest quasi-static limit of
+    ISO/TS 15066, table A.2, but for face and head."""
+    torque_deviation: float = 0.3
+    """Standard deviation of what no bias explains of each joint's torque [N m]."""
+    smoothing: float = 0.03
+    """Time constant of the torques in which a touch is looked for [s]."""
+    bias_time: float = 2.0
+    """In which the bias follows what nobody explains [s]."""
+    longest_touch: float = 20.0
+    """For which somebody may touch the arm until they are taken for a load [s]."""
+    gripper_settles: float = 0.5
+    """For which the hand may meet its object after the fingers have moved [s]."""
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if isinstance(value, float) and not value > 0:
+                raise ValueError(f"{name} must be positive, but is {value}.")
+
+
+class TorqueBias:
+    """What an arm that nobody touches tells as external torques, learned while it works.
+
+    tau = J_v^T f + o - F tanh(dq / v): a load's weight f at the hand, an offset o of each joint
+    (its model of gravity) and dry friction F that turns with the direction of motion. A Kalman
+    filter follows them; each is a random walk.
+    """
+
+    # Standard deviations at first, of f [N], o and F [N m]: of a load of 0.5 kg, and of friction
+    # of 0.3 to 1.3 N m, as identified by Gaz et al. (2019).
+    _FIRST = (5.0, 1.0, 0.5)
+    _FRICTION = 0.8
+    # Of the friction that a joint comes to rest with or leaves rest from, as a share of its size:
+    # it may be anything up to it, to either side.
+    _STICKS = 0.7
+
+    def __init__(self, joints: int, deviation: float):
+        """Begin with what is usual.
+
+        Args:
+            joints: Of the arm.
+            deviation: Of the noise of a torque [N m].
+        """
+        self._joints, self._deviation = joints, deviation
+        load, offset, friction = self._FIRST
+        self._size = np.concatenate(
+            [np.full(3, load), np.full(joints, offset), np.full(joints, friction)]
+        )
+        self.state = np.zeros(3 + 2 * joints)
+        self.state[3 + joints :] = self._FRICTION
+        self._covariance = np.diag(self._size**2)
+        self._sliding = np.zeros(joints)
+
+    def expected(
+        self, jacobian: Float[np.ndarray, "6 joints"], velocity: Float[np.ndarray, " joints"]
+    ) -> tuple[Float[np.ndarray, " joints"], Float[np.ndarray, "joints joints"]]:
+        """Torques of an arm that nobody touches [N m], and their covariance [N^2 m^2].
+
+        Args:
+            jacobian: Of the end effector.
+            velocity: Of the joints [rad/s].
+        """
+        H, joints = self._rows(jacobian, velocity), self._joints
+        # What a joint has begun or ceased to slide since is friction that nobody knows.
+        change = np.tanh(velocity / _SLIDES) - self._sliding
+        unknown = self._deviation**2 + (self._STICKS * self.state[3 + joints :] * change) ** 2
+        return H @ self.state, H @ self._covariance @ H.T + np.diag(unknown)
+
+    def follow(
+        self,
+        jacobian: Float[np.ndarray, "6 joints"],
+        velocity: Float[np.ndarray, " joints"],
+        torque: Float[np.ndarray, " joints"] | None,
+        dt: float,
+        time: float,
+    ) -> None:
+        """Take in a reading.
+
+        Args:
+            jacobian: Of the end effector.
+            velocity: Of the joints [rad/s].
+            torque: External torques of an arm that nobody touches [N m]; None: somebody does.
+            dt: Since the last reading [s].
+            time: In which offsets follow [s].
+        """
+        H, sliding = self._rows(jacobian, velocity), np.tanh(velocity / _SLIDES)
+        sticks = self._STICKS * self.state[3 + self._joints :] * (sliding - self._sliding)
+        offsets = np.arange(3, 3 + self._joints)
+        self._covariance[offsets, offsets] += sticks**2
+        self._sliding = sliding
+        if torque is None:
+            return
+        # A random walk that is as large as its prior within the time, seen in that time through
+        # noise: its filter forgets at this rate.
+        self._covariance += np.diag(self._size**2 * dt / time)
+        noise = self._deviation**2 * time / dt
+        PH = self._covariance @ H.T
+        K = np.linalg.solve(H @ PH + noise * np.eye(self._joints), PH.T).T
+        self.state = self.state + K @ (torque - H @ self.state)
+        self._covariance = self._covariance - K @ PH.T
+        self._covariance = 0.5 * (self._covariance + self._covariance.T)
+
+    def _rows(
+        self, jacobian: Float[np.ndarray, "6 joints"], velocity: Float[np.ndarray, " joints"]
+    ) -> Float[np.ndarray, "joints unknowns"]:
+        slides = np.diag(-np.tanh(velocity / _SLIDES))
+        return np.concatenate([jacobian[:3].T, np.eye(self._joints), slides], axis=1)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Explanation:
+    """How well a force at one place explains torques."""
+
+    force: Float[np.ndarray, "3"]
+    """Most likely one, in the base frame [N]."""
+    evidence: float
+    """Logarithm of the torques' probability density, whatever the force."""
+
+    @property
+    def size(self) -> float:
+        """Of the force [N]."""
+        return float(np.linalg.norm(self.force))
+
+    def __lt__(self, other: Explanation) -> bool:
+        return self.evidence < other.evidence
+
+
+def explain(
+    torque: Float[np.ndarray, " joints"],
+    rows: Float[np.ndarray, "joints loads"],
+    spread: Float[np.ndarray, " loads"],
+    unknown: Float[np.ndarray, "joints joints"],
+) -> Explanation:
+    """Explain torques by loads at a place, which are as likely as their size says.
+
+    Args:
+        torque: External torques without their bias [N m].
+        rows: Transposed Jacobian of the place: its first three loads are a force.
+        spread: Standard deviation of each load before anything is felt [N, N m].
+        unknown: Covariance of the torques of an arm that nobody touches [N^2 m^2].
+    """
+    loaded = rows * spread
+    covariance = loaded @ loaded.T + unknown
+    weighted = np.linalg.solve(covariance, torque)
+    _, size = np.linalg.slogdet(covariance)
+    loads = spread * (loaded.T @ weighted)
+    return Explanation(force=loads[:3], evidence=-0.5 * float(torque @ weighted + size))
+
+
+def evidence_of_none(
+    torque: Float[np.ndarray, " joints"], unknown: Float[np.ndarray, "joints joints"]
+) -> float:
+    """Logarithm of the probability density of torques [N m] of an arm that nobody touches."""
+    _, size = np.linalg.slogdet(unknown)
+    return -0.5 * float(torque @ np.linalg.solve(unknown, torque) + size)
+
+
+# Forces of people, and moments that they have about the tool centre point: of a hand that
+# grasps the gripper up to 10 cm beside it [N, N m].
+_PUSHES, _MOMENTS = 25.0, 2.5
+# By how much the logarithm of its evidence must be larger for the hand to be what is pushed: the
+# task waits for nothing if it is not.
+_SURE = 2.0
+# Loads of the end effector by what the task meets: force and moment [N, N m].
+_MET = np.array([60.0] * 3 + [10.0] * 3)
+
+
+# Change of the gripper's opening from one reading to the next at which the fingers move [m]: of
+# 10 mm/s, half a gripper's slowest.
+_FINGERS_MOVE = 1e-4
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Posture:
+    """What the torques of a posture say."""
+
+    jacobian: Float[np.ndarray, "6 joints"]
+    """Of the end effector."""
+    elbow: Float[np.ndarray, "3 joints"]
+    """Of the elbow's position: later joints do not move it."""
+    null: Float[np.ndarray, "joints redundant"]
+    """Orthonormal basis of the null space."""
+
+    @classmethod
+    def of(
+        cls, origins: Float[np.ndarray, "joints 3"], jacobian: Float[np.ndarray, "6 joints"]
+    ) -> _Posture:
+        """From the joints' origins [m] and the Jacobian of the end effector."""
+        elbow, axes = np.zeros_like(jacobian[:3]), jacobian[3:, :_ELBOW].T
+        elbow[:, :_ELBOW] = np.cross(axes, origins[_ELBOW - 1] - origins[:_ELBOW]).T
+        _, _, basis = np.linalg.svd(jacobian)
+        return cls(jacobian=jacobian, elbow=elbow, null=basis[len(jacobian) :].T)
+
+    def explained(
+        self,
+        torque: Float[np.ndarray, " joints"],
+        unknown: Float[np.ndarray, "joints joints"],
+    ) -> tuple[Explanation, Explanation]:
+        """Torques [N m] by a force at the elbow, and by one at the hand."""
+        forces, moments = np.full(3, _PUSHES), np.full(3, _MOMENTS)
+        return (
+            explain(torque, self.elbow.T, forces, unknown),
+            explain(torque, self.jacobian.T, np.concatenate([forces, moments]), unknown),
+        )
+
+
+class Touch(Human):
+    """A person who pushes the arm itself.
+
+    Attributes:
+        place: Where the arm is touched now.
+        force: With which, as far as is known, in the base frame [N].
+    """
+
+    def __init__(self, chain: SerialChain, config: TouchConfig | None = None):
+        """Begin with an arm that nobody touches.
+
+        Args:
+            chain: The arm.
+            config: What counts as a touch.
+        """
+        self._chain, self._config = chain, config or TouchConfig()
+        self._restart()
+
+    def _restart(self) -> None:
+        joints = len(self._chain.joint_names)
+        self._bias = TorqueBias(joints, self._config.torque_deviation)
+        self.place: Place = "nothing"
+        self.force = np.zeros(3)
+        self._felt = np.zeros(joints)
+        self._time, self._width = -math.inf, math.nan
+        # Raw torques and their times, for as long as a collision takes to rise.
+        self._lately: list[tuple[float, np.ndarray]] = []
+        self._fingers_moved = self._pushed = self._collided = self._touched = -math.inf
+        self._paused, self._expected, self._why = False, False, ""
+
+    def tell(self, feedback: Feedback) -> None:
+        """Learn whether the task feels its way."""
+        self._expected = feedback.contact_expected
+
+    def read(self, state: ArmState) -> HumanInput:
+        """What the touch asks for; nothing of an arm that tells no torques."""
+        still = np.zeros(len(state.joint_position))
+        if state.external_torque is None:
+            return HumanInput(nullspace_input=still)
+        dt = state.time - self._time
+        if dt < 0:  # a simulation that begins anew
+            self._restart()
+            dt = math.inf
+        if math.isinf(dt):
+            dt = self._config.smoothing
+        config, q = self._config, torch.from_numpy(state.joint_position)
+        origins, jacobian = self._chain.joint_origins_and_jacobian(q)
+        arm = _Posture.of(origins.numpy(), jacobian.numpy())
+        bias, unknown = self._bias.expected(arm.jacobian, state.joint_velocity)
+        free = state.external_torque - bias
+        self._felt += min(dt / config.smoothing, 1.0) * (free - self._felt)
+        self._time, meets = state.time, self._meets_objects(state)
+        if meets:  # whatever the hand meets says nothing of the elbow
+            unknown = unknown + arm.jacobian.T @ np.diag(_MET**2) @ arm.jacobian
+        above, hand = arm.explained(self._felt, unknown)
+        self._look(above, hand, evidence_of_none(self._felt, unknown))
+        self._watch_for_collision(arm, free, unknown, max(above, hand), meets)
+        if self.place == "nothing":
+            self._touched = state.time
+        leans = state.time - self._touched > config.longest_touch
+        self._bias.follow(
+            arm.jacobian,
+            state.joint_velocity,
+            state.external_torque if self.place == "nothing" or leans else None,
+            dt,
+            config.bias_time,
+        )
+        return HumanInput(
+            nullspace_input=self._nullspace_input(arm) if self.place == "elbow" else still,
+            pause=self._pauses(meets),
+            stop=self._why,
+        )
+
+    def _meets_objects(self, state: ArmState) -> bool:
+        """Whether the hand may meet what the task is about."""
+        if abs(state.gripper_width - self._width) > _FINGERS_MOVE:
+            self._fingers_moved = state.time
+        self._width = state.gripper_width
+        since = state.time - self._fingers_moved
+        return self._expected or since < self._config.gripper_settles
+
+    def _look(self, above: Explanation, hand: Explanation, none: float) -> None:
+        """See where the arm is touched; `none` is the evidence that it is not."""
+        config, before = self._config, self.place
+        likelier = hand.evidence - above.evidence
+        sure = max(above, hand).evidence - none > config.evidence
+        # Once touched, half of it is enough.
+        if before == "elbow" and above.size > 0.5 * config.elbow_force:
+            self.place = "elbow"
+        elif before == "hand" and hand.size > 0.5 * config.hand_force:
+            self.place = "hand"
+        elif sure and likelier < 0 and above.size > config.elbow_force:
+            self.place = "elbow"
+        elif sure and likelier > _SURE and hand.size > config.hand_force:
+            self.place = "hand"
+        else:
+            self.place = "nothing"
+        forces = {"nothing": np.zeros(3), "elbow": above.force, "hand": hand.force}
+        self.force = forces[self.place]
+
+    def _nullspace_input(self, arm: _Posture) -> Float[np.ndarray, " joints"]:
+        """What is felt in the null space, less near the dead band [N m]."""
+        beyond = float(np.linalg.norm(self.force)) / self._config.elbow_force - 1.0
+        return min(max(beyond, 0.0), 1.0) * (arm.null @ (arm.null.T @ self._felt))
+
+    def _pauses(self, meets: bool) -> bool:
+        """Whether the task is to wait."""
+        config, pushed = self._config, self.place == "hand" and not meets
+        again = pushed and self._time - self._pushed > config.released
+        if pushed:
+            self._pushed = self._time
+        if config.resumes == "push":
+            self._paused ^= again
+        else:
+            self._paused = self._time - self._pushed < config.released
+        return self._paused
+
+    def _watch_for_collision(
+        self,
+        arm: _Posture,
+        torque: Float[np.ndarray, " joints"],
+        unknown: Float[np.ndarray, "joints joints"],
+        now: Explanation,
+        meets: bool,
+    ) -> None:
+        """Note what meets the arm, too suddenly or too hard for a hand that pushes it."""
+        config, time = self._config, self._time
+        self._lately = [old for old in self._lately if old[0] > time - config.collision_time]
+        rise = torque - self._lately[0][1] if self._lately else np.zeros_like(torque)
+        self._lately.append((time, torque))
+        sudden = max(arm.explained(rise, unknown)).size
+        if now.size > config.collision_force:
+            self._why = f"something holds the arm with {now.size:.0f} N"
+            self._collided = time
+        elif sudden > config.collision_rise and not meets:
+            self._why = f"something has met the arm, with {sudden:.0f} N at once"
+            self._collided = time
+        elif self.place == "nothing" and time - self._collided > config.released:
+            self._why = ""
