@@ -26,8 +26,10 @@ Place = Literal["nothing", "elbow", "hand"]
 
 # Joint whose origin is the elbow, counted from 1: joints after it feel nothing of it.
 _ELBOW = 4
+# For which errors of the torques last: a filter's lag, and servos that settle [s].
+_CORRELATED = 0.1
 # Joint velocity from which on friction has its whole size [rad/s].
-_SLIDES = 0.01
+_SLIDES = 0.02
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,9 +43,12 @@ class TouchConfig:
     elbow_force: float = 7.0
     """Dead band of the elbow: force up to which it is not felt [N]. Half of it lets it go; twice
     as much counts whole."""
-    evidence: float = 3.0
+    gain: float = 2.0
+    """Null-space input per torque that is felt there. With a damping of 3 N m s/rad, 20 N at an
+    elbow that moves by 0.1 m a radian make 0.13 m/s."""
+    evidence: float = 6.0
     """By how much the logarithm of the evidence for a touch exceeds that for none."""
-    hand_force: float = 12.0
+    hand_force: float = 10.0
     """Force at the hand from which on the task pauses [N]; half of it lets it go on."""
     released: float = 0.4
     """For which the hand must be let go until the task goes on [s]."""
@@ -60,8 +65,6 @@ class TouchConfig:
     """Standard deviation of what no bias explains of each joint's torque [N m]."""
     smoothing: float = 0.03
     """Time constant of the torques in which a touch is looked for [s]."""
-    bias_time: float = 2.0
-    """In which the bias follows what nobody explains [s]."""
     longest_touch: float = 20.0
     """For which somebody may touch the arm until they are taken for a load [s]."""
     gripper_settles: float = 0.5
@@ -76,17 +79,20 @@ class TouchConfig:
 class TorqueBias:
     """What an arm that nobody touches tells as external torques, learned while it works.
 
-    tau = J_v^T f + o - F tanh(dq / v): a load's weight f at the hand, an offset o of each joint
+    tau = -J_z^T w + o - F tanh(dq / v): a load's weight w at the hand, an offset o of each joint
     (its model of gravity) and dry friction F that turns with the direction of motion. A Kalman
     filter follows them; each is a random walk.
     """
 
-    # Standard deviations at first, of f [N], o and F [N m]: of a load of 0.5 kg, and of friction
+    # Standard deviations at first, of w [N], o and F [N m]: of a load of 0.5 kg, and of friction
     # of 0.3 to 1.3 N m, as identified by Gaz et al. (2019).
     _FIRST = (5.0, 1.0, 0.5)
     _FRICTION = 0.8
-    # Of the friction that a joint comes to rest with or leaves rest from, as a share of its size:
-    # it may be anything up to it, to either side.
+    # By which they wander within a second: loads are taken up, and the error of a model of gravity
+    # changes with the posture [N, N m].
+    _DRIFT = (0.3, 0.1, 0.03)
+    # Of the friction of a joint at rest, as a share of its size: it may be anything up to it, to
+    # either side.
     _STICKS = 0.7
 
     def __init__(self, joints: int, deviation: float):
@@ -97,14 +103,12 @@ class TorqueBias:
             deviation: Of the noise of a torque [N m].
         """
         self._joints, self._deviation = joints, deviation
-        load, offset, friction = self._FIRST
-        self._size = np.concatenate(
-            [np.full(3, load), np.full(joints, offset), np.full(joints, friction)]
+        first, self._drift = (
+            np.repeat(sizes, (1, joints, joints)) for sizes in (self._FIRST, self._DRIFT)
         )
-        self.state = np.zeros(3 + 2 * joints)
-        self.state[3 + joints :] = self._FRICTION
-        self._covariance = np.diag(self._size**2)
-        self._sliding = np.zeros(joints)
+        self.state = np.zeros(1 + 2 * joints)
+        self.state[1 + joints :] = self._FRICTION
+        self._covariance = np.diag(first**2)
 
     def expected(
         self, jacobian: Float[np.ndarray, "6 joints"], velocity: Float[np.ndarray, " joints"]
@@ -115,42 +119,35 @@ class TorqueBias:
             jacobian: Of the end effector.
             velocity: Of the joints [rad/s].
         """
-        H, joints = self._rows(jacobian, velocity), self._joints
-        # What a joint has begun or ceased to slide since is friction that nobody knows.
-        change = np.tanh(velocity / _SLIDES) - self._sliding
-        unknown = self._deviation**2 + (self._STICKS * self.state[3 + joints :] * change) ** 2
-        return H @ self.state, H @ self._covariance @ H.T + np.diag(unknown)
+        H = self._rows(jacobian, velocity)
+        return H @ self.state, H @ self._covariance @ H.T + np.diag(self._unknown(velocity))
+
+    def _unknown(self, velocity: Float[np.ndarray, " joints"]) -> Float[np.ndarray, " joints"]:
+        """Variances of what no bias explains: friction of joints at rest may be anything."""
+        friction = self.state[1 + self._joints :] / np.cosh(velocity / _SLIDES)
+        return self._deviation**2 + (self._STICKS * friction) ** 2
 
     def follow(
         self,
         jacobian: Float[np.ndarray, "6 joints"],
         velocity: Float[np.ndarray, " joints"],
-        torque: Float[np.ndarray, " joints"] | None,
+        torque: Float[np.ndarray, " joints"],
         dt: float,
-        time: float,
     ) -> None:
         """Take in a reading.
 
         Args:
             jacobian: Of the end effector.
             velocity: Of the joints [rad/s].
-            torque: External torques of an arm that nobody touches [N m]; None: somebody does.
+            torque: External torques of an arm that nobody touches [N m].
             dt: Since the last reading [s].
-            time: In which offsets follow [s].
         """
-        H, sliding = self._rows(jacobian, velocity), np.tanh(velocity / _SLIDES)
-        sticks = self._STICKS * self.state[3 + self._joints :] * (sliding - self._sliding)
-        offsets = np.arange(3, 3 + self._joints)
-        self._covariance[offsets, offsets] += sticks**2
-        self._sliding = sliding
-        if torque is None:
-            return
-        # A random walk that is as large as its prior within the time, seen in that time through
-        # noise: its filter forgets at this rate.
-        self._covariance += np.diag(self._size**2 * dt / time)
-        noise = self._deviation**2 * time / dt
+        H = self._rows(jacobian, velocity)
+        self._covariance += np.diag(self._drift**2 * dt)
+        # Errors of one reading are those of the next, for a while.
+        noise = np.diag(self._unknown(velocity)) * max(_CORRELATED / dt, 1.0)
         PH = self._covariance @ H.T
-        K = np.linalg.solve(H @ PH + noise * np.eye(self._joints), PH.T).T
+        K = np.linalg.solve(H @ PH + noise, PH.T).T
         self.state = self.state + K @ (torque - H @ self.state)
         self._covariance = self._covariance - K @ PH.T
         self._covariance = 0.5 * (self._covariance + self._covariance.T)
@@ -159,7 +156,8 @@ class TorqueBias:
         self, jacobian: Float[np.ndarray, "6 joints"], velocity: Float[np.ndarray, " joints"]
     ) -> Float[np.ndarray, "joints unknowns"]:
         slides = np.diag(-np.tanh(velocity / _SLIDES))
-        return np.concatenate([jacobian[:3].T, np.eye(self._joints), slides], axis=1)
+        weight = -jacobian[2, :, None]
+        return np.concatenate([weight, np.eye(self._joints), slides], axis=1)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -286,7 +284,8 @@ class Touch(Human):
         self._time, self._width = -math.inf, math.nan
         # Raw torques and their times, for as long as a collision takes to rise.
         self._lately: list[tuple[float, np.ndarray]] = []
-        self._fingers_moved = self._pushed = self._collided = self._touched = -math.inf
+        self._fingers_moved = self._pushed = self._collided = self._let_go = -math.inf
+        self._alone = 0.0
         self._paused, self._expected, self._why = False, False, ""
 
     def tell(self, feedback: Feedback) -> None:
@@ -316,21 +315,23 @@ class Touch(Human):
         above, hand = arm.explained(self._felt, unknown)
         self._look(above, hand, evidence_of_none(self._felt, unknown))
         self._watch_for_collision(arm, free, unknown, max(above, hand), meets)
-        if self.place == "nothing":
-            self._touched = state.time
-        leans = state.time - self._touched > config.longest_touch
-        self._bias.follow(
-            arm.jacobian,
-            state.joint_velocity,
-            state.external_torque if self.place == "nothing" or leans else None,
-            dt,
-            config.bias_time,
-        )
+        if self._nobody_touches():
+            self._bias.follow(arm.jacobian, state.joint_velocity, state.external_torque, dt)
         return HumanInput(
             nullspace_input=self._nullspace_input(arm) if self.place == "elbow" else still,
             pause=self._pauses(meets),
             stop=self._why,
         )
+
+    def _nobody_touches(self) -> bool:
+        """Whether the torques are those of an arm alone, for the bias to follow them."""
+        if self.place != "nothing":
+            self._let_go = self._time
+        # When it stops, friction turns, and may hide the hand for a while that stopped it.
+        if self._time - self._let_go > self._config.released:
+            self._alone = self._time
+        since = self._time - self._alone
+        return since == 0 or since > self._config.longest_touch
 
     def _meets_objects(self, state: ArmState) -> bool:
         """Whether the hand may meet what the task is about."""
@@ -362,7 +363,8 @@ class Touch(Human):
     def _nullspace_input(self, arm: _Posture) -> Float[np.ndarray, " joints"]:
         """What is felt in the null space, less near the dead band [N m]."""
         beyond = float(np.linalg.norm(self.force)) / self._config.elbow_force - 1.0
-        return min(max(beyond, 0.0), 1.0) * (arm.null @ (arm.null.T @ self._felt))
+        share = self._config.gain * min(max(beyond, 0.0), 1.0)
+        return share * (arm.null @ (arm.null.T @ self._felt))
 
     def _pauses(self, meets: bool) -> bool:
         """Whether the task is to wait."""
