@@ -114,8 +114,8 @@ _CHECKED = 50
 _FELT, _GETTING_UNDER_WAY = 5, 25
 # Part of the task that constraints take beyond rounding.
 _SLOWED = 1e-3
-# For which what was felt may still be met: the fingers open, the hand leaves it. And in which an
-# arm that is stopped comes to rest [s].
+# For which what was felt may still be met: the fingers open, the hand leaves it. And in which
+# an arm that is stopped comes to rest [s].
 _LEAVING, _COMES_TO_REST = 1.0, 1.0
 # Images taken less than this apart are one image, whose age was read from another clock; and
 # for how long joint positions are remembered, longer than any camera's delay [s].

@@ -26,3 +26,5 @@ from hrc_learn.teleoperation.scripted_expert import ScriptedForce as ScriptedFor
 from hrc_learn.teleoperation.scripted_expert import ScriptedPerturbation as ScriptedPerturbation
 from hrc_learn.teleoperation.scripted_expert import Tremor as Tremor
 from hrc_learn.teleoperation.scripted_expert import random_pulls as random_pulls
+from hrc_learn.teleoperation.touch import Touch as Touch
+from hrc_learn.teleoperation.touch import TouchConfig as TouchConfig

@@ -245,9 +245,7 @@ def test_a_safety_filter_is_told_what_the_driver_does():
 
 def test_estimated_torques_are_those_that_the_servos_have_to_balance():
     """At rest: of a load and of weights that nobody entered, and of a push at the forearm."""
-    made = World(
-        replace(WORKPLACE.scene, objects=()), draw(payload=0.5, gravity_error=0.02)
-    )
+    made = World(replace(WORKPLACE.scene, objects=()), draw(payload=0.5, gravity_error=0.02))
     made.reset(HOVER)
     forearm = made.model.body("link4").id
     for push in ((0.0, 0.0, 0.0, 0.0, 0.0, 0.0), (4.0, 20.0, -6.0, 0.0, 0.5, 0.0)):
