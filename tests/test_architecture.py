@@ -106,7 +106,7 @@ LAZY_LIBRARIES: dict[str, set[str]] = {
     "vision": {"cv2"},
     "sim": {"franky_sim"},
     "viz": {"rich"},
-    "hardware": {"franky", "cv2"},
+    "hardware": {"franky", "pylibfranka", "cv2"},
     "teleoperation": {"viser", "pygame"},
     "experiments": {"rich"},
     "lerobot": {"torchvision"},

@@ -18,6 +18,10 @@ from hrc_learn.controller.controller import ControllerState as ControllerState
 from hrc_learn.controller.feedback import BlendingConfig as BlendingConfig
 from hrc_learn.controller.feedback import BlendingState as BlendingState
 from hrc_learn.controller.feedback import VisionBlending as VisionBlending
+from hrc_learn.controller.filtered_velocity import FilteredVelocity as FilteredVelocity
+from hrc_learn.controller.filtered_velocity import VelocityStep as VelocityStep
+from hrc_learn.controller.filtered_velocity import VelocityStepState as VelocityStepState
+from hrc_learn.controller.filtered_velocity import WantedVelocity as WantedVelocity
 from hrc_learn.controller.interface import GRIPPER_DOWN as GRIPPER_DOWN
 from hrc_learn.controller.interface import INITIAL_IMAGE_JACOBIAN as INITIAL_IMAGE_JACOBIAN
 from hrc_learn.controller.interface import Command as Command

@@ -14,9 +14,8 @@ import torch
 from torch import Tensor
 from torch.utils import _pytree
 
-from hrc_learn.controller import AdaptiveController, Observation
 from hrc_learn.deploy._inductor import tuned_for
-from hrc_learn.deploy.package import PackedStep, describe, machine
+from hrc_learn.deploy.package import PackedStep, Seen, Steppable, describe, machine
 from hrc_learn.store import Claim, new_file
 
 
@@ -24,9 +23,7 @@ class NoCompilerError(RuntimeError):
     """There is no C++ compiler to build a package with."""
 
 
-def export_step(
-    controller: AdaptiveController, observation: Observation, folder: Path | None = None
-) -> Path:
+def export_step(controller: Steppable, observation: Seen, folder: Path | None = None) -> Path:
     """Compile a controller's step, unless an equal one was compiled before.
 
     A package fits the machine it was built on. Its name in the folder is a hash of torch's
@@ -76,7 +73,7 @@ def export_step(
     return package
 
 
-def trace(step: PackedStep, observation: Observation) -> torch.export.ExportedProgram:
+def trace(step: PackedStep, observation: Seen) -> torch.export.ExportedProgram:
     """One graph of a step, in the form that AOTInductor takes."""
     with torch.no_grad():
         program = torch.export.export(step, tuple(step.example(observation)), strict=False)
@@ -88,7 +85,7 @@ def trace(step: PackedStep, observation: Observation) -> torch.export.ExportedPr
     return program
 
 
-def _structure(observation: Observation) -> list[tuple[str, str]]:
+def _structure(observation: Seen) -> list[tuple[str, str]]:
     """What of an example makes a difference to the step: all but the values of tensors."""
     leaves, _ = _pytree.tree_flatten_with_path(observation)
     return [

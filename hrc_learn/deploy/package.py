@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple, final
+from typing import Any, NamedTuple, Protocol, final, runtime_checkable
 
 import numpy as np
 import torch
@@ -24,7 +24,26 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.utils import _pytree
 
-from hrc_learn.controller import AdaptiveController, Observation
+from hrc_learn.controller import Observation, WantedVelocity
+from hrc_learn.kinematics import SerialChain
+
+type Seen = Observation | WantedVelocity
+"""What the steps of a controller are given."""
+
+
+@runtime_checkable
+class Steppable(Protocol):
+    """A module with a step to run in a loop: `AdaptiveController` or `VelocityStep`."""
+
+    chain: SerialChain
+
+    def initial_state(self, joint_position: Float[Tensor, "*batch n"], /) -> Any:
+        """State of an arm at rest [rad], a pytree."""
+        ...
+
+    def step(self, state: Any, observation: Any, /) -> tuple[Any, Any]:
+        """Take one step on what it is given; command and next state, pytrees."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -143,13 +162,13 @@ class StepLayouts(NamedTuple):
 
 @final
 class PackedStep(nn.Module):
-    """`AdaptiveController.step` on vectors, in place.
+    """The step of a controller on vectors, in place.
 
     It reads the vectors of state and observation, and writes those of the command and of the
     next state. What an observation leaves out, and a `dt` that is a number, are constants.
     """
 
-    def __init__(self, controller: AdaptiveController, observation: Observation):
+    def __init__(self, controller: Steppable, observation: Seen):
         """Take the structure of a step from an example.
 
         Args:
@@ -171,7 +190,7 @@ class PackedStep(nn.Module):
         )
         self.first_state = self.layouts.state.pack(tensors_of(state))
 
-    def example(self, observation: Observation) -> Vectors:
+    def example(self, observation: Seen) -> Vectors:
         """Vectors before the first step: at rest in the ready posture."""
         return Vectors(
             self.first_state.clone(),
@@ -219,7 +238,7 @@ class Package:
     """Vector of the observation that it was exported with."""
 
 
-def describe(step: PackedStep, observation: Observation) -> dict[str, str]:
+def describe(step: PackedStep, observation: Seen) -> dict[str, str]:
     """Metadata of a package: what to know of its step, as text that any language can read.
 
     The layout has a line for each field: which vector, field, dtype, 1 if it is batched, and

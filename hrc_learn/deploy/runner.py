@@ -14,12 +14,19 @@ import torch
 from jaxtyping import Float
 from torch.utils import _pytree
 
-from hrc_learn.controller import AdaptiveController, Observation
 from hrc_learn.deploy.export import NoCompilerError, export_step
-from hrc_learn.deploy.package import PackedStep, StepLayouts, Vectors, load, tensors_of
+from hrc_learn.deploy.package import (
+    PackedStep,
+    Seen,
+    StepLayouts,
+    Steppable,
+    Vectors,
+    load,
+    tensors_of,
+)
 
-_POSITIONS = ("safety.position", "pose_drift.joint_position")
-"""Fields of the state that remember where the joints were."""
+_POSITIONS = {"safety.position", "pose_drift.joint_position"}
+"""Fields that remember where the joints were, of the states that have them."""
 
 
 class StepRunner(ABC):
@@ -53,7 +60,7 @@ class StepRunner(ABC):
             `joint_velocity`.
         """
 
-    def observe(self, observation: Observation) -> None:
+    def observe(self, observation: Seen) -> None:
         """Write all fields of an observation at once."""
         vector = self._layouts.observation.pack(tensors_of(observation))
         self._vectors.observation.copy_(vector)
@@ -74,9 +81,23 @@ class StepRunner(ABC):
         """
         return _named(field, self._layouts.state.arrays(self._state_vector()))
 
+    def set_state(self, field: str, value: Float[np.ndarray, "..."]) -> None:
+        """Replace one field of the state, as where an arm has not done what it was told.
+
+        Raises:
+            ValueError: There is no such field.
+        """
+        vector = self._state_vector()
+        _named(field, self._layouts.state.arrays(vector))[...] = value
+        self._take_state(vector)
+
     @abstractmethod
     def _state_vector(self) -> torch.Tensor:
         """The state after the last step."""
+
+    @abstractmethod
+    def _take_state(self, vector: torch.Tensor) -> None:
+        """Go on from a state."""
 
 
 @final
@@ -102,8 +123,9 @@ class PackageRunner(StepRunner):
 
     def start(self, joint_position: Float[np.ndarray, "*batch n"]) -> None:
         self._vectors.state.copy_(self._first_state)
-        for field in _POSITIONS:
-            self.state(field)[...] = joint_position
+        state = self._layouts.state.arrays(self._vectors.state)
+        for field in _POSITIONS & state.keys():
+            state[field][...] = joint_position
 
     def step(self) -> Float[np.ndarray, "*batch n"]:
         self._run(self._arguments)
@@ -112,12 +134,15 @@ class PackageRunner(StepRunner):
     def _state_vector(self) -> torch.Tensor:
         return self._vectors.state
 
+    def _take_state(self, vector: torch.Tensor) -> None:
+        self._vectors.state.copy_(vector)
+
 
 @final
 class EagerRunner(StepRunner):
     """The same step uncompiled."""
 
-    def __init__(self, controller: AdaptiveController, observation: Observation):
+    def __init__(self, controller: Steppable, observation: Seen):
         """Take a step as it is; later observations have the fields of this one."""
         super().__init__(PackedStep(controller, observation).layouts)
         self._controller, self._last_command = controller, None
@@ -155,6 +180,12 @@ class EagerRunner(StepRunner):
     def _state_vector(self) -> torch.Tensor:
         return self._layouts.state.pack(tensors_of(self._state))
 
+    def _take_state(self, vector: torch.Tensor) -> None:
+        leaves, structure = _pytree.tree_flatten(self._state)
+        read = iter(self._layouts.state.unpack(vector))
+        new = [next(read) if isinstance(x, torch.Tensor) else x for x in leaves]
+        self._state = _pytree.tree_unflatten(new, structure)
+
 
 def _named(field: str, arrays: dict[str, np.ndarray]) -> np.ndarray:
     if field not in arrays:
@@ -163,7 +194,7 @@ def _named(field: str, arrays: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def open_step(
-    controller: AdaptiveController, observation: Observation, folder: Path | None = None
+    controller: Steppable, observation: Seen, folder: Path | None = None
 ) -> StepRunner:
     """The fastest runner there is: compiled, or eager with a warning without a C++ compiler.
 

@@ -11,6 +11,9 @@ from hrc_learn.hardware.cameras import VideoEndedError as VideoEndedError
 from hrc_learn.hardware.cameras import VideoFile as VideoFile
 from hrc_learn.hardware.cameras import open_camera as open_camera
 from hrc_learn.hardware.ending import ending_at_rest as ending_at_rest
+from hrc_learn.hardware.franka_arm import FrankaArm as FrankaArm
+from hrc_learn.hardware.franka_arm import FrankaConfig as FrankaConfig
+from hrc_learn.hardware.franka_arm import LoopTiming as LoopTiming
 from hrc_learn.hardware.franky_arm import ArmFaultError as ArmFaultError
 from hrc_learn.hardware.franky_arm import CollisionConfig as CollisionConfig
 from hrc_learn.hardware.franky_arm import FrankyArm as FrankyArm

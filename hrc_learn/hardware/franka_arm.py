@@ -1,0 +1,404 @@
+"""A Franka arm at 1 kHz, through Franka's own binding pylibfranka.
+
+The FR3 only: pylibfranka 0.21 speaks version 10 of the protocol, that of an FR3 with system
+5.9 or later. A Panda (FER) needs libfranka 0.9 or before, version 5 of the protocol, for which
+there is no such binding: take `FrankyArm` in franky's build for its server version.
+
+Tested against the protocol simulators franka-sim, with all that it enforces, and franky-sim.
+NOT RUN ON HARDWARE.
+"""
+
+from __future__ import annotations
+
+import math
+import multiprocessing
+import os
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import partial
+from types import TracebackType
+from typing import final
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from hrc_learn.controller import SafetyConfig, VelocityStep, WantedVelocity
+from hrc_learn.deploy import (
+    EagerRunner,
+    NoCompilerError,
+    PackageRunner,
+    StepRunner,
+    export_step,
+)
+from hrc_learn.hardware.arm_process import DriverError
+from hrc_learn.hardware.franka_gripper import FrankaHand, GripperProcess
+from hrc_learn.hardware.franka_loop import (
+    CYCLE,
+    JOINTS,
+    CollisionThresholds,
+    Load,
+    Orders,
+    Phase,
+    Report,
+    Robot,
+    Shared,
+    serve,
+)
+from hrc_learn.kinematics import SerialChain
+from hrc_learn.protocols import ArmState
+
+_STARTUP = 60.0
+"""Longest that connecting may take [s]."""
+_STALE = 0.2
+"""Age of a reading at which the loop counts as stalled [s]: ten times what the control box
+allows before it stops the arm by itself."""
+_REST = 3.0
+"""Longest that coming to rest may take [s]: at the limits of the maker half a second, with a
+tenth of the acceleration three."""
+_RECOVERY = 15.0
+"""Longest that recovery may take [s]; the control box needs some seconds."""
+_STILL = 0.02
+"""Measured joint velocities below this are rest [rad/s]: the encoders' noise is below it."""
+_PAUSE = 5e-4
+"""Between two looks at whether something has happened [s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrankaConfig:
+    """How an arm is driven."""
+
+    hold: float = 0.15
+    """How long a velocity holds [s]; then the arm is brought to rest."""
+    acceleration: float = 0.5
+    """Fraction of the arm's acceleration limits that is used, above 0 to 1."""
+    jerk: float = 0.3
+    """Fraction of its jerk limits, above 0 to 1. A third or less is safe whatever is lost: an
+    answer that came too late may count all the same, and then three changes of acceleration
+    meet in one."""
+    safety: SafetyConfig = field(default_factory=SafetyConfig)
+    """Of the filter, which sees these limits."""
+    realtime: bool = True
+    """Whether to insist on a realtime kernel and priority. Without them cycles are late now and
+    then, which the control box tolerates up to 20 in a row."""
+    compiled: bool = True
+    """Whether to compile the step, once for a machine, which takes up to a minute the first
+    time. Uncompiled it takes half of the time there is."""
+    collision: CollisionThresholds = field(default_factory=CollisionThresholds)
+    """What the control box stops the arm at."""
+    load: Load | None = None
+    """What the arm carries besides its end effector."""
+    gripper: bool = True
+    """Whether there is one."""
+    grip_force: float = 40.0
+    """To squeeze with [N]."""
+    grip_speed: float = 0.1
+    """Of the fingers [m/s]; the most that the Franka Hand has."""
+
+    def __post_init__(self) -> None:
+        for name in ("acceleration", "jerk"):
+            if not 0 < getattr(self, name) <= 1:
+                raise ValueError(f"{name} must be in (0, 1], but is {getattr(self, name)}")
+        for name in ("hold", "grip_force", "grip_speed"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ValueError(f"{name} must be positive, but is {getattr(self, name)}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoopTiming:
+    """How the loop has kept time so far."""
+
+    answered: int
+    """Cycles of motion that were answered."""
+    lost: int
+    """Cycles of motion of which no state was read in time."""
+    success_rate: float
+    """Of the last 100 answers, those that the control box got in time, by its own count; zero
+    at rest."""
+    cost: Float[np.ndarray, " bins"]
+    """How many answers took so many microseconds, from the state read to the answer sent."""
+
+    @property
+    def answered_share(self) -> float:
+        """Of all cycles; 1 before the first."""
+        return self.answered / max(1, self.answered + self.lost) if self.answered else 1.0
+
+    def percentile(self, percent: float) -> float:
+        """Time that this many of the answers took at most, to a microsecond [s].
+
+        NaN before the first.
+        """
+        total = self.cost.sum()
+        if total == 0:
+            return math.nan
+        reached = np.cumsum(self.cost) >= percent / 100 * total
+        return 1e-6 * (float(np.argmax(reached)) + 1.0)
+
+
+@final
+class FrankaArm:
+    """The arm and its gripper, as an `Arm`, a `Gripper` and a `StoppableArm`.
+
+        with FrankaArm("172.16.0.2", fr3) as arm:
+            while servoing():
+                arm.command(velocity(arm.read()))
+
+    The loop has a process of its own, and so has the gripper: nothing that Python does here
+    holds them up, and no call waits for either, except `stop`, `recover` and `close`. So it
+    goes into no `ArmProcess`, which it takes the place of: a velocity holds for
+    `FrankaConfig.hold`; then, or when this process has died, the loop brings the arm to rest
+    and ends the motion. If the loop dies or stalls, the control box stops the arm after 20 ms.
+
+    Whatever is commanded, position, velocity, acceleration, jerk and tool speed keep the limits
+    of `chain`. The arm may still hit itself or others, at which the control box stops it.
+
+    A fault leaves the arm stopped by its control box: `command` raises what happened, `read`
+    goes on as long as there is a connection, and `recover` makes the arm move again.
+    """
+
+    def __init__(self, ip: str, chain: SerialChain, config: FrankaConfig | None = None):
+        """Connect.
+
+        Args:
+            ip: Address of the control box.
+            chain: The arm with its limits and its tool centre point.
+            config: How to drive it.
+
+        Raises:
+            DriverError: The arm or its gripper cannot be reached, or realtime is missing; it
+                says which.
+            ValueError: The arm has not seven joints.
+        """
+        if len(chain.joint_names) != JOINTS:
+            raise ValueError(f"a Franka arm has 7 joints, but {chain} {len(chain.joint_names)}")
+        self._config = config = config or FrankaConfig()
+        self._shared, self._orders = Shared(), Orders()
+        # Of the threads here that command: the loop is never held up by it.
+        self._writing = threading.Lock()
+        robot = Robot(ip, config.realtime, config.collision, config.load)
+        context = multiprocessing.get_context("spawn")
+        self._process = context.Process(
+            target=serve,
+            args=(self._shared, robot, step_of(chain, config), config.hold, os.getpid()),
+            name="franka",
+            daemon=True,
+        )
+        self._gripper: GripperProcess | None = None
+        self._process.start()
+        try:
+            self._await(lambda report: report.phase == Phase.IDLE, _STARTUP, "connect")
+            if config.gripper:
+                hand = partial(FrankaHand, ip, speed=config.grip_speed, force=config.grip_force)
+                self._gripper = GripperProcess(hand)
+        except BaseException as error:
+            self._end()
+            if isinstance(error, RuntimeError) and not isinstance(error, DriverError):
+                raise DriverError(str(error)) from error
+            raise
+
+    @property
+    def pid(self) -> int | None:
+        """Number of the process that has the loop."""
+        return self._process.pid
+
+    @property
+    def fault(self) -> str:
+        """What has stopped the arm; empty: nothing has."""
+        stopped = self._report().phase in (Phase.FAULTED, Phase.ENDED)
+        return self._shared.message if stopped else ""
+
+    @property
+    def faults(self) -> int:
+        """How often something has."""
+        return self._report().faults
+
+    @property
+    def timing(self) -> LoopTiming:
+        """How the loop has kept time so far."""
+        report = self._report()
+        return LoopTiming(
+            answered=report.cycles,
+            lost=report.lost,
+            success_rate=report.success_rate,
+            cost=self._shared.costs.copy(),
+        )
+
+    def read(self) -> ArmState:
+        """Return the newest state, by the clock of the robot.
+
+        Raises:
+            DriverError: The loop has ended, or has read none for 0.2 s.
+        """
+        report = self._report()
+        age = time.monotonic() - report.stamp
+        if age > _STALE and report.phase != Phase.RECOVERING:
+            raise DriverError(self._stalled(report, age))
+        return ArmState(
+            time=report.time,
+            joint_position=report.joint_position,
+            joint_velocity=report.joint_velocity,
+            gripper_width=self._gripper.width if self._gripper else math.nan,
+            external_torque=report.external_torque,
+        )
+
+    def command(self, joint_velocity: Float[np.ndarray, "7"]) -> None:
+        """Set the joint velocities to hold [rad/s].
+
+        Raises:
+            ValueError: They are not seven finite numbers.
+            DriverError: The arm has been stopped; `recover` makes it move again.
+        """
+        velocity = np.asarray(joint_velocity, dtype=float)
+        if velocity.shape != (JOINTS,) or not np.isfinite(velocity).all():
+            raise ValueError(f"joint_velocity must be 7 finite numbers, but is {velocity}.")
+        self._check()
+        self._order(joint_velocity=velocity, stamp=time.monotonic(), stop=False)
+
+    def stop(self) -> None:
+        """Bring the arm to rest, and wait until it is.
+
+        Raises:
+            DriverError: It does not come to rest, or the loop has ended: then the control box
+                has stopped it.
+        """
+        self._order(stop=True, stamp=-math.inf)
+        self._await(
+            lambda report: report.resting and report.phase != Phase.MOVING, _REST, "stop"
+        )
+
+    def move(self, width: float) -> None:
+        """Open the gripper to a width, or squeeze what is between its fingers [m].
+
+        Returns at once; see `GripperProcess`.
+
+        Raises:
+            DriverError: There is no gripper, or the call before has failed.
+        """
+        if self._gripper is None:
+            raise DriverError("this arm was opened without a gripper.")
+        try:
+            self._gripper.move(width)
+        except RuntimeError as error:
+            raise DriverError(str(error)) from error
+
+    def recover(self) -> None:
+        """Make the arm move again after a fault, connecting again if need be; does nothing
+        where there is none.
+
+        What was commanded before is forgotten.
+
+        Raises:
+            DriverError: That is not possible; it says why.
+        """
+        report = self._report()
+        if report.phase not in (Phase.FAULTED, Phase.ENDED):
+            return
+        asked = self._orders.recoveries + 1
+        self._order(recoveries=asked)
+        self._await(lambda report: report.recoveries >= asked, _RECOVERY, "recover")
+        self._check()
+
+    def close(self) -> None:
+        """Bring the arm to rest, end the motion and both processes."""
+        self._order(end=True)
+        self._process.join(_REST)
+        self._end()
+
+    def __enter__(self) -> FrankaArm:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _order(self, **changes: object) -> None:
+        with self._writing:
+            self._orders = replace(self._orders, **changes)  # pyright: ignore[reportArgumentType]
+            self._shared.orders.write(self._orders.line())
+
+    def _report(self) -> Report:
+        line = self._shared.report.read()
+        if line is None:  # it died in the middle of a line
+            return Report(phase=Phase.ENDED)
+        return Report.of(line)
+
+    def _check(self) -> None:
+        """Raise what keeps the arm from moving."""
+        report = self._report()
+        if report.phase == Phase.FAULTED:
+            raise DriverError(self._shared.message)
+        if report.phase == Phase.ENDED or not self._process.is_alive():
+            raise DriverError(self._stalled(report, math.inf))
+
+    def _stalled(self, report: Report, age: float) -> str:
+        if report.phase == Phase.FAULTED:
+            return self._shared.message
+        if report.phase == Phase.ENDED or not self._process.is_alive():
+            return (
+                f"the process that has the loop has ended. {self._shared.message} The control "
+                "box has stopped the arm: make sure of that, and connect again."
+            )
+        return (
+            f"the loop has read no state for {age:.2f} s: something holds its process up, at "
+            "which the control box stops the arm."
+        )
+
+    def _await(self, reached: Callable[[Report], bool], patience: float, what: str) -> None:
+        end = time.monotonic() + patience
+        while not reached(report := self._report()):
+            if report.phase == Phase.ENDED or not self._process.is_alive():
+                raise DriverError(f"cannot {what}: {self._stalled(report, math.inf)}")
+            if time.monotonic() > end:
+                raise DriverError(f"cannot {what} within {patience:g} s. {self.fault}")
+            time.sleep(_PAUSE)
+
+    def _end(self) -> None:
+        if self._process.is_alive():
+            # It hangs or is stopped. Without its connection the control box ends the motion.
+            self._process.kill()
+        self._process.join()
+        if self._gripper is not None:
+            self._gripper.close()
+
+
+def _is_still(report: Report) -> bool:
+    ended = report.resting and report.phase != Phase.MOVING
+    return ended and bool(np.abs(report.joint_velocity).max() < _STILL)
+
+
+def step_of(chain: SerialChain, config: FrankaConfig) -> Callable[[], StepRunner]:
+    """What opens the step of the loop, in whatever process."""
+    limits = replace(
+        chain.limits,
+        acceleration=config.acceleration * chain.limits.acceleration,
+        jerk=config.jerk * chain.limits.jerk,
+    )
+    limited = SerialChain(
+        joint_names=chain.joint_names,
+        mounts=chain.mounts,
+        flange=chain.flange,
+        tcp=chain.tcp,
+        limits=limits,
+        ready=chain.ready,
+    )
+    step = VelocityStep(limited, dt=CYCLE, config=config.safety)
+    example = WantedVelocity(
+        joint_position=chain.ready,
+        joint_velocity=torch.zeros_like(chain.ready),
+        stop=torch.tensor(False),
+    )
+    if config.compiled:
+        try:
+            return partial(PackageRunner, export_step(step, example))
+        except NoCompilerError as error:
+            raise DriverError(
+                f"the step of the loop cannot be compiled: {error} Uncompiled (compiled=False) "
+                "it takes half of each millisecond."
+            ) from error
+    return partial(EagerRunner, step, example)

@@ -1,0 +1,548 @@
+"""The 1 kHz loop of a Franka arm, in a process of its own.
+
+Each millisecond the control box sends the state of the arm and takes one answer. pylibfranka
+holds the interpreter while it waits, and an interpreter that is busy elsewhere answers late:
+so nothing else runs in this process, and the rest of the world speaks to it through shared
+memory, which neither side ever waits for.
+
+The velocity that is wanted goes through the exported step (`VelocityStep`): position, velocity,
+acceleration, jerk and tool speed keep their limits whatever is asked for. It starts from what
+the control box itself has as the commanded velocity and acceleration, in the first cycle and
+after each that was lost, for there the box goes on with a constant acceleration.
+"""
+
+from __future__ import annotations
+
+import gc
+import importlib
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from enum import IntEnum
+from multiprocessing.sharedctypes import RawArray
+from types import FrameType
+from typing import Any, final
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from hrc_learn.deploy import StepRunner
+
+CYCLE = 1e-3
+"""Of Franka's control interface [s]."""
+JOINTS = 7
+TEXT = 2000
+"""Longest message about a fault [bytes]."""
+COST_BINS = 2000
+"""Of the histogram of what cycles cost, each 1 us wide; the last one has all that is longer."""
+
+_AGREES = 1e-5
+"""By how much the box's commanded velocity may differ from what was sent [rad/s]: it comes
+back in single precision, and where a cycle is lost it differs by a step of the acceleration."""
+_RESTS = 1e-6
+"""Commanded velocities below this are rest [rad/s]."""
+_PARENT_EVERY = 50
+"""Cycles between two looks at whether the process that commands still lives."""
+_TRIES = 100
+"""Readings of a mailbox before its writer is taken for dead in the middle of a line: a line is
+written within a microsecond or two."""
+
+
+class Phase(IntEnum):
+    """What the loop is doing."""
+
+    STARTING = 0
+    IDLE = 1
+    MOVING = 2
+    FAULTED = 3
+    RECOVERING = 4
+    ENDED = 5
+
+
+@final
+class Mailbox:
+    """The newest line of numbers that one process writes and others read, without a lock.
+
+    The first number counts: odd while a line is being written. A reader takes a line only if
+    the count was even and has not changed meanwhile, and never waits for a writer.
+    """
+
+    def __init__(self, size: int):
+        """Take shared memory for lines of a length."""
+        self._memory = RawArray("d", size + 1)
+        self._attach()
+
+    def _attach(self) -> None:
+        self._line = np.frombuffer(self._memory, dtype=float)
+
+    def __getstate__(self) -> object:
+        return self._memory
+
+    def __setstate__(self, memory: Any) -> None:
+        self._memory = memory
+        self._attach()
+
+    def write(self, line: Float[np.ndarray, " size"]) -> None:
+        """Replace the line. There is one writer at a time."""
+        self._line[0] += 1
+        self._line[1:] = line
+        self._line[0] += 1
+
+    def read(self) -> Float[np.ndarray, " size"] | None:
+        """Return the newest line; None: its writer stays in the middle of one."""
+        for _ in range(_TRIES):
+            before = self._line[0]
+            line = self._line[1:].copy()
+            if before % 2 == 0 and self._line[0] == before:
+                return line
+        return None
+
+
+def _zeros() -> Float[np.ndarray, "7"]:
+    return np.zeros(JOINTS)
+
+
+@dataclass
+class Orders:
+    """What the commanding process wants, as a line of a mailbox."""
+
+    stamp: float = -np.inf
+    """When the velocity was set, by time.monotonic() [s]."""
+    stop: bool = False
+    """Whether to brake to rest whatever is wanted."""
+    recoveries: int = 0
+    """How often recovery has been asked for."""
+    end: bool = False
+    """Whether to bring the arm to rest and end."""
+    joint_velocity: Float[np.ndarray, "7"] = field(default_factory=_zeros)
+    """Wanted [rad/s]."""
+
+    SIZE = 4 + JOINTS
+
+    def line(self) -> Float[np.ndarray, " size"]:
+        """The numbers."""
+        numbers = [self.stamp, self.stop, self.recoveries, self.end, *self.joint_velocity]
+        return np.array(numbers, dtype=float)
+
+    @classmethod
+    def of(cls, line: Float[np.ndarray, " size"]) -> Orders:
+        """From a line."""
+        return cls(float(line[0]), bool(line[1]), int(line[2]), bool(line[3]), line[4:])
+
+
+@dataclass
+class Report:
+    """What the loop tells, as a line of a mailbox."""
+
+    phase: Phase = Phase.STARTING
+    stamp: float = -np.inf
+    """When the state was read, by time.monotonic() [s]."""
+    time: float = 0.0
+    """Of the robot's clock [s]."""
+    recoveries: int = 0
+    """Requests for recovery that have been dealt with."""
+    faults: int = 0
+    """So far."""
+    cycles: int = 0
+    """Answered in motion."""
+    lost: int = 0
+    """Of which no state was read in time to be answered."""
+    success_rate: float = 0.0
+    """Share of the last 100 answers that the control box got in time, by its own count."""
+    resting: bool = True
+    """Whether the velocity that was sent last is zero."""
+    joint_position: Float[np.ndarray, "7"] = field(default_factory=_zeros)
+    """[rad]"""
+    joint_velocity: Float[np.ndarray, "7"] = field(default_factory=_zeros)
+    """[rad/s]"""
+    external_torque: Float[np.ndarray, "7"] = field(default_factory=_zeros)
+    """[N m]"""
+
+    SIZE = 9 + 3 * JOINTS
+
+    def line(self) -> Float[np.ndarray, " size"]:
+        """The numbers."""
+        head = [
+            self.phase, self.stamp, self.time, self.recoveries, self.faults, self.cycles,
+            self.lost, self.success_rate, self.resting,
+        ]  # fmt: skip
+        return np.array(
+            [*head, *self.joint_position, *self.joint_velocity, *self.external_torque],
+            dtype=float,
+        )
+
+    @classmethod
+    def of(cls, line: Float[np.ndarray, " size"]) -> Report:
+        """From a line."""
+        q, dq, torque = line[9:].reshape(3, JOINTS)
+        return cls(
+            phase=Phase(int(line[0])),
+            stamp=float(line[1]),
+            time=float(line[2]),
+            recoveries=int(line[3]),
+            faults=int(line[4]),
+            cycles=int(line[5]),
+            lost=int(line[6]),
+            success_rate=float(line[7]),
+            resting=bool(line[8]),
+            joint_position=q,
+            joint_velocity=dq,
+            external_torque=torque,
+        )
+
+
+@final
+class Shared:
+    """The memory that both processes have."""
+
+    def __init__(self):
+        self.orders, self.report = Mailbox(Orders.SIZE), Mailbox(Report.SIZE)
+        self.orders.write(Orders().line())
+        self.report.write(Report().line())
+        self._text = RawArray("c", TEXT)
+        self._costs = RawArray("d", COST_BINS)
+
+    @property
+    def message(self) -> str:
+        """About the last fault."""
+        return self._text.value.decode("utf-8", "replace")
+
+    @message.setter
+    def message(self, text: str) -> None:
+        self._text.value = text.encode()[: TEXT - 1]
+
+    @property
+    def costs(self) -> Float[np.ndarray, " bins"]:
+        """How many cycles cost how many microseconds, from a state read to it answered."""
+        return np.frombuffer(self._costs, dtype=float)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Load:
+    """What the arm carries besides its end effector, as the control box must know it."""
+
+    mass: float
+    """[kg]"""
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Of mass, in the frame of the flange [m]."""
+    inertia: tuple[float, ...] = (0.0,) * 9
+    """About that centre, by columns [kg m^2]."""
+
+    def __post_init__(self) -> None:
+        if not self.mass >= 0:
+            raise ValueError(f"mass must not be negative, but is {self.mass}")
+        if len(self.inertia) != 9:
+            raise ValueError(f"inertia must have 9 numbers, but has {len(self.inertia)}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class CollisionThresholds:
+    """What the control box takes for a contact or a collision, at which it stops the arm.
+
+    Of contact and collision alike, as in the examples of libfranka.
+    """
+
+    torque: tuple[float, ...] = (20.0, 20.0, 18.0, 18.0, 16.0, 14.0, 12.0)
+    """Of each joint [N m]; these and the next are those of libfranka's examples."""
+    force: tuple[float, ...] = (20.0, 20.0, 20.0, 25.0, 25.0, 25.0)
+    """At the end effector [N, N m]."""
+
+    def __post_init__(self) -> None:
+        for name, size in (("torque", JOINTS), ("force", 6)):
+            values = getattr(self, name)
+            if len(values) != size or not min(values) > 0:
+                raise ValueError(f"{name} must be {size} positive numbers, but is {values}")
+
+
+@dataclass(frozen=True)
+class Robot:
+    """How to reach an arm, and what its control box is told."""
+
+    ip: str
+    """Address of the control box."""
+    realtime: bool
+    """Whether to refuse a kernel or a priority without realtime."""
+    collision: CollisionThresholds
+    load: Load | None
+
+    def connect(self) -> Any:
+        """Connect, clear what stopped the arm before, and tell what has to be told.
+
+        Raises:
+            ImportError: The driver is not installed.
+            RuntimeError: The arm cannot be reached, or realtime is missing; it says which.
+        """
+        driver = import_pylibfranka()
+        config = driver.RealtimeConfig
+        if self.realtime:
+            _take_priority()
+        try:
+            robot = driver.Robot(self.ip, config.kEnforce if self.realtime else config.kIgnore)
+        except driver.RealtimeException as error:
+            raise RuntimeError(
+                f"{error} The kernel of this machine is not a realtime one (PREEMPT_RT), with "
+                "which a loop of 1 kHz is late now and then: install one, or accept that with "
+                "realtime=False."
+            ) from error
+        self.recover(robot)
+        return robot
+
+    def recover(self, robot: Any) -> None:
+        """Clear what has stopped the arm, and tell the box again what it may have forgotten."""
+        robot.automatic_error_recovery()
+        torque, force = list(self.collision.torque), list(self.collision.force)
+        robot.set_collision_behavior(torque, torque, force, force)
+        if self.load is not None:
+            robot.set_load(self.load.mass, list(self.load.centre), list(self.load.inertia))
+
+
+def import_pylibfranka() -> Any:
+    """Franka's binding.
+
+    Raises:
+        ImportError: It is not installed, or cannot be beside another driver.
+    """
+    try:
+        return importlib.import_module("pylibfranka")
+    except ImportError as error:
+        raise ImportError(
+            "an arm at 1 kHz needs Franka's pylibfranka, in the version for the system of "
+            "its control box: pip install pylibfranka. One process cannot have both it and "
+            f"franky. {error}"
+        ) from error
+
+
+def _take_priority() -> None:
+    highest = os.sched_get_priority_max(os.SCHED_FIFO)
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(highest))
+    except PermissionError as error:
+        raise RuntimeError(
+            "this user may not have realtime priority: add the line '@realtime - rtprio 99' to "
+            "/etc/security/limits.conf, the user to the group realtime, and log in again; or "
+            "accept late cycles with realtime=False."
+        ) from error
+
+
+def serve(
+    shared: Shared,
+    robot: Robot,
+    open_runner: Callable[[], StepRunner],
+    hold: float,
+    parent: int,
+) -> None:
+    """What runs in the process: the loop, until it is told to end or its parent has died."""
+    # Ctrl-C reaches all processes of a terminal: who commands decides what follows from it.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    torch.set_num_threads(1)
+    try:
+        loop = ControlLoop(shared, robot, open_runner(), hold, parent)
+    except Exception as error:
+        shared.message = f"{type(error).__name__}: {error}"
+        shared.report.write(Report(phase=Phase.ENDED, faults=1).line())
+        return
+
+    def end(number: int, frame: FrameType | None) -> None:
+        loop.ending = True
+
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, end)
+    # Collections would take milliseconds at a bad moment; a cycle leaves no garbage in circles.
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    loop.run()
+
+
+@final
+class ControlLoop:
+    """Reads, steps and answers.
+
+    Attributes:
+        ending: Whether to bring the arm to rest and end.
+    """
+
+    def __init__(
+        self, shared: Shared, robot: Robot, runner: StepRunner, hold: float, parent: int
+    ):
+        """Connect.
+
+        Args:
+            shared: With the process that commands.
+            robot: To connect to.
+            runner: Of the step, at `CYCLE`.
+            hold: How long a velocity holds [s].
+            parent: Process number of who commands; the loop ends when it has gone.
+        """
+        self.ending = False
+        self._driver = import_pylibfranka()
+        self._robot, self._runner, self._hold, self._parent = robot, runner, hold, parent
+        self._shared, self._report = shared, Report()
+        self._orders, self._costs = Orders(), shared.costs
+        self._recovered = -np.inf  # a velocity from before must not move the arm afterwards
+        self._velocity = runner.observation["joint_velocity"]
+        self._position = runner.observation["joint_position"]
+        self._stop = runner.observation["stop"]
+        self._warm_up()
+        self._link = robot.connect()
+
+    def run(self) -> None:
+        """Loop until told to end."""
+        while not self.ending:
+            try:
+                self._read_orders()
+                if self._report.phase == Phase.FAULTED or self._asked_to_recover():
+                    self._wait_for_recovery()
+                elif self._wanted().any():
+                    self._move()
+                else:
+                    self._watch()
+            except (
+                Exception
+            ) as error:  # whatever the driver raises: the box has stopped the arm
+                self._fail(error)
+        self._publish(Phase.ENDED)
+
+    def _warm_up(self) -> None:
+        """First steps are slow: take them before the arm waits for them."""
+        self._position[...], self._velocity[...], self._stop[...] = 0.0, 0.0, True
+        for _ in range(20):
+            self._runner.step()
+
+    def _read_orders(self) -> None:
+        line = self._shared.orders.read()
+        if line is None:
+            return  # its writer died or is stopped: what was wanted runs out
+        self._orders = Orders.of(line)
+        if self._orders.end:
+            self.ending = True
+
+    def _wanted(self) -> Float[np.ndarray, "7"]:
+        """The velocity that holds now [rad/s]."""
+        return np.zeros(JOINTS) if self._idles() else self._orders.joint_velocity
+
+    def _idles(self) -> bool:
+        """Whether nobody commands any more, or not since the last fault."""
+        stamp = self._orders.stamp
+        silent = time.monotonic() - stamp >= self._hold
+        return silent or self._orders.stop or stamp <= self._recovered
+
+    def _watch(self) -> None:
+        """One cycle at rest."""
+        self._note(self._link.read_once())
+        self._check_parent()
+        self._publish(Phase.IDLE)
+
+    def _check_parent(self) -> None:
+        if os.getppid() != self._parent:
+            self.ending = True
+
+    def _move(self) -> None:
+        """One motion, until it rests and nobody commands any more, or the loop shall end."""
+        mode = self._driver.ControllerMode.JointImpedance
+        control = self._link.start_joint_velocity_control(mode)
+        sent = np.full(JOINTS, np.nan)  # nothing: the first state says what the box has
+        report = self._report
+        number, finished = 0, False
+        while not finished:
+            state, period = control.readOnce()
+            begin = time.perf_counter()
+            number += 1
+            if number > 1:
+                report.lost += max(0, round(period.to_sec() / CYCLE) - 1)
+            self._note(state)
+            self._read_orders()
+            if number % _PARENT_EVERY == 0:
+                self._check_parent()
+            if number == 1:
+                self._runner.start(report.joint_position)
+            self._adopt(state, sent)
+            self._position[...] = report.joint_position
+            self._velocity[...] = self._wanted()
+            self._stop[...] = self._orders.stop or self.ending
+            sent = np.array(self._runner.step())
+            rests = bool(np.abs(sent).max() < _RESTS)
+            # Rest is sent once more before the motion ends, so that its acceleration is zero.
+            finished = rests and report.resting and number > 1
+            finished = finished and (self._idles() or self.ending)
+            answer = self._driver.JointVelocities(sent.tolist())
+            answer.motion_finished = finished
+            control.writeOnce(answer)
+            cost = time.perf_counter() - begin
+            report.resting = rests
+            report.cycles += 1
+            if not finished:  # that waits for the box to confirm
+                self._costs[min(int(1e6 * cost), COST_BINS - 1)] += 1
+            self._publish(Phase.MOVING)
+
+    def _adopt(self, state: Any, sent: Float[np.ndarray, "7"]) -> None:
+        """Go on from what the box has where that is not what was sent."""
+        velocity = np.array(state.dq_d)
+        if np.abs(velocity - sent).max() <= _AGREES or not np.isfinite(velocity).all():
+            return
+        acceleration = np.array(state.ddq_d)
+        self._runner.set_state("safety.velocity", velocity)
+        self._runner.set_state("safety.acceleration", np.nan_to_num(acceleration))
+
+    def _note(self, state: Any) -> None:
+        report = self._report
+        report.stamp, report.time = time.monotonic(), state.time.to_sec()
+        report.joint_position = np.array(state.q)
+        report.joint_velocity = np.array(state.dq)
+        report.external_torque = np.array(state.tau_ext_hat_filtered)
+        report.success_rate = state.control_command_success_rate
+
+    def _publish(self, phase: Phase) -> None:
+        self._report.phase = phase
+        self._shared.report.write(self._report.line())
+
+    def _fail(self, error: Exception) -> None:
+        self._shared.message = _explained(error)
+        self._report.faults += 1
+        self._report.resting = True
+        self._publish(Phase.FAULTED)
+
+    def _asked_to_recover(self) -> bool:
+        return self._orders.recoveries > self._report.recoveries
+
+    def _wait_for_recovery(self) -> None:
+        self._check_parent()
+        if not self._asked_to_recover():
+            self._look_on()
+            return
+        self._publish(Phase.RECOVERING)
+        asked = self._orders.recoveries
+        try:
+            self._robot.recover(self._link)
+        except self._driver.NetworkException:
+            self._link = self._robot.connect()
+        finally:
+            self._report.recoveries = asked
+        self._note(self._link.read_once())
+        self._recovered = time.monotonic()
+        self._publish(Phase.IDLE)
+
+    def _look_on(self) -> None:
+        """Go on reading while the arm is stopped, where there is still a connection."""
+        try:
+            self._note(self._link.read_once())
+        except Exception:
+            time.sleep(0.01)  # nothing can be read until somebody reconnects
+        self._publish(Phase.FAULTED)
+
+
+def _explained(error: Exception) -> str:
+    """What has stopped the arm, and what to do."""
+    kind = type(error).__name__
+    advice = {
+        "ControlException": "See that nothing touches the arm, then call recover().",
+        "CommandException": "Release the stop button and the brakes in Desk, activate FCI, "
+        "then call recover().",
+        "NetworkException": "The connection has gone: check cable and power, then call "
+        "recover(), which connects again.",
+    }.get(kind, "Call recover() to try again.")
+    return f"{kind}: {error} The arm is stopped by its control box. {advice}"
