@@ -1,4 +1,4 @@
-"""An FR3 for tests of drivers: the Panda's geometry, which it has, with the limits of its own."""
+"""An FR3 for tests of drivers: the geometry of the Panda, and limits of its own."""
 
 import torch
 

@@ -1,59 +1,112 @@
-"""Simulators of a Franka arm's network protocol for tests, and a driver connected to them."""
+"""Simulators of Franka's control interface, and a network that loses packets before them.
 
+Each has a process and a loopback address of its own: libfranka knows one port only.
+"""
+
+import os
+import random
+import subprocess
+import sys
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
-from types import SimpleNamespace
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
 
-from hrc_learn.hardware import FrankyArm, FrankyConfig
-from hrc_learn.kinematics import panda
-from hrc_learn.sim import SceneConfig, World
-from hrc_learn.sim.protocol_server import ServedArm, loopback_addresses, serve_world
+import numpy as np
+import pytest
 
-READY = panda.ready.numpy()
+_ROOT = Path(__file__).parents[1]
+_FRANKA_SIM = _ROOT / ".venv-franka-sim" / "bin" / "python"
+_SAMPLE = 23  # numbers, as in tools/franka_sim_server.py
+
+needs_franka_sim = pytest.mark.skipif(
+    not _FRANKA_SIM.exists(), reason="franka-sim has no environment: tools/make_franka_sim.sh"
+)
+
+
+def loopback() -> str:
+    """An address that nobody else is likely to use."""
+    # By the process too: tests that run side by side draw from generators seeded alike.
+    rng = random.Random(f"{os.getpid()} {random.random()}")
+    return f"127.{rng.randrange(16, 240)}.{rng.randrange(1, 250)}.{rng.randrange(1, 250)}"
+
+
+class Trace(NamedTuple):
+    """What a simulated arm did, a sample each millisecond or so."""
+
+    moment: np.ndarray
+    """By time.monotonic() [s]."""
+    time: np.ndarray
+    """Simulated [s]."""
+    position: np.ndarray
+    """(samples, 7) [rad]"""
+    velocity: np.ndarray
+    """(samples, 7) [rad/s]"""
+    commanded: np.ndarray
+    """(samples, 7): what the control box has as the commanded velocity [rad/s]."""
+
+    @classmethod
+    def read(cls, path: Path) -> "Trace":
+        numbers = np.fromfile(path)
+        table = numbers[: len(numbers) // _SAMPLE * _SAMPLE].reshape(-1, _SAMPLE)
+        parts = np.split(table, (1, 2, 9, 16), axis=1)
+        return cls(parts[0][:, 0], parts[1][:, 0], *parts[2:])
 
 
 @contextmanager
-def simulated_arm() -> Iterator[SimpleNamespace]:
-    """franky-sim's own arm in MuJoCo, which goes on in real time as far as the machine does.
+def franka_sim(host: str, trace: Path, *options: str) -> Iterator[subprocess.Popen]:
+    """A server of franka-sim that enforces limits and counts lost packets."""
+    program = _ROOT / "tools" / "franka_sim_server.py"
+    arguments = [_FRANKA_SIM, program, "--host", host, "--trace", trace, *options]
+    with _running(arguments) as process:
+        yield process
 
-    `server.running`, set to False, is a cable pulled out; `plug_in()` puts it back.
-    """
-    from franky_sim import SimulationServer
+
+@contextmanager
+def franky_sim(host: str) -> Iterator[subprocess.Popen]:
+    """A server of franky-sim, which enforces nothing."""
+    with _running([sys.executable, __file__, host]) as process:
+        yield process
+
+
+@contextmanager
+def lossy_network(host: str, server: str, loss: float) -> Iterator[subprocess.Popen]:
+    """A way to a server that loses this share of the packets in either direction."""
+    program = Path(__file__).with_name("lossy_network.py")
+    with _running([sys.executable, program, host, server, str(loss)]) as process:
+        yield process
+
+
+@contextmanager
+def _running(arguments: list) -> Iterator[subprocess.Popen]:
+    process = subprocess.Popen(
+        [str(x) for x in arguments],
+        stdout=subprocess.PIPE,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        text=True,
+    )
+    assert process.stdout is not None
+    try:
+        line = process.stdout.readline()
+        assert "listening" in line, f"{arguments[1]} did not start: {line}"
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+        process.stdout.close()
+
+
+def _serve_franky_sim(host: str) -> None:
     from franky_sim.mujoco_simulator import MujocoSimulator
+    from franky_sim.simulation_server import SimulationServer
 
-    with MujocoSimulator() as simulator:
-        robot = simulator.add_robot()
-        with SimulationServer(simulator, loopback_addresses()) as server:
-            server.run_async()
-
-            def pull_out() -> None:
-                server.running = False
-                assert server.async_thread is not None
-                server.async_thread.join()
-
-            yield SimpleNamespace(
-                ip=robot.hostname,
-                robot=robot,
-                server=server,
-                pull_out=pull_out,
-                plug_in=server.run_async,
-            )
+    simulator = MujocoSimulator()
+    simulator.init()
+    simulator.add_robot()
+    with SimulationServer(simulator, hostname_candidates=[host]) as server:
+        print("listening", flush=True)
+        server.run_forever()
 
 
-@contextmanager
-def served_world(
-    world: World | None = None, config: FrankyConfig | None = None
-) -> Iterator[SimpleNamespace]:
-    """A world of ours, at rest, with franky connected to its arm.
-
-    Time passes by `server.advance` only, so that a slow machine makes no difference.
-    """
-    if world is None:
-        world = World(SceneConfig(objects=()))
-        world.reset(READY)
-    config = config or FrankyConfig(realtime="ignore", dynamics=1.0)
-    with serve_world(world) as server:
-        with server.running():
-            driver = FrankyArm(server.address, config)
-        with closing(ServedArm(driver, server)) as arm:
-            yield SimpleNamespace(world=world, server=server, driver=driver, arm=arm)
+if __name__ == "__main__":
+    _serve_franky_sim(sys.argv[1])

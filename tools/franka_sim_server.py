@@ -4,7 +4,7 @@
     .venv-franka-sim/bin/python tools/franka_sim_server.py --host 127.0.0.1 --trace arm.bin
 
 libfranka knows one port only, 1337, and 1338 of the gripper: several servers run side by side
-on loopback addresses of their own (127.0.0.2, ...). "listening" on stdout says that it is ready.
+on loopback addresses of their own (127.0.0.2, ...). It says "listening" once it is ready.
 The model is the copy that make_franka_sim.sh has made: nothing is downloaded.
 """
 

@@ -60,8 +60,10 @@ _REST = 3.0
 tenth of the acceleration three."""
 _RECOVERY = 15.0
 """Longest that recovery may take [s]; the control box needs some seconds."""
+_LOOK = 0.02
+"""Time over which a velocity is measured, by two positions [s]: a single one is noisy."""
 _STILL = 0.02
-"""Measured joint velocities below this are rest [rad/s]: the encoders' noise is below it."""
+"""Below this it is rest [rad/s]: an encoder's noise of 0.1 mrad is a quarter of it."""
 _PAUSE = 5e-4
 """Between two looks at whether something has happened [s]."""
 
@@ -365,11 +367,6 @@ class FrankaArm:
         self._process.join()
         if self._gripper is not None:
             self._gripper.close()
-
-
-def _is_still(report: Report) -> bool:
-    ended = report.resting and report.phase != Phase.MOVING
-    return ended and bool(np.abs(report.joint_velocity).max() < _STILL)
 
 
 def step_of(chain: SerialChain, config: FrankaConfig) -> Callable[[], StepRunner]:

@@ -43,6 +43,8 @@ COST_BINS = 2000
 _AGREES = 1e-5
 """By how much the box's commanded velocity may differ from what was sent [rad/s]: it comes
 back in single precision, and where a cycle is lost it differs by a step of the acceleration."""
+_SAME = 1e-9
+"""By how much a report differs from the one before if it is the same [rad/s]."""
 _RESTS = 1e-6
 """Commanded velocities below this are rest [rad/s]."""
 _PARENT_EVERY = 50
@@ -383,6 +385,7 @@ class ControlLoop:
         self._robot, self._runner, self._hold, self._parent = robot, runner, hold, parent
         self._shared, self._report = shared, Report()
         self._orders, self._costs = Orders(), shared.costs
+        self._sent = self._reported = np.full(JOINTS, np.nan)
         self._recovered = -np.inf  # a velocity from before must not move the arm afterwards
         self._velocity = runner.observation["joint_velocity"]
         self._position = runner.observation["joint_position"]
@@ -445,7 +448,7 @@ class ControlLoop:
         """One motion, until it rests and nobody commands any more, or the loop shall end."""
         mode = self._driver.ControllerMode.JointImpedance
         control = self._link.start_joint_velocity_control(mode)
-        sent = np.full(JOINTS, np.nan)  # nothing: the first state says what the box has
+        self._sent = self._reported = np.full(JOINTS, np.nan)  # nothing yet
         report = self._report
         number, finished = 0, False
         while not finished:
@@ -460,16 +463,16 @@ class ControlLoop:
                 self._check_parent()
             if number == 1:
                 self._runner.start(report.joint_position)
-            self._adopt(state, sent)
+            self._adopt(state)
             self._position[...] = report.joint_position
             self._velocity[...] = self._wanted()
             self._stop[...] = self._orders.stop or self.ending
-            sent = np.array(self._runner.step())
-            rests = bool(np.abs(sent).max() < _RESTS)
+            self._sent = np.array(self._runner.step())
+            rests = bool(np.abs(self._sent).max() < _RESTS)
             # Rest is sent once more before the motion ends, so that its acceleration is zero.
             finished = rests and report.resting and number > 1
             finished = finished and (self._idles() or self.ending)
-            answer = self._driver.JointVelocities(sent.tolist())
+            answer = self._driver.JointVelocities(self._sent.tolist())
             answer.motion_finished = finished
             control.writeOnce(answer)
             cost = time.perf_counter() - begin
@@ -479,14 +482,14 @@ class ControlLoop:
                 self._costs[min(int(1e6 * cost), COST_BINS - 1)] += 1
             self._publish(Phase.MOVING)
 
-    def _adopt(self, state: Any, sent: Float[np.ndarray, "7"]) -> None:
-        """Go on from what the box has where that is not what was sent."""
-        velocity = np.array(state.dq_d)
-        if np.abs(velocity - sent).max() <= _AGREES or not np.isfinite(velocity).all():
-            return
-        acceleration = np.array(state.ddq_d)
-        self._runner.set_state("safety.velocity", velocity)
-        self._runner.set_state("safety.acceleration", np.nan_to_num(acceleration))
+    def _adopt(self, state: Any) -> None:
+        """Go on from what the box has where it has not got the last answer."""
+        reported = np.array(state.dq_d)
+        if answer_was_lost(reported, self._reported, self._sent):
+            acceleration = np.nan_to_num(np.array(state.ddq_d))
+            self._runner.set_state("safety.velocity", reported)
+            self._runner.set_state("safety.acceleration", acceleration)
+        self._reported = reported
 
     def _note(self, state: Any) -> None:
         report = self._report
@@ -533,6 +536,30 @@ class ControlLoop:
         except Exception:
             time.sleep(0.01)  # nothing can be read until somebody reconnects
         self._publish(Phase.FAULTED)
+
+
+def answer_was_lost(
+    reported: Float[np.ndarray, "7"],
+    before: Float[np.ndarray, "7"],
+    sent: Float[np.ndarray, "7"],
+) -> bool:
+    """Whether the control box goes on without the last answer, with a constant acceleration.
+
+    Then the next answer must start from where the box is. A report that has not changed at all
+    says nothing of the kind: it was written before the answer that the box has by now, and
+    starting from it would be a jump back.
+
+    Args:
+        reported: What the box has as the commanded velocity [rad/s].
+        before: What it had in the state before; NaN: there was none.
+        sent: The last answer; NaN: there was none.
+    """
+    if not np.isfinite(reported).all():
+        return False
+    if np.isnan(sent).any():
+        return True  # a motion begins with what the box has
+    unchanged = np.abs(reported - before).max() <= _SAME
+    return bool(np.abs(reported - sent).max() > _AGREES and not unchanged)
 
 
 def _explained(error: Exception) -> str:
