@@ -174,7 +174,9 @@ class FrankaArm:
             ValueError: The arm has not seven joints.
         """
         if len(chain.joint_names) != JOINTS:
-            raise ValueError(f"a Franka arm has 7 joints, but {chain} {len(chain.joint_names)}")
+            raise ValueError(
+                f"a Franka arm has {JOINTS} joints, but the chain {len(chain.joint_names)}."
+            )
         self._config = config = config or FrankaConfig()
         self._shared, self._orders = Shared(), Orders()
         # Of the threads here that command: the loop is never held up by it.
@@ -269,6 +271,19 @@ class FrankaArm:
         self._await(
             lambda report: report.resting and report.phase != Phase.MOVING, _REST, "stop"
         )
+        before = self._report()
+
+        def still(report: Report) -> bool:
+            nonlocal before
+            passed = report.time - before.time
+            if passed < _LOOK:
+                # Of an arm that its control box has stopped no clock may run any more.
+                return report.phase == Phase.FAULTED
+            way = np.abs(report.joint_position - before.joint_position).max()
+            before = report
+            return bool(way < _STILL * passed)
+
+        self._await(still, _REST, "stop")
 
     def move(self, width: float) -> None:
         """Open the gripper to a width, or squeeze what is between its fingers [m].
@@ -294,8 +309,8 @@ class FrankaArm:
         Raises:
             DriverError: That is not possible; it says why.
         """
-        report = self._report()
-        if report.phase not in (Phase.FAULTED, Phase.ENDED):
+        if self._report().phase != Phase.FAULTED:
+            self._check()
             return
         asked = self._orders.recoveries + 1
         self._order(recoveries=asked)

@@ -117,7 +117,7 @@ class GripperProcess:
     def busy(self) -> bool:
         """Whether the newest wish is still to be done."""
         line = self._told.read()
-        return line is not None and line[2] < self._wishes
+        return line is not None and bool(line[2] < self._wishes)
 
     def move(self, width: float) -> None:
         """Open to a width, or squeeze what is between the fingers [m]; returns at once.

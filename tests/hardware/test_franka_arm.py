@@ -1,0 +1,226 @@
+"""Franka's own binding against franky-sim, which speaks its protocol and enforces nothing.
+
+The step is run uncompiled, as compiling it takes a minute.
+"""
+
+import math
+import os
+import signal
+import time
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fr3 import FR3
+from franka_servers import franky_sim, loopback
+
+from hrc_learn.hardware import DriverError, FrankaArm, FrankaConfig, Load
+from hrc_learn.kinematics import SerialChain
+from hrc_learn.protocols import Arm, Gripper
+
+# Not imported: one process cannot have both drivers, and this one may get the other.
+pytestmark = pytest.mark.skipif(
+    not (find_spec("pylibfranka") and find_spec("franky_sim")),
+    reason="drivers and simulator come with the extra hardware",
+)
+
+# A velocity holds for longer than these tests are held up by others.
+CONFIG = FrankaConfig(realtime=False, compiled=False, hold=0.5)
+PATIENCE = 30.0
+
+
+@pytest.fixture(scope="module")
+def host():
+    address = loopback()
+    with franky_sim(address):
+        yield address
+
+
+@pytest.fixture(scope="module")
+def arm(host):
+    with FrankaArm(host, FR3, CONFIG) as arm:
+        yield arm
+        assert arm.faults == 0, arm.fault
+
+
+def wait_until(reached) -> None:
+    end = time.monotonic() + PATIENCE
+    while not reached():
+        assert time.monotonic() < end
+        time.sleep(0.002)
+
+
+def test_it_is_an_arm_and_a_gripper(arm):
+    assert isinstance(arm, Arm)
+    assert isinstance(arm, Gripper)
+
+
+def test_joints_move_as_they_are_told_and_rest_once_nobody_tells(arm):
+    velocity = 0.2 * np.array([1, -1, 1, -1, 1, 1, -1])
+    start = arm.read()
+    while (now := arm.read()).time < start.time + 0.8:
+        arm.command(velocity)
+        time.sleep(0.01)
+    way = now.joint_position - start.joint_position
+    # The motion begins with a ramp, and the servo follows late.
+    np.testing.assert_allclose(way, 0.8 * velocity, atol=0.02)
+    # From 0.2 rad/s at 5 rad/s^2 rest takes 0.04 s, and ramps of the jerk.
+    wait_until(lambda: arm.read().time > now.time + CONFIG.hold + 0.15)
+    at_rest = arm.read()
+    wait_until(lambda: arm.read().time > at_rest.time + 0.2)
+    still = arm.read().joint_position - at_rest.joint_position
+    assert np.abs(still).max() < 2e-3
+    assert np.abs(at_rest.joint_position - now.joint_position).max() < 0.2 * (
+        CONFIG.hold + 0.15
+    )
+
+
+def test_a_stop_is_over_when_the_arm_rests_and_what_was_told_before_is_forgotten(arm):
+    arm.command(np.full(7, 0.2))
+    wait_until(lambda: np.abs(arm.read().joint_velocity).max() > 0.1)
+    arm.stop()
+    before = arm.read()
+    wait_until(lambda: arm.read().time > before.time + 0.1)
+    way = np.abs(arm.read().joint_position - before.joint_position).max()
+    assert way < 0.1 * 0.02
+    arm.command(np.full(7, -0.2))
+    wait_until(lambda: np.abs(arm.read().joint_velocity).max() > 0.1)
+    arm.stop()
+
+
+@pytest.mark.parametrize(
+    "velocity",
+    [np.full(7, np.nan), np.array([0, 0, 0, np.inf, 0, 0, 0]), np.zeros(6), np.zeros((1, 7))],
+)
+def test_what_is_no_velocity_is_refused(arm, velocity):
+    with pytest.raises((ValueError, TypeError)):
+        arm.command(velocity)
+
+
+def test_the_state_has_what_the_robot_tells(arm):
+    state = arm.read()
+    assert state.external_torque is not None
+    assert state.external_torque.shape == (7,)
+    assert np.isfinite(state.external_torque).all()
+    # Of the robot: it counts milliseconds since the connection.
+    assert 0 < state.time < 1000
+    assert FR3.limits.contain(FR3.ready.new_tensor(state.joint_position))
+
+
+def test_the_gripper_moves_while_the_arm_is_read(arm):
+    arm.move(0.03)
+    assert arm._gripper.busy
+    began = arm.read().time
+    wait_until(lambda: not arm._gripper.busy)
+    assert arm.read().time > began
+    wait_until(lambda: abs(arm.read().gripper_width - 0.03) < 3e-3)
+    arm.move(0.0)  # squeezes; there is nothing between the fingers
+    wait_until(lambda: not arm._gripper.busy)
+    wait_until(lambda: arm.read().gripper_width < 5e-3)
+    arm.move(0.08)
+    wait_until(lambda: arm.read().gripper_width > 0.07)
+    with pytest.raises(ValueError, match="width must be finite"):
+        arm.move(math.nan)
+
+
+def test_cycles_are_counted(arm):
+    timing = arm.timing
+    assert timing.answered > 300
+    assert timing.cost.sum() > 300
+    assert 0 < timing.percentile(50.0) <= timing.percentile(99.0) <= 2e-3
+
+
+def test_a_loop_that_is_held_up_is_told_of_and_goes_on(arm):
+    os.kill(arm.pid, signal.SIGSTOP)
+    try:
+        wait_until(lambda: not reads(arm))
+        with pytest.raises(
+            DriverError, match=r"no state for .* s: something holds its process"
+        ):
+            arm.read()
+    finally:
+        os.kill(arm.pid, signal.SIGCONT)
+    wait_until(lambda: reads(arm))
+
+
+@pytest.mark.slow
+def test_each_fault_says_what_it_was_and_an_arm_can_be_recovered():
+    """One arm meets them one after the other, as starting one takes seconds."""
+    address = loopback()
+    config = replace(CONFIG, gripper=False, load=Load(mass=0.3, centre=(0.0, 0.0, 0.05)))
+    with franky_sim(address) as server, FrankaArm(address, FR3, config) as arm:
+        assert math.isnan(arm.read().gripper_width)
+        with pytest.raises(DriverError, match="without a gripper"):
+            arm.move(0.05)
+        arm.recover()  # there is nothing to recover from
+        assert arm.faults == 0
+
+        # The control box goes, and comes back.
+        arm.command(np.full(7, 0.1))
+        server.kill()
+        server.wait()
+        wait_until(lambda: arm.fault)
+        for refused in (lambda: arm.command(np.full(7, 0.1)), arm.recover):
+            with pytest.raises(DriverError, match=r"recover\(\)"):
+                refused()
+        wait_until(lambda: not reads(arm))
+        with franky_sim(address):
+            arm.recover()
+            assert arm.fault == ""
+            before = arm.read().joint_position
+            wait_until(lambda: arm.read().time > 0.1)
+            # What was commanded before the fault is forgotten.
+            np.testing.assert_allclose(arm.read().joint_position, before, atol=2e-3)
+            arm.command(np.full(7, 0.1))
+            wait_until(lambda: np.abs(arm.read().joint_velocity).max() > 0.05)
+            arm.stop()
+
+            # The loop dies.
+            os.kill(arm.pid, signal.SIGKILL)
+            wait_until(lambda: not reads(arm))
+            for refused in (lambda: arm.command(np.zeros(7)), arm.read, arm.stop, arm.recover):
+                with pytest.raises(DriverError, match=r"the loop has ended.*connect again"):
+                    refused()
+
+
+def reads(arm: FrankaArm) -> bool:
+    try:
+        arm.read()
+    except DriverError:
+        return False
+    return True
+
+
+@pytest.mark.slow
+def test_an_arm_that_is_not_there_is_named():
+    with pytest.raises(DriverError, match=r"cannot connect: .*NetworkException"):
+        FrankaArm(loopback(), FR3, replace(CONFIG, gripper=False))
+
+
+@pytest.mark.skipif(
+    Path("/sys/kernel/realtime").exists(), reason="the kernel of this machine is a realtime one"
+)
+def test_realtime_that_is_missing_is_named(host):
+    with pytest.raises(DriverError, match="realtime=False"):
+        FrankaArm(host, FR3, replace(CONFIG, realtime=True))
+
+
+def test_only_arms_of_seven_joints_are_driven():
+    short = SerialChain(
+        joint_names=FR3.joint_names[:6],
+        mounts=FR3.mounts[:6],
+        flange=FR3.flange,
+        tcp=FR3.tcp,
+        limits=replace(
+            FR3.limits,
+            **{
+                name: getattr(FR3.limits, name)[:6]
+                for name in ("lower", "upper", "velocity", "acceleration", "jerk", "torque")
+            },
+        ),
+        ready=FR3.ready[:6],
+    )
+    with pytest.raises(ValueError, match="7 joints"):
+        FrankaArm("127.0.0.1", short, CONFIG)

@@ -1,0 +1,148 @@
+"""The memory between the loop of a Franka arm and who commands it, and its settings."""
+
+import multiprocessing
+import time
+
+import numpy as np
+import pytest
+
+from hrc_learn.hardware import CollisionThresholds, FrankaConfig, Load, LoopTiming
+from hrc_learn.hardware.franka_loop import (
+    Mailbox,
+    Orders,
+    Phase,
+    Report,
+    Shared,
+    answer_was_lost,
+)
+
+
+def write_lines(mailbox: Mailbox, seconds: float) -> None:
+    end, k = time.monotonic() + seconds, 0
+    while time.monotonic() < end:
+        k += 1
+        mailbox.write(np.full(200, float(k)))
+
+
+def test_a_line_is_read_whole_while_another_process_writes():
+    mailbox = Mailbox(200)
+    writer = multiprocessing.get_context("fork").Process(
+        target=write_lines, args=(mailbox, 1.0)
+    )
+    writer.start()
+    seen = set()
+    while writer.is_alive():
+        line = mailbox.read()
+        if line is not None:
+            assert len(set(line)) == 1, "half of one line, half of another"
+            seen.add(line[0])
+    writer.join()
+    assert len(seen) > 10
+
+
+def test_a_writer_that_died_in_the_middle_of_a_line_holds_nobody_up():
+    mailbox = Mailbox(3)
+    mailbox.write(np.ones(3))
+    mailbox._line[0] += 1  # as at the moment of its death
+    assert mailbox.read() is None
+    mailbox._line[0] += 1
+    np.testing.assert_array_equal(mailbox.read(), np.ones(3))
+
+
+def test_orders_and_reports_come_out_as_they_went_in():
+    rng = np.random.default_rng(0)
+    orders = Orders(12.5, True, 3, True, rng.normal(size=7))
+    report = Report(
+        phase=Phase.RECOVERING,
+        stamp=1.5,
+        time=2.5,
+        recoveries=3,
+        faults=4,
+        cycles=5,
+        lost=6,
+        success_rate=0.75,
+        resting=False,
+        joint_position=rng.normal(size=7),
+        joint_velocity=rng.normal(size=7),
+        external_torque=rng.normal(size=7),
+    )
+    for said in (orders, report):
+        again = type(said).of(said.line())
+        assert vars(again).keys() == vars(said).keys()
+        for name, value in vars(said).items():
+            np.testing.assert_array_equal(getattr(again, name), value, err_msg=name)
+
+
+def test_a_message_of_any_length_arrives():
+    shared = Shared()
+    assert shared.message == ""
+    shared.message = "the stop button is pressed"
+    assert shared.message == "the stop button is pressed"
+    shared.message = "x" * 10_000
+    assert set(shared.message) == {"x"}
+    assert len(shared.message) < 10_000
+
+
+class TestLostAnswers:
+    """v was sent before, the box had an acceleration a, and v + d is the last answer."""
+
+    v, a, d = np.full(7, 0.3), np.full(7, 4e-3), np.full(7, 4e-3 + 1.5e-3)
+
+    def test_an_answer_that_came_back_was_not_lost(self):
+        single = (self.v + self.d).astype(np.float32).astype(float)
+        assert not answer_was_lost(single, self.v, self.v + self.d)
+
+    def test_a_box_that_went_on_by_itself_has_lost_it(self):
+        assert answer_was_lost(self.v + self.a, self.v, self.v + self.d)
+
+    def test_a_report_from_before_the_answer_says_nothing(self):
+        assert not answer_was_lost(self.v, self.v, self.v + self.d)
+
+    def test_one_joint_is_enough(self):
+        sent = self.v.copy()
+        sent[3] += 1e-4
+        changed = self.v + 1e-7
+        assert answer_was_lost(changed, self.v, sent)
+
+    def test_a_motion_begins_with_what_the_box_has(self):
+        nothing = np.full(7, np.nan)
+        assert answer_was_lost(self.v, nothing, nothing)
+
+    def test_nothing_is_begun_with_no_number(self):
+        nothing = np.full(7, np.nan)
+        assert not answer_was_lost(nothing, self.v, self.v)
+        assert not answer_was_lost(nothing, nothing, nothing)
+
+
+@pytest.mark.parametrize(
+    ("make", "named"),
+    [
+        (lambda: FrankaConfig(hold=0.0), "hold"),
+        (lambda: FrankaConfig(hold=np.inf), "hold"),
+        (lambda: FrankaConfig(acceleration=1.1), "acceleration"),
+        (lambda: FrankaConfig(jerk=0.0), "jerk"),
+        (lambda: FrankaConfig(grip_force=-1.0), "grip_force"),
+        (lambda: FrankaConfig(grip_speed=np.nan), "grip_speed"),
+        (lambda: Load(mass=-0.1), "mass"),
+        (lambda: Load(mass=np.nan), "mass"),
+        (lambda: Load(mass=0.1, inertia=(0.0,) * 6), "inertia"),
+        (lambda: CollisionThresholds(torque=(20.0,) * 6), "torque"),
+        (lambda: CollisionThresholds(force=(20.0,) * 5 + (0.0,)), "force"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(make, named):
+    with pytest.raises(ValueError, match=named):
+        make()
+
+
+def test_timing_counts_cycles_and_what_they_cost():
+    cost = np.zeros(2000)
+    cost[[100, 150, 900]] = 50, 48, 2
+    timing = LoopTiming(answered=98, lost=2, success_rate=0.98, cost=cost)
+    assert timing.answered_share == 0.98
+    assert timing.percentile(50.0) == pytest.approx(101e-6)
+    assert timing.percentile(98.0) == pytest.approx(151e-6)
+    assert timing.percentile(99.0) == pytest.approx(901e-6)
+    nothing = LoopTiming(answered=0, lost=0, success_rate=0.0, cost=np.zeros(2000))
+    assert nothing.answered_share == 1.0
+    assert np.isnan(nothing.percentile(50.0))
