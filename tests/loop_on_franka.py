@@ -27,5 +27,11 @@ def swing(t: float) -> np.ndarray:
     return 0.4 * np.cos(2 * t) * np.array([1, -1, 1, -1, 1, 1, 1])
 
 
+def loop_of(arm: FrankaArm) -> int:
+    """Number of the process that has the loop."""
+    assert arm.pid is not None
+    return arm.pid
+
+
 if __name__ == "__main__":
     main(sys.argv[1])

@@ -13,13 +13,16 @@ from __future__ import annotations
 import argparse
 import logging
 import os
+import random
 import signal
+import socket
 import struct
 import sys
 import threading
 import time
+from contextlib import suppress
 from pathlib import Path
-from types import FrameType
+from types import FrameType, SimpleNamespace
 from typing import Any
 
 _MODEL = Path(__file__).resolve().parents[1] / ".venv-franka-sim" / "model" / "fr3.xml"
@@ -34,10 +37,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--host", default="127.0.0.1", help="address to listen at")
     parser.add_argument("--trace", type=Path, help="receives what the arm does, each ms")
+    parser.add_argument("--loss", type=float, default=0.0, help="share of packets lost, 0 to 1")
     parser.add_argument("--lenient", action="store_true", help="report violations only")
     parser.add_argument("--object", type=float, help="width of what is in the gripper [m]")
     parser.add_argument("--log", default="WARNING", help="level of the server's log")
     args = parser.parse_args()
+    if not 0 <= args.loss < 1:
+        parser.error(f"--loss must be in [0, 1), but is {args.loss}")
     os.environ.setdefault("FR3_MJCF", str(_MODEL))
     if not Path(os.environ["FR3_MJCF"]).is_file():
         parser.error(f"no model {os.environ['FR3_MJCF']}: run tools/make_franka_sim.sh first")
@@ -46,6 +52,10 @@ def main() -> None:
         from franka_sim import FrankaSimServer  # pyright: ignore[reportMissingImports]
     except ImportError:
         parser.error("no franka-sim here: run this by .venv-franka-sim/bin/python")
+    if args.loss:
+        _lose_packets(args.loss)
+    with suppress(OSError):  # where that is not allowed, other programs make states late
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
     server = FrankaSimServer(
         host=args.host,
         gripper_object_width=args.object,
@@ -65,6 +75,26 @@ def main() -> None:
         pass
     finally:
         server.stop()
+
+
+def _lose_packets(share: float) -> None:
+    """Let sockets lose datagrams both ways: states that go out, answers that come in."""
+    from franka_sim.server import state_stream  # pyright: ignore[reportMissingImports]
+
+    rng = random.Random(0)
+
+    class LossySocket(socket.socket):
+        def sendto(self, data: bytes, *rest: Any) -> int:  # pyright: ignore[reportIncompatibleMethodOverride]
+            return len(data) if rng.random() < share else super().sendto(data, *rest)
+
+        def recvfrom(self, *rest: Any) -> tuple[bytes, Any]:
+            received = super().recvfrom(*rest)
+            if rng.random() < share:
+                raise BlockingIOError  # as when nothing has come
+            return received
+
+    # Its own view of the module: sockets of TCP lose nothing.
+    state_stream.socket = SimpleNamespace(**vars(socket) | {"socket": LossySocket})
 
 
 def _watch(server: Any, trace: Path | None) -> None:

@@ -280,8 +280,7 @@ class Robot:
         """
         driver = import_pylibfranka()
         config = driver.RealtimeConfig
-        if self.realtime:
-            _take_priority()
+        _take_priority(self.realtime)
         try:
             robot = driver.Robot(self.ip, config.kEnforce if self.realtime else config.kIgnore)
         except driver.RealtimeException as error:
@@ -318,16 +317,18 @@ def import_pylibfranka() -> Any:
         ) from error
 
 
-def _take_priority() -> None:
+def _take_priority(needed: bool) -> None:
+    """Come before other processes; where that is not allowed, only if it is not needed."""
     highest = os.sched_get_priority_max(os.SCHED_FIFO)
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(highest))
     except PermissionError as error:
-        raise RuntimeError(
-            "this user may not have realtime priority: add the line '@realtime - rtprio 99' to "
-            "/etc/security/limits.conf, the user to the group realtime, and log in again; or "
-            "accept late cycles with realtime=False."
-        ) from error
+        if needed:
+            raise RuntimeError(
+                "this user may not have realtime priority: add the line '@realtime - rtprio "
+                "99' to /etc/security/limits.conf, the user to the group realtime, and log in "
+                "again; or accept late cycles with realtime=False."
+            ) from error
 
 
 def serve(
@@ -484,11 +485,10 @@ class ControlLoop:
 
     def _adopt(self, state: Any) -> None:
         """Go on from what the box has where it has not got the last answer."""
-        reported = np.array(state.dq_d)
-        if answer_was_lost(reported, self._reported, self._sent):
-            acceleration = np.nan_to_num(np.array(state.ddq_d))
+        reported, acceleration = np.array(state.dq_d), np.array(state.ddq_d)
+        if answer_was_lost(reported, acceleration, self._reported, self._sent):
             self._runner.set_state("safety.velocity", reported)
-            self._runner.set_state("safety.acceleration", acceleration)
+            self._runner.set_state("safety.acceleration", np.nan_to_num(acceleration))
         self._reported = reported
 
     def _note(self, state: Any) -> None:
@@ -540,26 +540,31 @@ class ControlLoop:
 
 def answer_was_lost(
     reported: Float[np.ndarray, "7"],
+    acceleration: Float[np.ndarray, "7"],
     before: Float[np.ndarray, "7"],
     sent: Float[np.ndarray, "7"],
 ) -> bool:
     """Whether the control box goes on without the last answer, with a constant acceleration.
 
-    Then the next answer must start from where the box is. A report that has not changed at all
-    says nothing of the kind: it was written before the answer that the box has by now, and
-    starting from it would be a jump back.
+    Then the next answer must start from where the box is. A velocity that has not changed in
+    spite of an acceleration says nothing of the kind: it was written before the answer that the
+    box has by now, and starting from it would be a jump back.
 
     Args:
         reported: What the box has as the commanded velocity [rad/s].
-        before: What it had in the state before; NaN: there was none.
+        acceleration: And as the commanded acceleration [rad/s^2].
+        before: The velocity of the state before; NaN: there was none.
         sent: The last answer; NaN: there was none.
     """
     if not np.isfinite(reported).all():
         return False
     if np.isnan(sent).any():
         return True  # a motion begins with what the box has
+    if np.abs(reported - sent).max() <= _AGREES:
+        return False
     unchanged = np.abs(reported - before).max() <= _SAME
-    return bool(np.abs(reported - sent).max() > _AGREES and not unchanged)
+    accelerates = np.abs(acceleration).max() * CYCLE > _AGREES
+    return not (unchanged and accelerates)
 
 
 def _explained(error: Exception) -> str:

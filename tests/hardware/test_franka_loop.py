@@ -84,34 +84,34 @@ def test_a_message_of_any_length_arrives():
 
 
 class TestLostAnswers:
-    """v was sent before, the box had an acceleration a, and v + d is the last answer."""
+    """The box had a velocity v and an acceleration a; v + d was the last answer."""
 
-    v, a, d = np.full(7, 0.3), np.full(7, 4e-3), np.full(7, 4e-3 + 1.5e-3)
+    v, a = np.full(7, 0.3), np.full(7, 4.0)
+    d = 1e-3 * a + 1.5e-3
+    still, nothing = np.zeros(7), np.full(7, np.nan)
 
     def test_an_answer_that_came_back_was_not_lost(self):
         single = (self.v + self.d).astype(np.float32).astype(float)
-        assert not answer_was_lost(single, self.v, self.v + self.d)
+        assert not answer_was_lost(single, self.a, self.v, self.v + self.d)
 
     def test_a_box_that_went_on_by_itself_has_lost_it(self):
-        assert answer_was_lost(self.v + self.a, self.v, self.v + self.d)
+        assert answer_was_lost(self.v + 1e-3 * self.a, self.a, self.v, self.v + self.d)
+        assert answer_was_lost(self.v, self.still, self.v, self.v + self.d)
 
     def test_a_report_from_before_the_answer_says_nothing(self):
-        assert not answer_was_lost(self.v, self.v, self.v + self.d)
+        assert not answer_was_lost(self.v, self.a, self.v, self.v + self.d)
 
     def test_one_joint_is_enough(self):
-        sent = self.v.copy()
-        sent[3] += 1e-4
-        changed = self.v + 1e-7
-        assert answer_was_lost(changed, self.v, sent)
+        one = np.eye(7)[3]
+        assert answer_was_lost(self.v + 1e-7, self.a, self.v, self.v + 1e-4 * one)
+        assert not answer_was_lost(self.v, 4.0 * one, self.v, self.v + self.d)
 
     def test_a_motion_begins_with_what_the_box_has(self):
-        nothing = np.full(7, np.nan)
-        assert answer_was_lost(self.v, nothing, nothing)
+        assert answer_was_lost(self.v, self.a, self.nothing, self.nothing)
 
     def test_nothing_is_begun_with_no_number(self):
-        nothing = np.full(7, np.nan)
-        assert not answer_was_lost(nothing, self.v, self.v)
-        assert not answer_was_lost(nothing, nothing, nothing)
+        assert not answer_was_lost(self.nothing, self.a, self.v, self.v)
+        assert not answer_was_lost(self.nothing, self.a, self.nothing, self.nothing)
 
 
 @pytest.mark.parametrize(
