@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import gc
 import importlib
+import math
 import os
 import signal
 import threading
@@ -47,6 +48,9 @@ _SAME = 1e-9
 """By how much a report differs from the one before if it is the same [rad/s]."""
 _RESTS = 1e-6
 """Commanded velocities below this are rest [rad/s]."""
+_SLOWEST, _FOLLOWS = 4.0, 0.02
+"""Of a robot slower than its clock: the slowest, in seconds for a second of its own, and how
+fast that is learned, in 50 cycles."""
 _PARENT_EVERY = 50
 """Cycles between two looks at whether the process that commands still lives."""
 _TRIES = 100
@@ -362,6 +366,37 @@ def serve(
 
 
 @final
+class Punctuality:
+    """Tells which answers would come too late, by the clocks of this machine and of the robot.
+
+    A process that has been held up finds a state whose time is over. Its answer would be
+    dropped, or worse be taken for another cycle: it is better not given. A robot that is slower
+    than its clock, as a simulator on a busy machine, is not late for that.
+    """
+
+    def __init__(self):
+        self._last = math.nan
+        self._pace = 1.0
+        self._skipped = False
+
+    def late(self, now: float, period: float) -> bool:
+        """Whether to leave a state unanswered; never two in a row.
+
+        Args:
+            now: When it was read [s].
+            period: Time of the robot since the one before [s].
+        """
+        passed, self._last = now - self._last, now
+        if math.isnan(passed) or period <= 0:
+            return False
+        late = passed > self._pace * period + CYCLE and not self._skipped
+        self._skipped = late
+        pace = min(passed / period, _SLOWEST)
+        self._pace = max(1.0, self._pace + _FOLLOWS * (pace - self._pace))
+        return late
+
+
+@final
 class ControlLoop:
     """Reads, steps and answers.
 
@@ -451,10 +486,11 @@ class ControlLoop:
         control = self._link.start_joint_velocity_control(mode)
         self._sent = self._reported = np.full(JOINTS, np.nan)  # nothing yet
         report = self._report
-        number, finished = 0, False
+        number, finished, punctuality = 0, False, Punctuality()
         while not finished:
             state, period = control.readOnce()
             begin = time.perf_counter()
+            late = punctuality.late(begin, period.to_sec())
             number += 1
             if number > 1:
                 report.lost += max(0, round(period.to_sec() / CYCLE) - 1)
@@ -465,6 +501,10 @@ class ControlLoop:
             if number == 1:
                 self._runner.start(report.joint_position)
             self._adopt(state)
+            if late:
+                report.lost += 1
+                self._publish(Phase.MOVING)
+                continue
             self._position[...] = report.joint_position
             self._velocity[...] = self._wanted()
             self._stop[...] = self._orders.stop or self.ending

@@ -2,6 +2,7 @@
 
 import multiprocessing
 import time
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from hrc_learn.hardware.franka_loop import (
     Mailbox,
     Orders,
     Phase,
+    Punctuality,
     Report,
     Shared,
     answer_was_lost,
@@ -112,6 +114,32 @@ class TestLostAnswers:
     def test_nothing_is_begun_with_no_number(self):
         assert not answer_was_lost(self.nothing, self.a, self.v, self.v)
         assert not answer_was_lost(self.nothing, self.a, self.nothing, self.nothing)
+
+
+class TestPunctuality:
+    def test_a_loop_in_time_answers_each_cycle(self):
+        punctuality = Punctuality()
+        # Now and then one comes late and the next early, or a state is lost.
+        moments = [0.0, 1.0, 2.4, 3.0, 5.0, 6.9, 7.1]
+        periods = [1, 1, 1, 1, 2, 1, 1]
+        for moment, period in zip(moments, periods, strict=True):
+            assert not punctuality.late(1e-3 * moment, 1e-3 * period)
+
+    def test_a_state_that_was_found_after_a_stall_is_not_answered_but_the_newest_is(self):
+        punctuality = Punctuality()
+        for k in range(10):
+            assert not punctuality.late(1e-3 * k, 1e-3)
+        assert punctuality.late(19e-3, 1e-3)
+        assert not punctuality.late(19.3e-3, 9e-3)
+        assert not punctuality.late(20e-3, 1e-3)
+
+    def test_a_robot_that_is_slower_than_its_clock_is_answered(self):
+        punctuality = Punctuality()
+        late = [punctuality.late(2.5e-3 * k, 1e-3) for k in range(300)]
+        assert not any(first and second for first, second in pairwise(late))
+        assert not any(late[60:])
+        # Held up for 5 ms more, it is late all the same.
+        assert punctuality.late(2.5e-3 * 300 + 5e-3, 1e-3)
 
 
 @pytest.mark.parametrize(
