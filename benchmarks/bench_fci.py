@@ -1,0 +1,171 @@
+"""What a cycle of Franka's control interface costs: our loop beside a bare one, in one run.
+
+Against franka-sim with all that it enforces; without its environment (tools/make_franka_sim.sh)
+nothing is measured. The bare loop reads a state, writes a velocity of zero and does nothing else; it is the
+least that pylibfranka allows from Python. Ours is `FrankaArm`'s: the state read, the filtered
+step, the answer sent, the report written, with its step compiled and uncompiled. They take
+turns, and the share of one in the other says more than either where others use the machine: its
+load stands beside the figures. Costs are wall time, from the state read to the answer sent.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import multiprocessing
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from hrc_learn import cli
+from hrc_learn.hardware import FrankaArm, FrankaConfig
+from hrc_learn.kinematics import panda
+
+ROOT = Path(__file__).parents[1]
+PYTHON = ROOT / ".venv-franka-sim" / "bin" / "python"
+CYCLE = 1e-3
+LOOPS = ("bare", "compiled", "uncompiled")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args:
+    """Command line."""
+
+    seconds: float = 10.0
+    """Of motion, for each loop in each turn."""
+    turns: int = 2
+    """How often each loop is measured."""
+    host: str = "127.0.2.1"
+    """Address for the simulator."""
+    json: Path | None = None
+    """Receives the figures."""
+
+
+def main(args: Args) -> None:
+    """Measure, print a table, write the figures."""
+    if args.turns < 1 or not args.seconds > 0:
+        raise ValueError(f"nothing to measure in {args.turns} turns of {args.seconds} s")
+    if not PYTHON.exists():
+        Console().print("franka-sim has no environment: run tools/make_franka_sim.sh")
+        return
+    with simulator(args.host):
+        figures = measure(args)
+    show(figures)
+    if args.json:
+        cli.write_json(args.json, figures)
+
+
+@contextmanager
+def simulator(host: str) -> Iterator[None]:
+    """A server of franka-sim."""
+    program = ROOT / "tools" / "franka_sim_server.py"
+    with subprocess.Popen(
+        [PYTHON, program, "--host", host, "--log", "ERROR"], stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        try:
+            yield
+        finally:
+            process.kill()
+
+
+def measure(args: Args) -> dict[str, float]:
+    """Cost [us] and share answered of each loop, how they compare, and the load."""
+    costs: dict[str, list[np.ndarray]] = {name: [] for name in LOOPS}
+    answered: dict[str, list[float]] = {name: [] for name in LOOPS}
+    for _ in range(args.turns):
+        for name in LOOPS:
+            cost, share = (
+                bare_loop(args.host, args.seconds)
+                if name == "bare"
+                else our_loop(args.host, args.seconds, compiled=name == "compiled")
+            )
+            costs[name].append(cost)
+            answered[name].append(share)
+    figures = {}
+    for name in LOOPS:
+        total = np.sum(costs[name], axis=0)
+        for percent in (50, 99):
+            figures[f"{name}_p{percent}_us"] = percentile(total, percent)
+        figures[f"{name}_answered"] = float(np.mean(answered[name]))
+    for name in LOOPS[1:]:
+        for percent in (50, 99):
+            mine, floor = (figures[f"{x}_p{percent}_us"] for x in (name, "bare"))
+            figures[f"{name}_of_bare_p{percent}"] = mine / floor
+    return figures | {"load": os.getloadavg()[0], "cores": float(os.cpu_count() or 0)}
+
+
+def percentile(histogram: np.ndarray, percent: float) -> float:
+    """Of counts by the microsecond [us]."""
+    reached = np.cumsum(histogram) >= percent / 100 * histogram.sum()
+    return float(np.argmax(reached)) + 1.0
+
+
+def our_loop(host: str, seconds: float, *, compiled: bool) -> tuple[np.ndarray, float]:
+    """Histogram of what cycles cost by the microsecond, and the share answered."""
+    # The Panda's limits are above an FR3's: this keeps within both.
+    config = FrankaConfig(
+        realtime=False, gripper=False, compiled=compiled, acceleration=0.15, jerk=0.15
+    )
+    with FrankaArm(host, panda, config) as arm:
+        begin = time.monotonic()
+        while (t := time.monotonic() - begin) < seconds:
+            arm.command(0.2 * np.cos(2 * t) * np.array([1, -1, 1, -1, 1, 1, 1]))
+            time.sleep(0.02)
+        timing = arm.timing
+    return timing.cost, timing.answered_share
+
+
+def bare_loop(host: str, seconds: float) -> tuple[np.ndarray, float]:
+    """The same of the least that there is, in a process as the loop has one."""
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe()
+    process = context.Process(target=_bare_loop, args=(theirs, host, seconds))
+    process.start()
+    result = ours.recv()
+    process.join()
+    return result
+
+
+def _bare_loop(connection: Connection, host: str, seconds: float) -> None:
+    import pylibfranka
+
+    with suppress(PermissionError):
+        highest = os.sched_get_priority_max(os.SCHED_FIFO)
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(highest))
+    robot = pylibfranka.Robot(host, pylibfranka.RealtimeConfig.kIgnore)
+    robot.automatic_error_recovery()
+    control = robot.start_joint_velocity_control(pylibfranka.ControllerMode.JointImpedance)
+    cost, lost, cycles = np.zeros(2000), 0, 0
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        _, period = control.readOnce()
+        begin = time.perf_counter()
+        control.writeOnce(pylibfranka.JointVelocities([0.0] * 7))
+        cost[min(int(1e6 * (time.perf_counter() - begin)), len(cost) - 1)] += 1
+        cycles += 1
+        lost += max(0, round(period.to_sec() / CYCLE) - 1) if cycles > 1 else 0
+    connection.send((cost, cycles / (cycles + lost)))
+
+
+def show(figures: dict[str, float]) -> None:
+    """Print all figures."""
+    table = Table("figure", "measured", title="Cycles of 1 ms")
+    for name, value in figures.items():
+        table.add_row(name, f"{value:.4g}")
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    cli.run(main, Args)
