@@ -144,7 +144,7 @@ def test_batches_and_joints_are_followed_one_by_one(batch):
     torch.testing.assert_close(report.change, together - chunks)
     for index in itertools.product(*map(range, batch)):
         for j in range(7):
-            own = {k: v[j : j + 1] for k, v in vars(limits()).items()} | {
+            own = {k: v if v is None else v[j : j + 1] for k, v in vars(limits()).items()} | {
                 name: getattr(panda.limits, name)[j : j + 1]
                 for name in ("lower", "upper", "velocity", "acceleration", "jerk")
             }
