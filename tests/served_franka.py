@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from franka_servers import READY
+from franky_servers import READY
 from lerobot.robots import make_robot_from_config
 
 from hrc_learn.lerobot.robots import FrankaPandaConfig

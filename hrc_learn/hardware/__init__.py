@@ -14,11 +14,11 @@ from hrc_learn.hardware.ending import ending_at_rest as ending_at_rest
 from hrc_learn.hardware.franka_arm import FrankaArm as FrankaArm
 from hrc_learn.hardware.franka_arm import FrankaConfig as FrankaConfig
 from hrc_learn.hardware.franka_arm import LoopTiming as LoopTiming
+from hrc_learn.hardware.franka_settings import CollisionConfig as CollisionConfig
+from hrc_learn.hardware.franka_settings import Load as Load
 from hrc_learn.hardware.franky_arm import ArmFaultError as ArmFaultError
-from hrc_learn.hardware.franky_arm import CollisionConfig as CollisionConfig
 from hrc_learn.hardware.franky_arm import FrankyArm as FrankyArm
 from hrc_learn.hardware.franky_arm import FrankyConfig as FrankyConfig
-from hrc_learn.hardware.franky_arm import Load as Load
 from hrc_learn.hardware.franky_arm import Realtime as Realtime
 from hrc_learn.hardware.franky_arm import RealtimeError as RealtimeError
 from hrc_learn.hardware.gripper import GripperError as GripperError

@@ -38,8 +38,6 @@ from hrc_learn.hardware.franka_gripper import FrankaHand, GripperProcess
 from hrc_learn.hardware.franka_loop import (
     CYCLE,
     JOINTS,
-    CollisionThresholds,
-    Load,
     Orders,
     Phase,
     Report,
@@ -47,6 +45,7 @@ from hrc_learn.hardware.franka_loop import (
     Shared,
     serve,
 )
+from hrc_learn.hardware.franka_settings import CollisionConfig, Load
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.protocols import ArmState
 
@@ -92,7 +91,7 @@ class FrankaConfig:
     compiled: bool = True
     """Whether to compile the step, once for a machine, which takes up to a minute the first
     time. Uncompiled it takes half of the time there is."""
-    collision: CollisionThresholds = field(default_factory=CollisionThresholds)
+    collision: CollisionConfig = field(default_factory=CollisionConfig)
     """What the control box stops the arm at."""
     load: Load | None = None
     """What the arm carries besides its end effector."""

@@ -32,6 +32,7 @@ import torch
 from jaxtyping import Float
 
 from hrc_learn.deploy import StepRunner
+from hrc_learn.hardware.franka_settings import CollisionConfig, Load
 
 CYCLE = 1e-3
 """Of Franka's control interface [s]."""
@@ -227,43 +228,6 @@ class Shared:
         return np.frombuffer(self._costs, dtype=float)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Load:
-    """What the arm carries besides its end effector, as the control box must know it."""
-
-    mass: float
-    """[kg]"""
-    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Of mass, in the frame of the flange [m]."""
-    inertia: tuple[float, ...] = (0.0,) * 9
-    """About that centre, by columns [kg m^2]."""
-
-    def __post_init__(self) -> None:
-        if not self.mass >= 0:
-            raise ValueError(f"mass must not be negative, but is {self.mass}")
-        if len(self.inertia) != 9:
-            raise ValueError(f"inertia must have 9 numbers, but has {len(self.inertia)}")
-
-
-@dataclass(frozen=True, kw_only=True)
-class CollisionThresholds:
-    """What the control box takes for a contact or a collision, at which it stops the arm.
-
-    Of contact and collision alike, as in the examples of libfranka.
-    """
-
-    torque: tuple[float, ...] = (20.0, 20.0, 18.0, 18.0, 16.0, 14.0, 12.0)
-    """Of each joint [N m]; these and the next are those of libfranka's examples."""
-    force: tuple[float, ...] = (20.0, 20.0, 20.0, 25.0, 25.0, 25.0)
-    """At the end effector [N, N m]."""
-
-    def __post_init__(self) -> None:
-        for name, size in (("torque", JOINTS), ("force", 6)):
-            values = getattr(self, name)
-            if len(values) != size or not min(values) > 0:
-                raise ValueError(f"{name} must be {size} positive numbers, but is {values}")
-
-
 @dataclass(frozen=True)
 class Robot:
     """How to reach an arm, and what its control box is told."""
@@ -272,7 +236,7 @@ class Robot:
     """Address of the control box."""
     realtime: bool
     """Whether to refuse a kernel or a priority without realtime."""
-    collision: CollisionThresholds
+    collision: CollisionConfig
     load: Load | None
 
     def connect(self) -> Any:
@@ -302,7 +266,10 @@ class Robot:
         torque, force = list(self.collision.torque), list(self.collision.force)
         robot.set_collision_behavior(torque, torque, force, force)
         if self.load is not None:
-            robot.set_load(self.load.mass, list(self.load.centre), list(self.load.inertia))
+            # By columns, which for a symmetric matrix is by rows.
+            robot.set_load(
+                self.load.mass, list(self.load.centre), np.ravel(self.load.inertia).tolist()
+            )
 
 
 def import_pylibfranka() -> Any:

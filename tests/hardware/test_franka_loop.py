@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from hrc_learn.hardware import CollisionThresholds, FrankaConfig, Load, LoopTiming
+from hrc_learn.hardware import FrankaConfig, LoopTiming
 from hrc_learn.hardware.franka_loop import (
     Mailbox,
     Orders,
@@ -151,11 +151,6 @@ class TestPunctuality:
         (lambda: FrankaConfig(jerk=0.0), "jerk"),
         (lambda: FrankaConfig(grip_force=-1.0), "grip_force"),
         (lambda: FrankaConfig(grip_speed=np.nan), "grip_speed"),
-        (lambda: Load(mass=-0.1), "mass"),
-        (lambda: Load(mass=np.nan), "mass"),
-        (lambda: Load(mass=0.1, inertia=(0.0,) * 6), "inertia"),
-        (lambda: CollisionThresholds(torque=(20.0,) * 6), "torque"),
-        (lambda: CollisionThresholds(force=(20.0,) * 5 + (0.0,)), "force"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused(make, named):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from franka_servers import READY, served_world, simulated_arm
+from franky_servers import READY, served_world, simulated_arm
 from unchecked import shapes_unchecked
 
 from hrc_learn.hardware import (

@@ -6,7 +6,7 @@ import threading
 import numpy as np
 import pytest
 import torch
-from franka_servers import READY
+from franky_servers import READY
 from lerobot.robots import make_robot_from_config
 from served_franka import served_franka
 

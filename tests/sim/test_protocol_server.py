@@ -5,7 +5,7 @@ from contextlib import ExitStack
 
 import numpy as np
 import pytest
-from franka_servers import READY, served_world
+from franky_servers import READY, served_world
 
 from hrc_learn.experiments.arm_access import FRANKY_DELAY, SIMULATED, through_franky
 from hrc_learn.hardware import FrankyConfig
