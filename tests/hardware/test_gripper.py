@@ -16,13 +16,13 @@ class SlowGripper:
         self.width, self.calls = 0.08, []
         self.let = threading.Semaphore(0)
         self.begun = threading.Semaphore(0)
-        self.readings = threading.Semaphore(0)
+        self.failures = 0
         self.succeeds, self.broken = True, False
 
     def read_width(self):
         if self.broken:
+            self.failures += 1
             raise OSError("no route to host")
-        self.readings.release()
         return self.width
 
     def move(self, width):
@@ -132,6 +132,14 @@ def test_a_driver_that_raises_is_told_with_its_words(driver, gripper, told):
     wait_until(lambda: gripper.width == 0.02)  # connected again
     with pytest.raises(GripperError):
         gripper.check()  # still: the move was lost
+
+
+def test_a_connection_that_stays_broken_is_told_once(driver, gripper, told):
+    driver.broken = True
+    wait_until(lambda: driver.failures == 2)
+    driver.broken, driver.width = False, 0.01
+    wait_until(lambda: gripper.width == 0.01)
+    assert len(told) == 1
 
 
 def test_a_gripper_that_cannot_be_reached_is_an_error_at_once():
