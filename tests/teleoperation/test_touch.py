@@ -35,7 +35,7 @@ def test_the_evidence_of_loads_is_a_normal_density():
     torque = rng.standard_normal(7)
     for rows, spread in ((elbow.T, np.full(3, 20.0)), (J.T, np.array([20.0] * 3 + [2.0] * 3))):
         covariance = rows @ np.diag(spread**2) @ rows.T + unknown
-        expected = multivariate_normal.logpdf(torque, cov=covariance)
+        expected = multivariate_normal.logpdf(torque, cov=covariance)  # pyright: ignore[reportArgumentType]
         found = explain(torque, rows, spread, unknown)
         assert found.evidence - 3.5 * np.log(2 * np.pi) == pytest.approx(expected)
         # The most likely load: the minimum of what it costs, by its normal equations.
@@ -44,7 +44,7 @@ def test_the_evidence_of_loads_is_a_normal_density():
         load = np.linalg.solve(system, rows.T @ weight @ torque)
         np.testing.assert_allclose(found.force, load[:3])
         assert found.size == pytest.approx(np.linalg.norm(load[:3]))
-    none = multivariate_normal.logpdf(torque, cov=unknown)
+    none = multivariate_normal.logpdf(torque, cov=unknown)  # pyright: ignore[reportArgumentType]
     assert evidence_of_none(torque, unknown) - 3.5 * np.log(2 * np.pi) == pytest.approx(none)
 
 
@@ -198,7 +198,7 @@ def test_who_holds_the_hand_makes_the_task_wait(force):
     assert off_path(cell)[1].max() < 2.5e-3
     waited = cell.time - cell.task_time
     assert waited == pytest.approx(paused.max() - paused.min(), abs=0.05)
-    assert [remark.name for remark in cell.remarks] == ["The task waits.", "The task goes on."]
+    assert [remark.text for remark in cell.remarks] == ["The task waits.", "The task goes on."]
 
 
 def test_a_push_may_pause_the_task_until_the_next_one():
@@ -307,7 +307,7 @@ def test_however_slowly_it_comes_a_great_force_stops():
 @pytest.mark.parametrize("name", ["elbow_force", "released", "collision_rise"])
 def test_sizes_that_make_no_sense_are_refused(name):
     with pytest.raises(ValueError, match=name):
-        TouchConfig(**{name: 0.0})
+        TouchConfig(**{name: 0.0})  # pyright: ignore[reportArgumentType]
 
 
 class Says(Human):
