@@ -11,9 +11,10 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
-from hrc_learn.hardware import FrankyArm, FrankyConfig
+from hrc_learn.hardware import FrankaArm, FrankaConfig, FrankyArm, FrankyConfig
+from hrc_learn.kinematics import panda
 from hrc_learn.protocols import Arm, Gripper
 from hrc_learn.sim import Imperfections, World
 from hrc_learn.sim.protocol_server import ServedArm, serve_world
@@ -73,6 +74,34 @@ def through_franky(config: FrankyConfig | None = None) -> ArmAccess:
     return through_protocol(
         partial(FrankyArm, config=config), delay=FRANKY_DELAY, dynamics=config.dynamics
     )
+
+
+def through_franka(config: FrankaConfig | None = None) -> ArmAccess:
+    """Over the network protocol, by our loop at 1 kHz.
+
+    Args:
+        config: How the arm is driven; None: as for `through_franky`.
+    """
+    config = config or FrankaConfig(realtime=False)
+    return through_protocol(
+        partial(FrankaArm, chain=panda, config=config),
+        delay=FRANKY_DELAY,
+        dynamics=config.acceleration,
+    )
+
+
+ArmDriver = Literal["sim", "franky", "franka"]
+"""What leads an arm: the simulator itself, or a driver of the real one."""
+
+
+def access_by(driver: ArmDriver) -> ArmAccess:
+    """How a driver leads the arm of a world.
+
+    Args:
+        driver: Its name.
+    """
+    accesses = {"sim": lambda: SIMULATED, "franky": through_franky, "franka": through_franka}
+    return accesses[driver]()
 
 
 def through_protocol(

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Bool, Float
 
+from hrc_learn.protocols import ArmState
 from hrc_learn.sim.imperfections import DrawnImperfections, Imperfections
 from hrc_learn.sim.panda_model import FINGER_STROKE, MujocoArm, frame_of
 from hrc_learn.sim.physics_watch import PhysicsWatch
@@ -123,6 +124,9 @@ _PADS = ("finger_left_pad", "finger_right_pad")
 _TOUCHING = 1e-4
 # Cosine of the angle between the normal of a contact and that of a flat face: of 3 degrees.
 _FLAT = math.cos(math.radians(3.0))
+# Of an object in the tool's frame: its x lies along the fingers' line of closing, its top
+# towards the gripper.
+_IN_HAND = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
 _ARM_BODIES = ("link1",)  # the tree from link 1 on, hand and fingers included
 
 
@@ -248,14 +252,42 @@ class World:
         """
         width = 2 * self._object(name).half_size[0]
         self.reset(joint_position, gripper_width=width + 0.002)
-        tcp = self.arm.tcp_pose()
-        # The object's x lies along the fingers' line of closing, its top towards the gripper.
-        in_hand = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
-        self.reset(joint_position, {name: tcp @ in_hand}, gripper_width=width + 0.002)
+        in_hand = self.arm.tcp_pose() @ _IN_HAND
+        self.reset(joint_position, {name: in_hand}, gripper_width=width + 0.002)
         self.arm.move(0.0)
         self.advance(0.5)
         self.data.time = 0.0
         self._watch.restart()
+
+    def follow(self, state: ArmState, carried: str | None = None) -> None:
+        """Show an arm that is led elsewhere, at once; nothing is simulated.
+
+        Args:
+            state: Of that arm.
+            carried: The object that goes along, at its present pose in the gripper.
+        """
+        in_hand = None
+        if carried is not None:
+            in_hand = np.linalg.inv(self.arm.tcp_pose()) @ self.object_pose(carried)
+        # An arm without a gripper tells no width.
+        self.arm.place(state.joint_position, float(np.nan_to_num(state.gripper_width)))
+        self.data.time = state.time
+        mujoco.mj_kinematics(self.model, self.data)
+        if carried is not None and in_hand is not None:
+            self._put(carried, self.arm.tcp_pose() @ in_hand)
+
+    def put_in_hand(self, name: str) -> None:
+        """Put an object between the fingers at once, as `hold` does.
+
+        Raises:
+            KeyError: If there is no object of that name.
+        """
+        self._object(name)
+        self._put(name, self.arm.tcp_pose() @ _IN_HAND)
+
+    def _put(self, name: str, pose: Float[np.ndarray, "4 4"]) -> None:
+        _put(self.data, name, pose)
+        mujoco.mj_kinematics(self.model, self.data)
 
     def move_obstacle(
         self, name: str, centre: tuple[float, float, float] | Float[np.ndarray, "3"]

@@ -120,6 +120,9 @@ INTERACT, HOME, TRANSFER, RELEASE = Phase.INTERACT, Phase.HOME, Phase.TRANSFER, 
 _NEGLIGIBLE = 0.3
 RELEASE_TIME = 0.8
 """For the fingers to open and for the released object to come to rest [s]."""
+# Straight way back along the end effector's own axis, until nothing of the object is between
+# the fingers [m]; and its speed: at the usual one the shoulder comes near its limits [m/s].
+_CLEARANCE, _RETREAT_SPEED = 0.08, 0.08
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,6 +144,43 @@ class PickAndPlaceConfig:
     """How often to wait for a blocked path to become free."""
     wait: float = 2.0
     """How long each time [s]."""
+
+
+def place_along(cell: WorkCell, plan: Plan, goal: Pose, lowering: float) -> float:
+    """Carry what is in the hand along a plan, put it down and back out.
+
+    Args:
+        cell: Arm, gripper and person.
+        plan: To the goal.
+        goal: Of the end effector where it begins to put down, as the arm is to read it.
+        lowering: How far to go down if nothing is met [m].
+
+    Returns:
+        When it began to put down [s].
+    """
+    cell.begin_phase(Phase.TRANSFER)
+    cell.follow_path(plan.path)
+    # The arm follows late: at the end of the path it is not quite there.
+    cell.move_straight(goal)
+    cell.begin_phase(Phase.RELEASE)
+    begun = cell.time
+    _put_down(cell, goal, lowering)
+    cell.begin_phase(Phase.RETREAT)
+    clear = goal.apply(goal.position.new_tensor([0.0, 0.0, -_CLEARANCE]))
+    cell.move_straight(Pose(clear, goal.orientation), speed=_RETREAT_SPEED)
+    return begun
+
+
+def _put_down(cell: WorkCell, goal: Pose, lowering: float) -> Pose:
+    """Lower what is in the hand until it stands, and let go; where that was."""
+    below = Pose(goal.position.clone(), goal.orientation)
+    below.position[2] -= lowering
+    cell.move_until_contact(below)
+    released = cell.pose
+    cell.gripper.move(OPEN)
+    cell.load = None
+    cell.hold_pose(RELEASE_TIME)
+    return released
 
 
 class PickAndPlace:
@@ -340,13 +380,8 @@ class PickAndPlace:
 
     def _release(self, job: PickPlaceJob) -> Phase:
         self._cell.begin_phase(Phase.RELEASE)
-        below = Pose(job.goal.position.clone(), job.goal.orientation)
-        below.position[2] -= self._workplace.lowering(job.item.half_size)
-        self._cell.move_until_contact(below)
-        job.release = self._cell.pose
-        self._cell.gripper.move(OPEN)
-        self._cell.load = None
-        self._cell.hold_pose(RELEASE_TIME)
+        lowering = self._workplace.lowering(job.item.half_size)
+        job.release = _put_down(self._cell, job.goal, lowering)
         return Phase.RETREAT
 
     def _retreat(self, job: PickPlaceJob) -> Phase:

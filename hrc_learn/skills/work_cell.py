@@ -164,6 +164,9 @@ class WorkCellConfig(YieldingConfig):
     limit_room: float = 0.1
     """Distance from the margin of the joints' limits beyond which nobody can push the arm
     [rad]: of some centimetres of the end effector, which the task may need."""
+    speed: float = 1.0
+    """Share of its speed that the task is done with, as for a first run on a real arm, above 0
+    to 1. Beside paths the null space is as fast as ever."""
     longest_wait: float = 300.0
     """For which the arm stands still before somebody until the task is given up [s]; of people
     who share a table, who go away some time."""
@@ -172,6 +175,10 @@ class WorkCellConfig(YieldingConfig):
     way_making: WayMakingConfig | None = None
     """Whether the null space makes way by itself for people who are watched for, follows the
     person who pushes it, or both; None: it follows the person."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.speed <= 1:
+            raise ValueError(f"speed must be in (0, 1], but is {self.speed}.")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -305,7 +312,7 @@ class WorkCell:
         self._stood = 0.0
         # Share of the task's motion that a person who pauses it leaves, and whether the arm
         # comes to rest for good.
-        self._going, self._stopping = 1.0, False
+        self._going, self._stopping = self.config.speed, False
         # Until when something may be met that the task has felt for [s].
         self._contact_expected = -math.inf
         self._look()
@@ -555,7 +562,7 @@ class WorkCell:
             felt.append(-float(self._contact_force() @ along))
             before.append(self.pose)
             # An arm that waits for somebody gets under way anew.
-            moving = moving + 1 if self._pace * self._going == 1 else 0
+            moving = moving + 1 if self._is_undisturbed() else 0
             if moving <= _FELT + _GETTING_UNDER_WAY:
                 free = None
                 continue
@@ -613,7 +620,7 @@ class WorkCell:
             if not self._yielding.aside:
                 waited = 0.0
             # Who pushes again and again must not hold it up for good.
-            elif not self._yielding.pushed and self._pace * self._going == 1:
+            elif not self._yielding.pushed and self._is_undisturbed():
                 waited = max(waited + (1.0 - 2.0 * max(rate, 0.0)) * dt, 0.0)
             # The null space that led aside further back leads back there as well.
             backs = waited > STUCK and progress > 0
@@ -891,12 +898,18 @@ class WorkCell:
                 self.step(still)
             self._stopping = False
             raise StoppedByPersonError(f"stopped: {asked.stop}")
-        if asked.pause and self._going == 1:
+        full = self.config.speed
+        if asked.pause and self._going == full:
             self.tell("The task waits.")
         going = changed_rate(self._going, float(not asked.pause), self.config.dt)
-        if going == 1 and self._going < 1:
+        going = min(float(going), full)
+        if going == full and self._going < full:
             self.tell("The task goes on.")
-        self._going = float(going)
+        self._going = going
+
+    def _is_undisturbed(self) -> bool:
+        """Whether nobody slows the task down or pauses it."""
+        return self._pace == 1 and self._going == self.config.speed
 
     def _nullspace_input(self, asked: HumanInput) -> Float[np.ndarray, " joints"]:
         """Of the person who pushes, and by which the arm makes way by itself [N m]."""

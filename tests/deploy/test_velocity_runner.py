@@ -42,7 +42,7 @@ def test_a_state_that_is_set_is_where_the_next_step_begins():
 
 
 def test_a_field_that_there_is_not_is_named():
-    with pytest.raises(ValueError, match="no field 'velocity'; there are safety.velocity"):
+    with pytest.raises(ValueError, match=r"no field 'velocity'; there are safety\.velocity"):
         EagerRunner(STEP, EXAMPLE).set_state("velocity", np.zeros(7))
 
 

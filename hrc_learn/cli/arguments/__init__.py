@@ -17,6 +17,8 @@ Shelf = Literal["lower", "middle", "upper"]
 """Of `hrc_learn.sim.workplace.Workplace`."""
 Camera = Literal["auto", "egl", "synthetic"]
 """`hrc_learn.sim.CameraKind`."""
+ArmDriver = Literal["sim", "franky", "franka"]
+"""The simulated arm itself, and `hrc_learn.experiments.on_arm.Driver`."""
 Channel = Literal["joint", "position", "orientation", "pose"]
 """Keys of `hrc_learn.learning.channels.CHANNELS`."""
 Scaling = Literal["none", "paper", "amplitude", "rotation"]

@@ -8,7 +8,7 @@ from tyro.conf import Positional
 
 from hrc_learn.cli._options import Detail, More
 from hrc_learn.cli.arguments import (
-    Camera,
+    ArmDriver,
     Configuration,
     Experiment,
     Measured,
@@ -68,6 +68,13 @@ class RunExperiment(Imperfect, Written):
     and draw success and errors against them."""
     robot: Robot = "panda"
     """Arm that does it."""
+    arm: ArmDriver = "sim"
+    """Driver of a real arm, or the simulated one. "franky" is the package of that name,
+    "franka" our own loop at 1 kHz (docs/hardware.md)."""
+    ip: More[str] = ""
+    """Address of the arm, for a driver; "sim" serves the simulated one there."""
+    site: Configuration = Detail("hrc_learn.experiments.on_arm", "ArmSite")
+    """The real arm and its camera."""
     serve: bool = False
     """Serve the dashboard in the browser while the run goes on."""
     serving: Configuration = Detail("hrc_learn.experiments.run_recording", "LiveViewConfig")
@@ -82,9 +89,9 @@ type DrawnBox = tuple[float, float, float, float, float, float, float, float]
 class RunServoing(RunExperiment):
     """What those with a camera have in common."""
 
-    camera: Camera = "auto"
+    camera: str = "auto"
     """Camera: rendered by "egl", or "synthetic", which needs no OpenGL; "auto" renders where
-    it can."""
+    it can. For a real arm: number or path of a device, URL of a stream, or a video file."""
     gains: More[Path | None] = None
     """gains.json of `hrc tune`, in place of those of the controller."""
     page: bool = False
@@ -121,6 +128,8 @@ class RunPlacing(RunExperiment):
     """Dataset the motion was learned from; the one named in that folder when None."""
     speed: float = 1.5
     """How many times faster than demonstrated."""
+    shelf: More[Shelf] = "middle"
+    """Where to put the object with a real arm, which begins with it in its hand."""
     trials: int = 0
     """Random starts from which to place on each shelf besides."""
     noise: float = 0.1

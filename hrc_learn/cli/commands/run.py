@@ -6,9 +6,10 @@ An experiment that is given no model takes the demo's, learned first where they 
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from contextlib import ExitStack, closing
+from dataclasses import asdict, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast, get_args
 
 from rich.console import Console
 
@@ -26,15 +27,27 @@ from hrc_learn.cli.arguments.run import (
     RunServoing,
 )
 from hrc_learn.experiments.collaboration.experiment import CollaborationExperiment
-from hrc_learn.experiments.collaboration.trial import Disturbances
+from hrc_learn.experiments.collaboration.trial import Disturbances, workplace_for
 from hrc_learn.experiments.frame import Experiment, RunOptions, conduct
 from hrc_learn.experiments.grasping.experiment import GraspingExperiment
 from hrc_learn.experiments.grasping.trial import GraspingSceneConfig
+from hrc_learn.experiments.on_arm import (
+    ArmSite,
+    Task,
+    collaboration_task,
+    grasping_task,
+    placing_task,
+    run_on_arm,
+)
 from hrc_learn.experiments.placing.experiment import ABLATION, PlacingExperiment, dataset_of
+from hrc_learn.hardware import open_camera
 from hrc_learn.learning.tuning import with_gains
 from hrc_learn.protocols import DrawnRegion
-from hrc_learn.sim import Imperfections, OcclusionInterval
+from hrc_learn.sim import CameraKind, Imperfections, OcclusionInterval
+from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.marker_sensor import LatencyConfig
+from hrc_learn.skills.placing import PlacingSkill
+from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.skills.work_cell import WorkCellConfig
 from hrc_learn.store import write_text
 from hrc_learn.teleoperation import DrawnInterval
@@ -44,10 +57,32 @@ MODELS = Path("outputs/demo")
 """Where commands that are given no model look for those of the demo."""
 
 
+_SIMULATED_ONLY = (
+    "trials",
+    "curve",
+    "serve",
+    "page",
+    "draw_region",
+    "mark_target",
+    "turn_tool",
+    "random_camera",
+    "ablation",
+    "occlusion",
+    "camera_moved",
+    "worker",
+)
+"""Options that only the simulated work cell has."""
+
+
 def run_placing(args: RunPlacing) -> int:
     """The paper's first experiment."""
     args = _with_models(args)
     assert args.placing is not None
+    if _is_real(args):
+        workplace = Workplace()
+        skill = PlacingSkill.load(args.placing)
+        task = placing_task(skill, workplace, args.shelf, args.speed)
+        return _on_arm(args, workplace, task)
     dataset = args.demonstrations or dataset_of(args.placing)
     experiment = PlacingExperiment(
         placing=args.placing.resolve(),
@@ -58,6 +93,7 @@ def run_placing(args: RunPlacing) -> int:
         curve=args.curve,
         taught=args.taught,
         snapshots=args.pictures,
+        arm=args.arm,
     )
     return _conduct(experiment, args, counts={ABLATION: args.ablation})
 
@@ -67,6 +103,11 @@ def run_grasping(args: RunGrasping) -> int:
     args = _with_models(args)
     assert args.aiming is not None
     controller = with_gains(args.config.controller, args.gains)
+    config = replace(args.config, controller=controller)
+    if _is_real(args):
+        servoing = VisualServoSkill.load(args.aiming)
+        workplace = Workplace().approached(servoing.approach)
+        return _on_arm(args, workplace, grasping_task(servoing, workplace, config))
     experiment = GraspingExperiment(
         aiming=args.aiming.resolve(),
         variants=() if args.variants == ("none",) else args.variants,
@@ -75,10 +116,11 @@ def run_grasping(args: RunGrasping) -> int:
         ),
         imperfections=_imperfections(args),
         curve=args.curve,
-        camera=args.camera,
-        config=replace(args.config, controller=controller),
+        camera=_simulated_camera(args),
+        config=config,
         drawings=_drawings(args),
         page=PageConfig(port=args.port) if args.page else None,
+        arm=args.arm,
     )
     return _conduct(experiment, args)
 
@@ -89,11 +131,18 @@ def run_collaboration(args: RunCollaboration) -> int:
     assert args.aiming is not None
     assert args.placing is not None
     controller = with_gains(args.config.grasping.controller, args.gains)
-    grasping = replace(args.config.grasping, controller=controller)
+    config = replace(args.config, grasping=replace(args.config.grasping, controller=controller))
+    shelves = args.shelves or (args.shelf,)
+    if _is_real(args):
+        servoing, placing = VisualServoSkill.load(args.aiming), PlacingSkill.load(args.placing)
+        workplace = workplace_for(shelves, args.shelf_x, args.shelf_depth)
+        workplace = workplace.approached(servoing.approach)
+        task = collaboration_task(servoing, placing, workplace, shelves, config)
+        return _on_arm(args, workplace, task)
     experiment = CollaborationExperiment(
         aiming=args.aiming.resolve(),
         placing=args.placing.resolve(),
-        shelves=args.shelves or (args.shelf,),
+        shelves=shelves,
         shelf_x=args.shelf_x,
         shelf_depth=args.shelf_depth,
         pulls=args.pulls,
@@ -108,12 +157,72 @@ def run_collaboration(args: RunCollaboration) -> int:
         cell=WorkCellConfig(
             latency=LatencyConfig(delay=args.latency, frame_loss=args.frame_loss)
         ),
-        config=replace(args.config, grasping=grasping),
-        camera=args.camera,
+        config=config,
+        camera=_simulated_camera(args),
         drawings=_drawings(args),
         page=PageConfig(port=args.port) if args.page else None,
+        arm=args.arm,
     )
     return _conduct(experiment, args)
+
+
+def _is_real(args: RunExperiment) -> bool:
+    """Whether a real arm does it.
+
+    Raises:
+        ValueError: An address without a driver, a driver without an address, or an option of
+            the simulated work cell.
+    """
+    if args.arm == "sim":
+        if args.ip:
+            raise ValueError(f"--ip {args.ip} needs a driver: --arm franky or --arm franka.")
+        return False
+    if args.ip == "sim":
+        return False
+    if not args.ip:
+        raise ValueError(
+            f"--arm {args.arm} needs --ip with the address of the arm's control box; --ip sim "
+            "serves the simulated arm there."
+        )
+    given = {field.name: getattr(args, field.name) != field.default for field in fields(args)}
+    if simulated := [name for name in _SIMULATED_ONLY if given.get(name)]:
+        option = simulated[0].replace("_", "-")
+        raise ValueError(f"--{option} is for simulated arms, not for a real one (--ip).")
+    return True
+
+
+def _simulated_camera(args: RunServoing) -> CameraKind:
+    if args.camera not in get_args(CameraKind):
+        kinds = ", ".join(get_args(CameraKind))
+        raise ValueError(
+            f"--camera {args.camera}: the simulated work cell has the cameras {kinds}. Others "
+            "watch a real arm (--arm, --ip)."
+        )
+    return cast("CameraKind", args.camera)
+
+
+def _on_arm(args: RunExperiment, workplace: Workplace, task: Task) -> int:
+    """Let a real arm do a task, and write what it left; exit status 1 if it failed."""
+    console = Console()
+    site: ArmSite = replace(args.site, driver=args.arm, ip=args.ip)
+    with ExitStack() as stack:
+        camera, people = None, []
+        if isinstance(args, RunServoing):
+            source = "0" if args.camera == "auto" else args.camera
+            opened = open_camera(source, delay=site.camera_delay)
+            camera = stack.enter_context(closing(opened))
+        run = run_on_arm(
+            site,
+            workplace,
+            task,
+            camera=camera,
+            people=people,
+            on_phase=lambda phase, time: console.print(f"  {time:6.2f} s  {phase}"),
+        )
+    run.save(args.out, f"{args.arm} at {args.ip}", asdict(args))
+    console.print(run.failure or "done", style="red" if run.failure else "green")
+    console.print(f"Recording  rerun {args.out / 'run.rrd'}")
+    return int(bool(run.failure))
 
 
 def _drawings(args: RunServoing) -> tuple[DrawnInterval, ...]:

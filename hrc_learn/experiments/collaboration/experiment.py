@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import ClassVar, Literal
 
 from hrc_learn.demos import Demonstration, load_demos
+from hrc_learn.experiments.arm_access import ArmDriver, access_by
 from hrc_learn.experiments.collaboration.metrics import (
     CURVES,
     TRIAL_METRICS,
@@ -81,6 +82,9 @@ class CollaborationExperiment:
     page: PageConfig | None = None
     """Serve a page from which people push the elbow and draw too; the run takes real time
     then."""
+    arm: ArmDriver = "sim"
+    """What leads the simulated arm: the simulator itself, or a driver of the real one over its
+    network protocol."""
 
     def run(self, seed: int, observer: Observer = UNOBSERVED) -> CollaborationRun:
         """The whole job once; the seed draws the objects' poses and the image noise."""
@@ -102,6 +106,7 @@ class CollaborationExperiment:
             drawings=self.drawings,
             seed=seed,
             page=self.page,
+            access=access_by(self.arm),
             view=observer.view,
             on_phase=lambda phase, time: observer.tell(f"  {time:6.2f} s  {phase}"),
             on_page=lambda address: observer.tell(f"Page at {address}"),

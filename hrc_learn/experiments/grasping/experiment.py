@@ -7,6 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from hrc_learn.experiments.arm_access import ArmDriver, access_by
 from hrc_learn.experiments.frame import UNOBSERVED, Observer, RepeatedRun, Study
 from hrc_learn.experiments.grasping.metrics import CURVES, TRIAL_METRICS, grasping_metrics
 from hrc_learn.experiments.grasping.report import SUMMARY, grasping_sections, record_grasp
@@ -60,6 +61,9 @@ class GraspingExperiment:
     page: PageConfig | None = None
     """Serve a page from which people draw and pull the arm too; the grasp takes real time
     then."""
+    arm: ArmDriver = "sim"
+    """What leads the simulated arm: the simulator itself, or a driver of the real one over its
+    network protocol."""
 
     def __post_init__(self) -> None:
         if unknown := [name for name in self.variants if name not in VARIANTS]:
@@ -103,6 +107,7 @@ class GraspingExperiment:
             rng=np.random.default_rng([seed, 1]),
             drawings=() if compared else self.drawings,
             page=None if compared else self.page,
+            access=access_by(self.arm),
             view=observer.view,
             on_page=lambda address: observer.tell(f"Page at {address}"),
         )

@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float
 
 from hrc_learn.demos import Demonstration, load_demos
+from hrc_learn.experiments.arm_access import ArmDriver, access_by
 from hrc_learn.experiments.frame import UNOBSERVED, Observer, Study
 from hrc_learn.experiments.metric_table import Metric, evaluate
 from hrc_learn.experiments.placing import arm_angle_ablation
@@ -84,6 +85,9 @@ class PlacingExperiment:
     encoders read there corrects all goals."""
     snapshots: bool = True
     """Whether to render pictures of the arm, where this machine can."""
+    arm: ArmDriver = "sim"
+    """What leads the simulated arm: the simulator itself, or a driver of the real one over its
+    network protocol."""
 
     def __post_init__(self) -> None:
         if self.speed <= 0 or self.noise < 0:
@@ -128,6 +132,7 @@ class PlacingExperiment:
                     speed=self.speed,
                     world=world,
                     correction=correction,
+                    access=access_by(self.arm),
                     view=view,
                 )
                 placings[space, shelf] = placed

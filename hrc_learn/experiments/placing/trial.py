@@ -31,16 +31,10 @@ from hrc_learn.learning.channels import dimensionless_jerk
 from hrc_learn.sim import MotionLog, Touch, World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.arm_motion import nearest_configuration
-from hrc_learn.skills.grasping import OPEN
+from hrc_learn.skills.pick_and_place import place_along
 from hrc_learn.skills.placing import PlaceCorrection, PlacingSkill, Plan, PlanningSpace
 from hrc_learn.skills.work_cell import TaskFailedError, WorkCell, WorkCellConfig
 from hrc_learn.teleoperation import ScriptedPerturbation
-
-TRANSFER, RELEASE, RETREAT = "transfer", "release", "retreat"
-
-_OPENING = 0.8  # time the fingers take [s]
-_CLEARANCE = 0.08  # way back, until nothing of the object is between the fingers [m]
-_RETREAT_SPEED = 0.08  # at the usual one, the shoulder comes close to its limits [m/s]
 
 SPACES: dict[PlanningSpace, str] = {"pose": "task space", "joint": "joint space"}
 """Spaces in which motions to other shelves are planned: ours, and the paper's."""
@@ -143,19 +137,7 @@ def place(
         )
         stack.enter_context(view(cell, world, motion))
         plan = skill.plan(cell.joints, read, space=space, dt=cell.config.dt, speed=speed)
-        cell.begin_phase(TRANSFER)
-        cell.follow_path(plan.path)
-        # The arm follows late: at the end of the path it is not quite there.
-        cell.move_straight(read)
-        cell.begin_phase(RELEASE)
-        release_time = world.time
-        below = Pose(read.position.clone(), read.orientation)
-        below.position[2] -= workplace.lowering(item.half_size)
-        cell.move_until_contact(below)
-        cell.gripper.move(OPEN)
-        cell.hold_pose(_OPENING)
-        cell.begin_phase(RETREAT)
-        cell.move_straight(_back(read), speed=_RETREAT_SPEED)
+        release_time = place_along(cell, plan, read, workplace.lowering(item.half_size))
     return SimulatedPlacing(
         shelf=shelf,
         goal=goal,
@@ -170,12 +152,6 @@ def place(
         ),
         placed=world.rests_on(item.name, f"board_{shelf}"),
     )
-
-
-def _back(release: Pose) -> Pose:
-    """Clear of the object: straight back along the end effector's own axis."""
-    offset = release.position.new_tensor([0.0, 0.0, -_CLEARANCE])
-    return Pose(release.apply(offset), release.orientation)
 
 
 _SHOWN_ITERATIONS = 4

@@ -1,0 +1,299 @@
+"""The experiments' tasks on a real arm, before a real camera.
+
+The task code is that of the simulated work cell. Only nobody knows the truth: what is reported
+is what the robot itself can tell. A world of what is believed to stand around the arm checks
+the plans, and follows the arm to be drawn.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+
+from hrc_learn.deploy import Rate
+from hrc_learn.experiments.run_recording import record
+from hrc_learn.hardware import ArmProcess, FrankaArm, FrankaConfig, FrankyArm, FrankyConfig
+from hrc_learn.hardware.arm_process import StoppableArm
+from hrc_learn.kinematics import SerialChain, fr3, panda
+from hrc_learn.protocols import Camera, Human
+from hrc_learn.sim import MotionLog, World
+from hrc_learn.sim.workplace import Workplace
+from hrc_learn.skills.grasping import Grasping, GraspingConfig, as_load, joint_plan
+from hrc_learn.skills.marker_sensor import LatencyConfig, MarkerSensor
+from hrc_learn.skills.pick_and_place import HOME, PickAndPlace, PickAndPlaceConfig, place_along
+from hrc_learn.skills.placing import PlacingSkill, Plan, check_plan
+from hrc_learn.skills.visual_skill import VisualServoSkill
+from hrc_learn.skills.work_cell import TaskFailedError, WorkCell, WorkCellConfig
+from hrc_learn.store import new_folder, write_json
+from hrc_learn.teleoperation import CombinedInput, ScriptedDrawing, Touch
+from hrc_learn.viz.run_dashboard import record_run
+
+Driver = Literal["franky", "franka"]
+"""By which an arm is led: the package franky, or our loop at 1 kHz through pylibfranka."""
+
+_SILENCE = 0.15
+"""After which an arm whose loop says nothing is stopped [s], as in `franka_panda`."""
+_DELAY = 0.03
+"""From reading the joints to the arm following [s]: `Imperfections.nominal`; not measured."""
+_REDUCED_SPEED = 0.25
+"""Of the tool where people are [m/s] (ISO 10218-1, reduced speed)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArmSite:
+    """Which arm does the task, before which camera, and how fast."""
+
+    driver: Driver = "franky"
+    """By which it is led."""
+    ip: str = ""
+    """Address of its control box."""
+    robot: Literal["panda", "fr3"] = "panda"
+    """Whose limits are kept."""
+    camera_delay: float = 0.0
+    """From an image being taken until it arrives [s]: `hrc_learn.hardware.measure_delay`."""
+    realtime: bool = True
+    """Whether a kernel without real-time scheduling is refused."""
+    dynamics: float = 0.3
+    """Fraction of the arm's acceleration that is used."""
+    speed: float = 1.0
+    """Share of the planned speed of all paths: 0.1 for a first run."""
+    touch: bool = True
+    """Whether the arm itself is felt: who pushes its elbow moves its body, who pushes its hand
+    pauses the task."""
+
+    def __post_init__(self) -> None:
+        for name in ("dynamics", "speed"):
+            if not 0 < getattr(self, name) <= 1:
+                raise ValueError(f"{name} must be in (0, 1], but is {getattr(self, name)}.")
+
+    @property
+    def chain(self) -> SerialChain:
+        """The arm, with its limits."""
+        return {"panda": panda, "fr3": fr3}[self.robot]
+
+    def cell_config(self) -> WorkCellConfig:
+        """How the loop runs on this arm."""
+        config = WorkCellConfig()
+        safety = replace(
+            config.safety, braking=self.dynamics, delay=_DELAY, tcp_speed=_REDUCED_SPEED
+        )
+        return replace(
+            config,
+            safety=safety,
+            command_delay=_DELAY,
+            speed=self.speed,
+            latency=LatencyConfig(delay=self.camera_delay),
+        )
+
+
+@contextmanager
+def opened_arm(site: ArmSite) -> Iterator[StoppableArm]:
+    """Connect to the arm; it is at rest when the block ends, whatever ends it.
+
+    Raises:
+        ValueError: The site has no address.
+        DriverError: It cannot be reached; says why.
+    """
+    if not site.ip:
+        raise ValueError("ip: give the address of the arm's control box.")
+    # Not both: each driver registers the same types, and refuses to be loaded beside the other.
+    if site.driver == "franky":
+        realtime = "enforce" if site.realtime else "ignore"
+        config = FrankyConfig(dynamics=site.dynamics, timeout=_SILENCE, realtime=realtime)
+        with ArmProcess(partial(FrankyArm, site.ip, config), timeout=_SILENCE) as arm:
+            yield arm
+        return
+    config = FrankaConfig(
+        hold=_SILENCE, acceleration=site.dynamics, jerk=site.dynamics, realtime=site.realtime
+    )
+    with FrankaArm(site.ip, site.chain, config) as arm:
+        yield arm
+
+
+type Task = Callable[[WorkCell, Callable[[Plan], None]], str]
+"""Carries a task out, given the cell and what checks a plan; why it failed, or nothing."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArmRun:
+    """What a task on a real arm left."""
+
+    cell: WorkCell
+    believed: World
+    """What is believed to stand around the arm, in its last posture."""
+    motion: MotionLog
+    failure: str
+    """Why the task failed, as the robot sees it; empty if it did not."""
+
+    def save(self, folder: Path, title: str, configuration: dict[str, Any]) -> None:
+        """Write `run.rrd`, `log.npz`, `result.json` and `configuration.json`.
+
+        Args:
+            folder: Replaced if it is there.
+            title: Of the recording.
+            configuration: To be kept with the run.
+        """
+        log = self.cell.log
+        phases = [{"phase": event.text, "start": event.time} for event in log.events]
+        with new_folder(folder, configuration, overwrite=True) as part:
+            log.save(part / "log.npz")
+            record_run(part / "run.rrd", record(title, self.cell, self.believed, self.motion))
+            write_json(
+                part / "result.json",
+                {
+                    "failure": self.failure,
+                    "duration": float(np.ptp(log["time"])) if len(log) else 0.0,
+                    "phases": phases,
+                    "remarks": [
+                        {"text": said.text, "time": said.time} for said in self.cell.remarks
+                    ],
+                },
+            )
+
+
+def placing_task(skill: PlacingSkill, workplace: Workplace, shelf: str, speed: float) -> Task:
+    """Carry the object in the hand home and to a shelf, and release it there.
+
+    Args:
+        skill: Learned placing motion.
+        workplace: Where.
+        shelf: Which.
+        speed: How many times faster than demonstrated.
+    """
+    goal, item = workplace.shelf(shelf), workplace.scene.objects[0]
+
+    def task(cell: WorkCell, check: Callable[[Plan], None]) -> str:
+        cell.load = as_load(item)
+        home = joint_plan(cell, cell.joints, workplace.home_joints())
+        cell.begin_phase(HOME)
+        check(home)
+        cell.follow_path(home.path)
+        plan = skill.plan(cell.joints, goal, space="pose", dt=cell.config.dt, speed=speed)
+        check(plan)
+        place_along(cell, plan, goal, workplace.lowering(item.half_size))
+        return ""
+
+    return task
+
+
+def grasping_task(
+    servoing: VisualServoSkill, workplace: Workplace, config: GraspingConfig
+) -> Task:
+    """Grasp the first object with the camera, and carry it home.
+
+    Args:
+        servoing: Learned image Jacobian and visual target.
+        workplace: Where.
+        config: How.
+    """
+
+    def task(cell: WorkCell, check: Callable[[Plan], None]) -> str:
+        law = replace(config.controller, safety=cell.config.safety)
+        grasping = Grasping(
+            cell, workplace, servoing, replace(config, controller=law), check=check
+        )
+        grasping.grasp(workplace.scene.objects[0])
+        grasping.go_home()
+        return ""
+
+    return task
+
+
+def collaboration_task(
+    servoing: VisualServoSkill,
+    placing: PlacingSkill,
+    workplace: Workplace,
+    shelves: Sequence[str],
+    config: PickAndPlaceConfig,
+) -> Task:
+    """Grasp objects beside a person, and put each on its shelf.
+
+    Args:
+        servoing: Learned image Jacobian and visual target.
+        placing: Learned placing motion.
+        workplace: Where.
+        shelves: One for each of its objects.
+        config: How.
+    """
+
+    def task(cell: WorkCell, check: Callable[[Plan], None]) -> str:
+        law = replace(config.grasping.controller, safety=cell.config.safety)
+        settings = replace(config, grasping=replace(config.grasping, controller=law))
+        job = PickAndPlace(cell, workplace, servoing, placing, check, settings)
+        jobs = job.run(list(zip(workplace.scene.objects, shelves, strict=True)))
+        return "; ".join(done.failure for done in jobs if done.failure)
+
+    return task
+
+
+def run_on_arm(
+    site: ArmSite,
+    workplace: Workplace,
+    task: Task,
+    *,
+    camera: Camera | None = None,
+    people: Sequence[Human] = (),
+    on_phase: Callable[[str, float], None] = lambda phase, time: None,
+) -> ArmRun:
+    """Connect to the arm and let it do a task.
+
+    Whatever ends the task, the arm is at rest then.
+
+    Args:
+        site: Which arm, and how it is led.
+        workplace: What is believed to stand around it.
+        task: To be done.
+        camera: That watches; None: the task needs none.
+        people: Devices by which people lead the arm besides touching it.
+        on_phase: Told the name of each phase of the task, and when it begins [s].
+
+    Raises:
+        DriverError: The arm cannot be reached, or has been stopped.
+    """
+    believed, failure = World(workplace.scene), ""
+    with torch.inference_mode(), opened_arm(site) as arm:
+        believed.follow(arm.read())
+        config = site.cell_config()
+        # The arm's clock counts: that of a simulator may be slower than ours.
+        rate = Rate(config.dt, clock=lambda: arm.read().time)
+        held: str | None = None
+
+        def advance(duration: float) -> None:
+            nonlocal held
+            rate.wait()
+            before, held = held, _held(cell, workplace)
+            if held is not None and before is None:
+                believed.put_in_hand(held)
+            believed.follow(arm.read(), held)
+
+        motion = MotionLog(believed, advance)
+        touch = (Touch(site.chain),) if site.touch else ()
+        cell = WorkCell(
+            chain=site.chain,
+            arm=arm,
+            gripper=arm,
+            sensor=None if camera is None else MarkerSensor(camera, workplace.scene.marker_ids),
+            human=CombinedInput(ScriptedDrawing(()), *touch, *people),
+            advance=motion.advance,
+            config=config,
+            on_phase=on_phase,
+            clearance=workplace.arm_clearance,
+        )
+        try:
+            failure = task(cell, lambda plan: check_plan(plan, believed, held))
+        except TaskFailedError as error:
+            failure = str(error)
+    return ArmRun(cell=cell, believed=believed, motion=motion, failure=failure)
+
+
+def _held(cell: WorkCell, workplace: Workplace) -> str | None:
+    """Name of the object that the arm has in its hand: the one that is as large."""
+    if cell.load is None:
+        return None
+    items = workplace.scene.objects
+    return next((item.name for item in items if as_load(item) == cell.load), items[0].name)
