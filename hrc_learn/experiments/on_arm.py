@@ -5,6 +5,7 @@ is what the robot itself can tell. A world of what is believed to stand around t
 the plans, and follows the arm to be drawn.
 """
 
+import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -17,10 +18,17 @@ import torch
 
 from hrc_learn.deploy import Rate
 from hrc_learn.experiments.run_recording import record
-from hrc_learn.hardware import ArmProcess, FrankaArm, FrankaConfig, FrankyArm, FrankyConfig
+from hrc_learn.hardware import (
+    ArmProcess,
+    CameraError,
+    FrankaArm,
+    FrankaConfig,
+    FrankyArm,
+    FrankyConfig,
+)
 from hrc_learn.hardware.arm_process import StoppableArm
 from hrc_learn.kinematics import SerialChain, fr3, panda
-from hrc_learn.protocols import Camera, Human
+from hrc_learn.protocols import Camera
 from hrc_learn.sim import MotionLog, World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.grasping import Grasping, GraspingConfig, as_load, joint_plan
@@ -29,8 +37,8 @@ from hrc_learn.skills.pick_and_place import HOME, PickAndPlace, PickAndPlaceConf
 from hrc_learn.skills.placing import PlacingSkill, Plan, check_plan
 from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.skills.work_cell import TaskFailedError, WorkCell, WorkCellConfig
-from hrc_learn.store import new_folder, write_json
-from hrc_learn.teleoperation import CombinedInput, ScriptedDrawing, Touch
+from hrc_learn.store import new_folder, write_text
+from hrc_learn.teleoperation import ScriptedDrawing, Touch
 from hrc_learn.viz.run_dashboard import record_run
 
 Driver = Literal["franky", "franka"]
@@ -143,17 +151,15 @@ class ArmRun:
         with new_folder(folder, configuration, overwrite=True) as part:
             log.save(part / "log.npz")
             record_run(part / "run.rrd", record(title, self.cell, self.believed, self.motion))
-            write_json(
-                part / "result.json",
-                {
-                    "failure": self.failure,
-                    "duration": float(np.ptp(log["time"])) if len(log) else 0.0,
-                    "phases": phases,
-                    "remarks": [
-                        {"text": said.text, "time": said.time} for said in self.cell.remarks
-                    ],
-                },
-            )
+            result = {
+                "failure": self.failure,
+                "duration": float(np.ptp(log["time"])) if len(log) else 0.0,
+                "phases": phases,
+                "remarks": [
+                    {"text": said.text, "time": said.time} for said in self.cell.remarks
+                ],
+            }
+            write_text(part / "result.json", json.dumps(result, indent=2))
 
 
 def placing_task(skill: PlacingSkill, workplace: Workplace, shelf: str, speed: float) -> Task:
@@ -237,7 +243,6 @@ def run_on_arm(
     task: Task,
     *,
     camera: Camera | None = None,
-    people: Sequence[Human] = (),
     on_phase: Callable[[str, float], None] = lambda phase, time: None,
 ) -> ArmRun:
     """Connect to the arm and let it do a task.
@@ -249,7 +254,6 @@ def run_on_arm(
         workplace: What is believed to stand around it.
         task: To be done.
         camera: That watches; None: the task needs none.
-        people: Devices by which people lead the arm besides touching it.
         on_phase: Told the name of each phase of the task, and when it begins [s].
 
     Raises:
@@ -272,13 +276,12 @@ def run_on_arm(
             believed.follow(arm.read(), held)
 
         motion = MotionLog(believed, advance)
-        touch = (Touch(site.chain),) if site.touch else ()
         cell = WorkCell(
             chain=site.chain,
             arm=arm,
             gripper=arm,
             sensor=None if camera is None else MarkerSensor(camera, workplace.scene.marker_ids),
-            human=CombinedInput(ScriptedDrawing(()), *touch, *people),
+            human=Touch(site.chain) if site.touch else ScriptedDrawing(()),
             advance=motion.advance,
             config=config,
             on_phase=on_phase,
@@ -286,7 +289,7 @@ def run_on_arm(
         )
         try:
             failure = task(cell, lambda plan: check_plan(plan, believed, held))
-        except TaskFailedError as error:
+        except (TaskFailedError, CameraError) as error:
             failure = str(error)
     return ArmRun(cell=cell, believed=believed, motion=motion, failure=failure)
 

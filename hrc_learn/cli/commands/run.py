@@ -206,7 +206,7 @@ def _on_arm(args: RunExperiment, workplace: Workplace, task: Task) -> int:
     console = Console()
     site: ArmSite = replace(args.site, driver=args.arm, ip=args.ip)
     with ExitStack() as stack:
-        camera, people = None, []
+        camera = None
         if isinstance(args, RunServoing):
             source = "0" if args.camera == "auto" else args.camera
             opened = open_camera(source, delay=site.camera_delay)
@@ -216,7 +216,6 @@ def _on_arm(args: RunExperiment, workplace: Workplace, task: Task) -> int:
             workplace,
             task,
             camera=camera,
-            people=people,
             on_phase=lambda phase, time: console.print(f"  {time:6.2f} s  {phase}"),
         )
     run.save(args.out, f"{args.arm} at {args.ip}", asdict(args))
