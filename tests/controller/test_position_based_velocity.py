@@ -17,7 +17,7 @@ from hrc_learn.controller import (
     SafetyFilter,
 )
 from hrc_learn.controller.monitors import LimitMonitor
-from hrc_learn.deploy import EagerRunner, PackageRunner, StepRunner, export_step
+from hrc_learn.deploy import EagerRunner, PackageRunner, StepRunner, open_step
 from hrc_learn.experiments.controller.hostile_streams import (
     STREAMS,
     StreamConfig,
@@ -151,5 +151,6 @@ def test_the_controllers_step_brakes_before_an_fr3s_limits():
 
 @pytest.mark.slow
 def test_the_exported_step_brakes_before_an_fr3s_limits(tmp_path):
-    package = export_step(*fr3_step(), tmp_path)
-    assert push_outwards(PackageRunner(package), 5000) > 20
+    runner = open_step(*fr3_step(), tmp_path)
+    assert isinstance(runner, PackageRunner)
+    assert push_outwards(runner, 5000) > 20
