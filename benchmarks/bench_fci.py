@@ -1,12 +1,11 @@
 """What a cycle of Franka's control interface costs: our loop beside a bare one, in one run.
 
 Against franka-sim with all that it enforces; without its environment (tools/make_franka_sim.sh)
-nothing is measured. The bare loop reads a state, writes a velocity of zero and does nothing
-else; it is the least that pylibfranka allows from Python. Ours is `FrankaArm`'s: the state
-read, the filtered step, the answer sent, the report written, with its step compiled and
-uncompiled. They take turns, and the share of one in the other says more than either where
-others use the machine: its load stands beside the figures. Costs are wall time, from the state
-read to the answer sent.
+nothing is measured. The bare loop reads a state, writes a velocity of zero and does no more;
+it is the least that pylibfranka allows from Python. Ours is `FrankaArm`'s: the state read, the
+filtered step, the answer sent, with its step compiled and uncompiled. They take turns, and the
+share of one in the other says more than either where others use the machine: its load stands
+beside the figures. Costs are wall time, from the state read to the answer sent.
 """
 
 from __future__ import annotations

@@ -53,18 +53,23 @@ class Trace(NamedTuple):
         parts = np.split(table, (1, 2, 9, 16), axis=1)
         return cls(parts[0][:, 0], parts[1][:, 0], *parts[2:])
 
-    def rest_after(self, moment: float) -> float:
+    def rest_after(self, moment: float, watched: float = np.inf) -> float:
         """Simulated time from a moment until no joint moves any more [s].
 
         By the way within 20 ms, as joint 7 of this model trembles by 0.08 mrad a step.
+
+        Args:
+            moment: By time.monotonic() [s].
+            watched: For how long from then on [s].
         """
-        first = int(np.searchsorted(self.moment, moment))
-        later = np.searchsorted(self.time, self.time[first:] + 0.02)
-        here = np.arange(first, len(self.time))[later < len(self.time)]
-        later = later[later < len(self.time)]
-        way = np.abs(self.position[later] - self.position[here]).max(axis=1)
-        moving = np.flatnonzero(way > 0.02 * (self.time[later] - self.time[here]))
-        return float(self.time[here[moving[-1]]] - self.time[first]) if len(moving) else 0.0
+        first, end = np.searchsorted(self.moment, [moment, moment + watched])
+        time, position = self.time[first:end], self.position[first:end]
+        later = np.searchsorted(time, time + 0.02)
+        here = np.flatnonzero(later < len(time))
+        later = later[here]
+        way = np.abs(position[later] - position[here]).max(axis=1)
+        moving = np.flatnonzero(way > 0.02 * (time[later] - time[here]))
+        return float(time[later[moving[-1]]] - time[0]) if len(moving) else 0.0
 
 
 @contextmanager

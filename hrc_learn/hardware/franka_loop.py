@@ -468,14 +468,15 @@ class ControlLoop:
             if number == 1:
                 self._runner.start(report.joint_position)
             self._adopt(state)
-            if late:
-                report.lost += 1
-                self._publish(Phase.MOVING)
-                continue
             self._position[...] = report.joint_position
             self._velocity[...] = self._wanted()
             self._stop[...] = self._orders.stop or self.ending
-            self._sent = np.array(self._runner.step())
+            if not late:
+                self._sent = np.array(self._runner.step())
+            if late or time.perf_counter() - begin > CYCLE:
+                report.lost += 1
+                self._publish(Phase.MOVING)
+                continue
             rests = bool(np.abs(self._sent).max() < _RESTS)
             # Rest is sent once more before the motion ends, so that its acceleration is zero.
             finished = rests and report.resting and number > 1

@@ -119,7 +119,8 @@ def test_an_arm_whose_loop_is_killed_is_at_rest_at_once(server):
     moved = Trace.read(trace)
     speeds = [np.abs(moved.velocity[np.searchsorted(moved.moment, t)]).max() for t in moments]
     assert np.median(speeds) > 0.1, "they were killed in motion"
-    rests = [moved.rest_after(t) - moved.rest_after(t + 0.45) for t in moments]
+    rests = [moved.rest_after(t, 0.45) for t in moments]
+    assert max(rests) > 0.005, "something was seen to come to rest"
     assert max(rests) <= AT_REST, rests
 
 
@@ -186,7 +187,7 @@ def test_an_arm_that_nobody_commands_any_more_is_led_to_rest(server):
 def test_a_reflex_says_what_it_was(server):
     host, _ = server
     with FrankaArm(host, FR3, CONFIG) as arm:
-        fold = np.array([0, 0, 0, -0.3, 0.6, 0, 0])
+        fold = np.array([0, 0, 0, -0.3, 0, -0.2, 0])  # the hand comes onto the shoulder
         with pytest.raises(DriverError, match=r"self_collision_avoidance_violation.*recover"):
             _keep_on(arm, fold)
         arm.recover()
