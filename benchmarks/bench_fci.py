@@ -28,7 +28,7 @@ from rich.console import Console
 from rich.table import Table
 
 from hrc_learn import cli
-from hrc_learn.hardware import FrankaArm, FrankaConfig
+from hrc_learn.hardware import DriverError, FrankaArm, FrankaConfig
 from hrc_learn.kinematics import panda
 
 ROOT = Path(__file__).parents[1]
@@ -84,21 +84,24 @@ def measure(args: Args) -> dict[str, float]:
     """Cost [us] and share answered of each loop, how they compare, and the load."""
     costs: dict[str, list[np.ndarray]] = {name: [] for name in LOOPS}
     answered: dict[str, list[float]] = {name: [] for name in LOOPS}
+    reflexes = dict.fromkeys(LOOPS, 0)
     for _ in range(args.turns):
         for name in LOOPS:
-            cost, share = (
+            cost, share, stops = (
                 bare_loop(args.host, args.seconds)
                 if name == "bare"
                 else our_loop(args.host, args.seconds, compiled=name == "compiled")
             )
             costs[name].append(cost)
             answered[name].append(share)
+            reflexes[name] += stops
     figures = {}
     for name in LOOPS:
         total = np.sum(costs[name], axis=0)
         for percent in (50, 99):
             figures[f"{name}_p{percent}_us"] = percentile(total, percent)
         figures[f"{name}_answered"] = float(np.mean(answered[name]))
+        figures[f"{name}_reflexes"] = float(reflexes[name])
     for name in LOOPS[1:]:
         for percent in (50, 99):
             mine, floor = (figures[f"{x}_p{percent}_us"] for x in (name, "bare"))
@@ -112,8 +115,8 @@ def percentile(histogram: np.ndarray, percent: float) -> float:
     return float(np.argmax(reached)) + 1.0
 
 
-def our_loop(host: str, seconds: float, *, compiled: bool) -> tuple[np.ndarray, float]:
-    """Histogram of what cycles cost by the microsecond, and the share answered."""
+def our_loop(host: str, seconds: float, *, compiled: bool) -> tuple[np.ndarray, float, int]:
+    """Histogram of what cycles cost by the microsecond, the share answered, the reflexes."""
     # The Panda's limits are above an FR3's: this keeps within both.
     config = FrankaConfig(
         realtime=False, gripper=False, compiled=compiled, acceleration=0.15, jerk=0.15
@@ -121,13 +124,16 @@ def our_loop(host: str, seconds: float, *, compiled: bool) -> tuple[np.ndarray, 
     with FrankaArm(host, panda, config) as arm:
         begin = time.monotonic()
         while (t := time.monotonic() - begin) < seconds:
-            arm.command(0.2 * np.cos(2 * t) * np.array([1, -1, 1, -1, 1, 1, 1]))
+            try:
+                arm.command(0.2 * np.cos(2 * t) * np.array([1, -1, 1, -1, 1, 1, 1]))
+            except DriverError:  # too many cycles were missed
+                arm.recover()
             time.sleep(0.02)
-        timing = arm.timing
-    return timing.cost, timing.answered_share
+        timing, reflexes = arm.timing, arm.faults
+    return timing.cost, timing.answered_share, reflexes
 
 
-def bare_loop(host: str, seconds: float) -> tuple[np.ndarray, float]:
+def bare_loop(host: str, seconds: float) -> tuple[np.ndarray, float, int]:
     """The same of the least that there is, in a process as the loop has one."""
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
@@ -156,7 +162,7 @@ def _bare_loop(connection: Connection, host: str, seconds: float) -> None:
         cost[min(int(1e6 * (time.perf_counter() - begin)), len(cost) - 1)] += 1
         cycles += 1
         lost += max(0, round(period.to_sec() / CYCLE) - 1) if cycles > 1 else 0
-    connection.send((cost, cycles / (cycles + lost)))
+    connection.send((cost, cycles / (cycles + lost), 0))
 
 
 def show(figures: dict[str, float]) -> None:

@@ -89,9 +89,9 @@ class FrankaConfig:
     now and then, which the control box tolerates up to 20 in a row; priority is taken where the
     user may have it."""
     compiled: bool = True
-    """Whether to compile the step, once for a machine, which takes up to a minute the first
-    time. Uncompiled it takes half of the time there is."""
-    collision: CollisionConfig = field(default_factory=CollisionConfig)
+    """Whether to compile the step, once for a machine, which takes a minute or two the first
+    time. Uncompiled it takes a whole cycle on a busy machine: for simulators only."""
+    collision: CollisionThresholds = field(default_factory=CollisionThresholds)
     """What the control box stops the arm at."""
     load: Load | None = None
     """What the arm carries besides its end effector."""
@@ -414,6 +414,6 @@ def step_of(chain: SerialChain, config: FrankaConfig) -> Callable[[], StepRunner
         except NoCompilerError as error:
             raise DriverError(
                 f"the step of the loop cannot be compiled: {error} Uncompiled (compiled=False) "
-                "it takes half of each millisecond."
+                "it takes about a cycle, which serves for simulators only."
             ) from error
     return partial(EagerRunner, step, example)

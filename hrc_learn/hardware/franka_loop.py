@@ -362,6 +362,16 @@ class Punctuality:
         self._pace = max(1.0, self._pace + _FOLLOWS * (pace - self._pace))
         return late
 
+    def overdue(self, cost: float) -> bool:
+        """Whether to leave it unanswered as the answer has taken longer than a cycle.
+
+        Args:
+            cost: Time since the state was read [s].
+        """
+        overdue = cost > self._pace * CYCLE and not self._skipped
+        self._skipped = self._skipped or overdue
+        return overdue
+
 
 @final
 class ControlLoop:
@@ -473,7 +483,7 @@ class ControlLoop:
             self._stop[...] = self._orders.stop or self.ending
             if not late:
                 self._sent = np.array(self._runner.step())
-            if late or time.perf_counter() - begin > CYCLE:
+            if late or punctuality.overdue(time.perf_counter() - begin):
                 report.lost += 1
                 self._publish(Phase.MOVING)
                 continue
