@@ -7,9 +7,9 @@ import sys
 import time
 
 import numpy as np
-from fr3 import FR3
 
 from hrc_learn.hardware import FrankaArm, FrankaConfig
+from hrc_learn.kinematics import fr3 as FR3
 
 
 def main(host: str) -> None:

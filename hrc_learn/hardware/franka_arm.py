@@ -10,6 +10,7 @@ NOT RUN ON HARDWARE.
 
 from __future__ import annotations
 
+import copy
 import math
 import multiprocessing
 import os
@@ -91,7 +92,7 @@ class FrankaConfig:
     compiled: bool = True
     """Whether to compile the step, once for a machine, which takes a minute or two the first
     time. Uncompiled it takes a whole cycle on a busy machine: for simulators only."""
-    collision: CollisionThresholds = field(default_factory=CollisionThresholds)
+    collision: CollisionConfig = field(default_factory=CollisionConfig)
     """What the control box stops the arm at."""
     load: Load | None = None
     """What the arm carries besides its end effector."""
@@ -416,4 +417,6 @@ def step_of(chain: SerialChain, config: FrankaConfig) -> Callable[[], StepRunner
                 f"the step of the loop cannot be compiled: {error} Uncompiled (compiled=False) "
                 "it takes about a cycle, which serves for simulators only."
             ) from error
-    return partial(EagerRunner, step, example)
+    # Copies: on its way to another process the memory of a tensor is replaced by shared memory,
+    # and NumPy's views of it would be left behind.
+    return partial(EagerRunner, *copy.deepcopy((step, example)))

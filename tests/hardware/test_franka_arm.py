@@ -9,16 +9,18 @@ import signal
 import time
 from dataclasses import replace
 from importlib.util import find_spec
+from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 
 import numpy as np
 import pytest
-from fr3 import FR3
 from franka_servers import franky_sim, loopback
 from loop_on_franka import loop_of
 
 from hrc_learn.hardware import DriverError, FrankaArm, FrankaConfig, Load
-from hrc_learn.kinematics import SerialChain
+from hrc_learn.hardware.franka_arm import step_of
+from hrc_learn.kinematics import SerialChain, panda
+from hrc_learn.kinematics import fr3 as FR3
 from hrc_learn.protocols import Arm, Gripper
 
 # Not imported: one process cannot have both drivers, and this one may get the other.
@@ -56,6 +58,13 @@ def wait_until(reached) -> None:
 def test_it_is_an_arm_and_a_gripper(arm):
     assert isinstance(arm, Arm)
     assert isinstance(arm, Gripper)
+
+
+def test_views_of_the_chain_are_not_left_behind():
+    """PyTorch moves a tensor into shared memory as it is sent to another process."""
+    here = FR3.ready.data_ptr()
+    ForkingPickler.dumps(step_of(FR3, CONFIG))
+    assert FR3.ready.data_ptr() == here
 
 
 def test_joints_move_as_they_are_told_and_rest_once_nobody_tells(arm):
@@ -211,18 +220,18 @@ def test_realtime_that_is_missing_is_named(host):
 
 def test_only_arms_of_seven_joints_are_driven():
     short = SerialChain(
-        joint_names=FR3.joint_names[:6],
-        mounts=FR3.mounts[:6],
-        flange=FR3.flange,
-        tcp=FR3.tcp,
+        joint_names=panda.joint_names[:6],
+        mounts=panda.mounts[:6],
+        flange=panda.flange,
+        tcp=panda.tcp,
         limits=replace(
-            FR3.limits,
+            panda.limits,
             **{
-                name: getattr(FR3.limits, name)[:6]
+                name: getattr(panda.limits, name)[:6]
                 for name in ("lower", "upper", "velocity", "acceleration", "jerk", "torque")
             },
         ),
-        ready=FR3.ready[:6],
+        ready=panda.ready[:6],
     )
     with pytest.raises(ValueError, match="7 joints"):
         FrankaArm("127.0.0.1", short, CONFIG)

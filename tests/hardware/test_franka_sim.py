@@ -16,11 +16,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fr3 import FR3
 from franka_servers import Trace, franka_sim, loopback, needs_franka_sim
 from loop_on_franka import loop_of, swing
 
 from hrc_learn.hardware import DriverError, FrankaArm, FrankaConfig
+from hrc_learn.kinematics import fr3 as FR3
 
 pytestmark = [pytest.mark.slow, needs_franka_sim]
 

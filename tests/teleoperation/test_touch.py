@@ -160,6 +160,17 @@ def off_path(cell):
     return elbow.numpy(), hand.numpy(), log["time"][on]
 
 
+def beside_path(cell):
+    """Of the hand at each step from the nearest point of its path [m]."""
+    log = cell.log
+    on = np.isfinite(log["path_joints"][:, 0])
+    hand, path = (
+        panda.forward(torch.from_numpy(log[k][on])).position
+        for k in ("joint_position", "path_joints")
+    )
+    return torch.cdist(hand, path).amin(-1).numpy()
+
+
 def aside(q, size):
     """A force on the elbow along the way that the null space lets it go [N]."""
     way = (
@@ -191,11 +202,13 @@ def test_who_holds_the_hand_makes_the_task_wait(force):
     assert 1.0 < paused.min() < 1.4
     assert 2.5 < paused.max() < 3.3
     assert not len(human.moments("elbow"))
-    # It stands while it is held, and the path is met before, meanwhile and after.
+    # It stands while it is held, and keeps to the path before, meanwhile and after. Along it the
+    # arm, which follows 30 ms late, goes on by as much when the task stops.
     time, speed = cell.log["time"], np.abs(cell.log["command_velocity"]).max(axis=1)
     assert speed[(time > 1.8) & (time < 2.5)].max() < 0.02
     assert speed[time > paused.max() + 0.3].max() > 0.1
-    assert off_path(cell)[1].max() < 2.5e-3
+    assert beside_path(cell).max() < 2.5e-3
+    assert off_path(cell)[1].max() < 8e-3
     waited = cell.time - cell.task_time
     assert waited == pytest.approx(paused.max() - paused.min(), abs=0.05)
     assert [remark.text for remark in cell.remarks] == ["The task waits.", "The task goes on."]
