@@ -18,7 +18,8 @@ demo: .venv/.installed
 	$(PYTHON) -m hrc_learn.cli demo --out $(OUT) --shelf $(SHELF)
 
 test: .venv/.installed
-	$(PYTHON) -m pytest -n auto --dist loadfile
+	$(PYTHON) -m pytest -n auto --dist loadfile -m "not slow and not realtime"
+	$(PYTHON) -m pytest -m "realtime and not slow"
 
 test-slow: .venv/.installed
 	$(PYTHON) -m pytest -m slow

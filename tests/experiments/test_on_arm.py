@@ -20,6 +20,8 @@ from hrc_learn.skills.work_cell import TaskFailedError
 pytest.importorskip("franky")
 pytest.importorskip("franky_sim")
 
+pytestmark = pytest.mark.realtime
+
 WORKPLACE = Workplace()
 
 

@@ -24,10 +24,13 @@ from hrc_learn.kinematics import fr3 as FR3
 from hrc_learn.protocols import Arm, Gripper
 
 # Not imported: one process cannot have both drivers, and this one may get the other.
-pytestmark = pytest.mark.skipif(
-    not (find_spec("pylibfranka") and find_spec("franky_sim")),
-    reason="drivers and simulator come with the extra hardware",
-)
+pytestmark = [
+    pytest.mark.realtime,
+    pytest.mark.skipif(
+        not (find_spec("pylibfranka") and find_spec("franky_sim")),
+        reason="drivers and simulator come with the extra hardware",
+    ),
+]
 
 # A velocity holds for longer than these tests are held up by others.
 CONFIG = FrankaConfig(realtime=False, compiled=False, hold=0.5)

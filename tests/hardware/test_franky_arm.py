@@ -25,6 +25,8 @@ from hrc_learn.sim import Imperfections, SceneConfig, World
 pytest.importorskip("franky")
 pytest.importorskip("franky_sim")
 
+pytestmark = pytest.mark.realtime
+
 CONFIG = FrankyConfig(realtime="ignore", dynamics=1.0)
 
 

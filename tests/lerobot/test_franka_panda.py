@@ -20,6 +20,9 @@ from hrc_learn.sim.protocol_server import serve_world
 FPS = 20.0
 
 
+pytestmark = pytest.mark.realtime
+
+
 @pytest.fixture
 def served(tmp_path):
     with served_franka(tmp_path, fps=FPS, tcp_speed=0.2) as served:

@@ -201,6 +201,7 @@ def franka(tmp_path):
         yield served.robot
 
 
+@pytest.mark.realtime
 def test_a_page_shows_the_real_panda_where_it_is(franka, served):
     served.page.requests = ("home",)  # means nothing to a real arm
     served.get_action()

@@ -146,6 +146,7 @@ def test_a_person_who_is_not_recorded_adds_nothing(pulled):
     assert list(pulled(PULL).get_observation()) == [*JOINTS, GRIPPER]
 
 
+@pytest.mark.realtime
 def test_the_real_panda_yields_to_a_device_too(tmp_path, monkeypatch):
     settings = {"calibration_dir": tmp_path, "ip": "x", "fps": FPS, "timeout": 600.0}
     with pytest.raises(ValueError, match="person"):

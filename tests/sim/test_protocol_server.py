@@ -16,6 +16,8 @@ from hrc_learn.sim.workplace import Workplace
 pytest.importorskip("franky")
 pytest.importorskip("franky_sim")
 
+pytestmark = pytest.mark.realtime
+
 DT = 0.01
 
 

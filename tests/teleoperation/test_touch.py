@@ -202,8 +202,8 @@ def test_who_holds_the_hand_makes_the_task_wait(force):
     assert 1.0 < paused.min() < 1.4
     assert 2.5 < paused.max() < 3.3
     assert not len(human.moments("elbow"))
-    # It stands while it is held, and keeps to the path before, meanwhile and after. Along it the
-    # arm, which follows 30 ms late, goes on by as much when the task stops.
+    # It stands while it is held, and keeps to the path before, meanwhile and after. Along it
+    # the arm, which follows 30 ms late, goes on by as much when the task stops.
     time, speed = cell.log["time"], np.abs(cell.log["command_velocity"]).max(axis=1)
     assert speed[(time > 1.8) & (time < 2.5)].max() < 0.02
     assert speed[time > paused.max() + 0.3].max() > 0.1
