@@ -267,13 +267,21 @@ def run_on_arm(
         rate = Rate(config.dt, clock=lambda: arm.read().time)
         held: str | None = None
 
-        def advance(duration: float) -> None:
+        def take_up() -> None:
+            """Believe what the cell holds to be in the hand."""
             nonlocal held
-            rate.wait()
             before, held = held, _held(cell, workplace)
             if held is not None and before is None:
                 believed.put_in_hand(held)
+
+        def advance(duration: float) -> None:
+            rate.wait()
+            take_up()
             believed.follow(arm.read(), held)
+
+        def check(plan: Plan) -> None:
+            take_up()
+            check_plan(plan, believed, held)
 
         motion = MotionLog(believed, advance)
         cell = WorkCell(
@@ -288,7 +296,7 @@ def run_on_arm(
             clearance=workplace.arm_clearance,
         )
         try:
-            failure = task(cell, lambda plan: check_plan(plan, believed, held))
+            failure = task(cell, check)
         except (TaskFailedError, CameraError) as error:
             failure = str(error)
     return ArmRun(cell=cell, believed=believed, motion=motion, failure=failure)
