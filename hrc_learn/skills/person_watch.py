@@ -16,7 +16,7 @@ from hrc_learn.protocols import PersonTracker
 _NAN = math.nan
 # In which an arm comes to rest [s]: a joint from 0.5 rad/s with 0.3 of a Panda's acceleration,
 # as drivers plan. Of 60 jobs beside a worker none came too near with it, with measured speeds
-# alone one did, and without this rule up to six; cycles take 8 % longer for it.
+# alone one did, and without this rule up to seven; cycles take 8 % longer for it.
 _COMING_TO_REST = 0.2
 
 BESIDE_PEOPLE = ConstraintConfig(early_exit=True, distance_weight=0.1)
