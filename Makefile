@@ -19,7 +19,9 @@ demo: .venv/.installed
 
 test: .venv/.installed
 	$(PYTHON) -m pytest -n auto --dist loadfile -m "not slow and not realtime"
-	$(PYTHON) -m pytest -m "realtime and not slow"
+	@# A machine that does something else meanwhile may stall for longer than a protocol allows.
+	$(PYTHON) -m pytest -m "realtime and not slow" \
+	  || $(PYTHON) -m pytest --last-failed -m "realtime and not slow"
 
 test-slow: .venv/.installed
 	$(PYTHON) -m pytest -m slow

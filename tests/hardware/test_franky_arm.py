@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -193,6 +194,10 @@ def test_a_lost_connection_is_a_fault_until_it_is_recovered(simulator, capfd):
                     arm.command(np.zeros(7))
             with pytest.raises(ArmFaultError):
                 arm.stop()
+            # The gripper has a connection of its own, which waits for longer.
+            until = time.monotonic() + 20.0
+            while arm.gripper.failure is None and time.monotonic() < until:
+                time.sleep(0.05)
         finally:
             simulator.plug_in()
         arm.recover()
