@@ -4,6 +4,7 @@ Skills know these protocols only; MuJoCo, a recording or real hardware stands be
 Arrays are NumPy float64: that is what drivers and simulators speak.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal, Protocol, get_args, runtime_checkable
 
@@ -47,6 +48,16 @@ class Gripper(Protocol):
     def move(self, width: float) -> None:
         """Set the opening to reach or to squeeze towards [m]."""
         ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class OpenedArm:
+    """An arm that is ready to be led."""
+
+    arm: Arm
+    gripper: Gripper
+    advance: Callable[[float], None]
+    """Lets a time pass in its world [s]."""
 
 
 @runtime_checkable

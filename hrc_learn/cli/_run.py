@@ -14,12 +14,13 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn
 
 from hrc_learn.cli._options import complete, mentions_details, short_help
+from hrc_learn.cli.arguments import Led
 from hrc_learn.store import write_json
 
 EXTRAS = {
@@ -198,6 +199,35 @@ def refuse_existing(path: Path, overwrite: bool) -> None:
     """
     if path.exists() and not overwrite:
         raise FileExistsError(f"{path} exists: give another --out, or --overwrite it")
+
+
+def leads_real_arm(args: Led, simulated_only: Sequence[str] = ()) -> bool:
+    """Whether a command leads a real arm, not a simulated one.
+
+    Args:
+        args: Of the command.
+        simulated_only: Names of its options that only the simulated work cell has.
+
+    Raises:
+        ValueError: An address without a driver, a driver without an address, or an option of
+            the simulated work cell.
+    """
+    if args.arm == "sim":
+        if args.ip:
+            raise ValueError(f"--ip {args.ip} needs a driver: --arm franky or --arm franka.")
+        return False
+    if args.ip == "sim":
+        return False
+    if not args.ip:
+        raise ValueError(
+            f"--arm {args.arm} needs --ip with the address of the arm's control box; --ip sim "
+            "serves the simulated arm there."
+        )
+    given = {field.name: getattr(args, field.name) != field.default for field in fields(args)}
+    if simulated := [name for name in simulated_only if given.get(name)]:
+        option = simulated[0].replace("_", "-")
+        raise ValueError(f"--{option} is for simulated arms, not for a real one (--ip).")
+    return True
 
 
 def configuration(args: Any) -> dict[str, Any]:

@@ -8,30 +8,20 @@ sockets, and the 1 ms cycles of its protocol, which the world answers.
 """
 
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, closing, contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal
 
 from hrc_learn.hardware import FrankaArm, FrankaConfig, FrankyArm, FrankyConfig
 from hrc_learn.kinematics import panda
-from hrc_learn.protocols import Arm, Gripper
+from hrc_learn.protocols import OpenedArm
 from hrc_learn.sim import Imperfections, World
 from hrc_learn.sim.protocol_server import ServedArm, serve_world
 
 FRANKY_DELAY = 0.003
 """From a command to franky until the arm's servos have it [s]: two cycles of the protocol, and
 one that the state read before is old. Measured with commands every 10 ms."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class OpenedArm:
-    """The arm of a world, ready to be led."""
-
-    arm: Arm
-    gripper: Gripper
-    advance: Callable[[float], None]
-    """Lets a time pass in the world [s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,12 +44,7 @@ class ArmAccess:
         )
 
 
-@contextmanager
-def _directly(world: World) -> Iterator[OpenedArm]:
-    yield OpenedArm(arm=world.arm, gripper=world.arm, advance=world.advance)
-
-
-SIMULATED = ArmAccess(open=_directly)
+SIMULATED = ArmAccess(open=lambda world: nullcontext(world.opened_arm))
 """The simulated arm itself."""
 
 

@@ -28,7 +28,7 @@ from hrc_learn.hardware import (
 )
 from hrc_learn.hardware.arm_process import StoppableArm
 from hrc_learn.kinematics import SerialChain, fr3, panda
-from hrc_learn.protocols import Camera
+from hrc_learn.protocols import Camera, OpenedArm
 from hrc_learn.sim import MotionLog, World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.grasping import Grasping, GraspingConfig, as_load, joint_plan
@@ -121,6 +121,25 @@ def opened_arm(site: ArmSite) -> Iterator[StoppableArm]:
     )
     with FrankaArm(site.ip, site.chain, config) as arm:
         yield arm
+
+
+@contextmanager
+def opened_site(site: ArmSite, workplace: Workplace) -> Iterator[tuple[World, OpenedArm]]:
+    """The arm, and a world of what is believed to stand around it, which follows the arm.
+
+    Whoever leads the arm keeps the time: `advance` takes none.
+
+    Args:
+        site: Which arm, and how it is led.
+        workplace: What is believed to stand around it.
+    """
+    believed = World(workplace.scene)
+    with opened_arm(site) as arm:
+        believed.follow(arm.read())
+        yield (
+            believed,
+            OpenedArm(arm=arm, gripper=arm, advance=lambda _time: believed.follow(arm.read())),
+        )
 
 
 type Task = Callable[[WorkCell, Callable[[Plan], None]], str]

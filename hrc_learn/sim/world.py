@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Bool, Float
 
-from hrc_learn.protocols import ArmState
+from hrc_learn.protocols import ArmState, OpenedArm
 from hrc_learn.sim.imperfections import DrawnImperfections, Imperfections
 from hrc_learn.sim.panda_model import FINGER_STROKE, MujocoArm, frame_of
 from hrc_learn.sim.physics_watch import PhysicsWatch
@@ -186,6 +186,11 @@ class World:
     def time(self) -> float:
         """Simulated time [s]."""
         return self.data.time
+
+    @property
+    def opened_arm(self) -> OpenedArm:
+        """The simulated arm, to be led without a driver."""
+        return OpenedArm(arm=self.arm, gripper=self.arm, advance=self.advance)
 
     @property
     def table_top(self) -> float:

@@ -240,6 +240,8 @@ class HandGuidingConfig:
     """Largest speed towards a region or a target [m/s]."""
     approach_rate: float = 1.5
     """Decay rate of the distance to a target [1/s]."""
+    return_speed: float = 0.3
+    """Largest speed of a joint on its way to a posture [rad/s]."""
     safety: SafetyConfig = field(default_factory=SafetyConfig)
     """Of the safety filter, which is told what the arm's driver can do."""
 
@@ -248,6 +250,9 @@ class HandGuidingConfig:
             if isinstance(value, float | int) and not value > 0:
                 raise ValueError(f"{name} must be positive, but is {value}.")
 
+
+_ARRIVED = 1e-3
+"""From a posture at which a joint is there [rad]: ten times the noise of an encoder."""
 
 Frame = dict[str, np.ndarray | float | bool]
 """Columns of one recorded step, as `DatasetWriter.add_frame` takes them."""
@@ -307,6 +312,7 @@ class HandGuidedArm:
         self._chain, self._arm, self._human = chain, arm, human
         self._filter = SafetyFilter(chain.limits, self.config.safety)
         self._feedback = PersonFeedback(chain)
+        self._posture: Float[torch.Tensor, " joints"] | None = None
         self.safety: SafetyState
         self.restart()
 
@@ -314,6 +320,18 @@ class HandGuidedArm:
         """Restart where the arm is, at rest."""
         q = torch.from_numpy(self._arm.read().joint_position)
         self.safety = self._filter.initial_state(q)
+
+    def stop(self) -> None:
+        """Bring the arm to rest."""
+        self._arm.command(np.zeros(len(self._chain.joint_names)))
+
+    def move_to(self, joint_position: Float[torch.Tensor, " joints"]) -> None:
+        """Move there in a straight line in joint space, until the person moves the arm.
+
+        Args:
+            joint_position: [rad]
+        """
+        self._posture = joint_position
 
     def step(self) -> GuidedStep:
         """Read the arm and the human input, then command. The caller lets `dt` pass."""
@@ -327,6 +345,8 @@ class HandGuidedArm:
             twist[:3] = self._attraction(human_input, pose.position)
         null_velocity = torch.from_numpy(human_input.nullspace_input / self.config.damping)
         desired = resolved_rate(J, twist, null_velocity)
+        if (way := self._way_to_posture(q, human_input)) is not None:
+            desired = way
         velocity, self.safety, report = self._filter.step(
             self.safety, q, desired, self.config.dt, jacobian=J
         )
@@ -340,6 +360,22 @@ class HandGuidedArm:
             hindrances.note(cause, share_kept(desired, velocity))
         self._human.tell(self._feedback.told(state, J, pushed=pushed))
         return GuidedStep(state=state, human_input=human_input, pose=pose, command=command)
+
+    def _way_to_posture(
+        self, q: Float[torch.Tensor, " joints"], human_input: HumanInput
+    ) -> Float[torch.Tensor, " joints"] | None:
+        """Joint velocity towards the posture to move to [rad/s]; None: there is none."""
+        if human_input.twist.any() or human_input.nullspace_input.any():
+            self._posture = None
+        if self._posture is None:
+            return None
+        ahead = self._posture - q
+        if float(ahead.abs().max()) < _ARRIVED:
+            self._posture = None
+        # All joints slow down together, which keeps the line straight.
+        fastest = self.config.approach_rate * float(ahead.abs().max())
+        share = min(1.0, self.config.return_speed / max(fastest, TINY))
+        return share * self.config.approach_rate * ahead
 
     def _attraction(
         self, human_input: HumanInput, position: Float[torch.Tensor, "3"]

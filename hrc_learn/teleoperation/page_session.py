@@ -14,9 +14,10 @@ from hrc_learn.controller import INTERVENTIONS
 from hrc_learn.deploy import Rate
 from hrc_learn.geometry import Box
 from hrc_learn.kinematics import panda
-from hrc_learn.protocols import DrawnRegion, Human, Request
+from hrc_learn.protocols import DrawnRegion, Human, OpenedArm, Request
 from hrc_learn.sim import MovingBodies, World
 from hrc_learn.sim.workplace import Workplace
+from hrc_learn.skills.arm_motion import joint_line
 from hrc_learn.skills.pick_and_place import INTERACT
 from hrc_learn.skills.work_cell import SAFETY_COLUMNS, WorkCell
 from hrc_learn.teleoperation.demonstration_recorder import DemonstrationRecorder
@@ -34,6 +35,8 @@ from hrc_learn.viz.palette import GREEN, rgba
 _THICKNESS = 0.002
 # Control steps from one status shown beside a job to the next: ten times a second at 10 ms.
 _SHOW_EVERY = 10
+# Between the postures on a way that are looked at for contacts: 0.05 rad, 5 cm at 1 m reach.
+_LOOK = 0.05
 # How long what the arm says to the person is shown [s]: two lines are read in half of that.
 _REMARK_STAYS = 6.0
 _INVITATION = "Pull at a link or a knob: the end effector keeps servoing."
@@ -126,16 +129,19 @@ class PageSession:
         recorder: DemonstrationRecorder,
         world: World,
         *,
+        opened: OpenedArm | None = None,
         beside: tuple[Human, ...] = (),
         config: PageSessionConfig | None = None,
     ):
-        """Put an object into the gripper, at home.
+        """Start where the arm is.
 
         Args:
             workplace: Where.
             page: Shows what happens, and hands on what the person asks for.
             recorder: Of demonstrations.
-            world: Of the workplace.
+            world: Of the workplace, that the arm moves in.
+            opened: The arm; None: the simulated one without a driver, with an object in its
+                gripper at home.
             beside: Other sources of the person's input, such as a gamepad.
             config: How the session runs.
         """
@@ -144,9 +150,12 @@ class PageSession:
         self._config = config or PageSessionConfig()
         self._bodies = MovingBodies(world)
         self._home = workplace.home_joints().numpy()
-        self._go_home()
+        self._jumps, self._remark = opened is None, ""
+        self._opened = opened or world.opened_arm
+        if self._jumps:
+            world.hold(workplace.scene.objects[0].name, self._home)
         human = InputFilter(CombinedInput(page.human, *beside), self._config.input_filter)
-        self.arm = HandGuidedArm(panda, world.arm, human, self._config.guiding)
+        self.arm = HandGuidedArm(panda, self._opened.arm, human, self._config.guiding)
         self._ticks, self._width = 0, None
 
     def step(self) -> GuidedStep:
@@ -158,10 +167,11 @@ class PageSession:
         width = step.human_input.gripper
         if width is not None and width != self._width:
             self._width = width
-            self.world.arm.move(width)
-        self.world.advance(self._config.guiding.dt)
+            self._opened.gripper.move(width)
+        self._opened.advance(self._config.guiding.dt)
         self._page.place(*self._bodies.poses())
         for request in step.human_input.requests:
+            self._remark = ""
             self._handle(request)
         if self._ticks % self._config.show_every == 0:
             self._page.show(self._status(step))
@@ -172,20 +182,31 @@ class PageSession:
         if request == "finish":
             self.finished = True
         elif request == "home":
-            # The arm jumps home: a demonstration must not contain that.
+            # A demonstration must not contain that.
             if self._recorder.status.state == "recording":
                 self._recorder.handle("stop")
             self._go_home()
-            self.arm.restart()
         else:
             self._recorder.handle(request)
 
     def _go_home(self) -> None:
-        self.world.hold(self._workplace.scene.objects[0].name, self._home)
+        """A simulated arm without a driver jumps there, another moves in a straight line."""
+        if self._jumps:
+            self.world.hold(self._workplace.scene.objects[0].name, self._home)
+            self.arm.restart()
+            return
+        now, home = torch.from_numpy(self._opened.arm.read().joint_position), self._home
+        way = joint_line(now, torch.from_numpy(home), speed=1.0, dt=_LOOK).numpy()
+        touches = self.world.collisions_along(way)
+        if touches:
+            met = f"{touches[0].first} would meet {touches[0].second}"
+            self._remark = f"on the straight way home, {met}: lead the arm out first"
+        else:
+            self.arm.move_to(torch.from_numpy(home))
 
     def _status(self, step: GuidedStep) -> PageStatus:
         status, world = self._recorder.status, self.world
-        notes = [status.note]
+        notes = [status.note, self._remark]
         if status.state != "ready":
             notes.insert(0, place_target_hint(self._workplace, step.pose.position.numpy()))
         monitors = (world.cabinet_contacts, world.table_contacts, world.self_contacts)

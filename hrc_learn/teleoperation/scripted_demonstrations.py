@@ -4,6 +4,7 @@ posture; and how they are recorded and written as a LeRobot dataset.
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from jaxtyping import Float
 from hrc_learn.demos import DatasetWriter
 from hrc_learn.geometry import Pose, minimum_jerk, quaternion
 from hrc_learn.kinematics import gripper_down, panda
-from hrc_learn.protocols import Human
+from hrc_learn.protocols import Human, OpenedArm
 from hrc_learn.sim import HAND_MARKER, Touch, World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.arm_motion import nearest_configuration
@@ -60,8 +61,16 @@ class DemonstrationConfig:
         return 1.0 / (self.dt * self.record_every)
 
 
+type OpenArm = Callable[[World], AbstractContextManager[OpenedArm]]
+"""Connects to the arm of a world that is at rest, until a demonstration ends."""
+
+
+def _directly(world: World) -> AbstractContextManager[OpenedArm]:
+    return nullcontext(world.opened_arm)
+
+
 def guided_frames(
-    world: World,
+    opened: OpenedArm,
     human: Human,
     duration: float,
     config: DemonstrationConfig,
@@ -70,7 +79,7 @@ def guided_frames(
     """Let a person guide the arm, and yield what is to be recorded.
 
     Args:
-        world: The workplace, reset to where the demonstration starts.
+        opened: The arm, where the demonstration starts.
         human: Gives end-effector motion and null-space input.
         duration: Of the demonstration [s].
         config: How the arm is guided.
@@ -80,12 +89,12 @@ def guided_frames(
         A frame every `record_every` control steps.
     """
     guiding = HandGuidingConfig(dt=config.dt, damping=config.damping)
-    arm = HandGuidedArm(panda, world.arm, human, guiding)
+    arm = HandGuidedArm(panda, opened.arm, human, guiding)
     for k in range(round(duration / config.dt)):
         step = arm.step()
         if k % config.record_every == 0:
             yield {**step.frame(), **observe()}
-        world.advance(config.dt)
+        opened.advance(config.dt)
 
 
 def write_demonstrations(
@@ -191,11 +200,20 @@ def demonstrate_servoing(
     sensor: MarkerSensor,
     config: ServoDemonstrationConfig,
     rng: np.random.Generator,
+    open_arm: OpenArm = _directly,
 ) -> list[Frame]:
     """Demonstrate one motion that ends above an object.
 
     The object is detected before the arm comes between it and the camera; its pixel is kept in
     every frame, as the camera saw it then.
+
+    Args:
+        world: Reset for the demonstration.
+        workplace: Where.
+        sensor: The camera's markers.
+        config: How.
+        rng: Source of objects, paths and tremor.
+        open_arm: How the arm is led.
 
     Raises:
         ValueError: If the camera does not see the object.
@@ -228,7 +246,9 @@ def demonstrate_servoing(
             ANGLE_FEATURE: np.array([angle(last), angle(target)]),
         }
 
-    return list(guided_frames(world, expert, config.duration + config.settle, config, observe))
+    duration = config.duration + config.settle
+    with open_arm(world) as opened:
+        return list(guided_frames(opened, expert, duration, config, observe))
 
 
 def _turn_for(pose: Float[np.ndarray, "4 4"], workplace: Workplace) -> float:
@@ -296,8 +316,17 @@ def demonstrate_placing(
     shelf: str,
     config: PlacingDemonstrationConfig,
     rng: np.random.Generator,
+    open_arm: OpenArm = _directly,
 ) -> tuple[list[Frame], list[Touch]]:
     """Demonstrate one placing motion, from home to a shelf with the object in the gripper.
+
+    Args:
+        world: Reset for the demonstration.
+        workplace: Where.
+        shelf: Which.
+        config: How.
+        rng: Source of the tremor and of the initial position.
+        open_arm: How the arm is led.
 
     Returns:
         The recorded frames, and all contacts of arm or object with the cabinet on the way.
@@ -305,7 +334,8 @@ def demonstrate_placing(
     expert = placing_expert(workplace, shelf, config, rng)
     offset = torch.from_numpy(expert.path.position(0.0)) - workplace.home().position
     world.hold(workplace.scene.objects[0].name, workplace.home_joints(offset).numpy())
-    frames = list(guided_frames(world, expert, config.duration + config.settle, config))
+    with open_arm(world) as opened:
+        frames = list(guided_frames(opened, expert, config.duration + config.settle, config))
     return frames, world.cabinet_contacts.touches + world.object_contacts.touches
 
 
@@ -315,8 +345,17 @@ def demonstrate_placing_without_contact(
     shelf: str,
     config: PlacingDemonstrationConfig,
     rng: np.random.Generator,
+    open_arm: OpenArm = _directly,
 ) -> tuple[list[Frame], int]:
     """Demonstrate until nothing is touched on the way, as a person would.
+
+    Args:
+        world: Reset for each demonstration.
+        workplace: Where.
+        shelf: Which.
+        config: How.
+        rng: Source of the tremor and of the initial position.
+        open_arm: How the arm is led.
 
     Returns:
         The recorded frames, and how many demonstrations were discarded.
@@ -325,7 +364,7 @@ def demonstrate_placing_without_contact(
         TaskFailedError: If something was touched each time.
     """
     for attempt in range(_ATTEMPTS):
-        frames, touches = demonstrate_placing(world, workplace, shelf, config, rng)
+        frames, touches = demonstrate_placing(world, workplace, shelf, config, rng, open_arm)
         if not touches:
             return frames, attempt
     raise TaskFailedError(f"{_ATTEMPTS} demonstrations in a row hit the cabinet: {touches[0]}")

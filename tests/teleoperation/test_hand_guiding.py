@@ -109,6 +109,70 @@ def test_the_hand_that_leads_knows_better_than_the_region():
     np.testing.assert_allclose(led.q, alone.q, atol=1e-12)
 
 
+class Hesitant(Wish):
+    """Asks for nothing until a time, then for what they wish."""
+
+    def __init__(self, since, **asked):
+        super().__init__(**asked)
+        self.since = since
+
+    def read(self, state):
+        return self.asked if state.time >= self.since else HumanInput()
+
+
+def returned(person, seconds, offset):
+    """Arm and its path [rad] on the way to a posture so far from where it starts [rad]."""
+    arm, path = IdealArm(), []
+    led = HandGuidedArm(panda, arm, person, HandGuidingConfig(dt=0.01))
+    led.move_to(torch.from_numpy(arm.q + offset))
+    for _ in range(round(100 * seconds)):
+        led.step()
+        path.append(arm.q.copy())
+        arm.q += 0.01 * arm.velocity
+        arm.time += 0.01
+    return arm, np.array(path)
+
+
+def test_an_arm_that_is_sent_to_a_posture_goes_straight_there_and_rests():
+    offset = np.array([0.5, -0.2, 0.0, 0.3, 0.0, 0.1, -0.4])
+    arm, path = returned(Wish(), 8.0, offset)
+    np.testing.assert_allclose(path[-1] - path[0], offset, atol=2e-3)
+    np.testing.assert_allclose(arm.velocity, 0.0, atol=1e-6)
+    share = (path - path[0]) @ offset / (offset @ offset)
+    np.testing.assert_allclose(path - path[0], share[:, None] * offset, atol=1e-3)
+    assert (np.diff(share) >= -1e-9).all()
+    fastest = np.abs(np.diff(path, axis=0)).max() / 0.01
+    assert fastest == pytest.approx(HandGuidingConfig().return_speed, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    "asked",
+    [
+        {"twist": np.array([0.0, 0.0, 0.05, 0.0, 0.0, 0.0])},
+        {"nullspace_input": np.array([0.3, 0.0, 0.2, 0.0, 0.0, 0.0, 0.0])},
+    ],
+)
+def test_who_moves_the_arm_on_its_way_has_it(asked):
+    offset = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    _, path = returned(Hesitant(1.0, **asked), 1.0, offset)
+    gone = path[-1, 0] - path[0, 0]
+    arm, path = returned(Hesitant(1.0, **asked), 6.0, offset)
+    # A moment to come to rest, and what is asked for since, but not the way.
+    assert path[-1, 0] - path[0, 0] < gone + 0.3
+    assert np.abs(arm.velocity).max() > 1e-3
+
+
+def test_an_arm_that_is_stopped_rests_at_once():
+    arm = IdealArm()
+    led = HandGuidedArm(panda, arm, Wish(), HandGuidingConfig(dt=0.01))
+    led.move_to(torch.from_numpy(arm.q + 0.2))
+    for _ in range(30):
+        led.step()
+    assert arm.velocity.any()
+    led.stop()
+    assert not arm.velocity.any()
+
+
 def test_limits_hold_whatever_is_asked():
     arm, _ = lead(
         3.0, twist=np.array([0.0, 0.0, 5.0, 0.0, 0.0, 0.0]), nullspace_input=np.full(7, 1e3)

@@ -1,21 +1,31 @@
 """A page beside a task: who is there reaches the task, and time goes on for all."""
 
 import time
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
 import torch
+from unchecked import shapes_unchecked
 
+from hrc_learn.demos import DatasetWriter
 from hrc_learn.kinematics import panda
 from hrc_learn.protocols import DrawnRegion, Feedback, Human, HumanInput, Reason
 from hrc_learn.regions import PositionRegion
-from hrc_learn.sim import World
+from hrc_learn.sim import MovingBodies, World
 from hrc_learn.sim.workplace import Workplace
+from hrc_learn.skills.arm_motion import nearest_configuration
 from hrc_learn.skills.work_cell import WorkCell
 from hrc_learn.teleoperation import ScriptedPerturbation
-from hrc_learn.teleoperation.page import PageConfig
+from hrc_learn.teleoperation.demonstration_recorder import DemonstrationRecorder
+from hrc_learn.teleoperation.page import Page, PageConfig
 from hrc_learn.teleoperation.page.page_operator import HeldGizmo
-from hrc_learn.teleoperation.page_session import task_page
+from hrc_learn.teleoperation.page_session import (
+    FEATURES,
+    PageSession,
+    PageSessionConfig,
+    task_page,
+)
 from hrc_learn.viz.palette import PERSON, VERMILION, rgba
 
 
@@ -41,6 +51,58 @@ def beside(world):
     with task_page(world, 0.01, PageConfig(port=8500), opened.append) as beside:
         assert opened[0].startswith("http://127.0.0.1:")
         yield beside
+
+
+class Asking(Human):
+    """Asks once for the arm to go home."""
+
+    def __init__(self):
+        self.requests = ("home",)
+
+    def read(self, state):
+        requests, self.requests = self.requests, ()
+        return HumanInput(requests=requests)
+
+
+@contextmanager
+def session_from(start, tmp_path):
+    """A session with an arm that a driver leads, asked to go home from a posture [rad]."""
+    pytest.importorskip("viser", reason="the extra `ui` is not installed")
+    workplace, config = Workplace(), PageSessionConfig()
+    world = World(workplace.scene)
+    world.hold(workplace.scene.objects[0].name, start.numpy())
+    bodies = MovingBodies(world)
+    drawn = bodies.drawn(*(poses[None] for poses in bodies.poses()))
+    writer = DatasetWriter(tmp_path / "demos", config.fps, "panda", panda.joint_names, FEATURES)
+    page = Page(panda, drawn, workplace.scene.boxes(), PageConfig(port=8520), task="show it")
+    with DemonstrationRecorder(writer, lambda: page.task) as recorder, page:
+        yield PageSession(
+            workplace, page, recorder, world, opened=world.opened_arm, beside=(Asking(),)
+        )
+
+
+@shapes_unchecked()
+def test_an_arm_with_a_driver_moves_home_and_never_jumps(tmp_path):
+    home = Workplace().home_joints()
+    start = home + torch.tensor([0.2, -0.1, 0.1, 0.1, 0.0, 0.1, -0.2], dtype=torch.float64)
+    with session_from(start, tmp_path) as session:
+        path = [session.step().state.joint_position for _ in range(700)]
+        assert session.world.holds(session.world.config.objects[0].name)
+    np.testing.assert_allclose(path[0], start, atol=0.01)
+    np.testing.assert_allclose(path[-1], home, atol=5e-3)
+    assert np.abs(np.diff(path, axis=0)).max() < 0.01 * 0.5
+
+
+@shapes_unchecked()
+def test_an_arm_with_a_driver_does_not_go_home_through_a_board(tmp_path):
+    home, shelf = Workplace().home_joints(), Workplace().shelf("upper")
+    with session_from(nearest_configuration(shelf, near=home), tmp_path) as session:
+        steps = [session.step() for _ in range(50)]
+        note = session._status(steps[-1]).note
+    assert "would meet board_upper" in note
+    assert "lead the arm out first" in note
+    moved = steps[-1].state.joint_position - steps[0].state.joint_position
+    assert np.abs(moved).max() < 5e-3
 
 
 def test_the_script_and_the_page_pull_together_while_somebody_holds_on(world, beside):

@@ -10,6 +10,8 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Suppress
 
+from hrc_learn.cli._options import Detail, More
+
 Configuration = Annotated[Any, Suppress]
 """Type of an option that has a `Detail` for default."""
 
@@ -88,6 +90,19 @@ class Measured:
 
     json: Path | None = None
     """Receives the measured values as one flat object of numbers."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Led:
+    """A command that leads an arm."""
+
+    arm: ArmDriver = "sim"
+    """Driver of a real arm, or the simulated one. "franky" is the package of that name,
+    "franka" our own loop at 1 kHz (docs/hardware.md)."""
+    ip: More[str] = ""
+    """Address of the arm, for a driver; "sim" serves the simulated one there."""
+    site: Configuration = Detail("hrc_learn.experiments.on_arm", "ArmSite")
+    """The real arm, and what it stands before."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,9 +8,9 @@ from tyro.conf import Positional
 
 from hrc_learn.cli._options import Detail, More
 from hrc_learn.cli.arguments import (
-    ArmDriver,
     Configuration,
     Experiment,
+    Led,
     Measured,
     Robot,
     Shelf,
@@ -52,7 +52,7 @@ class Demo(Imperfect, Measured):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunExperiment(Imperfect, Written):
+class RunExperiment(Imperfect, Led, Written):
     """What the paper's three experiments have in common."""
 
     out: Path
@@ -68,13 +68,6 @@ class RunExperiment(Imperfect, Written):
     and draw success and errors against them."""
     robot: Robot = "panda"
     """Arm that does it."""
-    arm: ArmDriver = "sim"
-    """Driver of a real arm, or the simulated one. "franky" is the package of that name,
-    "franka" our own loop at 1 kHz (docs/hardware.md)."""
-    ip: More[str] = ""
-    """Address of the arm, for a driver; "sim" serves the simulated one there."""
-    site: Configuration = Detail("hrc_learn.experiments.on_arm", "ArmSite")
-    """The real arm and its camera."""
     serve: bool = False
     """Serve the dashboard in the browser while the run goes on."""
     serving: Configuration = Detail("hrc_learn.experiments.run_recording", "LiveViewConfig")
@@ -305,10 +298,11 @@ class SweepWorker(Imperfect, Written):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Serve(Measured):
-    """Run the controller at a fixed rate on the simulated arm, and report how fast it answers.
+class Serve(Led, Measured):
+    """Run the controller at a fixed rate on an arm, and report how fast it answers.
 
-    The arm servoes on a marker that an uncalibrated camera sees at 31 Hz. Step latency is the
+    The arm servoes on a marker that an uncalibrated camera sees at 31 Hz, both calculated from
+    its joints: no camera is needed, but a real arm does move. Step latency is the
     time from reading the joints to the command, lateness how long ago the tick was due, or the
     first of those that were missed before it; both in wall-clock time. A tick is missed when
     the loop, physics included, was still busy when the next one was due.
@@ -326,8 +320,8 @@ class Serve(Measured):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ServePage(Measured):
-    """Lead the simulated arm in a browser, and record demonstrations of your own.
+class ServePage(Led, Measured):
+    """Lead the arm in a browser, and record demonstrations of your own.
 
     Open the address that is printed. Drag a link or a knob of the arm, or of its virtual twin,
     to move it in its null space; drag the end effector's gizmo, such as to a green field on a

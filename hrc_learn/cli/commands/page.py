@@ -5,20 +5,24 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 
-import numpy as np
 import torch
 from rich.console import Console
 
 from hrc_learn.cli._options import resolved
-from hrc_learn.cli._run import configuration, write_values
+from hrc_learn.cli._run import configuration, leads_real_arm, write_values
 from hrc_learn.cli.arguments.run import ServePage
+from hrc_learn.controller import SafetyConfig
 from hrc_learn.demos import DatasetWriter
 from hrc_learn.deploy import Rate
+from hrc_learn.experiments.arm_access import access_by
+from hrc_learn.experiments.on_arm import ArmSite, opened_site
 from hrc_learn.hardware import ending_at_rest
 from hrc_learn.kinematics import panda
-from hrc_learn.protocols import Human
+from hrc_learn.protocols import Human, OpenedArm
 from hrc_learn.sim import MovingBodies, World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.teleoperation.demonstration_recorder import DemonstrationRecorder
@@ -41,8 +45,6 @@ def page(args: ServePage) -> None:
     torch.set_num_threads(1)
     sys.setswitchinterval(SWITCH_INTERVAL)
     workplace, console = Workplace(), Console()
-    world = World(workplace.scene)
-    bodies = MovingBodies(world)
     writer = DatasetWriter(
         args.out,
         fps=args.session.fps,
@@ -52,15 +54,24 @@ def page(args: ServePage) -> None:
         frames={"base": "panda_link0", "ee": "panda_hand_tcp"},
         details={"taught by": "a person at the page", "recorded with": configuration(args)},
     )
-    drawn = bodies.drawn(*(poses[None] for poses in bodies.poses()))
     stands = [*workplace.scene.boxes(), *place_targets(workplace)]
-    page = Page(panda, drawn, stands, args.page, task=args.task)
-    with DemonstrationRecorder(writer, lambda: page.task) as recorder, page:
-        session = PageSession(
-            workplace, page, recorder, world, beside=_beside(args.beside), config=args.session
-        )
-        console.print(f"Page at [bold]{page.url}[/]")
-        figures = _serve(session, page, args.session.guiding.dt, args.duration)
+    with _opened(args, workplace) as (world, opened, safety):
+        bodies = MovingBodies(world)
+        drawn = bodies.drawn(*(poses[None] for poses in bodies.poses()))
+        page = Page(panda, drawn, stands, args.page, task=args.task)
+        config = replace(args.session, guiding=replace(args.session.guiding, safety=safety))
+        with DemonstrationRecorder(writer, lambda: page.task) as recorder, page:
+            session = PageSession(
+                workplace,
+                page,
+                recorder,
+                world,
+                opened=opened,
+                beside=_beside(args.beside),
+                config=config,
+            )
+            console.print(f"Page at [bold]{page.url}[/]")
+            figures = _serve(session, page, config.guiding.dt, args.duration)
     figures["episodes"] = recorder.status.saved
     console.print(
         f"{args.out}: {recorder.status.saved} demonstrations"
@@ -68,6 +79,28 @@ def page(args: ServePage) -> None:
         else "Nothing saved, so there is no dataset"
     )
     write_values(args.json, figures)
+
+
+@contextmanager
+def _opened(
+    args: ServePage, workplace: Workplace
+) -> Iterator[tuple[World, OpenedArm | None, SafetyConfig]]:
+    """The world, its arm unless no driver leads it, and what the filter is told of it."""
+    safety: SafetyConfig = args.session.guiding.safety
+    if leads_real_arm(args):
+        site: ArmSite = replace(args.site, driver=args.arm, ip=args.ip)
+        with opened_site(site, workplace) as (world, opened):
+            yield world, opened, site.cell_config().safety
+        return
+    world = World(workplace.scene)
+    if args.arm == "sim":
+        yield world, None, safety
+        return
+    access = access_by(args.arm)
+    world.hold(workplace.scene.objects[0].name, workplace.home_joints().numpy())
+    with access.open(world) as opened:
+        told = replace(safety, delay=safety.delay + access.delay, braking=access.dynamics)
+        yield world, opened, told
 
 
 def _beside(device: str) -> tuple[Human, ...]:
@@ -82,7 +115,7 @@ def _serve(
     """Run the loop in the arm's own time; what was measured of it."""
     rate, steps = Rate(dt), 0
     try:
-        with ending_at_rest(lambda: session.world.arm.command(np.zeros(7))):
+        with ending_at_rest(session.arm.stop):
             while page.alive and not session.finished:
                 session.step()
                 steps += 1

@@ -7,8 +7,9 @@ import numpy as np
 from rich.progress import Progress, track
 
 from hrc_learn.cli._options import resolved
-from hrc_learn.cli._run import configuration, write_values
+from hrc_learn.cli._run import configuration, leads_real_arm, write_values
 from hrc_learn.cli.arguments.record import RecordExpert, RecordPlacing, RecordServoing
+from hrc_learn.experiments.arm_access import access_by
 from hrc_learn.sim import PhysicsError, World, open_camera
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.marker_sensor import MarkerSensor
@@ -21,6 +22,7 @@ from hrc_learn.skills.visual_skill import (
 from hrc_learn.skills.work_cell import TaskFailedError
 from hrc_learn.teleoperation.hand_guiding import Frame
 from hrc_learn.teleoperation.scripted_demonstrations import (
+    OpenArm,
     demonstrate_placing_without_contact,
     demonstrate_servoing,
     write_demonstrations,
@@ -32,6 +34,7 @@ def record_placing(args: RecordPlacing) -> int:
     args = resolved(args)
     if args.episodes < 1:
         raise ValueError(f"--episodes must be at least 1, but is {args.episodes}.")
+    open_arm = _opening(args)
     workplace = Workplace()
     goal = workplace.shelf(args.shelf).position.numpy()
     world = World(workplace.scene)
@@ -41,7 +44,7 @@ def record_placing(args: RecordPlacing) -> int:
     def demonstrations() -> Iterator[list[Frame]]:
         for _ in track(range(args.episodes), description="Placing demonstrations"):
             frames, thrown = demonstrate_placing_without_contact(
-                world, workplace, args.shelf, args.demonstration, rng
+                world, workplace, args.shelf, args.demonstration, rng, open_arm
             )
             thrown_away.append(thrown)
             errors.append(float(np.linalg.norm(frames[-1]["position"] - goal)))
@@ -78,6 +81,7 @@ def record_servoing(args: RecordServoing) -> None:
     args = resolved(args)
     if args.episodes < 1:
         raise ValueError(f"--episodes must be at least 1, but is {args.episodes}.")
+    open_arm = _opening(args)
     workplace = Workplace()
     world = World(workplace.scene)
     rng = np.random.default_rng(args.seed)
@@ -86,7 +90,9 @@ def record_servoing(args: RecordServoing) -> None:
 
     def demonstrations() -> Iterator[list[Frame]]:
         for _ in track(range(args.episodes), description="Servoing demonstrations"):
-            frames = demonstrate_servoing(world, workplace, sensor, args.demonstration, rng)
+            frames = demonstrate_servoing(
+                world, workplace, sensor, args.demonstration, rng, open_arm
+            )
             seen.append(float(np.mean([bool(frame["feature_visible"]) for frame in frames])))
             yield frames
 
@@ -101,6 +107,20 @@ def record_servoing(args: RecordServoing) -> None:
     )
     print(f"{args.episodes} demonstrations in {args.out}, marker seen {100 * min(seen):.0f} %")
     write_values(args.json, {"episodes": args.episodes, "marker_seen_min": min(seen)})
+
+
+def _opening(args: RecordPlacing | RecordServoing) -> OpenArm:
+    """How the scripted expert's arm is led.
+
+    Raises:
+        ValueError: It is a real one.
+    """
+    if leads_real_arm(args):
+        raise ValueError(
+            f"--ip {args.ip}: a scripted expert demonstrates in simulation only. Lead the real "
+            f"arm yourself: hrc page --arm {args.arm} --ip {args.ip}."
+        )
+    return access_by(args.arm).open
 
 
 def record_expert(args: RecordExpert) -> int:

@@ -7,14 +7,14 @@ import json
 import math
 from collections.abc import Mapping
 from contextlib import ExitStack, closing
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, cast, get_args
 
 from rich.console import Console
 
 from hrc_learn.cli._options import resolved
-from hrc_learn.cli._run import command_line, refuse_existing
+from hrc_learn.cli._run import command_line, leads_real_arm, refuse_existing
 from hrc_learn.cli.arguments.learn import FitImageJacobian, FitPrimitives
 from hrc_learn.cli.arguments.record import RecordPlacing, RecordServoing
 from hrc_learn.cli.arguments.run import (
@@ -78,7 +78,7 @@ def run_placing(args: RunPlacing) -> int:
     """The paper's first experiment."""
     args = _with_models(args)
     assert args.placing is not None
-    if _is_real(args):
+    if leads_real_arm(args, _SIMULATED_ONLY):
         workplace = Workplace()
         skill = PlacingSkill.load(args.placing)
         task = placing_task(skill, workplace, args.shelf, args.speed)
@@ -104,7 +104,7 @@ def run_grasping(args: RunGrasping) -> int:
     assert args.aiming is not None
     controller = with_gains(args.config.controller, args.gains)
     config = replace(args.config, controller=controller)
-    if _is_real(args):
+    if leads_real_arm(args, _SIMULATED_ONLY):
         servoing = VisualServoSkill.load(args.aiming)
         workplace = Workplace().approached(servoing.approach)
         return _on_arm(args, workplace, grasping_task(servoing, workplace, config))
@@ -133,7 +133,7 @@ def run_collaboration(args: RunCollaboration) -> int:
     controller = with_gains(args.config.grasping.controller, args.gains)
     config = replace(args.config, grasping=replace(args.config.grasping, controller=controller))
     shelves = args.shelves or (args.shelf,)
-    if _is_real(args):
+    if leads_real_arm(args, _SIMULATED_ONLY):
         servoing, placing = VisualServoSkill.load(args.aiming), PlacingSkill.load(args.placing)
         workplace = workplace_for(shelves, args.shelf_x, args.shelf_depth)
         workplace = workplace.approached(servoing.approach)
@@ -164,31 +164,6 @@ def run_collaboration(args: RunCollaboration) -> int:
         arm=args.arm,
     )
     return _conduct(experiment, args)
-
-
-def _is_real(args: RunExperiment) -> bool:
-    """Whether a real arm does it.
-
-    Raises:
-        ValueError: An address without a driver, a driver without an address, or an option of
-            the simulated work cell.
-    """
-    if args.arm == "sim":
-        if args.ip:
-            raise ValueError(f"--ip {args.ip} needs a driver: --arm franky or --arm franka.")
-        return False
-    if args.ip == "sim":
-        return False
-    if not args.ip:
-        raise ValueError(
-            f"--arm {args.arm} needs --ip with the address of the arm's control box; --ip sim "
-            "serves the simulated arm there."
-        )
-    given = {field.name: getattr(args, field.name) != field.default for field in fields(args)}
-    if simulated := [name for name in _SIMULATED_ONLY if given.get(name)]:
-        option = simulated[0].replace("_", "-")
-        raise ValueError(f"--{option} is for simulated arms, not for a real one (--ip).")
-    return True
 
 
 def _simulated_camera(args: RunServoing) -> CameraKind:

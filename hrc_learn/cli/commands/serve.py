@@ -5,29 +5,36 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import time
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
 from rich.console import Console
 
-from hrc_learn.cli._run import write_values
+from hrc_learn.cli._options import resolved
+from hrc_learn.cli._run import leads_real_arm, write_values
 from hrc_learn.cli.arguments.run import Serve
 from hrc_learn.controller import (
     GRIPPER_DOWN,
     INITIAL_IMAGE_JACOBIAN,
     INTERVENTIONS,
     AdaptiveController,
+    ControllerConfig,
     Goals,
     Observation,
     SafetyConfig,
 )
 from hrc_learn.deploy import EagerRunner, Rate, StepRunner, open_step
+from hrc_learn.experiments.arm_access import access_by
+from hrc_learn.experiments.on_arm import ArmSite, opened_arm
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.hardware import ending_at_rest
 from hrc_learn.jacobian import KalmanEstimator, RBFImageJacobian, paper_grid
 from hrc_learn.kinematics import panda
-from hrc_learn.protocols import Arm
+from hrc_learn.protocols import Arm, OpenedArm
 from hrc_learn.sim import SceneConfig, World
 from hrc_learn.sim.closed_loop import PinholeCamera
 
@@ -58,15 +65,16 @@ def serve(args: Serve) -> None:
     torch.set_num_threads(1)
     dt = 1 / args.rate
     camera = _camera()
-    controller, observation = _controller(camera, dt)
+    led = _led(args, dt)
+    controller, observation = _controller(camera, dt, led.safety)
     began = time.perf_counter()
     if args.step == "eager":
         runner = EagerRunner(controller, observation)
     else:
         runner = open_step(controller, observation, args.packages)
     opened = time.perf_counter() - began
-    world = World(SceneConfig(timestep=dt))
-    latencies, error = _serve(runner, world, camera, dt, round(args.duration * args.rate))
+    with led.opened() as arm:
+        latencies, error = _serve(runner, arm, camera, dt, round(args.duration * args.rate))
     figures = {"open_s": opened} | _figures(latencies) | {"pixel_error": error}
     counts = runner.state("safety.counts")
     figures |= {f"safety_{k}": int(n) for k, n in zip(INTERVENTIONS, counts, strict=True)}
@@ -100,7 +108,9 @@ def _camera() -> PinholeCamera:
     )
 
 
-def _controller(camera: PinholeCamera, dt: float) -> tuple[AdaptiveController, Observation]:
+def _controller(
+    camera: PinholeCamera, dt: float, safety: SafetyConfig
+) -> tuple[AdaptiveController, Observation]:
     """The controller, and an observation with all that the loop will tell it."""
     centre = torch.tensor(CENTRE, dtype=torch.float64)
     down = quaternion.normalize(centre.new_tensor(GRIPPER_DOWN))
@@ -108,7 +118,10 @@ def _controller(camera: PinholeCamera, dt: float) -> tuple[AdaptiveController, O
     J = torch.tensor(INITIAL_IMAGE_JACOBIAN, dtype=torch.float64)
     network = RBFImageJacobian.from_jacobian(J, paper_grid(), 0.1)
     controller = AdaptiveController(
-        panda, KalmanEstimator(network), Goals.at(centre, down, target)
+        panda,
+        KalmanEstimator(network),
+        Goals.at(centre, down, target),
+        config=ControllerConfig(safety=safety),
     )
     q = panda.ready
     observation = Observation(
@@ -124,26 +137,55 @@ def _controller(camera: PinholeCamera, dt: float) -> tuple[AdaptiveController, O
     return controller, observation
 
 
+@dataclass(frozen=True, kw_only=True)
+class _LedArm:
+    """The arm that is led."""
+
+    opened: Callable[[], AbstractContextManager[OpenedArm]]
+    """Connects to it."""
+    safety: SafetyConfig
+    """What the safety filter is told of it."""
+
+
+def _led(args: Serve, dt: float) -> _LedArm:
+    """A real arm, or a simulated one that is ready."""
+    if leads_real_arm(args):
+        site: ArmSite = replace(resolved(args).site, driver=args.arm, ip=args.ip)
+
+        @contextmanager
+        def open_arm() -> Iterator[OpenedArm]:
+            with opened_arm(site) as arm:
+                yield OpenedArm(arm=arm, gripper=arm, advance=lambda _time: None)
+
+        return _LedArm(opened=open_arm, safety=site.cell_config().safety)
+    world = World(SceneConfig(timestep=dt))
+    world.reset(panda.ready.numpy())
+    access = access_by(args.arm)
+    safety = SafetyConfig(delay=access.delay, braking=access.dynamics)
+    return _LedArm(opened=partial(access.open, world), safety=safety)
+
+
 def _serve(
-    runner: StepRunner, world: World, camera: PinholeCamera, dt: float, steps: int
+    runner: StepRunner, opened: OpenedArm, camera: PinholeCamera, dt: float, steps: int
 ) -> tuple[Latencies, float]:
     """Run the loop; returns latencies and the last pixel error [px]."""
-    world.reset(panda.ready.numpy())
+    arm = opened.arm
     target = runner.observation["feature"].copy()
     frame_steps = max(1, round(FRAME_TIME / dt))
     took, late = np.empty(steps), np.empty(steps)
-    _answer(runner, world.arm)  # the first call is slower than any other
-    runner.start(panda.ready.numpy())
+    runner.observation["joint_position"][:] = arm.read().joint_position
+    runner.step()  # the first one is slower than any other
+    runner.start(arm.read().joint_position)
     rate = Rate(dt)
-    with ending_at_rest(lambda: world.arm.command(np.zeros(7))):
+    with ending_at_rest(lambda: arm.command(np.zeros(7))):
         for k in range(steps):
             began = time.perf_counter()
-            _answer(runner, world.arm)
+            _answer(runner, arm)
             took[k] = time.perf_counter() - began
-            world.advance(dt)
+            opened.advance(dt)
             runner.observation["feature_new"][...] = k % frame_steps == 0
             if k % frame_steps == 0:
-                _look(runner.observation, camera, world.arm)
+                _look(runner.observation, camera, arm)
             late[k] = rate.wait()
     error = float(np.linalg.norm(runner.observation["feature"] - target))
     return Latencies(step=took, late=late, missed=rate.missed), error
