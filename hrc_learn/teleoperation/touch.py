@@ -215,6 +215,10 @@ _PUSHES, _MOMENTS = 25.0, 2.5
 # By how much the logarithm of its evidence must be larger for the hand to be what is pushed:
 # the task waits for nothing if it is not.
 _SURE = 2.0
+# By how much, for what begins like a push at one place to turn out as one at the other: while a
+# force rises, friction hides where it acts. In simulation the hand's evidence is at most 2 more
+# for a push at the elbow, and soon 10 to 400 more for one at the hand.
+_CHANGES = 8.0
 # Loads of the end effector by what the task meets: force and moment [N, N m].
 _MET = np.array([60.0] * 3 + [10.0] * 3)
 
@@ -348,10 +352,22 @@ class Touch(Human):
         likelier = hand.evidence - above.evidence
         evidence = max(above, hand).evidence - none
         sure = evidence > config.evidence
-        # Once touched, half of the force is enough, as long as something tells of it.
-        if before == "elbow" and evidence > 0 and above.size > 0.5 * config.elbow_force:
+        # Once touched, half of the force is enough, as long as something tells of it and it is
+        # not far likelier to be elsewhere.
+        felt = evidence > 0
+        if (
+            before == "elbow"
+            and felt
+            and likelier < _CHANGES
+            and above.size > 0.5 * config.elbow_force
+        ):
             self.place = "elbow"
-        elif before == "hand" and evidence > 0 and hand.size > 0.5 * config.hand_force:
+        elif (
+            before == "hand"
+            and felt
+            and likelier > -_CHANGES
+            and hand.size > 0.5 * config.hand_force
+        ):
             self.place = "hand"
         elif sure and likelier < 0 and above.size > config.elbow_force:
             self.place = "elbow"

@@ -214,6 +214,18 @@ def test_who_holds_the_hand_makes_the_task_wait(force):
     assert [remark.text for remark in cell.remarks] == ["The task waits.", "The task goes on."]
 
 
+def test_a_push_that_begins_like_one_at_the_elbow_turns_out_as_one_at_the_hand():
+    _, cell, human = at_work(202, [("hand", (16.2, -6.5, -9.7), 1.3, 1.6)])
+    there_and_back(cell, 4.0)
+    felt = [place for time, place, *_ in human.rows if 1.3 < time < 2.9]
+    assert "elbow" in felt  # what it begins like: else this test shows nothing
+    first = felt.index("hand")
+    assert set(felt[first : first + 100]) == {"hand"}
+    assert 1.3 < human.pauses().min() < 1.9
+    elbow, _, _ = off_path(cell)
+    assert elbow.max() < 0.01
+
+
 def test_a_push_may_pause_the_task_until_the_next_one():
     pushes = [("hand", (0.0, 0.0, -20.0), start, 0.8) for start in (1.0, 3.0)]
     _, cell, human = at_work(2, config=TouchConfig(resumes="push"), pushes=pushes[:1])
