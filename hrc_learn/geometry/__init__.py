@@ -1,6 +1,8 @@
 """Rotations, poses and shapes; every delicate numeric of the package is in `numerics`."""
 
 from hrc_learn.geometry import quaternion as quaternion
+from hrc_learn.geometry.mesh_files import MeshPart as MeshPart
+from hrc_learn.geometry.mesh_files import read_mesh as read_mesh
 from hrc_learn.geometry.numerics import minimum_jerk as minimum_jerk
 from hrc_learn.geometry.pose import Pose as Pose
 from hrc_learn.geometry.shapes import Body as Body

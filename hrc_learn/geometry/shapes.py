@@ -12,7 +12,8 @@ from jaxtyping import Float
 Colour = tuple[float, float, float, float]
 """Red, green, blue, opacity, each 0 to 1."""
 
-_WHITE: Colour = (0.86, 0.87, 0.89, 1.0)
+PLAIN: Colour = (0.86, 0.87, 0.89, 1.0)
+"""Of a robot's link that has no colour of its own."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,7 +26,7 @@ class Capsule:
     """[m]"""
     radius: float
     """[m]"""
-    colour: Colour = _WHITE
+    colour: Colour = PLAIN
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,13 +43,17 @@ class Box:
 
 @dataclass(frozen=True, kw_only=True)
 class MeshFile:
-    """A drawn shape in a file, in the frame of the body that carries it."""
+    """A drawn shape in a file (`read_mesh`), in the frame of the body that carries it."""
 
     path: Path
-    turn: float = 0.0
-    """About z [rad]."""
-    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """[m]"""
+    orientation: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    """Unit quaternion (w, x, y, z)."""
+    scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """Factors on the file's coordinates, along its own axes."""
+    colour: Colour | None = None
+    """Of what the file gives no colour; None: plain."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -62,9 +67,8 @@ class Body:
     """Unit quaternion (w, x, y, z)."""
     capsules: tuple[Capsule, ...] = ()
     boxes: tuple[Box, ...] = ()
-    mesh: MeshFile | None = None
-    """Drawn in place of capsules and nameless boxes, where the file is there and the viewer
-    can."""
+    meshes: tuple[MeshFile, ...] = ()
+    """Drawn in place of capsules and nameless boxes."""
 
 
 def arm_bodies(
@@ -72,7 +76,7 @@ def arm_bodies(
     orientation: Float[np.ndarray, "time links 4"],
     *,
     radius: float = 0.045,
-    colour: Colour = _WHITE,
+    colour: Colour = PLAIN,
 ) -> tuple[Body, ...]:
     """A stick arm for robots without a drawn model: a capsule from each frame to the next.
 

@@ -4,7 +4,7 @@ OpenGL, and what disturbs a camera in use: it is moved, refocused, or a marker i
 
 import sys
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -16,6 +16,7 @@ from jaxtyping import Float, UInt8
 from hrc_learn.geometry import quaternion
 from hrc_learn.geometry.shapes import Colour
 from hrc_learn.protocols import Camera
+from hrc_learn.sim.drawn_world import DrawnWorld
 from hrc_learn.sim.scene import (
     HAND_MARKER,
     NOWHERE,
@@ -36,6 +37,8 @@ from hrc_learn.vision import (
 # pyright: reportAttributeAccessIssue=false
 # MuJoCo ships no type stubs; its names come from a compiled module.
 
+
+_TOUCHING: Colour = (0.84, 0.37, 0.0, 1.0)  # of a link that touches something
 
 CameraKind = Literal["auto", "egl", "synthetic"]
 
@@ -87,33 +90,36 @@ class OffscreenRenderer:
         Raises:
             RenderingUnavailableError: If there is no EGL (on Linux) or no OpenGL to be had.
         """
-        self._world = world
-        self._size = (width, height)
-        world.model.vis.global_.offwidth = max(width, world.model.vis.global_.offwidth)
-        world.model.vis.global_.offheight = max(height, world.model.vis.global_.offheight)
         self._gl = _open_context(width, height)
-        self._context = mujoco.MjrContext(world.model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        self._size, self._drawn = (width, height), DrawnWorld(world)
+        model = self._drawn.model
+        model.vis.global_.offwidth = max(width, model.vis.global_.offwidth)
+        model.vis.global_.offheight = max(height, model.vis.global_.offheight)
+        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
         self._free = weakref.finalize(self, _free, self._gl, self._context)
         self._free.atexit = False
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
-        self._scene = mujoco.MjvScene(world.model, maxgeom=1000)
+        self._scene = mujoco.MjvScene(model, maxgeom=1000)
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
         self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
 
     def render(
-        self, camera: CameraModel, arrows: Sequence[Arrow] = ()
+        self, camera: CameraModel, arrows: Sequence[Arrow] = (), touching: Iterable[str] = ()
     ) -> UInt8[np.ndarray, "height width 3"]:
         """The image of an undistorted camera of the renderer's size, RGB.
 
         Args:
             camera: Where from.
             arrows: Drawn besides what is in the world.
+            touching: Names of geoms that stand out, as they touch something.
         """
         width, height = self._size
         self._gl.make_current()
+        self._drawn.update()
+        self._drawn.paint(touching, _TOUCHING)
         mujoco.mjv_updateScene(
-            self._world.model,
-            self._world.data,
+            self._drawn.model,
+            self._drawn.data,
             mujoco.MjvOption(),
             None,
             mujoco.MjvCamera(),

@@ -155,9 +155,7 @@ class World:
         self.config = config or SceneConfig()
         self.imperfections = imperfections or Imperfections().draw(np.random.default_rng(0))
         self.config = _as_it_is(self.config, self.imperfections)
-        spec = build_scene(self.config)
-        self.imperfections.apply(spec)
-        self.model = spec.compile()
+        self.model = self.describe().compile()
         self.data = mujoco.MjData(self.model)
         self._watch = PhysicsWatch(self.model, self.data)
         self.arm = MujocoArm(self.model, self.data, self.imperfections)
@@ -181,6 +179,12 @@ class World:
         self._watched = np.logical_or.reduce([monitor.watched for monitor in self._monitors])
         self._worker = np.array([self.model.body(name).mocapid[0] for name in workers], int)
         self._item = self.model.body(WORKER_ITEM).mocapid[0] if workers else None
+
+    def describe(self) -> mujoco.MjSpec:
+        """A description of all that is in it, as it truly is; `compile()` makes the model."""
+        spec = build_scene(self.config)
+        self.imperfections.apply(spec)
+        return spec
 
     @property
     def time(self) -> float:

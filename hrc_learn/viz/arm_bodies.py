@@ -1,6 +1,5 @@
 """The Panda as bodies to be drawn: real meshes where a package ships them, else capsules."""
 
-import math
 from collections import defaultdict
 from functools import cache
 from importlib.metadata import PackageNotFoundError, distribution
@@ -21,14 +20,14 @@ _TCP = 0.1034  # from the hand's frame along z [m]
 _PARTS = {
     **{f"link{i}": {"file": f"link{i}"} for i in range(8)},
     "hand": {"file": "hand"},
-    "tool": {"file": "hand", "offset": (0.0, 0.0, -_TCP)},
+    "tool": {"file": "hand", "position": (0.0, 0.0, -_TCP)},
     "finger_left": {"file": "finger"},
-    "finger_right": {"file": "finger", "turn": math.pi},
+    "finger_right": {"file": "finger", "orientation": (0.0, 0.0, 0.0, 1.0)},
 }
 
 
-def panda_mesh(body: str) -> MeshFile | None:
-    """Mesh of a link, the hand or a finger of the Panda.
+def panda_meshes(body: str) -> tuple[MeshFile, ...]:
+    """Meshes of a link, the hand or a finger of the Panda.
 
     Args:
         body: link0 to link7, hand, finger_left or finger_right; tool is the hand in the frame
@@ -39,9 +38,9 @@ def panda_mesh(body: str) -> MeshFile | None:
     """
     folder = _folder()
     if folder is None or body not in _PARTS:
-        return None
+        return ()
     place: dict[str, Any] = dict(_PARTS[body])
-    return MeshFile(path=folder / f"{place.pop('file')}.dae", **place)
+    return (MeshFile(path=folder / f"{place.pop('file')}.dae", **place),)
 
 
 @cache
@@ -82,7 +81,7 @@ def panda_bodies(joint_position: Float[np.ndarray, "time 7"]) -> tuple[Body, ...
             position=position[:, link],
             orientation=orientation[:, link],
             capsules=tuple(capsules),
-            mesh=panda_mesh(names[link]),
+            meshes=panda_meshes(names[link]),
         )
         for link, capsules in shapes.items()
     )

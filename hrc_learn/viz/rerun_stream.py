@@ -14,7 +14,7 @@ import rerun.blueprint as rrb
 from jaxtyping import Float, Int, UInt8
 from PIL import Image
 
-from hrc_learn.geometry import Body, Box, Capsule, MeshFile
+from hrc_learn.geometry import Body, Box, Capsule, MeshFile, MeshPart, read_mesh
 from hrc_learn.store import new_file
 from hrc_learn.viz import palette
 from hrc_learn.viz.panels import Curves, Plot, Tab
@@ -120,9 +120,12 @@ def body_path(body: Body) -> str:
 
 def send_shapes(still: StaticShapes, body: Body) -> None:
     """Send what a body looks like."""
-    path, mesh, plain = body_path(body), body.mesh, body.boxes
-    if mesh is not None:
-        still.send(f"{path}/mesh", mesh, lambda: _asset(mesh))
+    path, plain = body_path(body), body.boxes
+    for k, mesh in enumerate(body.meshes):
+        for j, part in enumerate(read_mesh(mesh.path)):
+            name = f"{path}/mesh{k}_{j}"
+            still.send(name, (mesh, j), lambda mesh=mesh, part=part: _drawn(mesh, part))
+    if body.meshes:
         plain = tuple(box for box in body.boxes if box.name)
     elif body.capsules:
         still.send(f"{path}/capsules", body.capsules, lambda: capsules(body.capsules))
@@ -130,13 +133,15 @@ def send_shapes(still: StaticShapes, body: Body) -> None:
         still.send(f"{path}/boxes", plain, lambda: boxes(plain))
 
 
-def _asset(mesh: MeshFile) -> tuple[rr.Asset3D, rr.Transform3D]:
-    """A mesh where it is on its body."""
-    # Rerun tells most kinds of files by their contents, but takes COLLADA for any XML.
-    kind = "model/vnd.collada+xml" if mesh.path.suffix == ".dae" else None
-    turn = rr.RotationAxisAngle(axis=(0, 0, 1), radians=mesh.turn)
-    place = rr.Transform3D(translation=mesh.offset, rotation=turn)
-    return rr.Asset3D(path=mesh.path, media_type=kind), place
+def _drawn(mesh: MeshFile, part: MeshPart) -> rr.Mesh3D:
+    """A part of a mesh where it is on its body."""
+    placed = part.placed(mesh)
+    return rr.Mesh3D(
+        vertex_positions=placed.vertices,
+        vertex_normals=placed.normals,
+        triangle_indices=placed.faces,
+        albedo_factor=placed.colour,
+    )
 
 
 def send_poses(

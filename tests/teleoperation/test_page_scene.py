@@ -3,8 +3,18 @@
 import numpy as np
 import pytest
 
-from hrc_learn.geometry import Body, Box, Capsule
-from hrc_learn.teleoperation.page.page_scene import body_mesh, box_mesh, capsule_mesh
+from hrc_learn.geometry import Body, Box, Capsule, MeshFile
+from hrc_learn.teleoperation.page.page_scene import body_meshes, box_mesh, capsule_mesh
+
+TETRAHEDRON = """v 0 0 0
+v 1 0 0
+v 0 1 0
+v 0 0 1
+f 1 3 2
+f 1 2 4
+f 1 4 3
+f 2 3 4
+"""
 
 
 def volume(mesh):
@@ -62,4 +72,32 @@ def test_a_body_is_all_its_shapes():
         boxes=(box,),
     )
     total = 2 * volume(capsule_mesh(capsule)) + volume(box_mesh(box))
-    assert volume(body_mesh(body)) == pytest.approx(total)
+    ((colour, mesh),) = body_meshes(body).items()
+    assert colour == capsule.colour
+    assert volume(mesh) == pytest.approx(total)
+
+
+def test_a_body_with_meshes_is_drawn_in_their_colours(tmp_path):
+    (tmp_path / "tetrahedron.obj").write_text(TETRAHEDRON)
+    red, plate_colour = (0.8, 0.1, 0.1, 1.0), (0.2, 0.2, 0.2, 1.0)
+    shapes = [
+        MeshFile(path=tmp_path / "tetrahedron.obj", colour=red),
+        MeshFile(path=tmp_path / "tetrahedron.obj", colour=red, scale=(-2.0, 1.0, 1.0)),
+    ]
+    size = (0.1, 0.1, 0.1)
+    body = Body(
+        name="link1",
+        position=np.zeros((1, 3)),
+        orientation=np.array([[1.0, 0.0, 0.0, 0.0]]),
+        capsules=(Capsule(start=(0.0, 0.0, 0.0), end=(0.0, 0.0, 1.0), radius=0.1),),
+        boxes=(
+            Box(centre=(2.0, 0.0, 0.0), half_size=size),
+            Box(centre=(2.0, 0.0, 0.0), half_size=size, name="plate", colour=plate_colour),
+        ),
+        meshes=tuple(shapes),
+    )
+    drawn = body_meshes(body)
+    assert set(drawn) == {red, plate_colour}
+    # The mirrored one has its outside outside as well: their volumes add up.
+    assert volume(drawn[red]) == pytest.approx((1 + 2) / 6)
+    assert volume(drawn[plate_colour]) == pytest.approx(8 * 0.1**3)

@@ -38,7 +38,6 @@ type Snapshots = Mapping[str, Sequence[tuple[str, Image]]]
 """Rendered pictures with their titles, by what they show."""
 
 _EYE, _TOWARDS = (1.30, 0.95, 1.10), (0.24, -0.30, 0.30)
-_TOUCHING = (0.84, 0.37, 0.0, 1.0)  # colour of a link that touches something
 # The object's x lies along the fingers' line of closing, its top towards the palm.
 _IN_GRIPPER = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
 
@@ -287,13 +286,7 @@ class Photographer:
         tool = panda.forward(torch.from_numpy(joints)).matrix().numpy()
         width = 2 * self._item.half_size[0]
         self._world.reset(joints, {self._item.name: tool @ _IN_GRIPPER}, gripper_width=width)
-        colours = self._world.model.geom_rgba
-        before = colours.copy()
-        for name in touching:
-            colours[self._world.model.geom(name).id] = _TOUCHING
-        image = self._renderer.render(self._camera)
-        colours[:] = before
-        return image
+        return self._renderer.render(self._camera, touching=touching)
 
     def close(self) -> None:
         """Free the OpenGL context."""

@@ -13,13 +13,15 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
-from hrc_learn.geometry import Body, Box, Capsule, Pose
+from hrc_learn.geometry import Body, Box, Capsule, Pose, read_mesh
+from hrc_learn.geometry.shapes import Colour
 from hrc_learn.protocols import DrawnRegion
 from hrc_learn.teleoperation.page.page_operator import AddedTurn, HeldGizmo, HeldGizmos
 from hrc_learn.viz.palette import PERSON, SKY, TARGET, rgba
 
 # viser is imported when a page is opened, and not before.
 if TYPE_CHECKING:
+    from viser import FrameHandle as FrameHandle
     from viser import IcosphereHandle as IcosphereHandle
     from viser import MeshHandle as MeshHandle
     from viser import SceneClickEvent as SceneClickEvent
@@ -30,7 +32,7 @@ if TYPE_CHECKING:
     Holdable = MeshHandle | IcosphereHandle
 else:
     # What checks annotations while the program runs must find something.
-    IcosphereHandle = MeshHandle = Holdable = ViserServer = Any
+    FrameHandle = IcosphereHandle = MeshHandle = Holdable = ViserServer = Any
     SceneClickEvent = SceneNodeDragEvent = SceneRectSelectEvent = Any
 
 
@@ -88,9 +90,25 @@ def box_mesh(box: Box) -> Mesh:
     return Mesh(np.array(box.centre) + vertices * box.half_size, faces)
 
 
-def body_mesh(body: Body) -> Mesh:
-    """All capsules and boxes of a body as one mesh."""
-    meshes = [*map(capsule_mesh, body.capsules), *map(box_mesh, body.boxes)]
+def body_meshes(body: Body) -> dict[Colour, Mesh]:
+    """All that a body looks like, one mesh for each colour: its own meshes and the boxes with a
+    name, or else its capsules and boxes in the colour of the first.
+    """
+    if not body.meshes:
+        shapes = [*map(capsule_mesh, body.capsules), *map(box_mesh, body.boxes)]
+        return {(*body.capsules, *body.boxes)[0].colour: _joined(shapes)}
+    parts: dict[Colour, list[Mesh]] = {}
+    for file in body.meshes:
+        for part in (part.placed(file) for part in read_mesh(file.path)):
+            assert part.colour is not None  # a placed part has one
+            parts.setdefault(part.colour, []).append(Mesh(part.vertices, part.faces))
+    for box in body.boxes:
+        if box.name:
+            parts.setdefault(box.colour, []).append(box_mesh(box))
+    return {colour: _joined(meshes) for colour, meshes in parts.items()}
+
+
+def _joined(meshes: Sequence[Mesh]) -> Mesh:
     first = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
     return Mesh(
         np.concatenate([mesh.vertices for mesh in meshes]),
@@ -111,6 +129,17 @@ _KNOBS = (2, 4, 6)
 _END_EFFECTOR_PARTS = ("link7", "hand", "finger_left", "finger_right")
 """What moves with the end effector, the last link too: a drag there guides it."""
 _PERSON = rgba(PERSON)[:3]
+
+
+_TWIN: Colour = (rgba(SKY)[0] / 255, rgba(SKY)[1] / 255, rgba(SKY)[2] / 255, 0.45)
+"""Of the virtual twin, which is seen through."""
+
+
+class _DrawnBody(NamedTuple):
+    """A body on the page."""
+
+    frame: FrameHandle
+    meshes: Sequence[MeshHandle]
 
 
 class PageScene:
@@ -167,9 +196,9 @@ class PageScene:
             link = None if is_hand else re.fullmatch(r"link([1-9]\d*)", body.name)
             joint = int(link[1]) if link else None
             if is_hand or joint is not None:
-                yield own, joint, here
+                yield from ((mesh, joint, here) for mesh in own.meshes)
                 if copy is not None:
-                    yield copy, joint, self.twin
+                    yield from ((mesh, joint, self.twin) for mesh in copy.meshes)
         for joint in _KNOBS:
             yield self._knobs[joint], joint, here
             yield self._twin_knobs[joint], joint, self.twin
@@ -191,16 +220,18 @@ class PageScene:
         for own, copy, position, orientation in nodes:
             for node in (own, copy):
                 if node is not None:
-                    node.position, node.wxyz = position, orientation
+                    node.frame.position, node.frame.wxyz = position, orientation
         for knobs in (self._knobs, self._twin_knobs):
             for joint, knob in knobs.items():
                 knob.position = joints[joint - 1]
 
     def show_twin(self, visible: bool) -> None:
         """Show or hide the twin."""
-        for node in (*self._copies, *self._twin_knobs.values()):
-            if node is not None:
-                node.visible = visible
+        for copy in self._copies:
+            if copy is not None:
+                copy.frame.visible = visible
+        for knob in self._twin_knobs.values():
+            knob.visible = visible
 
     def show_region(self, region: DrawnRegion | None) -> None:
         """Show the region to which a controller takes the end effector; None: there is none."""
@@ -243,21 +274,27 @@ class PageScene:
                 head_length=0.05,
             )
 
-    def _draw(self, parent: str, body: Body) -> MeshHandle:
-        mesh = body_mesh(body)
-        red, green, blue, _ = (*body.capsules, *body.boxes)[0].colour
-        own = round(255 * red), round(255 * green), round(255 * blue)
-        return self._scene.add_mesh_simple(
-            f"{parent}/arm/{body.name}",
-            mesh.vertices,
-            mesh.faces,
-            color=rgba(SKY)[:3] if parent else own,
-            opacity=0.45 if parent else None,
-            flat_shading=False,
-            position=body.position[0],
-            wxyz=body.orientation[0],
-            cast_shadow=not parent,
+    def _draw(self, parent: str, body: Body) -> _DrawnBody:
+        path = f"{parent}/arm/{body.name}"
+        frame = self._scene.add_frame(
+            path, position=body.position[0], wxyz=body.orientation[0], show_axes=False
         )
+        shapes = body_meshes(body)
+        if parent:
+            shapes = {_TWIN: _joined([*shapes.values()])}
+        meshes = [
+            self._scene.add_mesh_simple(
+                f"{path}/{k}",
+                mesh.vertices,
+                mesh.faces,
+                color=(round(255 * red), round(255 * green), round(255 * blue)),
+                opacity=opacity if opacity < 1 else None,
+                flat_shading=False,
+                cast_shadow=not parent,
+            )
+            for k, ((red, green, blue, opacity), mesh) in enumerate(shapes.items())
+        ]
+        return _DrawnBody(frame, meshes)
 
     def _draw_knob(self, parent: str, joint: int) -> IcosphereHandle:
         return self._scene.add_icosphere(
