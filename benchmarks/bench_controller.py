@@ -229,12 +229,12 @@ def _mink_call() -> Callable[[], object]:
     import mink  # pyright: ignore[reportMissingImports]
     import mujoco
 
-    from hrc_learn.sim import PandaModelConfig
-    from hrc_learn.sim.panda_model import add_panda
+    from hrc_learn.sim import ArmModelConfig
+    from hrc_learn.sim.arm_model import add_arm
 
     spec = mujoco.MjSpec()  # pyright: ignore[reportAttributeAccessIssue]
     spec.compiler.degree = False
-    add_panda(spec, PandaModelConfig())
+    add_arm(spec, ArmModelConfig())
     model = spec.compile()
     configuration = mink.Configuration(model)
     q = configuration.q.copy()

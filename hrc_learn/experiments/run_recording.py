@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from hrc_learn.demos import Demonstration
 from hrc_learn.geometry import Box, Pose, quaternion
-from hrc_learn.kinematics import panda
+from hrc_learn.kinematics import SerialChain, panda
 from hrc_learn.sim import MotionLog, Touch, World
 from hrc_learn.skills.pick_and_place import INTERACT, TRANSFER
 from hrc_learn.skills.placing import Plan
@@ -78,9 +78,9 @@ def body_poses(motion: MotionLog, name: str, steps: int) -> Pose:
     return Pose(torch.from_numpy(body.position), torch.from_numpy(body.orientation))
 
 
-def link_poses(log: LoggedSteps) -> Pose:
+def link_poses(log: LoggedSteps, chain: SerialChain = panda) -> Pose:
     """Poses of the joint frames, the flange and the tool at every step, (time, links)."""
-    return panda.link_poses(torch.from_numpy(log["joint_position"]))
+    return chain.link_poses(torch.from_numpy(log["joint_position"]))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -131,7 +131,7 @@ def limit_violations(cell: WorkCell) -> int:
         return 0
     q = torch.from_numpy(cell.log["joint_position"])
     v = torch.from_numpy(cell.log["joint_velocity"])
-    limits = panda.limits
+    limits = cell.chain.limits
     outside = (q < limits.lower) | (q > limits.upper) | (v.abs() > limits.velocity)
     return int(outside.any(dim=-1).sum())
 
@@ -171,8 +171,9 @@ def unwanted_contacts(
     }
 
 
-PANDA_LIMITS = JointLimits(lower=panda.limits.lower.numpy(), upper=panda.limits.upper.numpy())
-"""To be drawn beside joint positions."""
+def drawn_limits(chain: SerialChain) -> JointLimits:
+    """Limits of an arm, to be drawn beside its joint positions."""
+    return JointLimits(lower=chain.limits.lower.numpy(), upper=chain.limits.upper.numpy())
 
 
 def record(
@@ -210,9 +211,9 @@ def record(
     return RunRecording(
         title=title,
         time=time,
-        joint_names=panda.joint_names,
+        joint_names=cell.chain.joint_names,
         joint_position=log["joint_position"],
-        joint_limits=PANDA_LIMITS,
+        joint_limits=drawn_limits(cell.chain),
         demo_joint_position=_matching_demonstration(log, plans, demonstration),
         position=true_tool(motion, world, len(log)).position.numpy(),
         demo_path=None if demonstration is None else demonstration.position,

@@ -51,6 +51,7 @@ class CapsuleArm:
         capsules: Of its links.
         links: Number of the link of each capsule.
         radius: Of each capsule [m].
+        overlapping: Pairs of links that overlap by design, besides neighbours.
     """
 
     def __init__(
@@ -68,7 +69,7 @@ class CapsuleArm:
         """
         self.chain = chain
         self.capsules = tuple(capsules)
-        self._overlapping = tuple(overlapping)
+        self.overlapping = tuple(overlapping)
         self.links = tuple(capsule.link for capsule in capsules)
         ends = [[capsule.start, capsule.end] for capsule in capsules]
         self._ends = Constant(torch.tensor(ends, dtype=torch.float64))
@@ -91,7 +92,7 @@ class CapsuleArm:
 
     def with_capsules(self, more: Sequence[LinkCapsule]) -> CapsuleArm:
         """The same arm with further capsules, such as of what is mounted on its hand."""
-        return CapsuleArm(self.chain, (*self.capsules, *more), self._overlapping)
+        return CapsuleArm(self.chain, (*self.capsules, *more), self.overlapping)
 
     def segments(
         self,

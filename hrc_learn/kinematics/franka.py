@@ -238,7 +238,7 @@ LINK_CAPSULES = tuple(
 """Of the links of either arm; the simulated one is built from the same."""
 
 # The hand is a box of 60 x 200 x 66 mm, which this contains, and so are the open fingers.
-_HAND_CAPSULES = (
+HAND_CAPSULES = (
     LinkCapsule(
         link=TOOL_LINK, start=(0.0, -0.08, -0.0704), end=(0.0, 0.08, -0.0704), radius=0.05
     ),
@@ -248,13 +248,13 @@ _HAND_CAPSULES = (
 )
 # Links whose capsules overlap by design although they are no neighbours. The flange (8) has
 # none, so the hand follows link 7.
-_OVERLAPPING = ((0, 2), (1, 3), (3, 5), (5, 7), (6, TOOL_LINK), (7, TOOL_LINK))
+OVERLAPPING = ((0, 2), (1, 3), (3, 5), (5, 7), (6, TOOL_LINK), (7, TOOL_LINK))
 
-panda_capsules = CapsuleArm(panda, LINK_CAPSULES + _HAND_CAPSULES, _OVERLAPPING)
+panda_capsules = CapsuleArm(panda, LINK_CAPSULES + HAND_CAPSULES, OVERLAPPING)
 """The Panda with its hand."""
 
-panda_body = CapsuleArm(panda, LINK_CAPSULES, _OVERLAPPING)
+panda_body = CapsuleArm(panda, LINK_CAPSULES, OVERLAPPING)
 """Without the hand, which a task takes near to things on purpose."""
 
-fr3_capsules = CapsuleArm(fr3, LINK_CAPSULES + _HAND_CAPSULES, _OVERLAPPING)
+fr3_capsules = CapsuleArm(fr3, LINK_CAPSULES + HAND_CAPSULES, OVERLAPPING)
 """The Research 3 with its hand."""

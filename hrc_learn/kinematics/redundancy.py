@@ -182,6 +182,19 @@ def comfortable_postures(
             f"no posture within the joint limits brings the tool to {pose.position.tolist()} m "
             f"with orientation {pose.orientation.tolist()}; move the goal towards the arm"
         )
+    return best_postures(chain, solutions).to(pose.position)
+
+
+def best_postures(
+    chain: SerialChain, solutions: Float[Tensor, "solutions n"]
+) -> Float[Tensor, "postures n"]:
+    """Those of several joint positions that differ, the most comfortable one first.
+
+    Args:
+        chain: The arm.
+        solutions: One or more joint positions [rad].
+    """
+    lower, upper = chain.limits.lower, chain.limits.upper
     distance = torch.minimum(solutions - lower, upper - solutions).amin(-1)
     smallest = torch.linalg.svdvals(chain.jacobian(solutions))[:, -1]
     room = (distance / _GOOD_DISTANCE).clamp(max=1)
@@ -190,7 +203,7 @@ def comfortable_postures(
     for posture in solutions[score.argsort(descending=True, stable=True)]:
         if all(torch.linalg.vector_norm(posture - other) > _ALIKE for other in chosen):
             chosen.append(posture)
-    return torch.stack(chosen).to(pose.position)
+    return torch.stack(chosen)
 
 
 def clear_posture(

@@ -1,5 +1,9 @@
 """The workplace in MuJoCo: arm, furniture, objects, cameras, contacts."""
 
+from hrc_learn.sim.arm_model import FINGER_STROKE as FINGER_STROKE
+from hrc_learn.sim.arm_model import ArmModelConfig as ArmModelConfig
+from hrc_learn.sim.arm_model import Plate as Plate
+from hrc_learn.sim.arm_model import whole_arm as whole_arm
 from hrc_learn.sim.cameras import Arrow as Arrow
 from hrc_learn.sim.cameras import CameraChange as CameraChange
 from hrc_learn.sim.cameras import CameraKind as CameraKind
@@ -15,10 +19,6 @@ from hrc_learn.sim.imperfections import DrawnImperfections as DrawnImperfections
 from hrc_learn.sim.imperfections import Imperfections as Imperfections
 from hrc_learn.sim.moving_bodies import MotionLog as MotionLog
 from hrc_learn.sim.moving_bodies import MovingBodies as MovingBodies
-from hrc_learn.sim.panda_model import FINGER_STROKE as FINGER_STROKE
-from hrc_learn.sim.panda_model import PandaModelConfig as PandaModelConfig
-from hrc_learn.sim.panda_model import Plate as Plate
-from hrc_learn.sim.panda_model import whole_arm as whole_arm
 from hrc_learn.sim.physics_watch import PhysicsError as PhysicsError
 from hrc_learn.sim.scene import HAND_MARKER as HAND_MARKER
 from hrc_learn.sim.scene import NOWHERE as NOWHERE

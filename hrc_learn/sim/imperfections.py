@@ -14,7 +14,6 @@ import numpy as np
 from jaxtyping import Float
 
 from hrc_learn.controller import SafetyConfig, SeparationConfig
-from hrc_learn.kinematics import panda
 from hrc_learn.vision import ImageNoise
 
 # pyright: reportAttributeAccessIssue=false
@@ -251,8 +250,9 @@ class DrawnImperfections:
                 conaffinity=0,
                 group=5,
             )
-        for name in panda.joint_names:
-            joint = spec.joint(name)
+        for joint in spec.joints:
+            if joint.type != mujoco.mjtJoint.mjJNT_HINGE:  # fingers slide, objects are free
+                continue
             joint.frictionloss = self.sizes.joint_friction
             joint.parent.gravcomp = 1.0 + self.gravity_error
 

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hrc_learn.protocols import ArmState
-from hrc_learn.sim.panda_model import FINGER_STROKE
+from hrc_learn.sim.arm_model import FINGER_STROKE
 from hrc_learn.sim.world import World
 
 if TYPE_CHECKING:

@@ -12,12 +12,12 @@ import mujoco
 import numpy as np
 
 from hrc_learn.geometry import Box
-from hrc_learn.sim.panda_model import (
+from hrc_learn.sim.arm_model import (
     FIRM,
-    PandaModelConfig,
+    ArmModelConfig,
     Plate,
+    add_arm,
     add_box,
-    add_panda,
     add_plate,
 )
 from hrc_learn.sim.worker import COLOURS, PARTS, WORKER_ITEM_HALF_SIZE, Worker, WorkerConfig
@@ -128,7 +128,7 @@ def overhead_camera() -> CameraModel:
     )
 
 
-def _marked_arm() -> PandaModelConfig:
+def _marked_arm() -> ArmModelConfig:
     # The plate sticks out sideways, clear of the forearm as seen from above, and is mounted off
     # the middle: it is as wide as objects are, and must not be the first to meet a board.
     plate = Plate(
@@ -136,14 +136,14 @@ def _marked_arm() -> PandaModelConfig:
         position=(-0.008, 0.145, 0.02),
         orientation=(0.0, 1.0, 0.0, 0.0),
     )
-    return PandaModelConfig(marker=plate)
+    return ArmModelConfig(marker=plate)
 
 
 @dataclass(frozen=True, kw_only=True)
 class SceneConfig:
     """Everything that stands in the workplace."""
 
-    arm: PandaModelConfig = field(default_factory=_marked_arm)
+    arm: ArmModelConfig = field(default_factory=_marked_arm)
     table: Box = _TABLE
     cabinet: CabinetConfig = field(default_factory=CabinetConfig)
     objects: tuple[ObjectConfig, ...] = (ObjectConfig(),)
@@ -171,7 +171,7 @@ def build_scene(config: SceneConfig) -> mujoco.MjSpec:
     spec.modelname = "hrc_learn workplace"
     _set_options(spec, config)
     _add_surroundings(spec)
-    add_panda(spec, config.arm)
+    add_arm(spec, config.arm)
     for box in config.boxes():
         _add_box(spec, box)
     for obstacle in config.obstacles:

@@ -11,12 +11,12 @@ from torch import Tensor
 from hrc_learn.geometry import Pose
 from hrc_learn.geometry.numerics import Constant
 from hrc_learn.kinematics import (
+    PANDA,
+    UnreachableError,
+    WorkArm,
     coarse_orientation,
-    comfortable_postures,
     gripper_down,
     panda,
-    panda_body,
-    panda_capsules,
 )
 from hrc_learn.kinematics.tool_orientation import Approach
 from hrc_learn.sim.scene import HAND_MARKER, SceneConfig
@@ -29,6 +29,9 @@ def _vector(*values: float) -> Float[Tensor, " n"]:
 # Upper arm forward: the branch in which joint 1 keeps clear of its limits on both sides.
 _LEANING_FORWARD = _vector(1.0, 0.3, -1.2, -1.8, 0.3, 1.9, -1.0)
 
+
+# Postures at home that are looked at, and what an awkward one costs [rad of motion].
+_POSTURES, _PENALTY = 12, 4.0
 
 # Half the hand's thickness, and what is left under it for errors of base and encoders [m].
 _HAND_HALF, _OVER_BOARD = 0.030, 0.006
@@ -70,6 +73,11 @@ class Workplace:
     """Distance in front of the boards from which the end effector moves straight in [m]."""
 
     @property
+    def robot(self) -> WorkArm:
+        """The arm that works there."""
+        return self.scene.arm.robot
+
+    @property
     def tool_marker(self) -> int:
         """ArUco number of the marker on the end effector."""
         return HAND_MARKER
@@ -80,7 +88,7 @@ class Workplace:
 
     def home_joints(
         self, offset: Float[Tensor, "3"] | None = None, q7_offset: float = 0.0
-    ) -> Float[Tensor, "7"]:
+    ) -> Float[Tensor, " joints"]:
         """Joint positions at home.
 
         Args:
@@ -94,7 +102,9 @@ class Workplace:
         home = self.home()
         if offset is not None:
             home = Pose(home.position + offset, home.orientation)
-        return panda.inverse(home, self.home_q7 + q7_offset, near=_LEANING_FORWARD)
+        if self.robot is PANDA:
+            return panda.inverse(home, self.home_q7 + q7_offset, near=_LEANING_FORWARD)
+        return self.robot.nearest(home, near=self._home_posture)
 
     def hover(self) -> Pose:
         """End effector above the middle of the table."""
@@ -108,16 +118,55 @@ class Workplace:
         w, x, y, z = approach.orientation.tolist()
         return replace(self, hover_orientation=(w, x, y, z))
 
-    def hover_joints(self) -> Float[Tensor, "7"]:
+    def hover_joints(self) -> Float[Tensor, " joints"]:
         """Joint positions above the table, with the upper arm well off the vertical.
 
         Where it is upright, the axes of joints 1 and 3 coincide, and nobody can pull the elbow.
         """
-        return panda.inverse(self.hover(), self.hover_q7, near=_LEANING_FORWARD)
+        if self.robot is PANDA:
+            return panda.inverse(self.hover(), self.hover_q7, near=_LEANING_FORWARD)
+        return self.robot.nearest(self.hover(), near=self._home_posture)
 
-    def hover_postures(self) -> list[Float[Tensor, "7"]]:
+    @cached_property
+    def _home_posture(self) -> Float[Tensor, " joints"]:
+        """Of the postures at home, the one from which the arm gets on with its work best.
+
+        It needs a posture above the table and one at each shelf, all near to one another, and
+        each clear of the furniture and away from limits and singularities.
+        """
+        goals = [self.hover(), *(self.shelf_front(name) for name in self.shelf_names())]
+        goals += [self.shelf(name) for name in self.shelf_names()]
+        best, least = None, np.inf
+        for posture in self.robot.postures(self.home())[:_POSTURES]:
+            q, cost = posture, self._awkwardness(posture)
+            for goal in goals:
+                try:
+                    after = self.robot.nearest(goal, near=posture)
+                except UnreachableError:
+                    cost = np.inf
+                    break
+                cost += float((after - q).abs().max()) + self._awkwardness(after)
+            if cost < least:
+                best, least = posture, cost
+        if best is None:
+            raise UnreachableError(
+                f"the {self.robot.name} does not reach table, home and shelves in one posture: "
+                "move them towards it."
+            )
+        return best
+
+    def _awkwardness(self, q: Float[Tensor, " joints"]) -> float:
+        """How near a posture is to furniture, limits and singularities; 0: far from all."""
+        limits, chain = self.robot.chain.limits, self.robot.chain
+        room = float(torch.minimum(q - limits.lower, limits.upper - q).min())
+        smallest = float(torch.linalg.svdvals(chain.jacobian(q))[-1])
+        near = float(self.arm_clearance(q))
+        wanted = ((room, 0.3), (smallest, 0.15), (near, 0.05))  # [rad], [m/rad], [m]
+        return sum(_PENALTY * max(0.0, 1.0 - value / good) for value, good in wanted)
+
+    def hover_postures(self) -> list[Float[Tensor, " joints"]]:
         """Joint positions above the table, the preferred ones first."""
-        return [self.hover_joints(), *comfortable_postures(panda, self.hover())]
+        return [self.hover_joints(), *self.robot.postures(self.hover())]
 
     def object_region(self) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
         """Box in which objects may be on the table: centre and half edges [m]."""
@@ -125,16 +174,17 @@ class Workplace:
         half = _vector(*self.table_reach, highest / 2)
         return _vector(*self.table_centre, highest / 2), half
 
-    def arm_clearance(self, q: Float[Tensor, "*batch 7"]) -> Float[Tensor, "*batch"]:
+    def arm_clearance(self, q: Float[Tensor, "*batch joints"]) -> Float[Tensor, "*batch"]:
         """Distance of the arm from the furniture, its hand apart, and from itself [m].
 
         Args:
             q: Joint position [rad].
         """
         centre, half_size = self._furniture.like(q).split(3, dim=-1)
-        frames = panda.link_frames(q)
-        furniture = panda_body.box_distance(q, centre, half_size, frames)
-        return torch.minimum(furniture, panda_capsules.self_distance(q, frames))
+        robot = self.robot
+        frames = robot.chain.link_frames(q)
+        furniture = robot.body.box_distance(q, centre, half_size, frames)
+        return torch.minimum(furniture, robot.whole.self_distance(q, frames))
 
     @cached_property
     def _furniture(self) -> Constant:

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from hrc_learn.protocols import ArmState, OpenedArm
+from hrc_learn.sim.arm_model import FINGER_STROKE, MujocoArm, frame_of
 from hrc_learn.sim.imperfections import DrawnImperfections, Imperfections
-from hrc_learn.sim.panda_model import FINGER_STROKE, MujocoArm, frame_of
 from hrc_learn.sim.physics_watch import PhysicsWatch
 from hrc_learn.sim.scene import (
     HAND_MARKER,
@@ -153,12 +153,14 @@ class World:
             imperfections: How what there is departs from that; None: in nothing.
         """
         self.config = config or SceneConfig()
-        self.imperfections = imperfections or Imperfections().draw(np.random.default_rng(0))
+        self.imperfections = imperfections or Imperfections().draw(
+            np.random.default_rng(0), (config or SceneConfig()).arm.robot.joints
+        )
         self.config = _as_it_is(self.config, self.imperfections)
         self.model = self.describe().compile()
         self.data = mujoco.MjData(self.model)
         self._watch = PhysicsWatch(self.model, self.data)
-        self.arm = MujocoArm(self.model, self.data, self.imperfections)
+        self.arm = MujocoArm(self.model, self.data, self.imperfections, self.config.arm.robot)
         obstacles = [box.name for box in self.config.obstacles]
         cabinet = [box.name for box in self.config.cabinet.boxes()] + obstacles
         self.cabinet_contacts = ContactMonitor(self.model, _ARM_BODIES, cabinet)
@@ -204,7 +206,7 @@ class World:
 
     def reset(
         self,
-        joint_position: Float[np.ndarray, "7"],
+        joint_position: Float[np.ndarray, " joints"],
         objects: Mapping[str, Float[np.ndarray, "4 4"]] | None = None,
         gripper_width: float = 2 * FINGER_STROKE,
     ) -> None:
@@ -252,7 +254,7 @@ class World:
             for monitor in self._monitors:
                 monitor.pause()
 
-    def hold(self, name: str, joint_position: Float[np.ndarray, "7"]) -> None:
+    def hold(self, name: str, joint_position: Float[np.ndarray, " joints"]) -> None:
         """Reset with an object between the fingers, the grip settled.
 
         Args:
@@ -411,7 +413,7 @@ class World:
         return (to_tool @ marker)[:3, 3]
 
     def collisions_along(
-        self, path: Float[np.ndarray, "steps 7"], carried: str | None = None
+        self, path: Float[np.ndarray, "steps joints"], carried: str | None = None
     ) -> list[Touch]:
         """Touches of arm and cabinet, table or itself along a path of joint positions.
 

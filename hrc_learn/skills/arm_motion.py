@@ -22,10 +22,10 @@ from hrc_learn.controller import (
 from hrc_learn.geometry import Pose, minimum_jerk, quaternion
 from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import (
+    PANDA,
     SINGULAR_BELOW,
     SerialChain,
-    UnreachableError,
-    panda,
+    WorkArm,
     pseudo_inverse,
     singularity_damping,
 )
@@ -289,40 +289,20 @@ def joint_line(
 
 
 def nearest_configuration(
-    goal: Pose, near: Float[Tensor, "7"], samples: int = 57
-) -> Float[Tensor, "7"]:
+    goal: Pose, near: Float[Tensor, " joints"], samples: int = 57, robot: WorkArm = PANDA
+) -> Float[Tensor, " joints"]:
     """Joint positions that reach a pose, as near as can be to given ones.
-
-    Scans joint 7, the redundant one, and keeps the best of the analytic solutions.
 
     Args:
         goal: Pose of the tool centre point.
         near: Joint positions [rad].
-        samples: Values of joint 7 tried between its limits.
+        samples: Solutions sought among, where there are any number of them.
+        robot: The arm.
 
     Raises:
-        UnreachableError: If no value of joint 7 reaches the pose within the limits.
+        UnreachableError: No joint positions within the limits reach the pose.
     """
-    lower, upper = float(panda.limits.lower[6]), float(panda.limits.upper[6])
-    # A little inside the limits, where the arm can still be corrected.
-    candidates = torch.linspace(lower + 0.02, upper - 0.02, samples, dtype=torch.float64)
-    candidates = torch.cat([near[6:7], candidates])
-    best, distance = None, math.inf
-    for q7 in candidates:
-        try:
-            q = panda.inverse(goal, q7, near=near)
-        except UnreachableError:
-            continue
-        if (d := float((q - near).norm())) < distance:
-            best, distance = q, d
-    if best is None:
-        x, y, z = goal.position.tolist()
-        w = [round(v, 3) for v in quaternion.normalize(goal.orientation).tolist()]
-        raise UnreachableError(
-            f"no joint positions within the limits reach position ({x:.3f}, {y:.3f}, {z:.3f}) "
-            f"m with orientation {w} (wxyz): move the goal towards the robot or turn it."
-        )
-    return best
+    return robot.nearest(goal, near, samples)
 
 
 def joints_near(

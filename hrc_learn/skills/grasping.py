@@ -18,8 +18,8 @@ from torch import Tensor
 from hrc_learn.controller import AdaptiveController, ControllerConfig, Goals
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import ImageJacobianEstimator
-from hrc_learn.kinematics import GraspedBox, UnreachableError, panda_capsules
-from hrc_learn.skills.arm_motion import joint_line, nearest_configuration
+from hrc_learn.kinematics import GraspedBox, UnreachableError
+from hrc_learn.skills.arm_motion import joint_line
 from hrc_learn.skills.placing import Plan
 from hrc_learn.skills.visual_servoing import (
     ServoTarget,
@@ -263,10 +263,12 @@ class Grasping:
         """
         here = self._cell.joints
         try:
-            posture = nearest_configuration(pose, near=here, samples=_POSTURES)
+            posture = self._workplace.robot.nearest(pose, near=here, samples=_POSTURES)
         except UnreachableError:
             return "the arm does not reach there with this orientation"
-        table = panda_capsules.box_distance(posture, *self._workplace.object_region())
+        table = self._workplace.robot.whole.box_distance(
+            posture, *self._workplace.object_region()
+        )
         if float(table) < _PLATE_CLEARANCE:
             return "too near to what may stand on the table"
         try:
@@ -361,7 +363,8 @@ class Grasping:
         if clearance is None:
             return True
         path = torch.from_numpy(plan.path[::_CHECK_EVERY])
-        distance = panda_capsules.box_distance(path, *self._workplace.object_region())
+        whole = self._workplace.robot.whole
+        distance = whole.box_distance(path, *self._workplace.object_region())
         return bool((distance > clearance).all())
 
     def start_over(self) -> None:
@@ -381,7 +384,7 @@ def joint_plan(
     """A straight line in joint space as a plan for a work cell."""
     dt = cell.config.dt
     path = joint_line(start, goal, speed=JOINT_SPEED, dt=dt)
-    return Plan(goal=cell.chain.forward(goal), dt=dt, path=path.numpy())
+    return Plan(goal=cell.chain.forward(goal), dt=dt, path=path.numpy(), chain=cell.chain)
 
 
 def as_load(item: GraspObject) -> GraspedBox:

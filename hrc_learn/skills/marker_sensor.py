@@ -10,7 +10,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from hrc_learn.geometry import Pose
-from hrc_learn.kinematics import panda
+from hrc_learn.kinematics import SerialChain, panda
 from hrc_learn.protocols import Camera, TimedCamera
 from hrc_learn.vision import MarkerDetector, centre
 from hrc_learn.viz import StepLog
@@ -117,17 +117,20 @@ _OVER_TABLE = 0.22
 its marker [m]: the camera's view reaches about 0.25 m to each side."""
 
 
-def longest_occlusion(log: StepLog, middle: Pose, since: float) -> float:
+def longest_occlusion(
+    log: StepLog, middle: Pose, since: float, chain: SerialChain = panda
+) -> float:
     """Longest time without a detection while the end effector was over the table [s].
 
     Args:
         log: Of a work cell.
         middle: Of the end effector above the middle of the table.
         since: Steps from this time on count [s].
+        chain: The arm.
     """
     time = log["time"]
     rows = time >= since
-    position = panda.forward(torch.from_numpy(log["joint_position"][rows])).position
+    position = chain.forward(torch.from_numpy(log["joint_position"][rows])).position
     over_table = ((position - middle.position).norm(dim=-1) < _OVER_TABLE).numpy()
     occluded = over_table & np.isnan(log["feature"][rows, 0])
     # Rising and falling edges alternate: their distances are the lengths in steps.

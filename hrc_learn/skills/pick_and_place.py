@@ -23,7 +23,6 @@ from enum import StrEnum
 from typing import Literal
 
 from hrc_learn.geometry import Pose
-from hrc_learn.skills.arm_motion import nearest_configuration
 from hrc_learn.skills.grasping import (
     DESCENT_SPEED,
     OPEN,
@@ -261,7 +260,7 @@ class PickAndPlace:
 
     def _new_job(self, item: GraspObject, shelf: str) -> PickPlaceJob:
         goal = self._workplace.shelf(shelf, item.half_size)
-        nearest_configuration(goal, near=self._placing.joint.goal)
+        self._placing.robot.nearest(goal, near=self._placing.joint.goal)
         return PickPlaceJob(item=item, shelf=shelf, goal=goal)
 
     def _deliver(self, job: PickPlaceJob) -> None:
@@ -293,7 +292,9 @@ class PickAndPlace:
             job.servo_time = self._grasping.servo_to(job.target)
         except MissedGraspError as error:
             return self._start_over(job, "marker occluded", str(error))
-        occluded = longest_occlusion(self._cell.log, self._workplace.hover(), start)
+        occluded = longest_occlusion(
+            self._cell.log, self._workplace.hover(), start, self._cell.chain
+        )
         if occluded > _NEGLIGIBLE:
             self._note(job, "marker occluded", f"held the end effector for {occluded:.1f} s")
         return Phase.INTERACT if job.time_for_person > 0 else Phase.GRASP

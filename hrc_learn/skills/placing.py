@@ -20,14 +20,16 @@ from torch import Tensor
 from hrc_learn.dmp import JointDMP, PoseDMP
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import (
+    PANDA,
     SerialChain,
     UnreachableError,
+    WorkArm,
     arm_angle,
     arm_angle_and_motion,
     panda,
 )
 from hrc_learn.regions import JointRegion
-from hrc_learn.skills.arm_motion import joint_line, nearest_configuration, resolved_rate
+from hrc_learn.skills.arm_motion import joint_line, resolved_rate
 from hrc_learn.skills.work_cell import BlockedPathError
 from hrc_learn.skills.workplace import CollisionChecker, Workplace
 
@@ -45,13 +47,15 @@ class Plan:
     """Where the end effector should end."""
     dt: float
     """[s]"""
-    path: Float[np.ndarray, "steps 7"]
+    path: Float[np.ndarray, "steps joints"]
     """Joint positions [rad]."""
+    chain: SerialChain = panda
+    """The arm."""
 
     @property
     def tool_pose(self) -> Pose:
         """Pose of the end effector along the path."""
-        return panda.forward(torch.from_numpy(self.path))
+        return self.chain.forward(torch.from_numpy(self.path))
 
     @property
     def duration(self) -> float:
@@ -95,32 +99,42 @@ class PlacingSkill:
     joint: JointDMP
     """Motion of the joints."""
     pose: PoseDMP
-    """Motion of the end effector together with the arm angle, its null-space posture."""
+    """Motion of the end effector together with the arm angle, its null-space posture, of an arm
+    that has one."""
+    robot: WorkArm = PANDA
+    """The arm that they are of."""
 
     @classmethod
-    def load(cls, folder: Path) -> "PlacingSkill":
+    def load(cls, folder: Path, robot: WorkArm = PANDA) -> "PlacingSkill":
         """Read what `hrc fit` wrote.
+
+        Args:
+            folder: With the primitives.
+            robot: The arm that is to do it.
 
         Raises:
             FileNotFoundError: If the folder holds no primitives.
-            ValueError: If they are not of a Panda, or hold no poses.
+            ValueError: If they are of another arm, or hold no poses.
         """
         joint = JointDMP.load(folder / "joint").double()
-        if joint.joint_names != panda.joint_names:
+        names = robot.chain.joint_names
+        if joint.joint_names != names:
             raise ValueError(
-                f"{folder / 'joint'} moves the joints {joint.joint_names}, but the arm has "
-                f"{panda.joint_names}: fit demonstrations of this arm."
+                f"{folder / 'joint'} moves the joints {joint.joint_names}, but the "
+                f"{robot.name} has {names}: fit demonstrations of this arm, or name with "
+                "--robot the one that they are of."
             )
         if not (folder / "pose").is_dir():
             raise ValueError(
                 f"{folder} holds no pose primitive: its demonstrations had no end-effector "
                 "pose. Record it (columns ee.x ... ee.wz), then fit again."
             )
-        return cls(joint=joint, pose=PoseDMP.load(folder / "pose").double())
+        pose = PoseDMP.load(folder / "pose").double()
+        return cls(joint=joint, pose=pose, robot=robot)
 
     def plan(
         self,
-        start: Float[Tensor, "7"],
+        start: Float[Tensor, " joints"],
         goal: Pose,
         *,
         space: PlanningSpace,
@@ -140,9 +154,10 @@ class PlacingSkill:
             UnreachableError: If no joint positions reach the goal.
         """
         # Of both spaces: a goal out of reach is refused before anything is planned.
-        end = nearest_configuration(goal, near=self.joint.goal)
+        end = self.robot.nearest(goal, near=self.joint.goal)
         duration = float(self.joint.duration) / speed
         time = torch.arange(0.0, duration + dt / 2, dt, dtype=torch.float64)
+        chain, has_angle = self.robot.chain, self.robot.null_space == "arm angle"
         with torch.no_grad():
             if space == "joint":
                 still = torch.zeros_like(start)
@@ -152,25 +167,25 @@ class PlacingSkill:
             else:
                 motion = self.pose.rollout(
                     time,
-                    start=panda.forward(start),
+                    start=chain.forward(start),
                     goal=goal,
                     duration=duration,
                     start_velocity=torch.zeros(6, dtype=time.dtype),
-                    start_body=arm_angle(panda, start)[None],
+                    start_body=arm_angle(chain, start)[None] if has_angle else None,
                 )
-                angle = motion.body[:, 0]
-                path = follow_pose(panda, start, motion.pose, motion.twist, angle, dt)
-        return Plan(goal=goal, dt=dt, path=path.numpy())
+                angle = motion.body[:, 0] if has_angle else None
+                path = follow_pose(chain, start, motion.pose, motion.twist, angle, dt)
+        return Plan(goal=goal, dt=dt, path=path.numpy(), chain=chain)
 
 
 def follow_pose(
     chain: SerialChain,
-    start: Float[Tensor, "7"],
+    start: Float[Tensor, " joints"],
     poses: Pose,
     twist: Float[Tensor, "steps 6"],
-    angle: Float[Tensor, " steps"],
+    angle: Float[Tensor, " steps"] | None,
     dt: float,
-) -> Float[Tensor, "steps 7"]:
+) -> Float[Tensor, "steps joints"]:
     """Joint path that tracks poses of the end effector, and arm angles in the null space.
 
     u = J^+ (twist + k_e e) + N n (angle' + k_a (angle - angle(q))) - N xi_q, where
@@ -182,19 +197,22 @@ def follow_pose(
         start: Joint positions at the first pose [rad].
         poses: Desired poses of the end effector, (steps,).
         twist: Its desired motion (linear [m/s], angular [rad/s]).
-        angle: Desired arm angles, continuous [rad].
+        angle: Desired arm angles, continuous [rad]; None: the joint limits alone move the null
+            space, if there is one.
         dt: Time between samples [s].
     """
     limits = JointRegion.from_limits(chain.limits.lower, chain.limits.upper)
-    rate = torch.gradient(angle, spacing=dt)[0]
+    rate = None if angle is None else torch.gradient(angle, spacing=dt)[0]
     q, path = start, [start]
-    for k in range(len(angle) - 1):
+    for k in range(len(twist) - 1):
         pose, J = chain.forward_and_jacobian(q)
         desired = twist[k] + _POSE_GAIN * pose.twist_to(poses[k])
-        measured, motion = arm_angle_and_motion(chain, q, J)
-        # The shorter way around the circle.
-        error = torch.remainder(angle[k] - measured + torch.pi, 2 * torch.pi) - torch.pi
-        null_velocity = motion * (rate[k] + _ANGLE_GAIN * error) - limits.gradient(q)
+        null_velocity = -limits.gradient(q)
+        if angle is not None and rate is not None:
+            measured, motion = arm_angle_and_motion(chain, q, J)
+            # The shorter way around the circle.
+            error = torch.remainder(angle[k] - measured + torch.pi, 2 * torch.pi) - torch.pi
+            null_velocity = motion * (rate[k] + _ANGLE_GAIN * error) + null_velocity
         q = q + dt * resolved_rate(J, desired, null_velocity)
         path.append(q)
     return torch.stack(path)
@@ -211,13 +229,13 @@ def check_plan(plan: Plan, world: CollisionChecker, carried: str | None = None) 
     Raises:
         BlockedPathError: Otherwise; tells what and where.
     """
-    limits = panda.limits
+    limits, names = plan.chain.limits, plan.chain.joint_names
     path = torch.from_numpy(plan.path)
     outside = (path < limits.lower) | (path > limits.upper)
     if bool(outside.any()):
         k, joint = (int(i) for i in outside.nonzero()[0])
         raise BlockedPathError(
-            f"the plan leaves the range of {panda.joint_names[joint]} after {k * plan.dt:.1f} "
+            f"the plan leaves the range of {names[joint]} after {k * plan.dt:.1f} "
             f"s, at {float(path[k, joint]):.3f} rad."
         )
     speed = path.diff(dim=0).abs() / plan.dt
@@ -225,7 +243,7 @@ def check_plan(plan: Plan, world: CollisionChecker, carried: str | None = None) 
     if bool(too_fast.any()):
         k, joint = (int(i) for i in too_fast.nonzero()[0])
         raise BlockedPathError(
-            f"the plan asks {panda.joint_names[joint]} for {float(speed[k, joint]):.2f} rad/s "
+            f"the plan asks {names[joint]} for {float(speed[k, joint]):.2f} rad/s "
             f"after {k * plan.dt:.1f} s, more than its {float(limits.velocity[joint]):.2f} "
             "rad/s: plan it slower."
         )
@@ -262,7 +280,7 @@ class CandidatePlan(NamedTuple):
 
 def plan_candidates(
     goal: Pose,
-    start: Float[Tensor, "7"],
+    start: Float[Tensor, " joints"],
     skill: PlacingSkill,
     workplace: Workplace,
     *,
@@ -301,11 +319,13 @@ def plan_candidates(
         yield CandidatePlan(name, replace(rest, path=path))
 
 
-def _via_postures(workplace: Workplace) -> Iterator[tuple[str, Float[Tensor, "7"]]]:
+def _via_postures(workplace: Workplace) -> Iterator[tuple[str, Float[Tensor, " joints"]]]:
     """Joint positions near home that can be reached."""
     for name, offset in _VIA_POINTS.items():
         with suppress(UnreachableError):
             yield name, workplace.home_joints(torch.tensor(offset, dtype=torch.float64))
+    if workplace.robot.null_space != "arm angle":
+        return
     for name, change in _ARM_ANGLES.items():
         with suppress(UnreachableError):
             yield name, workplace.home_joints(q7_offset=change)

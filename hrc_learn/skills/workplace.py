@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.geometry import Pose
+from hrc_learn.kinematics import WorkArm
 from hrc_learn.vision import Marker
 
 
@@ -34,6 +35,11 @@ class GraspObject(Protocol):
 @runtime_checkable
 class Workplace(Protocol):
     """Poses of a task: table, home and shelves, known roughly, in the base frame."""
+
+    @property
+    def robot(self) -> WorkArm:
+        """The arm that works there."""
+        ...
 
     @property
     def tool_marker(self) -> int:
@@ -71,17 +77,17 @@ class Workplace(Protocol):
         """End effector above the middle of the table."""
         ...
 
-    def hover_joints(self) -> Float[Tensor, "7"]:
+    def hover_joints(self) -> Float[Tensor, " joints"]:
         """Joint positions there [rad]."""
         ...
 
-    def hover_postures(self) -> Sequence[Float[Tensor, "7"]]:
+    def hover_postures(self) -> Sequence[Float[Tensor, " joints"]]:
         """Several joint positions there, the preferred ones first [rad]."""
         ...
 
     def home_joints(
         self, offset: Float[Tensor, "3"] | None = None, q7_offset: float = 0.0
-    ) -> Float[Tensor, "7"]:
+    ) -> Float[Tensor, " joints"]:
         """Joint positions at home, where a placing motion starts [rad].
 
         Args:
@@ -137,7 +143,7 @@ class CollisionChecker(Protocol):
     """A geometric model of the workplace."""
 
     def collisions_along(
-        self, path: Float[np.ndarray, "steps 7"], carried: str | None = None
+        self, path: Float[np.ndarray, "steps joints"], carried: str | None = None
     ) -> Sequence[Collision]:
         """Contacts along a path of joint positions [rad], with an object carried along."""
         ...

@@ -155,7 +155,8 @@ class PageSession:
         if self._jumps:
             world.hold(workplace.scene.objects[0].name, self._home)
         human = InputFilter(CombinedInput(page.human, *beside), self._config.input_filter)
-        self.arm = HandGuidedArm(panda, self._opened.arm, human, self._config.guiding)
+        chain = world.arm.robot.chain
+        self.arm = HandGuidedArm(chain, self._opened.arm, human, self._config.guiding)
         self._ticks, self._width = 0, None
 
     def step(self) -> GuidedStep:

@@ -14,14 +14,13 @@ import torch
 from jaxtyping import Float, UInt8
 
 from hrc_learn.controller import SafetyConfig
-from hrc_learn.kinematics import gripper_down, panda
+from hrc_learn.kinematics import gripper_down
 from hrc_learn.protocols import ArmState, Feedback, Human, HumanInput
 from hrc_learn.sim import CameraKind, Imperfections, World, open_camera
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.arm_motion import (
     PositionServo,
     PositionServoConfig,
-    nearest_configuration,
 )
 from hrc_learn.skills.grasping import CLOSED, OPEN
 from hrc_learn.skills.marker_sensor import MarkerSensor
@@ -131,7 +130,7 @@ class Grasping(Scenario):
         # On the table as it is, of an object as tall as it is.
         pose[2, 3] = world.table_top + world.config.objects[0].half_size[2]
         hover = self.workplace.hover()
-        joints = nearest_configuration(hover, near=self.workplace.hover_joints())
+        joints = self.workplace.robot.nearest(hover, near=self.workplace.hover_joints())
         world.reset(joints.numpy(), {item.name: pose})
         grasp = pose[:3, 3]
         above, lifted = (grasp + np.array([0.0, 0.0, h]) for h in (0.08, self.height))
@@ -146,7 +145,7 @@ class Grasping(Scenario):
         self, points: list[np.ndarray], duration: float, start: float, rng: np.random.Generator
     ) -> ScriptedExpert:
         return ScriptedExpert(
-            panda,
+            self.workplace.robot.chain,
             GuidedPath(np.vstack(points), duration, start),
             tremor=Tremor(self.tremor, rng),
             orientation=lambda _position, _time: gripper_down(),
@@ -231,11 +230,16 @@ class ScenarioRun:
 
     def _build(self, rng: np.random.Generator) -> None:
         """The world with imperfections as they are drawn, and who leads the arm in it."""
-        self.world = World(self.scenario.workplace.scene, self._sizes.draw(rng))
+        self.world = World(
+            self.scenario.workplace.scene,
+            self._sizes.draw(rng, self.scenario.workplace.robot.joints),
+        )
         config = PositionServoConfig(safety=self._sizes.plant(SafetyConfig()))
-        self.servo = PositionServo(panda, self.world.arm, self.dt, config)
+        self.servo = PositionServo(
+            self.scenario.workplace.robot.chain, self.world.arm, self.dt, config
+        )
 
-    def command(self, joints: Float[np.ndarray, "7"], width: float) -> np.ndarray:
+    def command(self, joints: Float[np.ndarray, " joints"], width: float) -> np.ndarray:
         """Send the joints and the gripper on their way, and let time pass.
 
         Args:

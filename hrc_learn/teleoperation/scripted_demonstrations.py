@@ -14,11 +14,10 @@ from jaxtyping import Float
 
 from hrc_learn.demos import DatasetWriter
 from hrc_learn.geometry import Pose, minimum_jerk, quaternion
-from hrc_learn.kinematics import gripper_down, panda
+from hrc_learn.kinematics import PANDA, SerialChain, WorkArm, gripper_down
 from hrc_learn.protocols import Human, OpenedArm
 from hrc_learn.sim import HAND_MARKER, Touch, World
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.arm_motion import nearest_configuration
 from hrc_learn.skills.marker_sensor import MarkerSensor
 from hrc_learn.skills.visual_skill import ANGLE_FEATURE, OBJECT_FEATURE
 from hrc_learn.skills.work_cell import TaskFailedError
@@ -70,6 +69,7 @@ def _directly(world: World) -> AbstractContextManager[OpenedArm]:
 
 
 def guided_frames(
+    chain: SerialChain,
     opened: OpenedArm,
     human: Human,
     duration: float,
@@ -79,6 +79,7 @@ def guided_frames(
     """Let a person guide the arm, and yield what is to be recorded.
 
     Args:
+        chain: The arm's kinematics.
         opened: The arm, where the demonstration starts.
         human: Gives end-effector motion and null-space input.
         duration: Of the demonstration [s].
@@ -89,7 +90,7 @@ def guided_frames(
         A frame every `record_every` control steps.
     """
     guiding = HandGuidingConfig(dt=config.dt, damping=config.damping)
-    arm = HandGuidedArm(panda, opened.arm, human, guiding)
+    arm = HandGuidedArm(chain, opened.arm, human, guiding)
     for k in range(round(duration / config.dt)):
         step = arm.step()
         if k % config.record_every == 0:
@@ -106,8 +107,9 @@ def write_demonstrations(
     features: Mapping[str, Sequence[str]] | None = None,
     details: Mapping[str, object] | None = None,
     overwrite: bool = False,
+    robot: WorkArm = PANDA,
 ) -> None:
-    """Write demonstrations of a Panda as a LeRobot dataset, one episode each, as they come.
+    """Write demonstrations of an arm as a LeRobot dataset, one episode each, as they come.
 
     Args:
         path: Folder of the dataset.
@@ -117,6 +119,7 @@ def write_demonstrations(
         features: Columns beyond the usual ones: key, and names of the components.
         details: Anything else worth keeping with the dataset.
         overwrite: Replace an older dataset in that folder.
+        robot: The arm.
 
     Raises:
         FileExistsError: If there is something at `path` that may not be replaced.
@@ -126,10 +129,10 @@ def write_demonstrations(
         DatasetWriter(
             folder,
             fps=fps,
-            robot_type="panda",
-            joint_names=panda.joint_names,
+            robot_type=robot.name,
+            joint_names=robot.chain.joint_names,
             features=features,
-            frames={"base": "panda_link0", "ee": "panda_hand_tcp"},
+            frames={"base": f"{robot.name}_link0", "ee": f"{robot.name}_hand_tcp"},
             details=details,
         ) as writer,
     ):
@@ -190,7 +193,10 @@ def servo_expert(
         return quaternion.multiply(quaternion.exp(torch.from_numpy(turn)), gripper_down())
 
     return ScriptedExpert(
-        panda, path, tremor=Tremor(config.tremor, rng), orientation=orientation
+        workplace.robot.chain,
+        path,
+        tremor=Tremor(config.tremor, rng),
+        orientation=orientation,
     )
 
 
@@ -231,7 +237,7 @@ def demonstrate_servoing(
     expert = servo_expert(workplace, above, config, rng, _turn_for(pose, workplace))
     start = torch.from_numpy(expert.path.position(0.0))
     goal = Pose(start, expert.orientation(start, 0.0))
-    q = nearest_configuration(goal, near=workplace.hover_joints())
+    q = workplace.robot.nearest(goal, near=workplace.hover_joints())
     world.reset(q.numpy(), {item.name: pose})
     last = np.zeros((4, 2))
 
@@ -248,7 +254,9 @@ def demonstrate_servoing(
 
     duration = config.duration + config.settle
     with open_arm(world) as opened:
-        return list(guided_frames(opened, expert, duration, config, observe))
+        return list(
+            guided_frames(world.arm.robot.chain, opened, expert, duration, config, observe)
+        )
 
 
 def _turn_for(pose: Float[np.ndarray, "4 4"], workplace: Workplace) -> float:
@@ -302,10 +310,12 @@ def placing_expert(
     inside = goal + 0.3 * (front - goal)
     start = workplace.home().position + config.spread * torch.from_numpy(rng.standard_normal(3))
     waypoints = torch.stack([start, front + lifted, inside + lifted, goal]).numpy()
+    # Whose elbow is where it has to be, once the hand is, cannot be pulled aside.
+    pulled = config.pull_elbow and workplace.robot.null_space == "arm angle"
     return ScriptedExpert(
-        panda,
+        workplace.robot.chain,
         GuidedPath(waypoints, config.duration),
-        forces=ELBOW_FORCES if config.pull_elbow else (),
+        forces=ELBOW_FORCES if pulled else (),
         tremor=Tremor(config.tremor, rng),
     )
 
@@ -335,7 +345,8 @@ def demonstrate_placing(
     offset = torch.from_numpy(expert.path.position(0.0)) - workplace.home().position
     world.hold(workplace.scene.objects[0].name, workplace.home_joints(offset).numpy())
     with open_arm(world) as opened:
-        frames = list(guided_frames(opened, expert, config.duration + config.settle, config))
+        duration = config.duration + config.settle
+        frames = list(guided_frames(world.arm.robot.chain, opened, expert, duration, config))
     return frames, world.cabinet_contacts.touches + world.object_contacts.touches
 
 

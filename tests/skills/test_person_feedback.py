@@ -12,7 +12,7 @@ from unchecked import shapes_unchecked
 from hrc_learn.controller import ControllerConfig, SafetyFilter
 from hrc_learn.kinematics import GraspedBox, panda
 from hrc_learn.protocols import HINDRANCES, ArmState, Human, HumanInput, PersonObservation
-from hrc_learn.sim import PandaModelConfig, whole_arm
+from hrc_learn.sim import ArmModelConfig, whole_arm
 from hrc_learn.skills import WorkCell
 from hrc_learn.skills.person_feedback import Hindrances, PersonFeedback, limiting_joint
 from hrc_learn.skills.person_watch import PersonWatch
@@ -146,7 +146,7 @@ def test_who_pushes_the_arm_at_somebody_is_told_so(towards):
     elbow = panda.link_poses(Q).position[3].numpy()
     way = panda.joint_jacobian(Q, 4)[:3].numpy() @ push
     at = elbow + 0.35 * way / np.linalg.norm(way)
-    watch = PersonWatch(Bystander(arm, at), whole_arm(PandaModelConfig()))
+    watch = PersonWatch(Bystander(arm, at), whole_arm(ArmModelConfig()))
     person = Pusher(push if towards else -push)
     cell = cell_of(person, arm, watch=watch)
     with shapes_unchecked():

@@ -27,7 +27,7 @@ def test_a_mesh_is_drawn_in_place_of_what_it_shows(tmp_path):
     run = sample_run()
     (body,) = run.bodies
     plate = Box(centre=(0.0, 0.0, 0.1), half_size=(0.03, 0.03, 0.001), name="marker_plate")
-    half_turn, red = (0.0, 0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 1.0)
+    half_turn = (0.0, 0.0, 0.0, 1.0)
     mesh = MeshFile(
         path=tmp_path / "cube.stl", orientation=half_turn, colour=(1.0, 0.0, 0.0, 1.0)
     )

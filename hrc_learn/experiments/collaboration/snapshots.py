@@ -15,7 +15,6 @@ from hrc_learn.experiments.run_recording import spans
 from hrc_learn.experiments.snapshots import Image, viewpoint
 from hrc_learn.geometry import quaternion
 from hrc_learn.geometry.numerics import null_projection
-from hrc_learn.kinematics import panda
 from hrc_learn.sim import Arrow, OffscreenRenderer, World
 from hrc_learn.skills.pick_and_place import INTERACT, RELEASE
 from hrc_learn.viz import palette
@@ -82,7 +81,9 @@ def _furthest_aside(run: CollaborationRun, begin: float, end: float) -> float | 
     during &= np.abs(log["nullspace_input"]).max(axis=1) > _NOTHING
     if not during.any():
         return None
-    elbow = panda.joint_origins(torch.from_numpy(log["joint_position"][during]))[:, _ELBOW]
+    elbow = run.cell.chain.joint_origins(torch.from_numpy(log["joint_position"][during]))[
+        :, _ELBOW
+    ]
     aside = (elbow - elbow[0]).norm(dim=-1)
     return float(log["time"][during][int((aside >= _NEARLY * aside.max()).int().argmax())])
 
@@ -103,9 +104,9 @@ def _arrows(run: CollaborationRun, step: int) -> list[Arrow]:
     q = torch.from_numpy(log["joint_position"][step])
     d = torch.from_numpy(log["nullspace_input"][step])
     if float(d.abs().max()) > _NOTHING:
-        asked = null_projection(panda.jacobian(q), d)
-        along = (panda.joint_jacobian(q, _DRAGGED)[:3] @ asked).numpy()
-        elbow = panda.joint_origins(q)[_ELBOW].numpy()
+        asked = null_projection(run.cell.chain.jacobian(q), d)
+        along = (run.cell.chain.joint_jacobian(q, _DRAGGED)[:3] @ asked).numpy()
+        elbow = run.cell.chain.joint_origins(q)[_ELBOW].numpy()
         tip = elbow + _LENGTH * along / np.linalg.norm(along)
         arrows.append(
             Arrow(

@@ -24,7 +24,6 @@ from hrc_learn.experiments.collaboration.worker_room import (
 )
 from hrc_learn.experiments.run_recording import LiveView, no_live_view
 from hrc_learn.geometry import quaternion
-from hrc_learn.kinematics import panda
 from hrc_learn.sim import (
     CameraChange,
     CameraKind,
@@ -155,6 +154,7 @@ class CollaborationRun:
         return pull_effects(
             self.cell.log,
             self.pulls,
+            self.workplace.robot.chain,
             encoder_offset=offset,
             clearance=self.workplace.arm_clearance,
         )
@@ -268,13 +268,13 @@ def simulate_collaboration(
         cell_config, latency=latency, safety=safety, command_delay=plant.following_delay
     )
     config = _on_plant(config or PickAndPlaceConfig(), plant)
-    items = workplace.scene.objects
+    items, chain = workplace.scene.objects, workplace.robot.chain
     _check_shelves(workplace, shelves)
     # Drawn apart, so that runs with and without the worker are alike but for him.
     chance = np.random.default_rng([seed, 2])
     visit = somebody_comes(workplace, chance, beside_elbow=True) if worker else None
     scene = replace(workplace.scene, worker=None if visit is None else visit.worker.config)
-    world = World(scene, sizes.draw(rng))
+    world = World(scene, sizes.draw(rng, workplace.robot.joints))
     world.reset(
         workplace.home_joints().numpy(), _object_poses(workplace, world, sizes.object_yaw, rng)
     )
@@ -284,9 +284,9 @@ def simulate_collaboration(
         # Drawn apart, so that runs with and without pulls are alike but for them.
         pulls = random_pulls(np.random.default_rng([seed, 1]))
         config = replace(config, interactions=0)
-        person = ScriptedPerturbation(panda, pulls, 0.0, interaction)
+        person = ScriptedPerturbation(chain, pulls, 0.0, interaction)
     else:
-        person = ScriptedPerturbation(panda, forces, None, interaction)
+        person = ScriptedPerturbation(chain, forces, None, interaction)
     watch = None
     if visit is not None:
         tracker = WorkerSensor(visit, lambda: world.time, sizes, chance)
@@ -335,7 +335,7 @@ def simulate_collaboration(
             beside = stack.enter_context(opened)
             human, passing = beside.joined(human, advance)
         cell = WorkCell(
-            chain=panda,
+            chain=chain,
             arm=driven.arm,
             gripper=driven.gripper,
             sensor=MarkerSensor(eyes, workplace.scene.marker_ids),

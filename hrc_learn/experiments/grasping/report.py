@@ -17,7 +17,6 @@ from hrc_learn.experiments.grasping.metrics import REACHED
 from hrc_learn.experiments.grasping.trial import VARIANTS, GraspingRun, SimulatedGrasp
 from hrc_learn.experiments.run_recording import record
 from hrc_learn.geometry import Box
-from hrc_learn.kinematics import panda
 from hrc_learn.skills.visual_servoing import VisualServoConfig
 from hrc_learn.viz import CameraRecording, RunRecording, palette
 from hrc_learn.viz.figure_parts import STYLE, WIDTH, draw_box, frame_space, near, needed, space
@@ -56,7 +55,7 @@ class RegionActivity:
         log, above = run.cell.log, run.scene.workplace.hover()
         servoed = np.isfinite(log["target"]).all(axis=1)
         seen = servoed & np.isfinite(log["feature"]).all(axis=1)
-        tool = panda.forward(torch.from_numpy(log["joint_position"]))
+        tool = run.cell.chain.forward(torch.from_numpy(log["joint_position"]))
         goals = config.goals(above, np.zeros(2))
         turn = np.where(servoed, goals.orientation.potential(tool.orientation).numpy(), np.nan)
         vision = np.full_like(turn, np.nan)

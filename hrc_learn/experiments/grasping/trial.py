@@ -21,7 +21,6 @@ from hrc_learn.jacobian import (
     PaperEstimator,
     RBFImageJacobian,
 )
-from hrc_learn.kinematics import panda
 from hrc_learn.sim import (
     CameraKind,
     Imperfections,
@@ -137,7 +136,7 @@ class GraspingScene:
         """
         scene, sizes = workplace.scene, imperfections or Imperfections.ideal()
         # A stream of its own: the same scenes whatever the imperfections.
-        drawn = sizes.draw(rng.spawn(1)[0])
+        drawn = sizes.draw(rng.spawn(1)[0], workplace.robot.joints)
         yaw = max(_ALONG_EDGES, sizes.object_yaw)
         pose = workplace.random_object_pose(config.object_reach, rng, yaw)
         workplace = replace(
@@ -189,11 +188,11 @@ def _starts(
     workplace: Workplace, config: GraspingSceneConfig, rng: np.random.Generator
 ) -> Iterator[Float[np.ndarray, "7"]]:
     """Joint positions within the limits, with the end effector up and away."""
-    limits, hover = panda.limits, workplace.hover().position
+    limits, hover = workplace.robot.chain.limits, workplace.hover().position
     lower, upper = limits.lower + config.margin, limits.upper - config.margin
     while True:
         q = rng.uniform(lower, upper)
-        tool = panda.forward(torch.from_numpy(q)).position
+        tool = workplace.robot.chain.forward(torch.from_numpy(q)).position
         if tool[2] > config.height and (tool - hover).norm() > config.distance:
             yield q
 
@@ -330,7 +329,7 @@ def simulate_grasp(
             beside = stack.enter_context(opened)
             human, passing = beside.joined(human, motion.advance)
         cell = WorkCell(
-            chain=panda,
+            chain=workplace.robot.chain,
             arm=driven.arm,
             gripper=driven.gripper,
             sensor=MarkerSensor(eye, workplace.scene.marker_ids),

@@ -19,7 +19,6 @@ from hrc_learn.experiments.placing.arm_angle_ablation import SimulatedDemonstrat
 from hrc_learn.experiments.placing.trial import PlacingRun
 from hrc_learn.experiments.snapshots import Image, viewpoint
 from hrc_learn.geometry import Box
-from hrc_learn.kinematics import panda
 from hrc_learn.sim import OffscreenRenderer, World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.viz import JointLimits, palette
@@ -283,7 +282,7 @@ class Photographer:
             joints: Joint positions [rad].
             touching: Names of those geoms.
         """
-        tool = panda.forward(torch.from_numpy(joints)).matrix().numpy()
+        tool = self._world.arm.robot.chain.forward(torch.from_numpy(joints)).matrix().numpy()
         width = 2 * self._item.half_size[0]
         self._world.reset(joints, {self._item.name: tool @ _IN_GRIPPER}, gripper_width=width)
         return self._renderer.render(self._camera, touching=touching)

@@ -30,10 +30,9 @@ from hrc_learn.experiments.placing.trial import (
     demonstrated_approach,
     demonstrated_path,
 )
-from hrc_learn.experiments.run_recording import PANDA_LIMITS, demonstrated_joints, true_tool
+from hrc_learn.experiments.run_recording import demonstrated_joints, drawn_limits, true_tool
 from hrc_learn.experiments.snapshots import snapshots_figure
 from hrc_learn.geometry import Box
-from hrc_learn.kinematics import panda
 from hrc_learn.skills.work_cell import SAFETY_COLUMNS
 from hrc_learn.viz import RunRecording
 from hrc_learn.viz.report import Picture, Section
@@ -68,12 +67,12 @@ def record_placing(
     return RunRecording(
         title=f"Placing on the {run.shelf} shelf",
         time=log["time"],
-        joint_names=panda.joint_names,
+        joint_names=run.cell.chain.joint_names,
         joint_position=joints,
-        joint_limits=PANDA_LIMITS,
+        joint_limits=drawn_limits(run.cell.chain),
         demo_joint_position=demonstrated,
         position=tool.position.numpy(),
-        demo_path=demonstrated_path(demonstration),
+        demo_path=demonstrated_path(demonstration, run.cell.chain),
         plan_path=run.plan.tool_pose.position.numpy(),
         bodies=run.motion.bodies(),
         boxes=boxes,
@@ -92,7 +91,7 @@ def placing_sections(run: PlacingRun, snapshots: Snapshots) -> list[Section]:
     demonstration = Motion(
         time=run.demonstration.time - run.demonstration.time[0],
         joint_position=np.asarray(run.demonstration.joint_position),
-        path=demonstrated_path(run.demonstration),
+        path=demonstrated_path(run.demonstration, run.workplace.robot.chain),
     )
     sections = [
         _shelves(run, demonstration, snapshots),
@@ -158,7 +157,10 @@ def _shelves(run: PlacingRun, demonstration: Motion, snapshots: Snapshots) -> Se
                 Picture(
                     f"joints_{space}_space",
                     shelf_joints_figure(
-                        panda.joint_names, demonstration, motions[label], PANDA_LIMITS
+                        run.workplace.robot.chain.joint_names,
+                        demonstration,
+                        motions[label],
+                        drawn_limits(run.workplace.robot.chain),
                     ),
                     f"Joints, planned in {label}: the demonstration, and the faster motions to "
                     "three goals.",

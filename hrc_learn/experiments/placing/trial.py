@@ -26,11 +26,10 @@ from hrc_learn.experiments.run_recording import (
     unwanted_contacts,
 )
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.kinematics import panda
+from hrc_learn.kinematics import SerialChain, panda
 from hrc_learn.learning.channels import dimensionless_jerk
 from hrc_learn.sim import MotionLog, Touch, World
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills.arm_motion import nearest_configuration
 from hrc_learn.skills.pick_and_place import place_along
 from hrc_learn.skills.placing import PlaceCorrection, PlacingSkill, Plan, PlanningSpace
 from hrc_learn.skills.work_cell import TaskFailedError, WorkCell, WorkCellConfig
@@ -67,7 +66,7 @@ class SimulatedPlacing:
         return slice(0, len(self.plan.path))
 
     @property
-    def joint_position(self) -> Float[np.ndarray, "steps 7"]:
+    def joint_position(self) -> Float[np.ndarray, "steps joints"]:
         """True ones during the transfer, but for the encoders' noise [rad]."""
         offset = self.world.imperfections.encoder_offset
         return self.cell.log["joint_position"][self.transfer] - offset
@@ -88,7 +87,7 @@ def place(
     skill: PlacingSkill,
     workplace: Workplace,
     shelf: str,
-    start: Float[Tensor, "7"],
+    start: Float[Tensor, " joints"],
     *,
     space: PlanningSpace,
     speed: float = 1.5,
@@ -125,10 +124,10 @@ def place(
         driven = stack.enter_context(access.open(world))
         motion = MotionLog(world, driven.advance)
         cell = WorkCell(
-            chain=panda,
+            chain=workplace.robot.chain,
             arm=driven.arm,
             gripper=driven.gripper,
-            human=ScriptedPerturbation(panda, ()),
+            human=ScriptedPerturbation(workplace.robot.chain, ()),
             advance=motion.advance,
             config=WorkCellConfig(
                 safety=plant.plant(WorkCellConfig().safety),
@@ -159,7 +158,7 @@ _SHOWN_ITERATIONS = 4
 
 
 def taught_correction(
-    world: World, place: Pose, near: Float[Tensor, "7"], rng: np.random.Generator
+    world: World, place: Pose, near: Float[Tensor, " joints"], rng: np.random.Generator
 ) -> PlaceCorrection:
     """What the arm reads where a person has led its tool to a known place.
 
@@ -180,7 +179,7 @@ def taught_correction(
     read = led
     for _ in range(_SHOWN_ITERATIONS):
         # Where the tool truly is, and by how much it misses.
-        joints = nearest_configuration(read, near=near).numpy()
+        joints = world.arm.robot.nearest(read, near=near).numpy()
         world.reset(joints - errors.encoder_offset)
         matrix = torch.from_numpy(world.arm.tcp_pose())
         tool = Pose(matrix[:3, 3], quaternion.from_matrix(matrix[:3, :3]))
@@ -189,7 +188,7 @@ def taught_correction(
             read.position + led.position - tool.position,
             quaternion.multiply(read.orientation, missed),
         )
-    measured = panda.forward(torch.from_numpy(world.arm.read().joint_position))
+    measured = world.arm.robot.chain.forward(torch.from_numpy(world.arm.read().joint_position))
     return PlaceCorrection.of(measured, place)
 
 
@@ -199,7 +198,7 @@ _DRAWS = 100
 
 def random_start(
     world: World, workplace: Workplace, noise: float, rng: np.random.Generator
-) -> Float[Tensor, "7"]:
+) -> Float[Tensor, " joints"]:
     """Joint positions about home that are within the limits and touch nothing.
 
     Leaves the world there, with its first object in the gripper.
@@ -216,7 +215,7 @@ def random_start(
     home, item = workplace.home_joints(), workplace.scene.objects[0].name
     for _ in range(_DRAWS):
         start = home + noise * torch.from_numpy(rng.standard_normal(len(home)))
-        if not panda.limits.contain(start):
+        if not workplace.robot.chain.limits.contain(start):
             continue
         world.hold(item, start.numpy())
         if not world.collisions_along(start.numpy()[None], item):
@@ -283,7 +282,7 @@ def demonstrated_approach(demonstration: Demonstration, workplace: Workplace) ->
     Raises:
         ValueError: If the end effector was never led into the cabinet.
     """
-    path = demonstrated_path(demonstration)
+    path = demonstrated_path(demonstration, workplace.robot.chain)
     approach = ApproachPath.of(path, path[-1], _edge(workplace))
     if not len(approach.offset):
         raise ValueError(
@@ -298,19 +297,21 @@ def _edge(workplace: Workplace) -> float:
     return workplace.scene.cabinet.front + workplace.scene.objects[0].half_size[2]
 
 
-def demonstrated_path(demonstration: Demonstration) -> Float[np.ndarray, "frames 3"]:
+def demonstrated_path(
+    demonstration: Demonstration, chain: SerialChain = panda
+) -> Float[np.ndarray, "frames 3"]:
     """Of the tool centre point, from the demonstrated joints [m].
 
     Raises:
-        ValueError: If the demonstration holds no joints of a Panda.
+        ValueError: If the demonstration holds no joints of this arm.
     """
     joints = demonstration.joint_position
-    if joints is None or demonstration.joint_names != panda.joint_names:
+    if joints is None or demonstration.joint_names != chain.joint_names:
         raise ValueError(
             f"the demonstrations hold the joints {demonstration.joint_names}, but the arm has "
-            f"{panda.joint_names}: give demonstrations of this arm."
+            f"{chain.joint_names}: give demonstrations of this arm."
         )
-    return panda.forward(torch.from_numpy(joints)).position.numpy()
+    return chain.forward(torch.from_numpy(joints)).position.numpy()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -341,12 +342,12 @@ class PlacingOutcome:
         """Measure a placing against a demonstration for any shelf."""
         approach = approach_path(run.path, run.goal, workplace)
         aside = run.object_pose[:3, 3] - run.goal.position.numpy()
-        speed = np.abs(run.cell.log["joint_velocity"]) / panda.limits.velocity.numpy()
+        speed = np.abs(run.cell.log["joint_velocity"]) / run.cell.chain.limits.velocity.numpy()
         done, demonstrated = (
             dimensionless_jerk(torch.from_numpy(time), torch.from_numpy(path))
             for time, path in (
                 (run.time, run.path),
-                (demonstration.time, demonstrated_path(demonstration)),
+                (demonstration.time, demonstrated_path(demonstration, run.cell.chain)),
             )
         )
         return cls(

@@ -1,8 +1,8 @@
-"""The Panda in MuJoCo: model, gripper, marker plate, and its driver.
+"""An arm in MuJoCo: model, gripper, marker plate, and its driver.
 
-Body frames come from `hrc_learn.kinematics.panda`, so that simulator and controller share
-one table of numbers. Capsules and boxes follow the published link shapes to about a
-centimetre: they render ten times faster than meshes without a GPU and give clean contacts.
+Body frames come from the arm's own chain, so that simulator and controller share one table of
+numbers. Capsules and boxes follow the shapes of the links to a few centimetres: physics with
+them is faster than with meshes, and their contacts are clean.
 """
 
 import math
@@ -14,14 +14,7 @@ import torch
 from jaxtyping import Float
 
 from hrc_learn.geometry import quaternion
-from hrc_learn.kinematics import (
-    LINK_CAPSULES,
-    TOOL_LINK,
-    CapsuleArm,
-    LinkCapsule,
-    panda,
-    panda_capsules,
-)
+from hrc_learn.kinematics import PANDA, CapsuleArm, LinkCapsule, WorkArm
 from hrc_learn.protocols import ArmState
 from hrc_learn.sim.imperfections import CommandChannel, DrawnImperfections, Imperfections
 from hrc_learn.vision import Marker, marker_texture
@@ -119,89 +112,112 @@ def _add_picture(spec: mujoco.MjSpec, name: str, pixels: np.ndarray) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PandaModelConfig:
+class ArmModelConfig:
     """How the arm is built and driven."""
 
-    stiffness: tuple[float, ...] = (2e4, 2e4, 1.5e4, 1.5e4, 6e3, 6e3, 4e3)
-    """Position gain of the joint servos [N m/rad]."""
-    damping: tuple[float, ...] = (600.0, 600.0, 450.0, 450.0, 150.0, 150.0, 80.0)
-    """Velocity gain of the joint servos [N m s/rad]."""
+    robot: WorkArm = PANDA
+    """Which arm it is."""
+    stiffness: tuple[float, ...] = ()
+    """Position gain of the joint servos [N m/rad]; none given: by the torques of the joints."""
+    damping: tuple[float, ...] = ()
+    """Velocity gain of the joint servos [N m s/rad]; likewise."""
     grip_force: float = 40.0
     """Largest force of a finger [N] (the end effector's continuous rating is 70 N)."""
     marker: Plate | None = None
     """ArUco plate on the end effector, in the gripper's frame."""
 
+    def servo(self, joint: int) -> tuple[float, float]:
+        """Position [N m/rad] and velocity gain [N m s/rad] of a joint, counted from 0."""
+        if self.stiffness and self.damping:
+            return self.stiffness[joint], self.damping[joint]
+        if self.robot.name in _SERVOS:
+            stiffness, damping = _SERVOS[self.robot.name]
+            return stiffness[joint], damping[joint]
+        stiffness = _STIFFNESS * float(self.robot.chain.limits.torque[joint])
+        return stiffness, _DAMPING * stiffness
 
-# Masses of links 1 to 7 [kg], from franka_description.
-_MASSES = (4.97, 0.65, 3.23, 3.59, 1.23, 1.67, 0.74)
+    def armature(self, joint: int) -> float:
+        """Inertia of the motor and its gear, at the joint [kg m^2]."""
+        torque = float(self.robot.chain.limits.torque[joint])
+        # Small motors have lighter rotors; those of 50 N m and more are taken for the Panda's.
+        return 0.1 * min(1.0, torque / 50.0) if self.robot.name not in _SERVOS else 0.1
 
-# Neighbours whose primitives overlap by design (a static parent is not filtered by MuJoCo).
-_OVERLAPPING = (
-    ("link0", "link1"),
-    ("link0", "link2"),
-    ("link1", "link3"),
-    ("link3", "link5"),
-    ("link5", "link7"),
-    ("link6", "hand"),
-    ("link7", "hand"),
-    ("finger_left", "finger_right"),
+
+_SERVOS = dict.fromkeys(
+    ("panda", "fr3"),
+    (
+        (2e4, 2e4, 1.5e4, 1.5e4, 6e3, 6e3, 4e3),
+        (600.0, 600.0, 450.0, 450.0, 150.0, 150.0, 80.0),
+    ),
 )
+"""Gains of Franka's arms."""
+_STIFFNESS, _DAMPING = 230.0, 0.03
+"""Of other arms: of the Panda's strongest joint, per torque [1/rad], and damping per stiffness
+[s]."""
+_HAND = "hand"
 
 
-def add_panda(spec: mujoco.MjSpec, config: PandaModelConfig) -> None:
+def add_arm(spec: mujoco.MjSpec, config: ArmModelConfig) -> None:
     """Add the arm, its hand and its servos to a model, with the base at the world's origin.
 
-    Joints are named as in `panda.joint_names`, fingers `finger_left` and `finger_right`.
+    Links are named link0, link1, ..., joints as in its chain, fingers `finger_left` and
+    `finger_right`.
     """
+    robot, n = config.robot, config.robot.joints
     base = spec.worldbody.add_body(name="link0")
-    _add_capsules(base, 0, mass=None)
-    frames = panda.link_poses(torch.zeros(7, dtype=torch.float64)).matrix().numpy()
+    _add_capsules(base, robot, 0, mass=None)
+    still = torch.zeros(n, dtype=torch.float64)
+    frames = robot.chain.link_poses(still).matrix().numpy()
     body = base
     parent_frame = np.eye(4)
-    for i, name in enumerate(panda.joint_names):
+    for i, name in enumerate(robot.chain.joint_names):
         body = _add_body(body, f"link{i + 1}", np.linalg.inv(parent_frame) @ frames[i])
         parent_frame = frames[i]
         _add_joint(spec, body, name, i, config)
-        _add_capsules(body, i + 1, mass=_MASSES[i])
+        _add_capsules(body, robot, i + 1, mass=robot.masses[i])
     # The end effector's frame: at the flange, turned as the tool.
-    flange, tool = frames[7], frames[8]
+    flange, tool = frames[n], frames[n + 1]
     hand_frame = np.linalg.inv(parent_frame) @ tool
     hand_frame[:3, 3] = (np.linalg.inv(parent_frame) @ flange)[:3, 3]
-    hand = _add_body(body, "hand", hand_frame)
+    hand = _add_body(body, _HAND, hand_frame)
     hand.add_site(
         name="tcp", pos=(0, 0, np.linalg.norm(tool[:3, 3] - flange[:3, 3])), group=_HIDDEN
     )
     _add_hand(spec, hand, config)
-    for a, b in _OVERLAPPING:
-        spec.add_exclude(bodyname1=a, bodyname2=b)
+    names = {link: f"link{link}" for link in range(n + 1)} | {n + 2: _HAND}
+    # MuJoCo filters neighbours by itself, but for a static parent.
+    for a, b in ((0, 1), *robot.whole.overlapping):
+        if a in names and b in names:
+            spec.add_exclude(bodyname1=names[a], bodyname2=names[b])
+    spec.add_exclude(bodyname1="finger_left", bodyname2="finger_right")
 
 
 # Capsules side by side that cover a plate: each sticks out by a sixth of the plate's edge.
 _STRIPS = 3
 
 
-def whole_arm(config: PandaModelConfig) -> CapsuleArm:
+def whole_arm(config: ArmModelConfig) -> CapsuleArm:
     """Capsules that contain all of the modelled arm: links, hand, fingers and plate.
 
     The fingers are within the hand's capsules at any opening. Geoms of the simulator stick out
     by 0.1 mm at most. The other way, capsules reach beyond the hand by up to 30 mm, beyond
     closed fingers by up to 43 mm and beyond the plate by 11 mm.
     """
-    plate = config.marker
+    plate, robot = config.marker, config.robot
     if plate is None:
-        return panda_capsules
+        return robot.whole
     R = quaternion.to_matrix(torch.tensor(plate.orientation, dtype=torch.float64)).numpy()
     half = plate.marker.plate_size / 2
     across = half / _STRIPS
     radius = float(np.hypot(across, _THICKNESS))
     # From the hand's frame, at the flange, to that of the tool.
-    centre = np.array(plate.position) - [0.0, 0.0, float(panda.tcp[2, 3])]
+    centre = np.array(plate.position) - [0.0, 0.0, float(robot.chain.tcp[2, 3])]
     capsules = []
     for k in range(_STRIPS):
         x = -half + (2 * k + 1) * across
         start, end = (tuple((centre + R @ [x, y, -_THICKNESS]).tolist()) for y in (-half, half))
-        capsules.append(LinkCapsule(link=TOOL_LINK, start=start, end=end, radius=radius))
-    return panda_capsules.with_capsules(capsules)
+        capsules.append(LinkCapsule(link=robot.joints + 2, start=start, end=end, radius=radius))
+    return robot.whole.with_capsules(capsules)
 
 
 def _add_body(parent, name: str, transform: np.ndarray):
@@ -211,8 +227,19 @@ def _add_body(parent, name: str, transform: np.ndarray):
     return body
 
 
-def _add_capsules(body, link: int, mass: float | None) -> None:
-    capsules = [capsule for capsule in LINK_CAPSULES if capsule.link == link]
+def _add_capsules(body, robot: WorkArm, link: int, mass: float | None) -> None:
+    capsules = [capsule for capsule in robot.body.capsules if capsule.link == link]
+    if not capsules and mass is not None:
+        # A link without a shape still has its mass: a ball of 4 cm that touches nothing.
+        body.add_geom(
+            name=f"link{link}_0",
+            type=mujoco.mjtGeom.mjGEOM_SPHERE,
+            size=(0.04, 0, 0),
+            mass=mass,
+            contype=0,
+            conaffinity=0,
+            group=_HIDDEN,
+        )
     for k, capsule in enumerate(capsules):
         geom = body.add_geom(
             name=f"link{link}_{k}" if mass else f"link{link}",
@@ -225,22 +252,23 @@ def _add_capsules(body, link: int, mass: float | None) -> None:
             geom.mass = mass / len(capsules)
 
 
-def _add_joint(spec: mujoco.MjSpec, body, name: str, i: int, config: PandaModelConfig) -> None:
-    limits = panda.limits
+def _add_joint(spec: mujoco.MjSpec, body, name: str, i: int, config: ArmModelConfig) -> None:
+    limits = config.robot.chain.limits
+    stiffness, damping = config.servo(i)
     body.add_joint(
         name=name,
         type=mujoco.mjtJoint.mjJNT_HINGE,
         axis=(0, 0, 1),
         range=(float(limits.lower[i]), float(limits.upper[i])),
-        armature=0.1,
+        armature=config.armature(i),
     )
     torque = float(limits.torque[i])
     # Position and velocity servo together follow a moving reference without lag, as the
     # arm's own velocity interface does.
     position = _add_servo(spec, f"{name}_position", name, torque)
-    position.set_to_position(kp=config.stiffness[i])
+    position.set_to_position(kp=stiffness)
     velocity = _add_servo(spec, f"{name}_velocity", name, torque)
-    velocity.set_to_velocity(kv=config.damping[i])
+    velocity.set_to_velocity(kv=damping)
 
 
 def _add_servo(spec: mujoco.MjSpec, name: str, joint: str, strongest: float):
@@ -252,8 +280,8 @@ def _add_servo(spec: mujoco.MjSpec, name: str, joint: str, strongest: float):
     return servo
 
 
-def _add_hand(spec: mujoco.MjSpec, hand, config: PandaModelConfig) -> None:
-    add_box(hand, "hand", (0.03, 0.1, 0.033), _GREY, pos=(0, 0, 0.033), mass=0.73)
+def _add_hand(spec: mujoco.MjSpec, hand, config: ArmModelConfig) -> None:
+    add_box(hand, _HAND, (0.03, 0.1, 0.033), _GREY, pos=(0, 0, 0.033), mass=0.73)
     if config.marker is not None:
         add_plate(spec, hand, "hand_marker", config.marker)
     for name, side in (("finger_left", 1.0), ("finger_right", -1.0)):
@@ -305,7 +333,7 @@ class _UnknownWeights:
         self._any = bool((np.abs(self._carried) > 1e-9).any())
         self._gravity = model.opt.gravity
 
-    def torque(self, data: mujoco.MjData) -> Float[np.ndarray, "7"]:
+    def torque(self, data: mujoco.MjData) -> Float[np.ndarray, " joints"]:
         """Which they exert on the joints [N m]."""
         if not self._any:
             return np.zeros(len(self._links))
@@ -315,26 +343,31 @@ class _UnknownWeights:
 
 
 class MujocoArm:
-    """The simulated Panda as an `Arm` and a `Gripper`."""
+    """A simulated arm as an `Arm` and a `Gripper`."""
 
     def __init__(
         self,
         model: mujoco.MjModel,
         data: mujoco.MjData,
         imperfections: DrawnImperfections | None = None,
+        robot: WorkArm = PANDA,
     ):
         """Find its joints and servos.
 
         Args:
-            model: With the arm of `add_panda`.
+            model: With the arm of `add_arm`.
             data: Its state.
             imperfections: Of its encoders, its driver and its joints; None: none.
+            robot: Which arm it is.
         """
-        self._errors = imperfections or Imperfections().draw(np.random.default_rng(0))
-        self._channel = CommandChannel(self._errors, panda.limits.acceleration.numpy())
+        self.robot, chain = robot, robot.chain
+        self._errors = imperfections or Imperfections().draw(
+            np.random.default_rng(0), robot.joints
+        )
+        self._channel = CommandChannel(self._errors, chain.limits.acceleration.numpy())
         self._model = model
         self._data = data
-        names = panda.joint_names
+        names = chain.joint_names
         self.joints = np.array([model.joint(n).qposadr[0] for n in names])
         self._velocities = np.array([model.joint(n).dofadr[0] for n in names])
         self._position_servos = np.array([model.actuator(f"{n}_position").id for n in names])
@@ -362,7 +395,7 @@ class MujocoArm:
             ),
         )
 
-    def _external_torque(self) -> Float[np.ndarray, "7"]:
+    def _external_torque(self) -> Float[np.ndarray, " joints"]:
         """What an arm takes for external torques that measures those of its joints [N m].
 
         Contacts and forces from outside, friction, which no arm of this kind knows well, and
@@ -376,7 +409,7 @@ class MujocoArm:
             mujoco.mj_applyFT(self._model, data, force, moment, at, body, torque)
         return torque[self._velocities] + self._weights.torque(data)
 
-    def command(self, joint_velocity: Float[np.ndarray, "7"]) -> None:
+    def command(self, joint_velocity: Float[np.ndarray, " joints"]) -> None:
         """Set the joint velocities to hold from now on [rad/s]."""
         if not np.isfinite(joint_velocity).all():
             raise ValueError(f"joint_velocity must be finite, but is {joint_velocity}.")
@@ -386,7 +419,7 @@ class MujocoArm:
         """Open or close the gripper to a width [m]; 0 squeezes what is between the fingers."""
         self._data.ctrl[self._finger_servos] = np.clip(width / 2, 0.0, FINGER_STROKE)
 
-    def place(self, joint_position: Float[np.ndarray, "7"], gripper_width: float) -> None:
+    def place(self, joint_position: Float[np.ndarray, " joints"], gripper_width: float) -> None:
         """Set the joints at once, at rest. For resets, not for control."""
         self._reference = np.array(joint_position, dtype=float)
         self._channel.rest()

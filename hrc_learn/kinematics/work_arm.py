@@ -1,0 +1,276 @@
+"""An arm with the hand that it works with: what a work cell and its skills need of any arm.
+
+The hand is the same for all: two parallel fingers on a palm, of the Franka hand's size, bolted
+to the flange. An arm differs from another by its chain, its shape and its inverse.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, Protocol
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hrc_learn.geometry import MeshFile, Pose, quaternion
+from hrc_learn.kinematics.chain import SerialChain
+from hrc_learn.kinematics.collision import CapsuleArm, LinkCapsule
+from hrc_learn.kinematics.franka import (
+    HAND_CAPSULES,
+    LINK_CAPSULES,
+    OVERLAPPING,
+    FrankaArm,
+    UnreachableError,
+    panda,
+)
+from hrc_learn.kinematics.numerical_inverse import solutions_from
+from hrc_learn.kinematics.redundancy import best_postures, comfortable_postures
+
+type NullSpace = Literal["arm angle", "free", "none"]
+"""What a full pose of the tool leaves to the joints: one arm angle, of a shoulder, an elbow and
+a wrist whose axes meet; another self-motion; or nothing, as of six joints."""
+
+
+class WorkArm(ABC):
+    """An arm, its hand and its inverse.
+
+    Attributes:
+        name: By which commands know it.
+        chain: From the base to the tool centre point, between the fingertips.
+        body: Capsules of the links, without the hand.
+        whole: With the hand.
+        masses: Of the moving links [kg].
+        meshes: What links, hand and fingers look like, by the names of their bodies: link0,
+            link1, ..., hand, finger_left, finger_right; those that are missing are drawn as
+            capsules.
+    """
+
+    name: str
+    chain: SerialChain
+    body: CapsuleArm
+    whole: CapsuleArm
+    masses: tuple[float, ...]
+    meshes: Mapping[str, tuple[MeshFile, ...]]
+
+    @property
+    def joints(self) -> int:
+        """How many joints it has."""
+        return len(self.chain.joint_names)
+
+    @property
+    @abstractmethod
+    def null_space(self) -> NullSpace:
+        """What a full pose of the tool leaves to the joints."""
+
+    @abstractmethod
+    def nearest(
+        self, pose: Pose, near: Float[Tensor, " joints"], samples: int = 57
+    ) -> Float[Tensor, " joints"]:
+        """Joint positions that reach a pose, as near as can be to given ones [rad].
+
+        Args:
+            pose: Of the tool centre point.
+            near: Joint positions [rad].
+            samples: Solutions sought among, where there are any number of them.
+
+        Raises:
+            UnreachableError: None reaches the pose within the limits.
+        """
+
+    @abstractmethod
+    def postures(self, pose: Pose) -> Float[Tensor, "postures joints"]:
+        """Joint positions that reach a pose and differ, the most comfortable ones first [rad].
+
+        Raises:
+            UnreachableError: None reaches the pose within the limits.
+        """
+
+
+class FrankaWorkArm(WorkArm):
+    """A Franka arm with its own hand, and its inverse in closed form."""
+
+    chain: FrankaArm
+
+    def __init__(self, chain: FrankaArm):
+        """Of an arm whose links have the published shape."""
+        self.name, self.chain = chain.name, chain
+        self.body = CapsuleArm(chain, LINK_CAPSULES, OVERLAPPING)
+        self.whole = CapsuleArm(chain, LINK_CAPSULES + HAND_CAPSULES, OVERLAPPING)
+        # From franka_description.
+        self.masses = (4.97, 0.65, 3.23, 3.59, 1.23, 1.67, 0.74)
+        self.meshes = {}
+
+    @property
+    def null_space(self) -> NullSpace:
+        """Their arm angle."""
+        return "arm angle"
+
+    def nearest(
+        self, pose: Pose, near: Float[Tensor, " joints"], samples: int = 57
+    ) -> Float[Tensor, " joints"]:
+        """Scans joint 7, the redundant one, and keeps the best of the analytic solutions."""
+        lower, upper = float(self.chain.limits.lower[6]), float(self.chain.limits.upper[6])
+        # A little inside the limits, where the arm can still be corrected.
+        candidates = torch.linspace(lower + 0.02, upper - 0.02, samples, dtype=torch.float64)
+        candidates = torch.cat([near[6:7], candidates])
+        best, distance = None, math.inf
+        for q7 in candidates:
+            try:
+                q = self.chain.inverse(pose, q7, near=near)
+            except UnreachableError:
+                continue
+            if (d := float((q - near).norm())) < distance:
+                best, distance = q, d
+        if best is None:
+            raise UnreachableError(_unreachable(pose))
+        return best
+
+    def postures(self, pose: Pose) -> Float[Tensor, "postures joints"]:
+        """By scanning joint 7."""
+        return comfortable_postures(self.chain, pose)
+
+
+_TCP = 0.1034
+"""Fingertips of the hand, along z of the flange [m]."""
+
+
+class DescribedArm(Protocol):
+    """A bare arm from its description, as `hrc_learn.kinematics.arm.Arm` is one."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def chain(self) -> SerialChain: ...
+    @property
+    def body(self) -> CapsuleArm: ...
+    @property
+    def visuals(self) -> Sequence[Any]: ...
+    @property
+    def masses(self) -> Sequence[float]: ...
+
+
+class EquippedArm(WorkArm):
+    """Any arm with six or more joints, our hand at its flange, and a numerical inverse."""
+
+    def __init__(self, arm: DescribedArm):
+        """Take off what its description mounts on the flange, and bolt our hand to it.
+
+        Args:
+            arm: Whose flange has its z axis pointing away from the arm.
+
+        Raises:
+            ValueError: It has too few joints for a full pose of its tool.
+        """
+        old, n = arm.chain, len(arm.chain.joint_names)
+        if n < 6:
+            raise ValueError(
+                f"{arm.name} has {n} joints, but placing needs the full pose of the tool, for "
+                "which it takes six or more."
+            )
+        tcp = torch.eye(4, dtype=torch.float64)
+        tcp[2, 3] = _TCP
+        self.name = arm.name
+        self.chain = SerialChain(
+            joint_names=old.joint_names,
+            mounts=old.mounts,
+            flange=old.flange,
+            tcp=tcp,
+            limits=old.limits,
+            ready=old.ready,
+        )
+        links = tuple(c for c in arm.body.capsules if c.link <= n)
+        hand = tuple(
+            LinkCapsule(link=n + 2, start=c.start, end=c.end, radius=c.radius)
+            for c in HAND_CAPSULES
+        )
+        apart = (*arm.body.overlapping, (n - 1, n + 2), (n, n + 2))
+        self.body = CapsuleArm(self.chain, links, apart)
+        self.whole = CapsuleArm(self.chain, (*links, *hand), apart)
+        self.masses = tuple(arm.masses[1 : n + 1])
+        self.meshes = _meshes(arm, old.flange.numpy())
+
+    @property
+    def null_space(self) -> NullSpace:
+        """None of six joints; of more, whatever their axes leave."""
+        return "none" if self.joints == 6 else "free"
+
+    def nearest(
+        self, pose: Pose, near: Float[Tensor, " joints"], samples: int = 57
+    ) -> Float[Tensor, " joints"]:
+        """From there and from starts around it, by damped least squares."""
+        found = self._solutions(pose, samples, near)
+        return found[(found - near).norm(dim=-1).argmin()]
+
+    def postures(self, pose: Pose) -> Float[Tensor, "postures joints"]:
+        """From starts all over the joints' ranges."""
+        return best_postures(self.chain, self._solutions(pose, _STARTS, self.chain.ready))
+
+    def _solutions(
+        self, pose: Pose, samples: int, near: Float[Tensor, " joints"]
+    ) -> Float[Tensor, "solutions joints"]:
+        limits = self.chain.limits
+        # Drawn alike each time: an answer depends on what is asked for alone.
+        rng = torch.Generator().manual_seed(0)
+        # A joint that turns further than once around has the same poses again.
+        low, high = limits.lower.clamp(min=-math.pi), limits.upper.clamp(max=math.pi)
+        some = torch.rand(samples, self.joints, generator=rng, dtype=torch.float64)
+        starts = torch.cat([near[None].double(), low + (high - low) * some])
+        found = solutions_from(self.chain, pose, starts)
+        if len(found) == 0:
+            raise UnreachableError(_unreachable(pose))
+        return _turned_towards(found, near, limits.lower, limits.upper)
+
+
+_STARTS = 200
+"""From which postures are sought."""
+
+
+def _turned_towards(
+    q: Float[Tensor, "solutions joints"],
+    near: Float[Tensor, " joints"],
+    lower: Float[Tensor, " joints"],
+    upper: Float[Tensor, " joints"],
+) -> Float[Tensor, "solutions joints"]:
+    """The same poses with each joint turned by whole turns to be near given positions."""
+    turned = q - 2 * math.pi * torch.round((q - near) / (2 * math.pi))
+    return torch.where((turned >= lower) & (turned <= upper), turned, q)
+
+
+def _meshes(
+    arm: DescribedArm, flange: Float[np.ndarray, "4 4"]
+) -> dict[str, tuple[MeshFile, ...]]:
+    """What links and hand look like; nothing if the description has no meshes."""
+    n = len(arm.chain.joint_names)
+    meshes: dict[str, tuple[MeshFile, ...]] = {}
+    for visual in arm.visuals:
+        if visual.link > n + 1 or getattr(visual, "finger", None) is not None:
+            continue
+        pose = flange @ visual.pose if visual.link == n + 1 else visual.pose
+        turn = quaternion.from_matrix(torch.from_numpy(pose[:3, :3].copy())).tolist()
+        name = f"link{min(visual.link, n)}"
+        mesh = MeshFile(
+            path=visual.mesh.path,
+            position=tuple(pose[:3, 3].tolist()),
+            orientation=tuple(turn),
+            scale=visual.mesh.scale,
+            colour=visual.colour,
+        )
+        meshes[name] = (*meshes.get(name, ()), mesh)
+    return meshes
+
+
+def _unreachable(pose: Pose) -> str:
+    x, y, z = pose.position.tolist()
+    w = [round(v, 3) for v in quaternion.normalize(pose.orientation).tolist()]
+    return (
+        f"no joint positions within the limits reach position ({x:.3f}, {y:.3f}, {z:.3f}) "
+        f"m with orientation {w} (wxyz): move the goal towards the robot or turn it."
+    )
+
+
+PANDA = FrankaWorkArm(panda)
+"""The Panda, which everything is about where no other arm is named."""
