@@ -24,7 +24,7 @@ from hrc_learn.skills.work_cell import HINDRANCE_COLUMNS, SAFETY_COLUMNS, WorkCe
 from hrc_learn.vision import CameraModel
 from hrc_learn.viz import CameraRecording, JointLimits, LoggedSteps, RunRecording
 
-ELBOW, TOOL = 3, 8
+ELBOW, TOOL = 3, -1
 """Frames of the elbow and of the tool among the links."""
 
 
@@ -55,7 +55,8 @@ def true_image_jacobian(
     """
     used = np.isfinite(log["image_jacobian"]).all(axis=(1, 2))
     jacobian = np.full_like(log["image_jacobian"], np.nan)
-    poses, offset = link_poses(log), torch.from_numpy(world.hand_marker_offset())
+    poses = link_poses(log, world.arm.robot.chain)
+    offset = torch.from_numpy(world.hand_marker_offset())
     ends = [*(start for start, _ in cameras[1:]), math.inf]
     for (start, camera), end in zip(cameras, ends, strict=True):
         rows = used & (log["time"] >= start) & (log["time"] < end)

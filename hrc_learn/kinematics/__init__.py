@@ -34,6 +34,8 @@ from hrc_learn.kinematics.separation import separation as separation
 from hrc_learn.kinematics.tool_orientation import coarse_orientation as coarse_orientation
 from hrc_learn.kinematics.tool_orientation import gripper_down as gripper_down
 from hrc_learn.kinematics.work_arm import PANDA as PANDA
+from hrc_learn.kinematics.work_arm import ArmChoice as ArmChoice
 from hrc_learn.kinematics.work_arm import EquippedArm as EquippedArm
+from hrc_learn.kinematics.work_arm import FrankaWorkArm as FrankaWorkArm
 from hrc_learn.kinematics.work_arm import NullSpace as NullSpace
 from hrc_learn.kinematics.work_arm import WorkArm as WorkArm

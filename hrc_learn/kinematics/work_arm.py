@@ -9,7 +9,9 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, Protocol
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -25,6 +27,7 @@ from hrc_learn.kinematics.franka import (
     OVERLAPPING,
     FrankaArm,
     UnreachableError,
+    fr3,
     panda,
 )
 from hrc_learn.kinematics.numerical_inverse import solutions_from
@@ -44,9 +47,7 @@ class WorkArm(ABC):
         body: Capsules of the links, without the hand.
         whole: With the hand.
         masses: Of the moving links [kg].
-        meshes: What links, hand and fingers look like, by the names of their bodies: link0,
-            link1, ..., hand, finger_left, finger_right; those that are missing are drawn as
-            capsules.
+        meshes: What its links look like, by their names: link0, link1, ...
     """
 
     name: str
@@ -138,6 +139,7 @@ _TCP = 0.1034
 """Fingertips of the hand, along z of the flange [m]."""
 
 
+@runtime_checkable
 class DescribedArm(Protocol):
     """A bare arm from its description, as `hrc_learn.kinematics.arm.Arm` is one."""
 
@@ -274,3 +276,35 @@ def _unreachable(pose: Pose) -> str:
 
 PANDA = FrankaWorkArm(panda)
 """The Panda, which everything is about where no other arm is named."""
+
+
+@dataclass(frozen=True)
+class ArmChoice:
+    """Which arm is meant, in words: kept in configurations, opened where it is needed."""
+
+    name: str = "panda"
+    """Registered name, or a URDF or MJCF file."""
+    base: str = ""
+    """Link of a file that is the base; empty: its root."""
+    tip: str = ""
+    """Link of a file that is the flange; empty: the only end it has."""
+
+    def work_arm(self) -> WorkArm:
+        """The arm with our hand on it.
+
+        Raises:
+            ValueError: There is no such arm, or it cannot do the work.
+        """
+        return _opened(self)
+
+
+@cache
+def _opened(choice: ArmChoice) -> WorkArm:
+    franka = {"panda": PANDA, "fr3": FR3}
+    if choice.name not in franka:
+        raise ValueError(f"no arm {choice.name!r}: there are {', '.join(franka)}.")
+    return franka[choice.name]
+
+
+FR3 = FrankaWorkArm(fr3)
+"""The Research 3, with the same hand."""

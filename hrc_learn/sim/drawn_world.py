@@ -12,7 +12,7 @@ import mujoco
 from hrc_learn.geometry import MeshFile, read_mesh
 from hrc_learn.geometry.shapes import Colour
 from hrc_learn.sim.world import World
-from hrc_learn.viz.arm_bodies import panda_meshes
+from hrc_learn.viz.arm_bodies import arm_meshes
 
 # pyright: reportAttributeAccessIssue=false
 # MuJoCo ships no type stubs; its names come from a compiled module.
@@ -36,7 +36,7 @@ class DrawnWorld:
         self._world = world
         spec = world.describe()
         for body in spec.bodies:
-            if meshes := panda_meshes(body.name):
+            if meshes := arm_meshes(world.arm.robot, body.name):
                 for geom in body.geoms:
                     # Plates and the pictures on them are no part of the meshes.
                     if "marker" not in geom.name:

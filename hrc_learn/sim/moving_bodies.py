@@ -10,7 +10,7 @@ from hrc_learn.geometry import Body, Box, Capsule
 from hrc_learn.sim.scene import OCCLUDER, WORKER_BODIES, WORKER_ITEM
 from hrc_learn.sim.worker_distance import NearestPair, WorkerDistance
 from hrc_learn.sim.world import World, body_geoms
-from hrc_learn.viz.arm_bodies import panda_meshes
+from hrc_learn.viz.arm_bodies import arm_meshes
 
 # pyright: reportAttributeAccessIssue=false
 # MuJoCo ships no type stubs; its names come from a compiled module.
@@ -51,7 +51,7 @@ class MovingBodies:
                     orientation=orientations[:, i],
                     capsules=capsules,
                     boxes=boxes,
-                    meshes=panda_meshes(self.names[i]),
+                    meshes=arm_meshes(self._world.arm.robot, self.names[i]),
                 )
             )
         return tuple(bodies)

@@ -1,7 +1,9 @@
 """Poses of the task in the simulated scene: home, table, shelves."""
 
+import math
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,6 +34,7 @@ _LEANING_FORWARD = _vector(1.0, 0.3, -1.2, -1.8, 0.3, 1.9, -1.0)
 
 # Postures at home that are looked at, and what an awkward one costs [rad of motion].
 _POSTURES, _PENALTY = 12, 4.0
+_TRIED = 8  # starts from which a posture near another one is sought
 
 # Half the hand's thickness, and what is left under it for errors of base and encoders [m].
 _HAND_HALF, _OVER_BOARD = 0.030, 0.006
@@ -71,6 +74,18 @@ class Workplace:
     """Gap left under an object when it is released on a board [m]."""
     approach: float = 0.16
     """Distance in front of the boards from which the end effector moves straight in [m]."""
+
+    @classmethod
+    def of(cls, robot: WorkArm, **options: Any) -> "Workplace":
+        """The same place with another arm in it.
+
+        Args:
+            robot: The arm.
+            options: The remaining fields.
+        """
+        scene = SceneConfig()
+        scene = replace(scene, arm=replace(scene.arm, robot=robot))
+        return cls(scene=scene, **options)
 
     @property
     def robot(self) -> WorkArm:
@@ -127,33 +142,17 @@ class Workplace:
             return panda.inverse(self.hover(), self.hover_q7, near=_LEANING_FORWARD)
         return self.robot.nearest(self.hover(), near=self._home_posture)
 
-    @cached_property
+    @property
     def _home_posture(self) -> Float[Tensor, " joints"]:
-        """Of the postures at home, the one from which the arm gets on with its work best.
-
-        It needs a posture above the table and one at each shelf, all near to one another, and
-        each clear of the furniture and away from limits and singularities.
-        """
-        goals = [self.hover(), *(self.shelf_front(name) for name in self.shelf_names())]
-        goals += [self.shelf(name) for name in self.shelf_names()]
-        best, least = None, np.inf
-        for posture in self.robot.postures(self.home())[:_POSTURES]:
-            q, cost = posture, self._awkwardness(posture)
-            for goal in goals:
-                try:
-                    after = self.robot.nearest(goal, near=posture)
-                except UnreachableError:
-                    cost = np.inf
-                    break
-                cost += float((after - q).abs().max()) + self._awkwardness(after)
-            if cost < least:
-                best, least = posture, cost
-        if best is None:
-            raise UnreachableError(
-                f"the {self.robot.name} does not reach table, home and shelves in one posture: "
-                "move them towards it."
-            )
-        return best
+        """Near which the arm works."""
+        return _working_posture(
+            self.robot,
+            ("home_position", self.home_position),
+            ("table_centre", self.table_centre),
+            ("hover_height", self.hover_height),
+            ("shelf_x", self.shelf_x),
+            ("shelf_depth", self.shelf_depth),
+        )
 
     def _awkwardness(self, q: Float[Tensor, " joints"]) -> float:
         """How near a posture is to furniture, limits and singularities; 0: far from all."""
@@ -260,3 +259,45 @@ class Workplace:
         position = self.shelf(name).position.clone()
         position[1] = self.scene.cabinet.front + self.approach
         return Pose(position, coarse_orientation(position))
+
+
+@cache
+def _working_posture(
+    robot: WorkArm, *places: tuple[str, float | tuple[float, ...]]
+) -> Float[Tensor, " joints"]:
+    """Of an arm's postures at home, the one from which it gets on with its work best.
+
+    It has postures above the table and at each shelf that are all near to one another, clear of
+    the furniture and away from limits and singularities.
+
+    Args:
+        robot: The arm.
+        places: Fields of its workplace; the furniture is the ordinary one.
+
+    Raises:
+        UnreachableError: No posture at home is one for all of these places.
+    """
+    workplace = Workplace.of(robot, **dict(places))
+    names = workplace.shelf_names()
+    goals = [workplace.hover(), *map(workplace.shelf_front, names)]
+    goals += map(workplace.shelf, names)
+    best, least = None, math.inf
+    for posture in robot.postures(workplace.home())[:_POSTURES]:
+        cost = workplace._awkwardness(posture)
+        for goal in goals:
+            if cost > least:
+                break
+            try:
+                there = robot.nearest(goal, near=posture, samples=_TRIED)
+            except UnreachableError:
+                cost = math.inf
+                break
+            cost += float((there - posture).abs().max()) + workplace._awkwardness(there)
+        if cost < least:
+            best, least = posture, cost
+    if best is None:
+        raise UnreachableError(
+            f"the {robot.name} does not reach home, table and shelves in one posture: "
+            f"move them towards it ({', '.join(name for name, _ in places)})."
+        )
+    return best

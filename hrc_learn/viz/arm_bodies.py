@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 
 from hrc_learn.geometry import Body, Capsule, MeshFile
-from hrc_learn.kinematics import panda, panda_capsules
+from hrc_learn.kinematics import FrankaWorkArm, WorkArm, panda, panda_capsules
 
 # Meshes of the Panda, where the package that ships them is installed (extra `meshes`).
 
@@ -41,6 +41,23 @@ def panda_meshes(body: str) -> tuple[MeshFile, ...]:
         return ()
     place: dict[str, Any] = dict(_PARTS[body])
     return (MeshFile(path=folder / f"{place.pop('file')}.dae", **place),)
+
+
+_HAND = ("hand", "finger_left", "finger_right")
+
+
+def arm_meshes(robot: WorkArm, body: str) -> tuple[MeshFile, ...]:
+    """What a link, the hand or a finger of an arm looks like; nothing if that is not known.
+
+    Franka's arms look alike, and all arms carry the same hand.
+
+    Args:
+        robot: The arm.
+        body: link0, link1, ..., hand, finger_left or finger_right.
+    """
+    if isinstance(robot, FrankaWorkArm) or body in _HAND:
+        return panda_meshes(body)
+    return tuple(robot.meshes.get(body, ()))
 
 
 @cache

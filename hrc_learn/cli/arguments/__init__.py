@@ -25,8 +25,6 @@ Channel = Literal["joint", "position", "orientation", "pose"]
 """Keys of `hrc_learn.learning.channels.CHANNELS`."""
 Scaling = Literal["none", "paper", "amplitude", "rotation"]
 """Keys of `hrc_learn.dmp.forcing_scale.SCALINGS`."""
-Robot = Literal["panda"]
-"""Arms that the simulated work cell has."""
 Variant = Literal["learned", "unadapted", "kalman", "composite", "paper", "fixed", "none"]
 """Keys of `hrc_learn.experiments.grasping.experiment.VARIANTS`, and none of them."""
 WayMaking = Literal["none", "expert", "automatic", "both"]
@@ -82,6 +80,18 @@ Experiment = Literal[
     "stress_plant_worse",
 ]
 """Keys of `hrc_learn.experiments.controller.sweep.EXPERIMENTS`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OfRobot:
+    """A command that some arm carries out."""
+
+    robot: str = "panda"
+    """Arm that does it: a registered name, or a URDF or MJCF file."""
+    base: More[str] = ""
+    """Link of such a file that is the arm's base; its root when not given."""
+    tip: More[str] = ""
+    """Link of such a file that is the arm's flange; its only end when not given."""
 
 
 @dataclass(frozen=True, kw_only=True)

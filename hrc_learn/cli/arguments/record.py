@@ -5,11 +5,19 @@ from pathlib import Path
 from typing import Literal
 
 from hrc_learn.cli._options import Detail, More
-from hrc_learn.cli.arguments import Camera, Configuration, Led, Measured, Shelf, Written
+from hrc_learn.cli.arguments import (
+    Camera,
+    Configuration,
+    Led,
+    Measured,
+    OfRobot,
+    Shelf,
+    Written,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
-class RecordPlacing(Led, Written):
+class RecordPlacing(OfRobot, Led, Written):
     """Record demonstrations of placing an object on a shelf, with the null-space posture.
 
     The scripted expert guides the simulated arm from home into the cabinet while pulling its
@@ -32,7 +40,7 @@ class RecordPlacing(Led, Written):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RecordServoing(Led, Written):
+class RecordServoing(OfRobot, Led, Written):
     """Record demonstrations of visual servoing to an object by an uncalibrated camera.
 
     The scripted expert moves the marked end effector over the table and ends right above an

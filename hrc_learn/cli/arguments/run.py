@@ -12,7 +12,7 @@ from hrc_learn.cli.arguments import (
     Experiment,
     Led,
     Measured,
-    Robot,
+    OfRobot,
     Shelf,
     Variant,
     WayMaking,
@@ -31,7 +31,7 @@ class Imperfect:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Demo(Imperfect, Measured):
+class Demo(Imperfect, OfRobot, Measured):
     """Do the whole main job in simulation: demonstrate, learn, grasp, place.
 
     Records demonstrations of placing and of servoing, fits a movement primitive and an image
@@ -43,8 +43,6 @@ class Demo(Imperfect, Measured):
 
     out: Path = Path("outputs/demo")
     """Folder for demonstrations, models and the run."""
-    robot: Robot = "panda"
-    """Arm that does it."""
     shelf: Shelf = "middle"
     """Where to put the object; the middle shelf is the demonstrated one."""
     seed: int = 0
@@ -52,7 +50,7 @@ class Demo(Imperfect, Measured):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunExperiment(Imperfect, Led, Written):
+class RunExperiment(Imperfect, OfRobot, Led, Written):
     """What the paper's three experiments have in common."""
 
     out: Path
@@ -66,8 +64,6 @@ class RunExperiment(Imperfect, Led, Written):
     curve: More[tuple[float, ...]] = ()
     """Repeat with these sizes of the imperfections besides, in multiples of the nominal ones,
     and draw success and errors against them."""
-    robot: Robot = "panda"
-    """Arm that does it."""
     serve: bool = False
     """Serve the dashboard in the browser while the run goes on."""
     serving: Configuration = Detail("hrc_learn.experiments.run_recording", "LiveViewConfig")

@@ -10,6 +10,7 @@ from hrc_learn.cli._options import resolved
 from hrc_learn.cli._run import configuration, leads_real_arm, write_values
 from hrc_learn.cli.arguments.record import RecordExpert, RecordPlacing, RecordServoing
 from hrc_learn.experiments.arm_access import access_by
+from hrc_learn.kinematics import ArmChoice
 from hrc_learn.sim import PhysicsError, World, open_camera
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.marker_sensor import MarkerSensor
@@ -35,7 +36,8 @@ def record_placing(args: RecordPlacing) -> int:
     if args.episodes < 1:
         raise ValueError(f"--episodes must be at least 1, but is {args.episodes}.")
     open_arm = _opening(args)
-    workplace = Workplace()
+    robot = ArmChoice(args.robot, args.base, args.tip).work_arm()
+    workplace = Workplace.of(robot)
     goal = workplace.shelf(args.shelf).position.numpy()
     world = World(workplace.scene)
     rng = np.random.default_rng(args.seed)
@@ -62,6 +64,7 @@ def record_placing(args: RecordPlacing) -> int:
                 "recorded with": configuration(args),
             },
             overwrite=args.overwrite,
+            robot=robot,
         )
     except (TaskFailedError, PhysicsError) as error:
         print(f"failed: {error}", file=sys.stderr)
@@ -82,7 +85,8 @@ def record_servoing(args: RecordServoing) -> None:
     if args.episodes < 1:
         raise ValueError(f"--episodes must be at least 1, but is {args.episodes}.")
     open_arm = _opening(args)
-    workplace = Workplace()
+    robot = ArmChoice(args.robot, args.base, args.tip).work_arm()
+    workplace = Workplace.of(robot)
     world = World(workplace.scene)
     rng = np.random.default_rng(args.seed)
     sensor = MarkerSensor(open_camera(world, args.camera, rng=rng), workplace.scene.marker_ids)
@@ -104,6 +108,7 @@ def record_servoing(args: RecordServoing) -> None:
         features={OBJECT_FEATURE: OBJECT_FEATURE_NAMES, ANGLE_FEATURE: ANGLE_FEATURE_NAMES},
         details={"scene": "hrc_learn workplace", "recorded with": configuration(args)},
         overwrite=args.overwrite,
+        robot=robot,
     )
     print(f"{args.episodes} demonstrations in {args.out}, marker seen {100 * min(seen):.0f} %")
     write_values(args.json, {"episodes": args.episodes, "marker_seen_min": min(seen)})

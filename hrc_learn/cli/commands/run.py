@@ -15,6 +15,7 @@ from rich.console import Console
 
 from hrc_learn.cli._options import resolved
 from hrc_learn.cli._run import command_line, leads_real_arm, refuse_existing
+from hrc_learn.cli.arguments import OfRobot
 from hrc_learn.cli.arguments.learn import FitImageJacobian, FitPrimitives
 from hrc_learn.cli.arguments.record import RecordPlacing, RecordServoing
 from hrc_learn.cli.arguments.run import (
@@ -27,7 +28,7 @@ from hrc_learn.cli.arguments.run import (
     RunServoing,
 )
 from hrc_learn.experiments.collaboration.experiment import CollaborationExperiment
-from hrc_learn.experiments.collaboration.trial import Disturbances, workplace_for
+from hrc_learn.experiments.collaboration.trial import Disturbances, Pulls, workplace_for
 from hrc_learn.experiments.frame import Experiment, RunOptions, conduct
 from hrc_learn.experiments.grasping.experiment import GraspingExperiment
 from hrc_learn.experiments.grasping.trial import GraspingSceneConfig
@@ -41,6 +42,7 @@ from hrc_learn.experiments.on_arm import (
 )
 from hrc_learn.experiments.placing.experiment import ABLATION, PlacingExperiment, dataset_of
 from hrc_learn.hardware import open_camera
+from hrc_learn.kinematics import ArmChoice
 from hrc_learn.learning.tuning import with_gains
 from hrc_learn.protocols import DrawnRegion
 from hrc_learn.sim import CameraKind, Imperfections, OcclusionInterval
@@ -52,6 +54,8 @@ from hrc_learn.skills.work_cell import WorkCellConfig
 from hrc_learn.store import write_text
 from hrc_learn.teleoperation import DrawnInterval
 from hrc_learn.teleoperation.page import PageConfig
+
+_PANDA = ArmChoice()
 
 MODELS = Path("outputs/demo")
 """Where commands that are given no model look for those of the demo."""
@@ -94,6 +98,7 @@ def run_placing(args: RunPlacing) -> int:
         taught=args.taught,
         snapshots=args.pictures,
         arm=args.arm,
+        robot=_choice(args),
     )
     return _conduct(experiment, args, counts={ABLATION: args.ablation})
 
@@ -121,6 +126,7 @@ def run_grasping(args: RunGrasping) -> int:
         drawings=_drawings(args),
         page=PageConfig(port=args.port) if args.page else None,
         arm=args.arm,
+        robot=_choice(args),
     )
     return _conduct(experiment, args)
 
@@ -145,7 +151,7 @@ def run_collaboration(args: RunCollaboration) -> int:
         shelves=shelves,
         shelf_x=args.shelf_x,
         shelf_depth=args.shelf_depth,
-        pulls=args.pulls,
+        pulls=_possible_pulls(args),
         mapping=args.mapping,
         worker=args.worker,
         imperfections=_imperfections(args),
@@ -162,8 +168,25 @@ def run_collaboration(args: RunCollaboration) -> int:
         drawings=_drawings(args),
         page=PageConfig(port=args.port) if args.page else None,
         arm=args.arm,
+        robot=_choice(args),
     )
     return _conduct(experiment, args)
+
+
+def _choice(args: OfRobot) -> ArmChoice:
+    return ArmChoice(args.robot, args.base, args.tip)
+
+
+def _possible_pulls(args: RunCollaboration) -> Pulls:
+    """When a scripted person pulls the elbow of an arm that leaves it free to be pulled."""
+    robot = _choice(args).work_arm()
+    if robot.null_space == "none" and args.pulls != "none":
+        print(
+            f"note: the {robot.name} needs all its {robot.joints} joints for the pose of its "
+            "tool: nobody can pull its elbow aside, so nobody does."
+        )
+        return "none"
+    return args.pulls
 
 
 def _simulated_camera(args: RunServoing) -> CameraKind:
@@ -238,6 +261,11 @@ def _with_models[Args: RunExperiment](args: Args) -> Args:
     if any(not (MODELS / name).is_dir() for name in missing):
         console = Console()
         console.print(f"note: no model given and none in {MODELS}, so it is learned first")
+        if args.robot != "panda":
+            raise ValueError(
+                f"the models in {MODELS} are a Panda's: make those of the {args.robot} by "
+                f"`hrc demo --robot {args.robot} --out FOLDER`, and name them."
+            )
         learn(MODELS, console)
     return replace(resolved(args), **{name: MODELS / name for name in missing})
 
@@ -257,7 +285,7 @@ def _conduct(
 def demo(args: Demo) -> int:
     """The whole main job, command after command in one process."""
     console = Console()
-    learn(args.out, console, steps=5)
+    learn(args.out, console, steps=5, robot=_choice(args))
     write_text(args.out / "configuration.json", json.dumps(asdict(args), indent=2, default=str))
     _announce(console, 5, 5, "Grasping beside a person, carrying, placing")
     return run_collaboration(
@@ -266,6 +294,8 @@ def demo(args: Demo) -> int:
             aiming=args.out / "aiming",
             shelf=args.shelf,
             robot=args.robot,
+            base=args.base,
+            tip=args.tip,
             out=args.out / "run",
             seed=args.seed,
             imperfections=args.imperfections,
@@ -276,7 +306,7 @@ def demo(args: Demo) -> int:
     )
 
 
-def learn(out: Path, console: Console, steps: int = 4) -> None:
+def learn(out: Path, console: Console, steps: int = 4, robot: ArmChoice = _PANDA) -> None:
     """Record demonstrations of placing and servoing, and learn from them.
 
     Args:
@@ -284,6 +314,7 @@ def learn(out: Path, console: Console, steps: int = 4) -> None:
             older ones in it are replaced.
         console: Told what is being done.
         steps: How many there are, with those of the caller.
+        robot: The arm.
 
     Raises:
         RuntimeError: If the scripted expert fails.
@@ -291,11 +322,12 @@ def learn(out: Path, console: Console, steps: int = 4) -> None:
     from hrc_learn.cli.commands import fit, record
 
     placing, servoing = out / "placing_demos", out / "aiming_demos"
+    chosen = {"robot": robot.name, "base": robot.base, "tip": robot.tip}
     _announce(console, 1, steps, "Demonstrations of placing")
-    if record.record_placing(RecordPlacing(out=placing, overwrite=True)):
+    if record.record_placing(RecordPlacing(out=placing, overwrite=True, **chosen)):
         raise RuntimeError("the scripted expert could not place")
     _announce(console, 2, steps, "Demonstrations of servoing with an uncalibrated camera")
-    record.record_servoing(RecordServoing(out=servoing, overwrite=True))
+    record.record_servoing(RecordServoing(out=servoing, overwrite=True, **chosen))
     _announce(console, 3, steps, "Movement primitives from the first")
     fit.fit_primitives(FitPrimitives(dataset=placing, out=out / "placing", overwrite=True))
     _announce(console, 4, steps, "Image Jacobian from the second")

@@ -29,6 +29,7 @@ from hrc_learn.experiments.frame import UNOBSERVED, Observer, RepeatedRun, Study
 from hrc_learn.experiments.metric_table import Metric
 from hrc_learn.experiments.run_recording import record, worker_distance
 from hrc_learn.geometry import Box
+from hrc_learn.kinematics import ArmChoice
 from hrc_learn.sim import CameraKind, Imperfections, RenderingUnavailableError
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.pick_and_place import PickAndPlaceConfig
@@ -82,6 +83,8 @@ class CollaborationExperiment:
     page: PageConfig | None = None
     """Serve a page from which people push the elbow and draw too; the run takes real time
     then."""
+    robot: ArmChoice = field(default_factory=ArmChoice)
+    """Which arm does it."""
     arm: ArmDriver = "sim"
     """What leads the simulated arm: the simulator itself, or a driver of the real one over its
     network protocol."""
@@ -92,9 +95,11 @@ class CollaborationExperiment:
         keep_every = self.cell.keep_image_every * len(self.shelves)
         return simulate_collaboration(
             VisualServoSkill.load(self.aiming),
-            PlacingSkill.load(self.placing),
+            PlacingSkill.load(self.placing, self.robot.work_arm()),
             self.shelves,
-            workplace=workplace_for(self.shelves, self.shelf_x, self.shelf_depth),
+            workplace=workplace_for(
+                self.shelves, self.shelf_x, self.shelf_depth, self.robot.work_arm()
+            ),
             camera=self.camera,
             forces=self._forces(),
             disturbances=self.disturbances,

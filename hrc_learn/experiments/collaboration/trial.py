@@ -24,6 +24,7 @@ from hrc_learn.experiments.collaboration.worker_room import (
 )
 from hrc_learn.experiments.run_recording import LiveView, no_live_view
 from hrc_learn.geometry import quaternion
+from hrc_learn.kinematics import PANDA, WorkArm
 from hrc_learn.sim import (
     CameraChange,
     CameraKind,
@@ -379,7 +380,9 @@ def with_objects(workplace: Workplace, items: Sequence[ObjectConfig]) -> Workpla
     return replace(workplace, scene=replace(workplace.scene, objects=tuple(items)))
 
 
-def workplace_for(shelves: Sequence[str], shelf_x: float, shelf_depth: float) -> Workplace:
+def workplace_for(
+    shelves: Sequence[str], shelf_x: float, shelf_depth: float, robot: WorkArm = PANDA
+) -> Workplace:
     """A workplace with an object for each shelf.
 
     Raises:
@@ -390,7 +393,7 @@ def workplace_for(shelves: Sequence[str], shelf_x: float, shelf_depth: float) ->
             f"there are 1 to {len(THREE_OBJECTS)} objects to put on shelves, but "
             f"{len(shelves)} shelves are named."
         )
-    workplace = Workplace(shelf_x=shelf_x, shelf_depth=shelf_depth)
+    workplace = Workplace.of(robot, shelf_x=shelf_x, shelf_depth=shelf_depth)
     return with_objects(workplace, THREE_OBJECTS[: len(shelves)])
 
 

@@ -21,6 +21,7 @@ from hrc_learn.experiments.grasping.trial import (
     simulate_grasp,
 )
 from hrc_learn.experiments.metric_table import Metric
+from hrc_learn.kinematics import ArmChoice
 from hrc_learn.sim import CameraKind, Imperfections
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.grasping import GraspingConfig
@@ -61,6 +62,8 @@ class GraspingExperiment:
     page: PageConfig | None = None
     """Serve a page from which people draw and pull the arm too; the grasp takes real time
     then."""
+    robot: ArmChoice = field(default_factory=ArmChoice)
+    """Which arm does it."""
     arm: ArmDriver = "sim"
     """What leads the simulated arm: the simulator itself, or a driver of the real one over its
     network protocol."""
@@ -99,7 +102,13 @@ class GraspingExperiment:
         skill, rng = VisualServoSkill.load(self.aiming), np.random.default_rng(seed)
         return simulate_grasp(
             skill,
-            GraspingScene.draw(Workplace(), self.scene, rng, self.camera, self.imperfections),
+            GraspingScene.draw(
+                Workplace.of(self.robot.work_arm()),
+                self.scene,
+                rng,
+                self.camera,
+                self.imperfections,
+            ),
             estimator=VARIANTS[variant].estimator(skill.jacobian),
             told_target=compared,
             camera=self.camera,

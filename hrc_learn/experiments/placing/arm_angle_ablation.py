@@ -4,7 +4,7 @@ What it is worth that the expert moves the elbow along with the end effector.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from hrc_learn.experiments.metric_table import Metric, total
 from hrc_learn.experiments.monte_carlo import Trial
+from hrc_learn.kinematics import ArmChoice
 from hrc_learn.sim import Touch, World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.teleoperation.scripted_demonstrations import (
@@ -86,10 +87,12 @@ class AblationTrial:
 
     shelf: str
     """Where the motion leads."""
+    robot: ArmChoice = field(default_factory=ArmChoice)
+    """The arm."""
 
     def __call__(self, seed: int) -> Mapping[str, Any]:
         """Values by name; a failure if the motion with the posture was not free."""
-        ablation = Ablation.run(Workplace(), self.shelf, seed)
+        ablation = Ablation.run(Workplace.of(self.robot.work_arm()), self.shelf, seed)
         taught, untaught = ablation.with_posture, ablation.without_posture
         return {
             "with_posture_hit": int(bool(taught.contacts)),

@@ -45,7 +45,7 @@ from hrc_learn.experiments.placing.trial import (
     taught_correction,
 )
 from hrc_learn.experiments.run_recording import no_live_view
-from hrc_learn.kinematics import UnreachableError, panda
+from hrc_learn.kinematics import ArmChoice, FrankaWorkArm, UnreachableError
 from hrc_learn.sim import Imperfections, RenderingUnavailableError, World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.placing import PlacingSkill, PlanningSpace, check_plan
@@ -85,6 +85,8 @@ class PlacingExperiment:
     encoders read there corrects all goals."""
     snapshots: bool = True
     """Whether to render pictures of the arm, where this machine can."""
+    robot: ArmChoice = field(default_factory=ArmChoice)
+    """Which arm does it."""
     arm: ArmDriver = "sim"
     """What leads the simulated arm: the simulator itself, or a driver of the real one over its
     network protocol."""
@@ -104,13 +106,17 @@ class PlacingExperiment:
         Raises:
             ValueError: If the demonstration is not of this arm or ends at none of the shelves.
         """
-        skill, demonstration = PlacingSkill.load(self.placing), self._demonstration()
-        workplace = Workplace()
-        goal_shelf = demonstrated_shelf(demonstrated_path(demonstration)[-1], workplace)
+        skill, demonstration = (
+            PlacingSkill.load(self.placing, self.robot.work_arm()),
+            self._demonstration(),
+        )
+        workplace = self._workplace
+        path = demonstrated_path(demonstration, skill.robot.chain)
+        goal_shelf = demonstrated_shelf(path[-1], workplace)
         assert demonstration.joint_position is not None
         start = torch.from_numpy(demonstration.joint_position[0])
         rng = np.random.default_rng(seed)
-        world = World(workplace.scene, self.imperfections.draw(rng))
+        world = World(workplace.scene, self.imperfections.draw(rng, skill.robot.joints))
         correction = None
         if self.taught:
             correction = taught_correction(
@@ -154,7 +160,7 @@ class PlacingExperiment:
 
     def metrics(self) -> Sequence[Metric[PlacingRun]]:
         """Reproduction, both spaces, ablation."""
-        return run_metrics(Workplace().shelf_names())
+        return run_metrics(self._workplace.shelf_names())
 
     def recordings(self, run: PlacingRun) -> Mapping[str, RunRecording]:
         """Placings planned in task space; the demonstrated shelf's is "run"."""
@@ -187,7 +193,7 @@ class PlacingExperiment:
 
         The first with each size of the imperfections.
         """
-        shelves = Workplace().shelf_names()
+        shelves = self._workplace.shelf_names()
         starts = RandomStart(
             placing=self.placing,
             demonstrations=self.demonstrations,
@@ -195,8 +201,9 @@ class PlacingExperiment:
             noise=self.noise,
             imperfections=self.imperfections,
             taught=self.taught,
+            robot=self.robot,
         )
-        end = demonstrated_path(self._demonstration())[-1]
+        end = demonstrated_path(self._demonstration(), self.robot.work_arm().chain)[-1]
         study = Study(
             title="Placing on each shelf from random starts",
             trial=starts,
@@ -209,11 +216,17 @@ class PlacingExperiment:
             **study.at_sizes(self.curve),
             ABLATION: Study(
                 title="Paired demonstrations with and without null-space posture",
-                trial=AblationTrial(shelf=demonstrated_shelf(end, Workplace())),
+                trial=AblationTrial(
+                    shelf=demonstrated_shelf(end, self._workplace), robot=self.robot
+                ),
                 metrics=arm_angle_ablation.TRIAL_METRICS,
                 text="Another tremor and start for each pair.",
             ),
         }
+
+    @property
+    def _workplace(self) -> Workplace:
+        return Workplace.of(self.robot.work_arm())
 
     def _demonstration(self) -> Demonstration:
         return load_demos(self.demonstrations, episodes=[0])[0]
@@ -259,10 +272,12 @@ def demonstrated_shelf(end: Float[np.ndarray, "3"], workplace: Workplace) -> str
 def _reached_with_joint7(workplace: Workplace, end: np.ndarray) -> tuple[str, ...]:
     """Shelves that need no other position of joint 7 than the demonstration ended with."""
     near = torch.from_numpy(end)
-    reached = []
+    reached: list[str] = []
+    if not isinstance(workplace.robot, FrankaWorkArm):
+        return ()
     for shelf in workplace.shelf_names():
         try:
-            panda.inverse(workplace.shelf(shelf), near[6], near=near)
+            workplace.robot.chain.inverse(workplace.shelf(shelf), near[6], near=near)
         except UnreachableError:
             continue
         reached.append(shelf)
@@ -280,17 +295,19 @@ class RandomStart:
     """Standard deviation of each joint about home [rad]."""
     imperfections: Imperfections
     taught: bool
+    robot: ArmChoice = field(default_factory=ArmChoice)
 
     def __call__(self, seed: int) -> Mapping[str, Any]:
         """Metrics of placings in task space, and how many joint-space plans are blocked."""
-        skill = PlacingSkill.load(self.placing)
+        skill = PlacingSkill.load(self.placing, self.robot.work_arm())
         demonstration = load_demos(self.demonstrations, episodes=[0])[0]
-        workplace, rng = Workplace(), np.random.default_rng(seed)
-        world = World(workplace.scene, self.imperfections.draw(rng))
+        workplace, rng = Workplace.of(skill.robot), np.random.default_rng(seed)
+        world = World(workplace.scene, self.imperfections.draw(rng, skill.robot.joints))
         item = workplace.scene.objects[0].name
         correction = None
         if self.taught:
-            known = demonstrated_shelf(demonstrated_path(demonstration)[-1], workplace)
+            path = demonstrated_path(demonstration, skill.robot.chain)
+            known = demonstrated_shelf(path[-1], workplace)
             correction = taught_correction(world, workplace.shelf(known), skill.joint.goal, rng)
         outcomes, blocked = {}, 0
         for shelf in workplace.shelf_names():

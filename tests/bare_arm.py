@@ -1,0 +1,38 @@
+"""A Panda without some of its joints, as an arm that nobody has seen."""
+
+from types import SimpleNamespace
+
+import torch
+
+from hrc_learn.kinematics import CapsuleArm, JointLimits, LinkCapsule, SerialChain, panda
+
+
+def bare(left_out=(2,), name="cut"):
+    """What a description would give: its joints but for those left out, and thin capsules."""
+    keep = [i for i in range(7) if i not in left_out]
+    mounts, carried = [], torch.eye(4, dtype=torch.float64)
+    for i in range(7):
+        carried = carried @ panda.mounts[i]
+        if i in keep:
+            mounts.append(carried)
+            carried = torch.eye(4, dtype=torch.float64)
+    limits = {
+        field: getattr(panda.limits, field)[keep]
+        for field in ("lower", "upper", "velocity", "acceleration", "jerk", "torque")
+    }
+    chain = SerialChain(
+        joint_names=[f"{name}_{i}" for i in keep],
+        mounts=torch.stack(mounts),
+        flange=carried @ panda.flange,
+        tcp=torch.eye(4, dtype=torch.float64),
+        limits=JointLimits(**limits, vintage="test"),
+        ready=panda.ready[keep],
+    )
+    n = len(keep)
+    capsules = [
+        LinkCapsule(link=link, start=(0.0, 0.0, -0.02), end=(0.0, 0.0, 0.02), radius=0.01)
+        for link in (*range(n + 1), n + 2)
+    ]
+    body = CapsuleArm(chain, capsules, [(0, 2)])
+    masses = (3.0, *(2.0,) * n, 0.0, 0.7)
+    return SimpleNamespace(name=name, chain=chain, body=body, visuals=(), masses=masses)

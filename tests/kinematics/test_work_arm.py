@@ -1,0 +1,122 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from bare_arm import bare
+
+from hrc_learn.geometry import Pose
+from hrc_learn.kinematics import (
+    PANDA,
+    ArmChoice,
+    EquippedArm,
+    JointLimits,
+    UnreachableError,
+)
+from hrc_learn.kinematics.numerical_inverse import solutions_from
+
+
+def poses_of(chain, count, seed=0):
+    rng = torch.Generator().manual_seed(seed)
+    share = torch.rand(count, len(chain.joint_names), generator=rng, dtype=torch.float64)
+    lower, upper = chain.limits.lower, chain.limits.upper
+    q = lower + (0.1 + 0.8 * share) * (upper - lower)
+    return q, chain.forward(q)
+
+
+@pytest.mark.parametrize("left_out", [(2,), ()])
+def test_solutions_reach_the_pose_within_the_limits(left_out):
+    arm = EquippedArm(bare(left_out))
+    starts, poses = poses_of(arm.chain, 40)
+    for i in range(5):
+        found = solutions_from(arm.chain, poses[i], starts)
+        assert len(found)
+        assert arm.chain.limits.contain(found).all()
+        error = arm.chain.forward(found).twist_to(poses[i]).abs().max()
+        assert error < 1e-9
+
+
+def test_the_nearest_is_where_the_pose_came_from():
+    arm = EquippedArm(bare())
+    q, poses = poses_of(arm.chain, 10, seed=1)
+    for i in range(len(q)):
+        found = arm.nearest(poses[i], near=q[i] + 0.02)
+        # Six joints have finitely many solutions: the one beside is the same.
+        torch.testing.assert_close(found, q[i], atol=1e-7, rtol=0)
+
+
+def test_joints_that_turn_twice_around_stay_near():
+    turning = bare()
+    limits = turning.chain.limits
+    turning.chain.limits = JointLimits(
+        **{**vars(limits), "lower": limits.lower - 6.0, "upper": limits.upper + 6.0}
+    )
+    arm = EquippedArm(turning)
+    q, _ = poses_of(bare().chain, 3, seed=2)
+    pose = arm.chain.forward(q)
+    for i in range(3):
+        away = q[i] + torch.tensor([2 * math.pi, 0, 0, 0, 0, 0], dtype=torch.float64)
+        found = arm.nearest(pose[i], near=away)
+        torch.testing.assert_close(found, away, atol=1e-7, rtol=0)
+
+
+def test_postures_differ_and_the_first_is_the_most_comfortable():
+    arm = EquippedArm(bare())
+    _, poses = poses_of(arm.chain, 10, seed=3)
+    several = [found for found in (arm.postures(poses[i]) for i in range(10)) if len(found) > 1]
+    assert several
+    for found in several:
+        assert torch.pdist(found).min() > 1e-3
+        # Further from both singularities and limits than the first: no other is.
+        smallest = torch.linalg.svdvals(arm.chain.jacobian(found))[:, -1]
+        limits = arm.chain.limits
+        room = torch.minimum(found - limits.lower, limits.upper - found).amin(-1)
+        better = (smallest > smallest[0]) & (room > room[0])
+        enough = (room[0] > 0.3) & (smallest[0] > 0.1)
+        assert enough or not better.any()
+
+
+def test_a_pose_out_of_reach_is_refused():
+    arm = EquippedArm(bare())
+    far = Pose(torch.tensor([3.0, 0.0, 0.0]).double(), torch.tensor([1.0, 0, 0, 0]).double())
+    with pytest.raises(UnreachableError, match=r"\(3\.000, 0\.000, 0\.000\) m"):
+        arm.nearest(far, near=arm.chain.ready)
+    with pytest.raises(UnreachableError):
+        arm.postures(far)
+
+
+def test_it_carries_our_hand_in_place_of_its_own():
+    described = bare()
+    arm = EquippedArm(described)
+    hand = arm.chain.forward(arm.chain.ready).position
+    flange = described.chain.forward(described.chain.ready)
+    along = torch.tensor([0.0, 0.0, 0.1034], dtype=torch.float64)
+    torch.testing.assert_close(hand, flange.apply(along))
+    assert max(arm.body.links) == 6
+    own = [c for c in PANDA.whole.capsules if c.link == 9]
+    assert [c.radius for c in arm.whole.capsules if c.link == 8] == [c.radius for c in own]
+    assert arm.masses == (2.0,) * 6
+    assert (0, 2) in arm.whole.overlapping
+
+
+@pytest.mark.parametrize(
+    ("left_out", "null_space"), [((2,), "none"), ((), "free")], ids=["6", "7"]
+)
+def test_what_null_space_is_left(left_out, null_space):
+    arm = EquippedArm(bare(left_out))
+    rank = np.linalg.matrix_rank(arm.chain.jacobian(arm.chain.ready).numpy())
+    assert arm.null_space == null_space
+    assert (arm.joints - rank > 0) == (null_space == "free")
+    assert PANDA.null_space == "arm angle"
+
+
+def test_too_few_joints_are_refused():
+    with pytest.raises(ValueError, match="cut has 5 joints"):
+        EquippedArm(bare((2, 4)))
+
+
+def test_a_choice_opens_the_same_arm_each_time():
+    assert ArmChoice().work_arm() is PANDA
+    fr3 = ArmChoice("fr3").work_arm()
+    assert fr3.chain.joint_names[0] == "fr3_joint1"
+    assert ArmChoice("fr3").work_arm() is fr3

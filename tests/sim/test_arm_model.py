@@ -1,0 +1,118 @@
+"""The simulated arm against its own chain, for arms of other shapes than the Panda's."""
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from bare_arm import bare
+
+from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.kinematics import PANDA, ArmChoice, EquippedArm
+from hrc_learn.sim import ArmModelConfig, World
+from hrc_learn.sim.arm_model import whole_arm
+from hrc_learn.sim.drawn_world import DrawnWorld
+from hrc_learn.sim.workplace import Workplace
+
+ARMS = {
+    "panda": lambda: PANDA,
+    "fr3": ArmChoice("fr3").work_arm,
+    "six": lambda: EquippedArm(bare()),
+}
+
+
+@pytest.fixture(params=ARMS)
+def robot(request):
+    return ARMS[request.param]()
+
+
+def test_mujoco_has_the_tool_where_the_chain_has_it(robot):
+    world = World(Workplace.of(robot).scene)
+    rng = np.random.default_rng(0)
+    limits = robot.chain.limits
+    for _ in range(5):
+        q = rng.uniform(limits.lower.numpy(), limits.upper.numpy())
+        world.reset(q)
+        pose = robot.chain.forward(torch.from_numpy(q))
+        np.testing.assert_allclose(world.arm.tcp_pose(), pose.matrix().numpy(), atol=1e-9)
+        np.testing.assert_allclose(world.arm.read().joint_position, q)
+
+
+def test_it_holds_its_posture_and_follows_a_velocity(robot):
+    workplace = Workplace.of(robot)
+    world = World(workplace.scene)
+    start = robot.chain.ready.numpy().copy()
+    world.reset(start)
+    world.advance(0.5)
+    np.testing.assert_allclose(world.arm.read().joint_position, start, atol=2e-4)
+    velocity = np.full(robot.joints, 0.1)
+    world.arm.command(velocity)
+    world.advance(0.5)
+    moved = world.arm.read().joint_position - start
+    np.testing.assert_allclose(moved, 0.05, atol=5e-3)
+
+
+def test_its_capsules_are_those_of_the_distances(robot):
+    spec_world = World(Workplace.of(robot).scene)
+    world_capsules = [
+        spec_world.model.geom(g)
+        for g in range(spec_world.model.ngeom)
+        if spec_world.model.geom_type[g] == mujoco.mjtGeom.mjGEOM_CAPSULE
+    ]
+    radii = sorted(float(geom.size[0]) for geom in world_capsules)
+    assert radii == pytest.approx(sorted(c.radius for c in robot.body.capsules))
+    total = sum(robot.masses)
+    links = [spec_world.model.body(f"link{i + 1}").mass[0] for i in range(robot.joints)]
+    assert sum(links) == pytest.approx(total)
+    assert whole_arm(ArmModelConfig(robot=robot)) is robot.whole
+
+
+@pytest.mark.parametrize("name", ["panda", "fr3"])
+def test_the_workplace_is_within_reach(name):
+    robot = ARMS[name]()
+    workplace = Workplace.of(robot)
+    reached = {
+        "home": (workplace.home_joints(), workplace.home()),
+        "hover": (workplace.hover_joints(), workplace.hover()),
+    }
+    near = workplace.home_joints()
+    for shelf in workplace.shelf_names():
+        goal = workplace.shelf(shelf)
+        reached[shelf] = robot.nearest(goal, near=near), goal
+    for q, goal in reached.values():
+        assert robot.chain.limits.contain(q)
+        tool: Pose = robot.chain.forward(q)
+        assert (tool.position - goal.position).norm() < 1e-6
+        assert quaternion.angle(tool.orientation, goal.orientation) < 1e-6
+
+
+def test_a_drawn_world_is_where_the_world_is_and_leaves_it_alone():
+    workplace = Workplace.of(PANDA)
+    world = World(workplace.scene)
+    before = world.model.ngeom
+    drawn = DrawnWorld(world)
+    world.reset(workplace.home_joints().numpy())
+    world.move_obstacle("occluder", (0.1, 0.2, 0.3))
+    drawn.update()
+    assert world.model.ngeom == before
+    for body in range(world.model.nbody):
+        name = world.model.body(body).name
+        np.testing.assert_allclose(drawn.data.body(name).xpos, world.data.body(name).xpos)
+    # What is seen touches nothing, whatever touches something stays as it was.
+    seen = drawn.model.ngeom - before
+    touching = (drawn.model.geom_contype | drawn.model.geom_conaffinity) != 0
+    own = (world.model.geom_contype | world.model.geom_conaffinity) != 0
+    assert touching.sum() == own.sum()
+    assert seen == 0 or seen > 50
+
+
+def test_links_that_touch_stand_out_and_are_themselves_again():
+    world = World(Workplace.of(PANDA).scene)
+    drawn = DrawnWorld(world)
+    before = drawn.model.geom_rgba.copy()
+    red = (1.0, 0.0, 0.0, 1.0)
+    drawn.paint(["link5_0", "table"], red)
+    changed = (drawn.model.geom_rgba != before).any(axis=1)
+    names = {drawn.model.body(int(b)).name for b in drawn.model.geom_bodyid[changed]}
+    assert names == {"link5", "table"}
+    drawn.paint([], red)
+    np.testing.assert_array_equal(drawn.model.geom_rgba, before)
