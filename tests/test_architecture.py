@@ -99,7 +99,7 @@ LIBRARIES: dict[str, set[str]] = {
 """Libraries that modules of a package may import as soon as they are imported."""
 
 LAZY_LIBRARIES: dict[str, set[str]] = {
-    "kinematics": {"pytorch_kinematics", "frankik"},
+    "kinematics": {"pytorch_kinematics", "frankik", "mujoco", "scipy"},
     "jacobian": {"scipy"},
     "cli": {"ray"},
     "demos": {"av", "scipy"},

@@ -1,7 +1,10 @@
-"""Serial arms: forward kinematics, Jacobians and inverses; Franka's Panda and FR3."""
+"""Serial arms from their descriptions: kinematics, Jacobians, inverses, shapes."""
 
-from hrc_learn.kinematics.chain import JointLimits as JointLimits
-from hrc_learn.kinematics.chain import MotionLimits as MotionLimits
+from hrc_learn.kinematics._assembly import FingerJoint as FingerJoint
+from hrc_learn.kinematics._assembly import GripperDescription as GripperDescription
+from hrc_learn.kinematics._assembly import LinkVisual as LinkVisual
+from hrc_learn.kinematics.arm import Arm as Arm
+from hrc_learn.kinematics.chain import JointKind as JointKind
 from hrc_learn.kinematics.chain import SerialChain as SerialChain
 from hrc_learn.kinematics.collision import CapsuleArm as CapsuleArm
 from hrc_learn.kinematics.collision import LinkCapsule as LinkCapsule
@@ -19,6 +22,8 @@ from hrc_learn.kinematics.franka_limits import FR3_VINTAGES as FR3_VINTAGES
 from hrc_learn.kinematics.interchange import from_pytorch_kinematics as from_pytorch_kinematics
 from hrc_learn.kinematics.interchange import to_pytorch_kinematics as to_pytorch_kinematics
 from hrc_learn.kinematics.interchange import to_urdf as to_urdf
+from hrc_learn.kinematics.limits import JointLimits as JointLimits
+from hrc_learn.kinematics.limits import MotionLimits as MotionLimits
 from hrc_learn.kinematics.redundancy import SINGULAR_BELOW as SINGULAR_BELOW
 from hrc_learn.kinematics.redundancy import arm_angle as arm_angle
 from hrc_learn.kinematics.redundancy import arm_angle_and_motion as arm_angle_and_motion
@@ -28,6 +33,9 @@ from hrc_learn.kinematics.redundancy import comfortable_postures as comfortable_
 from hrc_learn.kinematics.redundancy import null_space_projector as null_space_projector
 from hrc_learn.kinematics.redundancy import pseudo_inverse as pseudo_inverse
 from hrc_learn.kinematics.redundancy import singularity_damping as singularity_damping
+from hrc_learn.kinematics.registry import MissingModelError as MissingModelError
+from hrc_learn.kinematics.registry import arm as arm
+from hrc_learn.kinematics.registry import registered_arms as registered_arms
 from hrc_learn.kinematics.separation import GraspedBox as GraspedBox
 from hrc_learn.kinematics.separation import Separation as Separation
 from hrc_learn.kinematics.separation import separation as separation

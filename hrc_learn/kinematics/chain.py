@@ -1,4 +1,4 @@
-"""Serial arms: limits of the joints, forward kinematics and geometric Jacobians.
+"""Serial arms: forward kinematics and geometric Jacobians.
 
 The kinematics are there twice: as matrix products, which is fast when run eagerly, and for
 compilers written out number by number. There, products with the zeros and ones of which an
@@ -10,106 +10,18 @@ operations take far longer.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.geometry import Pose
 from hrc_learn.geometry.numerics import Constant
+from hrc_learn.kinematics.limits import JointLimits
 
-
-@dataclass(frozen=True, kw_only=True)
-class MotionLimits:
-    """Limits of each joint's motion, float64; velocities and up are symmetric.
-
-    Of whatever else is moved as well, in its own unit in place of radians.
-
-    Some arms lower their velocity limits towards the limits of position, to be able to stop:
-    there `velocity_offset` and `deceleration` are given, both or neither, and
-    `velocity_bounds` is what holds. Without them it is `velocity` everywhere.
-    """
-
-    lower: Float[Tensor, " joints"]
-    """Smallest position [rad]."""
-    upper: Float[Tensor, " joints"]
-    """Largest position [rad]."""
-    velocity: Float[Tensor, " joints"]
-    """[rad/s]"""
-    acceleration: Float[Tensor, " joints"]
-    """[rad/s^2]"""
-    jerk: Float[Tensor, " joints"]
-    """[rad/s^3]"""
-    velocity_offset: Float[Tensor, " joints"] | None = None
-    """o of `velocity_bounds` [rad/s]; None: the limits of velocity are the same everywhere."""
-    deceleration: Float[Tensor, " joints"] | None = None
-    """d of `velocity_bounds` [rad/s^2]."""
-
-    def __post_init__(self):
-        if (self.velocity_offset is None) != (self.deceleration is None):
-            raise ValueError(
-                "velocity_offset and deceleration together tell how velocity limits depend on "
-                "the position: give both, or neither"
-            )
-
-    def slowed[Limits: MotionLimits](self: Limits, fraction: float) -> Limits:
-        """The same limits with velocities of at most a fraction of theirs, at each position."""
-        o, d = self.velocity_offset, self.deceleration
-        return replace(
-            self,
-            velocity=fraction * self.velocity,
-            velocity_offset=None if o is None else fraction * o,
-            deceleration=None if d is None else fraction**2 * d,
-        )
-
-    def velocity_bounds(
-        self, q: Float[Tensor, "*batch joints"]
-    ) -> tuple[Float[Tensor, "*batch joints"], Float[Tensor, "*batch joints"]]:
-        """Lowest and highest velocity [rad/s] allowed at a position.
-
-        With the distance x to the limit of position ahead it is
-
-            min(velocity, max(0, sqrt(2 d max(0, x)) - o)),
-
-        Franka's formula for the Research 3 ("Robot and interface specifications"): the speed
-        from which a joint stops before the limit with the deceleration d, less an offset. Zero
-        from o^2/(2 d) before the limit. Differentiable; at a limit the slope is zero, not
-        infinite.
-
-        Args:
-            q: Joint positions [rad].
-        """
-        velocity = self.velocity.to(q)
-        if self.velocity_offset is None or self.deceleration is None:
-            return (-velocity).expand(q.shape), velocity.expand(q.shape)
-        o, d = self.velocity_offset.to(q), self.deceleration.to(q)
-        ahead = torch.stack([q - self.lower.to(q), self.upper.to(q) - q])
-        # Nearer than that nothing is left, and the root has no slope at zero.
-        speed = (2 * d * ahead).maximum(o * o).sqrt() - o
-        lower, upper = speed.minimum(velocity)
-        return -lower, upper
-
-
-@dataclass(frozen=True, kw_only=True)
-class JointLimits(MotionLimits):
-    """Limits of each joint of an arm."""
-
-    torque: Float[Tensor, " joints"]
-    """[N m]"""
-    vintage: str
-    """Who published these numbers, and when: manufacturers revise them."""
-
-    @property
-    def middle(self) -> Float[Tensor, " joints"]:
-        """Centre of the range of each joint [rad]."""
-        return (self.lower + self.upper) / 2
-
-    def contain(self, q: Float[Tensor, "*batch joints"]) -> Bool[Tensor, "*batch"]:
-        """Whether all joints are within their range, limits included."""
-        lower, upper = self.lower.to(q), self.upper.to(q)
-        return torch.all((q >= lower) & (q <= upper), dim=-1)
-
+type JointKind = Literal["revolute", "continuous", "prismatic"]
+"""How a joint moves about or along its axis; a continuous one turns without end."""
 
 type _Row = list[Tensor]
 
@@ -118,13 +30,16 @@ def transform_and_jacobian(
     q: Float[Tensor, "*batch joints"],
     mounts: Sequence[Sequence[Sequence[float]]],
     tip: Sequence[Sequence[float]],
+    sliding: Sequence[bool] = (),
 ) -> tuple[Float[Tensor, "*batch 3 4"], Float[Tensor, "*batch 6 joints"]]:
     """Transform (R | p) of the tool centre point and its geometric Jacobian, written out.
 
     Args:
-        q: Joint positions [rad].
+        q: Joint positions [rad], of sliding joints [m].
         mounts: Frame of each joint at zero in the frame of the joint before (the base).
         tip: Tool centre point in the frame of the last joint.
+        sliding: Which joints move along their z axis; the others, by default all, turn about
+            it.
 
     Returns:
         Both with the batch last in memory.
@@ -132,14 +47,23 @@ def transform_and_jacobian(
     zero, one = torch.zeros_like(q[..., 0]), torch.ones_like(q[..., 0])
     frame = [[one if i == j else zero for j in range(4)] for i in range(3)]
     axes, origins = [], []
-    for angle, mount in zip(q.unbind(-1), mounts, strict=True):
-        frame = _turned(_product(frame, mount), torch.cos(angle), torch.sin(angle))
+    slides = sliding or (False,) * len(mounts)
+    for value, mount, slide in zip(q.unbind(-1), mounts, slides, strict=True):
+        frame = _product(frame, mount)
+        if slide:
+            frame = [[x, y, z, p + z * value] for x, y, z, p in frame]
+        else:
+            frame = _turned(frame, torch.cos(value), torch.sin(value))
         axes.append([row[2] for row in frame])
         origins.append([row[3] for row in frame])
     frame = _product(frame, tip)
     point = [row[3] for row in frame]
-    linear = [_cross(axis, _minus(point, o)) for axis, o in zip(axes, origins, strict=True)]
-    rows = [[column[k] for column in part] for part in (linear, axes) for k in range(3)]
+    linear = [
+        axis if slide else _cross(axis, _minus(point, o))
+        for axis, o, slide in zip(axes, origins, slides, strict=True)
+    ]
+    angular = [[zero] * 3 if s else axis for axis, s in zip(axes, slides, strict=True)]
+    rows = [[column[k] for column in part] for part in (linear, angular) for k in range(3)]
     return _matrix(frame), _matrix(rows)
 
 
@@ -191,11 +115,16 @@ def _matrix(rows: list[_Row]) -> Tensor:
 
 
 class SerialChain:
-    """An arm of revolute joints, each turning about the z axis of its own frame.
+    """An arm of joints that turn about, or slide along, the z axis of their own frame.
 
-    The transform from one joint to the next is linear in 1, sin q and cos q, so all of them
-    come from two fused multiply-adds; what remains is one matrix product a joint. Transforms
-    are kept as their upper three rows (R | p): the last row is known.
+    An axis of any other direction is one of a frame turned by a constant, which the mounts take
+    up (`hrc_learn.kinematics.arm` does this for descriptions in files). The transform from one
+    joint to the next is linear in 1, sin q and cos q, and in q itself for a joint that slides,
+    so all of them come from two or three fused multiply-adds; what remains is one product of
+    matrices a joint. Transforms are kept as their upper three rows (R | p): the last is known.
+
+    Joint positions and all that is derived from them are in radians, in metres for joints that
+    slide.
 
     Methods take any number of leading batch dimensions and follow dtype and device of q.
     """
@@ -209,6 +138,7 @@ class SerialChain:
         tcp: Float[Tensor, "4 4"],
         limits: JointLimits,
         ready: Float[Tensor, " joints"],
+        kinds: Sequence[JointKind] | None = None,
     ):
         """Describe an arm.
 
@@ -219,28 +149,38 @@ class SerialChain:
             tcp: Tool centre point in the frame of the flange.
             limits: Of the joints, in the same order.
             ready: A comfortable posture [rad], away from limits and singularities.
+            kinds: How each joint moves; all are revolute if None.
 
         Raises:
-            ValueError: The number of names, mounts, limits and joints of `ready` differ.
+            ValueError: The number of names, mounts, limits, kinds and joints of `ready` differ.
         """
-        counts = [len(joint_names), len(mounts), len(limits.lower), len(ready)]
+        kinds = kinds or ("revolute",) * len(joint_names)
+        counts = [len(joint_names), len(mounts), len(limits.lower), len(ready), len(kinds)]
         if len(set(counts)) > 1:
             raise ValueError(
-                "each joint needs a name, a mount, limits and a ready angle, but there are "
-                "{} names, {} mounts, {} limits and {} ready angles.".format(*counts)
+                "each joint needs a name, a mount, limits, a ready angle and a kind, but there "
+                "are {} names, {} mounts, {} limits, {} ready angles and {} kinds.".format(
+                    *counts
+                )
             )
         self.joint_names = tuple(joint_names)
         self.limits = limits
         self.ready = ready
+        self.kinds = tuple(kinds)
         self.mounts, self.flange, self.tcp = mounts.double(), flange.double(), tcp.double()
-        x, y = self.mounts[:, :, 0], self.mounts[:, :, 1]
+        self._slides = tuple(kind == "prismatic" for kind in kinds)
+        slides = torch.tensor(self._slides)[:, None, None]
+        x, y, z, _ = self.mounts.unbind(-1)
         zero = torch.zeros_like(x)
-        # mount Rz(q) = fixed + cosine cos(q) + sine sin(q), column by column.
-        self._fixed = Constant(
-            torch.stack([zero, zero, self.mounts[:, :, 2], self.mounts[:, :, 3]], dim=-1)
-        )
-        self._cosine = Constant(torch.stack([x, y, zero, zero], dim=-1))
-        self._sine = Constant(torch.stack([y, -x, zero, zero], dim=-1))
+        # mount Rz(q) = fixed + cosine cos(q) + sine sin(q), column by column; of a joint that
+        # slides, mount Tz(q) = fixed + slide q.
+        turned = torch.stack([x, y, zero, zero], dim=-1).masked_fill(slides, 0.0)
+        self._cosine = Constant(turned)
+        self._sine = Constant(torch.stack([turned[..., 1], -turned[..., 0], zero, zero], -1))
+        self._fixed = Constant(self.mounts - turned)
+        slide = torch.stack([zero, zero, zero, z], dim=-1)
+        self._slide = Constant(slide.masked_fill(~slides, 0.0)) if any(self._slides) else None
+        self._turning = Constant((~slides[..., 0]).double()) if any(self._slides) else None
         self._mount_entries = self.mounts.tolist()
         self._tip_entries = (self.flange @ self.tcp).tolist()
         self._flange = Constant(self.flange)
@@ -311,7 +251,7 @@ class SerialChain:
         tip = frames[-1] @ self._tip.like(q)
         frames = torch.stack(frames, dim=-3)
         axis, origin = frames[..., 2], frames[..., 3]
-        return origin, _screw_jacobian(axis, origin, tip[..., None, :, 3])
+        return origin, self._screw_jacobian(axis, origin, tip[..., None, :, 3])
 
     def jacobian(self, q: Float[Tensor, "*batch joints"]) -> Float[Tensor, "*batch 6 joints"]:
         """Geometric Jacobian of the tool centre point.
@@ -336,11 +276,13 @@ class SerialChain:
     ) -> tuple[Float[Tensor, "*batch 3 4"], Float[Tensor, "*batch 6 joints"]]:
         """`forward_and_jacobian` with the pose left as a matrix (R | p): no quaternion made."""
         if torch.compiler.is_compiling():
-            return transform_and_jacobian(q, self._mount_entries, self._tip_entries)
+            return transform_and_jacobian(
+                q, self._mount_entries, self._tip_entries, self._slides
+            )
         frames = self._joint_frames(q)
         tip = frames[-1] @ self._tip.like(q)
         frames = torch.stack(frames, dim=-3)
-        return tip, _screw_jacobian(frames[..., 2], frames[..., 3], tip[..., None, :, 3])
+        return tip, self._screw_jacobian(frames[..., 2], frames[..., 3], tip[..., None, :, 3])
 
     def joint_jacobian(
         self, q: Float[Tensor, "*batch joints"], joint: int
@@ -359,7 +301,7 @@ class SerialChain:
             raise ValueError(f"joint must be 1 to {count}, counted from the base, not {joint}.")
         frames = torch.stack(self._joint_frames(q, joint), dim=-3)
         origin = frames[..., -1:, :, 3]
-        J = _screw_jacobian(frames[..., 2], frames[..., 3], origin)
+        J = self._screw_jacobian(frames[..., 2], frames[..., 3], origin)
         return torch.nn.functional.pad(J, (0, count - joint))
 
     def _joint_frames(self, q: Tensor, count: int | None = None) -> list[Tensor]:
@@ -367,18 +309,23 @@ class SerialChain:
         angle = q[..., None, None]
         steps = torch.addcmul(self._fixed.like(q), self._sine.like(q), torch.sin(angle))
         steps = torch.addcmul(steps, self._cosine.like(q), torch.cos(angle))
+        if self._slide is not None:
+            steps = torch.addcmul(steps, self._slide.like(q), angle)
         first, *rest = steps.unbind(-3)
         frames = [first[..., :3, :]]
         for step in rest[: None if count is None else count - 1]:
             frames.append(frames[-1] @ step)
         return frames
 
-
-def _screw_jacobian(
-    axis: Float[Tensor, "*batch joints 3"],
-    origin: Float[Tensor, "*batch joints 3"],
-    point: Float[Tensor, "*batch 1 3"],
-) -> Float[Tensor, "*batch 6 joints"]:
-    """Twist of a frame at `point` for unit speed about each axis."""
-    linear = torch.linalg.cross(axis, point - origin)
-    return torch.cat([linear.mT, axis.mT], dim=-2)
+    def _screw_jacobian(
+        self,
+        axis: Float[Tensor, "*batch some 3"],
+        origin: Float[Tensor, "*batch some 3"],
+        point: Float[Tensor, "*batch 1 3"],
+    ) -> Float[Tensor, "*batch 6 some"]:
+        """Twist of a frame at `point` for unit speed of each of the first joints."""
+        linear, angular = torch.linalg.cross(axis, point - origin), axis
+        if self._turning is not None:
+            turning = self._turning.like(axis)[: axis.shape[-2]]
+            linear, angular = torch.lerp(axis, linear, turning), turning * axis
+        return torch.cat([linear.mT, angular.mT], dim=-2)

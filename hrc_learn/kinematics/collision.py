@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import final
 
@@ -83,7 +83,7 @@ class CapsuleArm:
             if abs(self.links[i] - self.links[k]) > 1
             and frozenset((self.links[i], self.links[k])) not in apart
         ]
-        self._pairs = torch.tensor(pairs).mT
+        self._pairs = torch.tensor(pairs, dtype=torch.long).reshape(-1, 2).mT
         first, second = self._pairs
         self._first, self._second = Constant(first), Constant(second)
         self._reach = Constant(self.radius[first] + self.radius[second])
@@ -93,6 +93,25 @@ class CapsuleArm:
     def with_capsules(self, more: Sequence[LinkCapsule]) -> CapsuleArm:
         """The same arm with further capsules, such as of what is mounted on its hand."""
         return CapsuleArm(self.chain, (*self.capsules, *more), self.overlapping)
+
+    def on_chain(
+        self, chain: SerialChain, moved: Mapping[int, Float[Tensor, "4 4"]]
+    ) -> CapsuleArm:
+        """The same capsules on a chain whose links have other frames.
+
+        Args:
+            chain: The arm, with as many joints.
+            moved: Pose of the old frame of a link in the new one, of links that differ.
+        """
+        capsules = []
+        for capsule in self.capsules:
+            T = moved.get(capsule.link)
+            if T is not None:
+                ends = torch.tensor([capsule.start, capsule.end]).double()
+                (a, b, c), (d, e, f) = (ends @ T[:3, :3].mT + T[:3, 3]).tolist()
+                capsule = replace(capsule, start=(a, b, c), end=(d, e, f))
+            capsules.append(capsule)
+        return CapsuleArm(chain, capsules, self._overlapping)
 
     def segments(
         self,
@@ -137,12 +156,14 @@ class CapsuleArm:
         q: Float[Tensor, "*batch joints"],
         frames: Float[Tensor, "*batch links 3 4"] | None = None,
     ) -> Float[Tensor, "*batch"]:
-        """Distance of the two nearest capsules that should not touch [m].
+        """Distance of the two nearest capsules that should not touch [m]; infinite without any.
 
         Args:
             q: Joint positions [rad].
             frames: `SerialChain.link_frames` there, where they are known.
         """
+        if self._pairs.numel() == 0:
+            return torch.full_like(q[..., 0], torch.inf)
         return self.pair_distances(q, frames).amin(-1)
 
     def box_distance(

@@ -24,10 +24,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.geometry import Pose
-from hrc_learn.kinematics.chain import JointLimits, SerialChain
+from hrc_learn.kinematics.chain import SerialChain
 from hrc_learn.kinematics.collision import CapsuleArm, LinkCapsule
 from hrc_learn.kinematics.franka_limits import FR3_LIMITS, PANDA_LIMITS
 from hrc_learn.kinematics.interchange import to_urdf
+from hrc_learn.kinematics.limits import JointLimits
 
 # Craig's modified Denavit-Hartenberg parameters, as published in Franka's "Robot and interface
 # specifications": a [m], d [m], alpha [rad].

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from hrc_learn.kinematics.chain import JointLimits
+from hrc_learn.kinematics.limits import JointLimits
 
 
 def _limits(vintage: str, **rows: tuple[float, ...]) -> JointLimits:

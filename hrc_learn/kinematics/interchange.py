@@ -14,7 +14,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.geometry import quaternion
-from hrc_learn.kinematics.chain import JointLimits, SerialChain
+from hrc_learn.kinematics.chain import SerialChain
+from hrc_learn.kinematics.limits import JointLimits
 
 if TYPE_CHECKING:
     import pytorch_kinematics

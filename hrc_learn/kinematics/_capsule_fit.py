@@ -1,0 +1,262 @@
+"""Capsules fitted around the links of an arm, and the pairs of links that may touch.
+
+What is contained are the convex hulls of a link's collision shapes, which is what MuJoCo takes
+for contacts as well. A link is cut into up to three parts by planes across one of its principal
+axes where this saves volume, each part of the hulls lies in one capsule.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations, pairwise
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from hrc_learn.kinematics._description import Shape, Transform
+from hrc_learn.kinematics._mesh_files import mesh_points
+from hrc_learn.kinematics.chain import SerialChain
+from hrc_learn.kinematics.collision import CapsuleArm, LinkCapsule
+
+# Capsules hold every point with this much to spare [m]: far above rounding.
+_SLACK = 1e-6
+# One more capsule for a link has to save this part of the volume.
+_WORTH = 0.2
+# Corners of the prism around a round shape: 2 % wider at the corners.
+_CORNERS = 16
+# Where a link is cut, as fractions of its extent along an axis.
+_CUTS = ((), (0.25,), (0.35,), (0.5,), (0.65,), (0.75,), (0.2, 0.8), (0.3, 0.7))
+# Rounds of the search for a capsule's axis, tries in each, and how far the tries go [rad].
+_ROUNDS, _TRIES, _TILT = 8, 24, 0.5
+# Steps towards the smallest circle around points (Badoiu and Clarkson 2003).
+_CIRCLE_STEPS = 40
+_SEED = 0
+_POSTURES = 2000
+# Pairs of links that come no nearer in any sampled posture are left out [m].
+_FAR = 0.1
+_ALWAYS = 0.99
+
+
+def fit_body(chain: SerialChain, shapes: Sequence[tuple[int, Shape, Transform]]) -> CapsuleArm:
+    """Capsules around shapes on an arm's links.
+
+    As MoveIt's setup assistant does, pairs of links are left out that are neighbours, that
+    overlap in all random postures, or that never come near to each other in any.
+
+    Args:
+        chain: The arm.
+        shapes: Number of the link's frame, the shape, and its pose there. Links without any are
+            given a capsule from their own frame to the next.
+    """
+    hulls: dict[int, list[_Hull]] = defaultdict(list)
+    capsules: list[LinkCapsule] = []
+    for link, shape, pose in shapes:
+        if shape.kind in ("sphere", "capsule"):
+            capsules.append(_round(link, shape, pose))
+        else:
+            hulls[link].append(hull_of(shape, pose))
+    for link, parts in hulls.items():
+        capsules += [_named(link, *fitted) for fitted in fit_link(parts)]
+    if not capsules:
+        capsules = _stick(chain)
+    return CapsuleArm(chain, capsules, _left_out(chain, capsules))
+
+
+@dataclass(frozen=True)
+class _Hull:
+    """A convex hull."""
+
+    points: Float[np.ndarray, "points 3"]
+    edges: Float[np.ndarray, "edges 2 3"]
+
+    def between(self, axis: np.ndarray, low: float, high: float) -> np.ndarray:
+        """Corners of the part between two planes across an axis."""
+        along = self.points @ axis
+        found = [self.points[(along >= low) & (along <= high)]]
+        start, end = self.edges[:, 0] @ axis, self.edges[:, 1] @ axis
+        for level in (low, high):
+            crosses = (start - level) * (end - level) < 0
+            fraction = (level - start[crosses]) / (end[crosses] - start[crosses])
+            first, second = self.edges[crosses, 0], self.edges[crosses, 1]
+            found.append(first + fraction[:, None] * (second - first))
+        return np.concatenate(found)
+
+
+def hull_of(shape: Shape, pose: Transform) -> _Hull:
+    """Convex hull of a shape, of a round one that of a prism around it."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    points = shape_points(shape) @ pose[:3, :3].T + pose[:3, 3]
+    try:
+        hull = ConvexHull(points)
+    except QhullError:  # flat: every pair of points may be an edge, of the few there are
+        return _Hull(points, points[list(combinations(range(min(len(points), 200)), 2))])
+    faces = hull.simplices
+    pairs = np.unique(np.sort(np.concatenate([faces[:, [i, i - 1]] for i in range(3)])), axis=0)
+    return _Hull(points[hull.vertices], points[pairs])
+
+
+def shape_points(shape: Shape) -> Float[np.ndarray, "points 3"]:
+    """Points whose convex hull contains a shape, in its own frame [m]."""
+    if shape.kind == "mesh":
+        assert shape.path is not None
+        return mesh_points(shape.path) * shape.scale
+    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    if shape.kind == "box":
+        return signs * shape.size
+    radius, half = shape.size
+    if shape.kind != "cylinder":  # a ball at each end, each in a cube
+        return signs * radius + np.sign(signs[:, 2:]) * [0, 0, half]
+    angle = np.arange(_CORNERS) * 2 * math.pi / _CORNERS
+    round_ = radius / math.cos(math.pi / _CORNERS) * np.stack([np.cos(angle), np.sin(angle)], 1)
+    return np.concatenate(
+        [np.column_stack([round_, np.full(_CORNERS, z)]) for z in (-half, half)]
+    )
+
+
+type _Fit = tuple[np.ndarray, np.ndarray, float]
+"""Both ends of the axis and the radius [m]."""
+
+
+def fit_link(hulls: Sequence[_Hull]) -> list[_Fit]:
+    """Up to three capsules that contain convex hulls."""
+    points = np.concatenate([hull.points for hull in hulls])
+    axes = np.linalg.svd(points - points.mean(0), full_matrices=False)[2]
+    rng = np.random.default_rng(_SEED)
+    best: dict[int, tuple[float, list[np.ndarray]]] = {}
+    for axis in axes:
+        along = points @ axis
+        low, high = along.min(), along.max()
+        for cuts in _CUTS:
+            levels = low + np.array([-0.1, *cuts, 1.1]) * (high - low)
+            parts = [
+                np.concatenate([hull.between(axis, a, b) for hull in hulls])
+                for a, b in pairwise(levels.tolist())
+            ]
+            parts = [part for part in parts if len(part)]
+            volume = sum(_volume(fit_capsule(part, rng, rounds=1)) for part in parts)
+            if len(parts) not in best or volume < best[len(parts)][0]:
+                best[len(parts)] = volume, parts
+    chosen = best[min(best)]
+    for count in sorted(best):
+        if best[count][0] < (1 - _WORTH) * chosen[0]:
+            chosen = best[count]
+    return [fit_capsule(part, rng, rounds=_ROUNDS) for part in chosen[1]]
+
+
+def _volume(fit: _Fit) -> float:
+    start, end, radius = fit
+    return math.pi * radius**2 * (float(np.linalg.norm(end - start)) + 4 / 3 * radius)
+
+
+def fit_capsule(
+    points: Float[np.ndarray, "points 3"], rng: np.random.Generator, *, rounds: int
+) -> _Fit:
+    """A small capsule around points.
+
+    From the best of the principal axes the axis is turned at random, ever less, and a turn kept
+    that makes the capsule smaller.
+    """
+    axes = np.linalg.svd(points - points.mean(0), full_matrices=False)[2]
+    volume, best = min((_around(points, axis[None])[0] for axis in axes), key=lambda f: f[0])
+    tilt = _TILT
+    for _ in range(rounds):
+        axis = best[0]
+        tried = axis + tilt * rng.standard_normal((_TRIES, 3))
+        tried /= np.linalg.norm(tried, axis=1, keepdims=True)
+        found = min(_around(points, tried), key=lambda f: f[0])
+        if found[0] < volume:
+            volume, best = found
+        else:
+            tilt /= 2
+    axis, start, end, radius = best
+    # The slack covers the rounding of the ends.
+    return start, end, radius + _SLACK
+
+
+def _around(points: np.ndarray, axes: np.ndarray) -> list[tuple[float, tuple]]:
+    """Volume and shape of the capsule around points along each axis."""
+    helper = np.eye(3)[np.abs(axes).argmin(1)]
+    u = np.cross(axes, helper)
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    v = np.cross(axes, u)
+    flat = np.stack([u @ points.T, v @ points.T], axis=-1)  # tries, points, 2
+    along = axes @ points.T
+    centre = (flat.max(1) + flat.min(1)) / 2
+    rows = np.arange(len(axes))
+    nearest, radius = centre, np.full(len(axes), np.inf)
+    for k in range(_CIRCLE_STEPS):
+        distance = np.linalg.norm(flat - centre[:, None], axis=-1)
+        furthest = distance.argmax(1)
+        r = distance[rows, furthest]
+        better = r < radius
+        nearest, radius = np.where(better[:, None], centre, nearest), np.minimum(radius, r)
+        centre = centre + (flat[rows, furthest] - centre) / (k + 2)
+    distance = np.linalg.norm(flat - nearest[:, None], axis=-1)
+    results = []
+    for i in rows:
+        shapes = []
+        for wider in (1.0, 1.05, 1.15):
+            r = radius[i] * wider
+            bulge = np.sqrt(np.maximum(r * r - distance[i] ** 2, 0.0))
+            # Every point must be no further out than the round end there.
+            low, high = (along[i] + bulge).min(), (along[i] - bulge).max()
+            if low > high:
+                low = high = (low + high) / 2
+            shapes.append((math.pi * r**2 * (high - low + 4 / 3 * r), low, high, r))
+        volume, low, high, r = min(shapes)
+        origin = nearest[i, 0] * u[i] + nearest[i, 1] * v[i]
+        ends = origin + low * axes[i], origin + high * axes[i]
+        results.append((float(volume), (axes[i], *ends, float(r))))
+    return results
+
+
+def _named(link: int, start: np.ndarray, end: np.ndarray, radius: float) -> LinkCapsule:
+    (a, b, c), (d, e, f) = start.tolist(), end.tolist()
+    return LinkCapsule(link=link, start=(a, b, c), end=(d, e, f), radius=radius)
+
+
+def _round(link: int, shape: Shape, pose: Transform) -> LinkCapsule:
+    radius, half = shape.size
+    start, end = (pose[:3, 3] + s * half * pose[:3, 2] for s in (-1, 1))
+    return _named(link, start, end, radius)
+
+
+def _stick(chain: SerialChain) -> list[LinkCapsule]:
+    """A thin capsule from each frame to the next, where there are no shapes at all."""
+    steps = [*chain.mounts, chain.flange, chain.tcp]
+    zero = np.zeros(3)
+    return [_named(link, zero, step[:3, 3].numpy(), 0.045) for link, step in enumerate(steps)]
+
+
+def _left_out(
+    chain: SerialChain, capsules: Sequence[LinkCapsule]
+) -> tuple[tuple[int, int], ...]:
+    """Pairs of links that are no neighbours and yet need no watching."""
+    last = len(chain.joint_names)
+    links = sorted({capsule.link for capsule in capsules})
+    # The last link, the flange and the tool are one body, and the link before its neighbour.
+    rigid = {
+        (i, k) for i, k in combinations(links, 2) if k > last and i >= last - 1 and k - i > 1
+    }
+    body = CapsuleArm(chain, capsules, tuple(rigid))
+    if not body.pairs:
+        return tuple(rigid)
+    rng = torch.Generator().manual_seed(_SEED)
+    lower, upper = chain.limits.lower, chain.limits.upper
+    q = lower + (upper - lower) * torch.rand(_POSTURES, len(lower), generator=rng).double()
+    distances = body.pair_distances(q)
+    nearest: dict[tuple[int, int], torch.Tensor] = {}
+    for (a, b), distance in zip(body.pairs, distances.mT, strict=True):
+        pair = (body.links[a], body.links[b])
+        before = nearest.get(pair)
+        nearest[pair] = distance if before is None else torch.minimum(before, distance)
+    for pair, distance in nearest.items():
+        always = float((distance < 0).double().mean()) > _ALWAYS
+        if always or float(distance.min()) > _FAR:
+            rigid.add(pair)
+    return tuple(sorted(rigid))

@@ -1,0 +1,240 @@
+"""Robot descriptions in MJCF, which MuJoCo itself reads, with defaults and includes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hrc_learn.geometry.shapes import Colour
+from hrc_learn.kinematics._description import (
+    Description,
+    Joint,
+    Link,
+    Shape,
+    Transform,
+    transform,
+)
+
+
+def read_mjcf(path: Path) -> Description:
+    """Read a file.
+
+    A body is a link, a site a link fixed to its body. Several joints of one body become links
+    in a row, named after the body and the joint.
+
+    Raises:
+        ValueError: The file is not MJCF.
+        FileNotFoundError: The file is not there.
+        ModuleNotFoundError: MuJoCo is not installed.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no robot description {path}")
+    try:
+        import mujoco
+    except ModuleNotFoundError:
+        raise ModuleNotFoundError(
+            f"{path} is MJCF, which MuJoCo reads: install hrc-learn[sim]", name="mujoco"
+        ) from None
+    try:
+        spec: Any = mujoco.MjSpec.from_file(str(path))  # pyright: ignore[reportAttributeAccessIssue]
+        # A material without a texture draws alike for us, and textures may be missing.
+        model = spec.compile()
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    return _Reader(path, spec, model, mujoco).description()
+
+
+class _Reader:
+    def __init__(self, path: Path, spec: Any, model: Any, mujoco: Any):
+        self.path, self.model, self.mujoco = path, model, mujoco
+        folder = path.parent / (spec.meshdir or "")
+        self.files = [folder / mesh.file for mesh in spec.meshes]
+
+    def description(self) -> Description:
+        model = self.model
+        links: dict[str, Link] = {}
+        joints: list[Joint] = []
+        followers = self._followers()
+        for i in range(model.nbody):
+            body = model.body(i)
+            name = body.name or ("world" if i == 0 else f"body{i}")
+            links[name] = self._link(i, name)
+            if i > 0:
+                joints += self._joints(i, name, links, followers)
+        for i in range(model.nsite):
+            site = model.site(i)
+            if site.name and site.name not in links:
+                links[site.name] = Link(name=site.name)
+                joints.append(
+                    _fixed(
+                        f"{site.name} (site)",
+                        self._name(int(model.site_bodyid[i])),
+                        site.name,
+                        self._pose(site.pos, site.quat),
+                    )
+                )
+        return Description(
+            name=self.path.stem,
+            path=self.path,
+            format="mjcf",
+            links=links,
+            joints=tuple(joints),
+            home=self._home(),
+        )
+
+    def _name(self, body: int) -> str:
+        return self.model.body(body).name or ("world" if body == 0 else f"body{body}")
+
+    def _link(self, i: int, name: str) -> Link:
+        model, visuals, collisions = self.model, [], []
+        first = int(model.body_geomadr[i])
+        for g in range(first, first + int(model.body_geomnum[i])):
+            shape = self._shape(g)
+            if shape is not None:
+                touches = model.geom_contype[g] or model.geom_conaffinity[g]
+                # By convention visual geoms do not collide, and group 3 and up is not drawn.
+                if touches:
+                    collisions.append(shape)
+                if not touches or int(model.geom_group[g]) < 3:
+                    visuals.append((bool(touches), shape))
+        # A geom of either kind is drawn only where a body has none that is visual alone.
+        alone = [shape for touches, shape in visuals if not touches]
+        drawn = alone or [shape for _, shape in visuals]
+        mass = float(model.body_mass[i])
+        return Link(
+            name=name,
+            mass=mass if mass > 0 else None,
+            visuals=tuple(drawn),
+            collisions=tuple(collisions),
+        )
+
+    def _shape(self, g: int) -> Shape | None:
+        model, kinds = self.model, self.mujoco.mjtGeom
+        kind = int(model.geom_type[g])
+        pose = self._pose(model.geom_pos[g], model.geom_quat[g])
+        place = {"pose": pose, "colour": self._colour(g)}
+        x, y, z = model.geom_size[g].tolist()
+        if kind == kinds.mjGEOM_MESH:
+            mesh = int(model.geom_dataid[g])
+            # MuJoCo moves meshes into their principal axes, and the geom against it.
+            moved = self._pose(model.mesh_pos[mesh], model.mesh_quat[mesh])
+            place["pose"] = pose @ np.linalg.inv(moved)
+            sx, sy, sz = model.mesh_scale[mesh].tolist()
+            path = self.files[mesh]
+            return Shape(kind="mesh", path=path, scale=(sx, sy, sz), **place)
+        if kind == kinds.mjGEOM_BOX:
+            return Shape(kind="box", size=(x, y, z), **place)
+        if kind == kinds.mjGEOM_SPHERE:
+            return Shape(kind="sphere", size=(x, 0.0), **place)
+        if kind == kinds.mjGEOM_CAPSULE:
+            return Shape(kind="capsule", size=(x, y), **place)
+        if kind == kinds.mjGEOM_CYLINDER:
+            return Shape(kind="cylinder", size=(x, y), **place)
+        return None  # planes, height fields and the like are no part of an arm
+
+    def _colour(self, g: int) -> Colour:
+        material = int(self.model.geom_matid[g])
+        rgba = self.model.geom_rgba[g] if material < 0 else self.model.mat_rgba[material]
+        red, green, blue, opacity = rgba.tolist()
+        return (red, green, blue, opacity)
+
+    def _joints(
+        self, i: int, name: str, links: dict[str, Link], followers: dict[int, Any]
+    ) -> list[Joint]:
+        model = self.model
+        parent = self._name(int(model.body_parentid[i]))
+        placed = self._pose(model.body_pos[i], model.body_quat[i])
+        first, count = int(model.body_jntadr[i]), int(model.body_jntnum[i])
+        if count == 0:
+            return [_fixed(f"{name} (fixed)", parent, name, placed)]
+        joints = []
+        for j in range(first, first + count):
+            joint = model.joint(j)
+            kind = ("free", "ball", "prismatic", "revolute")[int(model.jnt_type[j])]
+            anchor = np.eye(4)
+            anchor[:3, 3] = model.jnt_pos[j]
+            # A joint's position counts from the reference that the file gives it.
+            moving = f"{name}/{joint.name}"
+            zero = _moved(kind, model.jnt_axis[j], -float(model.qpos0[model.jnt_qposadr[j]]))
+            limited = bool(model.jnt_limited[j])
+            lower, upper = model.jnt_range[j].tolist() if limited else (None, None)
+            if kind == "revolute" and not limited:
+                kind = "continuous"
+            links[moving] = Link(name=moving)
+            joints.append(
+                Joint(
+                    name=joint.name or moving,
+                    kind=kind,
+                    parent=parent,
+                    child=moving,
+                    origin=placed @ anchor @ zero,
+                    axis=model.jnt_axis[j].copy(),
+                    lower=lower,
+                    upper=upper,
+                    effort=self._effort(j),
+                    follows=followers.get(j),
+                )
+            )
+            parent, placed = moving, np.linalg.inv(anchor)
+        joints.append(_fixed(f"{name} (fixed)", parent, name, placed))
+        return joints
+
+    def _effort(self, j: int) -> float | None:
+        """What the joint's actuators can do, or what the joint lets through."""
+        model = self.model
+        if model.jnt_actfrclimited[j]:
+            return float(np.abs(model.jnt_actfrcrange[j]).max())
+        for a in range(model.nu):
+            if model.actuator_trntype[a] == 0 and model.actuator_trnid[a, 0] == j:
+                if model.actuator_forcelimited[a]:
+                    return float(np.abs(model.actuator_forcerange[a]).max())
+                motor = model.actuator_biastype[a] == 0 and model.actuator_gaintype[a] == 0
+                if motor and model.actuator_ctrllimited[a]:
+                    gain = model.actuator_gainprm[a, 0] * model.actuator_gear[a, 0]
+                    return float(abs(gain) * np.abs(model.actuator_ctrlrange[a]).max())
+        return None
+
+    def _followers(self) -> dict[int, tuple[str, float, float]]:
+        """Joints that an equality ties to another, with factor and offset."""
+        model = self.model
+        tied = {}
+        for e in range(model.neq):
+            other = int(model.eq_obj2id[e])
+            if model.eq_type[e] == self.mujoco.mjtEq.mjEQ_JOINT and other >= 0:
+                offset, factor = model.eq_data[e, :2].tolist()
+                tied[int(model.eq_obj1id[e])] = (model.joint(other).name, factor, offset)
+        return tied
+
+    def _home(self) -> dict[str, float] | None:
+        for k in range(self.model.nkey):
+            if self.model.key(k).name == "home":
+                qpos = self.model.key_qpos[k]
+                return {
+                    self.model.joint(j).name: float(qpos[self.model.jnt_qposadr[j]])
+                    for j in range(self.model.njnt)
+                }
+        return None
+
+    def _pose(self, position: np.ndarray, quat: np.ndarray) -> Transform:
+        R = np.zeros(9)
+        self.mujoco.mju_quat2Mat(R, np.ascontiguousarray(quat, dtype=np.float64))
+        return transform(R.reshape(3, 3), np.array(position, dtype=np.float64))
+
+
+def _fixed(name: str, parent: str, child: str, origin: Transform) -> Joint:
+    axis = np.array([0.0, 0.0, 1.0])
+    return Joint(name=name, kind="fixed", parent=parent, child=child, origin=origin, axis=axis)
+
+
+def _moved(kind: str, axis: np.ndarray, by: float) -> Transform:
+    """Motion of a joint, as a transform."""
+    if by == 0 or kind not in ("revolute", "prismatic"):
+        return np.eye(4)
+    if kind == "prismatic":
+        return transform(np.eye(3), by * axis)
+    x, y, z = axis
+    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    R = np.eye(3) + np.sin(by) * K + (1 - np.cos(by)) * K @ K  # Rodrigues
+    return transform(R, np.zeros(3))
