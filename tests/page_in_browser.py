@@ -44,15 +44,15 @@ def wait_until(condition: Callable[[], object], what: str, timeout: float = 90.0
 class Session:
     """A page session that a thread steps, as the program does."""
 
-    def __init__(self, out: Path, mapping="transpose"):
+    def __init__(self, out: Path, mapping="transpose", **page_options):
         workplace, config = Workplace(), PageSessionConfig()
         world = World(workplace.scene)
         bodies = MovingBodies(world)
         drawn = bodies.drawn(*(poses[None] for poses in bodies.poses()))
         self.writer = DatasetWriter(out, config.fps, "panda", panda.joint_names, FEATURES)
-        page = PageConfig(
-            port=8300, timeout=PATIENCE, forces=InteractionForceConfig(mapping=mapping)
-        )
+        options = {"silence": PATIENCE, "timeout": PATIENCE, "meshes": False} | page_options
+        forces = InteractionForceConfig(mapping=mapping)
+        page = PageConfig(port=8300, forces=forces, **options)
         self.page = Page(panda, drawn, workplace.scene.boxes(), page, task="show it")
         self.recorder = DemonstrationRecorder(self.writer, lambda: self.page.task)
         self.session = PageSession(workplace, self.page, self.recorder, world)

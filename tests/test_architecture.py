@@ -107,7 +107,7 @@ LAZY_LIBRARIES: dict[str, set[str]] = {
     "sim": {"franky_sim"},
     "viz": {"rich"},
     "hardware": {"franky", "pylibfranka", "cv2"},
-    "teleoperation": {"viser", "pygame"},
+    "teleoperation": {"viser", "pygame", "websockets", "msgspec", "trimesh", "cv2"},
     "experiments": {"rich"},
     "lerobot": {"torchvision"},
 }
@@ -122,6 +122,10 @@ DISTRIBUTIONS = {
     "mpl_toolkits": "matplotlib",
     "cycler": "matplotlib",
     "PIL": "matplotlib",
+    # Requirements of viser's own.
+    "websockets": "viser",
+    "msgspec": "viser",
+    "trimesh": "viser",
     # Requirements of lerobot's own.
     "torchvision": "lerobot",
     "gymnasium": "lerobot",
@@ -471,6 +475,8 @@ def test_the_wheel_holds_the_package_alone(tmp_path):
     information = f"hrc_learn-{PROJECT['version']}.dist-info"
     assert roots == {"hrc_learn", information}
     packed = {name for name in names if name.startswith("hrc_learn/")}
-    data = (ROOT / "hrc_learn").rglob("*.css")
+    data = {
+        p for kind in ("css", "js", "html") for p in (ROOT / "hrc_learn").rglob(f"*.{kind}")
+    }
     typed = ROOT / "hrc_learn/py.typed"
     assert packed == {str(path.relative_to(ROOT)) for path in (*SOURCES, *data, typed)}

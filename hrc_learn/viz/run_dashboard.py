@@ -5,10 +5,12 @@ The same dashboard shows a finished run from a file, and one that still goes on 
 
 import os
 import socket
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from typing import Any, NamedTuple
 from urllib.parse import quote
@@ -375,22 +377,49 @@ def serve_stream(port: int = 9090, data_port: int = 9876) -> Iterator[DashboardS
     """
     for number in (port, data_port):
         _check_free(number)
-    stream = rr.RecordingStream("hrc_learn")
-    data = stream.serve_grpc(grpc_port=data_port)
-    rr.serve_web_viewer(web_port=port, open_browser=False, connect_to=data)
+    stream, data = rr.RecordingStream("hrc_learn"), f"rerun+http://127.0.0.1:{data_port}/proxy"
+    # A program of its own, as servers within this process listen on all interfaces.
+    command = [
+        *(sys.executable, "-m", "rerun", "--serve-web", "--bind", "127.0.0.1"),
+        *("--port", str(data_port), "--web-viewer-port", str(port)),
+        *("--server-memory-limit", "1GiB", "--hide-welcome-screen"),
+    ]
+    # In a session of its own, so that Ctrl-C reaches it after what is still to be sent.
+    quiet = subprocess.DEVNULL
+    server = subprocess.Popen(command, start_new_session=True, stdout=quiet, stderr=quiet)
     try:
+        _await_listening(server, (port, data_port))
+        stream.connect_grpc(data)
         yield DashboardServer(
             stream, f"http://127.0.0.1:{port}?url={quote(data, safe='')}", data
         )
     finally:
         stream.disconnect()
+        server.terminate()
+        server.wait()
+
+
+def _await_listening(server: subprocess.Popen[bytes], ports: Sequence[int]) -> None:
+    """Wait until a server answers at all its ports.
+
+    Raises:
+        RuntimeError: It has ended, or does not answer within a minute.
+    """
+    end = time.monotonic() + 60
+    for port in ports:
+        while True:
+            with suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=1):
+                break
+            if server.poll() is not None or time.monotonic() > end:
+                raise RuntimeError(f"rerun does not serve at port {port}: see `rerun --help`.")
+            time.sleep(0.05)
 
 
 def _check_free(port: int) -> None:
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            probe.bind(("", port))
+            probe.bind(("127.0.0.1", port))
         except OSError as error:
             raise ValueError(
                 f"port {port} is taken: end what uses it, or choose another."

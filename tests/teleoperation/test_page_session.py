@@ -112,7 +112,9 @@ def test_the_script_and_the_page_pull_together_while_somebody_holds_on(world, be
         return human.read(world.arm.read()).nullspace_input
 
     np.testing.assert_array_equal(effort(), np.ones(7))
+    beside._page.control.join("somebody")
     for _ in range(1000):  # the page renews what is asked, and may come in between
+        beside._page.control.hear("somebody")
         beside.human.post(HumanInput(nullspace_input=np.arange(7.0)))
         if (pulled := effort()).any() and pulled[6] > 1:
             break
@@ -175,13 +177,17 @@ def test_the_page_shows_how_far_a_held_elbow_follows_and_why_not_further(world, 
     elbow, wrist = page._scene._knobs[4], page._scene._knobs[6]
     far = panda.link_poses(cell.joints).position[3].numpy() + np.array([0.0, 0.02, 0.0])
     held = HeldGizmo(joint=4, held_at=np.zeros(3), pointer=far)
+    page.control.join("somebody")
 
     def until(condition, holds=True):
         end = time.monotonic() + 60
         while not condition():
             assert time.monotonic() < end
-            if holds:  # nobody's browser does, so it is soon let go
+            page.control.hear("somebody")
+            if holds:
                 page._held_gizmos.take(1, "elbow", held)
+            else:
+                page._held_gizmos.release(1, "elbow")
             time.sleep(0.02)
 
     def arrow_colour():

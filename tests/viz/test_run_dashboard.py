@@ -331,6 +331,11 @@ def test_a_viewer_that_connects_gets_the_run(tmp_path):
     page, data = free_ports()
     with serve_stream(page, data) as server:
         assert server.viewer.startswith(f"http://127.0.0.1:{page}?url=")
+        assert reachable(page, "127.0.0.1")
+        assert reachable(data, "127.0.0.1")
+        # This machine has addresses other than 127.0.0.1: nothing listens there.
+        assert not reachable(page, "127.0.0.2")
+        assert not reachable(data, "127.0.0.2")
         with live_dashboard(server.stream, lambda: run):
             pass
         # Late: what was sent before is kept for it.
@@ -348,6 +353,11 @@ def test_a_viewer_that_connects_gets_the_run(tmp_path):
     rrd = Rrd(got)
     joint = run_tabs(run)[-2].plots[0].curves[-1]
     np.testing.assert_array_equal(rrd.scalars(joint.path), joint.values)
+
+
+def reachable(port: int, host: str) -> bool:
+    with socket.socket() as probe:
+        return probe.connect_ex((host, port)) == 0
 
 
 def arrives(path: Path, size: int, timeout: float = 60.0) -> bool:

@@ -322,7 +322,7 @@ def learn(out: Path, console: Console, steps: int = 4, robot: ArmChoice = _PANDA
     from hrc_learn.cli.commands import fit, record
 
     placing, servoing = out / "placing_demos", out / "aiming_demos"
-    chosen = {"robot": robot.name, "base": robot.base, "tip": robot.tip}
+    chosen: dict[str, Any] = {"robot": robot.name, "base": robot.base, "tip": robot.tip}
     _announce(console, 1, steps, "Demonstrations of placing")
     if record.record_placing(RecordPlacing(out=placing, overwrite=True, **chosen)):
         raise RuntimeError("the scripted expert could not place")

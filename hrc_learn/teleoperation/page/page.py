@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import io
+import secrets
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from threading import Event, Thread
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from threading import Event, Lock, Thread
 from typing import Any
 
 import numpy as np
@@ -16,42 +19,63 @@ from jaxtyping import Float
 from hrc_learn.geometry import Body, Box, Pose
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.protocols import ArmState, HumanInput
+from hrc_learn.teleoperation.devices import RumbleConfig, rumble_strength
+from hrc_learn.teleoperation.gate import (
+    AddressConfig,
+    Control,
+    Gate,
+    GateCallbacks,
+    guarded_servers,
+    page_contents,
+)
+from hrc_learn.teleoperation.gate.messages import Ask, GuiUpdate, Hands, Message
 from hrc_learn.teleoperation.hand_guiding import InteractionForceConfig, leading_twist
+from hrc_learn.teleoperation.page.headset import (
+    HeadsetHands,
+    headset_contents,
+    scene_state,
+)
 from hrc_learn.teleoperation.page.page_operator import (
     AddedTurn,
     GizmoCommand,
+    HeldGizmo,
     HeldGizmos,
     PageHuman,
     gizmo_command,
 )
 from hrc_learn.teleoperation.page.page_scene import Gizmos, PageScene
-from hrc_learn.teleoperation.page.panel import PageStatus, Panel
+from hrc_learn.teleoperation.page.panel import PageStatus, Panel, felt_words
 from hrc_learn.viz.palette import followed_colour
 
 
 @dataclass(frozen=True, kw_only=True)
-class PageConfig:
+class PageConfig(AddressConfig):
     """The page's own settings."""
 
-    host: str = "127.0.0.1"
-    """Address to serve at. Whoever reaches it can move the arm."""
-    port: int = 8080
-    """Port to serve at; the next free one is taken if it is in use."""
     forces: InteractionForceConfig = field(default_factory=InteractionForceConfig)
     """How strongly gizmos act."""
+    silence: float = 0.12
+    """Time without a sign of life from who leads after which the arm is asked for no motion,
+    until the next one [s]."""
     timeout: float = 0.6
-    """Time without a sign of life from a browser after which its grips are let go [s]."""
+    """Likewise until everything they hold is let go, and longest that their page may be busy
+    while they hold something [s]."""
     refresh: float = 25.0
     """Times a second that the page follows the arm, and efforts are computed anew [1/s]."""
+    meshes: bool = True
+    """Whether the arm is drawn as it is; otherwise as capsules, which a browser that draws
+    without a graphics processor follows better."""
     twin: tuple[float, float, float] = (-0.1, 1.3, 0.0)
     """Where the virtual twin stands, from the arm [m]."""
 
     def __post_init__(self) -> None:
-        for name in ("timeout", "refresh"):
+        super().__post_init__()
+        for name in ("silence", "timeout", "refresh"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, but is {getattr(self, name)}.")
 
 
+_PULSES = RumbleConfig()  # a headset's controllers shake as a gamepad does
 _PANEL_EVERY = 5  # refreshes of the scene for one of the panel: text need not be as smooth
 
 
@@ -69,7 +93,10 @@ class Page:
 
     Attributes:
         human: The person at the page.
-        url: Where the page is.
+        address: Where the page is served.
+        url: Of the page, with the secret that opens it: who has it can move the arm.
+        control: Who leads.
+        farewell: What browsers show when the page is closed.
     """
 
     def __init__(
@@ -100,11 +127,45 @@ class Page:
         import viser
 
         self._config = config = config or PageConfig()
+        if not config.meshes:
+            bodies = [replace(body, meshes=()) for body in bodies]
         self._chain = chain
-        self.human = PageHuman(len(chain.joint_names))
-        self._server = viser.ViserServer(config.host, config.port, verbose=False)
-        self.url = f"http://{config.host}:{self._server.get_port()}"
-        self._held_gizmos, self._turn = HeldGizmos(config.timeout), AddedTurn()
+        self.control = control = Control(config.silence, config.timeout)
+        self.human = PageHuman(len(chain.joint_names), present=lambda: control.present)
+        secret = secrets.token_urlsafe(18)
+        # It prints its own address, which is of no use to people.
+        with guarded_servers(secret), contextlib.redirect_stdout(io.StringIO()):
+            self._server = viser.ViserServer("127.0.0.1", 0, verbose=False)
+        try:
+            self._gate = Gate(
+                config,
+                self.control,
+                {
+                    **page_contents(Path(viser.__file__).parent),
+                    **headset_contents(
+                        bodies,
+                        boxes,
+                        config.twin,
+                        guides=guides,
+                        draws=guides if draws is None else draws,
+                    ),
+                },
+                GateCallbacks(
+                    heard=self._heard,
+                    fits=self._fits,
+                    status=self._told,
+                    scene=lambda: self._scene_state,
+                ),
+                viewer=f"ws://127.0.0.1:{self._server.get_port()}",
+                secret=secret,
+            )
+        except ValueError:
+            self._server.stop()
+            raise
+        self.address = self._gate.address
+        self.url = self.address.link()
+        self._held_gizmos, self._turn = HeldGizmos(), AddedTurn()
+        self._hands = HeadsetHands(self._held_gizmos, self._turn, self._links, guides=guides)
         draws = guides if draws is None else draws
         self._scene = PageScene(self._server, bodies, boxes, config.twin)
         self._gizmos = Gizmos(
@@ -136,20 +197,23 @@ class Page:
         self._placed, self._counted = 0, (0, time.monotonic())
         self._closing = Event()
         self._error: BaseException | None = None
-        self._threads = [
-            Thread(target=self._guarded, args=(work,), name=f"page {name}", daemon=True)
-            for name, work in (("refresh", self._refresh), ("listen", self._listen))
-        ]
+        self.farewell = "The session has ended."
+        self._led, self._led_lock = self.control.turn, Lock()
+        self._wake = Event()
+        self._asked = 0.0
+        self._scene_state: dict[str, Any] = {}
+        self._thread = Thread(target=self._guarded, name="page refresh", daemon=True)
 
     def __enter__(self) -> Page:
-        for thread in self._threads:
-            thread.start()
+        self._thread.start()
+        self._gate.start()
         return self
 
     def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
         self._closing.set()
-        for thread in self._threads:
-            thread.join()
+        self._wake.set()
+        self._thread.join()
+        self._gate.close(self.farewell)
         self._server.stop()
         if self._error is not None and error is None:
             raise self._error
@@ -177,9 +241,9 @@ class Page:
         """Tell how the session stands."""
         self._status = status
 
-    def _guarded(self, work: Callable[[], None]) -> None:
+    def _guarded(self) -> None:
         try:
-            work()
+            self._refresh()
         except Exception as error:  # handed over to the thread that closes
             self._error = error
 
@@ -188,23 +252,37 @@ class Page:
         return None if state is None else self._chain.link_poses(_joints(state))
 
     def _refresh(self) -> None:
-        """Follow the arm, and renew what is asked of it."""
-        period, ticks = 1 / self._config.refresh, 0
-        while not self._closing.wait(period):
+        """Follow the arm, and renew what is asked of it: at once when hands have moved."""
+        period, ticks, due = 1 / self._config.refresh, 0, 0.0
+        while not self._closing.is_set():
+            self._wake.wait(max(due - time.monotonic(), 0.0))
+            self._wake.clear()
             state = self.human.state
             if state is None:
+                due = time.monotonic() + period
                 continue
             command = self._command(state)
             links = self._chain.link_poses(_joints(state))
             feedback = self.human.feedback
             colour = followed_colour(feedback.followed)
+            self._scene_state = scene_state(
+                *self._poses,
+                links,
+                command.arrows,
+                colour,
+                self._status.region,
+                *self._panel.drawn,
+            )
+            if time.monotonic() < due:
+                continue
+            due = time.monotonic() + period
             with self._server.atomic():
                 self._scene.move(*self._poses, links.position.numpy())
                 self._scene.point(command.arrows, colour, command.held)
                 self._scene.show_region(self._status.region)
                 self._gizmos.follow(links[-1])
                 if ticks % _PANEL_EVERY == 0:
-                    people = len(self._server.get_clients())
+                    people = self.control.people
                     self._panel.refresh(
                         self._status, command.nullspace_input, self._rate(), people
                     )
@@ -219,13 +297,12 @@ class Page:
 
     def _command(self, state: ArmState) -> GizmoCommand:
         panel, forces = self._panel, self._panel.forces
-        gizmos = self._held_gizmos.held().values()
-        turn = self._turn.rotation
+        gizmos, turn = self._held().values(), self._turn.rotation
         command = gizmo_command(
             self._chain, state.joint_position, gizmos, forces, coarse=panel.coarse, turn=turn
         )
         twist = command.twist
-        if not twist.any():
+        if not twist.any() and self.control.present:
             way, joints = panel.direction(), state.joint_position
             twist = leading_twist(
                 self._chain, joints, way, forces, coarse=panel.coarse, turn=turn
@@ -242,23 +319,74 @@ class Page:
         )
         return command
 
-    def _listen(self) -> None:
-        """Ask the browsers of those who hold something whether they are still there.
+    def _held(self) -> dict[tuple[Hashable, str], HeldGizmo]:
+        """What the person who leads holds, as long as there are signs of life from them.
 
-        A browser that is told nothing for a while may be gone, its network cable pulled: the
+        A browser that is told nothing for a while may be gone, its network cable pulled: a
         server learns of that much later. A pointer at rest sends nothing either.
         """
-        while not self._closing.wait(self._config.timeout / 4):
-            for holder in self._held_gizmos.holders:
-                client = self._server.get_clients().get(holder)
-                if client is None:
-                    self._held_gizmos.release_all(holder)
-                    continue
-                with contextlib.suppress(TimeoutError, RuntimeError):
-                    sent = time.monotonic()
-                    client.local_storage.get_item("alive", timeout=self._config.timeout)
-                    if time.monotonic() - sent < self._config.timeout:
-                        self._held_gizmos.hear(holder)
+        control = self.control
+        self._new_leader()
+        if control.gone:
+            self._held_gizmos.clear()
+            self._turn.drop()
+        held = self._held_gizmos.held() if control.present else {}
+        if held:
+            control.keep()
+        return held
+
+    def _new_leader(self) -> None:
+        """Drop what was held where somebody else leads since this was last called."""
+        with self._led_lock:
+            if (led := self.control.turn) != self._led:
+                self._led = led
+                self._held_gizmos.clear()
+                self._turn.drop()
+                self._hands.forget()
+
+    def _heard(self, message: Message) -> None:
+        """What a client of our own asks for, that leads."""
+        match message:
+            case Hands():
+                self._new_leader()
+                self._hands.hear(message)
+                self._asked = message.sent
+                self._wake.set()
+            case Ask(request=request):
+                self.human.request(request)
+            case _:
+                self._panel.hear(message)
+
+    def _fits(self, update: GuiUpdate) -> bool:
+        return self._panel.fits(update.uuid, update.updates)
+
+    def _told(self) -> dict[str, Any]:
+        """What the bar at the top of the page says."""
+        lag, limit = self.control.lag, self._config.timeout
+        words = ""
+        if self._error is not None:
+            words = "The page does not follow the arm any more: see the terminal."
+        elif lag > limit / 2:
+            words = (
+                f"This browser was busy for {lag:.1f} s: beyond {limit:.1f} s the arm lets go. "
+                "Make its window smaller, or hide the virtual twin."
+            )
+        feedback, status = self.human.feedback, self._status
+        return {
+            "words": words,
+            "recording": status.recording,
+            "seconds": round(status.seconds, 2),
+            "saved": status.saved,
+            "note": status.note,
+            "doing": status.doing,
+            "task": self.task,
+            "pushed": feedback.pushed,
+            "followed": round(feedback.followed, 3),
+            "pulse": rumble_strength(feedback, _PULSES),
+            "reasons": [reason.text for reason in feedback.reasons],
+            "felt": felt_words(feedback),
+            "sent": self._asked,
+        }
 
 
 def _joints(state: ArmState) -> Float[torch.Tensor, " joints"]:

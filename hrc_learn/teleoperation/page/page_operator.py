@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Hashable
 from dataclasses import dataclass, replace
 from threading import Lock
 
@@ -41,89 +41,56 @@ class HeldGizmo:
 
 
 class HeldGizmos:
-    """All held gizmos, each until it is released or its holder's browser times out.
+    """All held gizmos, each until it is released or its holder leaves.
 
     Safe to use from several threads. A holder is whatever tells two browsers apart.
     """
 
-    def __init__(self, timeout: float, clock: Callable[[], float] = time.monotonic):
-        """Start with nobody holding anything.
-
-        Args:
-            timeout: Time after the last sign of life at which a holder is given up [s].
-            clock: Tells the time [s].
-
-        Raises:
-            ValueError: The timeout is not positive.
-        """
-        if not timeout > 0:
-            raise ValueError(f"timeout must be positive, but is {timeout}.")
-        self.timeout = timeout
-        self._clock = clock
-        self._held: dict[tuple[int, str], HeldGizmo] = {}
-        self._heard: dict[int, float] = {}
+    def __init__(self) -> None:
+        """Start with nobody holding anything."""
+        self._held: dict[tuple[Hashable, str], HeldGizmo] = {}
         self._lock = Lock()
 
-    def take(self, holder: int, handle: str, held: HeldGizmo) -> None:
+    def take(self, holder: Hashable, handle: str, held: HeldGizmo) -> None:
         """Begin to hold a gizmo."""
         with self._lock:
             self._held[holder, handle] = held
-            self._heard[holder] = self._clock()
 
     def move(
         self,
-        holder: int,
+        holder: Hashable,
         handle: str,
         pointer: Float[np.ndarray, "3"],
         orientation: Float[np.ndarray, "4"] | None = None,
     ) -> None:
         """Drag a gizmo on; one that is not held (any more) stays where it is."""
         with self._lock:
-            self._heard[holder] = self._clock()
             held = self._held.get((holder, handle))
             if held is not None:
                 self._held[holder, handle] = replace(
                     held, pointer=pointer, orientation=orientation
                 )
 
-    def release(self, holder: int, handle: str) -> None:
+    def release(self, holder: Hashable, handle: str) -> None:
         """Let go of a gizmo."""
         with self._lock:
             self._held.pop((holder, handle), None)
 
-    def release_all(self, holder: int) -> None:
+    def release_all(self, holder: Hashable) -> None:
         """Forget somebody who has left."""
         with self._lock:
-            self._drop(holder)
+            for key in [key for key in self._held if key[0] == holder]:
+                del self._held[key]
 
-    def hear(self, holder: int) -> None:
-        """Note a sign of life."""
+    def clear(self) -> None:
+        """Let go of everything: a connection that comes back has to take its gizmo anew."""
         with self._lock:
-            if holder in self._heard:
-                self._heard[holder] = self._clock()
+            self._held.clear()
 
-    @property
-    def holders(self) -> set[int]:
-        """Those who hold something."""
+    def held(self) -> dict[tuple[Hashable, str], HeldGizmo]:
+        """All of them, by holder and name."""
         with self._lock:
-            return {holder for holder, _ in self._held}
-
-    def held(self) -> dict[tuple[int, str], HeldGizmo]:
-        """Those whose holders have been heard of lately, by holder and name.
-
-        The others are released for good: a connection that comes back does not move the arm
-        before its gizmo is taken anew.
-        """
-        with self._lock:
-            now = self._clock()
-            for holder in [h for h, t in self._heard.items() if now - t > self.timeout]:
-                self._drop(holder)
             return dict(self._held)
-
-    def _drop(self, holder: int) -> None:
-        self._heard.pop(holder, None)
-        for key in [key for key in self._held if key[0] == holder]:
-            del self._held[key]
 
 
 class AddedTurn:
@@ -138,21 +105,26 @@ class AddedTurn:
     def __init__(self) -> None:
         self._turn = self._before = self._taken = _NO_TURN
         self._lock = Lock()
-        self.holder: int | None = None
+        self.holder: Hashable | None = None
 
-    def take(self, holder: int, orientation: Float[np.ndarray, "4"]) -> None:
+    def take(self, holder: Hashable, orientation: Float[np.ndarray, "4"]) -> None:
         """Begin to turn a gizmo whose orientation is this (wxyz)."""
         with self._lock:
             self._taken, self._before = torch.from_numpy(orientation), self._turn
             self.holder = holder
 
-    def release(self, holder: int) -> None:
+    def release(self, holder: Hashable) -> None:
         """Let go of it."""
         with self._lock:
             if self.holder == holder:
                 self.holder = None
 
-    def move(self, holder: int, orientation: Float[np.ndarray, "4"]) -> None:
+    def drop(self) -> None:
+        """Let go of it, whoever holds it."""
+        with self._lock:
+            self.holder = None
+
+    def move(self, holder: Hashable, orientation: Float[np.ndarray, "4"]) -> None:
         """Turn it on, for who holds it."""
         with self._lock:
             if self.holder != holder:
@@ -197,6 +169,7 @@ class PageHuman(Human):
         *,
         holds_for: float = 0.25,
         clock: Callable[[], float] = time.monotonic,
+        present: Callable[[], bool] = lambda: True,
     ):
         """Start with a person who asks for nothing.
 
@@ -204,13 +177,14 @@ class PageHuman(Human):
             joints: Number of joints.
             holds_for: Time that a posted wish holds [s].
             clock: Tells the time [s].
+            present: Whether there are signs of life from the person; asked at each reading.
 
         Raises:
             ValueError: `holds_for` is not positive.
         """
         if not holds_for > 0:
             raise ValueError(f"holds_for must be positive, but is {holds_for}.")
-        self._holds_for, self._clock = holds_for, clock
+        self._holds_for, self._clock, self._present = holds_for, clock, present
         self._idle = _locked(HumanInput(nullspace_input=np.zeros(joints)))
         # While it holds, afterwards, and until when: changed together, as one reference.
         self._posted = (self._idle, self._idle, float("-inf"))
@@ -242,7 +216,7 @@ class PageHuman(Human):
         """What the person asks for now. Its arrays are shared: they may not be written to."""
         self._state = state
         asked, still, deadline = self._posted
-        if self._clock() > deadline:
+        if self._clock() > deadline or not self._present():
             asked = still
         if not self._requests:
             return asked

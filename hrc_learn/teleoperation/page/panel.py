@@ -14,6 +14,7 @@ from jaxtyping import Float
 from hrc_learn.geometry import Box
 from hrc_learn.protocols import DrawnRegion, Feedback, Request
 from hrc_learn.teleoperation.devices import DIRECTIONS, KeyboardState
+from hrc_learn.teleoperation.gate.messages import Gripper, Message, Region, Target, Task
 from hrc_learn.teleoperation.hand_guiding import InteractionForceConfig
 from hrc_learn.teleoperation.page.page_operator import AddedTurn
 from hrc_learn.teleoperation.page.page_scene import ViserServer
@@ -121,6 +122,18 @@ def feedback_html(feedback: Feedback) -> str:
         badge = _badge(followed_colour(feedback.followed), f"follows by {share} %")
         why = "; ".join(html.escape(reason.text) for reason in feedback.reasons)
         rows.append(f"{badge}&ensp;{why}")
+    rows += [
+        f'<div style="opacity:.75">{html.escape(words)}</div>' for words in felt_words(feedback)
+    ]
+    return f'<div style="padding:.2em .9em .4em">{"".join(rows)}</div>' if rows else ""
+
+
+def felt_words(feedback: Feedback) -> list[str]:
+    """What the arm feels, in words.
+
+    Args:
+        feedback: That the arm has told.
+    """
     force, felt = feedback.contact_force, []
     if force is not None and (size := float(np.linalg.norm(force))) >= _LEAST_CONTACT:
         felt.append(f"contact: {5 * round(size / 5)} N")
@@ -133,8 +146,7 @@ def feedback_html(feedback: Feedback) -> str:
         known = math.isfinite(distance)
         where = f"{max(distance, 0.0):.1f} m away" if known else "nobody knows where"
         felt.append(f"nearest person: {where}, pace {10 * round(10 * feedback.pace)} %")
-    rows += [f'<div style="opacity:.75">{html.escape(words)}</div>' for words in felt]
-    return f'<div style="padding:.2em .9em .4em">{"".join(rows)}</div>' if rows else ""
+    return felt
 
 
 def interventions_html(status: PageStatus, more: Sequence[str], latest: str) -> str:
@@ -179,6 +191,9 @@ def _turn_words(turn: tuple[float, float, float] | None) -> str:
     x, y, z = np.rad2deg(turn)
     return f"Turned by its rings: {x:.0f}, {y:.0f}, {z:.0f} degrees about x, y, z."
 
+
+LONGEST_TEXT = 200
+"""Characters that a text typed on the page may have."""
 
 OPEN = 0.08
 """Width of the open gripper [m]."""
@@ -336,6 +351,27 @@ class Panel:
         return None if self._region is None else self._region.target
 
     @property
+    def drawn(self) -> tuple[DrawnRegion | None, bool]:
+        """The region drawn, active or not, and whether it is; None where nobody draws."""
+        if self._region is None:
+            return None, False
+        return self._region.drawn, self._region.region is not None
+
+    def hear(self, message: Message) -> None:
+        """Do what a headset asks, as the panel's own controls would."""
+        match message:
+            case Gripper(width=width):
+                self.gripper = width
+            case Task(task=task) if self._task is not None:
+                self._task.value = task
+            case Region(centre=centre, half_size=half_size, active=active) if self._region:
+                self._region.draw(DrawnRegion(centre=centre, half_size=half_size), active)
+            case Target(point=point) if self._region is not None:
+                self._region.mark(None if point is None else np.array(point))
+            case _:
+                pass  # what this page does not offer
+
+    @property
     def forces(self) -> InteractionForceConfig:
         """How strongly gizmos act."""
         mapping: Any = _MAPPINGS[self._mapping.value]
@@ -343,6 +379,25 @@ class Panel:
         return replace(
             base, mapping=mapping, rate=share * base.rate, stiffness=share * base.stiffness
         )
+
+    def fits(self, uuid: str, updates: Mapping[str, Any]) -> bool:
+        """Whether a browser may set a control of the panel to a value.
+
+        Args:
+            uuid: Of the control; viser's, like the table it is looked up in.
+            updates: New values of its properties.
+        """
+        handle: Any = self._gui._gui_input_handle_from_uuid.get(uuid)
+        if handle is None or handle.disabled or set(updates) != {"value"}:
+            return False
+        value, now = updates["value"], handle.value
+        if isinstance(now, bool) or isinstance(value, bool):
+            return isinstance(value, bool) and isinstance(now, bool)
+        if isinstance(now, str):
+            options = getattr(handle, "options", None)
+            fits = isinstance(value, str) and len(value) <= LONGEST_TEXT
+            return fits and (options is None or value in options)
+        return isinstance(value, int | float) and handle.min <= value <= handle.max
 
     def direction(self) -> Float[np.ndarray, "3"]:
         """Where keys move the end effector: a unit vector, or zero."""

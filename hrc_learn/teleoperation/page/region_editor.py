@@ -140,6 +140,16 @@ class RegionEditor:
         return self._region if self._in_force.value else None
 
     @property
+    def drawn(self) -> DrawnRegion:
+        """The region, active or not."""
+        return self._region
+
+    def draw(self, region: DrawnRegion, active: bool) -> None:
+        """Take a region that was drawn elsewhere, and whether it is active."""
+        self._in_force.value = active
+        self.reshape(region)
+
+    @property
     def target(self) -> tuple[float, float, float] | None:
         """The point marked, where there is one [m]."""
         return self._target

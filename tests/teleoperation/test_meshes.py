@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hrc_learn.geometry import Body, Box, Capsule, MeshFile
-from hrc_learn.teleoperation.page.page_scene import body_meshes, box_mesh, capsule_mesh
+from hrc_learn.teleoperation.page.meshes import body_meshes, box_mesh, capsule_mesh
 
 TETRAHEDRON = """v 0 0 0
 v 1 0 0

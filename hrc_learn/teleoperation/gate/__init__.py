@@ -1,0 +1,12 @@
+"""The way in for browsers: address with a secret, TLS, who leads, and what may be said."""
+
+from hrc_learn.teleoperation.gate.address import Address as Address
+from hrc_learn.teleoperation.gate.address import AddressConfig as AddressConfig
+from hrc_learn.teleoperation.gate.address import qr_code as qr_code
+from hrc_learn.teleoperation.gate.control import Control as Control
+from hrc_learn.teleoperation.gate.gate import Content as Content
+from hrc_learn.teleoperation.gate.gate import Gate as Gate
+from hrc_learn.teleoperation.gate.gate import GateCallbacks as GateCallbacks
+from hrc_learn.teleoperation.gate.gate import guarded_servers as guarded_servers
+from hrc_learn.teleoperation.gate.gate import page_contents as page_contents
+from hrc_learn.teleoperation.gate.gate import static_contents as static_contents

@@ -1,0 +1,185 @@
+"""How a person gets to the page: its address with a secret, TLS, and a code for their phone."""
+
+from __future__ import annotations
+
+import ipaddress
+import os
+import secrets
+import shutil
+import socket
+import ssl
+import subprocess
+from dataclasses import dataclass, field
+from pathlib import Path
+
+_VALID_DAYS = 800  # browsers refuse certificates of more than 825 days
+
+
+@dataclass(frozen=True, kw_only=True)
+class AddressConfig:
+    """Where a page is served, and to whom."""
+
+    host: str = "127.0.0.1"
+    """Address to serve at: this machine only, unless it is one of the network. There the page
+    is served by TLS."""
+    port: int = 8080
+    """Port to serve at; the next free one is taken if it is in use."""
+    name: str = ""
+    """Name by which browsers reach this machine on the network; its own address if empty."""
+    certificate: Path | None = None
+    """Certificate for TLS (PEM); one of our own, which browsers ask about once, if None."""
+    key: Path | None = None
+    """Private key of that certificate (PEM)."""
+    most_clients: int = 8
+    """Browsers that may be there at once."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.port <= 65535:
+            raise ValueError(f"port must be 0 to 65535, but is {self.port}.")
+        if (self.certificate is None) != (self.key is None):
+            raise ValueError("a certificate and its key are given together, or neither.")
+        if self.most_clients < 1:
+            raise ValueError(f"most_clients must be at least 1, but is {self.most_clients}.")
+
+    @property
+    def local(self) -> bool:
+        """Whether this machine alone can reach the page."""
+        try:
+            return ipaddress.ip_address(self.host).is_loopback
+        except ValueError:
+            return self.host == "localhost"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Address:
+    """Of a page that is served."""
+
+    scheme: str
+    host: str
+    port: int
+    token: str = field(default_factory=lambda: secrets.token_urlsafe(18), repr=False)
+    """The secret that opens it; new with each start."""
+
+    @property
+    def origin(self) -> str:
+        """Without the secret."""
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return f"{self.scheme}://{host}:{self.port}"
+
+    def link(self, path: str = "/") -> str:
+        """With the secret: who has it can move the arm."""
+        return f"{self.origin}{path}?token={self.token}"
+
+
+def network_name(config: AddressConfig) -> str:
+    """Name or address by which browsers reach the page."""
+    if config.name or config.local or config.host not in ("0.0.0.0", "::"):
+        return config.name or config.host
+    # A datagram socket that is connected sends nothing: it only chooses the address that this
+    # machine would use. The one it would go to is reserved for documentation (RFC 5737).
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))
+        except OSError:
+            return socket.gethostname()
+        return probe.getsockname()[0]
+
+
+def listening_socket(config: AddressConfig, attempts: int = 100) -> socket.socket:
+    """A socket at the configured port, or at the next one that is free.
+
+    Raises:
+        ValueError: There is none, or the host is none of this machine's addresses.
+    """
+    last: OSError | None = None
+    for port in range(config.port, min(config.port + attempts, 65536)):
+        try:
+            family = socket.AF_INET6 if ":" in config.host else socket.AF_INET
+            return socket.create_server((config.host, port), family=family, backlog=32)
+        except OSError as error:
+            last = error
+            if isinstance(error, socket.gaierror):
+                break
+    raise ValueError(
+        f"nothing can be served at {config.host}, ports {config.port} and up: {last}. "
+        "Give an address of this machine, and a port that is free."
+    )
+
+
+def tls_context(config: AddressConfig) -> ssl.SSLContext | None:
+    """TLS for a page on the network; None for one that this machine alone can reach.
+
+    Without a certificate one is made by `openssl`, kept in the cache folder and used again, so
+    that browsers ask about it once.
+
+    Raises:
+        ValueError: There is neither a certificate nor a program to make one, or it is no good.
+    """
+    if config.local and config.certificate is None:
+        return None
+    certificate, key = config.certificate, config.key
+    if certificate is None or key is None:
+        certificate, key = _own_certificate(network_name(config))
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    try:
+        context.load_cert_chain(certificate, key)
+    except (OSError, ssl.SSLError) as error:
+        raise ValueError(f"certificate {certificate} with key {key}: {error}") from error
+    return context
+
+
+def _own_certificate(name: str) -> tuple[Path, Path]:
+    cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
+    folder = cache / "hrc_learn" / "tls"
+    certificate, key = folder / f"{name}.pem", folder / f"{name}.key"
+    if certificate.is_file() and key.is_file():
+        return certificate, key
+    openssl = shutil.which("openssl")
+    if openssl is None:
+        raise ValueError(
+            "a page on the network needs TLS: install openssl, which makes a certificate, or "
+            "give --page.certificate and --page.key."
+        )
+    folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+    try:
+        kind = f"IP:{ipaddress.ip_address(name)}"
+    except ValueError:
+        kind = f"DNS:{name}"
+    made = folder / f"{secrets.token_hex(4)}.new"
+    subprocess.run(
+        [
+            *(openssl, "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256"),
+            *("-nodes", "-days", str(_VALID_DAYS), "-subj", "/CN=hrc page"),
+            *("-addext", f"subjectAltName={kind}"),
+            *("-keyout", str(made.with_suffix(".key")), "-out", str(made)),
+        ],
+        check=True,
+        capture_output=True,
+    )
+    made.with_suffix(".key").replace(key)
+    made.replace(certificate)
+    return certificate, key
+
+
+def qr_code(text: str) -> str:
+    """A QR code for a terminal: two rows of it in each line, dark on light.
+
+    Args:
+        text: What it says; by OpenCV, which the simulator needs anyway.
+
+    Returns:
+        Lines of text; empty where OpenCV cannot encode.
+    """
+    try:
+        import cv2
+
+        code = cv2.QRCodeEncoder.create().encode(text) > 0
+    except (ImportError, AttributeError):
+        return ""
+    light = [[True, *row, True] for row in code.tolist()]
+    light += [[True] * len(light[0])] * (2 - len(light) % 2)
+    pairs = zip(light[::2], light[1::2], strict=True)
+    blocks = {(True, True): "█", (True, False): "▀", (False, True): "▄", (False, False): " "}
+    return "\n".join(
+        "".join(blocks[pair] for pair in zip(*rows, strict=True)) for rows in pairs
+    )

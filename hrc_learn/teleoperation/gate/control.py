@@ -1,0 +1,192 @@
+"""Who leads the arm: one client at a time, as long as it gives signs of life."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from threading import RLock
+from typing import Literal
+
+Role = Literal["leads", "watches"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ControlView:
+    """What one client is told about who leads."""
+
+    role: Role
+    taken: bool
+    """Whether anybody leads."""
+    asked: bool
+    """Whether somebody else asks to lead; of a client that watches, whether it asks itself."""
+
+
+class Control:
+    """One of several clients leads; the others watch, and may ask to lead.
+
+    The first to join leads. Who leads keeps that until they hand it over or leave; somebody who
+    asks also gets it when the leader has done nothing for `patience`. Nobody can take it in the
+    middle of a drag. Safe to use from several threads.
+    """
+
+    def __init__(
+        self,
+        silence: float,
+        timeout: float,
+        *,
+        patience: float = 10.0,
+        clock: Callable[[], float] = time.monotonic,
+    ):
+        """Start with nobody there.
+
+        Args:
+            silence: Time without a sign of life after which the leader asks for no motion [s].
+            timeout: Likewise until they lose what they hold, and a page that does not react is
+                taken for gone [s].
+            patience: How long a leader who does nothing keeps others waiting [s].
+            clock: Tells the time [s].
+
+        Raises:
+            ValueError: Times are not positive, or silence is longer than timeout.
+        """
+        if not 0 < silence <= timeout:
+            raise ValueError(
+                "silence must be positive and no longer than timeout, but they are "
+                f"{silence} and {timeout} s."
+            )
+        self._silence, self._timeout, self._patience = silence, timeout, patience
+        self._clock = clock
+        self._heard: dict[str, float] = {}
+        self._lag: dict[str, float] = {}
+        self._asking: dict[str, float] = {}
+        self._leader: str | None = None
+        self._acted = float("-inf")
+        self._turn = 0
+        self._lock = RLock()
+
+    def join(self, client: str) -> None:
+        """Somebody has come; where nobody leads, they do."""
+        with self._lock:
+            self._heard[client] = self._clock()
+            if self._leader is None:
+                self._give(client)
+
+    def leave(self, client: str) -> None:
+        """Somebody has left."""
+        with self._lock:
+            for table in (self._heard, self._lag, self._asking):
+                table.pop(client, None)
+            if client == self._leader:
+                # Who is left alone leads, as the first to come does: a page that is loaded anew
+                # may come before the old one has left.
+                alone = next(iter(self._heard)) if len(self._heard) == 1 else None
+                self._give(min(self._asking, key=self._asking.__getitem__, default=alone))
+
+    def hear(self, client: str, lag: float = 0.0) -> None:
+        """Note a sign of life.
+
+        Args:
+            client: Whose.
+            lag: How long ago their page last reacted [s]; a worker may go on when it hangs.
+        """
+        with self._lock:
+            if client in self._heard:
+                self._heard[client], self._lag[client] = self._clock(), lag
+
+    def act(self, client: str, *, idle: bool = False) -> bool:
+        """Whether a client may act now.
+
+        Args:
+            client: Who wants to.
+            idle: Whether it does nothing, as hands do that hold nothing: only who does
+                something keeps others waiting for longer.
+        """
+        with self._lock:
+            self._pass_on()
+            if client != self._leader:
+                return False
+            if not idle:
+                self._acted = self._clock()
+            return True
+
+    def keep(self) -> None:
+        """Note that the leader holds something, which they may without saying so."""
+        with self._lock:
+            self._acted = self._clock()
+
+    def ask(self, client: str) -> None:
+        """A client wants to lead: at once where nobody does, else when the leader lets them."""
+        with self._lock:
+            if client not in self._heard or client == self._leader:
+                return
+            if self._leader is None:
+                self._give(client)
+            else:
+                self._asking.setdefault(client, self._clock())
+
+    def hand_over(self, client: str) -> None:
+        """The leader hands over to who has asked first, or lets go of control."""
+        with self._lock:
+            if client == self._leader:
+                self._give(min(self._asking, key=self._asking.__getitem__, default=None))
+
+    @property
+    def turn(self) -> int:
+        """Rises with each change of leader: what was held before then is held no more."""
+        with self._lock:
+            self._pass_on()
+            return self._turn
+
+    @property
+    def present(self) -> bool:
+        """Whether the leader has been heard of lately enough to move the arm."""
+        return self._within(self._silence)
+
+    @property
+    def gone(self) -> bool:
+        """Whether the leader, if any, has been silent for so long that they hold nothing."""
+        return not self._within(self._timeout)
+
+    @property
+    def lag(self) -> float:
+        """How long ago the leader's page last reacted [s]."""
+        with self._lock:
+            return 0.0 if self._leader is None else self._lag.get(self._leader, 0.0)
+
+    @property
+    def people(self) -> int:
+        """How many are there."""
+        with self._lock:
+            return len(self._heard)
+
+    def view(self, client: str) -> ControlView:
+        """What to tell a client."""
+        with self._lock:
+            self._pass_on()
+            leads = client == self._leader
+            return ControlView(
+                role="leads" if leads else "watches",
+                taken=self._leader is not None,
+                asked=bool(self._asking) if leads else client in self._asking,
+            )
+
+    def _within(self, limit: float) -> bool:
+        with self._lock:
+            heard = self._heard.get(self._leader or "")
+            if heard is None:
+                return False
+            return self._clock() - heard <= limit and self.lag <= self._timeout
+
+    def _give(self, client: str | None) -> None:
+        self._leader, self._acted = client, self._clock()
+        self._asking.pop(client or "", None)
+        self._turn += 1
+
+    def _pass_on(self) -> None:
+        """Give control to who asks where the leader does not answer."""
+        if self._leader is None or not self._asking:
+            return
+        first = min(self._asking, key=self._asking.__getitem__)
+        if self._clock() - max(self._acted, self._asking[first]) >= self._patience:
+            self._give(first)

@@ -1,0 +1,477 @@
+"""The one way in for browsers: all that they send is checked before it reaches anything else.
+
+In front of viser, which lets anybody in who reaches its port, and of the XR client's socket.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hmac
+import http
+import json
+import logging
+import mimetypes
+import time
+from collections.abc import Awaitable, Callable, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from threading import Event, Thread
+from typing import TYPE_CHECKING, Any
+from urllib.parse import parse_qs, urlsplit
+
+from hrc_learn.teleoperation.gate.address import (
+    Address,
+    AddressConfig,
+    listening_socket,
+    network_name,
+    tls_context,
+)
+from hrc_learn.teleoperation.gate.control import Control
+from hrc_learn.teleoperation.gate.messages import (
+    Beat,
+    GuiUpdate,
+    Hands,
+    Hello,
+    Lead,
+    Message,
+    MessageError,
+    session_message,
+    view_message,
+)
+
+# websockets comes with viser, and is imported when a page is opened.
+if TYPE_CHECKING:
+    from websockets.asyncio.server import ServerConnection as ServerConnection
+    from websockets.http11 import Request as Request
+    from websockets.http11 import Response as Response
+else:
+    ServerConnection = Request = Response = Any
+
+_LARGEST = 16_384  # bytes of a message: the longest of ours has 1.5 kB
+_RATE, _BURST = 400.0, 800.0  # messages a second and at once: a mouse makes 2 x 125
+_CONNECTIONS = 64  # open at once, whatever they are: a browser needs 8
+_PER_PERSON = 2  # a page and its socket
+_WRONG_TOKENS, _FORGIVEN = 20.0, 1.0  # at once, and one a second: nobody guesses 144 bits
+_STATUS_EVERY, _SCENE_EVERY = 0.1, 1 / 60
+_GONE, _TOO_MUCH, _FULL = 1001, 1008, 1013  # codes of the WebSocket protocol (RFC 6455)
+
+_POLICY = (
+    "default-src 'self' 'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval' blob: data:; "
+    "connect-src 'self' blob: data:; frame-ancestors 'none'; form-action 'none'"
+)
+"""Nothing is fetched from, sent to or framed by anybody else."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Content:
+    """What is served at a path."""
+
+    body: bytes
+    kind: str
+    """Its MIME type."""
+
+    @classmethod
+    def of(cls, name: str, body: bytes) -> Content:
+        """By the ending of its name."""
+        kinds = {".js": "text/javascript", ".glb": "model/gltf-binary"}
+        suffix = name[name.rfind(".") :]
+        guess = kinds.get(suffix) or mimetypes.guess_type(name)[0]
+        return cls(body=body, kind=guess or "application/octet-stream")
+
+
+_STATIC = Path(__file__).parent / "static"
+
+
+def page_contents(viser: Path) -> dict[str, Content]:
+    """The page of viser with our part of it, by path.
+
+    Args:
+        viser: Folder of the package.
+    """
+    page = (viser / "client" / "build" / "index.html").read_bytes()
+    # Ours comes first: it says which socket viser's client opens.
+    page = page.replace(b"<head>", b'<head><script src="/static/session.js"></script>', 1)
+    page = page.replace(b"<title>Viser</title>", b"<title>hrc page</title>", 1)
+    return {"/": Content.of("index.html", page), **static_contents(_STATIC)}
+
+
+def static_contents(folder: Path) -> dict[str, Content]:
+    """Files of a folder, by path."""
+    return {
+        f"/static/{file.name}": Content.of(file.name, file.read_bytes())
+        for file in sorted(folder.iterdir())
+        if file.is_file()
+    }
+
+
+@dataclass(kw_only=True)
+class Bucket:
+    """Lets so many through a second, and so many at once."""
+
+    rate: float
+    burst: float
+    clock: Callable[[], float] = time.monotonic
+    left: float = field(init=False)
+    last: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.left, self.last = self.burst, self.clock()
+
+    def take(self) -> bool:
+        """Whether one more may pass."""
+        now = self.clock()
+        self.left = min(self.burst, self.left + self.rate * (now - self.last))
+        self.last = now
+        if self.left < 1:
+            return False
+        self.left -= 1
+        return True
+
+
+@dataclass(frozen=True, kw_only=True)
+class GateCallbacks:
+    """What the page does with what the gate lets through; called by the gate's thread."""
+
+    heard: Callable[[Message], None]
+    """A message of the client that leads."""
+    fits: Callable[[GuiUpdate], bool]
+    """Whether a control of viser's panel takes a value."""
+    status: Callable[[], Mapping[str, Any]]
+    """What all clients are told ten times a second."""
+    scene: Callable[[], Mapping[str, Any]]
+    """What clients are told that draw the scene themselves, as often as it changes."""
+
+
+class Gate:
+    """Serves pages and sockets to those who have the token, in a thread of its own.
+
+    Attributes:
+        address: Where, with the secret.
+        control: Who leads.
+    """
+
+    def __init__(
+        self,
+        config: AddressConfig,
+        control: Control,
+        contents: Mapping[str, Content],
+        callbacks: GateCallbacks,
+        viewer: str,
+        secret: str,
+    ):
+        """Listen; nobody is let in before `start`.
+
+        Args:
+            config: Where.
+            control: Who leads.
+            contents: By path.
+            callbacks: Of the page.
+            viewer: Address of viser's socket.
+            secret: That it wants to see.
+
+        Raises:
+            ValueError: It cannot be served there, or not safely.
+        """
+        self._context = tls_context(config)
+        self._socket = listening_socket(config)
+        self._config, self.control, self._contents = config, control, contents
+        self._callbacks, self._viewer, self._secret = callbacks, viewer, secret
+        self.address = Address(
+            scheme="https" if self._context else "http",
+            host=network_name(config),
+            port=self._socket.getsockname()[1],
+        )
+        self._cookie = f"hrc_page_{self.address.port}"
+        self._hosts = {self.address.host, "localhost", "127.0.0.1", "::1"}
+        self._sessions: dict[str, ServerConnection] = {}
+        self._views: dict[str, ServerConnection] = {}
+        self._open = 0
+        self._wrong = Bucket(rate=_FORGIVEN, burst=_WRONG_TOKENS)
+        self._ready, self._farewell = Event(), ""
+        self._thread = Thread(target=self._run, name="page gate", daemon=True)
+
+    def start(self) -> None:
+        """Let people in."""
+        self._thread.start()
+        self._ready.wait()
+
+    def close(self, words: str) -> None:
+        """Tell everybody that it is over, and why, and stop."""
+        self._farewell = words
+        if self._thread.is_alive():
+            with suppress(RuntimeError):  # it has just ended
+                self._loop.call_soon_threadsafe(self._end.set)
+            self._thread.join()
+        self._socket.close()
+
+    def _run(self) -> None:
+        asyncio.run(self._serve())
+
+    async def _serve(self) -> None:
+        from websockets.asyncio.server import serve
+
+        self._loop, self._end = asyncio.get_running_loop(), asyncio.Event()
+        async with serve(
+            self._handle,
+            sock=self._socket,
+            ssl=self._context,
+            process_request=self._admit,
+            select_subprotocol=lambda _, offered: next(
+                (name for name in offered if name.startswith("viser-v")), None
+            ),
+            max_size=_LARGEST,
+            compression=None,
+            open_timeout=5,
+            close_timeout=1,
+            ping_interval=5,
+            ping_timeout=10,
+            logger=_quiet_logger(),
+        ):
+            self._ready.set()
+            await self._end.wait()
+            words = json.dumps({"type": "end", "words": self._farewell})
+            for session in list(self._sessions.values()):
+                with suppress(Exception):  # whoever is gone need not be told
+                    await asyncio.wait_for(session.send(words), 0.5)
+
+    # Who is let in.
+
+    def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
+        """Answer a request; None lets a WebSocket through."""
+        parts = urlsplit(request.path)
+        if not self._is_ours(request.headers.get("Host", "")):
+            return _refused(403, "This page is not served under that name.")
+        if "token" in (query := parse_qs(parts.query)):
+            return self._enter(query["token"][0], parts.path)
+        if not self._knows(request):
+            return _refused(
+                401, "Open the whole address that the terminal shows: it has a secret."
+            )
+        if request.headers.get("Upgrade", "").lower() != "websocket":
+            content = self._contents.get(parts.path)
+            if content is None:
+                return _refused(404, "There is nothing here.")
+            return _response(200, content.body, content.kind)
+        if not self._from_ours(request.headers.get("Origin", "")):
+            return _refused(403, "Another site may not connect.")
+        route, _, client = parts.path.strip("/").partition("/")
+        if route not in ("session", "view") or not 16 <= len(client) <= 64:
+            return _refused(404, "There is nothing here.")
+        if self._open >= _CONNECTIONS:
+            return _refused(503, "Too many connections.")
+        return None
+
+    def _is_ours(self, host: str) -> bool:
+        """Whether a Host header names us: another name may have been bound to our address."""
+        parts = urlsplit(f"//{host}")
+        with suppress(ValueError):
+            return parts.hostname in self._hosts and parts.port in (self.address.port, None)
+        return False
+
+    def _from_ours(self, origin: str) -> bool:
+        parts = urlsplit(origin)
+        return parts.scheme == self.address.scheme and self._is_ours(parts.netloc)
+
+    def _enter(self, token: str, path: str) -> Response:
+        """Exchange the token of the address for a cookie, which no other site can send."""
+        if not hmac.compare_digest(token.encode(), self.address.token.encode()):
+            if self._wrong.take():
+                return _refused(403, "That secret is not the one of this start.")
+            return _refused(429, "Too many wrong secrets.")
+        secure = "; Secure" if self._context else ""
+        cookie = f"{self._cookie}={token}; HttpOnly; SameSite=Strict; Path=/{secure}"
+        where = path if path in self._contents else "/"
+        return _response(303, b"", "text/plain", Location=where, Set_Cookie=cookie)
+
+    def _knows(self, request: Request) -> bool:
+        cookies = "; ".join(request.headers.get_all("Cookie"))
+        for cookie in cookies.split(";"):
+            name, _, value = cookie.strip().partition("=")
+            if name == self._cookie:
+                return hmac.compare_digest(value.encode(), self.address.token.encode())
+        return False
+
+    # What they may say.
+
+    async def _handle(self, connection: ServerConnection) -> None:
+        assert connection.request is not None
+        route, _, client = urlsplit(connection.request.path).path.strip("/").partition("/")
+        table = self._sessions if route == "session" else self._views
+        if client in table or len(table) >= self._config.most_clients:
+            await connection.close(_FULL, "as many people are here as may be")
+            return
+        table[client] = connection
+        self._open += 1
+        try:
+            await (self._session if route == "session" else self._view)(connection, client)
+        except MessageError as error:
+            await connection.close(_TOO_MUCH, str(error)[:120])
+        finally:
+            self._open -= 1
+            del table[client]
+
+    async def _session(self, connection: ServerConnection, client: str) -> None:
+        """Our own clients: signs of life, wishes to lead, hands; the status comes back."""
+        self.control.join(client)
+        wants = {"scene": False}
+
+        async def listen() -> None:
+            bucket = Bucket(rate=_RATE, burst=_BURST)
+            async for raw in connection:
+                if not bucket.take():
+                    raise MessageError("too many messages")
+                self._hear(client, session_message(raw), wants)
+
+        async def tell() -> None:
+            status, last = 0.0, None
+            while True:
+                now = time.monotonic()
+                content: dict[str, Any] = {}
+                if now - status >= _STATUS_EVERY:
+                    status, view = now, vars(self.control.view(client))
+                    content = {"status": {**self._callbacks.status(), **view}}
+                if wants["scene"] and (scene := self._callbacks.scene()) is not last:
+                    last, content["scene"] = scene, scene
+                if content:
+                    await connection.send(json.dumps({"type": "state", **content}))
+                await asyncio.sleep(_SCENE_EVERY if wants["scene"] else _STATUS_EVERY)
+
+        try:
+            await _first(listen(), tell())
+        finally:
+            self.control.leave(client)
+
+    def _hear(self, client: str, message: Message, wants: dict[str, bool]) -> None:
+        match message:
+            case Beat(lag=lag):
+                self.control.hear(client, lag)
+            case Hello():
+                wants["scene"] = message.wants == "scene"
+            case Lead(wish="ask"):
+                self.control.ask(client)
+            case Lead():
+                self.control.hand_over(client)
+            case _:
+                # Who watches may have led when they sent this: it is no offence.
+                idle = isinstance(message, Hands) and not message.grips
+                if self.control.act(client, idle=idle):
+                    self._callbacks.heard(message)
+
+    async def _view(self, connection: ServerConnection, client: str) -> None:
+        """The page of viser: what fits goes on to it, and all that it says comes back."""
+        from websockets.asyncio.client import connect
+        from websockets.typing import Subprotocol
+
+        protocols = [Subprotocol(connection.subprotocol)] if connection.subprotocol else None
+        async with connect(
+            self._viewer,
+            subprotocols=protocols,
+            additional_headers={SECRET_HEADER: self._secret},
+            max_size=None,
+            compression=None,
+            ping_interval=None,
+            proxy=None,
+        ) as viewer:
+
+            async def up() -> None:
+                bucket = Bucket(rate=_RATE, burst=_BURST)
+                async for raw in connection:
+                    if not bucket.take():
+                        raise MessageError("too many messages")
+                    message = view_message(raw)
+                    if isinstance(message.content, GuiUpdate) and not self._callbacks.fits(
+                        message.content
+                    ):
+                        raise MessageError("no value of that control")
+                    if not message.acts or self.control.act(client):
+                        await viewer.send(raw)
+
+            async def down() -> None:
+                async for raw in viewer:
+                    await connection.send(raw)
+
+            await _first(up(), down())
+
+
+async def _first(*work: Awaitable[None]) -> None:
+    """Wait until one ends, and end the others; a connection that closes is no error."""
+    from websockets.exceptions import ConnectionClosed
+
+    tasks = [asyncio.ensure_future(one) for one in work]
+    try:
+        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        for task in done:
+            error = task.exception()
+            if error is not None and not isinstance(error, ConnectionClosed):
+                raise error
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+def _quiet_logger() -> logging.Logger:
+    """Says nothing of those who are not let in: anybody could fill the terminal with that."""
+    logger = logging.getLogger("hrc_learn.gate")
+    if not logger.filters:
+        logger.addFilter(lambda record: not record.getMessage().startswith("opening handshake"))
+    return logger
+
+
+def _refused(code: int, words: str) -> Response:
+    return _response(code, f"{words}\n".encode(), "text/plain; charset=utf-8")
+
+
+def _response(code: int, body: bytes, kind: str, **more: str) -> Response:
+    from websockets.datastructures import Headers
+    from websockets.http11 import Response
+
+    headers = Headers(
+        {
+            "Content-Type": kind,
+            "Content-Length": str(len(body)),
+            "Content-Security-Policy": _POLICY,
+            "X-Content-Type-Options": "nosniff",
+            "X-Frame-Options": "DENY",
+            "Referrer-Policy": "no-referrer",
+            "Permissions-Policy": "xr-spatial-tracking=(self)",
+            "Cache-Control": "no-store",
+            "Connection": "close",
+            **{name.replace("_", "-"): value for name, value in more.items()},
+        }
+    )
+    return Response(code, http.HTTPStatus(code).phrase, headers, body)
+
+
+SECRET_HEADER = "X-Page-Secret"
+
+
+@contextmanager
+def guarded_servers(secret: str):
+    """Within the block, servers of `websockets` are made such that they want to see a secret.
+
+    viser takes no hook by which to check who connects, and serves whoever reaches its port: any
+    site open in a browser of this machine does.
+
+    Args:
+        secret: That `SECRET_HEADER` has to hold.
+    """
+    import websockets.asyncio.server as server
+
+    plain = server.serve
+
+    def serve(*args: Any, **options: Any) -> Any:
+        def check(connection: ServerConnection, request: Request) -> Response | None:
+            given = request.headers.get(SECRET_HEADER, "")
+            if hmac.compare_digest(given.encode(), secret.encode()):
+                return None
+            return _refused(403, "This port is not for browsers.")
+
+        return plain(*args, **{**options, "process_request": check})
+
+    server.serve = serve  # type: ignore[assignment]
+    try:
+        yield
+    finally:
+        server.serve = plain

@@ -1,0 +1,71 @@
+// The page's tie to the program: signs of life, who leads, and what there is to say.
+//
+// Runs before viser's client. Signs of life come from a worker, which goes on while the page
+// draws, and tell for how long the page itself has not reacted.
+(() => {
+  "use strict";
+  const bytes = crypto.getRandomValues(new Uint8Array(18));
+  const client = btoa(String.fromCharCode(...bytes)).replaceAll("+", "-").replaceAll("/", "_");
+  const origin = location.origin.replace(/^http/, "ws");
+
+  // viser's client reads from the address which socket to open.
+  const address = new URL(location.href);
+  address.searchParams.set("websocket", `${origin}/view/${client}`);
+  history.replaceState(null, "", address);
+
+  const worker = new Worker("/static/beat.js");
+  worker.postMessage({ open: `${origin}/session/${client}` });
+  const send = (message) => worker.postMessage({ send: message });
+  setInterval(() => worker.postMessage({ alive: true }), 50);
+
+  let role = "", ended = false;
+  const bar = document.createElement("div");
+  const words = document.createElement("span");
+  const button = document.createElement("button");
+  bar.id = "session";
+  bar.setAttribute("role", "status");
+  bar.append(words, button);
+  const style = document.createElement("link");
+  style.rel = "stylesheet";
+  style.href = "/static/session.css";
+  document.head.append(style);
+  addEventListener("DOMContentLoaded", () => document.body.append(bar));
+
+  const show = (text, action, wish) => {
+    words.textContent = text;
+    button.hidden = !action;
+    button.textContent = action ?? "";
+    button.onclick = () => send({ type: "lead", wish });
+    bar.hidden = !text;
+  };
+
+  const state = ({ status }) => {
+    if (!status) return;
+    role = status.role;
+    bar.className = role;
+    if (role === "watches") {
+      if (status.asked) show("You watch. Who leads has been asked; give it ten seconds.");
+      else if (status.taken) show("You watch: somebody else leads.", "Ask to lead", "ask");
+      else show("Nobody leads.", "Lead", "ask");
+    } else if (status.asked) {
+      show("Somebody else asks to lead.", "Hand over", "hand_over");
+    } else {
+      bar.className = status.words ? "warns" : "leads";
+      show(status.words);
+    }
+  };
+
+  const over = (text) => {
+    ended = true;
+    bar.className = "over";
+    show(text);
+  };
+
+  worker.onmessage = ({ data }) => {
+    if (data.type === "state") state(data);
+    else if (data.type === "end") over(data.words);
+    else if (data.type === "closed" && !ended) {
+      over(data.words || "The program does not answer any more. Reload to look for it again.");
+    }
+  };
+})();

@@ -1,0 +1,185 @@
+"""What a headset's page is shown, and what its hands hold: the XR client's side of the page."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from hrc_learn.geometry import Body, Box, Pose
+from hrc_learn.protocols import DrawnRegion
+from hrc_learn.teleoperation.gate import Content, static_contents
+from hrc_learn.teleoperation.gate.messages import Grip, Hands, MessageError
+from hrc_learn.teleoperation.page.meshes import as_glb, body_meshes
+from hrc_learn.teleoperation.page.page_operator import AddedTurn, HeldGizmo, HeldGizmos
+from hrc_learn.teleoperation.page.page_scene import held_joint
+
+BUNDLE = Path(__file__).parents[1] / "xr" / "bundle"
+"""Where `python tools/build_xr.py` puts the XR client; wheels bring it."""
+BUILT = (BUNDLE / "xr.js").is_file()
+UNBUILT = "not built yet: run `python tools/build_xr.py` (it needs npm)."
+
+_HOLDER = "headset"
+_NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+class HeadsetHands:
+    """Turns what two hands hold into held gizmos, by the rules of the mouse.
+
+    A message names all that is held; what an earlier one named and this one does not is let go.
+    """
+
+    def __init__(
+        self,
+        held: HeldGizmos,
+        turn: AddedTurn,
+        links: Callable[[], Pose | None],
+        *,
+        guides: bool,
+    ):
+        """Start with empty hands.
+
+        Args:
+            held: Where held gizmos are noted.
+            turn: What a hand adds to the orientation of the end effector.
+            links: Frames of the arm as they are now; None before the arm is known.
+            guides: Whether the end effector may be held.
+        """
+        self._held, self._turn, self._links, self._guides = held, turn, links, guides
+        self._grips: dict[str, Grip] = {}
+        self._noted = False
+
+    def hear(self, hands: Hands) -> None:
+        """Take a message over.
+
+        Raises:
+            MessageError: It holds a joint that the arm does not have.
+        """
+        links = self._links()
+        if links is None:
+            return
+        now = {
+            grip.hand: grip for grip in hands.grips if self._guides or grip.joint is not None
+        }
+        if not self._noted:
+            self._grips, self._noted = now, True
+        for hand in self._grips.keys() - now.keys():
+            self._held.release(_HOLDER, hand)
+            self._turn.release((_HOLDER, hand))
+        for hand, grip in now.items():
+            before = self._grips.get(hand)
+            if before is None or (before.joint, before.start) != (grip.joint, grip.start):
+                self._take(grip, links)
+            else:
+                self._held.move(_HOLDER, hand, np.array(grip.pointer))
+            if grip.joint is None and grip.orientation is not None:
+                self._turn.move((_HOLDER, hand), np.array(grip.orientation))
+        self._grips = now
+
+    def forget(self) -> None:
+        """Somebody else leads: what their hands hold already moves nothing until taken anew."""
+        self._noted = False
+
+    def _take(self, grip: Grip, links: Pose) -> None:
+        start = torch.tensor(grip.start, dtype=torch.float64)
+        if grip.joint is None:
+            held_at = start - links[-1].position
+            if grip.orientation is not None:
+                self._turn.take((_HOLDER, grip.hand), _NO_TURN)
+        elif grip.joint < len(links.position):
+            held_at = links[grip.joint - 1].inverse().apply(start)
+        else:
+            raise MessageError(f"the arm has no joint {grip.joint}")
+        gizmo = HeldGizmo(
+            joint=grip.joint, held_at=held_at.numpy(), pointer=np.array(grip.pointer)
+        )
+        self._held.take(_HOLDER, grip.hand, gizmo)
+
+
+def headset_contents(
+    bodies: Sequence[Body],
+    boxes: Sequence[Box],
+    twin: tuple[float, float, float],
+    *,
+    guides: bool,
+    draws: bool,
+) -> dict[str, Content]:
+    """The XR client and what it draws, by path; where it is not built, words that say so.
+
+    Args:
+        bodies: What moves.
+        boxes: What stands.
+        twin: Where the virtual twin stands beside the arm [m].
+        guides: Whether the person guides the end effector and records.
+        draws: Whether they draw regions.
+    """
+    if not BUILT:
+        return {"/xr": Content(body=UNBUILT.encode(), kind="text/plain; charset=utf-8")}
+    contents = static_contents(BUNDLE)
+    contents["/xr"] = contents.pop("/static/xr.html")
+    drawn = []
+    for k, body in enumerate(bodies):
+        mesh = f"/mesh/{k}.glb" if body.meshes else None
+        if mesh is not None:
+            contents[mesh] = Content.of(mesh, as_glb(body_meshes(body)))
+        shapes = (*body.capsules, *body.boxes)
+        drawn.append(
+            {
+                "name": body.name,
+                "joint": held_joint(body),  # "nothing" of what cannot be held
+                "mesh": mesh,
+                "capsules": [vars(capsule) for capsule in body.capsules],
+                "boxes": [vars(box) for box in body.boxes],
+                "colour": shapes[0].colour if shapes else (0.7, 0.7, 0.7, 1.0),
+            }
+        )
+    scene = {
+        "bodies": drawn,
+        "boxes": [vars(box) for box in boxes],
+        "twin": twin,
+        "guides": guides,
+        "draws": draws,
+    }
+    contents["/xr/scene.json"] = Content(
+        body=json.dumps(scene).encode(), kind="application/json"
+    )
+    return contents
+
+
+def scene_state(
+    positions: Float[np.ndarray, "bodies 3"],
+    orientations: Float[np.ndarray, "bodies 4"],
+    links: Pose,
+    arrows: Float[np.ndarray, "arrows 2 3"],
+    colour: str,
+    followed: DrawnRegion | None,
+    drawn: DrawnRegion | None,
+    active: bool,
+) -> dict[str, Any]:
+    """Where everything is, for a client that draws the scene itself.
+
+    Args:
+        positions: Of the bodies [m].
+        orientations: Of the bodies (wxyz).
+        links: Frames of the arm; the last is the tool's.
+        arrows: From the points held to the pointers [m].
+        colour: Of the arrows: how far the arm follows.
+        followed: Region to which a controller takes the end effector.
+        drawn: Region that the person draws.
+        active: Whether that attracts the end effector.
+    """
+    return {
+        "bodies": np.concatenate([positions, orientations], axis=1).round(6).tolist(),
+        "links": links.position.numpy().round(6).tolist(),
+        "tool": links[-1].orientation.numpy().round(6).tolist(),
+        "arrows": arrows.round(6).tolist(),
+        "colour": colour,
+        "followed": None if followed is None else vars(followed),
+        "drawn": None if drawn is None else vars(drawn),
+        "active": active,
+    }

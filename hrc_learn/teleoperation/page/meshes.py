@@ -1,0 +1,108 @@
+"""Shapes of bodies as browsers draw them: triangles, by colour."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from hrc_learn.geometry import Body, Box, Capsule, read_mesh
+from hrc_learn.geometry.shapes import Colour
+
+
+class Mesh(NamedTuple):
+    """Triangles in the frame of a body."""
+
+    vertices: Float[np.ndarray, "vertices 3"]
+    """[m]"""
+    faces: Int[np.ndarray, "faces 3"]
+    """Corners of each triangle, counter-clockwise as seen from outside."""
+
+
+def capsule_mesh(capsule: Capsule, segments: int = 20) -> Mesh:
+    """A cylinder with round ends.
+
+    Args:
+        capsule: Its ends and radius.
+        segments: Around the axis; half as many from pole to pole.
+    """
+    start, end = np.array(capsule.start), np.array(capsule.end)
+    axis = end - start
+    length = float(np.linalg.norm(axis))
+    w = axis / length if length > 0 else np.array([0.0, 0.0, 1.0])
+    u = np.cross(w, np.eye(3)[np.abs(w).argmin()])
+    u /= np.linalg.norm(u)
+    v = np.cross(w, u)
+    # Rings from pole to pole; the equator is there twice, once at each end of the cylinder.
+    quarter = np.linspace(0, np.pi / 2, segments // 4 + 1)
+    latitude = np.concatenate([quarter - np.pi / 2, quarter])
+    origin = np.where(np.arange(len(latitude))[:, None] < len(quarter), start, end)
+    longitude = np.linspace(0, 2 * np.pi, segments, endpoint=False)
+    around = np.cos(longitude)[:, None] * u + np.sin(longitude)[:, None] * v
+    offset = np.cos(latitude)[:, None, None] * around + np.sin(latitude)[:, None, None] * w
+    vertices = origin[:, None] + capsule.radius * offset
+    return Mesh(vertices.reshape(-1, 3), _grid_faces(len(latitude), segments))
+
+
+def _grid_faces(rings: int, segments: int) -> Int[np.ndarray, "faces 3"]:
+    """Two triangles for each cell of a grid that closes around its second axis."""
+    ring, k = np.meshgrid(np.arange(rings - 1), np.arange(segments), indexing="ij")
+    here, right = ring * segments + k, ring * segments + (k + 1) % segments
+    above, above_right = here + segments, right + segments
+    faces = np.stack([here, right, above_right, here, above_right, above], axis=-1)
+    return faces.reshape(-1, 3)
+
+
+def box_mesh(box: Box) -> Mesh:
+    """A box along the axes of its body."""
+    corner = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    # Every side has corners of its own, so that shading keeps the edges sharp.
+    vertices = np.concatenate([corner[list(side)] for side in sides])
+    first = 4 * np.arange(6)[:, None]
+    faces = np.concatenate([first + np.array(half) for half in ((0, 1, 2), (0, 2, 3))])
+    return Mesh(np.array(box.centre) + vertices * box.half_size, faces)
+
+
+def body_meshes(body: Body) -> dict[Colour, Mesh]:
+    """All that a body looks like, one mesh for each colour: its own meshes and the boxes with a
+    name, or else its capsules and boxes in the colour of the first.
+    """
+    if not body.meshes:
+        shapes = [*map(capsule_mesh, body.capsules), *map(box_mesh, body.boxes)]
+        return {(*body.capsules, *body.boxes)[0].colour: joined(shapes)}
+    parts: dict[Colour, list[Mesh]] = {}
+    for file in body.meshes:
+        for part in (part.placed(file) for part in read_mesh(file.path)):
+            assert part.colour is not None  # a placed part has one
+            parts.setdefault(part.colour, []).append(Mesh(part.vertices, part.faces))
+    for box in body.boxes:
+        if box.name:
+            parts.setdefault(box.colour, []).append(box_mesh(box))
+    return {colour: joined(meshes) for colour, meshes in parts.items()}
+
+
+def joined(meshes: Sequence[Mesh]) -> Mesh:
+    """Several meshes as one."""
+    first = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
+    return Mesh(
+        np.concatenate([mesh.vertices for mesh in meshes]),
+        np.concatenate([mesh.faces + start for mesh, start in zip(meshes, first, strict=True)]),
+    )
+
+
+def as_glb(shapes: Mapping[Colour, Mesh]) -> bytes:
+    """Meshes and their colours as a binary glTF file; axes stay those of the body."""
+    import trimesh  # comes with viser
+    from trimesh.visual import TextureVisuals
+    from trimesh.visual.material import PBRMaterial
+
+    scene = trimesh.Scene()
+    for colour, mesh in shapes.items():
+        shape = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+        material = PBRMaterial(baseColorFactor=colour, metallicFactor=0.0)
+        shape.visual = TextureVisuals(material=material)
+        scene.add_geometry(shape)
+    glb = scene.export(file_type="glb")
+    assert isinstance(glb, bytes)
+    return glb

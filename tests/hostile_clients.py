@@ -1,0 +1,309 @@
+"""Clients that mean harm, or whose machines have gone mad, against a page that is served."""
+
+import asyncio
+import json
+import secrets
+import time
+from contextlib import suppress
+from urllib.error import HTTPError
+from urllib.request import HTTPRedirectHandler, Request, build_opener
+
+import msgspec
+import numpy as np
+from websockets.asyncio.client import connect
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+
+from hrc_learn.teleoperation.page import Page
+
+VISER = "viser-v1.1.1"
+
+
+class _Stay(HTTPRedirectHandler):
+    def redirect_request(self, *_):
+        return None
+
+
+def http(page: Page, path: str, **headers) -> tuple[int, dict, bytes]:
+    """Status, headers and body of a request to the page's server."""
+    where = f"http://127.0.0.1:{page.address.port}{path}"
+    try:
+        answer = build_opener(_Stay).open(Request(where, headers=headers), timeout=10)
+    except HTTPError as error:
+        answer = error
+    return answer.status, dict(answer.headers), answer.read()
+
+
+def cookie(page: Page) -> str:
+    """What somebody has who opened the address with its secret."""
+    _, headers, _ = http(page, f"/?token={page.address.token}")
+    return headers["Set-Cookie"].split(";")[0]
+
+
+def socket(page: Page, route: str, *, cookie="", origin=None, client="", **options):
+    """A socket of the page: who has all that it takes leaves the defaults."""
+    where = f"ws://127.0.0.1:{page.address.port}/{route}/{client or secrets.token_urlsafe(18)}"
+    headers = {"Cookie": cookie} if cookie else {}
+    origin = page.address.origin if origin is None else origin
+    options = {"proxy": None, "open_timeout": 10, "close_timeout": 1} | options
+    return connect(where, additional_headers=headers, origin=origin or None, **options)
+
+
+def hands(pointer=(0.3, 0.0, 0.9), joint=4, start=(0.3, 0.0, 0.5)) -> str:
+    grip = {"hand": "left", "joint": joint, "start": start, "pointer": pointer}
+    return json.dumps({"type": "hands", "grips": [grip]})
+
+
+BEAT = json.dumps({"type": "beat", "lag": 0.0})
+
+JUNK = (
+    "",
+    "{",
+    "[]",
+    "null",
+    '{"type": "none"}',
+    '{"type": "beat", "lag": NaN}',
+    '{"type": "beat", "lag": 1e999}',
+    '{"type": "beat", "lag": "0"}',
+    '{"type": "hands", "grips": [{"hand": "left"}]}',
+    '{"type": "request", "request": "explode"}',
+    '{"type": "gripper", "width": -100}',
+    '{"type": "region", "centre": [0, 0, 0], "half_size": [0, 1, 1], "active": true}',
+    '{"type": "region", "centre": [0, 0], "half_size": [1, 1, 1], "active": true}',
+    hands(pointer=(1e9, 0.0, 0.0)),
+    hands(joint=0),
+    hands(joint=99),
+    "[" * 2000,
+    "x" * 100_000,
+    b"\x00\xff" * 50,
+)
+"""What no client of ours says to the session."""
+
+
+def packed(kind: str, /, **fields) -> bytes:
+    return msgspec.msgpack.encode({"type": kind, **fields})
+
+
+VIEW_JUNK = (
+    b"",
+    b"\xc1",
+    "text",
+    packed("ShareUrlRequest"),
+    packed("FileTransferStartUpload", source_component_uuid="x", size_bytes=1 << 40),
+    packed("SetCameraPositionMessage", position=(0.0, 0.0, 0.0)),
+    packed("GuiUpdateMessage", uuid="none", updates={"value": True}),
+    packed("GuiUpdateMessage", uuid="none", updates={"visible": False}),
+    packed(
+        "TransformControlsUpdateMessage", name="/region", wxyz=(0, 0, 0, 0), position=(0, 0, 0)
+    ),
+    packed(
+        "TransformControlsUpdateMessage",
+        name="/end_effector",
+        wxyz=(1.0, 0.0, 0.0, 0.0),
+        position=(float("nan"), 0.0, 0.0),
+    ),
+    packed("SceneNodeDragMessage", phase="start", name="/arm/link4"),
+)
+"""What viser's page does not say, or not so."""
+
+DRAG = {
+    "name": "/arm/link4",
+    "instance_index": None,
+    "start_position": (0.3, 0.0, 0.5),
+    "start_screen_pos": (0.5, 0.5),
+    "end_position": (0.3, 0.5, 0.9),
+    "end_screen_pos": (0.6, 0.6),
+    "button": "left",
+    "modifier": None,
+    "owner": "",
+}
+
+
+async def refused(connection, codes=(401, 403, 404, 429, 503)) -> None:
+    """A socket that is not to open does not."""
+    try:
+        async with connection:
+            raise AssertionError("somebody was let in")
+    except InvalidStatus as error:
+        assert error.response.status_code in codes  # noqa: PT017
+
+
+async def until_closed(connection) -> None:
+    try:
+        async for _ in connection:
+            pass
+    except ConnectionClosed:
+        pass
+
+
+async def attack(page: Page, kind: str, known: str, rng: np.random.Generator) -> None:
+    """One hostile client.
+
+    Args:
+        page: Served, and led by somebody else.
+        kind: One of `ATTACKS`.
+        known: Cookie of somebody who has the secret.
+        rng: Varies what is sent.
+    """
+    route = ("session", "view")[rng.integers(2)]
+    match kind:
+        case "foreign origin":
+            origin = ("http://evil.example", "null", "http://127.0.0.1:1", "https://localhost")
+            await refused(socket(page, route, cookie=known, origin=origin[rng.integers(4)]))
+        case "no origin":
+            await refused(socket(page, route, cookie=known, origin=""))
+        case "no token":
+            await refused(socket(page, route))
+        case "wrong token":
+            wrong = secrets.token_urlsafe(18)
+            name = known.partition("=")[0]
+            await refused(socket(page, route, cookie=f"{name}={wrong}"))
+            status, *_ = await asyncio.to_thread(http, page, f"/?token={wrong}")
+            assert status in (403, 429)
+        case "rebound name":
+            status, *_ = await asyncio.to_thread(
+                http, page, "/", Cookie=known, Host=f"evil.example:{page.address.port}"
+            )
+            assert status == 403
+        case "past the gate":
+            inner = page._server.get_port()
+            where = f"ws://127.0.0.1:{inner}"
+            await refused(connect(where, subprotocols=[VISER], proxy=None))
+        case "raw junk":
+            _, writer = await asyncio.open_connection("127.0.0.1", page.address.port)
+            writer.write(rng.bytes(int(rng.integers(1, 4000))))
+            await writer.drain()
+            await asyncio.sleep(0.2)
+            writer.close()
+        case "slow":
+            _, writer = await asyncio.open_connection("127.0.0.1", page.address.port)
+            writer.write(b"GET / HTTP/1.1\r\n")
+            await asyncio.sleep(1.0)
+            writer.transport.abort()
+        case "junk":
+            async with socket(page, "session", cookie=known) as one:
+                await one.send(JUNK[rng.integers(len(JUNK))])
+                await until_closed(one)
+        case "viewer's junk":
+            async with socket(page, "view", cookie=known, subprotocols=[VISER]) as one:
+                await one.send(VIEW_JUNK[rng.integers(len(VIEW_JUNK))])
+                await until_closed(one)
+        case "flood":
+            async with socket(page, "session", cookie=known) as one:
+                try:
+                    for _ in range(3000):
+                        await one.send(BEAT)
+                except ConnectionClosed:
+                    pass
+                await until_closed(one)
+        case "stolen control":
+            async with socket(page, "session", cookie=known) as one:
+                for _ in range(20):
+                    await one.send(hands())
+                    await one.send(json.dumps({"type": "ask", "request": "finish"}))
+                    await one.send(json.dumps({"type": "lead", "wish": "hand_over"}))
+                    await one.send(json.dumps({"type": "gripper", "width": 0.0}))
+                    await asyncio.sleep(0.02)
+        case "stolen drag":
+            async with socket(page, "view", cookie=known, subprotocols=[VISER]) as one:
+                for phase in ("start", "update", "update"):
+                    await one.send(packed("SceneNodeDragMessage", phase=phase, **DRAG))
+                    await asyncio.sleep(0.05)
+                one.transport.abort()
+        case "vanishing":
+            async with socket(page, "session", cookie=known) as one:
+                await one.send(json.dumps({"type": "lead", "wish": "ask"}))
+                await one.send(hands())
+                one.transport.abort()
+
+
+ATTACKS = (
+    "foreign origin",
+    "no origin",
+    "no token",
+    "wrong token",
+    "rebound name",
+    "past the gate",
+    "raw junk",
+    "slow",
+    "junk",
+    "viewer's junk",
+    "flood",
+    "stolen control",
+    "stolen drag",
+    "vanishing",
+)
+
+
+class Leader:
+    """Somebody who leads well: pulls the elbow up and gives signs of life."""
+
+    def __init__(self, page: Page, known: str):
+        self._page, self._known = page, known
+        self.leads = asyncio.Event()
+        self.silent = False
+
+    async def run(self) -> None:
+        async with socket(self._page, "session", cookie=self._known) as one:
+            listening = asyncio.create_task(self._listen(one))
+            await one.send('{"type": "hands", "grips": []}')
+            try:
+                while True:
+                    if not self.silent:
+                        await one.send(BEAT)
+                        await one.send(hands())
+                    await asyncio.sleep(0.03)
+            finally:
+                listening.cancel()
+
+    async def _listen(self, one) -> None:
+        async for raw in one:
+            status = json.loads(raw).get("status", {})
+            if status.get("role") == "leads":
+                self.leads.set()
+
+
+async def siege(page: Page, kinds, seed: int, at_once: int = 6) -> None:
+    """Clients of these kinds, some at a time, while somebody leads on."""
+    known = await asyncio.to_thread(cookie, page)
+    leader = Leader(page, known)
+    leading = asyncio.create_task(leader.run())
+    await asyncio.wait_for(leader.leads.wait(), 20)
+    gap = asyncio.Semaphore(at_once)
+
+    async def one(k: int, kind: str) -> None:
+        async with gap:
+            rng = np.random.default_rng([seed, k])
+            with suppress(ConnectionClosed, ConnectionError):  # thrown out
+                await asyncio.wait_for(attack(page, kind, known, rng), 60)
+
+    await asyncio.gather(*(one(k, kind) for k, kind in enumerate(kinds)))
+    assert not leading.done(), leading.exception()
+    assert page.control.present
+    leading.cancel()
+
+
+def time_to_rest(page: Page, asked, known: str) -> float:
+    """How long an effort outlives the client that asks for it and vanishes [s]."""
+
+    async def go() -> float:
+        leader = Leader(page, known)
+        leading = asyncio.create_task(leader.run())
+        await asyncio.wait_for(leader.leads.wait(), 20)
+        while not asked().nullspace_input.any():
+            await asyncio.sleep(0.002)
+        # Its network is gone: nothing is closed, nothing comes any more.
+        leader.silent, gone = True, time.monotonic()
+        try:
+            return await asyncio.to_thread(_until_rest, asked, gone)
+        finally:
+            leading.cancel()
+
+    return asyncio.run(go())
+
+
+def _until_rest(asked, gone: float) -> float:
+    while asked().nullspace_input.any():
+        if time.monotonic() - gone > 10:
+            raise AssertionError("the effort stays")
+        time.sleep(0.001)
+    return time.monotonic() - gone

@@ -1,0 +1,242 @@
+"""Who leads, what may be said, and at which address: without a network."""
+
+import json
+import math
+import socket
+import ssl
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from hrc_learn.teleoperation.gate import Control, qr_code
+from hrc_learn.teleoperation.gate.address import (
+    Address,
+    AddressConfig,
+    listening_socket,
+    network_name,
+    tls_context,
+)
+from hrc_learn.teleoperation.gate.gate import Bucket
+from hrc_learn.teleoperation.gate.messages import (
+    Hands,
+    MessageError,
+    session_message,
+    view_message,
+)
+
+
+class Clock:
+    time = 0.0
+
+    def __call__(self):
+        return self.time
+
+
+@pytest.fixture
+def clock():
+    return Clock()
+
+
+@pytest.fixture
+def control(clock):
+    return Control(silence=0.15, timeout=0.6, patience=10.0, clock=clock)
+
+
+def test_the_first_to_come_leads_and_the_others_watch(control):
+    control.join("a")
+    control.join("b")
+    assert control.view("a").role == "leads"
+    assert control.view("b").role == "watches"
+    assert control.act("a")
+    assert not control.act("b")
+
+
+def test_signs_of_life_carry_motion_and_silence_ends_it(control, clock):
+    assert not control.present
+    control.join("a")
+    for _ in range(20):
+        clock.time += 0.14
+        assert control.present
+        control.hear("a")
+    clock.time += 0.16
+    assert not control.present
+    assert not control.gone
+    control.hear("a")
+    assert control.present
+    clock.time += 0.61
+    assert control.gone
+
+
+def test_a_page_that_hangs_behind_a_worker_that_beats_is_gone(control):
+    control.join("a")
+    control.hear("a", lag=0.59)
+    assert control.present
+    control.hear("a", lag=0.61)
+    assert not control.present
+    assert control.gone
+    assert control.lag == 0.61
+
+
+def test_another_persons_signs_of_life_do_not_count(control, clock):
+    control.join("a")
+    control.join("b")
+    clock.time += 0.2
+    control.hear("b")
+    assert not control.present
+
+
+def test_control_is_handed_over_to_who_asked_first(control, clock):
+    for client in "abc":
+        control.join(client)
+    turn = control.turn
+    control.ask("c")
+    clock.time += 1.0
+    control.ask("b")
+    assert control.view("a").asked
+    assert control.view("c").asked
+    control.hand_over("b")  # does not lead
+    assert control.turn == turn
+    control.hand_over("a")
+    assert control.act("c")
+    assert control.turn == turn + 1
+    assert not control.act("a")
+    assert control.view("c").asked  # b still waits
+
+
+def test_who_does_nothing_keeps_others_waiting_for_so_long(control, clock):
+    control.join("a")
+    control.join("b")
+    clock.time = 20.0  # being idle before anybody asked does not count
+    control.ask("b")
+    clock.time += 9.9
+    control.act("a", idle=True)
+    assert control.view("b").role == "watches"
+    clock.time += 0.2
+    assert control.view("b").role == "leads"
+
+
+@pytest.mark.parametrize("deed", ["act", "keep"])
+def test_nobody_takes_control_in_the_middle_of_a_drag(control, clock, deed):
+    control.join("a")
+    control.join("b")
+    control.ask("b")
+    for _ in range(20):
+        clock.time += 9.0
+        control.act("a") if deed == "act" else control.keep()
+        assert not control.act("b")
+
+
+def test_who_leaves_leads_no_more(control):
+    for client in "abd":
+        control.join(client)
+    control.leave("a")
+    assert control.gone
+    assert not control.view("b").taken  # nobody of several leads unasked
+    control.ask("b")
+    assert control.view("b").role == "leads"
+    control.join("c")
+    control.ask("c")
+    control.leave("b")
+    assert control.view("c").role == "leads"
+    control.leave("c")
+    assert control.view("d").role == "leads"  # alone
+
+
+def test_times_make_sense():
+    with pytest.raises(ValueError, match="silence must be positive"):
+        Control(silence=1.0, timeout=0.5)
+
+
+def test_a_bucket_lets_bursts_through_and_no_more_than_its_rate(clock):
+    bucket = Bucket(rate=10.0, burst=5.0, clock=clock)
+    assert [bucket.take() for _ in range(6)] == [True] * 5 + [False]
+    passed = 0
+    for _ in range(1000):
+        clock.time += 0.01
+        passed += bucket.take()
+    assert passed == pytest.approx(100, abs=1)
+
+
+def test_hands_are_understood():
+    grip = {"hand": "left", "joint": 4, "start": [0.1, 0, 0.2], "pointer": [0.1, 0.2, 0.3]}
+    end = {"hand": "right", "joint": None, "start": [0, 0, 0], "pointer": [0, 0, 1]}
+    message = session_message(json.dumps({"type": "hands", "grips": [grip, end], "sent": 3.5}))
+    assert isinstance(message, Hands)
+    assert message.grips[0].pointer == (0.1, 0.2, 0.3)
+    assert message.grips[1].joint is None
+    assert message.sent == 3.5
+    with pytest.raises(MessageError, match="one thing"):
+        session_message(json.dumps({"type": "hands", "grips": [grip, grip]}))
+    turned = {**end, "orientation": [1, 1, 0, 0]}
+    with pytest.raises(MessageError, match="unit quaternion"):
+        session_message(json.dumps({"type": "hands", "grips": [turned]}))
+
+
+@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
+def test_no_number_is_let_through_that_is_none(number):
+    import msgspec
+
+    fields = {"name": "/region", "wxyz": (1.0, 0.0, 0.0, 0.0), "position": (0.0, number, 0.0)}
+    raw = msgspec.msgpack.encode({"type": "TransformControlsUpdateMessage", **fields})
+    with pytest.raises(MessageError, match="finite"):
+        view_message(raw)
+
+
+def test_an_address_is_ours_alone_unless_asked_for():
+    assert AddressConfig().local
+    assert AddressConfig(host="localhost").local
+    assert not AddressConfig(host="0.0.0.0").local
+    assert tls_context(AddressConfig()) is None
+    assert network_name(AddressConfig(host="192.0.2.7")) == "192.0.2.7"
+    assert network_name(AddressConfig(host="0.0.0.0", name="arm.local")) == "arm.local"
+    one, other = (Address(scheme="http", host="::1", port=8080) for _ in range(2))
+    assert one.origin == "http://[::1]:8080"
+    assert one.token != other.token
+    assert one.token not in repr(one)
+    assert one.link("/xr") == f"http://[::1]:8080/xr?token={one.token}"
+
+
+def test_what_cannot_be_served_is_refused():
+    for port in (99999, -1):
+        with pytest.raises(ValueError, match="port must be 0 to 65535"):
+            AddressConfig(port=port)
+    with pytest.raises(ValueError, match="given together"):
+        AddressConfig(certificate=Path(__file__))
+    with pytest.raises(ValueError, match="nothing can be served at 192"):
+        listening_socket(AddressConfig(host="192.0.2.1"), attempts=2)
+
+
+def test_the_next_free_port_is_taken():
+    with listening_socket(AddressConfig(port=8700)) as one:
+        with listening_socket(AddressConfig(port=one.getsockname()[1])) as other:
+            assert other.getsockname()[1] > one.getsockname()[1]
+        assert isinstance(one, socket.socket)
+
+
+def test_a_page_on_the_network_has_a_certificate_of_its_own(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    config = AddressConfig(host="0.0.0.0", name="arm.local")
+    assert isinstance(tls_context(config), ssl.SSLContext)
+    folder = tmp_path / "hrc_learn" / "tls"
+    made = {file.name: file.read_bytes() for file in folder.iterdir()}
+    assert set(made) == {"arm.local.pem", "arm.local.key"}
+    assert folder.stat().st_mode & 0o077 == 0
+    tls_context(config)  # is used again
+    assert {file.name: file.read_bytes() for file in folder.iterdir()} == made
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(ValueError, match="install openssl"):
+        tls_context(AddressConfig(host="0.0.0.0", name="other.local"))
+    (folder / "arm.local.pem").write_text("no certificate")
+    with pytest.raises(ValueError, match=r"arm\.local\.pem"):
+        tls_context(config)
+
+
+def test_a_phone_reads_the_code():
+    text = "https://192.0.2.7:8080/xr?token=" + "aB3_-x" * 4
+    lines = qr_code(text).splitlines()
+    cells = {"█": (1, 1), "▀": (1, 0), "▄": (0, 1), " ": (0, 0)}
+    rows = [[cells[cell][half] for cell in line] for line in lines for half in (0, 1)]
+    image = np.kron(np.array(rows, np.uint8) * 255, np.ones((6, 6), np.uint8))
+    assert cv2.QRCodeDetector().detectAndDecode(image)[0] == text
