@@ -22,6 +22,10 @@ _REST = (0.3, 0.7)
 """Rest that is kept before and after the motion [s]: primitives smooth, and have to arrive."""
 
 
+UNNAMED = "not named"
+"""Task of a demonstration that was open when the program ended, without a name."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class RecorderStatus:
     """What a person wants to know of a recording."""
@@ -41,7 +45,8 @@ class DemonstrationRecorder:
     A person needs seconds from the button to the arm, and back: that rest is left out.
 
     Episodes are written by a thread, so that the control loop never waits for the disk. The
-    dataset is complete when the `with` block has ended; without any episode there is none.
+    dataset is complete when the `with` block has ended; without any episode there is none. A
+    demonstration that is still open then is saved: a signal or an error loses none.
     """
 
     def __init__(self, writer: DatasetWriter, task: Callable[[], str]):
@@ -62,7 +67,11 @@ class DemonstrationRecorder:
         return self
 
     def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
+        if self._state != "ready":  # ended by a signal, say: what was shown is not lost
+            self._save(task=self._task() or UNNAMED)
         self._thread.shutdown(wait=True)
+        if isinstance(error, SystemExit | KeyboardInterrupt):  # asked to end: nothing failed
+            kind = error = trace = None
         empty = contextlib.nullcontext()
         if error is None and not self._writer.episodes:
             empty = contextlib.suppress(DatasetError)
@@ -89,7 +98,7 @@ class DemonstrationRecorder:
             case "stop", "recording":
                 self._state, self._note = "stopped", "save it or discard it"
             case "save", "recording" | "stopped":
-                self._save()
+                self._save(self._task())
             case "discard", "recording" | "stopped":
                 self._frames, self._state, self._note = [], "ready", "discarded"
             case (("stop" | "save" | "discard"), _):
@@ -100,14 +109,23 @@ class DemonstrationRecorder:
         if self._state == "recording":
             self._frames.append(frame)
 
-    def _save(self) -> None:
-        frames, self._frames, self._state = self._frames, [], "ready"
+    def _save(self, task: str) -> None:
+        frames = self._frames
+        if not task.strip():
+            self._state, self._note = (
+                "stopped",
+                "not saved yet: say in Task what is demonstrated",
+            )
+            return
+        self._frames, self._state = [], "ready"
         if not frames:
             self._note = "nothing to save: the demonstration has no frames"
             return
+        if not moves(frames):
+            self._note = "nothing to save: the arm has not moved"
+            return
         self._note = "saved"
-        frames = without_rest(frames)
-        self._writing.append(self._thread.submit(self._write, frames, self._task()))
+        self._writing.append(self._thread.submit(self._write, without_rest(frames), task))
 
     def _write(self, frames: list[Frame], task: str) -> int:
         self._writer.start_episode(task)
@@ -117,6 +135,12 @@ class DemonstrationRecorder:
             return self._writer.save_episode()
         finally:
             self._writer.discard_episode()
+
+
+def moves(frames: list[Frame]) -> bool:
+    """Whether the arm or its gripper moves."""
+    state = np.stack([_state(frame) for frame in frames])
+    return bool((np.abs(state - state[0]) > _STILL).any())
 
 
 def without_rest(frames: list[Frame]) -> list[Frame]:

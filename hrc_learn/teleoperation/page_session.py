@@ -37,6 +37,8 @@ _THICKNESS = 0.002
 _SHOW_EVERY = 10
 # Between the postures on a way that are looked at for contacts: 0.05 rad, 5 cm at 1 m reach.
 _LOOK = 0.05
+# Without anybody at the page a recording goes on for so long [s]: pages load anew in less.
+_LEFT_FOR = 5.0
 # How long what the arm says to the person is shown [s]: two lines are read in half of that.
 _REMARK_STAYS = 6.0
 _INVITATION = "Pull at a link or a knob: the end effector keeps servoing."
@@ -158,6 +160,7 @@ class PageSession:
         chain = world.arm.robot.chain
         self.arm = HandGuidedArm(chain, self._opened.arm, human, self._config.guiding)
         self._ticks, self._width = 0, None
+        self._watched, self._alone = False, 0
 
     def step(self) -> GuidedStep:
         """One control step of the arm, and of the world."""
@@ -171,6 +174,7 @@ class PageSession:
             self._opened.gripper.move(width)
         self._opened.advance(self._config.guiding.dt)
         self._page.place(*self._bodies.poses())
+        self._stop_when_left()
         for request in step.human_input.requests:
             self._remark = ""
             self._handle(request)
@@ -182,6 +186,8 @@ class PageSession:
     def _handle(self, request: Request) -> None:
         if request == "finish":
             self.finished = True
+            saved = self._recorder.status.saved
+            self._page.farewell = f"Finished: {saved} demonstrations saved. Close this page."
         elif request == "home":
             # A demonstration must not contain that.
             if self._recorder.status.state == "recording":
@@ -189,6 +195,17 @@ class PageSession:
             self._go_home()
         else:
             self._recorder.handle(request)
+
+    def _stop_when_left(self) -> None:
+        """End a recording that everybody at the page has left, and keep what was shown."""
+        if self._recorder.status.state != "recording":
+            self._watched, self._alone = False, 0
+        elif self._page.control.people:
+            self._watched, self._alone = True, 0
+        elif self._watched:  # not by somebody at a gamepad alone
+            self._alone += 1
+            if self._alone * self._config.guiding.dt > _LEFT_FOR:
+                self._recorder.handle("stop")
 
     def _go_home(self) -> None:
         """A simulated arm without a driver jumps there, another moves in a straight line."""

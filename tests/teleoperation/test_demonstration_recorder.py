@@ -79,7 +79,47 @@ def test_nothing_saved_leaves_no_dataset_and_nothing_else(folder):
     with open_recorder(folder) as recorder:
         recorder.handle("start")
         record(recorder, 0, 3)
+        recorder.handle("discard")
+        recorder.handle("start")
+        recorder.add(frame(0))  # still open, but nothing moves
     assert not list(folder.parent.iterdir())
+
+
+@pytest.mark.parametrize("last", ["start", "stop"])
+@pytest.mark.parametrize("signal", [SystemExit, KeyboardInterrupt])
+def test_a_demonstration_that_is_open_when_the_program_is_ended_is_kept(folder, last, signal):
+    def run():
+        with open_recorder(folder) as recorder:
+            recorder.handle("start")
+            record(recorder, 0, 9)
+            recorder.handle(last)  # a second "start" changes nothing
+            record(recorder, 9, 9)
+            raise signal
+
+    with pytest.raises(signal):
+        run()
+    (demo,) = load_demos(folder)
+    assert len(demo) == (18 if last == "start" else 9)
+
+
+def test_what_does_not_move_or_has_no_name_is_not_saved(folder):
+    task = [" "]
+    writer = DatasetWriter(folder, FPS, "panda", panda.joint_names)
+    with DemonstrationRecorder(writer, lambda: task[0]) as recorder:
+        recorder.handle("start")
+        record(recorder, 0, 9)
+        recorder.handle("save")
+        assert recorder.status.state == "stopped"  # and waits for a name
+        assert "Task" in recorder.status.note
+        task[0] = "show it"
+        recorder.handle("save")
+        recorder.handle("start")
+        for _ in range(9):
+            recorder.add(frame(0))
+        recorder.handle("save")
+        assert "not moved" in recorder.status.note
+    assert recorder.status.saved == 1
+    assert [demo.task for demo in load_demos(folder)] == ["show it"]
 
 
 def test_an_empty_demonstration_is_not_saved(folder):
@@ -93,6 +133,7 @@ def test_frames_that_cannot_be_written_are_reported_and_the_next_are_saved(folde
     with open_recorder(folder) as recorder:
         recorder.handle("start")
         recorder.add({"time": 0.0, "joint_position": np.zeros(6)})
+        recorder.add({"time": 0.1, "joint_position": np.ones(6)})
         recorder.handle("save")
         recorder._writing[0].exception()  # wait for the thread
         assert recorder.status.note.startswith("not saved: frame 0: joint_position needs 7")

@@ -83,8 +83,8 @@ def test_the_page_opens_to_those_who_have_its_secret(session):
     assert b"/static/session.js" in body
     assert "frame-ancestors 'none'" in headers["Content-Security-Policy"]
     assert http(page, "/static/../gate.py", Cookie=cookie(page))[0] == 404
-    # What is opened is not lost on the way to the headset's page.
-    assert http(page, f"/xr?token={page.address.token}")[1]["Location"] == "/xr"
+    # Only what is served is a place to go to.
+    assert http(page, f"//evil.example?token={page.address.token}")[1]["Location"] == "/"
 
 
 @pytest.mark.parametrize("value", [-100.0, 1e9, True, "strong"])
@@ -177,3 +177,21 @@ def test_a_grip_that_was_held_before_the_hand_over_moves_nothing(session):
 
     asyncio.run(go())
     wait_until(lambda: not session.asked.nullspace_input.any(), "rest")
+
+
+def test_a_client_that_draws_the_scene_itself_is_told_where_everything_is(session):
+    page = session.page
+
+    async def go():
+        known = await asyncio.to_thread(cookie, page)
+        async with socket(page, "session", cookie=known) as one:
+            await one.send(json.dumps({"type": "hello", "wants": "scene"}))
+            async for raw in one:
+                if "scene" in (told := json.loads(raw)):
+                    return told["scene"]
+        raise AssertionError("the page has closed the connection")
+
+    scene = asyncio.run(go())
+    np.testing.assert_allclose(scene["links"][3], session.frame(4), atol=1e-3)
+    assert len(scene["bodies"]) == len(page._poses[0])
+    wait_until(lambda: page.control.people == 0, "everybody gone")

@@ -29,7 +29,6 @@ from hrc_learn.teleoperation.demonstration_recorder import DemonstrationRecorder
 from hrc_learn.teleoperation.devices import Gamepad, TerminalKeyboard
 from hrc_learn.teleoperation.gate import qr_code
 from hrc_learn.teleoperation.page import Page
-from hrc_learn.teleoperation.page.headset import BUILT, UNBUILT
 from hrc_learn.teleoperation.page_session import (
     FEATURES,
     PageSession,
@@ -108,13 +107,9 @@ def _opened(
 def _announce(console: Console, page: Page) -> None:
     """Say where the page is, with the secret that opens it."""
     console.print(f"Page at [bold]{page.url}[/]", soft_wrap=True)
-    headset = page.address.link("/xr")
-    console.print(f"For a headset or a phone: {headset if BUILT else UNBUILT}", soft_wrap=True)
     if page.address.scheme == "https":
         console.print("Whoever has this address can move the arm:")
-        console.print(qr_code(headset if BUILT else page.url))
-    elif BUILT:
-        console.print("Other devices reach it with --page.host 0.0.0.0, by TLS.")
+        console.print(qr_code(page.url))
 
 
 def _beside(device: str) -> tuple[Human, ...]:

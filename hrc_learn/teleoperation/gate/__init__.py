@@ -9,4 +9,3 @@ from hrc_learn.teleoperation.gate.gate import Gate as Gate
 from hrc_learn.teleoperation.gate.gate import GateCallbacks as GateCallbacks
 from hrc_learn.teleoperation.gate.gate import guarded_servers as guarded_servers
 from hrc_learn.teleoperation.gate.gate import page_contents as page_contents
-from hrc_learn.teleoperation.gate.gate import static_contents as static_contents

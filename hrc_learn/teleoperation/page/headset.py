@@ -1,28 +1,18 @@
-"""What a headset's page is shown, and what its hands hold: the XR client's side of the page."""
+"""What a client is told that draws the scene itself, and what the hands that it tracks hold."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
 
-from hrc_learn.geometry import Body, Box, Pose
+from hrc_learn.geometry import Pose
 from hrc_learn.protocols import DrawnRegion
-from hrc_learn.teleoperation.gate import Content, static_contents
 from hrc_learn.teleoperation.gate.messages import Grip, Hands, MessageError
-from hrc_learn.teleoperation.page.meshes import as_glb, body_meshes
 from hrc_learn.teleoperation.page.page_operator import AddedTurn, HeldGizmo, HeldGizmos
-from hrc_learn.teleoperation.page.page_scene import held_joint
-
-BUNDLE = Path(__file__).parents[1] / "xr" / "bundle"
-"""Where `python tools/build_xr.py` puts the XR client; wheels bring it."""
-BUILT = (BUNDLE / "xr.js").is_file()
-UNBUILT = "not built yet: run `python tools/build_xr.py` (it needs npm)."
 
 _HOLDER = "headset"
 _NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
@@ -99,56 +89,6 @@ class HeadsetHands:
             joint=grip.joint, held_at=held_at.numpy(), pointer=np.array(grip.pointer)
         )
         self._held.take(_HOLDER, grip.hand, gizmo)
-
-
-def headset_contents(
-    bodies: Sequence[Body],
-    boxes: Sequence[Box],
-    twin: tuple[float, float, float],
-    *,
-    guides: bool,
-    draws: bool,
-) -> dict[str, Content]:
-    """The XR client and what it draws, by path; where it is not built, words that say so.
-
-    Args:
-        bodies: What moves.
-        boxes: What stands.
-        twin: Where the virtual twin stands beside the arm [m].
-        guides: Whether the person guides the end effector and records.
-        draws: Whether they draw regions.
-    """
-    if not BUILT:
-        return {"/xr": Content(body=UNBUILT.encode(), kind="text/plain; charset=utf-8")}
-    contents = static_contents(BUNDLE)
-    contents["/xr"] = contents.pop("/static/xr.html")
-    drawn = []
-    for k, body in enumerate(bodies):
-        mesh = f"/mesh/{k}.glb" if body.meshes else None
-        if mesh is not None:
-            contents[mesh] = Content.of(mesh, as_glb(body_meshes(body)))
-        shapes = (*body.capsules, *body.boxes)
-        drawn.append(
-            {
-                "name": body.name,
-                "joint": held_joint(body),  # "nothing" of what cannot be held
-                "mesh": mesh,
-                "capsules": [vars(capsule) for capsule in body.capsules],
-                "boxes": [vars(box) for box in body.boxes],
-                "colour": shapes[0].colour if shapes else (0.7, 0.7, 0.7, 1.0),
-            }
-        )
-    scene = {
-        "bodies": drawn,
-        "boxes": [vars(box) for box in boxes],
-        "twin": twin,
-        "guides": guides,
-        "draws": draws,
-    }
-    contents["/xr/scene.json"] = Content(
-        body=json.dumps(scene).encode(), kind="application/json"
-    )
-    return contents
 
 
 def scene_state(

@@ -1,6 +1,6 @@
 """Shapes of bodies as browsers draw them: triangles, by colour."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -89,20 +89,3 @@ def joined(meshes: Sequence[Mesh]) -> Mesh:
         np.concatenate([mesh.vertices for mesh in meshes]),
         np.concatenate([mesh.faces + start for mesh, start in zip(meshes, first, strict=True)]),
     )
-
-
-def as_glb(shapes: Mapping[Colour, Mesh]) -> bytes:
-    """Meshes and their colours as a binary glTF file; axes stay those of the body."""
-    import trimesh  # comes with viser
-    from trimesh.visual import TextureVisuals
-    from trimesh.visual.material import PBRMaterial
-
-    scene = trimesh.Scene()
-    for colour, mesh in shapes.items():
-        shape = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-        material = PBRMaterial(baseColorFactor=colour, metallicFactor=0.0)
-        shape.visual = TextureVisuals(material=material)
-        scene.add_geometry(shape)
-    glb = scene.export(file_type="glb")
-    assert isinstance(glb, bytes)
-    return glb

@@ -7,7 +7,7 @@ import io
 import secrets
 import time
 from collections.abc import Hashable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Event, Lock, Thread
 from typing import Any
@@ -32,7 +32,6 @@ from hrc_learn.teleoperation.gate.messages import Ask, GuiUpdate, Hands, Message
 from hrc_learn.teleoperation.hand_guiding import InteractionForceConfig, leading_twist
 from hrc_learn.teleoperation.page.headset import (
     HeadsetHands,
-    headset_contents,
     scene_state,
 )
 from hrc_learn.teleoperation.page.page_operator import (
@@ -140,16 +139,7 @@ class Page:
             self._gate = Gate(
                 config,
                 self.control,
-                {
-                    **page_contents(Path(viser.__file__).parent),
-                    **headset_contents(
-                        bodies,
-                        boxes,
-                        config.twin,
-                        guides=guides,
-                        draws=guides if draws is None else draws,
-                    ),
-                },
+                page_contents(Path(viser.__file__).parent),
                 GateCallbacks(
                     heard=self._heard,
                     fits=self._fits,

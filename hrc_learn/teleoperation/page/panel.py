@@ -249,7 +249,7 @@ class Panel:
         )
         gui.main_panel.dock_right()
         self._task = self._switch = self._coarse = self._region = None
-        self._turn = turn
+        self._turn, self._keep = turn, None
         self._next: Request = "start"
         self._keys = KeyboardState()
         self.gripper: float | None = None
@@ -291,6 +291,7 @@ class Panel:
             group.on_click(
                 lambda event, requests=requests: request(requests[event.target.value])
             )
+            self._keep = self._keep or group  # the first: save and discard
 
     def _add_end_effector(self, let_turn: Callable[[bool, bool], None]) -> None:
         """Move the end effector by keys, turn it, open and close it."""
@@ -388,7 +389,7 @@ class Panel:
             updates: New values of its properties.
         """
         handle: Any = self._gui._gui_input_handle_from_uuid.get(uuid)
-        if handle is None or handle.disabled or set(updates) != {"value"}:
+        if handle is None or set(updates) != {"value"}:
             return False
         value, now = updates["value"], handle.value
         if isinstance(now, bool) or isinstance(value, bool):
@@ -428,6 +429,8 @@ class Panel:
             self._next = "stop" if status.recording == "recording" else "start"
             self._switch.label = self._next.capitalize()
             self._switch.icon = _ICONS[self._next]
+            if self._keep is not None:
+                self._keep.visible = status.recording == "stopped"
         largest = self._initial_forces.max_nullspace_input
         self._state.content = state_html(status, rate, people)
         self._bars.content = nullspace_input_html(nullspace_input, largest)
