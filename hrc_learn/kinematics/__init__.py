@@ -22,6 +22,11 @@ from hrc_learn.kinematics.franka_limits import FR3_VINTAGES as FR3_VINTAGES
 from hrc_learn.kinematics.interchange import from_pytorch_kinematics as from_pytorch_kinematics
 from hrc_learn.kinematics.interchange import to_pytorch_kinematics as to_pytorch_kinematics
 from hrc_learn.kinematics.interchange import to_urdf as to_urdf
+from hrc_learn.kinematics.inverse import InverseSolution as InverseSolution
+from hrc_learn.kinematics.inverse import TaskSpace as TaskSpace
+from hrc_learn.kinematics.inverse import null_space_dimension as null_space_dimension
+from hrc_learn.kinematics.inverse import solve_inverse as solve_inverse
+from hrc_learn.kinematics.inverse import task_error_and_jacobian as task_error_and_jacobian
 from hrc_learn.kinematics.limits import JointLimits as JointLimits
 from hrc_learn.kinematics.limits import MotionLimits as MotionLimits
 from hrc_learn.kinematics.redundancy import SINGULAR_BELOW as SINGULAR_BELOW

@@ -33,7 +33,7 @@ _CUTS = ((), (0.25,), (0.35,), (0.5,), (0.65,), (0.75,), (0.2, 0.8), (0.3, 0.7))
 # Rounds of the search for a capsule's axis, tries in each, and how far the tries go [rad].
 _ROUNDS, _TRIES, _TILT = 8, 24, 0.5
 # Steps towards the smallest circle around points (Badoiu and Clarkson 2003).
-_CIRCLE_STEPS = 40
+_CIRCLE_STEPS = 16
 _SEED = 0
 _POSTURES = 2000
 # Pairs of links that come no nearer in any sampled posture are left out [m].
@@ -125,7 +125,7 @@ type _Fit = tuple[np.ndarray, np.ndarray, float]
 def fit_link(hulls: Sequence[_Hull]) -> list[_Fit]:
     """Up to three capsules that contain convex hulls."""
     points = np.concatenate([hull.points for hull in hulls])
-    axes = np.linalg.svd(points - points.mean(0), full_matrices=False)[2]
+    axes = _principal_axes(points)
     rng = np.random.default_rng(_SEED)
     best: dict[int, tuple[float, list[np.ndarray]]] = {}
     for axis in axes:
@@ -161,8 +161,10 @@ def fit_capsule(
     From the best of the principal axes the axis is turned at random, ever less, and a turn kept
     that makes the capsule smaller.
     """
-    axes = np.linalg.svd(points - points.mean(0), full_matrices=False)[2]
-    volume, best = min((_around(points, axis[None])[0] for axis in axes), key=lambda f: f[0])
+    everything = points
+    points = np.unique(points[(points @ _DIRECTIONS.T).argmax(0)], axis=0)
+    axes = _principal_axes(points)
+    volume, best = min(_around(points, axes), key=lambda f: f[0])
     tilt = _TILT
     for _ in range(rounds):
         axis = best[0]
@@ -173,9 +175,28 @@ def fit_capsule(
             volume, best = found
         else:
             tilt /= 2
-    axis, start, end, radius = best
-    # The slack covers the rounding of the ends.
-    return start, end, radius + _SLACK
+    _, start, end, radius = best
+    way = end - start
+    fraction = (everything - start) @ way / max(float(way @ way), 1e-30)
+    nearest = start + fraction.clip(0, 1)[:, None] * way
+    furthest = float(np.linalg.norm(everything - nearest, axis=1).max())
+    return start, end, max(radius, furthest) + _SLACK
+
+
+def _principal_axes(points: np.ndarray) -> np.ndarray:
+    return np.linalg.eigh(np.cov(points.T, bias=True))[1].T
+
+
+def _sphere(count: int) -> np.ndarray:
+    """Directions spread evenly, along a spiral (Fibonacci)."""
+    k = np.arange(count) + 0.5
+    z, turn = 1 - 2 * k / count, k * math.pi * (1 + math.sqrt(5))
+    r = np.sqrt(1 - z * z)
+    return np.stack([r * np.cos(turn), r * np.sin(turn), z], axis=1)
+
+
+# A capsule is sought around the points furthest out in these, then widened for the rest.
+_DIRECTIONS = _sphere(128)
 
 
 def _around(points: np.ndarray, axes: np.ndarray) -> list[tuple[float, tuple]]:

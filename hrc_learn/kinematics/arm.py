@@ -19,6 +19,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from hrc_learn.geometry import Pose
 from hrc_learn.kinematics._assembly import (
     GripperDescription,
     LinkShape,
@@ -31,6 +32,8 @@ from hrc_learn.kinematics._mjcf import read_mjcf
 from hrc_learn.kinematics._urdf import read_urdf
 from hrc_learn.kinematics.chain import SerialChain
 from hrc_learn.kinematics.collision import CapsuleArm
+from hrc_learn.kinematics.franka import UnreachableError
+from hrc_learn.kinematics.inverse import TaskSpace, solve_inverse
 from hrc_learn.kinematics.limits import complete_limits, read_limits
 
 type LimitsGiven = Mapping[str, Mapping[str, float]] | Path | None
@@ -85,7 +88,7 @@ class Arm:
     def body(self) -> CapsuleArm:
         """Capsules that contain each link, with the pairs of links that may touch.
 
-        Fitted when first asked for, which takes a second or two.
+        Fitted when first asked for, which takes a few seconds.
         """
         if self.own_body is not None:
             return self.own_body
@@ -109,6 +112,36 @@ class Arm:
         return tuple(
             guess if mass is None else mass for mass, guess in zip(told, estimated, strict=True)
         )
+
+    def inverse(
+        self,
+        pose: Pose,
+        near: Float[Tensor, "*#batch joints"] | None = None,
+        *,
+        task: TaskSpace = "pose",
+    ) -> Float[Tensor, "*batch joints"]:
+        """Joint positions that bring the tool centre point to poses, within limits [rad, m].
+
+        Numerically, many poses at once (`solve_inverse`, which also tells what was not found).
+
+        Args:
+            pose: Of the tool centre point in the base frame.
+            near: Configuration to stay close to; the ready posture if None.
+            task: What of the pose matters: an arm of five joints has none for a whole pose.
+
+        Raises:
+            UnreachableError: No such positions were found; names the first such pose.
+        """
+        solution = solve_inverse(self.chain, pose, near, task=task)
+        if not bool(solution.found.all()):
+            first = tuple((~solution.found).nonzero()[0].tolist())
+            position = pose.position.expand(*solution.found.shape, 3)[first].tolist()
+            raise UnreachableError(
+                f"no joint positions within the limits of {self.name} were found for pose "
+                f"{list(first)} of {list(solution.found.shape)}, position {position} m, "
+                f"task {task!r}: move it closer to the base, turn it, or ask for less of it"
+            )
+        return solution.position
 
     def with_tool(self, tcp: Float[Tensor, "4 4"]) -> Arm:
         """The same arm with another tool centre point.

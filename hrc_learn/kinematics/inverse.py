@@ -1,0 +1,214 @@
+"""Inverse kinematics of any serial arm, batched: damped least squares from many starts.
+
+Levenberg and Marquardt's method with the damping of Sugihara 2011, "Solvability-unconcerned
+inverse kinematics by the Levenberg-Marquardt method": the damping is the error itself, so that
+it vanishes at a solution. Every start of every pose is one row of a batch; rows that have
+arrived leave it. Joint limits are kept at every iteration. Of a pose's solutions the one
+nearest to a wanted configuration is kept, and moved further towards it in the null space.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from hrc_learn.geometry import Pose
+from hrc_learn.kinematics.chain import SerialChain
+
+type TaskSpace = Literal["pose", "position+axis", "position"]
+"""What of the tool's pose matters: all, all but the turn about its z axis, the position."""
+
+TASK_ROWS = {"pose": 6, "position+axis": 5, "position": 3}
+# Weight of an angle against a distance [m/rad]: turning by 1 rad moves what is this far away.
+_LEVER = 0.3
+# Singular values below this part of the largest are none (`null_space_dimension`).
+_RANK = 1e-6
+_BIAS = 1e-9  # smallest damping: the system stays regular where the task has more rows than n
+_STARTS, _ROUNDS, _ITERATIONS = 12, 6, 40
+
+
+@dataclass(frozen=True)
+class InverseSolution:
+    """Joint positions that `solve_inverse` found."""
+
+    position: Float[Tensor, "*batch joints"]
+    """[rad, m]; the best tried where none was found."""
+    found: Bool[Tensor, "*batch"]
+    """Whether the pose is reached within limits."""
+
+
+def task_error_and_jacobian(
+    chain: SerialChain, q: Float[Tensor, "rows joints"], pose: Pose, task: TaskSpace = "pose"
+) -> tuple[Float[Tensor, "rows task"], Float[Tensor, "rows task joints"]]:
+    """What is left to a pose, and its Jacobian with respect to the joints.
+
+    Rows are the linear ones [m] in the base frame, then for "pose" the angular ones there
+    [rad], for "position+axis" the two angular ones across the wanted tool axis.
+
+    Args:
+        chain: The arm.
+        q: Joint positions [rad, m].
+        pose: Wanted, of the tool centre point.
+        task: What of it matters.
+    """
+    T, J = chain.transform_and_jacobian(q)
+    linear = pose.position - T[..., 3]
+    if task == "position":
+        return linear, J[..., :3, :]
+    if task == "pose":
+        error = Pose.from_matrix(T).twist_to(pose)
+        return error, J
+    R = pose.matrix()[..., :3, :3]
+    wanted, now = R[..., 2], T[..., 2]
+    across = torch.linalg.cross(now, wanted)
+    sine = torch.linalg.vector_norm(across, dim=-1, keepdim=True)
+    cosine = (now * wanted).sum(-1, keepdim=True)
+    angle = torch.atan2(sine, cosine)
+    # Opposite axes: any direction across will do, x of the wanted frame.
+    small = sine < 1e-9
+    axis = torch.where(small, R[..., 0], across / sine.clamp(min=1e-9))
+    turn = axis * torch.where(small & (cosine > 0), 0.0, angle)
+    sides = R[..., :2].mT
+    error = torch.cat([linear, (sides @ turn[..., None])[..., 0]], dim=-1)
+    return error, torch.cat([J[..., :3, :], sides @ J[..., 3:, :]], dim=-2)
+
+
+def null_space_dimension(
+    chain: SerialChain, q: Float[Tensor, "*batch joints"], task: TaskSpace = "pose"
+) -> Float[Tensor, "*batch"]:
+    """How many dimensions of joint motion leave a task alone: 1 of a 7-joint arm's pose.
+
+    Args:
+        chain: The arm.
+        q: Joint positions [rad, m]. At singularities there are more.
+        task: What must not move.
+    """
+    flat = q.reshape(-1, q.shape[-1])
+    _, J = task_error_and_jacobian(chain, flat, chain.forward(flat), task)
+    values = torch.linalg.svdvals(J)
+    rank = (values > _RANK * values[..., :1]).sum(-1)
+    return (q.shape[-1] - rank).reshape(q.shape[:-1]).to(q)
+
+
+def solve_inverse(
+    chain: SerialChain,
+    pose: Pose,
+    near: Float[Tensor, "*#batch joints"] | None = None,
+    *,
+    task: TaskSpace = "pose",
+    tolerance: float = 1e-6,
+    seed: int = 0,
+) -> InverseSolution:
+    """Joint positions that bring the tool centre point to poses, within limits.
+
+    Args:
+        chain: The arm.
+        pose: Of the tool centre point in the base frame.
+        near: Configuration to stay close to [rad, m]; the ready posture if None.
+        task: What of the pose matters.
+        tolerance: Of the position [m] and the orientation [rad].
+        seed: Of the random starts.
+    """
+    batch = pose.position.shape[:-1]
+    joints = len(chain.joint_names)
+    near = chain.ready if near is None else near
+    batch = torch.broadcast_shapes(batch, near.shape[:-1])
+    goal = Pose(
+        pose.position.detach().double().expand(*batch, 3).reshape(-1, 3),
+        pose.orientation.detach().double().expand(*batch, 4).reshape(-1, 4),
+    )
+    wish = near.detach().double().expand(*batch, joints).reshape(-1, joints)
+    lower, upper = chain.limits.lower, chain.limits.upper
+    rng = torch.Generator().manual_seed(seed)
+    best = wish.clone().clamp(lower, upper)
+    distance = torch.full((len(wish),), torch.inf, dtype=torch.float64)
+    for round_ in range(_ROUNDS):
+        # First from the wish itself and around it, then wherever the arm can be.
+        missing = distance.isinf().nonzero().flatten()
+        if len(missing) == 0:
+            break
+        random = torch.rand(len(missing), _STARTS, joints, generator=rng, dtype=torch.float64)
+        half = ((upper - lower) / 2).clamp(max=math.pi)
+        start = (lower + upper) / 2 + (2 * random - 1) * half
+        if round_ == 0:
+            start[:, 0] = best[missing]
+        row = missing.repeat_interleave(_STARTS)
+        q, reached = _descend(chain, goal[row], start.flatten(0, 1), task, tolerance)
+        q = _unwound(chain, q, wish[row])
+        apart = torch.linalg.vector_norm(q - wish[row], dim=-1)
+        apart = torch.where(reached, apart, torch.inf).unflatten(0, (-1, _STARTS))
+        least = apart.min(-1)
+        chosen = q.unflatten(0, (-1, _STARTS))[torch.arange(len(missing)), least.indices]
+        good = least.values.isfinite()
+        best[missing[good]], distance[missing[good]] = chosen[good], least.values[good]
+    found = distance.isfinite()
+    if found.any() and joints > TASK_ROWS[task]:
+        best[found] = _drawn_nearer(
+            chain, goal[found], best[found], wish[found], task, tolerance
+        )
+    return InverseSolution(best.reshape(*batch, joints).to(near), found.reshape(batch))
+
+
+def _step(
+    chain: SerialChain,
+    goal: Pose,
+    q: Tensor,
+    task: TaskSpace,
+    wish: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:
+    """One iteration, and the error before it [m, rad]."""
+    error, J = task_error_and_jacobian(chain, q, goal, task)
+    weight = torch.ones_like(error[:1])
+    weight[:, 3:] = _LEVER
+    e, A = error * weight, J * weight[..., None]
+    damping = e.square().sum(-1)[:, None, None] + _BIAS
+    eye = torch.eye(A.shape[-2], dtype=q.dtype)
+    gram = A @ A.mT + damping * eye
+    dq = (A.mT @ torch.linalg.solve(gram, e[..., None]))[..., 0]
+    if wish is not None:
+        away = wish - q
+        dq = dq + away - (A.mT @ torch.linalg.solve(gram, A @ away[..., None]))[..., 0]
+    return (q + dq).clamp(chain.limits.lower, chain.limits.upper), error
+
+
+def _descend(
+    chain: SerialChain, goal: Pose, q: Tensor, task: TaskSpace, tolerance: float
+) -> tuple[Tensor, Tensor]:
+    result, done = q.clone(), torch.zeros(len(q), dtype=torch.bool)
+    rows = torch.arange(len(q))
+    for _ in range(_ITERATIONS):
+        after, error = _step(chain, goal[rows], q, task)
+        arrived = error.abs().amax(-1) < tolerance
+        result[rows[arrived]], done[rows[arrived]] = q[arrived], True
+        rows, q = rows[~arrived], after[~arrived]
+        if len(rows) == 0:
+            break
+    return result, done
+
+
+def _unwound(chain: SerialChain, q: Tensor, wish: Tensor) -> Tensor:
+    """The same postures with joints turned by whole turns towards a wish, within limits."""
+    turns = torch.tensor([kind != "prismatic" for kind in chain.kinds])
+    whole = 2 * math.pi * ((wish - q) / (2 * math.pi)).round()
+    moved = q + torch.where(turns, whole, 0.0)
+    inside = (moved >= chain.limits.lower) & (moved <= chain.limits.upper)
+    return torch.where(inside, moved, q)
+
+
+def _drawn_nearer(
+    chain: SerialChain, goal: Pose, q: Tensor, wish: Tensor, task: TaskSpace, tolerance: float
+) -> Tensor:
+    """Moved in the null space towards a wish, as long as the pose is reached and it helps."""
+    moved = q
+    for _ in range(15):  # each removes most of what the null space can
+        moved, _ = _step(chain, goal, moved, task, wish)
+    moved, reached = _descend(chain, goal, moved, task, tolerance)
+    nearer = torch.linalg.vector_norm(moved - wish, dim=-1) < torch.linalg.vector_norm(
+        q - wish, dim=-1
+    )
+    return torch.where((reached & nearer)[:, None], moved, q)

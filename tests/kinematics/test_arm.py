@@ -1,0 +1,232 @@
+"""Arms from descriptions, against MuJoCo; their inverses, and what is said of bad files."""
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from sampling import generator
+from torch.testing import assert_close
+
+from hrc_learn.kinematics import (
+    Arm,
+    MissingModelError,
+    arm,
+    null_space_dimension,
+    registered_arms,
+    solve_inverse,
+)
+from hrc_learn.kinematics._capsule_fit import fit_link, hull_of
+from hrc_learn.kinematics._description import Shape, turn_to
+from hrc_learn.kinematics.chain import transform_and_jacobian
+
+ODD = """
+<robot name="odd">
+  <link name="base"/><link name="a"/><link name="b"/><link name="c"/><link name="tip"/>
+  <link name="finger"/>
+  <joint name="turn" type="continuous"><parent link="base"/><child link="a"/>
+    <origin xyz="0.1 0 0.3" rpy="0.2 0.1 -0.4"/><axis xyz="0.6 0 -0.8"/></joint>
+  <joint name="slide" type="prismatic"><parent link="a"/><child link="b"/>
+    <origin xyz="0 0.2 0.1" rpy="0 0 0.7"/><axis xyz="0 -1 0"/>
+    <limit lower="-0.2" upper="0.5" velocity="0.4" effort="6"/></joint>
+  <joint name="bend" type="revolute"><parent link="b"/><child link="c"/>
+    <origin xyz="0 0 0.2" rpy="0 -1.1 0"/><axis xyz="1 0 0"/>
+    <limit lower="-3" upper="3" velocity="7" effort="8"/></joint>
+  <joint name="end" type="fixed"><parent link="c"/><child link="tip"/>
+    <origin xyz="0 0.1 0.1" rpy="0 0 0.3"/></joint>
+  <joint name="grip" type="prismatic"><parent link="c"/><child link="finger"/>
+    <axis xyz="0 1 0"/><limit lower="0" upper="0.04" velocity="1" effort="1"/></joint>
+</robot>
+"""
+MESH = '<visual><geometry><mesh filename="no.stl"/></geometry></visual>'
+INERTIAL = """<inertial><mass value="1"/>
+<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>"""
+
+
+def installed(name: str) -> Arm:
+    try:
+        return arm(name)
+    except MissingModelError as error:
+        pytest.skip(str(error))
+
+
+def random_positions(chain, count: int, seed: int) -> torch.Tensor:
+    lower, upper = chain.limits.lower, chain.limits.upper
+    random = torch.rand(count, len(lower), generator=generator(seed), dtype=torch.float64)
+    return lower + (upper - lower) * random
+
+
+def assert_moves_like(a: Arm, model, base: str | None, tip: str, count: int) -> None:
+    """Pose and Jacobian of the tip in the base frame are MuJoCo's."""
+    data = mujoco.MjData(model)
+    addresses = [int(model.joint(name).qposadr[0]) for name in a.joint_names]
+    columns = [int(model.joint(name).dofadr[0]) for name in a.joint_names]
+    flange = a.with_tool(torch.eye(4, dtype=torch.float64)).chain
+    q = random_positions(flange, count, seed=1)
+    poses, jacobians = flange.forward_and_jacobian(q)
+    J = np.zeros((6, model.nv))
+    for row, T, ours in zip(q, poses.matrix(), jacobians, strict=True):
+        data.qpos[addresses] = row
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_jacBody(model, data, J[:3], J[3:], model.body(tip).id)
+        root = data.body(base) if base else data.body(0)
+        R, place = root.xmat.reshape(3, 3), data.body(tip)
+        assert_close(T[:3, 3].numpy(), R.T @ (place.xpos - root.xpos), rtol=0, atol=1e-9)
+        assert_close(T[:3, :3].numpy(), R.T @ place.xmat.reshape(3, 3), rtol=0, atol=1e-9)
+        turned = np.concatenate([R.T @ J[:3, columns], R.T @ J[3:, columns]])
+        assert_close(ours.numpy(), turned, rtol=0, atol=1e-9)
+
+
+def mujoco_model(a: Arm):
+    """MuJoCo's own reading of the file; of URDF without shapes, which it does not all know."""
+    assert a.description is not None
+    if a.format == "mjcf":
+        return mujoco.MjModel.from_xml_path(str(a.description))
+    from xml.etree import ElementTree
+
+    robot = ElementTree.parse(a.description).getroot()
+    for link in robot.findall("link"):
+        for part in [*link.findall("visual"), *link.findall("collision")]:
+            link.remove(part)
+        if link.find("inertial") is None:
+            link.append(ElementTree.fromstring(INERTIAL))
+    # Links without a joint between them are kept apart, and balance is not asked of masses.
+    extension = '<mujoco><compiler fusestatic="false" balanceinertia="true"/></mujoco>'
+    robot.append(ElementTree.fromstring(extension))
+    return mujoco.MjModel.from_xml_string(ElementTree.tostring(robot, encoding="unicode"))
+
+
+DESCRIBED = sorted(set(registered_arms()) - {"panda", "fr3"})
+
+
+@pytest.mark.parametrize("name", DESCRIBED)
+def test_registered_arms_move_like_mujocos(name):
+    a = installed(name)
+    assert_moves_like(a, mujoco_model(a), a.base, a.tip, 20)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", DESCRIBED)
+def test_registered_arms_move_like_mujocos_in_many_states(name):
+    a = installed(name)
+    assert_moves_like(a, mujoco_model(a), a.base, a.tip, 10_000)
+
+
+@pytest.mark.parametrize("name", registered_arms())
+def test_registered_arms_find_poses_they_can_reach(name):
+    chain = installed(name).chain
+    task = "pose" if len(chain.joint_names) > 5 else "position+axis"
+    q = random_positions(chain, 20, seed=2)
+    pose = chain.forward(q)
+    solution = solve_inverse(chain, pose, task=task)
+    found = solution.found
+    assert found.double().mean() >= 0.95
+    q = solution.position[found]
+    assert chain.limits.contain(q).all()
+    reached = chain.forward(q).matrix()
+    assert_close(reached[:, :3, 3], pose.position[found], rtol=0, atol=1e-5)
+    wanted = pose.matrix()[found]
+    columns = slice(2, 3) if task == "position+axis" else slice(0, 3)
+    assert_close(reached[:, :3, columns], wanted[:, :3, columns], rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", registered_arms())
+def test_registered_arms_are_ready_within_limits(name):
+    a = installed(name)
+    assert a.chain.limits.contain(a.chain.ready)
+    assert a.visuals or a.description is None
+    assert all(visual.mesh.path.is_file() for visual in a.visuals)
+
+
+def odd(tmp_path, text: str = ODD) -> Arm:
+    (tmp_path / "odd.urdf").write_text(text, encoding="utf-8")
+    return arm(tmp_path / "odd.urdf", tip="tip")
+
+
+def test_any_axis_and_sliding_joints(tmp_path):
+    a = odd(tmp_path)
+    assert a.chain.kinds == ("continuous", "prismatic", "revolute")
+    assert_moves_like(a, mujoco_model(a), "base", "tip", 50)
+    assert a.gripper is not None
+    assert a.gripper.opening == (0.0, 0.04)
+
+
+def test_written_out_kinematics_slide_too(tmp_path):
+    chain = odd(tmp_path).chain
+    q = random_positions(chain, 5, seed=3)
+    tip = (chain.flange @ chain.tcp).tolist()
+    written = transform_and_jacobian(q, chain.mounts.tolist(), tip, (False, True, False))
+    for ours, expected in zip(written, chain.transform_and_jacobian(q), strict=True):
+        assert_close(ours, expected, rtol=0, atol=1e-14)
+
+
+def test_limits_that_the_file_lacks_follow_the_rule(tmp_path):
+    limits = odd(tmp_path).chain.limits
+    assert limits.upper.tolist() == [2 * torch.pi, 0.5, 3.0]
+    assert limits.velocity.tolist() == [1.0, 0.4, 7.0]
+    assert_close(limits.acceleration, limits.velocity / 0.2)
+    assert_close(limits.jerk, limits.acceleration / 0.02)
+    assert limits.torque.tolist() == [torch.inf, 6.0, 8.0]
+
+
+def test_limits_beside_the_file_come_first(tmp_path):
+    text = "[default]\njerk = 9.0\n[bend]\nvelocity = 2.0\n"
+    (tmp_path / "odd.limits.toml").write_text(text, encoding="utf-8")
+    limits = odd(tmp_path).chain.limits
+    assert limits.jerk.tolist() == [9.0, 9.0, 9.0]
+    assert limits.velocity.tolist() == [1.0, 0.4, 2.0]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('"slide" type="prismatic"', '"slide" type="planar"', "joint slide is planar"),
+        ('<child link="b"/>', '<child link="x"/>', "joint slide has the child 'x'"),
+        ('lower="-0.2"', 'lower="-0.2m"', "limit of joint slide has lower='-0.2m'"),
+        ('<axis xyz="1 0 0"/>', '<axis xyz="0 0 0"/>', "axis of joint bend is zero"),
+        ('<link name="a"/>', f'<link name="a">{MESH}</link>', "mesh no.stl"),
+    ],
+)
+def test_bad_files_are_told_in_a_line(tmp_path, old, new, message):
+    assert old in ODD
+    with pytest.raises((ValueError, FileNotFoundError), match=message):
+        odd(tmp_path, ODD.replace(old, new))
+
+
+def test_several_ends_are_listed(tmp_path):
+    odd(tmp_path)
+    with pytest.raises(ValueError, match="2 ends; say which is the tool .*: c, tip, finger"):
+        arm(tmp_path / "odd.urdf")
+
+
+def test_unknown_names_are_answered_with_those_there_are():
+    with pytest.raises(ValueError, match="no arm 'unicorn': there are panda, fr3"):
+        arm("unicorn")
+
+
+@pytest.mark.parametrize("axis", [*np.eye(3), *-np.eye(3), [0.6, 0.0, -0.8]])
+def test_turns_take_z_to_the_axis(axis):
+    R = turn_to(np.array(axis))[:3, :3]
+    assert_close(R[:, 2], np.array(axis, dtype=float), rtol=0, atol=1e-15)
+    assert_close(R @ R.T, np.eye(3), rtol=0, atol=1e-15)
+    assert np.linalg.det(R) == pytest.approx(1)
+
+
+def test_null_space_that_tasks_leave():
+    chain = installed("panda").chain
+    tasks = ("pose", "position+axis", "position")
+    assert [int(null_space_dimension(chain, chain.ready, task)) for task in tasks] == [1, 2, 4]
+
+
+def test_capsules_contain_what_they_are_fitted_to():
+    shape = Shape(kind="box", pose=np.eye(4), size=(0.03, 0.05, 0.3))
+    hull = hull_of(shape, np.eye(4))
+    rng = np.random.default_rng(0)
+    inside = (2 * rng.random((2000, 3)) - 1) * shape.size
+    distance = np.full(len(inside), np.inf)
+    for start, end, radius in fit_link([hull]):
+        way = end - start
+        t = np.clip((inside - start) @ way / max(way @ way, 1e-30), 0, 1)
+        away = np.linalg.norm(inside - start - t[:, None] * way, axis=1) - radius
+        distance = np.minimum(distance, away)
+    assert distance.max() <= 0
