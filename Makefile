@@ -4,18 +4,20 @@
 PYTHON := .venv/bin/python
 OUT ?= outputs/demo
 SHELF ?= middle
+ROBOT ?= panda
 PYTHONS ?= 3.12
 
 help:
 	@echo "make demo    demonstrate, learn, grasp, place in simulation; writes $(OUT)"
 	@echo "             make demo SHELF=upper places on another shelf (lower, middle, upper)"
+	@echo "             make demo ROBOT=fr3 does it with another arm"
 	@echo "make test    run the tests"
 	@echo "make bench   measure the speed against floors and peers"
 	@echo "make docs    build the documentation site; writes outputs/docs"
 	@echo "make format  format the code        make check  lint, type-check, build the site"
 
 demo: .venv/.installed
-	$(PYTHON) -m hrc_learn.cli demo --out $(OUT) --shelf $(SHELF)
+	$(PYTHON) -m hrc_learn.cli demo --out $(OUT) --shelf $(SHELF) --robot $(ROBOT)
 
 test: .venv/.installed
 	$(PYTHON) -m pytest -n auto --dist loadfile -m "not slow and not realtime"

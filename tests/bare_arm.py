@@ -1,10 +1,8 @@
 """A Panda without some of its joints, as an arm that nobody has seen."""
 
-from types import SimpleNamespace
-
 import torch
 
-from hrc_learn.kinematics import CapsuleArm, JointLimits, LinkCapsule, SerialChain, panda
+from hrc_learn.kinematics import Arm, CapsuleArm, JointLimits, LinkCapsule, SerialChain, panda
 
 
 def bare(left_out=(2,), name="cut"):
@@ -35,4 +33,4 @@ def bare(left_out=(2,), name="cut"):
     ]
     body = CapsuleArm(chain, capsules, [(0, 2)])
     masses = (3.0, *(2.0,) * n, 0.0, 0.7)
-    return SimpleNamespace(name=name, chain=chain, body=body, visuals=(), masses=masses)
+    return Arm(name=name, chain=chain, own_body=body, told_masses=masses)

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Literal
 
 import numpy as np
 import torch
@@ -19,6 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.geometry import MeshFile, Pose, quaternion
+from hrc_learn.kinematics.arm import Arm
 from hrc_learn.kinematics.chain import SerialChain
 from hrc_learn.kinematics.collision import CapsuleArm, LinkCapsule
 from hrc_learn.kinematics.franka import (
@@ -139,26 +140,10 @@ _TCP = 0.1034
 """Fingertips of the hand, along z of the flange [m]."""
 
 
-@runtime_checkable
-class DescribedArm(Protocol):
-    """A bare arm from its description, as `hrc_learn.kinematics.arm.Arm` is one."""
-
-    @property
-    def name(self) -> str: ...
-    @property
-    def chain(self) -> SerialChain: ...
-    @property
-    def body(self) -> CapsuleArm: ...
-    @property
-    def visuals(self) -> Sequence[Any]: ...
-    @property
-    def masses(self) -> Sequence[float]: ...
-
-
 class EquippedArm(WorkArm):
     """Any arm with six or more joints, our hand at its flange, and a numerical inverse."""
 
-    def __init__(self, arm: DescribedArm):
+    def __init__(self, arm: Arm):
         """Take off what its description mounts on the flange, and bolt our hand to it.
 
         Args:
@@ -242,14 +227,12 @@ def _turned_towards(
     return torch.where((turned >= lower) & (turned <= upper), turned, q)
 
 
-def _meshes(
-    arm: DescribedArm, flange: Float[np.ndarray, "4 4"]
-) -> dict[str, tuple[MeshFile, ...]]:
+def _meshes(arm: Arm, flange: Float[np.ndarray, "4 4"]) -> dict[str, tuple[MeshFile, ...]]:
     """What links and hand look like; nothing if the description has no meshes."""
     n = len(arm.chain.joint_names)
     meshes: dict[str, tuple[MeshFile, ...]] = {}
     for visual in arm.visuals:
-        if visual.link > n + 1 or getattr(visual, "finger", None) is not None:
+        if visual.link > n + 1 or visual.finger is not None:
             continue
         pose = flange @ visual.pose if visual.link == n + 1 else visual.pose
         turn = quaternion.from_matrix(torch.from_numpy(pose[:3, :3].copy())).tolist()
@@ -300,10 +283,13 @@ class ArmChoice:
 
 @cache
 def _opened(choice: ArmChoice) -> WorkArm:
+    # Only here: descriptions are read when one is asked for.
+    from hrc_learn.kinematics.registry import arm
+
     franka = {"panda": PANDA, "fr3": FR3}
-    if choice.name not in franka:
-        raise ValueError(f"no arm {choice.name!r}: there are {', '.join(franka)}.")
-    return franka[choice.name]
+    if choice.name in franka and not choice.base and not choice.tip:
+        return franka[choice.name]
+    return EquippedArm(arm(choice.name, base=choice.base or None, tip=choice.tip or None))
 
 
 FR3 = FrankaWorkArm(fr3)

@@ -120,3 +120,8 @@ def test_a_choice_opens_the_same_arm_each_time():
     fr3 = ArmChoice("fr3").work_arm()
     assert fr3.chain.joint_names[0] == "fr3_joint1"
     assert ArmChoice("fr3").work_arm() is fr3
+
+
+def test_an_arm_that_there_is_not_is_named():
+    with pytest.raises(ValueError, match=r"no arm 'pandora': there are panda, fr3"):
+        ArmChoice("pandora").work_arm()
