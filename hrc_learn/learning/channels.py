@@ -15,7 +15,7 @@ from torch import Tensor
 from hrc_learn.demos import Demonstration, DemonstrationSet, PaddedDemonstrations
 from hrc_learn.dmp import JointDMP, OrientationDMP, PoseDMP
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.kinematics import arm_angle, panda
+from hrc_learn.kinematics import arm_angle, fr3, panda
 from hrc_learn.viz import (
     DemonstrationsRecording,
     DemonstrationTrace,
@@ -173,10 +173,12 @@ class Motions:
         return Reproduction(motion.position, motion.orientation)
 
     def _body_shape(self) -> Tensor | None:
-        """Arm angle of a Panda, continuous, and alike in turns at the start [rad]."""
-        if self.demos.joint_position is None or self.joint_names != panda.joint_names:
+        """Arm angle of a Franka arm, continuous, and alike in turns at the start [rad]."""
+        franka = {arm.joint_names: arm for arm in (panda, fr3)}
+        if self.demos.joint_position is None or self.joint_names not in franka:
             return None
-        angle = np.unwrap(arm_angle(panda, self.demos.joint_position).numpy(), axis=1)
+        chain = franka[self.joint_names]
+        angle = np.unwrap(arm_angle(chain, self.demos.joint_position).numpy(), axis=1)
         start = np.unwrap(angle[:, :1], axis=0) - angle[:, :1]
         return torch.from_numpy(angle + start)[..., None]
 

@@ -87,7 +87,7 @@ class OfRobot:
     """A command that some arm carries out."""
 
     robot: str = "panda"
-    """Arm that does it: a registered name, or a URDF or MJCF file."""
+    """Arm by its name, or its URDF or MJCF file."""
     base: More[str] = ""
     """Link of such a file that is the arm's base; its root when not given."""
     tip: More[str] = ""

@@ -322,12 +322,27 @@ def learn(out: Path, console: Console, steps: int = 4, robot: ArmChoice = _PANDA
     from hrc_learn.cli.commands import fit, record
 
     placing, servoing = out / "placing_demos", out / "aiming_demos"
-    chosen: dict[str, Any] = {"robot": robot.name, "base": robot.base, "tip": robot.tip}
     _announce(console, 1, steps, "Demonstrations of placing")
-    if record.record_placing(RecordPlacing(out=placing, overwrite=True, **chosen)):
+    if record.record_placing(
+        RecordPlacing(
+            out=placing,
+            robot=robot.name,
+            base=robot.base,
+            tip=robot.tip,
+            overwrite=True,
+        )
+    ):
         raise RuntimeError("the scripted expert could not place")
     _announce(console, 2, steps, "Demonstrations of servoing with an uncalibrated camera")
-    record.record_servoing(RecordServoing(out=servoing, overwrite=True, **chosen))
+    record.record_servoing(
+        RecordServoing(
+            out=servoing,
+            robot=robot.name,
+            base=robot.base,
+            tip=robot.tip,
+            overwrite=True,
+        )
+    )
     _announce(console, 3, steps, "Movement primitives from the first")
     fit.fit_primitives(FitPrimitives(dataset=placing, out=out / "placing", overwrite=True))
     _announce(console, 4, steps, "Image Jacobian from the second")
