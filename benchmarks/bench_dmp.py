@@ -13,6 +13,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -42,6 +43,10 @@ TARGETS: dict[str, tuple[float, int]] = {
     "step_us": (30, -1),
     "stepper_us": (8, -1),
     "backward_over_forward": (3, -1),
+    "own_durations_4096_per_s": (20_000, +1),
+    "own_durations_4096_of_shared": (0.5, +1),
+    "duration_gradient_over_forward": (3, -1),
+    "fit_own_stamps_256_ms": (100, -1),
     "joint_gradient_error": (1e-6, -1),
     "orientation_gradient_error": (1e-6, -1),
     "orientation_deg": (1e-3, -1),
@@ -75,7 +80,7 @@ def main(args: Args) -> None:
     for batch in (1, 256):
         figures |= measure_fits(batch, args.repeats)
     figures |= measure_poses(args.repeats) | measure_steps(args.repeats)
-    figures |= measure_gradients(args.repeats)
+    figures |= measure_gradients(args.repeats) | measure_own_times(args.repeats)
     figures |= measure_turns() | measure_gradient_error()
     if args.recordings:
         figures |= measure_reproduction(args.recordings)
@@ -99,7 +104,7 @@ def demonstrations(batch: int) -> tuple[torch.Tensor, torch.Tensor]:
 @torch.no_grad()
 def measure_rollouts(batch: int, repeats: int) -> dict[str, float]:
     """Position alone and with its derivatives, to new goals, against the bare product."""
-    dmp = JointDMP.fit(*demonstrations(batch))
+    dmp = JointDMP.fit(*demonstrations(batch), BASIS)
     goal = dmp.goal + 0.1
     X, H = torch.randn(batch * JOINTS, BASIS + 3), torch.randn(BASIS + 3, SAMPLES)
 
@@ -129,7 +134,7 @@ def measure_fits(batch: int, repeats: int) -> dict[str, float]:
     """Demonstrations to primitives, residuals included."""
     time, position = demonstrations(batch)
     calls: dict[str, Callable[[], object]] = {
-        name: lambda method=name: JointDMP.fit(time, position, method=method)
+        name: lambda method=name: JointDMP.fit(time, position, BASIS, method=method)
         for name in ("trajectory", "ridge")
     }
     t = time_calls(calls, repeats_for(batch, repeats))
@@ -145,7 +150,7 @@ def measure_fits(batch: int, repeats: int) -> dict[str, float]:
 def measure_poses(repeats: int) -> dict[str, float]:
     """Position and quaternion of 256 poses."""
     time, columns = demonstrations(256)
-    dmp = PoseDMP.fit(time, columns[..., :3], quaternion.exp(columns[..., 3:6]))
+    dmp = PoseDMP.fit(time, columns[..., :3], quaternion.exp(columns[..., 3:6]), BASIS)
 
     def rollout() -> tuple[torch.Tensor, ...]:
         motion = dmp.rollout()
@@ -162,7 +167,7 @@ def measure_steps(repeats: int) -> dict[str, float]:
     Each by itself, as in a loop: a step in turn with others finds its code out of the caches.
     """
     time, position = demonstrations(1)
-    dmp = JointDMP.fit(time.double(), position.double())
+    dmp = JointDMP.fit(time.double(), position.double(), BASIS)
     stepper = Stepper(dmp)
     state, plain = dmp.step(dmp.initial_state(), 0.5), stepper.initial_state()
     program, tensors = dmp.export().program.module(), state_tensors(state)
@@ -184,9 +189,50 @@ def measure_steps(repeats: int) -> dict[str, float]:
     return figures
 
 
+def measure_own_times(repeats: int) -> dict[str, float]:
+    """Each motion another duration, beside the same batch on one time grid; and by gradients.
+
+    Other stamps of each are fitted one by one.
+    """
+    figures: dict[str, float] = {}
+    for batch in (256, 4096):
+        time, position = demonstrations(batch)
+        dmp = JointDMP.fit(time, position, BASIS)
+        rng = torch.Generator().manual_seed(1)
+        duration = 3 * (1 + 0.5 * torch.rand(batch, generator=rng))
+        calls: dict[str, Callable[[], object]] = {
+            "shared": lambda dmp=dmp: dmp.rollout().position,
+            "own": lambda dmp=dmp, t=time, d=duration: dmp.rollout(t, duration=d).position,
+        }
+        with torch.no_grad():
+            t = time_calls(calls, repeats_for(batch, repeats))
+        figures |= {
+            f"own_durations_{batch}_per_s": batch / t["own"].median,
+            f"own_durations_{batch}_of_shared": t["shared"].median / t["own"].median,
+        }
+        if batch > 256:
+            continue
+        learned = duration.clone().requires_grad_()
+        seed = torch.randn(batch, SAMPLES, JOINTS, generator=rng)
+
+        def forward(dmp: JointDMP = dmp, d: torch.Tensor = learned) -> torch.Tensor:
+            return dmp.rollout(demonstrations(1)[0], duration=d).position
+
+        def both(d: torch.Tensor = learned, seed: torch.Tensor = seed) -> None:
+            torch.autograd.grad(forward(), d, seed)
+
+        stamps = time + 1e-4 * torch.rand(batch, SAMPLES, generator=rng)
+        t = time_calls({"forward": forward, "both": both}, max(repeats // 5, 3))
+        fit = partial(JointDMP.fit, stamps, position, BASIS)
+        fits = time_calls({"fit": fit}, 2)
+        figures["duration_gradient_over_forward"] = t["both"].median / t["forward"].median - 1
+        figures["fit_own_stamps_256_ms"] = 1e3 * fits["fit"].median
+    return figures
+
+
 def measure_gradients(repeats: int) -> dict[str, float]:
     """Backward through a rollout of 256, to weights and goal."""
-    dmp = JointDMP.fit(*demonstrations(256))
+    dmp = JointDMP.fit(*demonstrations(256), BASIS)
     goal = dmp.goal.clone().requires_grad_()
     seed = torch.randn(256, SAMPLES, JOINTS)
 

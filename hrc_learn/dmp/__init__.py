@@ -19,6 +19,7 @@ from hrc_learn.dmp._system.closed_forms import SpringDamper as SpringDamper
 from hrc_learn.dmp._system.response import Response as Response
 from hrc_learn.dmp._system.response import Trajectory as Trajectory
 from hrc_learn.dmp._system.response import response_of as response_of
+from hrc_learn.dmp.batching import stack as stack
 from hrc_learn.dmp.contextual_dmp import ContextualDMP as ContextualDMP
 from hrc_learn.dmp.contextual_dmp import PolynomialFeatures as PolynomialFeatures
 from hrc_learn.dmp.contextual_dmp import RidgeFit as RidgeFit

@@ -10,6 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -50,6 +51,14 @@ def to_tensor(
     return torch.as_tensor(values, dtype=dtype, device=device)
 
 
+def readable(*tensors: Tensor) -> bool:
+    """Whether values may decide what is done: nothing traces, maps or derives them."""
+    if torch.compiler.is_compiling():
+        return False
+    functorch = torch._C._functorch  # pyright: ignore[reportAttributeAccessIssue]
+    return not any(functorch.is_functorch_wrapped_tensor(x) for x in tensors)
+
+
 def vector(
     name: str, value: Vectors, like: Float[Tensor, "*batch D"]
 ) -> Float[Tensor, "*other D"]:
@@ -62,7 +71,21 @@ def vector(
     D = like.shape[-1]
     if tensor.ndim == 0 or tensor.shape[-1] != D:
         raise ValueError(f"{name} must have shape (..., {D}), got {tuple(tensor.shape)}")
-    return tensor
+    return finite(name, tensor)
+
+
+def finite(name: str, values: Tensor) -> Tensor:
+    """The values, as they are.
+
+    Raises:
+        ValueError: One is NaN or infinite.
+    """
+    # Of another device, looking would wait for all that was asked of it.
+    if values.is_cpu and readable(values) and not math.isfinite(values.detach().sum().item()):
+        wrong = values[~values.isfinite()]
+        if len(wrong):  # a sum overflows too
+            raise ValueError(f"{name} must be finite, but holds {wrong[0].item()}")
+    return values
 
 
 def positive(name: str, value: Scalars, like: Tensor) -> Float[Tensor, "*batch"]:
@@ -72,8 +95,9 @@ def positive(name: str, value: Scalars, like: Tensor) -> Float[Tensor, "*batch"]
         ValueError: One is not.
     """
     tensor = to_tensor(value, dtype=like.dtype, device=like.device)
-    if not (tensor > 0).all():
-        raise ValueError(f"{name} must be positive, got {tensor.min().item()}")
+    if readable(tensor) and not ((tensor > 0) & (tensor < math.inf)).all():
+        wrong = tensor[~((tensor > 0) & (tensor < math.inf))].reshape(-1)
+        raise ValueError(f"{name} must be positive and finite, got {wrong[0].item()}")
     return tensor
 
 
@@ -86,13 +110,44 @@ def normalised_time(
         ValueError: A single number, or times before the start.
     """
     time = to_tensor(time, dtype=torch.float64, device=duration.device)
-    if time.ndim == 0 or not (time >= 0).all():
+    if time.ndim == 0 or (readable(time) and not ((time >= 0) & (time < math.inf)).all()):
         raise ValueError("time must be an array of seconds since the start, none negative")
-    s = time / duration.double()[..., None]
-    # Rows that are all alike need one response matrix, not one each.
-    if s.ndim > 1 and not s.requires_grad and (s == s.reshape(-1, s.shape[-1])[0]).all():
-        return s.reshape(-1, s.shape[-1])[0]
-    return s
+    if time.ndim > 1 and duration.ndim and not _broadcast(time.shape[:-1], duration.shape):
+        raise ValueError(
+            f"time has shape {tuple(time.shape)}, but there are {tuple(duration.shape)} "
+            f"durations: time must be (T,) or {(*duration.shape, time.shape[-1])}"
+        )
+    # Motions that are all alike need one response matrix, not one each.
+    if readable(time, duration) and not (time.requires_grad or duration.requires_grad):
+        time, duration = _first_if_alike(time, 1), _first_if_alike(duration, 0)
+    return time / duration.double()[..., None]
+
+
+def regular_times(dt: float | int, duration: Float[Tensor, "*batch"]) -> Float[Tensor, "T"]:
+    """Times [s] every `dt`, from zero to the first that is not before the longest duration.
+
+    Raises:
+        ValueError: The interval is not positive.
+    """
+    if not (math.isfinite(dt) and dt > 0):
+        raise ValueError(f"dt must be positive, got {dt}")
+    # Rounding must not add one past the end.
+    last = math.ceil(duration.max().item() / dt * (1 - 1e-7))
+    return dt * torch.arange(last + 1, dtype=torch.float64, device=duration.device)
+
+
+def _broadcast(one: tuple[int, ...], other: tuple[int, ...]) -> bool:
+    """Whether two shapes go together."""
+    sizes = zip(reversed(one), reversed(other), strict=False)
+    return all(a == b or 1 in (a, b) for a, b in sizes)
+
+
+def _first_if_alike(values: Tensor, ndim: int) -> Tensor:
+    """The first of a batch of tensors of `ndim` axes, if the others are the same."""
+    if values.ndim == ndim:
+        return values
+    first = values[(0,) * (values.ndim - ndim)]
+    return first if bool((values == first).all()) else values
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -110,6 +165,12 @@ class FitReport:
     """Range that the demonstration covers in each coordinate."""
     trust: Float[Tensor, "*batch T D"] | None = None
     """In each sample, 0 to 1, that a robust fit came to."""
+    noise: Float[Tensor, "*batch D"] | None = None
+    """Standard deviation of what a fit took for noise."""
+    peak_acceleration: Float[Tensor, "*batch D"] | None = None
+    """Largest of the reproduction, per s^2: NRMSE says nothing of how rough a motion is."""
+    peak_jerk: Float[Tensor, "*batch D"] | None = None
+    """Likewise, per s^3."""
 
     @property
     def nrmse(self) -> Float[Tensor, "*batch"]:
@@ -206,6 +267,43 @@ class Samples:
         return values if self.complete else torch.where(self.mask[:, None], values, filling)
 
 
+def padded(time: Any, mask: Mask | None, *columns: Any) -> tuple[Any, Mask | None, list[Any]]:
+    """Lists of demonstrations, of any lengths, as one batch; anything else as it is.
+
+    Args:
+        time: Timestamps of each, (T_i,), or those of all.
+        mask: True where a sample counts, likewise, or None.
+        columns: Values of each, (T_i,) or (T_i, D), or None.
+
+    Raises:
+        ValueError: Lists of which one names another number of samples or demonstrations.
+    """
+    first = columns[0]
+    listed = isinstance(first, list | tuple) and all(hasattr(x, "shape") for x in first)
+    if not listed or not first or not first[0].ndim:
+        return time, mask, list(columns)
+    parts = [None if x is None else [to_tensor(row) for row in x] for x in columns]
+    lengths = [len(x) for x in first]
+    if not isinstance(time, list | tuple) or not hasattr(time[0], "shape"):
+        time = [time] * len(first)
+    parts.append([to_tensor(row) for row in time])
+    for part in parts:
+        if part is not None and [len(row) for row in part] != lengths:
+            raise ValueError(
+                f"demonstrations have {lengths} samples, but time or another column has "
+                f"{[len(row) for row in part]}"
+            )
+    marked = [torch.ones(n, dtype=torch.bool) for n in lengths]
+    if mask is not None:
+        marked = [to_tensor(row).bool() for row in mask]
+    joined = [
+        None if part is None else torch.nn.utils.rnn.pad_sequence(part, batch_first=True)
+        for part in (*parts, marked)
+    ]
+    whole = mask is None and len(set(lengths)) == 1
+    return joined[-2], None if whole else joined[-1], joined[:-2]
+
+
 def check_samples(
     time: Times,
     position: Points,
@@ -272,8 +370,21 @@ def check_samples(
     )
 
 
+def check_precision(dtype: torch.dtype) -> None:
+    """Raise ValueError for what a motion cannot be told in.
+
+    With half the digits, weights of some thousands leave a path by more than a radian.
+    """
+    if dtype not in (torch.float32, torch.float64):
+        raise ValueError(
+            f"a primitive needs float32 or float64, got {dtype}: cast its rollouts instead"
+        )
+
+
 def _floating(values: Points) -> Tensor:
     tensor = to_tensor(values)
+    if tensor.is_floating_point():
+        check_precision(tensor.dtype)
     return tensor if tensor.is_floating_point() else tensor.to(torch.get_default_dtype())
 
 

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from hrc_learn.dmp._arguments import readable
 from hrc_learn.dmp._system.closed_forms import SpringDamper, approach_state
 from hrc_learn.dmp._system.response import Response, broadcast_shapes
 
@@ -212,19 +213,17 @@ def _lagging(
 
 def host_values(*times: Tensor) -> tuple[Tensor, ...] | tuple[float, ...]:
     """The times as floats if each is a single one that nothing derives or traces."""
-    if torch.compiler.is_compiling() or not all(map(_plain, times)):
+    if not readable(*times) or not all(map(_plain, times)):
         return times
     return tuple(time.item() for time in times)
 
 
 def _plain(time: Tensor) -> bool:
-    functorch = torch._C._functorch  # pyright: ignore[reportAttributeAccessIssue]
     return (
         time.ndim == 0
         and time.is_cpu  # of another device, reading would wait for all that was asked of it
         and type(time) is Tensor
         and not time.requires_grad
-        and not functorch.is_functorch_wrapped_tensor(time)
         and forward_ad.unpack_dual(time).tangent is None
     )
 

@@ -20,9 +20,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from hrc_learn.dmp._arguments import FitReport, Samples
+from hrc_learn.dmp._smoothing import smoothed, warn_of_few_samples
 from hrc_learn.dmp._system.bases import Basis, GaussianBasis, balanced_units
 from hrc_learn.dmp._system.closed_forms import SpringDamper
-from hrc_learn.dmp._system.response import Response, response_of
+from hrc_learn.dmp._system.response import Response, Trajectory, response_of
 from hrc_learn.dmp.forcing_scale import Demonstrated, Scaling
 
 
@@ -44,8 +45,14 @@ class FitOptions(TypedDict, total=False):
     """Gains; alpha = 25, critically damped, unless given."""
     regularization: float
     """Ridge, relative to the largest singular value; 1e-7 unless given."""
+    smooth: bool | None
+    """Whether noise is taken off the samples first, as much of it as they give evidence of; see
+    `_smoothing.py`. None (default): unless the number of basis functions is given."""
 
 
+DEFAULT_COUNT = 50
+"""Basis functions, unless said: what is no noise in recordings of arms they follow to 5e-5 of
+the range, and fewer would not make a motion without noise smoother."""
 METHODS = ("trajectory", "ridge", "lwr")
 type Fit = tuple[Float[Tensor, "*batch D N"], Float[Tensor, "*batch D"]]
 
@@ -193,7 +200,11 @@ class MotionFit:
     response: Response
     """Of the spring and the basis."""
     samples: Samples
-    """Those fitted: as recorded, but for outliers of a robust fit."""
+    """Those fitted: as recorded, but for outliers of a robust fit and noise."""
+    noisy: Samples
+    """With the noise."""
+    noise: Float[Tensor, "B D"] | None
+    """Its standard deviation; None: nobody looked."""
     trust: Float[Tensor, "B D T"] | None
     """In each recorded sample, 0 to 1; None: whole in all."""
     weights: Float[Tensor, "B D N"]
@@ -227,10 +238,19 @@ class MotionFit:
             "approach": self.response.approach,
         }
 
-    def report(self, reproduction: Float[Tensor, "*batch T D"]) -> FitReport:
-        """Residuals of a motion, at all samples."""
+    def report(self, motion: Trajectory) -> FitReport:
+        """Residuals of a motion at all samples, noise included, and how rough it is."""
         trust = None if self.trust is None else self._batched(self.trust).mT
-        return self.samples.compare(reproduction.mT.reshape(self.samples.position.shape), trust)
+        positions = motion.position.mT.reshape(self.samples.position.shape)
+        report = self.noisy.compare(positions, trust)
+        if self.noise is None:
+            return report
+        return replace(
+            report,
+            noise=self._batched(self.noise),
+            peak_acceleration=motion.acceleration.abs().amax(-2),
+            peak_jerk=motion.jerk.abs().amax(-2),
+        )
 
     def _batched(self, values: Tensor) -> Tensor:
         samples = self.samples
@@ -239,7 +259,7 @@ class MotionFit:
 
 def fit_motion(
     samples: Samples,
-    n_basis: int,
+    n_basis: int | None,
     *,
     method: str = "trajectory",
     robust: str | None = None,
@@ -248,20 +268,34 @@ def fit_motion(
     spring: SpringDamper | None = None,
     # Far above rounding, far below what a sensor can tell.
     regularization: float = 1e-7,
+    smooth: bool | None = None,
 ) -> MotionFit:
     """Fit weights and start velocity; arguments as in `FitOptions`.
 
     Raises:
         ValueError: An option that there is not.
     """
-    basis, spring = basis or GaussianBasis(count=n_basis), spring or SpringDamper()
-    response = response_of(spring, basis, float(approach))
-    trust = None
+    if smooth is None:
+        smooth = n_basis is None and basis is None
+    if n_basis is not None or basis is not None:
+        warn_of_few_samples(samples, basis.count if basis else n_basis or 0)
+    basis = basis or GaussianBasis(count=n_basis or DEFAULT_COUNT)
+    response = response_of(spring or SpringDamper(), basis, float(approach))
+    trust = noise = None
     if robust is not None:
         samples, trust = robust_weights(robust, response, samples, regularization)
+    noisy = samples
+    if smooth:
+        samples, noise = smoothed(samples)
     weights, rate = fit_samples(method, response, samples, regularization)
     return MotionFit(
-        response=response, samples=samples, trust=trust, weights=weights, rate=rate
+        response=response,
+        samples=samples,
+        noisy=noisy,
+        noise=noise,
+        trust=trust,
+        weights=weights,
+        rate=rate,
     )
 
 

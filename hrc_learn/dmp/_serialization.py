@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import asdict
+from dataclasses import fields as dataclass_fields
 from types import NoneType
 from typing import Any
 
@@ -98,7 +99,7 @@ def linear_arguments(saved: SavedModel) -> dict[str, Any]:
         "units": saved.get("units", dict).get("coordinates", ""),
     }
     if "fit_report.rmse" in saved.tensors:
-        names = ("rmse", "peak", "span", "trust")
+        names = [field.name for field in dataclass_fields(FitReport)]
         report = {
             n: saved.tensor(f"fit_report.{n}")
             for n in names

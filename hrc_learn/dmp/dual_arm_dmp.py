@@ -240,7 +240,7 @@ class DualArmDMP(AdaptedPrimitive[Pose, PoseTrajectory, DualArmState]):
         time: Times,
         position: Points,
         orientation: Quaternions,
-        n_basis: int = 50,
+        n_basis: int | None = None,
         mask: Mask | None = None,
         *,
         object_goal: Pose | None = None,

@@ -8,7 +8,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.dmp._arguments import Mask, Points, Times, Vectors, check_samples, to_tensor
+from hrc_learn.dmp._arguments import (
+    Mask,
+    Points,
+    Scalars,
+    Times,
+    Vectors,
+    check_samples,
+    padded,
+    positive,
+    to_tensor,
+)
 from hrc_learn.dmp._closed_loop_step import DMPState
 from hrc_learn.dmp._fitting import FitOptions, fit_motion
 from hrc_learn.dmp._system.response import Trajectory, broadcast_shapes
@@ -83,7 +93,7 @@ class JointDMP(AdaptedPrimitive[Vectors, Trajectory, DMPState], LinearPrimitive)
         cls,
         time: Times,
         position: Points,
-        n_basis: int = 50,
+        n_basis: int | None = None,
         velocity: Points | None = None,
         mask: Mask | None = None,
         *,
@@ -96,9 +106,11 @@ class JointDMP(AdaptedPrimitive[Vectors, Trajectory, DMPState], LinearPrimitive)
 
         Args:
             time: Timestamps [s], (T,) or (*B, T); any origin, any spacing.
-            position: (T, D) or (*B, T, D); of the shape of `time`, it is taken as D = 1. Its
+            position: (T, D) or (*B, T, D); of the shape of `time`, it is taken as D = 1. Or a
+                list of (T_i, D) with a list of (T_i,), for demonstrations of any lengths. Its
                 floating dtype is the primitive's; the fit itself runs in float64.
-            n_basis: N, unless `basis` is given.
+            n_basis: N, unless `basis` is given. None: 50, of samples that noise was taken off;
+                see `FitOptions.smooth`.
             velocity: Recorded velocity per second, like `position`. Without it, the default
                 method fits the start velocity along and the others differentiate positions.
             mask: (*B, T), false where a sample does not count (padding, dropouts).
@@ -111,14 +123,47 @@ class JointDMP(AdaptedPrimitive[Vectors, Trajectory, DMPState], LinearPrimitive)
             ValueError: Bad samples (says which), or a scaling that the motion forbids.
         """
         scaling = find_scaling(scaling)
+        time, mask, (position, velocity) = padded(time, mask, position, velocity)
         recorded = check_samples(time, position, velocity, mask)
         check_names(joint_names, recorded.position.shape[1])
         fit = fit_motion(recorded, n_basis, **options)
         arguments = fit.arguments(scaling, joint_names)
         dmp = cls(**arguments, joint_names=joint_names, units=units)
         with torch.no_grad():
-            dmp.fit_report = fit.report(dmp.rollout().position)
+            dmp.fit_report = fit.report(dmp.rollout())
         return dmp
+
+    def admissible_duration(
+        self,
+        velocity: Vectors | Scalars | None = None,
+        acceleration: Vectors | Scalars | None = None,
+        *,
+        start: Vectors | None = None,
+        goal: Vectors | None = None,
+    ) -> Float[Tensor, "*batch"]:
+        """The shortest duration [s] in which the path keeps limits: put it into `rollout`.
+
+        Slowed down, a motion keeps its path, its start velocity going along: velocities fall
+        as 1 / duration and accelerations as its square.
+
+        Args:
+            velocity: Largest of each coordinate, per s, (D,) or one for all; None: any.
+            acceleration: Per s^2, likewise.
+            start: Of the motion; the demonstrated one, as the goal, unless given.
+            goal: Of the motion.
+        """
+        fine = torch.linspace(
+            0, 1, LIMIT_SAMPLES, dtype=torch.float64, device=self.start.device
+        )
+        motion = self.rollout(fine * self.duration[..., None].double(), start, goal)
+        factors = [torch.zeros_like(self.duration)]
+        for order, (made, limit) in enumerate(
+            ((motion.velocity, velocity), (motion.acceleration, acceleration)), start=1
+        ):
+            if limit is not None:
+                share = made.abs().amax(-2) / positive("a limit", limit, made)
+                factors.append(share.amax(-1) ** (1 / order))
+        return self.duration * torch.stack(torch.broadcast_tensors(*factors)).amax(0)
 
     def with_motion[S: "JointDMP"](self: S, motion: Any, frame: None = None) -> S:
         """The motion itself."""
@@ -156,6 +201,9 @@ def given_points(
     return tensor.expand(broadcast_shapes(tensor.shape, shape))
 
 
+LIMIT_SAMPLES = 2001
+"""Times at which limits are looked at: 40 for a basis function, between which a peak is higher
+by less than 1e-3."""
 TOLERANCE = 1.05
 """A held-out error this close to the smallest, by ratio, is as good."""
 

@@ -26,11 +26,12 @@ from hrc_learn.dmp._arguments import (
     Vectors,
     check_samples,
     demo_label,
+    finite,
     to_tensor,
 )
 from hrc_learn.dmp._closed_loop_step import DMPState
 from hrc_learn.dmp._fitting import FitOptions
-from hrc_learn.dmp._system.response import Trajectory
+from hrc_learn.dmp._system.response import ArrayOutputs, Trajectory
 from hrc_learn.dmp.coordinate_adapter import ColumnPoints, CoordinateAdapter, Ends, Retargeted
 from hrc_learn.dmp.joint_dmp import JointDMP, points_as_given
 from hrc_learn.dmp.linear_primitive import ColumnEnds, LinearPrimitive
@@ -99,8 +100,10 @@ def _softplus(x: Tensor) -> Tensor:
 torch.export.register_dataclass(SoftLimits, serialized_type_name="hrc_learn.dmp.SoftLimits")
 
 
-class LimitedTrajectory:
+class LimitedTrajectory(ArrayOutputs):
     """A motion between limits, each output computed when first asked for."""
+
+    outputs = Trajectory.outputs
 
     def __init__(self, free: Trajectory, limits: SoftLimits):
         """Constrain a motion without bounds."""
@@ -224,7 +227,7 @@ class LimitedCoordinates(CoordinateAdapter[Vectors, LimitedTrajectory, LimitedSt
         )
 
     def _released(self, goal: Vectors) -> Tensor:
-        return self.limits.release(self.limits.clamp(self._as_tensor(goal)))
+        return self.limits.release(self.limits.clamp(finite("goal", self._as_tensor(goal))))
 
     def _as_tensor(self, value: Vectors) -> Tensor:
         return to_tensor(value, self.limits.lower.dtype, self.limits.lower.device)
@@ -285,7 +288,7 @@ class LimitedDMP(AdaptedPrimitive[Vectors, LimitedTrajectory, LimitedState]):
         position: Points,
         lower: Vectors | Scalars,
         upper: Vectors | Scalars,
-        n_basis: int = 50,
+        n_basis: int | None = None,
         mask: Mask | None = None,
         *,
         softness: float = 0.02,

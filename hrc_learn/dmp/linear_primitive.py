@@ -18,6 +18,7 @@ from hrc_learn.dmp._arguments import (
     Scalars,
     Times,
     Vectors,
+    check_precision,
     normalised_time,
     positive,
     to_tensor,
@@ -113,10 +114,13 @@ class LinearPrimitive(nn.Module):
         check_names(joint_names, weights.shape[-2])
         if weights.shape[-1] != basis.count:
             raise ValueError(f"{weights.shape[-1]} weights for {basis.count} basis functions")
-        if weights.grad_fn is None:
-            self.weights = nn.Parameter(weights)
+        check_precision(weights.dtype)
+        if isinstance(weights, nn.Parameter) or not weights.requires_grad:
+            self.weights = (
+                weights if isinstance(weights, nn.Parameter) else nn.Parameter(weights)
+            )
         else:
-            # A parameter is a leaf, which no gradient passes.
+            # A parameter is a leaf of its own, which no gradient passes.
             self.register_buffer("weights", weights)
         buffers = (start, goal, start_velocity, duration, amplitude, timestamps)
         for name, value in zip(TENSORS[1:], buffers, strict=True):
@@ -128,6 +132,34 @@ class LinearPrimitive(nn.Module):
         self.units = units
         self.fit_report = fit_report
         self.response = response_of(spring, basis, approach)
+
+    def extra_repr(self) -> str:
+        """What it moves, for how long, of how many functions, and how well it fits."""
+        *batch, D, N = self.weights.shape
+        names = "" if self.joint_names is None else f" ({', '.join(self.joint_names)})"
+        low, high = (f"{x.item():.4g}" for x in self.duration.detach().aminmax())
+        parts = [
+            *([f"batch {tuple(batch)}"] if batch else []),
+            f"{D} columns [{self.units}]{names}",
+            f"{N} functions of {type(self.basis).__name__}",
+            f"{low} s" if low == high else f"{low} to {high} s",
+            f"scaling {self.scaling!r}",
+        ]
+        if self.fit_report is not None:
+            parts.append(f"NRMSE {self.fit_report.nrmse.max().item():.2g}")
+        return ", ".join(parts)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Any:
+        # Before anything is changed: what `half` has made of a module stays so.
+        check_precision(fn(self.weights.detach().reshape(-1)[:1]).dtype)
+        return super()._apply(fn, recurse)
+
+    def _load_from_state_dict(self, state_dict: Any, prefix: str, *arguments: Any) -> None:
+        # As many samples as the other was fitted to; all else has to be alike.
+        timestamps = state_dict.get(f"{prefix}timestamps")
+        if timestamps is not None and timestamps.shape != self.timestamps.shape:
+            self.timestamps = self.timestamps.new_empty(timestamps.shape)
+        super()._load_from_state_dict(state_dict, prefix, *arguments)
 
     @property
     def scaling(self) -> str:
@@ -203,7 +235,8 @@ class LinearPrimitive(nn.Module):
         if forcing_gain is not None:
             weights = weights * self._as_tensor(forcing_gain)[..., None, None]
         shape = weights.shape[:-1]
-        if not rate.shape == start.shape == goal.shape == shape:
+        if not rate.shape == start.shape == goal.shape == shape or duration.ndim:
+            self._motion_shape(rate=rate, start=start, goal=goal, duration=duration)
             shape = broadcast_shapes(shape, *(x.shape for x in columns))
             weights, columns = weights.expand(*shape, -1), [x.expand(shape) for x in columns]
         return Trajectory(
@@ -216,6 +249,7 @@ class LinearPrimitive(nn.Module):
     def begin(self, ends: ColumnEnds, duration: Float[Tensor, "*#batch"]) -> DMPState:
         """State at the start of a motion [s], for `advance`."""
         start, goal, rate = self.boundary(ends, duration)
+        self._motion_shape(rate=rate, start=start, goal=goal, duration=duration)
         return closed_loop_step.begin(self.response, self.weights, start, goal, rate, duration)
 
     def advance(
@@ -234,7 +268,9 @@ class LinearPrimitive(nn.Module):
         Arguments are those of `AdaptedPrimitive.step`, in columns: `external_acceleration` is
         added to the motion, per s^2, (*batch, D).
         """
-        target = state.target if goal is None else self._as_tensor(goal).expand_as(state.goal)
+        target = state.target
+        if goal is not None:
+            target = checked_vector("goal", goal, state.goal).expand_as(state.goal)
         # How long the motion takes at the pace of this step.
         duration, pace = state.duration, torch.ones_like(state.pace)
         if phase_stopping is not None:
@@ -268,6 +304,25 @@ class LinearPrimitive(nn.Module):
             return start, goal, self.start_rate(start, goal)
         velocity = checked_vector("start_velocity", velocity, self.start_velocity)
         return start, goal, velocity * duration[..., None]
+
+    def _motion_shape(self, **ends: Tensor) -> tuple[int, ...]:
+        """Of (*batch, D), for primitives and ends together.
+
+        Raises:
+            ValueError: They do not go together; says which.
+        """
+        shapes = {
+            name: (*x.shape, self.weights.shape[-2]) if name == "duration" else x.shape
+            for name, x in ends.items()
+        }
+        try:
+            return broadcast_shapes(self.weights.shape[:-1], *shapes.values())
+        except (ValueError, RuntimeError):
+            batches = ", ".join(f"{name} {tuple(x[:-1])}" for name, x in shapes.items())
+            raise ValueError(
+                f"batches must broadcast, but the primitive has {tuple(self.duration.shape)}, "
+                f"{batches}"
+            ) from None
 
     def curvature(self, state: DMPState) -> Float[Tensor, "*batch D"]:
         """d^2 y / ds^2 at a state that nothing couples to."""

@@ -15,8 +15,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from hrc_learn.dmp._arguments import FitReport, Points, Scalars, Times, to_tensor
+from hrc_learn.dmp._arguments import (
+    FitReport,
+    Points,
+    Scalars,
+    Times,
+    regular_times,
+    to_tensor,
+)
 from hrc_learn.dmp._via_points import ViaPoints, through_via_points
+from hrc_learn.dmp.batching import select
 from hrc_learn.dmp.coordinate_adapter import ColumnPoints, CoordinateAdapter, Ends
 from hrc_learn.dmp.linear_primitive import ColumnEnds, LinearPrimitive
 from hrc_learn.model_files import SavedModel, write_model
@@ -76,6 +84,8 @@ class AdaptedPrimitive[Value, Path, State](nn.Module, ABC):
 
     motion: LinearPrimitive
     """Of the columns."""
+    duration: Any
+    """Of the demonstration [s], (*batch)."""
 
     @property
     @abstractmethod
@@ -104,6 +114,26 @@ class AdaptedPrimitive[Value, Path, State](nn.Module, ABC):
         """Likewise, by the names they are saved under."""
         return {}
 
+    def __len__(self) -> int:
+        """Primitives along the first batch axis.
+
+        Raises:
+            TypeError: It is a single one.
+        """
+        if not self.duration.ndim:
+            raise TypeError("a single primitive has no length: it is no batch")
+        return self.duration.shape[0]
+
+    def __bool__(self) -> bool:
+        """There is one, or a batch: never what its length says."""
+        return True
+
+    def __getitem__[S: "AdaptedPrimitive"](self: S, index: Any) -> S:
+        """Some of a batch, by what indexes a tensor's first axes; with memory of their own."""
+        if not self.duration.ndim:
+            raise TypeError("a single primitive cannot be indexed: it is no batch")
+        return select(self, index)
+
     def rollout(
         self,
         time: Times | None = None,
@@ -113,6 +143,7 @@ class AdaptedPrimitive[Value, Path, State](nn.Module, ABC):
         start_velocity: Any = None,
         *,
         speed: Scalars | None = None,
+        dt: float | int | None = None,
         forcing_gain: Scalars | None = None,
         **ends: Any,
     ) -> Path:
@@ -132,12 +163,18 @@ class AdaptedPrimitive[Value, Path, State](nn.Module, ABC):
                 the duration so that the path stays the same, and turned and dilated with the
                 way if the scaling is `"rotation"`.
             speed: Instead of a duration, how many times faster than the demonstration.
+            dt: Instead of times, the interval [s] from one to the next; they go from zero to
+                the end of the longest motion, or the first one past it.
             forcing_gain: Factor on the forcing term, (*batch): how wide a rhythm swings.
             ends: Others that the kind has.
         """
         motion, adapter = self.motion, self.adapter
         given = Ends(start, goal, start_velocity)
         columns, tau, frame = self._columns(given, duration, speed, ends)
+        if dt is not None:
+            if time is not None:
+                raise ValueError("give times or an interval dt, not both")
+            time = regular_times(dt, tau)
         times = None if time is None else adapter.times(time)
         rolled = adapter.roll(motion, columns, tau, times, adapter.each(forcing_gain))
         return adapter.trajectory(rolled, frame)

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from hrc_learn.dmp._arguments import Points, Times, Vectors, to_tensor
 from hrc_learn.dmp._closed_loop_step import DMPState
-from hrc_learn.dmp._system.response import Trajectory
+from hrc_learn.dmp._system.response import ArrayOutputs, Trajectory
 from hrc_learn.dmp.coordinate_adapter import ColumnPoints, CoordinateAdapter, Ends, Retargeted
 from hrc_learn.dmp.joint_dmp import JointDMP, points_as_given
 from hrc_learn.dmp.linear_primitive import ColumnEnds, LinearPrimitive
@@ -25,8 +25,10 @@ from hrc_learn.dmp.motion_primitive import WrappedPrimitive
 from hrc_learn.model_files import SavedModel
 
 
-class MovingTrajectory:
+class MovingTrajectory(ArrayOutputs):
     """A motion to a moving goal, each output computed when first asked for."""
+
+    outputs = Trajectory.outputs
 
     def __init__(self, seen: Trajectory, velocity: Float[Tensor, "*#batch D"]):
         """Add the motion of the goal (its `velocity` per second) to what is seen from it."""

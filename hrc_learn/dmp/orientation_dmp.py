@@ -21,10 +21,12 @@ from hrc_learn.dmp._arguments import (
     Samples,
     Times,
     check_samples,
+    padded,
     to_tensor,
 )
 from hrc_learn.dmp._closed_loop_step import DMPState
 from hrc_learn.dmp._fitting import FitOptions
+from hrc_learn.dmp._system.response import ArrayOutputs
 from hrc_learn.dmp.coordinate_adapter import ColumnPoints, CoordinateAdapter, Ends, Retargeted
 from hrc_learn.dmp.joint_dmp import JointDMP, given_points
 from hrc_learn.dmp.linear_primitive import ColumnEnds, LinearPrimitive
@@ -40,8 +42,10 @@ from hrc_learn.geometry import quaternion
 from hrc_learn.model_files import SavedModel
 
 
-class OrientationTrajectory:
+class OrientationTrajectory(ArrayOutputs):
     """An orientation over time, each output computed when first asked for."""
+
+    outputs = ("time", "orientation", "angular_velocity", "angular_acceleration")
 
     def __init__(self, errors: Any, reference: Float[Tensor, "*batch 4"], first: int = 0):
         """Read the motion of an error, found in columns `first` to `first` + 3 of `errors`."""
@@ -259,7 +263,7 @@ class OrientationDMP(WrappedPrimitive[Quaternions, OrientationTrajectory, Orient
         cls,
         time: Times,
         orientation: Quaternions,
-        n_basis: int = 50,
+        n_basis: int | None = None,
         mask: Mask | None = None,
         *,
         formulation: str = "log",
@@ -271,7 +275,7 @@ class OrientationDMP(WrappedPrimitive[Quaternions, OrientationTrajectory, Orient
             time: Timestamps [s], (T,) or (*B, T).
             orientation: Unit quaternions (w, x, y, z), (*B, T, 4). Signs may flip; neighbours
                 must be less than half a turn apart.
-            n_basis: N, unless `basis` is given.
+            n_basis: N, unless `basis` is given; None as for `JointDMP.fit`.
             mask: (*B, T), false where a sample does not count.
             formulation: `"log"`, exact, or `"ude"`, integrated and for turns of less than 360
                 degrees.
@@ -281,6 +285,7 @@ class OrientationDMP(WrappedPrimitive[Quaternions, OrientationTrajectory, Orient
             ValueError: Bad samples (says which), or no such formulation.
         """
         _check_formulation(formulation)
+        time, mask, (orientation,) = padded(time, mask, orientation)
         error, goal = fitted_error(time, orientation, mask)
         motion = JointDMP.fit(time, error, n_basis, mask=mask, **options)
         if not FORMULATIONS[formulation].linear:

@@ -17,6 +17,7 @@ from hrc_learn.dmp._arguments import (
     Vectors,
     check_samples,
     demo_label,
+    readable,
     to_tensor,
 )
 from hrc_learn.geometry import quaternion
@@ -152,7 +153,7 @@ def unit_quaternion(value: Quaternions, like: Tensor) -> Float[Tensor, "*batch 4
     shaped = q.ndim > 0 and q.shape[-1] == 4
     # A tracer cannot look at values.
     # Not a tolerance on units: it tells a quaternion from zeros and from three Euler angles.
-    if not (shaped and (torch.compiler.is_compiling() or (q.norm(dim=-1) > 0.5).all())):
+    if not (shaped and (not readable(q) or (q.norm(dim=-1) > 0.5).all())):
         raise ValueError(f"an orientation must be unit quaternions (w, x, y, z), got {value}")
     return quaternion.normalize(q)
 

@@ -16,11 +16,13 @@ from hrc_learn.dmp._arguments import (
     Times,
     Vectors,
     check_samples,
+    finite,
+    padded,
     to_tensor,
 )
 from hrc_learn.dmp._closed_loop_step import DMPState
 from hrc_learn.dmp._fitting import FitOptions
-from hrc_learn.dmp._system.response import Trajectory, broadcast_shapes
+from hrc_learn.dmp._system.response import ArrayOutputs, Trajectory, broadcast_shapes
 from hrc_learn.dmp.coordinate_adapter import ColumnPoints, CoordinateAdapter, Ends, Retargeted
 from hrc_learn.dmp.forcing_scale import find_scaling
 from hrc_learn.dmp.joint_dmp import JointDMP, given_points
@@ -41,8 +43,13 @@ POSITION, ERROR, BODY = slice(0, 3), slice(3, 6), slice(6, None)
 """Columns of a pose: position [m], orientation error [rad], and what moves along."""
 
 
-class PoseTrajectory:
+class PoseTrajectory(ArrayOutputs):
     """A pose over time, each output computed when first asked for."""
+
+    outputs = (
+        *("time", "position", "orientation", "velocity", "angular_velocity"),
+        *("acceleration", "angular_acceleration", "body", "body_velocity"),
+    )
 
     def __init__(self, motion: Trajectory, reference: Float[Tensor, "*batch 4"]):
         self._motion = motion
@@ -159,6 +166,8 @@ class PoseCoordinates(CoordinateAdapter[Pose, PoseTrajectory, PoseState]):
     ) -> tuple[ColumnEnds, Tensor]:
         """A new orientation moves the start's error or the reference, the rest its columns."""
         like, (start, goal, velocity) = motion.start, given
+        check_pose("start", start)
+        check_pose("goal", goal)
         demonstrated = motion.start_velocity * (motion.duration / duration)[..., None]
         twist = None if velocity is None else to_tensor(velocity, like.dtype, like.device)
         error, rate, reference = error_ends(
@@ -219,6 +228,7 @@ class PoseCoordinates(CoordinateAdapter[Pose, PoseTrajectory, PoseState]):
         """The same pose, twist and acceleration, as the error to a new reference."""
         target = columns.target
         if goal is not None:
+            check_pose("goal", goal)
             rotation = unit_quaternion(goal.orientation, frame)
             new = reference_of(motion.goal[..., ERROR], rotation).expand_as(frame)
             values = columns.position, columns.rate, motion.curvature(columns)
@@ -318,7 +328,7 @@ class PoseDMP(WrappedPrimitive[Pose, PoseTrajectory, PoseState]):
         time: Times,
         position: Points,
         orientation: Quaternions,
-        n_basis: int = 50,
+        n_basis: int | None = None,
         body: Points | None = None,
         mask: Mask | None = None,
         *,
@@ -331,7 +341,7 @@ class PoseDMP(WrappedPrimitive[Pose, PoseTrajectory, PoseState]):
             time: Timestamps [s], (T,) or (*B, T).
             position: (*B, T, 3) [m]. Its floating dtype is the primitive's.
             orientation: Unit quaternions (w, x, y, z), (*B, T, 4); signs may flip.
-            n_basis: N, unless `basis` is given.
+            n_basis: N, unless `basis` is given; None as for `JointDMP.fit`.
             body: Coordinates learned along, (*B, T, K), or (T,) for one.
             mask: (*B, T), false where a sample does not count.
             scaling: Of the forcing term of the position, as for `JointDMP.fit`; `"rotation"`
@@ -341,6 +351,9 @@ class PoseDMP(WrappedPrimitive[Pose, PoseTrajectory, PoseState]):
         Raises:
             ValueError: Bad samples (says which), or a scaling that the motion forbids.
         """
+        time, mask, (position, orientation, body) = padded(
+            time, mask, position, orientation, body
+        )
         error, goal = fitted_error(time, orientation, mask)
         coordinates = demonstrated_columns(time, position, error, body, mask)
         motion = JointDMP.fit(
@@ -386,6 +399,19 @@ class PoseDMP(WrappedPrimitive[Pose, PoseTrajectory, PoseState]):
     @classmethod
     def _restored[S: "PoseDMP"](cls: type[S], saved: SavedModel) -> S:
         return cls(JointDMP.restore(saved), saved.tensor("goal_orientation"))
+
+
+def check_pose(name: str, value: Any) -> None:
+    """Raise ValueError unless a value is None or a finite `Pose`."""
+    if value is None:
+        return
+    if not isinstance(value, Pose):
+        raise ValueError(
+            f"{name} of a pose primitive must be a Pose, got {type(value).__name__}: "
+            "Pose(position, orientation), (..., 3) and (..., 4) as (w, x, y, z)"
+        )
+    finite(f"position of {name}", value.position)
+    finite(f"orientation of {name}", value.orientation)
 
 
 def demonstrated_columns(

@@ -134,14 +134,16 @@ def fit_primitives(
         method: See `JointDMP.fit`.
         channels: To learn; none: joints and pose, or what there is of them.
         candidates: Numbers of basis functions to choose from.
-        options: Further options of the fit, such as `robust` or `scaling`.
+        options: Further options of the fit, such as `robust` or `scaling`. Noise is taken off
+            unless `smooth` says otherwise.
 
     Raises:
         ValueError: If the demonstrations hold no motion, or not what a channel needs.
     """
     motions = Motions.of(demos)
     channels = select_channels(motions, channels)
-    options = {"method": method, **options}
+    # Recordings of arms and of people hold noise, which a fit would follow.
+    options = {"method": method, "smooth": True, **options}
     selection = None
     if n_basis is None:
         selection = _select(motions, channels[0], candidates, options)

@@ -10,14 +10,17 @@ from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from hrc_learn.dmp._arguments import readable
 from hrc_learn.dmp._system.bases import Basis
 from hrc_learn.dmp._system.closed_forms import SpringDamper, approach_state, minimum_jerk
+from hrc_learn.dmp._system.own_times import OwnTimesTable, motion, without_subnormals
 
 GAUSS_POINTS = 12
 """For the forcing over one piece of a table, which no basis function changes much in."""
@@ -114,6 +117,11 @@ class PiecewisePolynomial:
         return cls(solved.reshape(values.shape).contiguous(), interval, periodic)
 
     @property
+    def points(self) -> Float[Tensor, "P"]:
+        """Where a piece of unit length is interpolated (float64)."""
+        return chebyshev_points()
+
+    @property
     def end(self) -> float:
         """Where the last piece ends."""
         return self.interval * self.coefficients.shape[0]
@@ -186,7 +194,13 @@ class Response:
         """(y, y') that unit weights alone cause, (2, N): from rest at the goal at s = 0, or,
         of a periodic basis, the limit cycle."""
         self._matrices: OrderedDict[tuple, tuple[Tensor, Tensor, Tensor]] = OrderedDict()
+        self.own_times: dict[tuple[int, torch.dtype, torch.device], OwnTimesTable] = {}
+        """For motions each at times of its own, see `own_times.py`."""
         self._latest: tuple[Tensor, tuple[Tensor, Tensor, Tensor]] | None = None
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Tables are made again from what they were made of, or found: there is one for all.
+        return response_of, (self.spring, self.basis, self.approach)
 
     def matrices(
         self, s: Float[Tensor, "T"], dtype: torch.dtype
@@ -216,7 +230,7 @@ class Response:
     def _transposed(self, s: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
         """`matrices`, for all calls to come."""
         H = self.evaluate(s.detach().clone().double()).to(dtype)
-        position, velocity, acceleration = _without_subnormals(H).permute(1, 2, 0).contiguous()
+        position, velocity, acceleration = without_subnormals(H).permute(1, 2, 0).contiguous()
         return position, velocity, acceleration
 
     def evaluate(self, s: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 3 M"]:
@@ -298,6 +312,7 @@ class _StateAt(torch.autograd.Function):
     def setup_context(ctx, inputs, output):
         s, ctx.response = inputs
         ctx.save_for_backward(s)
+        ctx.save_for_forward(s)
 
     @staticmethod
     def backward(ctx, grad):
@@ -306,11 +321,10 @@ class _StateAt(torch.autograd.Function):
         rate = ctx.response.evaluate(s)[..., 1:, :]
         return (grad * rate).sum((-2, -1)), None
 
-
-def _without_subnormals(values: Tensor) -> Tensor:
-    """Zeros for what is lost beside one, but makes every product take several times as long."""
-    limits = torch.finfo(values.dtype)
-    return torch.where(values.abs() < limits.tiny / limits.eps, 0.0, values)
+    @staticmethod
+    def jvp(ctx, ds, _):
+        (s,) = ctx.saved_tensors
+        return ctx.response.evaluate(s)[..., 1:, :] * ds[..., None, None]
 
 
 # A table of 50 Gaussians has 1.3 MB; few programs hold 64 kinds of primitive at a time.
@@ -320,12 +334,24 @@ def response_of(spring: SpringDamper, basis: Basis, approach: float = 0.0) -> Re
     return Response(spring, basis, approach)
 
 
-class Trajectory:
+class ArrayOutputs:
+    """Outputs of a rollout as NumPy arrays."""
+
+    outputs: ClassVar[tuple[str, ...]]
+
+    def numpy(self) -> dict[str, np.ndarray]:
+        """Every output by name, without gradients."""
+        return {name: getattr(self, name).detach().cpu().numpy() for name in self.outputs}
+
+
+class Trajectory(ArrayOutputs):
     """A motion over time, each output computed when first asked for.
 
     Position, velocity and acceleration are one matrix product each; a caller that needs the
     position alone pays for nothing else.
     """
+
+    outputs = ("time", "position", "velocity", "acceleration")
 
     def __init__(
         self,
@@ -371,27 +397,41 @@ class Trajectory:
         """The same per second squared."""
         return self._output(2)
 
+    @cached_property
+    def jerk(self) -> Float[Tensor, "*batch T D"]:
+        """The same per second cubed."""
+        X = self._coordinates / self.duration[..., None, None] ** 3
+        return self._at_own_times(X, 3)
+
     def _output(self, order: int) -> Float[Tensor, "*batch T D"]:
         X = self._coordinates
         if order:
             X = X / self.duration[..., None, None] ** order
-        if self.s.ndim == 1 and not self.s.requires_grad:
-            # One flat product: batched ones against a shared matrix are ten times slower.
-            H = self._response.matrices(self.s, X.dtype)[order]
-            y = X @ H if X.ndim == 2 else (X.flatten(0, -2) @ H).view(*X.shape[:-1], -1)
-        else:
-            y = X @ self._rows[..., order, :].to(X.dtype).mT
+        if self.s.ndim > 1 or self.s.requires_grad or not readable(self.s):
+            return self._at_own_times(X, order)
+        # One flat product: batched ones against a shared matrix are ten times slower.
+        H = self._response.matrices(self.s, X.dtype)[order]
+        y = X @ H if X.ndim == 2 else (X.flatten(0, -2) @ H).view(*X.shape[:-1], -1)
         return y.mT if y.shape[:-2] == self._batch else y.mT.expand(*self._batch, -1, -1)
+
+    def _at_own_times(self, X: Tensor, order: int) -> Float[Tensor, "*batch T D"]:
+        s, (D, M) = self.s.double(), X.shape[-2:]
+        if X.ndim == 2:
+            # Of one primitive, the times of a batch are times of one motion.
+            y = motion(self._response, s.reshape(1, -1), X[None], order)
+            y = y.view(*s.shape, D)
+        else:
+            batch = broadcast_shapes(X.shape[:-2], s.shape[:-1])
+            s = s.expand(*batch, -1).reshape(-1, s.shape[-1])
+            y = motion(self._response, s, X.expand(*batch, D, M).reshape(-1, D, M), order)
+            y = y.view(*batch, -1, D)
+        return y.expand(*self._batch, -1, -1)
 
     @cached_property
     def _batch(self) -> torch.Size | tuple[int, ...]:
         return broadcast_shapes(
             self._coordinates.shape[:-2], self.s.shape[:-1], self.duration.shape
         )
-
-    @cached_property
-    def _rows(self) -> Float[Tensor, "*#batch T 3 M"]:
-        return self._response.evaluate(self.s.double())
 
 
 def broadcast_shapes(*shapes: tuple[int, ...]) -> tuple[int, ...]:

@@ -1,0 +1,362 @@
+"""Motions at times of their own: each of a batch another duration, or other timestamps.
+
+On one time grid a batch is one product with a matrix of responses. On many grids that matrix
+would be another one for each motion, fifty times as large as the motion. Here the polynomials
+of the response are multiplied by the coordinates first: what is left is a piecewise polynomial
+for each column, whose value at any time is a sum of a few rows weighted by powers.
+
+That is linear in the coordinates, and its derivative by time is the motion of the next order.
+So a motion, its adjoint, and the derivatives of both of any order are the same two functions.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from hrc_learn.dmp._system.response import Response
+
+NEGLIGIBLE = 4
+"""Epsilons of a dtype, relative to the largest value of a column, by which polynomials of a
+lower degree may differ: a sum of fifty products rounds off as much."""
+AT_ONCE = 2**16
+"""Samples whose indices and powers a core keeps in its cache; a million takes twice as long."""
+
+
+def motion(
+    response: "Response",
+    s: Float[Tensor, "B T"],
+    coordinates: Float[Tensor, "B D M"],
+    order: int,
+) -> Float[Tensor, "B T D"]:
+    """A derivative of y by s at times of its own; differentiable in times and coordinates.
+
+    Args:
+        response: Of the primitive.
+        s: Normalised times, >= 0 (float64).
+        coordinates: As `Response` takes them.
+        order: 0 for y itself, 1 for y', and so on.
+    """
+    if torch.compiler.is_compiling():
+        return _gathered(_table(response, order, coordinates), s, coordinates)
+    return _Motion.apply(s, coordinates, response, order)  # pyright: ignore[reportReturnType]
+
+
+@dataclass(frozen=True, eq=False)
+class OwnTimesTable:
+    """Coordinates to the coefficients of a motion, or of one of its derivatives by s.
+
+    Piece p has K coefficients, of 1, u, u^2 ... with u from -1 to 1 along it. Where the
+    forcing ends, one more piece stands for all times after that: there the state at its end,
+    seen from the goal, goes back as the unforced spring has it.
+    """
+
+    response: "Response"
+    order: int
+    """Of the derivative."""
+    matrix: Float[Tensor, "M rows"]
+    """To the coefficients of all pieces, in turn."""
+    size: int
+    """K."""
+    others: Float[Tensor, "M extra"] | None
+    """To what is multiplied by functions that are no polynomials on a piece; see `extra`."""
+
+    def place(
+        self, s: Float[Tensor, "B T"], dtype: torch.dtype
+    ) -> tuple[Int[Tensor, "B T"], Float[Tensor, "B T K"]]:
+        """The piece that each time lies on, and what its coefficients are multiplied by."""
+        forced = self.response.forced
+        pieces, periodic = len(forced.coefficients), forced.periodic
+        x = s / forced.interval
+        x = x % pieces if periodic else x.clamp(0, pieces)
+        piece = x.detach().to(torch.int32).clamp(max=pieces - periodic)
+        u = (2 * (x - piece) - 1).to(dtype)[..., None]
+        powers = torch.cat([torch.ones_like(u), u.expand(*s.shape, self.size - 1)], dim=-1)
+        powers = powers.cumprod(-1)
+        if periodic or not (torch.compiler.is_compiling() or piece.max() == pieces):
+            return piece, powers
+        back = _spring_rows(self.response, (s - forced.end).clamp(min=0), self.order)
+        goal = torch.full_like(s, float(self.order == 0))[..., None]
+        back = torch.cat([back, goal], dim=-1).to(dtype)
+        back = torch.nn.functional.pad(back, (0, self.size - back.shape[-1]))
+        return piece, torch.where((piece == pieces)[..., None], back, powers)
+
+    def extra(self, s: Float[Tensor, "B T"], dtype: torch.dtype) -> Float[Tensor, "B T extra"]:
+        """What the columns of `others` are multiplied by."""
+        if self.response.forced.periodic:
+            return _spring_rows(self.response, s, self.order).to(dtype)
+        return _approach(s, self.response.approach, self.order).to(dtype)[..., None]
+
+
+def _spring_rows(response: "Response", s: Tensor, order: int) -> Float[Tensor, "*batch 2"]:
+    """The row of exp(A s) A^order that gives y of (y - g, y') at s = 0."""
+    spring = response.spring
+    C, S = spring.modes(s, torch)
+    first, second = C + S * (spring.alpha / 2), S
+    for _ in range(order):
+        first, second = -spring.stiffness * second, first - spring.alpha * second
+    return torch.stack([first, second], dim=-1)
+
+
+def _approach(s: Tensor, share: float, order: int) -> Tensor:
+    """m(s) - 1 of the minimum-jerk curve of an approach, or a derivative of it by s."""
+    polynomial = np.polynomial.Polynomial([-1.0, 0, 0, 10, -15, 6]).deriv(order)
+    u = (s / share).clamp(0, 1)
+    value = torch.zeros_like(u)
+    for c in polynomial.coef[::-1].tolist():
+        value = value * u + c
+    return torch.where((s < share) | (order == 0), value / share**order, 0.0)
+
+
+def _table(response: "Response", order: int, like: Tensor) -> OwnTimesTable:
+    """The table of one order, in dtype and on the device of `like`; made once."""
+    if torch.compiler.is_compiling():
+        # What is made while a program is traced cannot be kept, and costs it nothing.
+        return _tabulate(response, order, like.dtype, like.device)
+    key = order, like.dtype, like.device
+    if key not in response.own_times:
+        with torch.inference_mode(False), torch.no_grad():
+            response.own_times[key] = _tabulate(response, *key)
+    return response.own_times[key]
+
+
+def _tabulate(
+    response: "Response", order: int, dtype: torch.dtype, device: torch.device
+) -> OwnTimesTable:
+    forced, N = response.forced, response.basis.count
+    row = forced.coefficients[:, :, min(order, 1)]
+    for _ in range(order - 1):
+        # F' is as exact as F is: so that is differentiated, not F.
+        exponents = torch.arange(row.shape[1], dtype=row.dtype, device=row.device)
+        row = row * (2 / forced.interval * exponents)[:, None]
+        row = torch.nn.functional.pad(row[:, 1:], (0, 0, 0, 1))
+    free, goal = _spring_pieces(response, order), torch.zeros_like(row[..., :1])
+    goal[:, 0] = float(order == 0)
+    rate, start = free[..., 1:], free[..., :1]
+    others = row.new_zeros(N + 3, 2)
+    if forced.periodic:
+        # The motion is the limit cycle, and what it takes to be off it at first dies out.
+        others[:N] = -forced(0.0).mT
+        others[N, 1] = others[N + 1, 0] = 1.0
+        others[N + 2, 0] = -1.0
+        coefficients = torch.cat([row, 0 * free, goal], dim=-1)
+    else:
+        if response.approach:
+            start = torch.zeros_like(start)
+            others = others[:, :1]
+            others[N + 1], others[N + 2] = -1.0, 1.0
+        coefficients = torch.cat([row, rate, start, goal - start], dim=-1)
+        E = response.spring.propagator(forced.end).to(row)
+        after = torch.zeros_like(coefficients[:1])
+        after[0, :2, :N] = forced(forced.end)
+        after[0, :2, N] = E[:, 1]
+        if not response.approach:
+            after[0, :2, N + 1], after[0, :2, N + 2] = E[:, 0], -E[:, 0]
+        after[0, 2, N + 2] = 1.0
+        coefficients = torch.cat([coefficients, after])
+    if not torch.compiler.is_compiling():
+        coefficients = _of_least_degree(coefficients, NEGLIGIBLE * torch.finfo(dtype).eps)
+    matrix = without_subnormals(coefficients.flatten(0, 1).mT.to(device, dtype)).contiguous()
+    needed = forced.periodic or response.approach
+    return OwnTimesTable(
+        response,
+        order,
+        matrix,
+        coefficients.shape[1],
+        others.to(device, dtype) if needed else None,
+    )
+
+
+def without_subnormals(values: Tensor) -> Tensor:
+    """Zeros for what is lost beside one, but makes every product take several times as long."""
+    limits = torch.finfo(values.dtype)
+    return torch.where(values.abs() < limits.tiny / limits.eps, 0.0, values)
+
+
+def _spring_pieces(response: "Response", order: int) -> Float[Tensor, "pieces P 2"]:
+    """Coefficients of `_spring_rows` on the pieces of the forcing."""
+    forced = response.forced
+    u = forced.points.to(forced.coefficients)
+    knots = torch.arange(len(forced.coefficients), dtype=u.dtype, device=u.device)
+    values = _spring_rows(response, forced.interval * (knots[:, None] + u), order)
+    return forced.interpolate(values[..., None, :], forced.interval).coefficients[..., 0, :]
+
+
+def _of_least_degree(
+    coefficients: Float[Tensor, "pieces P M"], tolerance: float
+) -> Float[Tensor, "pieces K M"]:
+    """Polynomials of the lowest degree that differ by no more than a share of the largest."""
+    P = coefficients.shape[1]
+    exponents = torch.arange(P, device=coefficients.device)
+    watched = torch.linspace(-1, 1, 4 * P).to(coefficients)[:, None] ** exponents
+    size = (watched @ coefficients).abs().amax((0, 1))
+    for degree in range(2, P - 1):
+        k = torch.arange(degree + 1).to(coefficients)
+        u = -torch.cos(torch.pi * k / degree)[:, None]
+        # The polynomial through its Chebyshev points, the ends among them.
+        lower = torch.linalg.solve(u ** exponents[: degree + 1], u**exponents)
+        lower = torch.nn.functional.pad(lower, (0, 0, 0, P - degree - 1))
+        off = (watched @ (lower @ coefficients - coefficients)).abs().amax((0, 1))
+        if (off <= tolerance * size).all():
+            return (lower @ coefficients)[:, : degree + 1]
+    return coefficients
+
+
+def _rows(table: OwnTimesTable, coordinates: Float[Tensor, "B D M"]) -> Tensor:
+    """Coefficients of each motion, (B, pieces, K, D)."""
+    B, D, M = coordinates.shape
+    rows = coordinates.reshape(-1, M) @ table.matrix
+    return rows.view(B, D, -1, table.size).permute(0, 2, 3, 1)
+
+
+def _gathered(table: OwnTimesTable, s: Tensor, coordinates: Tensor) -> Float[Tensor, "B T D"]:
+    """`motion` of plain operations, as a compiler joins them."""
+    piece, powers = table.place(s, coordinates.dtype)
+    rows = _rows(table, coordinates)
+    index = piece.long()[..., None, None].expand(-1, -1, *rows.shape[2:])
+    y = (rows.gather(1, index) * powers[..., None]).sum(-2)
+    if table.others is not None:
+        y = y + table.extra(s, y.dtype) @ (coordinates @ table.others).mT
+    return y
+
+
+def _parts(s: Float[Tensor, "B T"]) -> Iterator[slice]:
+    """The batch in parts of `AT_ONCE` samples."""
+    size = max(1, AT_ONCE // max(s.shape[1], 1))
+    return (slice(i, i + size) for i in range(0, s.shape[0], size))
+
+
+class _Motion(torch.autograd.Function):
+    """`motion` in one pass over the samples."""
+
+    @staticmethod
+    def forward(s, coordinates, response, order):
+        table = _table(response, order, coordinates)
+        B, D, _ = coordinates.shape
+        y = coordinates.new_empty(B, s.shape[1], D)
+        for part in _parts(s):
+            x = coordinates[part]
+            piece, powers = table.place(s[part], y.dtype)
+            rows = _rows(table, x).contiguous().view(-1, D)
+            piece += (len(rows) // len(x) // table.size) * torch.arange(
+                len(x), dtype=piece.dtype, device=piece.device
+            )[:, None]
+            index = (piece * table.size)[..., None] + torch.arange(
+                table.size, dtype=piece.dtype, device=piece.device
+            )
+            # A weighted sum of rows for each sample: the one operation that does not write
+            # the rows down first.
+            y[part] = torch.nn.functional.embedding_bag(
+                index.view(-1, table.size),
+                rows,
+                mode="sum",
+                per_sample_weights=powers.view(-1, table.size),
+            ).view(len(x), -1, D)
+            if table.others is not None:
+                y[part] += table.extra(s[part], y.dtype) @ (x @ table.others).mT
+        return y
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        s, coordinates, ctx.response, ctx.order = inputs
+        ctx.save_for_backward(s, coordinates)
+        ctx.save_for_forward(s, coordinates)
+
+    @staticmethod
+    def backward(ctx, grad):
+        s, x = ctx.saved_tensors
+        by_s = by_x = None
+        if ctx.needs_input_grad[0]:
+            by_s = _along(grad, _Motion.apply(s, x, ctx.response, ctx.order + 1), s)
+        if ctx.needs_input_grad[1]:
+            by_x = _Adjoint.apply(s, grad, ctx.response, ctx.order)
+        return by_s, by_x, None, None
+
+    @staticmethod
+    def jvp(ctx, ds, dx, *_):
+        s, x = ctx.saved_tensors
+        change = 0.0
+        if dx is not None:
+            change = _Motion.apply(s, dx, ctx.response, ctx.order)
+        if ds is not None:
+            rate = _Motion.apply(s, x, ctx.response, ctx.order + 1)
+            change = change + rate * ds.to(rate)[..., None]
+        return change
+
+    @staticmethod
+    def vmap(info, in_dims, s, coordinates, response, order):
+        return _batched(_Motion, info, in_dims, s, coordinates, response, order)
+
+
+class _Adjoint(torch.autograd.Function):
+    """Gradient of `_Motion` by its coordinates, which is linear in that by the motion."""
+
+    @staticmethod
+    def forward(s, grad, response, order):
+        table = _table(response, order, grad)
+        B, _, D = grad.shape
+        by_x = grad.new_empty(B, D, len(table.matrix))
+        for part in _parts(s):
+            g = grad[part]
+            piece, powers = table.place(s[part], g.dtype)
+            pieces = table.matrix.shape[1] // table.size
+            rows = g.new_zeros(len(g) * pieces, table.size * D)
+            first = pieces * torch.arange(len(g), device=g.device)[:, None]
+            share = (powers[..., None] * g[..., None, :]).view(-1, table.size * D)
+            rows.index_add_(0, (piece + first).view(-1), share)
+            rows = rows.view(len(g), -1, D).mT.reshape(len(g) * D, -1)
+            by_x[part] = (rows @ table.matrix.mT).view(len(g), D, -1)
+            if table.others is not None:
+                by_x[part] += (g.mT @ table.extra(s[part], g.dtype)) @ table.others.mT
+        return by_x
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        s, grad, ctx.response, ctx.order = inputs
+        ctx.save_for_backward(s, grad)
+        ctx.save_for_forward(s, grad)
+
+    @staticmethod
+    def backward(ctx, weight):
+        s, grad = ctx.saved_tensors
+        by_s = by_grad = None
+        if ctx.needs_input_grad[0]:
+            by_s = _along(grad, _Motion.apply(s, weight, ctx.response, ctx.order + 1), s)
+        if ctx.needs_input_grad[1]:
+            by_grad = _Motion.apply(s, weight, ctx.response, ctx.order)
+        return by_s, by_grad, None, None
+
+    @staticmethod
+    def jvp(ctx, ds, dgrad, *_):
+        s, grad = ctx.saved_tensors
+        change = 0.0
+        if dgrad is not None:
+            change = _Adjoint.apply(s, dgrad, ctx.response, ctx.order)
+        if ds is not None:
+            moved = grad * ds.to(grad)[..., None]
+            change = change + _Adjoint.apply(s, moved, ctx.response, ctx.order + 1)
+        return change
+
+    @staticmethod
+    def vmap(info, in_dims, s, grad, response, order):
+        return _batched(_Adjoint, info, in_dims, s, grad, response, order)
+
+
+def _along(grad: Any, rate: Any, s: Tensor) -> Tensor:
+    """What a gradient by the motion comes to by its times."""
+    return (grad * rate).sum(-1).to(s.dtype)
+
+
+def _batched(function: Any, info: Any, in_dims: Any, s: Tensor, x: Tensor, *others: Any) -> Any:
+    """One batch of what `torch.vmap` maps over."""
+    s, x = (
+        value.expand(info.batch_size, *value.shape) if dim is None else value.movedim(dim, 0)
+        for value, dim in zip((s, x), in_dims, strict=False)
+    )
+    result = function.apply(s.flatten(0, 1), x.flatten(0, 1), *others)
+    return result.unflatten(0, s.shape[:2]), 0
