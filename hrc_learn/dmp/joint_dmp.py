@@ -1,5 +1,6 @@
 """Movement primitive of joints, or of any coordinates that add up like them."""
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Unpack
@@ -253,7 +254,10 @@ def select_basis_count(
         square, weight = torch.zeros((), dtype=torch.float64), 0
         for held in folds:
             kept = (samples.mask & ~held).reshape(*samples.batch, -1)
-            dmp = JointDMP.fit(time, position, count, mask=kept, **fit_arguments)
+            with warnings.catch_warnings():
+                # Too many functions for the samples: that is what is to be found out.
+                warnings.simplefilter("ignore", UserWarning)
+                dmp = JointDMP.fit(time, position, count, mask=kept, **fit_arguments)
             with torch.no_grad():
                 reproduction = dmp.rollout(elapsed).position.mT.reshape(samples.position.shape)
                 miss = (reproduction - samples.position).double() / samples.span.amax()

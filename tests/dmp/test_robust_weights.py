@@ -28,7 +28,7 @@ def test_spikes_are_not_followed(method, robust):
     time, clean = arm_motion(moving_start=True)
     position, _ = spiked(clean)
     clear, plain, tamed = (
-        rms(JointDMP.fit(time, y, method=method, **options).rollout().position - clean)
+        rms(JointDMP.fit(time, y, 50, method=method, **options).rollout().position - clean)
         for y, options in ((clean, {}), (position, {}), (position, {"robust": robust}))
     )
     assert plain > 0.03
