@@ -99,6 +99,43 @@ def write_folder(
     return root
 
 
+def one_step_of_act(root: Path) -> float:
+    """Loss of one training step of LeRobot's ACT on a dataset, by its own factory."""
+    import torch
+    from lerobot.configs import FeatureType
+    from lerobot.datasets import LeRobotDataset
+    from lerobot.policies.act.configuration_act import ACTConfig
+    from lerobot.policies.factory import make_policy, make_pre_post_processors
+
+    config = ACTConfig(
+        chunk_size=8,
+        n_action_steps=8,
+        device="cpu",
+        pretrained_backbone_weights=None,
+        dim_model=64,
+        n_heads=2,
+        dim_feedforward=64,
+        push_to_hub=False,
+    )
+    torch.manual_seed(0)
+    fps = read_info(root)["fps"]
+    dataset = LeRobotDataset(
+        "local/new",
+        root=root,
+        video_backend="pyav",
+        delta_timestamps={"action": [k / fps for k in range(8)]},
+    )
+    policy = make_policy(config, ds_meta=dataset.meta)
+    assert any(f.type is FeatureType.ACTION for f in policy.config.output_features.values())
+    preprocess, _ = make_pre_post_processors(config, dataset_stats=dataset.meta.stats)
+    batch = next(iter(torch.utils.data.DataLoader(dataset, batch_size=4)))
+    optimizer = torch.optim.Adam(policy.parameters(), 1e-4)
+    loss, _ = policy.forward(preprocess(batch))
+    loss.backward()
+    optimizer.step()
+    return float(loss.detach())
+
+
 def read_info(root: Path) -> dict:
     return json.loads((root / "meta/info.json").read_text())
 

@@ -109,8 +109,9 @@ class FeatureCache:
                 file=file,
                 episode=episode,
             )
-        table = read_table(open_parquet(Path(), file, episode), file)
-        u, v, visible = (to_numpy(table.column(name))[:, 0] for name in ("u", "v", "visible"))
+        name = self.path(episode).name
+        table = read_table(open_parquet(self._folder, name, episode), file)
+        u, v, visible = (to_numpy(table.column(c))[:, 0] for c in ("u", "v", "visible"))
         if len(u) != frames:
             raise DatasetError(
                 f"{self.name} has {len(u)} frames, the episode {frames}: run "

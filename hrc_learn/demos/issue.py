@@ -1,10 +1,22 @@
 """What is wrong with a dataset, and where: the one form that errors and reports share."""
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
-# What is wrong with a dataset, and where: the one form that errors and reports share.
+_UNPRINTABLE = re.compile(
+    # Control characters, and those that turn the direction of text or hide it.
+    "[\x00-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u2069\ufeff\ud800-\udfff]"
+)
+_LONGEST_NAME = 300
+
+
+def plain_text(text: str) -> str:
+    """Text from a file as it may be shown in a terminal: without escapes, and not too long."""
+    shown = _UNPRINTABLE.sub(lambda found: f"\\x{ord(found[0]):02x}", text)
+    return shown if len(shown) <= _LONGEST_NAME else f"{shown[:_LONGEST_NAME]}..."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,12 +33,22 @@ class Issue:
     """First frame concerned, counted from the start of the episode."""
     key: str | None = None
     """Column (feature) concerned, with the name of its component where one is to blame."""
+    severity: float = 0.0
+    """How bad it is among findings of its kind, in the kind's own measure."""
+
+    @property
+    def kind(self) -> tuple[str, str]:
+        """What findings that differ in their place and figures alone have in common."""
+        column = (self.key or "").split(" (")[0]
+        words = re.sub(r"[-+]?\d[\d.e+-]*|'[^']*'", "#", self.message)
+        # What is said before the figures: names of joints come and go.
+        return column, " ".join(w for w in words.split() if "." not in w.strip(".,:;"))[:120]
 
     def __str__(self) -> str:
         episode = None if self.episode is None else f"episode {self.episode}"
         frame = None if self.frame is None else f"frame {self.frame}"
         place = ", ".join(part for part in (self.file, episode, frame, self.key) if part)
-        return f"{place}: {self.message}" if place else self.message
+        return plain_text(f"{place}: {self.message}" if place else self.message)
 
 
 class DatasetError(ValueError):
@@ -77,6 +99,10 @@ class UnitsWarning(UserWarning):
 
 # The findings about one dataset.
 
+_KINDS_SHOWN = 16
+"""Lines of errors and of warnings: both fit on one screen."""
+_PLACES_SHOWN = 8
+
 
 @dataclass(kw_only=True)
 class ValidationReport:
@@ -91,6 +117,8 @@ class ValidationReport:
     """Episodes whose frames could be read."""
     frames: int = 0
     """Frames of those episodes."""
+    contract: Any = None
+    """What each column means (`read.contract.Contract`); None where nothing could be read."""
 
     @property
     def ok(self) -> bool:
@@ -110,15 +138,25 @@ class ValidationReport:
         if error.finding not in self.errors:
             self.errors.append(error.finding)
 
-    def lines(self) -> Iterator[str]:
-        """The report in words; findings alike but for the episode share a line."""
-        for kind, findings in (("error", self.errors), ("warning", self.warnings)):
-            alike: dict[tuple, list[Issue]] = {}
+    def lines(self, full: bool = False) -> Iterator[str]:
+        """The report in words: findings of a kind share a line that names the worst place.
+
+        Args:
+            full: Every finding on a line of its own.
+        """
+        for level, findings in (("error", self.errors), ("warning", self.warnings)):
+            if full:
+                yield from (f"{level}: {finding}" for finding in findings)
+                continue
+            kinds: dict[tuple, list[Issue]] = {}
             for finding in findings:
-                alike.setdefault((finding.key, finding.message), []).append(finding)
-            for first, *others in alike.values():
-                also = f" (and {len(others)} times more)" if others else ""
-                yield f"{kind}: {first}{also}"
+                kinds.setdefault(finding.kind, []).append(finding)
+            # Errors of many kinds come from one broken file: the first ones tell the rest.
+            for alike in list(kinds.values())[:_KINDS_SHOWN]:
+                worst = max(alike, key=lambda finding: finding.severity)
+                yield f"{level}: {worst}{_elsewhere(worst, alike)}"
+            if len(kinds) > _KINDS_SHOWN:
+                yield f"{level}: and {len(kinds) - _KINDS_SHOWN} kinds more (--full)"
         yield (
             f"{self.path}: {self.episodes} episodes, {self.frames} frames, "
             f"{len(self.errors)} errors, {len(self.warnings)} warnings"
@@ -131,3 +169,15 @@ class ValidationReport:
 
     def __str__(self) -> str:
         return "\n".join(self.lines())
+
+
+def _elsewhere(worst: Issue, alike: list[Issue]) -> str:
+    """Where else findings of the kind are."""
+    if len(alike) == 1:
+        return ""
+    others = [finding for finding in alike if finding is not worst]
+    places = dict.fromkeys(f.episode for f in others if f.episode is not None)
+    shown = ", ".join(map(str, [*places][:_PLACES_SHOWN]))
+    more = ", ..." if len(places) > _PLACES_SHOWN else ""
+    where = f"; episodes {shown}{more}" if places else ""
+    return f" (and {len(others)} times more{where})"

@@ -224,8 +224,9 @@ def test_offsets_that_point_into_another_episode(root):
         return table.set_column(index, "dataset_from_index", [[0, 50, 120]])
 
     rewrite(root / EPISODES, shift)
-    finding = find(check_dataset(root).errors, "is 0, expected 1")
-    assert (finding.episode, finding.key) == (1, "episode_index")
+    errors = check_dataset(root).errors
+    finding = next(f for f in errors if "begins at row 50" in f.message)
+    assert (finding.episode, finding.file) == (1, DATA)
     with pytest.raises(DatasetError, match="offsets in the list of episodes are wrong"):
         load_demos(root)
 
@@ -257,7 +258,9 @@ def test_joint_sets_that_cannot_be_matched(tmp_path):
     q = joint_path()
     names = {STATE: NAMES, "action": ["x1.pos", "x2.pos"]}
     root = write_folder(tmp_path / "set", [{STATE: q, "action": q[:, :2]}], names)
-    assert find(check_dataset(root).errors, "cannot be matched").key == "command_position"
+    report = check_dataset(root)
+    assert find(report.warnings, "cannot be matched").key == "command_position"
+    assert load_demos(root)[0].command_position is None
 
 
 def test_a_dataset_without_joints_or_poses(tmp_path):
@@ -341,7 +344,7 @@ ODD = {
     ),
     "same episode twice": (
         lambda r: replay(
-            r, **{STATE: lambda v: columns(0)[STATE] + 1e-5, "action": lambda v: v}
+            r, **{key: lambda v, key=key: columns(0)[key] + 1e-5 for key in (STATE, "action")}
         ),
         "same motion as episode 0",
         (1, None, None),
@@ -359,6 +362,10 @@ ODD = {
 }
 
 
+SHOWS_NOTHING = ("frozen",)
+"""Read all the same, though an episode without motion is an error: nothing fits to it."""
+
+
 @pytest.mark.parametrize("defect", ODD)
 def test_oddities_are_warnings_and_the_dataset_stays_readable(root, defect):
     damage, message, place = ODD[defect]
@@ -370,7 +377,7 @@ def test_oddities_are_warnings_and_the_dataset_stays_readable(root, defect):
     else:
         finding = find(report.warnings, message)
         assert (finding.episode, finding.frame, finding.key) == place
-    assert report.ok
+    assert report.ok or defect in SHOWS_NOTHING, str(report)
     assert len(load_demos(root)) == 3
 
 
@@ -464,7 +471,7 @@ def test_a_damaged_sidecar(root):
 
 def test_the_report_reads_as_text(root):
     change_info(root, fps=40)
-    assert "(and 2 times more)" in str(check_dataset(root))
+    assert "(and 2 times more; episodes 1, 2)" in str(check_dataset(root))
     (root / DATA).unlink()
     text = str(check_dataset(root))
     assert text.startswith(f"error: {DATA}, episode 0: not found")

@@ -54,7 +54,8 @@ def test_every_defect_is_found_and_located(copy, name):
     assert found, str(report)
     named = [f for f in found if f.episode == copy.episode] if defect.episode else found
     assert_place(named[0], defect, copy)
-    assert report.ok != defect.error
+    # An arm that never moves shows nothing, which is an error beside the warning.
+    assert report.ok != (defect.error or name == "frozen state")
     if not defect.error:
         assert len(load_demos(copy.root)) == 3
         return

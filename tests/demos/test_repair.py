@@ -1,11 +1,22 @@
 """What a repair changes, and that its result is a sound dataset."""
 
+import json
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from lerobot_folders import FPS, joint_path, read_info, write_folder
+from lerobot_folders import (
+    FPS,
+    joint_path,
+    one_step_of_act,
+    read_info,
+    rewrite,
+    write_folder,
+    write_info,
+)
 from scipy.spatial.transform import Rotation
 
 from hrc_learn.demos import DatasetError, DatasetWriter, check_dataset, load_demos
@@ -14,7 +25,7 @@ from hrc_learn.demos.repair import RepairOptions, repair_dataset
 STATE = "observation.state"
 NAMES = ["a.pos", "b.pos", "c.pos"]
 VERSIONS = ["v3.0", "v2.1", "v2.0"]
-QUIET = RepairOptions(trim=False, drop_repeats=False, unwrap=False, fix_signs=False)
+QUIET = RepairOptions(trim=False, drop_late=False, unwrap=False, fix_signs=False)
 
 
 def write(root, motions, names=NAMES, **options):
@@ -65,8 +76,9 @@ def test_standing_still_is_trimmed(tmp_path, version):
 def test_repeated_frames_go_and_the_stamps_of_the_others_stay(tmp_path):
     q = joint_path(60)
     stalled = np.repeat(q[::2], 2, axis=0)
-    report, (demo,) = repaired(tmp_path, [stalled], RepairOptions(trim=False))
-    assert report.changes == {0: ("dropped 30 repeated frames",)}
+    options = RepairOptions(trim=False, drop_repeats=True)
+    report, (demo,) = repaired(tmp_path, [stalled], options)
+    assert report.changes == {0: ("dropped 30 repeated frames: 60 -> 30",)}
     np.testing.assert_array_equal(demo.joint_position, q[::2])
     np.testing.assert_allclose(demo.time, 2 * np.arange(30) / FPS, atol=1e-6)
 
@@ -76,8 +88,9 @@ def test_pauses_stay(tmp_path):
     pausing = np.concatenate(
         [q[:30], np.repeat(q[30:31], 20, axis=0), q[31:40], q[40:41], q[40:]]
     )
-    report, (demo,) = repaired(tmp_path, [pausing], RepairOptions(trim=False))
-    assert report.changes == {0: ("dropped 1 repeated frames",)}
+    options = RepairOptions(trim=False, drop_repeats=True)
+    report, (demo,) = repaired(tmp_path, [pausing], options)
+    assert report.changes == {0: ("dropped 1 repeated frames: 80 -> 79",)}
     np.testing.assert_array_equal(demo.joint_position, np.delete(pausing, 60, axis=0))
 
 
@@ -89,7 +102,7 @@ def test_frames_stamped_no_later_go(tmp_path):
     with pytest.raises(DatasetError, match="stamps must increase"):
         repair_dataset(root, tmp_path / "new", QUIET)
     report = repair_dataset(root, tmp_path / "new", RepairOptions(trim=False))
-    assert report.changes == {0: ("dropped 3 frames whose stamp does not increase",)}
+    assert report.changes == {0: ("dropped 3 frames whose stamp does not increase: 60 -> 57",)}
     np.testing.assert_allclose(
         load_demos(tmp_path / "new")[0].time, np.delete(stamps, [20, 21, 22])
     )
@@ -126,7 +139,7 @@ def test_encoders_that_wrapped_are_unwrapped_in_their_own_unit(tmp_path, turn, u
     root = write(tmp_path / "old", [q])
     options = RepairOptions(trim=False)
     report = repair_dataset(root, tmp_path / "new", options, units={"joint_position": unit})
-    assert report.changes == {0: ("unwrapped joint_position (b)",)}
+    assert report.changes[0][0].startswith("unwrapped joint_position (b): largest step ")
     (demo,) = load_demos(tmp_path / "new")  # the unit is remembered
     smooth = q.copy()
     smooth[30:45, 1] -= turn
@@ -156,7 +169,7 @@ def test_rotation_vectors_are_unwrapped(tmp_path):
     pose = np.hstack([joint_path(60), turn.as_rotvec()])
     names = ["x", "y", "z", "wx", "wy", "wz"]
     report, _ = repaired(tmp_path, [pose], RepairOptions(trim=False), names)
-    assert report.changes == {0: ("unwrapped rotation_vector (2)",)}
+    assert report.changes[0][0].startswith("unwrapped rotation_vector (2): largest step ")
     table = pq.read_table(tmp_path / "new/data/chunk-000/file-000.parquet")
     raw = np.array(table.column(STATE).to_pylist())[:, 5]
     np.testing.assert_allclose(raw, np.linspace(2, 5, 60), atol=1e-9)
@@ -297,3 +310,162 @@ def test_lerobot_decodes_the_images_of_the_frames_that_are_left(tmp_path, monkey
     key = "observation.images.front"
     for k in (0, 5, 15):
         np.testing.assert_array_equal(new[k][key].numpy(), old[first + k][key].numpy())
+
+
+def commanded(q, command, hand):
+    return {STATE: np.hstack([q, hand]), "action": np.hstack([q + command, hand])}
+
+
+HAND = [*NAMES, "left_finger_0.pos"]
+
+
+def test_what_switches_between_levels_is_no_encoder_that_wrapped(tmp_path):
+    """A hand that opens and closes between -3 and 3 rad stays as it is, state and command."""
+    q, levels = joint_path(60), np.where(np.arange(60) // 9 % 2, 3.0, -3.0)[:, None]
+    noisy = levels + 0.01 * np.sin(np.arange(60))[:, None]
+    episodes = [commanded(q, 0.01, levels), commanded(q + 0.1, 0.01, noisy)]
+    names = {STATE: HAND, "action": HAND}
+    root = write_folder(tmp_path / "old", episodes, names, dtype="float64")
+    for commands in (False, True):
+        options = RepairOptions(trim=False, unwrap_commands=commands)
+        report = repair_dataset(root, tmp_path / f"new{commands}", options)
+        assert report.changed == 0
+    report = repair_dataset(root, tmp_path / "named", RepairOptions(trim=False, fps=30))
+    for row in load_demos(tmp_path / "named", episodes=[0])[0].joint_position[:, 3]:
+        assert abs(row) == 3.0  # resampled, with nothing in between
+
+
+def test_joints_are_not_torn_from_their_commands(tmp_path):
+    q = 4 * np.linspace(0, 1, 60)[:, None] * np.ones(3)
+    wrapped = (q + np.pi) % (2 * np.pi) - np.pi
+    episode = {STATE: wrapped, "action": (q + 0.05 + np.pi) % (2 * np.pi) - np.pi}
+    names = {STATE: NAMES, "action": NAMES}
+    root = write_folder(tmp_path / "old", [episode], names, dtype="float64")
+    assert repair_dataset(root, tmp_path / "new", RepairOptions(trim=False)).changed == 0
+    both = RepairOptions(trim=False, unwrap_commands=True)
+    report = repair_dataset(root, tmp_path / "both", both)
+    assert len(report.changes[0]) == 2
+    (demo,) = load_demos(tmp_path / "both")
+    np.testing.assert_allclose(demo.joint_position, q, atol=1e-9)
+    np.testing.assert_allclose(demo.command_position, q + 0.05, atol=1e-9)
+
+
+def test_trimming_waits_for_the_gripper_and_for_the_command(tmp_path):
+    q = joint_path(100, seed=2)
+    waiting = np.concatenate([np.repeat(q[:1], 100, 0), q, np.repeat(q[-1:], 100, 0)])
+    opening = (np.arange(300) > 250)[:, None] * 1.0
+    command = np.where(np.arange(300)[:, None] > 40, waiting + 0.02, waiting)
+    episode = {STATE: np.hstack([waiting, opening]), "action": command}
+    names = {STATE: [*NAMES, "gripper.pos"], "action": NAMES}
+    root = write_folder(tmp_path / "old", [episode], names, dtype="float64")
+    repair_dataset(root, tmp_path / "new", RepairOptions(keep_rest=0.0))
+    (demo,) = load_demos(tmp_path / "new")
+    first, last = round(demo.start_time * FPS), round((demo.start_time + demo.duration) * FPS)
+    assert (first, last) == (40, 251)
+
+
+def test_a_dry_run_says_the_same_and_writes_nothing(tmp_path):
+    q = joint_path(60)
+    q[30:, 1] += 2 * np.pi
+    root = write(tmp_path / "old", [q, joint_path(60, seed=1)])
+    said = repair_dataset(root, tmp_path / "new", RepairOptions(trim=False, dry_run=True))
+    assert [*tmp_path.iterdir()] == [root]
+    assert "nothing written" in str(said)
+    done = repair_dataset(root, tmp_path / "new", RepairOptions(trim=False))
+    assert (done.changes, done.frames) == (said.changes, said.frames)
+
+
+def picture(shade: int) -> bytes:
+    """A PNG image of one shade."""
+    import av
+
+    stream = av.CodecContext.create("png", "w")
+    stream.width, stream.height, stream.pix_fmt = 8, 6, "rgb24"
+    frame = av.VideoFrame.from_ndarray(np.full((6, 8, 3), shade, np.uint8), format="rgb24")
+    stream.time_base = Fraction(1, 50)
+    return b"".join(bytes(packet) for packet in [*stream.encode(frame), *stream.encode()])
+
+
+def with_others(root: Path) -> Path:
+    """A column of images, one of texts and one of two axes, beside a state with a rest."""
+    q = joint_path(60, seed=3)
+    q = np.concatenate([np.repeat(q[:1], 60, 0), q])
+    write_folder(root, [{STATE: q}, {STATE: q + 0.1}], {STATE: NAMES}, version="v2.1")
+    info = read_info(root)
+    info["features"] |= {
+        "observation.images.front": {"dtype": "image", "shape": [6, 8, 3], "names": None},
+        "note": {"dtype": "string", "shape": [1], "names": None},
+        "grid": {"dtype": "float32", "shape": [2, 3], "names": None},
+    }
+    write_info(root, info)
+    for episode in range(2):
+        images = [{"bytes": picture(k), "path": None} for k in range(120)]
+        grid = np.arange(720.0).reshape(120, 2, 3).tolist()
+        rewrite(
+            root / f"data/chunk-000/episode_{episode:06d}.parquet",
+            lambda table, images=images, grid=grid: (
+                table.append_column("observation.images.front", pa.array(images))
+                .append_column("note", pa.array([f"frame {k}" for k in range(120)]))
+                .append_column("grid", pa.array(grid, pa.list_(pa.list_(pa.float32()))))
+            ),
+        )
+    return root
+
+
+def test_images_texts_and_grids_stay_with_their_frames(tmp_path):
+    repair_dataset(with_others(tmp_path / "old"), tmp_path / "new")
+    assert check_dataset(tmp_path / "new").ok
+    table = pq.read_table(tmp_path / "new/data/chunk-000/file-000.parquet")
+    rows = table.slice(0, len(load_demos(tmp_path / "new")[0])).to_pylist()
+    first = 120 - len(rows)
+    assert 30 < first < 60
+    assert [row["note"] for row in rows] == [f"frame {k}" for k in range(first, 120)]
+    assert rows[5]["observation.images.front"]["bytes"] == picture(first + 5)
+    assert rows[5]["grid"] == np.arange(720).reshape(120, 2, 3)[first + 5].tolist()
+    stats = json.loads((tmp_path / "new/meta/stats.json").read_text())
+    shades = np.arange(first, 120) / 255
+    mean = np.ravel(stats["observation.images.front"]["mean"])
+    np.testing.assert_allclose(mean, shades.mean(), atol=0.01)
+
+
+@pytest.mark.slow
+def test_lerobot_reads_images_texts_and_grids(tmp_path, monkeypatch):
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    lerobot_dataset = pytest.importorskip("lerobot.datasets").LeRobotDataset
+    repair_dataset(with_others(tmp_path / "old"), tmp_path / "new", RepairOptions(trim=False))
+    dataset = lerobot_dataset("local/new", root=tmp_path / "new")
+    assert dataset[7]["note"] == "frame 7"
+    assert tuple(dataset[7]["grid"].shape) == (2, 3)
+    np.testing.assert_allclose(dataset[7]["observation.images.front"].numpy(), 7 / 255)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pictures", [True, False])
+def test_a_step_of_act_runs_on_what_was_repaired(tmp_path, monkeypatch, pictures):
+    """The real policy of LeRobot, with its own statistics, learns from the result."""
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    pytest.importorskip("lerobot.policies.act")
+    rng = np.random.default_rng(0)
+    if pictures:
+        root = tmp_path / "old"
+        with DatasetWriter(root, 50, "any", ["a", "b"], cameras={"front": (64, 64)}) as writer:
+            for _ in range(2):
+                writer.start_episode("look")
+                for k in range(50):
+                    image = rng.integers(0, 255, (64, 64, 3), dtype=np.uint8)
+                    q = [0.02 * max(k - 25, 0), 0.01 * k]
+                    writer.add_frame(
+                        joint_position=q, command_position=q, images={"front": image}
+                    )
+                writer.save_episode()
+    else:
+        q = joint_path(60)
+        around = {"observation.environment_state": joint_path(60, seed=5)}
+        episodes = [{STATE: q, "action": q + 0.01, **around} for _ in range(2)]
+        root = write_folder(
+            tmp_path / "old", episodes, {STATE: NAMES, "action": NAMES}, version="v2.0"
+        )
+    repair_dataset(root, tmp_path / "new")
+    loss = one_step_of_act(tmp_path / "new")
+    assert np.isfinite(loss)
+    assert loss > 0

@@ -14,8 +14,9 @@ from hrc_learn.cli.arguments import Measured, Written
 class Check(Written):
     """Check a LeRobot dataset: what is broken, what is odd enough to look at before training.
 
-    Every finding names the file, episode, frame and column as closely as is known. Exit status:
-    0 no errors, 1 errors in the data, 2 no dataset there.
+    Every finding names the file, episode, frame and column as closely as is known; a table
+    shows what each column means, in which unit, and why. Exit status: 0 no errors, 1 errors in
+    the data, 2 no dataset there.
     """
 
     dataset: Path
@@ -26,8 +27,14 @@ class Check(Written):
     """Units on disk by quantity, such as: joint_position deg position mm."""
     speed_limits: dict[str, float] = field(default_factory=dict)
     """Fastest each joint can turn [rad/s], such as: joint1 2.1 joint2 2.1."""
+    mapping: More[dict[str, str]] = field(default_factory=dict)
+    """Columns by quantity where they are not found, such as: command_position action[0:7]."""
     strict: bool = False
     """Count warnings as errors in the exit status."""
+    full: bool = False
+    """Every finding on a line of its own, instead of one for each kind."""
+    keep_contract: bool = False
+    """Keep what the columns mean, as the table shows it, in DATASET/meta/hrc_learn.json."""
     findings: Path | None = None
     """Receives every finding: a JSON list of kind, message, file, episode, frame, key."""
 
@@ -36,9 +43,9 @@ class Check(Written):
 class Repair(Measured):
     """Repair a LeRobot dataset into a new copy, and say what was changed in which episode.
 
-    Standing still is trimmed, repeated frames are dropped, angles unwrapped and signs of
-    quaternions fixed; more on request. Any version is read, version 3.0 is written; the old
-    dataset is left as it is. Check the copy with `hrc check`.
+    Standing still is trimmed, measured angles of the arm are unwrapped and signs of quaternions
+    fixed; more on request. Commands, hands, grippers and whatever switches between levels stay
+    as they are. Any version is read, version 3.0 is written; the old dataset is left as it is.
 
         hrc repair --dataset broken --out repaired
         hrc repair --dataset broken --out repaired --fps 50 --drop-bad-episodes --no-videos
@@ -52,10 +59,14 @@ class Repair(Measured):
     """Cut off standing still before and after the motion."""
     keep_rest: More[float] = 0.1
     """Standing still that is left at either end [s]."""
-    drop_repeats: bool = True
-    """Drop frames that repeat the one before for up to 0.1 s, and those stamped no later."""
+    drop_late: More[bool] = True
+    """Drop frames that a column of true stamps has no later than the one before."""
+    drop_repeats: bool = False
+    """Drop frames that repeat the one before, commands and all, for up to 0.1 s."""
     unwrap: bool = True
-    """Take whole turns out of joints and angles that jump by one."""
+    """Take whole turns out of measured joints and angles of the arm that jump by one."""
+    unwrap_commands: More[bool] = False
+    """Do so to commands too, and to joints whose command jumps along."""
     fix_signs: bool = True
     """Choose the signs of quaternions so that they do not jump."""
     drop_bad_frames: bool = False
@@ -66,8 +77,12 @@ class Repair(Measured):
     """Resample to a regular grid of this rate [1/s]; None leaves the frames as they are."""
     videos: bool = True
     """Keep the videos. Frames dropped in the middle and resampling would need new ones."""
+    dry_run: bool = False
+    """Only say what would be changed; nothing is written."""
     units: dict[str, str] = field(default_factory=dict)
     """Units on disk by quantity, such as: joint_position deg position mm."""
+    mapping: More[dict[str, str]] = field(default_factory=dict)
+    """Columns by quantity where they are not found, such as: command_position action[0:7]."""
 
     @property
     def folder(self) -> Path:

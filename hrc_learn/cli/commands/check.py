@@ -1,6 +1,7 @@
 """`hrc check`, `hrc repair`, `hrc recover`: errors in a dataset, and their repair."""
 
 import json
+from collections.abc import Mapping
 from dataclasses import fields
 
 from rich.progress import track
@@ -8,16 +9,36 @@ from rich.progress import track
 from hrc_learn.cli._run import configuration, write_values
 from hrc_learn.cli.arguments.dataset import Check, Recover, Repair
 from hrc_learn.demos import check_dataset, recover_all
+from hrc_learn.demos.format.metadata import SIDECAR_PATH
+from hrc_learn.demos.read.contract import contract_content, keep_contract
 from hrc_learn.demos.repair import RepairOptions, repair_dataset
 from hrc_learn.store import new_folder, write_json, write_text
+
+
+def columns(mapping: Mapping[str, str]) -> dict[str, str | list[str]]:
+    """Columns by quantity as typed: a feature, a range of it, or names joined by commas."""
+    return {role: text.split(",") if "," in text else text for role, text in mapping.items()}
 
 
 def check(args: Check) -> int:
     """Check the dataset and print the findings."""
     if not args.dataset.is_dir():
         raise FileNotFoundError(f"there is no dataset at {args.dataset}")
-    report = check_dataset(args.dataset, units=args.units, speed_limits=args.speed_limits)
-    print(report)
+    report = check_dataset(
+        args.dataset,
+        columns(args.mapping),
+        units=args.units,
+        speed_limits=args.speed_limits,
+    )
+    contract = report.contract
+    if contract is not None:
+        print(*contract.lines(), "", sep="\n")
+    print(*report.lines(full=args.full), sep="\n")
+    if args.keep_contract:
+        if contract is None:
+            raise ValueError(f"{args.dataset}: nothing could be read to keep a contract of")
+        keep_contract(args.dataset, contract)
+        print(f"contract kept in {args.dataset / SIDECAR_PATH}: edit it there")
     findings = json.dumps(report.records(), indent=2) + "\n"
     counts = {
         "errors": len(report.errors),
@@ -29,6 +50,8 @@ def check(args: Check) -> int:
         with new_folder(args.out, configuration(args), args.overwrite) as folder:
             write_text(folder / "findings.json", findings)
             write_json(folder / "metrics.json", counts)
+            if contract is not None:
+                write_json(folder / "contract.json", contract_content(contract))
     if args.findings is not None:
         write_text(args.findings, findings)
     write_values(args.json, counts)
@@ -45,6 +68,7 @@ def repair(args: Repair) -> None:
         args.dataset,
         args.folder,
         options,
+        mapping=columns(args.mapping),
         units=args.units,
         progress=lambda episodes: track(episodes, description="Repairing"),
     )

@@ -5,6 +5,8 @@ hold is the business of `read.frames` and `read.column_mapping`.
 """
 
 import json
+import re
+import stat
 from bisect import bisect_left, bisect_right
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
@@ -16,7 +18,13 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from hrc_learn.demos.format.metadata import INFO_PATH, Feature, read_features
+from hrc_learn.demos.format.metadata import (
+    INFO_PATH,
+    QUANTILES,
+    Feature,
+    Statistics,
+    read_features,
+)
 from hrc_learn.demos.issue import DatasetError
 from hrc_learn.demos.write.episode import staging_folder
 from hrc_learn.store import settle
@@ -64,6 +72,13 @@ class DatasetFolder:
         return files
 
     @cached_property
+    def first_index(self) -> dict[int, int]:
+        """Episode -> frames of all episodes before it."""
+        ordered = sorted(self.episodes, key=lambda entry: entry.index)
+        starts = accumulate((entry.length for entry in ordered), initial=0)
+        return {e.index: start for e, start in zip(ordered, starts, strict=False)}
+
+    @cached_property
     def promised_rows(self) -> dict[str, int]:
         """Data file -> frames it should hold by the list of episodes."""
         return {
@@ -93,6 +108,10 @@ def open_folder(path: str | Path) -> DatasetFolder:
     )
 
 
+_FASTEST = 1e6
+"""No robot reports more often [1/s]."""
+
+
 def read_info(root: Path) -> dict:
     """`meta/info.json`, its version and frame rate known to be usable.
 
@@ -101,7 +120,7 @@ def read_info(root: Path) -> dict:
     """
     path = root / INFO_PATH
     settle(root)
-    if not path.is_file():
+    if not path.exists():
         raise DatasetError(_why_no_info(root), file=path)
     info = read_json(path)
     missing = [key for key in ("codebase_version", "fps", "features") if key not in info]
@@ -114,10 +133,16 @@ def read_info(root: Path) -> dict:
             file=INFO_PATH,
             key="codebase_version",
         )
-    if not isinstance(info["fps"], int | float) or not info["fps"] > 0:
+    fps = info["fps"]
+    number = isinstance(fps, int | float) and not isinstance(fps, bool)
+    if not number or not 0 < fps < _FASTEST:
         raise DatasetError(
-            f"fps must be positive, got {info['fps']!r}", file=INFO_PATH, key="fps"
+            f"fps must be positive and below {_FASTEST:g}, got {fps!r}",
+            file=INFO_PATH,
+            key="fps",
         )
+    if not isinstance(info["features"], dict):
+        raise DatasetError("features must be an object", file=INFO_PATH, key="features")
     return info
 
 
@@ -145,9 +170,38 @@ def read_tasks(root: Path, info: dict) -> dict[int, str]:
         texts = [
             row.get("task", row.get("__index_level_0__", row.get("index"))) for row in rows
         ]
-        return {int(row["task_index"]): str(t) for row, t in zip(rows, texts, strict=True)}
-    rows = _read_json_lines(root, "meta/tasks.jsonl", ("task_index", "task"))
-    return {int(row["task_index"]): str(row["task"]) for row in rows}
+    else:
+        file = "meta/tasks.jsonl"
+        rows = _read_json_lines(root, file, ("task_index", "task"))
+        texts = [row["task"] for row in rows]
+    indices = [_integer(row["task_index"], "task_index", file) for row in rows]
+    return {index: str(text) for index, text in zip(indices, texts, strict=True)}
+
+
+def recorded_statistics(folder: DatasetFolder) -> dict[int, Statistics]:
+    """Statistics of each episode's features, those that have all of LeRobot's figures.
+
+    Raises:
+        DatasetError: Their file is damaged.
+    """
+    found: dict[int, Statistics] = {}
+    lines = "meta/episodes_stats.jsonl"
+    if _generation(folder.version) == 3:
+        for path in sorted((folder.root / "meta/episodes").glob("*/*.parquet")):
+            for row in read_rows(folder.root, str(path.relative_to(folder.root)), ()):
+                statistics = found.setdefault(row["episode_index"], {})
+                for name, value in row.items():
+                    if name.startswith("stats/") and value is not None:
+                        key, _, statistic = name.removeprefix("stats/").rpartition("/")
+                        statistics.setdefault(key, {})[statistic] = value
+    elif (folder.root / lines).is_file():
+        for row in _read_json_lines(folder.root, lines, ("episode_index", "stats")):
+            found[int(row["episode_index"])] = row["stats"]
+    wanted = {*QUANTILES, "min", "max", "mean", "std", "count"}
+    return {
+        index: {key: s for key, s in statistics.items() if wanted <= s.keys()}
+        for index, statistics in found.items()
+    }
 
 
 def read_json(path: Path) -> dict:
@@ -156,13 +210,122 @@ def read_json(path: Path) -> dict:
     Raises:
         DatasetError: The file holds none.
     """
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise DatasetError(f"is no valid JSON: {error}", file=path) from error
+    content = _parse(read_text(path), path)
     if not isinstance(content, dict):
         raise DatasetError("is no JSON object", file=path)
     return content
+
+
+def _parse(text: str, file: str | Path, place: str = "") -> Any:
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:  # of numbers with too many digits too
+        raise DatasetError(f"{place}is no valid JSON: {error}", file=file) from error
+
+
+_LARGEST_TEXT = 2**28
+"""Bytes of metadata: 10,000 episodes have 100 MB of statistics at most."""
+_POINTER = b"version https://git-lfs.github.com/spec/"
+
+
+def read_text(path: Path) -> str:
+    """Text of a metadata file.
+
+    Raises:
+        DatasetError: It is none, cannot be read, or is a pointer of Git LFS.
+    """
+    require_file(path, path)
+    try:
+        if path.stat().st_size > _LARGEST_TEXT:
+            raise DatasetError("is too large to be metadata", file=path)
+        return path.read_bytes().decode("utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise DatasetError(f"cannot be read as text: {error}", file=path) from error
+
+
+def require_file(path: Path, name: str | Path, episode: int | None = None) -> None:
+    """Refuse what is no ordinary file of the dataset, before anything is read of it.
+
+    Raises:
+        DatasetError: There is no such file, it is a device or a pipe, may not be read, or is a
+            pointer of Git LFS.
+    """
+    place: dict[str, Any] = {"file": name, "episode": episode}
+    try:
+        mode = path.stat().st_mode
+        if not stat.S_ISREG(mode):
+            kind = "a folder" if stat.S_ISDIR(mode) else "a device or pipe"
+            raise DatasetError(f"is {kind}, not a file", **place)
+        with path.open("rb") as stream:
+            head = stream.read(len(_POINTER))
+    except FileNotFoundError as error:
+        raise DatasetError("not found: the copy is incomplete", **place) from error
+    except OSError as error:  # loops of links too
+        raise DatasetError(f"cannot be read: {error.strerror}", **place) from error
+    if head == _POINTER:
+        raise DatasetError(
+            "is a pointer of Git LFS, not the file itself: run `git lfs pull` in the dataset",
+            **place,
+        )
+
+
+_FIELD = re.compile(r"\{([a-z_]+)(?::0?(\d{1,2})d)?\}")
+
+
+def path_in(root: Path, template: object, key: str, **places: int | str) -> str:
+    """Path of a file of the dataset, relative to it, from its template in `meta/info.json`.
+
+    Raises:
+        DatasetError: The template does not fit the version, or leads out of the dataset.
+    """
+    text = str(template)
+    left = _FIELD.sub("", text)
+    if "{" in left or "}" in left or any(m[1] not in places for m in _FIELD.finditer(text)):
+        raise DatasetError(
+            f"{key} {template!r} does not fit the dataset's version", file=INFO_PATH, key=key
+        )
+    try:
+        file = text.format(**places)
+    except ValueError as error:
+        raise DatasetError(f"{key} {template!r}: {error}", file=INFO_PATH, key=key) from error
+    if not is_inside(root, file):
+        raise DatasetError(
+            f"{key} leads out of the dataset ({file!r}): it is not followed",
+            file=INFO_PATH,
+            key=key,
+        )
+    return file
+
+
+def is_inside(root: Path, file: str | Path) -> bool:
+    """Whether a file lies in the dataset once links are followed.
+
+    The Hub's cache keeps files in a folder of blobs beside its snapshots, which counts too.
+    """
+    try:
+        real, here = (root / file).resolve(), root.resolve()
+    except (OSError, RuntimeError, ValueError):
+        return False
+    homes = [here]
+    if here.parent.name == "snapshots":
+        homes.append(here.parent.parent / "blobs")
+    return ".." not in Path(file).parts and any(real.is_relative_to(home) for home in homes)
+
+
+def _integer(value: object, name: str, file: str, lowest: int = 0, line: str = "") -> int:
+    """A count or index from metadata.
+
+    Raises:
+        DatasetError: It is none.
+    """
+    whole = isinstance(value, int) or (isinstance(value, float) and value.is_integer())
+    if isinstance(value, bool) or not whole or not lowest <= int(value) < 2**53:  # type: ignore[arg-type]
+        raise DatasetError(
+            f"{line}{name} must be a whole number of at least {lowest}, got {value!r}",
+            file=file,
+            key=name,
+        )
+    return int(value)  # type: ignore[arg-type]
 
 
 def _why_no_info(root: Path) -> str:
@@ -205,57 +368,63 @@ def _episodes_v3(root: Path, info: dict) -> Iterable[EpisodeEntry]:
     ]
     first_row: dict[tuple, int] = {}
     for row in rows:
-        place = row["data/chunk_index"], row["data/file_index"]
-        start = int(row["dataset_from_index"])
+        place = tuple(
+            _integer(row[name], name, "meta/episodes")
+            for name in ("data/chunk_index", "data/file_index")
+        )
+        start = _integer(row["dataset_from_index"], "dataset_from_index", "meta/episodes")
         first_row[place] = min(first_row.get(place, start), start)
     for row in rows:
         chunk, file = row["data/chunk_index"], row["data/file_index"]
         yield EpisodeEntry(
-            index=row["episode_index"],
-            length=row["length"],
-            tasks=tuple(row.get("tasks") or ()),
-            file=_data_file(info, chunk_index=chunk, file_index=file),
-            start=row["dataset_from_index"] - first_row[chunk, file],
+            index=_integer(row["episode_index"], "episode_index", "meta/episodes"),
+            length=_integer(row["length"], "length", "meta/episodes"),
+            tasks=_task_texts(row),
+            file=path_in(
+                root, info.get("data_path"), "data_path", chunk_index=chunk, file_index=file
+            ),
+            start=int(row["dataset_from_index"]) - first_row[chunk, file],
         )
 
 
 def _episodes_v2(root: Path, info: dict) -> Iterable[EpisodeEntry]:
-    rows = _read_json_lines(root, "meta/episodes.jsonl", ("episode_index", "length"))
+    name = "meta/episodes.jsonl"
+    rows = _read_json_lines(root, name, ("episode_index", "length"))
+    size = _integer(info.get("chunks_size", 1000), "chunks_size", INFO_PATH, lowest=1)
     for row in rows:
-        index = int(row["episode_index"])
-        chunk = index // int(info.get("chunks_size", 1000))
+        index = _integer(row["episode_index"], "episode_index", name)
         yield EpisodeEntry(
             index=index,
-            length=int(row["length"]),
-            tasks=tuple(row.get("tasks") or ()),
-            file=_data_file(info, episode_chunk=chunk, episode_index=index),
+            length=_integer(row["length"], "length", name),
+            tasks=_task_texts(row),
+            file=path_in(
+                root,
+                info.get("data_path"),
+                "data_path",
+                episode_chunk=index // size,
+                episode_index=index,
+            ),
             start=0,
         )
 
 
-def _data_file(info: dict, **places: int) -> str:
-    try:
-        return str(info["data_path"]).format(**places)
-    except (KeyError, ValueError, IndexError) as error:
-        raise DatasetError(
-            f"data_path {info.get('data_path')!r} does not fit the dataset's version",
-            file=INFO_PATH,
-            key="data_path",
-        ) from error
+def _task_texts(row: dict) -> tuple[str, ...]:
+    tasks = row.get("tasks") or ()
+    return tuple(map(str, tasks)) if isinstance(tasks, list | tuple) else (str(tasks),)
 
 
 def _read_json_lines(root: Path, file: str, required: tuple[str, ...]) -> list[dict]:
     path = root / file
-    if not path.is_file():
-        raise DatasetError("not found: the copy is incomplete", file=file)
+    require_file(path, file)
+    if not is_inside(root, file):
+        raise DatasetError("leads out of the dataset: it is not followed", file=file)
     rows = []
-    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
         if not line.strip():
             continue
-        try:
-            row = json.loads(line)
-        except json.JSONDecodeError as error:
-            raise DatasetError(f"line {number} is no valid JSON: {error}", file=file) from error
+        row = _parse(line, file, f"line {number} ")
+        if not isinstance(row, dict):
+            raise DatasetError(f"line {number} is no JSON object", file=file)
         missing = [key for key in required if key not in row]
         if missing:
             raise DatasetError(f"line {number} lacks {', '.join(missing)}", file=file)
@@ -272,13 +441,14 @@ def open_parquet(root: Path, file: str, episode: int | None = None) -> pq.Parque
     Raises:
         DatasetError: It is missing, or truncated.
     """
+    require_file(root / file, file, episode)
+    if not is_inside(root, file):
+        raise DatasetError(
+            "leads out of the dataset: it is not followed", file=file, episode=episode
+        )
     try:
         return pq.ParquetFile(root / file)
-    except FileNotFoundError as error:
-        raise DatasetError(
-            "not found: the copy is incomplete", file=file, episode=episode
-        ) from error
-    except (pa.ArrowInvalid, OSError) as error:
+    except (pa.ArrowException, OSError, ValueError) as error:
         raise DatasetError(
             "unreadable: the file is truncated, because the recording was not finalized or "
             "the copy is incomplete",
@@ -330,7 +500,7 @@ def read_table(
         groups, offset = _row_groups(parquet.metadata, rows)
         table = parquet.read_row_groups(groups, columns=wanted)
         return table.slice(rows.start - offset, rows.stop - rows.start)
-    except (pa.ArrowInvalid, OSError) as error:
+    except (pa.ArrowException, OSError, ValueError) as error:
         raise DatasetError(
             f"unreadable: the file is damaged ({error}); copy it again", file=file
         ) from error

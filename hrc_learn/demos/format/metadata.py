@@ -22,6 +22,10 @@ NUMERIC = ("float", "int", "uint", "bool")
 """How the dtypes begin that hold numbers."""
 
 
+# Of one column of numbers; a wrist's force field has some hundred.
+_WIDEST, _MOST_AXES = 100_000, 8
+
+
 @dataclass(frozen=True, kw_only=True)
 class Feature:
     """One column of the frames, as `meta/info.json` declares it."""
@@ -53,7 +57,11 @@ def read_features(info: dict) -> dict[str, Feature]:
         names = None
         try:
             dtype, shape = str(declared["dtype"]), tuple(int(n) for n in declared["shape"])
-        except (KeyError, TypeError, ValueError) as error:
+            if any(n < 0 for n in shape) or len(shape) > _MOST_AXES:
+                raise ValueError(f"shape {shape}")
+            if dtype.startswith(NUMERIC) and prod(shape) > _WIDEST:
+                raise ValueError(f"{prod(shape)} numbers a frame")
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise DatasetError(
                 f"the feature's declaration is malformed: {error!r}", file=INFO_PATH, key=key
             ) from error
@@ -106,6 +114,8 @@ class Sidecar:
     """What poses are relative to ("base") and of ("ee")."""
     details: dict = field(default_factory=dict)
     """Whatever else the writer was asked to keep."""
+    contract: dict = field(default_factory=dict)
+    """What each component means, as `read.contract` keeps it; {} where it was not kept."""
 
 
 def sidecar_copy(sidecar: Sidecar, units: Mapping[str, str]) -> dict:
@@ -138,8 +148,11 @@ def read_sidecar(root: Path) -> Sidecar:
             joint_names=tuple(content["joint_names"]),
             frames=content["frames"],
             details=content["details"],
+            contract=content.get("contract") or {},
         )
-    except (json.JSONDecodeError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        if isinstance(error, DatasetError):
+            raise
         raise DatasetError(
             f"damaged ({error!r}); delete it to have units guessed, or restore it",
             file=SIDECAR_PATH,
@@ -203,11 +216,16 @@ def data_schema(schema: pa.Schema, features: Mapping[str, dict]) -> pa.Schema:
     """The schema with the types in Hugging Face's own terms, as LeRobot leaves them."""
     types = {}
     for name in schema.names:
-        value = {"dtype": features[name]["dtype"], "_type": "Value"}
-        width = features[name]["shape"][0]
-        types[name] = (
-            value if width == 1 else {"feature": value, "length": width, "_type": "List"}
-        )
+        dtype, shape = features[name]["dtype"], list(features[name]["shape"])
+        value = {"dtype": dtype, "_type": "Value"}
+        if dtype == "image":
+            types[name] = {"_type": "Image"}
+        elif len(shape) > 1:
+            types[name] = {"shape": shape, "dtype": dtype, "_type": f"Array{len(shape)}D"}
+        elif prod(shape) == 1:
+            types[name] = value
+        else:
+            types[name] = {"feature": value, "length": shape[0], "_type": "List"}
     return schema.with_metadata({"huggingface": json.dumps({"info": {"features": types}})})
 
 

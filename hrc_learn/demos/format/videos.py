@@ -6,9 +6,10 @@ lost with the recording; a file an episode is neither.
 """
 
 import contextlib
+import io
 import shutil
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Shaped, UInt8
 
-from hrc_learn.demos.format.dataset_folder import DatasetFolder, EpisodeEntry, read_rows
+from hrc_learn.demos.format.dataset_folder import (
+    DatasetFolder,
+    EpisodeEntry,
+    path_in,
+    read_rows,
+)
 from hrc_learn.demos.format.metadata import (
     CHUNK_SIZE,
     VIDEO_PATH,
@@ -50,8 +56,16 @@ def video_keys(folder: DatasetFolder) -> list[str]:
     return [key for key, feature in folder.features.items() if feature.dtype == "video"]
 
 
-def read_segments(folder: DatasetFolder) -> dict[int, Segments]:
-    """Where the images of each episode lie; without those whose file is not there."""
+def read_segments(folder: DatasetFolder, missing: bool = False) -> dict[int, Segments]:
+    """Where the images of each episode lie.
+
+    Args:
+        folder: The dataset.
+        missing: Also those whose file is not there.
+
+    Raises:
+        DatasetError: The metadata lead to no file, or out of the dataset.
+    """
     keys = video_keys(folder)
     if not keys:
         return {}
@@ -59,7 +73,7 @@ def read_segments(folder: DatasetFolder) -> dict[int, Segments]:
     segments = {}
     for entry in folder.episodes:
         found = places.get(entry.index) or _of_own_file(folder, entry, keys)
-        segments[entry.index] = {k: s for k, s in found.items() if s.file.is_file()}
+        segments[entry.index] = {k: s for k, s in found.items() if missing or s.file.is_file()}
     return segments
 
 
@@ -71,37 +85,43 @@ def _places_v3(folder: DatasetFolder, keys: list[str]) -> dict[int, Segments]:
             places[row["episode_index"]] = {
                 key: VideoSegment(
                     file=folder.root
-                    / str(template).format(
+                    / path_in(
+                        folder.root,
+                        template,
+                        "video_path",
                         video_key=key,
                         chunk_index=row[f"videos/{key}/chunk_index"],
                         file_index=row[f"videos/{key}/file_index"],
                     ),
-                    start=row[f"videos/{key}/from_timestamp"],
-                    stop=row[f"videos/{key}/to_timestamp"],
+                    start=float(row[f"videos/{key}/from_timestamp"]),
+                    stop=float(row[f"videos/{key}/to_timestamp"]),
                 )
                 for key in keys
-                if f"videos/{key}/chunk_index" in row
+                if row.get(f"videos/{key}/chunk_index") is not None
             }
     return places
 
 
 def _of_own_file(folder: DatasetFolder, entry: EpisodeEntry, keys: list[str]) -> Segments:
-    template = str(folder.info.get("video_path"))
+    if folder.version.startswith("v3"):
+        return {}
+    template = folder.info.get("video_path")
     chunk = entry.index // int(folder.info.get("chunks_size", 1000))
-    try:
-        files = {
-            key: template.format(video_key=key, episode_chunk=chunk, episode_index=entry.index)
-            for key in keys
-        }
-    except (KeyError, IndexError, ValueError) as error:
-        if folder.version.startswith("v3"):
-            return {}
-        raise DatasetError(
-            f"video_path {template!r} does not fit the dataset's version", file="meta/info.json"
-        ) from error
     return {
-        key: VideoSegment(file=folder.root / file, start=0.0, stop=entry.length / folder.fps)
-        for key, file in files.items()
+        key: VideoSegment(
+            file=folder.root
+            / path_in(
+                folder.root,
+                template,
+                "video_path",
+                video_key=key,
+                episode_chunk=chunk,
+                episode_index=entry.index,
+            ),
+            start=0.0,
+            stop=entry.length / folder.fps,
+        )
+        for key in keys
     }
 
 
@@ -137,6 +157,42 @@ def decode(segment: VideoSegment, fps: float) -> Iterator[tuple[int, Image]]:
             f"incomplete",
             file=segment.file,
         ) from error
+
+
+def image_at(segment: VideoSegment, frame: int, fps: float) -> Image:
+    """One image (RGB) of an episode, without decoding those long before it.
+
+    Raises:
+        DatasetError: The file is no video that can be decoded, or ends before.
+    """
+    at = segment.start + frame / fps
+    found = next(decode(replace(segment, start=at, stop=at + 1 / fps), fps), None)
+    if found is None:
+        raise DatasetError(f"ends before frame {frame} of the episode", file=segment.file)
+    return found[1]
+
+
+def decode_image(content: bytes) -> Image:
+    """An image (RGB) from the bytes of its file.
+
+    Raises:
+        DatasetError: They are no image.
+    """
+    import av
+
+    try:
+        container = av.open(io.BytesIO(content or b""), "r")
+        with container:
+            image = next(container.decode(video=0)).to_ndarray(format="rgb24")
+    except (av.FFmpegError, IndexError, StopIteration) as error:
+        raise DatasetError(f"holds an image that cannot be decoded ({error})") from error
+    return image
+
+
+def sampled_pixels(image: Image) -> Image:
+    """Some of its pixels, about 150 along its longer side."""
+    stride = max(1, max(image.shape[:2]) // _SAMPLE_PIXELS)
+    return image[::stride, ::stride]
 
 
 # Videos of a recording.
@@ -264,7 +320,6 @@ class _Video:
         stream: Any = self._container.add_stream("libx264", rate=self._rate, options=_CODEC)
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
         self._stream = stream
-        self._stride = max(1, max(height, width) // _SAMPLE_PIXELS)
         self._count = 0
         self._samples: list[Shaped[np.ndarray, "..."]] = []
 
@@ -272,7 +327,7 @@ class _Video:
         import av
 
         if self._count % _SAMPLE_EVERY == 0:
-            self._samples.append(image[:: self._stride, :: self._stride].copy())
+            self._samples.append(sampled_pixels(image).copy())
         frame = av.VideoFrame.from_ndarray(image, format="rgb24")
         frame.pts = self._count
         frame.time_base = 1 / self._rate
@@ -298,13 +353,17 @@ class _Video:
 class VideoPlacement:
     """Files of videos as they are placed in a new dataset: each once, whoever shares it."""
 
-    def __init__(self, root: Path, taken: Mapping[str, int] | None = None):
+    def __init__(
+        self, root: Path, taken: Mapping[str, int] | None = None, *, share: bool = True
+    ):
         """
         Args:
             root: The new dataset.
             taken: Files that each camera already has there.
+            share: Give files a second name; otherwise they are copied.
         """
         self._root = root
+        self._put = link if share else _copy
         self._count = dict(taken or {})
         self._placed: dict[tuple[str, Path], int] = {}
 
@@ -321,9 +380,14 @@ class VideoPlacement:
     def _place(self, key: str, file: Path) -> int:
         if (key, file) not in self._placed:
             number = self._count.get(key, 0)
-            link(file, self._root / place(VIDEO_PATH, number, video_key=key))
+            self._put(file, self._root / place(VIDEO_PATH, number, video_key=key))
             self._count[key], self._placed[key, file] = number + 1, number
         return self._placed[key, file]
+
+
+def _copy(source: Path, target: Path) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(source, target)
 
 
 def link(source: Path, target: Path) -> None:

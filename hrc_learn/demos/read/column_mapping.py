@@ -14,6 +14,7 @@ from hrc_learn.demos.read.roles import (
     ORIENTATION_ROLES,
     ROLES,
     ComponentMeaning,
+    joint_of,
     meaning_of_component,
     role_of_key,
     says_joint_quantity,
@@ -91,8 +92,7 @@ def _selection(
 
 
 def _label(name: str, role: str) -> str:
-    stem = role in JOINT_FIELDS and says_joint_quantity(name)
-    return name.rpartition(".")[0] if stem else name
+    return joint_of(name) if role in JOINT_FIELDS else name
 
 
 def _feature_range(
@@ -163,7 +163,10 @@ class ColumnMapping:
 
 
 def map_columns(
-    features: Mapping[str, Feature], sidecar: Sidecar, mapping: MappingSpec | None = None
+    features: Mapping[str, Feature],
+    sidecar: Sidecar,
+    mapping: MappingSpec | None = None,
+    kept: Mapping[str, ColumnSelection] | None = None,
 ) -> ColumnMapping:
     """Find the quantities among the features.
 
@@ -171,6 +174,7 @@ def map_columns(
         features: As declared by the dataset.
         sidecar: What our own writer declared; its columns spare all guessing.
         mapping: Role -> columns, as in `load_demos`; a role given None is left out.
+        kept: Columns by a contract that is kept with the dataset; spares all guessing.
 
     Raises:
         DatasetError: The mapping names a role or column that does not exist.
@@ -181,7 +185,9 @@ def map_columns(
         if feature.numeric and key not in INDEX_KEYS
     }
     notes: list[str] = []
-    if sidecar.columns:
+    if kept is not None:
+        found = dict(kept)
+    elif sidecar.columns:
         declared = {
             role: [f"{column['key']}/{name}" for name in column["names"]]
             for role, column in sidecar.columns.items()
@@ -333,10 +339,7 @@ _POSES = ("position", *ORIENTATION_ROLES)
 
 def _select(role: str, feature: Feature, indices: Sequence[int]) -> ColumnSelection:
     names = feature.names or tuple(f"joint_{i + 1}" for i in range(feature.width))
-    labels = tuple(
-        names[i].rpartition(".")[0] if says_joint_quantity(names[i]) else names[i]
-        for i in indices
-    )
+    labels = tuple(joint_of(names[i]) for i in indices)
     columns = tuple((feature.key, index) for index in indices)
     return ColumnSelection(
         role=role, columns=columns, labels=labels, numbered=feature.names is None

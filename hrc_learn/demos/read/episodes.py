@@ -2,8 +2,10 @@
 in the units on disk.
 """
 
+import contextlib
+import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -21,11 +23,14 @@ from hrc_learn.demos.read.column_mapping import (
     MappingSpec,
     map_columns,
 )
+from hrc_learn.demos.read.contract import changed_since, contract_of
 from hrc_learn.demos.read.frames import RawFrames, read_frames
 from hrc_learn.demos.read.roles import (
+    ORIENTATION_ROLES,
     UnitDecision,
     decide_units,
     guessed_from_values,
+    is_hand,
     unit_factor,
 )
 
@@ -63,6 +68,9 @@ def count_faults(folder: DatasetFolder) -> Iterator[DatasetError]:
             yield DatasetError("has no frames", **entry.location)
 
 
+_SAMPLED_EPISODES = 32
+"""Episodes that decide on units."""
+
 # Quantities picked out of raw columns, still in the units they have on disk.
 
 Quantities = dict[str, Float64[np.ndarray, "_frames _components"]]
@@ -76,24 +84,119 @@ def select_quantities(
     return {role: _columns(frames, selection.columns) for role, selection in selections.items()}
 
 
+Peaks = dict[str, Float64[np.ndarray, "_components"]]
+"""Role -> size that the values of each component reach in one episode."""
+
+# More frames of an episode tell no more about its size.
+_SAMPLED_FRAMES = 1000
+
+
+def usual_peaks(quantities: Quantities, roles: Sequence[str]) -> Peaks:
+    """What the values of these roles reach in one episode, but for half a percent of them."""
+    peaks: Peaks = {}
+    for role in roles:
+        values = quantities[role]
+        sizes = np.abs(values[:: 1 + len(values) // _SAMPLED_FRAMES])
+        sizes[~np.isfinite(sizes)] = 0.0
+        if len(sizes):
+            place = int(0.995 * (len(sizes) - 1))
+            peaks[role] = np.partition(sizes, place, axis=0)[place]
+    return peaks
+
+
 def units_on_disk(
-    roles: Iterable[str],
-    episodes: Iterable[Quantities],
+    selections: Mapping[str, ColumnSelection],
+    episodes: Iterable[tuple[EpisodeEntry, Quantities]],
     fps: float,
-    declared: Mapping[str, str],
+    declared: Mapping[str, str | Sequence[str]],
     given: Mapping[str, str],
-) -> dict[str, UnitDecision]:
-    """The unit of each of these quantities, as `decide_units`, from their finite values."""
-    largest, step = dict.fromkeys(roles, 0.0), None
-    for quantities in episodes:
-        for role, values in quantities.items():
-            peak = np.abs(values).max(initial=0.0, where=np.isfinite(values))
-            largest[role] = max(largest[role], float(peak))
+    sample: Collection[int] | None = None,
+) -> tuple[dict[str, UnitDecision], list[DatasetError]]:
+    """The unit of each of these quantities, from what their values usually reach.
+
+    The size of a component is the median over episodes of what it reaches in each, so that no
+    frame and no episode decides alone.
+
+    Args:
+        selections: Columns of the quantities.
+        episodes: Episodes, in the units on disk.
+        fps: Frame rate [1/s].
+        declared: Units by the sidecar, as in `decide_units`.
+        given: Units by the caller, which win.
+        sample: Episodes that decide; None: all.
+
+    Returns:
+        The decisions, and what episodes and columns contradict them.
+
+    Raises:
+        DatasetError: A unit is unknown, or does not fit its quantity.
+    """
+    guessed = guessed_from_values(selections, {*declared, *given})
+    steps: list[float] = []
+    peaks: list[tuple[EpisodeEntry, Peaks]] = []
+    for entry, quantities in episodes:
+        peaks.append((entry, usual_peaks(quantities, [r for r in guessed if r in quantities])))
         time = quantities.get("time", np.empty((0, 1)))
-        if step is None and len(time) > 1:
+        if len(time) > 1:
             # The usual one as a multiple of the nominal period.
-            step = float(np.median(np.diff(time[:, 0]))) * fps
-    return decide_units(largest, declared, given, 1.0 if step is None else step)
+            steps.append(float(np.nanmedian(np.diff(time[:, 0]))) * fps)
+    usual: dict[str, float | Sequence[float]] = dict.fromkeys(selections, 0.0)
+    deciding = [p for entry, p in peaks if sample is None or entry.index in sample] or [
+        p for _, p in peaks
+    ]
+    for role in guessed:
+        known = [p[role] for p in deciding if role in p]
+        if known:
+            usual[role] = np.median(known, axis=0).tolist()
+    hands = {
+        role: [is_hand(label) for label in selection.labels]
+        for role, selection in selections.items()
+    }
+    step = float(np.median(steps)) if steps else 1.0
+    decisions = decide_units(usual, declared, given, step, hands)
+    faults = [
+        fault
+        for role in guessed
+        if isinstance(usual[role], list)
+        for fault in _unit_faults(selections[role], usual[role], decisions[role], peaks)
+    ]
+    return decisions, faults
+
+
+_DEGREES = math.log(180 / math.pi)
+_NEAR = math.log(2.5)
+"""How far sizes may be from a factor of 57.3 and still speak for degrees."""
+
+
+def _unit_faults(
+    selection: ColumnSelection,
+    usual: float | Sequence[float],
+    decision: UnitDecision,
+    peaks: Sequence[tuple[EpisodeEntry, Peaks]],
+) -> Iterator[DatasetError]:
+    """Episodes that are 57.3 times as large or small as the others, as degrees are."""
+    role, size = selection.role, np.asarray(usual)
+    if role not in ("joint_position", "command_position", *ORIENTATION_ROLES):
+        return
+    # What hardly moves has no size to compare; a share is none of an angle.
+    telling = (size > 1e-2) & (np.array([decision.unit_of(i) for i in range(len(size))]) != "1")
+    if not telling.any():
+        return
+    for entry, of_episode in peaks:
+        own = of_episode.get(role)
+        if own is None or len(own) != len(size):
+            continue
+        ratio = np.log(np.maximum(own[telling], 1e-9) / size[telling])
+        if abs(abs(float(np.median(ratio))) - _DEGREES) < _NEAR:
+            seems = "deg" if np.median(ratio) > 0 else "rad"
+            key, index = selection.columns[int(np.flatnonzero(telling)[0])]
+            yield DatasetError(
+                f"{role} is about {math.exp(abs(float(np.median(ratio)))):.0f} times as "
+                f"{'large' if seems == 'deg' else 'small'} as in the other episodes: {seems} "
+                f"among {decision.unit}? Leave the episode out, or record it again",
+                **entry.location,
+                key=f"{key} ({selection.labels[selection.columns.index((key, index))]})",
+            )
 
 
 def _columns(
@@ -241,26 +344,64 @@ class EpisodeReader:
     @property
     def notes(self) -> list[str]:
         """What had to be guessed, or comes from elsewhere."""
-        if self.extracted is None:
-            return [*self.column_mapping.notes]
-        beside = f"feature: {self.extracted.name}, as it was extracted from the videos"
-        return [*self.column_mapping.notes, beside]
+        notes = [*self.column_mapping.notes]
+        if (changed := changed_since(self.folder, contract_of(self.sidecar))) is not None:
+            notes.append(changed)
+        if self.extracted is not None:
+            notes.append(f"feature: {self.extracted.name}, as it was extracted from the videos")
+        return notes
 
     def decide_units(
         self, episodes: Iterable[RawEpisode], given: Mapping[str, str]
     ) -> dict[str, UnitDecision]:
-        """The unit of every quantity, from the values of these episodes where not declared.
+        """The unit of every quantity, where not declared from the values of these episodes and
+        of a sample of the dataset, the same whichever episodes are wanted.
 
         Raises:
-            DatasetError: A unit is unknown, or does not fit its quantity.
+            DatasetError: A unit is unknown, or does not fit its quantity, or an episode is in
+                another one than the rest.
         """
-        return units_on_disk(
-            self.column_mapping.selections,
-            (episode.quantities for episode in episodes),
+        declared = self.declared_units
+        selections, read = self.column_mapping.selections, set()
+
+        def all_episodes() -> Iterator[tuple[EpisodeEntry, Quantities]]:
+            for episode in episodes:
+                read.add(episode.entry.index)
+                yield episode.entry, episode.quantities
+            roles = guessed_from_values(selections, {*declared, *given})
+            for entry in self._sample if roles else ():
+                if entry.index not in read:
+                    # Its faults are told when it is asked for.
+                    with contextlib.suppress(DatasetError):
+                        for episode in self.read([entry], roles):
+                            yield entry, episode.quantities
+
+        decisions, faults = units_on_disk(
+            selections,
+            all_episodes(),
             self.folder.fps,
-            self.sidecar.units,
+            declared,
             given,
+            {entry.index for entry in self._sample},
         )
+        wanted = {entry.index for entry in self.entries}
+        for fault in faults:
+            if fault.episode in wanted:
+                raise fault
+        return decisions
+
+    @property
+    def declared_units(self) -> Mapping[str, str | Sequence[str]]:
+        """Units by role from the sidecar, of each component where a contract is kept."""
+        contract = contract_of(self.sidecar)
+        return self.sidecar.units | ({} if contract is None else contract.units())
+
+    @property
+    def _sample(self) -> Sequence[EpisodeEntry]:
+        """Episodes evenly over the dataset, which decide on its units."""
+        every = self.folder.episodes
+        places = np.linspace(0, len(every) - 1, min(len(every), _SAMPLED_EPISODES))
+        return [every[int(place)] for place in places]
 
     def survey(self, given: Mapping[str, str]) -> dict[str, UnitDecision]:
         """The same from a pass of its own over those columns whose unit must be guessed.
@@ -270,13 +411,26 @@ class EpisodeReader:
         """
         for role, unit in given.items():  # before anything long is read
             unit_factor(role, unit)
-        stated = {*self.sidecar.units, *given}
+        stated = {*self.declared_units, *given}
         roles = {*guessed_from_values(self.column_mapping.selections, stated)}
         entries = self.entries if roles else self.entries[:1]
         if "time" in self.column_mapping.selections and "time" not in stated:
             roles.add("time")
         episodes = self.read(tuple(dict.fromkeys(entries)), roles) if roles else ()
         return self.decide_units(episodes, given)
+
+
+def read_mapping(
+    folder: DatasetFolder, sidecar: Sidecar, mapping: MappingSpec | None
+) -> ColumnMapping:
+    """The quantities among the columns: the caller's, the contract's, or those found by name.
+
+    Raises:
+        DatasetError: The mapping or the contract name what does not exist.
+    """
+    contract = contract_of(sidecar)
+    kept = None if contract is None else contract.selections(folder.features)
+    return map_columns(folder.features, sidecar, mapping, kept)
 
 
 def open_reader(
@@ -296,7 +450,7 @@ def open_reader(
     for fault in count_faults(folder):
         raise fault
     sidecar = read_sidecar(folder.root)
-    column_mapping = map_columns(folder.features, sidecar, mapping)
+    column_mapping = read_mapping(folder, sidecar, mapping)
     has_own = "feature" in column_mapping.selections or "feature" in (mapping or {})
     return EpisodeReader(
         folder=folder,

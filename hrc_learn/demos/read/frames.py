@@ -223,7 +223,10 @@ def to_numpy(column: pa.ChunkedArray) -> Shaped[np.ndarray, "rows components"]:
     Raises:
         BadRowError: A value is missing, or rows differ in their number of components.
     """
-    array = pa.concat_arrays(column.chunks or [pa.array([], column.type)])
+    try:
+        array = pa.concat_arrays(column.chunks or [pa.array([], column.type)])
+    except pa.ArrowException as error:
+        raise BadRowError(0, f"cannot be read: {error}") from error
     rows = len(array)
     while True:
         _refuse_nulls(array, rows)
@@ -235,7 +238,13 @@ def to_numpy(column: pa.ChunkedArray) -> Shaped[np.ndarray, "rows components"]:
             array = _flatten_ragged(array, rows)
         else:
             break
+    if not (pa.types.is_integer(array.type) or pa.types.is_floating(array.type)) and (
+        not pa.types.is_boolean(array.type)
+    ):
+        raise BadRowError(0, f"holds {array.type}, not numbers")
     values = _without_pandas(array)
+    if rows and len(values) % rows:
+        raise BadRowError(0, f"{len(values)} numbers do not share out among {rows} frames")
     return values.reshape(rows, len(values) // rows if rows else 0)
 
 

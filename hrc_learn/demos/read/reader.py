@@ -50,8 +50,9 @@ def to_demonstration(
     """
     entry, frames, quantities = episode.entry, episode.frames, episode.quantities
     scaled = {
-        role: values if decisions[role].factor == 1 else values * decisions[role].factor
+        role: values if np.all(factor == 1) else values * factor
         for role, values in quantities.items()
+        for factor in (decisions[role].factor,)
     }
     time = frame_timestamps(folder, entry, frames, scaled.get("time"))
     fields = {role: scaled[role] for role in JOINT_FIELDS if role in scaled}

@@ -2,8 +2,11 @@
 
 import math
 import re
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
 
 from hrc_learn.demos.format.metadata import SIDECAR_PATH
 from hrc_learn.demos.issue import DatasetError
@@ -83,6 +86,16 @@ JOINT_SUFFIXES = {
 
 _JOINT_PREFIXES = {"qpos": "joint_position", "qvel": "joint_velocity", "effort": "joint_effort"}
 
+# `joint_1_vel`: only behind what is plainly a joint, since `ee_pos` or `x_vel` are none.
+_UNDERSCORED = re.compile(
+    r"(.*(?:joint|motor|axis)_?\w*|\w*j\d+|\w*_\d+)_([a-z]+)", re.IGNORECASE
+)
+_GRIPPER = re.compile(r"gripper|(?:^|[._/ ])(?:jaw|claw)(?:$|[._/ ])")
+_HAND = re.compile(
+    r"finger|thumb|pinky|knuckle|"
+    r"(?:^|[._/ ])(?:hand|palm|index|middle|ring|little|claw|jaw|gripper)(?:$|[._/ \d])"
+)
+
 _XYZ = {"x": 0, "y": 1, "z": 2}
 _POSE_COMPONENTS = {
     **{name: ("position", slot) for name, slot in _XYZ.items()},
@@ -139,10 +152,12 @@ def meaning_of_component(name: str) -> ComponentMeaning | None:
     component = _POSE_COMPONENTS.get(ee[1] if ee else plain)
     if component:
         return ComponentMeaning(*component)
-    stem, _, suffix = name.strip().rpartition(".")
-    roles = [role for role, names in JOINT_SUFFIXES.items() if suffix.lower() in names]
-    if (ee and "gripper" in ee[1]) or ("gripper" in plain and (not stem or roles)):
+    stem, suffix = split_name(name.strip())
+    roles = [role for role, names in JOINT_SUFFIXES.items() if suffix in names]
+    if (ee and "gripper" in ee[1]) or (_GRIPPER.search(plain) and (not stem or roles)):
         # A gripper's velocity or force is of no use here and must not pass for its opening.
+        if re.search(r"_(?:vel|velocity|torque|effort|force|current)$", plain):
+            return None
         return ComponentMeaning("gripper", name) if roles in ([], ["joint_position"]) else None
     if stem and roles:
         return ComponentMeaning(roles[0], stem)
@@ -152,10 +167,29 @@ def meaning_of_component(name: str) -> ComponentMeaning | None:
     return None
 
 
+def split_name(name: str) -> tuple[str, str]:
+    """Joint and quantity of a name such as `joint_1.pos` or `joint_1_vel`; "" for no joint."""
+    stem, dot, suffix = name.rpartition(".")
+    if not dot and (match := _UNDERSCORED.fullmatch(name)):
+        known = any(match[2].lower() in names for names in JOINT_SUFFIXES.values())
+        stem, suffix = (match[1], match[2]) if known else ("", name)
+    return stem, suffix.lower()
+
+
 def says_joint_quantity(name: str) -> bool:
     """Whether the name ends in a suffix of `JOINT_SUFFIXES`."""
-    _, dot, suffix = name.rpartition(".")
-    return bool(dot) and any(suffix.lower() in names for names in JOINT_SUFFIXES.values())
+    stem, suffix = split_name(name)
+    return bool(stem) and any(suffix in names for names in JOINT_SUFFIXES.values())
+
+
+def joint_of(name: str) -> str:
+    """The joint that a component is of: its name without what is measured of it."""
+    return split_name(name)[0] if says_joint_quantity(name) else name
+
+
+def is_hand(name: str) -> bool:
+    """Whether a joint is one of a hand or gripper by its name, not of the arm."""
+    return bool(_HAND.search(name.strip().lower()))
 
 
 def role_of_key(key: str) -> str | None:
@@ -205,7 +239,7 @@ _FOLLOWERS = {
 }
 """Quantities taken to be in the unit of another where nothing is said of them."""
 
-_GUESSABLE = ("joint_position", "command_position", "position", *_ROTATION_LIMIT)
+_GUESSABLE = ("joint_position", "command_position", "position", "gripper", *_ROTATION_LIMIT)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -214,15 +248,28 @@ class UnitDecision:
 
     role: str
     unit: str
+    """That of its components, or of most of them."""
+    units: tuple[str, ...] = ()
+    """Unit of each component where they differ: an arm in degrees, its fingers from 0 to 1."""
     note: str | None = None
     """What was guessed and how to overrule it; None where nothing had to be."""
     converts: bool = False
     """Whether a guess changes the values."""
+    confidence: float = 1.0
+    """0 to 1."""
+    evidence: str = ""
+    """What speaks for a guess, in words."""
 
     @property
-    def factor(self) -> float:
-        """What values on disk are multiplied by."""
-        return unit_factor(self.role, self.unit)
+    def factor(self) -> float | Float64[np.ndarray, " components"]:
+        """What values on disk are multiplied by: one number, or one for each component."""
+        if not self.units:
+            return unit_factor(self.role, self.unit)
+        return np.array([unit_factor(self.role, unit) for unit in self.units])
+
+    def unit_of(self, component: int) -> str:
+        """Unit of one of its components."""
+        return self.units[component] if self.units else self.unit
 
 
 def unit_factor(role: str, unit: str) -> float:
@@ -237,7 +284,8 @@ def unit_factor(role: str, unit: str) -> float:
         )
     own = ROLES[role].unit
     options = next(units for units in _DIMENSIONS.values() if own in units)
-    if role == "gripper":
+    if role in ("gripper", "joint_position", "command_position"):
+        # Grippers and hands come as a share of their opening, hobby arms of their range.
         options = options | _DIMENSIONS["ratio"]
     if unit not in options:
         raise DatasetError(
@@ -247,18 +295,21 @@ def unit_factor(role: str, unit: str) -> float:
 
 
 def decide_units(
-    largest: Mapping[str, float],
-    declared: Mapping[str, str],
+    largest: Mapping[str, float | Sequence[float]],
+    declared: Mapping[str, str | Sequence[str]],
     given: Mapping[str, str],
     frame_step: float = 1.0,
+    hands: Mapping[str, Sequence[bool]] | None = None,
 ) -> dict[str, UnitDecision]:
     """Decide on a unit for every quantity.
 
     Args:
-        largest: Largest absolute value of each quantity on disk, by role.
-        declared: Units by role from the dataset's sidecar.
+        largest: Usual largest absolute value of each quantity on disk, by role: of all, or of
+            each component.
+        declared: Units by role, or of each component, from the dataset's sidecar.
         given: Units by role from the caller; they win.
         frame_step: Step of the true stamps on disk, as a multiple of the nominal period [s].
+        hands: Which components are fingers or grippers, by role; none where not given.
 
     Raises:
         DatasetError: A unit is unknown, or does not fit its quantity.
@@ -266,25 +317,43 @@ def decide_units(
     for role, unit in given.items():
         unit_factor(role, unit)
     for role, unit in declared.items():
-        try:
-            unit_factor(role, unit)
-        except DatasetError as error:
-            raise DatasetError(str(error), file=SIDECAR_PATH, key=f"units.{role}") from error
+        for one in (unit,) if isinstance(unit, str) else unit:
+            try:
+                unit_factor(role, one)
+            except DatasetError as error:
+                raise DatasetError(
+                    str(error), file=SIDECAR_PATH, key=f"units.{role}"
+                ) from error
     stated = {**declared, **given}
     decisions: dict[str, UnitDecision] = {}
     for role in sorted(largest, key=lambda role: role in _FOLLOWERS):
         if role in stated:
-            decisions[role] = UnitDecision(role=role, unit=stated[role])
+            decisions[role] = _stated(role, stated[role])
         elif (leader := decisions.get(_FOLLOWERS.get(role, ""))) is not None:
             per_second = "/s" if role.endswith("velocity") else ""
-            decisions[role] = UnitDecision(role=role, unit=leader.unit + per_second)
+            units = () if per_second else leader.units
+            decisions[role] = UnitDecision(
+                role=role,
+                unit=leader.unit + per_second if leader.unit != "1" else ROLES[role].unit,
+                units=units,
+                confidence=leader.confidence,
+                evidence=f"that of {leader.role}",
+            )
         elif role == "time":
             decisions[role] = _guess_time(frame_step)
         elif role in _GUESSABLE:
-            decisions[role] = _guess(role, largest[role])
+            peaks = np.atleast_1d(np.asarray(largest[role], float))
+            decisions[role] = _guess(role, peaks, (hands or {}).get(role, ()))
         else:
             decisions[role] = UnitDecision(role=role, unit=ROLES[role].unit)
     return decisions
+
+
+def _stated(role: str, unit: str | Sequence[str]) -> UnitDecision:
+    if isinstance(unit, str):
+        return UnitDecision(role=role, unit=unit)
+    most = max(dict.fromkeys(unit), key=list(unit).count)
+    return UnitDecision(role=role, unit=most, units=tuple(unit) if len({*unit}) > 1 else ())
 
 
 def guessed_from_values(roles: Iterable[str], stated: Collection[str]) -> list[str]:
@@ -292,25 +361,79 @@ def guessed_from_values(roles: Iterable[str], stated: Collection[str]) -> list[s
     return [role for role in roles if role in _GUESSABLE and role not in stated]
 
 
-def _guess(role: str, largest: float) -> UnitDecision:
-    if role == "position":
-        unit = next((unit for unit, limit in _REACH.items() if largest <= limit), "mm")
-    elif role in _ROTATION_LIMIT:
-        unit = "rad" if largest <= _ROTATION_LIMIT[role] else "deg"
-    else:
-        unit = next((unit for unit, limit in _JOINT_LIMITS.items() if largest <= limit), "tick")
+# A share of a range, with noise about it; a gripper opens no wider than 0.2 m.
+_RATIO, _WIDEST_RATIO, _PERCENT, _WIDEST_GRIPPER = 1.05, 2.0, 105.0, 0.2
+
+
+def _guess(role: str, peaks: np.ndarray, hands: Sequence[bool]) -> UnitDecision:
+    if role == "gripper":
+        return _guess_gripper(float(peaks.max()))
+    of_arm = ~np.asarray(hands, bool) if len(hands) == len(peaks) else np.ones(len(peaks), bool)
+    largest = float(peaks[of_arm].max() if of_arm.any() else peaks.max())
+    unit, certain = guess_unit(role, largest), 0.95
+    units: tuple[str, ...] = ()
+    if role in ("joint_position", "command_position"):
+        units = tuple(
+            unit if arm else _unit_of_finger(float(peak), unit)
+            for peak, arm in zip(peaks, of_arm, strict=True)
+        )
+        # A joint within two turns of a degree says nothing; in radians all of them do.
+        certain = 0.95 if largest <= 2 * math.pi else 0.8
     caution = {
         "deg": " (LeRobot's -100..100 look alike)" if role not in _ROTATION_LIMIT else "",
         "tick": " (1/4096 of a turn, zero unknown)",
     }.get(unit, "")
+    if caution:
+        certain = 0.5 if 95 <= largest <= 101 else 0.8
+    others = sorted({*units} - {unit})
+    besides = f", fingers for {', '.join(others)}" if others else ""
     return UnitDecision(
         role=role,
         unit=unit,
+        units=units if others else (),
         note=(
-            f"{role}: no unit declared, values reach {largest:.4g}: taken for {unit}{caution}; "
-            f"overrule with units={{{role!r}: ...}}"
+            f"{role}: no unit declared, values usually reach {largest:.4g}: taken for "
+            f"{unit}{caution}{besides}; overrule with units={{{role!r}: ...}}"
         ),
         converts=unit != ROLES[role].unit,
+        confidence=certain,
+        evidence=f"values usually reach {largest:.3g}",
+    )
+
+
+def guess_unit(role: str, largest: float) -> str:
+    """The unit that values of this size are usually in."""
+    if role == "position":
+        return next((unit for unit, limit in _REACH.items() if largest <= limit), "mm")
+    if role in _ROTATION_LIMIT:
+        return "rad" if largest <= _ROTATION_LIMIT[role] else "deg"
+    return next((unit for unit, limit in _JOINT_LIMITS.items() if largest <= limit), "tick")
+
+
+def _unit_of_finger(peak: float, arm: str) -> str:
+    """In radians beside an arm in them, unless its range is a share; degrees likewise."""
+    if peak <= _RATIO:
+        return "1"
+    if peak <= _JOINT_LIMITS["rad"]:
+        return "rad"
+    return "%" if peak <= _PERCENT and arm != "deg" else arm
+
+
+def _guess_gripper(largest: float) -> UnitDecision:
+    limits = {"m": _WIDEST_GRIPPER, "1": _WIDEST_RATIO, "%": _PERCENT, "mm": math.inf}
+    unit = next(unit for unit, limit in limits.items() if largest <= limit)
+    factor = unit_factor("gripper", unit)
+    note = (
+        f"gripper: no unit declared, values usually reach {largest:.4g}: taken for {unit}; "
+        f"overrule with units={{'gripper': ...}}"
+    )
+    return UnitDecision(
+        role="gripper",
+        unit=unit,
+        note=note if factor != 1 else None,
+        converts=factor != 1,
+        confidence=0.8,
+        evidence=f"values usually reach {largest:.3g}",
     )
 
 

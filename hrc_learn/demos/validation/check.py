@@ -1,6 +1,6 @@
 """Examining a dataset before anything is learned from it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,38 +9,44 @@ from jaxtyping import Float64
 
 from hrc_learn.demos.demonstration import JOINT_FIELDS
 from hrc_learn.demos.format.dataset_folder import DatasetFolder, EpisodeEntry
-from hrc_learn.demos.format.metadata import read_sidecar
+from hrc_learn.demos.format.metadata import SIDECAR_PATH, read_sidecar
 from hrc_learn.demos.issue import DatasetError, ValidationReport
-from hrc_learn.demos.read.column_mapping import (
-    ColumnMapping,
-    MappingSpec,
-    map_columns,
-    parse_mapping,
+from hrc_learn.demos.read.column_mapping import ColumnMapping, MappingSpec, parse_mapping
+from hrc_learn.demos.read.contract import changed_since, contract_of, infer_contract
+from hrc_learn.demos.read.episodes import (
+    Quantities,
+    read_mapping,
+    select_quantities,
+    units_on_disk,
 )
-from hrc_learn.demos.read.episodes import Quantities, select_quantities, units_on_disk
 from hrc_learn.demos.read.frames import RawFrames, recorded_stamps
+from hrc_learn.demos.read.profiles import EpisodeProfile, Tracking, profile_columns, track
 from hrc_learn.demos.read.reader import to_quaternion
-from hrc_learn.demos.read.roles import (
-    ORIENTATION_ROLES,
-    UnitDecision,
-    unit_factor,
-)
+from hrc_learn.demos.read.roles import ORIENTATION_ROLES, UnitDecision, unit_factor
+from hrc_learn.demos.validation.consistency_checks import check_consistency
 from hrc_learn.demos.validation.data_checks import (
+    ColumnSummary,
+    Duplicates,
     check_columns,
     check_commands,
-    check_duplicates,
     check_finite,
+    check_frozen,
     check_jumps,
     check_length,
+    check_motion,
     check_repeats,
+    check_spikes,
     check_stillness,
     check_timestamps,
 )
 from hrc_learn.demos.validation.structure_checks import (
-    check_file,
+    attempt,
+    check_files,
     check_indices,
     check_metadata,
+    check_statistics,
 )
+from hrc_learn.demos.validation.video_checks import check_videos
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,6 +59,10 @@ class _SoundEpisode:
     quantities: Quantities
 
 
+_KEPT_BYTES = 2**27
+"""Frames that are kept for the second look; of larger datasets they are read twice."""
+
+
 def check_dataset(
     path: str | Path,
     mapping: MappingSpec | None = None,
@@ -61,7 +71,7 @@ def check_dataset(
 ) -> ValidationReport:
     """Examine a LeRobot dataset of version 2.0, 2.1 or 3.0.
 
-    Whatever can be read is looked at, whatever else is broken.
+    Whatever can be read is looked at, whatever else is broken, an episode at a time.
 
     Args:
         path: The dataset's folder.
@@ -79,32 +89,38 @@ def check_dataset(
     if folder is None:
         return report
     parse_mapping(mapping or {}, folder.features)
-    episodes = _check_frames(folder, report)
-    report.episodes = len(episodes)
-    report.frames = sum(entry.length for entry, _ in episodes)
-    check_columns(folder, episodes, report)
-    try:
-        column_mapping, semantics = _resolve_semantics(
-            folder, episodes, mapping or {}, units or {}, report
-        )
-    except DatasetError as error:
-        report.add(error)
-        return report
-    _check_joint_sets(column_mapping, report)
-    for episode in semantics:
-        _check_episode(folder, episode, column_mapping, speed_limits or {}, report)
-    moving = [(episode.entry, _motion(episode)) for episode in semantics]
-    check_duplicates([(e, m) for e, m in moving if m is not None], report)
+    survey = _Survey(folder, report)
+    episodes = survey.first_look()
+    check_columns(folder, survey.columns, report)
+    check_statistics(folder, survey.columns, report)
+    attempt(report, lambda: check_videos(folder, report))
+    attempt(
+        report,
+        lambda: _check_meaning(
+            survey, episodes, mapping or {}, units or {}, speed_limits or {}
+        ),
+    )
     return report
 
 
-def _check_frames(
-    folder: DatasetFolder, report: ValidationReport
-) -> list[tuple[EpisodeEntry, RawFrames]]:
-    """Everything that needs no understanding of the columns."""
-    sound = []
-    for file, entries in folder.files().items():
-        for entry, frames in check_file(folder, file, entries, report):
+class _Survey:
+    """The episodes of a dataset that can be read, first for themselves, then for their meaning.
+
+    Attributes:
+        columns: What the values of each feature reach over all episodes.
+    """
+
+    def __init__(self, folder: DatasetFolder, report: ValidationReport):
+        self.folder = folder
+        self.report = report
+        self.columns: dict[str, ColumnSummary] = {}
+        self._kept: list[tuple[EpisodeEntry, RawFrames]] = []
+        self._whole = True
+
+    def first_look(self) -> list[EpisodeEntry]:
+        """Everything that needs no understanding of columns; the episodes that were read."""
+        folder, report, size, read = self.folder, self.report, 0, []
+        for entry, frames in check_files(folder, report):
             check_indices(folder, entry, frames, report)
             check_finite(folder.features, entry, frames, report)
             check_repeats(entry, frames, report)
@@ -112,44 +128,130 @@ def _check_frames(
             if "timestamp" in frames:
                 stamps = frames["timestamp"][:, 0].astype(float)
                 check_timestamps(entry, "timestamp", stamps, folder.fps, report)
-            sound.append((entry, frames))
-    return sound
+            for key, values in frames.items():
+                self.columns.setdefault(key, ColumnSummary()).add(values)
+            read.append(entry)
+            report.frames += entry.length
+            size += sum(values.nbytes for values in frames.values())
+            if size < _KEPT_BYTES:
+                # Views into a file's columns would keep them all.
+                kept = {key: values.copy() for key, values in frames.items()}
+                self._kept.append((entry, kept))
+            else:
+                self._whole, self._kept = False, []
+        report.episodes = len(read)
+        return read
+
+    def again(self) -> Iterator[tuple[EpisodeEntry, RawFrames]]:
+        """The same episodes once more; nothing is reported twice."""
+        if self._whole:
+            yield from self._kept
+        else:
+            yield from check_files(self.folder, ValidationReport(path=self.report.path))
 
 
-def _resolve_semantics(
-    folder: DatasetFolder,
-    episodes: Sequence[tuple[EpisodeEntry, RawFrames]],
+def _check_meaning(
+    survey: _Survey,
+    episodes: Sequence[EpisodeEntry],
     mapping: MappingSpec,
     units: Mapping[str, str],
-    report: ValidationReport,
-) -> tuple[ColumnMapping, list[_SoundEpisode]]:
-    """Find the quantities, decide on their units, and convert what is sound.
+    speed_limits: Mapping[str, float | int],
+) -> None:
+    """Find the quantities and their units, and look at every motion and between them.
 
     Raises:
         DatasetError: The mapping, the units or the sidecar are wrong.
     """
+    folder, report = survey.folder, survey.report
     sidecar = read_sidecar(folder.root)
-    column_mapping = map_columns(folder.features, sidecar, mapping)
-    raw = [
-        (entry, frames, select_quantities(frames, column_mapping.selections))
-        for entry, frames in episodes
-        if _sound(frames, column_mapping)
-    ]
-    decisions = {}
-    if raw:
-        recorded = (quantities for _, _, quantities in raw)
-        declared = sidecar.units
-        decisions = units_on_disk(
-            column_mapping.selections, recorded, folder.fps, declared, units
-        )
-    _report_guesses(column_mapping, decisions, report)
-    semantics = []
-    for entry, frames, quantities in raw:
-        scaled = {role: v * decisions[role].factor for role, v in quantities.items()}
-        _check_orientation(entry, quantities, scaled, report)
+    columns = read_mapping(folder, sidecar, mapping)
+    contract = contract_of(sidecar)
+    if (changed := changed_since(folder, contract)) is not None:
+        report.warning(changed, file=SIDECAR_PATH)
+    profiles: dict[int, EpisodeProfile] = {}
+
+    def quantities() -> Iterator[tuple[EpisodeEntry, Quantities]]:
+        for entry, frames in survey.again():
+            profile = EpisodeProfile(
+                index=entry.index, length=entry.length, columns=profile_columns(frames)
+            )
+            profiles[entry.index] = profile
+            if _sound(frames, columns):
+                found = select_quantities(frames, columns.selections)
+                profile.tracking.update(_tracking(found, folder.fps))
+                yield entry, found
+
+    declared = sidecar.units | ({} if contract is None else contract.units())
+    decisions, faults = units_on_disk(
+        columns.selections, quantities(), folder.fps, declared, units
+    )
+    for fault in faults:
+        report.add(fault)
+    _report_guesses(columns, decisions if profiles else {}, report)
+    _check_joint_sets(columns, report)
+    sketches = Duplicates()
+    bad = {fault.episode for fault in faults}
+    usual = _usual_motion(columns, decisions, profiles)
+    for entry, frames in survey.again():
+        if not _sound(frames, columns):
+            continue
+        raw = select_quantities(frames, columns.selections)
+        scaled = {role: v * decisions[role].factor for role, v in raw.items()}
+        _check_orientation(entry, raw, scaled, report)
         time = scaled["time"][:, 0] if "time" in scaled else recorded_stamps(folder, frames)
-        semantics.append(_SoundEpisode(entry=entry, time=time, quantities=scaled))
-    return column_mapping, semantics
+        episode = _SoundEpisode(entry=entry, time=time, quantities=scaled)
+        if entry.index not in bad:
+            _check_episode(folder, episode, columns, speed_limits, usual, report)
+        if (motion := _motion(episode)) is not None:
+            sketches.add(entry, motion)
+    sketches.report(report)
+    check_consistency(folder, columns, profiles, report)
+    report.contract = infer_contract(folder, columns, decisions, [*profiles.values()])
+    if contract is not None:
+        report.contract = contract
+
+
+def _tracking(quantities: Quantities, fps: float) -> dict[str, Tracking]:
+    """How commands, joints and their rates go together."""
+    joints, found = quantities.get("joint_position"), {}
+    if joints is None or len(joints) < 3:
+        return {}
+    rates = np.gradient(joints, 1 / fps, axis=0)
+    pairs = {
+        "command_position": (quantities.get("command_position"), joints),
+        "rates": (quantities.get("command_position"), rates),
+        "command_velocity": (quantities.get("command_velocity"), rates),
+        "joint_velocity": (quantities.get("joint_velocity"), rates),
+    }
+    for name, (given, followed) in pairs.items():
+        if given is not None and given.shape == followed.shape:
+            tracking = track(given, followed, fps)
+            if tracking is not None:
+                found[name] = tracking
+    return found
+
+
+def _usual_motion(
+    columns: ColumnMapping,
+    decisions: Mapping[str, UnitDecision],
+    profiles: Mapping[int, EpisodeProfile],
+) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Usual step and span of joints and commands, in our units, by quantity."""
+    usual = {}
+    for role in ("joint_position", "command_position"):
+        if role not in columns.selections:
+            continue
+        places = columns.selections[role].columns
+        known = [p for p in profiles.values() if all(key in p.columns for key, _ in places)]
+        if known:
+            usual[role] = tuple(
+                np.median(
+                    [[getattr(p.columns[k], name)[i] for k, i in places] for p in known], axis=0
+                )
+                * decisions[role].factor
+                for name in ("step", "span")
+            )
+    return usual
 
 
 def _sound(frames: RawFrames, column_mapping: ColumnMapping) -> bool:
@@ -211,11 +313,15 @@ def _check_joint_sets(column_mapping: ColumnMapping, report: ValidationReport) -
         if set(others) < set(column_mapping.joint_names):
             report.warning(f"{message}: it is left among the extra columns", key=role)
         elif len(others) == len(column_mapping.joint_names):
-            report.warning(f"{message}: leader and follower? They are not compared", key=role)
+            report.warning(
+                f"{message}: leader and follower? Left among the extra columns; --mapping "
+                f"{role} KEY pairs them in their order",
+                key=role,
+            )
         else:
-            report.error(
-                f"{message}: they cannot be matched; name them alike, or map one of them "
-                f"(mapping={{{role!r}: [...]}}) or leave it out ({{{role!r}: None}})",
+            report.warning(
+                f"{message}: they cannot be matched; left among the extra columns. Name them "
+                f"alike, or map one of them (--mapping {role} KEY[0:7])",
                 key=role,
             )
     if not any(role in column_mapping.selections for role in (*JOINT_FIELDS, "position")):
@@ -229,6 +335,7 @@ def _check_episode(
     episode: _SoundEpisode,
     column_mapping: ColumnMapping,
     speed_limits: Mapping[str, float | int],
+    usual: Mapping[str, tuple[np.ndarray, np.ndarray]],
     report: ValidationReport,
 ) -> None:
     entry, time, quantities = episode.entry, episode.time, episode.quantities
@@ -238,13 +345,21 @@ def _check_episode(
         return  # reported as an error; speeds make no sense
     moving = _motion(episode)
     if moving is not None:
+        check_motion(entry, moving, report)
         check_stillness(entry, time, moving, report)
+    for role in usual:
+        names = column_mapping.joint_names
+        check_spikes(entry, role, quantities[role], names, *usual[role], report)
     joints = quantities.get("joint_position")
     if joints is None:
         return
     check_jumps(entry, time, joints, column_mapping.joint_names, speed_limits, report)
     if "command_position" in quantities:
         check_commands(entry, joints, quantities["command_position"], report)
+        if "joint_position" in usual:
+            span = usual["joint_position"][1]
+            names = column_mapping.joint_names
+            check_frozen(entry, joints, quantities["command_position"], names, span, report)
 
 
 def _motion(episode: _SoundEpisode) -> np.ndarray | None:

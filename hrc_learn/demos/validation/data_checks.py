@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Shaped
 
 from hrc_learn.demos.format.dataset_folder import DatasetFolder, EpisodeEntry
 from hrc_learn.demos.format.metadata import Feature
@@ -67,31 +67,73 @@ def repeated_frames(frames: RawFrames) -> Bool[np.ndarray, " frames"]:
     """Frames whose observations are all those of the frame before, clocks left aside."""
     length = len(next(iter(frames.values())))
     state = [v for key, v in frames.items() if key.startswith("observation.")]
-    state = [v for v in state if not _is_clock(v)]
+    state = [v for v in state if not is_clock(v)]
     if not state or length < 2:
         return np.zeros(length, dtype=bool)
     same = np.logical_and.reduce([(v[1:] == v[:-1]).all(1) for v in state])
     return np.concatenate([[False], same])
 
 
+class ColumnSummary:
+    """What the values of one feature reach, gathered episode by episode."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.finite = True
+        self.low = self.high = self.total = np.zeros(0)
+        self._at_low = self._at_high = np.zeros(0)
+
+    def add(self, values: Shaped[np.ndarray, "frames components"]) -> None:
+        """Take an episode into account."""
+        if not len(values) or not self.finite:
+            return
+        values = values.astype(float)
+        if not np.isfinite(values).all() or (self.count and values.shape[1] != len(self.low)):
+            self.finite = False
+            return
+        low, high = values.min(0), values.max(0)
+        at_low, at_high = (values == low).sum(0), (values == high).sum(0)
+        if not self.count:
+            self.low, self.high, self.total = low, high, values.sum(0)
+            self._at_low, self._at_high = at_low, at_high
+        else:
+            self._at_low = _joined(low, self.low, at_low, self._at_low)
+            self._at_high = _joined(-high, -self.high, at_high, self._at_high)
+            self.low, self.high = np.minimum(low, self.low), np.maximum(high, self.high)
+            self.total = self.total + values.sum(0)
+        self.count += len(values)
+
+    @property
+    def at_end(self) -> Float64[np.ndarray, " components"]:
+        """Share of the frames in which each component sits at the end it sits at more."""
+        return np.maximum(self._at_low, self._at_high) / max(self.count, 1)
+
+    @property
+    def binary(self) -> Bool[np.ndarray, " components"]:
+        """Components with two values, such as a gripper that is open or closed."""
+        return self._at_low + self._at_high >= self.count
+
+
+def _joined(
+    end: np.ndarray, other: np.ndarray, count: np.ndarray, others: np.ndarray
+) -> np.ndarray:
+    """How many values sit at the lower of two ends."""
+    return np.where(end < other, count, np.where(end > other, others, count + others))
+
+
 def check_columns(
-    folder: DatasetFolder,
-    episodes: Sequence[tuple[EpisodeEntry, RawFrames]],
-    report: ValidationReport,
+    folder: DatasetFolder, columns: Mapping[str, ColumnSummary], report: ValidationReport
 ) -> None:
     """Components that never change, or that sit at an end of their range."""
-    keys = {key for _, frames in episodes for key in frames} - {*INDEX_KEYS}
-    for key in sorted(keys):
-        values = np.concatenate([frames[key] for _, frames in episodes if key in frames])
-        if not len(values) or not np.isfinite(values.astype(float)).all():
+    for key in sorted({*columns} - {*INDEX_KEYS}):
+        summary, feature = columns[key], folder.features.get(key)
+        if not summary.count or not summary.finite:
             continue
-        low, high = values.min(0), values.max(0)
-        constant = low == high
-        feature = folder.features.get(key)
+        constant = summary.low == summary.high
         if constant.any():
             report.warning(f"never changes: {_names(feature, constant)}", key=key)
-        at_end = np.maximum((values == low).mean(0), (values == high).mean(0))
-        saturated = (at_end > _SATURATED) & ~constant & ~_binary(values)
+        at_end = summary.at_end
+        saturated = (at_end > _SATURATED) & ~constant & ~summary.binary
         if saturated.any() and key.startswith(("observation.state", "action", "state")):
             report.warning(
                 f"sits at an end of its range for up to {100 * at_end[saturated].max():.0f} % "
@@ -113,12 +155,8 @@ def _names(feature: Feature | None, chosen: np.ndarray) -> str:
     return ", ".join(component_name(feature, int(i)) for i in np.flatnonzero(chosen))
 
 
-def _binary(values: np.ndarray) -> np.ndarray:
-    """Components with two values, such as a flag or a gripper that is open or closed."""
-    return ((values == values.min(0)) | (values == values.max(0))).all(0)
-
-
-def _is_clock(values: np.ndarray) -> bool:
+def is_clock(values: np.ndarray) -> bool:
+    """Whether a column only ever counts up, frame by frame."""
     return values.shape[1] == 1 and bool((np.diff(values[:, 0]) > 0).all())
 
 
@@ -208,25 +246,138 @@ def check_commands(
         )
 
 
-def check_duplicates(
-    episodes: Sequence[tuple[EpisodeEntry, Float64[np.ndarray, "_frames _"]]],
+_EMPTY = 1e-4
+"""Motion below which nothing was shown [rad or m]: less than encoders and trackers see."""
+
+
+def check_motion(
+    entry: EpisodeEntry, motion: Float64[np.ndarray, "frames _"], report: ValidationReport
+) -> None:
+    """Demonstrations that show nothing: no primitive can be fitted to them."""
+    span = float(np.ptp(motion, axis=0).max())
+    if span < _EMPTY:
+        report.error(
+            f"moves by {span:.2g} in all: nothing was demonstrated; leave the episode out",
+            **entry.location,
+        )
+
+
+# A spike is so many times a usual fast step, and such a part of the usual range.
+_SPIKE, _SPIKE_SHARE, _JUMP, _JUMP_SHARE = 4.0, 0.03, 8.0, 0.1
+_LEAST_SPIKE, _LEAST_JUMP = 0.03, 0.1
+"""Smaller ones are noise [rad]."""
+
+
+def check_spikes(
+    entry: EpisodeEntry,
+    role: str,
+    values: Joints,
+    names: Sequence[str],
+    step: Float64[np.ndarray, " joints"],
+    span: Float64[np.ndarray, " joints"],
     report: ValidationReport,
 ) -> None:
+    """Frames out of line with both neighbours, and steps far beyond those usual here.
+
+    Args:
+        entry: The episode.
+        role: What the values are.
+        values: Positions of joints, or of their commands.
+        names: Of the joints.
+        step: Usual fast step of each (one in a hundred is above).
+        span: Usual range of each.
+        report: Receives what is found.
+    """
+    steps = np.diff(values, axis=0)
+    bound = np.maximum(_SPIKE * step, _SPIKE_SHARE * span) + _LEAST_SPIKE
+    moves = (step > 0) & (step < 0.2 * span)  # others switch between levels
+    there, back = steps[:-1], steps[1:]
+    opposite = there * back < 0
+    spike = opposite & (np.minimum(np.abs(there), np.abs(back)) > bound) & moves
+    jump = (np.abs(steps) > np.maximum(_JUMP * step, _JUMP_SHARE * span) + _LEAST_JUMP) & moves
+    jump[:-1] &= ~spike
+    jump[1:] &= ~spike
+    for odd, what, offset in ((spike, "leaps away for one frame", 1), (jump, "jumps", 1)):
+        if not odd.any():
+            continue
+        size = np.where(odd, np.abs(steps[: len(odd)]) / np.maximum(step, 1e-9), 0.0)
+        frame, joint = (int(i) for i in np.unravel_index(int(size.argmax()), size.shape))
+        report.warning(
+            f"{names[joint]} {what} by {steps[frame, joint]:.3g}, "
+            f"{size[frame, joint]:.0f} times its usual fast step; {int(odd.any(1).sum())} such "
+            f"frames in the episode",
+            **entry.location,
+            frame=int(frame) + offset,
+            key=f"{role} ({names[joint]})",
+            severity=float(size.max()),
+        )
+
+
+def check_frozen(
+    entry: EpisodeEntry,
+    joints: Joints,
+    command: Joints,
+    names: Sequence[str],
+    span: Float64[np.ndarray, " joints"],
+    report: ValidationReport,
+) -> None:
+    """Joints that stay exactly where they are while their command goes elsewhere."""
+    if joints.shape != command.shape or len(joints) < 20:
+        return
+    for joint in np.flatnonzero(span > 0):
+        moves = np.flatnonzero(np.diff(joints[:, joint]) != 0)
+        edges = np.concatenate([[-1], moves, [len(joints) - 1]])
+        longest = int(np.diff(edges).argmax())
+        first, last = int(edges[longest]) + 1, int(edges[longest + 1])
+        if last - first < 10:
+            continue
+        asked = float(np.ptp(command[first : last + 1, joint]))
+        if asked > 0.25 * span[joint] and asked > 0.02:
+            report.warning(
+                f"{names[joint]} stays exactly the same for {last - first} frames while its "
+                f"command moves by {asked:.3g}: the encoder froze?",
+                **entry.location,
+                frame=first,
+                key=f"joint_position ({names[joint]})",
+                severity=asked,
+            )
+
+
+class Duplicates:
     """Episodes that show the same motion to within a thousandth of its span."""
-    seen: list[tuple[EpisodeEntry, np.ndarray]] = []
-    for entry, motion in episodes:
-        sketch = motion[np.linspace(0, len(motion) - 1, 20).round().astype(int)]
-        span = float(np.ptp(motion, axis=0).max())
-        for earlier, other in seen:
-            close = abs(earlier.length - entry.length) <= 0.02 * entry.length
-            if close and span and np.abs(sketch - other).max() < _SAME_EPISODE * span:
-                report.warning(
-                    f"shows the same motion as episode {earlier.index}: recorded once, "
-                    f"stored twice?",
-                    **entry.location,
-                )
-                break
-        seen.append((entry, sketch))
+
+    def __init__(self) -> None:
+        self._entries: list[EpisodeEntry] = []
+        self._sketches: list[np.ndarray] = []
+        self._spans: list[float] = []
+
+    def add(self, entry: EpisodeEntry, motion: Float64[np.ndarray, "frames _"]) -> None:
+        """Remember 20 moments of an episode."""
+        places = np.linspace(0, len(motion) - 1, 20).round().astype(int)
+        self._entries.append(entry)
+        self._sketches.append(motion[places].reshape(-1))
+        self._spans.append(float(np.ptp(motion, axis=0).max()))
+
+    def report(self, report: ValidationReport) -> None:
+        """Tell those that are the same as an earlier one."""
+        from scipy.spatial import KDTree
+
+        if len({sketch.shape for sketch in self._sketches}) != 1:
+            return
+        tree = KDTree(np.stack(self._sketches))
+        for number, (entry, span) in enumerate(zip(self._entries, self._spans, strict=True)):
+            radius = _SAME_EPISODE * span
+            close = tree.query_ball_point(self._sketches[number], radius, p=np.inf)
+            for other in sorted(close):
+                earlier = self._entries[other]
+                same = abs(earlier.length - entry.length) <= 0.02 * entry.length
+                if other < number and same and span:
+                    report.warning(
+                        f"shows the same motion as episode {earlier.index}: recorded once, "
+                        f"stored twice?",
+                        **entry.location,
+                    )
+                    break
 
 
 # Oddities of the stamps.
@@ -266,6 +417,13 @@ def check_timestamps(
         )
         return
     usual = float(np.median(steps))
+    if key == "timestamp" and abs(time[0]) > 0.5 / fps:
+        report.warning(
+            f"begins at {time[0]:.6g} s, not at 0: LeRobot's stamps count from the start of "
+            f"the episode",
+            frame=0,
+            **place,
+        )
     if abs(usual * fps - 1) > _RATE_TOLERANCE:
         report.warning(
             f"frames are {1e3 * usual:.4g} ms apart ({1 / usual:.4g} Hz), but fps says "

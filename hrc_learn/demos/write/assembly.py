@@ -117,6 +117,7 @@ def assemble(
     earlier: Path | None = None,
     videos: Sequence[Segments] | None = None,
     tasks: Sequence[str] = (),
+    share: bool = True,
 ) -> None:
     """Write the dataset of these staged episodes.
 
@@ -127,6 +128,8 @@ def assemble(
             its files get a second name in the new one.
         videos: Images of each episode; None: those that were recorded beside it.
         tasks: Task texts that have an index already, in its order.
+        share: Let the dataset share its videos with where they come from, under a second
+            name, instead of copying them.
     """
     header = read_episode(paths[0]).header
     for folder in ("meta/episodes/chunk-000", "data"):
@@ -135,7 +138,7 @@ def assemble(
     index = _carry_over(earlier, target) if earlier is not None else _Index()
     index.tasks |= dict.fromkeys(tasks)
     taken = {key: _count_videos(index, key) for key in cameras}
-    shelf = VideoPlacement(target, taken)
+    shelf = VideoPlacement(target, taken, share=share)
     if videos is None:
         videos = [_recorded_videos(path, cameras, header.fps) for path in paths]
     segments = iter(videos)

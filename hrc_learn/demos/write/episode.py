@@ -345,17 +345,31 @@ def staged_paths(folder: Path, first: int = 0) -> list[Path]:
     return paths
 
 
-def to_table(values: dict[str, np.ndarray], features: dict[str, dict]) -> pa.Table:
-    """Arrow table of one episode: a number or a list of fixed length a frame."""
+def to_table(
+    values: Mapping[str, np.ndarray],
+    features: Mapping[str, Mapping],
+    others: Mapping[str, pa.Array | pa.ChunkedArray] | None = None,
+) -> pa.Table:
+    """Arrow table of one episode: a number or a list of fixed length a frame.
+
+    Args:
+        values: Numbers by feature, (frames, components).
+        features: As in `meta/info.json`, in the order of the columns.
+        others: Columns that hold no numbers, such as images and texts.
+    """
+    others = others or {}
     arrays = {
-        key: _to_arrow(values[key], feature["dtype"], feature["shape"][0])
+        key: others[key]
+        if key in others
+        else _to_arrow(values[key], feature["dtype"], feature["shape"])
         for key, feature in features.items()
         if feature["dtype"] != "video"
     }
     return pa.table(arrays)
 
 
-def _to_arrow(values: np.ndarray, dtype: str, width: int) -> pa.Array:
+def _to_arrow(values: np.ndarray, dtype: str, shape: Sequence[int]) -> pa.Array:
+    width = int(np.prod(shape))
     contiguous = np.ascontiguousarray(values, dtype=dtype)
     if contiguous.dtype == bool:
         flat = pa.array(contiguous.reshape(-1))  # packed to bits
@@ -365,6 +379,13 @@ def _to_arrow(values: np.ndarray, dtype: str, width: int) -> pa.Array:
     flat = pa.Array.from_buffers(
         pa.from_numpy_dtype(contiguous.dtype), contiguous.size, buffers
     )
+    if len(shape) > 1:  # lists of lists, as Hugging Face keeps arrays of several axes
+        for length in reversed(shape):
+            ends = np.arange(len(flat) // length + 1, dtype=np.int32) * length
+            buffers = [None, pa.py_buffer(ends)]
+            kind = pa.list_(flat.type)
+            flat = pa.Array.from_buffers(kind, len(ends) - 1, buffers, children=[flat])
+        return flat
     return flat if width == 1 else pa.FixedSizeListArray.from_arrays(flat, width)
 
 
