@@ -51,7 +51,8 @@ def check(args: Check) -> int:
             write_text(folder / "findings.json", findings)
             write_json(folder / "metrics.json", counts)
             if contract is not None:
-                write_json(folder / "contract.json", contract_content(contract))
+                text = json.dumps(contract_content(contract), indent=2) + "\n"
+                write_text(folder / "contract.json", text)
     if args.findings is not None:
         write_text(args.findings, findings)
     write_values(args.json, counts)

@@ -242,7 +242,11 @@ def _usual_motion(
         if role not in columns.selections:
             continue
         places = columns.selections[role].columns
-        known = [p for p in profiles.values() if all(key in p.columns for key, _ in places)]
+        known = [
+            p
+            for p in profiles.values()
+            if all(k in p.columns and i < len(p.columns[k].start) for k, i in places)
+        ]
         if known:
             usual[role] = tuple(
                 np.median(

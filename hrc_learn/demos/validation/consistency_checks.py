@@ -71,6 +71,8 @@ def _features(
             continue
         discrete = np.mean([is_discrete(p.columns[key], p.length) for p in known], axis=0)
         width = widths.pop()[0]
+        if width != declared.width:
+            continue  # reported with the columns
         yield _Feature(
             key=key,
             entries=[entries[p.index] for p in known],
