@@ -2,6 +2,7 @@
 
 from hrc_learn.geometry import quaternion as quaternion
 from hrc_learn.geometry.mesh_files import MeshPart as MeshPart
+from hrc_learn.geometry.mesh_files import mesh_points as mesh_points
 from hrc_learn.geometry.mesh_files import read_mesh as read_mesh
 from hrc_learn.geometry.numerics import minimum_jerk as minimum_jerk
 from hrc_learn.geometry.pose import Pose as Pose

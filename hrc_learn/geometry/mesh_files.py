@@ -65,15 +65,28 @@ def read_mesh(path: Path) -> tuple[MeshPart, ...]:
     Raises:
         ValueError: The file is of another kind, or holds no triangle.
     """
+    return tuple(_part(triangles, colour) for triangles, colour in _read(path))
+
+
+def mesh_points(path: Path) -> Float[np.ndarray, "points 3"]:
+    """Corners of the triangles in a file that `read_mesh` reads, each once [m].
+
+    Raises:
+        ValueError: The file is of another kind, or holds no triangle.
+    """
+    corners = [triangles.reshape(-1, 3) for triangles, _ in _read(path)]
+    return np.unique(np.concatenate(corners).astype(np.float64), axis=0)
+
+
+def _read(path: Path) -> "list[tuple[_Triangles, Colour | None]]":
+    """Triangles of each colour in a file; at least one."""
     readers = {".dae": _read_collada, ".stl": _read_stl, ".obj": _read_obj}
     reader = readers.get(path.suffix.lower())
     if reader is None:
         raise ValueError(
             f"{path}: cannot read {path.suffix} meshes, only {', '.join(readers)}."
         )
-    parts = tuple(
-        _part(triangles, colour) for triangles, colour in reader(path) if len(triangles)
-    )
+    parts = [part for part in reader(path) if len(part[0])]
     if not parts:
         raise ValueError(f"{path} holds no triangle: is it complete?")
     return parts

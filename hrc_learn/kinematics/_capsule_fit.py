@@ -17,8 +17,8 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from hrc_learn.geometry import mesh_points
 from hrc_learn.kinematics._description import Shape, Transform
-from hrc_learn.kinematics._mesh_files import mesh_points
 from hrc_learn.kinematics.chain import SerialChain
 from hrc_learn.kinematics.collision import CapsuleArm, LinkCapsule
 

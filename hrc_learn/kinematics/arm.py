@@ -39,8 +39,8 @@ from hrc_learn.kinematics.limits import complete_limits, read_limits
 type LimitsGiven = Mapping[str, Mapping[str, float]] | Path | None
 """Limits that replace or complete those of a description, see `complete_limits`, or a file."""
 
-# Of arms whose description gives no masses: aluminium shells with motors and gears in them
-# come to this of the capsules' volume (Panda: 18 kg in 15 l).
+# Of arms whose description gives no masses, of the capsules' volume: a guess, a little above
+# water, for aluminium shells with motors and gears in them.
 _DENSITY = 1200.0  # [kg/m^3]
 
 

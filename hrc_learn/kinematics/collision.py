@@ -111,7 +111,7 @@ class CapsuleArm:
                 (a, b, c), (d, e, f) = (ends @ T[:3, :3].mT + T[:3, 3]).tolist()
                 capsule = replace(capsule, start=(a, b, c), end=(d, e, f))
             capsules.append(capsule)
-        return CapsuleArm(chain, capsules, self._overlapping)
+        return CapsuleArm(chain, capsules, self.overlapping)
 
     def segments(
         self,

@@ -39,7 +39,8 @@ class _Source:
     tool: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
     """Tool in the frame of the tip: origin [m] and the direction of approach, its z axis."""
     limits: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    """What the file does not tell, from the maker's data sheet."""
+    """What the file does not tell. Velocities are those that makers publish, written down from
+    memory: compare them with the data sheet before a real arm is led by them."""
 
 
 def _degrees(*speeds: int | float, names: str, first: int = 1) -> dict[str, dict[str, float]]:
@@ -84,7 +85,7 @@ _SOURCES = {
         base="base",
         tip="right_hand",
         ready=(0.0, -_H, _H, -_H, -_H, 0.0),
-        # UR5e technical specifications: 180 degrees a second each.
+        # UR5e: 180 degrees a second each.
         limits={"default": {"velocity": math.pi}},
     ),
     # The dimensions are those of the R800, not of the larger iiwa 14.
@@ -95,7 +96,6 @@ _SOURCES = {
         base="base",
         tip="right_hand",
         ready=(0.0, 0.65, 0.0, -1.89, 0.0, 0.6, 0.0),
-        # KUKA, LBR iiwa 7 R800 data sheet.
         limits=_degrees(98, 98, 100, 130, 140, 180, 180, names="joint_{}"),
     ),
     "gen3": _Source(
@@ -105,7 +105,7 @@ _SOURCES = {
         base="base",
         tip="right_hand",
         ready=(0.0, 0.65, 0.0, 1.89, 0.0, 0.6, -_H),
-        # Kinova, Gen3 user guide: large actuators 1.39 rad/s, small ones 1.22 rad/s.
+        # Large actuators 1.39 rad/s, small ones 1.22 rad/s.
         limits=_degrees(*(79.64,) * 4, *(69.91,) * 3, names="Actuator{}"),
     ),
     "jaco": _Source(
@@ -115,7 +115,7 @@ _SOURCES = {
         base="base",
         tip="right_hand",
         ready=(3.192, 3.68, 0.0, 1.17, 0.05, 3.76, 3.142),
-        # Kinova's description of the j2s7s300: 36 degrees a second, the wrist's joints 48.
+        # 36 degrees a second, the wrist's joints 48.
         limits=_degrees(36, 36, 36, 36, 48, 48, 48, names="j2s7s300_joint_{}"),
     ),
     "sawyer": _Source(
@@ -125,7 +125,6 @@ _SOURCES = {
         base="base",
         tip="right_hand",
         ready=(0.0, -1.18, 0.0, 2.18, 0.0, 0.57, 3.3161),
-        # Rethink's description of the arm.
         limits=_degrees(
             99.7, 76.1, 112.1, 112.1, 199.7, 199.7, 260.4, names="right_j{}", first=0
         ),
@@ -156,7 +155,7 @@ _SOURCES = {
         ready=(0.0, -0.4, 0.6, 0.0, 1.3, 0.0),
         # Between the fingertips: where gym-aloha's own calibration sites are.
         tool=((0.15, 0.0, 0.0), (1.0, 0.0, 0.0)),
-        # Trossen's description of the arm: pi rad/s each.
+        # Pi rad/s each.
         limits={"default": {"velocity": math.pi}},
     ),
     "so101": _Source(

@@ -149,17 +149,17 @@ class Motions:
             return values[:, 0], values.take_along_dim(last, dim=1)[:, 0]
 
         time, duration = self.demos.time, self.demos.time.take_along_dim(last[..., 0], dim=1)
-        timing = {"duration": duration[:, 0]}
+        lasting = duration[:, 0]
         if isinstance(primitive, JointDMP):
             start, goal = ends(CHANNELS[channel][0])
-            return Reproduction(primitive.rollout(time, start, goal, **timing).position)
+            return Reproduction(primitive.rollout(time, start, goal, lasting).position)
         turn_start, turn_goal = ends("orientation")
         if isinstance(primitive, OrientationDMP):
-            motion = primitive.rollout(time, turn_start, turn_goal, **timing)
+            motion = primitive.rollout(time, turn_start, turn_goal, lasting)
             return Reproduction(orientation=motion.orientation)
         start, goal = ends("position")
         motion = primitive.rollout(
-            time, Pose(start, turn_start), Pose(goal, turn_goal), **timing
+            time, Pose(start, turn_start), Pose(goal, turn_goal), lasting
         )
         return Reproduction(motion.position, motion.orientation)
 

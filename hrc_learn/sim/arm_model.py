@@ -242,7 +242,7 @@ def _add_capsules(body, robot: WorkArm, link: int, mass: float | None) -> None:
         )
     for k, capsule in enumerate(capsules):
         geom = body.add_geom(
-            name=f"link{link}_{k}" if mass else f"link{link}",
+            name=f"link{link}_{k}" if mass or k else f"link{link}",
             type=_CAPSULE,
             fromto=(*capsule.start, *capsule.end),
             size=(capsule.radius, 0, 0),

@@ -157,7 +157,7 @@ def test_options_of_a_repair_are_those_of_the_package():
     [
         (("demo", "--shelf", "top"), "'lower', 'middle', 'upper'"),
         (("run", "collaboration", "--shelf", "top"), "'lower', 'middle', 'upper'"),
-        (("demo", "--robot", "ur5"), "invalid choice 'ur5'"),
+        (("demo", "--robot", "ur99"), "no arm 'ur99': there are panda, fr3"),
         (("fit", "--datset", "demos", "--dataset", "x"), "--datset demos; perhaps --dataset"),
         (("fit", "--datset", "demos"), "--datset demos"),
         (("fit",), "missing: --dataset (see hrc fit primitives --help)"),

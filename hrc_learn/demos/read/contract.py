@@ -274,7 +274,7 @@ def infer_contract(
             if role is None:
                 parts.append(_unnamed(part, float(discrete[index]), feature.key))
             else:
-                parts.append(_of_role(part, number, decisions[role], profiles))
+                parts.append(_of_role(part, number, decisions[role], profiles, folder.fps))
     return Contract(components=tuple(parts), fingerprint=fingerprint(folder))
 
 
@@ -293,6 +293,7 @@ def _of_role(
     number: int,
     decision: UnitDecision,
     profiles: Sequence[EpisodeProfile],
+    fps: float,
 ) -> ComponentContract:
     role, hand = decision.role, is_hand(part.name)
     names = {
@@ -323,8 +324,7 @@ def _of_role(
     if role == "joint_velocity":
         shown = f"slope {slope:.2f} against differences of the position, R2 {fit:.2f}"
         return replace(part, sign=sign, evidence=shown)
-    # The median over episodes, in seconds of the nominal rate: `track` counts frames.
-    return replace(part, sign=sign, delay=delay, evidence=shown)
+    return replace(part, sign=sign, delay=delay / fps, evidence=shown)
 
 
 def _agreement(tracked: Sequence[Tracking], number: int) -> tuple[float, float, float, int]:
