@@ -106,8 +106,8 @@ class JointLimits(MotionLimits):
 
 # What a description does not tell, and why these: slower than the slowest joint of any arm
 # registered here but Kinova's, and ISO 10218-1's reduced speed for what slides; full speed
-# after 0.2 s and full acceleration after 20 ms, both a choice of ours (the Panda: 0.13 to 0.29 s,
-# 2 ms).
+# after 0.2 s and full acceleration after 20 ms, both a choice of ours (the Panda's: 0.13 to
+# 0.29 s and 2 ms).
 DEFAULT_VELOCITY = 1.0  # [rad/s]
 DEFAULT_SLIDING_VELOCITY = 0.25  # [m/s]
 _SECONDS_TO_FULL_SPEED = 0.2
