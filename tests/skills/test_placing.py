@@ -19,10 +19,11 @@ from hrc_learn.learning.primitive_fitting import fit_primitives
 from hrc_learn.sim import World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.placing import PlacingSkill, check_plan, plan_candidates
-from hrc_learn.skills.work_cell import BlockedPathError
+from hrc_learn.skills.work_cell import BlockedPathError, TaskFailedError
 from hrc_learn.teleoperation.scripted_demonstrations import (
     PlacingDemonstrationConfig,
     demonstrate_placing,
+    demonstrate_placing_without_contact,
 )
 
 WORKPLACE = Workplace()
@@ -95,6 +96,16 @@ def test_without_pulling_the_elbow_the_arm_hits_the_open_door():
         world, WORKPLACE, "middle", config, np.random.default_rng(0)
     )
     assert "cabinet_door" in {touch.second for touch in touches}
+
+
+@shapes_unchecked()
+def test_a_demonstration_that_does_not_arrive_is_none():
+    # The first second of a motion of a minute: nothing is touched, and nothing reached.
+    config = PlacingDemonstrationConfig(pull_elbow=False, duration=60.0, settle=-59.0)
+    with pytest.raises(TaskFailedError, match=r"3 demonstrations .* \d+ cm from its place"):
+        demonstrate_placing_without_contact(
+            World(WORKPLACE.scene), WORKPLACE, "middle", config, np.random.default_rng(0)
+        )
 
 
 def test_each_primitive_repeats_its_demonstration_and_their_mean_comes_close(fitted):
