@@ -24,6 +24,7 @@ from hrc_learn.vision import Marker, marker_texture
 
 
 _CAPSULE = mujoco.mjtGeom.mjGEOM_CAPSULE
+_SHORTEST = 1e-6  # length of a capsule from which on it is no ball [m]
 _BOX = mujoco.mjtGeom.mjGEOM_BOX
 
 _HIDDEN = 4  # sites of this group are not drawn
@@ -241,12 +242,17 @@ def _add_capsules(body, robot: WorkArm, link: int, mass: float | None) -> None:
             group=_HIDDEN,
         )
     for k, capsule in enumerate(capsules):
+        # MuJoCo takes no capsule without a length.
+        is_ball = math.dist(capsule.start, capsule.end) < _SHORTEST
+        along = (
+            {"pos": capsule.start} if is_ball else {"fromto": (*capsule.start, *capsule.end)}
+        )
         geom = body.add_geom(
             name=f"link{link}_{k}" if mass or k else f"link{link}",
-            type=_CAPSULE,
-            fromto=(*capsule.start, *capsule.end),
+            type=mujoco.mjtGeom.mjGEOM_SPHERE if is_ball else _CAPSULE,
             size=(capsule.radius, 0, 0),
             rgba=_WHITE,
+            **along,
         )
         if mass is not None:
             geom.mass = mass / len(capsules)

@@ -7,9 +7,10 @@ import torch
 from bare_arm import bare
 
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.kinematics import PANDA, ArmChoice, EquippedArm
+from hrc_learn.kinematics import PANDA, ArmChoice, CapsuleArm, EquippedArm, LinkCapsule, panda
+from hrc_learn.kinematics.work_arm import FrankaWorkArm
 from hrc_learn.sim import ArmModelConfig, World
-from hrc_learn.sim.arm_model import whole_arm
+from hrc_learn.sim.arm_model import add_arm, whole_arm
 from hrc_learn.sim.drawn_world import DrawnWorld
 from hrc_learn.sim.workplace import Workplace
 
@@ -116,3 +117,18 @@ def test_links_that_touch_stand_out_and_are_themselves_again():
     assert names == {"link5", "table"}
     drawn.paint([], red)
     np.testing.assert_array_equal(drawn.model.geom_rgba, before)
+
+
+def test_a_capsule_without_a_length_is_a_ball_and_a_base_may_have_several():
+    robot = FrankaWorkArm(panda)
+    point, radius = (0.0, 0.0, 0.1), 0.05
+    balls = [LinkCapsule(link=i, start=point, end=point, radius=radius) for i in range(8)]
+    robot.body = CapsuleArm(panda, [balls[0], *balls])
+    spec = mujoco.MjSpec()
+    add_arm(spec, ArmModelConfig(robot=robot))
+    model = spec.compile()
+    geoms = [model.geom(name) for name in ("link0", "link0_1", "link4_0")]
+    for geom in geoms:
+        assert geom.type[0] == mujoco.mjtGeom.mjGEOM_SPHERE
+        np.testing.assert_allclose(geom.pos, point)
+        assert geom.size[0] == radius
