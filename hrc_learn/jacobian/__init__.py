@@ -1,5 +1,10 @@
 """The image Jacobian: learned offline from demonstrations, adapted online."""
 
+from hrc_learn.jacobian.camera_motion import CameraMotion as CameraMotion
+from hrc_learn.jacobian.camera_motion import CameraPlacement as CameraPlacement
+from hrc_learn.jacobian.camera_motion import CameraReference as CameraReference
+from hrc_learn.jacobian.camera_motion import CameraWatch as CameraWatch
+from hrc_learn.jacobian.camera_motion import camera_placements as camera_placements
 from hrc_learn.jacobian.estimator import FixedEstimator as FixedEstimator
 from hrc_learn.jacobian.estimator import ImageJacobianEstimator as ImageJacobianEstimator
 from hrc_learn.jacobian.estimator import KeyFrameEstimator as KeyFrameEstimator
@@ -31,6 +36,7 @@ from hrc_learn.jacobian.model_selection import maximize_evidence as maximize_evi
 from hrc_learn.jacobian.network import RBFImageJacobian as RBFImageJacobian
 from hrc_learn.jacobian.network import nominal_network as nominal_network
 from hrc_learn.jacobian.network import stack_networks as stack_networks
+from hrc_learn.jacobian.perspective import MarkerCamera as MarkerCamera
 from hrc_learn.jacobian.perspective import depth_gradient as depth_gradient
 from hrc_learn.jacobian.perspective import fit_focal_length as fit_focal_length
 from hrc_learn.jacobian.samples import ImageDemonstration as ImageDemonstration

@@ -10,10 +10,14 @@ are known. A point at an offset o then is seen at
 
     x + J o / (1 + g^T o),    g = r_3 / z.
 
-Neither lens distortion nor an image centre off the middle is modelled.
+The closed form models neither lens distortion nor an image centre off the middle; a camera
+fitted to demonstrations (`MarkerCamera`) does.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from itertools import islice
 
 import numpy as np
@@ -31,6 +35,13 @@ lenses of 30 to 80 degrees are within one of it."""
 _PIXEL_NOISE = 1.0
 """Residual beyond which a frame counts less [px]: several times a detector's noise, about what
 the calibration of an arm leaves."""
+_CENTER_SPREAD = 0.02
+"""Prior standard deviation of the principal point about the middle, over the image's width:
+assembled cameras are off by some tens of pixels in two thousand."""
+_RADIAL_SPREAD = 0.2
+"""Prior standard deviation of the radial coefficient: lenses but fish eyes are within it."""
+_NEAREST = 1e-3
+"""Least depth of a point [m]."""
 _TINY = 1e-12
 _FRAMES = 2000
 """About so many are fitted to: the noise averages out long before."""
@@ -74,6 +85,135 @@ def _camera(
     return rows + xi[..., :, None] * axis[..., None, :], depth, axis
 
 
+@dataclass(frozen=True, kw_only=True)
+class MarkerCamera:
+    """A camera, and the place of a marker on the tool that it watches, found from motion alone.
+
+    A pinhole with Brown's first radial coefficient. The marker's place and the camera's are
+    found together, so a tool centre point that is off, or a base that was measured wrongly, is
+    within them.
+    """
+
+    focal: float
+    """Focal length [px]."""
+    center: tuple[float, float]
+    """Principal point (u, v) [px]."""
+    radial: float
+    """Brown's k1: a point at xi is seen at xi (1 + k1 |xi|^2)."""
+    rotation: tuple[float, float, float]
+    """Rotation vector from base to camera frame (OpenCV's axes) [rad]."""
+    shift: tuple[float, float, float]
+    """Of the base's origin in the camera frame [m]."""
+    marker: tuple[float, float, float]
+    """Place of the marker in the tool's frame [m]."""
+
+    @staticmethod
+    def fit(
+        demonstrations: Sequence[ImageDemonstration],
+        network: RBFImageJacobian,
+        image_size: tuple[int, int],
+        *,
+        lens: bool = True,
+    ) -> MarkerCamera:
+        """Find it by robust nonlinear least squares on the pixels.
+
+        Args:
+            demonstrations: In which the tool moved and turned, read one by one.
+            network: Image Jacobian fitted to them, to begin with; in float64.
+            image_size: Width and height [px].
+            lens: Whether the principal point and the radial coefficient are found too, or
+                are the image's middle and zero.
+        """
+        # Of the extras that read demonstrations and simulate; this package does without.
+        from scipy.optimize import least_squares
+
+        pose, pixel = _sampled(demonstrations)
+        tool, turn = pose.position.numpy(), quaternion.to_matrix(pose.orientation).numpy()
+        seen_at, middle_pixel, width = pixel.numpy(), np.array(image_size) / 2, image_size[0]
+        with torch.no_grad():
+            jacobians = network(pose).numpy()[..., :3]
+        spread = np.array([_CENTER_SPREAD * width] * 2 + [_RADIAL_SPREAD])
+
+        def residuals(unknown: Float[np.ndarray, " unknown"]) -> Float[np.ndarray, " all"]:
+            log_focal, rotation, shift, marker, optics = np.split(unknown, [1, 4, 7, 10])
+            center, radial = _optics(optics, middle_pixel)
+            rows = _matrix(rotation)
+            point = (tool + turn @ marker - middle) @ (rows @ first).T + shift
+            seen = _project(point, width * np.exp(log_focal), center, radial)
+            priors = np.append(log_focal / _FOCAL_SPREAD, optics / spread[: len(optics)])
+            return np.append((seen - seen_at).ravel() / _PIXEL_NOISE, priors)
+
+        middle, xi = tool.mean(0), (seen_at.mean(0) - middle_pixel) / width
+        rows, depth, axis = _camera(jacobians.mean(0) / width, xi)
+        u, _, vt = np.linalg.svd(np.vstack([rows, axis]))
+        first = u @ vt
+        start = np.zeros(13 if lens else 10)
+        start[4:7] = depth * np.append(xi, 1.0)
+        found = least_squares(residuals, start, loss="soft_l1", x_scale="jac").x
+        log_focal, rotation, shift, marker, optics = np.split(found, [1, 4, 7, 10])
+        matrix = _matrix(rotation) @ first
+        center, radial = _optics(optics, middle_pixel)
+        return MarkerCamera(
+            focal=width * float(np.exp(log_focal[0])),
+            center=_pair(center),
+            radial=radial,
+            rotation=_triple(_rotation_vector(matrix)),
+            shift=_triple(shift - matrix @ middle),
+            marker=_triple(marker),
+        )
+
+    def points(self, pose: Pose) -> Float[np.ndarray, "*batch 3"]:
+        """The marker in the camera frame [m] at poses of the tool, in float64."""
+        base = pose.apply(pose.position.new_tensor(self.marker)).numpy()
+        return base @ _matrix(np.array(self.rotation)).T + np.array(self.shift)
+
+    def project(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2"]:
+        """Where points of the camera frame [m] are seen [px]."""
+        return _project(points, self.focal, np.array(self.center), self.radial)
+
+    def motion_jacobian(
+        self, points: Float[np.ndarray, "*batch 3"]
+    ) -> Float[np.ndarray, "*batch 2 6"]:
+        """Derivative of pixels by a twist of the camera in its own frame [px/rad, px/m].
+
+        Three columns of rotation, then three of translation: the interaction matrix of
+        Espiau, Chaumette and Rives (1992) for points, times the lens.
+
+        Args:
+            points: In the camera frame [m].
+        """
+        x, y, z = np.moveaxis(points, -1, 0)
+        z = z.clip(min=_NEAREST)
+        xi = np.stack([x / z, y / z], axis=-1)
+        square = (xi**2).sum(-1)[..., None, None]
+        lens = (1 + self.radial * square) * np.eye(2) + 2 * self.radial * (
+            xi[..., :, None] * xi[..., None, :]
+        )
+        zero = np.zeros_like(z)
+        pinhole = np.stack(
+            [
+                np.stack([1 / z, zero, -x / z**2], axis=-1),
+                np.stack([zero, 1 / z, -y / z**2], axis=-1),
+            ],
+            axis=-2,
+        )
+        # A camera that turns by w and moves by v sees a point move by p x w - v.
+        turned = np.cross(points[..., None, :], np.eye(3)).swapaxes(-1, -2)
+        moved = np.concatenate([turned, np.broadcast_to(-np.eye(3), turned.shape)], axis=-1)
+        return self.focal * lens @ pinhole @ moved
+
+    def moved(self, twist: Float[np.ndarray, "6"]) -> MarkerCamera:
+        """The same camera, turned by a rotation vector [rad] about its own axes, then moved
+        along what were its axes before [m].
+        """
+        back = _matrix(twist[:3]).T
+        return replace(
+            self,
+            rotation=_triple(_rotation_vector(back @ _matrix(np.array(self.rotation)))),
+            shift=_triple(back @ (np.array(self.shift) - twist[3:])),
+        )
+
+
 def fit_focal_length(
     demonstrations: Sequence[ImageDemonstration],
     network: RBFImageJacobian,
@@ -81,41 +221,51 @@ def fit_focal_length(
 ) -> float:
     """Focal length of the camera that saw a marker of a moving tool [px].
 
-    Found together with the pose of the camera and the marker's place on the tool, by robust
-    nonlinear least squares on the pixels. Motions that do not tell it leave it near the width
-    of the image.
+    Found together with the pose of the camera and the marker's place on the tool, without a
+    lens (see `MarkerCamera.fit`). Motions that do not tell it leave it near the width of the
+    image.
 
     Args:
         demonstrations: In which the tool moved, read one by one.
         network: Image Jacobian fitted to them, to begin with.
         image_size: Width and height [px].
     """
-    # Of the extras that read demonstrations and simulate; this package does without.
-    from scipy.optimize import least_squares
+    return MarkerCamera.fit(demonstrations, network, image_size, lens=False).focal
 
-    pose, pixel = _sampled(demonstrations)
-    tool, turn = pose.position.numpy(), quaternion.to_matrix(pose.orientation).numpy()
-    seen_at, center, width = pixel.numpy(), np.array(image_size) / 2, float(image_size[0])
-    with torch.no_grad():
-        jacobians = network(pose).numpy()[..., :3]
 
-    def residuals(unknown: Float[np.ndarray, "10"]) -> Float[np.ndarray, " residuals"]:
-        log_focal, rotation, shift, marker = np.split(unknown, [1, 4, 7])
-        rows = quaternion.to_matrix(quaternion.exp(torch.from_numpy(rotation))).numpy()
-        point = (tool + turn @ marker - middle) @ (rows @ first).T + shift
-        # Points behind the camera are no solution: far off, yet finite.
-        depth = point[:, 2:].clip(min=1e-3)
-        error = width * np.exp(log_focal) * point[:, :2] / depth + center - seen_at
-        return np.append(error.ravel() / _PIXEL_NOISE, log_focal / _FOCAL_SPREAD)
+def _project(
+    points: Float[np.ndarray, "*batch 3"],
+    focal: float | Float[np.ndarray, "1"],
+    center: Float[np.ndarray, "2"],
+    radial: float,
+) -> Float[np.ndarray, "*batch 2"]:
+    # Points behind the camera are no solution: far off, yet finite.
+    xi = points[..., :2] / points[..., 2:].clip(min=_NEAREST)
+    return focal * xi * (1 + radial * (xi**2).sum(-1, keepdims=True)) + center
 
-    middle, xi = tool.mean(0), (seen_at.mean(0) - center) / width
-    rows, depth, axis = _camera(jacobians.mean(0) / width, xi)
-    u, _, vt = np.linalg.svd(np.vstack([rows, axis]))
-    first = u @ vt
-    start = np.zeros(10)
-    start[4:7] = depth * np.append(xi, 1.0)
-    found = least_squares(residuals, start, loss="soft_l1", x_scale="jac")
-    return width * float(np.exp(found.x[0]))
+
+def _optics(
+    optics: Float[np.ndarray, " optics"], middle: Float[np.ndarray, "2"]
+) -> tuple[Float[np.ndarray, "2"], float]:
+    return (middle + optics[:2], float(optics[2])) if len(optics) else (middle, 0.0)
+
+
+def _matrix(rotation: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    return quaternion.to_matrix(quaternion.exp(torch.from_numpy(rotation))).numpy()
+
+
+def _rotation_vector(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3"]:
+    return quaternion.log(quaternion.from_matrix(torch.from_numpy(matrix))).numpy()
+
+
+def _pair(values: Float[np.ndarray, "2"]) -> tuple[float, float]:
+    u, v = values.tolist()
+    return u, v
+
+
+def _triple(values: Float[np.ndarray, "3"]) -> tuple[float, float, float]:
+    x, y, z = values.tolist()
+    return x, y, z
 
 
 def _sampled(

@@ -1,0 +1,215 @@
+"""A camera that was moved is noticed and measured; one that stood still is left in peace.
+
+The camera that is moved is OpenCV's.
+"""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.jacobian import (
+    CameraReference,
+    CameraWatch,
+    ImageDemonstration,
+    MarkerCamera,
+    RBFCenters,
+    RBFImageJacobian,
+    camera_placements,
+)
+
+IMAGE, FPS, MARKER = (1440, 1080), 25.0, np.array([0.0, 0.06, 0.03])
+ROTATION, SHIFT = np.array([np.pi - 0.2, 0.1, 0.05]), np.array([-0.4, 0.05, 1.1])
+INTRINSICS = np.array([[1700.0, 0, 731.0], [0, 1700.0, 530.0], [0, 0, 1.0]])
+LENS = np.array([-0.06, 0.0, 0.0, 0.0])
+
+
+def moved(turn, shift):
+    """Rotation vector and translation of the camera after a motion along its own axes."""
+    back = cv2.Rodrigues(np.asarray(turn, float))[0].T
+    return cv2.Rodrigues(back @ cv2.Rodrigues(ROTATION)[0])[0][:, 0], back @ (SHIFT - shift)
+
+
+def demonstration(rng, place=(ROTATION, SHIFT), frames=150, noise=0.1, middle=(0.45, 0.0, 0.2)):
+    """A tool that wanders and turns before the camera, its marker unseen now and then."""
+    time = np.linspace(0, 1, frames)[:, None]
+    wave = sum(rng.normal(0, 0.06, 3) * np.sin(2 * np.pi * k * time) for k in (0.5, 1.0, 1.5))
+    turn = quaternion.exp(torch.from_numpy(np.sin(2 * np.pi * time) * rng.normal(0, 0.25, 3)))
+    pose = Pose(torch.from_numpy(np.array(middle) + wave), turn)
+    points = pose.apply(torch.from_numpy(MARKER)).numpy()
+    pixels = cv2.projectPoints(points, *place, INTRINSICS, LENS)[0][:, 0]
+    visible = torch.from_numpy(rng.random(frames) > 0.1)
+    pixels[~visible.numpy()] = np.nan
+    feature = torch.from_numpy(pixels + rng.normal(0, noise, pixels.shape))
+    return ImageDemonstration(pose=pose, feature=feature, visible=visible)
+
+
+def run(watch, demo):
+    """What a watch says, frame by frame."""
+    watch.clear()
+    return [
+        watch.update(frame / FPS, demo.pose[frame], demo.feature[frame].numpy())
+        for frame in demo.visible.nonzero()[:, 0].tolist()
+    ]
+
+
+@pytest.fixture(scope="module")
+def demonstrations():
+    rng = np.random.default_rng(0)
+    return [demonstration(rng) for _ in range(8)]
+
+
+@pytest.fixture(scope="module")
+def reference(demonstrations):
+    return CameraReference.fit(demonstrations, FPS, IMAGE)
+
+
+@pytest.fixture(scope="module")
+def camera(demonstrations):
+    neurons = RBFCenters.around(demonstrations)
+    network = RBFImageJacobian.fit_demonstrations(demonstrations, neurons)
+    return MarkerCamera.fit(demonstrations, network.double(), IMAGE)
+
+
+def test_the_camera_is_found_with_its_lens(camera):
+    rng = np.random.default_rng(5)
+    fresh = demonstration(rng, noise=0.0)
+    error = camera.project(camera.points(fresh.pose)) - fresh.feature.numpy()
+    assert np.nanmax(np.abs(error)) < 0.5
+    assert camera.focal == pytest.approx(1700.0, rel=0.02)
+    assert camera.radial == pytest.approx(-0.06, abs=0.03)
+    # The marker is at the place that OpenCV put it, not only somewhere that fits.
+    np.testing.assert_allclose(camera.marker, MARKER, atol=2e-3)
+
+
+def test_the_interaction_matrix_is_the_derivative_of_the_moved_camera(camera):
+    pose = demonstration(np.random.default_rng(1)).pose[:5]
+    derivative = camera.motion_jacobian(camera.points(pose))
+    for axis, step in enumerate(1e-6 * np.eye(6)):
+        ahead, behind = camera.moved(step), camera.moved(-step)
+        change = ahead.project(ahead.points(pose)) - behind.project(behind.points(pose))
+        np.testing.assert_allclose(derivative[..., axis], change / 2e-6, rtol=1e-4, atol=1e-3)
+
+
+def test_a_moved_camera_is_that_of_opencv():
+    turn, shift = np.array([0.1, -0.2, 0.15]), np.array([0.03, 0.02, -0.05])
+    home = MarkerCamera(
+        focal=1700.0,
+        center=(731.0, 530.0),
+        radial=-0.06,
+        rotation=tuple(ROTATION),
+        shift=tuple(SHIFT),
+        marker=tuple(MARKER),
+    )
+    there = home.moved(np.concatenate([turn, shift]))
+    pose = demonstration(np.random.default_rng(2)).pose
+    points = pose.apply(torch.from_numpy(MARKER)).numpy()
+    expected = cv2.projectPoints(points, *moved(turn, shift), INTRINSICS, LENS)[0][:, 0]
+    np.testing.assert_allclose(there.project(there.points(pose)), expected, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("turn", "shift"),
+    [
+        *((np.deg2rad(0.1) * axis, np.zeros(3)) for axis in np.eye(3)[:2]),
+        *((np.zeros(3), 2e-3 * axis) for axis in np.eye(3)[:2]),
+        (np.deg2rad([0.0, 0.0, 1.0]), np.zeros(3)),
+    ],
+)
+def test_small_motions_are_noticed(reference, turn, shift):
+    seen = run(
+        CameraWatch(reference), demonstration(np.random.default_rng(3), moved(turn, shift))
+    )
+    assert any(seen[: int(2 * FPS)])
+
+
+def test_a_camera_that_stood_still_is_left_in_peace(reference):
+    rng = np.random.default_rng(4)
+    for _ in range(10):
+        assert not any(run(CameraWatch(reference), demonstration(rng)))
+
+
+def test_a_large_motion_is_measured(reference):
+    turn, shift = np.deg2rad([4.0, -6.0, 7.0]), np.array([0.05, -0.06, 0.04])
+    fresh = demonstration(np.random.default_rng(6), moved(turn, shift))
+    motion = run(CameraWatch(reference), fresh)[-1]
+    there = reference.camera.moved(motion.twist)
+    last = slice(-25, None)
+    error = there.project(there.points(fresh.pose)) - fresh.feature.numpy()
+    # A second of motion tells where the marker is seen, not how much of it was a turn.
+    assert np.nanmax(np.abs(error[last])) < 3.0
+    assert motion.angle == pytest.approx(np.linalg.norm(turn), rel=0.5)
+    assert str(motion).startswith(f"camera moved by {np.rad2deg(motion.angle):.1f} degrees")
+
+
+def test_a_marker_half_covered_is_no_motion(reference):
+    rng = np.random.default_rng(7)
+    fresh = demonstration(rng)
+    fresh.feature[::20] += 15.0
+    assert not any(run(CameraWatch(reference), fresh))
+
+
+def test_what_was_seen_before_a_pause_is_forgotten(reference):
+    watch = CameraWatch(reference)
+    knocked = demonstration(
+        np.random.default_rng(8), moved(np.deg2rad([1.0, 0, 0]), np.zeros(3))
+    )
+    assert run(watch, knocked)[-1]
+    assert not any(run(watch, demonstration(np.random.default_rng(9))))
+
+
+def test_frames_out_of_order_and_without_numbers_are_refused(reference):
+    watch, pose = CameraWatch(reference), demonstration(np.random.default_rng(0)).pose[0]
+    watch.update(1.0, pose, np.array([700.0, 500.0]))
+    with pytest.raises(ValueError, match="clear"):
+        watch.update(1.0, pose, np.array([700.0, 500.0]))
+    with pytest.raises(ValueError, match="finite"):
+        watch.update(2.0, pose, np.array([np.nan, 500.0]))
+
+
+def test_a_reference_survives_json(reference):
+    again = CameraReference.from_content(json.loads(json.dumps(reference.content())))
+    assert again == reference
+    with pytest.raises(ValueError, match="threshold"):
+        CameraReference.from_content({"camera": reference.content()["camera"]})
+
+
+def test_one_demonstration_is_not_enough(demonstrations):
+    with pytest.raises(ValueError, match="two demonstrations"):
+        CameraReference.fit(demonstrations[:1], FPS, IMAGE)
+
+
+def test_a_marker_never_seen_is_said(demonstrations):
+    hidden = [
+        ImageDemonstration(
+            pose=demo.pose,
+            feature=demo.feature,
+            # Enough to fit a camera, never enough within a second.
+            visible=demo.visible & (torch.arange(len(demo.visible)) % 10 == 0),
+        )
+        for demo in demonstrations
+    ]
+    with pytest.raises(ValueError, match="never seen"):
+        CameraReference.fit(hidden, FPS, IMAGE)
+
+
+def test_placements_tell_episodes_of_a_moved_camera_apart():
+    rng = np.random.default_rng(10)
+    knocked = moved(np.deg2rad([0.3, -0.4, 0.0]), np.array([0.004, 0.0, 0.0]))
+    demos = [demonstration(rng) for _ in range(6)]
+    demos += [demonstration(rng, knocked) for _ in range(4)]
+    demos += [demonstration(rng) for _ in range(2)]
+    first, second = camera_placements(demos, IMAGE)
+    assert first.episodes == (0, 1, 2, 3, 4, 5, 10, 11)
+    assert second.episodes == (6, 7, 8, 9)
+    assert first.motion.displacement == pytest.approx(0.0, abs=1.0)
+    # Of 0.5 degrees and 4 mm: 1700 px times about 9 mrad, and what the shift adds.
+    assert 8.0 < second.motion.displacement < 25.0
+
+
+def test_a_camera_that_stood_still_has_one_placement(demonstrations):
+    (only,) = camera_placements(demonstrations, IMAGE)
+    assert only.episodes == tuple(range(len(demonstrations)))
