@@ -142,7 +142,7 @@ class CameraReference:
             ValueError: A field is missing or of another kind.
         """
         try:
-            fields = {
+            fields: dict[str, Any] = {
                 name: tuple(map(float, value))
                 if isinstance(value, list | tuple)
                 else float(value)

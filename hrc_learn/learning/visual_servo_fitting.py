@@ -91,7 +91,7 @@ def fit_visual_servo(
     )
 
 
-def feature_trajectories(demos: Demonstrations) -> LazyMap[Demonstration, ImageDemonstration]:
+def feature_trajectories(demos: Demonstrations) -> Sequence[ImageDemonstration]:
     """Demonstrations as the fit of an image Jacobian takes them, read when asked for."""
     return LazyMap(demos, partial(_watched, source=demos.source))
 

@@ -5,6 +5,7 @@
 they are asked for.
 """
 
+from hrc_learn.lerobot import camera_watch as camera_watch
 from hrc_learn.lerobot import envs as envs
 from hrc_learn.lerobot import processor as processor
 from hrc_learn.lerobot import robots as robots

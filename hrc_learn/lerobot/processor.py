@@ -303,24 +303,29 @@ def add_smoothing(checkpoint: Path, limits: ActionLimits) -> None:
         FileNotFoundError: The folder holds no processors.
         ValueError: They cannot be read.
     """
-    before, after = (_read(checkpoint / name) for name in (PREPROCESSOR, POSTPROCESSOR))
+    before, after = (read_pipeline(checkpoint / name) for name in (PREPROCESSOR, POSTPROCESSOR))
     watch = {"registry_name": WATCH, "config": {"pair": "smooth"}}
     smooth = {"registry_name": SMOOTH, "config": {**asdict(limits), "pair": "smooth"}}
     before["steps"].insert(0, watch)  # before a step that renames or normalises the state
     after["steps"].append(smooth)
     # Without the one that watches, the other still works: so it comes first.
-    _write(checkpoint / PREPROCESSOR, before)
-    _write(checkpoint / POSTPROCESSOR, after)
+    write_pipeline(checkpoint / PREPROCESSOR, before)
+    write_pipeline(checkpoint / POSTPROCESSOR, after)
 
 
 def remove_smoothing(checkpoint: Path) -> None:
     """Take the steps out again; complains as `add_smoothing`."""
     for name in (PREPROCESSOR, POSTPROCESSOR):
-        _write(checkpoint / name, _read(checkpoint / name))
+        write_pipeline(checkpoint / name, read_pipeline(checkpoint / name))
 
 
-def _read(path: Path) -> dict[str, Any]:
-    """A pipeline's settings without our steps."""
+def read_pipeline(path: Path, without: Sequence[str] = (WATCH, SMOOTH)) -> dict[str, Any]:
+    """A pipeline's settings without the steps of these names.
+
+    Raises:
+        FileNotFoundError: It is not there.
+        ValueError: It cannot be read.
+    """
     if not path.is_file():
         raise FileNotFoundError(
             f"there is no {path}: give the folder `pretrained_model` of a LeRobot checkpoint."
@@ -330,10 +335,11 @@ def _read(path: Path) -> dict[str, Any]:
         steps = content["steps"]
     except (json.JSONDecodeError, KeyError, TypeError) as error:
         raise ValueError(f"{path} is not a processor of LeRobot: {error}") from None
-    content["steps"] = [s for s in steps if s.get("registry_name") not in (WATCH, SMOOTH)]
+    content["steps"] = [s for s in steps if s.get("registry_name") not in without]
     return content
 
 
-def _write(path: Path, content: dict[str, Any]) -> None:
+def write_pipeline(path: Path, content: dict[str, Any]) -> None:
+    """Write a pipeline's settings; the file is whole or as it was."""
     with new_file(path) as new:
         new.write_text(json.dumps(content, indent=2), encoding="utf-8")

@@ -35,6 +35,8 @@ class Check(Written):
     """Every finding on a line of its own, instead of one for each kind."""
     keep_contract: bool = False
     """Keep what the columns mean, as the table shows it, in DATASET/meta/hrc_learn.json."""
+    camera: bool = False
+    """Also tell in which episodes the camera stood where, by the marker of the robot's tool."""
     findings: Path | None = None
     """Receives every finding: a JSON list of kind, message, file, episode, frame, key."""
 

@@ -3,15 +3,19 @@
 import json
 from collections.abc import Mapping
 from dataclasses import fields
+from pathlib import Path
 
 from rich.progress import track
 
 from hrc_learn.cli._run import configuration, write_values
 from hrc_learn.cli.arguments.dataset import Check, Recover, Repair
-from hrc_learn.demos import check_dataset, recover_all
+from hrc_learn.controller.interface import IMAGE_SIZE
+from hrc_learn.demos import check_dataset, load_demos, recover_all
 from hrc_learn.demos.format.metadata import SIDECAR_PATH
 from hrc_learn.demos.read.contract import contract_content, keep_contract
 from hrc_learn.demos.repair import RepairOptions, repair_dataset
+from hrc_learn.jacobian import camera_placements
+from hrc_learn.learning.visual_servo_fitting import feature_trajectories
 from hrc_learn.store import new_folder, write_json, write_text
 
 
@@ -34,6 +38,7 @@ def check(args: Check) -> int:
     if contract is not None:
         print(*contract.lines(), "", sep="\n")
     print(*report.lines(full=args.full), sep="\n")
+    moved = args.camera and _camera_moved(args.dataset)
     if args.keep_contract:
         if contract is None:
             raise ValueError(f"{args.dataset}: nothing could be read to keep a contract of")
@@ -46,6 +51,8 @@ def check(args: Check) -> int:
         "episodes": report.episodes,
         "frames": report.frames,
     }
+    if args.camera:
+        counts["camera_moved"] = int(moved)
     if args.out is not None:
         with new_folder(args.out, configuration(args), args.overwrite) as folder:
             write_text(folder / "findings.json", findings)
@@ -56,7 +63,20 @@ def check(args: Check) -> int:
     if args.findings is not None:
         write_text(args.findings, findings)
     write_values(args.json, counts)
-    return int(bool(report.errors or (args.strict and report.warnings)))
+    return int(bool(report.errors or (args.strict and (report.warnings or moved))))
+
+
+def _camera_moved(dataset: Path) -> bool:
+    """Whether the camera was moved between episodes; prints where it stood in which."""
+    demos = load_demos(dataset)
+    placements = camera_placements(list(feature_trajectories(demos)), IMAGE_SIZE)
+    if not placements:
+        print("camera: the marker is seen in fewer than two episodes, nothing to compare")
+    for number, placement in enumerate(placements):
+        episodes = ", ".join(str(demos[index].episode) for index in placement.episodes)
+        found = placement.motion if number else "camera stood still"
+        print(f"{found} in episodes {episodes}")
+    return len(placements) > 1
 
 
 def repair(args: Repair) -> None:

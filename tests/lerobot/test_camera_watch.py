@@ -1,0 +1,149 @@
+"""A step of any policy's preprocessor that notices a camera that was moved."""
+
+import json
+import logging
+
+import numpy as np
+import pytest
+import torch
+from lerobot.lerobot_types import TransitionKey
+from lerobot.processor import ProcessorStepRegistry
+
+from hrc_learn.demos import DatasetWriter
+from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.jacobian import MarkerCamera
+from hrc_learn.lerobot.camera_watch import (
+    CAMERA_WATCH,
+    FEATURE,
+    POSE_NAMES,
+    CameraWatchStep,
+    add_camera_watch,
+)
+from hrc_learn.lerobot.processor import PREPROCESSOR
+
+FPS = 25
+CAMERA = MarkerCamera(
+    focal=1500.0,
+    center=(720.0, 540.0),
+    radial=0.0,
+    rotation=(np.pi - 0.2, 0.1, 0.05),
+    shift=(-0.4, 0.05, 1.1),
+    marker=(0.0, 0.06, 0.03),
+)
+
+
+def episode(rng, camera=CAMERA, frames=100):
+    """Poses of a tool as vectors, and the pixels of its marker."""
+    time = np.linspace(0, 1, frames)[:, None]
+    wave = sum(rng.normal(0, 0.05, 3) * np.sin(2 * np.pi * k * time) for k in (0.5, 1.0, 1.5))
+    turn = np.sin(2 * np.pi * time) * rng.normal(0, 0.2, 3)
+    pose = Pose(
+        torch.from_numpy(np.array([0.45, 0.0, 0.2]) + wave),
+        quaternion.exp(torch.from_numpy(turn)),
+    )
+    pixels = camera.project(camera.points(pose)) + rng.normal(0, 0.1, (frames, 2))
+    return pose, pixels
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    root, rng = tmp_path_factory.mktemp("sets") / "set", np.random.default_rng(0)
+    with DatasetWriter(root, FPS, "any", ["a"]) as writer:
+        for _ in range(6):
+            writer.start_episode("look")
+            pose, pixels = episode(rng)
+            for k, pixel in enumerate(pixels):
+                writer.add_frame(
+                    joint_position=[0.01 * k],
+                    position=pose.position[k].numpy(),
+                    orientation=pose.orientation[k].numpy(),
+                    feature=pixel,
+                    feature_visible=True,
+                )
+            writer.save_episode()
+    return root
+
+
+@pytest.fixture
+def step(dataset, tmp_path):
+    """As LeRobot makes it of the checkpoint's file."""
+    content = {
+        "name": "policy",
+        "steps": [{"registry_name": "to_batch_processor", "config": {}}],
+    }
+    (tmp_path / PREPROCESSOR).write_text(json.dumps(content))
+    add_camera_watch(tmp_path, dataset)
+    add_camera_watch(tmp_path, dataset)  # replaces its own
+    first, *others = json.loads((tmp_path / PREPROCESSOR).read_text())["steps"]
+    assert [other["registry_name"] for other in others] == ["to_batch_processor"]
+    assert first["registry_name"] == CAMERA_WATCH
+    return ProcessorStepRegistry.get(CAMERA_WATCH)(**first["config"])
+
+
+def rollout(step, dataset, pose, pixels):
+    """Show the step an episode as a robot would."""
+    names = json.loads((dataset / "meta/info.json").read_text())["features"][
+        "observation.state"
+    ]
+    columns = [names["names"].index(name) for name in POSE_NAMES]
+    for k, pixel in enumerate(pixels):
+        state = torch.zeros(1, len(names["names"]))
+        state[0, columns] = pose[k].vector().float()
+        feature = torch.tensor([[*pixel, 1.0]], dtype=torch.float32)
+        transition = {TransitionKey.OBSERVATION: {"observation.state": state, FEATURE: feature}}
+        assert step(transition) is transition
+
+
+def test_a_camera_that_stands_still_is_left_in_peace(step, dataset, caplog):
+    rng = np.random.default_rng(1)
+    for _ in range(3):
+        rollout(step, dataset, *episode(rng))
+        step.reset()
+    assert not caplog.records
+
+
+def test_a_moved_camera_is_warned_about_once_an_episode(step, dataset, caplog):
+    caplog.set_level(logging.WARNING)
+    rng = np.random.default_rng(2)
+    moved = CAMERA.moved(np.array([0.0, np.deg2rad(0.5), 0.0, 0.004, 0.0, 0.0]))
+    rollout(step, dataset, *episode(rng, moved))
+    (record,) = caplog.records
+    assert "camera moved by" in record.getMessage()
+    assert step.motion.displacement > 5
+    step.reset()
+    assert step.motion is None
+    rollout(step, dataset, *episode(rng, moved))
+    assert len(caplog.records) == 2
+
+
+def test_an_unseen_marker_and_missing_observations_are_passed_over(step, dataset):
+    pose, pixels = episode(np.random.default_rng(3))
+    rollout(step, dataset, pose, np.full_like(pixels, np.nan))
+    assert step.motion is None
+    step({TransitionKey.OBSERVATION: None})
+    step({TransitionKey.OBSERVATION: {FEATURE: torch.zeros(1, 3)}})
+
+
+def test_several_environments_at_once_are_refused(step):
+    observation = {"observation.state": torch.zeros(2, 7), FEATURE: torch.zeros(2, 3)}
+    with pytest.raises(ValueError, match="batch_size"):
+        step({TransitionKey.OBSERVATION: observation})
+
+
+def test_settings_that_make_no_sense_are_refused(step):
+    for change, word in (({"fps": 0.0}, "fps"), ({"pose_columns": [1]}, "ee.x")):
+        with pytest.raises(ValueError, match=word):
+            CameraWatchStep(**step.get_config() | change)
+
+
+def test_what_is_missing_is_named(dataset, tmp_path):
+    with pytest.raises(FileNotFoundError, match=PREPROCESSOR):
+        add_camera_watch(tmp_path, dataset)
+    (tmp_path / PREPROCESSOR).write_text(json.dumps({"steps": []}))
+    with DatasetWriter(tmp_path / "bare", FPS, "any", ["a"]) as writer:
+        writer.start_episode("look")
+        for k in range(5):
+            writer.add_frame(joint_position=[0.01 * k])
+        writer.save_episode()
+    with pytest.raises(ValueError, match=r"ee\.x"):
+        add_camera_watch(tmp_path, tmp_path / "bare")
