@@ -30,6 +30,7 @@ _LEVER = 0.3
 _RANK = 1e-6
 _BIAS = 1e-9  # smallest damping: the system stays regular where the task has more rows than n
 _STARTS, _ROUNDS, _ITERATIONS = 12, 6, 40
+_CORRECTIONS = 2  # of Newton's, from one pose of a path to the next
 
 
 @dataclass(frozen=True)
@@ -152,6 +153,71 @@ def solve_inverse(
             chain, goal[found], best[found], wish[found], task, tolerance
         )
     return InverseSolution(best.reshape(*batch, joints).to(near), found.reshape(batch))
+
+
+def solutions_from(
+    chain: SerialChain,
+    pose: Pose,
+    starts: Float[Tensor, "*#batch starts joints"],
+    *,
+    task: TaskSpace = "pose",
+    tolerance: float = 1e-9,
+) -> Float[Tensor, "*batch starts joints"]:
+    """Joint positions that reach poses within the limits, from each of several starts.
+
+    Args:
+        chain: The arm.
+        pose: Of the tool centre point.
+        starts: Joint positions [rad, m].
+        task: What of the pose matters.
+        tolerance: Of the position [m] and the orientation [rad].
+
+    Returns:
+        In the order of the starts; NaN for those that do not lead there.
+    """
+    count, joints = starts.shape[-2:]
+    batch = torch.broadcast_shapes(pose.position.shape[:-1], starts.shape[:-2])
+    goal = Pose(
+        pose.position.detach().double().expand(*batch, 3).reshape(-1, 3),
+        pose.orientation.detach().double().expand(*batch, 4).reshape(-1, 4),
+    )
+    row = torch.arange(len(goal.position)).repeat_interleave(count)
+    start = starts.detach().double().expand(*batch, count, joints).reshape(-1, joints)
+    start = start.clamp(chain.limits.lower, chain.limits.upper)
+    q, reached = _descend(chain, goal[row], start, task, tolerance)
+    return torch.where(reached[:, None], q, torch.nan).reshape(*batch, count, joints)
+
+
+def follow_poses(
+    chain: SerialChain, path: Pose, start: Float[Tensor, "*rows joints"]
+) -> tuple[Float[Tensor, "steps *rows joints"], Float[Tensor, "steps *rows"]]:
+    """Joint positions along a path of the tool, led there from pose to pose.
+
+    Joints move as little as they can from one pose to the next, as an arm's do whose tool is
+    led in velocity; at their limits they stay behind.
+
+    Args:
+        chain: The arm.
+        path: Of the tool centre point, (steps, *#rows).
+        start: Joint positions at the first pose [rad, m].
+
+    Returns:
+        Joint positions, and how far the tool is from each pose: the larger one of distance [m]
+        and angle [rad].
+    """
+    q, positions, errors = start.reshape(-1, start.shape[-1]), [], []
+    rows = start.shape[:-1]
+    for k in range(len(path.position)):
+        goal = Pose(
+            path.position[k].expand(*rows, 3).reshape(-1, 3),
+            path.orientation[k].expand(*rows, 4).reshape(-1, 4),
+        )
+        for _ in range(_CORRECTIONS):
+            q, _ = _step(chain, goal, q, "pose")
+        left, _ = task_error_and_jacobian(chain, q, goal)
+        positions.append(q.reshape(start.shape))
+        errors.append(left.unflatten(-1, (2, 3)).norm(dim=-1).amax(-1).reshape(rows))
+    return torch.stack(positions), torch.stack(errors)
 
 
 def _step(

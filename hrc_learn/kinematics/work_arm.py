@@ -31,7 +31,7 @@ from hrc_learn.kinematics.franka import (
     fr3,
     panda,
 )
-from hrc_learn.kinematics.numerical_inverse import solutions_from
+from hrc_learn.kinematics.inverse import solutions_from
 from hrc_learn.kinematics.redundancy import best_postures, comfortable_postures
 
 type NullSpace = Literal["arm angle", "free", "none"]
@@ -119,17 +119,15 @@ class FrankaWorkArm(WorkArm):
         # A little inside the limits, where the arm can still be corrected.
         candidates = torch.linspace(lower + 0.02, upper - 0.02, samples, dtype=torch.float64)
         candidates = torch.cat([near[6:7], candidates])
-        best, distance = None, math.inf
-        for q7 in candidates:
-            try:
-                q = self.chain.inverse(pose, q7, near=near)
-            except UnreachableError:
-                continue
-            if (d := float((q - near).norm())) < distance:
-                best, distance = q, d
-        if best is None:
+        many = Pose(
+            pose.position.double().expand(len(candidates), 3),
+            pose.orientation.double().expand(len(candidates), 4),
+        )
+        found = self.chain.inverse_all(many, candidates).flatten(0, 1)
+        found = found[found.isfinite().all(-1)]
+        if len(found) == 0:
             raise UnreachableError(_unreachable(pose))
-        return best
+        return found[(found - near).norm(dim=-1).argmin()]
 
     def postures(self, pose: Pose) -> Float[Tensor, "postures joints"]:
         """By scanning joint 7."""
@@ -207,6 +205,7 @@ class EquippedArm(WorkArm):
         some = torch.rand(samples, self.joints, generator=rng, dtype=torch.float64)
         starts = torch.cat([near[None].double(), low + (high - low) * some])
         found = solutions_from(self.chain, pose, starts)
+        found = found[found.isfinite().all(-1)]
         if len(found) == 0:
             raise UnreachableError(_unreachable(pose))
         return _turned_towards(found, near, limits.lower, limits.upper)

@@ -12,8 +12,9 @@ from hrc_learn.kinematics import (
     EquippedArm,
     JointLimits,
     UnreachableError,
+    panda,
 )
-from hrc_learn.kinematics.numerical_inverse import solutions_from
+from hrc_learn.kinematics.inverse import follow_poses, solutions_from
 
 
 def poses_of(chain, count, seed=0):
@@ -28,8 +29,10 @@ def poses_of(chain, count, seed=0):
 def test_solutions_reach_the_pose_within_the_limits(left_out):
     arm = EquippedArm(bare(left_out))
     starts, poses = poses_of(arm.chain, 40)
+    found_of_all = solutions_from(arm.chain, poses[:5], starts)
     for i in range(5):
-        found = solutions_from(arm.chain, poses[i], starts)
+        found = found_of_all[i]
+        found = found[found.isfinite().all(-1)]
         assert len(found)
         assert arm.chain.limits.contain(found).all()
         error = arm.chain.forward(found).twist_to(poses[i]).abs().max()
@@ -125,3 +128,70 @@ def test_a_choice_opens_the_same_arm_each_time():
 def test_an_arm_that_there_is_not_is_named():
     with pytest.raises(ValueError, match=r"no arm 'pandora': there are panda, fr3"):
         ArmChoice("pandora").work_arm()
+
+
+def test_the_nearest_of_frankas_is_the_best_of_a_scan_of_joint_7():
+    lower, upper = float(panda.limits.lower[6]) + 0.02, float(panda.limits.upper[6]) - 0.02
+    q, poses = poses_of(panda, 6, seed=4)
+    for i in range(len(q)):
+        near = (q[i] + 0.3).clamp(panda.limits.lower, panda.limits.upper)
+        found = PANDA.nearest(poses[i], near=near, samples=15)
+        scanned = []
+        for q7 in [float(near[6]), *torch.linspace(lower, upper, 15).tolist()]:
+            try:
+                scanned.append(panda.inverse(poses[i], q7, near=near))
+            except UnreachableError:
+                continue
+        least = min(float((other - near).norm()) for other in scanned)
+        assert float((found - near).norm()) == pytest.approx(least, abs=1e-6)
+        assert panda.forward(found).twist_to(poses[i]).abs().max() < 1e-6
+
+
+@pytest.mark.parametrize("batch", [(), (3,), (2, 2)])
+def test_solutions_of_many_poses_are_those_of_each(batch):
+    chain = bare().chain
+    starts, poses = poses_of(chain, 12, seed=5)
+    count = math.prod(batch)
+    many = Pose(
+        poses.position[:count].reshape(*batch, 3), poses.orientation[:count].reshape(*batch, 4)
+    )
+    found = solutions_from(chain, many, starts).reshape(count, 12, -1)
+    for i in range(count):
+        torch.testing.assert_close(
+            found[i], solutions_from(chain, poses[i], starts), equal_nan=True
+        )
+    assert found.isfinite().any()
+    assert found.isnan().any()
+
+
+def test_joints_led_along_a_path_stay_on_it_and_move_steadily():
+    chain = bare(()).chain
+    start = chain.ready + 0.05
+    begin = chain.forward(start)
+    share = torch.linspace(0, 1, 40, dtype=torch.float64)[:, None]
+    aside = torch.tensor([0.05, -0.08, 0.06], dtype=torch.float64)
+    path = Pose(begin.position + share * aside, begin.orientation.expand(40, 4))
+    rows = torch.stack([start, start])
+    q, error = follow_poses(chain, path, rows)
+    assert q.shape == (40, 2, 7)
+    assert error.max() < 1e-6
+    reached = chain.forward(q[:, 0]).twist_to(path).abs().max()
+    assert reached < 1e-6
+    # As the arm's own resolved rate leads there: dq = J^+ dx, integrated in small steps.
+    slow = start.clone()
+    for _ in range(2000):
+        J = chain.jacobian(slow)
+        twist = torch.cat([aside, torch.zeros(3, dtype=torch.float64)]) / 2000
+        slow = slow + torch.linalg.pinv(J) @ twist
+    torch.testing.assert_close(q[-1, 0], slow, atol=2e-3, rtol=0)
+
+
+def test_a_path_out_of_reach_is_not_followed():
+    chain = bare(()).chain
+    begin = chain.forward(chain.ready)
+    share = torch.linspace(0, 1, 20, dtype=torch.float64)[:, None]
+    away = torch.tensor([3.0, 0.0, 0.0], dtype=torch.float64)
+    path = Pose(begin.position + share * away, begin.orientation.expand(20, 4))
+    q, error = follow_poses(chain, path, chain.ready)
+    assert error[0] < 1e-6 < 0.5 < error[-1]
+    assert chain.limits.contain(q).all()
