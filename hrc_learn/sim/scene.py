@@ -128,15 +128,19 @@ def overhead_camera() -> CameraModel:
     )
 
 
-def _marked_arm() -> ArmModelConfig:
-    # The plate sticks out sideways, clear of the forearm as seen from above, and is mounted off
-    # the middle: it is as wide as objects are, and must not be the first to meet a board.
-    plate = Plate(
+def marked_plate() -> Plate:
+    """The plate on the hand, by which the camera finds it."""
+    # It sticks out sideways, clear of the forearm as seen from above, and is mounted off the
+    # middle: it is as wide as objects are, and must not be the first to meet a board.
+    return Plate(
         marker=Marker(HAND_MARKER, 0.048),
         position=(-0.008, 0.145, 0.02),
         orientation=(0.0, 1.0, 0.0, 0.0),
     )
-    return ArmModelConfig(marker=plate)
+
+
+def _marked_arm() -> ArmModelConfig:
+    return ArmModelConfig(marker=marked_plate())
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,6 +1,10 @@
-"""Poses of the task in the simulated scene: home, table, shelves."""
+"""Poses of the task in the simulated scene, home, table and shelves, as they suit an arm.
 
-import math
+No place is written down per arm. Tables and cabinets at several distances are looked at, the
+usual ones first, until the arm has a posture in which it does the work (`layout_quality`).
+"""
+
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from typing import Any
@@ -13,15 +17,20 @@ from torch import Tensor
 from hrc_learn.geometry import Pose
 from hrc_learn.geometry.numerics import Constant
 from hrc_learn.kinematics import (
-    PANDA,
+    FrankaWorkArm,
     UnreachableError,
     WorkArm,
     coarse_orientation,
     gripper_down,
-    panda,
 )
 from hrc_learn.kinematics.tool_orientation import Approach
-from hrc_learn.sim.scene import HAND_MARKER, SceneConfig
+from hrc_learn.sim.layout_quality import (
+    MarkedTurns,
+    clearance_quality,
+    marked_turns,
+    way_quality,
+)
+from hrc_learn.sim.scene import HAND_MARKER, SceneConfig, marked_plate
 
 
 def _vector(*values: float) -> Float[Tensor, " n"]:
@@ -32,9 +41,18 @@ def _vector(*values: float) -> Float[Tensor, " n"]:
 _LEANING_FORWARD = _vector(1.0, 0.3, -1.2, -1.8, 0.3, 1.9, -1.0)
 
 
-# Postures at home that are looked at, and what an awkward one costs [rad of motion].
-_POSTURES, _PENALTY = 12, 4.0
-_TRIED = 8  # starts from which a posture near another one is sought
+# Distances of table and cabinet from the base, as shares of the usual ones, and where the
+# cabinet stands besides: further along the base's x axis, and higher [m].
+_SCALES = (1.0, 0.85, 0.7)
+_ALONG, _HIGHER = (0.0, 0.1, -0.1), (0.0, -0.1, 0.1)
+# How far behind the boards' front edge objects are put [m]: thick wrists stay outside.
+_DEPTHS = (0.10, 0.05)
+# Quality with which a layout is taken without looking at others.
+_ENOUGH = 0.3
+_UNSEEN = 10.0  # what a share of poses without a view of the marker costs of it
+# Postures at home that are looked at; of the best, and of those above the table, so many.
+_POSTURES, _TRIED = 16, 6
+_LIFT, _INSIDE = 0.03, 0.3  # of the expert's way over the edge of a board
 
 # Half the hand's thickness, and what is left under it for errors of base and encoders [m].
 _HAND_HALF, _OVER_BOARD = 0.030, 0.006
@@ -48,7 +66,10 @@ class Workplace:
     home_position: tuple[float, float, float] = (0.60, 0.0, 0.35)
     """End effector between table and cabinet, where a placing motion starts [m]."""
     home_q7: float = -1.0
-    """Joint 7 at home [rad]: the elbow leans to the left, away from the cabinet."""
+    """Joint 7 of Franka's arms at home [rad]: the elbow leans to the left, away from the
+    cabinet."""
+    home_posture: tuple[float, ...] = ()
+    """Joint positions of other arms near which they are at home [rad]."""
     table_centre: tuple[float, float] = (0.24, 0.54)
     """Middle of the part of the table that the camera sees well [m]."""
     table_reach: tuple[float, float] = (0.14, 0.14)
@@ -58,7 +79,9 @@ class Workplace:
     hover_orientation: tuple[float, float, float, float] = tuple(gripper_down().tolist())
     """Of the end effector above the table (wxyz)."""
     hover_q7: float = -0.1
-    """Joint 7 above the table [rad]."""
+    """Joint 7 of Franka's arms above the table [rad]."""
+    hover_posture: tuple[float, ...] = ()
+    """Joint positions of other arms near which they are above the table [rad]."""
     fingertip: float = 0.012
     """How far the fingers reach beyond the tool centre point, in the middle of the pads [m]."""
     palm: float = 0.0374
@@ -70,6 +93,8 @@ class Workplace:
     """Where along the boards objects are put [m]."""
     shelf_depth: float = 0.10
     """From the boards' front edge to the tool centre point [m]."""
+    level_at: float = 0.6
+    """Distance to the right of the base at which the end effector is level [m]."""
     clearance: float = 0.007
     """Gap left under an object when it is released on a board [m]."""
     approach: float = 0.16
@@ -77,12 +102,17 @@ class Workplace:
 
     @classmethod
     def of(cls, robot: WorkArm, **options: Any) -> "Workplace":
-        """The same place with another arm in it.
+        """The same place with another arm in it, laid out for its reach.
 
         Args:
             robot: The arm.
             options: The remaining fields.
+
+        Raises:
+            UnreachableError: The arm cannot do the work in any layout.
         """
+        if not isinstance(robot, FrankaWorkArm):
+            return replace(layout_for(robot).workplace, **options)
         scene = SceneConfig()
         scene = replace(scene, arm=replace(scene.arm, robot=robot))
         return cls(scene=scene, **options)
@@ -117,9 +147,11 @@ class Workplace:
         home = self.home()
         if offset is not None:
             home = Pose(home.position + offset, home.orientation)
-        if self.robot is PANDA:
-            return panda.inverse(home, self.home_q7 + q7_offset, near=_LEANING_FORWARD)
-        return self.robot.nearest(home, near=self._home_posture)
+        if isinstance(self.robot, FrankaWorkArm):
+            return self.robot.chain.inverse(
+                home, self.home_q7 + q7_offset, near=_LEANING_FORWARD
+            )
+        return self.robot.nearest(home, near=_vector(*self.home_posture))
 
     def hover(self) -> Pose:
         """End effector above the middle of the table."""
@@ -138,30 +170,9 @@ class Workplace:
 
         Where it is upright, the axes of joints 1 and 3 coincide, and nobody can pull the elbow.
         """
-        if self.robot is PANDA:
-            return panda.inverse(self.hover(), self.hover_q7, near=_LEANING_FORWARD)
-        return self.robot.nearest(self.hover(), near=self._home_posture)
-
-    @property
-    def _home_posture(self) -> Float[Tensor, " joints"]:
-        """Near which the arm works."""
-        return _working_posture(
-            self.robot,
-            ("home_position", self.home_position),
-            ("table_centre", self.table_centre),
-            ("hover_height", self.hover_height),
-            ("shelf_x", self.shelf_x),
-            ("shelf_depth", self.shelf_depth),
-        )
-
-    def _awkwardness(self, q: Float[Tensor, " joints"]) -> float:
-        """How near a posture is to furniture, limits and singularities; 0: far from all."""
-        limits, chain = self.robot.chain.limits, self.robot.chain
-        room = float(torch.minimum(q - limits.lower, limits.upper - q).min())
-        smallest = float(torch.linalg.svdvals(chain.jacobian(q))[-1])
-        near = float(self.arm_clearance(q))
-        wanted = ((room, 0.3), (smallest, 0.15), (near, 0.05))  # [rad], [m/rad], [m]
-        return sum(_PENALTY * max(0.0, 1.0 - value / good) for value, good in wanted)
+        if isinstance(self.robot, FrankaWorkArm):
+            return self.robot.chain.inverse(self.hover(), self.hover_q7, near=_LEANING_FORWARD)
+        return self.robot.nearest(self.hover(), near=_vector(*self.hover_posture))
 
     def hover_postures(self) -> list[Float[Tensor, " joints"]]:
         """Joint positions above the table, the preferred ones first."""
@@ -179,11 +190,21 @@ class Workplace:
         Args:
             q: Joint position [rad].
         """
+        return torch.minimum(*self.arm_clearances(q))
+
+    def arm_clearances(
+        self, q: Float[Tensor, "*batch joints"]
+    ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+        """Distance of the arm from the furniture, its hand apart, and that from itself [m].
+
+        Args:
+            q: Joint position [rad].
+        """
         centre, half_size = self._furniture.like(q).split(3, dim=-1)
         robot = self.robot
         frames = robot.chain.link_frames(q)
         furniture = robot.body.box_distance(q, centre, half_size, frames)
-        return torch.minimum(furniture, robot.whole.self_distance(q, frames))
+        return furniture, robot.whole.self_distance(q, frames)
 
     @cached_property
     def _furniture(self) -> Constant:
@@ -244,7 +265,7 @@ class Workplace:
         # Grasped from above, an object lies on its side once the end effector is level.
         height = cabinet.shelves[name] + b + self.clearance
         position = _vector(self.shelf_x, cabinet.front - self.shelf_depth, height)
-        return Pose(position, coarse_orientation(position))
+        return Pose(position, coarse_orientation(position, self.level_at))
 
     def lowering(self, half_size: tuple[float, float, float]) -> float:
         """How far an object may be let down until the hand itself would be near the board [m].
@@ -258,46 +279,173 @@ class Workplace:
         """End effector in front of a shelf, at the height of the release."""
         position = self.shelf(name).position.clone()
         position[1] = self.scene.cabinet.front + self.approach
-        return Pose(position, coarse_orientation(position))
+        return Pose(position, coarse_orientation(position, self.level_at))
+
+
+@dataclass(frozen=True, kw_only=True)
+class CellLayout:
+    """Where an arm works, and how."""
+
+    workplace: Workplace
+    """With its furniture, postures, the side of the marker and the turns above the table."""
+    quality: float
+    """Least room on the way, from 0, where something fails, to 1, where there is plenty."""
+    seen: float
+    """Share of poses above the table, within its turns, that are reached with the marker in
+    view."""
 
 
 @cache
-def _working_posture(
-    robot: WorkArm, *places: tuple[str, float | tuple[float, ...]]
-) -> Float[Tensor, " joints"]:
-    """Of an arm's postures at home, the one from which it gets on with its work best.
-
-    It has postures above the table and at each shelf that are all near to one another, clear of
-    the furniture and away from limits and singularities.
-
-    Args:
-        robot: The arm.
-        places: Fields of its workplace; the furniture is the ordinary one.
+def layout_for(robot: WorkArm) -> CellLayout:
+    """The best layout for an arm, the usual one if that is good enough.
 
     Raises:
-        UnreachableError: No posture at home is one for all of these places.
+        UnreachableError: In none it gets to the table and to all shelves.
     """
-    workplace = Workplace.of(robot, **dict(places))
-    names = workplace.shelf_names()
-    goals = [workplace.hover(), *map(workplace.shelf_front, names)]
-    goals += map(workplace.shelf, names)
-    best, least = None, math.inf
-    for posture in robot.postures(workplace.home())[:_POSTURES]:
-        cost = workplace._awkwardness(posture)
-        for goal in goals:
-            if cost > least:
-                break
-            try:
-                there = robot.nearest(goal, near=posture, samples=_TRIED)
-            except UnreachableError:
-                cost = math.inf
-                break
-            cost += float((there - posture).abs().max()) + workplace._awkwardness(there)
-        if cost < least:
-            best, least = posture, cost
+    best: CellLayout | None = None
+    for scale in _SCALES:
+        places = list(_workplaces(robot, scale))
+        above = _above_table(places[0])
+        for workplace in places if above else ():
+            found = _evaluated(workplace, above)
+            if found is not None and (best is None or _rank(found) > _rank(best)):
+                best = found
+            if best is not None and _rank(best) >= _ENOUGH:
+                return best
     if best is None:
         raise UnreachableError(
-            f"the {robot.name} does not reach home, table and shelves in one posture: "
-            f"move them towards it ({', '.join(name for name, _ in places)})."
+            f"the {robot.name} does not get from home to the table and to all shelves, with "
+            f"distances of {_SCALES[-1]:g} to {_SCALES[0]:g} times the usual ones: it is too "
+            "small for this work cell, or its joints are in each other's way."
         )
     return best
+
+
+def _rank(layout: CellLayout) -> float:
+    return _worth(layout.quality, layout.seen)
+
+
+def _worth(quality: float, seen: float) -> float:
+    # A marker that is out of view for longer than a moment ends the servoing.
+    return min(quality, 1.0 - _UNSEEN * (1.0 - seen))
+
+
+def _workplaces(robot: WorkArm, scale: float) -> Iterator[Workplace]:
+    """With the table at one distance, and the cabinet in several places."""
+    usual = SceneConfig()
+    usual = replace(usual, arm=replace(usual.arm, robot=robot))
+    shifts = [(along, higher) for along in _ALONG for higher in _HIGHER]
+    for along, higher in sorted(shifts, key=lambda shift: abs(shift[0]) + abs(shift[1])):
+        for depth in _DEPTHS:
+            yield _placed(usual, scale, along, higher, depth)
+
+
+def _placed(
+    usual: SceneConfig, scale: float, along: float, higher: float, depth: float
+) -> Workplace:
+    """The usual workplace with other distances."""
+    place, cabinet, table = Workplace(), usual.cabinet, usual.table
+    level_at = scale * place.level_at
+    left = scale * cabinet.left + along
+    moved = replace(
+        cabinet,
+        left=left,
+        right=left + cabinet.right - cabinet.left,
+        front=depth - level_at,
+        shelves={name: scale * z + higher for name, z in cabinet.shelves.items()},
+        top=cabinet.top + higher,
+        door_reach=scale * cabinet.door_reach,
+    )
+    (x, y, z), (a, b, c) = table.centre, table.half_size
+    pose = usual.camera.pose.copy()
+    pose[:2, 3] *= scale
+    scene = replace(
+        usual,
+        cabinet=moved,
+        table=replace(
+            table, centre=(scale * x, scale * y, z), half_size=(scale * a, scale * b, c)
+        ),
+        camera=replace(usual.camera, pose=pose),
+    )
+    home_x, home_y, home_z = place.home_position
+    return Workplace(
+        scene=scene,
+        home_position=(scale * home_x + along, home_y, scale * home_z + max(higher, 0.0)),
+        table_centre=(scale * place.table_centre[0], scale * place.table_centre[1]),
+        shelf_x=scale * place.shelf_x + along,
+        shelf_depth=depth,
+        level_at=level_at,
+    )
+
+
+type _Above = list[tuple[Float[Tensor, " joints"], MarkedTurns]]
+
+
+def _above_table(workplace: Workplace) -> _Above:
+    """Joint positions above the table, and how the hand turns there; the best first."""
+    robot, scene = workplace.robot, workplace.scene
+    try:
+        postures = robot.postures(workplace.hover())[:_POSTURES]
+    except UnreachableError:
+        return []
+    found = [
+        (
+            hover,
+            marked_turns(
+                robot,
+                workplace.arm_clearances,
+                scene.camera,
+                marked_plate(),
+                workplace.hover(),
+                workplace.table_reach,
+                hover,
+            ),
+        )
+        for hover in postures
+    ]
+    found.sort(key=lambda pair: _worth(pair[1].quality, pair[1].seen), reverse=True)
+    return found[: 2 * _TRIED]
+
+
+def _evaluated(workplace: Workplace, above: _Above) -> CellLayout | None:
+    """A workplace with the postures in which the arm does best there; None: it fails."""
+    robot, scene = workplace.robot, workplace.scene
+    try:
+        at_home = robot.postures(workplace.home())[:_POSTURES]
+    except UnreachableError:
+        return None
+    ways = [_way_to_shelf(workplace, name) for name in workplace.shelf_names()]
+    clearances, level_at = workplace.arm_clearances, workplace.level_at
+    to_shelves = torch.stack(
+        [way_quality(robot, clearances, way, level_at, at_home) for way in ways]
+    ).amin(0)
+    best: CellLayout | None = None
+    for k in to_shelves.argsort(descending=True).tolist()[:_TRIED]:
+        home, quality = at_home[k], float(to_shelves[k])
+        # Of those that are good enough the one nearest to home.
+        nearest = sorted(above, key=lambda pair: float((pair[0] - home).abs().max()))
+        for hover, marked in nearest if quality > 0 else ():
+            between = torch.lerp(home, hover, torch.linspace(0, 1, 25).double()[:, None])
+            clear = float(clearance_quality(clearances, between).min())
+            layout = CellLayout(
+                workplace=replace(
+                    workplace,
+                    scene=replace(scene, arm=replace(scene.arm, marker=marked.plate)),
+                    hover_turns=marked.turns,
+                    home_posture=tuple(home.tolist()),
+                    hover_posture=tuple(hover.tolist()),
+                ),
+                quality=min(quality, marked.quality, clear, 1.0),
+                seen=marked.seen,
+            )
+            if clear > 0 and (best is None or min(_rank(layout), _ENOUGH) > _rank(best)):
+                best = layout
+    return best
+
+
+def _way_to_shelf(workplace: Workplace, name: str) -> Float[Tensor, "points 3"]:
+    """Of the end effector from home over the edge of a board, as the expert leads it [m]."""
+    goal, front = workplace.shelf(name).position, workplace.shelf_front(name).position
+    lift = _vector(0.0, 0.0, _LIFT)
+    inside = goal + _INSIDE * (front - goal) + lift
+    return torch.stack([workplace.home().position, front + lift, inside, goal])

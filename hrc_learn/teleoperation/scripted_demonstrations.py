@@ -14,7 +14,13 @@ from jaxtyping import Float
 
 from hrc_learn.demos import DatasetWriter
 from hrc_learn.geometry import Pose, minimum_jerk, quaternion
-from hrc_learn.kinematics import PANDA, SerialChain, WorkArm, gripper_down
+from hrc_learn.kinematics import (
+    PANDA,
+    SerialChain,
+    WorkArm,
+    coarse_orientation,
+    gripper_down,
+)
 from hrc_learn.protocols import Human, OpenedArm
 from hrc_learn.sim import HAND_MARKER, Touch, World
 from hrc_learn.sim.workplace import Workplace
@@ -320,6 +326,7 @@ def placing_expert(
         GuidedPath(waypoints, config.duration),
         forces=ELBOW_FORCES if pulled else (),
         tremor=Tremor(config.tremor, rng),
+        orientation=lambda position, _: coarse_orientation(position, workplace.level_at),
     )
 
 

@@ -1,5 +1,7 @@
 """The simulated arm against its own chain, for arms of other shapes than the Panda's."""
 
+from functools import cache
+
 import mujoco
 import numpy as np
 import pytest
@@ -17,7 +19,7 @@ from hrc_learn.sim.workplace import Workplace
 ARMS = {
     "panda": lambda: PANDA,
     "fr3": ArmChoice("fr3").work_arm,
-    "six": lambda: EquippedArm(bare()),
+    "six": cache(lambda: EquippedArm(bare())),
 }
 
 

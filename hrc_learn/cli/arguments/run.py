@@ -184,10 +184,10 @@ class RunCollaboration(RunServoing):
     """Where to put the object."""
     shelves: tuple[Shelf, ...] = ()
     """Where to put each of two or three objects, in place of --shelf."""
-    shelf_x: More[float] = 0.40
-    """Where along the board [m], in the robot's base frame."""
-    shelf_depth: More[float] = 0.10
-    """How far behind the board's front edge [m]."""
+    shelf_x: More[float | None] = None
+    """Where along the board [m], in the robot's base frame; None: as the cell is laid out."""
+    shelf_depth: More[float | None] = None
+    """How far behind the board's front edge [m]; likewise."""
     occlusion: More[tuple[tuple[float, float], ...]] = ()
     """Intervals in which a board occludes the marker: start and duration [s]."""
     camera_moved: bool = False

@@ -31,7 +31,6 @@ from hrc_learn.experiments.run_recording import record, worker_distance
 from hrc_learn.geometry import Box
 from hrc_learn.kinematics import ArmChoice
 from hrc_learn.sim import CameraKind, Imperfections, RenderingUnavailableError
-from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.pick_and_place import PickAndPlaceConfig
 from hrc_learn.skills.placing import PlacingSkill
 from hrc_learn.skills.visual_skill import VisualServoSkill
@@ -60,10 +59,10 @@ class CollaborationExperiment:
     """Folder of the placing skill."""
     shelves: tuple[str, ...] = ("middle",)
     """One for each of up to three objects."""
-    shelf_x: float = Workplace.shelf_x
-    """Where along the boards objects are placed [m]."""
-    shelf_depth: float = Workplace.shelf_depth
-    """How far behind the boards' front edge [m]."""
+    shelf_x: float | None = None
+    """Where along the boards objects are placed [m]; None: as the cell is laid out."""
+    shelf_depth: float | None = None
+    """How far behind the boards' front edge [m]; likewise."""
     pulls: Pulls = "scripted"
     """When the scripted person pulls the elbow."""
     mapping: ForceMapping = DEFAULT_MAPPING

@@ -381,9 +381,18 @@ def with_objects(workplace: Workplace, items: Sequence[ObjectConfig]) -> Workpla
 
 
 def workplace_for(
-    shelves: Sequence[str], shelf_x: float, shelf_depth: float, robot: WorkArm = PANDA
+    shelves: Sequence[str],
+    shelf_x: float | None = None,
+    shelf_depth: float | None = None,
+    robot: WorkArm = PANDA,
 ) -> Workplace:
     """A workplace with an object for each shelf.
+
+    Args:
+        shelves: Their names.
+        shelf_x: Where along the boards objects are put [m]; None: as the cell is laid out.
+        shelf_depth: How far behind the boards' front edge [m]; likewise.
+        robot: The arm.
 
     Raises:
         ValueError: If there are more shelves named than objects known, or none.
@@ -393,7 +402,9 @@ def workplace_for(
             f"there are 1 to {len(THREE_OBJECTS)} objects to put on shelves, but "
             f"{len(shelves)} shelves are named."
         )
-    workplace = Workplace.of(robot, shelf_x=shelf_x, shelf_depth=shelf_depth)
+    given = {"shelf_x": shelf_x, "shelf_depth": shelf_depth}
+    options = {name: value for name, value in given.items() if value is not None}
+    workplace = Workplace.of(robot, **options)
     return with_objects(workplace, THREE_OBJECTS[: len(shelves)])
 
 

@@ -1,0 +1,219 @@
+"""How well an arm does the work in a cell, from its kinematics alone.
+
+The arm is led along the paths of the job without physics: how much room that leaves to limits,
+singularities and furniture is the quality of a posture to begin in. Above the table the marker
+on the hand has to be seen besides, at half a turn of the hand, which is as good as a whole one
+to a parallel gripper.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.kinematics import WorkArm, coarse_orientation
+from hrc_learn.kinematics.collision import segment_distance
+from hrc_learn.kinematics.inverse import follow_poses
+from hrc_learn.sim.arm_model import Plate
+from hrc_learn.vision import CameraModel
+
+type Clearances = Callable[[Tensor], tuple[Tensor, Tensor]]
+"""Distance of an arm from the furniture and from itself at joint positions [m]."""
+
+# What is good: distance from limits [rad], smallest singular value [m/rad], distance from
+# furniture and from itself [m], speed of joints by their limits.
+_ROOM, _SINGULAR, _CLEAR, _APART, _SPEED = 0.25, 0.08, 0.04, 0.01, 0.8
+# From which distance on the tool has not followed: of the larger of metres and radians.
+_LOST = 5e-3
+# Samples of a path to a shelf, of one across the table, and of half a turn above it.
+_STEPS, _ACROSS, _HALF_TURN = 60, 8, 24
+_DURATION = 14.0  # which the way to a shelf takes [s]
+
+
+def clearance_quality(
+    clearances: Clearances, q: Float[Tensor, "*batch joints"]
+) -> Float[Tensor, "*batch"]:
+    """Room to furniture and to the arm itself; 0: touching, 1 and more: plenty.
+
+    Args:
+        clearances: Of the arm.
+        q: Joint positions [rad].
+    """
+    furniture, itself = clearances(q)
+    return torch.minimum(furniture / _CLEAR, itself / _APART)
+
+
+def _quality(
+    robot: WorkArm,
+    clearances: Clearances,
+    q: Float[Tensor, "steps *rows joints"],
+    error: Float[Tensor, "steps *rows"],
+) -> Float[Tensor, "steps *rows"]:
+    """From 0, where the arm does not get or touches something, to 1, where there is room."""
+    chain = robot.chain
+    room = torch.minimum(q - chain.limits.lower, chain.limits.upper - q).amin(-1)
+    smallest = torch.linalg.svdvals(chain.jacobian(q))[..., -1]
+    clear = clearance_quality(clearances, q)
+    shares = torch.stack([room / _ROOM, smallest / _SINGULAR, clear])
+    return torch.where(error < _LOST, shares.amin(0).clamp(0.0, 1.0), 0.0)
+
+
+def way_quality(
+    robot: WorkArm,
+    clearances: Clearances,
+    points: Float[Tensor, "points 3"],
+    level_at: float,
+    start: Float[Tensor, "postures joints"],
+) -> Float[Tensor, " postures"]:
+    """Least quality along a way to a shelf, the hand tilted by the rule of the expert.
+
+    Args:
+        robot: The arm.
+        clearances: Of it.
+        points: Of the tool centre point, from home [m].
+        level_at: Distance to the right of the base at which the hand is level [m].
+        start: Joint positions at the first point [rad].
+
+    Returns:
+        From 0, where the arm does not get there or touches something, to 1, plenty of room.
+    """
+    lengths = (points[1:] - points[:-1]).norm(dim=-1)
+    ends = torch.cat([torch.zeros(1, dtype=torch.float64), lengths.cumsum(0)])
+    at = torch.linspace(0.0, float(ends[-1]), _STEPS, dtype=torch.float64)
+    columns = [np.interp(at.numpy(), ends.numpy(), column) for column in points.T.numpy()]
+    position = torch.from_numpy(np.stack(columns, axis=-1))
+    path = Pose(position, coarse_orientation(position, level_at))
+    q, error = follow_poses(robot.chain, path, start)
+    least = _quality(robot, clearances, q, error).amin(0)
+    # A minimum-jerk motion is 1.875 times as fast as on average.
+    speed = (q[1:] - q[:-1]).abs() * 1.875 * _STEPS / _DURATION
+    share = (speed / robot.chain.limits.velocity).amax(-1).amax(0)
+    return torch.where(share > _SPEED, least * (_SPEED / share), least)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MarkedTurns:
+    """How the hand turns above the table, and on which side of it the marker is."""
+
+    plate: Plate
+    """Which carries the marker."""
+    turns: tuple[float, float]
+    """Least and greatest turn about the vertical [rad], half a turn apart."""
+    quality: float
+    """Least there, from 0 to 1."""
+    seen: float
+    """Share of poses that are reached with the marker in view."""
+
+
+def marked_turns(
+    robot: WorkArm,
+    clearances: Clearances,
+    camera: CameraModel,
+    plate: Plate,
+    middle: Pose,
+    reach: tuple[float, float],
+    hover: Float[Tensor, " joints"],
+) -> MarkedTurns:
+    """Side of the marker and half turn of the hand that do best above a table.
+
+    Args:
+        robot: The arm.
+        clearances: Of it.
+        camera: Which has to see the marker.
+        plate: Which carries it, on one of two sides that it may be on.
+        middle: Of the tool centre point above the middle of the table.
+        reach: How far from there it goes, along x and y [m].
+        hover: Joint positions there [rad].
+    """
+    q, error = _turned_above_table(robot, middle, reach, hover)
+    reached = _quality(robot, clearances, q, error)
+    best: tuple[tuple[float, float], MarkedTurns] | None = None
+    for side in (plate, _other_side(plate)):
+        good = (marker_seen(robot, camera, side, q) & (reached > 0)).double()
+        for first in range(_HALF_TURN + 1):
+            window = slice(first, first + _HALF_TURN + 1)
+            seen, least = float(good[window].mean()), float(reached[window].amin())
+            # Of windows as good as each other, to 1 %, the one in the middle.
+            off_middle = abs(first - _HALF_TURN / 2) / _HALF_TURN
+            score = (round(seen, 2), least - off_middle)
+            if best is None or score > best[0]:
+                turn = (first / _HALF_TURN - 1) * math.pi
+                turns = (turn, turn + math.pi)
+                best = score, MarkedTurns(plate=side, turns=turns, quality=least, seen=seen)
+    assert best is not None
+    return best[1]
+
+
+def _turned_above_table(
+    robot: WorkArm, middle: Pose, reach: tuple[float, float], hover: Float[Tensor, " joints"]
+) -> tuple[Float[Tensor, "turns places joints"], Float[Tensor, "turns places"]]:
+    """Joint positions above five places, for all turns of the hand from -180 to 180 degrees."""
+    chain, (a, b) = robot.chain, reach
+    aside = torch.tensor(
+        [[0.0, 0.0, 0.0], [a, b, 0.0], [a, -b, 0.0], [-a, b, 0.0], [-a, -b, 0.0]]
+    ).double()
+    share = torch.linspace(0.0, 1.0, _ACROSS, dtype=torch.float64)
+    across = Pose(
+        middle.position + share[:, None, None] * aside,
+        middle.orientation.expand(_ACROSS, len(aside), 4),
+    )
+    q, _ = follow_poses(chain, across, hover.expand(len(aside), -1))
+    halves = []
+    for sense in (-1.0, 1.0):
+        turns = sense * torch.linspace(0.0, math.pi, _HALF_TURN + 1, dtype=torch.float64)
+        about = quaternion.exp(torch.stack([0 * turns, 0 * turns, turns], dim=-1))
+        orientation = quaternion.multiply(about, middle.orientation)[:, None]
+        path = Pose(
+            (middle.position + aside).expand(len(turns), -1, -1),
+            orientation.expand(-1, len(aside), 4),
+        )
+        halves.append(follow_poses(chain, path, q[-1]))
+    (left, left_error), (right, right_error) = halves
+    return (
+        torch.cat([left.flip(0), right[1:]]),
+        torch.cat([left_error.flip(0), right_error[1:]]),
+    )
+
+
+def _other_side(plate: Plate) -> Plate:
+    """The same plate on the other side of the hand, turned by half a turn about its axis."""
+    x, y, z = plate.position
+    half = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
+    turned = quaternion.multiply(half, torch.tensor(plate.orientation, dtype=torch.float64))
+    w, i, j, k = turned.tolist()
+    return replace(plate, position=(-x, -y, z), orientation=(w, i, j, k))
+
+
+def marker_seen(
+    robot: WorkArm, camera: CameraModel, plate: Plate, q: Float[Tensor, "*batch joints"]
+) -> Bool[Tensor, "*batch"]:
+    """Whether a camera sees all of a plate on the hand: no link between, and in the image.
+
+    Args:
+        robot: The arm.
+        camera: The camera.
+        plate: In the frame of the hand.
+        q: Joint positions [rad].
+    """
+    tool = robot.chain.forward(q)
+    # From the hand's frame, at the flange, to that of the tool.
+    half = plate.marker.plate_size / 2
+    corners = torch.tensor([[a, b, 0.0] for a in (-1, 1) for b in (-1, 1)]).double() * half
+    turn = torch.tensor(plate.orientation, dtype=torch.float64)
+    back = torch.tensor([0.0, 0.0, float(robot.chain.tcp[:3, 3].norm())], dtype=torch.float64)
+    centre = torch.tensor(plate.position, dtype=torch.float64) - back
+    points = centre + quaternion.rotate(turn, corners)
+    world = tool.position[..., None, :] + quaternion.rotate(
+        tool.orientation[..., None, :], points
+    )
+    eye = torch.from_numpy(camera.pose[:3, 3].copy())
+    rays = torch.stack([eye.expand_as(world), world], dim=-2)
+    radii = torch.tensor([c.radius for c in robot.body.capsules], dtype=torch.float64)
+    links = robot.body.segments(q)[..., None, :, :, :]
+    free = (segment_distance(rays[..., None, :, :], links) > radii).all(-1).all(-1)
+    return free & torch.from_numpy(camera.in_view(world.numpy())).all(-1)

@@ -1,0 +1,150 @@
+"""The work cell laid out for arms of other shapes than the Panda's."""
+
+from dataclasses import replace
+from functools import cache
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from bare_arm import bare
+
+from hrc_learn.geometry import Pose
+from hrc_learn.kinematics import (
+    ArmChoice,
+    EquippedArm,
+    SerialChain,
+    UnreachableError,
+    coarse_orientation,
+    panda,
+)
+from hrc_learn.kinematics.inverse import follow_poses
+from hrc_learn.kinematics.registry import MissingModelError
+from hrc_learn.sim import World
+from hrc_learn.sim.layout_quality import marker_seen
+from hrc_learn.sim.workplace import Workplace, layout_for
+
+# pyright: reportAttributeAccessIssue=false
+# MuJoCo ships no type stubs; its names come from a compiled module.
+
+
+@cache
+def six_joints():
+    return EquippedArm(bare())
+
+
+def described(name):
+    try:
+        return ArmChoice(name).work_arm()
+    except MissingModelError as error:
+        pytest.skip(str(error))
+
+
+# The search takes a few seconds of each arm.
+@pytest.fixture(params=["six", pytest.param("xarm7", marks=pytest.mark.slow)])
+def robot(request):
+    return six_joints() if request.param == "six" else described(request.param)
+
+
+def test_the_arm_gets_to_all_shelves_and_touches_nothing(robot):
+    workplace = Workplace.of(robot)
+    world = World(workplace.scene)
+    start = workplace.home_joints()
+    assert robot.chain.limits.contain(start)
+    share = torch.linspace(0, 1, 60, dtype=torch.float64)[:, None]
+    for name in workplace.shelf_names():
+        front, goal = workplace.shelf_front(name), workplace.shelf(name)
+        to_front = torch.lerp(workplace.home().position, front.position, share)
+        inside = torch.lerp(front.position, goal.position, share)
+        position = torch.cat([to_front, inside])
+        path = Pose(position, coarse_orientation(position, workplace.level_at))
+        q, error = follow_poses(robot.chain, path, start)
+        assert error.max() < 1e-3
+        assert robot.chain.limits.contain(q).all()
+        assert world.collisions_along(q.numpy()) == []
+        # The rule of the expert ends level, as the place on the shelf has it.
+        assert path[-1].twist_to(goal).abs().max() < 1e-9
+
+
+def test_above_the_table_it_turns_by_half_a_turn_with_its_marker_in_view(robot):
+    layout = layout_for(robot)
+    workplace = layout.workplace
+    least, most = workplace.hover_turns
+    assert most - least == pytest.approx(np.pi)
+    # The demonstrated orientation is among them, or the hand would begin outside.
+    assert least <= 0 <= most
+    assert layout.seen > 0.9
+    assert 0 < layout.quality <= 1
+    plate = workplace.scene.arm.marker
+    assert plate is not None
+    assert marker_seen(robot, workplace.scene.camera, plate, workplace.hover_joints())
+
+
+def test_a_marker_is_seen_where_no_ray_to_it_meets_a_link():
+    workplace = Workplace()
+    plate = workplace.scene.arm.marker
+    assert plate is not None
+    # On the hand's axis, right above the wrist: links come between more often than not.
+    plate = replace(plate, position=(0.0, 0.06, 0.02))
+    arm = replace(workplace.scene.arm, marker=plate)
+    workplace = replace(workplace, scene=replace(workplace.scene, arm=arm))
+    world = World(workplace.scene)
+    rng = np.random.default_rng(3)
+    eye = workplace.scene.camera.pose[:3, 3]
+    hover = workplace.hover_joints()
+    said, rays = [], []
+    for _ in range(60):
+        q = hover + torch.from_numpy(rng.uniform(-0.5, 0.5, 7))
+        world.reset(q.numpy())
+        site = world.data.site("hand_marker")
+        half = plate.marker.plate_size / 2
+        corners = site.xpos + np.array(
+            [
+                site.xmat.reshape(3, 3) @ [a * half, b * half, 0.0]
+                for a in (-1, 1)
+                for b in (-1, 1)
+            ]
+        )
+        blocked = []
+        for corner in corners:
+            way = corner - eye
+            hit = np.zeros(1, dtype=np.int32)
+            distance = mujoco.mj_ray(
+                world.model, world.data, eye, way, None, 1, -1, hit, np.zeros(3)
+            )
+            body = "" if hit[0] < 0 else world.model.body(world.model.geom_bodyid[hit[0]]).name
+            blocked.append(body.startswith("link") and 0 <= distance < 1)
+        in_view = workplace.scene.camera.in_view(corners).all()
+        rays.append(not any(blocked) and bool(in_view))
+        said.append(bool(marker_seen(workplace.robot, workplace.scene.camera, plate, q)))
+    assert said == rays
+    assert 5 < sum(said) < 55
+
+
+def test_an_arm_too_small_for_the_cell_is_refused():
+    small = bare()
+    chain = small.chain
+    mounts = chain.mounts.clone()
+    mounts[:, :3, 3] *= 0.3
+    shrunk = SerialChain(
+        joint_names=chain.joint_names,
+        mounts=mounts,
+        flange=chain.flange,
+        tcp=chain.tcp,
+        limits=chain.limits,
+        ready=chain.ready,
+    )
+    with pytest.raises(UnreachableError, match=r"cut .* too small"):
+        layout_for(EquippedArm(replace(small, chain=shrunk)))
+
+
+def test_the_cell_of_frankas_is_the_usual_one():
+    fr3 = Workplace.of(ArmChoice("fr3").work_arm())
+    usual = Workplace()
+    assert fr3.home_position == usual.home_position
+    assert fr3.hover_turns == usual.hover_turns
+    assert fr3.scene.boxes() == usual.scene.boxes()
+    assert fr3.scene.arm.marker == usual.scene.arm.marker
+    q = fr3.home_joints()
+    assert float((q - Workplace().home_joints()).abs().max()) < 1e-6
+    assert fr3.robot.chain is not panda
