@@ -1,0 +1,167 @@
+"""A table of the registered arms: joints, reach, agreement with MuJoCo, inverse, and demo.
+
+Written between the lines `<!-- arms:begin -->` and `<!-- arms:end -->` of the files given. The
+last column is of earlier runs of `hrc demo --robot NAME --json FOLDER/NAME.json`; an arm
+without one is shown as not tried. Arms whose package is not installed are left out.
+"""
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import json
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree
+
+import mujoco
+import numpy as np
+import torch
+from rich.console import Console
+
+from hrc_learn import cli
+from hrc_learn.kinematics import Arm, MissingModelError, arm, registered_arms, solve_inverse
+from hrc_learn.kinematics.registry import maker_of
+
+# pyright: reportAttributeAccessIssue=false
+# MuJoCo ships no type stubs; its names come from a compiled module.
+
+_BEGIN, _END = "<!-- arms:begin -->", "<!-- arms:end -->"
+_HEADER = (
+    "| arm | maker | joints | reach [m] | largest difference from MuJoCo | poses found "
+    "| ms a pose | `hrc demo` |\n|---|---|---|---|---|---|---|---|"
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args:
+    states: int = 500
+    """Random joint positions in which MuJoCo's pose and Jacobian are compared."""
+    poses: int = 200
+    """Random reachable poses to invert."""
+    demos: Path | None = None
+    """Folder with NAME.json of `hrc demo`."""
+    files: tuple[Path, ...] = ()
+    """Into which the table is written."""
+    json: Path | None = None
+    """Receives the figures as one flat object."""
+
+
+def main(args: Args) -> None:
+    """Measure, print the table, write it."""
+    torch.set_num_threads(1)
+    rows, figures = [_HEADER], {}
+    for name in registered_arms():
+        try:
+            described = arm(name)
+        except MissingModelError:
+            continue
+        measured = _measured(described, args)
+        figures |= {f"{name}_{key}": value for key, value in measured.items()}
+        error = measured.get("difference_from_mujoco")
+        rows.append(
+            f"| {name} | {maker_of(name)} | {measured['joints']:.0f} "
+            f"| {measured['reach_m']:.2f} "
+            f"| {'its own model' if error is None else f'{error:.0e}'} "
+            f"| {100 * measured['inverse_found']:.1f} % | {measured['inverse_ms']:.0f} "
+            f"| {_demo(name, args.demos)} |"
+        )
+        Console().print(rows[-1], highlight=False)
+    for file in args.files:
+        text = file.read_text()
+        if _BEGIN not in text or _END not in text:
+            raise ValueError(f"{file}: needs the lines {_BEGIN} and {_END}, for the table.")
+        before, after = text.split(_BEGIN)[0], text.split(_END)[1]
+        file.write_text("\n".join([before + _BEGIN, *rows, _END + after]))
+    if args.json is not None:
+        cli.write_json(args.json, figures)
+
+
+def _measured(described: Arm, args: Args) -> dict[str, float]:
+    chain = described.chain
+    n, rng = len(chain.joint_names), torch.Generator().manual_seed(0)
+    lower, upper = chain.limits.lower, chain.limits.upper
+
+    def drawn(count: int) -> torch.Tensor:
+        share = torch.rand(count, n, generator=rng, dtype=torch.float64)
+        return lower + (upper - lower) * share
+
+    # Of the tool centre point from joint 2, as far as 5,000 random states tell.
+    q = drawn(5000)
+    shoulder = chain.joint_origins(q)[:, 1]
+    reach = float((chain.forward(q).position - shoulder).norm(dim=-1).max())
+    pose = chain.forward(drawn(args.poses))
+    begun = time.thread_time()
+    found = solve_inverse(chain, pose, task="pose" if n >= 6 else "position+axis").found
+    spent = time.thread_time() - begun
+    figures = {
+        "joints": float(n),
+        "reach_m": reach,
+        "inverse_found": float(found.double().mean()),
+        "inverse_ms": 1e3 * spent / args.poses,
+    }
+    if described.description is not None:
+        figures["difference_from_mujoco"] = _difference(described, drawn(args.states))
+    return figures
+
+
+def _difference(described: Arm, q: torch.Tensor) -> float:
+    """Largest one of flange positions [m], rotations and Jacobians."""
+    model = _mujoco_model(described)
+    data, names = mujoco.MjData(model), described.joint_names
+    addresses = [int(model.joint(name).qposadr[0]) for name in names]
+    columns = [int(model.joint(name).dofadr[0]) for name in names]
+    flange = described.with_tool(torch.eye(4, dtype=torch.float64)).chain
+    poses, jacobians = flange.forward_and_jacobian(q)
+    J, largest = np.zeros((6, model.nv)), 0.0
+    for row, T, ours in zip(q, poses.matrix().numpy(), jacobians.numpy(), strict=True):
+        data.qpos[addresses] = row
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_jacBody(model, data, J[:3], J[3:], model.body(described.tip).id)
+        root = data.body(described.base) if described.base else data.body(0)
+        R, tip = root.xmat.reshape(3, 3), data.body(described.tip)
+        theirs = np.concatenate([R.T @ J[:3, columns], R.T @ J[3:, columns]])
+        largest = max(
+            largest,
+            float(np.abs(T[:3, 3] - R.T @ (tip.xpos - root.xpos)).max()),
+            float(np.abs(T[:3, :3] - R.T @ tip.xmat.reshape(3, 3)).max()),
+            float(np.abs(ours - theirs).max()),
+        )
+    return largest
+
+
+def _mujoco_model(described: Arm) -> mujoco.MjModel:
+    """MuJoCo's own reading of the file; of URDF the kinematics alone."""
+    assert described.description is not None
+    if described.format == "mjcf":
+        return mujoco.MjModel.from_xml_path(str(described.description))
+    robot = ElementTree.parse(described.description).getroot()
+    for link in robot.findall("link"):
+        for part in list(link):
+            link.remove(part)
+        inertial = ElementTree.SubElement(link, "inertial")
+        ElementTree.SubElement(inertial, "mass", value="1")
+        zero = dict.fromkeys(("ixy", "ixz", "iyz"), "0")
+        ElementTree.SubElement(inertial, "inertia", ixx="1", iyy="1", izz="1", **zero)
+    kept_apart = '<mujoco><compiler fusestatic="false"/></mujoco>'
+    robot.append(ElementTree.fromstring(kept_apart))
+    return mujoco.MjModel.from_xml_string(ElementTree.tostring(robot, encoding="unicode"))
+
+
+def _demo(name: str, folder: Path | None) -> str:
+    path = None if folder is None else folder / f"{name}.json"
+    if path is None or not path.is_file():
+        return "not tried"
+    values = json.loads(path.read_text())
+    if values["success_rate"] < 1:
+        return "not done"
+    return (
+        f"grasped, {values['grasp_offset_mm']:.1f} mm off; "
+        f"placed, {values['place_error_mm']:.1f} mm off; {values['contacts']:.0f} contacts"
+    )
+
+
+if __name__ == "__main__":
+    cli.run(main, Args)
