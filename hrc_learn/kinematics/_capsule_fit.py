@@ -87,8 +87,19 @@ class _Hull:
 
 
 def hull_of(shape: Shape, pose: Transform) -> _Hull:
-    """Convex hull of a shape, of a round one that of a prism around it."""
-    from scipy.spatial import ConvexHull, QhullError
+    """Convex hull of a shape, of a round one that of a prism around it.
+
+    Raises:
+        ModuleNotFoundError: SciPy is not installed.
+    """
+    try:  # only here: the rest of the package's core works without it
+        from scipy.spatial import ConvexHull, QhullError
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(
+            "fitting capsules to the shapes of an arm needs SciPy: pip install "
+            "'hrc-learn[demos]'",
+            name="scipy",
+        ) from error
 
     points = shape_points(shape) @ pose[:3, :3].T + pose[:3, 3]
     try:

@@ -38,7 +38,7 @@ def to_urdf(chain: SerialChain, name: str = "arm") -> str:
     limits = chain.limits
     for i, joint_name in enumerate(chain.joint_names):
         joint = _add_joint(
-            robot, joint_name, "revolute", links[i], links[i + 1], chain.mounts[i]
+            robot, joint_name, chain.kinds[i], links[i], links[i + 1], chain.mounts[i]
         )
         ElementTree.SubElement(joint, "axis", xyz="0 0 1")
         ElementTree.SubElement(

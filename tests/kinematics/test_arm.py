@@ -1,5 +1,7 @@
 """Arms from descriptions, against MuJoCo; their inverses, and what is said of bad files."""
 
+import sys
+
 import mujoco
 import numpy as np
 import pytest
@@ -230,3 +232,10 @@ def test_capsules_contain_what_they_are_fitted_to():
         away = np.linalg.norm(inside - start - t[:, None] * way, axis=1) - radius
         distance = np.minimum(distance, away)
     assert distance.max() <= 0
+
+
+def test_without_scipy_shapes_are_not_fitted_and_it_says_why(monkeypatch):
+    monkeypatch.setitem(sys.modules, "scipy.spatial", None)
+    box = Shape(pose=np.eye(4), kind="box", size=(0.1, 0.1, 0.1))
+    with pytest.raises(ModuleNotFoundError, match=r"SciPy: pip install 'hrc-learn\[demos\]'"):
+        hull_of(box, np.eye(4))

@@ -9,7 +9,15 @@ from arm_samples import joint_positions
 from sampling import generator
 from torch.testing import assert_close
 
-from hrc_learn.kinematics import from_pytorch_kinematics, panda, to_pytorch_kinematics
+from hrc_learn.kinematics import (
+    Arm,
+    JointLimits,
+    SerialChain,
+    from_pytorch_kinematics,
+    panda,
+    to_pytorch_kinematics,
+)
+from hrc_learn.kinematics.interchange import to_urdf
 
 # Axes along x, -z and a slant, a fixed joint in the middle and one at the end.
 ODD_ARM = """
@@ -95,3 +103,36 @@ def test_sliding_joint_is_refused_by_name():
     peer = pytorch_kinematics.build_serial_chain_from_urdf(text.encode(), "tip")
     with pytest.raises(ValueError, match="joint two is prismatic"):
         from_pytorch_kinematics(peer, acceleration=10.0, jerk=100.0)
+
+
+def test_urdf_keeps_how_each_joint_moves(tmp_path):
+    turn, slide = torch.eye(4).double(), torch.eye(4).double()
+    turn[:3, 3] = torch.tensor([0.1, 0.0, 0.3])
+    slide[:3, :3] = torch.tensor([[0, 0, 1], [1, 0, 0], [0, 1, 0]]).double()
+    still = torch.eye(4).double()
+    each = torch.ones(3).double()
+    limits = JointLimits(
+        lower=torch.tensor([-3.0, -0.2, -1.0]).double(),
+        upper=torch.tensor([3.0, 0.5, 2.0]).double(),
+        velocity=each,
+        acceleration=each,
+        jerk=each,
+        torque=each,
+        vintage="test",
+    )
+    chain = SerialChain(
+        joint_names=["turn", "slide", "bend"],
+        mounts=torch.stack([turn, slide, turn @ slide]),
+        flange=turn,
+        tcp=still,
+        limits=limits,
+        ready=0.1 * each,
+        kinds=("revolute", "prismatic", "revolute"),
+    )
+    file = tmp_path / "sliding.urdf"
+    file.write_text(to_urdf(chain))
+    read = Arm.from_urdf(file, base="link0", tip="tcp").chain
+    assert read.kinds == chain.kinds
+    q = torch.tensor([[0.3, 0.2, -0.7], [-2.0, -0.1, 1.5]]).double()
+    assert_close(read.forward(q).matrix(), chain.forward(q).matrix(), rtol=0, atol=1e-12)
+    assert_close(read.jacobian(q), chain.jacobian(q), rtol=0, atol=1e-12)
