@@ -37,6 +37,9 @@ from hrc_learn.dmp.limited_dmp import LimitedState as LimitedState
 from hrc_learn.dmp.limited_dmp import LimitedTrajectory as LimitedTrajectory
 from hrc_learn.dmp.limited_dmp import SoftLimits as SoftLimits
 from hrc_learn.dmp.linear_primitive import LinearPrimitive as LinearPrimitive
+from hrc_learn.dmp.motion_head import MotionDistribution as MotionDistribution
+from hrc_learn.dmp.motion_head import MotionHead as MotionHead
+from hrc_learn.dmp.motion_head import PlannedTrajectory as PlannedTrajectory
 from hrc_learn.dmp.motion_primitive import AdaptedPrimitive as AdaptedPrimitive
 from hrc_learn.dmp.motion_primitive import MotionPrimitive as MotionPrimitive
 from hrc_learn.dmp.moving_goal_dmp import MovingGoalDMP as MovingGoalDMP

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Real
 from torch import Tensor
+from torch.autograd.forward_ad import unpack_dual
 
 type Nested = Sequence
 """Lists or tuples, of numbers or of more of them."""
@@ -56,7 +57,10 @@ def readable(*tensors: Tensor) -> bool:
     if torch.compiler.is_compiling():
         return False
     functorch = torch._C._functorch  # pyright: ignore[reportAttributeAccessIssue]
-    return not any(functorch.is_functorch_wrapped_tensor(x) for x in tensors)
+    return not any(
+        functorch.is_functorch_wrapped_tensor(x) or unpack_dual(x).tangent is not None
+        for x in tensors
+    )
 
 
 def vector(

@@ -13,7 +13,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -80,7 +79,7 @@ class OwnTimesTable:
         powers = powers.cumprod(-1)
         if periodic or not (torch.compiler.is_compiling() or piece.max() == pieces):
             return piece, powers
-        back = _spring_rows(self.response, (s - forced.end).clamp(min=0), self.order)
+        back = spring_rows(self.response, (s - forced.end).clamp(min=0), self.order)
         goal = torch.full_like(s, float(self.order == 0))[..., None]
         back = torch.cat([back, goal], dim=-1).to(dtype)
         back = torch.nn.functional.pad(back, (0, self.size - back.shape[-1]))
@@ -89,11 +88,11 @@ class OwnTimesTable:
     def extra(self, s: Float[Tensor, "B T"], dtype: torch.dtype) -> Float[Tensor, "B T extra"]:
         """What the columns of `others` are multiplied by."""
         if self.response.forced.periodic:
-            return _spring_rows(self.response, s, self.order).to(dtype)
+            return spring_rows(self.response, s, self.order).to(dtype)
         return _approach(s, self.response.approach, self.order).to(dtype)[..., None]
 
 
-def _spring_rows(response: "Response", s: Tensor, order: int) -> Float[Tensor, "*batch 2"]:
+def spring_rows(response: "Response", s: Tensor, order: int) -> Float[Tensor, "*batch 2"]:
     """The row of exp(A s) A^order that gives y of (y - g, y') at s = 0."""
     spring = response.spring
     C, S = spring.modes(s, torch)
@@ -105,10 +104,13 @@ def _spring_rows(response: "Response", s: Tensor, order: int) -> Float[Tensor, "
 
 def _approach(s: Tensor, share: float, order: int) -> Tensor:
     """m(s) - 1 of the minimum-jerk curve of an approach, or a derivative of it by s."""
-    polynomial = np.polynomial.Polynomial([-1.0, 0, 0, 10, -15, 6]).deriv(order)
+    # Of numbers alone: a compiler does not look into NumPy's polynomials.
+    coefficients = [-1.0, 0.0, 0.0, 10.0, -15.0, 6.0]
+    for _ in range(order):
+        coefficients = [k * c for k, c in enumerate(coefficients)][1:]
     u = (s / share).clamp(0, 1)
     value = torch.zeros_like(u)
-    for c in polynomial.coef[::-1].tolist():
+    for c in reversed(coefficients):
         value = value * u + c
     return torch.where((s < share) | (order == 0), value / share**order, 0.0)
 
@@ -179,11 +181,11 @@ def without_subnormals(values: Tensor) -> Tensor:
 
 
 def _spring_pieces(response: "Response", order: int) -> Float[Tensor, "pieces P 2"]:
-    """Coefficients of `_spring_rows` on the pieces of the forcing."""
+    """Coefficients of `spring_rows` on the pieces of the forcing."""
     forced = response.forced
     u = forced.points.to(forced.coefficients)
     knots = torch.arange(len(forced.coefficients), dtype=u.dtype, device=u.device)
-    values = _spring_rows(response, forced.interval * (knots[:, None] + u), order)
+    values = spring_rows(response, forced.interval * (knots[:, None] + u), order)
     return forced.interpolate(values[..., None, :], forced.interval).coefficients[..., 0, :]
 
 

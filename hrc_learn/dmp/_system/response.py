@@ -400,14 +400,13 @@ class Trajectory(ArrayOutputs):
     @cached_property
     def jerk(self) -> Float[Tensor, "*batch T D"]:
         """The same per second cubed."""
-        X = self._coordinates / self.duration[..., None, None] ** 3
-        return self._at_own_times(X, 3)
+        return self._output(3)
 
     def _output(self, order: int) -> Float[Tensor, "*batch T D"]:
         X = self._coordinates
         if order:
             X = X / self.duration[..., None, None] ** order
-        if self.s.ndim > 1 or self.s.requires_grad or not readable(self.s):
+        if order > 2 or self.s.ndim > 1 or self.s.requires_grad or not readable(self.s):
             return self._at_own_times(X, order)
         # One flat product: batched ones against a shared matrix are ten times slower.
         H = self._response.matrices(self.s, X.dtype)[order]
