@@ -192,7 +192,7 @@ def measure_steps(repeats: int) -> dict[str, float]:
 def measure_own_times(repeats: int) -> dict[str, float]:
     """Each motion another duration, beside the same batch on one time grid; and by gradients.
 
-    Other stamps of each are fitted one by one.
+    And fits of stamps that differ.
     """
     figures: dict[str, float] = {}
     for batch in (256, 4096):

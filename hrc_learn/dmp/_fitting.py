@@ -16,13 +16,14 @@ from functools import lru_cache
 from typing import Any, TypedDict
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from hrc_learn.dmp._arguments import FitReport, Samples
 from hrc_learn.dmp._smoothing import smoothed, warn_of_few_samples
 from hrc_learn.dmp._system.bases import Basis, GaussianBasis, balanced_units
 from hrc_learn.dmp._system.closed_forms import SpringDamper
+from hrc_learn.dmp._system.own_times import products
 from hrc_learn.dmp._system.response import Response, Trajectory, response_of
 from hrc_learn.dmp.forcing_scale import Demonstrated, Scaling
 
@@ -78,13 +79,98 @@ def fit_samples(
         rate = samples.velocity.double() * samples.duration[:, None, None]
     if samples.shared:
         return _fit(method, response, samples.s[0], position, rate, regularization)
-    fits = []
-    for i, valid in enumerate(samples.mask):
+    weights = position.new_empty(*position.shape[:2], response.basis.count)
+    start_rate = position.new_empty(position.shape[:2])
+    alone = torch.ones(len(position), dtype=torch.bool)
+    if method == "trajectory" and not (response.approach or response.basis.periodic):
+        weights, start_rate, alone = _fit_at_own_times(response, samples, rate, regularization)
+    for i in alone.nonzero()[:, 0].tolist():
+        valid = samples.mask[i]
         one_rate = None if rate is None else rate[i, :, valid]
         s = samples.s[i, valid]
-        fits.append(_fit(method, response, s, position[i, :, valid], one_rate, regularization))
-    weights, start_rate = zip(*fits, strict=True)
-    return torch.stack(weights), torch.stack(start_rate)
+        weights[i], start_rate[i] = _fit(
+            method, response, s, position[i, :, valid], one_rate, regularization
+        )
+    return weights, start_rate
+
+
+EVEN = 20
+"""Samples a basis function of the even grid that columns are orthonormal on."""
+WELL_POSED = 1e-3
+"""Least over largest diagonal entry of a Cholesky factor from which products are solved: half
+of the digits of float64 are lost at 1e-8."""
+ROUNDS_OF_NORM = 4
+"""Of the power iteration for the largest singular value, which a ridge is measured by; the next
+one is a third of it, so that an error falls to a percent in two."""
+
+
+def _fit_at_own_times(
+    response: Response,
+    samples: Samples,
+    rate: Float[Tensor, "B D T"] | None,
+    regularization: float,
+) -> tuple[Float[Tensor, "B D N"], Float[Tensor, "B D"], Bool[Tensor, "B"]]:
+    """`"trajectory"` for all demonstrations at once, whatever their timestamps.
+
+    The normal equations, in columns that are orthonormal on an even grid: of samples that tell
+    the functions apart, no digits are lost by squaring those.
+
+    Returns:
+        Weights, dy/ds, and which demonstrations leave functions undetermined, whose results are
+        not to be used.
+    """
+    N, fit_rate = response.basis.count, rate is None
+    n = N + fit_rate
+    mixing, sigma, directions = _orthonormal_columns(response, n, samples.s.device)
+    apart = mixing[:n, :n]
+    mask = samples.mask.to(mixing)
+    position = torch.where(samples.mask[:, None], samples.position.double(), 0.0)
+    gram, right = products(response, mixing, samples.s, position, mask)
+    known = [samples.first.double(), samples.last.double()]
+    if rate is not None:
+        known.insert(0, rate[..., 0] if samples.complete else _first(rate, samples.mask))
+    right = right[:, :n] - gram[:, :n, n:] @ torch.stack(known, 1)
+    A = gram[:, :n, :n]
+    # The ridge is one of the balanced weights, in units of their largest singular value: by
+    # power iteration from that of the even grid.
+    v, norm = directions[:1].expand(len(A), -1), A.new_zeros(len(A), 1)
+    for _ in range(ROUNDS_OF_NORM):
+        v = (A @ (v @ directions.mT * sigma)[..., None])[..., 0] * sigma @ directions
+        norm = v.norm(dim=-1, keepdim=True)
+        v = v / norm
+    A = A + torch.diag_embed(regularization**2 * norm / sigma**2)
+    factor, failed = torch.linalg.cholesky_ex(A)
+    diagonal = factor.diagonal(dim1=-2, dim2=-1)
+    alone = (failed > 0) | ~(diagonal.amin(-1) > WELL_POSED * diagonal.amax(-1))
+    unknown = (apart @ torch.cholesky_solve(right, factor)).mT
+    if rate is None:
+        return unknown[..., :-1], unknown[..., -1], alone
+    return unknown, known[0], alone
+
+
+@lru_cache(maxsize=16)
+def _orthonormal_columns(
+    response: Response, n: int, device: torch.device
+) -> tuple[Float[Tensor, "M M"], Float[Tensor, "n"], Float[Tensor, "n n"]]:
+    """What n columns stand for that are orthonormal on an even grid.
+
+    Returns:
+        Coordinates of each column, those after n as they are; singular values of the balanced
+        design, and its right singular vectors in rows.
+    """
+    N = response.basis.count
+    even = torch.linspace(0, 1, EVEN * N + 1, dtype=torch.float64, device=device)
+    H = response.evaluate(even)[:, 0]
+    unit = balanced_units(response.basis, H, n - N)
+    _, sigma, Vh = torch.linalg.svd(H[:, :n] * unit, full_matrices=False)
+    mixing = torch.eye(H.shape[1]).to(H)
+    mixing[:n, :n] = unit[:, None] * Vh.mT / sigma
+    return mixing, sigma, Vh
+
+
+def _first(values: Float[Tensor, "B D T"], mask: Bool[Tensor, "B T"]) -> Float[Tensor, "B D"]:
+    index = mask.long().argmax(-1)[:, None, None].expand(-1, values.shape[1], 1)
+    return values.gather(-1, index)[..., 0]
 
 
 def _fit(

@@ -18,7 +18,7 @@ from hrc_learn.dmp import (
     SpringDamper,
     response_of,
 )
-from hrc_learn.dmp._system.own_times import motion
+from hrc_learn.dmp._system.own_times import motion, products
 
 BASES = {
     "gaussian": (GaussianBasis(count=12), 0.0),
@@ -150,3 +150,72 @@ for dmp, output in kinds:
 def test_compiles_without_a_break():
     """In a process of its own: a compiler cannot follow the shape checks of these tests."""
     subprocess.run([sys.executable, "-c", COMPILED], check=True)
+
+
+def recordings(n, lengths, velocity=False):
+    """Motions with timestamps of their own, in lists."""
+    rng = torch.Generator().manual_seed(3)
+    times, positions = [], []
+    for k in range(n):
+        time, position = arm_motion(lengths[k], 3, 1.0 + k, seed=k)
+        spacing = time.diff() * (0.2 + torch.rand(len(time) - 1, generator=rng).double())
+        times.append(torch.cat([time[:1], spacing.cumsum(0)]))
+        positions.append(position)
+    rates = [torch.gradient(y, dim=0)[0] for y in positions] if velocity else None
+    return times, positions, rates
+
+
+# Of 14 samples 12 functions cannot be told apart: those are solved by themselves.
+@pytest.mark.parametrize("velocity", [False, True], ids=["positions", "velocities"])
+@pytest.mark.parametrize("lengths", [(200, 200, 200), (90, 200, 140), (200, 14, 90)], ids=str)
+@pytest.mark.parametrize(
+    "basis", [GaussianBasis(count=12), SplineBasis(count=12), BASES["learned"][0]], ids=repr
+)
+def test_fits_of_own_timestamps_are_a_loop(basis, lengths, velocity):
+    times, positions, rates = recordings(3, lengths, velocity)
+    together = JointDMP.fit(times, positions, velocity=rates, basis=basis)
+    for i, (time, position) in enumerate(zip(times, positions, strict=True)):
+        rate = rates[i] if rates else None
+        alone = JointDMP.fit(time, position, velocity=rate, basis=basis)
+        shown = alone.rollout(time)
+        torch.testing.assert_close(
+            together[i].rollout(time).position, shown.position, rtol=0, atol=1e-8
+        )
+        size = shown.acceleration.abs().max().item()
+        torch.testing.assert_close(
+            together[i].rollout(time).acceleration, shown.acceleration, rtol=0, atol=1e-6 * size
+        )
+
+
+def test_samples_that_do_not_count_change_no_fit():
+    time, position = zip(*(arm_motion(80, 3, 1.0 + k, seed=k) for k in range(3)), strict=True)
+    time, position = torch.stack(time), torch.stack(position)
+    time = time + 1e-3 * torch.rand(time.shape, generator=torch.Generator().manual_seed(0))
+    mask = torch.ones_like(time).bool()
+    mask[0, 30:40] = mask[2, 70:] = mask[1, 0] = False
+    velocity = torch.gradient(position, dim=1)[0]
+    together = JointDMP.fit(time, position, 12, velocity, mask)
+    for i in range(3):
+        kept = mask[i]
+        alone = JointDMP.fit(time[i, kept], position[i, kept], 12, velocity[i, kept])
+        torch.testing.assert_close(together[i].weights, alone.weights, rtol=1e-6, atol=1e-5)
+        torch.testing.assert_close(together[i].start_velocity, alone.start_velocity)
+
+
+def test_products_are_those_of_the_design():
+    rng = torch.Generator().manual_seed(0)
+    s = torch.rand(3, 60, generator=rng, dtype=torch.float64).sort(-1).values
+    s[:, 0], s[:, -1] = 0.0, 1.0
+    # All at one place, and pieces that hold nothing.
+    s[2, 1:-1] = 0.4
+    y = torch.randn(3, 2, 60, generator=rng, dtype=torch.float64)
+    mask = (torch.rand(3, 60, generator=rng) < 0.8).double()
+    for basis, approach in list(BASES.values())[:2]:
+        response = response_of(SpringDamper(), basis, approach)
+        mixing = torch.randn(response.size, 7, generator=rng, dtype=torch.float64)
+        gram, right = products(response, mixing, s, y, mask)
+        H = response.evaluate(s)[..., 0, :] @ mixing
+        expected = H.mT @ (mask[..., None] * H)
+        torch.testing.assert_close(gram, expected, rtol=1e-8, atol=1e-8)
+        expected = H.mT @ (mask[..., None] * y.mT)
+        torch.testing.assert_close(right, expected, rtol=1e-8, atol=1e-8)

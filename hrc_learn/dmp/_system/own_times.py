@@ -9,6 +9,7 @@ That is linear in the coordinates, and its derivative by time is the motion of t
 So a motion, its adjoint, and the derivatives of both of any order are the same two functions.
 """
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -23,6 +24,9 @@ if TYPE_CHECKING:
 NEGLIGIBLE = 4
 """Epsilons of a dtype, relative to the largest value of a column, by which polynomials of a
 lower degree may differ: a sum of fifty products rounds off as much."""
+UNSEEN = 1e-9
+"""Likewise, of columns whose products are solved for weights: what is left of it in a motion is
+well below what the response itself is exact to."""
 AT_ONCE = 2**16
 """Samples whose indices and powers a core keeps in its cache; a million takes twice as long."""
 
@@ -172,6 +176,61 @@ def _tabulate(
         coefficients.shape[1],
         others.to(device, dtype) if needed else None,
     )
+
+
+def products(
+    response: "Response",
+    mixing: Float[Tensor, "M n"],
+    s: Float[Tensor, "B T"],
+    y: Float[Tensor, "B D T"],
+    mask: Float[Tensor, "B T"],
+) -> tuple[Float[Tensor, "B n n"], Float[Tensor, "B n D"]]:
+    """H'H and H'y of the columns H(s) mixing, over the samples that count (float64).
+
+    No H is made: on a piece a column is a polynomial, so that sums of powers of the times say
+    all about the samples there.
+
+    Args:
+        response: Without approach, of a basis that is not periodic.
+        mixing: What coordinates each column stands for.
+        s: Normalised times from 0 to 1, never falling.
+        y: Samples.
+        mask: 1 where one counts, 0 elsewhere.
+    """
+    table = _table(response, 0, s)
+    K, n, D = table.size, mixing.shape[1], y.shape[1]
+    # The last piece stands for times long after the end.
+    coefficients = (mixing.mT @ table.matrix).view(n, -1, K)[:, :-1].permute(1, 2, 0)
+    reached = min(int(1 / response.forced.interval) + 1, len(coefficients))
+    coefficients = _of_least_degree(coefficients[:reached], UNSEEN)
+    P, K = coefficients.shape[:2]
+    edges = torch.arange(P + 1, dtype=s.dtype, device=s.device)
+    # Samples at the very end belong to the last piece.
+    edges[-1] = math.inf
+    gram, right = s.new_empty(len(s), n, n), s.new_empty(len(s), n, D)
+    for part in _parts(s):
+        x, B = s[part] / response.forced.interval, len(s[part])
+        first = torch.searchsorted(x.contiguous(), edges.expand(B, -1).contiguous())
+        most = int(first.diff(dim=-1).amax())
+        index = first[:, :-1, None] + torch.arange(most, device=s.device)
+        there = index < first[:, 1:, None]
+        index = index.clamp(max=s.shape[1] - 1).flatten(1)
+        counts = mask[part].gather(1, index).view(B, P, most) * there
+        u = 2 * (x.gather(1, index).view(B, P, most) - edges[:P, None]) - 1
+        power, samples = counts, y[part].mT.gather(1, index[..., None].expand(-1, -1, D))
+        powers = s.new_empty(B, P, most, K + D)
+        powers[..., K:] = samples.view(B, P, most, D)
+        for k in range(K):
+            powers[..., k] = power
+            power = power * u
+        sums = powers[..., :K].mT @ powers
+        # Of polynomials times polynomials, in an order that leaves one flat product.
+        inner = sums[..., :K].permute(1, 2, 0, 3).reshape(P, K * B, K) @ coefficients
+        flat = coefficients.reshape(P * K, n).mT
+        gram[part] = (flat @ inner.view(P * K, B * n)).view(n, B, n).movedim(1, 0)
+        outer = sums[..., K:].permute(1, 2, 0, 3).reshape(P * K, B * D)
+        right[part] = (flat @ outer).view(n, B, D).movedim(1, 0)
+    return gram, right
 
 
 def without_subnormals(values: Tensor) -> Tensor:
