@@ -1,0 +1,207 @@
+"""What a person is about to do, and what the robot does then, from how they began.
+
+Interaction primitives (Ben Amor et al. 2014; Maeda et al. 2017, "Probabilistic movement
+primitives for coordination of multiple human-robot collaborative tasks"): the motions of both
+are Gaussian together, so that those of the robot follow from what has been seen of the
+person's. Of which kind of interaction that is the beginning, and how long it is going to take,
+is inferred along: each kind and duration has a likelihood in closed form.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from hrc_learn.dmp._arguments import Points, Times, padded, positive, to_tensor
+from hrc_learn.dmp.joint_dmp import JointDMP
+from hrc_learn.dmp.probabilistic_dmp import ProbabilisticDMP
+
+DURATIONS = 31
+"""Compared for each kind, three standard deviations either way: a fifth of one apart, below
+which likelihoods of a few samples hardly differ."""
+LEAST_SPREAD = 0.05
+"""Of the logarithm of durations: people repeat themselves to about five percent at best, and a
+few demonstrations may by chance agree better."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class InteractionPrimitive:
+    """Gaussians over motions of a person and a robot together, one for each kind."""
+
+    kinds: tuple[str, ...]
+    models: tuple[ProbabilisticDMP[JointDMP], ...]
+    """Of all columns, those of the person first."""
+    prior: Float[Tensor, "K"]
+    """Share of the demonstrations of each kind."""
+    log_duration: Float[Tensor, "K 2"]
+    """Mean and standard deviation of the logarithm of durations [s]."""
+    observed: int
+    """How many columns are the person's."""
+
+    @classmethod
+    def fit(
+        cls,
+        time: Times | Sequence[Times],
+        person: Points | Sequence[Points],
+        robot: Points | Sequence[Points],
+        kinds: Sequence[str] | None = None,
+        *,
+        n_basis: int = 15,
+        slack: float = 0.0,
+    ) -> "InteractionPrimitive":
+        """Learn from demonstrations in which both move.
+
+        Args:
+            time: [s], (T,), (B, T) or a list of (T_i,), shared by both.
+            person: What is seen of the person, (B, T, H) or a list of (T_i, H).
+            robot: (B, T, R) or a list.
+            kinds: Name of the kind that each demonstration is of; all of one if None.
+            n_basis: Of each column.
+            slack: Freedom beyond what the demonstrations vary; see `ProbabilisticDMP.fit`.
+
+        Raises:
+            ValueError: Fewer than two demonstrations of a kind, or lengths that differ.
+        """
+        time, mask, (person, robot) = padded(time, None, person, robot)
+        person, robot = (to_tensor(x, torch.float64) for x in (person, robot))
+        if person.ndim != 3 or robot.shape[:2] != person.shape[:2]:
+            raise ValueError(
+                "person and robot must be (B, T, columns) of the same B and T, got "
+                f"{tuple(person.shape)} and {tuple(robot.shape)}"
+            )
+        kinds = ["interaction"] * len(person) if kinds is None else list(kinds)
+        if len(kinds) != len(person):
+            raise ValueError(f"{len(kinds)} kinds for {len(person)} demonstrations")
+        names = tuple(dict.fromkeys(kinds))
+        both = JointDMP.fit(time, torch.cat([person, robot], -1), n_basis, mask=mask)
+        models, durations = [], []
+        for name in names:
+            those = [i for i, kind in enumerate(kinds) if kind == name]
+            if len(those) < 2:
+                raise ValueError(f"kind {name!r} has one demonstration: it needs two or more")
+            models.append(ProbabilisticDMP.fit(both[those], slack))
+            logarithm = both.duration[those].double().log()
+            spread = logarithm.std().clamp(min=LEAST_SPREAD)
+            durations.append(torch.stack([logarithm.mean(), spread]))
+        counts = torch.tensor([kinds.count(name) for name in names], dtype=torch.float64)
+        return cls(
+            kinds=names,
+            models=tuple(models),
+            prior=counts / counts.sum(),
+            log_duration=torch.stack(durations),
+            observed=person.shape[-1],
+        )
+
+    def observe(self, time: Times, person: Points, noise: float) -> "InteractionEstimate":
+        """What has been seen of the person so far says about the rest.
+
+        Args:
+            time: [s] since the person set off, (n,), increasing.
+            person: (n, H); NaN where nothing was seen.
+            noise: Standard deviation of each value, of the sensor and of what people vary from
+                sample to sample.
+
+        Raises:
+            ValueError: Other shapes, or nothing seen at all.
+        """
+        seen_at = to_tensor(time, torch.float64)
+        values = to_tensor(person, torch.float64)
+        if seen_at.ndim != 1 or values.shape != (len(seen_at), self.observed):
+            raise ValueError(
+                f"time and person must be (n,) and (n, {self.observed}), got "
+                f"{tuple(seen_at.shape)} and {tuple(values.shape)}"
+            )
+        if values.isnan().all():
+            raise ValueError("nothing was seen of the person")
+        positive("noise", noise, values)
+        steps = torch.linspace(-3, 3, DURATIONS, dtype=torch.float64)
+        duration = (self.log_duration[:, :1] + self.log_duration[:, 1:] * steps).exp()
+        likelihood = torch.stack(
+            [
+                self._log_likelihood(model, seen_at / tau[:, None], values, noise)
+                for model, tau in zip(self.models, duration, strict=True)
+            ]
+        )
+        score = likelihood - steps.square() / 2 + self.prior.log()[:, None]
+        posterior = torch.softmax(score.flatten(), 0).view_as(score)
+        probability = posterior.sum(-1)
+        kind = int(probability.argmax())
+        # One duration of a skewed distribution: the mean of its logarithm.
+        within = posterior[kind] / probability[kind]
+        expected = (within * duration[kind].log()).sum().exp()
+        model = self.models[kind]
+        whole = torch.full((len(values), model.mean.shape[0]), math.nan, dtype=torch.float64)
+        whole[:, : self.observed] = values
+        scale = model.primitive.duration.double() / expected
+        return InteractionEstimate(
+            kind=self.kinds[kind],
+            probability=probability,
+            duration=expected.item(),
+            phase=(seen_at[-1] / expected).clamp(max=1).item(),
+            motion=model.condition(seen_at * scale, whole, noise=noise),
+            observed=self.observed,
+        )
+
+    def _log_likelihood(
+        self,
+        model: ProbabilisticDMP[JointDMP],
+        s: Float[Tensor, "G n"],
+        values: Float[Tensor, "n H"],
+        noise: float,
+    ) -> Float[Tensor, "G"]:
+        """Log density of what was seen, at other normalised times for each duration."""
+        rows = model.primitive.response.evaluate(s)[:, :, 0]
+        mean = rows @ model.mean[: self.observed].mT
+        spread = model.spread.view(*model.mean.shape, -1)[: self.observed]
+        seen = ~values.isnan().flatten()
+        root = torch.einsum("gnm,hmr->gnhr", rows, spread).flatten(1, 2)[:, seen] / noise
+        z = ((values - mean).flatten(1)[:, seen] / noise)[..., None]
+        # By Woodbury, less what all kinds and durations have in common.
+        factor = torch.linalg.cholesky(root.mT @ root + torch.eye(root.shape[-1]).to(root))
+        part = torch.linalg.solve_triangular(factor, root.mT @ z, upper=False)
+        square = z.square().sum((-2, -1)) - part.square().sum((-2, -1))
+        return -square / 2 - factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class InteractionEstimate:
+    """What a person seems to be about, and the motion of the robot that goes with it."""
+
+    kind: str
+    """The most likely one."""
+    probability: Float[Tensor, "K"]
+    """Of each kind, over all durations."""
+    duration: float
+    """Expected [s]."""
+    phase: float
+    """How much of it has passed, 0 to 1."""
+    motion: ProbabilisticDMP[JointDMP]
+    """Of both, given what was seen; in the time of its primitive's duration."""
+    observed: int
+    """How many columns are the person's."""
+
+    def robot(self, time: Times) -> tuple[Float[Tensor, "T R"], Float[Tensor, "T R"]]:
+        """Mean and standard deviation of the robot at times [s] since the person set off."""
+        mean, deviation = self._both(time)
+        return mean[:, self.observed :], deviation[:, self.observed :]
+
+    def person(self, time: Times) -> tuple[Float[Tensor, "T H"], Float[Tensor, "T H"]]:
+        """Likewise of the person, who is expected there."""
+        mean, deviation = self._both(time)
+        return mean[:, : self.observed], deviation[:, : self.observed]
+
+    def stiffness(self, time: Times, largest: float, tolerance: float) -> Float[Tensor, "T R"]:
+        """How firmly to follow the mean: less where the person may still lead elsewhere.
+
+        largest tolerance^2 / (tolerance^2 + variance), the share of a Gaussian of that standard
+        deviation in its product with the prediction.
+        """
+        variance = self.robot(time)[1].square()
+        return largest * tolerance**2 / (tolerance**2 + variance)
+
+    def _both(self, time: Times) -> tuple[Tensor, Tensor]:
+        scale = self.motion.primitive.duration.double() / self.duration
+        return self.motion.position(to_tensor(time, torch.float64) * scale)
