@@ -1,0 +1,319 @@
+"""Compare `MotionHead` with ProDMP of MP_PyTorch as the last layer of a policy that searches.
+
+Episodic reinforcement learning in MuJoCo: an arm of five joints in a plane passes two points
+at given times and ends at a third. A network reads the three points and says, once an episode,
+the mean of a Gaussian over the parameters of a motion; a clipped policy gradient (PPO, as for
+black boxes in Otto et al. 2022) improves it. The network, its optimiser, the contexts, the
+number of parameters and the root mean square by which the first samples deviate are the same
+for both heads, each at its defaults otherwise. CMA-ES searches both parameter spaces as well,
+for one context at a time and without a network. Figures are returns by environment steps.
+
+Needs mp_pytorch and cma: pip install mp_pytorch cma
+"""
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import math
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cma  # pyright: ignore[reportMissingImports]
+import matplotlib.pyplot as plt
+import mujoco
+import mujoco.rollout
+import numpy as np
+import torch
+from jaxtyping import Float
+from mp_pytorch.mp import MPFactory  # pyright: ignore[reportMissingImports]
+from rich.console import Console
+from rich.table import Table
+from torch import Tensor, nn
+
+from hrc_learn import cli
+from hrc_learn.dmp import MotionHead
+
+JOINTS, LINK = 5, 0.2
+"""Of the arm, and the length of each of its links [m]."""
+STEP, DURATION = 0.01, 2.0
+"""Of the simulation and of an episode [s]."""
+STEPS = round(DURATION / STEP)
+PASSED = (0.35, 0.7, 1.0)
+"""Shares of the episode at which the tip is to be at the three points."""
+EFFORT = 1e-4
+"""Cost of a mean squared joint acceleration of 1 rad^2/s^4, in metres of distance."""
+QUANTILE = 2.776
+"""Of Student's distribution with four degrees of freedom: of five seeds, 95 %."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args:
+    seeds: int = 5
+    """Runs of each, with other contexts, networks and samples."""
+    iterations: int = 400
+    """Updates of a policy."""
+    episodes: int = 128
+    """Between two updates."""
+    search_episodes: int = 3000
+    """Of CMA-ES for one context."""
+    n_basis: int = 5
+    """Of each joint; as many parameters and one, the goal."""
+    deviation: float = 0.3
+    """Standard deviation of whitened parameters at first."""
+    rate: float = 1e-3
+    """Of Adam."""
+    first_seed: int = 0
+    """Others than those reported are for choosing `deviation` and `rate`."""
+    picture: Path | None = None
+    """Receives the learning curves."""
+    json: Path | None = None
+    """Receives the figures as one flat object."""
+
+
+type Motions = Callable[[Float[Tensor, "B P"]], Float[Tensor, "B T D"]]
+"""Parameters to joint positions at every step."""
+
+
+def main(args: Args) -> None:
+    """Learn with both heads and all seeds; print, draw and write what came of it."""
+    if args.seeds != 5:
+        warnings.warn("intervals are those of five seeds", stacklevel=1)
+    torch.set_num_threads(1)
+    heads = {"MotionHead": our_motions(args.n_basis), "ProDMP": prodmp_motions(args.n_basis)}
+    curves: dict[str, Float[np.ndarray, "seeds points"]] = {}
+    for name, motions in heads.items():
+        seeds = range(args.first_seed, args.first_seed + args.seeds)
+        curves[f"policy, {name}"] = np.stack([learn(motions, args, seed) for seed in seeds])
+        curves[f"CMA-ES, {name}"] = np.stack([search(motions, args, seed) for seed in seeds])
+    figures = summarise(curves, args)
+    show(figures)
+    if args.picture:
+        draw(curves, args, args.picture)
+    if args.json:
+        cli.write_json(args.json, figures)
+
+
+def our_motions(n_basis: int) -> Motions:
+    """Of a head without timing."""
+    head = MotionHead(JOINTS, n_basis, duration=DURATION)
+    time = STEP * torch.arange(1, STEPS + 1)
+    return lambda z: head(z, time, torch.zeros(JOINTS)).position
+
+
+def prodmp_motions(n_basis: int) -> Motions:
+    """Of ProDMP, with each basis function scaled to one as its authors advise.
+
+    All are scaled once more, so that unit normal parameters deviate as much as in our head.
+    """
+    mp = MPFactory.init_mp(
+        mp_type="prodmp",
+        num_dof=JOINTS,
+        tau=DURATION,
+        mp_args={
+            "num_basis": n_basis,
+            "num_basis_outside": 0,
+            "basis_bandwidth_factor": 3,
+            "alpha_phase": 3,
+            "alpha": 25,
+            "dt": STEP,
+            "auto_scale_basis": True,
+            "relative_goal": True,
+        },
+    )
+    time = STEP * torch.arange(1, STEPS + 1)
+
+    def motions(z: Float[Tensor, "B P"]) -> Float[Tensor, "B T D"]:
+        still = torch.zeros(len(z), JOINTS)
+        times = time.expand(len(z), -1)
+        return mp.get_traj_pos(times, z, torch.zeros(len(z)), still, still)
+
+    z = torch.randn(2000, JOINTS * (n_basis + 1), generator=torch.Generator().manual_seed(0))
+    gain = our_motions(n_basis)(z).square().mean().sqrt() / motions(z).square().mean().sqrt()
+    return lambda z: motions(gain * z)
+
+
+class Reacher:
+    """Episodes of the arm, its joints led along motions by springs and dampers."""
+
+    def __init__(self):
+        body = end = ""
+        for i in range(JOINTS):
+            body += (
+                f'<body pos="{LINK * (i > 0)} 0 0"><joint name="j{i}" axis="0 0 1" '
+                f'damping="0.05" armature="0.01"/><geom type="capsule" size="0.02" '
+                f'fromto="0 0 0 {LINK} 0 0" mass="0.3"/>'
+            )
+            end += "</body>"
+        motors = "".join(
+            f'<position joint="j{i}" kp="60" kv="4" forcerange="-20 20"/>'
+            for i in range(JOINTS)
+        )
+        self._model = mujoco.MjModel.from_xml_string(
+            f'<mujoco><option timestep="{STEP}" gravity="0 0 0" integrator="implicitfast">'
+            f'<flag contact="disable"/></option><worldbody>{body}<site name="tip" '
+            f'pos="{LINK} 0 0"/>{end}</worldbody><actuator>{motors}</actuator>'
+            '<sensor><framepos objtype="site" objname="tip"/></sensor></mujoco>'
+        )
+        self._data = mujoco.MjData(self._model)
+        size = mujoco.mj_stateSize(self._model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        self._start = np.zeros((1, size))
+
+    def returns(
+        self, path: Float[Tensor, "B T D"], context: Float[Tensor, "B 6"]
+    ) -> Float[Tensor, "B"]:
+        """Minus the distances from the points [m] and the effort."""
+        control = path.double().numpy()
+        initial = self._start.repeat(len(control), 0)
+        state, tip = mujoco.rollout.rollout(self._model, self._data, initial, control)
+        times = [round(share * STEPS) - 1 for share in PASSED]
+        points = context.double().numpy().reshape(-1, 3, 2)
+        distance = np.linalg.norm(tip[:, times, :2] - points, axis=-1).sum(-1)
+        speed = state[..., 1 + JOINTS : 1 + 2 * JOINTS]
+        effort = np.square(np.diff(speed, axis=1) / STEP).mean((1, 2))
+        return torch.from_numpy(-distance - EFFORT * effort).float()
+
+
+def contexts(n: int, rng: torch.Generator) -> Float[Tensor, "n 6"]:
+    """Three points each that the arm reaches, the second near the way of the others."""
+    first, last = 0.7 * torch.randn(2, n, JOINTS, generator=rng)
+    middle = (first + last) / 2 + 0.4 * torch.randn(n, JOINTS, generator=rng)
+    angle = torch.stack([first, middle, last], 1).cumsum(-1)
+    return LINK * torch.stack([angle.cos().sum(-1), angle.sin().sum(-1)], -1).flatten(1)
+
+
+def network(outputs: int) -> nn.Sequential:
+    """Two hidden layers; it puts out zeros at first."""
+    last = nn.Linear(64, outputs)
+    nn.init.zeros_(last.weight)
+    nn.init.zeros_(last.bias)
+    return nn.Sequential(nn.Linear(6, 64), nn.Tanh(), nn.Linear(64, 64), nn.Tanh(), last)
+
+
+def learn(motions: Motions, args: Args, seed: int) -> Float[np.ndarray, "points"]:
+    """Returns of the mean policy on held-out contexts, before each tenth update and at last."""
+    torch.manual_seed(seed)
+    rng = torch.Generator().manual_seed(seed)
+    reacher, held_out = Reacher(), contexts(64, torch.Generator().manual_seed(10_000))
+    P = JOINTS * (args.n_basis + 1)
+    mean, value = network(P), network(1)
+    log_deviation = nn.Parameter(torch.full((P,), math.log(args.deviation)))
+    optimiser = torch.optim.Adam(
+        [*mean.parameters(), *value.parameters(), log_deviation], args.rate
+    )
+    curve = []
+    for iteration in range(args.iterations + 1):
+        if iteration % 10 == 0:
+            with torch.no_grad():
+                z = mean(held_out)
+            curve.append(reacher.returns(motions(z), held_out).mean().item())
+        if iteration == args.iterations:
+            break
+        x = contexts(args.episodes, rng)
+        with torch.no_grad():
+            policy = torch.distributions.Normal(mean(x), log_deviation.exp())
+            z = policy.sample()
+            before = policy.log_prob(z).sum(-1)
+            gained = reacher.returns(motions(z), x)
+            advantage = gained - value(x)[:, 0]
+            advantage = (advantage - advantage.mean()) / advantage.std()
+        for _ in range(10):
+            for part in torch.randperm(len(x), generator=rng).split(32):
+                policy = torch.distributions.Normal(mean(x[part]), log_deviation.exp())
+                ratio = (policy.log_prob(z[part]).sum(-1) - before[part]).exp()
+                surrogate = torch.minimum(
+                    ratio * advantage[part], ratio.clamp(0.8, 1.2) * advantage[part]
+                )
+                miss = (value(x[part])[:, 0] - gained[part]).square().mean()
+                optimiser.zero_grad()
+                (miss - surrogate.mean()).backward()
+                optimiser.step()
+    return np.array(curve)
+
+
+def search(motions: Motions, args: Args, seed: int) -> Float[np.ndarray, "points"]:
+    """Best return that CMA-ES has seen for one context, by generation."""
+    context = contexts(1, torch.Generator().manual_seed(20_000 + seed))
+    reacher, P = Reacher(), JOINTS * (args.n_basis + 1)
+    options = {"seed": seed + 1, "verbose": -9, "maxfevals": args.search_episodes}
+    strategy = cma.CMAEvolutionStrategy(P * [0.0], args.deviation, options)
+    curve, best = [], -math.inf
+    for _ in range(args.search_episodes // strategy.popsize):
+        asked = strategy.ask()
+        z = torch.tensor(np.array(asked), dtype=torch.float32)
+        gained = reacher.returns(motions(z), context.expand(len(z), -1))
+        strategy.tell(asked, (-gained).tolist())
+        best = max(best, gained.max().item())
+        curve.append(best)
+    return np.array(curve)
+
+
+def summarise(
+    curves: dict[str, Float[np.ndarray, "seeds points"]], args: Args
+) -> dict[str, float]:
+    """Means and half-widths of 95 % intervals, of both heads and their difference by seed."""
+    figures: dict[str, float] = {}
+    for kind in ("policy", "CMA-ES"):
+        ours, theirs = (curves[f"{kind}, {name}"] for name in ("MotionHead", "ProDMP"))
+        for share, when in ((0.25, "quarter"), (0.5, "half"), (1.0, "end")):
+            k = round(share * (ours.shape[1] - 1))
+            for name, runs in (
+                ("motion_head", ours), ("prodmp", theirs), ("difference", ours - theirs)
+            ):  # fmt: skip
+                key = f"{kind.lower().replace('-', '_')}_{name}_{when}"
+                figures[key] = float(runs[:, k].mean())
+                figures[f"{key}_interval"] = half_width(runs[:, k])
+        target = theirs.mean(0)[-1]
+        reached = np.flatnonzero(ours.mean(0) >= target)
+        share = reached[0] / (ours.shape[1] - 1) if len(reached) else math.nan
+        figures[f"{kind.lower().replace('-', '_')}_steps_to_their_last_return"] = float(share)
+    figures["environment_steps_of_a_policy"] = args.iterations * args.episodes * STEPS
+    figures["environment_steps_of_cma_es"] = args.search_episodes * STEPS
+    return figures
+
+
+def half_width(values: Float[np.ndarray, "seeds"]) -> float:
+    """Of the 95 % interval of a mean."""
+    return QUANTILE * float(values.std(ddof=1)) / math.sqrt(len(values))
+
+
+def show(figures: dict[str, float]) -> None:
+    """Print all figures."""
+    table = Table("figure", "value", title="A reacher through points, return [m]")
+    for name, value in figures.items():
+        table.add_row(name, f"{value:,.4g}")
+    Console().print(table)
+
+
+def draw(
+    curves: dict[str, Float[np.ndarray, "seeds points"]], args: Args, picture: Path
+) -> None:
+    """Learning curves with intervals of the mean."""
+    figure, axes = plt.subplots(1, 2, figsize=(9.6, 3.6), layout="constrained")
+    for axis, kind, total in (
+        (axes[0], "policy", args.iterations * args.episodes * STEPS),
+        (axes[1], "CMA-ES", args.search_episodes * STEPS),
+    ):
+        for name, color in (("MotionHead", "tab:blue"), ("ProDMP", "tab:orange")):
+            runs = curves[f"{kind}, {name}"]
+            steps = np.linspace(0, total / 1e6, runs.shape[1])
+            middle = runs.mean(0)
+            width = np.array([half_width(column) for column in runs.T])
+            axis.plot(steps, middle, color=color, label=name)
+            axis.fill_between(steps, middle - width, middle + width, color=color, alpha=0.2)
+        axis.set_xlabel("environment steps [million]")
+        axis.set_ylabel("return [m]")
+        axis.grid(alpha=0.3)
+    axes[0].set_title("policy over all contexts, held-out contexts")
+    axes[1].set_title("CMA-ES, one context a seed, best so far")
+    low = min(runs.mean(0)[len(runs.T) // 20] for key, runs in curves.items() if "CMA" in key)
+    axes[1].set_ylim(1.1 * low, 0)
+    axes[0].legend(loc="lower right")
+    figure.savefig(picture, dpi=110)
+    plt.close(figure)
+
+
+if __name__ == "__main__":
+    cli.run(main, Args)
