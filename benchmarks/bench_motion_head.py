@@ -24,11 +24,11 @@ from pathlib import Path
 import cma  # pyright: ignore[reportMissingImports]
 import matplotlib.pyplot as plt
 import mujoco
-import mujoco.rollout
 import numpy as np
 import torch
 from jaxtyping import Float
 from mp_pytorch.mp import MPFactory  # pyright: ignore[reportMissingImports]
+from mujoco import rollout
 from rich.console import Console
 from rich.table import Table
 from torch import Tensor, nn
@@ -167,7 +167,9 @@ class Reacher:
         """Minus the distances from the points [m] and the effort."""
         control = path.double().numpy()
         initial = self._start.repeat(len(control), 0)
-        state, tip = mujoco.rollout.rollout(self._model, self._data, initial, control)
+        state, tip = (
+            np.asarray(x) for x in rollout.rollout(self._model, self._data, initial, control)
+        )
         times = [round(share * STEPS) - 1 for share in PASSED]
         points = context.double().numpy().reshape(-1, 3, 2)
         distance = np.linalg.norm(tip[:, times, :2] - points, axis=-1).sum(-1)

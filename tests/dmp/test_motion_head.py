@@ -6,6 +6,7 @@ import sys
 import pytest
 import torch
 from demo_motions import arm_motion, minimum_jerk
+from safetensors.torch import load_file, save_file
 from torch.distributions import MultivariateNormal, kl_divergence
 from unchecked import shapes_unchecked
 
@@ -262,11 +263,11 @@ def test_gradients_reach_mean_and_factor(head, factor):
 
 
 def test_state_survives_a_file(head, tmp_path):
-    torch.save(head.state_dict(), tmp_path / "head.pt")
+    save_file(head.state_dict(), tmp_path / "head.safetensors")
     other = MotionHead(2, 6, amplitude=9.0, basis=head.response.basis).double()
     if head.goal_centre is not None:
         other.goal_centre = torch.zeros(2)
-    other.load_state_dict(torch.load(tmp_path / "head.pt"))
+    other.load_state_dict(load_file(tmp_path / "head.safetensors"))
     assert torch.equal(other.amplitude, head.amplitude)
     single = MotionHead(2, 6)
     z = torch.zeros(single.n_parameters)
