@@ -23,18 +23,20 @@ from pathlib import Path
 
 import cma  # pyright: ignore[reportMissingImports]
 import matplotlib.pyplot as plt
-import mujoco
 import numpy as np
 import torch
 from jaxtyping import Float
 from mp_pytorch.mp import MPFactory  # pyright: ignore[reportMissingImports]
-from mujoco import rollout
+from mujoco import MjData, MjModel, mj_stateSize, mjtState, rollout
 from rich.console import Console
 from rich.table import Table
 from torch import Tensor, nn
 
 from hrc_learn import cli
 from hrc_learn.dmp import MotionHead
+
+# MuJoCo's classes are compiled, and its stubs leave most of them out.
+# pyright: reportAttributeAccessIssue=false
 
 JOINTS, LINK = 5, 0.2
 """Of the arm, and the length of each of its links [m]."""
@@ -151,14 +153,14 @@ class Reacher:
             f'<position joint="j{i}" kp="60" kv="4" forcerange="-20 20"/>'
             for i in range(JOINTS)
         )
-        self._model = mujoco.MjModel.from_xml_string(
+        self._model = MjModel.from_xml_string(
             f'<mujoco><option timestep="{STEP}" gravity="0 0 0" integrator="implicitfast">'
             f'<flag contact="disable"/></option><worldbody>{body}<site name="tip" '
             f'pos="{LINK} 0 0"/>{end}</worldbody><actuator>{motors}</actuator>'
             '<sensor><framepos objtype="site" objname="tip"/></sensor></mujoco>'
         )
-        self._data = mujoco.MjData(self._model)
-        size = mujoco.mj_stateSize(self._model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        self._data = MjData(self._model)
+        size = mj_stateSize(self._model, mjtState.mjSTATE_FULLPHYSICS)
         self._start = np.zeros((1, size))
 
     def returns(
