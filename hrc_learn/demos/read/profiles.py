@@ -63,7 +63,8 @@ class Tracking:
     delay: int
     """Frames by which the state comes later, the same for all components."""
     residual: Float64[np.ndarray, " delays"]
-    """What is left of the state's variance at each delay, from the longest lead on."""
+    """What is left of the variance of the components that follow their command, at each delay,
+    from the longest lead on."""
     slope: Float64[np.ndarray, " components"]
     """Change of the state for a change of the command, at that delay."""
     offset: Float64[np.ndarray, " components"]
@@ -155,6 +156,14 @@ def gain_over(tracking: Tracking, delay: int) -> float:
 
 # Of the variance: a tenth of the motion.
 _LITTLE = 0.01
+_FOLLOWED = 0.2
+"""What is left of the variance of a component that follows its command."""
+
+
+def _standardized(values: np.ndarray) -> np.ndarray:
+    """Components of mean 0 and variance 1; 0 where nothing moves."""
+    centered = values - values.mean(0)
+    return centered / np.maximum(centered.std(0), 1e-12)
 
 
 def track(
@@ -176,14 +185,16 @@ def track(
     if not moving.any():
         return None
     inner = slice(reach, frames - reach)
-    late = state[inner][:, moving] / size[moving]
+    late = _standardized(state[inner][:, moving])
     delays = np.arange(-reach, reach + 1)
-    residual = np.empty(len(delays))
+    left = np.empty((len(delays), late.shape[1]))
     for number, delay in enumerate(delays):
-        # state(t) against command(t - delay), whatever stands between their zeros
-        early = command[reach - delay : frames - reach - delay][:, moving] / size[moving]
-        difference = late - early
-        residual[number] = np.minimum(difference.var(0), 4.0).mean()
+        # state(t) against command(t - delay), whatever their zeros and scales
+        early = _standardized(command[reach - delay : frames - reach - delay][:, moving])
+        left[number] = 1 - np.maximum((late * early).mean(0), 0) ** 2
+    # Hands and grippers that stand still at an object tell nothing of the delay.
+    followed = left.min(0) < _FOLLOWED
+    residual = left[:, followed if followed.any() else slice(None)].mean(1)
     best = int(residual.argmin())
     delay = int(delays[best])
     there = slice(max(delay, 0), frames + min(delay, 0))

@@ -48,13 +48,14 @@ def check_consistency(
     """Compare every episode with the others, and commands with what follows them."""
     entries = {entry.index: entry for entry in folder.episodes}
     check_lengths([entries[i] for i in profiles], report)
-    check_tracking(mapping, entries, profiles, report)
+    check_tracking(folder, mapping, entries, profiles, report)
     for feature in _features(folder, entries, profiles):
         check_sizes(feature, report)
         if len(feature.entries) < _FEW:
             continue
         check_holds(feature, folder.fps, report)
         check_noise(feature, report)
+        check_switches(feature, report)
         if feature.key.startswith(("observation.", "state", "action")):
             check_exchanges(feature, report)
 
@@ -160,6 +161,29 @@ def check_noise(feature: _Feature, report: ValidationReport) -> None:
             )
 
 
+def check_switches(feature: _Feature, report: ValidationReport) -> None:
+    """Grippers and flags that stay, or begin and end the other way, in one episode alone."""
+    span = feature.stack("span")
+    ends = np.stack([feature.stack("start"), feature.stack("goal")], axis=1)
+    usual = np.median(ends, axis=0)
+    near = np.abs(ends - usual) <= 0.1 * feature.span
+    opposite = np.abs(ends - usual[::-1]) <= 0.1 * feature.span
+    switches = ~feature.smooth & (np.ptp(usual, axis=0) > 0.5 * feature.span)
+    for component in np.flatnonzero(switches & (feature.span > 0)):
+        alike = near[:, :, component].all(1)
+        if alike.sum() < max(_FEW, len(alike) - 1):
+            continue  # no habit to go against
+        for number in np.flatnonzero(~alike):
+            place = {**feature.entries[number].location, "key": feature.key}
+            name = feature.names[component]
+            if span[number, component] == 0:
+                report.warning(f"{name} stays, it switches in the other episodes", **place)
+            elif opposite[number, :, component].all():
+                report.warning(
+                    f"{name} switches the other way than in the other episodes", **place
+                )
+
+
 # Exchanged columns, signs and directions, by where each component usually is.
 
 _FAR_OFF = 3.0
@@ -241,6 +265,7 @@ def _name(feature: _Feature, moving: np.ndarray, number: int | np.integer) -> st
 
 
 def check_tracking(
+    folder: DatasetFolder,
     mapping: ColumnMapping,
     entries: Mapping[int, EpisodeEntry],
     profiles: Mapping[int, EpisodeProfile],
@@ -258,7 +283,7 @@ def check_tracking(
     with np.errstate(all="ignore"):
         usual = np.nan_to_num(np.nanmedian(np.where(np.isnan(fits), 0, fits), axis=0))
         slope = np.nan_to_num(np.nanmedian(np.where(np.isnan(slopes), 0, slopes), axis=0))
-    _check_rates(mapping, profiles, usual, key, report)
+    _check_rates(folder, mapping, profiles, usual, report)
     follow = usual > _FOLLOWS
     if not follow.any():
         return
@@ -324,24 +349,37 @@ def check_tracking(
             )
 
 
+_PROMPT = 0.2
+"""Delay [s] at which an arm follows its command; slow motion resembles its own rate later."""
+
+
 def _check_rates(
+    folder: DatasetFolder,
     mapping: ColumnMapping,
     profiles: Mapping[int, EpisodeProfile],
     position_fit: np.ndarray,
-    key: str,
     report: ValidationReport,
 ) -> None:
     """Commands that are taken for positions by their names, and are velocities."""
-    rates = [p.tracking["rates"] for p in profiles.values() if "rates" in p.tracking]
+    known = [p.tracking for p in profiles.values()]
+    rates = [t["rates"] for t in known if "rates" in t]
+    positions = [t["command_position"] for t in known if "command_position" in t]
     if not rates:
         return
+    rate_delay, position_delay = (
+        abs(float(np.median([t.delay for t in group]))) / folder.fps
+        for group in (rates, positions)
+    )
+    # Of two ways to read a smooth motion the one without a long delay is meant.
+    prompt = rate_delay <= _PROMPT < position_delay
     with np.errstate(all="ignore"):
         fit = np.nan_to_num(np.median([np.nan_to_num(t.fit) for t in rates], axis=0))
         slope = np.nan_to_num(np.median([np.nan_to_num(t.slope) for t in rates], axis=0))
-    speeds = (fit > _FOLLOWS) & (position_fit < _LOST) & (np.abs(slope) > 0.3)
-    speeds &= np.abs(slope) < 3
+    speeds = (fit > _FOLLOWS) & (np.abs(slope) > 0.3) & (np.abs(slope) < 3)
+    speeds &= (position_fit < _LOST) | (prompt & (position_fit < fit))
     if speeds.sum() > len(speeds) / 2:
-        names = mapping.selections["command_position"].labels
+        command = mapping.selections["command_position"]
+        key, names = command.columns[0][0], command.labels
         report.error(
             f"is taken for positions, but follows the velocity of the state with slope "
             f"{float(np.median(slope[speeds])):.2f}: {', '.join(names[:6])}; say so "

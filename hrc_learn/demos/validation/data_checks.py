@@ -344,7 +344,7 @@ def check_frozen(
 
 
 class Duplicates:
-    """Episodes that show the same motion to within a thousandth of its span."""
+    """Episodes that show the same motion, at any pace, to within a thousandth of its span."""
 
     def __init__(self) -> None:
         self._entries: list[EpisodeEntry] = []
@@ -353,9 +353,13 @@ class Duplicates:
 
     def add(self, entry: EpisodeEntry, motion: Float64[np.ndarray, "frames _"]) -> None:
         """Remember 20 moments of an episode."""
-        places = np.linspace(0, len(motion) - 1, 20).round().astype(int)
+        places = np.linspace(0, len(motion) - 1, 20)
+        before = places.astype(int)
+        share = (places - before)[:, None]
+        after = np.minimum(before + 1, len(motion) - 1)
+        sketch = (1 - share) * motion[before] + share * motion[after]
         self._entries.append(entry)
-        self._sketches.append(motion[places].reshape(-1))
+        self._sketches.append(sketch.reshape(-1))
         self._spans.append(float(np.ptp(motion, axis=0).max()))
 
     def report(self, report: ValidationReport) -> None:
@@ -370,8 +374,7 @@ class Duplicates:
             close = tree.query_ball_point(self._sketches[number], radius, p=np.inf)
             for other in sorted(close):
                 earlier = self._entries[other]
-                same = abs(earlier.length - entry.length) <= 0.02 * entry.length
-                if other < number and same and span:
+                if other < number and span:
                     report.warning(
                         f"shows the same motion as episode {earlier.index}: recorded once, "
                         f"stored twice?",

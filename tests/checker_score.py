@@ -1,0 +1,143 @@
+"""How many kinds of defects a check of datasets finds, and what it makes of sound sets."""
+
+import re
+import resource
+import shutil
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+
+from broken_copies import Copy
+from file_defects import FILES, VIDEOS
+from value_defects import STAMPS, VALUES, Kind, NotHereError
+
+KINDS: dict[str, Kind] = VALUES | STAMPS | FILES | VIDEOS
+
+Line = tuple[str, str]
+"""A finding: its level, and the whole of its text."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """What a check made of one broken copy."""
+
+    dataset: str
+    kind: str
+    severe: bool
+    found: bool
+    """Something is said that is not said of the sound set, with its place where it has one."""
+    error: bool
+    """That is said as an error."""
+    crash: str
+    """Why the check ended without a report: an exception, or the time limit."""
+    seconds: float
+    megabytes: float
+    """Most memory the process held."""
+    said: tuple[str, ...]
+
+
+def _check(root: str, pipe) -> None:
+    """In a process of its own: a report, or why there is none."""
+    start = time.monotonic()
+    try:
+        from hrc_learn.demos import check_dataset
+
+        report = check_dataset(root)
+        lines = [("error", str(i)) for i in report.errors]
+        lines += [("warning", str(i)) for i in report.warnings]
+        "\n".join(report.lines())
+        # What a step of the check did not foresee is a finding, and a fault of the check.
+        unforeseen = [text for _, text in lines if "cannot be examined further (" in text]
+        crash = unforeseen[0] if unforeseen else ""
+    except BaseException as error:
+        lines, crash = [], f"{type(error).__name__}: {error}"[:300]
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    pipe.send((lines, crash, time.monotonic() - start, memory))
+
+
+class Checker:
+    """Checks datasets in processes of their own, bounded in time."""
+
+    def __init__(self, limit: float = 60.0):
+        self.limit = limit
+        self._context = get_context("forkserver")
+        self._context.set_forkserver_preload(["hrc_learn.demos.validation.check"])
+
+    def __call__(self, root: Path) -> tuple[list[Line], str, float, float]:
+        """Findings, reason of a failure, seconds and megabytes."""
+        ours, theirs = self._context.Pipe(duplex=False)
+        process = self._context.Process(target=_check, args=(str(root), theirs))
+        process.start()
+        theirs.close()
+        try:
+            answer = ours.recv() if ours.poll(self.limit) else None
+        except EOFError:
+            answer = ([], "the process died", 0.0, 0.0)
+        if answer is None:
+            process.kill()
+            answer = ([], f"no answer within {self.limit:g} s", self.limit, 0.0)
+        process.join()
+        return answer
+
+
+def broken_copy(clean: Path, kind: Kind, folder: Path) -> Copy | None:
+    """A copy with the defect; None where it does not apply to the set."""
+    shutil.rmtree(folder, ignore_errors=True)
+    shutil.copytree(clean, folder)
+    copy = Copy(folder)
+    try:
+        kind.damage(copy)
+    except NotHereError:
+        return None
+    return copy
+
+
+def outcomes(
+    clean: Path, name: str, kinds: Iterable[str], work: Path, check: Checker
+) -> Iterator[Outcome]:
+    """Do every kind of damage to copies of a set and check them.
+
+    Args:
+        clean: The sound set.
+        name: What it is called in the outcomes.
+        kinds: Names in `KINDS`.
+        work: Folder for the copies.
+        check: Checks one.
+    """
+    before = {_plain(line, clean) for line in check(clean)[0]}
+    for kind_name in kinds:
+        kind = KINDS[kind_name]
+        copy = broken_copy(clean, kind, work / "broken")
+        if copy is None:
+            continue
+        lines, crash, seconds, megabytes = check(copy.root)
+        new = [line for line in lines if _plain(line, copy.root) not in before]
+        if "statistics" not in kind_name:  # those are off after almost any damage
+            new = [line for line in new if "statistics are" not in line[1]]
+        if kind.local:
+            new = [line for line in new if _names(line[1], copy)]
+        yield Outcome(
+            dataset=name,
+            kind=kind_name,
+            severe=kind.severe,
+            found=bool(new),
+            error=any(level == "error" for level, _ in new),
+            crash=crash,
+            seconds=seconds,
+            megabytes=megabytes,
+            said=tuple(f"{level}: {text}" for level, text in new),
+        )
+        shutil.rmtree(copy.root, ignore_errors=True)
+
+
+def _plain(line: Line, root: Path) -> Line:
+    return line[0], line[1].replace(str(root), "")
+
+
+def _names(text: str, copy: Copy) -> bool:
+    """Whether a finding names the second episode, or its file."""
+    if re.search(rf"episodes? {copy.episode}\b", text) or copy.data in text:
+        return True
+    return bool(re.search(r"(episode_000001|file-000)\.mp4", text))
