@@ -322,3 +322,51 @@ def test_a_closed_form_policy_is_a_checkpoint_of_numbers_alone(tmp_path, episode
 def test_a_closed_form_policy_takes_a_dataset(tmp_path):
     with pytest.raises(FileNotFoundError, match="no LeRobot dataset"):
         write_closed_form_policy(tmp_path, tmp_path, n_basis=12)
+
+
+@pytest.mark.parametrize(
+    ("state", "message"),
+    [
+        ({}, "needs observation.state"),
+        ({STATE: torch.zeros(1, 4)}, "3 values in observation.state.* has 4"),
+        ({STATE: torch.tensor([[0.0, 0.0, torch.nan]])}, r"not finite in a\.pos"),
+    ],
+)
+def test_states_that_cannot_be_used_are_named(state, message):
+    policy = fitted_policy(SHOWN)
+    with pytest.raises(ValueError, match=message):
+        policy.select_action({GOAL: SHOWN[0][GOAL][:1]} | state)
+
+
+@pytest.mark.parametrize(
+    ("key", "values", "message"),
+    [
+        (STATE, {"mean": torch.zeros(3)}, "lack std of observation.state"),
+        (GOAL, {}, "lack mean of observation.environment_state"),
+        ("action", {"mean": torch.zeros(3), "std": torch.ones(2)}, "2 finite.* mean of action"),
+        (STATE, {"mean": torch.zeros(3), "std": torch.full((3,), torch.nan)}, "3 finite.* std"),
+    ],
+)
+def test_statistics_that_cannot_be_used_are_named(key, values, message):
+    with pytest.raises(ValueError, match=message):
+        DMPPolicy(config_for(SHOWN[0]), dataset_stats=stats_of(SHOWN) | {key: values})
+
+
+def test_tuning_on_states_in_another_order_is_refused():
+    config = config_for(SHOWN[0])
+    names = {"action": {"names": ["a.pos", "b.pos"]}}
+    same = {"observation.state": {"names": ["b.pos", "gripper.pos", "a.pos"]}}
+    config.set_dataset_feature_metadata(names | same)
+    other = {"observation.state": {"names": ["a.pos", "gripper.pos", "b.pos"]}}
+    with pytest.raises(
+        ValueError, match=r"b\.pos, gripper\.pos, a\.pos, in this order; .*a\.pos"
+    ):
+        config.set_dataset_feature_metadata(names | other)
+
+
+def test_a_truncated_checkpoint_is_named(tmp_path):
+    fitted_policy(SHOWN).save_pretrained(tmp_path)
+    weights = tmp_path / "model.safetensors"
+    weights.write_bytes(weights.read_bytes()[:-100])
+    with pytest.raises(ValueError, match=r"model\.safetensors is damaged"):
+        DMPPolicy.from_pretrained(tmp_path)

@@ -60,6 +60,7 @@ class DMPConfig(PreTrainedConfig):
             )
         # LeRobot overwrites the field before it hands over the dataset.
         self._trained_for = self.action_feature_names
+        self._trained_on = self.state_names
 
     @property
     def observation_delta_indices(self) -> list[int]:
@@ -102,7 +103,8 @@ class DMPConfig(PreTrainedConfig):
         """Take the names of components from a dataset; LeRobot calls this.
 
         Raises:
-            ValueError: The policy was trained for other actions.
+            ValueError: The policy was trained for other actions, or on other states or these
+                in another order.
         """
         self.action_feature_names = _names(features, "action")
         self.state_names = _names(features, "observation.state")
@@ -111,6 +113,12 @@ class DMPConfig(PreTrainedConfig):
                 f"the policy in {self.pretrained_path} was trained for the actions "
                 f"{', '.join(self._trained_for)}; the dataset has "
                 f"{', '.join(self.action_feature_names or ['no names'])}"
+            )
+        if self._trained_on not in (None, self.state_names):
+            raise ValueError(
+                f"the policy in {self.pretrained_path} was trained on observation.state with "
+                f"{', '.join(self._trained_on)}, in this order; the dataset has "
+                f"{', '.join(self.state_names or ['no names'])}"
             )
 
 
