@@ -94,7 +94,7 @@ LIBRARIES: dict[str, set[str]] = {
     "hardware": {"torch", "jaxtyping", "numpy"},
     "teleoperation": {"torch", "jaxtyping", "numpy", "scipy"},
     "experiments": {"torch", "jaxtyping", "numpy", "matplotlib"},
-    "lerobot": {"torch", "jaxtyping", "numpy", "lerobot", "gymnasium"},
+    "lerobot": {"torch", "jaxtyping", "numpy", "safetensors", "lerobot", "gymnasium"},
 }
 """Libraries that modules of a package may import as soon as they are imported."""
 
