@@ -63,6 +63,27 @@ class LazyMap[S, T](Sequence[T]):
         return map(self._function, self._items)
 
 
+_LEAST_MOTION = 1e-4
+"""Less is noise of encoders and trackers [rad, m, or of a quaternion's components]."""
+
+
+def require_motion(demo: Demonstration, source: str) -> None:
+    """Refuse a demonstration that shows nothing: errors relative to its motion are no numbers.
+
+    Raises:
+        ValueError: Neither its joints nor its pose move, or they are not finite.
+    """
+    columns = (demo.joint_position, demo.position, demo.orientation)
+    shown = [column for column in columns if column is not None and column.size]
+    place = f"{source}, episode {demo.episode}"
+    if any(not np.isfinite(column).all() for column in shown):
+        raise ValueError(f"{place}: holds values that are no numbers; `hrc check` names them")
+    if shown and max(float(np.ptp(column, axis=0).max()) for column in shown) < _LEAST_MOTION:
+        raise ValueError(
+            f"{place}: nothing moves in it; leave it out (--episodes names those to learn from)"
+        )
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Motions:
     """Demonstrations of one motion, ready for a primitive of any channel."""
@@ -74,6 +95,8 @@ class Motions:
     @classmethod
     def of(cls, demos: DemonstrationSet) -> "Motions":
         """Pad them; of a Panda, the pose of the end effector follows from the joints."""
+        for demo in demos:
+            require_motion(demo, demos.source)
         padded = demos.padded()
         joints = padded.joint_position if demos.joint_names == panda.joint_names else None
         if joints is not None and (padded.position is None or padded.orientation is None):

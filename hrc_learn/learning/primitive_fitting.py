@@ -37,6 +37,7 @@ from hrc_learn.learning.channels import (
     Motions,
     Primitive,
     reproduction_error,
+    require_motion,
     select_channels,
 )
 from hrc_learn.viz import FitRecording, JointLimits
@@ -338,6 +339,7 @@ def _stamped_column(
     demo: Demonstration, name: str, source: str
 ) -> tuple[Float[np.ndarray, " T"], Float[np.ndarray, "T D"]]:
     """Stamps [s] and one column of a demonstration."""
+    require_motion(demo, source)
     values = getattr(demo, name)
     if values is None:
         raise ValueError(f"{source}, episode {demo.episode}: no {name}.")

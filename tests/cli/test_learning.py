@@ -44,6 +44,20 @@ def test_fit_and_evaluate_on_demonstrations_held_out(poses, tmp_path):
     done("evaluate", "--model", model, "--dataset", poses, "--most-nrmse", 1e-9, status=1)
 
 
+def test_an_evaluation_reads_the_dataset_as_its_fit_did(poses, tmp_path):
+    model = tmp_path / "model"
+    done(
+        *("fit", "--dataset", poses, "--out", model, "--episodes", 0, 1, "--n-basis", 20),
+        *("--channels", "position", "--units", "position", "mm"),
+    )
+    evaluate = ("evaluate", "--model", model, "--dataset", poses, "--json", tmp_path / "f.json")
+    done(*evaluate)
+    of_fit = json.loads((tmp_path / "f.json").read_text())
+    done(*evaluate, "--units", "position", "m")
+    of_metres = json.loads((tmp_path / "f.json").read_text())
+    assert of_metres["position_largest_max"] > 100 * of_fit["position_largest_max"]
+
+
 def test_a_streamed_fit(poses, tmp_path):
     done(
         *("fit", "--dataset", poses, "--out", tmp_path / "model"),

@@ -67,6 +67,19 @@ def test_a_kind_that_was_not_recorded_is_refused(demos):
         fit_primitives(demos, 10, channels=("joint",))
 
 
+@pytest.mark.parametrize(
+    ("position", "message"),
+    [(np.full((40, 3), 0.3), "nothing moves in it"), (np.full((40, 3), np.nan), "no numbers")],
+)
+def test_a_demonstration_that_shows_nothing_is_refused(position, message):
+    still = Demonstration(
+        episode=1, fps=20, time=np.arange(40) / 20, joint_names=(), position=position
+    )
+    shown = DemonstrationSet([demonstration(0), still])
+    with pytest.raises(ValueError, match=f"episode 1: .*{message}"):
+        fit_primitives(shown, 10, channels=("position",))
+
+
 def test_the_number_of_basis_functions_is_chosen_by_samples_held_out(demos):
     fitted = fit_primitives(demos, None, channels=("position",), candidates=(5, 12, 20))
     assert fitted.selection is not None

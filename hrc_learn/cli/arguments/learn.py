@@ -1,6 +1,6 @@
 """Command lines of the commands that learn from demonstrations and measure what was learned."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -55,6 +55,10 @@ class FitPrimitives(Fit):
     """How forcing scales with start and goal."""
     joint_names: More[tuple[str, ...]] = ()
     """Joints to learn, by name and in this order; all when empty."""
+    units: More[dict[str, str]] = field(default_factory=dict)
+    """Units on disk by quantity, such as: joint_position deg position mm."""
+    mapping: More[dict[str, str]] = field(default_factory=dict)
+    """Columns by quantity where they are not found, such as: joint_position action[0:7]."""
     as_lerobot_policy: bool = False
     """Write the folder of a trained LeRobot policy instead, of type dmp: from observations to
     the dataset's own actions, joints or the end effector, in closed form."""
@@ -111,6 +115,10 @@ class EvaluatePrimitives(Written):
     """Folder for figures and measured values; none are kept without."""
     episodes: tuple[int, ...] = ()
     """Episodes to evaluate on; when empty those that were not learned from, or all."""
+    units: More[dict[str, str]] = field(default_factory=dict)
+    """Units on disk by quantity; those the model was fitted with when empty."""
+    mapping: More[dict[str, str]] = field(default_factory=dict)
+    """Columns by quantity; those the model was fitted with when empty."""
     most_nrmse: float | None = None
     """Largest median error that passes."""
 

@@ -15,6 +15,7 @@ from hrc_learn.cli.arguments.learn import (
     EvaluatePrimitives,
     FitPrimitives,
 )
+from hrc_learn.cli.commands.check import columns
 from hrc_learn.cli.commands.fit import fit_primitives
 from hrc_learn.demos import DemonstrationSet, load_demos, open_demos
 from hrc_learn.learning.channels import (
@@ -56,7 +57,15 @@ def _fit_most(args: EvaluatePrimitives, model: Path) -> None:
     # Every fifth is held out, the last one of few; a single one cannot be.
     held_out = set(args.episodes or range(count)[4::5] or range(count)[1:][-1:])
     episodes = tuple(i for i in range(count) if i not in held_out)
-    fit_primitives(FitPrimitives(dataset=args.dataset, out=model, episodes=episodes))
+    fit_primitives(
+        FitPrimitives(
+            dataset=args.dataset,
+            out=model,
+            episodes=episodes,
+            units=args.units,
+            mapping=args.mapping,
+        )
+    )
 
 
 def _evaluate(args: EvaluatePrimitives, model: Path) -> int:
@@ -105,7 +114,13 @@ def _demonstrations(
     names = tuple(made_by.get("joint_names") or ())
     if same and (not learned or set(episodes) & set(learned)):
         console.print("note: some of these demonstrations were learned from")
-    return load_demos(args.dataset, episodes=episodes or None, joint_names=names or None)
+    return load_demos(
+        args.dataset,
+        episodes=episodes or None,
+        joint_names=names or None,
+        mapping=columns(args.mapping or made_by.get("mapping") or {}),
+        units=args.units or made_by.get("units") or {},
+    )
 
 
 def _duration_ratio(motions: Motions, duration: torch.Tensor) -> float:

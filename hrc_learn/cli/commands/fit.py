@@ -12,6 +12,7 @@ from hrc_learn import distributed
 from hrc_learn.cli._options import resolved
 from hrc_learn.cli._run import show_values, write_values
 from hrc_learn.cli.arguments.learn import FitImageJacobian, FitPrimitives
+from hrc_learn.cli.commands.check import columns
 from hrc_learn.demos import DemonstrationSource, load_demos, open_demos
 from hrc_learn.jacobian import CellErrors, RBFCenters, grid
 from hrc_learn.learning.primitive_fitting import (
@@ -43,9 +44,7 @@ def fit_primitives(args: FitPrimitives) -> None:
     if args.several == "streamed":
         _fit_streamed(args)
         return
-    demos = load_demos(
-        args.dataset, episodes=args.episodes or None, joint_names=args.joint_names or None
-    )
+    demos = load_demos(args.dataset, **_wanted(args))
     for note in demos.notes:
         console.print(f"note: {note}")
     with new_folder(args.folder, _made_by(args), args.overwrite) as folder:
@@ -70,11 +69,19 @@ def fit_primitives(args: FitPrimitives) -> None:
         _finish(args, metrics, folder)
 
 
+def _wanted(args: FitPrimitives) -> dict[str, Any]:
+    """What to read of the dataset, and how."""
+    return {
+        "episodes": args.episodes or None,
+        "joint_names": args.joint_names or None,
+        "mapping": columns(args.mapping),
+        "units": args.units,
+    }
+
+
 def _fit_streamed(args: FitPrimitives) -> None:
     with distributed.processes() as rank:
-        demos = open_demos(
-            args.dataset, episodes=args.episodes or None, joint_names=args.joint_names or None
-        )
+        demos = open_demos(args.dataset, **_wanted(args))
         fits, metrics = fit_streamed(demos, args.n_basis or 60, channels=args.channels)
         if rank:
             return
@@ -89,6 +96,7 @@ def _fit_policy(args: FitPrimitives, console: Console) -> None:
     from hrc_learn.lerobot.policy.modeling_dmp import write_closed_form_policy
 
     given = (args.channels, args.context, args.joint_names, args.robust)
+    given += (args.units, args.mapping)
     if any(given) or (args.several, args.method, args.scaling) != (
         "mean",
         "trajectory",
