@@ -70,7 +70,8 @@ def main() -> int:
                     print(f"{name}: {outcome.kind}: {outcome.crash or 'not found'}", flush=True)
             if args.json is not None:
                 content = {"clean": clean, "outcomes": [asdict(o) for o in every]}
-                args.json.write_text(json.dumps(content, indent=1) + "\n")
+                text = json.dumps(content, indent=1) + "\n"
+                args.json.write_text(text, encoding="utf-8")
     print("| | severe | as errors | others | crashes | longest | most memory |")
     print("|---|---|---|---|---|---|---|")
     for name, results in by_set.items():
