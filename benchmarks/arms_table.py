@@ -69,11 +69,11 @@ def main(args: Args) -> None:
         )
         Console().print(rows[-1], highlight=False)
     for file in args.files:
-        text = file.read_text()
+        text = file.read_text(encoding="utf-8")
         if _BEGIN not in text or _END not in text:
             raise ValueError(f"{file}: needs the lines {_BEGIN} and {_END}, for the table.")
         before, after = text.split(_BEGIN)[0], text.split(_END)[1]
-        file.write_text("\n".join([before + _BEGIN, *rows, _END + after]))
+        file.write_text("\n".join([before + _BEGIN, *rows, _END + after]), encoding="utf-8")
     if args.json is not None:
         cli.write_json(args.json, figures)
 
@@ -154,7 +154,7 @@ def _demo(name: str, folder: Path | None) -> str:
     path = None if folder is None else folder / f"{name}.json"
     if path is None or not path.is_file():
         return "not tried"
-    values = json.loads(path.read_text())
+    values = json.loads(path.read_text(encoding="utf-8"))
     if values["success_rate"] < 1:
         return "not done"
     return (

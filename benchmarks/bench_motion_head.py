@@ -19,14 +19,13 @@ import math
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 
-import cma  # pyright: ignore[reportMissingImports]
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
 from jaxtyping import Float
-from mp_pytorch.mp import MPFactory  # pyright: ignore[reportMissingImports]
 from mujoco import MjData, MjModel, mj_stateSize, mjtState, rollout
 from rich.console import Console
 from rich.table import Table
@@ -81,6 +80,9 @@ type Motions = Callable[[Float[Tensor, "B P"]], Float[Tensor, "B T D"]]
 
 def main(args: Args) -> None:
     """Learn with both heads and all seeds; print, draw and write what came of it."""
+    missing = [name for name in ("mp_pytorch", "cma") if find_spec(name) is None]
+    if missing:
+        raise ValueError(f"not installed: pip install {' '.join(missing)}")
     if args.seeds != 5:
         warnings.warn("intervals are those of five seeds", stacklevel=1)
     torch.set_num_threads(1)
@@ -110,6 +112,8 @@ def prodmp_motions(n_basis: int) -> Motions:
 
     All are scaled once more, so that unit normal parameters deviate as much as in our head.
     """
+    from mp_pytorch.mp import MPFactory  # pyright: ignore[reportMissingImports]
+
     mp = MPFactory.init_mp(
         mp_type="prodmp",
         num_dof=JOINTS,
@@ -239,6 +243,8 @@ def learn(motions: Motions, args: Args, seed: int) -> Float[np.ndarray, "points"
 
 def search(motions: Motions, args: Args, seed: int) -> Float[np.ndarray, "points"]:
     """Best return that CMA-ES has seen for one context, by generation."""
+    import cma  # pyright: ignore[reportMissingImports]
+
     context = contexts(1, torch.Generator().manual_seed(20_000 + seed))
     reacher, P = Reacher(), JOINTS * (args.n_basis + 1)
     options = {"seed": seed + 1, "verbose": -9, "maxfevals": args.search_episodes}
