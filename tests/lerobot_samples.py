@@ -10,9 +10,10 @@ from torch import Tensor
 
 from hrc_learn.demos import DatasetWriter
 from hrc_learn.dmp._system.closed_forms import quintic
-from hrc_learn.lerobot import DMPConfig
+from hrc_learn.lerobot import DMPConfig, MotionChunkConfig
 from hrc_learn.lerobot.policy.closed_form import SampleWindows
 from hrc_learn.lerobot.policy.modeling_dmp import DMPPolicy
+from hrc_learn.lerobot.policy.modeling_motion_chunk import MotionChunkPolicy
 
 FPS = 20.0
 NAMES = ["a.pos", "b.pos"]
@@ -70,11 +71,14 @@ def write_dataset(folder: Path, episodes: list[Episode], *, images: bool = False
 
 def stats_of(episodes: list[Episode]) -> dict[str, dict[str, Tensor]]:
     columns = {key: torch.cat([e[key] for e in episodes]) for key in episodes[0]}
-    return {key: {"mean": x.mean(0), "std": x.std(0)} for key, x in columns.items()}
+    return {
+        key: {"mean": x.mean(0), "std": x.std(0), "min": x.amin(0), "max": x.amax(0)}
+        for key, x in columns.items()
+    }
 
 
-def config_for(episode: Mapping[str, Tensor], **changes) -> DMPConfig:
-    """Settings for what the episode holds; images are (frames, C, H, W)."""
+def features_of(episode: Mapping[str, Tensor]) -> dict[str, dict[str, PolicyFeature]]:
+    """What the episode holds; images are (frames, C, H, W)."""
     kinds = {STATE: FeatureType.STATE, GOAL: FeatureType.ENV}
     inputs = {
         key: PolicyFeature(kinds.get(key, FeatureType.VISUAL), tuple(x.shape[1:]))
@@ -82,6 +86,11 @@ def config_for(episode: Mapping[str, Tensor], **changes) -> DMPConfig:
         if key != "action"
     }
     action = PolicyFeature(FeatureType.ACTION, tuple(episode["action"].shape[1:]))
+    return {"input_features": inputs, "output_features": {"action": action}}
+
+
+def config_for(episode: Mapping[str, Tensor], **changes) -> DMPConfig:
+    """Settings for what the episode holds."""
     settings = {
         "chunk_size": 10,
         "n_action_steps": 6,
@@ -94,9 +103,27 @@ def config_for(episode: Mapping[str, Tensor], **changes) -> DMPConfig:
         "device": "cpu",
         "push_to_hub": False,
     }
-    return DMPConfig(
-        input_features=inputs, output_features={"action": action}, **settings | changes
-    )
+    return DMPConfig(**features_of(episode), **settings | changes)
+
+
+def chunk_policy(episodes: list[Episode], **changes) -> MotionChunkPolicy:
+    """A `motion_chunk` in closed form, small."""
+    settings = {
+        "chunk_size": 10,
+        "n_action_steps": 6,
+        "n_basis": 6,
+        "hidden_dim": 32,
+        "n_keypoints": 4,
+        "fps": FPS,
+        "state_names": ["b.pos", "gripper.pos", "a.pos"],
+        "action_feature_names": NAMES,
+        "device": "cpu",
+        "push_to_hub": False,
+    }
+    config = MotionChunkConfig(**features_of(episodes[0]), **settings | changes)
+    policy = MotionChunkPolicy(config, dataset_stats=stats_of(episodes))
+    policy.fit(episodes)
+    return policy
 
 
 def fitted_policy(episodes: list[Episode], **changes) -> DMPPolicy:
@@ -114,14 +141,16 @@ def shaken(policy: DMPPolicy, seed: int = 0) -> DMPPolicy:
     return policy
 
 
-def windows(policy: DMPPolicy, episodes: list[Episode]) -> SampleWindows:
+def windows(policy: DMPPolicy | MotionChunkPolicy, episodes: list[Episode]) -> SampleWindows:
     seen = policy.config.observation_delta_indices
     deltas = {key: seen for key in episodes[0] if key != "action"}
     deltas["action"] = policy.config.action_delta_indices
     return SampleWindows(episodes, deltas, FPS)
 
 
-def played(policy: DMPPolicy, episode: Episode, frames: int | None = None) -> Tensor:
+def played(
+    policy: DMPPolicy | MotionChunkPolicy, episode: Episode, frames: int | None = None
+) -> Tensor:
     """Actions of a policy that sees an episode go by, (frames, A)."""
     policy.reset()
     frames = len(episode["action"]) if frames is None else frames

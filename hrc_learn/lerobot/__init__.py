@@ -11,3 +11,6 @@ from hrc_learn.lerobot import processor as processor
 from hrc_learn.lerobot import robots as robots
 from hrc_learn.lerobot import teleoperators as teleoperators
 from hrc_learn.lerobot.policy.configuration_dmp import DMPConfig as DMPConfig
+from hrc_learn.lerobot.policy.configuration_motion_chunk import (
+    MotionChunkConfig as MotionChunkConfig,
+)

@@ -1,4 +1,4 @@
-"""LeRobot's own commands with the policy `dmp`, offline, each in a process of its own."""
+"""LeRobot's own commands with our policies, offline, each in a process of its own."""
 
 import json
 import os
@@ -69,24 +69,25 @@ import torch
 from lerobot.policies import get_policy_class, make_pre_post_processors
 import hrc_learn.lerobot
 
-policy = get_policy_class("dmp").from_pretrained(sys.argv[1])
+policy = get_policy_class(sys.argv[2]).from_pretrained(sys.argv[1])
 before, after = make_pre_post_processors(policy.config, pretrained_path=sys.argv[1])
 seen = {k: torch.zeros(f.shape) for k, f in policy.config.input_features.items()}
 print("action", *after(policy.select_action(before(seen))).flatten().tolist())
 """
 
 
-def first_action_in_a_fresh_process(folder: Path) -> list[float]:
+def first_action_in_a_fresh_process(folder: Path, kind: str = "dmp") -> list[float]:
     done = subprocess.run(
-        [sys.executable, "-c", FRESH, folder], capture_output=True, text=True, check=True
+        [sys.executable, "-c", FRESH, folder, kind], capture_output=True, text=True, check=True
     )
     (line,) = (x for x in done.stdout.splitlines() if x.startswith("action"))
     return [float(x) for x in line.split()[1:]]
 
 
-def test_train_resume_tune_and_load_with_images(pictures, tmp_path):
+@pytest.mark.parametrize("kind", ["dmp", "motion_chunk"])
+def test_train_resume_tune_and_load_with_images(pictures, tmp_path, kind):
     out = tmp_path / "run"
-    new = (DISCOVER, "--policy.type=dmp", *SMALL, *common(pictures, out))
+    new = (DISCOVER, f"--policy.type={kind}", *SMALL, *common(pictures, out))
     train(*new, "--batch_size=4", "--steps=4", "--save_freq=2")
     config = json.loads((checkpoint(out) / "config.json").read_text())
     assert config["fps"] == FPS
@@ -98,7 +99,7 @@ def test_train_resume_tune_and_load_with_images(pictures, tmp_path):
     tuned = tmp_path / "tuned"
     start = f"--policy.path={checkpoint(out)}"
     train(ALSO_OF_A_PATH, start, *common(pictures, tuned), "--batch_size=4", "--steps=1")
-    assert len(first_action_in_a_fresh_process(checkpoint(tuned))) == 2
+    assert len(first_action_in_a_fresh_process(checkpoint(tuned), kind)) == 2
 
 
 def test_two_ranks_learn_what_one_learns(numbers, tmp_path):

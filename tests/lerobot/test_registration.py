@@ -6,7 +6,7 @@ from lerobot.processor import ProcessorStepRegistry
 from lerobot.robots import RobotConfig
 from lerobot.teleoperators import TeleoperatorConfig
 
-from hrc_learn.lerobot import DMPConfig
+from hrc_learn.lerobot import DMPConfig, MotionChunkConfig
 from hrc_learn.lerobot.envs import PandaEnvConfig
 from hrc_learn.lerobot.robots import FrankaPandaConfig, MujocoPandaConfig
 from hrc_learn.lerobot.teleoperators import PandaExpertConfig, PandaPageConfig
@@ -21,3 +21,4 @@ def test_lerobot_knows_them_by_name():
     for step in ("hrc_learn_watch_state", "hrc_learn_smooth_actions"):
         assert ProcessorStepRegistry.get(step)
     assert PreTrainedConfig.get_choice_class("dmp") is DMPConfig
+    assert PreTrainedConfig.get_choice_class("motion_chunk") is MotionChunkConfig

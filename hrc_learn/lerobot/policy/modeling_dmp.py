@@ -14,11 +14,16 @@ from lerobot.policies import make_pre_post_processors
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from lerobot.utils.feature_utils import dataset_to_policy_features
-from safetensors import SafetensorError
 from torch import Tensor
 
 from hrc_learn.dmp import GaussianBasis, SpringDamper, response_of
 from hrc_learn.lerobot.policy.closed_form import read_episodes
+from hrc_learn.lerobot.policy.common import (
+    frame_rate,
+    load_weights,
+    require_numbers,
+    require_statistics,
+)
 from hrc_learn.lerobot.policy.configuration_dmp import DMPConfig
 from hrc_learn.lerobot.policy.motion_planner import (
     ActionEncoding,
@@ -69,7 +74,7 @@ class DMPPolicy(PreTrainedPolicy):
         """
         super().__init__(config)
         config.validate_features()
-        config.fps = _frame_rate(config, dataset_meta)
+        config.fps = frame_rate(config, dataset_meta)
         self.config = config
         self.planner = _planner(config, 1 / config.fps)
         self.left_out_error = math.nan
@@ -132,7 +137,7 @@ class DMPPolicy(PreTrainedPolicy):
             ValueError: Numbers are missing, of another width, or not finite.
         """
         self.eval()
-        self._require_numbers(batch)
+        require_numbers(self.config, self.planner.encoder.widths, batch)
         if self._underway is None:
             plan_start = self.planner.initial_plan(batch)
             start = plan_start.start
@@ -155,37 +160,18 @@ class DMPPolicy(PreTrainedPolicy):
     def _width(self) -> int:
         return len(self.planner.encoding.mean)
 
-    def _require_numbers(self, batch: Mapping[str, Tensor]) -> None:
-        for key, width in self.planner.encoder.widths.items():
-            if key not in batch:
-                raise ValueError(f"the policy 'dmp' needs {key}; it is not in the observation")
-            if batch[key].shape[-1] != width:
-                raise ValueError(
-                    f"the policy 'dmp' was trained with {width} values in {key}, but the "
-                    f"observation has {batch[key].shape[-1]}"
-                )
-            bad = (~batch[key].isfinite()).flatten(0, -2).any(0).nonzero().flatten().tolist()
-            if bad:
-                names = self.config.state_names if key == OBS_STATE else None
-                which = ", ".join(names[i] if names else str(i) for i in bad)
-                raise ValueError(f"{key} is not finite in {which}: see to the sensor")
-
     @classmethod
     def _load_as_safetensor(
         cls, model: Any, model_file: str, map_location: str, strict: bool
     ) -> Any:
-        try:
-            return super()._load_as_safetensor(model, model_file, map_location, strict)
-        except SafetensorError as error:
-            raise ValueError(
-                f"{model_file} is damaged ({error}): copy or train the policy again"
-            ) from error
+        load = super()._load_as_safetensor
+        return load_weights(load, model, model_file, map_location, strict)
 
     def _whiten(self, stats: Mapping[str, Mapping[str, Any]] | None) -> None:
         if stats is None:
             return
         for key, width in (*self.planner.encoder.widths.items(), (ACTION, self._width)):
-            _require_statistics(stats, key, width)
+            require_statistics(stats, key, width)
         self.planner.encoder.whiten(stats)
         mean, std = (torch.as_tensor(stats[ACTION][k]) for k in ("mean", "std"))
         self.planner.encoding.whiten(std, mean)
@@ -206,18 +192,6 @@ class DMPPolicy(PreTrainedPolicy):
             len(episodes),
             self.left_out_error,
         )
-
-
-def _require_statistics(stats: Mapping[str, Mapping[str, Any]], key: str, width: int) -> None:
-    for name in ("mean", "std"):
-        if name not in stats.get(key, {}):
-            raise ValueError(f"the dataset's statistics (meta/stats.json) lack {name} of {key}")
-        values = torch.as_tensor(stats[key][name])
-        if values.shape != (width,) or not values.isfinite().all():
-            raise ValueError(
-                f"the dataset's statistics (meta/stats.json) must have {width} finite numbers "
-                f"as {name} of {key}, got {values.tolist()}"
-            )
 
 
 def _planner(config: DMPConfig, step: float) -> MotionPlanner:
@@ -246,23 +220,6 @@ def _planner(config: DMPConfig, step: float) -> MotionPlanner:
         step=step,
         chunk_size=config.chunk_size,
     )
-
-
-def _frame_rate(config: DMPConfig, dataset_meta: Any) -> float:
-    trained, shown = config.fps, None if dataset_meta is None else float(dataset_meta.fps)
-    if trained is None:
-        if shown is None:
-            raise ValueError(
-                "the policy 'dmp' must know how many actions a second there are: train it on a "
-                "dataset, or give fps (--policy.fps)"
-            )
-        return shown
-    if shown not in (None, trained):
-        raise ValueError(
-            f"the policy is for {trained:g} actions a second, the dataset has {shown:g}: "
-            "resample it, or train a policy of its own"
-        )
-    return trained
 
 
 def write_closed_form_policy(

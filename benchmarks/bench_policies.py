@@ -1,0 +1,280 @@
+"""Compare policies on demonstrations that they did not learn from, at equal CPU time.
+
+Of a LeRobot dataset every fifth episode is held out. Policies see its states go by and say
+what to do; reported is how far that is from what was shown, and how abruptly commands change
+where one chunk follows another, beside how abruptly the demonstrators moved. No robot moves:
+what a policy does is not seen by it, so this says nothing of how it recovers.
+
+Peers are the nearest neighbour, the chunk shown after the state most like the one seen, and a
+small ACT of LeRobot, which trains as long as ours by the clock of the CPU.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("HF_HUB_OFFLINE", "1")
+
+import json
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from rich.console import Console
+from rich.table import Table
+from torch import Tensor
+
+from hrc_learn import cli
+
+STATE, ACTION = "observation.state", "action"
+ENVIRONMENT = "observation.environment_state"
+WARM_UP = 50
+"""Steps of training in which the learning rate rises."""
+CONSTANT = 1e-6
+"""Columns of the action that vary by less play no part."""
+type Episode = dict[str, Tensor]
+type Player = Callable[[Float[Tensor, "T F"], int], Float[Tensor, "T A"]]
+"""From an episode's states, and how many actions of a chunk are carried out, to actions."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args:
+    data: tuple[Path, ...]
+    """Folders of LeRobot datasets."""
+    policies: tuple[str, ...] = ("nearest", "act", "dmp", "motion_chunk")
+    """nearest: neighbour; act: a small one; dmp and motion_chunk: ours, trained from their
+    closed form."""
+    minutes: float = 1.0
+    """CPU time of building and training each."""
+    chunk: int = 50
+    """Actions predicted at once."""
+    executed: tuple[int, ...] = (25, 10)
+    """Of these, how many are carried out before the next prediction."""
+    every: int = 5
+    """Of the episodes every so many is held out."""
+    batch_size: int = 64
+    """Samples in each step of training."""
+    state: str = STATE
+    """Column of the states."""
+    action: str = ACTION
+    """Column of the actions."""
+    seed: int = 0
+    """Of weights and batches."""
+    json: Path | None = None
+    """Receives all figures as one flat object."""
+
+
+def main(args: Args) -> None:
+    from hrc_learn.lerobot.policy.closed_form import read_episodes
+
+    torch.set_num_threads(1)
+    figures: dict[str, float] = {}
+    for root in args.data:
+        columns = read_episodes(root, (args.state, args.action))
+        episodes = [
+            {STATE: e[args.state].float(), ACTION: e[args.action].float()} for e in columns
+        ]
+        info = json.loads((root / "meta" / "info.json").read_text("utf-8"))
+        fps = float(info["fps"])
+        shown = [e for k, e in enumerate(episodes) if k % args.every]
+        held_out = episodes[:: args.every]
+        stats = _statistics(shown)
+        spread = stats[ACTION]["std"]
+        varies = spread > CONSTANT
+        wanted = [(e[ACTION] / spread)[:, varies] for e in held_out]
+        jerk = _rms([_jerk(x, fps) for x in wanted])
+        table = Table("policy", "steps", "CPU s", *_titles(args.executed))
+        table.title = f"{root.name}: {len(held_out)} of {len(episodes)} episodes held out"
+        for name in args.policies:
+            torch.manual_seed(args.seed)
+            play, steps, seconds = _learn(name, shown, stats, fps, args)
+            row = []
+            for executed in args.executed:
+                made = [(play(e[STATE], executed) / spread)[:, varies] for e in held_out]
+                error = _rms([x - y for x, y in zip(made, wanted, strict=True)])
+                seam = _rms([_at_seams(_jerk(x, fps), executed) for x in made])
+                row += [error, seam]
+                figures |= {
+                    f"{root.name}_{name}_{executed}_rmse": error,
+                    f"{root.name}_{name}_{executed}_seam_jerk": seam,
+                }
+            table.add_row(name, str(steps), f"{seconds:.0f}", *(f"{x:.3g}" for x in row))
+        table.add_row("demonstrators", "", "", *(("", f"{jerk:.3g}") * len(args.executed)))
+        figures[f"{root.name}_demonstrators_jerk"] = jerk
+        Console().print(table)
+        if args.json is not None:
+            cli.write_json(args.json, figures)
+
+
+def _titles(executed: Sequence[int]) -> list[str]:
+    return [t for n in executed for t in (f"RMSE, {n} executed", "jerk at seams [1/s^3]")]
+
+
+def _statistics(episodes: Sequence[Episode]) -> dict[str, dict[str, Tensor]]:
+    stats = {}
+    for key in (STATE, ACTION):
+        x = torch.cat([e[key] for e in episodes])
+        low, high = x.aminmax(dim=0)
+        stats[key] = {"mean": x.mean(0), "std": x.std(0), "min": low, "max": high}
+    return stats
+
+
+def _rms(parts: Sequence[Tensor]) -> float:
+    return float(torch.cat(parts).double().square().mean().sqrt())
+
+
+def _jerk(x: Float[Tensor, "T A"], fps: float) -> Float[Tensor, "T3 A"]:
+    return x.double().diff(n=3, dim=0) * fps**3
+
+
+def _at_seams(jerk: Float[Tensor, "T3 A"], executed: int) -> Float[Tensor, "n A"]:
+    """Third difference k is of the actions k to k + 3; a seam is before action m executed."""
+    k = torch.arange(len(jerk))
+    return jerk[(k + 3 >= executed) & ((k + 3) % executed < 3)]
+
+
+def _learn(
+    name: str,
+    shown: Sequence[Episode],
+    stats: dict[str, dict[str, Tensor]],
+    fps: float,
+    args: Args,
+) -> tuple[Player, int, float]:
+    """A policy, the steps it was trained for, and the CPU time that took [s]."""
+    begun = time.process_time()
+    if name == "nearest":
+        return _nearest(shown, stats, args.chunk), 0, time.process_time() - begun
+    from lerobot.policies import get_policy_class, make_pre_post_processors
+
+    import hrc_learn.lerobot  # noqa: F401  registers ours
+
+    config = _config(name, shown[0], fps, args)
+    with_environment = name == "act"
+    if with_environment:
+        # ACT demands images or the environment's state: it gets the state there.
+        stats = stats | {ENVIRONMENT: stats[STATE]}
+        shown = [e | {ENVIRONMENT: e[STATE]} for e in shown]
+    begun = time.process_time()
+    policy: Any = get_policy_class(name)(config, dataset_stats=stats)
+    if name == "dmp":
+        policy.planner.fit(shown, ACTION)
+    elif name == "motion_chunk":
+        policy.fit(shown)
+    before, after = make_pre_post_processors(config, dataset_stats=stats)
+    steps = _train(policy, before, shown, fps, begun + 60 * args.minutes, args)
+    seconds = time.process_time() - begun
+
+    @torch.no_grad()
+    def play(states: Tensor, executed: int) -> Tensor:
+        policy.config.n_action_steps = executed
+        policy.reset()
+        made = []
+        for state in states:
+            seen = {STATE: state} | ({ENVIRONMENT: state} if with_environment else {})
+            made.append(after(policy.select_action(before(seen))))
+        return torch.cat(made)
+
+    return play, steps, seconds
+
+
+def _nearest(
+    shown: Sequence[Episode], stats: dict[str, dict[str, Tensor]], chunk: int
+) -> Player:
+    from hrc_learn.lerobot.policy.closed_form import SampleWindows
+
+    windows = SampleWindows(shown, {STATE: None, ACTION: range(chunk)}, 1)
+    all_of_it = windows.batch(torch.arange(len(windows)))
+    scale = torch.where(stats[STATE]["std"] > CONSTANT, stats[STATE]["std"], torch.inf)
+    known = all_of_it[STATE] / scale
+
+    def play(states: Tensor, executed: int) -> Tensor:
+        nearest = [
+            int((known - state / scale).square().sum(-1).argmin())
+            for state in states[::executed]
+        ]
+        made = torch.cat([all_of_it[ACTION][k, :executed] for k in nearest])
+        return made[: len(states)]
+
+    return play
+
+
+def _config(name: str, episode: Episode, fps: float, args: Args) -> Any:
+    from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature
+    from lerobot.policies import ACTConfig
+
+    from hrc_learn.lerobot import DMPConfig, MotionChunkConfig
+
+    state = (episode[STATE].shape[1],)
+    common: dict[str, Any] = {
+        "chunk_size": args.chunk,
+        "n_action_steps": args.executed[0],
+        "device": "cpu",
+        "push_to_hub": False,
+        "input_features": {STATE: PolicyFeature(FeatureType.STATE, state)},
+        "output_features": {
+            ACTION: PolicyFeature(FeatureType.ACTION, (episode[ACTION].shape[1],))
+        },
+    }
+    match name:
+        case "dmp":
+            return DMPConfig(**common, fps=fps)
+        case "motion_chunk":
+            return MotionChunkConfig(**common, fps=fps)
+        case "act":
+            common["input_features"][ENVIRONMENT] = PolicyFeature(FeatureType.ENV, state)
+            return ACTConfig(
+                **common,
+                normalization_mapping=dict.fromkeys(
+                    ("STATE", "ENV", "ACTION"), NormalizationMode.MEAN_STD
+                ),
+                dim_model=64,
+                n_heads=4,
+                dim_feedforward=256,
+                n_encoder_layers=2,
+                use_vae=False,
+                optimizer_lr=1e-3,
+            )
+    raise ValueError(f"--policies takes nearest, act, dmp and motion_chunk, not {name!r}")
+
+
+def _train(
+    policy: Any, before: Any, shown: Sequence[Episode], fps: float, until: float, args: Args
+) -> int:
+    """As lerobot-train does it, with batches from memory, until so much CPU time has passed.
+
+    The learning rate falls along a cosine over that time.
+    """
+    from hrc_learn.lerobot.policy.closed_form import SampleWindows
+
+    config = policy.config
+    seen = config.observation_delta_indices
+    deltas = {key: seen if key != ACTION else config.action_delta_indices for key in shown[0]}
+    windows = SampleWindows(shown, deltas, fps)
+    optimizer = config.get_optimizer_preset().build(policy.get_optim_params())
+    rates = [group["lr"] for group in optimizer.param_groups]
+    rng = torch.Generator().manual_seed(args.seed)
+    begun, steps = time.process_time(), 0
+    policy.train()
+    while (now := time.process_time()) < until:
+        share = (now - begun) / (until - begun)
+        factor = min(1, (steps + 1) / WARM_UP) * (1 + math.cos(math.pi * share)) / 2
+        for group, rate in zip(optimizer.param_groups, rates, strict=True):
+            group["lr"] = rate * factor
+        loss, _ = policy.forward(before(windows.draw(args.batch_size, rng)))
+        optimizer.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(policy.parameters(), 10.0)
+        optimizer.step()
+        steps += 1
+    policy.eval()
+    return steps
+
+
+if __name__ == "__main__":
+    cli.run(main, Args)

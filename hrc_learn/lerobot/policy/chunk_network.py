@@ -1,0 +1,255 @@
+"""From what is seen to chunks of a motion, and from those to what can go on from anywhere."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from hrc_learn.dmp import fit_ridge
+from hrc_learn.dmp.motion_head import MotionHead
+
+# Chunks as a motion: a linear map of few numbers, with its derivatives.
+
+TINY = 1e-9
+"""Added to what is inverted, so that it can be."""
+
+
+class ChunkDecoder(nn.Module):
+    """Coefficients of a movement primitive a column to the actions of a chunk.
+
+    A column has M = N + 3 coefficients: start, start velocity, and the N weights and the goal
+    of a `MotionHead`. Actions and their derivatives are linear in them, so demonstrated chunks
+    are projected onto them in closed form, and so is a chunk onto those that begin in a given
+    state.
+    """
+
+    maps: Float[Tensor, "4 samples M"]
+    """From coefficients to position, velocity, acceleration and jerk at each action and, for
+    the state that a chunk ends in, at the one after the last."""
+    projection: Float[Tensor, "M samples"]
+
+    def __init__(self, chunk_size: int, step: float, n_basis: int, blend_time: float):
+        """Compute the maps.
+
+        Args:
+            chunk_size: Actions of a chunk.
+            step: From one action to the next [s].
+            n_basis: N, weights a column.
+            blend_time: About how long a motion takes to get from where it is to what is
+                planned [s].
+        """
+        super().__init__()
+        self.blend_time = blend_time
+        head = MotionHead(1, n_basis, duration=chunk_size * step).double()
+        unit = torch.eye(n_basis + 3, dtype=torch.float64)
+        time = step * torch.arange(chunk_size + 1, dtype=torch.float64)
+        motion = head(unit[:, 2:], time, unit[:, :1], unit[:, 1:2])
+        acceleration = motion.acceleration[..., 0].T
+        (jerk,) = torch.gradient(acceleration, spacing=step, dim=0)
+        position, velocity = motion.position[..., 0].T, motion.velocity[..., 0].T
+        maps = torch.stack([position, velocity, acceleration, jerk])
+        # Both follow from the settings; in double precision, as jerk spans many magnitudes.
+        self.register_buffer("maps", maps, persistent=False)
+        self.register_buffer("projection", torch.linalg.pinv(position), persistent=False)
+
+    @property
+    def size(self) -> int:
+        """M, coefficients of a column."""
+        return self.maps.shape[-1]
+
+    def project(self, chunks: Float[Tensor, "*batch samples D"]) -> Float[Tensor, "*batch D M"]:
+        """The coefficients whose motion is nearest to demonstrated chunks."""
+        return (self.projection @ chunks.double()).mT.to(chunks)
+
+    def positions(
+        self, coefficients: Float[Tensor, "*batch D M"]
+    ) -> Float[Tensor, "*batch samples D"]:
+        """Actions of a chunk, and the one after its last."""
+        return self.maps[0].to(coefficients) @ coefficients.mT
+
+    def states(
+        self, coefficients: Float[Tensor, "*batch D M"]
+    ) -> Float[Tensor, "*batch samples 3 D"]:
+        """Position, velocity and acceleration likewise."""
+        x = coefficients.double().mT[..., None, :, :]
+        return (self.maps[:3] @ x).transpose(-3, -2)
+
+    def begin_in(
+        self,
+        coefficients: Float[Tensor, "*batch D M"],
+        state: Float[Tensor, "*batch 3 D"],
+        index: int = 0,
+    ) -> Float[Tensor, "*batch D M"]:
+        """The motion that is in a state at an action, and then soon where it was planned to be.
+
+        Of all changes of the coefficients that lead through the state, exactly, it is the one
+        of least  sum_t d(t)^2 + blend_time^6 d'''(t)^2  from that action on.
+
+        Args:
+            coefficients: As planned.
+            state: Position, velocity and acceleration.
+            index: Of the action at which the motion is in that state.
+        """
+        position, jerk = self.maps[0, index:], self.maps[3, index:]
+        cost = position.T @ position + self.blend_time**6 * jerk.T @ jerk
+        cost = cost + TINY * cost.diagonal().mean() * torch.eye(self.size).to(cost)
+        through = self.maps[:3, index]
+        back = torch.linalg.solve(cost, through.T)
+        change = back @ torch.linalg.inv(through @ back)
+        x = coefficients.double()
+        off = state.double().mT - x @ through.T
+        return x + off @ change.T
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MotionChunk:
+    """Actions to come as a motion, of a batch."""
+
+    states: Float[Tensor, "B samples 3 D"]
+    """Position, velocity and acceleration of the smooth columns, whitened."""
+    upper: Float[Tensor, "B samples G"]
+    """1 where a two-level column is at its upper level, else 0."""
+    actions: Float[Tensor, "B samples A"]
+
+    def after(self, steps: Int[Tensor, "B"]) -> "MotionChunk":
+        """What is left after so many actions; it stands still where there is no more."""
+        samples = self.states.shape[1]
+        index = steps[:, None] + torch.arange(samples, device=steps.device)
+        over = index > samples - 1
+        index = index.clamp(max=samples - 1)
+        row = torch.arange(len(steps), device=steps.device)[:, None]
+        states = self.states[row, index].clone()
+        states[:, :, 1:] = torch.where(over[..., None, None], 0.0, states[:, :, 1:])
+        return MotionChunk(
+            states=states, upper=self.upper[row, index], actions=self.actions[row, index]
+        )
+
+
+# Several plans for one observation, and how likely each is.
+
+RIDGE = 1e-2
+"""Of the regression that a network starts from: a share of the spread of its inputs."""
+SPREAD = 1e-3
+"""Of coefficients, at least: those that never change are not divided by nothing."""
+DIFFERENCE = 0.02
+"""Of plans at first, in the spread of the coefficients."""
+FARTHEST = 10.0
+"""Spreads beyond which inputs are taken for wrong, and for no more than that."""
+LEFT_OVER = 0.05
+"""Weight of the plans that are not the nearest to what was shown, so that none is forgotten."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Plans:
+    """K plans for each element of a batch."""
+
+    coefficients: Float[Tensor, "B K D M"]
+    scores: Float[Tensor, "B K"]
+    """Logits of how likely each plan is."""
+    levels: Float[Tensor, "B samples G"]
+    """Logits of two-level columns to be at the upper level."""
+
+
+class ChunkNetwork(nn.Module):
+    """Plans as a function of what is seen and, where it is known, of how the arm moves.
+
+    The plans are a linear function of the numbers seen, which a fit in closed form sets, and a
+    network, which starts with next to nothing. How the arm moves, position and velocity of the
+    actions that are carried out, tells apart what looks alike on the way there and back.
+    """
+
+    mean: Float[Tensor, "D M"]
+    spread: Float[Tensor, "D M"]
+    """Of the coefficients of demonstrated chunks."""
+
+    def __init__(
+        self,
+        *,
+        numbers: int,
+        features: int,
+        columns: int,
+        two_level: int,
+        decoder: ChunkDecoder,
+        n_plans: int,
+        hidden: int,
+        dropout: float,
+    ):
+        """Make one that stands still.
+
+        Args:
+            numbers: Of the features, those that a linear function suits, in front.
+            features: Of an observation.
+            columns: D, that move smoothly.
+            two_level: G, that know two levels only.
+            decoder: For coefficients and the length of a chunk.
+            n_plans: K.
+            hidden: Width of the network.
+            dropout: Share of its hidden features left out while it trains.
+        """
+        super().__init__()
+        self.numbers, self.columns, self.n_plans = numbers, columns, n_plans
+        self.samples, self.two_level = decoder.maps.shape[1], two_level
+        self.register_buffer("mean", torch.zeros(columns, decoder.size))
+        self.register_buffer("spread", torch.ones(columns, decoder.size))
+        self.linear = nn.Linear(numbers, columns * decoder.size)
+        self.levels = nn.Linear(hidden, self.samples * two_level)
+        self.into = nn.Linear(features + 2 * columns + 1, hidden)
+        self.blocks = nn.ModuleList(_block(hidden, dropout) for _ in range(2))
+        self.plans = nn.Linear(hidden, n_plans * columns * decoder.size)
+        self.scores = nn.Linear(hidden, n_plans)
+        for layer in (self.linear, self.plans, self.scores):
+            nn.init.zeros_(layer.weight)
+            nn.init.zeros_(layer.bias)
+        if n_plans > 1:  # plans that were all the same would learn the same
+            nn.init.normal_(self.plans.bias, std=DIFFERENCE)
+
+    def forward(
+        self,
+        features: Float[Tensor, "B F"],
+        moving: Float[Tensor, "B 2 D"],
+        known: Float[Tensor, "B"],
+    ) -> Plans:
+        """Plans for what is seen.
+
+        Args:
+            features: Of the observation.
+            moving: Position and velocity of the motion now, each in its spread.
+            known: 1 where that is known, else 0.
+        """
+        features = features.clamp(-FARTHEST, FARTHEST)
+        motion = moving.flatten(1).clamp(-FARTHEST, FARTHEST) * known[:, None]
+        x = F.gelu(self.into(torch.cat([features, motion, known[:, None]], dim=-1)))
+        for block in self.blocks:
+            x = x + block(x)
+        plain = self.linear(features[:, : self.numbers])[:, None]
+        plans = plain + self.plans(x).unflatten(-1, (self.n_plans, -1))
+        shape = (self.columns, self.mean.shape[-1])
+        return Plans(
+            coefficients=plans.unflatten(-1, shape) * self.spread + self.mean,
+            scores=self.scores(x),
+            levels=self.levels(x).unflatten(-1, (self.samples, self.two_level)),
+        )
+
+    @torch.no_grad()
+    def fit(self, numbers: Float[Tensor, "n C"], coefficients: Float[Tensor, "n D M"]) -> None:
+        """Set the linear function by regression of demonstrated chunks on what was seen."""
+        self.mean.copy_(coefficients.mean(0))
+        self.spread.copy_(coefficients.std(0).clamp_min(SPREAD))
+        whitened = ((coefficients - self.mean) / self.spread).flatten(1)
+        if self.numbers:
+            fit = fit_ridge(numbers.double(), whitened.double(), RIDGE)
+            slopes = fit.coefficients[1:] / fit.scale[:, None]
+            self.linear.weight.copy_(slopes.T)
+            self.linear.bias.copy_(-numbers.double().mean(0) @ slopes)
+
+
+def _block(hidden: int, dropout: float) -> nn.Module:
+    return nn.Sequential(
+        nn.LayerNorm(hidden),
+        nn.Linear(hidden, hidden),
+        nn.GELU(),
+        nn.Dropout(dropout),
+        nn.Linear(hidden, hidden),
+    )

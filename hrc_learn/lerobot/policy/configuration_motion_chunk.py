@@ -1,0 +1,67 @@
+"""Settings of the policy `motion_chunk`."""
+
+from dataclasses import dataclass
+
+from lerobot.configs import PreTrainedConfig
+from lerobot.optim import CosineDecayWithWarmupSchedulerConfig
+
+from hrc_learn.lerobot.policy.common import MotionPolicyConfig
+
+HISTORY = 4
+"""Actions before a chunk from which training takes the velocity of the motion."""
+
+
+@PreTrainedConfig.register_subclass("motion_chunk")
+@dataclass
+class MotionChunkConfig(MotionPolicyConfig):
+    """Chunks of actions, each a motion that goes on from what is being carried out."""
+
+    n_basis: int = 10
+    """Basis functions a coordinate and chunk."""
+    hidden_dim: int = 256
+    """Width of the network."""
+    dropout: float = 0.1
+    """Share of the network's hidden features left out in training."""
+    n_plans: int = 3
+    """Plans for each observation, of which one is carried out: as many ways to go as the
+    demonstrations may show from one place."""
+    sample_plans: bool = False
+    """Whether a motion begins with a plan drawn by its likelihood, or with the likeliest."""
+    two_level_actions: list[int] | None = None
+    """Components of the action that know two levels only, such as a gripper that is open or
+    shut, and jump between them; None: those that the dataset's statistics show to be such."""
+    blend_time: float = 0.05
+    """About how long a chunk takes from what is carried out to what is planned [s]."""
+    optimizer_lr: float = 1e-3
+    optimizer_weight_decay: float = 1e-2
+    scheduler_decay_steps: int = 20_000
+    """Steps along which the learning rate falls to nothing; no more than are trained."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("n_basis", "hidden_dim", "n_plans"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if self.blend_time <= 0:
+            raise ValueError(f"blend_time must be positive seconds, got {self.blend_time}")
+        if self.chunk_size < 4:
+            raise ValueError(f"chunk_size must be at least 4, got {self.chunk_size}")
+
+    @property
+    def observation_delta_indices(self) -> None:
+        """The current observation alone."""
+        return
+
+    @property
+    def action_delta_indices(self) -> list[int]:
+        """The chunk, the action after it, and those before it."""
+        return list(range(-HISTORY, self.chunk_size + 1))
+
+    def get_scheduler_preset(self) -> CosineDecayWithWarmupSchedulerConfig:
+        """From full rate to nothing along a cosine."""
+        return CosineDecayWithWarmupSchedulerConfig(
+            num_warmup_steps=min(100, self.scheduler_decay_steps),
+            num_decay_steps=self.scheduler_decay_steps,
+            peak_lr=self.optimizer_lr,
+            decay_lr=0.0,
+        )

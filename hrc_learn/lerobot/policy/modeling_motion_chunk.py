@@ -1,0 +1,483 @@
+"""The policy `motion_chunk` as LeRobot calls it."""
+
+import logging
+from collections import deque
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int
+from lerobot.policies.pretrained import PreTrainedPolicy
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+from torch import Tensor
+from torch.nn import functional as F
+
+from hrc_learn.lerobot.policy.chunk_network import (
+    LEFT_OVER,
+    ChunkDecoder,
+    ChunkNetwork,
+    MotionChunk,
+    Plans,
+)
+from hrc_learn.lerobot.policy.closed_form import SampleWindows, read_episodes
+from hrc_learn.lerobot.policy.common import (
+    frame_rate,
+    load_weights,
+    require_numbers,
+    require_statistics,
+)
+from hrc_learn.lerobot.policy.configuration_motion_chunk import HISTORY, MotionChunkConfig
+from hrc_learn.lerobot.policy.motion_planner import (
+    ActionEncoding,
+    matched_columns,
+    rotation_triples,
+)
+from hrc_learn.lerobot.policy.networks import Observation, ObservationEncoder
+
+logger = logging.getLogger(__name__)
+
+TWO_LEVEL = 0.9
+"""Share of the largest variance between minimum and maximum (Bhatia and Davis 2000, "A better
+bound on the variance") from which on a column knows two levels: 1 if it is never between."""
+MEASURED = 0.5
+"""Spreads by which actions may differ from the state of their name to be what it measures."""
+UNSURE = 0.3
+"""Noise on position and velocity of the motion in training, in their spreads: policies that are
+sure of their own past go on with it whatever they see."""
+UNKNOWN = 0.15
+"""Share of samples trained without either, as after a reset."""
+VELOCITY_WEIGHT = 0.005
+"""Of the error in velocity, spreads a second, beside that in position."""
+SCORE_WEIGHT = 0.1
+"""Of the scores of plans beside the plans: a classification learns faster."""
+SAME_WAY = 0.5
+"""Root mean square distance, in spreads, from which on plans are different ways to go: of
+nearer ones the mean is closer to what is shown than any, of others it is neither way."""
+
+SLOWEST = 1e-3
+"""Of the spreads of velocities: what never moved is not divided by nothing."""
+MOST_CHUNKS = 50_000
+"""That say enough of a linear function; more are spread evenly."""
+
+
+class MotionChunkPolicy(PreTrainedPolicy):
+    """Chunks that begin as what is being carried out goes on: C2, whatever is predicted.
+
+    From each observation, and how the arm moves, a network plans the next second or two. What
+    is carried out is the motion nearest to that plan of those that begin with the position,
+    the velocity and the acceleration that the actions before will have led to. No clock runs:
+    chunks may be asked for at any time, and after `reset` from anywhere.
+    """
+
+    config_class = MotionChunkConfig  # pyright: ignore[reportAssignmentType]
+    name = "motion_chunk"  # pyright: ignore[reportAssignmentType]
+    config: MotionChunkConfig
+
+    measured: Int[Tensor, "A"]
+    """Columns of the state that hold the action's components; -1: none does."""
+    levels: Float[Tensor, "2 A"]
+    """Least and largest action, whitened."""
+    velocity_spread: Float[Tensor, "A"]
+    """Root mean square of the velocity of demonstrated actions, whitened, per second."""
+
+    def __init__(
+        self,
+        config: MotionChunkConfig,
+        dataset_stats: Mapping[str, Mapping[str, Any]] | None = None,
+        dataset_meta: Any = None,
+        **_: Any,
+    ):
+        """Build the policy and, of a dataset, fit what is linear in it in closed form.
+
+        A policy that is loaded takes what it was trained with from its checkpoint.
+
+        Args:
+            config: With the features known.
+            dataset_stats: Statistics that numbers are whitened by.
+            dataset_meta: `LeRobotDatasetMetadata` to take the frame rate from, and the
+                demonstrations where they lie on disk.
+
+        Raises:
+            ValueError: Features that the policy cannot work with, a frame rate that is unknown
+                or another one, or statistics with gaps.
+        """
+        super().__init__(config)
+        config.validate_features()
+        config.fps = frame_rate(config, dataset_meta)
+        self.config = config
+        inputs = config.input_features or {}
+        widths = {k: inputs[k].shape[0] for k in (OBS_STATE, OBS_ENV_STATE) if k in inputs}
+        self.encoder = ObservationEncoder(
+            widths,
+            {key: feature.shape[0] for key, feature in config.image_features.items()},
+            backbone=config.vision_backbone,
+            n_keypoints=config.n_keypoints,
+        )
+        (width,) = (config.output_features or {})[ACTION].shape
+        names, states = config.action_feature_names, config.state_names
+        self.encoding = ActionEncoding(width, rotation_triples(names))
+        # States that turn are seen as orientations too, whose vectors do not jump.
+        self.turning = ActionEncoding(
+            widths.get(OBS_STATE, 0), rotation_triples(states) if OBS_STATE in widths else []
+        )
+        columns = matched_columns(
+            names, states if OBS_STATE in widths else None, (width, widths.get(OBS_STATE, 0))
+        )
+        self.register_buffer("measured", torch.tensor(columns))
+        self.register_buffer("levels", torch.tensor([[-1.0], [1.0]]).repeat(1, width))
+        self.register_buffer("velocity_spread", torch.ones(width))
+        if config.pretrained_path is None:
+            self._whiten(dataset_stats)
+        config.two_level_actions = config.two_level_actions or []
+        self._stepped = sorted(config.two_level_actions)
+        if not set(self._stepped) < set(range(width)):
+            raise ValueError(
+                f"two_level_actions must be some of the action's components 0 to {width - 1}, "
+                f"not all of them; got {self._stepped}"
+            )
+        self._smooth = [k for k in range(width) if k not in self._stepped]
+        self.decoder = ChunkDecoder(
+            config.chunk_size, 1 / config.fps, config.n_basis, config.blend_time
+        )
+        self.network = ChunkNetwork(
+            numbers=sum(widths.values()),
+            features=self.encoder.size,
+            columns=len(self._smooth),
+            two_level=len(self._stepped),
+            decoder=self.decoder,
+            n_plans=config.n_plans,
+            hidden=config.hidden_dim,
+            dropout=config.dropout,
+        )
+        if config.pretrained_path is None:
+            self._fit(dataset_meta)
+        self.reset()
+
+    def get_optim_params(self) -> Any:
+        """All parameters alike."""
+        return self.parameters()
+
+    def supports_rtc(self) -> bool:
+        """Chunks go on from what is left of the one before: without guidance, exactly."""
+        return True
+
+    def reset(self) -> None:
+        """Forget the motion that is under way: the next begins where the arm is measured."""
+        self._chunk: MotionChunk | None = None
+        self._action_queue: deque[Tensor] = deque()
+
+    def forward(
+        self, batch: dict[str, Tensor], reduction: str = "mean"
+    ) -> tuple[Tensor, dict[str, float]]:
+        """Error of the nearest plan, position and velocity, and of the scores and levels.
+
+        Actions before the beginning of an episode and after its end count as none.
+
+        Args:
+            batch: As LeRobot loads it by the config's delta indices: observations (B, ...),
+                `action` (B, HISTORY + chunk + 1, A) and `action_is_pad`.
+            reduction: "none" for one loss each, (B), else their mean.
+
+        Returns:
+            The loss, and the root mean square error of the nearest plans in the spread of
+            each component of the action.
+        """
+        coordinates = self.encoding.to_coordinates(batch[ACTION])
+        shown = coordinates[:, HISTORY:]
+        velocity = (shown[:, 0] - coordinates[:, 0]) / (HISTORY * self._step)
+        moving = torch.stack([shown[:, 0], velocity / self.velocity_spread], dim=1)
+        known = torch.ones(len(shown), device=shown.device)
+        if self.training:
+            moving = moving + UNSURE * torch.randn_like(moving)
+            known = (torch.rand_like(known) > UNKNOWN).to(moving)
+        plans = self.network(
+            self.encoder(self._turned(batch)), moving[..., self._smooth], known
+        )
+        present = (~batch[f"{ACTION}_is_pad"][:, HISTORY:]).to(shown)
+        error = self.decoder.positions(plans.coefficients) - shown[:, None, :, self._smooth]
+        rate = error.diff(dim=2) / self._step
+        each = (error.abs().mean(-1) * present[:, None]).mean(-1)
+        each = each + VELOCITY_WEIGHT * (rate.abs().mean(-1) * present[:, None, 1:]).mean(-1)
+        best = each.argmin(1)
+        row = torch.arange(len(best), device=best.device)
+        loss = (1 - LEFT_OVER) * each[row, best] + LEFT_OVER * each.mean(1)
+        loss = loss + SCORE_WEIGHT * F.cross_entropy(plans.scores, best, reduction="none")
+        if self._stepped:
+            low, high = self.levels[:, self._stepped]
+            up = (shown[..., self._stepped] > (low + high) / 2).to(shown)
+            wrong = F.binary_cross_entropy_with_logits(plans.levels, up, reduction="none")
+            loss = loss + (wrong.mean(-1) * present).mean(-1)
+        square = error.detach()[row, best].square().mean(-1) * present
+        rmse = {"rmse": float((square.sum() / present.sum()).sqrt())}
+        return (loss if reduction == "none" else loss.mean()), rmse
+
+    @torch.no_grad()
+    def predict_action_chunk(
+        self,
+        batch: dict[str, Tensor],
+        inference_delay: int = 0,
+        prev_chunk_left_over: Tensor | None = None,
+        **_: Any,
+    ) -> Float[Tensor, "B chunk A"]:
+        """The next chunk, its first action for the time of the observation.
+
+        It begins as the last one goes on from where that has got to: where the actions that
+        are left over say, exactly; else at the step of it that is nearest to what is planned
+        for the observation. After `reset` it begins where the arm is measured.
+
+        Args:
+            batch: Observations (B, ...).
+            inference_delay: Actions that will be carried out before the chunk is there: its
+                first ones, which are those left over.
+            prev_chunk_left_over: Actions of the last chunk that are still to be carried out,
+                (n, A) or (1, n, A), as LeRobot's real-time chunking gives them.
+
+        Raises:
+            ValueError: Numbers are missing, of another width, or not finite; or a delay that
+                is negative.
+        """
+        self.eval()
+        if inference_delay < 0:
+            raise ValueError(f"inference_delay must not be negative, got {inference_delay}")
+        require_numbers(self.config, self.encoder.widths, batch)
+        features = self.encoder(self._turned(batch))
+        if prev_chunk_left_over is not None:
+            before = self._left_over(prev_chunk_left_over)
+        elif self._chunk is not None:
+            before = self._chunk.after(self._steps_done(features, self._chunk))
+        else:
+            before = None
+        return self._go_on(batch, features, before, inference_delay)
+
+    @torch.no_grad()
+    def select_action(self, batch: dict[str, Tensor], **_: Any) -> Float[Tensor, "B A"]:
+        """The next action; a new chunk is predicted when the last one is used up."""
+        if not self._action_queue:
+            self.eval()
+            require_numbers(self.config, self.encoder.widths, batch)
+            steps, features = self.config.n_action_steps, self.encoder(self._turned(batch))
+            before = None
+            if self._chunk is not None:
+                done = torch.full((len(features),), steps, device=features.device)
+                before = self._chunk.after(done)
+            chunk = self._go_on(batch, features, before, 0)
+            self._action_queue.extend(chunk[:, :steps].unbind(1))
+        return self._action_queue.popleft()
+
+    @property
+    def _step(self) -> float:
+        assert self.config.fps is not None
+        return 1 / self.config.fps
+
+    def _turned(self, batch: Observation) -> Observation:
+        """The observation with what turns in its state as an orientation."""
+        if not self.turning.triples:
+            return batch
+        state = self.turning.to_coordinates(batch[OBS_STATE][:, None])[:, 0]
+        return {**batch, OBS_STATE: state}
+
+    def _go_on(
+        self, batch: Observation, features: Tensor, before: MotionChunk | None, delay: int
+    ) -> Float[Tensor, "B chunk A"]:
+        """Plan, and keep the motion that leads from what is carried out to the plan."""
+        plans = self._plans(features, before)
+        planned = self._chosen(plans, before)
+        if before is None:
+            delay = 0
+            state = self._beginning(batch, self.decoder.states(planned)[:, 0])
+        else:
+            delay = min(delay, self.config.chunk_size)
+            state = before.states[:, delay]
+        motion = self.decoder.begin_in(planned, state, delay)
+        states, upper = self.decoder.states(motion), (plans.levels > 0).to(features)
+        if before is not None:
+            states[:, :delay] = before.states[:, :delay]
+            upper[:, :delay] = before.upper[:, :delay]
+        self._chunk = MotionChunk(
+            states=states, upper=upper, actions=self._actions(states[:, :, 0], upper)
+        )
+        return self._chunk.actions[:, :-1]
+
+    def _plans(self, features: Tensor, before: MotionChunk | None) -> Plans:
+        known = features.new_full((len(features),), float(before is not None))
+        moving = features.new_zeros(len(features), 2, len(self._smooth))
+        if before is not None:
+            moving = before.states[:, 0, :2].to(features)
+            moving = (
+                moving
+                / torch.stack([torch.ones_like(self.velocity_spread), self.velocity_spread])[
+                    :, self._smooth
+                ]
+            )
+        return self.network(features, moving, known)
+
+    def _chosen(self, plans: Plans, before: MotionChunk | None) -> Float[Tensor, "B D M"]:
+        """One plan: likely, and the way that is being gone; the mean of those of one way."""
+        scores = plans.scores.log_softmax(-1)
+        positions = self.decoder.positions(plans.coefficients)
+        if before is not None:
+            off = positions - before.states[:, None, :, 0].to(positions)
+            scores = scores - off.square().mean((-2, -1)) / (2 * SAME_WAY**2)
+        if before is None and self.config.sample_plans:
+            chosen = torch.multinomial(scores.exp(), 1)[:, 0]
+        else:
+            chosen = scores.argmax(-1)
+        row = torch.arange(len(chosen), device=chosen.device)
+        apart = (positions - positions[row, chosen][:, None]).square().mean((-2, -1))
+        share = scores.masked_fill(apart >= SAME_WAY**2, -torch.inf).softmax(-1)
+        return (share[..., None, None] * plans.coefficients).sum(1)
+
+    def _beginning(
+        self, batch: Observation, planned: Float[Tensor, "B 3 D"]
+    ) -> Float[Tensor, "B 3 D"]:
+        """As planned, but where the arm is measured, as far as it is."""
+        if OBS_STATE not in self.encoder.widths:
+            return planned
+        values = batch[OBS_STATE][:, None, self.measured.clamp_min(0)]
+        seen = self.encoding.to_coordinates(values.to(self.encoding.mean))[:, 0]
+        seen, there = seen[:, self._smooth].to(planned), self.measured[self._smooth] >= 0
+        position = torch.where(there, seen, planned[:, 0])
+        return torch.cat([position[:, None], planned[:, 1:]], dim=1)
+
+    def _actions(self, position: Tensor, upper: Tensor) -> Float[Tensor, "B samples A"]:
+        low, high = self.levels[:, self._stepped]
+        coordinates = self.encoding.mean.new_zeros(*position.shape[:2], self.levels.shape[1])
+        coordinates[..., self._smooth] = position.to(coordinates)
+        coordinates[..., self._stepped] = low + upper * (high - low)
+        return self.encoding.to_actions(coordinates)
+
+    def _steps_done(self, features: Tensor, chunk: MotionChunk) -> Int[Tensor, "B"]:
+        """At which action the last chunk is nearest to the one planned for what is seen now."""
+        planned = self._chosen(self._plans(features, None), None)
+        now = self.decoder.states(planned)[:, :1, 0]
+        return (chunk.states[:, 1:, 0] - now).square().sum(-1).argmin(1) + 1
+
+    def _left_over(self, actions: Tensor) -> MotionChunk | None:
+        """What goes on in actions of the last chunk, or of whatever made them."""
+        actions = actions.reshape(-1, self.levels.shape[1]).to(self.encoding.mean)
+        # LeRobot fills short ones up with zeros.
+        there = actions.any(-1).nonzero().flatten()
+        actions = actions[: int(there[-1]) + 1] if len(there) else actions[:0]
+        chunk, samples = self._chunk, self.config.chunk_size + 1
+        if chunk is not None:
+            if not len(actions):
+                return chunk.after(torch.tensor([samples], device=actions.device))
+            for k in range(samples):
+                same = chunk.actions[0, k : k + len(actions)]
+                if len(same) and torch.equal(same, actions[: len(same)]):
+                    return chunk.after(torch.tensor([k], device=actions.device))
+        if not len(actions):
+            return None
+        # Somebody else's: as fast as they change, and standing still after the last.
+        index = torch.arange(samples, device=actions.device).clamp(max=len(actions) - 1)
+        coordinates = self.encoding.to_coordinates(actions[index][None])
+        position = coordinates[..., self._smooth].double()
+        (velocity,) = torch.gradient(position, spacing=self._step, dim=1)
+        (acceleration,) = torch.gradient(velocity, spacing=self._step, dim=1)
+        low, high = self.levels[:, self._stepped]
+        return MotionChunk(
+            states=torch.stack([position, velocity, acceleration], dim=2),
+            upper=(coordinates[..., self._stepped] > (low + high) / 2).to(coordinates),
+            actions=actions[index][None],
+        )
+
+    @classmethod
+    def _load_as_safetensor(
+        cls, model: Any, model_file: str, map_location: str, strict: bool
+    ) -> Any:
+        load = super()._load_as_safetensor
+        return load_weights(load, model, model_file, map_location, strict)
+
+    def _whiten(self, stats: Mapping[str, Mapping[str, Any]] | None) -> None:
+        """Take spreads, levels, and which columns know two levels only, from statistics."""
+        if stats is None:
+            return
+        width = len(self.encoding.mean)
+        for key, size in self.encoder.widths.items():
+            require_statistics(stats, key, size)
+        require_statistics(stats, ACTION, width, ("mean", "std", "min", "max"))
+        self.encoder.whiten(stats)
+        mean, std, low, high = (
+            torch.as_tensor(stats[ACTION][k]).to(self.encoding.mean)
+            for k in ("mean", "std", "min", "max")
+        )
+        self.encoding.whiten(std, mean)
+        self.levels.copy_((torch.stack([low, high]) - mean) / self.encoding.std)
+        if self.config.two_level_actions is None:
+            largest = (high - mean) * (mean - low)
+            two = (std > 0) & (std.square() > TWO_LEVEL * largest)
+            turning = {i for triple in self.encoding.triples for i in triple}
+            found = [i for i in two.nonzero().flatten().tolist() if i not in turning]
+            self.config.two_level_actions = found if len(found) < width else []
+
+    def _fit(self, dataset_meta: Any) -> None:
+        """Start from the demonstrations, if they lie on disk."""
+        if dataset_meta is None:
+            return
+        root = Path(dataset_meta.root)
+        if not (root / "data").is_dir():
+            logger.warning("no demonstrations in %s: training starts from standing still", root)
+            return
+        keys = (ACTION, *self.encoder.widths)
+        self.fit(read_episodes(root, keys, self.config.fit_episodes))
+
+    @torch.no_grad()
+    def fit(self, demonstrations: list[dict[str, Tensor]]) -> None:
+        """Set what is linear in closed form, numbers being whitened already.
+
+        Args:
+            demonstrations: Columns by key, (frames, components).
+
+        Raises:
+            ValueError: Orientations more than half a turn away from their mean.
+        """
+        actions = [shown[ACTION].to(self.encoding.mean) for shown in demonstrations]
+        if self.encoding.triples:
+            low, high = (self.levels * self.encoding.std + self.encoding.mean).unbind()
+            self.encoding.learn(actions)
+            self.levels.copy_(
+                (torch.stack([low, high]) - self.encoding.mean) / self.encoding.std
+            )
+        episodes = [
+            {key: shown[key] for key in self.encoder.widths}
+            | {ACTION: self.encoding.to_coordinates(action)}
+            for shown, action in zip(demonstrations, actions, strict=True)
+        ]
+        if OBS_STATE in self.encoder.widths:
+            states = [e[OBS_STATE].to(self.encoding.mean) for e in episodes]
+            self._keep_measured(torch.cat(states), torch.cat([e[ACTION] for e in episodes]))
+            if self.turning.triples:
+                self._learn_turning(states)
+        rates = torch.cat([e[ACTION].diff(dim=0) / self._step for e in episodes])
+        self.velocity_spread.copy_(rates.square().mean(0).sqrt().clamp_min(SLOWEST))
+        deltas: dict[str, Any] = dict.fromkeys(self.encoder.widths)
+        samples = self.config.chunk_size + 1
+        windows = SampleWindows(episodes, {**deltas, ACTION: range(samples)}, 1 / self._step)
+        every = -(-len(windows) // MOST_CHUNKS)
+        batch = windows.batch(torch.arange(0, len(windows), every))
+        chunks = batch.pop(ACTION)[..., self._smooth]
+        numbers = chunks.new_zeros(len(chunks), 0)
+        if self.encoder.widths:
+            numbers = self.encoder.numbers(self._turned(batch))
+        self.network.fit(numbers, self.decoder.project(chunks))
+
+    def _learn_turning(self, states: list[Tensor]) -> None:
+        """Take references of orientations and, for what they make of states, the spread."""
+        turning = self.turning
+        turning.learn(states)
+        turning.whiten(torch.ones_like(turning.std), torch.zeros_like(turning.mean))
+        turned = torch.cat([turning.to_coordinates(x[:, None])[:, 0] for x in states])
+        mean, std = self.encoder.mean, self.encoder.std
+        first = slice(0, len(turning.mean))  # states come first among the numbers
+        mean[first] = turned.mean(0)
+        std[first] = turned.std(0).clamp_min(SLOWEST)
+
+    def _keep_measured(self, states: Tensor, coordinates: Tensor) -> None:
+        """Drop columns of the state whose values are not those that actions set."""
+        values = states[None, :, self.measured.clamp_min(0)].to(coordinates)
+        off = self.encoding.to_coordinates(values)[0] - coordinates
+        far = off.square().mean(0).sqrt() > MEASURED
+        for triple in self.encoding.triples:
+            far[triple] = far[triple].any()
+        self.measured[far] = -1

@@ -1,0 +1,470 @@
+"""What LeRobot, and whoever trusts a policy with an arm, may expect of `motion_chunk`."""
+
+import json
+import math
+
+import pytest
+import torch
+from lerobot.policies import get_policy_class
+from lerobot.policies.rtc import ActionQueue, RTCConfig
+from lerobot.rollout.inference.rtc import supports_rtc_inference
+from lerobot_samples import (
+    FPS,
+    GOAL,
+    STATE,
+    chunk_policy,
+    features_of,
+    played,
+    reaching,
+    stats_of,
+    windows,
+)
+
+from hrc_learn.lerobot import MotionChunkConfig
+from hrc_learn.lerobot.policy.chunk_network import ChunkDecoder
+from hrc_learn.lerobot.policy.modeling_motion_chunk import MotionChunkPolicy
+
+SHOWN = reaching(10)
+IMAGE = "observation.images.front"
+UNNAMED = {"state_names": None, "action_feature_names": None}
+RATE = 1.5
+"""Of the decay to the origin in `decaying` [1/s]."""
+
+
+def decaying(count=12, frames=80):
+    """Motions whose future is a linear function of where they are: a' = -RATE a."""
+    rng = torch.Generator().manual_seed(0)
+    time = torch.arange(frames)[:, None] / FPS
+    paths = [torch.randn(2, generator=rng) * torch.exp(-RATE * time) for _ in range(count)]
+    return [{STATE: path, "action": path} for path in paths]
+
+
+def wild(policy, seed=0):
+    """The same after a training that went astray: what is seen changes the motion wildly."""
+    rng = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for layer in (policy.network.plans, policy.network.scores, policy.network.levels):
+            layer.weight.copy_(0.3 * torch.randn(layer.weight.shape, generator=rng))
+    return policy
+
+
+def executed(policy, start, steps):
+    """Actions by a policy whose arm is where the last action sent it, (steps, A)."""
+    policy.reset()
+    where, made = start, []
+    for _ in range(steps):
+        where = policy.select_action({STATE: where[None]})[0]
+        made.append(where)
+    return torch.stack(made)
+
+
+def train(policy, episodes, steps, rate=3e-3, size=64):
+    samples, rng = windows(policy, episodes), torch.Generator().manual_seed(0)
+    optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=rate)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
+    policy.train()
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        for _ in range(steps):
+            optimizer.zero_grad()
+            policy.forward(samples.draw(size, rng))[0].backward()
+            optimizer.step()
+            schedule.step()
+    return policy.eval()
+
+
+@pytest.mark.parametrize("index", [0, 3, 9])
+def test_a_chunk_begins_in_the_state_it_is_given_and_soon_is_as_planned(index):
+    decoder = ChunkDecoder(20, 0.05, 8, blend_time=0.05)
+    rng = torch.Generator().manual_seed(0)
+    planned, state = torch.randn(3, 2, decoder.size, generator=rng), torch.zeros(3, 3, 2)
+    state[:, 0] = decoder.states(planned)[:, index, 0] + 1
+    motion = decoder.begin_in(planned, state, index)
+    reached = decoder.states(motion)[:, index]
+    torch.testing.assert_close(reached, state.double(), rtol=0, atol=1e-8)
+    off = (decoder.states(motion) - decoder.states(planned))[:, :, 0].abs()
+    torch.testing.assert_close(off[:, index], torch.ones_like(off[:, 0]), rtol=0, atol=1e-6)
+    assert off[:, index + 8 :].max() < 0.25
+    # In the state that was planned there is nothing to change.
+    same = decoder.begin_in(planned, decoder.states(planned)[:, index], index)
+    torch.testing.assert_close(same, planned.double(), rtol=0, atol=1e-8)
+
+
+def test_states_are_derivatives_of_positions():
+    decoder = ChunkDecoder(400, 0.005, 8, blend_time=0.05)
+    planned = torch.randn(1, decoder.size, generator=torch.Generator().manual_seed(0))
+    y, yd, ydd = decoder.states(planned.double())[..., 0].unbind(-1)
+    inner = slice(2, -2)
+    for value, rate in ((y, yd), (yd, ydd)):
+        (difference,) = torch.gradient(value, spacing=0.005)
+        error = (difference - rate)[inner].abs().max()
+        assert error < 2e-3 * rate.abs().max()
+
+
+def test_projection_finds_what_the_decoder_made():
+    decoder = ChunkDecoder(30, 0.05, 8, blend_time=0.05)
+    made = torch.randn(5, 3, decoder.size, generator=torch.Generator().manual_seed(0))
+    chunks = decoder.positions(made.double())
+    again = decoder.positions(decoder.project(chunks))
+    assert (again - chunks).square().mean().sqrt() < 0.02 * chunks.std()
+
+
+@pytest.mark.parametrize("steps", [1, 4, 10])
+def test_a_seam_keeps_position_velocity_and_acceleration_whatever_is_predicted(steps):
+    policy = wild(chunk_policy(SHOWN))
+    rng = torch.Generator().manual_seed(1)
+    chunk = None
+    for _ in range(4):
+        seen = {STATE: torch.randn(1, 3, generator=rng), GOAL: torch.randn(1, 2, generator=rng)}
+        left = None if chunk is None else chunk[0, steps:]
+        before = policy._chunk
+        chunk = policy.predict_action_chunk(seen, prev_chunk_left_over=left)
+        if before is None or steps == 10:
+            continue
+        # From one action to the next, of an arm that is sent from chunk to chunk.
+        torch.testing.assert_close(chunk[0, 0], left[0], rtol=0, atol=1e-5)
+        seam, end = policy._chunk.states[0, 0], before.states[0, steps]
+        torch.testing.assert_close(seam, end, rtol=0, atol=1e-5)
+
+
+def test_selected_actions_are_one_smooth_motion():
+    """At 2000 actions a second even jumps of the acceleration show."""
+    policy = chunk_policy(SHOWN, fps=2000.0, chunk_size=200, n_action_steps=50, blend_time=0.02)
+    policy = wild(policy.double())
+    rng = torch.Generator().manual_seed(0)
+    seen = {STATE: torch.zeros(1, 3), GOAL: torch.zeros(1, 2)}
+    made = []
+    for _ in range(8):
+        seen = {key: x + torch.randn(x.shape, generator=rng) for key, x in seen.items()}
+        made += [policy.select_action(seen) for _ in range(50)]
+    acceleration = torch.cat(made).diff(n=2, dim=0) * 2000**2
+    jump = acceleration.diff(dim=0).abs().amax(-1)
+    seams = torch.arange(48, len(jump), 50)
+    at_seams = torch.stack([jump[k - 1 : k + 3].max() for k in seams])
+    # A jump would be as large as accelerations are, not as they change in half a millisecond.
+    assert at_seams.max() < 0.2 * acceleration.abs().max()
+
+
+@pytest.mark.parametrize("steps", [5, 10, 25, 50])
+def test_the_motion_is_the_same_however_often_it_is_planned(steps):
+    shown = decaying()
+    policy = chunk_policy(shown, chunk_size=50, n_action_steps=steps, n_basis=10, **UNNAMED)
+    start = torch.tensor([0.8, -0.5])
+    made = executed(policy, start, 60)
+    truth = start * torch.exp(-RATE * torch.arange(60)[:, None] / FPS)
+    # Every plan sees the arm one step late, where the last action sent it.
+    torch.testing.assert_close(made, truth, rtol=0, atol=0.03)
+
+
+def test_reset_in_mid_motion_goes_on_from_there():
+    policy = chunk_policy(decaying(), chunk_size=50, n_action_steps=25, n_basis=10, **UNNAMED)
+    where = torch.tensor([0.5, 0.2])
+    whole = executed(policy, where, 60)
+    first = executed(policy, where, 13)
+    rest = executed(policy, first[-1], 40)
+    torch.testing.assert_close(rest, whole[12:52], rtol=0, atol=0.02)
+
+
+def test_the_first_action_is_where_the_arm_is_measured():
+    policy = chunk_policy(SHOWN)
+    played(policy, SHOWN[0], 13)
+    policy.reset()
+    # State is b, gripper, a.
+    elsewhere = {STATE: torch.tensor([[0.2, 0.0, -0.3]]), GOAL: SHOWN[0][GOAL][:1]}
+    torch.testing.assert_close(policy.select_action(elsewhere), torch.tensor([[-0.3, 0.2]]))
+
+
+def test_states_that_are_not_what_actions_set_are_no_beginning():
+    """As of velocities that are commanded under the names of positions."""
+    shown = [{STATE: 5 - 3 * e["action"].flip(-1), "action": e["action"]} for e in SHOWN]
+    policy = chunk_policy(shown, **UNNAMED)
+    assert (policy.measured == -1).all()
+    assert chunk_policy(SHOWN).measured.tolist() == [2, 0]
+
+
+def test_real_time_chunks_begin_with_what_will_be_carried_out_meanwhile():
+    policy = wild(chunk_policy(SHOWN))
+    assert supports_rtc_inference(policy)
+    seen = {STATE: torch.zeros(1, 3), GOAL: torch.ones(1, 2)}
+    first = policy.predict_action_chunk(seen)[0]
+    before = policy._chunk
+    other = {STATE: torch.ones(1, 3), GOAL: -torch.ones(1, 2)}
+    chunk = policy.predict_action_chunk(
+        other, inference_delay=4, prev_chunk_left_over=first[3:]
+    )[0]
+    torch.testing.assert_close(chunk[:4], first[3:7], rtol=0, atol=0)
+    now, then = policy._chunk.states[0, 4], before.states[0, 7]
+    torch.testing.assert_close(now, then, rtol=0, atol=1e-5)
+    assert (chunk[8] - first[7]).abs().max() > 0.1
+
+
+def test_lerobots_action_queue_runs_without_a_jump():
+    """Its queue cuts left-overs off and replaces chunks late, by more than was expected."""
+    policy = wild(chunk_policy(SHOWN, chunk_size=40, n_action_steps=20, fps=100.0))
+    queue, rng = ActionQueue(RTCConfig(execution_horizon=10)), torch.Generator().manual_seed(0)
+    made = []
+    for expected, real in ((0, 0), (5, 5), (5, 7), (5, 6), (3, 3)):
+        seen = {STATE: torch.randn(1, 3, generator=rng), GOAL: torch.randn(1, 2, generator=rng)}
+        left = queue.get_left_over()
+        if left is not None:
+            left = left[:10]
+        index = queue.get_action_index()
+        chunk = policy.predict_action_chunk(
+            seen, inference_delay=expected, prev_chunk_left_over=left
+        )[0]
+        made += [queue.get() for _ in range(real)]
+        queue.merge(chunk, chunk, real, index)
+        made += [queue.get() for _ in range(9)]
+    made = torch.stack(made)
+    change = made.diff(n=2, dim=0).abs().amax()
+    # Chunks by themselves, each from where the arm is measured, jump.
+    cut = []
+    for _ in range(5):
+        policy.reset()
+        seen = {STATE: torch.randn(1, 3, generator=rng), GOAL: torch.randn(1, 2, generator=rng)}
+        cut.append(policy.predict_action_chunk(seen)[0, :9])
+    jump = torch.cat(cut).diff(n=2, dim=0).abs().amax()
+    assert change < 0.2 * jump
+
+
+def test_left_over_actions_of_others_are_gone_on_with():
+    """As fast as they change, also where LeRobot fills them up with zeros."""
+    policy = wild(chunk_policy(SHOWN))
+    time = torch.arange(6)[:, None] / FPS
+    others = torch.tensor([0.3, -0.4]) + time * torch.tensor([1.0, -0.5])
+    seen = {STATE: torch.zeros(1, 3), GOAL: torch.ones(1, 2)}
+    for left in (others, torch.cat([others, torch.zeros(4, 2)])):
+        policy.reset()
+        chunk = policy.predict_action_chunk(seen, inference_delay=3, prev_chunk_left_over=left)[
+            0
+        ]
+        torch.testing.assert_close(chunk[:4], others[:4], rtol=0, atol=1e-5)
+    # Nothing left over: the arm stands at the end of the last chunk.
+    end = chunk[-1]
+    chunk = policy.predict_action_chunk(seen, prev_chunk_left_over=others[:0])[0]
+    torch.testing.assert_close(chunk[0], end, rtol=0, atol=0.3)
+
+
+def test_who_does_not_say_what_was_carried_out_is_found_on_the_chunk():
+    """As LeRobot's asynchronous server: the step is told by what is seen."""
+    policy = chunk_policy(decaying(), chunk_size=50, n_basis=10, **UNNAMED)
+    first = policy.predict_action_chunk({STATE: torch.tensor([[0.9, -0.6]])})[0]
+    for steps in (4, 11):
+        second = policy.predict_action_chunk({STATE: first[steps][None]})[0]
+        torch.testing.assert_close(second[0], first[steps], rtol=0, atol=0.02)
+        first = second
+
+
+def gripping(count=10):
+    """A gripper that shuts where the arm passes half its way, up to 1, in one step."""
+    episodes = []
+    for episode in reaching(count):
+        path = episode["action"]
+        share = path[:, :1] / path[-1, 0]
+        shut = (share > 0.5).float() * 40
+        action = torch.cat([path, shut], dim=-1)
+        episodes.append({STATE: action, "action": action})
+    return episodes
+
+
+def test_a_gripper_of_two_levels_jumps_and_never_stands_between():
+    shown = gripping()
+    policy = train(chunk_policy(shown, **UNNAMED), shown, 150)
+    assert policy.config.two_level_actions == [2]
+    right = []
+    for episode in shown[:4]:
+        made = played(policy, episode)
+        assert set(made[:, 2].tolist()) == {0.0, 40.0}
+        right.append(made[:, 2] == episode["action"][:, 2])
+    assert torch.cat(right).float().mean() > 0.93
+
+
+def test_a_gripper_that_opens_slowly_is_a_motion():
+    shown = [
+        {STATE: e[STATE], "action": torch.cat([e["action"], u[:, None]], dim=-1)}
+        for e in SHOWN
+        for u in [torch.linspace(0, 1, len(e["action"]))]
+    ]
+    assert chunk_policy(shown, **UNNAMED).config.two_level_actions == []
+
+
+def passing(count=24, frames=40):
+    """Past an obstacle at (1, 0), half of the times on either side, from the same place."""
+    rng = torch.Generator().manual_seed(0)
+    x = torch.linspace(0, 2, frames)
+    episodes = []
+    for k in range(count):
+        side = 1 if k % 2 else -1
+        y = side * 0.6 * torch.sin(math.pi * x / 2) ** 2
+        path = torch.stack([x, y + 0.02 * torch.randn((), generator=rng)], dim=-1)
+        episodes.append({STATE: path, "action": path})
+    return episodes
+
+
+def sides(policy, count):
+    """Where each of so many motions passes the obstacle."""
+    passes = []
+    for _ in range(count):
+        path = executed(policy, torch.zeros(2), 32)
+        passes.append(path[(path[:, 0] - 1).abs().argmin(), 1])
+    return torch.stack(passes)
+
+
+@pytest.mark.slow
+def test_both_ways_round_an_obstacle_are_kept_and_none_between():
+    shown = passing()
+    settings = dict(chunk_size=20, n_action_steps=5, n_basis=8, hidden_dim=64, **UNNAMED)
+    policy = train(chunk_policy(shown, sample_plans=True, **settings), shown, 1000)
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        y = sides(policy, 60)
+    in_a_mode = (y.abs() - 0.6).abs() < 0.2
+    assert in_a_mode.float().mean() >= 0.95
+    assert 0.25 < (y > 0).float().mean() < 0.75
+    # The likeliest is one of them, always the same.
+    policy.config.sample_plans = False
+    assert sides(policy, 2).diff().abs() == 0
+
+
+def with_images(episodes, keep):
+    rng = torch.Generator().manual_seed(0)
+    return [
+        {key: e[key] for key in keep}
+        | {IMAGE: torch.rand(len(e["action"]), 3, 16, 24, generator=rng)}
+        for e in episodes
+    ]
+
+
+SEEN = {
+    "state": [{k: e[k] for k in (STATE, "action")} for e in SHOWN],
+    "state and environment": SHOWN,
+    "environment": [{k: e[k] for k in (GOAL, "action")} for e in SHOWN],
+    "state and image": with_images(SHOWN, (STATE, "action")),
+    "image": with_images(SHOWN, ("action",)),
+    "gripper": gripping(),
+}
+
+
+@pytest.mark.parametrize(("name", "episodes"), SEEN.items(), ids=SEEN)
+def test_losses_chunks_and_gradients_whatever_it_sees(name, episodes):
+    names = UNNAMED if name == "gripper" else {}
+    policy = wild(chunk_policy(episodes, **names))
+    width = episodes[0]["action"].shape[1]
+    batch = windows(policy, episodes).draw(6, torch.Generator().manual_seed(0))
+    policy.eval()
+    loss, values = policy.forward(batch)
+    each, _ = policy.forward(batch, reduction="none")
+    assert loss.shape == ()
+    torch.testing.assert_close(each.mean(), loss)
+    assert values["rmse"] > 0
+    policy.train()
+    policy.forward(batch)[0].backward()
+    for parameter_name, parameter in policy.named_parameters():
+        if parameter.numel():
+            assert parameter.grad is not None, parameter_name
+            assert parameter.grad.isfinite().all(), parameter_name
+            assert parameter.grad.any(), parameter_name
+    now = {key: episodes[0][key][:2] for key in episodes[0] if key != "action"}
+    assert policy.predict_action_chunk(now).shape == (2, 10, width)
+    assert policy.predict_action_chunk(now).shape == (2, 10, width)
+    policy.reset()
+    assert policy.select_action(now).shape == (2, width)
+
+
+def test_padding_is_not_learned():
+    policy = chunk_policy(SHOWN).eval()
+    samples = windows(policy, SHOWN)
+    # The last frames of an episode, the middle of it, the last of another.
+    batch = samples.batch(torch.tensor([len(SHOWN[0]["action"]) - 2, 5, len(samples) - 1]))
+    loss, _ = policy.forward(batch)
+    absent = batch["action_is_pad"].clone()
+    # Before the beginning an arm stands where it begins: that much is known of it.
+    absent[:, :5] = False
+    batch["action"] = torch.where(absent[..., None], 100.0, batch["action"])
+    torch.testing.assert_close(policy.forward(batch)[0], loss, rtol=0, atol=1e-5)
+
+
+def test_training_takes_up_what_the_closed_form_leaves():
+    """Goals in the cube root of what is seen: no straight line fits, the network does."""
+    bent = [e | {GOAL: e[GOAL].sign() * e[GOAL].abs() ** 3} for e in SHOWN]
+    policy = chunk_policy(bent)
+    samples = windows(policy, bent)
+    some = samples.batch(torch.arange(0, len(samples), 10))
+    before, _ = policy.eval().forward(some)
+    after, _ = train(policy, bent, 100).forward(some)
+    assert after < 0.7 * before
+
+
+def test_a_hand_that_points_down_turns_without_a_jump():
+    """Half a turn from the base frame, where a rotation vector changes its sign."""
+    names = ["ee.wx", "ee.wy", "ee.wz"]
+    tilt = torch.linspace(-0.3, 0.3, 40)
+    turn = torch.pi + tilt
+    turn = torch.where(turn > torch.pi, turn - 2 * torch.pi, turn)
+    vectors = torch.stack([turn, torch.zeros(40), torch.zeros(40)], dim=-1)
+    episode = {STATE: vectors, "action": vectors}
+    policy = chunk_policy([episode], state_names=names, action_feature_names=names)
+    assert policy.config.two_level_actions == []
+    assert played(policy, episode).diff(dim=0).abs().max() < 0.06
+
+
+def test_a_checkpoint_brings_everything(tmp_path):
+    shown = gripping()
+    policy = wild(chunk_policy(shown, **UNNAMED))
+    policy.save_pretrained(tmp_path)
+    assert {p.name for p in tmp_path.iterdir()} == {"config.json", "model.safetensors"}
+    assert json.loads((tmp_path / "config.json").read_text())["two_level_actions"] == [2]
+    loaded = get_policy_class("motion_chunk").from_pretrained(tmp_path)
+    assert isinstance(loaded, MotionChunkPolicy)
+    torch.testing.assert_close(played(loaded, shown[1]), played(policy, shown[1]))
+    weights = tmp_path / "model.safetensors"
+    weights.write_bytes(weights.read_bytes()[:-100])
+    with pytest.raises(ValueError, match=r"model\.safetensors is damaged"):
+        MotionChunkPolicy.from_pretrained(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"fps": None}, "how many actions a second"),
+        ({"n_action_steps": 11}, "1 to chunk_size"),
+        ({"n_obs_steps": 2}, "sees one step"),
+        ({"n_plans": 0}, "n_plans must be at least 1"),
+        ({"blend_time": 0.0}, "blend_time must be positive"),
+        ({"chunk_size": 3, "n_action_steps": 1}, "chunk_size must be at least 4"),
+        ({"two_level_actions": [2]}, "two_level_actions"),
+    ],
+)
+def test_settings_that_make_no_policy(changes, message):
+    with pytest.raises(ValueError, match=message):
+        chunk_policy(SHOWN, **changes)
+
+
+@pytest.mark.parametrize(
+    ("state", "message"),
+    [
+        ({}, "'motion_chunk' needs observation.state"),
+        ({STATE: torch.zeros(1, 4)}, "3 values in observation.state.* has 4"),
+        ({STATE: torch.tensor([[0.0, 0.0, torch.nan]])}, r"not finite in a\.pos"),
+    ],
+)
+def test_states_that_cannot_be_used_are_named(state, message):
+    policy, seen = chunk_policy(SHOWN), {GOAL: SHOWN[0][GOAL][:1]} | state
+    with pytest.raises(ValueError, match=message):
+        policy.select_action(seen)
+    with pytest.raises(ValueError, match=message):
+        policy.predict_action_chunk(seen)
+
+
+def test_a_negative_delay_is_refused():
+    seen = {STATE: torch.zeros(1, 3), GOAL: torch.zeros(1, 2)}
+    with pytest.raises(ValueError, match="inference_delay must not be negative, got -1"):
+        chunk_policy(SHOWN).predict_action_chunk(seen, inference_delay=-1)
+
+
+def test_statistics_that_cannot_be_used_are_named():
+    stats = stats_of(SHOWN)
+    del stats["action"]["max"]
+    config = MotionChunkConfig(**features_of(SHOWN[0]), fps=FPS, device="cpu")
+    with pytest.raises(ValueError, match="lack max of action"):
+        MotionChunkPolicy(config, dataset_stats=stats)
