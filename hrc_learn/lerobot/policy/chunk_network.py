@@ -12,6 +12,8 @@ from hrc_learn.dmp.motion_head import MotionHead
 
 # Chunks as a motion: a linear map of few numbers, with its derivatives.
 
+NOISE = 1e-2
+"""Of demonstrated actions over their spread: what it hides is not learned."""
 TINY = 1e-9
 """Added to what is inverted, so that it can be."""
 
@@ -52,7 +54,9 @@ class ChunkDecoder(nn.Module):
         maps = torch.stack([position, velocity, acceleration, jerk])
         # Both follow from the settings; in double precision, as jerk spans many magnitudes.
         self.register_buffer("maps", maps, persistent=False)
-        self.register_buffer("projection", torch.linalg.pinv(position), persistent=False)
+        normal = position.T @ position + NOISE**2 * unit
+        projection = torch.linalg.solve(normal, position.T)
+        self.register_buffer("projection", projection, persistent=False)
 
     @property
     def size(self) -> int:
