@@ -6,7 +6,8 @@ the derivatives L of the pixel by the camera's twist (its interaction matrix). O
 seconds, e is fitted by one such motion; how much of it that explains, as the root mean square
 over the frames, is compared with what the demonstrations themselves show at most when each of
 them is left out of the fit. Errors of calibration, lens and stamps are within that, and so do
-not raise an alarm.
+not raise an alarm. Where no demonstration went, nothing is known of these errors, and nothing
+is compared.
 """
 
 from __future__ import annotations
@@ -81,6 +82,14 @@ class CameraReference:
     """Displacement beyond which the camera was moved [px]."""
     window: float
     """Over which the threshold was measured [s]."""
+    lower: tuple[float, float, float]
+    """Corner of the box in which demonstrations showed the marker, in the camera frame [m]."""
+    upper: tuple[float, float, float]
+    """The opposite one."""
+
+    def covers(self, point: Float[np.ndarray, "3"]) -> bool:
+        """Whether demonstrations showed the marker at or around a point of the camera frame."""
+        return bool(((point >= self.lower) & (point <= self.upper)).all())
 
     @staticmethod
     def fit(
@@ -119,7 +128,7 @@ class CameraReference:
         for fold in range(folds):
             others = [d for i, d in enumerate(demonstrations) if i % folds != fold]
             camera = _camera_of(others, image_size)
-            watch = CameraWatch(CameraReference(camera=camera, threshold=np.inf, window=window))
+            watch = CameraWatch(_reference(camera, others, np.inf, window))
             for demo in demonstrations[fold::folds]:
                 largest = max(largest, _largest_displacement(watch, demo, fps))
         if not largest:
@@ -128,7 +137,7 @@ class CameraReference:
                 "demonstration: there is nothing to compare with."
             )
         camera = _camera_of(demonstrations, image_size)
-        return CameraReference(camera=camera, threshold=margin * largest, window=window)
+        return _reference(camera, demonstrations, margin * largest, window)
 
     def content(self) -> dict[str, Any]:
         """As JSON takes it."""
@@ -142,21 +151,34 @@ class CameraReference:
             ValueError: A field is missing or of another kind.
         """
         try:
-            fields: dict[str, Any] = {
-                name: tuple(map(float, value))
-                if isinstance(value, list | tuple)
-                else float(value)
-                for name, value in content["camera"].items()
-            }
-            return CameraReference(
-                camera=MarkerCamera(**fields),
-                threshold=float(content["threshold"]),
-                window=float(content["window"]),
-            )
+            camera = MarkerCamera(**_numbers(content["camera"]))
+            return CameraReference(**{**_numbers({**content, "camera": 0.0}), "camera": camera})
         except (KeyError, TypeError, AttributeError) as error:
             raise ValueError(
-                f"a camera's reference has camera, threshold and window, this one not: {error}."
+                "a camera's reference has camera, threshold, window, lower and upper, this one "
+                f"not: {error}."
             ) from error
+
+
+def _numbers(content: dict[str, Any]) -> dict[str, Any]:
+    """With tuples where JSON has lists."""
+    return {
+        name: tuple(map(float, value)) if isinstance(value, list | tuple) else float(value)
+        for name, value in content.items()
+    }
+
+
+def _reference(
+    camera: MarkerCamera,
+    demonstrations: Sequence[ImageDemonstration],
+    threshold: float,
+    window: float,
+) -> CameraReference:
+    points = np.concatenate([camera.points(_seen(demo)[0]) for demo in demonstrations])
+    lower, upper = (tuple(corner.tolist()) for corner in (points.min(0), points.max(0)))
+    return CameraReference(
+        camera=camera, threshold=threshold, window=window, lower=lower, upper=upper
+    )
 
 
 class _Frame(NamedTuple):
@@ -190,6 +212,8 @@ class CameraWatch:
     ) -> CameraMotion | None:
         """Take one frame in which the marker was found.
 
+        It does not count where the tool is outside the region of the demonstrations.
+
         Args:
             time: Of the image [s], later than the frame's before.
             pose: Of the tool at that time, unbatched.
@@ -214,16 +238,17 @@ class CameraWatch:
             )
         camera = self.reference.camera
         point = camera.points(_double(pose))
-        frames.append(
-            _Frame(
-                time,
-                point,
-                pixel,
-                pixel - camera.project(point),
-                camera.motion_jacobian(point),
+        if self.reference.covers(point):
+            frames.append(
+                _Frame(
+                    time,
+                    point,
+                    pixel,
+                    pixel - camera.project(point),
+                    camera.motion_jacobian(point),
+                )
             )
-        )
-        while frames[0].time < time - self.reference.window:
+        while frames and frames[0].time < time - self.reference.window:
             frames.popleft()
         if len(frames) < _FEWEST:
             self.displacement = 0.0

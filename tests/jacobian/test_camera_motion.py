@@ -152,6 +152,24 @@ def test_a_marker_half_covered_is_no_motion(reference):
     assert not any(run(CameraWatch(reference), fresh))
 
 
+def test_frames_where_no_demonstration_went_do_not_count(reference, demonstrations):
+    rng = np.random.default_rng(11)
+    knocked = moved(np.deg2rad([2.0, 0.0, 0.0]), np.zeros(3))
+    outside = demonstration(rng, knocked, middle=(2.0, 0.0, 0.2))
+    watch = CameraWatch(reference)
+    assert not any(run(watch, outside))
+    assert watch.displacement == 0.0
+    everywhere = np.concatenate(
+        [reference.camera.points(demo.pose[demo.visible]) for demo in demonstrations]
+    )
+    assert all(map(reference.covers, everywhere))
+    width = np.subtract(reference.upper, reference.lower)
+    for axis in np.eye(3):
+        for corner, away in ((reference.lower, -1e-6), (reference.upper, 1e-6)):
+            assert reference.covers(np.asarray(corner, float))
+            assert not reference.covers(np.asarray(corner, float) + away * width * axis)
+
+
 def test_what_was_seen_before_a_pause_is_forgotten(reference):
     watch = CameraWatch(reference)
     knocked = demonstration(
@@ -173,7 +191,7 @@ def test_frames_out_of_order_and_without_numbers_are_refused(reference):
 def test_a_reference_survives_json(reference):
     again = CameraReference.from_content(json.loads(json.dumps(reference.content())))
     assert again == reference
-    with pytest.raises(ValueError, match="threshold"):
+    with pytest.raises(ValueError, match="upper"):
         CameraReference.from_content({"camera": reference.content()["camera"]})
 
 
