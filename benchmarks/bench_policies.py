@@ -125,7 +125,7 @@ def _statistics(episodes: Sequence[Episode]) -> dict[str, dict[str, Tensor]]:
     return stats
 
 
-def _rms(parts: Sequence[Tensor]) -> float:
+def _rms(parts: list[Tensor]) -> float:
     return float(torch.cat(parts).double().square().mean().sqrt())
 
 

@@ -98,7 +98,7 @@ class CameraReference:
         image_size: tuple[int, int],
         *,
         window: float = 1.0,
-        margin: float = 2.0,
+        margin: float = 2.5,
     ) -> CameraReference:
         """Learn where the marker must be seen, and how far off it is without any motion.
 
