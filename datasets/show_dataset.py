@@ -1,4 +1,4 @@
-"""Look at the demonstrations of a LeRobot dataset: a Rerun recording of all of them.
+"""Look at the demonstrations of a LeRobot dataset, or at a run or a fit, in Rerun.
 
 The same as `hrc show`.
 """

@@ -105,7 +105,7 @@ LAZY_LIBRARIES: dict[str, set[str]] = {
     "demos": {"av", "scipy"},
     "vision": {"cv2"},
     "sim": {"franky_sim"},
-    "viz": {"rich"},
+    "viz": {"av", "rich"},
     "hardware": {"franky", "pylibfranka", "cv2"},
     "teleoperation": {"viser", "pygame", "websockets", "msgspec", "trimesh", "cv2"},
     "experiments": {"rich"},

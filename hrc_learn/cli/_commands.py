@@ -60,7 +60,9 @@ COMMANDS: dict[str, Command] = {
     "import": Command(
         "arrays to a LeRobot dataset", "convert.import_arrays", "dataset.ImportArrays"
     ),
-    "show": Command("demonstrations in Rerun", "show.show", "dataset.Show", ("dataset",)),
+    "show": Command(
+        "a run, a fit or demonstrations in Rerun", "show.show", "dataset.Show", ("path",)
+    ),
     "check": Command(
         "errors and oddities by file, episode, frame and key",
         "check.check",

@@ -29,7 +29,10 @@ _NAMES = 26
 """Columns that option names take; a longer one has its text below."""
 _WIDEST = 100
 """Lines longer than this read badly."""
-_LAST = ("camera", "trials", "processes", "seed", "robot", "serve", "overwrite", "json")
+_LAST = (
+    *("camera", "trials", "processes", "seed", "robot"),
+    *("film", "verbose", "serve", "overwrite", "json"),
+)
 """Options that many commands share come after those that are a command's own."""
 
 

@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
+from hrc_learn.experiments.film import film
 from hrc_learn.experiments.imperfection_curve import curve_section
 from hrc_learn.experiments.metric_table import Evaluation, Metric, Summary, evaluate
 from hrc_learn.experiments.monte_carlo import Run as TrialRun
@@ -27,10 +28,13 @@ from hrc_learn.skills.work_cell import TaskFailedError
 from hrc_learn.store import new_folder, write_json
 from hrc_learn.viz import LoggedSteps, RunRecording
 from hrc_learn.viz.report import (
+    FILM,
+    PAGE,
     Measurement,
     Picture,
     Report,
     Section,
+    show_command,
     show_measurements,
     software_versions,
     write_report,
@@ -50,6 +54,8 @@ class Observer:
 
 UNOBSERVED = Observer()
 
+RUN = "run"
+"""Name of the recording of the run itself, among those that an experiment makes."""
 TRIALS = "trials"
 """Name of the study whose statistics are the experiment's own."""
 
@@ -239,6 +245,10 @@ class RunOptions:
     """Serve the dashboard of the run in the browser while it goes on."""
     serving: LiveViewConfig = field(default_factory=LiveViewConfig)
     """Where, with --serve."""
+    film: bool = True
+    """Make a film of the run, in the folder and in the report."""
+    verbose: bool = False
+    """Show all that was measured, not just the first of it."""
     overwrite: bool = False
     """Replace an older run in that folder."""
     json: Path | None = None
@@ -315,15 +325,21 @@ def _conduct[Run](
             for name, file in files.items()
         }
         results = Results.of(experiment, run, options.seed, trials)
-        with console.status("Writing recordings and report"):
+        with console.status("Writing recordings"):
             recordings = experiment.recordings(run)
             for name, recording in recordings.items():
                 record_run(folder / f"{name}.rrd", recording)
             experiment.log(run).save(folder / "log.npz")
+        shown = None
+        if options.film and (recording := recordings.get(RUN)) is not None:
+            with console.status("Making the film"):
+                shown = film(recording)
+        with console.status("Writing the report"):
             report = Report(
                 title=experiment.title,
                 summary=experiment.summary,
                 table=results.table,
+                film=shown,
                 sections=(
                     *experiment.sections(run, recordings),
                     *(studies[name].section(known) for name, known in trials.items()),
@@ -341,13 +357,16 @@ def _conduct[Run](
         file.unlink()
     if options.json is not None:
         write_json(options.json, results.values)
-    show_measurements(results.table)
+    show_measurements(results.table, options.verbose)
     for name, known in trials.items():
         console.print(Summary.of(known).table(studies[name].title))
     if results.failure:
         print(f"failed: {results.failure}", file=sys.stderr)
-    console.print(f"Recordings rerun {options.out / '*.rrd'}")
-    console.print(f"Report     {options.out / 'report.html'}")
+    # On lines of their own and unbroken, to be pasted whatever the width of the terminal.
+    print(f"Report: {shlex.quote(str(options.out / PAGE))}")
+    if shown is not None:
+        print(f"Film: {shlex.quote(str(options.out / FILM))}")
+    print(f"Dashboard: {show_command(options.out)}")
     return 0 if results.ok else 1
 
 

@@ -14,6 +14,7 @@ from hrc_learn.sim.cameras import OffscreenRenderer as OffscreenRenderer
 from hrc_learn.sim.cameras import RenderingUnavailableError as RenderingUnavailableError
 from hrc_learn.sim.cameras import ScriptedOcclusion as ScriptedOcclusion
 from hrc_learn.sim.cameras import open_camera as open_camera
+from hrc_learn.sim.drawn_world import RecordedWorld as RecordedWorld
 from hrc_learn.sim.imperfections import CommandChannel as CommandChannel
 from hrc_learn.sim.imperfections import DrawnImperfections as DrawnImperfections
 from hrc_learn.sim.imperfections import Imperfections as Imperfections

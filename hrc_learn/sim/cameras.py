@@ -16,7 +16,7 @@ from jaxtyping import Float, UInt8
 from hrc_learn.geometry import quaternion
 from hrc_learn.geometry.shapes import Colour
 from hrc_learn.protocols import Camera
-from hrc_learn.sim.drawn_world import DrawnWorld
+from hrc_learn.sim.drawn_world import DrawnWorld, RecordedWorld
 from hrc_learn.sim.scene import (
     HAND_MARKER,
     NOWHERE,
@@ -84,14 +84,20 @@ class Arrow:
 class OffscreenRenderer:
     """Renders a world from ideal pinhole cameras into arrays."""
 
-    def __init__(self, world: World, width: int, height: int):
+    def __init__(self, world: World | RecordedWorld, width: int, height: int):
         """Open an OpenGL context.
+
+        Args:
+            world: As it is whenever it is rendered, or a run that is shown again.
+            width: Of the images [px].
+            height: Of the images [px].
 
         Raises:
             RenderingUnavailableError: If there is no EGL (on Linux) or no OpenGL to be had.
         """
         self._gl = _open_context(width, height)
-        self._size, self._drawn = (width, height), DrawnWorld(world)
+        self._size = (width, height)
+        self._drawn = DrawnWorld(world) if isinstance(world, World) else world
         model = self._drawn.model
         model.vis.global_.offwidth = max(width, model.vis.global_.offwidth)
         model.vis.global_.offheight = max(height, model.vis.global_.offheight)

@@ -8,10 +8,13 @@ state of the first.
 from collections.abc import Iterable
 
 import mujoco
+import numpy as np
 
-from hrc_learn.geometry import MeshFile, read_mesh
-from hrc_learn.geometry.shapes import Colour
+from hrc_learn.geometry import Body, MeshFile, read_mesh
+from hrc_learn.geometry.shapes import Box, Colour
+from hrc_learn.sim.scene import add_surroundings
 from hrc_learn.sim.world import World
+from hrc_learn.viz import RunRecording
 from hrc_learn.viz.arm_bodies import arm_meshes
 
 # pyright: reportAttributeAccessIssue=false
@@ -71,6 +74,80 @@ class DrawnWorld:
                 self.model.geom_rgba[own & (self.model.geom_group == _SHOWN)] = colour
             else:
                 self.model.geom_rgba[geom.id] = colour
+
+
+class RecordedWorld:
+    """A run as its recording shows it, to be rendered at any of its steps.
+
+    It needs no more than the recording: a run of any task, in simulation or not, can be looked
+    at without the world that it ran in.
+
+    Attributes:
+        model: To be rendered. Its bodies have no joints; each is put where it was.
+        data: As the run was at the last `show`.
+    """
+
+    def __init__(self, recording: RunRecording):
+        self._bodies = recording.bodies
+        spec = mujoco.MjSpec()
+        spec.compiler.degree = False
+        add_surroundings(spec)
+        for box in recording.boxes:
+            _add_drawn_box(spec.worldbody, box)
+        for number, body in enumerate(recording.bodies):
+            _add_drawn_body(spec, body, f"body{number}")
+        self.model = spec.compile()
+        self.data = mujoco.MjData(self.model)
+        self.show(0)
+
+    def show(self, step: int) -> None:
+        """Put everything where it was at a step."""
+        for number, body in enumerate(self._bodies):
+            self.data.mocap_pos[number] = body.position[step]
+            self.data.mocap_quat[number] = body.orientation[step]
+        self.update()
+
+    def update(self) -> None:
+        """Make ready to be rendered."""
+        mujoco.mj_kinematics(self.model, self.data)
+        mujoco.mj_camlight(self.model, self.data)
+
+    def paint(self, geoms: Iterable[str], colour: Colour) -> None:
+        """Nothing stands out: a recording does not know what touched what."""
+
+
+def _add_drawn_body(spec: mujoco.MjSpec, body: Body, name: str) -> None:
+    drawn = spec.worldbody.add_body(name=name, mocap=True)
+    for mesh in body.meshes:
+        add_mesh(spec, drawn, mesh)
+    for box in body.boxes:
+        if box.name or not body.meshes:  # as in every other picture of a body
+            _add_drawn_box(drawn, box)
+    for capsule in () if body.meshes else body.capsules:
+        ends = np.array([*capsule.start, *capsule.end])
+        if np.allclose(ends[:3], ends[3:]):  # a capsule without a length has no direction
+            drawn.add_geom(
+                type=mujoco.mjtGeom.mjGEOM_SPHERE,
+                size=(capsule.radius, 0, 0),
+                pos=capsule.start,
+                rgba=capsule.colour,
+            )
+            continue
+        drawn.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+            size=(capsule.radius, 0, 0),
+            fromto=ends,
+            rgba=capsule.colour,
+        )
+
+
+def _add_drawn_box(body: mujoco.MjsBody, box: Box) -> None:
+    body.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        size=box.half_size,
+        pos=box.centre,
+        rgba=box.colour,
+    )
 
 
 def add_mesh(spec: mujoco.MjSpec, body: mujoco.MjsBody, mesh: MeshFile) -> None:

@@ -174,7 +174,7 @@ def build_scene(config: SceneConfig) -> mujoco.MjSpec:
     spec = mujoco.MjSpec()
     spec.modelname = "hrc_learn workplace"
     _set_options(spec, config)
-    _add_surroundings(spec)
+    add_surroundings(spec)
     add_arm(spec, config.arm)
     for box in config.boxes():
         _add_box(spec, box)
@@ -200,15 +200,16 @@ def _set_options(spec: mujoco.MjSpec, config: SceneConfig) -> None:
     spec.option.noslip_iterations = 3
     spec.visual.global_.offwidth = config.camera.width
     spec.visual.global_.offheight = config.camera.height
+
+
+def add_surroundings(spec: mujoco.MjSpec) -> None:
+    """Add light, floor, pedestal and sky, and say how finely they are drawn."""
     spec.visual.quality.offsamples = 0  # four times cheaper without a GPU
     spec.visual.quality.shadowsize = 0
     spec.visual.headlight.ambient = (0.45, 0.45, 0.45)
     spec.visual.headlight.diffuse = (0.35, 0.35, 0.35)
     spec.visual.headlight.specular = (0.0, 0.0, 0.0)
     spec.visual.map.znear = 0.02
-
-
-def _add_surroundings(spec: mujoco.MjSpec) -> None:
     spec.add_texture(
         name="sky",
         type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,

@@ -1,6 +1,8 @@
 """The commands for datasets as a user runs them: results, messages, exit status."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +10,7 @@ import pytest
 from commands import hrc
 from lerobot_folders import joint_path, write_folder
 
+from hrc_learn.cli.commands import show
 from hrc_learn.demos import DatasetWriter, load_demos
 
 ROOT = Path(__file__).parents[2]
@@ -206,6 +209,58 @@ def test_demonstrations_are_shown_in_a_recording(recording, tmp_path):
     assert hrc("show", tmp_path / "set", "--out", out, "--json", figures).status == 0
     assert out.stat().st_size > 1000
     assert json.loads(figures.read_text()) == {"episodes": 1, "seconds": pytest.approx(0.597)}
+
+
+@pytest.fixture
+def viewer(monkeypatch):
+    """Command lines that would open a viewer, instead of doing so."""
+    opened = []
+
+    def start(command, check):
+        assert all(Path(word).is_file() for word in command if word.endswith(".rrd"))
+        opened.append(command)
+        return subprocess.CompletedProcess(command, 0)
+
+    monkeypatch.setattr(show.subprocess, "run", start)
+    return opened
+
+
+def test_recordings_of_a_folder_are_opened_the_run_first(viewer, tmp_path, monkeypatch):
+    monkeypatch.setenv("DISPLAY", ":0")
+    for name in ("compared.rrd", "run.rrd", "log.npz"):
+        (tmp_path / name).touch()
+    assert hrc("show", tmp_path).status == 0
+    (command,) = viewer
+    assert command[:3] == [sys.executable, "-m", "rerun"]
+    assert command[3:] == [str(tmp_path / "run.rrd"), str(tmp_path / "compared.rrd")]
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="has a screen")
+def test_without_a_screen_a_recording_is_served_to_this_machine_alone(
+    viewer, tmp_path, monkeypatch
+):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    (tmp_path / "run.rrd").touch()
+    shown = hrc("show", tmp_path / "run.rrd")
+    assert (shown.status, "no screen" in shown.output) == (0, True)
+    assert viewer[0][3:6] == ["--serve-web", "--bind", "127.0.0.1"]
+
+
+def test_demonstrations_are_opened_from_a_recording_that_does_not_stay(
+    viewer, recording, tmp_path
+):
+    hrc("import", recording, "--out", tmp_path / "set", "--joints", "q", "--time", "t")
+    assert hrc("show", tmp_path / "set", "--web").status == 0
+    assert not Path(viewer[0][-1]).exists()
+
+
+def test_what_cannot_be_shown_is_said(viewer, tmp_path):
+    (tmp_path / "run.rrd").touch()
+    refused = hrc("show", tmp_path, "--out", tmp_path / "demos.rrd")
+    assert (refused.status, "recorded already" in refused.error) == (2, True)
+    assert "is not there" in hrc("show", tmp_path / "nowhere").error
+    assert not viewer
 
 
 def test_saved_episodes_are_recovered(tmp_path):

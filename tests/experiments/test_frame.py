@@ -120,6 +120,7 @@ def test_a_new_experiment_is_run_repeated_and_reported(work):
     assert {path.name for path in folder.iterdir()} == {
         ".manifest.json",
         "figures",
+        "film.mp4",
         "log.npz",
         "made_by.json",
         "measured.json",

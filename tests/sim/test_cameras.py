@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from sample_runs import sample_run
 
-from hrc_learn.geometry import Pose
+from hrc_learn.geometry import Body, Box, Capsule, Pose
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import (
     HAND_MARKER,
@@ -15,6 +16,7 @@ from hrc_learn.sim import (
     ChangingCamera,
     EGLCamera,
     OcclusionInterval,
+    RecordedWorld,
     RenderingUnavailableError,
     SceneConfig,
     ScriptedOcclusion,
@@ -232,3 +234,30 @@ def test_images_come_from_the_camera_of_the_day():
     assert (camera.read() != before).all()
     assert [time for time, _ in camera.history] == [-np.inf, 3.5]
     assert camera.model is other
+
+
+def test_a_recorded_run_has_its_bodies_where_they_were():
+    run = sample_run()
+    steps = np.arange(len(run.time))
+    turn = np.stack([np.cos(0.01 * steps), 0 * steps, 0 * steps, np.sin(0.01 * steps)], axis=-1)
+    place = np.stack([0.01 * steps, 0 * steps, 0.3 + 0 * steps], axis=-1)
+    shapes = {
+        "boxes": (Box(centre=(0.1, 0.0, 0.0), half_size=(0.01, 0.02, 0.03)),),
+        "capsules": (
+            Capsule(start=(0.0, 0.0, 0.0), end=(0.2, 0.0, 0.0), radius=0.02),
+            Capsule(start=(0.0, 0.3, 0.0), end=(0.0, 0.3, 0.0), radius=0.02),
+        ),
+    }
+    body = Body(name="it", position=place, orientation=turn, **shapes)
+    world = RecordedWorld(sample_run(bodies=(body,), boxes=()))
+    drawn = np.flatnonzero(world.model.geom_bodyid == world.model.body("body0").id)
+    middles = np.array([[0.1, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.3, 0.0]])
+    for step in (0, 50, 100):
+        world.show(step)
+        angle = 0.02 * step
+        R = np.array(
+            [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
+        )
+        np.testing.assert_allclose(
+            world.data.geom_xpos[drawn], middles @ R.T + place[step], atol=1e-9
+        )

@@ -2,6 +2,8 @@ import base64
 import math
 import platform
 import re
+import shutil
+import sys
 from dataclasses import replace
 from html.parser import HTMLParser
 from io import BytesIO
@@ -13,13 +15,16 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from hrc_learn.viz.report import (
+    Film,
     Measurement,
     Picture,
     Report,
     Section,
     flatten,
+    leading,
     read_report,
     reports_page,
+    show_command,
     show_measurements,
     software_versions,
     write_report,
@@ -244,6 +249,52 @@ def test_measurements_are_printed_beside_their_targets(capsys):
     assert "│ a │ 1 │ ≤ 2 │ ok │" in lines
     assert "│ b │ 3 │ ≤ 2 │ missed │" in lines
     assert "│ c │ 3 │ │ │" in lines
+
+
+def test_the_first_values_are_those_missed_and_those_with_targets(capsys):
+    table = [FREE, GOOD, replace(BAD, name="worst"), replace(FREE, name="d")]
+    assert leading(table, 2) == ((table[1], table[2]), (table[0], table[3]))
+    assert leading(table, 0) == ((table[2],), (table[0], table[1], table[3]))
+    show_measurements([replace(GOOD, name=f"v{i}") for i in range(20)])
+    shown = capsys.readouterr().out
+    assert "v7" in shown
+    assert "v8" not in shown
+    assert "12 more: --verbose" in shown
+    show_measurements([replace(GOOD, name=f"v{i}") for i in range(20)], everything=True)
+    assert "v19" in capsys.readouterr().out
+
+
+def test_other_values_are_folded():
+    html = reports_page("x", [report(table=[replace(GOOD, name=f"v{i}") for i in range(9)])])
+    seen, folded = html.split("<summary>3 more values</summary>")
+    assert "<td>v5</td>" in seen
+    assert "<td>v6</td>" in folded.split("</details>")[0]
+
+
+def test_the_command_that_opens_a_dashboard_is_that_of_this_python(monkeypatch, tmp_path):
+    python = tmp_path / "bin" / "python"
+    monkeypatch.setattr(sys, "executable", str(python))
+    monkeypatch.setattr(shutil, "which", lambda name: None)
+    monkeypatch.chdir(tmp_path)
+    assert show_command("a run") == "bin/python -m hrc_learn.cli show 'a run'"
+    python.parent.mkdir()
+    (tmp_path / "bin" / "hrc").touch()
+    assert show_command("run") == "bin/hrc show run"
+    monkeypatch.setattr(shutil, "which", lambda name: str(tmp_path / "bin" / "hrc"))
+    assert show_command("run") == "hrc show run"
+
+
+def test_a_film_is_in_the_page_and_in_the_folder(tmp_path):
+    film = Film(b"an mp4", "The run & more")
+    write_report(tmp_path, report(film=film))
+    assert (tmp_path / "film.mp4").read_bytes() == film.mp4
+    assert read_report(tmp_path).film == film
+    html = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "video" in Page(html).tags
+    encoded = re.search(r"data:video/mp4;base64,([^\"]+)", html)
+    assert encoded
+    assert base64.b64decode(encoded[1]) == film.mp4
+    assert "The run &amp; more" in html
 
 
 def test_several_reports_are_listed_with_their_verdicts_first():

@@ -144,19 +144,24 @@ class ImportArrays(Measured):
 
 @dataclass(frozen=True, kw_only=True)
 class Show(Measured):
-    """Look at the demonstrations of a LeRobot dataset: a Rerun recording of all of them.
+    """Look at a run, a fit, or the demonstrations of a LeRobot dataset in Rerun.
 
-    Paths of the end effector in 3D with the arm (a Panda; of other robots the paths alone),
-    every joint of all demonstrations over one another, and for each what else was recorded:
-    image feature, the person's effort, gripper.
+    Opens the dashboards that a command left in a folder. Of a dataset it makes one: paths of
+    the end effector in 3D with the arm (a Panda; of other robots the paths alone), every joint
+    of all demonstrations over one another, and for each what else was recorded: image feature,
+    the person's effort, gripper.
     """
 
-    dataset: Path
-    """Folder of the dataset, version 2.0, 2.1 or 3.0."""
-    out: Path
-    """Recording to write, as .rrd; replaces an older one."""
+    path: Path
+    """Folder of a run or a fit, a recording (.rrd), or the folder of a dataset of version 2.0,
+    2.1 or 3.0."""
+    out: Path | None = None
+    """Recording of a dataset to write, as .rrd, instead of opening it; replaces an older
+    one."""
+    web: bool = False
+    """Open it in the browser, as where there is no screen; ends with Ctrl-C."""
     episodes: tuple[int, ...] = ()
-    """Episodes to show; all when empty."""
+    """Episodes of a dataset to show; all when empty."""
     units: dict[str, str] = field(default_factory=dict)
     """Units on disk by quantity, such as: joint_position deg position mm."""
 

@@ -47,6 +47,10 @@ class Demo(Imperfect, OfRobot, Measured):
     """Where to put the object; the middle shelf is the demonstrated one."""
     seed: int = 0
     """Seed of where the object lies and of image noise."""
+    film: bool = True
+    """Make a film of the run, in its folder and its report."""
+    verbose: bool = False
+    """Show all that was measured, not just the first of it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,6 +68,10 @@ class RunExperiment(Imperfect, OfRobot, Led, Written):
     curve: More[tuple[float, ...]] = ()
     """Repeat with these sizes of the imperfections besides, in multiples of the nominal ones,
     and draw success and errors against them."""
+    film: More[bool] = True
+    """Make a film of the run, in the folder and in the report."""
+    verbose: More[bool] = False
+    """Show all that was measured, not just the first of it."""
     serve: bool = False
     """Serve the dashboard in the browser while the run goes on."""
     serving: Configuration = Detail("hrc_learn.experiments.run_recording", "LiveViewConfig")

@@ -32,6 +32,7 @@ from hrc_learn.viz.figures import (
     workspace_figure,
 )
 from hrc_learn.viz.learning_dashboards import record_fit, record_learning
+from hrc_learn.viz.report import show_command
 
 
 def fit_primitives(args: FitPrimitives) -> None:
@@ -197,7 +198,7 @@ def _write(
         record_learning(folder / "fit.rrd", learning_recording(skill, demos, title))
     show_values(f"Image Jacobian from {args.dataset}", metrics)
     console.print(f"Model in {args.folder}")
-    console.print(f"Recording  rerun {args.folder / 'fit.rrd'}")
+    print(f"Dashboard: {show_command(args.folder)}")
     write_values(args.json, metrics)
 
 

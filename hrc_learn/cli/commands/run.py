@@ -54,6 +54,7 @@ from hrc_learn.skills.work_cell import WorkCellConfig
 from hrc_learn.store import write_text
 from hrc_learn.teleoperation import DrawnInterval
 from hrc_learn.teleoperation.page import PageConfig
+from hrc_learn.viz.report import show_command
 
 _PANDA = ArmChoice()
 
@@ -218,7 +219,7 @@ def _on_arm(args: RunExperiment, workplace: Workplace, task: Task) -> int:
         )
     run.save(args.out, f"{args.arm} at {args.ip}", asdict(args))
     console.print(run.failure or "done", style="red" if run.failure else "green")
-    console.print(f"Recording  rerun {args.out / 'run.rrd'}")
+    print(f"Dashboard: {show_command(args.out)}")
     return int(bool(run.failure))
 
 
@@ -300,6 +301,8 @@ def demo(args: Demo) -> int:
             seed=args.seed,
             imperfections=args.imperfections,
             ideal=args.ideal,
+            film=args.film,
+            verbose=args.verbose,
             overwrite=True,
             json=args.json,
         )

@@ -1,4 +1,11 @@
-"""`hrc show`, `hrc report`: demonstrations in Rerun, and runs on a page."""
+"""`hrc show`, `hrc report`: dashboards in Rerun, and runs on a page."""
+
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
 
 from hrc_learn.cli._run import write_values
 from hrc_learn.cli.arguments.dataset import Show
@@ -7,19 +14,71 @@ from hrc_learn.store import write_text
 from hrc_learn.viz.report import read_report, reports_page
 
 
-def show(args: Show) -> None:
-    """A recording of the demonstrations of a dataset."""
+def show(args: Show) -> int:
+    """Open recordings, or make one of the demonstrations of a dataset."""
+    if not args.path.exists():
+        raise FileNotFoundError(f"{args.path} is not there.")
+    if recordings := recordings_in(args.path):
+        if args.out is not None:
+            raise ValueError(
+                f"--out is for a dataset, but {args.path} is recorded already: "
+                f"{', '.join(map(str, recordings))}."
+            )
+        return _open(recordings, args.web)
+    if args.out is not None:
+        args.out.parent.mkdir(parents=True, exist_ok=True)
+        _record_demonstrations(args, args.out)
+        print(args.out)
+        return 0
+    with tempfile.TemporaryDirectory(prefix="hrc_show_") as folder:
+        recording = Path(folder) / "demonstrations.rrd"
+        _record_demonstrations(args, recording)
+        return _open([recording], args.web)
+
+
+def recordings_in(path: Path) -> list[Path]:
+    """The recording that a path is, or those in a folder; that of the run itself first."""
+    if path.is_file():
+        return [path]
+    return sorted(path.glob("*.rrd"), key=lambda file: (file.stem != "run", file.name))
+
+
+def viewer_command(recordings: Sequence[Path], web: bool) -> list[str]:
+    """The command line of the viewer, by the Python that this is: no path has to hold it.
+
+    Args:
+        recordings: To open.
+        web: In the browser.
+    """
+    # On this machine alone: the viewer would listen to all networks by default.
+    serving = ["--serve-web", "--bind", "127.0.0.1"] if web else []
+    return [sys.executable, "-m", "rerun", *serving, *map(str, recordings)]
+
+
+def _open(recordings: Sequence[Path], web: bool) -> int:
+    screen = not sys.platform.startswith("linux") or any(
+        os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")
+    )
+    if not screen and not web:
+        print("no screen here: the dashboard is served to the browser (Ctrl-C ends it)")
+    try:
+        return subprocess.run(
+            viewer_command(recordings, web or not screen), check=False
+        ).returncode
+    except KeyboardInterrupt:
+        return 0
+
+
+def _record_demonstrations(args: Show, out: Path) -> None:
     # Rerun and PyTorch, which a report does without.
     from hrc_learn.demos import load_demos
     from hrc_learn.learning.channels import demonstrations_recording
     from hrc_learn.viz.learning_dashboards import record_demonstrations
 
-    demos = load_demos(args.dataset, episodes=args.episodes or None, units=args.units or None)
-    title = f"Demonstrations in {args.dataset.resolve().name}"
-    shown = demonstrations_recording(demos, title)
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    record_demonstrations(args.out, shown)
-    print(f"{len(demos)} demonstrations: rerun {args.out}")
+    demos = load_demos(args.path, episodes=args.episodes or None, units=args.units or None)
+    title = f"Demonstrations in {args.path.resolve().name}"
+    record_demonstrations(out, demonstrations_recording(demos, title))
+    print(f"{len(demos)} demonstrations")
     seconds = sum(demo.duration for demo in demos)
     write_values(args.json, {"episodes": len(demos), "seconds": seconds})
 

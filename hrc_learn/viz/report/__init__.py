@@ -1,17 +1,22 @@
 """Reports: what was done and measured, as one page that can be mailed, printed and kept.
 
 A program fills a `Report` and hands it to `write_report`, which leaves `report.json`,
-`figures/*.png` and the self-contained `report.html` in the run's folder. `read_report` takes
-them up again, and `reports_page` puts several on one page.
+`figures/*.png`, `film.mp4` and the self-contained `report.html` in the run's folder.
+`read_report` takes them up again, and `reports_page` puts several on one page.
 """
 
+from hrc_learn.viz.report.content import Film as Film
 from hrc_learn.viz.report.content import Measurement as Measurement
 from hrc_learn.viz.report.content import Picture as Picture
 from hrc_learn.viz.report.content import Report as Report
 from hrc_learn.viz.report.content import Section as Section
 from hrc_learn.viz.report.content import flatten as flatten
+from hrc_learn.viz.report.content import leading as leading
+from hrc_learn.viz.report.content import show_command as show_command
 from hrc_learn.viz.report.content import show_measurements as show_measurements
 from hrc_learn.viz.report.content import software_versions as software_versions
+from hrc_learn.viz.report.files import FILM as FILM
+from hrc_learn.viz.report.files import PAGE as PAGE
 from hrc_learn.viz.report.files import REPORT as REPORT
 from hrc_learn.viz.report.files import read_report as read_report
 from hrc_learn.viz.report.files import reports_page as reports_page

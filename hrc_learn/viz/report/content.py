@@ -1,12 +1,17 @@
 """What a report holds: text, measured values beside their targets, pictures, versions."""
 
 import math
+import os
 import platform
 import re
+import shlex
+import shutil
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.metadata import PackageNotFoundError, version
 from io import BytesIO
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -98,6 +103,15 @@ class Picture:
         return buffer.getvalue()
 
 
+@dataclass(frozen=True)
+class Film:
+    """A film with its caption."""
+
+    mp4: bytes
+    """The file."""
+    caption: str
+
+
 @dataclass(frozen=True, kw_only=True)
 class Section:
     """A heading, paragraphs and pictures."""
@@ -122,6 +136,8 @@ class Report:
     table: Sequence[Measurement] = ()
     """Everything measured, with targets where there are any."""
     sections: Sequence[Section] = ()
+    film: Film | None = None
+    """Of the run."""
     configuration: Mapping[str, object] = field(default_factory=dict)
     """What the run was configured with; nested mappings are flattened."""
     versions: Mapping[str, str] = field(default_factory=dict)
@@ -149,6 +165,27 @@ class Report:
     def pictures(self) -> tuple[Picture, ...]:
         """Those of all sections, in order."""
         return tuple(picture for section in self.sections for picture in section.figures)
+
+
+def leading(
+    table: Sequence[Measurement], count: int
+) -> tuple[tuple[Measurement, ...], tuple[Measurement, ...]]:
+    """Measurements to show first, and the others, both in the order of the table.
+
+    Those that missed their targets come first, however many; then others with a target.
+
+    Args:
+        table: All of them.
+        count: How many are shown first, unless more missed.
+    """
+    ranks = {False: 0, True: 1, None: 2}
+    order = sorted(range(len(table)), key=lambda i: ranks[table[i].ok])
+    missed = sum(m.ok is False for m in table)
+    first = set(order[: max(count, missed)])
+    return (
+        tuple(m for i, m in enumerate(table) if i in first),
+        tuple(m for i, m in enumerate(table) if i not in first),
+    )
 
 
 def _rounded(value: float | int, resolution: float) -> float | int:
@@ -196,13 +233,43 @@ def software_versions() -> dict[str, str]:
     return found
 
 
-def show_measurements(table: Sequence[Measurement]) -> None:
-    """Print measured values beside their targets."""
+def show_command(path: str | os.PathLike[str]) -> str:
+    """The line that opens the dashboard of a run or a recording, to be pasted into a shell.
+
+    It names the program of the Python that this is where another, or none, is on the path.
+    """
+    python = Path(sys.executable)
+    beside = python.with_name("hrc")
+    if shutil.which("hrc") == str(beside):
+        return shlex.join(["hrc", "show", str(path)])
+    words = [str(beside)] if beside.is_file() else [str(python), "-m", "hrc_learn.cli"]
+    return shlex.join([*(_shortest(word) for word in words), "show", str(path)])
+
+
+def _shortest(word: str) -> str:
+    path = Path(word)
+    return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else word
+
+
+_ROWS = 8
+"""Of a table in the terminal: a screen keeps them in view with what follows."""
+
+
+def show_measurements(table: Sequence[Measurement], everything: bool = False) -> None:
+    """Print measured values beside their targets.
+
+    Args:
+        table: The values.
+        everything: All of them, not just the missed and the first of the others.
+    """
     from rich.console import Console
     from rich.table import Table
 
     shown = Table("measured", "value", "target", "", title="Measured")
     marks = {True: "[green]ok[/]", False: "[red]missed[/]", None: ""}
-    for m in table:
+    first, others = (tuple(table), ()) if everything else leading(table, _ROWS)
+    for m in first:
         shown.add_row(m.name, m.shown, m.bound, marks[m.ok])
+    if others:
+        shown.caption = f"{len(others)} more: --verbose, or the report"
     Console().print(shown)

@@ -18,7 +18,15 @@ from pathlib import Path
 from typing import Any
 
 from hrc_learn.store import new_file
-from hrc_learn.viz.report.content import Measurement, Picture, Report, Section, flatten
+from hrc_learn.viz.report.content import (
+    Film,
+    Measurement,
+    Picture,
+    Report,
+    Section,
+    flatten,
+    leading,
+)
 
 
 def reports_page(title: str, reports: Sequence[Report]) -> str:
@@ -92,6 +100,7 @@ def _report(report: Report, anchor: str) -> str:
             f'<h1 id="{anchor}">{escape(report.title)}</h1>',
             _verdict(report),
             _paragraphs(report.summary),
+            "" if report.film is None else _film(report.film),
             _measurements(report.table),
             *(_section(section) for section in report.sections),
             *(
@@ -114,14 +123,24 @@ def _verdict(report: Report) -> str:
     return f'<span class="verdict miss">{missed}</span>'
 
 
+_FIRST = 6
+"""Values of a report that are seen without unfolding anything."""
+
+
 def _measurements(table: Sequence[Measurement]) -> str:
+    """The first values as a table, the others folded."""
     if not table:
         return ""
     claims = any(m.claim for m in table)
     heads = '<th>Measured</th><th class="n">Value</th><th class="n">Target</th><th></th>'
     if claims:
         heads += "<th>The paper says</th>"
-    return _table(heads, [_row(m, claims) for m in table])
+    first, others = leading(table, _FIRST)
+    page = _table(heads, [_row(m, claims) for m in first])
+    if others:
+        folded = _table(heads, [_row(m, claims) for m in others])
+        page += f"<details><summary>{len(others)} more values</summary>{folded}</details>"
+    return page
 
 
 def _row(m: Measurement, claims: bool) -> str:
@@ -148,6 +167,16 @@ def _figure(picture: Picture) -> str:
     caption = escape(picture.caption)
     return (
         f'<figure><img alt="{caption}" src="data:image/png;base64,{data}">'
+        f"<figcaption>{caption}</figcaption></figure>"
+    )
+
+
+def _film(film: Film) -> str:
+    data = base64.b64encode(film.mp4).decode("ascii")
+    caption = escape(film.caption)
+    return (
+        f'<figure><video controls autoplay muted loop playsinline aria-label="{caption}" '
+        f'src="data:video/mp4;base64,{data}"></video>'
         f"<figcaption>{caption}</figcaption></figure>"
     )
 
@@ -191,12 +220,13 @@ REPORT = "report.json"
 """File that tells the folder of a run that has a report."""
 PAGE = "report.html"
 FIGURES = "figures"
+FILM = "film.mp4"
 FORMAT = "hrc_learn report"
 VERSION = 1
 
 
 def write_report(folder: str | os.PathLike[str], report: Report) -> None:
-    """Write `report.json`, `figures/*.png` and the self-contained page `report.html`.
+    """Write `report.json`, `figures/*.png`, `film.mp4` and the self-contained `report.html`.
 
     Args:
         folder: Of the run. Each file appears only when it is complete, `report.json` last.
@@ -208,6 +238,9 @@ def write_report(folder: str | os.PathLike[str], report: Report) -> None:
     for picture in report.pictures:
         with new_file(folder / FIGURES / f"{picture.name}.png") as part:
             part.write_bytes(picture.png())
+    if report.film is not None:
+        with new_file(folder / FILM) as part:
+            part.write_bytes(report.film.mp4)
     with new_file(folder / PAGE) as part:
         part.write_text(reports_page(report.title, [report]), encoding="utf-8")
     with new_file(folder / REPORT) as part:
@@ -219,7 +252,7 @@ def read_report(folder: str | os.PathLike[str]) -> Report:
     """Read what `write_report` left in a folder.
 
     Raises:
-        FileNotFoundError: If there is no such folder, or a picture of the report is missing.
+        FileNotFoundError: If there is no such folder, or a picture or the film is missing.
         ValueError: If the folder holds no report, or one that this version cannot read.
     """
     folder = Path(folder)
@@ -262,6 +295,7 @@ def _to_json(report: Report) -> dict[str, Any]:
         "title": report.title,
         "summary": report.summary,
         "command": report.command,
+        "film": None if report.film is None else report.film.caption,
         "table": [asdict(m) | {"value": _finite(m.value)} for m in report.table],
         "sections": [
             {
@@ -296,8 +330,13 @@ def _from_json(content: Mapping[str, Any], folder: Path) -> Report:
         Measurement(**row | {"value": math.nan if row["value"] is None else row["value"]})
         for row in content["table"]
     ]
+    # Reports of earlier versions of this package have no film.
+    caption = content.get("film")
+    film = None if caption is None else Film((folder / FILM).read_bytes(), caption)
     same = ("title", "summary", "command", "configuration", "versions")
-    return Report(table=table, sections=sections, **{name: content[name] for name in same})
+    return Report(
+        table=table, sections=sections, film=film, **{name: content[name] for name in same}
+    )
 
 
 def _finite(value: float | int) -> float | int | None:
