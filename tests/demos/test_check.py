@@ -448,6 +448,24 @@ def test_quaternions_that_flip_or_are_none(tmp_path):
     find(report.errors, "quaternion of length 0.2 at frame 40")
 
 
+@pytest.mark.parametrize(("turn", "errors"), [(0.98 * np.pi, 0), (0.8 * np.pi, 1)])
+def test_a_rotation_near_half_a_turn_may_be_turned_over(tmp_path, turn, errors):
+    """A vector v and v (1 - 2 pi / |v|) are the same rotation; far from pi they are far apart."""
+    names = {STATE: ["ee.x", "ee.y", "ee.z", "ee.wx", "ee.wy", "ee.wz"]}
+    rng, episodes = np.random.default_rng(0), []
+    for episode in range(6):
+        wave = np.sin(np.linspace(0, 3, 60))[:, None]
+        vector = np.array([0.05, turn, 0.1]) + 0.02 * rng.normal(size=3) * wave
+        if episode == 2:
+            vector[:, 1] *= -1
+        place = joint_path(60, 3) + 0.01 * rng.normal(size=3)
+        episodes.append({STATE: np.hstack([place, vector])})
+    report = check_dataset(write_folder(tmp_path / "set", episodes, names))
+    found = [e for e in report.errors if "other sign" in e.message]
+    assert len(found) == errors
+    assert all(e.episode == 2 and "ee.wy" in e.message for e in found)
+
+
 def test_names_unknown(root):
     change_feature(root, STATE, names=None)
     find(check_dataset(root).warnings, "names no components")

@@ -4,12 +4,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
 from hrc_learn.demos.format.dataset_folder import DatasetFolder, EpisodeEntry
 from hrc_learn.demos.issue import ValidationReport
 from hrc_learn.demos.read.column_mapping import ColumnMapping
 from hrc_learn.demos.read.profiles import ColumnProfile, EpisodeProfile, gain_over, is_discrete
+from hrc_learn.demos.read.roles import meaning_of_component
 from hrc_learn.demos.validation.data_checks import component_name
 
 _FEW = 3
@@ -188,13 +189,15 @@ def check_switches(feature: _Feature, report: ValidationReport) -> None:
 
 _FAR_OFF = 3.0
 """Spreads from which an episode is not where the others are."""
+_HALF_TURN = 0.9 * np.pi
+"""Size of a rotation vector [rad] from which the noise of a hand turns it over."""
 
 
 def check_exchanges(feature: _Feature, report: ValidationReport) -> None:
     """Columns exchanged, negated, moved or run backwards in one episode."""
     from scipy.optimize import linear_sum_assignment
 
-    moving = np.flatnonzero(feature.smooth & (feature.span > 0))
+    moving = np.flatnonzero(feature.smooth & (feature.span > 0) & ~_without_sign(feature))
     if not len(moving):
         return
     levels = feature.stack("levels")[:, 1:4, moving]
@@ -255,6 +258,19 @@ def check_exchanges(feature: _Feature, report: ValidationReport) -> None:
         elif len(moved):
             names = ", ".join(_name(feature, moving, i) for i in moved[:6])
             report.warning(f"is far from the other episodes: {names}", **place)
+
+
+def _without_sign(feature: _Feature) -> Bool[np.ndarray, " components"]:
+    """Components of orientations that mean the same turned over.
+
+    Of quaternions, and of rotation vectors near half a turn in any episode.
+    """
+    meanings = map(meaning_of_component, feature.names)
+    roles = np.array([meaning.role if meaning else "" for meaning in meanings])
+    vectors = roles == "rotation_vector"
+    middles = np.linalg.norm(feature.stack("levels")[:, 2] * vectors, axis=1)
+    near_half_turn = bool((middles > _HALF_TURN).any())
+    return np.char.startswith(roles, "quaternion") | (vectors & near_half_turn)
 
 
 def _name(feature: _Feature, moving: np.ndarray, number: int | np.integer) -> str:
