@@ -5,6 +5,11 @@ in the report of that kind of run, and the lines between `<!-- KIND measured -->
 `<!-- end -->` become the table of what that run measured.
 
 python docs/experiments.py --placing outputs/placing --grasping outputs/grasping
+
+The film of a run becomes images/film.webp, which README and page show.
+
+hrc run collaboration --pulls random --worker --out outputs/beside
+python docs/experiments.py --film outputs/beside
 """
 
 import re
@@ -12,6 +17,7 @@ from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 
+import av
 from PIL import Image
 
 from hrc_learn import cli
@@ -22,6 +28,8 @@ WIDTH = 1000
 """Of the pictures, at most [px]."""
 COLOURS = 256
 """Of a picture: what flat areas and lines need, in a sixth of the bytes."""
+FILM_WIDTH, FILM_STEP = 640, 3
+"""Of the film's pictures [px], and which of them are shown: a page loads it in a second."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,6 +44,8 @@ class Args:
     """Folder of `hrc run collaboration`, likewise."""
     curve: Path | None = None
     """Folder of a run with `--curve`, likewise: success against the size of imperfections."""
+    film: Path | None = None
+    """Folder of a run with a film, likewise."""
     page: Path = PAGE
     """The page; its pictures are in images/ beside it."""
 
@@ -48,10 +58,17 @@ def main(args: Args) -> None:
         "curve": args.curve,
     }
     reports = {kind: read_report(run) for kind, run in runs.items() if run is not None}
-    if not reports:
-        raise ValueError("no run: give --placing, --grasping, --collaboration or --curve")
+    if not reports and args.film is None:
+        raise ValueError(
+            "no run: give --placing, --grasping, --collaboration, --curve or --film"
+        )
     text = args.page.read_text()
     pictures: dict[str, bytes] = {}
+    if args.film is not None:
+        film = read_report(args.film).film
+        if film is None:
+            raise ValueError(f"{args.film} has no film: run it without --no-film.")
+        pictures["film.webp"] = animation(film.mp4)
     for kind, report in reports.items():
         pictures |= shown_pictures(kind, report, text)
         text = with_table(kind, report, text)
@@ -74,6 +91,28 @@ def shown_pictures(kind: str, report: Report, page: str) -> dict[str, bytes]:
             f"{', '.join(there)}"
         )
     return {f"{kind}_{name}.png": small(there[name].png()) for name in wanted}
+
+
+def animation(mp4: bytes) -> bytes:
+    """A film as a picture that moves, which Markdown shows anywhere."""
+    with av.open(BytesIO(mp4)) as file:
+        rate = file.streams.video[0].average_rate
+        assert rate is not None
+        pictures = [frame.to_image() for frame in file.decode(video=0)][::FILM_STEP]
+    for picture in pictures:
+        picture.thumbnail((FILM_WIDTH, FILM_WIDTH))
+    buffer = BytesIO()
+    pictures[0].save(
+        buffer,
+        "WEBP",
+        save_all=True,
+        append_images=pictures[1:],
+        duration=round(1000 * FILM_STEP / rate),
+        loop=0,
+        quality=55,
+        method=6,
+    )
+    return buffer.getvalue()
 
 
 def small(png: bytes) -> bytes:

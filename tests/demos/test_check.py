@@ -450,7 +450,7 @@ def test_quaternions_that_flip_or_are_none(tmp_path):
 
 @pytest.mark.parametrize(("turn", "errors"), [(0.98 * np.pi, 0), (0.8 * np.pi, 1)])
 def test_a_rotation_near_half_a_turn_may_be_turned_over(tmp_path, turn, errors):
-    """A vector v and v (1 - 2 pi / |v|) are the same rotation; far from pi they are far apart."""
+    """v and v (1 - 2 pi / |v|) are one rotation; unless |v| is near pi they lie far apart."""
     names = {STATE: ["ee.x", "ee.y", "ee.z", "ee.wx", "ee.wy", "ee.wz"]}
     rng, episodes = np.random.default_rng(0), []
     for episode in range(6):

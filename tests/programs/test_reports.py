@@ -3,6 +3,7 @@
 import importlib.util
 import json
 import sys
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 
@@ -11,7 +12,16 @@ import pytest
 from commands import done
 from PIL import Image
 
-from hrc_learn.viz.report import Measurement, Picture, Report, Section, write_report
+from hrc_learn.viz.film import film_mp4
+from hrc_learn.viz.report import (
+    Film,
+    Measurement,
+    Picture,
+    Report,
+    Section,
+    read_report,
+    write_report,
+)
 
 ROOT = Path(__file__).parents[2]
 IMAGES = ROOT / "docs" / "images"
@@ -113,6 +123,23 @@ def test_lines_keep_their_colours_beside_a_photograph(experiments):
     shown = np.asarray(Image.open(BytesIO(small)).convert("RGB")).astype(int)
     for row, colour in lines.items():
         assert np.abs(shown[row] - colour).max() < 10
+
+
+def test_a_film_becomes_a_picture_that_moves(runs, tmp_path, experiments):
+    levels = [20, 90, 160, 230]
+    pictures = [np.full((90, 960, 3), level, np.uint8) for level in levels for _ in range(3)]
+    film = Film(film_mp4(pictures, 15.0), "")
+    write_report(tmp_path / "run", replace(read_report(runs[0]), film=film))
+    page = tmp_path / "page.md"
+    page.write_text("kept")
+    experiments.main(experiments.Args(film=tmp_path / "run", page=page))
+    shown = Image.open(tmp_path / "images" / "film.webp")
+    assert (shown.size, shown.n_frames) == ((640, 60), 4)
+    for number, level in enumerate(levels):
+        shown.seek(number)
+        assert np.asarray(shown.convert("RGB")).mean() == pytest.approx(level, abs=8)
+    with pytest.raises(ValueError, match="has no film"):
+        experiments.main(experiments.Args(film=runs[0], page=page))
 
 
 @pytest.mark.parametrize(
