@@ -163,6 +163,7 @@ def test_the_command_asks_for_the_job_and_reports_it(models, job, monkeypatch, t
     assert 0 < measured["elbow_moved_median_mm"] == pytest.approx(measured["elbow_moved_mm"])
     assert {path.name for path in out.iterdir()} == {
         "figures",
+        "film.mp4",
         "log.npz",
         ".manifest.json",
         "made_by.json",
