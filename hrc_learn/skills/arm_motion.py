@@ -211,6 +211,7 @@ def kept_clear(
     null: Float[Tensor, "*batch joints"],
     clearance: Callable[[Float[Tensor, "*batch joints"]], Float[Tensor, "*batch"]],
     margin: float,
+    look_ahead: float = LOOK_AHEAD,
 ) -> ClearMotion:
     """As much of a null-space motion as keeps the arm clear of what is around it.
 
@@ -221,15 +222,17 @@ def kept_clear(
         clearance: Distance of an arm at given joint positions from what it must not meet [m].
         margin: Distance to keep [m]. Where the task alone leaves less, the null space takes
             no more of it.
+        look_ahead: Time in which the motion stops before the margin, as an exponential does
+            [s].
     """
-    ahead = joint_position + LOOK_AHEAD * (task + _shares_of(null))
+    ahead = joint_position + look_ahead * (task + _shares_of(null))
     now, without, *_ = every = clearance(torch.cat([joint_position[None], ahead]))
     waits = without < torch.clamp(now, max=margin)
     if bool((every >= margin).all()):
         return ClearMotion(null, waits, now)
     closing = without - every[2:]
     room = without - margin
-    allowed = room.clamp(min=0.0) + LOOK_AHEAD * _SLIDING * (1.0 + room / _DEEPEST).clamp(
+    allowed = room.clamp(min=0.0) + look_ahead * _SLIDING * (1.0 + room / _DEEPEST).clamp(
         0.0, 1.0
     )
     # Closing in grows with the share: where it is too fast, so much less of it.

@@ -17,6 +17,7 @@ from hrc_learn.protocols import ArmState, Human
 from hrc_learn.skills.arm_motion import joints_near, kept_clear, resolved_rate
 from hrc_learn.skills.null_space_yielding import (
     CHANGE_OF_RATE,
+    FAR_ASIDE,
     LONGEST_RETURN,
     NARROW,
     NullSpaceYielding,
@@ -31,6 +32,9 @@ _SHARE_OF_ACCELERATION = 0.4
 # Fastest joint of a null-space motion [rad/s]: at 20 actions a second it turns by 0.05 rad in
 # one, on a chord of whose arc an elbow of 0.3 m and a hand at 0.8 m are 0.3 mm off.
 _FASTEST = 1.0
+# In which a null-space motion stops before an obstacle [s]: joint 2, at its fastest, by the
+# part of its acceleration that the null space may take, 3 rad/s^2.
+_STOPPING = 0.33
 # Distance kept from a joint limit, and decay rate of the remaining one [rad, 1/s]: within the
 # margins of the servo, which would stop single joints and so move the end effector.
 _FROM_LIMIT, _LIMIT_RATE = 0.05, 5.0
@@ -52,6 +56,9 @@ _STRAIGHT, _NEARBY = (0.65, 0.8), 0.3
 _REGAINED = 0.3
 # Postures that are as near are the same, for a motion that waits [rad].
 _MET_AGAIN = 0.02
+
+
+Room = Callable[[Float[Tensor, "*batch joints"]], Float[Tensor, "*batch"]]
 
 
 class ComplementaryMotion:
@@ -84,8 +91,7 @@ class ComplementaryMotion:
         dt: float,
         limits: MotionLimits,
         config: YieldingConfig | None = None,
-        clearance: Callable[[Float[Tensor, "*batch joints"]], Float[Tensor, "*batch"]]
-        | None = None,
+        clearance: Room | None = None,
     ):
         """Begin where the first step is.
 
@@ -240,11 +246,17 @@ class ComplementaryMotion:
             hindrances.note_across(push, null_projection(J, push))
             hindrances.note("too_far", share)
         # Where the policy itself leads the arm nearer, people may as well.
-        own = float(self._room(ahead).min()) - _NO_NEARER
-        margin = min(self._config.clearance, own)
-        led = feasible(wanted)
-        clear = kept_clear(joints, going, led, self._room, margin)
-        null, waits, distance = clear.null, bool(clear.waits), float(clear.distance)
+        own = self._rooms(ahead).amin(0) - _NO_NEARER
+        margins = own.clamp(max=self._config.clearance).tolist()
+        margin = min(margins)
+        null = led = feasible(wanted)
+        waits = False
+        # Each for itself: how fast the arm may near one says nothing of another.
+        for room, least in zip(self._obstacles, margins, strict=True):
+            clear = kept_clear(joints, going, led, room, least, _STOPPING)
+            null = clear.null if share_kept(led, clear.null) < share_kept(led, null) else null
+            waits |= bool(clear.waits)
+        distance = float(self._clear(joints))
         if waits or straight < _STRAIGHT[0]:
             # Against the person, as the end effector would have to stop otherwise.
             null, waits = self._retreat(joints, going, feasible(retreat), led, margin)
@@ -253,10 +265,11 @@ class ComplementaryMotion:
             asked = null_projection(J, moved / dt + wanted)
             possible = self._within_limits(joints, posture, task, asked, told=True)
             if share_kept(led, null) < 1 and straight >= _STRAIGHT[0]:
-                stretched = distance < float(self._clear(joints))
+                stretched = float(self._from_singularity(joints)) < distance
                 cause = "singularity" if stretched else "obstacle"
                 hindrances.note(cause, share_kept(possible, null), distance=100 * distance)
-        waits = waits or straight < _STRAIGHT[0]
+        # At a pose that stays the null space leads back as it led aside, further on maybe not.
+        waits = waits or straight < _STRAIGHT[0] or float(error.norm()) > FAR_ASIDE
         self._null = null
         reached = joints_near(self._chain, goal, joints + dt * (task + null))
         off = self._chain.forward(reached).twist_to(goal)
@@ -268,13 +281,34 @@ class ComplementaryMotion:
             return None, False
         return reached, not (waits or far or (back is not None and bool(narrow.any())))
 
-    def _room(self, joints: Float[Tensor, "*batch joints"]) -> Float[Tensor, "*batch"]:
-        """Distance of the arm from what it must not meet [m], and from its singularities.
+    @property
+    def _obstacles(self) -> tuple[Room, ...]:
+        """Distances of the arm from all that it must not come near."""
+        return self._clear, self._from_singularity, self._from_limits
 
-        Those count as obstacles that begin where an arm can no longer follow beside its path.
+    def _rooms(self, joints: Float[Tensor, "*batch joints"]) -> Float[Tensor, "*batch 3"]:
+        """Distances from each of these [m]."""
+        return torch.stack([room(joints) for room in self._obstacles], dim=-1)
+
+    def _room(self, joints: Float[Tensor, "*batch joints"]) -> Float[Tensor, "*batch"]:
+        """Distance from the nearest of them [m]."""
+        return self._rooms(joints).amin(-1)
+
+    def _from_singularity(
+        self, joints: Float[Tensor, "*batch joints"]
+    ) -> Float[Tensor, "*batch"]:
+        """Of the arm's singularities, obstacles that begin where it can no longer follow beside
+        its path: smallest singular values count as metres.
         """
-        room = smallest_singular_value(self._chain, joints) - NARROW + self._config.clearance
-        return torch.minimum(room, self._clear(joints))
+        return smallest_singular_value(self._chain, joints) - NARROW + self._config.clearance
+
+    def _from_limits(self, joints: Float[Tensor, "*batch joints"]) -> Float[Tensor, "*batch"]:
+        """Of the limits of the joints, which the task may near as well as the person: radians
+        count as metres.
+        """
+        limits = self._limits
+        room = torch.minimum(joints - limits.lower, limits.upper - joints).amin(-1)
+        return room - _FROM_LIMIT + self._config.clearance
 
     def _clear(self, joints: Float[Tensor, "*batch joints"]) -> Float[Tensor, "*batch"]:
         """Distance of the arm from what it must not meet [m]."""

@@ -11,6 +11,7 @@ from unchecked import shapes_unchecked
 from hrc_learn.kinematics import panda
 from hrc_learn.protocols import ArmState, Human, HumanInput
 from hrc_learn.skills import ComplementaryMotion, YieldingConfig, joint_line
+from hrc_learn.skills.null_space_yielding import FAR_ASIDE
 
 DT = 0.05
 SIDEWAYS = np.array([4.0, 0.0, -4.0, 0.0, 3.0, 0.0, 0.0])
@@ -88,7 +89,7 @@ def test_what_nobody_pushes_is_handed_on_as_it_is():
 @pytest.mark.parametrize("strength", [1.0, -2.0])
 def test_the_elbow_goes_aside_and_back_while_the_hand_goes_on(strength):
     wishes = line(still=6.0)
-    postures, joints, _ = followed(wishes, Pusher(strength * SIDEWAYS, 0.6, 3.0))
+    postures, joints, _ = followed(wishes, Pusher(strength * SIDEWAYS, 0.6, 1.9))
     np.testing.assert_array_equal(postures.numpy(), wishes)  # without a pause
     aside = (elbow(joints) - elbow(postures)).norm(dim=-1)
     assert aside.max() > 0.15
@@ -227,3 +228,32 @@ def test_beginning_anew_forgets_the_push():
     assert not motion.offset.any()
     assert not motion.nullspace_input.any()
     assert not motion.waits
+
+
+@pytest.mark.parametrize("seed", [8, 10, 19])
+def test_paths_beside_the_policys_own_keep_the_limits(seed):
+    """Random ones, on which the task alone, or a stop, would lead joints aside beyond them."""
+    rng = np.random.default_rng(seed)
+    goal = panda.ready + torch.from_numpy(rng.uniform(-0.9, 0.9, 7))
+    goal = goal.clamp(panda.limits.lower + 0.25, panda.limits.upper - 0.25)
+    path = joint_line(panda.ready, goal, speed=0.6, dt=DT).numpy()
+    wishes = np.concatenate([path, np.repeat(path[-1:], 60, axis=0)])
+    push = rng.choice([-1, 1]) * rng.uniform(1, 2) * SIDEWAYS
+    postures, joints, _ = followed(wishes, Pusher(push, 0.3, rng.uniform(1.5, 3.5)))
+    assert (elbow(joints) - elbow(postures)).norm(dim=-1).max() > 0.05
+    assert (joints <= panda.limits.upper).all()
+    assert (joints >= panda.limits.lower).all()
+    assert (joints.diff(n=2, dim=0).abs() / DT**2 <= panda.limits.acceleration).all()
+    assert hand_off(postures, joints)[0] < 1e-6
+
+
+def test_joints_far_aside_hold_the_policy_until_they_are_nearer():
+    """Where the end effector rests the null space leads back as it led aside."""
+    wishes = line(still=6.0)
+    postures, joints, _ = followed(wishes, Pusher(SIDEWAYS, 0.6, 3.0))
+    far = (joints - postures).norm(dim=-1) > FAR_ASIDE
+    assert far.sum() > 20
+    # It needs 0.2 s to stop.
+    moves = postures.diff(dim=0).abs().amax(dim=-1) > 0
+    assert not moves[4:][far.unfold(0, 6, 1).all(dim=-1)].any()
+    np.testing.assert_allclose(joints[-1], wishes[-1], atol=1e-3)
