@@ -2,10 +2,7 @@
 
 import ast
 import dataclasses
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -13,7 +10,6 @@ import pytest
 from hrc_learn.cli._commands import COMMANDS, find
 
 ROOT = Path(__file__).parents[1]
-README = ROOT / "README.md"
 PAGES = [
     *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")),
     *sorted((ROOT / "docs").glob("*.md")),
@@ -40,30 +36,11 @@ OPTION = re.compile(r"(?<!\S)--([a-z][\w-]*)")
 by_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 
 
-def blocks(page: Path, *languages: str) -> list[str]:
-    """Fenced blocks in one of some languages."""
-    return [body for language, body in BLOCK.findall(page.read_text()) if language in languages]
-
-
 def code(page: Path) -> str:
     """Everything set as code: fenced blocks, and spans within lines."""
     text = page.read_text()
     fenced = [body.replace("\\\n", " ") for _, body in BLOCK.findall(text)]
     return "\n".join([*fenced, *re.findall(r"`([^`\n]+)`", BLOCK.sub("", text))])
-
-
-def test_the_example_runs(tmp_path):
-    """One block that needs nothing before it; it may write into the folder it runs in."""
-    (example,) = blocks(README, "python")
-    done = subprocess.run(
-        [sys.executable, "-c", example],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=600,
-        env={**os.environ, "MPLBACKEND": "agg"},
-    )
-    assert done.returncode == 0, done.stderr
 
 
 @by_page

@@ -292,7 +292,7 @@ class DemonstrationSet(Sequence[Demonstration]):
         return DemonstrationSet(chosen, notes=self.notes, source=self.source)
 
     def map(self, change: Callable[[Demonstration], Demonstration]) -> "DemonstrationSet":
-        """What `change` makes of each demonstration, such as a step of `demos.preparation`."""
+        """What `change` makes of each demonstration, such as a step of `preprocessing`."""
         changed = [change(demo) for demo in self]
         return DemonstrationSet(changed, notes=self.notes, source=self.source)
 

@@ -211,7 +211,7 @@ _SMOOTH = ("joint_position", "joint_velocity", "position")
 def resample_to_grid(
     edit: EpisodeEdit, semantics: ColumnSemantics, fps: float | int
 ) -> EpisodeEdit:
-    """Resample every column, as `preparation.resample` does.
+    """Resample every column, as `preprocessing.resample` does.
 
     Rotation vectors and Euler angles are interpolated as they are: unwrap them first.
 

@@ -1,0 +1,138 @@
+"""The Python blocks of README and docs/ run, pasted page by page from top to bottom."""
+
+import functools
+import importlib
+import importlib.util
+import re
+import socket
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from lerobot_folders import joint_path, write_folder
+from unchecked import shapes_unchecked
+
+from hrc_learn.dmp import PoseDMP
+from hrc_learn.viz import run_dashboard
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+BLOCK = re.compile(
+    r"^(?:<!-- not run: (?P<reason>[^>]+) -->\n)?```(?P<language>\w*)\n(?P<body>.*?)^```",
+    re.MULTILINE | re.DOTALL,
+)
+NAME = re.compile(r"`(hrc_learn(?:\.\w+)+)`")
+MOST_NOT_RUN = 3
+"""Blocks that only say what cannot be tried here; a new one has to be worth it."""
+
+
+def python_blocks(page: Path) -> list[re.Match[str]]:
+    return [m for m in BLOCK.finditer(page.read_text("utf-8")) if m["language"] == "python"]
+
+
+def pasted(page: Path) -> str:
+    """What is run of a page, each line at its number there, so that errors name it."""
+    text = page.read_text("utf-8")
+    lines = [""] * text.count("\n")
+    for block in python_blocks(page):
+        if block["reason"] is None:
+            first = text.count("\n", 0, block.start("body"))
+            body = block["body"].splitlines()
+            lines[first : first + len(body)] = body
+    return "\n".join(lines)
+
+
+def recorded_dataset(root: Path) -> None:
+    """The reader's own dataset: three motions of seven joints, with poses of the tool."""
+    episodes = []
+    for seed in range(3):
+        joints = joint_path(120, 7, seed)
+        position = 0.3 + 0.1 * joints[:, :3]
+        upright = np.tile([0.0, 0.0, 0.0, 1.0], (len(joints), 1))
+        episodes.append(
+            {
+                "observation.state": joints,
+                "observation.tool_quaternion": upright,
+                "observation.tool_position": position,
+            }
+        )
+    names = {
+        "observation.state": [f"joint{i}.pos" for i in range(1, 8)],
+        "observation.tool_quaternion": ["qx", "qy", "qz", "qw"],
+        "observation.tool_position": ["tool_x", "tool_y", "tool_z"],
+    }
+    write_folder(root, episodes, names)
+
+
+def fitted_pose(folder: Path) -> None:
+    """What `hrc fit` leaves of the hand's motion, of a small one."""
+    time = torch.linspace(0, 1, 60, dtype=torch.float64)
+    position = 0.4 + 0.1 * torch.from_numpy(joint_path(60, 3))
+    upright = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64).repeat(60, 1)
+    folder.parent.mkdir(parents=True)
+    PoseDMP.fit(time, position, upright, n_basis=20).save(folder)
+
+
+def free_ports(count: int) -> tuple[int, ...]:
+    """Ports that nobody listens on, all open at once so that they differ."""
+    sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(count)]
+    try:
+        return tuple(one.getsockname()[1] for one in sockets)
+    finally:
+        for one in sockets:
+            one.close()
+
+
+@pytest.fixture
+def reader(tmp_path, monkeypatch):
+    """A reader's session: an empty folder but for a dataset, the ports usual for us free."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    # Whoever else works on this machine may use the usual ones.
+    serve = functools.partial(run_dashboard.serve_stream, *free_ports(2))
+    monkeypatch.setattr(run_dashboard, "serve_stream", serve)
+    recorded_dataset(tmp_path / "path/to/dataset")
+    fitted_pose(tmp_path / "models/place/pose")
+    dtype = torch.get_default_dtype()
+    yield
+    torch.set_default_dtype(dtype)
+
+
+RUN = [page for page in PAGES if pasted(page).strip()]
+
+
+@pytest.mark.parametrize("page", RUN, ids=lambda page: page.stem)
+@pytest.mark.usefixtures("reader")
+def test_a_page_can_be_pasted_from_top_to_bottom(page):
+    code = compile(pasted(page), str(page), "exec")
+    with shapes_unchecked():
+        exec(code, {"__name__": "__main__"})
+
+
+def test_few_blocks_are_not_run():
+    reasons = [m["reason"] for page in PAGES for m in python_blocks(page) if m["reason"]]
+    assert len(reasons) <= MOST_NOT_RUN, reasons
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_names_of_the_package_can_be_imported(page):
+    wrong = []
+    for name in sorted(set(NAME.findall(page.read_text("utf-8")))):
+        module, rest = name, []
+        while module and not _is_module(module):
+            module, _, last = module.rpartition(".")
+            rest.insert(0, last)
+        value = importlib.import_module(module)
+        for part in rest:
+            value = getattr(value, part, None)
+        if value is None:
+            wrong.append(name)
+    assert not wrong
+
+
+def _is_module(name: str) -> bool:
+    try:
+        return importlib.util.find_spec(name) is not None
+    except ModuleNotFoundError:
+        return False
