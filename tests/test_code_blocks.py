@@ -14,6 +14,7 @@ from lerobot_folders import joint_path, write_folder
 from unchecked import shapes_unchecked
 
 from hrc_learn.dmp import PoseDMP
+from hrc_learn.kinematics import panda, to_urdf
 from hrc_learn.viz import run_dashboard
 
 ROOT = Path(__file__).parents[1]
@@ -94,6 +95,7 @@ def reader(tmp_path, monkeypatch):
     monkeypatch.setattr(run_dashboard, "serve_stream", serve)
     recorded_dataset(tmp_path / "path/to/dataset")
     fitted_pose(tmp_path / "models/place/pose")
+    (tmp_path / "my.urdf").write_text(to_urdf(panda))
     dtype = torch.get_default_dtype()
     yield
     torch.set_default_dtype(dtype)
