@@ -52,7 +52,7 @@ class Session:
         self.writer = DatasetWriter(out, config.fps, "panda", panda.joint_names, FEATURES)
         options = {"silence": PATIENCE, "timeout": PATIENCE, "meshes": False} | page_options
         forces = InteractionForceConfig(mapping=mapping)
-        page = PageConfig(port=8300, forces=forces, **options)
+        page = PageConfig(forces=forces, **options)
         self.page = Page(panda, drawn, workplace.scene.boxes(), page, task="show it")
         self.recorder = DemonstrationRecorder(self.writer, lambda: self.page.task)
         self.session = PageSession(workplace, self.page, self.recorder, world)

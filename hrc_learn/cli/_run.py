@@ -162,7 +162,12 @@ def _complaint(box: str) -> str:
     if missing := re.findall(r"^ {4}(\S+)", said, re.MULTILINE):
         return f"missing: {', '.join(missing)}"
     # Why each of several types did not fit is for programmers.
-    return " ".join(said.split()).split(" Got errors")[0].rstrip(".")
+    text = " ".join(said.split()).split(" Got errors")[0].rstrip(".")
+    # A configuration names its field, and who typed the command an option.
+    if refused := re.match(r"Error parsing ([\w.-]+): (\w+) must be ", text):
+        option = f"--{refused[1]}.{refused[2].replace('_', '-')}"
+        return f"{option} must be {text[refused.end() :]}"
+    return text
 
 
 def show_values(title: str, values: Mapping[str, float]) -> None:

@@ -46,8 +46,8 @@ class PersonConfig:
     """Whether the null-space input, and how far it has moved the joints, is observed too."""
     host: str = "127.0.0.1"
     """Address to serve the page at. Whoever reaches it can move the arm."""
-    port: int = 8080
-    """Port to serve it at; the next free one is taken if it is in use."""
+    port: int | None = None
+    """Port to serve it at; the first free one from 8080 on if None."""
 
     @property
     def names(self) -> tuple[str, ...]:

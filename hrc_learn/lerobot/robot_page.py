@@ -18,12 +18,12 @@ class RobotPage:
         page: Served until it is closed.
     """
 
-    def __init__(self, host: str, port: int, note: str, *, guides: bool = True):
+    def __init__(self, host: str, port: int | None, note: str, *, guides: bool = True):
         """Serve it.
 
         Args:
             host: Address to serve at.
-            port: To serve at; the next free one is taken if it is in use.
+            port: To serve at; None: the first free one from 8080 on.
             note: What the page says.
             guides: Whether the person leads the end effector too, and not the body alone.
         """

@@ -92,6 +92,11 @@ def place_target_hint(workplace: Workplace, position: Float[np.ndarray, "3"]) ->
     return f"{nearest} shelf: {', '.join(steps) or 'there'}"
 
 
+def counted(demonstrations: int) -> str:
+    """How many there are, in words."""
+    return f"{demonstrations} demonstration{'s' * (demonstrations != 1)}"
+
+
 @dataclass(frozen=True, kw_only=True)
 class PageSessionConfig:
     """How a session runs."""
@@ -187,7 +192,7 @@ class PageSession:
         if request == "finish":
             self.finished = True
             saved = self._recorder.status.saved
-            self._page.farewell = f"Finished: {saved} demonstrations saved. Close this page."
+            self._page.farewell = f"Finished: {counted(saved)} saved. You can close this tab."
         elif request == "home":
             # A demonstration must not contain that.
             if self._recorder.status.state == "recording":

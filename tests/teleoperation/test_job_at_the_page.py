@@ -34,7 +34,7 @@ class Job:
             forces=(),
             config=PickAndPlaceConfig(interaction=15.0),
             seed=3,
-            page=PageConfig(port=8600, timeout=PATIENCE),
+            page=PageConfig(timeout=PATIENCE),
             view=self._watch,
         )
 

@@ -73,7 +73,7 @@ def show(tab) -> None:
 def test_ones_own_demonstration_is_recorded_learned_and_run(tmp_path):
     demos, model, log = tmp_path / "demos", tmp_path / "model", tmp_path / "log"
     with log.open("w") as output, chromium(tmp_path / "chromium", (900, 600)) as tab:
-        options = ["--port", "8400", "--page.timeout", "12", "--page.forces.speed", "0.1"]
+        options = ["--page.timeout", "12", "--page.forces.speed", "0.1"]
         options += ["--out", str(demos), "--json", str(tmp_path / "figures")]
         program = subprocess.Popen(
             [sys.executable, "control/serve_page.py", *options],

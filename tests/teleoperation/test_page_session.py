@@ -48,7 +48,7 @@ def world():
 def beside(world):
     pytest.importorskip("viser", reason="the extra `ui` is not installed")
     opened = []
-    with task_page(world, 0.01, PageConfig(port=8500), opened.append) as beside:
+    with task_page(world, 0.01, PageConfig(), opened.append) as beside:
         assert opened[0].startswith("http://127.0.0.1:")
         yield beside
 
@@ -74,7 +74,7 @@ def session_from(start, tmp_path):
     bodies = MovingBodies(world)
     drawn = bodies.drawn(*(poses[None] for poses in bodies.poses()))
     writer = DatasetWriter(tmp_path / "demos", config.fps, "panda", panda.joint_names, FEATURES)
-    page = Page(panda, drawn, workplace.scene.boxes(), PageConfig(port=8520), task="show it")
+    page = Page(panda, drawn, workplace.scene.boxes(), PageConfig(), task="show it")
     with DemonstrationRecorder(writer, lambda: page.task) as recorder, page:
         yield PageSession(
             workplace, page, recorder, world, opened=world.opened_arm, beside=(Asking(),)

@@ -94,8 +94,8 @@ class RunServoing(RunExperiment):
     page: bool = False
     """Serve a page in the browser, from which people watch, draw where to, and pull at the
     elbow."""
-    port: int = 8080
-    """Port of that page."""
+    port: int | None = None
+    """Port of that page, which must be free; the first free one from 8080 on when not given."""
     draw_region: More[tuple[DrawnBox, ...]] = ()
     """Regions that a scripted person draws while the arm servoes: start and duration [s], x y z
     of the centre and of the half edges [m]."""
@@ -336,7 +336,7 @@ class ServePage(Led, Measured):
     out: Path
     """Folder of the dataset to record; must not exist."""
     port: int | None = None
-    """Port of the page; that of --page.port, 8080, when not given."""
+    """Port of the page, which must be free; the first free one from 8080 on when not given."""
     task: str = "put the object on the middle shelf"
     """What is to be shown, in words; it can be changed on the page."""
     beside: Literal["nothing", "gamepad", "keyboard"] = "nothing"

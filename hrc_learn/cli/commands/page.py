@@ -32,6 +32,7 @@ from hrc_learn.teleoperation.page import Page
 from hrc_learn.teleoperation.page_session import (
     FEATURES,
     PageSession,
+    counted,
     place_targets,
 )
 
@@ -55,31 +56,32 @@ def page(args: ServePage) -> None:
         frames={"base": "panda_link0", "ee": "panda_hand_tcp"},
         details={"taught by": "a person at the page", "recorded with": configuration(args)},
     )
+    recorder = DemonstrationRecorder(writer, lambda: page.task)
     stands = [*workplace.scene.boxes(), *place_targets(workplace)]
-    with _opened(args, workplace) as (world, opened, safety):
-        bodies = MovingBodies(world)
-        drawn = bodies.drawn(*(poses[None] for poses in bodies.poses()))
-        page = Page(panda, drawn, stands, args.page, task=args.task)
-        config = replace(args.session, guiding=replace(args.session.guiding, safety=safety))
-        with DemonstrationRecorder(writer, lambda: page.task) as recorder, page:
-            session = PageSession(
-                workplace,
-                page,
-                recorder,
-                world,
-                opened=opened,
-                beside=_beside(args.beside),
-                config=config,
-            )
-            _announce(console, page)
-            figures = _serve(session, page, config.guiding.dt, args.duration)
-    figures["episodes"] = recorder.status.saved
-    console.print(
-        f"{args.out}: {recorder.status.saved} demonstrations"
-        if recorder.status.saved
-        else "Nothing saved, so there is no dataset"
-    )
-    write_values(args.json, figures)
+    try:
+        # The recorder ends last: whatever ends the rest, what is open is kept.
+        with recorder, _opened(args, workplace) as (world, opened, safety):
+            bodies = MovingBodies(world)
+            drawn = bodies.drawn(*(poses[None] for poses in bodies.poses()))
+            config = replace(args.session, guiding=replace(args.session.guiding, safety=safety))
+            with Page(panda, drawn, stands, args.page, task=args.task) as page:
+                session = PageSession(
+                    workplace,
+                    page,
+                    recorder,
+                    world,
+                    opened=opened,
+                    beside=_beside(args.beside),
+                    config=config,
+                )
+                _announce(console, page)
+                figures = _serve(session, page, config.guiding.dt, args.duration)
+    finally:
+        if saved := recorder.status.saved:
+            console.print(f"{args.out}: {counted(saved)}", soft_wrap=True)
+    if not saved:
+        console.print("Nothing saved, so there is no dataset")
+    write_values(args.json, {**figures, "episodes": saved})
 
 
 @contextmanager

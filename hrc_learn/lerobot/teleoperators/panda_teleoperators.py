@@ -168,8 +168,8 @@ class PandaPageConfig(PandaTeleoperatorConfig):
 
     host: str = "127.0.0.1"
     """Address to serve the page at. Whoever reaches it can move the arm."""
-    port: int = 8080
-    """Port to serve at; the next free one is taken if it is in use."""
+    port: int | None = None
+    """Port to serve at; the first free one from 8080 on if None."""
 
 
 class PandaPage(PandaTeleoperator):

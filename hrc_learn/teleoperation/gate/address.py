@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import ipaddress
 import os
 import secrets
@@ -12,6 +13,7 @@ import subprocess
 from dataclasses import dataclass, field
 from pathlib import Path
 
+_FIRST_PORTS = range(8080, 8180)  # tried in turn where none was asked for
 _VALID_DAYS = 800  # browsers refuse certificates of more than 825 days
 
 
@@ -22,8 +24,9 @@ class AddressConfig:
     host: str = "127.0.0.1"
     """Address to serve at: this machine only, unless it is one of the network. There the page
     is served by TLS."""
-    port: int = 8080
-    """Port to serve at; the next free one is taken if it is in use."""
+    port: int | None = None
+    """Port to serve at, which must be free; 0: any that is. None: the first free one from 8080
+    on."""
     name: str = ""
     """Name by which browsers reach this machine on the network; its own address if empty."""
     certificate: Path | None = None
@@ -34,7 +37,7 @@ class AddressConfig:
     """Browsers that may be there at once."""
 
     def __post_init__(self) -> None:
-        if not 0 <= self.port <= 65535:
+        if self.port is not None and not 0 <= self.port <= 65535:
             raise ValueError(f"port must be 0 to 65535, but is {self.port}.")
         if (self.certificate is None) != (self.key is None):
             raise ValueError("a certificate and its key are given together, or neither.")
@@ -85,25 +88,31 @@ def network_name(config: AddressConfig) -> str:
         return probe.getsockname()[0]
 
 
-def listening_socket(config: AddressConfig, attempts: int = 100) -> socket.socket:
-    """A socket at the configured port, or at the next one that is free.
+def listening_socket(config: AddressConfig) -> socket.socket:
+    """A socket at the configured port, or at the first free one from 8080 on.
 
     Raises:
-        ValueError: There is none, or the host is none of this machine's addresses.
+        ValueError: The port is not free, or the host is none of this machine's addresses.
     """
+    family = socket.AF_INET6 if ":" in config.host else socket.AF_INET
+    ports = _FIRST_PORTS if config.port is None else (config.port,)
     last: OSError | None = None
-    for port in range(config.port, min(config.port + attempts, 65536)):
+    for port in ports:
         try:
-            family = socket.AF_INET6 if ":" in config.host else socket.AF_INET
             return socket.create_server((config.host, port), family=family, backlog=32)
         except OSError as error:
             last = error
-            if isinstance(error, socket.gaierror):
-                break
-    raise ValueError(
-        f"nothing can be served at {config.host}, ports {config.port} and up: {last}. "
-        "Give an address of this machine, and a port that is free."
-    )
+            if isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL:
+                raise ValueError(
+                    f"host {config.host} is no address of this machine: {error.strerror}"
+                ) from error
+    assert last is not None
+    if last.errno == errno.EADDRINUSE:
+        why, cure = "is in use", "give another port, or none for the first that is free"
+    else:
+        why, cure = f"cannot be served at: {last.strerror}", "give another port"
+    which = f"port {ports[0]}" if len(ports) == 1 else f"each port from {ports[0]} on"
+    raise ValueError(f"{which} of {config.host} {why}; {cure}.") from last
 
 
 def tls_context(config: AddressConfig) -> ssl.SSLContext | None:

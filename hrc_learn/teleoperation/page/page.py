@@ -150,7 +150,7 @@ class Page:
                 secret=secret,
             )
         except ValueError:
-            self._server.stop()
+            self._stop_viewer()
             raise
         self.address = self._gate.address
         self.url = self.address.link()
@@ -204,9 +204,13 @@ class Page:
         self._wake.set()
         self._thread.join()
         self._gate.close(self.farewell)
-        self._server.stop()
+        self._stop_viewer()
         if self._error is not None and error is None:
             raise self._error
+
+    def _stop_viewer(self) -> None:
+        with contextlib.redirect_stdout(io.StringIO()):  # it says so, to nobody's use
+            self._server.stop()
 
     @property
     def task(self) -> str:
