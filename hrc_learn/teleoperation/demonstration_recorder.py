@@ -1,8 +1,9 @@
 """Recording demonstrations at a person's word: start, stop, then save or discard."""
 
 import contextlib
+import time
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -20,7 +21,16 @@ _STILL = 0.005
 """Motion of a joint [rad], or of the gripper [m], below which a person has not begun yet."""
 _REST = (0.3, 0.7)
 """Rest that is kept before and after the motion [s]: primitives smooth, and have to arrive."""
-
+_SHORTEST = 0.5
+"""Shortest demonstration [s]: a mouse click on a link moves the arm for less."""
+_MOST_LOST, _LONGEST_GAP = 0.05, 0.2
+"""Share of lost frames, and time without one [s], from which a demonstration is doubted: at
+0.5 m/s the hand goes on for 10 cm meanwhile."""
+_LATE, _MOST_LATE = 2.0, 0.2
+"""Periods after which a frame is late, and share of such frames from which the arm was seen to
+stutter: a page drawn without a graphics processor beside it makes some 2 % late."""
+_DRAFT_EVERY = 2.0
+"""Time from one draft of the open demonstration to the next [s]."""
 
 UNNAMED = "not named"
 """Task of a demonstration that was open when the program ended, without a name."""
@@ -46,29 +56,39 @@ class DemonstrationRecorder:
 
     Episodes are written by a thread, so that the control loop never waits for the disk. The
     dataset is complete when the `with` block has ended; without any episode there is none. A
-    demonstration that is still open then is saved: a signal or an error loses none.
+    demonstration that is still open then is saved: a signal or an error loses none. While it
+    is recorded a draft of it is written every `_DRAFT_EVERY` seconds, which `recover_dataset`
+    makes an episode of after a power cut.
     """
 
-    def __init__(self, writer: DatasetWriter, task: Callable[[], str]):
+    def __init__(
+        self,
+        writer: DatasetWriter,
+        task: Callable[[], str],
+        clock: Callable[[], float] = time.monotonic,
+    ):
         """Prepare.
 
         Args:
             writer: Of the dataset, used by nobody else.
             task: What is demonstrated, in words; asked for when a demonstration is saved.
+            clock: Tells the time that passes for the person [s].
         """
-        self._writer, self._task = writer, task
+        self._writer, self._task, self._clock = writer, task, clock
         self._frames: list[Frame] = []
+        self._came: list[float] = []  # when, by the clock [s]
         self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="recorder")
         self._writing: list[Future[int]] = []
+        self._draft: Future[float] | None = None
+        self._draft_due = 0.0
         self._state: RecorderState = "ready"
-        self._note = ""
+        self._note, self._insists = "", False
 
     def __enter__(self) -> "DemonstrationRecorder":
         return self
 
     def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
-        if self._state != "ready":  # ended by a signal, say: what was shown is not lost
-            self._save(task=self._task() or UNNAMED)
+        self.finish()
         self._thread.shutdown(wait=True)
         if isinstance(error, SystemExit | KeyboardInterrupt):  # asked to end: nothing failed
             kind = error = trace = None
@@ -78,15 +98,20 @@ class DemonstrationRecorder:
         with empty:
             self._writer.__exit__(kind, error, trace)
 
+    def finish(self) -> None:
+        """Keep what is open, unless nothing in it moves, and wait until all is on disk."""
+        if self._state != "ready":  # ended by a signal, say: what was shown is not lost
+            self._insists = True
+            self._save(task=self._task() or UNNAMED)
+        wait(self._writing)
+
     @property
     def status(self) -> RecorderStatus:
         """As it is now."""
-        seconds = 0.0
-        if self._frames:
-            seconds = float(self._frames[-1]["time"]) - float(self._frames[0]["time"])
         saved = sum(w.done() and w.exception() is None for w in self._writing)
         failed = next((w.exception() for w in self._writing[::-1] if w.done()), None)
         note = self._note if failed is None else f"not saved: {failed}"
+        seconds = _duration(self._frames)
         return RecorderStatus(state=self._state, seconds=seconds, saved=saved, note=note)
 
     def handle(self, request: Request) -> None:
@@ -94,38 +119,81 @@ class DemonstrationRecorder:
         match request, self._state:
             case "start", "ready" | "stopped":
                 # Starting over is the quickest way to discard.
-                self._frames, self._state, self._note = [], "recording", ""
+                self._forget()
+                self._state, self._note = "recording", ""
+                self._draft_due = self._clock() + _DRAFT_EVERY
             case "stop", "recording":
-                self._state, self._note = "stopped", "save it or discard it"
+                self._state, self._note = "stopped", ""
             case "save", "recording" | "stopped":
                 self._save(self._task())
             case "discard", "recording" | "stopped":
-                self._frames, self._state, self._note = [], "ready", "discarded"
+                self._forget()
+                self._note = "discarded"
             case (("stop" | "save" | "discard"), _):
                 self._note = f"nothing to {request}: start a demonstration first"
 
     def add(self, frame: Frame) -> None:
         """Keep a frame while recording."""
-        if self._state == "recording":
-            self._frames.append(frame)
+        if self._state != "recording":
+            return
+        now = self._clock()
+        self._frames.append(frame)
+        self._came.append(now)
+        if self._draft is not None and self._draft.done():
+            # A long demonstration takes longer to write: a tenth of the time at most.
+            took = self._draft.result()
+            self._draft, self._draft_due = None, now + max(_DRAFT_EVERY, 10 * took)
+        if self._draft is None and now >= self._draft_due:
+            frames, task = self._frames[:], self._task() or UNNAMED
+            self._draft = self._thread.submit(self._write_draft, frames, task)
+
+    def _forget(self) -> None:
+        """Drop the demonstration in hand, and its draft."""
+        self._frames, self._came, self._state, self._insists = [], [], "ready", False
+        self._thread.submit(self._writer.discard_draft)
 
     def _save(self, task: str) -> None:
         frames = self._frames
         if not task.strip():
-            self._state, self._note = (
-                "stopped",
-                "not saved yet: say in Task what is demonstrated",
-            )
+            self._state = "stopped"
+            self._note = "not saved yet: say in Task what is demonstrated"
             return
-        self._frames, self._state = [], "ready"
-        if not frames:
-            self._note = "nothing to save: the demonstration has no frames"
+        if why := worthless(frames):
+            self._forget()
+            self._note = f"nothing to save: {why}"
             return
-        if not moves(frames):
-            self._note = "nothing to save: the arm has not moved"
+        if not self._insists and (doubt := self._doubt()):
+            self._state, self._insists = "stopped", True
+            self._note = f"not saved yet: {doubt}. Save again to keep it all the same"
             return
+        self._frames, self._came, self._state, self._insists = [], [], "ready", False
         self._note = "saved"
         self._writing.append(self._thread.submit(self._write, without_rest(frames), task))
+
+    def _doubt(self) -> str:
+        """Why a demonstration should rather be shown again; empty if it is good."""
+        period = 1 / self._writer.fps
+        stamps = np.array([float(frame["time"]) for frame in self._frames])
+        gaps = np.diff(stamps)
+        lost = float((np.rint(gaps / period) - 1).clip(0).sum())
+        if lost > _MOST_LOST * (lost + len(stamps)) or gaps.max() - period > _LONGEST_GAP:
+            return (
+                f"{100 * lost / (lost + len(stamps)):.0f} % of its frames are lost, up to "
+                f"{gaps.max():.2f} s in a row"
+            )
+        late = int((np.diff(self._came) > _LATE * period).sum())
+        if late > _MOST_LATE * len(gaps):
+            return f"the loop was late at {late} of {len(stamps)} frames: this machine is busy"
+        return ""
+
+    def _write_draft(self, frames: list[Frame], task: str) -> float:
+        """Time that it took [s]."""
+        began = time.perf_counter()
+        # What cannot be written is told when it is saved.
+        with contextlib.suppress(ValueError, OSError):
+            if not worthless(frames):
+                self._writer.write_draft(task, frames)
+        return time.perf_counter() - began
 
     def _write(self, frames: list[Frame], task: str) -> int:
         self._writer.start_episode(task)
@@ -133,8 +201,26 @@ class DemonstrationRecorder:
             for frame in frames:
                 self._writer.add_frame(images=None, **frame)
             return self._writer.save_episode()
+        except ValueError:
+            self._writer.discard_draft()
+            raise
         finally:
             self._writer.discard_episode()
+
+
+def worthless(frames: list[Frame]) -> str:
+    """Why a demonstration shows nothing at all; empty if it shows something."""
+    if not frames:
+        return "the demonstration has no frames"
+    if not moves(frames):
+        return "the arm has not moved"
+    if (seconds := _duration(without_rest(frames))) < _SHORTEST:
+        return f"the arm has moved for {seconds:.1f} s only"
+    return ""
+
+
+def _duration(frames: list[Frame]) -> float:
+    return float(frames[-1]["time"]) - float(frames[0]["time"]) if frames else 0.0
 
 
 def moves(frames: list[Frame]) -> bool:

@@ -164,6 +164,10 @@ class PageSession:
         human = InputFilter(CombinedInput(page.human, *beside), self._config.input_filter)
         chain = world.arm.robot.chain
         self.arm = HandGuidedArm(chain, self._opened.arm, human, self._config.guiding)
+        page.farewell = (
+            "The program was ended. A demonstration that was open is kept. "
+            "You can close this tab."
+        )
         self._ticks, self._width = 0, None
         self._watched, self._alone = False, 0
 
@@ -191,6 +195,8 @@ class PageSession:
     def _handle(self, request: Request) -> None:
         if request == "finish":
             self.finished = True
+            self.arm.stop()
+            self._recorder.finish()
             saved = self._recorder.status.saved
             self._page.farewell = f"Finished: {counted(saved)} saved. You can close this tab."
         elif request == "home":
@@ -211,6 +217,9 @@ class PageSession:
             self._alone += 1
             if self._alone * self._config.guiding.dt > _LEFT_FOR:
                 self._recorder.handle("stop")
+                self._remark = (
+                    f"the recording was stopped: nobody was here for {_LEFT_FOR:.0f} s"
+                )
 
     def _go_home(self) -> None:
         """A simulated arm without a driver jumps there, another moves in a straight line."""

@@ -1,13 +1,19 @@
 """Recording at a person's word, without a person."""
 
+import shutil
+
 import numpy as np
 import pytest
 
-from hrc_learn.demos import DatasetWriter, load_demos
+from hrc_learn.demos import DatasetError, DatasetWriter, load_demos, recover_dataset
 from hrc_learn.kinematics import panda
-from hrc_learn.teleoperation.demonstration_recorder import DemonstrationRecorder, without_rest
+from hrc_learn.teleoperation.demonstration_recorder import (
+    UNNAMED,
+    DemonstrationRecorder,
+    without_rest,
+)
 
-FPS = 50.0
+FPS = 5.0  # few frames make a demonstration of half a second
 
 
 def frame(k):
@@ -118,6 +124,10 @@ def test_what_does_not_move_or_has_no_name_is_not_saved(folder):
             recorder.add(frame(0))
         recorder.handle("save")
         assert "not moved" in recorder.status.note
+        recorder.handle("start")
+        record(recorder, 0, 3)
+        recorder.handle("save")
+        assert recorder.status.note == "nothing to save: the arm has moved for 0.4 s only"
     assert recorder.status.saved == 1
     assert [demo.task for demo in load_demos(folder)] == ["show it"]
 
@@ -132,8 +142,8 @@ def test_an_empty_demonstration_is_not_saved(folder):
 def test_frames_that_cannot_be_written_are_reported_and_the_next_are_saved(folder):
     with open_recorder(folder) as recorder:
         recorder.handle("start")
-        recorder.add({"time": 0.0, "joint_position": np.zeros(6)})
-        recorder.add({"time": 0.1, "joint_position": np.ones(6)})
+        for k in range(4):
+            recorder.add({"time": k / FPS, "joint_position": np.full(6, 0.1 * k)})
         recorder.handle("save")
         recorder._writing[0].exception()  # wait for the thread
         assert recorder.status.note.startswith("not saved: frame 0: joint_position needs 7")
@@ -157,14 +167,17 @@ def test_what_was_saved_before_a_failure_is_not_lost(folder):
     assert "recover_dataset" in caught.value.__notes__[0]
 
 
+FINE = 50.0
+
+
 def resting_frames(moves):
     """Two seconds of rest, a second in which something moves, two of rest."""
     return [
         {
-            "time": 10.0 + k / FPS,
+            "time": 10.0 + k / FINE,
             "joint_position": np.zeros(7),
             "gripper": 0.08,
-            **moves(np.clip(k / FPS - 2.0, 0.0, 1.0)),
+            **moves(np.clip(k / FINE - 2.0, 0.0, 1.0)),
         }
         for k in range(251)
     ]
@@ -199,3 +212,75 @@ def test_a_motion_that_is_cut_off_is_kept_to_its_end():
     kept = without_rest(frames)
     assert kept[-1] is frames[-1]
     assert kept[0]["time"] == pytest.approx(11.7, abs=0.12)
+
+
+@pytest.mark.parametrize(
+    ("kept", "share"), [(lambda k: k % 5, "19 %"), (lambda k: k not in (40, 41), "2 %")]
+)
+def test_lost_frames_are_told_and_saving_again_insists(folder, kept, share):
+    with open_recorder(folder) as recorder:
+        recorder.handle("start")
+        for k in filter(kept, range(1, 100)):
+            recorder.add(frame(k))
+        recorder.handle("save")
+        told = recorder.status
+        assert told.state == "stopped"
+        assert (
+            f"{share} of its frames are lost, up to 0.{'4' if kept(5) == 0 else '6'}"
+            in told.note
+        )
+        assert "Save again" in told.note
+        recorder.handle("save")
+        assert recorder.status.state == "ready"
+    assert recorder.status.saved == 1
+
+
+@pytest.mark.parametrize(("late", "good"), [(19, True), (21, False)])
+def test_a_loop_that_stutters_is_told(folder, late, good):
+    now = [0.0]
+    writer = DatasetWriter(folder, FPS, "panda", panda.joint_names)
+    with DemonstrationRecorder(writer, lambda: "show it", lambda: now[0]) as recorder:
+        recorder.handle("start")
+        for k in range(101):
+            recorder.add(frame(k))
+            now[0] += (2.1 if k < late else 1.9) / FPS
+        recorder.handle("save")
+        assert recorder.status.state == ("ready" if good else "stopped")
+        assert good or f"late at {late} of 101 frames" in recorder.status.note
+    assert recorder.status.saved == 1  # what is open is kept in any case
+
+
+def test_a_draft_is_on_disk_until_it_is_saved_or_discarded(folder):
+    now = [0.0]
+
+    def show(recorder, count):
+        now[0] = 0.0
+        recorder.handle("start")
+        for k in range(count):
+            now[0] = k / FPS
+            recorder.add(frame(k))
+        recorder._thread.submit(int).result()  # wait for the thread
+
+    def drafted():
+        left = folder.with_name("copy.recording")
+        shutil.copytree(folder.with_name("demos.recording"), left)
+        try:
+            return [len(demo) for demo in load_demos(recover_dataset(left.with_suffix("")))]
+        except DatasetError:
+            return []
+        finally:
+            shutil.rmtree(folder.with_name("copy"), ignore_errors=True)
+
+    writer = DatasetWriter(folder, FPS, "panda", panda.joint_names)
+    with DemonstrationRecorder(writer, lambda: "", lambda: now[0]) as recorder:
+        show(recorder, 10)
+        assert drafted() == []  # not yet two seconds
+        recorder.handle("discard")
+        show(recorder, 16)
+        assert drafted() == [11]
+        recorder.handle("discard")
+        recorder._thread.submit(int).result()
+        assert drafted() == []
+        show(recorder, 20)
+    (demo,) = load_demos(folder)
+    assert (len(demo), demo.task) == (20, UNNAMED)

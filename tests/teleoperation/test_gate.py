@@ -17,6 +17,7 @@ from hrc_learn.teleoperation.gate.address import (
     network_name,
     tls_context,
 )
+from hrc_learn.teleoperation.gate.control import Link
 from hrc_learn.teleoperation.gate.gate import Bucket
 from hrc_learn.teleoperation.gate.messages import (
     Hands,
@@ -24,6 +25,8 @@ from hrc_learn.teleoperation.gate.messages import (
     session_message,
     view_message,
 )
+from hrc_learn.teleoperation.page import PageConfig
+from hrc_learn.teleoperation.page.page import slow_words
 
 
 class Clock:
@@ -66,6 +69,29 @@ def test_signs_of_life_carry_motion_and_silence_ends_it(control, clock):
     assert control.present
     clock.time += 0.61
     assert control.gone
+
+
+def test_what_slowed_the_leader_down_is_told_for_a_while(control, clock):
+    config = PageConfig(silence=0.15, timeout=0.6)
+    control.join("a")
+    for _ in range(20):
+        clock.time += 0.04
+        control.hear("a", delay=0.02)
+    assert slow_words(control.link, config) == ""
+    control.hear("a", delay=0.3)
+    assert "there and back takes 300 ms" in slow_words(control.link, config)
+    clock.time += 0.4
+    control.hear("a", delay=0.2)
+    assert "nothing was heard of this browser for 0.40 s" in slow_words(control.link, config)
+    assert "up to 300 ms" in slow_words(control.link, config)
+    control.hear("a", lag=0.35)
+    assert "busy for 0.3" in slow_words(control.link, config)
+    for _ in range(31):
+        clock.time += 0.1
+        control.hear("a", delay=0.02)
+    assert slow_words(control.link, config) == ""
+    control.leave("a")
+    assert control.link == Link()
 
 
 def test_a_page_that_hangs_behind_a_worker_that_beats_is_gone(control):

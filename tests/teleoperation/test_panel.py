@@ -7,6 +7,7 @@ import numpy as np
 from hrc_learn.protocols import Feedback, Reason
 from hrc_learn.teleoperation.page import PageStatus
 from hrc_learn.teleoperation.page.panel import (
+    can_do,
     feedback_html,
     interventions_html,
     nullspace_input_html,
@@ -55,6 +56,20 @@ def test_what_others_have_written_is_not_taken_for_the_pages_own():
     assert "recording 1.5 s" in state_html(
         PageStatus(recording="recording", seconds=1.5), rate=0.0, people=0
     )
+
+
+def test_what_can_be_done_now_is_said():
+    said = {
+        (state, task): can_do(PageStatus(recording=state), task)
+        for state in ("ready", "recording", "stopped")
+        for task in ("", "show it")
+    }
+    assert "Press Start" in said["ready", ""]
+    assert "press Stop" in said["recording", "show it"]
+    assert said["stopped", "show it"] == "Save it or discard it."
+    assert "Task" in said["stopped", ""]
+    assert can_do(PageStatus(doing="servo"), "") == ""
+    assert "Press Start" in state_html(PageStatus(), rate=0.0, people=0)
 
 
 def test_an_arm_that_works_by_itself_says_what_it_does_and_records_nothing():

@@ -95,7 +95,7 @@ class RunServoing(RunExperiment):
     """Serve a page in the browser, from which people watch, draw where to, and pull at the
     elbow."""
     port: int | None = None
-    """Port of that page, which must be free; the first free one from 8080 on when not given."""
+    """Port of that page."""
     draw_region: More[tuple[DrawnBox, ...]] = ()
     """Regions that a scripted person draws while the arm servoes: start and duration [s], x y z
     of the centre and of the half edges [m]."""

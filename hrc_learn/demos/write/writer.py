@@ -227,6 +227,32 @@ class DatasetWriter:
         episode |= {key: demonstration.extra[key] for key in self.features}
         return self._save(episode, demonstration.task)
 
+    def write_draft(self, task: str, frames: Sequence[Mapping[str, Any]]) -> None:
+        """Keep frames that are no episode yet, in case that the power fails now.
+
+        `recover_dataset` makes an episode of them. The next draft, and the next episode saved,
+        replace them.
+
+        Args:
+            task: What is shown, in words.
+            frames: Values of each, as `add_frame` takes them.
+
+        Raises:
+            RuntimeError: The dataset has cameras, whose images a draft does not hold.
+            ValueError: As in `add_frame` and `save_episode`.
+        """
+        if self._video_features:
+            raise RuntimeError("a draft holds no images: save episodes instead")
+        buffer = EpisodeBuffer(self.joint_names, self.features)
+        for values in frames:
+            buffer.append(values)
+        _, staged = self._staged(buffer.arrays(), task, self._tasks.get(task, len(self._tasks)))
+        write_episode(episode_path(self._staging, self.episodes), staged)
+
+    def discard_draft(self) -> None:
+        """Forget the draft, if any."""
+        episode_path(self._staging, self.episodes).unlink(missing_ok=True)
+
     def discard_episode(self) -> None:
         """Forget the open episode, if any."""
         self._task, self._buffer = None, EpisodeBuffer(self.joint_names, self.features)
@@ -283,6 +309,25 @@ class DatasetWriter:
         return self._task
 
     def _save(self, episode: Episode, task: str) -> int:
+        number = self._tasks.get(task, len(self._tasks))
+        self._columns, staged = self._staged(episode, task, number)
+        self._tasks[task] = number
+        staged.statistics.update(self._images.finish(self.episodes))
+        write_episode(episode_path(self._staging, self.episodes), staged)
+        self._saved_frames += len(staged.table)
+        self.episodes += 1
+        return self.episodes - 1
+
+    def _staged(
+        self, episode: Episode, task: str, number: int
+    ) -> tuple[list[Column], StagedEpisode]:
+        """The columns of an episode, and the episode as the next file of the recording.
+
+        Args:
+            episode: Its quantities.
+            task: What is shown, in words.
+            number: Index of that task.
+        """
         if not episode:
             raise ValueError(f"episode {self.episodes} has no frames")
         episode = complete(episode, self.fps)
@@ -294,39 +339,34 @@ class DatasetWriter:
             examine(episode)
         except ValueError as error:
             raise ValueError(f"episode {self.episodes} was not saved: {error}") from error
-        self._columns = columns
-        number = self._tasks.setdefault(task, len(self._tasks))
         values = encode(columns, episode) | index_columns(
             self.fps,
             self.episodes,
             self._saved_frames,
             np.full(len(episode["time"]), number),
         )
-        header = self._header()
+        header = self._header(columns)
         if self._earlier is not None:
             _require_same_columns(self._earlier, header)
         staged = StagedEpisode(
             header=header,
             tasks=[task],
-            statistics=episode_statistics(values) | self._images.finish(self.episodes),
+            statistics=episode_statistics(values),
             table=to_table(values, header.features),
         )
-        write_episode(episode_path(self._staging, self.episodes), staged)
-        self._saved_frames += len(staged.table)
-        self.episodes += 1
-        return self.episodes - 1
+        return columns, staged
 
-    def _header(self) -> RecordingHeader:
+    def _header(self, columns: Sequence[Column]) -> RecordingHeader:
         return RecordingHeader(
             fps=self.fps,
             robot_type=self.robot_type,
             features={
-                **lerobot_features(self._columns, self._dtype),
+                **lerobot_features(columns, self._dtype),
                 **self._video_features,
                 **INDEX_FEATURES,
             },
             sidecar=sidecar_content(
-                self._columns, self.joint_names, self._frames_of_poses, self._details
+                columns, self.joint_names, self._frames_of_poses, self._details
             ),
         )
 

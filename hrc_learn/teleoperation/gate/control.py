@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from threading import RLock
@@ -20,6 +21,22 @@ class ControlView:
     """Whether anybody leads."""
     asked: bool
     """Whether somebody else asks to lead; of a client that watches, whether it asks itself."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Link:
+    """How the leader's browser was heard of in the last seconds."""
+
+    silence: float = 0.0
+    """Longest time without a sign of life [s]."""
+    delay: float = 0.0
+    """Longest way there and back [s]."""
+    lag: float = 0.0
+    """Longest time that their page did not react [s]."""
+
+
+_REMEMBERED = 3.0
+"""How long what slowed a browser down is told [s]: a sentence is read in that."""
 
 
 class Control:
@@ -59,6 +76,7 @@ class Control:
         self._clock = clock
         self._heard: dict[str, float] = {}
         self._lag: dict[str, float] = {}
+        self._links: dict[str, deque[tuple[float, Link]]] = {}
         self._asking: dict[str, float] = {}
         self._leader: str | None = None
         self._acted = float("-inf")
@@ -68,14 +86,14 @@ class Control:
     def join(self, client: str) -> None:
         """Somebody has come; where nobody leads, they do."""
         with self._lock:
-            self._heard[client] = self._clock()
+            self._heard[client], self._links[client] = self._clock(), deque()
             if self._leader is None:
                 self._give(client)
 
     def leave(self, client: str) -> None:
         """Somebody has left."""
         with self._lock:
-            for table in (self._heard, self._lag, self._asking):
+            for table in (self._heard, self._lag, self._links, self._asking):
                 table.pop(client, None)
             if client == self._leader:
                 # Who is left alone leads, as the first to come does: a page that is loaded anew
@@ -83,16 +101,23 @@ class Control:
                 alone = next(iter(self._heard)) if len(self._heard) == 1 else None
                 self._give(min(self._asking, key=self._asking.__getitem__, default=alone))
 
-    def hear(self, client: str, lag: float = 0.0) -> None:
+    def hear(self, client: str, lag: float = 0.0, delay: float = 0.0) -> None:
         """Note a sign of life.
 
         Args:
             client: Whose.
             lag: How long ago their page last reacted [s]; a worker may go on when it hangs.
+            delay: How long the way there and back took [s]; zero where it was not measured.
         """
         with self._lock:
-            if client in self._heard:
-                self._heard[client], self._lag[client] = self._clock(), lag
+            if client not in self._heard:
+                return
+            now = self._clock()
+            silence, links = now - self._heard[client], self._links[client]
+            self._heard[client], self._lag[client] = now, lag
+            links.append((now, Link(silence=silence, delay=delay, lag=lag)))
+            while links[0][0] < now - _REMEMBERED:
+                links.popleft()
 
     def act(self, client: str, *, idle: bool = False) -> bool:
         """Whether a client may act now.
@@ -153,6 +178,20 @@ class Control:
         """How long ago the leader's page last reacted [s]."""
         with self._lock:
             return 0.0 if self._leader is None else self._lag.get(self._leader, 0.0)
+
+    @property
+    def link(self) -> Link:
+        """The worst of the leader's connection in the last seconds."""
+        with self._lock:
+            since = self._clock() - _REMEMBERED
+            recent = [
+                link for time, link in self._links.get(self._leader or "", ()) if time > since
+            ]
+        return Link(
+            silence=max((link.silence for link in recent), default=0.0),
+            delay=max((link.delay for link in recent), default=0.0),
+            lag=max((link.lag for link in recent), default=0.0),
+        )
 
     @property
     def people(self) -> int:

@@ -330,7 +330,7 @@ class Gate:
                 content: dict[str, Any] = {}
                 if now - status >= _STATUS_EVERY:
                     status, view = now, vars(self.control.view(client))
-                    content = {"status": {**self._callbacks.status(), **view}}
+                    content = {"status": {**self._callbacks.status(), **view}, "clock": now}
                 if wants["scene"] and (scene := self._callbacks.scene()) is not last:
                     last, content["scene"] = scene, scene
                 if content:
@@ -344,8 +344,9 @@ class Gate:
 
     def _hear(self, client: str, message: Message, wants: dict[str, bool]) -> None:
         match message:
-            case Beat(lag=lag):
-                self.control.hear(client, lag)
+            case Beat(lag=lag, echo=echo):
+                delay = 0.0 if echo is None else max(time.monotonic() - echo, 0.0)
+                self.control.hear(client, lag, delay)
             case Hello():
                 wants["scene"] = message.wants == "scene"
             case Lead(wish="ask"):

@@ -42,6 +42,9 @@ class Beat:
 
     lag: float
     """How long ago the page has last reacted [s]."""
+    echo: float | None = None
+    """Clock of the server that it was told last, returned at once: how long the way there and
+    back takes."""
 
     def __post_init__(self) -> None:
         if self.lag < 0:

@@ -28,6 +28,7 @@ from hrc_learn.teleoperation.gate import (
     guarded_servers,
     page_contents,
 )
+from hrc_learn.teleoperation.gate.control import Link
 from hrc_learn.teleoperation.gate.messages import Ask, GuiUpdate, Hands, Message
 from hrc_learn.teleoperation.hand_guiding import InteractionForceConfig, leading_twist
 from hrc_learn.teleoperation.page.headset import (
@@ -75,6 +76,7 @@ class PageConfig(AddressConfig):
 
 
 _PULSES = RumbleConfig()  # a headset's controllers shake as a gamepad does
+_SLOW = 0.25  # way there and back from which a drag is seen to be followed late [s]
 _PANEL_EVERY = 5  # refreshes of the scene for one of the panel: text need not be as smooth
 
 
@@ -154,7 +156,8 @@ class Page:
             raise
         self.address = self._gate.address
         self.url = self.address.link()
-        self._held_gizmos, self._turn = HeldGizmos(), AddedTurn()
+        self._wake = Event()
+        self._held_gizmos, self._turn = HeldGizmos(self._wake.set), AddedTurn()
         self._hands = HeadsetHands(self._held_gizmos, self._turn, self._links, guides=guides)
         draws = guides if draws is None else draws
         self._scene = PageScene(self._server, bodies, boxes, config.twin)
@@ -189,7 +192,6 @@ class Page:
         self._error: BaseException | None = None
         self.farewell = "The session has ended."
         self._led, self._led_lock = self.control.turn, Lock()
-        self._wake = Event()
         self._asked = 0.0
         self._scene_state: dict[str, Any] = {}
         self._thread = Thread(target=self._guarded, name="page refresh", daemon=True)
@@ -356,15 +358,11 @@ class Page:
 
     def _told(self) -> dict[str, Any]:
         """What the bar at the top of the page says."""
-        lag, limit = self.control.lag, self._config.timeout
         words = ""
         if self._error is not None:
             words = "The page does not follow the arm any more: see the terminal."
-        elif lag > limit / 2:
-            words = (
-                f"This browser was busy for {lag:.1f} s: beyond {limit:.1f} s the arm lets go. "
-                "Make its window smaller, or hide the virtual twin."
-            )
+        else:
+            words = slow_words(self.control.link, self._config)
         feedback, status = self.human.feedback, self._status
         return {
             "words": words,
@@ -381,6 +379,32 @@ class Page:
             "felt": felt_words(feedback),
             "sent": self._asked,
         }
+
+
+def slow_words(link: Link, config: PageConfig) -> str:
+    """Why a drag is followed late or not at all; empty if it is followed at once.
+
+    Args:
+        link: The leader's connection.
+        config: Of the page.
+    """
+    if link.lag > config.timeout / 2:
+        return (
+            f"This browser was busy for {link.lag:.1f} s: beyond {config.timeout:.1f} s the "
+            "arm lets go. Make its window smaller, or hide the virtual twin."
+        )
+    if link.silence > config.silence:
+        return (
+            f"The link is slow: nothing was heard of this browser for {link.silence:.2f} s, "
+            f"and beyond {config.silence:.2f} s the arm waits. There and back takes up to "
+            f"{1e3 * link.delay:.0f} ms."
+        )
+    if link.delay > _SLOW:
+        return (
+            f"The link is slow: there and back takes {1e3 * link.delay:.0f} ms, and the arm "
+            "follows a drag that much later."
+        )
+    return ""
 
 
 def _joints(state: ArmState) -> Float[torch.Tensor, " joints"]:

@@ -46,8 +46,13 @@ class HeldGizmos:
     Safe to use from several threads. A holder is whatever tells two browsers apart.
     """
 
-    def __init__(self) -> None:
-        """Start with nobody holding anything."""
+    def __init__(self, changed: Callable[[], object] = lambda: None) -> None:
+        """Start with nobody holding anything.
+
+        Args:
+            changed: Called when a gizmo has been taken, dragged or released.
+        """
+        self._changed = changed
         self._held: dict[tuple[Hashable, str], HeldGizmo] = {}
         self._lock = Lock()
 
@@ -55,6 +60,7 @@ class HeldGizmos:
         """Begin to hold a gizmo."""
         with self._lock:
             self._held[holder, handle] = held
+        self._changed()
 
     def move(
         self,
@@ -70,11 +76,13 @@ class HeldGizmos:
                 self._held[holder, handle] = replace(
                     held, pointer=pointer, orientation=orientation
                 )
+        self._changed()
 
     def release(self, holder: Hashable, handle: str) -> None:
         """Let go of a gizmo."""
         with self._lock:
             self._held.pop((holder, handle), None)
+        self._changed()
 
     def release_all(self, holder: Hashable) -> None:
         """Forget somebody who has left."""

@@ -22,6 +22,7 @@ from hrc_learn.viz.palette import PERSON, SKY, TARGET, rgba
 
 # viser is imported when a page is opened, and not before.
 if TYPE_CHECKING:
+    from viser import ClientHandle as ClientHandle
     from viser import FrameHandle as FrameHandle
     from viser import IcosphereHandle as IcosphereHandle
     from viser import MeshHandle as MeshHandle
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
     Holdable = MeshHandle | IcosphereHandle
 else:
     # What checks annotations while the program runs must find something.
-    FrameHandle = IcosphereHandle = MeshHandle = Holdable = ViserServer = Any
+    ClientHandle = FrameHandle = IcosphereHandle = MeshHandle = Holdable = ViserServer = Any
     SceneClickEvent = SceneNodeDragEvent = SceneRectSelectEvent = Any
 
 
@@ -260,9 +261,24 @@ class PageScene:
             dimensions=(0.24, 0.24, 0.72),
             position=(-0.03, 0.0, -0.36),
         )
-        server.initial_camera.position = (2.65, 1.05, 1.15)
-        server.initial_camera.look_at = (0.1, 0.47, 0.12)
+        server.initial_camera.position = _CAMERA
+        server.initial_camera.look_at = _LOOK_AT
         server.initial_camera.fov = 0.9
+        server.on_client_connect(_step_back)
+
+
+_CAMERA, _LOOK_AT = (2.65, 1.05, 1.15), (0.1, 0.47, 0.12)
+_ASPECT = 1.2  # of a view at which cabinet and twin are both in it
+
+
+def _step_back(client: ClientHandle) -> None:
+    """Let a camera stand back whose view is narrow, as a phone's is: what is seen stays."""
+    aspect = client.camera.aspect
+    if aspect < _ASPECT:
+        look_at = np.array(_LOOK_AT)
+        # Its position takes along what it looks at.
+        client.camera.position = look_at + _ASPECT / aspect * (np.array(_CAMERA) - look_at)
+        client.camera.look_at = _LOOK_AT
 
 
 _BASE_AXES = (1.0, 0.0, 0.0, 0.0)  # unit quaternion (wxyz)

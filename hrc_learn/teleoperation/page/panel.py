@@ -46,13 +46,32 @@ class PageStatus:
     """To which a controller takes the end effector; None: it follows no region."""
 
 
-def state_html(status: PageStatus, rate: float, people: int) -> str:
+def can_do(status: PageStatus, task: str) -> str:
+    """What the person can do now, in words; empty beside an arm that works by itself.
+
+    Args:
+        status: Of the session.
+        task: What is demonstrated, in words.
+    """
+    if status.doing:
+        return ""
+    if status.recording == "ready":
+        return "Press Start, then lead the arm: drag its hand, a link or a knob."
+    if status.recording == "recording":
+        return "Lead the arm, then press Stop."
+    return (
+        "Save it or discard it." if task.strip() else "Say in Task what is shown, then save it."
+    )
+
+
+def state_html(status: PageStatus, rate: float, people: int, task: str = "") -> str:
     """What is guided here, what it is doing, and who watches.
 
     Args:
         status: Of the session.
         rate: Steps that the loop takes [1/s].
         people: Browsers that show the page.
+        task: What is demonstrated, in words.
     """
     if status.doing:
         doing = f"{_badge(BLUE, status.doing)}&ensp;{status.seconds:.1f} s"
@@ -67,6 +86,7 @@ def state_html(status: PageStatus, rate: float, people: int) -> str:
         '<div style="padding:.2em .9em .5em;line-height:1.5">'
         f'<div style="font-size:1.15em;font-weight:600">{html.escape(status.title)}</div>'
         f"{doing}"
+        f"<div>{can_do(status, task)}</div>"
         f'<div style="opacity:.75;font-size:.85em">{html.escape(status.note) or "&nbsp;"}</div>'
         f'<div style="opacity:.75;font-size:.85em">{rate:.0f} steps a second, '
         f"{people} connected</div></div>"
@@ -429,10 +449,12 @@ class Panel:
             self._next = "stop" if status.recording == "recording" else "start"
             self._switch.label = self._next.capitalize()
             self._switch.icon = _ICONS[self._next]
+            # Starting over would throw away what waits to be saved.
+            self._switch.disabled = status.recording == "stopped"
             if self._keep is not None:
                 self._keep.visible = status.recording == "stopped"
         largest = self._initial_forces.max_nullspace_input
-        self._state.content = state_html(status, rate, people)
+        self._state.content = state_html(status, rate, people, self.task)
         self._bars.content = nullspace_input_html(nullspace_input, largest)
         if self._region is not None:
             self._turn_text.content = _turn_words(self._turn.vector)

@@ -8,12 +8,18 @@ self.onmessage = ({ data }) => {
   else if (data.send && socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify(data.send));
   else if (data.open) {
     socket = new WebSocket(data.open);
-    socket.onmessage = (event) => self.postMessage(JSON.parse(event.data));
+    socket.onmessage = (event) => {
+      const message = JSON.parse(event.data);
+      if (message.clock !== undefined) beat(message.clock);
+      self.postMessage(message);
+    };
     socket.onclose = (event) => self.postMessage({ type: "closed", words: event.reason });
   }
 };
-setInterval(() => {
+// With the clock of the server, it learns how long the way there and back takes.
+const beat = (echo) => {
   if (socket?.readyState !== WebSocket.OPEN) return;
   const lag = Math.max(0, Date.now() - alive) / 1000;
-  socket.send(JSON.stringify({ type: "beat", lag }));
-}, BEAT);
+  socket.send(JSON.stringify(echo === undefined ? { type: "beat", lag } : { type: "beat", lag, echo }));
+};
+setInterval(() => beat(), BEAT);
