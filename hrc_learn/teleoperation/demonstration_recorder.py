@@ -27,8 +27,8 @@ _MOST_LOST, _LONGEST_GAP = 0.05, 0.2
 """Share of lost frames, and time without one [s], from which a demonstration is doubted: at
 0.5 m/s the hand goes on for 10 cm meanwhile."""
 _LATE, _MOST_LATE = 2.0, 0.2
-"""Periods after which a frame is late, and share of such frames from which the arm was seen to
-stutter: a page drawn without a graphics processor beside it makes some 2 % late."""
+"""Periods after which a frame is late, and share of such frames from which a demonstration is
+doubted: one in five, so that a machine that is busy for a moment asks for nothing."""
 _DRAFT_EVERY = 2.0
 """Time from one draft of the open demonstration to the next [s]."""
 
