@@ -1,9 +1,11 @@
 """Episodes added to a dataset that is there already."""
 
+import shlex
 import shutil
 
 import numpy as np
 import pytest
+from commands import hrc
 from lerobot_folders import joint_path, read_info
 from power_cuts import cut_off
 
@@ -13,7 +15,6 @@ from hrc_learn.demos import (
     check_dataset,
     load_demos,
     recover_all,
-    recover_dataset,
 )
 
 JOINTS = ("a", "b", "c")
@@ -98,9 +99,12 @@ def test_a_broken_recording_leaves_the_dataset_whole_and_its_episodes_safe(tmp_p
         record(root, [1], ["place"], append=True, then=KeyboardInterrupt())
     assert "The 1 episodes saved" in raised.value.__notes__[0]
     assert_holds(root, [0], ["reach"])
-    with pytest.raises(FileExistsError, match="recover_dataset"):
+    with pytest.raises(FileExistsError, match="recover_dataset") as raised:
         record(root, [2], ["pour"], append=True)
-    assert recover_dataset(root) == root
+    # The command that it names, as pasted.
+    command = shlex.split(str(raised.value).split("`")[1])
+    assert command[0] == "hrc"
+    assert not hrc(*command[1:]).status
     assert_holds(root, [0, 1], ["reach", "place"])
     assert list(tmp_path.iterdir()) == [root]
 

@@ -6,6 +6,7 @@ hold is the business of `read.frames` and `read.column_mapping`.
 
 import json
 import re
+import shlex
 import stat
 from bisect import bisect_left, bisect_right
 from collections.abc import Collection, Iterable, Sequence
@@ -328,11 +329,17 @@ def _integer(value: object, name: str, file: str, lowest: int = 0, line: str = "
     return int(value)  # type: ignore[arg-type]
 
 
+def how_to_recover(root: Path) -> str:
+    """The command, and the call, that make a dataset of an interrupted recording."""
+    command = shlex.join(["hrc", "recover", "--path", str(root)])
+    return f"`{command}`, or hrc_learn.demos.recover_dataset({str(root)!r}),"
+
+
 def _why_no_info(root: Path) -> str:
     if staging_folder(root).is_dir():
         return (
             f"not found: the recording was broken off before it became a dataset. "
-            f"hrc_learn.demos.recover_dataset({str(root)!r}) makes one of its saved episodes"
+            f"{how_to_recover(root)} makes one of its saved episodes"
         )
     if not root.exists():
         return "there is no dataset: the folder does not exist"

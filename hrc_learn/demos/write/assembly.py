@@ -17,7 +17,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from hrc_learn.demos.format.dataset_folder import open_folder, read_rows
+from hrc_learn.demos.format.dataset_folder import how_to_recover, open_folder, read_rows
 from hrc_learn.demos.format.metadata import (
     CHUNK_SIZE,
     DATA_PATH,
@@ -260,8 +260,8 @@ def begin(root: Path, earlier_episodes: int | None) -> None:
     except FileExistsError:
         raise FileExistsError(
             f"{staging} holds a recording that was interrupted: "
-            f"hrc_learn.demos.recover_dataset({str(root)!r}) makes a dataset of its saved "
-            f"episodes; remove it to start anew"
+            f"{how_to_recover(root)} makes a dataset of its saved episodes; remove it to "
+            f"start anew"
         ) from None
     _write(staging, earlier_episodes)
 

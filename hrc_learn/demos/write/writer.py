@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from hrc_learn.demos.demonstration import Demonstration
-from hrc_learn.demos.format.dataset_folder import DatasetFolder, open_folder
+from hrc_learn.demos.format.dataset_folder import DatasetFolder, how_to_recover, open_folder
 from hrc_learn.demos.format.metadata import INDEX_FEATURES, episode_statistics, read_sidecar
 from hrc_learn.demos.format.videos import CameraRecorder, Image, video_features
 from hrc_learn.demos.issue import DatasetError
@@ -145,8 +145,7 @@ class DatasetWriter:
         if self._new_episodes:
             error.add_note(
                 f"The {self._new_episodes} episodes saved before this are kept in "
-                f"{self._staging}; hrc_learn.demos.recover_dataset({str(self.root)!r}) makes "
-                f"a dataset of them."
+                f"{self._staging}; {how_to_recover(self.root)} makes a dataset of them."
             )
 
     def start_episode(self, task: str) -> None:
