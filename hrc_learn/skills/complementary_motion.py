@@ -69,7 +69,7 @@ class ComplementaryMotion:
     policy's posture has it and move in its null space, within their limits and clear of what
     is around them. When the person lets go they return to the policy's posture, or stay beside
     it (`YieldingConfig.after_push`). Where the arm, aside, cannot follow, the motion waits and
-    goes on from there, as on planned paths (`WorkCell.follow_path`).
+    goes on from there, as on planned paths (`follow_path`).
 
     Attributes:
         posture: Joint positions that the policy has now, as without the person [rad]; None

@@ -12,7 +12,7 @@ from torch import Tensor
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import SerialChain, panda
 from hrc_learn.protocols import Camera, TimedCamera
-from hrc_learn.vision import MarkerDetector, centre
+from hrc_learn.vision import MarkerDetector, angle, centre
 from hrc_learn.viz import StepLog
 
 
@@ -110,6 +110,82 @@ class DelayedChannel:
         while self._pending and self._pending[0].time <= taken_by:
             arrived = self._pending.popleft()
         return arrived
+
+
+# Images taken less than this apart are one image, whose age was read from another clock; and
+# for how long joint positions are remembered, longer than any camera's delay [s].
+_SAME_IMAGE, _REMEMBERED = 1e-3, 1.0
+
+
+class DelayedDetection:
+    """Markers as a controller comes to know them: late, some never, each with the joint
+    positions of when its image was taken.
+    """
+
+    def __init__(
+        self,
+        sensor: MarkerSensor | None,
+        latency: LatencyConfig,
+        dt: float,
+        rng: np.random.Generator,
+    ):
+        """Begin with nothing detected.
+
+        Args:
+            sensor: The camera with its detector; None where a task needs none.
+            latency: How late images are, and how many are lost.
+            dt: Control step [s].
+            rng: Decides which images are lost.
+        """
+        self._sensor, self._channel = sensor, DelayedChannel(latency, rng)
+        self._taken = -np.inf  # the newest image [s]
+        self._joints: deque[tuple[float, np.ndarray]] = deque(maxlen=round(_REMEMBERED / dt))
+
+    def image(self) -> UInt8[np.ndarray, "height width 3"] | None:
+        """An image taken now; None without a camera."""
+        return None if self._sensor is None else self._sensor.read()
+
+    def remember(self, time: float, joints: Float[np.ndarray, " joints"]) -> None:
+        """Where the joints are at a time [s, rad]."""
+        self._joints.append((time, joints))
+
+    def detect(
+        self, time: float, joints: Float[Tensor, " joints"], ids: Iterable[int] | None = None
+    ) -> None:
+        """Take an image, and detect markers in it.
+
+        Args:
+            time: The clock [s].
+            joints: Where the joints are by then [rad].
+            ids: Markers that matter now; None: all.
+        """
+        found = {} if self._sensor is None else self._sensor.corners(ids)
+        taken = time - (0.0 if self._sensor is None else self._sensor.age)
+        # A camera that is slower than the detection gives the same image again: no new one.
+        if abs(taken - self._taken) > _SAME_IMAGE:
+            self._taken = taken
+        self._channel.send(
+            MarkerObservation(
+                time=self._taken,
+                joints=self._joints_at(self._taken, time, joints),
+                pixels={id: centre(corners) for id, corners in found.items()},
+                angles={id: angle(corners) for id, corners in found.items()},
+            )
+        )
+
+    def newest(self, time: float) -> MarkerObservation | None:
+        """The newest that has arrived by a time [s] since last asked; None if none has."""
+        return self._channel.newest(time)
+
+    def _joints_at(
+        self, time: float, now: float, joints: Float[Tensor, " joints"]
+    ) -> Float[Tensor, " joints"]:
+        """Where the joints were at a time [s], as far back as is remembered [rad]."""
+        if time >= now or not self._joints:
+            return joints
+        times, passed = zip(*self._joints, (now, joints.numpy()), strict=True)
+        columns = np.stack(passed, axis=-1)
+        return torch.tensor([np.interp(time, times, column) for column in columns])
 
 
 _OVER_TABLE = 0.22

@@ -23,6 +23,7 @@ from enum import StrEnum
 from typing import Literal
 
 from hrc_learn.geometry import Pose
+from hrc_learn.skills.failures import BlockedPathError, MissedGraspError, TaskFailedError
 from hrc_learn.skills.grasping import (
     DESCENT_SPEED,
     OPEN,
@@ -33,15 +34,11 @@ from hrc_learn.skills.grasping import (
     raised,
 )
 from hrc_learn.skills.marker_sensor import longest_occlusion
+from hrc_learn.skills.path_following import follow_path
 from hrc_learn.skills.placing import PlacingSkill, Plan, PlanningSpace, plan_candidates
 from hrc_learn.skills.visual_servoing import ServoTarget
 from hrc_learn.skills.visual_skill import VisualServoSkill
-from hrc_learn.skills.work_cell import (
-    BlockedPathError,
-    MissedGraspError,
-    TaskFailedError,
-    WorkCell,
-)
+from hrc_learn.skills.work_cell import WorkCell
 from hrc_learn.skills.workplace import GraspObject, Workplace
 
 Mishap = Literal[
@@ -158,7 +155,7 @@ def place_along(cell: WorkCell, plan: Plan, goal: Pose, lowering: float) -> floa
         When it began to put down [s].
     """
     cell.begin_phase(Phase.TRANSFER)
-    cell.follow_path(plan.path)
+    follow_path(cell, plan.path)
     # The arm follows late: at the end of the path it is not quite there.
     cell.move_straight(goal)
     cell.begin_phase(Phase.RELEASE)
@@ -346,11 +343,11 @@ class PickAndPlace:
             job.failure = f"transfer: all paths to the {job.shelf} shelf stayed blocked"
             return Phase.PUT_BACK
         job.plan = plan
-        tracked = self._cell.follow_path(
-            plan.path, until=lambda: not holds(self._cell, job.item)
+        tracked = follow_path(
+            self._cell, plan.path, until=lambda: not holds(self._cell, job.item)
         )
         if tracked < len(plan.path):
-            self._cell.follow_path(plan.path[:tracked][::-1])
+            follow_path(self._cell, plan.path[:tracked][::-1])
             return self._start_over(job, "dropped object", "lost on the way to the shelf")
         self._cell.move_straight(plan.goal)
         return Phase.RELEASE
@@ -389,7 +386,7 @@ class PickAndPlace:
         """Back out along the same path: what was free then is free now."""
         assert job.plan is not None
         self._cell.begin_phase(Phase.RETREAT)
-        self._cell.follow_path(job.plan.path[::-1])
+        follow_path(self._cell, job.plan.path[::-1])
         return Phase.OVER
 
     def _put_back(self, job: PickPlaceJob) -> Phase:
@@ -398,7 +395,7 @@ class PickAndPlace:
         self._cell.begin_phase(Phase.PUT_BACK)
         plan = joint_plan(self._cell, self._cell.joints, self._workplace.hover_joints())
         self._check(plan)
-        self._cell.follow_path(plan.path)
+        follow_path(self._cell, plan.path)
         self._cell.move_straight(raised(job.picked_up, self._config.grasping.lift))
         self._cell.move_straight(job.picked_up, speed=DESCENT_SPEED)
         self._grasping.start_over()

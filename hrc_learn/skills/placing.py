@@ -30,7 +30,7 @@ from hrc_learn.kinematics import (
 )
 from hrc_learn.regions import JointRegion
 from hrc_learn.skills.arm_motion import joint_line, resolved_rate
-from hrc_learn.skills.work_cell import BlockedPathError
+from hrc_learn.skills.failures import BlockedPathError
 from hrc_learn.skills.workplace import CollisionChecker, Workplace
 
 PlanningSpace = Literal["joint", "pose"]

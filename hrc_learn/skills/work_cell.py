@@ -14,7 +14,6 @@ from torch import Tensor
 from hrc_learn.controller import (
     INTERVENTIONS,
     Command,
-    ConstraintReport,
     Distances,
     SafetyConfig,
     SafetyFilter,
@@ -38,57 +37,33 @@ from hrc_learn.protocols import (
 from hrc_learn.regions import PositionRegion
 from hrc_learn.skills.arm_motion import (
     StraightLine,
-    joint_line,
     kept_clear,
     null_space_giving_way,
     null_space_slowdown,
     task_rate,
 )
+from hrc_learn.skills.failures import StoppedByPersonError
 from hrc_learn.skills.marker_sensor import (
-    DelayedChannel,
+    DelayedDetection,
     LatencyConfig,
     MarkerObservation,
     MarkerSensor,
 )
 from hrc_learn.skills.null_space_yielding import (
-    CHANGE_OF_RATE,
-    FAR_ASIDE,
-    LONGEST_RETURN,
-    NARROW,
     NullSpaceYielding,
     YieldingConfig,
-    changed_rate,
     share_of_motion,
-    smallest_singular_value,
 )
+from hrc_learn.skills.pace import TaskPace, at_people, people_bind
 from hrc_learn.skills.person_feedback import (
+    Hindrances,
     PersonFeedback,
     contact_force,
     filter_hindrance,
     share_kept,
 )
 from hrc_learn.skills.person_watch import BESIDE_PEOPLE, PersonWatch
-from hrc_learn.vision import angle, centre
 from hrc_learn.viz import Event, StepLog
-
-# What skills ask of the place they work in, whether simulated or real.
-
-
-class TaskFailedError(RuntimeError):
-    """A task could not be carried out; the message says at which phase and why."""
-
-
-class MissedGraspError(TaskFailedError):
-    """A grasp failed; another attempt may succeed."""
-
-
-class StoppedByPersonError(TaskFailedError):
-    """The person beside the arm has stopped it, or something has met it; it is at rest."""
-
-
-class BlockedPathError(TaskFailedError):
-    """A planned motion would collide or leave the limits of the arm."""
-
 
 HINDRANCE_COLUMNS = HINDRANCES
 """Names of the components of the log's column "hindered"."""
@@ -98,32 +73,12 @@ SAFETY_COLUMNS = INTERVENTIONS
 
 # At the end of a straight line, for the pose error to decay by pose_gain [s].
 _SETTLING_TIME = 0.4
-STUCK = 2.0
-"""Time after which a path that waits for the joints is gone back [s]."""
-# After which they go back straight [s]; and to how many samples of the path that is tried.
-_LONGEST_WAIT, _OTHERS = 20.0, 20
-# Distance of the end effector from its path for the path to wait, and time by which servos lag
-# [m, s]: half the deviation that a push may cause, and twice the lag of an arm 20 ms late.
-_ON_PATH, _SERVO_LAG = 0.001, 0.06
-# Metres that a radian of the end effector counts for: a length of hand and object.
-_METRES_PER_RADIAN = 0.1
-# Postures on the straight way back to a path that are checked: 0.1 rad apart at most.
-_CHECKED = 50
 # Readings of the torque that are averaged, and steps in which an arm gets under way: friction
 # keeps it back at first.
 _FELT, _GETTING_UNDER_WAY = 5, 25
-# Part of the task that constraints take beyond rounding.
-_SLOWED = 1e-3
 # For which what was felt may still be met: the fingers open, the hand leaves it. And in which
 # an arm that is stopped comes to rest [s].
 _LEAVING, _COMES_TO_REST = 1.0, 1.0
-# Images taken less than this apart are one image, whose age was read from another clock; and
-# for how long joint positions are remembered, longer than any camera's delay [s].
-_SAME_IMAGE, _REMEMBERED = 1e-3, 1.0
-# How much faster the arm might close in on people who do not hold it back [m/s]: what the
-# program leaves unused is rounding. And pace below which it stands still.
-_SPARE, _STANDS = 1e-3, 0.01
-
 _NAN = float("nan")
 # Logged as the goal of steps without a path.
 _NOWHERE = np.full(3, _NAN)
@@ -229,7 +184,10 @@ class WorkCell:
         observation: Newest detection of markers that has arrived.
         watched: Where people beside the arm may be; None: nobody watches for them.
         load: What the arm holds, which people must not be hit with either.
-        task_time: The clock without what the task waited for people, or was paused by them [s].
+        pace: How fast people let the task go on.
+        yielding: How the null space yields to the person, and goes back.
+        clearance: Distance of an arm at given joint positions from itself and from what stands
+            around [m]; None: people can push it anywhere within its limits.
         human_input: What the person asks for now.
         tracked_markers: Markers detected every `detect_every` steps; empty: no image is taken.
         log: Columns of every step so far, and the phases of the task.
@@ -277,14 +235,14 @@ class WorkCell:
         self.gripper = gripper
         self.tracked_markers: Collection[int] = ()
         self.log = StepLog()
-        # Of the path that the next step follows; of most steps none.
-        self._path_joints = self._no_path = np.full(len(chain.joint_names), _NAN)
+        # Logged as the joints of the path by steps without one.
+        self._no_path = np.full(len(chain.joint_names), _NAN)
         self.images: list[KeptImage] = []
         self.remarks: list[Event] = []
         self.region: PositionRegion | None = None
-        self._arm, self._sensor, self._human = arm, sensor, human
+        self._arm, self._human = arm, human
         self._advance, self._on_phase = advance, on_phase
-        self._clearance = clearance
+        self.clearance = clearance
         safety = self.config.safety
         self._watch, self.load = watch, None
         self._safety = SafetyFilter(chain.limits, self.watchful(safety))
@@ -294,25 +252,24 @@ class WorkCell:
         self._ticks = 0
         self._reading = _Reading(chain, self._room, arm.read())
         self._feedback, self._pushing = PersonFeedback(chain), False
-        self._yielding = NullSpaceYielding(
+        self.yielding = NullSpaceYielding(
             chain, self.config.dt, self.config, self._feedback.hindrances
         )
         asked = human.read(self.state)
-        self.human_input = replace(asked, nullspace_input=self._yielding.nullspace_input)
+        self.human_input = replace(asked, nullspace_input=self.yielding.nullspace_input)
         self.observation = MarkerObservation()
-        self._channel = DelayedChannel(self.config.latency, rng or np.random.default_rng(0))
-        # When the newest image was taken, and the joint positions of the time before now.
-        self._taken = -math.inf
-        remembered = round(_REMEMBERED / self.config.dt)
-        self._passed: deque[tuple[float, np.ndarray]] = deque(maxlen=remembered)
+        self._markers = DelayedDetection(
+            sensor, self.config.latency, self.config.dt, rng or np.random.default_rng(0)
+        )
         self._guard = self._safety.initial_state(self.joints)
-        # Share of the wanted motion that people beside the arm leave, and the sum of it.
-        self._pace, self.task_time = 1.0, self.time
-        # For how long it has stood still before somebody [s].
-        self._stood = 0.0
-        # Share of the task's motion that a person who pauses it leaves, and whether the arm
-        # comes to rest for good.
-        self._going, self._stopping = self.config.speed, False
+        self.pace = TaskPace(
+            time=self.time,
+            dt=self.config.dt,
+            speed=self.config.speed,
+            longest_wait=self.config.longest_wait,
+        )
+        # Whether a person has stopped the task, and the arm is coming to rest.
+        self._stopping = False
         # Until when something may be met that the task has felt for [s].
         self._contact_expected = -math.inf
         self._look()
@@ -340,6 +297,16 @@ class WorkCell:
         return self._reading.state
 
     @property
+    def hindrances(self) -> Hindrances:
+        """What keeps the arm from following the person in this step."""
+        return self._feedback.hindrances
+
+    @property
+    def commanded_velocity(self) -> Float[Tensor, " joints"]:
+        """Of the last step [rad/s]."""
+        return self._guard.velocity
+
+    @property
     def time(self) -> float:
         """Clock of the arm [s]."""
         return self.state.time
@@ -355,28 +322,8 @@ class WorkCell:
 
     def detect(self, ids: Collection[int] | None = None) -> None:
         """Take an image and detect markers in it, all by default; it may be late, or lost."""
-        found = {} if self._sensor is None else self._sensor.corners(ids)
-        taken = self.time - (0.0 if self._sensor is None else self._sensor.age)
-        # A camera that is slower than the detection gives the same image again: no new one.
-        if abs(taken - self._taken) > _SAME_IMAGE:
-            self._taken = taken
-        self._channel.send(
-            MarkerObservation(
-                time=self._taken,
-                joints=self._joints_at(self._taken),
-                pixels={id: centre(corners) for id, corners in found.items()},
-                angles={id: angle(corners) for id, corners in found.items()},
-            )
-        )
+        self._markers.detect(self.time, self.joints, ids)
         self._receive()
-
-    def _joints_at(self, time: float) -> Float[Tensor, " joints"]:
-        """Where the joints were at a time [s], as far back as is remembered [rad]."""
-        if time >= self.time or not self._passed:
-            return self.joints
-        times, joints = zip(*self._passed, (self.time, self.joints.numpy()), strict=True)
-        columns = np.stack(joints, axis=-1)
-        return torch.tensor([np.interp(time, times, column) for column in columns])
 
     def wait_for_detection(self) -> MarkerObservation:
         """Hold still until an image taken from now on has arrived; what was detected in it."""
@@ -387,12 +334,19 @@ class WorkCell:
             self.detect()
         return self.observation
 
-    def step(self, joint_velocity: Float[Tensor, " joints"], goal: Pose | None = None) -> None:
+    def step(
+        self,
+        joint_velocity: Float[Tensor, " joints"],
+        goal: Pose | None = None,
+        *,
+        path_joints: Float[Tensor, " joints"] | None = None,
+    ) -> None:
         """Send a command through the safety filter, and let one step pass.
 
         Args:
             joint_velocity: The command [rad/s].
             goal: Where the end effector should be now, for the log.
+            path_joints: Where the joints should be on a path of theirs [rad], for the log.
         """
         safe, self._guard, report = self._safety.step(
             self._guard,
@@ -406,7 +360,13 @@ class WorkCell:
         self._note_filter(joint_velocity, safe, report)
         position = _NOWHERE if goal is None else goal.position.numpy()
         self.region = None
-        self._send(safe, safety=report.flags.numpy(), goal_position=position, **_NO_VISION)
+        self._send(
+            safe,
+            safety=report.flags.numpy(),
+            goal_position=position,
+            path_joints=self._no_path if path_joints is None else path_joints.numpy(),
+            **_NO_VISION,
+        )
 
     def execute(
         self,
@@ -431,7 +391,7 @@ class WorkCell:
             turn: What a person has added to the planned orientation, as a rotation vector
                 [rad]; None: nothing.
         """
-        velocity = self._going * command.joint_velocity
+        velocity = self.pace.led * command.joint_velocity
         self._guard = self._safety.initial_state(self.joints, velocity)
         self.region = region
         self._keep_pace(command.twist, command.joint_velocity, command.safety)
@@ -448,6 +408,7 @@ class WorkCell:
             vision_activation=float(command.vision_level),
             approach=approach,
             goal_position=_NOWHERE,
+            path_joints=self._no_path,
             region=torch.cat([region.centre, region.half_size]).numpy(),
             drawn=drawn,
             turn=np.zeros(3) if turn is None else turn,
@@ -458,6 +419,8 @@ class WorkCell:
         goal: Pose,
         twist: Float[Tensor, "6"],
         drift: Float[Tensor, " joints"] | None = None,
+        *,
+        path_joints: Float[Tensor, " joints"] | None = None,
     ) -> bool:
         """One step of tracking a moving pose; the null space yields to the person.
 
@@ -465,6 +428,7 @@ class WorkCell:
             goal: Where the end effector should be.
             twist: Its velocity (linear [m/s], angular [rad/s]).
             drift: Joint velocity whose null-space part is wanted besides [rad/s].
+            path_joints: Where the joints should be on a path of theirs [rad], for the log.
 
         Returns:
             Whether the arm, pushed aside, would meet something if the pose went on.
@@ -473,7 +437,7 @@ class WorkCell:
         # Where the arm will be when it follows: the null space is that of then.
         J = self.chain.jacobian(joints + self.config.command_delay * self._guard.velocity)
         correction = self.config.pose_gain * self.pose.twist_to(goal)
-        null_velocity = self._yielding.null_velocity
+        null_velocity = self.yielding.null_velocity
         if drift is not None:
             null_velocity = null_velocity + drift
         task = task_rate(J, twist + correction)
@@ -481,16 +445,16 @@ class WorkCell:
         if drift is not None:
             # A person may push the way that the path leads: both together bend the null space.
             slowdown = null_space_slowdown(self.chain, joints, null)
-            self._feedback.hindrances.note("speed", float(slowdown))
+            self.hindrances.note("speed", float(slowdown))
             null = null * slowdown
         waits = False
-        if self._clearance is not None and bool(null.any()):
-            clear = kept_clear(joints, task, null, self._clearance, self.config.clearance)
+        if self.clearance is not None and bool(null.any()):
+            clear = kept_clear(joints, task, null, self.clearance, self.config.clearance)
             distance, kept = 100 * float(clear.distance), share_kept(null, clear.null)
-            self._feedback.hindrances.note("obstacle", kept, distance=distance)
+            self.hindrances.note("obstacle", kept, distance=distance)
             null, waits = clear.null, bool(clear.waits)
         null = self._within_limits(J, task, null)
-        self.step(task + null, goal)
+        self.step(task + null, goal, path_joints=path_joints)
         return waits
 
     def _within_limits(
@@ -509,7 +473,7 @@ class WorkCell:
             kept = scale_null_space(task, gives_way, *bounds)
         if self._pushing:
             room = self._reading.room
-            self._feedback.hindrances.note_limits(null, kept, task + null, room)
+            self.hindrances.note_limits(null, kept, task + null, room)
         return kept
 
     def hold_pose(self, duration: float) -> None:
@@ -523,8 +487,8 @@ class WorkCell:
             goal: Where to.
             speed: Mean speed [m/s].
         """
-        line, begun = StraightLine(self.pose, goal, speed), self.task_time
-        while (passed := self.task_time - begun) < line.duration:
+        line, begun = StraightLine(self.pose, goal, speed), self.pace.time
+        while (passed := self.pace.time - begun) < line.duration:
             self._track_line(line, passed)
         self._settle(goal, _SETTLING_TIME)
 
@@ -533,7 +497,7 @@ class WorkCell:
         now = min(passed + self.config.dt, line.duration)
         pose, _ = line.at(now)
         _, twist = line.at(min(now + self.config.command_delay, line.duration))
-        self.track_pose(pose, self._going * twist)
+        self.track_pose(pose, self.pace.led * twist)
 
     def move_until_contact(
         self, goal: Pose, speed: float = 0.02, force: float = 12.0
@@ -555,14 +519,14 @@ class WorkCell:
         felt: deque[float] = deque(maxlen=_FELT)
         before: deque[Pose] = deque(maxlen=_FELT)
         free, moving = None, 0
-        line, begun = StraightLine(self.pose, goal, speed), self.task_time
-        while (passed := self.task_time - begun) < line.duration:
+        line, begun = StraightLine(self.pose, goal, speed), self.pace.time
+        while (passed := self.pace.time - begun) < line.duration:
             self._contact_expected = self.time + _LEAVING
             self._track_line(line, passed)
             felt.append(-float(self._contact_force() @ along))
             before.append(self.pose)
             # An arm that waits for somebody gets under way anew.
-            moving = moving + 1 if self._is_undisturbed() else 0
+            moving = moving + 1 if self.pace.undisturbed else 0
             if moving <= _FELT + _GETTING_UNDER_WAY:
                 free = None
                 continue
@@ -579,165 +543,6 @@ class WorkCell:
         """Estimate of the force on the end effector [N]; zero if the arm tells none."""
         force = contact_force(self.jacobian, self.state)
         return np.zeros(3) if force is None else force
-
-    def follow_path(
-        self, path: Float[np.ndarray, "steps joints"], until: Callable[[], bool] = lambda: False
-    ) -> int:
-        """Move the joints along a path sampled at the control step, yielding to the person.
-
-        While a person pushes, the end effector keeps to the poses of the path, and the null
-        space yields. Where the arm, pushed aside, cannot follow, the path waits: where it would
-        meet something, and before a singularity of the path, at which nobody can push the arm
-        off it. When they let go the joints go back to the path, at the end of it too, or stay
-        beside it (`WorkCellConfig.after_push`).
-
-        Args:
-            path: Joint positions [rad].
-            until: Asked before each step whether to stop there.
-
-        Returns:
-            Number of samples that were tracked.
-
-        Raises:
-            BlockedPathError: If the arm, pushed aside, does not find back to a path that waits.
-        """
-        dt = self.config.dt
-        velocity = np.gradient(path, dt, axis=0) if len(path) > 1 else np.zeros_like(path)
-        narrow = smallest_singular_value(self.chain, torch.from_numpy(path.copy())) < NARROW
-        progress, rate, waited = 0.0, 1.0, 0.0
-        if len(path):
-            self._yielding.begin(torch.from_numpy(path[0]) - self.joints)
-        while progress <= len(path) - 1:
-            if until():
-                return int(progress)
-            now = rate * self._going
-            later = progress + now * self.config.command_delay / dt
-            goal, wanted = _between(path, progress), now * _between(velocity, later)
-            here, ahead = int(progress), int(progress + CHANGE_OF_RATE / dt)
-            behind = self._track_joints(
-                goal, wanted, yields=not bool(narrow[here]), returns=rate <= 0
-            )
-            if not self._yielding.aside:
-                waited = 0.0
-            # Who pushes again and again must not hold it up for good.
-            elif not self._yielding.pushed and self._is_undisturbed():
-                waited = max(waited + (1.0 - 2.0 * max(rate, 0.0)) * dt, 0.0)
-            # The null space that led aside further back leads back there as well.
-            backs = waited > STUCK and progress > 0
-            if not backs and self._yielding.aside:
-                stops = bool(narrow[here : ahead + 1].any()) or self._astray(goal)
-                behind = math.inf if stops else behind
-            rate = float(changed_rate(rate, 2.0 - behind, dt, -1 if backs else 1))
-            if rate <= 0:
-                self._feedback.hindrances.mention("task_waits")
-            progress = max(progress + rate * self._pace * self._going, 0.0)
-            if waited > _LONGEST_WAIT:
-                progress = self._go_straight_back(path, progress)
-                waited = 0.0
-        if len(path) and self.config.after_push == "return":
-            end = torch.from_numpy(path[-1])
-            deadline = self.time + LONGEST_RETURN
-            yielding = self._yielding
-            while yielding.aside and not yielding.pushed and self.time < deadline:
-                self._track_joints(end, torch.zeros_like(end))
-        return len(path)
-
-    def _astray(self, goal: Float[Tensor, " joints"]) -> bool:
-        """Whether joints aside might not find back to a path that goes on.
-
-        The null space leads to another posture for the same pose, if that is nearer by then,
-        and no task is kept near a singularity that the path itself does not pass.
-        """
-        if (
-            self.config.after_push == "return"
-            and float((goal - self.joints).norm()) > FAR_ASIDE
-        ):
-            return True
-        ahead = self.joints + CHANGE_OF_RATE * self._guard.velocity
-        near = smallest_singular_value(self.chain, torch.stack([self.joints, ahead]))
-        return bool((near < NARROW).any())
-
-    def _go_straight_back(
-        self, path: Float[np.ndarray, "steps joints"], progress: float
-    ) -> float:
-        """To a path that waits, where no motion of the null space leads.
-
-        Another posture for the same pose may lie between. The end effector leaves its path.
-
-        Args:
-            path: Joint positions [rad].
-            progress: Sample at which it waits.
-
-        Returns:
-            The sample at which the arm is then: that one if its way there is clear of what is
-            around it, else the nearest to the arm of which it is.
-
-        Raises:
-            BlockedPathError: If the arm would meet something on the way to any sample.
-        """
-        others = range(0, len(path), max(1, len(path) // _OTHERS))
-        far = {k: float(np.linalg.norm(path[k] - self.joints.numpy())) for k in others}
-        for sample in (progress, *sorted(far, key=far.__getitem__)):
-            goal = _between(path, sample)
-            way = joint_line(self.joints, goal, self.config.return_speed, self.config.dt)
-            if self._is_clear(way):
-                break
-        else:
-            raise BlockedPathError(
-                "path: the arm was pushed aside and finds no way back that is clear of what is "
-                "around it."
-            )
-        self._yielding.aside, pose, passed = False, self.chain.forward(goal), 0.0
-        while passed <= len(way) - 1:
-            q = way[int(passed)]
-            passed += self._going
-            self._path_joints = q.numpy()
-            self._feedback.hindrances.note("too_far", 0.0)
-            self.step(self.config.pose_gain * (q - self.joints), pose)
-        return float(sample)
-
-    def _is_clear(self, way: Float[Tensor, "steps joints"]) -> bool:
-        """Whether the arm comes no nearer to what is around it than at the ends of a way."""
-        if self._clearance is None:
-            return True
-        distance = self._clearance(way[:: max(1, len(way) // _CHECKED)])
-        ends = distance[[0, -1]].min()
-        return not bool((distance < ends.clamp(max=self.config.clearance)).any())
-
-    def _track_joints(
-        self,
-        goal: Float[Tensor, " joints"],
-        velocity: Float[Tensor, " joints"],
-        yields: bool = True,
-        returns: bool = False,
-    ) -> float:
-        """One step along a path of the joints, or of the end effector while they are aside.
-
-        Args:
-            goal: Where on the path [rad].
-            velocity: Along it [rad/s].
-            yields: Whether the person can push the joints off it here.
-            returns: Whether joints that were pushed off it go back in any case.
-
-        Returns:
-            How far the end effector then is from its goal, as a ratio to what is allowed;
-            above 1 the path has to wait.
-        """
-        error = goal - self.joints
-        self._path_joints = goal.numpy()
-        back = self._yielding.way_back(
-            self.joints, error, self.jacobian, yields=yields, returns=returns
-        )
-        pose = self.chain.forward(goal)
-        if back is None:
-            if not yields:
-                self._feedback.hindrances.note("narrow_path", 0.0)
-            self.step(velocity + self.config.pose_gain * error, pose)
-            return 0.0
-        twist = self.chain.jacobian(goal + self.config.command_delay * velocity) @ velocity
-        if self.track_pose(pose, twist, velocity + back):
-            return math.inf
-        return float(behind_path(self.pose.twist_to(pose), twist))
 
     def _settle(self, goal: Pose, duration: float) -> None:
         still = torch.zeros(6, dtype=torch.float64)
@@ -787,15 +592,7 @@ class WorkCell:
             and bool(people_bind(distances, sent, kept, self._safety.config))
         ):
             pace = float(share_of_motion(asked, self.jacobian @ sent))
-        # It may drop at once; it rises as paths get under way.
-        self._pace = min(pace, self._pace + self.config.dt / CHANGE_OF_RATE)
-        self.task_time += self._pace * self._going * self.config.dt
-        self._stood = self._stood + self.config.dt if self._pace < _STANDS else 0.0
-        if self._stood > self.config.longest_wait:
-            raise TaskFailedError(
-                f"somebody has been in the way of the arm for {self._stood:.0f} s: free its "
-                "way, or let it wait longer (longest_wait)."
-            )
+        self.pace.beside(pace)
 
     def _at_people(self, sent: Float[Tensor, " joints"]) -> bool:
         """Whether a velocity takes the arm towards people as fast as it may [rad/s]."""
@@ -818,16 +615,16 @@ class WorkCell:
         if cause is not None:
             J = self.jacobian
             kept = share_kept(null_projection(J, wanted), null_projection(J, sent))
-            self._feedback.hindrances.note(cause, kept)
+            self.hindrances.note(cause, kept)
 
     def _note_controller(self, command: Command, approach: float) -> None:
         """Note what the adaptive controller takes from a push, beside its own gradient."""
         if not self._pushing:
             return
-        wanted = self._yielding.null_velocity - command.xi_q / self.config.damping
+        wanted = self.yielding.null_velocity - command.xi_q / self.config.damping
         wanted = null_projection(self.jacobian, wanted)
         bounds = self._safety.velocity_bounds(self.joints)
-        self._feedback.hindrances.note_limits(wanted, command.null_velocity, wanted, bounds)
+        self.hindrances.note_limits(wanted, command.null_velocity, wanted, bounds)
         # A joint-space approach moves the null space as well, by an unknown part of it.
         if approach == 0:
             self._note_filter(command.null_velocity, command.joint_velocity, command.safety)
@@ -839,7 +636,7 @@ class WorkCell:
             self.jacobian,
             pushed=self._pushing,
             person_distance=None if self.watched is None else self.watched.nearest,
-            pace=self._pace * self._going,
+            pace=self.pace.share,
             load=self.load,
             contact_expected=self.time < self._contact_expected,
         )
@@ -852,34 +649,32 @@ class WorkCell:
             joint_velocity=self.state.joint_velocity,
             command_velocity=velocity.numpy(),
             nullspace_input=self.human_input.nullspace_input,
-            path_joints=self._path_joints,
             gripper=self.state.gripper_width,
             followed=told.followed if told.pushed else _NAN,
             hindered=_hindered(told),
             **self._watched_columns(velocity),
             **columns,
         )
-        self._path_joints = self._no_path
         self._arm.command(velocity.numpy())
         self._human.tell(told)
         self._advance(self.config.dt)
         self._ticks += 1
-        self._passed.append((self.time, self.state.joint_position))
+        self._markers.remember(self.time, self.state.joint_position)
         self._reading = _Reading(self.chain, self._room, self._arm.read())
         self._look()
         asked = self._human.read(self.state)
         way = self.config.way_making
         self._pushing = bool(asked.nullspace_input.any()) and (way is None or way.expert)
         push = smooth = self._nullspace_input(asked)
-        if push.any() or self._yielding.pushed:
-            smooth = self._yielding.feel(push, self.joints, self._reading.room, self.jacobian)
+        if push.any() or self.yielding.pushed:
+            smooth = self.yielding.feel(push, self.joints, self._reading.room, self.jacobian)
         self.human_input = replace(asked, nullspace_input=smooth)
         self._receive()
         if self.tracked_markers and self._ticks % self.config.detect_every == 0:
             self.detect(self.tracked_markers)
         every = self.config.keep_image_every
-        if self._sensor is not None and every and self._ticks % every == 0:
-            self.images.append(KeptImage(time=self.time, image=self._sensor.read()))
+        if every and self._ticks % every == 0 and (image := self._markers.image()) is not None:
+            self.images.append(KeptImage(time=self.time, image=image))
         self._wait_or_stop(asked)
 
     def _wait_or_stop(self, asked: HumanInput) -> None:
@@ -898,18 +693,7 @@ class WorkCell:
                 self.step(still)
             self._stopping = False
             raise StoppedByPersonError(f"stopped: {asked.stop}")
-        full = self.config.speed
-        if asked.pause and self._going == full:
-            self.tell("The task waits.")
-        going = changed_rate(self._going, float(not asked.pause), self.config.dt)
-        going = min(float(going), full)
-        if going == full and self._going < full:
-            self.tell("The task goes on.")
-        self._going = going
-
-    def _is_undisturbed(self) -> bool:
-        """Whether nobody slows the task down or pauses it."""
-        return self._pace == 1 and self._going == self.config.speed
+        self.pace.lead(asked.pause, self.tell)
 
     def _nullspace_input(self, asked: HumanInput) -> Float[np.ndarray, " joints"]:
         """Of the person who pushes, and by which the arm makes way by itself [N m]."""
@@ -935,11 +719,11 @@ class WorkCell:
             "person_age": self.watched.age,
             "protective_distance": float(needed[tightest]),
             "separation_margin": float((near.distance - needed)[tightest]),
-            "pace": self._pace,
+            "pace": self.pace.beside_people,
         }
 
     def _receive(self) -> None:
-        self.observation = self._channel.newest(self.time) or self.observation
+        self.observation = self._markers.newest(self.time) or self.observation
 
 
 def _hindered(told: Feedback) -> Bool[np.ndarray, " hindrances"]:
@@ -948,64 +732,3 @@ def _hindered(told: Feedback) -> Bool[np.ndarray, " hindrances"]:
         return _UNHINDERED
     reasons = {reason.hindrance for reason in told.reasons}
     return np.array([hindrance in reasons for hindrance in HINDRANCE_COLUMNS])
-
-
-def _between(samples: Float[np.ndarray, "steps joints"], at: float) -> Float[Tensor, " joints"]:
-    """A path between two of its samples, or at its end."""
-    k = min(int(at), len(samples) - 1)
-    following = samples[min(k + 1, len(samples) - 1)]
-    return torch.from_numpy(samples[k] + (at - k) * (following - samples[k]))
-
-
-def people_bind(
-    distances: Distances,
-    sent: Float[Tensor, "*batch joints"],
-    kept: ConstraintReport,
-    safety: SafetyConfig,
-) -> Bool[Tensor, "*batch"]:
-    """Whether the arm was slowed down as it came as near to people as it may, or as it does not
-    know where they are.
-
-    Where only its own limits hold it back, a path must go on: it would wait for ever.
-
-    Args:
-        distances: From people.
-        sent: To the arm [rad/s].
-        kept: What keeping its limits took.
-        safety: Of the filter, with constraints.
-    """
-    near = at_people(distances, sent, safety)
-    return ~distances.known() | ~kept.solved | ((kept.slowed > _SLOWED) & near)
-
-
-def at_people(
-    distances: Distances, sent: Float[Tensor, "*batch joints"], safety: SafetyConfig
-) -> Bool[Tensor, "*batch"]:
-    """Whether a velocity takes the arm towards people as fast as it may.
-
-    Args:
-        distances: From people.
-        sent: To the arm [rad/s].
-        safety: Of the filter, with constraints.
-    """
-    assert safety.constraints is not None  # without them there are no limits to be met
-    allowed = distances.closing_speed(safety.constraints, safety.separation)
-    opening = torch.linalg.vecdot(distances.gradient, sent.unsqueeze(-2))
-    return (allowed + opening <= _SPARE).any(-1)
-
-
-def behind_path(
-    off: Float[Tensor, "*batch 6"], twist: Float[Tensor, "*batch 6"]
-) -> Float[Tensor, "*batch"]:
-    """How far the end effector is from its path, as a ratio to what is allowed.
-
-    Args:
-        off: Motion to where it should be (linear [m], angular [rad]).
-        twist: Of the path there (linear [m/s], angular [rad/s]).
-    """
-    return _size(off) / (_ON_PATH + _SERVO_LAG * _size(twist))
-
-
-def _size(twist: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch"]:
-    """Of a motion, its turn counted in metres [m]."""
-    return twist[..., :3].norm(dim=-1) + _METRES_PER_RADIAN * twist[..., 3:].norm(dim=-1)

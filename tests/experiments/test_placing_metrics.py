@@ -27,8 +27,8 @@ from hrc_learn.kinematics import panda
 from hrc_learn.sim import Imperfections, Touch, World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.arm_motion import nearest_configuration
+from hrc_learn.skills.failures import TaskFailedError
 from hrc_learn.skills.placing import PlaceCorrection
-from hrc_learn.skills.work_cell import TaskFailedError
 
 WORKPLACE = Workplace()
 SHELVES = WORKPLACE.shelf_names()

@@ -16,6 +16,7 @@ from hrc_learn.protocols import HumanInput, PersonObservation
 from hrc_learn.sim import whole_arm
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills import TaskFailedError, WorkCell, WorkCellConfig, joint_line
+from hrc_learn.skills.path_following import follow_path
 from hrc_learn.skills.person_watch import PersonWatch
 from hrc_learn.teleoperation import ScriptedPerturbation
 
@@ -87,7 +88,7 @@ def follow(cell):
     """A path that turns the arm about its base."""
     goal = panda.ready.clone()
     goal[0] += 0.8
-    cell.follow_path(joint_line(panda.ready, goal, speed=0.8, dt=0.01).numpy())
+    follow_path(cell, joint_line(panda.ready, goal, speed=0.8, dt=0.01).numpy())
 
 
 def straight(cell):
@@ -119,8 +120,8 @@ def test_the_arm_waits_before_who_stands_in_its_way_and_goes_on_when_they_have_l
     ways = [torch.from_numpy(c.log["joint_position"]) for c in (free, cell)]
     tips = [panda.forward(q).position for q in ways]
     assert torch.cdist(tips[1], tips[0]).amin(-1).max() < 5e-3
-    assert cell.task_time == pytest.approx(free.task_time, abs=0.15)
-    assert free.task_time == pytest.approx(free.time, abs=1e-9)
+    assert cell.pace.time == pytest.approx(free.pace.time, abs=0.15)
+    assert free.pace.time == pytest.approx(free.time, abs=1e-9)
     assert cell.time > 4.0
     assert cell.log["pace"].min() < 0.01
     assert (free.log["pace"] == 1.0).all()
@@ -158,7 +159,7 @@ def test_an_arm_that_moves_away_rests_by_the_time_that_somebody_catches_up_with_
     goal = panda.ready.clone()
     goal[0] += 0.8
     path = joint_line(panda.ready, goal, speed=0.8, dt=0.01).numpy()
-    cell.follow_path(path, until=lambda: cell.time >= visitor._end)
+    follow_path(cell, path, until=lambda: cell.time >= visitor._end)
     apart, speed = distances(cell, visitor), np.linalg.norm(cell.log["joint_velocity"], axis=1)
     assert speed.max() > 0.5
     assert apart[-1] < 0.05
@@ -179,7 +180,7 @@ def test_limits_of_the_arm_itself_are_not_waited_for():
     cell = beside(Visitor(IN_THE_WAY, 0.0, 0.0))
     cell.move_straight(sideways(1.2), speed=0.4)
     assert cell.log["safety"].any()
-    assert cell.task_time == pytest.approx(cell.time, abs=1e-9)
+    assert cell.pace.time == pytest.approx(cell.time, abs=1e-9)
 
 
 def test_an_arm_that_does_not_know_where_people_are_rests():
@@ -188,7 +189,7 @@ def test_an_arm_that_does_not_know_where_people_are_rests():
     for _ in range(50):
         cell.step(torch.full((7,), 0.2, dtype=torch.float64))
     torch.testing.assert_close(cell.joints, begun, rtol=0, atol=1e-3)
-    assert cell.task_time < 0.1
+    assert cell.pace.time < 0.1
 
 
 @pytest.mark.parametrize(

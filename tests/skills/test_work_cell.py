@@ -12,8 +12,14 @@ from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import panda
 from hrc_learn.protocols import HINDRANCES, Human, HumanInput
 from hrc_learn.sim.workplace import Workplace
-from hrc_learn.skills import BlockedPathError, WorkCell, WorkCellConfig, joint_line
+from hrc_learn.skills import (
+    BlockedPathError,
+    WorkCell,
+    WorkCellConfig,
+    joint_line,
+)
 from hrc_learn.skills.null_space_yielding import FAR_ASIDE
+from hrc_learn.skills.path_following import PathFollower, follow_path
 from hrc_learn.teleoperation import ScriptedPerturbation
 
 
@@ -26,7 +32,7 @@ def cell():
 def test_the_joints_move_along_a_path_as_fast_as_it_runs(cell):
     far = torch.tensor([0.3, -0.2, 0.1, 0.2, -0.1, 0.3, -0.3], dtype=torch.float64)
     path = joint_line(panda.ready, panda.ready + far, speed=0.3, dt=0.01).numpy()
-    assert cell.follow_path(path) == len(path)
+    assert follow_path(cell, path) == len(path)
     commanded = cell.log["command_velocity"]
     # The slope of a minimum jerk motion, by its polynomial (Flash and Hogan 1985).
     duration = 1.875 * 0.3 / 0.3  # its peak is 15/8 of its mean speed
@@ -40,14 +46,14 @@ def test_the_joints_move_along_a_path_as_fast_as_it_runs(cell):
 def test_a_path_of_one_sample_or_none_leaves_the_arm_where_it_is(cell):
     here = cell.joints.numpy()
     for samples in (1, 0):
-        assert cell.follow_path(np.repeat(here[None], samples, axis=0)) == samples
+        assert follow_path(cell, np.repeat(here[None], samples, axis=0)) == samples
     np.testing.assert_array_equal(cell.joints, here)
 
 
 def test_a_path_is_left_when_its_end_is_told(cell):
     far = torch.full((7,), 0.1, dtype=torch.float64)
     path = joint_line(panda.ready, panda.ready + far, speed=0.3, dt=0.01).numpy()
-    assert cell.follow_path(path, until=lambda: len(cell.log) == 12) == 12
+    assert follow_path(cell, path, until=lambda: len(cell.log) == 12) == 12
 
 
 class CountingSensor:
@@ -63,11 +69,12 @@ class CountingSensor:
 
 @pytest.mark.parametrize("tracked", [(), (7,)])
 def test_markers_are_detected_now_and_then_while_they_are_tracked(cell, tracked):
-    cell._sensor, cell.tracked_markers = CountingSensor(), tracked
+    sensor = CountingSensor()
+    cell._markers._sensor, cell.tracked_markers = sensor, tracked
     cell.hold_pose(0.02)
-    assert cell._sensor.asked == []
+    assert sensor.asked == []
     cell.hold_pose(0.10)  # twelve steps by now, with a detection at each fourth
-    assert cell._sensor.asked == 3 * [tracked] * bool(tracked)
+    assert sensor.asked == 3 * [tracked] * bool(tracked)
 
 
 class SlowCamera:
@@ -92,7 +99,7 @@ class SlowCamera:
 
 def test_an_image_counts_for_when_it_was_taken_and_once(cell):
     arm = cell._arm
-    cell._sensor, cell.tracked_markers = SlowCamera(arm), (7,)
+    cell._markers._sensor, cell.tracked_markers = SlowCamera(arm), (7,)
     turning, seen = torch.zeros(7).double(), []
     turning[0] = 0.2
     for _ in range(100):
@@ -214,7 +221,7 @@ def test_an_arm_whose_delay_is_known_keeps_to_its_path(straight):
                 up = torch.tensor([0.05, 0.1, 0.1], dtype=torch.float64)
                 cell.move_straight(Pose(here.position + up, here.orientation))
             else:
-                cell.follow_path(transfer())
+                follow_path(cell, transfer())
         hand = panda.forward(torch.from_numpy(cell.log["joint_position"])).position
         away = hand - torch.from_numpy(cell.log["goal_position"])
         return float(away.norm(dim=-1).max())
@@ -323,7 +330,7 @@ def pushed_along(path, push, seconds, **options):
         chain=panda, arm=arm, gripper=arm, human=Person(), advance=arm.advance, **options
     )
     with shapes_unchecked():  # hundreds of steps: three times as long checked
-        cell.follow_path(path)
+        follow_path(cell, path)
     return cell
 
 
@@ -368,18 +375,22 @@ def test_a_person_pushes_the_elbow_aside_during_a_planned_motion_and_the_hand_go
     assert speed < np.abs(free.log["joint_velocity"]).max() + 0.4
 
 
+def is_astray(cell, goal):
+    return PathFollower(cell, cell.joints[None].numpy()).is_astray(goal)
+
+
 def test_joints_are_astray_far_from_their_path_and_near_a_singularity(cell):
     near = torch.full((7,), 0.9 * FAR_ASIDE / 7**0.5, dtype=torch.float64)
-    assert not cell._astray(cell.joints + near)
-    assert cell._astray(cell.joints + near * 1.2)
+    assert not is_astray(cell, cell.joints + near)
+    assert is_astray(cell, cell.joints + near * 1.2)
     straight = torch.tensor([0.0, 0.0, 0.0, -0.1, 0.0, 0.1, 0.0], dtype=torch.float64)
     stretched = cell_with(ObedientArm(straight.numpy()))
     assert np.linalg.svd(panda.jacobian(straight).numpy())[1][-1] < 0.06
-    assert stretched._astray(stretched.joints)
+    assert is_astray(stretched, stretched.joints)
     # Whoever stays beside the path need not find back.
     arm = ObedientArm(panda.ready.numpy())
     stays = cell_with(arm, config=WorkCellConfig(after_push="stay"))
-    assert not stays._astray(stays.joints + near * 1.2)
+    assert not is_astray(stays, stays.joints + near * 1.2)
 
 
 def test_an_arm_that_meets_something_is_not_one_that_was_pushed():
@@ -391,7 +402,7 @@ def test_an_arm_that_meets_something_is_not_one_that_was_pushed():
 
     cell, path = cell_with(Stuck(panda.ready.numpy())), transfer()
     with shapes_unchecked():
-        assert cell.follow_path(path, until=lambda: len(cell.log) > 2 * len(path)) == len(path)
+        assert follow_path(cell, path, until=lambda: len(cell.log) > 2 * len(path)) == len(path)
     assert abs(float(cell.joints[0]) - path[-1, 0]) > 0.5
     assert len(cell.log) == len(path)
 
@@ -481,9 +492,9 @@ def test_an_arm_that_finds_no_way_back_goes_straight_or_says_so(distance):
     with shapes_unchecked():
         if distance < 0:
             with pytest.raises(BlockedPathError, match="pushed aside"):
-                cell._go_straight_back(path, 0.0)
+                PathFollower(cell, path).go_straight_back(0.0)
         else:
-            assert cell._go_straight_back(path, 0.0) == 0.0
+            assert PathFollower(cell, path).go_straight_back(0.0) == 0.0
             np.testing.assert_allclose(cell.joints, goal, atol=0.03)
             speed = np.linalg.norm(cell.log["joint_velocity"], axis=1).max()
             assert speed < 2 * cell.config.return_speed
@@ -504,7 +515,7 @@ def test_where_the_way_back_is_blocked_another_sample_of_the_path_is_as_good():
     cell = cell_with(arm, clearance=clearance)
     path = joint_line(start, waits, speed=0.5, dt=0.01).numpy()
     with shapes_unchecked():
-        sample = cell._go_straight_back(path, float(len(path) - 1))
+        sample = PathFollower(cell, path).go_straight_back(float(len(path) - 1))
     assert sample < len(path) / 2
     np.testing.assert_allclose(cell.joints, path[int(sample)], atol=0.05)
     assert clearance(torch.from_numpy(cell.log["joint_position"])).min() > 0

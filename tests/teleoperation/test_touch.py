@@ -15,6 +15,7 @@ from hrc_learn.protocols import ArmState, Feedback, Human, HumanInput
 from hrc_learn.sim import Imperfections, World
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills import StoppedByPersonError, WorkCell, WorkCellConfig, joint_line
+from hrc_learn.skills.path_following import follow_path
 from hrc_learn.teleoperation import CombinedInput, Touch, TouchConfig
 from hrc_learn.teleoperation.touch import TorqueBias, evidence_of_none, explain
 
@@ -147,7 +148,7 @@ def there_and_back(cell, duration=3.0):
     speed = 1.875 * 0.3 / duration
     for end in (far, cell.joints.clone()):
         path = joint_line(cell.joints, end, speed=speed, dt=0.01).numpy()
-        cell.follow_path(path)
+        follow_path(cell, path)
 
 
 def off_path(cell):
@@ -209,7 +210,7 @@ def test_who_holds_the_hand_makes_the_task_wait(force):
     assert speed[time > paused.max() + 0.3].max() > 0.1
     assert beside_path(cell).max() < 2.5e-3
     assert off_path(cell)[1].max() < 8e-3
-    waited = cell.time - cell.task_time
+    waited = cell.time - cell.pace.time
     assert waited == pytest.approx(paused.max() - paused.min(), abs=0.05)
     assert [remark.text for remark in cell.remarks] == ["The task waits.", "The task goes on."]
 

@@ -21,6 +21,7 @@ from hrc_learn.skills.arm_motion import (
     joints_near,
     nearest_configuration,
 )
+from hrc_learn.skills.failures import BlockedPathError
 from hrc_learn.skills.grasping import (
     CLOSING_TIME,
     DESCENT_SPEED,
@@ -31,7 +32,6 @@ from hrc_learn.skills.grasping import (
 )
 from hrc_learn.skills.pick_and_place import RELEASE_TIME, PickAndPlaceConfig
 from hrc_learn.skills.placing import PlacingSkill, Plan, check_plan, plan_candidates
-from hrc_learn.skills.work_cell import BlockedPathError
 
 # Above the object the arm servoes on its image; a median grasp takes so long in vision [s]
 # (docs/experiments.md, grasping).

@@ -57,13 +57,15 @@ from hrc_learn.skills.null_space_yielding import (
     smallest_singular_value,
     stays_aside,
 )
+from hrc_learn.skills.pace import people_bind
+from hrc_learn.skills.path_following import STUCK, behind_path
 from hrc_learn.skills.person_watch import (
     BESIDE_PEOPLE,
     PersonWatchConfig,
     share_of_speed,
     urgent_distances,
 )
-from hrc_learn.skills.work_cell import STUCK, WorkCellConfig, behind_path, people_bind
+from hrc_learn.skills.work_cell import WorkCellConfig
 from hrc_learn.teleoperation import ScriptedForce
 
 # Pairs of capsules farther apart than any that is looked for [m].

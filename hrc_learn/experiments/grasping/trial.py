@@ -32,11 +32,12 @@ from hrc_learn.sim import (
 from hrc_learn.sim.imperfections import DrawnImperfections
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.arm_motion import joint_line
+from hrc_learn.skills.failures import TaskFailedError
 from hrc_learn.skills.grasping import Grasping, GraspingConfig, GraspResult
 from hrc_learn.skills.marker_sensor import LatencyConfig, MarkerSensor
 from hrc_learn.skills.placing import Plan, check_plan
 from hrc_learn.skills.visual_skill import VisualServoSkill, from_learned, guessed_network
-from hrc_learn.skills.work_cell import TaskFailedError, WorkCell, WorkCellConfig
+from hrc_learn.skills.work_cell import WorkCell, WorkCellConfig
 from hrc_learn.teleoperation import DrawnInterval, ScriptedDrawing
 from hrc_learn.teleoperation.page import PageConfig
 from hrc_learn.teleoperation.page_session import task_page

@@ -30,9 +30,10 @@ from hrc_learn.kinematics import SerialChain, panda
 from hrc_learn.learning.channels import dimensionless_jerk
 from hrc_learn.sim import MotionLog, Touch, World
 from hrc_learn.sim.workplace import Workplace
+from hrc_learn.skills.failures import TaskFailedError
 from hrc_learn.skills.pick_and_place import place_along
 from hrc_learn.skills.placing import PlaceCorrection, PlacingSkill, Plan, PlanningSpace
-from hrc_learn.skills.work_cell import TaskFailedError, WorkCell, WorkCellConfig
+from hrc_learn.skills.work_cell import WorkCell, WorkCellConfig
 from hrc_learn.teleoperation import ScriptedPerturbation
 
 SPACES: dict[PlanningSpace, str] = {"pose": "task space", "joint": "joint space"}
