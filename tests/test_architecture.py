@@ -101,8 +101,8 @@ LIBRARIES: dict[str, set[str]] = {
 LAZY_LIBRARIES: dict[str, set[str]] = {
     "kinematics": {"pytorch_kinematics", "frankik", "mujoco", "scipy"},
     "jacobian": {"scipy"},
-    "cli": {"ray"},
-    "demos": {"av", "scipy"},
+    "cli": {"ray", "huggingface_hub", "httpx"},
+    "demos": {"av", "scipy", "huggingface_hub"},
     "vision": {"cv2"},
     "sim": {"franky_sim"},
     "viz": {"av", "rich"},
@@ -118,6 +118,7 @@ DISTRIBUTIONS = {
     "cv2": "opencv-python-headless",
     "rerun": "rerun-sdk",
     "franky_sim": "franky-sim",
+    "huggingface_hub": "huggingface-hub",
     # Parts and requirements of matplotlib's own.
     "mpl_toolkits": "matplotlib",
     "cycler": "matplotlib",
@@ -128,6 +129,8 @@ DISTRIBUTIONS = {
     "trimesh": "viser",
     # Requirements of lerobot's own.
     "torchvision": "lerobot",
+    # Requirement of huggingface-hub's own.
+    "httpx": "huggingface-hub",
     "gymnasium": "lerobot",
 }
 """What a library is called in pyproject.toml where that is not its name in code."""

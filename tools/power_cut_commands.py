@@ -74,6 +74,7 @@ CASES = {
     "extract": Case(
         "marked --marker 7 --json j.json", copies=("marked",), grows=("marked.features",)
     ),
+    "push": Case("{inputs}/placing_demos me/set --dry-run --json j.json"),
     "fit primitives": Case("--dataset {inputs}/placing_demos --out out --json j.json"),
     "fit image-jacobian": Case("--dataset {inputs}/aiming_demos --out out --json j.json"),
     "evaluate primitives": Case(

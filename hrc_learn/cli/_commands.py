@@ -87,6 +87,12 @@ COMMANDS: dict[str, Command] = {
         "dataset.Extract",
         ("dataset",),
     ),
+    "push": Command(
+        "a dataset, checked and with a card, to the Hugging Face Hub",
+        "push.push",
+        "dataset.Push",
+        ("dataset", "repo"),
+    ),
     "fit primitives": Command(
         "movement primitives of joints and end effector",
         "fit.fit_primitives",

@@ -42,6 +42,7 @@ EXTRAS = {
     "franky_sim": "hardware",
     "example_robot_data": "meshes",
     "ray": "sweep",
+    "huggingface_hub": "hub",
 }
 """Extra of the package that brings a library."""
 

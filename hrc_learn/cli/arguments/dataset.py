@@ -185,6 +185,41 @@ class Extract(Measured):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Push(Measured):
+    """Check a LeRobot dataset and bring it to the Hugging Face Hub, with a card that says what
+    is in it.
+
+    The repository is made if it does not exist, and else brought up to the dataset; LeRobot
+    finds it by the tag of its version, which moves when all is there. Log in with `hf auth
+    login`.
+
+        hrc push pour alice/pour --license cc-by-4.0
+        hrc push pour alice/pour --dry-run
+    """
+
+    dataset: Path
+    """Folder of the dataset, version 2.0, 2.1 or 3.0."""
+    repo: str
+    """OWNER/NAME on the Hub."""
+    private: bool = True
+    """Make a new repository private; one that exists stays as it is."""
+    license: str | None = None
+    """Identifier of the licence, such as cc-by-4.0; without one nobody may use it."""
+    tags: tuple[str, ...] = ()
+    """Tags besides LeRobot and the robot's name."""
+    description: str = ""
+    """What was recorded and how, in Markdown, for the card."""
+    branch: More[str] = "main"
+    """Branch; made if it does not exist."""
+    videos: bool = True
+    """Send the videos too."""
+    unsound: bool = False
+    """Send a dataset that has errors."""
+    dry_run: bool = False
+    """Only show the card, and which files would go."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Recover(Measured):
     """Recover what processes that were killed left behind, of a path and of anything below it.
 

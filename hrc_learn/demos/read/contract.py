@@ -81,9 +81,9 @@ class Contract:
     fingerprint: str
     """Of the data that it was inferred from."""
 
-    def lines(self) -> Iterator[str]:
-        """The contract as a table; components alike in role and unit that follow each other in
-        one feature share a line.
+    def rows(self) -> list[tuple[str, ...]]:
+        """The contract as a table, its head first; components alike in role and unit that
+        follow each other in one feature share a row.
         """
         rows = [("column", "role", "unit", "range", "sign", "delay", "sure", "evidence")]
         groups: list[list[ComponentContract]] = []
@@ -114,6 +114,11 @@ class Contract:
                     weakest.evidence,
                 )
             )
+        return rows
+
+    def lines(self) -> Iterator[str]:
+        """The table as text."""
+        rows = self.rows()
         widths = [max(len(row[i]) for row in rows) for i in range(7)]
         for row in rows:
             cells = (f"{cell:{w}}" for cell, w in zip(row, widths, strict=False))
