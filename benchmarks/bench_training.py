@@ -69,7 +69,8 @@ def main(args: Args) -> None:
             figures["jacobian_held_out_relative"] = (
                 network.report.held_out_error / network.report.motion
             )
-    cli.show_values("Fits in one pass", figures)
+    for name, value in figures.items():
+        print(f"{name:<32} {value:.3g}")
     if args.json is not None:
         cli.write_json(args.json, figures)
 

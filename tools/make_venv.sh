@@ -1,10 +1,25 @@
 #!/usr/bin/env bash
 # Builds .venv with everything the demo and the tests need: with uv when it is there,
 # else with Python 3.12's own venv and pip. Says in one line what is missing.
+#
+#   UV_TORCH_BACKEND=cpu make demo   PyTorch without CUDA, much smaller; uv's own switch, which
+#                                    knows cu128, rocm6.4, auto and more.
 set -euo pipefail
 cd "$(dirname "$0")/.."
+torch=${UV_TORCH_BACKEND:-}
+extras='.[all,hardware,dev,docs]'
 
 say() { printf '%s\n' "$*" >&2; }
+
+# Sizes of a set-up on Linux, PyTorch 2.10 with CUDA: du of .venv, and of what pip fetched.
+announce() {
+  if [ -n "$torch" ]; then
+    say "Building .venv with $1, PyTorch for $torch. A first run fetches what is not cached."
+  else
+    say "Building .venv with $1. A first run fetches about 4 GB, most of it PyTorch with CUDA; 8 GB on disk."
+    say "PyTorch without CUDA: UV_TORCH_BACKEND=cpu make demo (needs uv)."
+  fi
+}
 
 find_python() {
   local name
@@ -17,14 +32,19 @@ find_python() {
   return 1
 }
 
+if [ -n "$torch" ] && ! command -v uv >/dev/null 2>&1; then
+  say "UV_TORCH_BACKEND=$torch needs uv, which knows where that build of PyTorch is: install uv, or unset it."
+  exit 1
+fi
+
 rm -rf .venv
 if command -v uv >/dev/null 2>&1; then
-  say "Building .venv with uv (some GB of PyTorch on a first run) ..."
+  announce uv
   uv venv --quiet --python 3.12 .venv || {
     say "Missing: Python 3.12, which uv could neither find nor fetch. Install it, then run make again."
     exit 1
   }
-  uv pip install --quiet --python .venv/bin/python --constraint constraints.txt --editable '.[all,hardware,dev,docs]'
+  uv pip install --python .venv/bin/python --constraint constraints.txt --editable "$extras"
 else
   python=$(find_python) || {
     say "Missing: Python 3.12. Install it (Debian: python3.12 and python3.12-venv; or pyenv, or uv), then run make again."
@@ -34,8 +54,14 @@ else
     say "Missing: the venv module of $python (Debian: apt install python3.12-venv). Install it, then run make again."
     exit 1
   }
-  say "Building .venv with $python and pip (some GB of PyTorch on a first run) ..."
+  announce "$python and pip"
   "$python" -m venv .venv
-  .venv/bin/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[all,hardware,dev,docs]'
+  install=(.venv/bin/python -m pip install --disable-pip-version-check --constraint constraints.txt --editable "$extras")
+  if [ -t 1 ]; then
+    "${install[@]}"  # pip's own bars
+  else
+    # In a log, a line a package rather than none for minutes.
+    "${install[@]}" | awk '/Downloading|Processing|Building|Installing/ && !/metadata/ {print substr($0, 1, 100); fflush()}'
+  fi
 fi
 say "Ready: .venv"

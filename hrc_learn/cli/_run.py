@@ -171,17 +171,6 @@ def _complaint(box: str) -> str:
     return text
 
 
-def show_values(title: str, values: Mapping[str, float]) -> None:
-    """Print measured values as a table."""
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table("measure", "value", title=title)
-    for name, value in values.items():
-        table.add_row(name.replace("_", " "), f"{value:.3g}")
-    Console().print(table)
-
-
 def write_values(path: Path | None, values: Mapping[str, float | int]) -> None:
     """Write measured values as one flat object, where a file is asked for."""
     if path is not None:

@@ -24,7 +24,8 @@ def asked(monkeypatch, tmp_path):
 
     def pretend(args):
         asked.append(args)
-        args.out.mkdir(parents=True)
+        args.out.mkdir(parents=True, exist_ok=True)
+        (args.out / "made").write_text(type(args).__name__)
         return 0
 
     for module, step in STEPS:
@@ -59,6 +60,35 @@ def test_each_step_works_on_what_the_one_before_it_left(asked, conducted):
         assert step.overwrite
     assert [f"[{i}/5]" in outcome.output for i in range(7)] == [False, *[True] * 5, False]
     assert '"shelf": "upper"' in Path("new/configuration.json").read_text()
+
+
+def test_a_second_demo_does_only_what_is_not_there_unchanged(asked, conducted):
+    def done_again(*options):
+        asked.clear()
+        done("demo", "--out", "new", *options)
+        return [args.out.name for args in asked]
+
+    every = ["placing_demos", "aiming_demos", "placing", "aiming"]
+    assert done_again() == every
+    assert done_again("--shelf", "upper", "--seed", 3) == []
+    assert len(conducted) == 2
+    # Somebody records more: what was learned from that is learned again, and nothing else.
+    Path("new/placing_demos/more").write_text("a demonstration")
+    assert done_again() == ["placing_demos", "placing"]
+    assert done_again() == []
+    Path("new/aiming/made").unlink()
+    assert done_again() == ["aiming"]
+    assert done_again("--robot", "fr3") == every
+    assert done_again("--robot", "fr3", "--again") == every
+    Path("new/steps.json").write_text("no JSON")
+    assert done_again("--robot", "fr3") == every
+
+
+def test_other_code_does_all_again(asked, conducted, monkeypatch):
+    done("demo", "--out", "new")
+    monkeypatch.setattr("hrc_learn.cli._ledger.software_versions", lambda: {"torch": "other"})
+    done("demo", "--out", "new")
+    assert len(asked) == 8
 
 
 def test_a_demo_that_fails_fails_as_its_job(asked, monkeypatch):

@@ -109,3 +109,19 @@ def test_an_evaluation_without_a_model_holds_demonstrations_out(poses, tmp_path)
     assert json.loads((tmp_path / "figures.json").read_text())["demonstrations"] == 1
     # The model was for this once.
     assert [path.name for path in tmp_path.iterdir()] == ["figures.json"]
+
+
+def test_a_fit_shows_few_rows_with_units_and_all_of_them_if_wanted(poses, tmp_path):
+    fit = ("fit", "--dataset", poses, "--n-basis", 20, "--channels", "position", "orientation")
+    short = done(*fit, "--out", tmp_path / "short").output
+    whole = done(*fit, "--out", tmp_path / "whole", "--verbose").output
+    metrics = json.loads((tmp_path / "short" / "metrics.json").read_text())
+    (row,) = [line for line in short.splitlines() if "worst NRMSE" in line]
+    assert "< 0.01 %" in row
+    assert "ok" in row
+    (row,) = [line for line in short.splitlines() if "median NRMSE" in line]
+    assert f"{100 * metrics['mean_position_nrmse_median']:.2f} %" in row
+    rows = [line for line in short.splitlines() if line.startswith("│")]
+    assert 4 <= len(rows) <= 8
+    assert sum(line.startswith("│") for line in whole.splitlines()) == len(metrics)
+    assert f"{len(metrics) - len(rows)} more" in short

@@ -18,6 +18,8 @@ class Fit(Written):
     """Folder for the model. DATASET_model when not given."""
     episodes: tuple[int, ...] = ()
     """Episodes to learn from; all when empty."""
+    verbose: More[bool] = False
+    """Show all that was measured, not just what matters first."""
 
     @property
     def folder(self) -> Path:

@@ -37,8 +37,9 @@ class Demo(Imperfect, OfRobot, Measured):
     Records demonstrations of placing and of servoing, fits a movement primitive and an image
     Jacobian to them, then grasps a box with an uncalibrated camera while a scripted person
     draws the elbow aside, carries it to the cabinet along the learned motion, and puts it on a
-    shelf. Results of an older demo in the folder are replaced. Exit status 1 if the job failed
-    or a target was missed.
+    shelf. Demonstrations and models of an older demo in the folder are kept where they are what
+    this one would make; the run is replaced. Exit status 1 if the job failed or a target was
+    missed.
     """
 
     out: Path = Path("outputs/demo")
@@ -51,6 +52,8 @@ class Demo(Imperfect, OfRobot, Measured):
     """Make a film of the run, in its folder and its report."""
     verbose: bool = False
     """Show all that was measured, not just the first of it."""
+    again: More[bool] = False
+    """Record and learn anew, even what is there and unchanged."""
 
 
 @dataclass(frozen=True, kw_only=True)

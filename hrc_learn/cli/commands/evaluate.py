@@ -1,6 +1,6 @@
 """`hrc evaluate`: what was learned, on demonstrations held out and against the truth."""
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -9,7 +9,8 @@ from rich.console import Console
 from rich.table import Table
 
 from hrc_learn.cli._options import resolved
-from hrc_learn.cli._run import show_values, write_values
+from hrc_learn.cli._run import write_values
+from hrc_learn.cli._tables import named
 from hrc_learn.cli.arguments.learn import (
     EvaluateImageJacobian,
     EvaluatePrimitives,
@@ -28,6 +29,7 @@ from hrc_learn.learning.channels import (
 from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.store import new_folder, read_made_by, write_json
 from hrc_learn.viz.figures import measures_figure
+from hrc_learn.viz.report import show_measurements
 
 UNITS = {
     "nrmse": "",
@@ -184,8 +186,18 @@ def evaluate_image_jacobian(args: EvaluateImageJacobian) -> int:
                 loops,
                 on_run=lambda name: status.update(f"Closed loops, {name} Jacobian"),
             )
-    show_values(f"Image Jacobian {args.model}", figures)
+    targets = {
+        "upright_relative_error_median": (MOST_ERROR, False),
+        "speed_up_over_fixed": (LEAST_SPEED_UP, True),
+    }
+    rows = [
+        replace(named(name, figures[name]), target=target, at_least=at_least)
+        for name, (target, at_least) in targets.items()
+        if name in figures
+    ]
+    others = [named(name, value) for name, value in figures.items() if name not in targets]
+    show_measurements(
+        [*rows, *others], title=f"Image Jacobian {args.model}", elsewhere="--json FILE"
+    )
     write_values(args.json, figures)
-    missed = figures["upright_relative_error_median"] > MOST_ERROR
-    missed |= figures.get("speed_up_over_fixed", LEAST_SPEED_UP) < LEAST_SPEED_UP
-    return int(missed)
+    return int(any(row.ok is False for row in rows))

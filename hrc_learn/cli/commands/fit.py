@@ -1,5 +1,6 @@
 """`hrc fit`: movement primitives and image Jacobian from demonstrations."""
 
+import shlex
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,8 @@ from rich.console import Console
 
 from hrc_learn import distributed
 from hrc_learn.cli._options import resolved
-from hrc_learn.cli._run import show_values, write_values
+from hrc_learn.cli._run import write_values
+from hrc_learn.cli._tables import image_jacobian_rows, primitive_rows, show_values
 from hrc_learn.cli.arguments.learn import FitImageJacobian, FitPrimitives
 from hrc_learn.cli.commands.check import columns
 from hrc_learn.demos import DemonstrationSource, load_demos, open_demos
@@ -142,8 +144,8 @@ def _draw(fitted: FittedPrimitives, args: FitPrimitives, folder: Path) -> None:
 
 def _finish(args: FitPrimitives, metrics: dict[str, float], folder: Path) -> None:
     write_json(folder / "metrics.json", metrics)
-    show_values(f"Fit of {args.dataset}", metrics)
-    print(f"Model in {args.folder}")
+    show_values(f"Fit of {args.dataset}", metrics, primitive_rows(metrics), args.verbose)
+    print(f"Model in {shlex.quote(str(args.folder))}")
     write_values(args.json, metrics)
 
 
@@ -196,8 +198,9 @@ def _write(
             figure.savefig(folder / "learning.png", dpi=120)
         title = f"Image Jacobian from {args.dataset.name}"
         record_learning(folder / "fit.rrd", learning_recording(skill, demos, title))
-    show_values(f"Image Jacobian from {args.dataset}", metrics)
-    console.print(f"Model in {args.folder}")
+    rows = image_jacobian_rows(metrics)
+    show_values(f"Image Jacobian from {args.dataset}", metrics, rows, args.verbose)
+    print(f"Model in {shlex.quote(str(args.folder))}")
     print(f"Dashboard: {show_command(args.folder)}")
     write_values(args.json, metrics)
 

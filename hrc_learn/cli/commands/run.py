@@ -13,6 +13,7 @@ from typing import Any, cast, get_args
 
 from rich.console import Console
 
+from hrc_learn.cli._ledger import Ledger
 from hrc_learn.cli._options import resolved
 from hrc_learn.cli._run import command_line, leads_real_arm, refuse_existing
 from hrc_learn.cli.arguments import OfRobot
@@ -286,7 +287,7 @@ def _conduct(
 def demo(args: Demo) -> int:
     """The whole main job, command after command in one process."""
     console = Console()
-    learn(args.out, console, steps=5, robot=_choice(args))
+    learn(args.out, console, steps=5, robot=_choice(args), again=args.again)
     write_text(args.out / "configuration.json", json.dumps(asdict(args), indent=2, default=str))
     _announce(console, 5, 5, "Grasping beside a person, carrying, placing")
     return run_collaboration(
@@ -309,8 +310,16 @@ def demo(args: Demo) -> int:
     )
 
 
-def learn(out: Path, console: Console, steps: int = 4, robot: ArmChoice = _PANDA) -> None:
+def learn(
+    out: Path,
+    console: Console,
+    steps: int = 4,
+    robot: ArmChoice = _PANDA,
+    again: bool = False,
+) -> None:
     """Record demonstrations of placing and servoing, and learn from them.
+
+    What is there already from the same options and code is kept.
 
     Args:
         out: Folder for `placing_demos`, `aiming_demos` and the models `placing`, `aiming`;
@@ -318,6 +327,7 @@ def learn(out: Path, console: Console, steps: int = 4, robot: ArmChoice = _PANDA
         console: Told what is being done.
         steps: How many there are, with those of the caller.
         robot: The arm.
+        again: Whether all is done anew.
 
     Raises:
         RuntimeError: If the scripted expert fails.
@@ -325,34 +335,54 @@ def learn(out: Path, console: Console, steps: int = 4, robot: ArmChoice = _PANDA
     from hrc_learn.cli.commands import fit, record
 
     placing, servoing = out / "placing_demos", out / "aiming_demos"
-    _announce(console, 1, steps, "Demonstrations of placing")
-    if record.record_placing(
-        RecordPlacing(
-            out=placing,
-            robot=robot.name,
-            base=robot.base,
-            tip=robot.tip,
-            overwrite=True,
-        )
+    of_robot: dict[str, Any] = {
+        "robot": robot.name,
+        "base": robot.base,
+        "tip": robot.tip,
+        "overwrite": True,
+    }
+
+    def record_placing() -> None:
+        if record.record_placing(RecordPlacing(out=placing, **of_robot)):
+            raise RuntimeError("the scripted expert could not place")
+
+    def record_servoing() -> None:
+        record.record_servoing(RecordServoing(out=servoing, **of_robot))
+
+    def fit_primitives() -> None:
+        fit.fit_primitives(FitPrimitives(dataset=placing, out=out / "placing", overwrite=True))
+
+    def fit_image_jacobian() -> None:
+        arguments = FitImageJacobian(dataset=servoing, out=out / "aiming", overwrite=True)
+        fit.fit_image_jacobian(arguments)
+
+    ledger, options = Ledger(out / "steps.json"), {"robot": asdict(robot)}
+    for number, (what, work, made, reads) in enumerate(
+        (
+            ("Demonstrations of placing", record_placing, placing, ()),
+            (
+                "Demonstrations of servoing with an uncalibrated camera",
+                record_servoing,
+                servoing,
+                (),
+            ),
+            ("Movement primitives from the first", fit_primitives, out / "placing", (placing,)),
+            (
+                "Image Jacobian from the second",
+                fit_image_jacobian,
+                out / "aiming",
+                (servoing,),
+            ),
+        ),
+        start=1,
     ):
-        raise RuntimeError("the scripted expert could not place")
-    _announce(console, 2, steps, "Demonstrations of servoing with an uncalibrated camera")
-    record.record_servoing(
-        RecordServoing(
-            out=servoing,
-            robot=robot.name,
-            base=robot.base,
-            tip=robot.tip,
-            overwrite=True,
-        )
-    )
-    _announce(console, 3, steps, "Movement primitives from the first")
-    fit.fit_primitives(FitPrimitives(dataset=placing, out=out / "placing", overwrite=True))
-    _announce(console, 4, steps, "Image Jacobian from the second")
-    fit.fit_image_jacobian(
-        FitImageJacobian(dataset=servoing, out=out / "aiming", overwrite=True)
-    )
+        if not again and ledger.holds(made, options, *reads):
+            _announce(console, number, steps, f"{what}: there and unchanged in {made}")
+            continue
+        _announce(console, number, steps, what)
+        work()
+        ledger.enter(made, options, *reads)
 
 
 def _announce(console: Console, step: int, steps: int, what: str) -> None:
-    console.print(f"[bold]\\[{step}/{steps}] {what}[/]", highlight=False)
+    console.print(f"\\[{step}/{steps}] {what}", style="bold", highlight=False, soft_wrap=True)

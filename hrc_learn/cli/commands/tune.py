@@ -11,7 +11,8 @@ from rich.console import Console
 from rich.progress import Progress
 
 from hrc_learn.cli._options import resolved
-from hrc_learn.cli._run import show_values, write_values
+from hrc_learn.cli._run import write_values
+from hrc_learn.cli._tables import named
 from hrc_learn.cli.arguments.learn import Tune
 from hrc_learn.controller import ControllerConfig
 from hrc_learn.experiments.controller.initialization_study import (
@@ -26,6 +27,7 @@ from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.visual_skill import guessed_network
 from hrc_learn.store import new_folder, write_json, write_text
 from hrc_learn.viz.figures import learning_figure
+from hrc_learn.viz.report import show_measurements
 
 
 def tune(args: Tune) -> None:
@@ -55,7 +57,9 @@ def tune(args: Tune) -> None:
         write_json(folder / "metrics.json", figures)
         learning_figure(history, len(history) - 1, "s").savefig(folder / "search.png", dpi=120)
     place.unlink(missing_ok=True)
-    show_values("Gains, on closed loops not searched", figures)
+    rows = [named(name, value) for name, value in figures.items()]
+    title = "Gains, on closed loops not searched"
+    show_measurements(rows, title=title, elsewhere="metrics.json")
     console.print(f"Gains in {args.out / 'gains.json'}")
     write_values(args.json, figures)
 

@@ -255,21 +255,33 @@ _ROWS = 8
 """Of a table in the terminal: a screen keeps them in view with what follows."""
 
 
-def show_measurements(table: Sequence[Measurement], everything: bool = False) -> None:
+def show_measurements(
+    table: Sequence[Measurement],
+    everything: bool = False,
+    *,
+    title: str = "Measured",
+    more: int = 0,
+    elsewhere: str = "--verbose, or the report",
+) -> None:
     """Print measured values beside their targets.
 
     Args:
         table: The values.
         everything: All of them, not just the missed and the first of the others.
+        title: Of the table.
+        more: How many values there are besides.
+        elsewhere: Where those that are not shown can be read.
     """
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
-    shown = Table("measured", "value", "target", "", title="Measured")
+    # As text: brackets in the name of a folder are no markup.
+    shown = Table("measured", "value", "target", "", title=Text(title))
     marks = {True: "[green]ok[/]", False: "[red]missed[/]", None: ""}
     first, others = (tuple(table), ()) if everything else leading(table, _ROWS)
     for m in first:
         shown.add_row(m.name, m.shown, m.bound, marks[m.ok])
-    if others:
-        shown.caption = f"{len(others)} more: --verbose, or the report"
+    if left := more + len(others):
+        shown.caption = f"{left} more: {elsewhere}"
     Console().print(shown)
