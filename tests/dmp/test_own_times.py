@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -18,6 +19,7 @@ from hrc_learn.dmp import (
     SpringDamper,
     response_of,
 )
+from hrc_learn.dmp._system import own_times
 from hrc_learn.dmp._system.own_times import motion, products
 
 BASES = {
@@ -61,8 +63,9 @@ def test_polynomials_give_what_the_response_gives(basis, approach, spring, order
 def test_derivatives_of_any_order_and_direction(basis, approach):
     response = response_of(SpringDamper(), basis, approach)
     s, x = random_motions(basis, batch=2)
-    s, x = (0.2 + 0.6 * s[:, 3:6] / 2.5).requires_grad_(), x[:, :1].requires_grad_()
-    for order in (0, 1):
+    s, x = 0.2 + 0.6 * s[:, 3:6] / 2.5, x[:, :1].requires_grad_()
+    for order, times in enumerate((s, s.sort(-1).values)):
+        s = times.clone().requires_grad_()
 
         def y(s, x, order=order):
             return motion(response, s, x, order)
@@ -71,6 +74,24 @@ def test_derivatives_of_any_order_and_direction(basis, approach):
             y, (s, x), atol=1e-6, check_forward_ad=True, check_batched_grad=True
         )
         assert torch.autograd.gradgradcheck(y, (s, x), atol=1e-4, rtol=1e-3)
+
+
+def test_a_gradient_by_times_alone_makes_none_by_coordinates(monkeypatch):
+    response = response_of(SpringDamper(), GaussianBasis(count=12), 0.0)
+    s, x = random_motions(response.basis)
+    s, leaf = s.requires_grad_(), x.requires_grad_()
+    y = motion(response, s, 2 * leaf, 0)
+    by_s, by_x = torch.autograd.grad(y.sum(), (s, leaf), retain_graph=True)
+    assert by_x.abs().max() > 0
+
+    def unwanted(*arguments):
+        raise AssertionError("nobody asked for it")
+
+    monkeypatch.setattr(own_times, "_Adjoint", SimpleNamespace(apply=unwanted))
+    torch.testing.assert_close(torch.autograd.grad(y.sum(), s, retain_graph=True)[0], by_s)
+    monkeypatch.setattr(own_times, "_along", unwanted)
+    with pytest.raises(AssertionError):
+        torch.autograd.grad(y.sum(), leaf)
 
 
 @pytest.fixture(scope="module")
