@@ -94,7 +94,10 @@ LIBRARIES: dict[str, set[str]] = {
     "hardware": {"torch", "jaxtyping", "numpy"},
     "teleoperation": {"torch", "jaxtyping", "numpy", "scipy"},
     "experiments": {"torch", "jaxtyping", "numpy", "matplotlib"},
-    "lerobot": {"torch", "jaxtyping", "numpy", "safetensors", "lerobot", "gymnasium"},
+    "lerobot": {
+        *("torch", "jaxtyping", "numpy", "safetensors"),
+        *("lerobot", "gymnasium", "draccus"),
+    },
 }
 """Libraries that modules of a package may import as soon as they are imported."""
 
@@ -109,7 +112,7 @@ LAZY_LIBRARIES: dict[str, set[str]] = {
     "hardware": {"franky", "pylibfranka", "cv2"},
     "teleoperation": {"viser", "pygame", "websockets", "msgspec", "trimesh", "cv2"},
     "experiments": {"rich"},
-    "lerobot": {"torchvision"},
+    "lerobot": {"torchvision", "pyarrow"},
 }
 """Libraries that they may import in the functions that need them, and nowhere else."""
 
@@ -132,6 +135,7 @@ DISTRIBUTIONS = {
     # Requirement of huggingface-hub's own.
     "httpx": "huggingface-hub",
     "gymnasium": "lerobot",
+    "draccus": "lerobot",
 }
 """What a library is called in pyproject.toml where that is not its name in code."""
 

@@ -7,8 +7,8 @@ they are asked for.
 
 from hrc_learn.lerobot import camera_watch as camera_watch
 from hrc_learn.lerobot import envs as envs
-from hrc_learn.lerobot import processor as processor
 from hrc_learn.lerobot import robots as robots
+from hrc_learn.lerobot import smoothing as smoothing
 from hrc_learn.lerobot import teleoperators as teleoperators
 from hrc_learn.lerobot.policy.configuration_dmp import DMPConfig as DMPConfig
 from hrc_learn.lerobot.policy.configuration_motion_chunk import (

@@ -25,7 +25,8 @@ from hrc_learn.demos.format.dataset_folder import read_info
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import CameraMotion, CameraReference, CameraWatch
 from hrc_learn.learning.visual_servo_fitting import feature_trajectories
-from hrc_learn.lerobot.processor import PREPROCESSOR, read_pipeline, write_pipeline
+from hrc_learn.lerobot.smoothing import PREPROCESSOR, read_pipeline
+from hrc_learn.lerobot.smoothing.limits import write_json
 
 CAMERA_WATCH = "hrc_learn_camera_watch"
 POSE_NAMES = ("ee.x", "ee.y", "ee.z", "ee.wx", "ee.wy", "ee.wz")
@@ -147,5 +148,5 @@ def add_camera_watch(
         pose_columns=[names.index(name) for name in POSE_NAMES],
     )
     content["steps"].insert(0, {"registry_name": CAMERA_WATCH, "config": step.get_config()})
-    write_pipeline(path, content)
+    write_json(path, content)
     return reference

@@ -2,14 +2,24 @@
 
 import itertools
 import json
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from hrc_learn.demos import DatasetWriter
-from hrc_learn.kinematics import panda
-from hrc_learn.lerobot.action_limits import demonstrated_limits
-from hrc_learn.lerobot.panda_robot import JOINTS
+from hrc_learn.lerobot import smoothing
+from hrc_learn.lerobot.smoothing import (
+    ActionLimits,
+    calibrated_ranges,
+    demonstrated_limits,
+    gathered_limits,
+    urdf_limits,
+)
+from hrc_learn.lerobot.smoothing.command import main
 
 FPS = 20.0
 
@@ -82,14 +92,6 @@ def test_what_holds_still_has_a_thousandth_of_the_largest_limit(tmp_path):
         assert values[1] == pytest.approx(max(values) / 1000)
 
 
-def test_joints_of_the_panda_have_its_limits(tmp_path):
-    dataset = write(tmp_path / "set", paths(7), panda.joint_names)
-    limits = demonstrated_limits(dataset)
-    assert limits.names == list(JOINTS)
-    assert limits.lower == panda.limits.lower.tolist()
-    assert limits.upper == panda.limits.upper.tolist()
-
-
 def test_names_may_be_missing_or_grouped(tmp_path):
     dataset = write(tmp_path / "set", paths())
     describe_anew(dataset, lambda f: f["action"].update(names={"motors": ["x", "y", "z"]}))
@@ -122,3 +124,138 @@ def test_a_dataset_without_actions_is_refused(tmp_path):
     describe_anew(dataset, lambda f: f.pop("action"))
     with pytest.raises(ValueError, match="has no actions"):
         demonstrated_limits(dataset)
+
+
+URDF = """<?xml version="1.0"?>
+<robot name="arm">
+  <joint name="a" type="revolute"><limit lower="-1.5" upper="2" velocity="0.25"/></joint>
+  <joint name="b" type="continuous"><limit velocity="3" effort="1"/></joint>
+  <joint name="c" type="prismatic"><limit lower="0" upper="0.1" velocity="0"/></joint>
+  <joint name="d" type="fixed"/>
+</robot>
+"""
+
+
+def test_a_urdf_tells_positions_and_velocities(tmp_path):
+    file = tmp_path / "arm.urdf"
+    file.write_text(URDF)
+    ranges, velocities = urdf_limits(file)
+    assert ranges == {"a.pos": (-1.5, 2.0), "c.pos": (0.0, 0.1)}
+    assert velocities == {"a.pos": 0.25, "b.pos": 3.0}
+    ranges, velocities = urdf_limits(file, degrees=True)
+    assert ranges["a.pos"] == pytest.approx((-85.94367, 114.59156))
+    assert velocities["b.pos"] == pytest.approx(171.88734)
+    assert ranges["c.pos"] == (0.0, 0.1)  # metres stay
+
+
+CALIBRATION = {
+    "a": {"id": 1, "drive_mode": 0, "homing_offset": 5, "range_min": 1000, "range_max": 3047},
+    "gripper": {"id": 2, "drive_mode": 0, "homing_offset": 5, "range_min": 9, "range_max": 99},
+}
+
+
+def test_a_calibration_tells_positions_as_lerobot_does(tmp_path):
+    """Against LeRobot's own normalisation of the ends, of a bus that is never opened."""
+    from lerobot.motors import Motor, MotorCalibration, MotorNormMode
+    from lerobot.motors.feetech import FeetechMotorsBus
+
+    file = tmp_path / "me.json"
+    file.write_text(json.dumps(CALIBRATION))
+    for degrees, mode in ((True, MotorNormMode.DEGREES), (False, MotorNormMode.RANGE_M100_100)):
+        motors = {
+            "a": Motor(1, "sts3215", mode),
+            "gripper": Motor(2, "sts3215", MotorNormMode.RANGE_0_100),
+        }
+        calibration = {k: MotorCalibration(**v) for k, v in CALIBRATION.items()}
+        bus = object.__new__(FeetechMotorsBus)  # its driver need not be installed
+        bus.motors, bus.calibration = motors, calibration
+        bus._id_to_name_dict = {m.id: name for name, m in motors.items()}
+        bus._id_to_model_dict = {m.id: m.model for m in motors.values()}
+        ranges = calibrated_ranges(file, degrees=degrees)
+        for side, end in enumerate(("range_min", "range_max")):
+            expected = bus._normalize({m["id"]: m[end] for m in CALIBRATION.values()})
+            found = [ranges["a.pos"][side], ranges["gripper.pos"][side]]
+            assert found == pytest.approx(list(expected.values()))
+
+
+def test_what_is_known_is_put_together(tmp_path):
+    shown = paths()
+    dataset = write(tmp_path / "set", shown)
+    (tmp_path / "arm.urdf").write_text(URDF)
+    (tmp_path / "me.json").write_text(json.dumps({"a": CALIBRATION["a"]}))
+    plain = demonstrated_limits(dataset, 0.5)
+    limits = gathered_limits(
+        dataset, share=0.5, urdf=tmp_path / "arm.urdf", calibration=tmp_path / "me.json"
+    )
+    assert (limits.lower, limits.upper) == ([-100.0, None, 0.0], [100.0, None, 0.1])
+    assert limits.velocity == [0.25, min(3.0, plain.velocity[1]), plain.velocity[2]]
+    assert limits.jerk == plain.jerk
+
+
+@pytest.mark.parametrize(
+    ("read", "content", "message"),
+    [
+        (urdf_limits, "<robot", "is not a URDF"),
+        (urdf_limits, "<mujoco/>", "describes a mujoco"),
+        (urdf_limits, "<robot/>", "has no joints with limits"),
+        (calibrated_ranges, "[]", "it has no motors"),
+        (calibrated_ranges, '{"a": {"range_min": 5, "range_max": 5}}', "a has no range_min"),
+        (calibrated_ranges, '{"a": 3}', "a has no range_min"),
+        (calibrated_ranges, "nonsense", "is damaged"),
+    ],
+)
+def test_files_that_tell_no_limits_are_refused(tmp_path, read, content, message):
+    (tmp_path / "file").write_text(content)
+    with pytest.raises(ValueError, match=message):
+        read(tmp_path / "file")
+    with pytest.raises(FileNotFoundError, match="none"):
+        read(tmp_path / "none")
+
+
+def test_the_command_says_what_is_wrong_and_writes_what_it_found(tmp_path, capsys):
+    dataset, out = write(tmp_path / "set", paths()), tmp_path / "limits.json"
+    arguments = ["limits", "--dataset", str(dataset), "--out", str(out)]
+    assert main([*arguments, "--share", "0"]) == 1
+    assert "share must be positive" in capsys.readouterr().err
+    (tmp_path / "me.json").write_text(json.dumps({"z": CALIBRATION["a"]}))
+    assert main([*arguments, "--calibration", str(tmp_path / "me.json")]) == 1
+    assert "names z.pos, but the actions of the dataset are a.pos" in capsys.readouterr().err
+    assert not out.exists()
+    assert main(arguments) == 0
+    assert ActionLimits.load(out) == demonstrated_limits(dataset)
+    assert out.stat().st_mode & 0o044
+    assert main(["add", "--checkpoint", str(tmp_path), "--limits", str(out)]) == 1
+    assert "pretrained_model" in capsys.readouterr().err
+
+
+def test_the_distribution_of_its_own_imports_nothing_else_of_ours(tmp_path):
+    """Built as a wheel, and loaded where hrc_learn cannot be found."""
+    pytest.importorskip("hatchling", reason="the build backend is not installed")
+    project = Path(__file__).parents[2] / "plugins" / "lerobot_smooth"
+    build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)]
+    subprocess.run(build, cwd=project, check=True, capture_output=True)
+    (wheel,) = tmp_path.glob("*.whl")
+    program = (
+        "import sys; sys.modules['hrc_learn'] = None; import lerobot_smooth.command;"
+        "from lerobot.robots import RobotConfig;"
+        "print('smooth' in RobotConfig.get_known_choices())"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(wheel)}
+    ran = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, env=environment
+    )
+    assert (ran.stdout.strip(), ran.returncode) == ("True", 0), ran.stderr
+
+
+def test_both_copies_get_on_in_one_process(tmp_path):
+    folder = Path(smoothing.__file__).parent
+    (tmp_path / "lerobot_smooth").symlink_to(folder)
+    program = "import hrc_learn.lerobot.smoothing, lerobot_smooth"
+    path = os.pathsep.join([str(tmp_path), str(Path(__file__).parents[2])])
+    ran = subprocess.run(
+        [sys.executable, "-c", program],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": path},
+    )
+    assert ran.returncode == 0, ran.stderr

@@ -19,7 +19,7 @@ from hrc_learn.lerobot.camera_watch import (
     CameraWatchStep,
     add_camera_watch,
 )
-from hrc_learn.lerobot.processor import PREPROCESSOR
+from hrc_learn.lerobot.smoothing import PREPROCESSOR
 
 FPS = 25
 CAMERA = MarkerCamera(

@@ -3,7 +3,6 @@
 import functools
 import gc
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,11 +16,10 @@ from lerobot.processor.converters import (
     transition_to_policy_action,
 )
 
-from hrc_learn.controller import ActionChunkReport
-from hrc_learn.lerobot.action_limits import ActionLimits
-from hrc_learn.lerobot.processor import (
+from hrc_learn.lerobot.smoothing import (
     POSTPROCESSOR,
     PREPROCESSOR,
+    ActionLimits,
     Changes,
     SmoothActionsStep,
     WatchStateStep,
@@ -150,16 +148,29 @@ def test_actions_of_another_width_are_refused(checkpoint):
         after(torch.zeros(1, 3))
 
 
+def test_two_robots_of_one_checkpoint_do_not_see_each_other(checkpoint):
+    (first, move_first, _), (second, move_second, _) = loaded(checkpoint), loaded(checkpoint)
+    observe(first, 0.5)
+    observe(second, -0.5)
+    here = torch.tensor([[0.5, 0.0]])
+    torch.testing.assert_close(move_first(here), here)
+    torch.testing.assert_close(move_second(-here), -here)
+
+
 def test_a_step_that_is_gone_is_no_longer_asked():
-    """Two policies in one process: what the first one saw is not taken for the second's."""
     watch = WatchStateStep(pair="of a policy")
-    watch(batch_to_transition({"observation.state": torch.tensor([[0.25, 0.5]])}))
-    seen = WatchStateStep.newest_state("of a policy")
-    assert seen is not None
-    assert seen.tolist() == [[0.25, 0.5]]
+    smooth = SmoothActionsStep(**SETTINGS | {"pair": "of a policy"})
+    assert smooth.watch is watch
     del watch
     gc.collect()
-    assert WatchStateStep.newest_state("of a policy") is None
+    assert smooth.watch is None
+
+
+def test_steps_find_each_other_built_in_either_order():
+    smooth = SmoothActionsStep(**SETTINGS | {"pair": "late"})
+    watch = WatchStateStep(pair="late")
+    assert smooth.watch is watch
+    assert SmoothActionsStep(**SETTINGS | {"pair": "late"}).watch is None
 
 
 def chunk_of(a, b=0.0, batch=1):
@@ -254,15 +265,14 @@ def test_settings_that_do_not_fit_are_refused():
 
 def test_changes_add_up():
     changes = Changes(["a", "b"])
-    broken = torch.zeros(1, 3, 4, dtype=torch.bool)
+    broken = np.zeros((1, 3, 4), dtype=bool)
     broken[0, :2, 1] = broken[0, 2, 3] = True
-    change = torch.tensor([[[0.0, 2e-6], [-0.3, 0.0], [1e-7, 0.0]]], dtype=torch.float64)
-    report = ActionChunkReport(broken=broken, change=change)
-    changes.add(report)
+    change = np.array([[[0.0, 2e-6], [-0.3, 0.0], [1e-7, 0.0]]])
+    changes.add(broken, change)
     assert (changes.steps, changes.changed) == (3, 2)
     assert changes.broken == {"position": 0, "velocity": 2, "acceleration": 0, "jerk": 1}
     assert changes.largest == {"a": pytest.approx(0.3), "b": pytest.approx(2e-6)}
-    changes.add(replace(report, change=change.flip(-1) / 3))
+    changes.add(broken, change[..., ::-1] / 3)
     assert (changes.steps, changes.changed) == (6, 3)
     assert changes.broken["velocity"] == 4
     assert changes.largest == {"a": pytest.approx(0.3), "b": pytest.approx(0.1)}

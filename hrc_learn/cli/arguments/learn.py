@@ -185,14 +185,24 @@ class Smooth(Measured):
     Adds two steps to the processors of a checkpoint. They keep actions within limits of
     position, velocity, acceleration and jerk, and blend the seams between chunks. The limits
     are how abruptly the demonstrators of its dataset moved. Weights stay as they are; --remove
-    takes the steps out.
+    takes the steps out. With --limits they are also written to a file, for a robot of
+    `--robot.type=smooth`, which leads any other at the rate of its motors.
     """
 
-    checkpoint: Path
-    """Folder `pretrained_model` of the checkpoint."""
+    checkpoint: Path | None = None
+    """Folder `pretrained_model` of the checkpoint; None: only --limits are written."""
     dataset: Path | None = None
     """LeRobot dataset it was trained on; not needed to remove the steps."""
     share: float = 1.0
     """Share of the demonstrators' velocity, acceleration and jerk to allow."""
+    urdf: Path | None = None
+    """Positions and velocities of the joints that it names, beside the demonstrators'."""
+    calibration: Path | None = None
+    """LeRobot's calibration of the robot: the positions that its motors were moved through."""
+    degrees: bool = False
+    """Actions are in degrees, where there is a URDF or a calibration; else in radians, or
+    percent of what was calibrated."""
+    limits: Path | None = None
+    """Receives the limits, as a file for --robot.limits of a `smooth` robot."""
     remove: bool = False
     """Take the steps out again."""

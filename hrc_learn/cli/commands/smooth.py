@@ -8,16 +8,19 @@ from rich.table import Table
 
 from hrc_learn.cli._run import write_values
 from hrc_learn.cli.arguments.learn import Smooth
+from hrc_learn.kinematics import panda
 
 
 def smooth(args: Smooth) -> None:
-    if not args.checkpoint.is_dir():
+    if args.checkpoint is not None and not args.checkpoint.is_dir():
         raise FileNotFoundError(f"there is no folder {args.checkpoint}")
+    if args.checkpoint is None and (args.remove or args.limits is None):
+        raise ValueError("--checkpoint is needed, or --limits to write them to a file alone.")
     # LeRobot takes seconds to import.
-    from hrc_learn.lerobot.action_limits import demonstrated_limits
-    from hrc_learn.lerobot.processor import add_smoothing, remove_smoothing
+    from hrc_learn.lerobot.panda_robot import JOINTS
+    from hrc_learn.lerobot.smoothing import add_smoothing, gathered_limits, remove_smoothing
 
-    if args.remove:
+    if args.remove and args.checkpoint is not None:
         remove_smoothing(args.checkpoint)
         print(f"{args.checkpoint} is as it was trained")
         return
@@ -25,15 +28,28 @@ def smooth(args: Smooth) -> None:
         raise ValueError("--dataset is needed: limits are those of its demonstrators.")
     if not args.share > 0:
         raise ValueError(f"--share must be positive, but is {args.share}.")
-    limits = demonstrated_limits(args.dataset, args.share)
-    add_smoothing(args.checkpoint, limits)
+    limits = gathered_limits(
+        args.dataset,
+        share=args.share,
+        urdf=args.urdf,
+        calibration=args.calibration,
+        degrees=args.degrees,
+    )
+    if args.urdf is None and args.calibration is None:
+        ends = zip(panda.limits.lower.tolist(), panda.limits.upper.tolist(), strict=True)
+        limits = limits.within(dict(zip(JOINTS, ends, strict=True)))
+    if args.limits is not None:
+        limits.save(args.limits)
+    if args.checkpoint is not None:
+        add_smoothing(args.checkpoint, limits)
     values = asdict(limits)
     table = Table("value", "velocity [1/s]", "acceleration [1/s^2]", "jerk [1/s^3]")
     kinds = ("velocity", "acceleration", "jerk")
     for i, name in enumerate(limits.names):
         table.add_row(name, *(f"{values[kind][i]:.3g}" for kind in kinds))
     Console().print(table)
-    print(f"actions of {args.checkpoint} are kept within these limits")
+    if args.checkpoint is not None:
+        print(f"actions of {args.checkpoint} are kept within these limits")
     figures = {
         f"{kind}_{name}": float(v)
         for kind in kinds

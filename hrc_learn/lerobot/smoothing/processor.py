@@ -6,16 +6,14 @@ checkpoint that was trained without them.
 
 from __future__ import annotations
 
-import json
 import logging
-import math
 import weakref
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, ClassVar
-from weakref import WeakValueDictionary
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from lerobot.configs import PipelineFeatureType, PolicyFeature
@@ -24,15 +22,8 @@ from lerobot.processor import ProcessorStep, ProcessorStepRegistry
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
-from hrc_learn.controller import (
-    LIMIT_KINDS,
-    ActionChunkFilter,
-    ActionChunkReport,
-    ActionChunkState,
-)
-from hrc_learn.kinematics import MotionLimits
-from hrc_learn.lerobot.action_limits import ActionLimits
-from hrc_learn.store import new_file
+from .limits import ActionLimits, read_json, write_json
+from .motion_filter import LIMIT_KINDS, MotionFilter, MotionState
 
 # What smoothing has changed, added up.
 
@@ -60,15 +51,22 @@ class Changes:
         self.broken = dict.fromkeys(LIMIT_KINDS, 0)
         self.largest = dict.fromkeys(self.names, 0.0)
 
-    def add(self, report: ActionChunkReport) -> None:
-        """Count what was done to a chunk."""
-        change = report.change.abs().reshape(-1, len(self.names))
+    def add(
+        self, broken: Bool[np.ndarray, "*batch T 4"], change: Float[np.ndarray, "*batch T D"]
+    ) -> None:
+        """Count what was done to a chunk.
+
+        Args:
+            broken: Which of `LIMIT_KINDS` each action would have broken.
+            change: What was handed out, less what was asked for.
+        """
+        change = np.abs(change).reshape(-1, len(self.names))
         self.steps += len(change)
         self.changed += int((change > _SAME).any(-1).sum())
-        broken = report.broken.flatten(0, -2).sum(0).tolist()
-        for kind, count in zip(LIMIT_KINDS, broken, strict=True):
+        counts = broken.reshape(-1, len(LIMIT_KINDS)).sum(0).tolist()
+        for kind, count in zip(LIMIT_KINDS, counts, strict=True):
             self.broken[kind] += count
-        for name, most in zip(self.names, torch.amax(change, 0).tolist(), strict=True):
+        for name, most in zip(self.names, change.max(0).tolist(), strict=True):
             self.largest[name] = max(self.largest[name], most)
 
     def __str__(self) -> str:
@@ -89,10 +87,9 @@ _JUMP = 5.0
 _Features = dict[PipelineFeatureType, dict[str, PolicyFeature]]
 
 
-@ProcessorStepRegistry.register(WATCH)
 @dataclass
 class WatchStateStep(ProcessorStep):
-    """Keeps the state as the robot reports it, for the `SmoothActionsStep` of the same name.
+    """Keeps the state as the robot reports it, for the `SmoothActionsStep` of the same policy.
 
     Belongs at the beginning of the preprocessor, where the state has its name and units.
     """
@@ -102,18 +99,19 @@ class WatchStateStep(ProcessorStep):
     state: Tensor | None = field(default=None, init=False, repr=False)
     """Newest state of the robot, (batch, values); None before the first observation."""
 
-    # LeRobot builds both steps of a policy from files, each without the other: the one that
-    # smooths finds the one that watches by name, for as long as somebody holds it.
-    _alive: ClassVar[WeakValueDictionary[str, Any]] = WeakValueDictionary()
+    # LeRobot builds a policy's processors from two files, first the one with this step, and
+    # gives neither to the other. So the next step to be built that smooths takes the newest of
+    # its name, once: what is built for another robot later is not asked.
+    _built: ClassVar[dict[str, weakref.ref[Any]]] = {}
 
     def __post_init__(self) -> None:
-        self._alive[self.pair] = self
+        self._built[self.pair] = weakref.ref(self)
 
     @classmethod
-    def newest_state(cls, pair: str) -> Tensor | None:
-        """What the step of that name saw last; None where no such step is in use."""
-        step = cls._alive.get(pair)
-        return None if step is None else step.state
+    def take_newest(cls, pair: str) -> WatchStateStep | None:
+        """The step of that name that was built last; None where it is gone or taken."""
+        step = cls._built.pop(pair, None)
+        return None if step is None else step()
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
         observation = transition.get(TransitionKey.OBSERVATION) or {}
@@ -132,7 +130,6 @@ class WatchStateStep(ProcessorStep):
         return features
 
 
-@ProcessorStepRegistry.register(SMOOTH)
 @dataclass
 class SmoothActionsStep(ProcessorStep):
     """Keeps actions within limits of position, velocity, acceleration and jerk.
@@ -140,7 +137,7 @@ class SmoothActionsStep(ProcessorStep):
     Belongs at the end of the postprocessor, where actions have their units. Takes one action at
     a time, (batch, values), as lerobot-rollout and lerobot-eval hand them on, or whole chunks
     (batch, steps, values). A motion begins where the robot is, and anew where it is put; a
-    chunk begins where the robot is on the one before. See `ActionChunkFilter`.
+    chunk begins where the robot is on the one before. See `MotionFilter`.
     """
 
     fps: float
@@ -165,26 +162,27 @@ class SmoothActionsStep(ProcessorStep):
     """What was changed since the last reset."""
 
     def __post_init__(self) -> None:
-        for name in ("velocity", "acceleration", "jerk", "lower", "upper", "state_columns"):
-            if len(getattr(self, name)) != len(self.names):
-                raise ValueError(
-                    f"smooth actions: {name} must have one entry for each of "
-                    f"{', '.join(self.names)}, but has {len(getattr(self, name))}."
-                )
-        limits = MotionLimits(
-            lower=_tensor(self.lower, missing=-math.inf),
-            upper=_tensor(self.upper, missing=math.inf),
-            velocity=_tensor(self.velocity),
-            acceleration=_tensor(self.acceleration),
-            jerk=_tensor(self.jerk),
-        )
-        self._smoother = ActionChunkFilter(limits, 1.0 / self.fps)
-        self._columns = torch.tensor(self.state_columns)
-        self._state: ActionChunkState | None = None
-        self._chunk: Tensor | None = None
-        self._before: Tensor | None = None
+        limits = {f.name: getattr(self, f.name) for f in fields(ActionLimits)}
+        self._filter = MotionFilter(ActionLimits(**limits), 1.0 / self.fps)
+        self._columns = np.array(self.state_columns)
+        self._watch: weakref.ref[WatchStateStep] | None = None
+        self.watch = WatchStateStep.take_newest(self.pair)
+        self._state: MotionState | None = None
+        self._chunk: np.ndarray | None = None
+        self._before: np.ndarray | None = None
         self.changes = Changes(self.names)
         weakref.finalize(self, _log, self.changes)
+
+    @property
+    def watch(self) -> WatchStateStep | None:
+        """The step that tells where the robot is; None: none does."""
+        if self._watch is None:
+            self.watch = WatchStateStep.take_newest(self.pair)
+        return None if self._watch is None else self._watch()
+
+    @watch.setter
+    def watch(self, step: WatchStateStep | None) -> None:
+        self._watch = None if step is None else weakref.ref(step)
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
         action = transition.get(TransitionKey.ACTION)
@@ -196,14 +194,17 @@ class SmoothActionsStep(ProcessorStep):
                 f"limits are given for {', '.join(self.names)}."
             )
         whole = action.dim() == 3
-        chunk = (action if whole else action.unsqueeze(-2)).detach().cpu()
-        with torch.inference_mode():
-            state = self._start(chunk, whole)
-            smooth, self._state, report = self._smoother(chunk, state)
-        self.changes.add(report)
+        asked = (action if whole else action.unsqueeze(-2)).detach().cpu().double().numpy()
+        state = self._start(asked, whole)
+        broken, made = self._filter.broken(state, asked), []
+        for k in range(asked.shape[-2]):
+            state = self._filter.step(state, asked[..., k, :])
+            made.append(state.position)
+        self._state, chunk = state, np.stack(made, axis=-2)
+        self.changes.add(broken, np.nan_to_num(chunk - asked))
         # An acceleration takes three actions; with fewer the next chunk goes on from the state.
-        self._chunk = smooth.to(torch.float64) if whole and smooth.shape[-2] > 2 else None
-        smooth = smooth.to(action)
+        self._chunk = chunk if whole and len(made) > 2 else None
+        smooth = torch.from_numpy(chunk).to(action)
         return {**transition, TransitionKey.ACTION: smooth if whole else smooth.squeeze(-2)}  # pyright: ignore[reportReturnType]
 
     def reset(self) -> None:
@@ -218,24 +219,23 @@ class SmoothActionsStep(ProcessorStep):
     def transform_features(self, features: _Features) -> _Features:
         return features
 
-    def _start(self, chunk: Tensor, whole: bool) -> ActionChunkState:
+    def _start(self, asked: np.ndarray, whole: bool) -> MotionState:
         """Where the motion goes on from."""
-        measured = self._measured(chunk)
-        fresh = self._smoother.initial_state(measured)
-        if self._state is None or self._state.position.shape != measured.shape:
-            self._before = measured
-            return fresh
+        measured = self._measured(asked)
         state = self._state
+        if state is None or state.position.shape != measured.shape:
+            self._before = measured
+            return MotionState.moving(measured)
         if whole and self._chunk is not None:
             state = self._reached(measured, self._chunk)
         jumped = self._jumped(measured)
         self._before = measured
-        return _where(jumped, fresh, state) if jumped.any() else state
+        return _where(jumped, MotionState.moving(measured), state)
 
-    def _measured(self, chunk: Tensor) -> Float[Tensor, "batch values"]:
+    def _measured(self, asked: np.ndarray) -> Float[np.ndarray, "batch values"]:
         """Where the robot is; values that are not measured are where they are sent."""
-        here = chunk[..., 0, :].to(torch.float64)
-        state = WatchStateStep.newest_state(self.pair)
+        here = np.nan_to_num(asked[..., 0, :])
+        state = None if self.watch is None else self.watch.state
         if state is None or state.shape[0] != here.shape[0]:
             return here
         if int(self._columns.max()) >= state.shape[-1]:
@@ -243,46 +243,47 @@ class SmoothActionsStep(ProcessorStep):
                 f"smooth actions: state_columns reach {int(self._columns.max())}, but the "
                 f"state has {state.shape[-1]} values."
             )
-        values = state[..., self._columns.clamp(min=0)].to(here)
-        return torch.where(self._columns >= 0, values, here)
+        values = state.double().numpy()[..., np.maximum(self._columns, 0)]
+        return np.where(self._columns >= 0, values, here)
 
-    def _jumped(self, measured: Tensor) -> Bool[Tensor, " batch"]:
+    def _jumped(self, measured: np.ndarray) -> Bool[np.ndarray, " batch"]:
         """Whether the robot was put somewhere, which no motion explains."""
         assert self._before is not None  # there is one as soon as there is a state
-        farthest = _JUMP * self._smoother.barrier.velocity / self.fps
-        moved = (measured - self._before).abs() > farthest
-        return (moved & (self._columns >= 0)).any(-1)
+        farthest = _JUMP * self._filter.velocity / self.fps
+        moved = np.abs(measured - self._before) > farthest
+        return np.any(moved & (self._columns >= 0), axis=-1)
 
-    def _reached(self, measured: Tensor, chunk: Tensor) -> ActionChunkState:
+    def _reached(self, measured: np.ndarray, chunk: np.ndarray) -> MotionState:
         """State on the chunk before, where it is nearest to the robot."""
-        scaled = (chunk - measured.unsqueeze(-2)) / self._smoother.barrier.velocity
-        seen = torch.where(self._columns >= 0, scaled, 0.0)
-        nearest = seen.square().sum(-1).argmin(-1).clamp(min=2)
-        rows = torch.arange(len(chunk))
+        scaled = (chunk - measured[..., None, :]) / self._filter.velocity
+        seen = np.where(self._columns >= 0, scaled, 0.0)
+        nearest = np.maximum(np.square(seen).sum(-1).argmin(-1), 2)
+        rows = np.arange(len(chunk))
         last, middle, first = (chunk[rows, nearest - k] for k in range(3))
         velocity = (last - middle) * self.fps
-        state = self._smoother.initial_state(last, velocity)
         acceleration = (velocity - (middle - first) * self.fps) * self.fps
-        return replace(state, acceleration=acceleration)
+        return MotionState.moving(last, velocity, acceleration)
 
 
-def _tensor(values: Sequence[float | None], missing: float = math.nan) -> Float[Tensor, " n"]:
-    return torch.tensor([missing if v is None else v for v in values], dtype=torch.float64)
-
-
-def _where(
-    rows: Bool[Tensor, " batch"], yes: ActionChunkState, no: ActionChunkState
-) -> ActionChunkState:
+def _where(rows: Bool[np.ndarray, " batch"], yes: MotionState, no: MotionState) -> MotionState:
+    if not rows.any():
+        return no
     values = {
-        name: torch.where(rows.unsqueeze(-1), getattr(yes, name), getattr(no, name))
+        name: np.where(rows[..., None], getattr(yes, name), getattr(no, name))
         for name in vars(no)
     }
-    return replace(no, **values)
+    return MotionState(**values)
 
 
 def _log(changes: Changes) -> None:
     if changes.steps:
         logging.info("smooth actions: %s", changes)
+
+
+for _name, _step in ((WATCH, WatchStateStep), (SMOOTH, SmoothActionsStep)):
+    # The same steps may be installed as a distribution of their own, and known already.
+    if _name not in ProcessorStepRegistry.list():
+        ProcessorStepRegistry.register(_name)(_step)
 
 
 # Adding the steps to a checkpoint.
@@ -309,14 +310,14 @@ def add_smoothing(checkpoint: Path, limits: ActionLimits) -> None:
     before["steps"].insert(0, watch)  # before a step that renames or normalises the state
     after["steps"].append(smooth)
     # Without the one that watches, the other still works: so it comes first.
-    write_pipeline(checkpoint / PREPROCESSOR, before)
-    write_pipeline(checkpoint / POSTPROCESSOR, after)
+    write_json(checkpoint / PREPROCESSOR, before)
+    write_json(checkpoint / POSTPROCESSOR, after)
 
 
 def remove_smoothing(checkpoint: Path) -> None:
     """Take the steps out again; complains as `add_smoothing`."""
     for name in (PREPROCESSOR, POSTPROCESSOR):
-        write_pipeline(checkpoint / name, read_pipeline(checkpoint / name))
+        write_json(checkpoint / name, read_pipeline(checkpoint / name))
 
 
 def read_pipeline(path: Path, without: Sequence[str] = (WATCH, SMOOTH)) -> dict[str, Any]:
@@ -330,16 +331,10 @@ def read_pipeline(path: Path, without: Sequence[str] = (WATCH, SMOOTH)) -> dict[
         raise FileNotFoundError(
             f"there is no {path}: give the folder `pretrained_model` of a LeRobot checkpoint."
         )
+    content = read_json(path)
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
         steps = content["steps"]
-    except (json.JSONDecodeError, KeyError, TypeError) as error:
+    except (KeyError, TypeError) as error:
         raise ValueError(f"{path} is not a processor of LeRobot: {error}") from None
     content["steps"] = [s for s in steps if s.get("registry_name") not in without]
     return content
-
-
-def write_pipeline(path: Path, content: dict[str, Any]) -> None:
-    """Write a pipeline's settings; the file is whole or as it was."""
-    with new_file(path) as new:
-        new.write_text(json.dumps(content, indent=2), encoding="utf-8")

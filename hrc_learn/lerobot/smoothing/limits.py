@@ -1,0 +1,364 @@
+"""Limits of a robot's actions: by its demonstrators, its URDF or its calibration."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+from jaxtyping import Float
+
+ACTION, STATE = "action", "observation.state"
+_UNUSUAL = 0.999
+"""Share of the differences that a limit is not less than: single glitches are no limit."""
+_STILL = 1e-3
+"""Of the largest limit, what a value gets that never moved: no limit may be zero."""
+_ENCODER_STEPS = 4095
+"""Of a turn, of the servos that LeRobot calibrates in degrees (Feetech STS, Dynamixel X)."""
+
+type Range = tuple[float | None, float | None]
+"""Lowest and highest position; None: no limit."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ActionLimits:
+    """Limits of every value of an action, in its unit, and where it is measured.
+
+    Raises:
+        ValueError: A limit is missing, not positive, or a lower one not below its upper one.
+    """
+
+    names: list[str]
+    fps: float
+    """Actions a second."""
+    velocity: list[float]
+    """[1/s]"""
+    acceleration: list[float]
+    """[1/s^2]"""
+    jerk: list[float]
+    """[1/s^3]"""
+    lower: list[float | None]
+    """Lowest position; None: no limit."""
+    upper: list[float | None]
+    """Highest position; None: no limit."""
+    state_columns: list[int]
+    """Where each value is measured in `observation.state`; -1: nowhere."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.fps < math.inf:
+            raise ValueError(f"fps must be positive and finite, got {self.fps}")
+        kinds = ("velocity", "acceleration", "jerk")
+        for name in (*kinds, "lower", "upper", "state_columns"):
+            if len(getattr(self, name)) != len(self.names):
+                raise ValueError(
+                    f"smooth actions: {name} must have one entry for each of "
+                    f"{', '.join(self.names)}, but has {len(getattr(self, name))}."
+                )
+        for kind in kinds:
+            for name, value in zip(self.names, getattr(self, kind), strict=True):
+                if not 0 < value < math.inf:
+                    raise ValueError(
+                        f"smooth actions: the limit of {kind} of {name} must be positive and "
+                        f"finite, but is {value}."
+                    )
+        for name, low, high in zip(self.names, *self.positions(), strict=True):
+            if not low < high:
+                raise ValueError(
+                    f"smooth actions: the lowest position of {name}, {low:g}, must be below "
+                    f"the highest, {high:g}."
+                )
+
+    def positions(self) -> tuple[Float[np.ndarray, " D"], Float[np.ndarray, " D"]]:
+        """Lowest and highest positions; infinite where there is no limit."""
+        low = [-math.inf if x is None else x for x in self.lower]
+        high = [math.inf if x is None else x for x in self.upper]
+        return np.array(low, dtype=np.float64), np.array(high, dtype=np.float64)
+
+    def within(self, ranges: Mapping[str, Range]) -> ActionLimits:
+        """The same with limits of position for the values that are named."""
+        pairs = [
+            ranges.get(name, (low, high))
+            for name, low, high in zip(self.names, self.lower, self.upper, strict=True)
+        ]
+        return replace(self, lower=[p[0] for p in pairs], upper=[p[1] for p in pairs])
+
+    def slower(self, velocities: Mapping[str, float]) -> ActionLimits:
+        """The same with velocities of at most these, for the values that are named."""
+        velocity = [
+            min(v, velocities.get(name, math.inf))
+            for name, v in zip(self.names, self.velocity, strict=True)
+        ]
+        return replace(self, velocity=velocity)
+
+    def save(self, path: Path) -> None:
+        """Write them as JSON; the file is whole or as it was."""
+        write_json(path, asdict(self))
+
+    @classmethod
+    def load(cls, path: Path) -> ActionLimits:
+        """Read what `save` wrote.
+
+        Raises:
+            FileNotFoundError: There is no such file.
+            ValueError: It holds no limits.
+        """
+        content = read_json(path)
+        names = {f.name for f in fields(cls)}
+        if not isinstance(content, dict) or content.keys() != names:
+            raise ValueError(
+                f"{path} holds no limits of actions: there must be {', '.join(sorted(names))}"
+            )
+        return cls(**content)
+
+
+def gathered_limits(
+    dataset: Path,
+    *,
+    share: float = 1.0,
+    urdf: Path | None = None,
+    calibration: Path | None = None,
+    degrees: bool = False,
+) -> ActionLimits:
+    """The demonstrators' limits, with positions and velocities of whatever else is known.
+
+    Args:
+        dataset: As of `demonstrated_limits`.
+        share: Likewise.
+        urdf: As of `urdf_limits`; None: there is none.
+        calibration: As of `calibrated_ranges`, whose ranges count before those of the URDF.
+        degrees: Whether the robot's actions are in degrees.
+
+    Raises:
+        FileNotFoundError: A file is missing.
+        ValueError: One cannot be read, or names nothing that the dataset has.
+    """
+    if not share > 0:
+        raise ValueError(f"share must be positive, but is {share}")
+    limits = demonstrated_limits(dataset, share)
+    if urdf is not None:
+        ranges, velocities = urdf_limits(urdf, degrees=degrees)
+        _require_names(limits, {*ranges, *velocities}, urdf)
+        limits = limits.within(ranges).slower(velocities)
+    if calibration is not None:
+        ranges = calibrated_ranges(calibration, degrees=degrees)
+        _require_names(limits, set(ranges), calibration)
+        limits = limits.within(ranges)
+    return limits
+
+
+def _require_names(limits: ActionLimits, found: set[str], file: Path) -> None:
+    if found.isdisjoint(limits.names):
+        raise ValueError(
+            f"{file} names {', '.join(sorted(found))}, but the actions of the dataset are "
+            f"{', '.join(limits.names)}"
+        )
+
+
+def demonstrated_limits(dataset: Path, share: float = 1.0) -> ActionLimits:
+    """The policy may move as abruptly as its demonstrators did, and no more.
+
+    Limits are the 99.9th percentiles of differences of the actions within episodes, without
+    limits of position.
+
+    Args:
+        dataset: LeRobot dataset that the policy was trained on.
+        share: Of what was demonstrated.
+
+    Raises:
+        FileNotFoundError: There is no dataset.
+        ValueError: It cannot be read, or its actions hold still.
+    """
+    info = read_json(dataset / "meta" / "info.json")
+    features, fps = info["features"], float(info["fps"])
+    if ACTION not in features:
+        raise ValueError(f"{dataset} has no actions.")
+    episodes = _read_actions(dataset)
+    names, width = _names(features, ACTION), episodes[0].shape[-1]
+    names = names or [f"{ACTION}.{i}" for i in range(width)]
+    limits = [share * _largest(episodes, order, fps) for order in (1, 2, 3)]
+    if not all((limit > 0).any() for limit in limits):
+        raise ValueError(f"the actions of {dataset} hold still: there is no motion to go by.")
+    velocity, acceleration, jerk = (
+        np.maximum(limit, _STILL * limit.max()).tolist() for limit in limits
+    )
+    return ActionLimits(
+        names=names,
+        fps=fps,
+        velocity=velocity,
+        acceleration=acceleration,
+        jerk=jerk,
+        lower=[None] * width,
+        upper=[None] * width,
+        state_columns=_state_columns(features, names, width),
+    )
+
+
+def urdf_limits(
+    urdf: Path, *, degrees: bool = False
+) -> tuple[dict[str, Range], dict[str, float]]:
+    """Ranges and velocities of the joints of a URDF, named as LeRobot names their actions.
+
+    A URDF has no limits of acceleration or jerk: those are the demonstrators'. Joints that turn
+    for ever have no range; values of zero, which many exporters write, are no limits.
+
+    Args:
+        urdf: File.
+        degrees: Whether the robot's actions are in degrees; a URDF has radians.
+
+    Returns:
+        Lowest and highest position of `NAME.pos`, and its velocity.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: It is no URDF.
+    """
+    try:
+        root = ElementTree.fromstring(urdf.read_text(encoding="utf-8"))
+    except ElementTree.ParseError as error:
+        raise ValueError(f"{urdf} is not a URDF: {error}") from None
+    if root.tag != "robot":
+        raise ValueError(f"{urdf} is not a URDF: it describes a {root.tag}, not a robot")
+    ranges: dict[str, Range] = {}
+    velocities: dict[str, float] = {}
+    for joint in root.iter("joint"):
+        kind, limit = joint.get("type"), joint.find("limit")
+        if limit is None or kind not in ("revolute", "continuous", "prismatic"):
+            continue
+        unit = math.degrees(1) if degrees and kind != "prismatic" else 1.0
+        name = f"{joint.get('name')}.pos"
+        low, high = (unit * float(limit.get(side, 0)) for side in ("lower", "upper"))
+        if kind != "continuous" and low < high:
+            ranges[name] = (low, high)
+        if (velocity := unit * float(limit.get("velocity", 0))) > 0:
+            velocities[name] = velocity
+    if not ranges and not velocities:
+        raise ValueError(f"{urdf} has no joints with limits")
+    return ranges, velocities
+
+
+def calibrated_ranges(
+    calibration: Path, *, degrees: bool = True, grippers: Sequence[str] = ("gripper",)
+) -> dict[str, Range]:
+    """Ranges that a robot's motors were moved through when LeRobot calibrated it.
+
+    Args:
+        calibration: File that LeRobot keeps in `calibration/robots/TYPE/ID.json`.
+        degrees: Whether the robot is led in degrees, LeRobot's `use_degrees`; else in percent,
+            -100 to 100.
+        grippers: Motors that are led in 0 to 100 in either case.
+
+    Returns:
+        Lowest and highest position of `NAME.pos`.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: It is no calibration.
+    """
+    content = read_json(calibration)
+    ranges: dict[str, Range] = {}
+    for name, motor in content.items() if isinstance(content, dict) else ():
+        try:
+            half = (float(motor["range_max"]) - float(motor["range_min"])) / 2
+        except (TypeError, KeyError, ValueError):
+            half = 0.0
+        if half <= 0:
+            raise ValueError(
+                f"{calibration} is no calibration of LeRobot: {name} has no range_min below a "
+                "range_max"
+            )
+        if name in grippers:
+            ranges[f"{name}.pos"] = (0.0, 100.0)
+        else:
+            end = half * 360 / _ENCODER_STEPS if degrees else 100.0
+            ranges[f"{name}.pos"] = (-end, end)
+    if not ranges:
+        raise ValueError(f"{calibration} is no calibration of LeRobot: it has no motors")
+    return ranges
+
+
+# Files.
+
+
+def read_json(path: Path) -> Any:
+    """Content of a file.
+
+    Raises:
+        FileNotFoundError: There is none.
+        ValueError: It is damaged.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no {path}")
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged: {error}") from None
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write a file that is whole or as it was."""
+    with tempfile.NamedTemporaryFile(
+        "w", encoding="utf-8", dir=path.parent, prefix=f".{path.name}.", delete=False
+    ) as new:
+        json.dump(content, new, indent=2)
+        new.flush()
+        os.fsync(new.fileno())
+    # As readable as any file that is written; temporary ones are private.
+    umask = os.umask(0)
+    os.umask(umask)
+    Path(new.name).chmod(0o666 & ~umask)
+    Path(new.name).replace(path)
+
+
+def _read_actions(dataset: Path) -> list[Float[np.ndarray, "frames D"]]:
+    """Actions of each episode, of all versions of the format that keep them in Parquet."""
+    from pyarrow import ArrowInvalid, parquet
+
+    files = sorted((dataset / "data").glob("chunk-*/*.parquet"))
+    episodes: dict[int, list[np.ndarray]] = {}
+    for file in files:
+        try:
+            table = parquet.read_table(file, columns=["episode_index", ACTION])
+        except (ArrowInvalid, OSError) as error:
+            raise ValueError(f"{file} cannot be read: {error}") from None
+        if table.num_columns != 2:
+            raise ValueError(f"{file} lacks the columns episode_index and {ACTION}.")
+        index = table["episode_index"].to_numpy()
+        actions = np.array(table[ACTION].to_pylist(), dtype=np.float64)
+        actions = actions.reshape(len(index), -1)
+        for k in np.unique(index):
+            episodes.setdefault(int(k), []).append(actions[index == k])
+    if not episodes:
+        raise ValueError(f"{dataset} has no episodes.")
+    return [np.concatenate(parts) for _, parts in sorted(episodes.items())]
+
+
+def _largest(episodes: Sequence[np.ndarray], order: int, fps: float) -> np.ndarray:
+    differences = [np.abs(np.diff(e, n=order, axis=0)) for e in episodes if len(e) > order]
+    if not differences:
+        raise ValueError("episodes are too short to tell how the actions move.")
+    return np.quantile(np.concatenate(differences), _UNUSUAL, axis=0) * fps**order
+
+
+def _names(features: Mapping[str, Any], key: str) -> list[str]:
+    names = features[key].get("names") or []
+    if isinstance(names, dict):
+        names = next(iter(names.values()), [])
+    return [str(name) for name in names]
+
+
+def _state_columns(features: Mapping[str, Any], names: list[str], width: int) -> list[int]:
+    """By name; where neither has names, states as wide as actions are what they command."""
+    if STATE not in features:
+        return [-1] * width
+    states = _names(features, STATE)
+    if not states and not _names(features, ACTION):
+        return list(range(width)) if features[STATE]["shape"][0] == width else [-1] * width
+    index = {name: i for i, name in enumerate(states)}
+    return [index.get(name, -1) for name in names]
