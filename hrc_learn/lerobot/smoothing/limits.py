@@ -347,10 +347,17 @@ def _largest(episodes: Sequence[np.ndarray], order: int, fps: float) -> np.ndarr
 
 
 def _names(features: Mapping[str, Any], key: str) -> list[str]:
-    names = features[key].get("names") or []
+    """From any of the forms met: flat, nested or in a dict; none where they do not fit."""
+    names = _flat(features[key].get("names") or [])
+    return names if len(names) == math.prod(features[key]["shape"]) else []
+
+
+def _flat(names: Any) -> list[str]:
     if isinstance(names, dict):
-        names = next(iter(names.values()), [])
-    return [str(name) for name in names]
+        names = list(names.values())
+    if not isinstance(names, list | tuple):
+        return [str(names)]
+    return [name for part in names for name in _flat(part)]
 
 
 def _state_columns(features: Mapping[str, Any], names: list[str], width: int) -> list[int]:
