@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations, pairwise
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from hrc_learn.geometry import mesh_points
 from hrc_learn.kinematics._description import Shape, Transform
@@ -39,13 +39,25 @@ _POSTURES = 2000
 # Pairs of links that come no nearer in any sampled posture are left out [m].
 _FAR = 0.1
 _ALWAYS = 0.99
+# Of the positions of two joints between two links in which their capsules overlap: more than
+# this part tells nothing of where the links meet.
+_MOST = 0.5
+# Of each of the two joints between two links so many positions are looked at: every 5 degrees
+# of a whole turn.
+_GRID = 73
+# Steps of the search for a plane between two hulls: those not parted by then count as touching.
+_PARTING_STEPS = 200
 
 
 def fit_body(chain: SerialChain, shapes: Sequence[tuple[int, Shape, Transform]]) -> CapsuleArm:
     """Capsules around shapes on an arm's links.
 
     As MoveIt's setup assistant does, pairs of links are left out that are neighbours, that
-    overlap in all random postures, or that never come near to each other in any.
+    overlap in all random postures, or that never come near to each other in any. Capsules are
+    rounder than links: around a short, wide link they meet those of the link after the next.
+    Such a pair is left out where the convex hulls themselves never meet, whatever the two
+    joints between; or where its capsules overlap in most positions of these, and so tell
+    nothing (Universal Robots, whose links pass beside each other a centimetre apart).
 
     Args:
         chain: The arm.
@@ -63,7 +75,7 @@ def fit_body(chain: SerialChain, shapes: Sequence[tuple[int, Shape, Transform]])
         capsules += [_named(link, *fitted) for fitted in fit_link(parts)]
     if not capsules:
         capsules = _stick(chain)
-    return CapsuleArm(chain, capsules, _left_out(chain, capsules))
+    return CapsuleArm(chain, capsules, _left_out(chain, capsules, hulls))
 
 
 @dataclass(frozen=True)
@@ -266,7 +278,9 @@ def _stick(chain: SerialChain) -> list[LinkCapsule]:
 
 
 def _left_out(
-    chain: SerialChain, capsules: Sequence[LinkCapsule]
+    chain: SerialChain,
+    capsules: Sequence[LinkCapsule],
+    hulls: Mapping[int, Sequence[_Hull]],
 ) -> tuple[tuple[int, int], ...]:
     """Pairs of links that are no neighbours and yet need no watching."""
     last = len(chain.joint_names)
@@ -281,14 +295,101 @@ def _left_out(
     rng = torch.Generator().manual_seed(_SEED)
     lower, upper = chain.limits.lower, chain.limits.upper
     q = lower + (upper - lower) * torch.rand(_POSTURES, len(lower), generator=rng).double()
-    distances = body.pair_distances(q)
-    nearest: dict[tuple[int, int], torch.Tensor] = {}
-    for (a, b), distance in zip(body.pairs, distances.mT, strict=True):
-        pair = (body.links[a], body.links[b])
-        before = nearest.get(pair)
-        nearest[pair] = distance if before is None else torch.minimum(before, distance)
-    for pair, distance in nearest.items():
+    # Round shapes are what their capsules are: nothing is gained by looking at hulls.
+    round_ = {capsule.link for capsule in capsules} - set(hulls)
+    for (i, k), distance in _by_links(body, q).items():
         always = float((distance < 0).double().mean()) > _ALWAYS
         if always or float(distance.min()) > _FAR:
-            rigid.add(pair)
+            rigid.add((i, k))
+        elif min(k, last) - i == 2:
+            crossed = _grid(chain, i, min(k, last))
+            met = _by_links(body, crossed)[i, k] < 0
+            apart = i not in round_ and k not in round_ and bool(met.any())
+            apart = apart and not _meet(chain, crossed[met], (i, k), hulls)
+            if apart or float(met.double().mean()) > _MOST:
+                rigid.add((i, k))
     return tuple(sorted(rigid))
+
+
+def _by_links(
+    body: CapsuleArm, q: Float[torch.Tensor, "postures joints"]
+) -> dict[tuple[int, int], Float[torch.Tensor, " postures"]]:
+    """Distance of the nearest capsules of each pair of links, lower number first [m]."""
+    nearest: dict[tuple[int, int], torch.Tensor] = {}
+    for (a, b), distance in zip(body.pairs, body.pair_distances(q).mT, strict=True):
+        first, second = sorted((body.links[a], body.links[b]))
+        before = nearest.get((first, second))
+        nearest[first, second] = distance if before is None else torch.minimum(before, distance)
+    return nearest
+
+
+def _grid(chain: SerialChain, first: int, second: int) -> Float[torch.Tensor, "grid joints"]:
+    """All positions of the two joints between links, the others in the middle."""
+    q = chain.limits.middle.repeat(_GRID, _GRID, 1)
+    for axis, joint in enumerate(range(first, second)):
+        middle = chain.limits.middle[joint]
+        half = (chain.limits.upper[joint] - chain.limits.lower[joint]) / 2
+        if chain.kinds[joint] != "prismatic":
+            half = half.clamp(max=math.pi)
+        at = middle + half * torch.linspace(-1, 1, _GRID, dtype=torch.float64)
+        q[..., joint] = at[:, None] if axis == 0 else at
+    return q.flatten(0, 1)
+
+
+def _meet(
+    chain: SerialChain,
+    q: Float[torch.Tensor, "postures joints"],
+    pair: tuple[int, int],
+    hulls: Mapping[int, Sequence[_Hull]],
+) -> bool:
+    """Whether convex hulls of two links meet, or may, in any of several postures."""
+    frames = chain.link_frames(q)
+    base = torch.eye(4, dtype=torch.float64)[:3].expand(len(q), 3, 4)
+    R, p = zip(
+        *((T[..., :3], T[..., 3]) for T in (frames[:, i - 1] if i else base for i in pair)),
+        strict=True,
+    )
+    turn, shift = R[0].mT @ R[1], (R[0].mT @ (p[1] - p[0])[..., None])[..., 0]
+    return any(
+        not bool(_parted(first.points, second.points, turn, shift).all())
+        for first in hulls[pair[0]]
+        for second in hulls[pair[1]]
+    )
+
+
+def _parted(
+    first: Float[np.ndarray, "points 3"],
+    second: Float[np.ndarray, "corners 3"],
+    turn: Float[torch.Tensor, "poses 3 3"],
+    shift: Float[torch.Tensor, "poses 3"],
+) -> Bool[torch.Tensor, " poses"]:
+    """Where a plane between two convex hulls is found, so that they certainly do not meet.
+
+    Gilbert's method (1966) walks, among differences of their points, towards the shortest one:
+    the plane across it parts the hulls as soon as all differences lie beyond the plane.
+
+    Args:
+        first: Corners of one.
+        second: Corners of the other, in its own frame.
+        turn: Of that frame in the first one's.
+        shift: Its origin there [m].
+    """
+    a, b = torch.from_numpy(first), torch.from_numpy(second)
+    parted = torch.zeros(len(shift), dtype=torch.bool)
+    rows = torch.arange(len(shift))
+    v = a.mean(0) - (turn @ b.mean(0) + shift)
+    for _ in range(_PARTING_STEPS):
+        R, p = turn[rows], shift[rows]
+        nearest = a[(v @ a.mT).argmin(-1)]
+        other = b[((v[:, None] @ R)[:, 0] @ b.mT).argmax(-1)]
+        w = nearest - ((R @ other[..., None])[..., 0] + p)
+        beyond = (v * w).sum(-1) > 0
+        parted[rows[beyond]] = True
+        rows, v, w = rows[~beyond], v[~beyond], w[~beyond]
+        if len(rows) == 0:
+            break
+        # The point of the segment from v to w that is nearest to the origin.
+        way = v - w
+        share = (v * way).sum(-1) / (way * way).sum(-1).clamp(min=1e-30)
+        v = v - share.clamp(0, 1)[:, None] * way
+    return parted

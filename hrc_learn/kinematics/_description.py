@@ -176,10 +176,21 @@ class Description:
         link = base
         while len(self.below(link)) == 1:
             link = self.below(link)[0].child
+        # Ends behind the most joints are the likeliest; those behind none are no tools.
+        moved = {name: self._joints_above(name, base) for name in (link, *leaves)}
+        ends = sorted((n for n in moved if moved[n]), key=moved.__getitem__, reverse=True)
         raise ValueError(
             f"{self.path} has {len(leaves)} ends; say which is the tool with tip=: "
-            f"{', '.join([link, *leaves] if link != base else leaves)}"
+            f"{', '.join(ends or leaves)}"
         )
+
+    def _joints_above(self, link: str, base: str) -> int:
+        """How many joints move a link against the base."""
+        count = 0
+        while link != base and (joint := self.above(link)) is not None:
+            count += joint.kind in MOVING
+            link = joint.parent
+        return count
 
 
 def turn_to(axis: Float[np.ndarray, "3"]) -> Transform:

@@ -48,6 +48,8 @@ def read_urdf(
         raise ValueError(f"{path} is no URDF: it begins with <{robot.tag}>, not with <robot>")
     reader = _Reader(path, robot, package_dirs, meshes)
     links = [reader.link(element) for element in robot.findall("link")]
+    if not links:
+        raise ValueError(f"{path} has no links: is it complete, and made from its xacro file?")
     joints = tuple(reader.joint(element) for element in robot.findall("joint"))
     named = {link.name: link for link in links}
     for joint in joints:

@@ -17,7 +17,7 @@ from hrc_learn.kinematics import (
     registered_arms,
     solve_inverse,
 )
-from hrc_learn.kinematics._capsule_fit import fit_link, hull_of
+from hrc_learn.kinematics._capsule_fit import _parted, fit_link, hull_of
 from hrc_learn.kinematics._description import Shape, turn_to
 from hrc_learn.kinematics.chain import transform_and_jacobian
 
@@ -88,12 +88,11 @@ def mujoco_model(a: Arm):
 
     robot = ElementTree.parse(a.description).getroot()
     for link in robot.findall("link"):
-        for part in [*link.findall("visual"), *link.findall("collision")]:
+        for part in list(link):
             link.remove(part)
-        if link.find("inertial") is None:
-            link.append(ElementTree.fromstring(INERTIAL))
-    # Links without a joint between them are kept apart, and balance is not asked of masses.
-    extension = '<mujoco><compiler fusestatic="false" balanceinertia="true"/></mujoco>'
+        link.append(ElementTree.fromstring(INERTIAL))
+    # Links without a joint between them are kept apart.
+    extension = '<mujoco><compiler fusestatic="false"/></mujoco>'
     robot.append(ElementTree.fromstring(extension))
     return mujoco.MjModel.from_xml_string(ElementTree.tostring(robot, encoding="unicode"))
 
@@ -197,8 +196,45 @@ def test_bad_files_are_told_in_a_line(tmp_path, old, new, message):
 
 def test_several_ends_are_listed(tmp_path):
     odd(tmp_path)
-    with pytest.raises(ValueError, match=r"2 ends; say which is the tool .*: c, tip, finger"):
+    with pytest.raises(ValueError, match=r"2 ends; say which is the tool .*: finger, c, tip"):
         arm(tmp_path / "odd.urdf")
+
+
+def test_ends_that_nothing_moves_are_no_tools(tmp_path):
+    mark = (
+        '<link name="mark"/><joint name="m" type="fixed"><parent link="base"/>'
+        '<child link="mark"/></joint></robot>'
+    )
+    odd(tmp_path, ODD.replace("</robot>", mark))
+    with pytest.raises(ValueError, match=r"3 ends; .*with tip=: finger, tip$"):
+        arm(tmp_path / "odd.urdf")
+
+
+def test_a_description_without_links_is_refused(tmp_path):
+    (tmp_path / "none.urdf").write_text("<robot/>", encoding="utf-8")
+    with pytest.raises(ValueError, match=r"none\.urdf has no links"):
+        arm(tmp_path / "none.urdf")
+
+
+# None of them is registered.
+@pytest.mark.parametrize(
+    ("file", "base", "tip", "joints"),
+    [
+        ("kinova_description/robots/kinova.urdf", None, "j2s6s200_end_effector", 6),
+        ("talos_data/robots/talos_reduced.urdf", "torso_2_link", "gripper_left_base_link", 7),
+        ("tiago_description/robots/tiago_no_hand.urdf", "torso_lift_link", "arm_tool_link", 7),
+        ("baxter_description/urdf/baxter.urdf", "torso", "left_gripper", 7),
+    ],
+)
+def test_a_description_that_nobody_prepared_is_taken(file, base, tip, joints):
+    ur5 = installed("ur5").description
+    assert ur5 is not None
+    path = next(folder for folder in ur5.parents if folder.name == "robots") / file
+    a = arm(path, base=base, tip=tip)
+    assert len(a.joint_names) == joints
+    assert_moves_like(a, mujoco_model(a), a.base, tip, 20)
+    pose = a.chain.forward(random_positions(a.chain, 20, seed=2))
+    assert solve_inverse(a.chain, pose).found.double().mean() >= 0.95
 
 
 def test_unknown_names_are_answered_with_those_there_are():
@@ -232,6 +268,33 @@ def test_capsules_contain_what_they_are_fitted_to():
         away = np.linalg.norm(inside - start - t[:, None] * way, axis=1) - radius
         distance = np.minimum(distance, away)
     assert distance.max() <= 0
+
+
+BOX = Shape(kind="box", pose=np.eye(4), size=(0.1, 0.2, 0.3))
+
+
+@pytest.mark.parametrize("gap", [-0.2, -1e-3, 0.02, 0.2])
+def test_hulls_are_parted_where_a_plane_fits_between(gap):
+    corners = hull_of(BOX, np.eye(4)).points
+    rng = generator(4)
+    # A corner of one box is as far from a face of the other as is said, in any orientation.
+    R = torch.linalg.qr(torch.randn(50, 3, 3, generator=rng, dtype=torch.float64))[0]
+    turned = R @ torch.from_numpy(corners).T
+    lowest = turned.amin(-1)
+    shift = torch.stack(
+        [0.1 + gap - lowest[:, 0], 0.05 + 0 * lowest[:, 1], 0.05 + 0 * lowest[:, 2]], dim=-1
+    )
+    # Its corner lies over the face, within it.
+    at = turned.gather(-1, turned[:, :1].argmin(-1, keepdim=True).expand(-1, 3, 1))[..., 0]
+    shift[:, 1:] -= at[:, 1:]
+    assert bool((_parted(corners, corners, R, shift) == (gap > 0)).all())
+
+
+@pytest.mark.parametrize("name", ["z1", "ur5", "ur10", "ur5e"])
+def test_most_postures_of_an_arm_are_no_contact_with_itself(name):
+    a = installed(name)
+    q = random_positions(a.chain, 1000, seed=6)
+    assert float((a.body.self_distance(q) < 0).double().mean()) < 0.6
 
 
 def test_without_scipy_shapes_are_not_fitted_and_it_says_why(monkeypatch):
