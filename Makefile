@@ -10,7 +10,7 @@ PYTHONS ?= 3.12
 help:
 	@echo "make demo    demonstrate, learn, grasp, place in simulation; writes $(OUT)"
 	@echo "             make demo SHELF=upper places on another shelf (lower, middle, upper)"
-	@echo "             make demo ROBOT=xarm7 does it with another arm (fr3, gen3, jaco, sawyer, ...)"
+	@echo "             make demo ROBOT=xarm7 does it with another arm (ur5, ur5e, iiwa7, fr3, ...)"
 	@echo "make test    run the tests"
 	@echo "make bench   measure the speed against floors and peers"
 	@echo "make docs    build the documentation site; writes outputs/docs"

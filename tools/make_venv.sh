@@ -37,6 +37,10 @@ if [ -n "$torch" ] && ! command -v uv >/dev/null 2>&1; then
   exit 1
 fi
 
+# Simulators of whose packages the descriptions of arms alone are wanted, not what they require
+# (gym-aloha's MuJoCo is older than ours, robosuite's OpenCV replaces the headless one).
+arms=(robosuite==1.5.2 gym-aloha==0.1.5)
+
 rm -rf .venv
 if command -v uv >/dev/null 2>&1; then
   announce uv
@@ -45,6 +49,7 @@ if command -v uv >/dev/null 2>&1; then
     exit 1
   }
   uv pip install --python .venv/bin/python --constraint constraints.txt --editable "$extras"
+  install_arms=(uv pip install --quiet --python .venv/bin/python)
 else
   python=$(find_python) || {
     say "Missing: Python 3.12. Install it (Debian: python3.12 and python3.12-venv; or pyenv, or uv), then run make again."
@@ -63,5 +68,8 @@ else
     # In a log, a line a package rather than none for minutes.
     "${install[@]}" | awk '/Downloading|Processing|Building|Installing/ && !/metadata/ {print substr($0, 1, 100); fflush()}'
   fi
+  install_arms=(.venv/bin/python -m pip install --quiet --disable-pip-version-check)
 fi
+"${install_arms[@]}" --no-deps "${arms[@]}" ||
+  say "Left out: iiwa7, ur5e, gen3, jaco, sawyer (robosuite) and viperx (gym-aloha): not to be had."
 say "Ready: .venv"
