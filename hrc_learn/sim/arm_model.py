@@ -190,6 +190,9 @@ def add_arm(spec: mujoco.MjSpec, config: ArmModelConfig) -> None:
     for a, b in ((0, 1), *robot.whole.overlapping):
         if a in names and b in names:
             spec.add_exclude(bodyname1=names[a], bodyname2=names[b])
+        if a == 0 and b in names:
+            # The pedestal goes on where the base ends: a wide shoulder brushes both.
+            spec.add_exclude(bodyname1="world", bodyname2=names[b])
     spec.add_exclude(bodyname1="finger_left", bodyname2="finger_right")
 
 

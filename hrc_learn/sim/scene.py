@@ -66,7 +66,7 @@ class CabinetConfig:
     thickness: float = 0.02
     """Of boards and walls [m]."""
     door_reach: float = 0.34
-    """How far the open door stands out of the cabinet [m]."""
+    """How far the open door stands out of the cabinet [m]; 0: it has none."""
 
     def boxes(self) -> list[Box]:
         """Boards, walls, back and door."""
@@ -84,8 +84,10 @@ class CabinetConfig:
             ("cabinet_left", (self.left - t, y, z), (t, d, h)),
             ("cabinet_right", (self.right + t, y, z), (t, d, h)),
             ("cabinet_back", (x, back_y, z), (w + 2 * t, t, h)),
-            ("cabinet_door", (self.left - t, door_y, z), (t, self.door_reach / 2, h)),
         ]
+        if self.door_reach > 0:
+            door = (self.left - t, door_y, z), (t, self.door_reach / 2, h)
+            parts.append(("cabinet_door", *door))
         return [
             Box(
                 name=name,

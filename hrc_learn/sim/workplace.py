@@ -4,7 +4,7 @@ No place is written down per arm. Tables and cabinets at several distances are l
 usual ones first, until the arm has a posture in which it does the work (`layout_quality`).
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from typing import Any
@@ -43,7 +43,10 @@ _LEANING_FORWARD = _vector(1.0, 0.3, -1.2, -1.8, 0.3, 1.9, -1.0)
 
 # Distances of table and cabinet from the base, as shares of the usual ones, and where the
 # cabinet stands besides: further along the base's x axis, and higher [m].
-_SCALES = (1.0, 0.85, 0.7)
+_SCALES = (1.0, 0.85, 0.7, 0.55)
+# How far from the middle of the table an arm must get in view of the camera [m]: with room to
+# spare, then no further than objects are put.
+_REACHES = (0.14, 0.1)
 _ALONG, _HIGHER = (0.0, 0.1, -0.1), (0.0, -0.1, 0.1)
 # How far behind the boards' front edge objects are put [m]: thick wrists stay outside.
 _DEPTHS = (0.10, 0.05)
@@ -295,6 +298,9 @@ class CellLayout:
     view."""
 
 
+type _Above = list[tuple[Float[Tensor, " joints"], MarkedTurns]]
+
+
 @cache
 def layout_for(robot: WorkArm) -> CellLayout:
     """The best layout for an arm, the usual one if that is good enough.
@@ -303,15 +309,11 @@ def layout_for(robot: WorkArm) -> CellLayout:
         UnreachableError: In none it gets to the table and to all shelves.
     """
     best: CellLayout | None = None
-    for scale in _SCALES:
-        places = list(_workplaces(robot, scale))
-        above = _above_table(places[0])
-        for workplace in places if above else ():
-            found = _evaluated(workplace, above)
-            if found is not None and (best is None or _rank(found) > _rank(best)):
-                best = found
-            if best is not None and _rank(best) >= _ENOUGH:
-                return best
+    for layout in _layouts(robot):
+        if best is None or _rank(layout) > _rank(best):
+            best = layout
+        if _rank(best) >= _ENOUGH:
+            return best
     if best is None:
         raise UnreachableError(
             f"the {robot.name} does not get from home to the table and to all shelves, with "
@@ -319,6 +321,32 @@ def layout_for(robot: WorkArm) -> CellLayout:
             "small for this work cell, or its joints are in each other's way."
         )
     return best
+
+
+def _layouts(robot: WorkArm) -> Iterator[CellLayout]:
+    """Layouts in which an arm does the work, the likely ones first."""
+    unlikely = []
+    for reach in _REACHES:
+        for scale in _SCALES:
+            places = [
+                replace(place, table_reach=(reach, reach))
+                for place in _workplaces(robot, scale)
+            ]
+            above = _above_table(places[0])
+            # No layout is better than the best posture above its table.
+            if any(_worth(m.quality, m.seen) >= _ENOUGH for _, m in above):
+                yield from _evaluated_all(places, above)
+            elif above:
+                unlikely.append((places, above))
+    for places, above in unlikely:
+        yield from _evaluated_all(places, above)
+
+
+def _evaluated_all(places: Sequence[Workplace], above: _Above) -> Iterator[CellLayout]:
+    for workplace in places:
+        layout = _evaluated(workplace, above)
+        if layout is not None:
+            yield layout
 
 
 def _rank(layout: CellLayout) -> float:
@@ -354,7 +382,8 @@ def _placed(
         front=depth - level_at,
         shelves={name: scale * z + higher for name, z in cabinet.shelves.items()},
         top=cabinet.top + higher,
-        door_reach=scale * cabinet.door_reach,
+        # The door is there for an elbow to be led around it, as that of six joints cannot be.
+        door_reach=scale * cabinet.door_reach * (usual.arm.robot.null_space != "none"),
     )
     (x, y, z), (a, b, c) = table.centre, table.half_size
     pose = usual.camera.pose.copy()
@@ -376,9 +405,6 @@ def _placed(
         shelf_depth=depth,
         level_at=level_at,
     )
-
-
-type _Above = list[tuple[Float[Tensor, " joints"], MarkedTurns]]
 
 
 def _above_table(workplace: Workplace) -> _Above:

@@ -167,7 +167,7 @@ class World:
         objects = [item.name for item in self.config.objects]
         self.object_contacts = ContactMonitor(self.model, objects, cabinet)
         self.table_contacts = ContactMonitor(self.model, _ARM_BODIES, [self.config.table.name])
-        self.self_contacts = ContactMonitor(self.model, _ARM_BODIES, _ARM_BODIES)
+        self.self_contacts = ContactMonitor(self.model, _ARM_BODIES, ("link0",))
         workers = WORKER_BODIES if self.config.worker is not None else ()
         self.worker_contacts = ContactMonitor(self.model, (*_ARM_BODIES, *objects), workers)
         self._monitors = (
