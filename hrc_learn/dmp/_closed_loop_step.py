@@ -5,6 +5,7 @@ equation alone, known at both ends of the step. What the state differs from the 
 dies out as the unforced spring has it. So no step is too long, whatever its length.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -101,7 +102,7 @@ def begin(
 
 def advance(
     state: DMPState,
-    ds: Float[Tensor, "*#batch"],
+    ds: Float[Tensor, "*#batch"] | float,
     *,
     response: Response,
     weights: Float[Tensor, "*#batch D N"],
@@ -115,7 +116,7 @@ def advance(
 
     Args:
         state: Where the primitive is.
-        ds: Step in normalised time (float64).
+        ds: Step in normalised time (float64); a number where nothing traces or derives it.
         response: Of the primitive.
         weights: Of the unscaled forcing term.
         scale: What the ends make of (*batch, K, D) that the forcing term causes.
@@ -125,8 +126,10 @@ def advance(
         pace: Kept in the state for its velocity.
     """
     spring, s = response.spring, state.s + ds
-    now, span = host_values(s, ds)
-    E, coast = _transitions(spring, span, response.coasting(now))
+    (now,) = host_values(s)
+    if isinstance(ds, float) and isinstance(now, Tensor):
+        ds = torch.full_like(s, ds)
+    E, coast = _transitions(spring, ds, response.coasting(now))
     forced = response.forced.to(s.device)(now).to(target) @ weights.mT
     if coast is not None:
         forced = coast.to(target) @ forced
@@ -189,7 +192,7 @@ def _product_plus(A: Tensor, x: Tensor, b: Tensor) -> Tensor:
 
 
 def _lagging(
-    goal: Tensor, target: Tensor, ds: Tensor, rate: float, spring: SpringDamper
+    goal: Tensor, target: Tensor, ds: Tensor | float, rate: float, spring: SpringDamper
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The goal after the step, and the (y - target, y') it leads to, before and after.
 
@@ -204,7 +207,10 @@ def _lagging(
     gain = spring.stiffness / denominator
     # A goal behind its target decays to it, and the motion it leads to with it.
     lag_before = goal - target
-    lag_after = lag_before * torch.exp(-rate * ds).to(goal)[..., None]
+    if isinstance(ds, Tensor):
+        lag_after = lag_before * torch.exp(-rate * ds).to(goal)[..., None]
+    else:
+        lag_after = lag_before * math.exp(-rate * ds)
     before, after = (
         torch.stack([gain * lag, -rate * gain * lag], dim=-2) for lag in (lag_before, lag_after)
     )

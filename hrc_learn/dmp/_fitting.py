@@ -23,7 +23,7 @@ from hrc_learn.dmp._arguments import FitReport, Samples
 from hrc_learn.dmp._smoothing import smoothed, warn_of_few_samples
 from hrc_learn.dmp._system.bases import Basis, GaussianBasis, balanced_units
 from hrc_learn.dmp._system.closed_forms import SpringDamper
-from hrc_learn.dmp._system.own_times import products
+from hrc_learn.dmp._system.own_times import ColumnPieces
 from hrc_learn.dmp._system.response import Response, Trajectory, response_of
 from hrc_learn.dmp.forcing_scale import Demonstrated, Scaling
 
@@ -121,11 +121,11 @@ def _fit_at_own_times(
     """
     N, fit_rate = response.basis.count, rate is None
     n = N + fit_rate
-    mixing, sigma, directions = _orthonormal_columns(response, n, samples.s.device)
+    mixing, sigma, directions, pieces = _orthonormal_columns(response, n, samples.s.device)
     apart = mixing[:n, :n]
     mask = samples.mask.to(mixing)
     position = torch.where(samples.mask[:, None], samples.position.double(), 0.0)
-    gram, right = products(response, mixing, samples.s, position, mask)
+    gram, right = pieces.products(samples.s, position, mask)
     known = [samples.first.double(), samples.last.double()]
     if rate is not None:
         known.insert(0, rate[..., 0] if samples.complete else _first(rate, samples.mask))
@@ -151,12 +151,12 @@ def _fit_at_own_times(
 @lru_cache(maxsize=16)
 def _orthonormal_columns(
     response: Response, n: int, device: torch.device
-) -> tuple[Float[Tensor, "M M"], Float[Tensor, "n"], Float[Tensor, "n n"]]:
+) -> tuple[Float[Tensor, "M M"], Float[Tensor, "n"], Float[Tensor, "n n"], ColumnPieces]:
     """What n columns stand for that are orthonormal on an even grid.
 
     Returns:
         Coordinates of each column, those after n as they are; singular values of the balanced
-        design, and its right singular vectors in rows.
+        design, and its right singular vectors in rows; and the columns along the motion.
     """
     N = response.basis.count
     even = torch.linspace(0, 1, EVEN * N + 1, dtype=torch.float64, device=device)
@@ -165,7 +165,7 @@ def _orthonormal_columns(
     _, sigma, Vh = torch.linalg.svd(H[:, :n] * unit, full_matrices=False)
     mixing = torch.eye(H.shape[1]).to(H)
     mixing[:n, :n] = unit[:, None] * Vh.mT / sigma
-    return mixing, sigma, Vh
+    return mixing, sigma, Vh, ColumnPieces.of(response, mixing)
 
 
 def _first(values: Float[Tensor, "B D T"], mask: Bool[Tensor, "B T"]) -> Float[Tensor, "B D"]:

@@ -121,6 +121,10 @@ class NoScaling(Scaling):
 
     name: ClassVar[str] = "none"
 
+    def unscale(self, values: Tensor, reference: Demonstrated) -> Tensor:
+        """The values."""
+        return values
+
     def _scale(
         self, values: Any, start: Any, goal: Any, reference: Demonstrated, xp: ModuleType
     ) -> Any:

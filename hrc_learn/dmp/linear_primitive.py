@@ -333,7 +333,8 @@ class LinearPrimitive(nn.Module):
         self, start: Float[Tensor, "*#batch D"], goal: Float[Tensor, "*#batch D"]
     ) -> Float[Tensor, "*#batch D"]:
         """Dy/ds that a motion between these starts with, unless told otherwise."""
-        rate = self.start_velocity * self.duration[..., None]
+        duration = self.duration
+        rate = self.start_velocity * (duration[..., None] if duration.ndim else duration)
         if not self.forcing_scale.turns:
             return rate
         return self._scaled(rate[..., None, :], start, goal)[..., 0, :]
@@ -416,9 +417,13 @@ class LinearPrimitive(nn.Module):
             return self.weights
         return self._scaled(self.weights.mT, start, goal).mT
 
-    def _step_length(self, dt: Scalars, duration: Tensor) -> Tensor:
-        """Ds in float64. A number is multiplied as it is: to divide it takes a tensor."""
-        if not isinstance(dt, float):
+    def _step_length(self, dt: Scalars, duration: Tensor) -> Tensor | float:
+        """Ds in float64; a number where it may be one, which takes a tenth of the time."""
+        if isinstance(dt, float):
+            (known,) = closed_loop_step.host_values(duration)
+            if isinstance(known, float):
+                return dt / known
+        else:
             dt = to_tensor(dt, dtype=torch.float64, device=duration.device)
         return duration.double().reciprocal() * dt
 

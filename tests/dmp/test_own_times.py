@@ -20,7 +20,7 @@ from hrc_learn.dmp import (
     response_of,
 )
 from hrc_learn.dmp._system import own_times
-from hrc_learn.dmp._system.own_times import motion, products
+from hrc_learn.dmp._system.own_times import ColumnPieces, motion
 
 BASES = {
     "gaussian": (GaussianBasis(count=12), 0.0),
@@ -231,10 +231,17 @@ def test_products_are_those_of_the_design():
     s[2, 1:-1] = 0.4
     y = torch.randn(3, 2, 60, generator=rng, dtype=torch.float64)
     mask = (torch.rand(3, 60, generator=rng) < 0.8).double()
-    for basis, approach in list(BASES.values())[:2]:
-        response = response_of(SpringDamper(), basis, approach)
+    # One that fades before the end is for samples after that as well.
+    early = GaussianBasis(count=12, phase=ExponentialPhase(decay=60.0))
+    for basis in (
+        GaussianBasis(count=12),
+        GaussianBasis(count=40),
+        SplineBasis(count=9),
+        early,
+    ):
+        response = response_of(SpringDamper(), basis, 0.0)
         mixing = torch.randn(response.size, 7, generator=rng, dtype=torch.float64)
-        gram, right = products(response, mixing, s, y, mask)
+        gram, right = ColumnPieces.of(response, mixing).products(s, y, mask)
         H = response.evaluate(s)[..., 0, :] @ mixing
         expected = H.mT @ (mask[..., None] * H)
         torch.testing.assert_close(gram, expected, rtol=1e-8, atol=1e-8)

@@ -27,6 +27,8 @@ lower degree may differ: a sum of fifty products rounds off as much."""
 UNSEEN = 1e-9
 """Likewise, of columns whose products are solved for weights: what is left of it in a motion is
 well below what the response itself is exact to."""
+MOST_TERMS = 20
+"""Of a Chebyshev series on a piece: a few dozen samples on each, fitted the fastest."""
 AT_ONCE = 2**16
 """Samples whose indices and powers a core keeps in its cache; a million takes twice as long."""
 
@@ -190,59 +192,83 @@ def _tabulate(
     )
 
 
-def products(
-    response: "Response",
-    mixing: Float[Tensor, "M n"],
-    s: Float[Tensor, "B T"],
-    y: Float[Tensor, "B D T"],
-    mask: Float[Tensor, "B T"],
-) -> tuple[Float[Tensor, "B n n"], Float[Tensor, "B n D"]]:
-    """H'H and H'y of the columns H(s) mixing, over the samples that count (float64).
+@dataclass(frozen=True, eq=False)
+class ColumnPieces:
+    """Columns H(s) mixing along the motion, as Chebyshev series on pieces of one length."""
 
-    No H is made: on a piece a column is a polynomial, so that sums of powers of the times say
-    all about the samples there.
+    interval: float
+    coefficients: Float[Tensor, "P K n"]
 
-    Args:
-        response: Without approach, of a basis that is not periodic.
-        mixing: What coordinates each column stands for.
-        s: Normalised times from 0 to 1, never falling.
-        y: Samples.
-        mask: 1 where one counts, 0 elsewhere.
-    """
-    table = _table(response, 0, s)
-    K, n, D = table.size, mixing.shape[1], y.shape[1]
-    # The last piece stands for times long after the end.
-    coefficients = (mixing.mT @ table.matrix).view(n, -1, K)[:, :-1].permute(1, 2, 0)
-    reached = min(int(1 / response.forced.interval) + 1, len(coefficients))
-    coefficients = _of_least_degree(coefficients[:reached], UNSEEN)
-    P, K = coefficients.shape[:2]
-    edges = torch.arange(P + 1, dtype=s.dtype, device=s.device)
-    # Samples at the very end belong to the last piece.
-    edges[-1] = math.inf
-    gram, right = s.new_empty(len(s), n, n), s.new_empty(len(s), n, D)
-    for part in _parts(s):
-        x, B = s[part] / response.forced.interval, len(s[part])
-        first = torch.searchsorted(x.contiguous(), edges.expand(B, -1).contiguous())
-        most = int(first.diff(dim=-1).amax())
-        index = first[:, :-1, None] + torch.arange(most, device=s.device)
-        there = index < first[:, 1:, None]
-        index = index.clamp(max=s.shape[1] - 1).flatten(1)
-        counts = mask[part].gather(1, index).view(B, P, most) * there
-        u = 2 * (x.gather(1, index).view(B, P, most) - edges[:P, None]) - 1
-        power, samples = counts, y[part].mT.gather(1, index[..., None].expand(-1, -1, D))
-        powers = s.new_empty(B, P, most, K + D)
-        powers[..., K:] = samples.view(B, P, most, D)
-        for k in range(K):
-            powers[..., k] = power
-            power = power * u
-        sums = powers[..., :K].mT @ powers
-        # Of polynomials times polynomials, in an order that leaves one flat product.
-        inner = sums[..., :K].permute(1, 2, 0, 3).reshape(P, K * B, K) @ coefficients
-        flat = coefficients.reshape(P * K, n).mT
-        gram[part] = (flat @ inner.view(P * K, B * n)).view(n, B, n).movedim(1, 0)
-        outer = sums[..., K:].permute(1, 2, 0, 3).reshape(P * K, B * D)
-        right[part] = (flat @ outer).view(n, B, D).movedim(1, 0)
-    return gram, right
+    @classmethod
+    def of(cls, response: "Response", mixing: Float[Tensor, "M n"]) -> "ColumnPieces":
+        """As few pieces as series of `MOST_TERMS` can do with, from s = 0 to 1.
+
+        Args:
+            response: Without approach, of a basis that is not periodic.
+            mixing: What coordinates each column stands for.
+        """
+        angle = torch.pi * torch.arange(4 * MOST_TERMS + 1).to(mixing) / (4 * MOST_TERMS)
+        series = torch.cos(angle[:, None] * torch.arange(MOST_TERMS).to(mixing))
+        fit = torch.linalg.pinv(series)
+        for merged in (8, 4, 2, 1):
+            # Of whole pieces of the forcing: a spline has its knots between them.
+            interval = merged * response.forced.interval
+            knots = interval * torch.arange(math.ceil(1 / interval - 1e-9)).to(mixing)
+            s = knots[:, None] + interval * (1 + torch.cos(angle)) / 2
+            values = response.evaluate(s)[..., 0, :] @ mixing
+            coefficients, size = fit @ values, values.abs().amax((0, 1))
+            off = (series @ coefficients - values).abs().amax((0, 1))
+            if merged == 1 or (off <= UNSEEN * size).all():
+                break
+        # What terms leave out is at most the sum of their coefficients.
+        left = coefficients.abs().flip(1).cumsum(1).flip(1).amax(0)
+        terms = int((left > UNSEEN * size).any(-1).sum())
+        return cls(interval, coefficients[:, :terms].contiguous())
+
+    def products(
+        self,
+        s: Float[Tensor, "B T"],
+        y: Float[Tensor, "B D T"],
+        mask: Float[Tensor, "B T"],
+    ) -> tuple[Float[Tensor, "B n n"], Float[Tensor, "B n D"]]:
+        """H'H and H'y of the columns, over the samples that count (float64).
+
+        No H is made: sums over the samples of a piece, of products of Chebyshev polynomials,
+        say all about them.
+
+        Args:
+            s: Normalised times from 0 to 1, never falling.
+            y: Samples.
+            mask: 1 where one counts, 0 elsewhere.
+        """
+        (P, K, n), D = self.coefficients.shape, y.shape[1]
+        edges = torch.arange(P + 1, dtype=s.dtype, device=s.device)
+        # Samples at the very end belong to the last piece.
+        edges[-1] = math.inf
+        gram, right = s.new_empty(len(s), n, n), s.new_empty(len(s), n, D)
+        flat = self.coefficients.reshape(P * K, n).mT
+        for part in _parts(s):
+            x, B = s[part] / self.interval, len(s[part])
+            first = torch.searchsorted(x.contiguous(), edges.expand(B, -1).contiguous())
+            most = int(first.diff(dim=-1).amax())
+            index = first[:, :-1, None] + torch.arange(most, device=s.device)
+            there = index < first[:, 1:, None]
+            index = index.clamp(max=s.shape[1] - 1).flatten(1)
+            u = 2 * (x.gather(1, index).view(B, P, most) - edges[:P, None]) - 1
+            rows = s.new_empty(B, P, K + D, most)
+            samples = y[part].gather(2, index[:, None].expand(-1, D, -1))
+            rows[:, :, K:] = samples.view(B, D, P, most).transpose(1, 2)
+            rows[:, :, 0] = mask[part].gather(1, index).view(B, P, most) * there
+            rows[:, :, 1] = rows[:, :, 0] * u
+            for k in range(2, K):
+                rows[:, :, k] = 2 * u * rows[:, :, k - 1] - rows[:, :, k - 2]
+            sums = rows[:, :, :K] @ rows.mT
+            # Of series times series, in an order that leaves one flat product.
+            inner = sums[..., :K].permute(1, 2, 0, 3).reshape(P, K * B, K) @ self.coefficients
+            gram[part] = (flat @ inner.view(P * K, B * n)).view(n, B, n).movedim(1, 0)
+            outer = sums[..., K:].permute(1, 2, 0, 3).reshape(P * K, B * D)
+            right[part] = (flat @ outer).view(n, B, D).movedim(1, 0)
+        return gram, right
 
 
 def without_subnormals(values: Tensor) -> Tensor:

@@ -196,7 +196,8 @@ class Response:
         self._matrices: OrderedDict[tuple, tuple[Tensor, Tensor, Tensor]] = OrderedDict()
         self.own_times: dict[tuple[int, torch.dtype, torch.device], OwnTimesTable] = {}
         """For motions each at times of its own, see `own_times.py`."""
-        self._latest: tuple[Tensor, tuple[Tensor, Tensor, Tensor]] | None = None
+        self._latest: tuple[Tensor, int, Tensor, tuple[Tensor, Tensor, Tensor]] | None = None
+        """A grid, the version of it, a copy, and its matrices."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Tables are made again from what they were made of, or found: there is one for all.
@@ -212,18 +213,22 @@ class Response:
             dtype: Of the result.
         """
         if self._latest is not None:
-            grid, matrices = self._latest
-            alike = matrices[0].dtype == dtype and grid.device == s.device
-            # By content: a grid that was changed in place is another one.
-            if alike and grid.dtype == s.dtype and torch.equal(grid, s):
-                return matrices
+            own, version, grid, matrices = self._latest
+            if matrices[0].dtype == dtype:
+                if own is s and not s.is_inference() and s._version == version:
+                    return matrices
+                # By content: a grid that was changed in place is another one.
+                alike = grid.dtype == s.dtype and grid.device == s.device
+                if alike and torch.equal(grid, s):
+                    return matrices
         key = (s.detach().cpu().numpy().tobytes(), s.dtype, s.device, dtype)
         if key not in self._matrices:
             self._matrices[key] = self._transposed(s, dtype)
             if len(self._matrices) > GRIDS_KEPT:
                 self._matrices.popitem(last=False)
         self._matrices.move_to_end(key)
-        self._latest = s.detach().clone(), self._matrices[key]
+        version = 0 if s.is_inference() else s._version
+        self._latest = s, version, s.detach().clone(), self._matrices[key]
         return self._matrices[key]
 
     @torch.inference_mode(False)
