@@ -39,6 +39,7 @@ from hrc_learn.dmp.limited_dmp import LimitedState as LimitedState
 from hrc_learn.dmp.limited_dmp import LimitedTrajectory as LimitedTrajectory
 from hrc_learn.dmp.limited_dmp import SoftLimits as SoftLimits
 from hrc_learn.dmp.linear_primitive import LinearPrimitive as LinearPrimitive
+from hrc_learn.dmp.mixture_dmp import MixtureDMP as MixtureDMP
 from hrc_learn.dmp.motion_head import MotionDistribution as MotionDistribution
 from hrc_learn.dmp.motion_head import MotionHead as MotionHead
 from hrc_learn.dmp.motion_head import PlannedTrajectory as PlannedTrajectory

@@ -1,0 +1,137 @@
+"""How well a demonstration is predicted from others that go several ways.
+
+Made-up planar sets like those of the LASA handwriting data: strokes to one end from starts
+that scatter by 7 % of the way, of one way or of two or three, seven to nine demonstrations
+each. Each is left out in turn and predicted from the others, given its start and goal alone.
+"""
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from rich.console import Console
+from rich.table import Table
+from torch import Tensor
+
+from hrc_learn import cli
+from hrc_learn.dmp import JointDMP, MixtureDMP, mean_primitive
+
+SAMPLES = 150
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args:
+    sets: int = 32
+    """Of demonstrations, half of them of one way."""
+    n_basis: int = 30
+    """Basis functions of each primitive."""
+    seed: int = 0
+    json: Path | None = None
+    """Receives the figures as one flat object."""
+
+
+def main(args: Args) -> None:
+    """Predict, print a table, write the figures."""
+    torch.set_num_threads(1)
+    rng = torch.Generator().manual_seed(args.seed)
+    errors: dict[str, list[float]] = {"nearest": [], "mean": [], "mixture": []}
+    several, right = [], []
+    with torch.no_grad():
+        for k in range(args.sets):
+            ways = 1 if k % 2 == 0 else 2 + int(torch.randint(2, (), generator=rng))
+            time, position = made_up(ways, rng)
+            primitives = JointDMP.fit(time, position, args.n_basis)
+            for i in range(len(position)):
+                found = predict(primitives, i, position, errors)
+                several.append(ways > 1)
+                right.append(found == ways)
+    figures = summarise(errors, np.array(several)) | {"modes_right": float(np.mean(right))}
+    show(figures)
+    if args.json:
+        cli.write_json(args.json, figures)
+
+
+def made_up(ways: int, rng: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Times (n, T) [s] and positions (n, T, 2) of one set."""
+    shapes = [stroke(rng) for _ in range(ways)]
+    shown = [demonstration(*shapes[i % ways], rng) for i in range(7 if ways < 3 else 9)]
+    time, position = zip(*shown, strict=True)
+    return torch.stack(time), torch.stack(position)
+
+
+def stroke(rng: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Where it starts, and how it bends: three sines of each coordinate."""
+    start = torch.randn(2, generator=rng, dtype=torch.float64)
+    length = 0.7 + 0.6 * torch.rand(1, generator=rng, dtype=torch.float64)
+    bend = torch.randn(3, 2, generator=rng, dtype=torch.float64)
+    return length * start / start.norm(), bend * torch.tensor([0.5, 0.35, 0.2])[:, None]
+
+
+def demonstration(start: Tensor, bend: Tensor, rng: torch.Generator) -> tuple[Tensor, Tensor]:
+    """One of a stroke: from another start, bent by 15 % more or less, earlier or later."""
+    start = start + 0.07 * torch.randn(2, generator=rng, dtype=torch.float64)
+    bend = bend * (1 + 0.15 * torch.randn(bend.shape, generator=rng, dtype=torch.float64))
+    s = torch.linspace(0, 1, SAMPLES, dtype=torch.float64)
+    duration = 2 + torch.rand(1, generator=rng, dtype=torch.float64)
+    warped = s + 0.15 * torch.randn(1, generator=rng, dtype=torch.float64) * s * (1 - s)
+    way = 1 - warped**3 * (10 - 15 * warped + 6 * warped**2)
+    waves = torch.sin(torch.pi * torch.arange(1, 4) * warped[:, None]) @ bend
+    return duration * s, way[:, None] * start + (4 * warped * (1 - warped))[:, None] * waves
+
+
+def predict(
+    primitives: JointDMP, i: int, position: Tensor, errors: dict[str, list[float]]
+) -> int:
+    """Add errors by method [% of the largest range of the set]; how many modes there are."""
+    others = primitives[[j for j in range(len(position)) if j != i]]
+    start, goal = position[i, 0], position[i, -1]
+    away = (others.start - start).norm(dim=-1) + (others.goal - goal).norm(dim=-1)
+    mixture = MixtureDMP.fit(others)
+    context = torch.stack([start, goal], dim=-1).flatten()
+    predictions = {
+        "nearest": others[int(away.argmin())],
+        "mean": mean_primitive(others),
+        "mixture": mixture.at(context).mean_primitive(),
+    }
+    low, high = position.flatten(0, 1).aminmax(dim=0)
+    s = torch.linspace(0, 1, SAMPLES, dtype=torch.float64)
+    for name, dmp in predictions.items():
+        path = dmp.with_ends(start, goal).rollout(s * dmp.duration).position
+        off = (path - position[i]).square().mean().sqrt()
+        errors[name].append(100 * (off / (high - low).max()).item())
+    return len(mixture.modes)
+
+
+def summarise(errors: dict[str, list[float]], several: np.ndarray) -> dict[str, float]:
+    """Median and 90th percentile, of all, of sets of one way and of several."""
+    figures = {}
+    for name, values in errors.items():
+        which = {"all": several | True, "one_way": ~several, "several_ways": several}
+        for group, rows in which.items():
+            for share, quantile in (("median", 0.5), ("p90", 0.9)):
+                chosen = np.array(values)[rows]
+                figures[f"{name}_{group}_{share}"] = float(np.quantile(chosen, quantile))
+    return figures
+
+
+def show(figures: dict[str, float]) -> None:
+    """A row for each method."""
+    groups = ("all", "one_way", "several_ways")
+    title = f"RMSE, % of range: median / p90 (modes right: {figures['modes_right']:.0%})"
+    table = Table("predicted by", *groups, title=title)
+    for name in ("nearest", "mean", "mixture"):
+        cells = [
+            f"{figures[f'{name}_{group}_median']:.1f} / {figures[f'{name}_{group}_p90']:.1f}"
+            for group in groups
+        ]
+        table.add_row(name, *cells)
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    cli.run(main, Args)
