@@ -84,7 +84,7 @@ def main(args: Args) -> None:
         fps = float(info["fps"])
         shown = [e for k, e in enumerate(episodes) if k % args.every]
         held_out = episodes[:: args.every]
-        stats = _statistics(shown)
+        stats = statistics(shown)
         spread = stats[ACTION]["std"]
         varies = spread > CONSTANT
         wanted = [(e[ACTION] / spread)[:, varies] for e in held_out]
@@ -116,7 +116,7 @@ def _titles(executed: Sequence[int]) -> list[str]:
     return [t for n in executed for t in (f"RMSE, {n} executed", "jerk at seams [1/s^3]")]
 
 
-def _statistics(episodes: Sequence[Episode]) -> dict[str, dict[str, Tensor]]:
+def statistics(episodes: Sequence[Episode]) -> dict[str, dict[str, Tensor]]:
     stats = {}
     for key in (STATE, ACTION):
         x = torch.cat([e[key] for e in episodes])
@@ -154,7 +154,7 @@ def _learn(
 
     import hrc_learn.lerobot  # noqa: F401  registers ours
 
-    config = _config(name, shown[0], fps, args)
+    config = config_of(name, shown[0], fps, args.chunk, args.executed[0])
     with_environment = name == "act"
     if with_environment:
         # ACT demands images or the environment's state: it gets the state there.
@@ -167,7 +167,8 @@ def _learn(
     elif name == "motion_chunk":
         policy.fit(shown)
     before, after = make_pre_post_processors(config, dataset_stats=stats)
-    steps = _train(policy, before, shown, fps, begun + 60 * args.minutes, args)
+    until = begun + 60 * args.minutes
+    steps = train(policy, before, shown, fps, until, args.batch_size, args.seed)
     seconds = time.process_time() - begun
 
     @torch.no_grad()
@@ -204,16 +205,17 @@ def _nearest(
     return play
 
 
-def _config(name: str, episode: Episode, fps: float, args: Args) -> Any:
+def config_of(name: str, episode: Episode, fps: float, chunk: int, executed: int) -> Any:
+    """Settings of a policy that predicts so many actions and carries out so many of them."""
     from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature
-    from lerobot.policies import ACTConfig
+    from lerobot.policies import ACTConfig, DiffusionConfig
 
     from hrc_learn.lerobot import DMPConfig, MotionChunkConfig
 
     state = (episode[STATE].shape[1],)
     common: dict[str, Any] = {
-        "chunk_size": args.chunk,
-        "n_action_steps": args.executed[0],
+        "chunk_size": chunk,
+        "n_action_steps": executed,
         "device": "cpu",
         "push_to_hub": False,
         "input_features": {STATE: PolicyFeature(FeatureType.STATE, state)},
@@ -240,11 +242,28 @@ def _config(name: str, episode: Episode, fps: float, args: Args) -> Any:
                 use_vae=False,
                 optimizer_lr=1e-3,
             )
+        case "diffusion":
+            common["input_features"][ENVIRONMENT] = PolicyFeature(FeatureType.ENV, state)
+            common["horizon"] = common.pop("chunk_size")
+            return DiffusionConfig(
+                **common,
+                down_dims=(64, 128),
+                noise_scheduler_type="DDIM",
+                num_inference_steps=10,
+                diffusion_step_embed_dim=64,
+                optimizer_lr=1e-3,
+            )
     raise ValueError(f"--policies takes nearest, act, dmp and motion_chunk, not {name!r}")
 
 
-def _train(
-    policy: Any, before: Any, shown: Sequence[Episode], fps: float, until: float, args: Args
+def train(
+    policy: Any,
+    before: Any,
+    shown: Sequence[Episode],
+    fps: float,
+    until: float,
+    batch_size: int,
+    seed: int,
 ) -> int:
     """As lerobot-train does it, with batches from memory, until so much CPU time has passed.
 
@@ -258,7 +277,7 @@ def _train(
     windows = SampleWindows(shown, deltas, fps)
     optimizer = config.get_optimizer_preset().build(policy.get_optim_params())
     rates = [group["lr"] for group in optimizer.param_groups]
-    rng = torch.Generator().manual_seed(args.seed)
+    rng = torch.Generator().manual_seed(seed)
     begun, steps = time.process_time(), 0
     policy.train()
     while (now := time.process_time()) < until:
@@ -266,7 +285,7 @@ def _train(
         factor = min(1, (steps + 1) / WARM_UP) * (1 + math.cos(math.pi * share)) / 2
         for group, rate in zip(optimizer.param_groups, rates, strict=True):
             group["lr"] = rate * factor
-        loss, _ = policy.forward(before(windows.draw(args.batch_size, rng)))
+        loss, _ = policy.forward(before(windows.draw(batch_size, rng)))
         optimizer.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(policy.parameters(), 10.0)

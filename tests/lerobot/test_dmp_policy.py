@@ -251,7 +251,7 @@ def test_a_dataset_on_disk_is_fitted_by_its_episodes(tmp_path, caplog):
     like.planner.fit([shown[0], shown[2]], "action")
     torch.testing.assert_close(played(policy, shown[1]), played(like, shown[1]))
     # Of a dataset that is streamed nothing lies on disk.
-    DMPPolicy(config, dataset_meta=SimpleNamespace(root=tmp_path, fps=FPS))
+    DMPPolicy(config, dataset_stats=stats, dataset_meta=SimpleNamespace(root=tmp_path, fps=FPS))
     assert "training starts from standing still" in caplog.text
 
 

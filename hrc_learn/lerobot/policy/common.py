@@ -1,5 +1,6 @@
 """What the policies ask of a dataset and of observations alike."""
 
+import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -12,6 +13,12 @@ from safetensors import SafetensorError
 from torch import Tensor
 
 from hrc_learn.demos.format.metadata import flatten_names
+
+logger = logging.getLogger(__name__)
+
+OUTLIER = 25.0
+"""Spreads from the mean from which on a value is no motion: one glitch among n frames is
+sqrt(n) spreads away, a gripper that opens for every 600th frame as many."""
 
 
 @dataclass
@@ -167,6 +174,8 @@ def require_statistics(
 ) -> None:
     """See whether a dataset's statistics have finite numbers for each component.
 
+    Warns of components with a value so far off that all others look alike beside it.
+
     Raises:
         ValueError: They have not.
     """
@@ -179,6 +188,36 @@ def require_statistics(
                 f"the dataset's statistics (meta/stats.json) must have {width} finite numbers "
                 f"as {name} of {key}, got {values.tolist()}"
             )
+    mean, std, low, high = (
+        torch.as_tensor(stats[key].get(name, stats[key]["mean"])).double()
+        for name in ("mean", "std", "min", "max")
+    )
+    farthest = torch.maximum(high - mean, mean - low)
+    if wild := (farthest > OUTLIER * std).nonzero().flatten().tolist():
+        values = ", ".join(
+            f"component {i}: {low[i]:.4g} to {high[i]:.4g}, spread {std[i]:.4g}" for i in wild
+        )
+        logger.warning(
+            "%s has values more than %g spreads from the mean (%s): repair the dataset, or "
+            "what is usual there looks like standing still",
+            key,
+            OUTLIER,
+            values,
+        )
+
+
+def require_any_statistics(stats: Mapping[str, Any] | None, dataset_meta: Any) -> None:
+    """See whether a dataset that is trained on has statistics at all.
+
+    Raises:
+        ValueError: It has not.
+    """
+    if dataset_meta is not None and not stats:
+        raise ValueError(
+            f"the dataset in {dataset_meta.root} has no statistics (meta/stats.json), by which "
+            "the policy whitens what it sees and does: compute them with LeRobot's "
+            "`lerobot-edit-dataset --operation.type recompute_stats`, or record it again"
+        )
 
 
 def load_weights(load: Callable[..., Any], model: Any, file: str, *arguments: Any) -> Any:

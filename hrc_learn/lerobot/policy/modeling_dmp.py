@@ -21,6 +21,7 @@ from hrc_learn.lerobot.policy.closed_form import read_episodes
 from hrc_learn.lerobot.policy.common import (
     frame_rate,
     load_weights,
+    require_any_statistics,
     require_numbers,
     require_statistics,
 )
@@ -80,6 +81,7 @@ class DMPPolicy(PreTrainedPolicy):
         self.left_out_error = math.nan
         """Of demonstrations left out of the closed form, in the spread of the actions."""
         if config.pretrained_path is None:
+            require_any_statistics(dataset_stats, dataset_meta)
             self._whiten(dataset_stats)
             self._fit(dataset_meta)
         self.reset()

@@ -24,6 +24,7 @@ from hrc_learn.lerobot.policy.closed_form import SampleWindows, read_episodes
 from hrc_learn.lerobot.policy.common import (
     frame_rate,
     load_weights,
+    require_any_statistics,
     require_numbers,
     require_statistics,
 )
@@ -128,6 +129,7 @@ class MotionChunkPolicy(PreTrainedPolicy):
         self.register_buffer("levels", torch.tensor([[-1.0], [1.0]]).repeat(1, width))
         self.register_buffer("velocity_spread", torch.ones(width))
         if config.pretrained_path is None:
+            require_any_statistics(dataset_stats, dataset_meta)
             self._whiten(dataset_stats)
         config.two_level_actions = config.two_level_actions or []
         self._stepped = sorted(config.two_level_actions)
