@@ -21,6 +21,7 @@ from torch import Tensor
 
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import gripper_down, panda, panda_capsules
+from hrc_learn.lerobot.loop_watch import LoopWatch
 from hrc_learn.lerobot.person import Person, PersonConfig
 from hrc_learn.protocols import Arm, ArmState
 
@@ -269,6 +270,7 @@ class PandaRobot(Device, Robot):
         )
         self._rotation = DOWN
         self._person_config = config.person
+        self._loop = LoopWatch(str(self), config.fps)
 
     @property
     def observation_features(self) -> dict[str, Any]:
@@ -291,6 +293,7 @@ class PandaRobot(Device, Robot):
 
     def disconnect(self) -> None:
         self._need_connection()
+        self._loop.end()
         robot_registry().remove(self)
         if self.complement is not None:
             self.complement = None
@@ -314,6 +317,8 @@ class PandaRobot(Device, Robot):
 
     def send_action(self, action: dict[str, Any]) -> dict[str, float]:
         self._need_connection()
+        if self.in_real_time:
+            self._loop.tick()
         where, width = target_of(action)
         joints = self._joints_at(where) if isinstance(where, Pose) else where
         if self.complement is not None:
@@ -338,6 +343,11 @@ class PandaRobot(Device, Robot):
     @abstractmethod
     def servo(self) -> PositionServo:
         """Which leads the arm by positions."""
+
+    @property
+    def in_real_time(self) -> bool:
+        """Whether the arm goes on moving while the loop is late."""
+        return True
 
     @property
     def world(self) -> World | None:

@@ -7,8 +7,9 @@ from lerobot.robots import make_robot_from_config
 from lerobot.teleoperators import make_teleoperator_from_config
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 
+from hrc_learn.lerobot.loop_watch import LoopWatch
 from hrc_learn.lerobot.panda_robot import GRIPPER, HAND, JOINTS, PIXELS
-from hrc_learn.lerobot.robots import MujocoPandaConfig
+from hrc_learn.lerobot.robots import MujocoPanda, MujocoPandaConfig
 from hrc_learn.lerobot.teleoperators import PandaExpertConfig
 
 FPS = 20.0
@@ -37,7 +38,7 @@ def test_the_sim_goes_where_it_is_sent_and_time_passes_by_actions(simulated):
     assert there[GRIPPER] == pytest.approx(0.06, abs=3e-3)
 
 
-def test_a_sim_begins_anew_with_the_recorders_next_episode(simulated, monkeypatch):
+def test_a_sim_begins_anew_with_the_recorders_next_episode(simulated, monkeypatch, caplog):
     """Not when the loop hangs within one."""
     clock = [100.0]
     monkeypatch.setattr(time, "monotonic", lambda: clock[0])
@@ -55,9 +56,41 @@ def test_a_sim_begins_anew_with_the_recorders_next_episode(simulated, monkeypatc
     assert frame(0.0) == (0, 1, 0)
     assert frame(1.5) == (0, 2, 0)  # hangs
     assert frame(0.5 + 0.5 / FPS) == (0, 3, 0)  # the last frame, a little late
+    assert not caplog.text
     assert frame(1.2 / FPS) == (1, 1, 1)  # saved; the next episode
     assert frame(1.9) == (1, 2, 1)
     assert frame(0.3) == (2, 1, 2)
+    shown = f"0.2 s of the demonstration's {robot.run.scenario.duration:.1f} s"
+    assert f"episode 0 of this recording ends before the job is done: {shown}" in caplog.text
+    assert "episode 1 of this recording" in caplog.text
+    assert "episode 2" not in caplog.text
+    robot.disconnect()
+    assert "episode 2 of this recording" in caplog.text
+
+
+def test_a_job_that_is_done_is_a_whole_episode(simulated, caplog, monkeypatch):
+    robot = simulated(scenario="grasping", fps=FPS, episode_time=2.0)
+    seen = robot.get_observation()
+    robot.send_action({name: seen[name] for name in (*JOINTS, GRIPPER)})
+    monkeypatch.setattr(robot.run, "succeeded", lambda: True)
+    robot.disconnect()
+    assert not caplog.text
+
+
+@pytest.mark.parametrize("in_real_time", [True, False])
+def test_late_actions_of_an_arm_that_moves_on_are_told(
+    simulated, monkeypatch, caplog, in_real_time
+):
+    robot, clock = simulated(scenario="grasping", fps=FPS), [0.0]
+    monkeypatch.setattr(MujocoPanda, "in_real_time", in_real_time)
+    robot._loop = LoopWatch("arm", FPS, lambda: clock[0])
+    seen = robot.get_observation()
+    for gap in (1.0, 1.0, 3.0):
+        robot.send_action({name: seen[name] for name in (*JOINTS, GRIPPER)})
+        clock[0] += gap / FPS
+    robot.send_action({name: seen[name] for name in (*JOINTS, GRIPPER)})
+    robot.disconnect()
+    assert ("arm: 1 of 4 actions came late" in caplog.text) == in_real_time
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
     from hrc_learn.sim import World
     from hrc_learn.skills.arm_motion import PositionServo
     from hrc_learn.teleoperation.scenarios import ScenarioRun
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass
@@ -113,6 +116,10 @@ class MujocoPanda(PandaRobot):
         return self.run.servo
 
     @property
+    def in_real_time(self) -> bool:
+        return False
+
+    @property
     def world(self) -> World:
         return self.run.world
 
@@ -159,8 +166,29 @@ class MujocoPanda(PandaRobot):
         if not self.run.commands:
             self._began = now
         elif length and now - self._began > length + self.dt:
+            self._warn_of_half_an_episode()
             self.begin(self.run.seed + 1)
             self._began = now
+
+    def disconnect(self) -> None:
+        self._need_connection()
+        if self.config.episode_time and self.run.commands:
+            self._warn_of_half_an_episode()
+        super().disconnect()
+
+    def _warn_of_half_an_episode(self) -> None:
+        """Where the clock, or a late loop, ended it before the job was done."""
+        shown, whole = self.dt * self.run.commands, self.run.scenario.duration
+        if not self.run.succeeded():
+            logger.warning(
+                "episode %d of this recording ends before the job is done: %.1f s of the "
+                "demonstration's %.1f s were shown. Delete it (lerobot-edit-dataset "
+                "--operation.type delete_episodes), and give more time (--robot.episode_time "
+                "and --dataset.episode_time_s)",
+                self.initial_configurations,
+                shown,
+                whole,
+            )
 
     def begin(self, seed: int) -> None:
         """Put everything in place as a seed has it."""
