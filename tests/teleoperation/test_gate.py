@@ -17,8 +17,8 @@ from hrc_learn.teleoperation.gate.address import (
     network_name,
     tls_context,
 )
+from hrc_learn.teleoperation.gate.admission import Bucket
 from hrc_learn.teleoperation.gate.control import Link
-from hrc_learn.teleoperation.gate.gate import Bucket
 from hrc_learn.teleoperation.gate.messages import (
     Hands,
     MessageError,

@@ -14,19 +14,18 @@ import mimetypes
 import time
 from collections.abc import Awaitable, Callable, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from threading import Event, Thread
 from typing import TYPE_CHECKING, Any
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import urlsplit
 
 from hrc_learn.teleoperation.gate.address import (
-    Address,
     AddressConfig,
     listening_socket,
-    network_name,
     tls_context,
 )
+from hrc_learn.teleoperation.gate.admission import HEADERS, Admission, Bucket
 from hrc_learn.teleoperation.gate.control import Control
 from hrc_learn.teleoperation.gate.messages import (
     Beat,
@@ -52,15 +51,8 @@ _LARGEST = 16_384  # bytes of a message: the longest of ours has 1.5 kB
 _RATE, _BURST = 400.0, 800.0  # messages a second and at once: a mouse makes 2 x 125
 _CONNECTIONS = 64  # open at once, whatever they are: a browser needs 8
 _PER_PERSON = 2  # a page and its socket
-_WRONG_TOKENS, _FORGIVEN = 20.0, 1.0  # at once, and one a second: nobody guesses 144 bits
 _STATUS_EVERY, _SCENE_EVERY = 0.1, 1 / 60
 _GONE, _TOO_MUCH, _FULL = 1001, 1008, 1013  # codes of the WebSocket protocol (RFC 6455)
-
-_POLICY = (
-    "default-src 'self' 'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval' blob: data:; "
-    "connect-src 'self' blob: data:; frame-ancestors 'none'; form-action 'none'"
-)
-"""Nothing is fetched from, sent to or framed by anybody else."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,30 +95,6 @@ def static_contents(folder: Path) -> dict[str, Content]:
         for file in sorted(folder.iterdir())
         if file.is_file()
     }
-
-
-@dataclass(kw_only=True)
-class Bucket:
-    """Lets so many through a second, and so many at once."""
-
-    rate: float
-    burst: float
-    clock: Callable[[], float] = time.monotonic
-    left: float = field(init=False)
-    last: float = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.left, self.last = self.burst, self.clock()
-
-    def take(self) -> bool:
-        """Whether one more may pass."""
-        now = self.clock()
-        self.left = min(self.burst, self.left + self.rate * (now - self.last))
-        self.last = now
-        if self.left < 1:
-            return False
-        self.left -= 1
-        return True
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,17 +145,12 @@ class Gate:
         self._socket = listening_socket(config)
         self._config, self.control, self._contents = config, control, contents
         self._callbacks, self._viewer, self._secret = callbacks, viewer, secret
-        self.address = Address(
-            scheme="https" if self._context else "http",
-            host=network_name(config),
-            port=self._socket.getsockname()[1],
-        )
-        self._cookie = f"hrc_page_{self.address.port}"
-        self._hosts = {self.address.host, "localhost", "127.0.0.1", "::1"}
+        port = self._socket.getsockname()[1]
+        self._admission = Admission(config, port, tls=self._context is not None)
+        self.address = self._admission.address
         self._sessions: dict[str, ServerConnection] = {}
         self._views: dict[str, ServerConnection] = {}
         self._open = 0
-        self._wrong = Bucket(rate=_FORGIVEN, burst=_WRONG_TOKENS)
         self._ready, self._farewell = Event(), ""
         self._thread = Thread(target=self._run, name="page gate", daemon=True)
 
@@ -239,21 +202,22 @@ class Gate:
 
     def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
         """Answer a request; None lets a WebSocket through."""
+        verdict = self._admission.refuse(
+            request.path,
+            request.headers.get("Host", ""),
+            request.headers.get_all("Cookie"),
+            self._contents.__contains__,
+        )
+        if verdict is not None:
+            words = f"{verdict.words}\n".encode() if verdict.words else b""
+            return _response(verdict.code, words, _PLAIN, **verdict.headers)
         parts = urlsplit(request.path)
-        if not self._is_ours(request.headers.get("Host", "")):
-            return _refused(403, "This page is not served under that name.")
-        if "token" in (query := parse_qs(parts.query)):
-            return self._enter(query["token"][0], parts.path)
-        if not self._knows(request):
-            return _refused(
-                401, "Open the whole address that the terminal shows: it has a secret."
-            )
         if request.headers.get("Upgrade", "").lower() != "websocket":
             content = self._contents.get(parts.path)
             if content is None:
                 return _refused(404, "There is nothing here.")
             return _response(200, content.body, content.kind)
-        if not self._from_ours(request.headers.get("Origin", "")):
+        if not self._admission.from_ours(request.headers.get("Origin", "")):
             return _refused(403, "Another site may not connect.")
         route, _, client = parts.path.strip("/").partition("/")
         if route not in ("session", "view") or not 16 <= len(client) <= 64:
@@ -261,36 +225,6 @@ class Gate:
         if self._open >= _CONNECTIONS:
             return _refused(503, "Too many connections.")
         return None
-
-    def _is_ours(self, host: str) -> bool:
-        """Whether a Host header names us: another name may have been bound to our address."""
-        parts = urlsplit(f"//{host}")
-        with suppress(ValueError):
-            return parts.hostname in self._hosts and parts.port in (self.address.port, None)
-        return False
-
-    def _from_ours(self, origin: str) -> bool:
-        parts = urlsplit(origin)
-        return parts.scheme == self.address.scheme and self._is_ours(parts.netloc)
-
-    def _enter(self, token: str, path: str) -> Response:
-        """Exchange the token of the address for a cookie, which no other site can send."""
-        if not hmac.compare_digest(token.encode(), self.address.token.encode()):
-            if self._wrong.take():
-                return _refused(403, "That secret is not the one of this start.")
-            return _refused(429, "Too many wrong secrets.")
-        secure = "; Secure" if self._context else ""
-        cookie = f"{self._cookie}={token}; HttpOnly; SameSite=Strict; Path=/{secure}"
-        where = path if path in self._contents else "/"
-        return _response(303, b"", "text/plain", Location=where, Set_Cookie=cookie)
-
-    def _knows(self, request: Request) -> bool:
-        cookies = "; ".join(request.headers.get_all("Cookie"))
-        for cookie in cookies.split(";"):
-            name, _, value = cookie.strip().partition("=")
-            if name == self._cookie:
-                return hmac.compare_digest(value.encode(), self.address.token.encode())
-        return False
 
     # What they may say.
 
@@ -420,8 +354,11 @@ def _quiet_logger() -> logging.Logger:
     return logger
 
 
+_PLAIN = "text/plain; charset=utf-8"
+
+
 def _refused(code: int, words: str) -> Response:
-    return _response(code, f"{words}\n".encode(), "text/plain; charset=utf-8")
+    return _response(code, f"{words}\n".encode(), _PLAIN)
 
 
 def _response(code: int, body: bytes, kind: str, **more: str) -> Response:
@@ -432,14 +369,10 @@ def _response(code: int, body: bytes, kind: str, **more: str) -> Response:
         {
             "Content-Type": kind,
             "Content-Length": str(len(body)),
-            "Content-Security-Policy": _POLICY,
-            "X-Content-Type-Options": "nosniff",
-            "X-Frame-Options": "DENY",
-            "Referrer-Policy": "no-referrer",
+            **HEADERS,
             "Permissions-Policy": "xr-spatial-tracking=(self)",
-            "Cache-Control": "no-store",
             "Connection": "close",
-            **{name.replace("_", "-"): value for name, value in more.items()},
+            **more,
         }
     )
     return Response(code, http.HTTPStatus(code).phrase, headers, body)

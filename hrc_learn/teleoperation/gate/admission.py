@@ -1,0 +1,138 @@
+"""Who is let in: those who opened the address with its secret, under our own name."""
+
+from __future__ import annotations
+
+import hmac
+import time
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from urllib.parse import parse_qs, urlsplit
+
+from hrc_learn.teleoperation.gate.address import Address, AddressConfig, network_name
+
+_WRONG_TOKENS, _FORGIVEN = 20.0, 1.0  # at once, and one a second: nobody guesses 144 bits
+
+_POLICY = (
+    "default-src 'self' 'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval' blob: data:; "
+    "connect-src 'self' blob: data:; frame-ancestors 'none'; form-action 'none'"
+)
+"""Nothing is fetched from, sent to or framed by anybody else."""
+
+HEADERS = {
+    "Content-Security-Policy": _POLICY,
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-store",
+}
+"""Of every answer."""
+
+
+@dataclass(kw_only=True)
+class Bucket:
+    """Lets so many through a second, and so many at once."""
+
+    rate: float
+    burst: float
+    clock: Callable[[], float] = time.monotonic
+    left: float = field(init=False)
+    last: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.left, self.last = self.burst, self.clock()
+
+    def take(self) -> bool:
+        """Whether one more may pass."""
+        now = self.clock()
+        self.left = min(self.burst, self.left + self.rate * (now - self.last))
+        self.last = now
+        if self.left < 1:
+            return False
+        self.left -= 1
+        return True
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """What a request is answered with before anything else is looked at."""
+
+    code: int
+    """Of HTTP."""
+    words: str = ""
+    headers: dict[str, str] = field(default_factory=dict)
+
+
+class Admission:
+    """Tells whether a request comes from somebody who may be here.
+
+    The secret of the address is exchanged for a cookie, which no other site can send.
+
+    Attributes:
+        address: Of what is served, with the secret.
+    """
+
+    def __init__(self, config: AddressConfig, port: int, *, tls: bool):
+        """
+        Args:
+            config: Where it is served.
+            port: That was free.
+            tls: Whether it is served by TLS.
+        """
+        self.address = Address(
+            scheme="https" if tls else "http", host=network_name(config), port=port
+        )
+        self._cookie = f"hrc_page_{port}"
+        self._hosts = {self.address.host, "localhost", "127.0.0.1", "::1"}
+        self._wrong = Bucket(rate=_FORGIVEN, burst=_WRONG_TOKENS)
+
+    def refuse(
+        self, target: str, host: str, cookies: Iterable[str], known: Callable[[str], bool]
+    ) -> Verdict | None:
+        """What a request is refused or led on with; None where it may pass.
+
+        Args:
+            target: Path and query that were asked for.
+            host: The header.
+            cookies: The headers.
+            known: Whether there is something at a path.
+        """
+        parts = urlsplit(target)
+        if not self.is_ours(host):
+            return Verdict(code=403, words="This page is not served under that name.")
+        if "token" in (query := parse_qs(parts.query)):
+            return self._enter(query["token"][0], parts.path if known(parts.path) else "/")
+        if not self._knows(cookies):
+            return Verdict(
+                code=401,
+                words="Open the whole address that the terminal shows: it has a secret.",
+            )
+        return None
+
+    def is_ours(self, host: str) -> bool:
+        """Whether a Host header names us: another name may have been bound to our address."""
+        parts = urlsplit(f"//{host}")
+        with suppress(ValueError):
+            return parts.hostname in self._hosts and parts.port in (self.address.port, None)
+        return False
+
+    def from_ours(self, origin: str) -> bool:
+        """Whether an Origin header is that of our own page."""
+        parts = urlsplit(origin)
+        return parts.scheme == self.address.scheme and self.is_ours(parts.netloc)
+
+    def _enter(self, token: str, path: str) -> Verdict:
+        if not hmac.compare_digest(token.encode(), self.address.token.encode()):
+            if self._wrong.take():
+                return Verdict(code=403, words="That secret is not the one of this start.")
+            return Verdict(code=429, words="Too many wrong secrets.")
+        secure = "; Secure" if self.address.scheme == "https" else ""
+        cookie = f"{self._cookie}={token}; HttpOnly; SameSite=Strict; Path=/{secure}"
+        return Verdict(code=303, headers={"Location": path, "Set-Cookie": cookie})
+
+    def _knows(self, cookies: Iterable[str]) -> bool:
+        for cookie in "; ".join(cookies).split(";"):
+            name, _, value = cookie.strip().partition("=")
+            if name == self._cookie:
+                return hmac.compare_digest(value.encode(), self.address.token.encode())
+        return False
