@@ -75,6 +75,12 @@ COMMANDS: dict[str, Command] = {
         "dataset.Repair",
         ("dataset", "out"),
     ),
+    "curate": Command(
+        "which episodes stay, decided in the browser",
+        "curate.curate",
+        "dataset.Curate",
+        ("dataset",),
+    ),
     "recover": Command(
         "what a process that was killed left behind",
         "check.recover",
@@ -88,7 +94,7 @@ COMMANDS: dict[str, Command] = {
         ("dataset",),
     ),
     "push": Command(
-        "a dataset, checked and with a card, to the Hugging Face Hub",
+        "a dataset, checked, to the Hugging Face Hub",
         "push.push",
         "dataset.Push",
         ("dataset", "repo"),

@@ -11,6 +11,8 @@ from hrc_learn.demos.issue import DatasetError as DatasetError
 from hrc_learn.demos.issue import Issue as Issue
 from hrc_learn.demos.issue import UnitsWarning as UnitsWarning
 from hrc_learn.demos.issue import ValidationReport as ValidationReport
+from hrc_learn.demos.read.images import ImageReader as ImageReader
+from hrc_learn.demos.read.images import load_images as load_images
 from hrc_learn.demos.read.reader import DemonstrationSource as DemonstrationSource
 from hrc_learn.demos.read.reader import load_demos as load_demos
 from hrc_learn.demos.read.reader import open_demos as open_demos

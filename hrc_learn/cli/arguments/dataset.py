@@ -2,11 +2,11 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from tyro.conf import Positional
 
-from hrc_learn.cli._options import More
+from hrc_learn.cli._options import Detail, More
 from hrc_learn.cli.arguments import Measured, Written
 
 
@@ -90,6 +90,48 @@ class Repair(Measured):
     def folder(self) -> Path:
         """Where the copy is written."""
         return self.out or self.dataset.with_name(f"{self.dataset.name}_repaired")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Curate(Measured):
+    """Look through the episodes of a LeRobot dataset, the most doubtful first, and decide which
+    are accepted, cut or rejected.
+
+    Opens a page in the browser with videos and curves; what is decided there is kept beside the
+    dataset, in DATASET.curation.json, and the cleaned set is written to a new place. The same
+    ranking in the terminal:
+
+        hrc curate pour --no-browser
+        hrc curate pour --no-browser --reject 3 7 --cut 12 30:410 --write
+    """
+
+    dataset: Path
+    """Folder of the dataset, version 2.0, 2.1 or 3.0."""
+    out: Path | None = None
+    """Folder of the cleaned dataset; must not exist. DATASET_curated when not given."""
+    browser: bool = True
+    """Open the page in the browser."""
+    reject: tuple[int, ...] = ()
+    """Episodes that go. In the terminal."""
+    accept: tuple[int, ...] = ()
+    """Episodes that stay as they are. In the terminal."""
+    cut: dict[int, str] = field(default_factory=dict)
+    """Frames that stay of an episode, such as: 12 30:410. In the terminal."""
+    write: bool = False
+    """Write the cleaned dataset by what was decided, and serve no page."""
+    full: bool = False
+    """Every episode in the terminal, and not only the most doubtful."""
+    units: dict[str, str] = field(default_factory=dict)
+    """Units on disk by quantity, such as: joint_position deg position mm."""
+    mapping: More[dict[str, str]] = field(default_factory=dict)
+    """Columns by quantity where they are not found, such as: command_position action[0:7]."""
+    page: Any = Detail("hrc_learn.teleoperation.gate.address", "AddressConfig")
+    """Where the page is served."""
+
+    @property
+    def folder(self) -> Path:
+        """Where the cleaned dataset is written."""
+        return self.out or self.dataset.with_name(f"{self.dataset.resolve().name}_curated")
 
 
 @dataclass(frozen=True, kw_only=True)

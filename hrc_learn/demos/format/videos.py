@@ -8,7 +8,7 @@ lost with the recording; a file an episode is neither.
 import contextlib
 import io
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
@@ -125,12 +125,19 @@ def _of_own_file(folder: DatasetFolder, entry: EpisodeEntry, keys: list[str]) ->
     }
 
 
-def decode(segment: VideoSegment, fps: float) -> Iterator[tuple[int, Image]]:
+def decode(
+    segment: VideoSegment,
+    fps: float,
+    size: tuple[int, int] | None = None,
+    skip: Callable[[int], bool] | None = None,
+) -> Iterator[tuple[int, Image]]:
     """Images (RGB) with the frames of the episode they belong to, in order.
 
     Args:
         segment: Where they lie.
         fps: Frame rate of the dataset [1/s].
+        size: Height and width to scale to [px]; None: as they are.
+        skip: Of which frames no image is wanted; None: of none.
 
     Raises:
         DatasetError: The file is no video that can be decoded.
@@ -138,6 +145,7 @@ def decode(segment: VideoSegment, fps: float) -> Iterator[tuple[int, Image]]:
     import av
 
     half_period = 0.5 / fps
+    scaled: dict[str, Any] = {} if size is None else {"height": size[0], "width": size[1]}
     try:
         with av.open(str(segment.file)) as container:
             stream = container.streams.video[0]
@@ -149,8 +157,11 @@ def decode(segment: VideoSegment, fps: float) -> Iterator[tuple[int, Image]]:
                 time = float(image.time or 0.0)
                 if time > segment.stop - half_period:
                     return
-                if time > segment.start - half_period:
-                    yield round((time - segment.start) * fps), image.to_ndarray(format="rgb24")
+                if time <= segment.start - half_period:
+                    continue
+                frame = round((time - segment.start) * fps)
+                if skip is None or not skip(frame):
+                    yield frame, image.to_ndarray(format="rgb24", **scaled)
     except (av.FFmpegError, IndexError) as error:
         raise DatasetError(
             f"cannot be decoded ({error}): the recording was broken off, or the copy is "
@@ -172,18 +183,23 @@ def image_at(segment: VideoSegment, frame: int, fps: float) -> Image:
     return found[1]
 
 
-def decode_image(content: bytes) -> Image:
+def decode_image(content: bytes, size: tuple[int, int] | None = None) -> Image:
     """An image (RGB) from the bytes of its file.
+
+    Args:
+        content: Of the file.
+        size: Height and width to scale to [px]; None: as it is.
 
     Raises:
         DatasetError: They are no image.
     """
     import av
 
+    scaled: dict[str, Any] = {} if size is None else {"height": size[0], "width": size[1]}
     try:
         container = av.open(io.BytesIO(content or b""), "r")
         with container:
-            image = next(container.decode(video=0)).to_ndarray(format="rgb24")
+            image = next(container.decode(video=0)).to_ndarray(format="rgb24", **scaled)
     except (av.FFmpegError, IndexError, StopIteration) as error:
         raise DatasetError(f"holds an image that cannot be decoded ({error})") from error
     return image

@@ -85,6 +85,7 @@ def repair_dataset(
     mapping: MappingSpec | None = None,
     units: Mapping[str, str] | None = None,
     progress: Progress | None = None,
+    kept: Mapping[int, slice] | None = None,
 ) -> RepairReport:
     """Repair a dataset of version 2.0, 2.1 or 3.0 into a new one of version 3.0.
 
@@ -100,6 +101,7 @@ def repair_dataset(
         units: Units on disk by role, as in `load_demos`; kept in the new dataset.
         progress: Called with the episodes one after another, and gives them back: a hook for
             a progress bar.
+        kept: Episodes that stay, and which of their frames; None: all.
 
     Raises:
         DatasetError: An episode cannot be read or repaired, and may not be left out.
@@ -111,7 +113,7 @@ def repair_dataset(
         raise DatasetError("the dataset holds no episodes", file=folder.root)
     semantics = _resolve(folder, sidecar, mapping, units)
     segments = read_segments(folder) if options.videos else {}
-    recast = ColumnRewriter(folder, sidecar, semantics, options, units, segments)
+    recast = ColumnRewriter(folder, sidecar, semantics, options, units, segments, kept)
     report = RepairReport(path=Path(out), notes=recast.notes, dry_run=options.dry_run)
     if options.dry_run:
         for entry in progress(folder.episodes) if progress else folder.episodes:
@@ -139,9 +141,9 @@ def repair_dataset(
         assemble(paths, target, videos=videos, tasks=recast.tasks, share=False)
         _copy_notes(folder.root, target)
         if (contract := contract_of(sidecar)) is not None:
-            kept = replace(contract, fingerprint=fingerprint(open_folder(target)))
+            carried = replace(contract, fingerprint=fingerprint(open_folder(target)))
             content = read_sidecar(target)
-            content = replace(content, contract=contract_content(kept))
+            content = replace(content, contract=contract_content(carried))
             write_json(target / SIDECAR_PATH, sidecar_copy(content, content.units))
         shutil.rmtree(staging)
     return report
@@ -151,6 +153,9 @@ def _edited(
     recast: "ColumnRewriter", entry: EpisodeEntry, options: RepairOptions, report: RepairReport
 ) -> EpisodeEdit | None:
     """The episode repaired; None, and the reason in the report, where it is left out."""
+    if recast.kept is not None and entry.index not in recast.kept:
+        report.left_out[entry.index] = "not kept"
+        return None
     try:
         edit = _repair(recast, entry, options)
         recast.videos_of(edit)
@@ -222,6 +227,11 @@ def _repair(
         time=recorded_stamps(folder, frames) if time is None else time,
         kept=np.arange(entry.length),
     )
+    if recast.kept is not None:
+        part = recast.kept[entry.index]
+        wanted = np.zeros(entry.length, dtype=bool)
+        wanted[part] = True
+        edit = edit.only(wanted, f"cut to frames {part.start} to {part.stop}")
     if time is None:
         edit = renew_stamps(edit, folder.fps)
     edit = drop_bad_frames(edit, semantics, options.drop_bad_frames)
@@ -257,6 +267,7 @@ class ColumnRewriter:
         folder: The old dataset.
         semantics: What its columns mean.
         tasks: Task texts by index.
+        kept: Episodes that stay, and which of their frames; None: all.
         notes: What is changed in all episodes.
     """
 
@@ -268,7 +279,9 @@ class ColumnRewriter:
         options: RepairOptions,
         units: Mapping[str, str],
         segments: Mapping[int, Segments],
+        kept: Mapping[int, slice] | None = None,
     ):
+        self.kept = kept
         self.notes: list[str] = []
         self.folder = folder
         self.semantics = semantics

@@ -1,0 +1,421 @@
+"""Serves the page on which episodes are accepted, cut and rejected, to who has its secret."""
+
+from __future__ import annotations
+
+import json
+import logging
+import struct
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import asdict
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from itertools import pairwise
+from pathlib import Path
+from threading import Lock, Thread
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+
+from hrc_learn.demos import DatasetError, Demonstration, open_demos
+from hrc_learn.demos.curation import (
+    MEASURES,
+    Decision,
+    Ranking,
+    keep_decisions,
+    read_decisions,
+    write_curated,
+)
+from hrc_learn.demos.curation.decisions import decision
+from hrc_learn.demos.issue import plain_text
+from hrc_learn.demos.read.column_mapping import MappingSpec
+from hrc_learn.demos.read.images import ImageReader, jpeg
+from hrc_learn.teleoperation.gate.address import AddressConfig, listening_socket, tls_context
+from hrc_learn.teleoperation.gate.admission import HEADERS, Admission
+from hrc_learn.teleoperation.gate.gate import Content, static_contents
+
+_BLOCK = 32
+"""Images sent at once: a second of a video, few enough to be shown soon."""
+_TALLEST = 360
+"""Images are scaled down to this height [px]."""
+_MOST_POINTS = 2000
+"""Points of a curve; of longer ones the extremes of every stretch are sent."""
+_LONGEST_BODY = 4096
+_PATIENCE = 30
+"""Seconds that a request may take to arrive."""
+
+_logger = logging.getLogger("hrc_learn.curation")
+
+
+class RefusedError(Exception):
+    """A request that cannot be answered."""
+
+    def __init__(self, code: int, words: str):
+        super().__init__(words)
+        self.code = code
+
+
+class CurationPage:
+    """A ranking to look through in a browser; decisions are kept at once, beside the dataset.
+
+        with CurationPage(rank_episodes(path), out) as page:
+            print(page.url)
+            page.wait()
+
+    Attributes:
+        decisions: By episode, as they are now.
+        url: With the secret that lets in.
+    """
+
+    def __init__(
+        self,
+        ranking: Ranking,
+        out: Path,
+        address: AddressConfig | None = None,
+        *,
+        mapping: MappingSpec | None = None,
+        units: Mapping[str, str] | None = None,
+    ):
+        """
+        Args:
+            ranking: Of the dataset.
+            out: Where the cleaned dataset goes.
+            address: Where the page is served.
+            mapping: Where quantities are that are not found by name, as in `load_demos`.
+            units: Units on disk by role, as in `load_demos`.
+
+        Raises:
+            DatasetError: Decisions are kept beside the dataset that are not about it.
+            ValueError: It cannot be served there, or not safely.
+        """
+        config = address or AddressConfig()
+        self.ranking, self.out = ranking, out
+        self.decisions = read_decisions(ranking.path)
+        self._options: dict[str, Any] = {"mapping": mapping, "units": units}
+        self._lengths = {q.episode: q.length for q in ranking.episodes}
+        self._broken = {q.episode for q in ranking.episodes if q.broken}
+        self._images = ImageReader(ranking.path)
+        self._lock, self._writing = Lock(), ThreadPoolExecutor(1)
+        self._written: Future[str] | None = None
+        self.contents = {
+            **static_contents(Path(__file__).parent / "static"),
+            "/": Content.of("index.html", (_STATIC / "index.html").read_bytes()),
+        }
+        context = tls_context(config)
+        self._socket = listening_socket(config)
+        self.admission = Admission(
+            config, self._socket.getsockname()[1], tls=context is not None
+        )
+        handler = type("Handler", (_Handler,), {"page": self})
+        self._server = _Server(self._socket.getsockname()[:2], handler, bind_and_activate=False)
+        self._server.socket.close()
+        self._server.socket = (
+            self._socket
+            if context is None
+            else context.wrap_socket(
+                self._socket, server_side=True, do_handshake_on_connect=False
+            )
+        )
+        self._thread = Thread(target=self._server.serve_forever, args=(0.1,), daemon=True)
+
+    @property
+    def url(self) -> str:
+        return self.admission.address.link()
+
+    def __enter__(self) -> CurationPage:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._server.shutdown()
+        self._thread.join()
+        self._server.server_close()
+        self._writing.shutdown()
+
+    def wait(self) -> None:
+        """Until the page is closed by another thread, or Ctrl-C."""
+        self._thread.join()
+
+    # What is asked for.
+
+    def answer(self, path: str) -> Content:
+        """What is at a path.
+
+        Raises:
+            RefusedError: Nothing, or it cannot be read.
+        """
+        if path in self.contents:
+            return self.contents[path]
+        words = path.strip("/").split("/")
+        try:
+            match words:
+                case ["data", "overview"]:
+                    return _json(self.overview())
+                case ["data", "state"]:
+                    return _json(self.state())
+                case ["data", "curves", episode]:
+                    return _json(self.curves(int(episode)))
+                case ["data", "images", episode, camera, first]:
+                    return self.images(int(episode), int(camera), int(first))
+        except DatasetError as error:
+            raise RefusedError(422, str(error)) from error
+        except (ValueError, LookupError) as error:
+            raise RefusedError(404, "There is nothing here.") from error
+        raise RefusedError(404, "There is nothing here.")
+
+    def overview(self) -> dict[str, Any]:
+        """All that the page shows before an episode is chosen."""
+        episodes = [asdict(q) for q in self.ranking.episodes]
+        for episode in episodes:
+            cameras = self._images.available(episode["episode"])
+            episode["cameras"] = [self._images.cameras.index(key) for key in cameras]
+        # The most usual episode is shown beside every other.
+        known = [q for q in self.ranking.episodes if "distance" in q.measures and not q.broken]
+        usual = min(known, key=lambda q: q.measures["distance"], default=None)
+        return {
+            "name": plain_text(self.ranking.path.resolve().name),
+            "notes": self.ranking.notes,
+            "measures": MEASURES,
+            "cameras": [plain_text(key.rpartition(".")[2]) for key in self._images.cameras],
+            "block": _BLOCK,
+            "episodes": episodes,
+            "usual": None if usual is None else usual.episode,
+            **self.state(),
+        }
+
+    def state(self) -> dict[str, Any]:
+        """What was decided, and whether it is written."""
+        with self._lock:
+            written = {"out": str(self.out), "writing": False, "said": "", "failed": False}
+            if self._written is not None:
+                written["writing"] = not self._written.done()
+                if self._written.done():
+                    error = self._written.exception()
+                    written["failed"] = error is not None
+                    written["said"] = str(error) if error else self._written.result()
+            decided = {str(index): asdict(d) for index, d in self.decisions.items()}
+        return {"decisions": decided, "written": written}
+
+    def curves(self, episode: int) -> dict[str, Any]:
+        """All that moves in an episode, over time."""
+        (demo,) = open_demos(self.ranking.path, [episode], **self._options)
+        frames = _stretches(demo)
+        return {
+            "time": demo.time.tolist(),
+            "charts": [
+                {
+                    "name": plain_text(name),
+                    "unit": unit,
+                    "lines": [
+                        {"name": label, "points": _points(values, frames)}
+                        for label, values in lines.items()
+                    ],
+                }
+                for name, unit, lines in _charts(demo)
+            ],
+        }
+
+    def images(self, episode: int, camera: int, first: int) -> Content:
+        """A block of images: how many, the length of each in bytes, and then they."""
+        key = self._images.cameras[camera]
+        if episode not in self._lengths or not 0 <= first < self._lengths[episode]:
+            raise RefusedError(404, "There is no such image.")
+        wanted = range(first, min(first + _BLOCK, self._lengths[episode]))
+        height, width = self._size(key)
+        found = [
+            jpeg(image)
+            for _, image in self._images.stream(episode, key, wanted, (height, width))
+        ]
+        head = struct.pack(f"<{1 + len(found)}I", len(found), *map(len, found))
+        return Content(body=head + b"".join(found), kind="application/octet-stream")
+
+    def _size(self, key: str) -> tuple[int, int]:
+        """Of the images sent: even, as their format wants it."""
+        height, width = self._images.size(key)
+        scale = min(1.0, _TALLEST / height)
+        return 2 * max(1, round(scale * height / 2)), 2 * max(1, round(scale * width / 2))
+
+    # What is decided.
+
+    def act(self, path: str, said: Any) -> Content:
+        """Take a decision, or write the cleaned dataset.
+
+        Raises:
+            RefusedError: It makes no sense.
+        """
+        if path == "/decide" and isinstance(said, dict):
+            self._decide(said)
+        elif path == "/write":
+            with self._lock:
+                if self._written is not None and not self._written.done():
+                    raise RefusedError(409, "It is being written.")
+                self._written = self._writing.submit(self._write, dict(self.decisions))
+        else:
+            raise RefusedError(404, "There is nothing here.")
+        return _json(self.state())
+
+    def _decide(self, said: dict[str, Any]) -> None:
+        episode, start, stop = (said.get(name, 0) for name in ("episode", "start", "stop"))
+        if not all(isinstance(value, int) for value in (episode, start, stop)):
+            raise RefusedError(400, "Numbers are missing.")
+        if episode not in self._lengths:
+            raise RefusedError(404, "There is no such episode.")
+        with self._lock:
+            if said.get("verdict") is None:
+                self.decisions.pop(episode, None)
+            else:
+                try:
+                    made = decision(str(said["verdict"]), self._lengths[episode], start, stop)
+                except ValueError as error:
+                    raise RefusedError(400, str(error)) from error
+                self.decisions[episode] = made
+            keep_decisions(self.ranking.path, self.decisions)
+
+    def _write(self, decisions: dict[int, Decision]) -> str:
+        report = write_curated(self.ranking.path, self.out, decisions, **self._options)
+        return (
+            f"{len(report.changes)} episodes with {report.frames} of {report.frames_before} "
+            f"frames are in {self.out}"
+        )
+
+
+_STATIC = Path(__file__).parent / "static"
+
+
+def _json(content: Any) -> Content:
+    # NaN is no JSON: browsers refuse it.
+    text = json.dumps(_finite(content), allow_nan=False)
+    return Content(body=text.encode(), kind="application/json")
+
+
+def _finite(content: Any) -> Any:
+    if isinstance(content, float):
+        return content if np.isfinite(content) else None
+    if isinstance(content, dict):
+        return {key: _finite(value) for key, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [_finite(value) for value in content]
+    return content
+
+
+_JOINT_LINES = {
+    "joint_position": ("state", "rad"),
+    "command_position": ("command", "rad"),
+}
+_OTHER_CHARTS = {"position": ("xyz", "m"), "feature": ("uv", "px")}
+
+
+def _charts(demo: Demonstration) -> list[tuple[str, str, dict[str, np.ndarray]]]:
+    """Name, unit and lines of each chart."""
+    charts = []
+    for number, joint in enumerate(demo.joint_names):
+        lines = {
+            label: getattr(demo, name)[:, number]
+            for name, (label, _) in _JOINT_LINES.items()
+            if getattr(demo, name) is not None
+        }
+        if lines:
+            charts.append((joint, "rad", lines))
+    for name, (letters, unit) in _OTHER_CHARTS.items():
+        values = getattr(demo, name)
+        if values is not None:
+            lines = {letter: values[:, i] for i, letter in enumerate(letters)}
+            charts.append((name, unit, lines))
+    if demo.gripper is not None:
+        charts.append(("gripper", "", {"state": demo.gripper}))
+    for key, values in demo.extra.items():
+        if 0 < values.shape[1] <= 12:
+            lines = {f"{i}": values[:, i] for i in range(values.shape[1])}
+            charts.append((key, "", lines))
+    return charts
+
+
+def _stretches(demo: Demonstration) -> np.ndarray | None:
+    """Where long curves are parted; None: every frame is shown."""
+    if len(demo) <= _MOST_POINTS:
+        return None
+    return np.linspace(0, len(demo), _MOST_POINTS // 2 + 1).astype(int)
+
+
+def _points(values: np.ndarray, edges: np.ndarray | None) -> tuple[list[int], list[float]]:
+    """Frames and values of a curve: its extremes within every stretch, so that none is lost."""
+    if edges is None:
+        return list(range(len(values))), values.tolist()
+    chosen: list[int] = []
+    for first, last in pairwise(edges.tolist()):
+        part = values[first:last]
+        chosen += sorted({first + int(part.argmin()), first + int(part.argmax())})
+    return chosen, values[chosen].tolist()
+
+
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+    request_queue_size = 32
+
+    def handle_error(self, request: object, client_address: object) -> None:
+        """Whoever went away, or spoke no HTTP, need not be told of."""
+        _logger.debug("a request failed", exc_info=True)
+
+
+class _Handler(BaseHTTPRequestHandler):
+    page: CurationPage
+    protocol_version = "HTTP/1.1"
+    server_version, sys_version = "hrc", ""
+    timeout = _PATIENCE
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Requests are no news."""
+
+    def do_GET(self) -> None:
+        self._reply(lambda: self.page.answer(urlsplit(self.path).path))
+
+    def do_POST(self) -> None:
+        self._reply(self._act)
+
+    def _act(self) -> Content:
+        if not self.page.admission.from_ours(self.headers.get("Origin", "")):
+            raise RefusedError(403, "Another site may not decide.")
+        try:
+            length = int(self.headers.get("Content-Length", ""))
+        except ValueError:
+            raise RefusedError(411, "Its length is missing.") from None
+        if not 0 <= length <= _LONGEST_BODY:
+            self.close_connection = True
+            raise RefusedError(413, "That is too long.")
+        try:
+            said = json.loads(self.rfile.read(length) or b"{}")
+        except (ValueError, RecursionError):
+            raise RefusedError(400, "That is no JSON.") from None
+        return self.page.act(urlsplit(self.path).path, said)
+
+    def _reply(self, answer: Callable[[], Content]) -> None:
+        refusal = self.page.admission.refuse(
+            self.path,
+            self.headers.get("Host", ""),
+            self.headers.get_all("Cookie", []),
+            self.page.contents.__contains__,
+        )
+        if refusal is not None:
+            self.close_connection = True
+            self._send(refusal.code, refusal.words.encode(), _PLAIN, refusal.headers)
+            return
+        try:
+            content = answer()
+        except RefusedError as error:
+            self._send(error.code, str(error).encode(), _PLAIN, {})
+        except Exception as error:  # a fault of ours: the page shows it and goes on
+            _logger.exception("%s failed", self.path)
+            self._send(500, f"{type(error).__name__}: {error}".encode(), _PLAIN, {})
+        else:
+            self._send(200, content.body, content.kind, {})
+
+    def _send(self, code: int, body: bytes, kind: str, more: Mapping[str, str]) -> None:
+        self.send_response(code)
+        headers = {**HEADERS, "Content-Type": kind, "Content-Length": str(len(body)), **more}
+        for name, value in headers.items():
+            self.send_header(name, value)
+        self.end_headers()
+        self.wfile.write(body)
+
+
+_PLAIN = "text/plain; charset=utf-8"

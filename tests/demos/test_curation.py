@@ -1,0 +1,209 @@
+"""What speaks against an episode, what is decided, and the cleaned copy."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from clean_sets import CAMERA, FPS, demonstration, write_set
+from lerobot_folders import write_folder
+
+from hrc_learn.demos import DatasetError, check_dataset, load_demos
+from hrc_learn.demos.curation import (
+    Decision,
+    keep_decisions,
+    rank_episodes,
+    read_decisions,
+    write_curated,
+)
+from hrc_learn.demos.curation.decisions import decision, decisions_path
+from hrc_learn.demos.curation.ranking import density_clusters, log_dimensionless_jerk
+from hrc_learn.demos.read.images import load_images
+
+NAMES = [*(f"joint{i}.pos" for i in range(1, 7)), "gripper.pos"]
+
+
+def odd_set(root: Path) -> Path:
+    """Fourteen demonstrations of which six are odd, each in its own way."""
+    rng = np.random.default_rng(0)
+    made = [demonstration(seed) for seed in range(14)]
+    made[3] = {key: values.copy() for key, values in made[1].items()}
+    waits = {key: np.repeat(values[:1], 90, axis=0) for key, values in made[5].items()}
+    waits["observation.state"][:, :6] += 2e-4 * rng.standard_normal((90, 6))
+    made[5] = {key: np.concatenate([waits[key], made[5][key]]) for key in made[5]}
+    shaken = made[7]["observation.state"]
+    shaken[:, :6] += 0.01 * rng.standard_normal((len(shaken), 6))
+    state = made[9]["observation.state"]
+    state[:, [1, 2]] = state[:, [2, 1]]
+    action = made[11]["action"]
+    made[11]["action"] = np.concatenate([np.repeat(action[:1], 20, axis=0), action[:-20]])
+    bend = 0.8 * np.sin(np.linspace(0, 3, len(made[2]["action"])))[:, None]
+    for values in made[2].values():
+        values[:, :6] += bend
+    return write_folder(root, made, dict.fromkeys(made[0], NAMES), fps=FPS)
+
+
+@pytest.fixture(scope="module")
+def odd(tmp_path_factory):
+    return odd_set(tmp_path_factory.mktemp("curation") / "odd")
+
+
+@pytest.fixture(scope="module")
+def ranking(odd):
+    return rank_episodes(odd)
+
+
+def test_every_odd_episode_comes_before_every_sound_one(ranking):
+    assert {q.episode for q in ranking.episodes[:6]} == {2, 3, 5, 7, 9, 11}
+    assert all(q.score == 0 and not q.reasons for q in ranking.episodes[6:])
+
+
+@pytest.mark.parametrize(
+    ("episode", "reason"),
+    [
+        (2, "unlike all others"),
+        (3, "nearly repeats episode 1"),
+        (5, "standing still"),
+        (7, "jerkily"),
+        (9, "exchanged"),
+        (11, "shifted against states"),
+    ],
+)
+def test_the_reason_is_the_one_that_was_made(ranking, episode, reason):
+    (quality,) = (q for q in ranking.episodes if q.episode == episode)
+    assert any(reason in said for said in quality.reasons)
+
+
+def test_the_motion_of_a_late_beginner_is_found(ranking):
+    (late,) = (q for q in ranking.episodes if q.episode == 5)
+    assert 80 <= late.start <= 95
+    assert late.stop == late.length
+    assert late.measures["idle"] == pytest.approx(90 / late.length, abs=0.05)
+
+
+def test_the_odd_are_of_no_group_and_the_sound_of_one(ranking):
+    groups = ranking.clusters
+    assert {2, 5, 9} <= {*groups[-1]}
+    assert {0, 4, 6, 8, 10, 12, 13} <= {*groups[0]}
+
+
+def test_two_ways_to_do_it_are_two_groups_and_no_outliers(tmp_path):
+    made = [demonstration(seed) for seed in range(16)]
+    for episode in made[::2]:
+        for values in episode.values():
+            values[:, 0] *= -1
+    write_folder(tmp_path / "two", made, dict.fromkeys(made[0], NAMES), fps=FPS)
+    ranking = rank_episodes(tmp_path / "two")
+    groups = [*map(set, (v for k, v in ranking.clusters.items() if k >= 0))]
+    assert sorted(map(min, groups)) == [0, 1]
+    assert all(len({i % 2 for i in group}) == 1 for group in groups)
+    assert not any("unlike" in said for q in ranking.episodes for said in q.reasons)
+
+
+def test_what_all_episodes_share_speaks_against_none(tmp_path):
+    root = write_set(tmp_path / "set", "v2.1")
+    for file in (root / "data").rglob("*.parquet"):
+        table = pq.read_table(file)
+        place = table.column_names.index("timestamp")
+        column = np.asarray(table.column("timestamp")) + np.float32(0.05)
+        pq.write_table(table.set_column(place, "timestamp", [column]), file)
+    assert any("begins at" in str(w) for w in check_dataset(root).warnings)
+    assert all(not q.reasons for q in rank_episodes(root).episodes)
+
+
+def test_an_episode_that_cannot_be_read_comes_first_and_hides_no_other(tmp_path):
+    root = write_set(tmp_path / "set", "v2.1")
+    file = root / "data/chunk-000/episode_000002.parquet"
+    file.write_bytes(file.read_bytes()[:200])
+    first, *rest = rank_episodes(root).episodes
+    assert first.episode == 2
+    assert first.broken
+    assert all(q.measures for q in rest)
+
+
+def test_the_table_shows_the_worst_and_counts_the_rest(ranking):
+    lines = [*ranking.lines(most=3)]
+    assert lines[0].split()[:3] == ["episode", "doubt", "group"]
+    assert lines[1].split()[0] == str(ranking.episodes[0].episode)
+    assert "and 11 episodes less doubtful" in lines[4]
+
+
+def test_jerk_knows_neither_units_nor_pace():
+    s = np.linspace(0, 1, 400)
+    # Minimum jerk: the integral of the squared jerk is 720, its path as long as it is wide.
+    path = (10 * s**3 - 15 * s**4 + 6 * s**5)[:, None]
+    exact = np.log(720.0)
+    assert log_dimensionless_jerk(s, path) == pytest.approx(exact, abs=0.05)
+    assert log_dimensionless_jerk(3 * s, 57.3 * path) == pytest.approx(exact, abs=0.05)
+    assert np.isnan(log_dimensionless_jerk(s, np.zeros((400, 2))))
+
+
+def test_density_clusters_are_those_of_the_definition():
+    rng = np.random.default_rng(1)
+    points = np.concatenate(
+        [rng.normal(0, 0.1, (30, 2)), rng.normal(3, 0.1, (12, 2)), [[1.5, 1.5]]]
+    )
+    labels = density_clusters(points, 0.3, 3)
+    near = np.linalg.norm(points[:, None] - points, axis=-1) <= 0.3
+    core = near.sum(1) - 1 >= 3
+    for i, label in enumerate(labels):
+        of_cores = {int(labels[j]) for j in np.flatnonzero(near[i] & core)}
+        assert (label in of_cores) if of_cores else label == -1
+        assert not core[i] or of_cores == {label}
+    assert (labels[:30] == 0).sum() > 25
+    assert labels[-1] == -1
+
+
+# What is decided.
+
+
+def test_decisions_are_kept_beside_the_dataset(odd, tmp_path):
+    root = shutil.copytree(odd, tmp_path / "set")
+    before = sorted(root.rglob("*"))
+    decided = {3: Decision(verdict="reject"), 5: Decision(verdict="cut", start=85, stop=200)}
+    keep_decisions(root, decided)
+    assert read_decisions(root) == decided
+    assert sorted(root.rglob("*")) == before
+    content = json.loads(decisions_path(root).read_text())
+    content["decisions"]["3"]["length"] += 1
+    decisions_path(root).write_text(json.dumps(content))
+    with pytest.raises(DatasetError, match="of another dataset"):
+        read_decisions(root)
+    decisions_path(root).write_text("[1]")
+    with pytest.raises(DatasetError, match="holds no decisions"):
+        read_decisions(root)
+
+
+@pytest.mark.parametrize("cut", [(-1, 10), (5, 6), (5, 5), (9, 3), (0, 101)])
+def test_cuts_that_leave_nothing_or_do_not_exist_are_refused(cut):
+    with pytest.raises(ValueError, match="no part"):
+        decision("cut", 100, *cut)
+    assert decision("cut", 100, 98, 100).stop == 100
+
+
+@pytest.mark.parametrize("version", ["v3.0", "v2.1"])
+def test_the_cleaned_set_is_what_was_decided_and_the_source_as_it_was(tmp_path, version):
+    root = write_set(tmp_path / "set", version, camera=True)
+    before = {path: path.read_bytes() for path in root.rglob("*") if path.is_file()}
+    decided = {1: Decision(verdict="reject"), 2: Decision(verdict="cut", start=20, stop=90)}
+    report = write_curated(root, tmp_path / "out", decided)
+    old, new = load_demos(root), load_demos(tmp_path / "out")
+    assert [*report.changes] == [0, 2, 3, 4]
+    np.testing.assert_array_equal(new[0].joint_position, old[0].joint_position)
+    np.testing.assert_array_equal(new[1].joint_position, old[2].joint_position[20:90])
+    np.testing.assert_array_equal(new[1].command_position, old[2].command_position[20:90])
+    shown = load_images(tmp_path / "out", 1)[CAMERA]
+    assert (shown == load_images(root, 2, frames=range(20, 90))[CAMERA]).all()
+    assert not check_dataset(tmp_path / "out").errors
+    assert {path: path.read_bytes() for path in before} == before
+
+
+def test_all_rejected_and_unknown_episodes_are_refused(odd, tmp_path):
+    everything = dict.fromkeys(range(14), Decision(verdict="reject"))
+    with pytest.raises(DatasetError, match="every episode"):
+        write_curated(odd, tmp_path / "out", everything)
+    with pytest.raises(DatasetError, match="no such episode"):
+        write_curated(odd, tmp_path / "out", {14: Decision(verdict="reject")})
+    assert not (tmp_path / "out").exists()
