@@ -39,8 +39,8 @@ class _Source:
     tool: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
     """Tool in the frame of the tip: origin [m] and the direction of approach, its z axis."""
     limits: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    """What the file does not tell. Velocities are those that makers publish, written down from
-    memory: compare them with the data sheet before a real arm is led by them."""
+    """What the file does not tell. Velocities are those of the descriptions for ROS that are
+    named beside them: compare them with the data sheet before a real arm is led by them."""
 
 
 def _degrees(*speeds: int | float, names: str, first: int = 1) -> dict[str, dict[str, float]]:
@@ -85,7 +85,8 @@ _SOURCES = {
         base="base",
         tip="right_hand",
         ready=(0.0, -_H, _H, -_H, -_H, 0.0),
-        # UR5e: 180 degrees a second each.
+        # ros-industrial/universal_robot, ur_description/config/ur5e/joint_limits.yaml, which
+        # has them from the UR5e's user manual 5.8: 180 degrees a second each.
         limits={"default": {"velocity": math.pi}},
     ),
     # The dimensions are those of the R800, not of the larger iiwa 14.
@@ -96,6 +97,7 @@ _SOURCES = {
         base="base",
         tip="right_hand",
         ready=(0.0, 0.65, 0.0, -1.89, 0.0, 0.6, 0.0),
+        # lbr-stack/lbr_fri_ros2_stack, lbr_description/urdf/iiwa7/joint_limits.yaml.
         limits=_degrees(98, 98, 100, 130, 140, 180, 180, names="joint_{}"),
     ),
     "gen3": _Source(
@@ -105,7 +107,8 @@ _SOURCES = {
         base="base",
         tip="right_hand",
         ready=(0.0, 0.65, 0.0, 1.89, 0.0, 0.6, -_H),
-        # Large actuators 1.39 rad/s, small ones 1.22 rad/s.
+        # Kinovarobotics/ros_kortex, gen3/7dof/urdf/gen3_macro.xacro: large actuators 1.3963,
+        # small ones 1.2218 rad/s; rounded down.
         limits=_degrees(*(79.64,) * 4, *(69.91,) * 3, names="Actuator{}"),
     ),
     "jaco": _Source(
@@ -115,7 +118,8 @@ _SOURCES = {
         base="base",
         tip="right_hand",
         ready=(3.192, 3.68, 0.0, 1.17, 0.05, 3.76, 3.142),
-        # 36 degrees a second, the wrist's joints 48.
+        # As example-robot-data's kinova.urdf has them of the j2s6s200, whose actuators these
+        # are: 36 degrees a second, the wrist's joints 48.
         limits=_degrees(36, 36, 36, 36, 48, 48, 48, names="j2s7s300_joint_{}"),
     ),
     "sawyer": _Source(
@@ -125,6 +129,8 @@ _SOURCES = {
         base="base",
         tip="right_hand",
         ready=(0.0, -1.18, 0.0, 2.18, 0.0, 0.57, 3.3161),
+        # RethinkRobotics/sawyer_robot, sawyer_description/urdf/sawyer_base.urdf.xacro: 1.74,
+        # 1.328, 1.957 twice, 3.485 twice and 4.545 rad/s.
         limits=_degrees(
             99.7, 76.1, 112.1, 112.1, 199.7, 199.7, 260.4, names="right_j{}", first=0
         ),
@@ -155,7 +161,7 @@ _SOURCES = {
         ready=(0.0, -0.4, 0.6, 0.0, 1.3, 0.0),
         # Between the fingertips: where gym-aloha's own calibration sites are.
         tool=((0.15, 0.0, 0.0), (1.0, 0.0, 0.0)),
-        # Pi rad/s each.
+        # Interbotix/interbotix_ros_manipulators, vx300s.urdf.xacro: pi rad/s each.
         limits={"default": {"velocity": math.pi}},
     ),
     "so101": _Source(
