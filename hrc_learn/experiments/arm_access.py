@@ -14,7 +14,7 @@ from functools import partial
 from typing import Any, Literal
 
 from hrc_learn.hardware import FrankaArm, FrankaConfig, FrankyArm, FrankyConfig
-from hrc_learn.kinematics import panda
+from hrc_learn.kinematics import PANDA, FrankaWorkArm, SerialChain, WorkArm, panda
 from hrc_learn.protocols import OpenedArm
 from hrc_learn.sim import Imperfections, World
 from hrc_learn.sim.protocol_server import ServedArm, serve_world
@@ -61,15 +61,16 @@ def through_franky(config: FrankyConfig | None = None) -> ArmAccess:
     )
 
 
-def through_franka(config: FrankaConfig | None = None) -> ArmAccess:
+def through_franka(config: FrankaConfig | None = None, chain: SerialChain = panda) -> ArmAccess:
     """Over the network protocol, by our loop at 1 kHz.
 
     Args:
         config: How the arm is driven; None: as for `through_franky`.
+        chain: The arm.
     """
     config = config or FrankaConfig(realtime=False)
     return through_protocol(
-        partial(FrankaArm, chain=panda, config=config),
+        partial(FrankaArm, chain=chain, config=config),
         delay=FRANKY_DELAY,
         dynamics=config.acceleration,
     )
@@ -79,14 +80,24 @@ ArmDriver = Literal["sim", "franky", "franka"]
 """What leads an arm: the simulator itself, or a driver of the real one."""
 
 
-def access_by(driver: ArmDriver) -> ArmAccess:
+def access_by(driver: ArmDriver, robot: WorkArm = PANDA) -> ArmAccess:
     """How a driver leads the arm of a world.
 
     Args:
         driver: Its name.
+        robot: The arm.
+
+    Raises:
+        ValueError: The driver is of other arms.
     """
-    accesses = {"sim": lambda: SIMULATED, "franky": through_franky, "franka": through_franka}
-    return accesses[driver]()
+    if driver == "sim":
+        return SIMULATED
+    if not isinstance(robot, FrankaWorkArm):
+        raise ValueError(
+            f"--arm {driver} drives Franka's arms, not the {robot.name}: leave it out, and the "
+            "simulated arm is led without a driver."
+        )
+    return through_franky() if driver == "franky" else through_franka(chain=robot.chain)
 
 
 def through_protocol(

@@ -13,7 +13,6 @@ from jaxtyping import Float
 from hrc_learn.controller import INTERVENTIONS
 from hrc_learn.deploy import Rate
 from hrc_learn.geometry import Box
-from hrc_learn.kinematics import panda
 from hrc_learn.protocols import DrawnRegion, Human, OpenedArm, Request
 from hrc_learn.sim import MovingBodies, World
 from hrc_learn.sim.workplace import Workplace
@@ -365,6 +364,7 @@ def task_page(
     bodies = MovingBodies(world)
     drawn = bodies.drawn(*(poses[None] for poses in bodies.poses()))
     boxes = world.config.boxes()
-    with Page(panda, drawn, boxes, config, guides=False, draws=True) as page:
+    chain = world.arm.robot.chain
+    with Page(chain, drawn, boxes, config, guides=False, draws=True) as page:
         on_open(page.url)
         yield TaskPage(world, page, dt, title)

@@ -7,8 +7,11 @@ import sys
 from pathlib import Path
 
 import pytest
+from bare_arm import bare
 from commands import hrc
 from unchecked import shapes_unchecked
+
+from hrc_learn.kinematics import to_urdf
 
 
 @pytest.fixture(autouse=True)
@@ -38,6 +41,24 @@ def test_it_reports_latencies_and_interventions(tmp_path):
     assert outcome.status == 0, outcome.error
     check(json.loads((tmp_path / "j").read_text()), steps=100)
     assert "step_p99_us" in outcome.output
+
+
+def test_it_leads_an_arm_of_another_description(tmp_path):
+    six = bare().chain
+    file = tmp_path / "cut.urdf"
+    file.write_text(to_urdf(six, "cut"), encoding="utf-8")
+    options = ("--tip", "flange", "--step", "eager", "--rate", "100", "--duration", "1")
+    outcome = hrc("serve", "--robot", file, *options, "--json", tmp_path / "j")
+    assert outcome.status == 0, outcome.error
+    check(json.loads((tmp_path / "j").read_text()), steps=100)
+
+
+def test_a_driver_of_another_arm_is_bad_input(tmp_path):
+    file = tmp_path / "cut.urdf"
+    file.write_text(to_urdf(bare().chain, "cut"), encoding="utf-8")
+    outcome = hrc("serve", "--robot", file, "--tip", "flange", "--arm", "franky", "--ip", "sim")
+    assert outcome.status == 2
+    assert "--arm franky drives Franka's arms, not the cut" in outcome.error
 
 
 @pytest.mark.parametrize(

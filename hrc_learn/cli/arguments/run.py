@@ -305,7 +305,7 @@ class SweepWorker(Imperfect, Written):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Serve(Led, Measured):
+class Serve(OfRobot, Led, Measured):
     """Run the controller at a fixed rate on an arm, and report how fast it answers.
 
     The arm servoes on a marker that an uncalibrated camera sees at 31 Hz, both calculated from
@@ -327,7 +327,7 @@ class Serve(Led, Measured):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ServePage(Led, Measured):
+class ServePage(OfRobot, Led, Measured):
     """Lead the arm in a browser, and record demonstrations of your own.
 
     Open the address that is printed. Drag a link or a knob of the arm, or of its virtual twin,

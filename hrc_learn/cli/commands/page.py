@@ -21,7 +21,7 @@ from hrc_learn.deploy import Rate
 from hrc_learn.experiments.arm_access import access_by
 from hrc_learn.experiments.on_arm import ArmSite, opened_site
 from hrc_learn.hardware import ending_at_rest
-from hrc_learn.kinematics import panda
+from hrc_learn.kinematics import ArmChoice, SerialChain
 from hrc_learn.protocols import Human, OpenedArm
 from hrc_learn.sim import MovingBodies, World
 from hrc_learn.sim.workplace import Workplace
@@ -46,14 +46,15 @@ def page(args: ServePage) -> None:
         args = replace(args, page=replace(args.page, port=args.port))
     torch.set_num_threads(1)
     sys.setswitchinterval(SWITCH_INTERVAL)
-    workplace, console = Workplace(), Console()
+    robot, console = ArmChoice(args.robot, args.base, args.tip).work_arm(), Console()
+    workplace = Workplace.of(robot)
     writer = DatasetWriter(
         args.out,
         fps=args.session.fps,
-        robot_type="panda",
-        joint_names=panda.joint_names,
+        robot_type=robot.name,
+        joint_names=robot.chain.joint_names,
         features=FEATURES,
-        frames={"base": "panda_link0", "ee": "panda_hand_tcp"},
+        frames={"base": f"{robot.name}_link0", "ee": f"{robot.name}_hand_tcp"},
         details={"taught by": "a person at the page", "recorded with": configuration(args)},
     )
     recorder = DemonstrationRecorder(writer, lambda: page.task)
@@ -64,14 +65,14 @@ def page(args: ServePage) -> None:
             bodies = MovingBodies(world)
             drawn = bodies.drawn(*(poses[None] for poses in bodies.poses()))
             config = replace(args.session, guiding=replace(args.session.guiding, safety=safety))
-            with Page(panda, drawn, stands, args.page, task=args.task) as page:
+            with Page(robot.chain, drawn, stands, args.page, task=args.task) as page:
                 session = PageSession(
                     workplace,
                     page,
                     recorder,
                     world,
                     opened=opened,
-                    beside=_beside(args.beside),
+                    beside=_beside(args.beside, robot.chain),
                     config=config,
                 )
                 _announce(console, page)
@@ -99,7 +100,7 @@ def _opened(
     if args.arm == "sim":
         yield world, None, safety
         return
-    access = access_by(args.arm)
+    access = access_by(args.arm, workplace.robot)
     world.hold(workplace.scene.objects[0].name, workplace.home_joints().numpy())
     with access.open(world) as opened:
         told = replace(safety, delay=safety.delay + access.delay, braking=access.dynamics)
@@ -114,10 +115,10 @@ def _announce(console: Console, page: Page) -> None:
         console.print(qr_code(page.url))
 
 
-def _beside(device: str) -> tuple[Human, ...]:
+def _beside(device: str, chain: SerialChain) -> tuple[Human, ...]:
     if device == "gamepad":
-        return (Gamepad.open(panda),)
-    return (TerminalKeyboard.open(panda),) if device == "keyboard" else ()
+        return (Gamepad.open(chain),)
+    return (TerminalKeyboard.open(chain),) if device == "keyboard" else ()
 
 
 def _serve(

@@ -10,7 +10,7 @@ from hrc_learn.cli._options import resolved
 from hrc_learn.cli._run import configuration, leads_real_arm, write_values
 from hrc_learn.cli.arguments.record import RecordExpert, RecordPlacing, RecordServoing
 from hrc_learn.experiments.arm_access import access_by
-from hrc_learn.kinematics import ArmChoice
+from hrc_learn.kinematics import ArmChoice, WorkArm
 from hrc_learn.sim import PhysicsError, World, open_camera
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.failures import TaskFailedError
@@ -35,8 +35,8 @@ def record_placing(args: RecordPlacing) -> int:
     args = resolved(args)
     if args.episodes < 1:
         raise ValueError(f"--episodes must be at least 1, but is {args.episodes}.")
-    open_arm = _opening(args)
     robot = ArmChoice(args.robot, args.base, args.tip).work_arm()
+    open_arm = _opening(args, robot)
     workplace = Workplace.of(robot)
     goal = workplace.shelf(args.shelf).position.numpy()
     world = World(workplace.scene)
@@ -84,8 +84,8 @@ def record_servoing(args: RecordServoing) -> None:
     args = resolved(args)
     if args.episodes < 1:
         raise ValueError(f"--episodes must be at least 1, but is {args.episodes}.")
-    open_arm = _opening(args)
     robot = ArmChoice(args.robot, args.base, args.tip).work_arm()
+    open_arm = _opening(args, robot)
     workplace = Workplace.of(robot)
     world = World(workplace.scene)
     rng = np.random.default_rng(args.seed)
@@ -114,18 +114,18 @@ def record_servoing(args: RecordServoing) -> None:
     write_values(args.json, {"episodes": args.episodes, "marker_seen_min": min(seen)})
 
 
-def _opening(args: RecordPlacing | RecordServoing) -> OpenArm:
+def _opening(args: RecordPlacing | RecordServoing, robot: WorkArm) -> OpenArm:
     """How the scripted expert's arm is led.
 
     Raises:
-        ValueError: It is a real one.
+        ValueError: It is a real one, or not the driver's.
     """
     if leads_real_arm(args):
         raise ValueError(
             f"--ip {args.ip}: a scripted expert demonstrates in simulation only. Lead the real "
             f"arm yourself: hrc page --arm {args.arm} --ip {args.ip}."
         )
-    return access_by(args.arm).open
+    return access_by(args.arm, robot).open
 
 
 def record_expert(args: RecordExpert) -> int:

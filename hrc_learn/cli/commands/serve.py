@@ -33,7 +33,7 @@ from hrc_learn.experiments.on_arm import ArmSite, opened_arm
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.hardware import ending_at_rest
 from hrc_learn.jacobian import KalmanEstimator, RBFImageJacobian, paper_grid
-from hrc_learn.kinematics import panda
+from hrc_learn.kinematics import ArmChoice, SerialChain, WorkArm
 from hrc_learn.protocols import Arm, OpenedArm
 from hrc_learn.sim import SceneConfig, World
 from hrc_learn.sim.closed_loop import PinholeCamera
@@ -64,9 +64,9 @@ def serve(args: Serve) -> None:
         raise ValueError(f"rate must be at least {slowest:g}, as the safety filter asks")
     torch.set_num_threads(1)
     dt = 1 / args.rate
-    camera = _camera()
-    led = _led(args, dt)
-    controller, observation = _controller(camera, dt, led.safety)
+    camera, robot = _camera(), ArmChoice(args.robot, args.base, args.tip).work_arm()
+    led = _led(args, dt, robot)
+    controller, observation = _controller(robot.chain, camera, dt, led.safety)
     began = time.perf_counter()
     if args.step == "eager":
         runner = EagerRunner(controller, observation)
@@ -74,7 +74,8 @@ def serve(args: Serve) -> None:
         runner = open_step(controller, observation, args.packages)
     opened = time.perf_counter() - began
     with led.opened() as arm:
-        latencies, error = _serve(runner, arm, camera, dt, round(args.duration * args.rate))
+        steps = round(args.duration * args.rate)
+        latencies, error = _serve(runner, arm, robot.chain, camera, dt, steps)
     figures = {"open_s": opened} | _figures(latencies) | {"pixel_error": error}
     counts = runner.state("safety.counts")
     figures |= {f"safety_{k}": int(n) for k, n in zip(INTERVENTIONS, counts, strict=True)}
@@ -109,7 +110,7 @@ def _camera() -> PinholeCamera:
 
 
 def _controller(
-    camera: PinholeCamera, dt: float, safety: SafetyConfig
+    chain: SerialChain, camera: PinholeCamera, dt: float, safety: SafetyConfig
 ) -> tuple[AdaptiveController, Observation]:
     """The controller, and an observation with all that the loop will tell it."""
     centre = torch.tensor(CENTRE, dtype=torch.float64)
@@ -118,12 +119,12 @@ def _controller(
     J = torch.tensor(INITIAL_IMAGE_JACOBIAN, dtype=torch.float64)
     network = RBFImageJacobian.from_jacobian(J, paper_grid(), 0.1)
     controller = AdaptiveController(
-        panda,
+        chain,
         KalmanEstimator(network),
         Goals.at(centre, down, target),
         config=ControllerConfig(safety=safety),
     )
-    q = panda.ready
+    q = chain.ready
     observation = Observation(
         joint_position=q,
         feature=target,
@@ -147,7 +148,7 @@ class _LedArm:
     """What the safety filter is told of it."""
 
 
-def _led(args: Serve, dt: float) -> _LedArm:
+def _led(args: Serve, dt: float, robot: WorkArm) -> _LedArm:
     """A real arm, or a simulated one that is ready."""
     if leads_real_arm(args):
         site: ArmSite = replace(resolved(args).site, driver=args.arm, ip=args.ip)
@@ -158,15 +159,21 @@ def _led(args: Serve, dt: float) -> _LedArm:
                 yield OpenedArm(arm=arm, gripper=arm, advance=lambda _time: None)
 
         return _LedArm(opened=open_arm, safety=site.cell_config().safety)
-    world = World(SceneConfig(timestep=dt))
-    world.reset(panda.ready.numpy())
-    access = access_by(args.arm)
+    scene = SceneConfig(timestep=dt)
+    world = World(replace(scene, arm=replace(scene.arm, robot=robot)))
+    world.reset(robot.chain.ready.numpy())
+    access = access_by(args.arm, robot)
     safety = SafetyConfig(delay=access.delay, braking=access.dynamics)
     return _LedArm(opened=partial(access.open, world), safety=safety)
 
 
 def _serve(
-    runner: StepRunner, opened: OpenedArm, camera: PinholeCamera, dt: float, steps: int
+    runner: StepRunner,
+    opened: OpenedArm,
+    chain: SerialChain,
+    camera: PinholeCamera,
+    dt: float,
+    steps: int,
 ) -> tuple[Latencies, float]:
     """Run the loop; returns latencies and the last pixel error [px]."""
     arm = opened.arm
@@ -177,7 +184,7 @@ def _serve(
     runner.step()  # the first one is slower than any other
     runner.start(arm.read().joint_position)
     rate = Rate(dt)
-    with ending_at_rest(lambda: arm.command(np.zeros(7))):
+    with ending_at_rest(lambda: arm.command(np.zeros(len(chain.joint_names)))):
         for k in range(steps):
             began = time.perf_counter()
             _answer(runner, arm)
@@ -185,7 +192,7 @@ def _serve(
             opened.advance(dt)
             runner.observation["feature_new"][...] = k % frame_steps == 0
             if k % frame_steps == 0:
-                _look(runner.observation, camera, arm)
+                _look(runner.observation, chain, camera, arm)
             late[k] = rate.wait()
     error = float(np.linalg.norm(runner.observation["feature"] - target))
     return Latencies(step=took, late=late, missed=rate.missed), error
@@ -197,10 +204,12 @@ def _answer(runner: StepRunner, arm: Arm) -> None:
     arm.command(runner.step())
 
 
-def _look(arrays: dict[str, np.ndarray], camera: PinholeCamera, arm: Arm) -> None:
+def _look(
+    arrays: dict[str, np.ndarray], chain: SerialChain, camera: PinholeCamera, arm: Arm
+) -> None:
     """Image of the marker, with the joints when it was taken."""
     q = arm.read().joint_position
-    feature, visible = camera.project(panda.forward(torch.from_numpy(q)))
+    feature, visible = camera.project(chain.forward(torch.from_numpy(q)))
     arrays["feature"][:] = feature.numpy()
     arrays["feature_visible"][...] = bool(visible)
     arrays["image_joint_position"][:] = q
