@@ -71,6 +71,19 @@ class DMPContract:
         outputs = self.outputs(dmp.rollout())
         assert self.distance(outputs, self.demonstrate(0)) < self.reproduction
 
+    def test_reversed_goes_the_same_way_back(self, dmp):
+        back = dmp.reversed()
+        time, *columns = self.demonstrate(0)
+        flipped = time, *(column.flip(0) for column in columns)
+        assert self.distance(self.outputs(back.rollout()), flipped) < 3 * self.reproduction
+        again = self.outputs(back.reversed().rollout())
+        assert self.distance(again, self.demonstrate(0)) < 5 * self.reproduction
+        batch = self.fit(*self.batch(2)).reversed()
+        alone = self.fit(*self.demonstrate(1)).reversed()
+        together = self.outputs(batch.rollout(**self.arguments(*self.ends(7))))
+        alone = self.outputs(alone.rollout(**self.arguments(*self.ends(7))))
+        self.assert_same(together, alone, atol=1e-6, index=1)
+
     def test_a_batch_is_a_loop(self):
         dmp = self.fit(*self.batch(3))
         arguments = self.arguments(*self.ends(7))

@@ -54,6 +54,8 @@ class FitOptions(TypedDict, total=False):
 DEFAULT_COUNT = 50
 """Basis functions, unless said: what is no noise in recordings of arms they follow to 5e-5 of
 the range, and fewer would not make a motion without noise smoother."""
+REGULARIZATION = 1e-7
+"""Of a fit, unless said: far above rounding, far below what a sensor can tell."""
 METHODS = ("trajectory", "ridge", "lwr")
 type Fit = tuple[Float[Tensor, "*batch D N"], Float[Tensor, "*batch D"]]
 
@@ -355,8 +357,7 @@ def fit_motion(
     approach: float | int = 0.0,
     basis: Basis | None = None,
     spring: SpringDamper | None = None,
-    # Far above rounding, far below what a sensor can tell.
-    regularization: float = 1e-7,
+    regularization: float = REGULARIZATION,
     smooth: bool | None = None,
 ) -> MotionFit:
     """Fit weights and start velocity; arguments as in `FitOptions`.

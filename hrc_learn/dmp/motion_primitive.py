@@ -20,14 +20,20 @@ from hrc_learn.dmp._arguments import (
     Points,
     Scalars,
     Times,
+    check_samples,
     regular_times,
     to_tensor,
 )
+from hrc_learn.dmp._fitting import REGULARIZATION, fit_samples
 from hrc_learn.dmp._via_points import ViaPoints, through_via_points
 from hrc_learn.dmp.batching import select
 from hrc_learn.dmp.coordinate_adapter import ColumnPoints, CoordinateAdapter, Ends
+from hrc_learn.dmp.forcing_scale import Demonstrated
 from hrc_learn.dmp.linear_primitive import ColumnEnds, LinearPrimitive
 from hrc_learn.model_files import SavedModel, write_model
+
+FINE = 20
+"""Samples for each basis function of a motion that is fitted anew: more change no digit."""
 
 
 @runtime_checkable
@@ -366,6 +372,32 @@ class AdaptedPrimitive[Value, Path, State](nn.Module, ABC):
         weights = motion.weights.expand(*rest.shape[:-1], -1)
         x = torch.cat([weights, rest], dim=-1)
         return self.with_motion(motion.with_coordinates(x, moved.duration), frame)
+
+    def reversed[S: "AdaptedPrimitive"](self: S) -> S:
+        """The primitive that goes the same way back, from the goal to the start.
+
+        Its motion is this one's at duration - t, as closely as its functions can follow, and
+        takes new starts and goals like any other.
+
+        Raises:
+            ValueError: A rhythm, which has no end to begin at.
+        """
+        motion = self.linear_motion()
+        if motion.basis.periodic:
+            raise ValueError("a rhythm goes on: it has no end from which to go back")
+        s = torch.linspace(0, 1, FINE * motion.basis.count + 1, dtype=torch.float64)
+        s = s.to(motion.start.device)
+        with torch.no_grad():
+            shown = motion.roll(ColumnEnds(), motion.duration, s * motion.duration[..., None])
+            samples = check_samples(s, shown.position.double().flip(-2))
+            weights, rate = fit_samples("trajectory", motion.response, samples, REGULARIZATION)
+            first, last = samples.first, samples.last
+            made = Demonstrated(first, last, motion.amplitude.reshape(first.shape).double())
+            weights = motion.forcing_scale.unscale(weights.mT, made).mT
+            x = torch.cat([weights, torch.stack([rate, first, last], dim=-1)], dim=-1)
+        x = x.view(*motion.weights.shape[:-1], -1)
+        back = 1 - motion.timestamps.flip(-1)
+        return self.with_motion(motion.with_coordinates(x, timestamps=back))
 
     def linear_motion(self) -> LinearPrimitive:
         """The linear primitive inside.

@@ -163,6 +163,10 @@ class TestOrientationOfUde(TestOrientation):
     reproduction = 1e-4
     fast_gradients = True
 
+    def test_reversed_goes_the_same_way_back(self, dmp):
+        with pytest.raises(ValueError, match="not linear"):
+            dmp.reversed()
+
     @pytest.mark.slow
     def test_motion_settles_at_the_goal_from_anywhere(self, dmp):
         super().test_motion_settles_at_the_goal_from_anywhere(dmp)

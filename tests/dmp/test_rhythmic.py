@@ -11,6 +11,10 @@ from hrc_learn.dmp import PeriodicBasis, Response, SpringDamper, Stepper, fit_rh
 class TestRhythmic(DMPContract):
     reproduction = 5e-5
 
+    def test_reversed_goes_the_same_way_back(self, dmp):
+        with pytest.raises(ValueError, match="rhythm goes on"):
+            dmp.reversed()
+
     def demonstrate(self, seed, n_samples=300):
         return rhythm(seed, n_samples)
 

@@ -31,6 +31,10 @@ def orientations(seed):
 class TestRhythmicOrientation(DMPContract):
     reproduction = 1e-4
 
+    def test_reversed_goes_the_same_way_back(self, dmp):
+        with pytest.raises(ValueError, match="rhythm goes on"):
+            dmp.reversed()
+
     def demonstrate(self, seed, n_samples=300):
         return waving(seed, n_samples)
 
