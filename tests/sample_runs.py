@@ -18,8 +18,10 @@ OPTIONAL = (
     "nullspace_input",
     "image_jacobian",
     "joint_limits",
+    "joint_velocity",
     "plan_path",
     "position_deviation",
+    "push",
     "region",
     "rotation_deviation",
     "true_image_jacobian",
@@ -28,7 +30,7 @@ OPTIONAL = (
 )
 """Fields of a run that may be None."""
 NAMES = tuple(f"joint{i}" for i in range(1, 8))
-LIMITS = JointLimits(lower=np.full(7, -2.9), upper=np.full(7, 2.9))
+LIMITS = JointLimits(lower=np.full(7, -2.9), upper=np.full(7, 2.9), velocity=np.full(7, 2.0))
 
 
 def camera_recording(time: np.ndarray, images: int = 3) -> CameraRecording:
@@ -55,6 +57,8 @@ def sample_run(**changes) -> RunRecording:
     position = np.stack([0.4 + 0.1 * np.sin(time), 0.1 * time, 0.3 + 0 * time], axis=-1)
     effort = np.zeros((STEPS, 7))
     effort[80:120, 3] = 1.0
+    push = np.full((STEPS, 2, 3), np.nan)
+    push[80:120] = [[0.4, 0.1, 0.5], [0.4, 0.5, 0.5]]
     upright = np.tile([np.cos(0.3), 0.0, 0.0, np.sin(0.3)], (STEPS, 1))
     body = Body(
         name="hand",
@@ -68,6 +72,7 @@ def sample_run(**changes) -> RunRecording:
         "time": time,
         "joint_names": NAMES,
         "joint_position": np.sin(time[:, None] + np.arange(7)),
+        "joint_velocity": np.cos(time[:, None] + np.arange(7)),
         "joint_limits": LIMITS,
         "demo_joint_position": np.sin(time[:, None] + np.arange(7)) + 0.01,
         "position": position,
@@ -82,6 +87,7 @@ def sample_run(**changes) -> RunRecording:
         "weight_norm": 5.0 + time,
         "potentials": {"vision": np.exp(-time), "Cartesian box": 2 * np.exp(-time)},
         "nullspace_input": effort,
+        "push": push,
         "followed": np.where(time > 2.0, 0.4, np.nan),
         "hindered": {"joint_limit": time > 3.0, "person": time > 4.0},
         "elbow_motion": 0.1 * effort[:, 3],

@@ -10,7 +10,6 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float
 
-from hrc_learn.experiments.run_recording import ELBOW
 from hrc_learn.geometry import Box
 from hrc_learn.sim import Arrow, OffscreenRenderer, RecordedWorld, RenderingUnavailableError
 from hrc_learn.skills.pick_and_place import HOME, INTERACT, RELEASE, TRANSFER
@@ -44,12 +43,8 @@ _CAPTIONS = {
 """What the robot does in each phase."""
 
 _CARRYING = (HOME, TRANSFER, RELEASE, "retreat")
-_NOTHING = 0.5  # input below which nobody pulls [N m]
-_ARROW = 0.45  # length of the arrow of a pull, and of the forearm that pulls [m]
 _ABOVE = 0.15  # of the arrow above the forearm [m]
 _HAND = 0.04  # width of the hand and forearm that pull [m]
-_AROUND = 0.4  # over which the way of the elbow is taken [s]
-_STILL = 2e-3  # way of an elbow that keeps still in that time [m]
 _BESIDE = 1.0  # from which on the distance of a worker is of interest [m]
 _TRAIL = 2.0  # how long the way of the tool stays in the picture [s]
 _POINTS = 60  # of a path that is drawn
@@ -170,19 +165,10 @@ def _drawn_in(run: RunRecording, step: int) -> tuple[list[Line], list[tuple[str,
 
 
 def _pull(run: RunRecording, step: int) -> list[Line]:
-    """The forearm that pulls the elbow along its way, and an arrow there."""
-    elbow = next((body for body in run.bodies if body.name == f"link{ELBOW + 1}"), None)
-    if elbow is None or run.nullspace_input is None:
+    """The forearm that pulls the elbow, and an arrow above it."""
+    if run.push is None or not np.isfinite(run.push[step]).all():
         return []
-    if np.abs(run.nullspace_input[step]).max() < _NOTHING:
-        return []
-    time = run.time[step]
-    a, b = np.searchsorted(run.time, [time - _AROUND / 2, time + _AROUND / 2])
-    way = elbow.position[min(b, len(run.time) - 1)] - elbow.position[a]
-    if np.linalg.norm(way) < _STILL:
-        return []
-    along, at = way / np.linalg.norm(way), elbow.position[step]
-    tip = at + _ARROW * along
+    at, tip = run.push[step]
     above = np.array([0.0, 0.0, _ABOVE])
     return [
         Line(

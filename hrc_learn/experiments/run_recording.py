@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from hrc_learn.demos import Demonstration
 from hrc_learn.geometry import Box, Pose, quaternion
+from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import SerialChain, panda
 from hrc_learn.sim import MotionLog, Touch, World
 from hrc_learn.skills.pick_and_place import INTERACT, TRANSFER
@@ -174,7 +175,44 @@ def unwanted_contacts(
 
 def drawn_limits(chain: SerialChain) -> JointLimits:
     """Limits of an arm, to be drawn beside its joint positions."""
-    return JointLimits(lower=chain.limits.lower.numpy(), upper=chain.limits.upper.numpy())
+    limits = chain.limits
+    return JointLimits(
+        lower=limits.lower.numpy(),
+        upper=limits.upper.numpy(),
+        velocity=limits.velocity.numpy(),
+    )
+
+
+_PUSHED = 4
+"""Joint, from 1, whose frame is at the elbow of an arm of seven joints: there a person takes
+hold (paper, Experiment 3)."""
+_NOTHING = 0.5  # input below which nobody pushes [N m]
+_ARROW = 0.45  # length of the arrow of a push [m]
+
+
+def pushes(
+    chain: SerialChain,
+    joint_position: Float[np.ndarray, "time joints"],
+    nullspace_input: Float[np.ndarray, "time joints"],
+) -> Float[np.ndarray, "time 2 3"]:
+    """The elbow, and a point in the direction in which a person pushes it; NaN without a push.
+
+    Args:
+        chain: The arm.
+        joint_position: [rad]
+        nullspace_input: Of the person, on each joint [N m].
+    """
+    points = np.full((len(joint_position), 2, 3), np.nan)
+    rows = np.abs(nullspace_input).max(axis=1, initial=0.0) > _NOTHING
+    if len(chain.joint_names) < _PUSHED or not rows.any():
+        return points
+    q, d = torch.from_numpy(joint_position[rows]), torch.from_numpy(nullspace_input[rows])
+    asked = null_projection(chain.jacobian(q), d)
+    way = (chain.joint_jacobian(q, _PUSHED)[..., :3, :] @ asked[..., None])[..., 0]
+    elbow = chain.joint_origins(q)[..., _PUSHED - 1, :]
+    tip = elbow + _ARROW * torch.nn.functional.normalize(way, dim=-1)
+    points[rows] = torch.stack([elbow, tip], dim=-2).numpy()
+    return points
 
 
 def record(
@@ -214,6 +252,7 @@ def record(
         time=time,
         joint_names=cell.chain.joint_names,
         joint_position=log["joint_position"],
+        joint_velocity=log["joint_velocity"],
         joint_limits=drawn_limits(cell.chain),
         demo_joint_position=_matching_demonstration(log, plans, demonstration),
         position=true_tool(motion, world, len(log)).position.numpy(),
@@ -237,6 +276,7 @@ def record(
         potentials={"task space": log["potential"]},
         potential_rate=log["potential_rate"],
         nullspace_input=log["nullspace_input"],
+        push=pushes(cell.chain, log["joint_position"], log["nullspace_input"]),
         followed=log["followed"],
         hindered={name: log["hindered"][:, i] for i, name in enumerate(HINDRANCE_COLUMNS)},
         elbow_motion=deviation.elbow,

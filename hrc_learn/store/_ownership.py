@@ -67,7 +67,7 @@ RESULTS = Kind(
     files=(
         MADE_BY,
         *("measured.json", "metrics.json", "gains.json", "log.npz"),
-        *("report.html", "report.json", "figures/*.png"),
+        *("report.html", "report.json", "figures/*.png", "figures/*.svg"),
         *("fit.rrd", "run.rrd", "run_*.rrd", "compared_*.rrd"),
         *("trials.jsonl", "grasps.jsonl", "starts.jsonl", "lessons.jsonl"),
         *("error_map.png", "learning.png", "search.png", "n_basis.png", "joints.png"),

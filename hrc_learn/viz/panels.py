@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Shaped
@@ -22,6 +22,8 @@ class Curves:
     values: Shaped[np.ndarray, "time curves"]
     colours: tuple[Colour, ...]
     width: float = 1.5
+    marks: bool = False
+    """Points rather than lines: what happens in a single step is seen as well."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,46 +53,68 @@ class Tab:
 def run_tabs(run: RunRecording) -> list[Tab]:
     """Every tab that the run has data for."""
     tabs = [
+        _story(run),
         _servoing(run),
-        _regions(run),
-        _image_jacobian(run),
-        _person(run),
-        _worker(run),
-        _joints(run),
+        _person_and_worker(run),
+        _primitive(run),
         _safety(run),
+        _lyapunov(run),
     ]
     return [tab for tab in tabs if tab.plots]
 
 
+def _story(run: RunRecording) -> Tab:
+    """What the run is about, a curve each: the others tabs have the details."""
+    plots = []
+    if run.camera is not None:
+        error = single("story/error", "distance", run.camera.error, palette.RUN_ON_DARK)
+        plots.append(Plot(title="Servoing: from feature to target [px]", curves=(error,)))
+    if run.nullspace_input is not None:
+        effort = np.abs(run.nullspace_input).max(axis=1)
+        curve = single("story/effort", "largest of the joints", effort, palette.PERSON)
+        plots.append(Plot(title="Person: null-space effort [N m]", curves=(curve,)))
+    if run.position_deviation is not None:
+        off = 1e3 * run.position_deviation
+        curve = single("story/deviation", "deviation", off, palette.PURPLE)
+        plots.append(Plot(title="End effector: moved by the person [mm]", curves=(curve,)))
+    if run.worker_distance:
+        name, true = next(iter(run.worker_distance.items()))
+        curve = single("story/distance", name, 1e3 * true, palette.GREEN)
+        plots.append(Plot(title="Worker: distance from the robot [mm]", curves=(curve,)))
+    return Tab(title="Story", plots=tuple(plots))
+
+
 def _servoing(run: RunRecording) -> Tab:
     if run.camera is None:
-        return Tab(title="Pixel error", plots=())
+        return Tab(title="Servoing", plots=())
     error = single("camera/error", "distance", run.camera.error, palette.RUN_ON_DARK)
     delta = run.camera.feature - run.camera.target
     parts = several("camera/error_uv", ("u (right)", "v (down)"), delta)
-    plots = (
+    plots = [
         Plot(title="Distance from feature to target [px]", curves=(error,)),
-        Plot(title="Feature minus target: u blue, v orange [px]", curves=(parts,)),
-    )
-    return Tab(title="Pixel error", plots=plots)
+        Plot(title="Feature minus target [px]", curves=(parts,), legend=True),
+        *_image_jacobian(run),
+    ]
+    return Tab(title="Servoing", plots=tuple(plots), columns=2)
 
 
-def _regions(run: RunRecording) -> Tab:
+def _lyapunov(run: RunRecording) -> Tab:
     plots = tuple(
         Plot(
-            title=f"Potential of the region: {name} [-]",
+            title=f"V, potential of the region: {name} [-]",
             curves=(single(f"regions/{slug(name)}", name, values, palette.RUN_ON_DARK),),
         )
         for name, values in run.potentials.items()
     )
     if run.potential_rate is not None:
         rate = single("regions/rate", "dV/dt", run.potential_rate, palette.PURPLE)
-        title = "Rate of the potential, dV/dt, if the image Jacobian is as estimated [1/s]"
+        title = "dV/dt, if the image Jacobian is as estimated [1/s]"
         plots += (Plot(title=title, curves=(rate,)),)
-    return Tab(title="Regions", plots=plots)
+    return Tab(title="Lyapunov", plots=plots)
 
 
-def _image_jacobian(run: RunRecording) -> Tab:
+def _image_jacobian(run: RunRecording) -> list[Plot]:
+    """Its entries, beside the true ones where they are known."""
     plots = []
     if run.image_jacobian is not None:
         for row, pixel in enumerate(("u", "v")):
@@ -99,7 +123,7 @@ def _image_jacobian(run: RunRecording) -> Tab:
     if run.weight_norm is not None:
         norm = single("image_jacobian/weight_norm", "‖W‖", run.weight_norm, palette.PURPLE)
         plots.append(Plot(title="Norm of the learned weights [-]", curves=(norm,)))
-    return Tab(title="Image Jacobian", plots=tuple(plots))
+    return plots
 
 
 def _jacobian_plot(run: RunRecording, row: int, pixel: str, half: str) -> Plot:
@@ -110,17 +134,22 @@ def _jacobian_plot(run: RunRecording, row: int, pixel: str, half: str) -> Plot:
     path = f"image_jacobian/{pixel}_{half}"
     names = tuple(f"∂{pixel}/∂{symbol}{axis}" for axis in "xyz")
     curves = [several(f"{path}/estimate", names, run.image_jacobian[:, row, columns])]
-    title = f"∂{pixel} / {half} velocity [{unit}]: x blue, y orange, z green"
+    title = f"Image Jacobian: ∂{pixel} / {half} velocity [{unit}]"
     if run.true_image_jacobian is not None:
         true = run.true_image_jacobian[:, row, columns]
-        names = tuple(f"{name} true" for name in names)
-        # The viewer draws entities by name: the thin estimate has to come after it.
-        curves.insert(0, several(f"{path}/actual", names, true, width=5.0, light=True))
-        title += "; pale: true"
-    return Plot(title=title, curves=tuple(curves))
+        # One entry of the legend for the three. The viewer draws entities by name: the thin
+        # estimate has to come after it.
+        pale = several(f"{path}/actual", ("true",) * 3, true, width=5.0, light=True)
+        curves.insert(0, pale)
+    return Plot(title=title, curves=tuple(curves), legend=True)
 
 
-def _person(run: RunRecording) -> Tab:
+def _person_and_worker(run: RunRecording) -> Tab:
+    plots = (*_person(run), *_worker(run))
+    return Tab(title="Person and worker", plots=plots)
+
+
+def _person(run: RunRecording) -> list[Plot]:
     plots = []
     if run.nullspace_input is not None:
         effort = several("person/effort", run.joint_names, run.nullspace_input)
@@ -152,31 +181,33 @@ def _person(run: RunRecording) -> Tab:
         if values is not None:
             curve = single(f"person/{path}", path.split("_")[0], unit * values, colour)
             plots.append(Plot(title=title, curves=(curve,)))
-    return Tab(title="Person", plots=tuple(plots))
+    return plots
 
 
-def _worker(run: RunRecording) -> Tab:
+def _worker(run: RunRecording) -> list[Plot]:
     if not run.worker_distance:
-        return Tab(title="Worker", plots=())
+        return []
     values = 1e3 * np.column_stack(list(run.worker_distance.values()))
     distance = several("worker/distance", run.worker_distance, values)
     title = "Distance of the worker from the robot and its load [mm]"
     # What matters are the last few centimetres.
     near = several("worker/near", run.worker_distance, np.where(values < 300, values, np.nan))
-    plots = (
+    return [
         Plot(title=title, curves=(distance,), legend=True),
-        Plot(title=f"{title}, below 300", curves=(near,), range=(-50.0, 300.0)),
-    )
-    return Tab(title="Worker", plots=plots)
+        Plot(title=f"{title}, below 300", curves=(near,), range=(-50.0, 300.0), legend=True),
+    ]
 
 
-def _joints(run: RunRecording) -> Tab:
+def _primitive(run: RunRecording) -> Tab:
     demo, limits = run.demo_joint_position, run.joint_limits
-    plots = tuple(
+    plots = [
         joint_plot("joints", name, i, run.joint_position, demo, limits)
         for i, name in enumerate(run.joint_names)
-    )
-    return Tab(title=joints_title(demo is not None, limits is not None), plots=plots, columns=2)
+    ]
+    # The names of the first hold for all, in plots that are too small for one each.
+    plots[0] = replace(plots[0], legend=True)
+    title = "Joints" if demo is None else "Primitive"
+    return Tab(title=title, plots=tuple(plots), columns=2)
 
 
 def joints_title(demo: bool, limits: bool, position: str = "position") -> str:
@@ -214,15 +245,43 @@ def limit_curves(path: str, limits: JointLimits, i: int, steps: int) -> Curves:
 
 def _safety(run: RunRecording) -> Tab:
     plots = []
-    for name, values in run.safety.items():
-        values = values.astype(float)
-        curves = single(f"safety/{slug(name)}", name, values, palette.LIMIT)
-        # A guard that never acted is a line at the bottom, not in the middle.
-        top = max(1.0, float(np.nanmax(values, initial=0.0)))
-        room = (-0.05 * top, 1.05 * top)
-        kind = name.replace("_", " ")
-        plots.append(Plot(title=f"Safety filter: {kind}", curves=(curves,), range=room))
-    return Tab(title="Safety", plots=tuple(plots), columns=2)
+    limits, names = run.joint_limits, run.joint_names
+    if limits is not None:
+        middle, half = (limits.upper + limits.lower) / 2, (limits.upper - limits.lower) / 2
+        shares = (run.joint_position - middle) / half
+        title = "Joints in their ranges: -1 the lower limit, 1 the upper [-]"
+        plots.append(_within("safety/position", title, names, shares))
+        if limits.velocity is not None and run.joint_velocity is not None:
+            shares = run.joint_velocity / limits.velocity
+            title = "Joint velocities, in parts of their limits [-]"
+            plots.append(_within("safety/velocity", title, names, shares))
+    if run.safety:
+        # A row of its own for each guard, with marks where it acted.
+        acted = [np.nan_to_num(np.asarray(on, dtype=float)) > 0 for on in run.safety.values()]
+        rows = [np.where(on, k + 1.0, np.nan) for k, on in enumerate(acted)]
+        guards = [name.replace("_", " ") for name in run.safety]
+        marks = several("safety/acted", guards, np.column_stack(rows), width=4.0)
+        marks = replace(marks, marks=True)
+        title = "What the safety filter changed a command for"
+        plots.append(
+            Plot(title=title, curves=(marks,), range=(0.0, len(rows) + 1.0), legend=True)
+        )
+    return Tab(title="Safety", plots=tuple(plots))
+
+
+def _within(
+    path: str, title: str, names: Iterable[str], shares: Shaped[np.ndarray, "time joints"]
+) -> Plot:
+    """Shares of limits, between -1 and 1."""
+    red = palette.rgba(palette.LIMIT)
+    bounds = Curves(
+        path=f"{path}/limits",
+        names=("limit", "limit"),
+        values=np.broadcast_to([-1.0, 1.0], (len(shares), 2)),
+        colours=(red, red),
+    )
+    curves = (several(f"{path}/joints", names, shares), bounds)
+    return Plot(title=title, curves=curves, range=(-1.1, 1.1), legend=True)
 
 
 def slug(name: str) -> str:

@@ -23,6 +23,8 @@ class JointLimits:
     """[rad]"""
     upper: Float[np.ndarray, " joints"]
     """[rad]"""
+    velocity: Float[np.ndarray, " joints"] | None = None
+    """Largest speeds [rad/s]."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -67,6 +69,8 @@ class RunRecording:
     joint_names: tuple[str, ...]
     joint_position: Float[np.ndarray, "time joints"]
     """[rad]"""
+    joint_velocity: Float[np.ndarray, "time joints"] | None = None
+    """[rad/s]"""
     joint_limits: JointLimits | None = None
     demo_joint_position: Float[np.ndarray, "time joints"] | None = None
     """Demonstration at the matching phase of the run, NaN elsewhere [rad]."""
@@ -105,6 +109,9 @@ class RunRecording:
 
     nullspace_input: Float[np.ndarray, "time joints"] | None = None
     """Null-space input d of the person, on each joint [N m]."""
+    push: Float[np.ndarray, "time 2 3"] | None = None
+    """Point of the arm that the person pushes, and another in the direction in which they push
+    it [m]; NaN while nobody pushes."""
     followed: Float[np.ndarray, " time"] | None = None
     """Share of the push that the arm follows, 0 to 1; NaN while nobody pushes."""
     hindered: Mapping[str, Bool[np.ndarray, " time"]] = field(default_factory=dict)
@@ -148,6 +155,7 @@ class RunRecording:
 
 _SERIES = (
     "joint_position",
+    "joint_velocity",
     "demo_joint_position",
     "position",
     "image_jacobian",
@@ -155,6 +163,7 @@ _SERIES = (
     "weight_norm",
     "potential_rate",
     "nullspace_input",
+    "push",
     "followed",
     "elbow_motion",
     "position_deviation",

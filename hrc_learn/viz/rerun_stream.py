@@ -99,8 +99,14 @@ def send_curves(
     send_rows(stream, seconds(time), curves)
 
 
-def style(curves: Curves) -> rr.SeriesLines:
+def style(curves: Curves) -> rr.SeriesLines | rr.SeriesPoints:
     """Names, colours and widths of curves."""
+    if curves.marks:
+        return rr.SeriesPoints(
+            names=curves.names,
+            colors=curves.colours,
+            marker_sizes=[curves.width] * len(curves.names),
+        )
     return rr.SeriesLines(
         names=curves.names, colors=curves.colours, widths=[curves.width] * len(curves.names)
     )

@@ -153,6 +153,8 @@ class RunStream:
         self._send_path(run, ends)
         if run.worker_nearest is not None:
             self._send_nearest(time, run.worker_nearest, at)
+        if run.push is not None:
+            self._send_push(time, run.push, at)
         if run.active_region is not None:
             self._send_region(run, run.active_region, first)
         if run.camera is not None:
@@ -208,6 +210,22 @@ class RunStream:
         )
         known = np.isfinite(nearest[at]).all(axis=(1, 2))
         columns = rr.LineStrips3D.columns(strips=list(nearest[at][known]))
+        self._stream.send_columns(path, seconds(time[at]), columns.partition(known.astype(int)))
+
+    def _send_push(
+        self,
+        time: Float[np.ndarray, " time"],
+        push: Float[np.ndarray, "time 2 3"],
+        at: Int[np.ndarray, " chosen"],
+    ) -> None:
+        """An arrow at the point of the arm that the person pushes."""
+        path, colours = "world/push", [palette.rgba(palette.PERSON)]
+        self._still.send(
+            path, None, lambda: rr.Arrows3D.from_fields(radii=[0.012], colors=colours)
+        )
+        known = np.isfinite(push[at]).all(axis=(1, 2))
+        start, end = push[at][known].swapaxes(0, 1)
+        columns = rr.Arrows3D.columns(origins=start, vectors=end - start)
         self._stream.send_columns(path, seconds(time[at]), columns.partition(known.astype(int)))
 
     def _send_phases(self, run: RunRecording) -> None:

@@ -9,7 +9,6 @@ from sample_runs import sample_run
 
 from hrc_learn.experiments import film
 from hrc_learn.experiments.film import caption, frames
-from hrc_learn.geometry import Body
 from hrc_learn.viz import palette
 from hrc_learn.viz.step_log import Event
 
@@ -18,13 +17,11 @@ def labels(run, step):
     return [name for name, _ in film._drawn_in(run, step)[1]]
 
 
-def with_elbow(speed):
-    """A run whose elbow moves along y [m/s] while a person pulls."""
-    time = sample_run().time
-    position = np.stack([0 * time, speed * time, 0.5 + 0 * time], axis=-1)
-    upright = np.tile([1.0, 0.0, 0.0, 0.0], (len(time), 1))
-    elbow = Body(name="link4", position=position, orientation=upright)
-    return sample_run(bodies=(elbow,), worker_nearest=None)
+def pushed(steps):
+    """A run whose elbow is pushed along y in these steps."""
+    push = np.full((len(sample_run().time), 2, 3), np.nan)
+    push[steps] = [[0.1, 0.0, 0.5], [0.1, 0.45, 0.5]]
+    return sample_run(push=push, worker_nearest=None)
 
 
 @pytest.mark.parametrize(("duration", "shown"), [(4.0, 4.0), (400.0, film.LONGEST)])
@@ -51,21 +48,16 @@ def test_the_caption_is_of_the_phase_that_was_entered_last():
     assert caption(run, 3.0) == "My own phase"
 
 
-def test_a_pull_is_an_arrow_along_the_way_of_the_elbow_while_it_lasts():
-    run, pulled, free = with_elbow(0.2), 100, 20
+def test_a_pull_is_an_arrow_above_the_forearm_while_it_lasts():
+    run, pulled, free = pushed(slice(80, 120)), 100, 20
     arrow, forearm = film._pull(run, pulled)
     assert arrow.head
-    way = np.subtract(arrow.end, arrow.start)
-    np.testing.assert_allclose(way / np.linalg.norm(way), [0, 1, 0], atol=1e-9)
-    elbow = run.bodies[0].position[pulled]
-    np.testing.assert_allclose(forearm.start, elbow)
+    np.testing.assert_allclose(np.subtract(arrow.end, arrow.start), [0, 0.45, 0], atol=1e-9)
+    np.testing.assert_allclose(forearm.start, [0.1, 0.0, 0.5])
+    assert arrow.start[2] > forearm.start[2]
     assert film._pull(run, free) == []
     assert "a person pulls the elbow" in labels(run, pulled)
     assert "a person pulls the elbow" not in labels(run, free)
-
-
-def test_an_elbow_that_keeps_still_has_no_arrow():
-    assert film._pull(with_elbow(0.0), 100) == []
 
 
 def test_the_plan_is_shown_while_the_arm_carries_and_the_region_before():

@@ -2,14 +2,10 @@ import numpy as np
 import pytest
 from sample_runs import OPTIONAL, STEPS, sample_run
 
+from hrc_learn.viz import JointLimits
 from hrc_learn.viz.panels import Curves, Tab, run_tabs
 
-FIELDS = {
-    "camera": "Pixel error",
-    "potentials": "Regions",
-    "safety": "Safety",
-    "worker_distance": "Worker",
-}
+FIELDS = {"camera": "Servoing", "potentials": "Lyapunov"}
 
 
 def curves(tabs: list[Tab]) -> dict[str, Curves]:
@@ -29,15 +25,43 @@ def test_a_bare_run_shows_its_joints():
     bare = dict.fromkeys(OPTIONAL)
     none = {name: {} for name in ("potentials", "safety", "worker_distance", "hindered")}
     (tab,) = run_tabs(sample_run(**bare, **none))
-    assert tab.title == "Joints: position blue"
+    assert tab.title == "Joints"
     assert [plot.title for plot in tab.plots] == [f"joint{i} [rad]" for i in range(1, 8)]
 
 
-def test_titles_tell_what_the_colours_mean():
+def test_the_tabs_tell_the_story_first():
     titles = [tab.title for tab in run_tabs(sample_run())]
-    assert "Joints: position blue, demonstration grey, limits red" in titles
-    shown = [plot.title for tab in run_tabs(sample_run()) for plot in tab.plots]
-    assert "∂u / linear velocity [px/m]: x blue, y orange, z green; pale: true" in shown
+    expected = ["Story", "Servoing", "Person and worker", "Primitive", "Safety", "Lyapunov"]
+    assert titles == expected
+
+
+def test_colours_are_told_by_legends_that_name_each_curve():
+    tabs = {tab.title: tab for tab in run_tabs(sample_run())}
+    for tab in tabs.values():
+        for plot in tab.plots:
+            several = len({name for c in plot.curves for name in c.names}) > 1
+            several |= any(c.marks for c in plot.curves)
+            # The joints' plots are small: the first has the legend of all.
+            small = tab.title == "Primitive" and plot is not tab.plots[0]
+            assert plot.legend == (several and not small), plot.title
+    first = {name for c in tabs["Primitive"].plots[0].curves for name in c.names}
+    assert first == {"position", "demonstration", "lower limit", "upper limit"}
+
+
+def test_the_story_shows_what_other_tabs_show_in_detail():
+    run = sample_run()
+    shown = curves(run_tabs(run))
+    np.testing.assert_array_equal(shown["story/error"].values, shown["camera/error"].values)
+    np.testing.assert_allclose(
+        shown["story/effort"].values[:, 0], np.abs(run.nullspace_input).max(axis=1)
+    )
+    np.testing.assert_array_equal(
+        shown["story/distance"].values[:, 0], shown["worker/distance"].values[:, 0]
+    )
+    bare = sample_run(camera=None, nullspace_input=None, position_deviation=None)
+    assert [plot.title for plot in run_tabs(bare)[0].plots] == [
+        "Worker: distance from the robot [mm]"
+    ]
 
 
 def test_curves_have_a_name_and_a_colour_each_and_a_path_of_their_own():
@@ -84,16 +108,39 @@ def test_the_distance_of_a_worker_is_shown_twice_the_second_time_from_near():
 
 def test_names_with_blanks_and_slashes_make_plain_paths():
     values = np.zeros(STEPS)
-    shown = curves(run_tabs(sample_run(safety={"limit [rad/s]": values})))
-    assert "safety/limit_rad_s" in shown
+    shown = curves(run_tabs(sample_run(potentials={"box [m/s]": values})))
+    assert "regions/box_m_s" in shown
 
 
-def test_guards_that_never_acted_lie_at_the_bottom_of_their_plot():
-    never, often = np.zeros(STEPS), np.arange(STEPS)
-    tabs = run_tabs(sample_run(safety={"never": never, "often": often.astype(float)}))
-    ranges = {plot.title: plot.range for plot in tabs[-1].plots}
-    assert ranges["Safety filter: never"] == (-0.05, 1.05)
-    assert ranges["Safety filter: often"] == pytest.approx((-9.95, 208.95))
+def test_joints_at_their_limits_are_at_the_edges_of_the_bands():
+    limits = JointLimits(
+        lower=np.array([-1.0, 0.0]), upper=np.array([1.0, 4.0]), velocity=np.array([2.0, 0.5])
+    )
+    position = np.tile([-1.0, 3.0], (STEPS, 1))
+    velocity = np.tile([1.0, -0.5], (STEPS, 1))
+    run = sample_run(
+        joint_names=("a", "b"),
+        joint_limits=limits,
+        joint_position=position,
+        joint_velocity=velocity,
+        demo_joint_position=None,
+        nullspace_input=None,
+    )
+    shown = curves(run_tabs(run))
+    np.testing.assert_allclose(shown["safety/position/joints"].values[7], [-1.0, 0.5])
+    np.testing.assert_allclose(shown["safety/velocity/joints"].values[7], [0.5, -1.0])
+    np.testing.assert_array_equal(shown["safety/velocity/limits"].values[7], [-1.0, 1.0])
+
+
+def test_guards_are_marks_at_heights_of_their_own_where_they_acted():
+    often = np.arange(STEPS) % 3
+    run = sample_run(safety={"never": np.zeros(STEPS), "often_so": often, "at_once": often > 1})
+    marks = curves(run_tabs(run))["safety/acted"]
+    assert marks.names == ("never", "often so", "at once")
+    assert np.isnan(marks.values[:, 0]).all()
+    for k, acted in ((1, often > 0), (2, often > 1)):
+        np.testing.assert_array_equal(np.isfinite(marks.values[:, k]), acted)
+        assert (marks.values[acted, k] == k + 1).all()
 
 
 def test_hindrances_are_lines_at_heights_of_their_own_while_they_act():

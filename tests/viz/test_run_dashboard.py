@@ -50,7 +50,8 @@ def test_every_curve_is_recorded_at_every_step(run, rrd):
     for curves in every:
         np.testing.assert_array_equal(rrd.scalars(curves.path), curves.values)
         np.testing.assert_allclose(rrd.time(curves.path), run.time, atol=1e-9)
-        names = rrd.column(curves.path, "SeriesLines:names", static=True)
+        kind = "SeriesPoints" if curves.marks else "SeriesLines"
+        names = rrd.column(curves.path, f"{kind}:names", static=True)
         assert names == [list(curves.names)]
 
 
@@ -109,6 +110,21 @@ def test_a_line_joins_worker_and_robot_where_they_are_nearest(tmp_path):
         assert len(strips) == (k >= 50)
         for strip in strips:
             np.testing.assert_allclose(strip, nearest[k], atol=1e-6)
+
+
+def test_an_arrow_shows_where_a_person_pushes_while_they_do(run, rrd):
+    time = rrd.time("world/push")
+    at = np.searchsorted(run.time, time - 1e-9)
+    pushed = np.isfinite(run.push[at, 0, 0])
+    assert 0 < pushed.sum() < len(pushed)
+    vectors = rrd.column("world/push", "Arrows3D:vectors")
+    assert [len(row) for row in vectors] == pushed.astype(int).tolist()
+    k = int(pushed.argmax())
+    np.testing.assert_allclose(
+        vectors[k][0], run.push[at[k], 1] - run.push[at[k], 0], atol=1e-6
+    )
+    origins = rrd.column("world/push", "Arrows3D:origins")
+    np.testing.assert_allclose(origins[k][0], run.push[at[k], 0], atol=1e-6)
 
 
 def test_the_path_of_the_run_grows_to_its_end(run, rrd):
@@ -351,7 +367,8 @@ def test_a_viewer_that_connects_gets_the_run(tmp_path):
             os.killpg(viewer.pid, signal.SIGTERM)
             viewer.wait(timeout=120)
     rrd = Rrd(got)
-    joint = run_tabs(run)[-2].plots[0].curves[-1]
+    (tab,) = (tab for tab in run_tabs(run) if tab.title == "Primitive")
+    joint = tab.plots[0].curves[-1]
     np.testing.assert_array_equal(rrd.scalars(joint.path), joint.values)
 
 

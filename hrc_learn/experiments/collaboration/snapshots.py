@@ -11,20 +11,15 @@ import torch
 from jaxtyping import Float
 
 from hrc_learn.experiments.collaboration.trial import CollaborationRun
-from hrc_learn.experiments.run_recording import spans
+from hrc_learn.experiments.run_recording import pushes, spans
 from hrc_learn.experiments.snapshots import Image, viewpoint
 from hrc_learn.geometry import quaternion
-from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.sim import Arrow, OffscreenRenderer, World
 from hrc_learn.skills.pick_and_place import INTERACT, RELEASE
 from hrc_learn.viz import palette
 
 EYE, TOWARDS = (1.55, 1.45, 1.25), (0.0, 0.25, 0.30)
 """Where the pictures are taken from, and what is in their middle [m]."""
-# Joint that the expert drags, from 1, and its origin's number.
-_DRAGGED, _ELBOW = 4, 3
-# Length of the arrow [m], and input below which nobody drags [N m].
-_LENGTH, _NOTHING = 0.45, 0.5
 # Fraction of the way aside at which the drag is still on.
 _NEARLY = 0.9
 
@@ -78,14 +73,13 @@ def _furthest_aside(run: CollaborationRun, begin: float, end: float) -> float | 
     """When the elbow is nearly as far aside as it gets, on the way there."""
     log = run.cell.log
     during = (log["time"] >= begin) & (log["time"] < end)
-    during &= np.abs(log["nullspace_input"]).max(axis=1) > _NOTHING
+    push = pushes(run.cell.chain, log["joint_position"], log["nullspace_input"])
+    during &= np.isfinite(push[:, 0, 0])
     if not during.any():
         return None
-    elbow = run.cell.chain.joint_origins(torch.from_numpy(log["joint_position"][during]))[
-        :, _ELBOW
-    ]
-    aside = (elbow - elbow[0]).norm(dim=-1)
-    return float(log["time"][during][int((aside >= _NEARLY * aside.max()).int().argmax())])
+    elbow = push[during, 0]
+    aside = np.linalg.norm(elbow - elbow[0], axis=-1)
+    return float(log["time"][during][(aside >= _NEARLY * aside.max()).argmax()])
 
 
 def _matrix(body, step: int) -> Float[np.ndarray, "4 4"]:
@@ -100,19 +94,11 @@ def _arrows(run: CollaborationRun, step: int) -> list[Arrow]:
     """To the nearest point of the worker, and where the elbow is dragged."""
     near, far = map(_point, run.motion.nearest(step + 1)[step].points)
     arrows = [Arrow(start=near, end=far, colour=_rgba(palette.PURPLE), width=0.008, head=False)]
-    log = run.cell.log
-    q = torch.from_numpy(log["joint_position"][step])
-    d = torch.from_numpy(log["nullspace_input"][step])
-    if float(d.abs().max()) > _NOTHING:
-        asked = null_projection(run.cell.chain.jacobian(q), d)
-        along = (run.cell.chain.joint_jacobian(q, _DRAGGED)[:3] @ asked).numpy()
-        elbow = run.cell.chain.joint_origins(q)[_ELBOW].numpy()
-        tip = elbow + _LENGTH * along / np.linalg.norm(along)
-        arrows.append(
-            Arrow(
-                start=_point(elbow), end=_point(tip), colour=_rgba(palette.PERSON), width=0.03
-            )
-        )
+    log, rows = run.cell.log, slice(step, step + 1)
+    (push,) = pushes(run.cell.chain, log["joint_position"][rows], log["nullspace_input"][rows])
+    if np.isfinite(push).all():
+        elbow, tip = map(_point, push)
+        arrows.append(Arrow(start=elbow, end=tip, colour=_rgba(palette.PERSON), width=0.03))
     return arrows
 
 

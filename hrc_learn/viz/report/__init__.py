@@ -1,7 +1,7 @@
 """Reports: what was done and measured, as one page that can be mailed, printed and kept.
 
 A program fills a `Report` and hands it to `write_report`, which leaves `report.json`,
-`figures/*.png`, `film.mp4` and the self-contained `report.html` in the run's folder.
+pictures, `film.mp4` and the self-contained `report.html` in the run's folder.
 `read_report` takes them up again, and `reports_page` puts several on one page.
 """
 

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _DPI = 150  # sharp in print, at the width of a page
+_LARGEST_SVG = 400_000  # beyond, curves of thousands of points: a PNG is smaller by far [bytes]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,6 +82,8 @@ class Picture:
     drawing: "Figure | UInt8[np.ndarray, 'height width 3'] | bytes"
     """A matplotlib figure, an image, or a finished PNG file."""
     caption: str
+    svg: bytes | None = None
+    """The same as vector graphics, which a page shows instead where there are any."""
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[\w-]+", self.name):
@@ -101,6 +104,21 @@ class Picture:
         else:
             self.drawing.savefig(buffer, format="png", dpi=_DPI)
         return buffer.getvalue()
+
+    def drawn(self) -> "Picture":
+        """The picture as files: a figure as PNG and, unless that is too much, as SVG."""
+        return replace(self, drawing=self.png(), svg=self.svg or self._vector())
+
+    def _vector(self) -> bytes | None:
+        if isinstance(self.drawing, (bytes, np.ndarray)):
+            return None
+        import matplotlib
+
+        buffer = BytesIO()
+        # The same file from the same figure: without the time, and with fixed names inside.
+        with matplotlib.rc_context({"svg.hashsalt": self.name}):
+            self.drawing.savefig(buffer, format="svg", metadata={"Date": None})
+        return buffer.getvalue() if buffer.tell() <= _LARGEST_SVG else None
 
 
 @dataclass(frozen=True)

@@ -163,10 +163,11 @@ def _section(section: Section) -> str:
 
 
 def _figure(picture: Picture) -> str:
-    data = base64.b64encode(picture.png()).decode("ascii")
+    kind, content = ("svg+xml", picture.svg) if picture.svg else ("png", picture.png())
+    data = base64.b64encode(content).decode("ascii")
     caption = escape(picture.caption)
     return (
-        f'<figure><img alt="{caption}" src="data:image/png;base64,{data}">'
+        f'<figure><img alt="{caption}" src="data:image/{kind};base64,{data}">'
         f"<figcaption>{caption}</figcaption></figure>"
     )
 
@@ -226,7 +227,9 @@ VERSION = 1
 
 
 def write_report(folder: str | os.PathLike[str], report: Report) -> None:
-    """Write `report.json`, `figures/*.png`, `film.mp4` and the self-contained `report.html`.
+    """Write `report.json`, pictures, `film.mp4` and the self-contained `report.html`.
+
+    Pictures are `figures/*.png`, and `*.svg` besides where they are figures of few lines.
 
     Args:
         folder: Of the run. Each file appears only when it is complete, `report.json` last.
@@ -238,6 +241,12 @@ def write_report(folder: str | os.PathLike[str], report: Report) -> None:
     for picture in report.pictures:
         with new_file(folder / FIGURES / f"{picture.name}.png") as part:
             part.write_bytes(picture.png())
+        vector = folder / FIGURES / f"{picture.name}.svg"
+        if picture.svg is not None:
+            with new_file(vector) as part:
+                part.write_bytes(picture.svg)
+        else:
+            vector.unlink(missing_ok=True)  # of an older report
     if report.film is not None:
         with new_file(folder / FILM) as part:
             part.write_bytes(report.film.mp4)
@@ -281,7 +290,7 @@ def read_report(folder: str | os.PathLike[str]) -> Report:
 def _drawn(report: Report) -> Report:
     """The report with every figure drawn, so that none is drawn twice."""
     sections = [
-        replace(section, figures=[replace(p, drawing=p.png()) for p in section.figures])
+        replace(section, figures=[p.drawn() for p in section.figures])
         for section in report.sections
     ]
     return replace(report, sections=sections)
@@ -320,6 +329,7 @@ def _from_json(content: Mapping[str, Any], folder: Path) -> Report:
                     figure["name"],
                     (folder / FIGURES / f"{figure['name']}.png").read_bytes(),
                     figure["caption"],
+                    _bytes_if_there(folder / FIGURES / f"{figure['name']}.svg"),
                 )
                 for figure in section["figures"]
             ],
@@ -337,6 +347,10 @@ def _from_json(content: Mapping[str, Any], folder: Path) -> Report:
     return Report(
         table=table, sections=sections, film=film, **{name: content[name] for name in same}
     )
+
+
+def _bytes_if_there(path: Path) -> bytes | None:
+    return path.read_bytes() if path.is_file() else None
 
 
 def _finite(value: float | int) -> float | int | None:
