@@ -202,22 +202,27 @@ def capsules(shapes: tuple[Capsule, ...]) -> rr.Capsules3D:
     )
 
 
-def tab_view(tab: Tab) -> rrb.Grid:
-    """Layout of one tab."""
+def tab_view(tab: Tab, span: tuple[float, float] | None = None) -> rrb.Grid:
+    """Layout of one tab, with the time that its plots show; what is new when None [s]."""
     return rrb.Grid(
-        contents=[plot_view(plot) for plot in tab.plots],
+        contents=[plot_view(plot, span) for plot in tab.plots],
         grid_columns=tab.columns,
         row_shares=[plot.share for plot in tab.plots[:: tab.columns]],
         name=tab.title,
     )
 
 
-def plot_view(plot: Plot) -> rrb.TimeSeriesView:
-    """Layout of one plot."""
+def plot_view(plot: Plot, span: tuple[float, float] | None = None) -> rrb.TimeSeriesView:
+    """Layout of one plot; `span` as in `tab_view`."""
+    shown = None
+    if span is not None:
+        first, last = (rrb.TimeRangeBoundary.absolute(seconds=t) for t in span)
+        shown = rrb.TimeAxis(view_range=rrb.TimeRange(first, last))
     return rrb.TimeSeriesView(
         origin="/",
         contents=[f"/{curves.path}" for curves in plot.curves],
         name=plot.title,
+        axis_x=shown,
         axis_y=None if plot.range is None else rrb.ScalarAxis(range=plot.range),
         # Most curves that need a legend begin low or at zero.
         plot_legend=rrb.PlotLegend("LeftTop", visible=plot.legend),

@@ -50,15 +50,20 @@ def run_outline(run: RunRecording) -> tuple:
     return plots, run.camera is not None, bool(run.phases)
 
 
-def run_layout(run: RunRecording) -> rrb.Blueprint:
-    """The robot and its camera beside tabs of curves."""
-    # The first look at the scene should not miss the camera.
-    eyes = [] if run.camera is None else [run.camera.model.pose[None, :3, 3]]
+def run_layout(run: RunRecording, finished: bool = True) -> rrb.Blueprint:
+    """The robot and its camera beside tabs of curves.
+
+    Args:
+        run: What is shown.
+        finished: Whether plots show all of it, not just what comes.
+    """
+    span = (float(run.time[0]), float(run.time[-1])) if finished and len(run.time) > 1 else None
     scene = rrb.Spatial3DView(
         origin="/world",
         contents=["+ /world/**", "- /world/camera/image/**"],
         name="Robot: path of the run (blue), demonstration (grey), plan (orange), region",
-        eye_controls=frame_view(np.concatenate([run.position, *eyes])),
+        # On the work; a camera that watches from afar would make it small.
+        eye_controls=frame_view(run.position),
     )
     left: list[rrb.View] = [scene]
     if run.camera is not None:
@@ -69,7 +74,7 @@ def run_layout(run: RunRecording) -> rrb.Blueprint:
                 contents=["$origin/**"],
             )
         )
-    tabs = [tab_view(tab) for tab in run_tabs(run)]
+    tabs = [tab_view(tab, span) for tab in run_tabs(run)]
     right: list[rrb.Container | rrb.View] = [rrb.Tabs(contents=tabs, active_tab=0)]
     if run.phases:
         # The text tells the time as well: all other columns would only narrow it.
@@ -90,13 +95,14 @@ class RunStream:
     it, sends one that still goes on. What arrives is the same.
     """
 
-    def __init__(self, stream: rr.RecordingStream):
+    def __init__(self, stream: rr.RecordingStream, finished: bool = False):
         """Send to a recording stream.
 
         Args:
             stream: Into a file or to a viewer.
+            finished: Whether the run is over, so that plots show all of it.
         """
-        self._stream, self._still = stream, StaticShapes(stream)
+        self._stream, self._still, self._finished = stream, StaticShapes(stream), finished
         self._camera = CameraStream(stream, self._still)
         self._rows = self._phases = self._remarks = 0
         self._outline: tuple | None = None
@@ -109,7 +115,7 @@ class RunStream:
         """
         outline = run_outline(run)
         if outline != self._outline:
-            self._stream.send_blueprint(run_layout(run))
+            self._stream.send_blueprint(run_layout(run, self._finished))
             self._outline = outline
         self._send_scene(run)
         if len(run.time) > self._rows:
@@ -249,7 +255,7 @@ def record_run(path: str | os.PathLike[str], run: RunRecording) -> None:
         run: What happened. Panels without data are left out.
     """
     with rrd_file(path, run.title) as stream:
-        RunStream(stream).send(run)
+        RunStream(stream, finished=True).send(run)
 
 
 class LogStream:

@@ -68,8 +68,10 @@ def fit_primitives(args: FitPrimitives) -> None:
         fitted.save(folder, each=args.several == "distribution")
         if args.several == "distribution":
             metrics |= {f"{k}_spread": _spread(fitted, k) for k in fitted.each}
-        _draw(fitted, args, folder)
+        drawn = _draw(fitted, args, folder)
         _finish(args, metrics, folder)
+    if drawn:
+        print(f"Dashboard: {show_command(args.folder)}")
 
 
 def _wanted(args: FitPrimitives) -> dict[str, Any]:
@@ -131,15 +133,17 @@ def _spread(fitted: FittedPrimitives, channel: str) -> float:
     return float(np.sqrt(np.square(distribution.position(time)[1].numpy()).mean()))
 
 
-def _draw(fitted: FittedPrimitives, args: FitPrimitives, folder: Path) -> None:
+def _draw(fitted: FittedPrimitives, args: FitPrimitives, folder: Path) -> bool:
+    """Figures and a recording of the fit, where there is more than an orientation to show."""
     if set(fitted.each) == {"orientation"}:
-        return
+        return False
     shown = fit_recording(fitted, f"Fit of {args.dataset.name}")
     record_fit(folder / "fit.rrd", shown)
     name = "joints" if "joint" in fitted.each else "position"
     fit_joints_figure(shown).savefig(folder / f"{name}.png", dpi=120)
     if shown.residual:
         residual_figure(shown).savefig(folder / "n_basis.png", dpi=120)
+    return True
 
 
 def _finish(args: FitPrimitives, metrics: dict[str, float], folder: Path) -> None:
