@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 
 from hrc_learn.demos import DatasetWriter
+from hrc_learn.kinematics import panda
 from hrc_learn.lerobot import smoothing
+from hrc_learn.lerobot.panda_robot import JOINTS
 from hrc_learn.lerobot.smoothing import (
     ActionLimits,
     calibrated_ranges,
@@ -263,3 +265,27 @@ def test_both_copies_get_on_in_one_process(tmp_path):
         env={**os.environ, "PYTHONPATH": path},
     )
     assert ran.returncode == 0, ran.stderr
+
+
+def test_hrc_smooth_writes_limits_with_the_positions_that_are_known(tmp_path):
+    from hrc_learn.cli.arguments.learn import Smooth
+    from hrc_learn.cli.commands.smooth import smooth
+
+    dataset = write(tmp_path / "set", paths(7), panda.joint_names)
+    file = tmp_path / "limits.json"
+    smooth(Smooth(dataset=dataset, limits=file))
+    limits = ActionLimits.load(file)
+    assert limits.names == list(JOINTS)
+    assert limits.lower == panda.limits.lower.tolist()
+    assert limits.upper == panda.limits.upper.tolist()
+    urdf = URDF.replace('name="a"', f'name="{panda.joint_names[0]}"')
+    (tmp_path / "arm.urdf").write_text(urdf)
+    smooth(Smooth(dataset=dataset, limits=file, urdf=tmp_path / "arm.urdf"))
+    limits = ActionLimits.load(file)
+    assert limits.lower == [-1.5, *[None] * 6]
+    assert limits.velocity[0] == 0.25
+    for arguments in ({"dataset": dataset}, {"limits": file, "remove": True}):
+        with pytest.raises(ValueError, match="--checkpoint is needed"):
+            smooth(Smooth(**arguments))
+    with pytest.raises(ValueError, match="--share must be positive"):
+        smooth(Smooth(dataset=dataset, limits=file, share=0.0))
