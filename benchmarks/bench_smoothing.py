@@ -92,7 +92,6 @@ class Played:
     asked: np.ndarray
     ensembled: np.ndarray | None
     shown: np.ndarray
-    start: np.ndarray
 
 
 @dataclass
@@ -114,7 +113,7 @@ def main(args: Args) -> None:
     scores: dict[tuple[str, str], Score] = {}
     figures: dict[str, float] = {}
     count = -(-args.chunks // (len(args.data) * len(args.policies)))
-    for root in args.data:
+    for done, root in enumerate(args.data, start=1):
         shown, held_out, limits, fps = _read(root, args)
         spread = statistics(shown)[ACTION]["std"].double().numpy()
         for name in args.policies:
@@ -133,6 +132,13 @@ def main(args: Args) -> None:
                 score = scores.setdefault((name, way), Score())
                 _add(score, path, played, limits, spread, args.rate)
             figures[f"{root.name}_{name}_chunks"] = made
+        _report(scores, figures, done, args)
+
+
+def _report(
+    scores: dict[tuple[str, str], Score], figures: dict[str, float], robots: int, args: Args
+) -> None:
+    """Print and keep what is known so far."""
     table = Table(
         *("policy", "way", "setpoints", "beyond limits", "largest, over the limit"),
         *("late [actions]", "RMSE to asked", "RMSE to shown"),
@@ -142,7 +148,7 @@ def main(args: Args) -> None:
             "setpoints": score.setpoints,
             "beyond": score.broken,
             "excess": score.excess,
-            "late": score.late / len(args.data),
+            "late": score.late / robots,
             "rmse_asked": (score.square_asked / score.compared) ** 0.5,
             "rmse_shown": (score.square_shown / score.compared) ** 0.5,
         }
@@ -229,7 +235,6 @@ def _play(name: str, learned: Any, episode: Episode, args: Args) -> Played:
         asked=actions,
         ensembled=torch.cat(ensembled).double().numpy() if ensembled else None,
         shown=episode[ACTION].double().numpy(),
-        start=actions[0],
     )
 
 
@@ -248,10 +253,15 @@ def _ways(
         )
     for degree, latency in ((3, 2.0), (3, 1.0), (1, 1.0)):
         upsampler = ActionUpsampler(limits, args.rate, degree=degree, latency=latency)
-        paths = []
-        for p in played:
-            upsampler.reset(p.start)
-            paths.append(np.concatenate([upsampler.frame(a) for a in p.asked]))
+        # All episodes at once, the shorter ones with their last action repeated.
+        longest = max(len(a) for a in asked)
+        padded = np.stack(
+            [np.pad(a, ((0, longest - len(a)), (0, 0)), "edge") for a in asked], 1
+        )
+        upsampler.reset(padded[0])
+        made = np.concatenate([upsampler.frame(action) for action in padded])
+        per = args.rate / limits.fps
+        paths = [made[: int(len(a) * per), k] for k, a in enumerate(asked)]
         yield f"smooth {degree}, {latency:g}", paths
 
 

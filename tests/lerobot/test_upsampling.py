@@ -77,6 +77,16 @@ def test_any_actions_are_followed_within_limits(rate, latency):
         assert np.abs(path).max() <= limit * (1 + 1e-5)
 
 
+def test_several_robots_are_led_as_each_by_itself():
+    rng = np.random.default_rng(2)
+    actions = rng.normal(size=(12, 3, 2)).repeat(2, 0)
+    together = setpoints(ActionUpsampler(limits(), 125.0, latency=1.0), actions, actions[0])
+    for k in range(3):
+        one = ActionUpsampler(limits(), 125.0, latency=1.0)
+        alone = setpoints(one, actions[:, k], actions[0, k])
+        np.testing.assert_allclose(together[:, k], alone, rtol=0, atol=1e-12)
+
+
 def test_rates_that_do_not_divide_keep_time():
     upsampler = ActionUpsampler(limits(), 125.0)
     upsampler.reset(np.zeros(2))

@@ -70,11 +70,11 @@ class ActionUpsampler:
         self._phase = 0.0
 
     @property
-    def position(self) -> Float[np.ndarray, " D"]:
+    def position(self) -> Float[np.ndarray, "*batch D"]:
         return self._state.position
 
-    def reset(self, position: Float[np.ndarray, " D"]) -> None:
-        """Begin at rest where the robot is.
+    def reset(self, position: Float[np.ndarray, "*batch D"]) -> None:
+        """Begin at rest where the robot is; several robots are led at once where there are.
 
         Raises:
             ValueError: It has another number of values than the limits.
@@ -84,7 +84,7 @@ class ActionUpsampler:
         self._points = np.repeat(position[None], self.degree + 1, axis=0)
         self._newest, self._phase = position, 0.0
 
-    def push(self, action: Float[np.ndarray, " D"]) -> None:
+    def push(self, action: Float[np.ndarray, "*batch D"]) -> None:
         """Take the next action; the phase of `setpoint` counts from now on.
 
         Values that are not finite are taken for those before.
@@ -105,7 +105,7 @@ class ActionUpsampler:
         """Take the newest action once more: with no other ones, the motion comes to rest."""
         self.push(self._newest)
 
-    def setpoint(self, phase: float) -> Float[np.ndarray, " D"]:
+    def setpoint(self, phase: float) -> Float[np.ndarray, "*batch D"]:
         """The next setpoint, 1/rate after the last.
 
         Args:
@@ -114,10 +114,10 @@ class ActionUpsampler:
         """
         assert self._points is not None  # reset() comes before push()
         weights = _weights(self.degree, min(phase, _LATEST))
-        self._state = self._filter.step(self._state, weights @ self._points)
+        self._state = self._filter.step(self._state, np.tensordot(weights, self._points, 1))
         return self._state.position
 
-    def frame(self, action: Float[np.ndarray, " D"]) -> Float[np.ndarray, "n D"]:
+    def frame(self, action: Float[np.ndarray, "*batch D"]) -> Float[np.ndarray, "n *batch D"]:
         """All setpoints until the next action is due.
 
         Where the rates do not divide, their number changes from one action to the next.
@@ -136,7 +136,7 @@ class ActionUpsampler:
 
     def _checked(self, values: np.ndarray) -> np.ndarray:
         values = np.asarray(values, dtype=np.float64)
-        if values.shape != (len(self.limits.names),):
+        if values.shape[-1:] != (len(self.limits.names),):
             raise ValueError(
                 f"limits are given for {', '.join(self.limits.names)}, but there are values "
                 f"of shape {values.shape}"
