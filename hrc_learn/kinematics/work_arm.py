@@ -70,17 +70,17 @@ class WorkArm(ABC):
 
     @abstractmethod
     def nearest(
-        self, pose: Pose, near: Float[Tensor, " joints"], samples: int = 57
-    ) -> Float[Tensor, " joints"]:
-        """Joint positions that reach a pose, as near as can be to given ones [rad].
+        self, pose: Pose, near: Float[Tensor, "*#batch joints"], samples: int = 57
+    ) -> Float[Tensor, "*batch joints"]:
+        """Joint positions that reach poses, as near as can be to given ones [rad].
 
         Args:
-            pose: Of the tool centre point.
+            pose: Of the tool centre point, in any batch shape.
             near: Joint positions [rad].
             samples: Solutions sought among, where there are any number of them.
 
         Raises:
-            UnreachableError: None reaches the pose within the limits.
+            UnreachableError: None reaches a pose within the limits; names the first such pose.
         """
 
     @abstractmethod
@@ -112,22 +112,22 @@ class FrankaWorkArm(WorkArm):
         return "arm angle"
 
     def nearest(
-        self, pose: Pose, near: Float[Tensor, " joints"], samples: int = 57
-    ) -> Float[Tensor, " joints"]:
+        self, pose: Pose, near: Float[Tensor, "*#batch joints"], samples: int = 57
+    ) -> Float[Tensor, "*batch joints"]:
         """Scans joint 7, the redundant one, and keeps the best of the analytic solutions."""
         lower, upper = float(self.chain.limits.lower[6]), float(self.chain.limits.upper[6])
+        batch = torch.broadcast_shapes(pose.position.shape[:-1], near.shape[:-1])
         # A little inside the limits, where the arm can still be corrected.
         candidates = torch.linspace(lower + 0.02, upper - 0.02, samples, dtype=torch.float64)
-        candidates = torch.cat([near[6:7], candidates])
-        many = Pose(
-            pose.position.double().expand(len(candidates), 3),
-            pose.orientation.double().expand(len(candidates), 4),
+        candidates = torch.cat(
+            [near[..., 6:7].expand(*batch, 1), candidates.expand(*batch, samples)], dim=-1
         )
-        found = self.chain.inverse_all(many, candidates).flatten(0, 1)
-        found = found[found.isfinite().all(-1)]
-        if len(found) == 0:
-            raise UnreachableError(_unreachable(pose))
-        return found[(found - near).norm(dim=-1).argmin()]
+        many = Pose(
+            pose.position.double().unsqueeze(-2).expand(*candidates.shape, 3),
+            pose.orientation.double().unsqueeze(-2).expand(*candidates.shape, 4),
+        )
+        found = self.chain.inverse_all(many, candidates).flatten(-3, -2)
+        return _nearest_of(found, pose, near)
 
     def postures(self, pose: Pose) -> Float[Tensor, "postures joints"]:
         """By scanning joint 7."""
@@ -184,43 +184,66 @@ class EquippedArm(WorkArm):
         return "none" if self.joints == 6 else "free"
 
     def nearest(
-        self, pose: Pose, near: Float[Tensor, " joints"], samples: int = 57
-    ) -> Float[Tensor, " joints"]:
-        """From there and from starts around it, by damped least squares."""
-        found = self._solutions(pose, samples, near)
-        return found[(found - near).norm(dim=-1).argmin()]
+        self, pose: Pose, near: Float[Tensor, "*#batch joints"], samples: int = 57
+    ) -> Float[Tensor, "*batch joints"]:
+        """From there and from starts all over, by damped least squares."""
+        return _nearest_of(self._solutions(pose, samples, near), pose, near)
 
     def postures(self, pose: Pose) -> Float[Tensor, "postures joints"]:
         """From starts all over the joints' ranges."""
-        return best_postures(self.chain, self._solutions(pose, _STARTS, self.chain.ready))
+        found = self._solutions(pose, _STARTS, self.chain.ready)
+        found = found[found.isfinite().all(-1)]
+        if len(found) == 0:
+            raise UnreachableError(_unreachable(pose))
+        return best_postures(self.chain, found)
 
     def _solutions(
-        self, pose: Pose, samples: int, near: Float[Tensor, " joints"]
-    ) -> Float[Tensor, "solutions joints"]:
+        self, pose: Pose, samples: int, near: Float[Tensor, "*#batch joints"]
+    ) -> Float[Tensor, "*batch solutions joints"]:
+        """From the wish itself and from random starts; NaN where they do not lead there."""
         limits = self.chain.limits
         # Drawn alike each time: an answer depends on what is asked for alone.
         rng = torch.Generator().manual_seed(0)
         # A joint that turns further than once around has the same poses again.
         low, high = limits.lower.clamp(min=-math.pi), limits.upper.clamp(max=math.pi)
         some = torch.rand(samples, self.joints, generator=rng, dtype=torch.float64)
-        starts = torch.cat([near[None].double(), low + (high - low) * some])
-        found = solutions_from(self.chain, pose, starts)
-        found = found[found.isfinite().all(-1)]
-        if len(found) == 0:
-            raise UnreachableError(_unreachable(pose))
-        return _turned_towards(found, near, limits.lower, limits.upper)
+        wish = near.double().unsqueeze(-2)
+        all_over = (low + (high - low) * some).expand(*near.shape[:-1], -1, -1)
+        found = solutions_from(self.chain, pose, torch.cat([wish, all_over], dim=-2))
+        return _turned_towards(found, wish, limits.lower, limits.upper)
 
 
 _STARTS = 200
 """From which postures are sought."""
 
 
+def _nearest_of(
+    found: Float[Tensor, "*batch solutions joints"],
+    pose: Pose,
+    near: Float[Tensor, "*#batch joints"],
+) -> Float[Tensor, "*batch joints"]:
+    """Of the solutions of each pose, or NaN, the one nearest to given joint positions.
+
+    Raises:
+        UnreachableError: There is none of a pose; names the first.
+    """
+    distance = (found - near.unsqueeze(-2)).norm(dim=-1)
+    least = torch.where(distance.isnan(), torch.inf, distance).min(-1)
+    missing = least.values.isinf()
+    if bool(missing.any()):
+        first = tuple(missing.nonzero()[0].tolist())
+        position = pose.position.expand(*missing.shape, 3)[first]
+        orientation = pose.orientation.expand(*missing.shape, 4)[first]
+        raise UnreachableError(_unreachable(Pose(position, orientation)))
+    return torch.take_along_dim(found, least.indices[..., None, None], dim=-2).squeeze(-2)
+
+
 def _turned_towards(
-    q: Float[Tensor, "solutions joints"],
-    near: Float[Tensor, " joints"],
+    q: Float[Tensor, "*batch solutions joints"],
+    near: Float[Tensor, "*#batch #solutions joints"],
     lower: Float[Tensor, " joints"],
     upper: Float[Tensor, " joints"],
-) -> Float[Tensor, "solutions joints"]:
+) -> Float[Tensor, "*batch solutions joints"]:
     """The same poses with each joint turned by whole turns to be near given positions."""
     turned = q - 2 * math.pi * torch.round((q - near) / (2 * math.pi))
     return torch.where((turned >= lower) & (turned <= upper), turned, q)

@@ -292,18 +292,21 @@ def joint_line(
 
 
 def nearest_configuration(
-    goal: Pose, near: Float[Tensor, " joints"], samples: int = 57, robot: WorkArm = PANDA
-) -> Float[Tensor, " joints"]:
-    """Joint positions that reach a pose, as near as can be to given ones.
+    goal: Pose,
+    near: Float[Tensor, "*#batch joints"],
+    samples: int = 57,
+    robot: WorkArm = PANDA,
+) -> Float[Tensor, "*batch joints"]:
+    """Joint positions that reach poses, as near as can be to given ones.
 
     Args:
-        goal: Pose of the tool centre point.
+        goal: Poses of the tool centre point.
         near: Joint positions [rad].
         samples: Solutions sought among, where there are any number of them.
         robot: The arm.
 
     Raises:
-        UnreachableError: No joint positions within the limits reach the pose.
+        UnreachableError: No joint positions within the limits reach a pose.
     """
     return robot.nearest(goal, near, samples)
 

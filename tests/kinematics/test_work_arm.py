@@ -147,6 +147,35 @@ def test_the_nearest_of_frankas_is_the_best_of_a_scan_of_joint_7():
         assert panda.forward(found).twist_to(poses[i]).abs().max() < 1e-6
 
 
+@pytest.mark.parametrize("of", ["panda", "cut"])
+@pytest.mark.parametrize("batch", [(), (1,), (3,), (2, 2)])
+def test_the_nearest_of_many_poses_are_those_of_each(batch, of):
+    arm = PANDA if of == "panda" else EquippedArm(bare())
+    q, poses = poses_of(arm.chain, 4, seed=6)
+    near = (q + 0.2).clamp(arm.chain.limits.lower, arm.chain.limits.upper)
+    count = math.prod(batch)
+    shaped = Pose(
+        poses.position[:count].reshape(*batch, 3), poses.orientation[:count].reshape(*batch, 4)
+    )
+    found = arm.nearest(shaped, near[:count].reshape(*batch, -1), samples=9)
+    assert found.shape == (*batch, arm.joints)
+    for i, row in enumerate(found.reshape(count, -1)):
+        torch.testing.assert_close(row, arm.nearest(poses[i], near[i], samples=9))
+    # One wish for all of them.
+    same = arm.nearest(shaped, near[0], samples=9).reshape(count, -1)
+    torch.testing.assert_close(same[-1], arm.nearest(poses[count - 1], near[0], samples=9))
+
+
+@pytest.mark.parametrize("of", ["panda", "cut"])
+def test_the_first_of_many_poses_out_of_reach_is_named(of):
+    arm = PANDA if of == "panda" else EquippedArm(bare())
+    _, poses = poses_of(arm.chain, 3, seed=7)
+    position = poses.position.clone()
+    position[1, 0], position[2, 0] = 2.5, 3.5
+    with pytest.raises(UnreachableError, match=r"position \(2\.500,"):
+        arm.nearest(Pose(position, poses.orientation), arm.chain.ready, samples=9)
+
+
 @pytest.mark.parametrize("batch", [(), (3,), (2, 2)])
 def test_solutions_of_many_poses_are_those_of_each(batch):
     chain = bare().chain

@@ -169,9 +169,7 @@ class ClosedLoops:
 
 def _postures(tool: Pose, near: Float[Tensor, "joints"]) -> Float[Tensor, "starts joints"]:
     """Joint positions with the end effector at each of the poses [rad]."""
-    return torch.stack(
-        [nearest_configuration(tool[i], near, samples=9) for i in range(len(tool.position))]
-    )
+    return nearest_configuration(tool, near, samples=9)
 
 
 class _Turned(KalmanEstimator):
