@@ -24,6 +24,11 @@ _OF_CHANNEL = {
     "position": "end effector",
     "orientation": "orientation",
 }
+_HELD_OUT = {
+    "mean": "mean of the others",
+    "contextual": "function of start and goal",
+    "nearest": "nearest of the others",
+}
 _UNITS = ("px", "mm", "deg", "rad", "ms", "s", "%")
 
 
@@ -62,6 +67,14 @@ def primitive_rows(values: Mapping[str, float]) -> list[Measurement]:
         for name in ("demonstrations", "basis_functions")
         if name in values
     ]
+    if "left_out_error" in values:
+        rows.append(
+            Measurement(
+                name="error of demonstrations left out, of the spread of actions",
+                value=_PER_CENT * values["left_out_error"],
+                unit="%",
+            )
+        )
     for channel, word in _OF_CHANNEL.items():
         own, common = f"{channel}_nrmse", f"mean_{channel}_nrmse"
         if f"{own}_median" in values:
@@ -84,6 +97,23 @@ def primitive_rows(values: Mapping[str, float]) -> list[Measurement]:
                     resolution=_FINEST,
                 )
             )
+        held_out = {
+            model: values[f"held_out_{channel}_{model}_nrmse_median"]
+            for model in _HELD_OUT
+            if f"held_out_{channel}_{model}_nrmse_median" in values
+        }
+        # The mean, and the best of what is less simple.
+        others = sorted((m for m in held_out if m != "mean"), key=held_out.__getitem__)
+        rows += [
+            Measurement(
+                name=f"{word}: held out, {_HELD_OUT[model]}",
+                value=_PER_CENT * held_out[model],
+                unit="%",
+                resolution=_FINEST,
+            )
+            for model in ["mean", *others[:1]]
+            if model in held_out
+        ]
         if f"{channel}_turn_rmse_max" in values:
             rows.append(
                 Measurement(

@@ -238,21 +238,20 @@ CONTEXTUAL = "contextual"
 
 
 def contexts(
-    demos: DemonstrationSet, columns: Sequence[str], fitted: FittedPrimitives, channel: str
+    demos: DemonstrationSet, columns: Sequence[str], motions: Motions, channel: str
 ) -> Float[Tensor, "demos C"]:
     """What each demonstration was about.
 
     Args:
         demos: The demonstrations.
         columns: Whose first row it is; none: start and goal of the motion.
-        fitted: To them.
+        motions: Those of the demonstrations.
         channel: Whose start and goal.
 
     Raises:
         ValueError: A demonstration lacks a column.
     """
     if not columns:
-        motions = fitted.motions
         position = motions.position(channel)
         last = (motions.demos.length - 1)[:, None, None]
         goal = position.take_along_dim(last, dim=1)[:, 0]
@@ -270,9 +269,22 @@ def contexts(
 
 
 def fit_contextual(
-    fitted: FittedPrimitives, demos: DemonstrationSet, columns: Sequence[str], folder: Path
+    fitted: FittedPrimitives,
+    demos: DemonstrationSet,
+    columns: Sequence[str],
+    folder: Path,
+    channels: Sequence[str] = ("joint", "position"),
+    regularization: float = 1e-6,
 ) -> dict[str, float]:
     """Fit a primitive for every context, of joints and of positions; save into the folder.
+
+    Args:
+        fitted: To the demonstrations.
+        demos: The demonstrations.
+        columns: Whose first row is the context; none: start and goal.
+        folder: Of the model.
+        channels: Those wanted of them.
+        regularization: See `ContextualDMP.fit`.
 
     Returns:
         Error of each demonstration predicted from the others: median and largest.
@@ -280,7 +292,7 @@ def fit_contextual(
     Raises:
         ValueError: Fewer than two demonstrations, no such channel, or a missing context.
     """
-    linear = [channel for channel in ("joint", "position") if channel in fitted.each]
+    linear = [channel for channel in channels if channel in fitted.each]
     if not linear:
         raise ValueError("a function of a context is learned of joints or of positions.")
     metrics = {}
@@ -289,8 +301,9 @@ def fit_contextual(
         model = ContextualDMP.fit(
             motions.demos.time,
             motions.position(channel),
-            contexts(demos, columns, fitted, channel),
+            contexts(demos, columns, motions, channel),
             fitted.n_basis,
+            regularization=regularization,
             mask=motions.demos.mask,
             **motions.naming(channel),
             **fitted.options,

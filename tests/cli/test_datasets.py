@@ -38,6 +38,10 @@ def test_arrays_are_imported_checked_and_read(recording, tmp_path):
     assert demos[1].start_time == 3.0
     np.testing.assert_allclose(demos[1].time, 0.003 * np.arange(200), atol=1e-9)
     np.testing.assert_allclose(demos[1].joint_position, joint_path(200, 7), atol=1e-6)
+    # The action is where the next frame is; the last one is to stay.
+    command = demos[1].command_position
+    np.testing.assert_array_equal(command[:-1], demos[1].joint_position[1:])
+    np.testing.assert_array_equal(command[-1], demos[1].joint_position[-1])
     status, text, _ = hrc("check", out, "--json", tmp_path / "check.json")
     assert status == 0
     checked = json.loads((tmp_path / "check.json").read_text())
@@ -62,6 +66,12 @@ def test_poses_are_imported_in_centimetres(tmp_path):
     assert len(demos) == 2
     np.testing.assert_allclose(demos[0].position, joint_path(50), atol=1e-6)
     assert demos[0].duration == pytest.approx(5)
+    action = demos[0].extra["action"]
+    np.testing.assert_allclose(action[:-1, :3], demos[0].position[1:], atol=1e-6)
+    np.testing.assert_allclose(action[:-1, 3], 2 * angle[1:], atol=1e-6)
+    again = ("import", tmp_path / "poses.npy", "--out", tmp_path / "bare", "--no-actions")
+    assert hrc(*again, "--columns", "px,py,pz,qw,qx,qy,qz", "--duration", "5")[0] == 0
+    assert not load_demos(tmp_path / "bare")[0].extra
 
 
 @pytest.mark.parametrize(

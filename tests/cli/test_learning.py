@@ -122,6 +122,37 @@ def test_a_fit_shows_few_rows_with_units_and_all_of_them_if_wanted(poses, tmp_pa
     (row,) = [line for line in short.splitlines() if "median NRMSE" in line]
     assert f"{100 * metrics['mean_position_nrmse_median']:.2f} %" in row
     rows = [line for line in short.splitlines() if line.startswith("│")]
-    assert 4 <= len(rows) <= 8
+    assert 4 <= len(rows) <= 10
     assert sum(line.startswith("│") for line in whole.splitlines()) == len(metrics)
     assert f"{len(metrics) - len(rows)} more" in short
+
+
+def test_a_fit_says_what_predicts_best_and_an_evaluation_takes_it(poses, tmp_path):
+    model = tmp_path / "model"
+    output = done(
+        *("fit", "--dataset", poses, "--n-basis", 20, "--channels", "position", "--out", model)
+    ).output
+    assert "held out, function of start and goal" in output
+    metrics = json.loads((model / "metrics.json").read_text())
+    errors = [metrics[f"held_out_position_{m}_nrmse_median"] for m in ("mean", "contextual")]
+    assert json.loads((model / "prediction.json").read_text())["models"] == {
+        "position": "contextual" if errors[1] < 0.9 * errors[0] else "mean"
+    }
+    if errors[1] < 0.9 * errors[0]:
+        assert "position: a function of start and goal" in output
+        assert "contextual model" in done("evaluate", model, poses).output
+
+
+def test_a_policy_of_a_dataset_without_actions_names_the_cure(poses, tmp_path):
+    np.savez(
+        tmp_path / "q.npz", t=0.01 * np.arange(50), q=np.linspace(0, 1, 100).reshape(50, 2)
+    )
+    bare = tmp_path / "bare"
+    arguments = ("--joints", "q", "--time", "t", "--no-actions")
+    done("import", tmp_path / "q.npz", "--out", bare, *arguments)
+    out = tmp_path / "policy"
+    outcome = done("fit", "--dataset", bare, "--out", out, "--as-lerobot-policy", status=2)
+    assert "no actions" in outcome.error
+    assert "hrc import --actions" in outcome.error
+    done("fit", "--dataset", poses, "--out", out, "--as-lerobot-policy", "--n-basis", 20)
+    assert (out / "model.safetensors").is_file()

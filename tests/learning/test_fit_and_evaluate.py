@@ -91,10 +91,10 @@ def test_the_number_of_basis_functions_is_chosen_by_samples_held_out(demos):
 
 def test_contexts_are_ends_or_columns(demos, tmp_path):
     fitted = fit_primitives(demos, 15, channels=("position",))
-    ends = contexts(demos, (), fitted, "position")
+    ends = contexts(demos, (), fitted.motions, "position")
     assert ends.shape == (3, 6)
     np.testing.assert_allclose(ends[1, 3:], demos[1].position[-1])
-    size = contexts(demos, ("observation.size",), fitted, "position")
+    size = contexts(demos, ("observation.size",), fitted.motions, "position")
     assert size[:, 0].tolist() == [1.5, 2.5, 3.5]
     metrics = fit_contextual(fitted, demos, ("observation.size",), tmp_path)
     # The reach is a linear function of the size, so two demonstrations tell of the third.
@@ -103,7 +103,7 @@ def test_contexts_are_ends_or_columns(demos, tmp_path):
     middle = model.at([2.0])
     assert middle.goal[0].item() == pytest.approx(0.3 + 0.25, abs=1e-4)
     with pytest.raises(ValueError, match=r"episode 0: no column 'observation.mass'"):
-        contexts(demos, ("observation.mass",), fitted, "position")
+        contexts(demos, ("observation.mass",), fitted.motions, "position")
 
 
 def test_errors_of_a_known_offset(demos):

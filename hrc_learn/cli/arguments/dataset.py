@@ -168,6 +168,9 @@ class ImportArrays(Measured):
     """Length of each demonstration [s] where there are no stamps."""
     fps: float | None = None
     """Frame rate [1/s] where there are no stamps."""
+    actions: bool = True
+    """Take what the next frame holds for the action of each, joints or else the pose, as is
+    usual where a person led the arm: LeRobot's policies learn from actions alone."""
     joint_unit: Literal["rad", "deg"] = "rad"
     """Unit of the joint positions."""
     position_unit: Literal["m", "cm", "mm"] = "m"

@@ -40,10 +40,12 @@ class FitPrimitives(Fit):
 
     channels: tuple[Channel, ...] = ()
     """What to learn; joint and pose, or what there is of them, when empty."""
-    several: Literal["mean", "distribution", "contextual", "streamed"] = "mean"
-    """What to keep of several demonstrations. Their mean; all of them as well, which a
-    DMPDistribution is made of; a primitive for every context; or one fitted to all in one
-    pass, one demonstration in memory at a time, and under torchrun in several processes."""
+    several: Literal["best", "mean", "distribution", "contextual", "streamed"] = "best"
+    """What to keep of several demonstrations. Their mean and, of joints and positions, whatever
+    predicts held-out ones clearly better: a function of start and goal, or the nearest of
+    them. Their mean alone; all of them as well, which a DMPDistribution is made of; a
+    primitive for every context; or one fitted to all in one pass, one demonstration in memory
+    at a time, and under torchrun in several processes."""
     context: More[tuple[str, ...]] = ()
     """Columns whose first row is the context; start and goal when empty."""
     n_basis: int | None = 60

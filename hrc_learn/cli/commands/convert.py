@@ -1,6 +1,8 @@
 """`hrc import`, `hrc extract`: datasets from arrays, and image features from videos."""
 
 import time
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +12,7 @@ from hrc_learn.cli._run import write_values
 from hrc_learn.cli.arguments.dataset import Extract, ImportArrays
 from hrc_learn.demos import DatasetWriter, Demonstration, Detector, extract_features
 from hrc_learn.demos.read.arrays import ArraySources, demonstrations_from_table, read_table
+from hrc_learn.demos.write.episode import rotation_vectors
 from hrc_learn.vision import MarkerDetector, centre
 
 
@@ -25,8 +28,11 @@ def import_arrays(args: ImportArrays) -> None:
             f"{sorted({len(demo.joint_names) for demo in demos})}, frame rates {rates} Hz "
             f"(give --fps to count all alike; stamps are kept)"
         )
+    features = {}
+    if args.actions:
+        demos, features = with_actions(demos)
     with DatasetWriter(
-        args.out, rates[0], args.robot_type, demos[0].joint_names, dtype=args.dtype
+        args.out, rates[0], args.robot_type, demos[0].joint_names, features, dtype=args.dtype
     ) as writer:
         for demo in demos:
             writer.add_episode(demo)
@@ -41,6 +47,40 @@ def import_arrays(args: ImportArrays) -> None:
         f"{summary['seconds']:.1f} s"
     )
     write_values(args.json, summary)
+
+
+_POSE_ACTION = {
+    "position": ("ee.x", "ee.y", "ee.z"),
+    "orientation": ("ee.wx", "ee.wy", "ee.wz"),
+}
+
+
+def with_actions(
+    demos: Sequence[Demonstration],
+) -> tuple[list[Demonstration], dict[str, tuple[str, ...]]]:
+    """Demonstrations whose action is where the next frame is; the last one's is to stay.
+
+    Args:
+        demos: All of the same columns.
+
+    Returns:
+        Those, and the features of their own that a `DatasetWriter` is to be told of.
+    """
+    if demos[0].joint_position is not None:
+        return [replace(d, command_position=_next(d.joint_position)) for d in demos], {}
+    parts = [name for name in _POSE_ACTION if getattr(demos[0], name) is not None]
+    made = []
+    for demo in demos:
+        columns = [getattr(demo, name) for name in parts]
+        columns = [rotation_vectors(c) if c.shape[1] == 4 else c for c in columns]
+        action = _next(np.concatenate(columns, axis=1))
+        made.append(replace(demo, extra={**demo.extra, "action": action}))
+    return made, {"action": tuple(name for part in parts for name in _POSE_ACTION[part])}
+
+
+def _next(values: np.ndarray | None) -> np.ndarray:
+    assert values is not None
+    return np.concatenate([values[1:], values[-1:]])
 
 
 def _read(args: ImportArrays, path: Path) -> list[Demonstration]:

@@ -26,6 +26,7 @@ from hrc_learn.learning.channels import (
     load_primitive,
     reproduction_error,
 )
+from hrc_learn.learning.model_choice import best_models, predict
 from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.store import new_folder, read_made_by, write_json
 from hrc_learn.viz.figures import measures_figure
@@ -79,10 +80,12 @@ def _evaluate(args: EvaluatePrimitives, model: Path) -> int:
     motions = Motions.of(demos)
     figures: dict[str, float] = {"demonstrations": float(len(demos))}
     errors: dict[str, ReproductionError] = {}
+    for channel, better in best_models(model).items():
+        console.print(f"note: {channel} is predicted by the {better} model, not by the mean")
     for channel in channels:
         motions.require(channel)
         primitive = load_primitive(model / channel, channel)
-        made = motions.adapted(channel, primitive)
+        made = predict(model, channel, motions, demos)
         errors[channel] = reproduction_error(channel, motions, made)
         figures |= errors[channel].summary(channel)
         figures[f"{channel}_duration_ratio_median"] = _duration_ratio(

@@ -17,6 +17,7 @@ from hrc_learn.cli.arguments.learn import FitImageJacobian, FitPrimitives
 from hrc_learn.cli.commands.check import columns
 from hrc_learn.demos import DemonstrationSource, load_demos, open_demos
 from hrc_learn.jacobian import CellErrors, RBFCenters, grid
+from hrc_learn.learning.model_choice import best_models, keep_best
 from hrc_learn.learning.primitive_fitting import (
     FittedPrimitives,
     fit_contextual,
@@ -65,6 +66,9 @@ def fit_primitives(args: FitPrimitives) -> None:
             metrics = fitted.metrics()
             if args.several == "contextual":
                 metrics |= fit_contextual(fitted, demos, args.context, folder)
+            # Scaled motions are linear neither in their mean nor in a context.
+            if args.several == "best" and args.scaling == "none":
+                metrics |= keep_best(fitted, demos, args.context, folder)
         fitted.save(folder, each=args.several == "distribution")
         if args.several == "distribution":
             metrics |= {f"{k}_spread": _spread(fitted, k) for k in fitted.each}
@@ -103,7 +107,7 @@ def _fit_policy(args: FitPrimitives, console: Console) -> None:
     given = (args.channels, args.context, args.joint_names, args.robust)
     given += (args.units, args.mapping)
     if any(given) or (args.several, args.method, args.scaling) != (
-        "mean",
+        "best",
         "trajectory",
         "none",
     ):
@@ -149,8 +153,21 @@ def _draw(fitted: FittedPrimitives, args: FitPrimitives, folder: Path) -> bool:
 def _finish(args: FitPrimitives, metrics: dict[str, float], folder: Path) -> None:
     write_json(folder / "metrics.json", metrics)
     show_values(f"Fit of {args.dataset}", metrics, primitive_rows(metrics), args.verbose)
+    for channel, better in best_models(folder).items():
+        error = 100 * metrics[f"held_out_{channel}_{better}_nrmse_median"]
+        mean = 100 * metrics[f"held_out_{channel}_mean_nrmse_median"]
+        print(
+            f"{channel}: {_MODELS[better]} predicts held-out demonstrations best, NRMSE "
+            f"{error:.1f} % against {mean:.1f} % of the mean; hrc evaluate takes it"
+        )
     print(f"Model in {shlex.quote(str(args.folder))}")
     write_values(args.json, metrics)
+
+
+_MODELS = {
+    "contextual": "a function of start and goal (or of --context)",
+    "nearest": "the demonstration of the nearest start and goal",
+}
 
 
 def fit_image_jacobian(args: FitImageJacobian) -> None:

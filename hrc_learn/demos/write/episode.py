@@ -144,7 +144,7 @@ def encode(
     for column in columns:
         values = np.asarray(episode[column.given], dtype=np.float64)
         if column.role == "rotation_vector":
-            values = _rotation_vectors(values)
+            values = rotation_vectors(values)
         parts.setdefault(column.key, []).append(values.reshape(len(values), -1))
     return {key: np.concatenate(arrays, axis=1) for key, arrays in parts.items()}
 
@@ -155,7 +155,7 @@ def _expand(names: tuple[str, ...], joint_names: Sequence[str]) -> tuple[str, ..
     return names
 
 
-def _rotation_vectors(
+def rotation_vectors(
     orientation: Float64[np.ndarray, "frames 4"],
 ) -> Float64[np.ndarray, "frames 3"]:
     # A gripper that points down has turned by about pi, where the shortest rotation

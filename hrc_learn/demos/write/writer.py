@@ -94,7 +94,7 @@ class DatasetWriter:
         if len(set(joint_names)) != len(joint_names):
             raise ValueError(f"joint names must differ, got {', '.join(joint_names)}")
         for key in features or {}:
-            if not key.startswith(("observation.", "action.")):
+            if key != "action" and not key.startswith(("observation.", "action.")):
                 raise ValueError(
                     f"feature {key!r} needs a key that LeRobot understands: 'observation.{key}'"
                 )

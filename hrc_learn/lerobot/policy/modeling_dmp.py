@@ -249,6 +249,11 @@ def write_closed_form_policy(
         raise FileNotFoundError(f"there is no LeRobot dataset in {dataset}")
     meta = LeRobotDatasetMetadata(f"local/{dataset.name}", root=dataset)
     features = dataset_to_policy_features(meta.features)
+    if not any(feature.type is FeatureType.ACTION for feature in features.values()):
+        raise ValueError(
+            f"{dataset} has no actions, which are what policies learn: record them, or import "
+            f"arrays with them (hrc import --actions)"
+        )
     config = DMPConfig(
         n_basis=n_basis,
         fit_episodes=None if episodes is None else list(episodes),
