@@ -288,7 +288,8 @@ for _name, _step in ((WATCH, WatchStateStep), (SMOOTH, SmoothActionsStep)):
 
 # Adding the steps to a checkpoint.
 
-PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor.json", "policy_postprocessor.json"
+PREPROCESSOR = "policy_preprocessor.json"
+POSTPROCESSOR = "policy_postprocessor.json"
 
 
 def add_smoothing(checkpoint: Path, limits: ActionLimits) -> None:
