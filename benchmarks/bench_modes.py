@@ -31,6 +31,7 @@ class Args:
     n_basis: int = 30
     """Basis functions of each primitive."""
     seed: int = 0
+    """Of the made-up demonstrations."""
     json: Path | None = None
     """Receives the figures as one flat object."""
 

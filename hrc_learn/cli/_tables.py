@@ -25,9 +25,9 @@ _OF_CHANNEL = {
     "orientation": "orientation",
 }
 _HELD_OUT = {
-    "mean": "mean of the others",
-    "contextual": "function of start and goal",
-    "nearest": "nearest of the others",
+    "mean": "by the mean",
+    "contextual": "by start and goal",
+    "nearest": "by the nearest",
 }
 _UNITS = ("px", "mm", "deg", "rad", "ms", "s", "%")
 
@@ -62,11 +62,9 @@ def named(name: str, value: float) -> Measurement:
 
 def primitive_rows(values: Mapping[str, float]) -> list[Measurement]:
     """What matters of `FittedPrimitives.metrics`, NRMSE relative to the range of the motion."""
-    rows = [
-        Measurement(name=name.replace("_", " "), value=round(values[name]))
-        for name in ("demonstrations", "basis_functions")
-        if name in values
-    ]
+    rows = []
+    if "demonstrations" in values:
+        rows.append(Measurement(name="demonstrations", value=round(values["demonstrations"])))
     if "left_out_error" in values:
         rows.append(
             Measurement(
@@ -76,53 +74,30 @@ def primitive_rows(values: Mapping[str, float]) -> list[Measurement]:
             )
         )
     for channel, word in _OF_CHANNEL.items():
-        own, common = f"{channel}_nrmse", f"mean_{channel}_nrmse"
-        if f"{own}_median" in values:
-            # The worst of them: one demonstration that is not represented must not hide.
-            rows.append(
-                Measurement(
-                    name=f"{word}: worst NRMSE of a demonstration",
-                    value=_PER_CENT * values[f"{own}_max"],
-                    unit="%",
-                    target=REPRESENTED,
-                    resolution=_FINEST,
-                )
-            )
-        if f"{common}_median" in values:
-            rows.append(
-                Measurement(
-                    name=f"{word}: median NRMSE, one for all",
-                    value=_PER_CENT * values[f"{common}_median"],
-                    unit="%",
-                    resolution=_FINEST,
-                )
-            )
         held_out = {
-            model: values[f"held_out_{channel}_{model}_nrmse_median"]
-            for model in _HELD_OUT
+            said: f"held_out_{channel}_{model}_nrmse_median"
+            for model, said in _HELD_OUT.items()
             if f"held_out_{channel}_{model}_nrmse_median" in values
         }
-        # The mean, and the best of what is less simple.
-        others = sorted((m for m in held_out if m != "mean"), key=held_out.__getitem__)
+        best = min(held_out, key=lambda said: values[held_out[said]], default="")
+        shown = (
+            # The worst of them: one demonstration that is not represented must not hide.
+            (f"{channel}_nrmse_max", "worst NRMSE of a demonstration", "%", REPRESENTED),
+            (f"mean_{channel}_nrmse_median", "median NRMSE, one for all", "%", None),
+            (held_out.get(best, ""), f"held out, {best}", "%", None),
+            (f"{channel}_turn_rmse_max", "worst rotation error", "deg", None),
+        )
         rows += [
             Measurement(
-                name=f"{word}: held out, {_HELD_OUT[model]}",
-                value=_PER_CENT * held_out[model],
-                unit="%",
+                name=f"{word}: {name}",
+                value=(_PER_CENT if unit == "%" else 1.0) * values[key],
+                unit=unit,
+                target=target,
                 resolution=_FINEST,
             )
-            for model in ["mean", *others[:1]]
-            if model in held_out
+            for key, name, unit, target in shown
+            if key in values
         ]
-        if f"{channel}_turn_rmse_max" in values:
-            rows.append(
-                Measurement(
-                    name=f"{word}: worst rotation error",
-                    value=values[f"{channel}_turn_rmse_max"],
-                    unit="deg",
-                    resolution=_FINEST,
-                )
-            )
     return rows
 
 
