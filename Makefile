@@ -1,4 +1,4 @@
-.PHONY: demo test test-slow test-wheel docs format check bench clean
+.PHONY: demo test test-slow test-wheel docs format check bench xr clean
 .DEFAULT_GOAL := help
 
 PYTHON := .venv/bin/python
@@ -12,6 +12,7 @@ help:
 	@echo "             make demo SHELF=upper places on another shelf (lower, middle, upper)"
 	@echo "             make demo ROBOT=xarm7 does it with another arm (ur5, ur5e, iiwa7, fr3, ...)"
 	@echo "make test    run the tests"
+	@echo "make xr      build the client for headsets and phones"
 	@echo "make bench   measure the speed against floors and peers"
 	@echo "make docs    build the documentation site; writes outputs/docs"
 	@echo "make format  format the code        make check  lint, type-check, build the site"
@@ -44,6 +45,9 @@ check: .venv/.installed
 	$(PYTHON) -m ruff format --check .
 	$(PYTHON) -m pyright
 	$(PYTHON) tools/build_docs.py
+
+xr: .venv/.installed
+	$(PYTHON) tools/build_xr.py
 
 bench: .venv/.installed
 	for program in benchmarks/bench_*.py; do $(PYTHON) $$program || exit 1; done

@@ -162,7 +162,9 @@ class Browser:
 
 
 @contextmanager
-def chromium(folder: Path, size: tuple[int, int] = (900, 560)) -> Iterator:
+def chromium(
+    folder: Path, size: tuple[int, int] = (900, 560), more: tuple[str, ...] = ()
+) -> Iterator:
     """A fresh tab of a headless Chromium; skips where there is none."""
     api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
     if CHROMIUM is None:
@@ -173,7 +175,7 @@ def chromium(folder: Path, size: tuple[int, int] = (900, 560)) -> Iterator:
             executable_path=CHROMIUM,
             headless=True,
             viewport={"width": size[0], "height": size[1]},
-            args=list(OPTIONS),
+            args=[*OPTIONS, *more],
         )
         try:
             yield context.pages[0] if context.pages else context.new_page()

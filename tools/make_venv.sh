@@ -72,4 +72,8 @@ else
 fi
 "${install_arms[@]}" --no-deps "${arms[@]}" ||
   say "Left out: iiwa7, ur5e, gen3, jaco, sawyer (robosuite) and viperx (gym-aloha): not to be had."
+if command -v node >/dev/null 2>&1 && command -v npm >/dev/null 2>&1; then
+  .venv/bin/python tools/build_xr.py >/dev/null 2>&1 ||
+    say "The client for headsets was not built; 'make xr' says why. All else works without it."
+fi
 say "Ready: .venv"

@@ -35,6 +35,7 @@ EXTRAS = {
     "matplotlib": "viz",
     "viser": "ui",
     "pygame": "gamepad",
+    "forcedimension_core": "haptic",
     "lerobot": "lerobot",
     "gymnasium": "lerobot",
     "franky": "hardware",

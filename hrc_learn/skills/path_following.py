@@ -59,7 +59,11 @@ def follow_path(
     """
     if not len(path):
         return 0
-    return PathFollower(cell, path).follow(until)
+    cell.plan = path
+    try:
+        return PathFollower(cell, path).follow(until)
+    finally:
+        cell.plan = None
 
 
 class PathFollower:

@@ -194,6 +194,7 @@ class WorkCell:
         remarks: What was said to the person beside the arm, and when [s].
         region: To which the last command of a controller led the end effector; None: the last
             command was of no controller.
+        plan: Path that the joints follow [rad]; None: they follow none.
         images: Images kept for the recording.
     """
 
@@ -240,6 +241,7 @@ class WorkCell:
         self.images: list[KeptImage] = []
         self.remarks: list[Event] = []
         self.region: PositionRegion | None = None
+        self.plan: Float[np.ndarray, "steps joints"] | None = None
         self._arm, self._human = arm, human
         self._advance, self._on_phase = advance, on_phase
         self.clearance = clearance

@@ -2,7 +2,7 @@
 job and pulls the arm's body.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
@@ -21,6 +21,7 @@ from hrc_learn.skills.pick_and_place import INTERACT
 from hrc_learn.skills.work_cell import SAFETY_COLUMNS, WorkCell
 from hrc_learn.teleoperation.demonstration_recorder import DemonstrationRecorder
 from hrc_learn.teleoperation.devices import CombinedInput, InputFilter, InputFilterConfig
+from hrc_learn.teleoperation.gate.messages import TrackedHand
 from hrc_learn.teleoperation.hand_guiding import (
     Frame,
     GuidedStep,
@@ -38,16 +39,23 @@ _SHOW_EVERY = 10
 _LOOK = 0.05
 # Without anybody at the page a recording goes on for so long [s]: pages load anew in less.
 _LEFT_FOR = 5.0
+# Of a planned way, as many points as make it look smooth.
+_WAY_POINTS = 24
 # How long what the arm says to the person is shown [s]: two lines are read in half of that.
 _REMARK_STAYS = 6.0
 _INVITATION = "Pull at a link or a knob: the end effector keeps servoing."
 
+_HAND = ("x", "y", "z", "qw", "qx", "qy", "qz")
+
 FEATURES = {
     "observation.human_twist": ("vx", "vy", "vz", "wx", "wy", "wz"),
     "observation.region": ("x", "y", "z", "half_x", "half_y", "half_z"),
+    "observation.left_hand": _HAND,
+    "observation.right_hand": _HAND,
 }
-"""Recorded beside the usual columns: end-effector motion that the person asked for, and the
-active region (zeros where there is none)."""
+"""Recorded beside the usual columns: end-effector motion that the person asked for, the active
+region (zeros where there is none), and the pose of each hand in the base frame (zeros while no
+headset sees it)."""
 
 
 def place_targets(workplace: Workplace) -> list[Box]:
@@ -175,7 +183,7 @@ class PageSession:
         with torch.inference_mode():
             step = self.arm.step()
         if self._ticks % self._config.record_every == 0:
-            self._recorder.add(recorded(step))
+            self._recorder.add({**recorded(step), **hand_columns(self._page.hands)})
         width = step.human_input.gripper
         if width is not None and width != self._width:
             self._width = width
@@ -265,6 +273,20 @@ def recorded(step: GuidedStep) -> Frame:
     }
 
 
+def hand_columns(hands: Mapping[str, TrackedHand]) -> Frame:
+    """Columns of the person's hands.
+
+    Args:
+        hands: That are seen, by "left" and "right".
+    """
+    columns: Frame = {}
+    for name in ("left", "right"):
+        seen = hands.get(name)
+        pose = np.zeros(7) if seen is None else np.array([*seen.position, *seen.orientation])
+        columns[f"observation.{name}_hand"] = pose
+    return columns
+
+
 class TaskPage:
     """A page beside a task that runs by itself: people watch it, and pull the arm.
 
@@ -331,9 +353,18 @@ class TaskPage:
             seconds=cell.time,
             note=note,
             region=_followed(cell),
+            plan=_way(cell),
             interventions=dict(zip(SAFETY_COLUMNS, map(int, acted), strict=True)),
             contacts=len(world.cabinet_contacts.touches) + len(world.table_contacts.touches),
         )
+
+
+def _way(cell: WorkCell) -> Float[np.ndarray, "points 3"] | None:
+    """The end effector along the path that is being followed, if any [m]."""
+    if cell.plan is None:
+        return None
+    some = np.linspace(0, len(cell.plan) - 1, min(len(cell.plan), _WAY_POINTS)).astype(int)
+    return cell.chain.forward(torch.from_numpy(cell.plan[some])).position.numpy()
 
 
 def _followed(cell: WorkCell) -> DrawnRegion | None:

@@ -330,10 +330,11 @@ class Serve(OfRobot, Led, Measured):
 class ServePage(OfRobot, Led, Measured):
     """Lead the arm in a browser, and record demonstrations of your own.
 
-    Open the address that is printed. Drag a link or a knob of the arm, or of its virtual twin,
-    to move it in its null space; drag the end effector's gizmo, such as to a green field on a
-    shelf. Start, stop, save. Ends with "Finish", with Ctrl-C, or after --duration, and leaves a
-    LeRobot dataset if anything was saved.
+    Open the address that is printed, or in a headset or on a phone the other one. Drag a link
+    or a knob of the arm, or of its virtual twin, to move it in its null space; drag the end
+    effector's gizmo, such as to a green field on a shelf. Start, stop, save. Ends with
+    "Finish", with Ctrl-C, or after --duration, and leaves a LeRobot dataset if anything was
+    saved.
     """
 
     out: Path
@@ -342,9 +343,10 @@ class ServePage(OfRobot, Led, Measured):
     """Port of the page, which must be free; the first free one from 8080 on when not given."""
     task: str = "put the object on the middle shelf"
     """What is to be shown, in words; it can be changed on the page."""
-    beside: Literal["nothing", "gamepad", "keyboard"] = "nothing"
+    beside: Literal["nothing", "gamepad", "keyboard", "haptic"] = "nothing"
     """A device for the other hand, which moves the end effector: a gamepad (extra `gamepad`),
-    or the keys of the terminal this runs in."""
+    the keys of the terminal this runs in, or a haptic device of Force Dimension (extra
+    `haptic`; not run on hardware)."""
     duration: float | None = None
     """End after this time [s]; None: when the person finishes."""
     page: Configuration = Detail("hrc_learn.teleoperation.page", "PageConfig")

@@ -28,7 +28,9 @@ from hrc_learn.sim.workplace import Workplace
 from hrc_learn.teleoperation.demonstration_recorder import DemonstrationRecorder
 from hrc_learn.teleoperation.devices import Gamepad, TerminalKeyboard
 from hrc_learn.teleoperation.gate import qr_code
+from hrc_learn.teleoperation.haptic_device import HapticDevice
 from hrc_learn.teleoperation.page import Page
+from hrc_learn.teleoperation.page.headset_scene import BUILD
 from hrc_learn.teleoperation.page_session import (
     FEATURES,
     PageSession,
@@ -65,14 +67,17 @@ def page(args: ServePage) -> None:
             bodies = MovingBodies(world)
             drawn = bodies.drawn(*(poses[None] for poses in bodies.poses()))
             config = replace(args.session, guiding=replace(args.session.guiding, safety=safety))
-            with Page(robot.chain, drawn, stands, args.page, task=args.task) as page:
+            with (
+                _beside(args.beside, robot.chain) as beside,
+                Page(robot.chain, drawn, stands, args.page, task=args.task) as page,
+            ):
                 session = PageSession(
                     workplace,
                     page,
                     recorder,
                     world,
                     opened=opened,
-                    beside=_beside(args.beside, robot.chain),
+                    beside=beside,
                     config=config,
                 )
                 _announce(console, page)
@@ -110,15 +115,25 @@ def _opened(
 def _announce(console: Console, page: Page) -> None:
     """Say where the page is, with the secret that opens it."""
     console.print(f"Page at [bold]{page.url}[/]", soft_wrap=True)
+    if page.headset_url:
+        console.print(f"For headsets and phones: [bold]{page.headset_url}[/]", soft_wrap=True)
+    else:
+        console.print(f"No client for headsets: [bold]{BUILD}[/] in a checkout builds it")
     if page.address.scheme == "https":
         console.print("Whoever has this address can move the arm:")
         console.print(qr_code(page.url))
 
 
-def _beside(device: str, chain: SerialChain) -> tuple[Human, ...]:
-    if device == "gamepad":
-        return (Gamepad.open(chain),)
-    return (TerminalKeyboard.open(chain),) if device == "keyboard" else ()
+@contextmanager
+def _beside(device: str, chain: SerialChain) -> Iterator[tuple[Human, ...]]:
+    """The device for the other hand, if any."""
+    if device == "haptic":
+        with HapticDevice.open(chain) as haptic:
+            yield (haptic,)
+    elif device == "gamepad":
+        yield (Gamepad.open(chain),)
+    else:
+        yield (TerminalKeyboard.open(chain),) if device == "keyboard" else ()
 
 
 def _serve(

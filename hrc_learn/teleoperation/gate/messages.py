@@ -142,10 +142,27 @@ class Grip:
 
 
 @dataclass(frozen=True, kw_only=True)
+class TrackedHand:
+    """Where a hand is, whether it holds something or not."""
+
+    hand: Literal["left", "right"]
+    position: Point
+    """Between thumb and index finger, or of the controller, in the base frame [m]."""
+    orientation: Quaternion
+    """Of the hand's grip (wxyz, base frame)."""
+
+    def __post_init__(self) -> None:
+        _near(self.position)
+        _unit(self.orientation)
+
+
+@dataclass(frozen=True, kw_only=True)
 class Hands:
     """All that is held now: what is not named is let go."""
 
     grips: tuple[Grip, ...]
+    tracked: tuple[TrackedHand, ...] = ()
+    """Hands that are seen now."""
     sent: float = 0.0
     """Clock of the client, returned with the status: how long the way there and back takes."""
 
@@ -154,6 +171,8 @@ class Hands:
             raise ValueError(f"{_MOST_GRIPS} hands at most.")
         if len({grip.hand for grip in self.grips}) < len(self.grips):
             raise ValueError("a hand holds one thing.")
+        if len({seen.hand for seen in self.tracked}) < len(self.tracked):
+            raise ValueError("a hand is in one place.")
 
 
 Message = Beat | Hello | Lead | Ask | Task | Gripper | Region | Target | Hands

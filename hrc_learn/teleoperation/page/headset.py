@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from hrc_learn.geometry import Pose
 from hrc_learn.protocols import DrawnRegion
-from hrc_learn.teleoperation.gate.messages import Grip, Hands, MessageError
+from hrc_learn.teleoperation.gate.messages import Grip, Hands, MessageError, TrackedHand
 from hrc_learn.teleoperation.page.page_operator import AddedTurn, HeldGizmo, HeldGizmos
 
 _HOLDER = "headset"
@@ -42,7 +42,13 @@ class HeadsetHands:
         """
         self._held, self._turn, self._links, self._guides = held, turn, links, guides
         self._grips: dict[str, Grip] = {}
+        self._tracked: Mapping[str, TrackedHand] = {}
         self._noted = False
+
+    @property
+    def tracked(self) -> Mapping[str, TrackedHand]:
+        """Where the hands are that are seen now, by name."""
+        return self._tracked
 
     def hear(self, hands: Hands) -> None:
         """Take a message over.
@@ -50,6 +56,7 @@ class HeadsetHands:
         Raises:
             MessageError: It holds a joint that the arm does not have.
         """
+        self._tracked = {seen.hand: seen for seen in hands.tracked}
         links = self._links()
         if links is None:
             return
@@ -73,7 +80,7 @@ class HeadsetHands:
 
     def forget(self) -> None:
         """Somebody else leads: what their hands hold already moves nothing until taken anew."""
-        self._noted = False
+        self._noted, self._tracked = False, {}
 
     def _take(self, grip: Grip, links: Pose) -> None:
         start = torch.tensor(grip.start, dtype=torch.float64)
@@ -100,6 +107,7 @@ def scene_state(
     followed: DrawnRegion | None,
     drawn: DrawnRegion | None,
     active: bool,
+    plan: Float[np.ndarray, "points 3"] | None = None,
 ) -> dict[str, Any]:
     """Where everything is, for a client that draws the scene itself.
 
@@ -112,6 +120,7 @@ def scene_state(
         followed: Region to which a controller takes the end effector.
         drawn: Region that the person draws.
         active: Whether that attracts the end effector.
+        plan: Way that the end effector is about to take [m]; None: it has none.
     """
     return {
         "bodies": np.concatenate([positions, orientations], axis=1).round(6).tolist(),
@@ -122,4 +131,5 @@ def scene_state(
         "followed": None if followed is None else vars(followed),
         "drawn": None if drawn is None else vars(drawn),
         "active": active,
+        "plan": [] if plan is None else plan.round(4).tolist(),
     }

@@ -6,7 +6,7 @@ import contextlib
 import io
 import secrets
 import time
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from threading import Event, Lock, Thread
@@ -29,12 +29,20 @@ from hrc_learn.teleoperation.gate import (
     page_contents,
 )
 from hrc_learn.teleoperation.gate.control import Link
-from hrc_learn.teleoperation.gate.messages import Ask, GuiUpdate, Hands, Message
+from hrc_learn.teleoperation.gate.messages import (
+    Ask,
+    GuiUpdate,
+    Hands,
+    Message,
+    Point,
+    TrackedHand,
+)
 from hrc_learn.teleoperation.hand_guiding import InteractionForceConfig, leading_twist
 from hrc_learn.teleoperation.page.headset import (
     HeadsetHands,
     scene_state,
 )
+from hrc_learn.teleoperation.page.headset_scene import headset_contents
 from hrc_learn.teleoperation.page.page_operator import (
     AddedTurn,
     GizmoCommand,
@@ -44,7 +52,7 @@ from hrc_learn.teleoperation.page.page_operator import (
     gizmo_command,
 )
 from hrc_learn.teleoperation.page.page_scene import Gizmos, PageScene
-from hrc_learn.teleoperation.page.panel import PageStatus, Panel, felt_words
+from hrc_learn.teleoperation.page.panel import OPEN, PageStatus, Panel, felt_words
 from hrc_learn.viz.palette import followed_colour
 
 
@@ -67,14 +75,25 @@ class PageConfig(AddressConfig):
     without a graphics processor follows better."""
     twin: tuple[float, float, float] = (-0.1, 1.3, 0.0)
     """Where the virtual twin stands, from the arm [m]."""
+    touch_points: tuple[Point, ...] = ((0.4, 0.0, 0.0), (0.7, 0.0, 0.0), (0.4, 0.3, 0.0))
+    """Points of the real workplace, in the base frame, that a person in a headset touches to
+    lay the virtual arm over the real one [m]; three at least, well apart."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in ("silence", "timeout", "refresh"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, but is {getattr(self, name)}.")
+        level = np.array(self.touch_points).reshape(-1, 3)[:, :2]
+        if len(level) < 3 or np.ptp(level, axis=0).max() < _APART:
+            raise ValueError(
+                f"touch_points must be three at least, {_APART} m apart or more as seen from "
+                f"above, but are {self.touch_points}."
+            )
 
 
+# Between touched points: 1 cm off at 10 cm turns the arm by 6 degrees [m].
+_APART = 0.1
 _PULSES = RumbleConfig()  # a headset's controllers shake as a gamepad does
 _SLOW = 0.25  # way there and back from which a drag is seen to be followed late [s]
 _PANEL_EVERY = 5  # refreshes of the scene for one of the panel: text need not be as smooth
@@ -96,6 +115,7 @@ class Page:
         human: The person at the page.
         address: Where the page is served.
         url: Of the page, with the secret that opens it: who has it can move the arm.
+        headset_url: Likewise for headsets and phones; empty where that client is not built.
         control: Who leads.
         farewell: What browsers show when the page is closed.
     """
@@ -133,6 +153,16 @@ class Page:
         self._chain = chain
         self.control = control = Control(config.silence, config.timeout)
         self.human = PageHuman(len(chain.joint_names), present=lambda: control.present)
+        draws = guides if draws is None else draws
+        headset = headset_contents(
+            bodies,
+            boxes,
+            touch_points=config.touch_points,
+            guides=guides,
+            draws=draws,
+            task=task,
+            opening=OPEN,
+        )
         secret = secrets.token_urlsafe(18)
         # It prints its own address, which is of no use to people.
         with guarded_servers(secret), contextlib.redirect_stdout(io.StringIO()):
@@ -141,7 +171,7 @@ class Page:
             self._gate = Gate(
                 config,
                 self.control,
-                page_contents(Path(viser.__file__).parent),
+                {**page_contents(Path(viser.__file__).parent), **headset},
                 GateCallbacks(
                     heard=self._heard,
                     fits=self._fits,
@@ -156,10 +186,10 @@ class Page:
             raise
         self.address = self._gate.address
         self.url = self.address.link()
+        self.headset_url = self.address.link("/xr") if headset else ""
         self._wake = Event()
         self._held_gizmos, self._turn = HeldGizmos(self._wake.set), AddedTurn()
         self._hands = HeadsetHands(self._held_gizmos, self._turn, self._links, guides=guides)
-        draws = guides if draws is None else draws
         self._scene = PageScene(self._server, bodies, boxes, config.twin)
         self._gizmos = Gizmos(
             self._server,
@@ -220,6 +250,11 @@ class Page:
         return self._panel.task
 
     @property
+    def hands(self) -> Mapping[str, TrackedHand]:
+        """Where the leader's hands are, by "left" and "right", if a headset sees them."""
+        return self._hands.tracked if self.control.present else {}
+
+    @property
     def alive(self) -> bool:
         """Whether the page still follows the arm; leaving the block raises why it does not."""
         return self._error is None
@@ -268,6 +303,7 @@ class Page:
                 colour,
                 self._status.region,
                 *self._panel.drawn,
+                self._status.plan,
             )
             if time.monotonic() < due:
                 continue

@@ -53,6 +53,13 @@ _END_EFFECTOR_PARTS = ("link7", "hand", "finger_left", "finger_right")
 _PERSON = rgba(PERSON)[:3]
 
 
+PEDESTAL = Box(
+    name="pedestal",
+    centre=(-0.03, 0.0, -0.36),
+    half_size=(0.12, 0.12, 0.36),
+    colour=(0.30, 0.30, 0.32, 1.0),
+)
+"""What the arm stands on."""
 _TWIN: Colour = (rgba(SKY)[0] / 255, rgba(SKY)[1] / 255, rgba(SKY)[2] / 255, 0.45)
 """Of the virtual twin, which is seen through."""
 
@@ -255,12 +262,7 @@ class PageScene:
         self._scene.add_grid(
             "/floor", width=6.0, height=6.0, cell_size=0.25, position=(0.0, 0.5, -0.72)
         )
-        self._scene.add_box(
-            "/furniture/pedestal",
-            color=(77, 77, 82),
-            dimensions=(0.24, 0.24, 0.72),
-            position=(-0.03, 0.0, -0.36),
-        )
+        self._draw_box(PEDESTAL)
         server.initial_camera.position = _CAMERA
         server.initial_camera.look_at = _LOOK_AT
         server.initial_camera.fov = 0.9

@@ -44,6 +44,8 @@ class PageStatus:
     """Touches of the surroundings."""
     region: DrawnRegion | None = None
     """To which a controller takes the end effector; None: it follows no region."""
+    plan: Float[np.ndarray, "points 3"] | None = None
+    """Way that the end effector is about to take [m]; None: it has none."""
 
 
 def can_do(status: PageStatus, task: str) -> str:

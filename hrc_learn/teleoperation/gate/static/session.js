@@ -61,6 +61,18 @@
     show(text);
   };
 
+  // Where this device has cameras or displays for it, the arm can stand in the room.
+  const offerRoom = async () => {
+    const able = await navigator.xr?.isSessionSupported("immersive-ar").catch(() => false);
+    if (!able || !(await fetch("/xr")).ok) return;
+    const link = document.createElement("a");
+    link.id = "room";
+    link.href = "/xr";
+    link.textContent = "In AR";
+    document.body.append(link);
+  };
+  addEventListener("DOMContentLoaded", offerRoom);
+
   worker.onmessage = ({ data }) => {
     if (data.type === "state") state(data);
     else if (data.type === "end") over(data.words);

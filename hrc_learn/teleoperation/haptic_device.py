@@ -1,0 +1,208 @@
+"""A haptic device that leads the end effector and pushes back, as the paper's Omega does.
+
+Not run on hardware: `forcedimension-core`, the extra `haptic`, drives it where the maker's SDK
+is installed; tests drive the same interface without a device.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from threading import Event, Thread
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from hrc_learn.kinematics import SerialChain, coarse_orientation
+from hrc_learn.protocols import ArmState, Feedback, Human, HumanInput
+from hrc_learn.teleoperation.hand_guiding import (
+    InteractionForceConfig,
+    capped,
+    guiding_twist,
+)
+
+
+@runtime_checkable
+class ForceDevice(Protocol):
+    """What we use of `forcedimension_core.dhd`, by its names; -1 says that something failed."""
+
+    def getPosition(self, out: Any, ID: int = -1) -> int: ...
+    def getLinearVelocity(self, out: Any, ID: int = -1) -> int: ...
+    def setForce(self, f: Any, ID: int = -1) -> int: ...
+    def getButton(self, index: int, ID: int = -1) -> int: ...
+    def enableForce(self, enable: bool, ID: int = -1) -> int: ...
+    def close(self, ID: int = -1) -> int: ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class HapticDeviceConfig:
+    """How the device leads, and how it pushes back."""
+
+    scale: float = 2.5
+    """Motion of the end effector for that of the hand: an Omega's workspace is 0.16 m wide."""
+    stiffness: float = 120.0
+    """Of the spring that pulls the hand back to where the arm has followed it [N/m]."""
+    damping: float = 4.0
+    """Against motion of the hand while the clutch is closed [N s/m]."""
+    contact: float = 0.1
+    """Share of the contact force at the end effector that the hand feels."""
+    max_force: float = 6.0
+    """Largest force on the hand [N]; an Omega can hold 12."""
+    rate: float = 1000.0
+    """Times a second that the force is renewed [1/s]."""
+    stale: float = 0.1
+    """Time without word from the control loop after which no force is left [s]."""
+    clutch: int = 0
+    """Button that closes the clutch while it is held."""
+    forces: InteractionForceConfig = field(default_factory=InteractionForceConfig)
+    """Fastest motion of the end effector, and how it turns."""
+
+    def __post_init__(self) -> None:
+        for name in ("scale", "max_force", "rate", "stale"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive, but is {getattr(self, name)}.")
+        for name in ("stiffness", "damping", "contact"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name} must not be negative: {getattr(self, name)}.")
+
+
+class _Pull(NamedTuple):
+    """What the thread of forces is told, as one reference."""
+
+    rest: Float[np.ndarray, "3"]
+    """Where the hand would be had it gone as far as the arm [m]."""
+    push: Float[np.ndarray, "3"]
+    """Force of what the arm meets, as the hand feels it [N]."""
+    until: float
+    """When it is stale [s]."""
+
+
+class HapticDevice(Human):
+    """Leads the end effector while its clutch is held, and is pulled to where the arm is.
+
+    The pointer is the end effector where the clutch closed, moved as the hand has moved since,
+    by `scale`; the end effector follows it as a gizmo. What the arm does not follow is felt:
+
+        f = stiffness (x_arm - x) - damping x' + contact f_contact,     |f| <= max_force
+
+    with x_arm the place of the hand at which the pointer would be at the end effector. Axes of
+    the device are those of the base for a person who faces the arm: x to the person, z up.
+
+        with HapticDevice.open(panda) as device:
+            HandGuidedArm(panda, arm, device)
+
+    A device that is unplugged asks for nothing.
+    """
+
+    def __init__(
+        self,
+        chain: SerialChain,
+        device: ForceDevice,
+        config: HapticDeviceConfig | None = None,
+        *,
+        number: int = -1,
+        clock: Callable[[], float] = time.monotonic,
+    ):
+        """Take an open device; `HapticDevice.open` finds one.
+
+        Args:
+            chain: The arm that is led.
+            device: Of Force Dimension's interface.
+            config: How it acts.
+            number: Of the device; -1: the one opened last.
+            clock: Tells the time [s].
+        """
+        self._chain, self._device, self._number = chain, device, number
+        self._config, self._clock = config or HapticDeviceConfig(), clock
+        self._led: tuple[np.ndarray, np.ndarray] | None = None  # hand and tool at the clutch
+        self._tool = np.zeros(3)
+        self._pull: _Pull | None = None
+        self._closing = Event()
+        self._thread = Thread(target=self._push_back, name="haptic device", daemon=True)
+
+    @classmethod
+    def open(cls, chain: SerialChain, config: HapticDeviceConfig | None = None) -> HapticDevice:
+        """Open the first device by forcedimension-core, which the extra `haptic` brings.
+
+        Args:
+            chain: The arm that is led.
+            config: How the device acts.
+
+        Raises:
+            ValueError: There is no device, or the maker's SDK is not installed.
+        """
+        try:
+            from forcedimension_core import dhd
+        except ImportError as error:
+            raise ValueError(
+                f"a haptic device needs the extra `haptic` and Force Dimension's SDK: {error}"
+            ) from error
+        number = dhd.open()
+        if number < 0:
+            raise ValueError(f"no haptic device: {dhd.errorGetLastStr()}.")
+        return cls(chain, dhd, config, number=number)
+
+    def __enter__(self) -> HapticDevice:
+        self._device.enableForce(True, self._number)
+        self._thread.start()
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        self._closing.set()
+        self._thread.join()
+        self._device.setForce((0.0, 0.0, 0.0), self._number)
+        self._device.enableForce(False, self._number)
+        self._device.close(self._number)
+
+    def read(self, state: ArmState) -> HumanInput:
+        """Motion of the end effector as the hand is now."""
+        still = HumanInput(nullspace_input=np.zeros(len(state.joint_position)))
+        config, hand = self._config, self._vector(self._device.getPosition)
+        tool = self._chain.forward(torch.from_numpy(state.joint_position))
+        self._tool = tool.position.numpy()
+        if hand is None or self._device.getButton(config.clutch, self._number) != 1:
+            self._led = None
+            return still
+        if self._led is None:
+            self._led = hand, self._tool
+        began, led = self._led
+        pointer = led + config.scale * (hand - began)
+        velocity = config.forces.rate * (pointer - self._tool)
+        twist = guiding_twist(tool, velocity, coarse_orientation(tool.position), config.forces)
+        return HumanInput(nullspace_input=still.nullspace_input, twist=twist)
+
+    def tell(self, feedback: Feedback) -> None:
+        """Let the hand feel how far the arm is behind, and what it meets."""
+        if self._led is None:
+            self._pull = None
+            return
+        began, led = self._led
+        rest = began + (self._tool - led) / self._config.scale
+        push = np.zeros(3)
+        if feedback.contact_force is not None and not feedback.contact_expected:
+            push = self._config.contact * feedback.contact_force
+        self._pull = _Pull(rest, push, self._clock() + self._config.stale)
+
+    def force(self) -> Float[np.ndarray, "3"]:
+        """Force on the hand now [N]; none where the clutch is open or the loop is silent."""
+        pull, config = self._pull, self._config
+        hand = self._vector(self._device.getPosition)
+        velocity = self._vector(self._device.getLinearVelocity)
+        if pull is None or hand is None or velocity is None or self._clock() > pull.until:
+            return np.zeros(3)
+        spring = config.stiffness * (pull.rest - hand) - config.damping * velocity
+        return capped(spring + pull.push, config.max_force)
+
+    def _vector(self, read: Callable[..., int]) -> Float[np.ndarray, "3"] | None:
+        out = [0.0, 0.0, 0.0]
+        return None if read(out, self._number) < 0 else np.array(out)
+
+    def _push_back(self) -> None:
+        period = 1 / self._config.rate
+        with contextlib.suppress(OSError):  # it has been unplugged
+            while not self._closing.wait(period):
+                self._device.setForce(self.force().tolist(), self._number)
