@@ -1,0 +1,254 @@
+"""From a hand that moves to the effort that a controller reads, by the page and by the headset.
+
+A headset emulated in Chromium pinches link 4 and jumps to and fro; a mouse drags the same link
+on viser's page. The way is measured from the instant at which the hand is set or the mouse
+moved, by the clock of this machine, to the first reading of `Human.read` that differs: wall
+time, with drawing without a graphics processor, so that it says as much of the machine's load
+as of the page. Beside it, frames a second that the client draws, and the same with others who
+watch. With `--soak` the hand goes on for a while, and the memory of both sides is looked at.
+
+    python benchmarks/bench_page.py --watchers 4 --soak 10
+"""
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from rich.console import Console
+from rich.table import Table
+
+sys.path.append(str(Path(__file__).parents[1] / "tests"))
+from headset_in_browser import Headset, headset
+from page_in_browser import Browser, chromium
+
+from hrc_learn import cli
+from hrc_learn.cli._run import write_values
+from hrc_learn.kinematics import panda
+from hrc_learn.protocols import ArmState
+from hrc_learn.sim import MovingBodies, World
+from hrc_learn.sim.workplace import Workplace
+from hrc_learn.teleoperation.page import Page, PageConfig
+
+_POLL = 0.001  # between readings of the person [s]
+_LOST = 2.0  # a motion that has no effect within this is counted as lost [s]
+_JUMPS = """
+window.jumped = [];
+window.jumping = setInterval(() => {
+  const p = headset.hands.left.position;
+  const by = 0.03 * (window.jumped.length % 2 ? -1 : 1);
+  p.set(p.x + by, p.y + by, p.z);
+  window.jumped.push(performance.timeOrigin + performance.now());
+}, 250);
+"""
+_WATCH = """
+import asyncio, sys
+from websockets.asyncio.client import connect
+url, cookie, origin = sys.argv[1:]
+async def main():
+    headers = {"Cookie": cookie}
+    async with connect(url, additional_headers=headers, origin=origin, proxy=None) as socket:
+        await socket.send('{"type": "hello", "wants": "scene"}')
+        async for _ in socket:
+            await socket.send('{"type": "beat", "lag": 0}')
+asyncio.run(main())
+"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args:
+    seconds: float = 20.0
+    """Time of each measurement [s]."""
+    watchers: int = 4
+    """Who watch in the second measurement."""
+    soak: float = 0.0
+    """Minutes that the hand goes on at the end."""
+    meshes: bool = False
+    """Whether the client draws real meshes, three arms of them, rather than capsules."""
+    json: Path | None = None
+    """Receives the figures as one flat object."""
+
+
+class Reader:
+    """Reads the person as a control loop does, and notes when what they ask for changes."""
+
+    def __init__(self, page: Page, state: ArmState):
+        self.changes: list[float] = []
+        self._page, self._state, self._closing = page, state, threading.Event()
+        self._thread = threading.Thread(target=self._run)
+
+    def _run(self) -> None:
+        last = np.zeros(7)
+        while not self._closing.wait(_POLL):
+            d = self._page.human.read(self._state).nullspace_input
+            if np.abs(d - last).max() > 1e-9:
+                self.changes.append(time.time())
+                last = d
+
+    def __enter__(self) -> "Reader":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        self._closing.set()
+        self._thread.join()
+
+    def delays(self, moved: list[float]) -> np.ndarray:
+        """From each motion to its effect [s]; of lost ones infinity."""
+        changes = np.array([*self.changes, np.inf])
+        first = changes[np.searchsorted(changes, moved)]
+        delays = first - np.array(moved)
+        return np.where(delays > _LOST, np.inf, delays)
+
+
+@contextmanager
+def still_page(meshes: bool):
+    """A page beside an arm that stands still: only hands change what is asked."""
+    workplace = Workplace()
+    world, q = World(workplace.scene), workplace.home_joints().numpy()
+    world.hold(workplace.scene.objects[0].name, q)
+    bodies = MovingBodies(world)
+    drawn = bodies.drawn(*(poses[None] for poses in bodies.poses()))
+    config = PageConfig(meshes=meshes, silence=5.0, timeout=5.0)
+    state = ArmState(time=0.0, joint_position=q, joint_velocity=np.zeros(7), gripper_width=0.05)
+    with Page(panda, drawn, workplace.scene.boxes(), config, task="measure") as page:
+        page.human.read(state)
+        yield page, state
+
+
+def by_hand(page: Page, state: ArmState, person: Headset, seconds: float) -> dict[str, float]:
+    """Of a hand that jumps to and fro."""
+    frames, began = person.tab.evaluate("window.seen.frames"), time.time()
+    with Reader(page, state) as reader:
+        person.tab.evaluate(_JUMPS)
+        time.sleep(seconds)
+        person.tab.evaluate("clearInterval(window.jumping)")
+        time.sleep(_LOST)
+    moved = [t / 1e3 for t in person.tab.evaluate("window.jumped")]
+    drawn = person.tab.evaluate("window.seen.frames") - frames
+    return {**figures(reader.delays(moved)), "frames_per_s": drawn / (time.time() - began)}
+
+
+def by_mouse(page: Page, state: ArmState, folder: Path, seconds: float) -> dict[str, float]:
+    """Of a mouse that drags link 4 on viser's page."""
+    q = torch.from_numpy(state.joint_position)
+    elbow = panda.link_poses(q)[3].position.numpy()
+    moved = []
+    with chromium(folder) as tab, Reader(page, state) as reader:
+        browser = Browser(tab, page)
+        x, y = browser.pixel(elbow)
+        held = lambda: page.human.read(state).nullspace_input.any()  # noqa: E731
+        with browser.dragging(elbow, by=(40, -10), until=held):
+            for k in range(int(seconds / 0.25)):
+                moved.append(time.time())
+                tab.mouse.move(x + 40 + 15 * (k % 2), y - 10)
+                time.sleep(0.25)
+    return figures(reader.delays(moved))
+
+
+def figures(delays: np.ndarray) -> dict[str, float]:
+    """Of delays: median and 95th percentile [ms], and how many there were and were lost."""
+    median, p95 = np.percentile(delays, [50, 95], method="higher")
+    lost = int(np.isinf(delays).sum())
+    return {"p50_ms": 1e3 * median, "p95_ms": 1e3 * p95, "motions": len(delays), "lost": lost}
+
+
+@contextmanager
+def watched(page: Page, count: int):
+    """Others who are told the scene, in processes of their own."""
+    from hostile_clients import cookie
+
+    urls = [
+        f"ws://127.0.0.1:{page.address.port}/session/somebody-who-watches-{k}"
+        for k in range(count)
+    ]
+    command = [sys.executable, "-c", _WATCH]
+    watchers = [
+        subprocess.Popen([*command, url, cookie(page), page.address.origin]) for url in urls
+    ]
+    try:
+        while page.control.people < count + 1:
+            time.sleep(0.1)
+        yield
+    finally:
+        for watcher in watchers:
+            watcher.terminate()
+            watcher.wait()
+
+
+def memory(person: Headset) -> tuple[float, float]:
+    """Of this process and of the client's heap [MB]."""
+    pages = int(Path("/proc/self/statm").read_text("ascii").split()[1])
+    person.tab.evaluate("window.gc && gc()")
+    heap = person.tab.evaluate("performance.memory.usedJSHeapSize")
+    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6, heap / 1e6
+
+
+def soaked(page: Page, state: ArmState, person: Headset, minutes: float) -> dict[str, float]:
+    """Memory before and after, and what got lost meanwhile."""
+    by_hand(page, state, person, 20)  # what is filled once is full
+    server, client = memory(person)
+    lost = 0.0
+    for _ in range(max(round(minutes), 1)):
+        lost += by_hand(page, state, person, 58)["lost"]
+    after = memory(person)
+    grown = {"server_grown_mb": after[0] - server, "client_grown_mb": after[1] - client}
+    return {"minutes": minutes, "lost": lost, **grown, "server_mb": after[0]}
+
+
+def main(args: Args) -> None:
+    """Measure, print a table, write the figures."""
+    torch.set_num_threads(1)
+    rows: dict[str, dict[str, float]] = {}
+    with (
+        tempfile.TemporaryDirectory() as name,
+        still_page(args.meshes) as (page, state),
+    ):
+        folder = Path(name)
+        rows["mouse"] = by_mouse(page, state, folder / "mouse", args.seconds)
+        with headset(folder / "headset", page, (320, 200)) as person:
+            person.enter()
+            arm = person.tab.evaluate("JSON.parse(localStorage['hrc-placing'] ?? '{}').arm")
+            assert arm is None  # it stands ahead of where the person entered
+            q = torch.from_numpy(state.joint_position)
+            x, y, z = panda.link_poses(q)[3].position.tolist()
+            # Ahead by 1.1 m on a table of 0.72 m, with x to the person.
+            person.reach("left", [y, 0.72 + z, -1.1 + x])
+            person.pinch("left")
+            if not page.human.read(state).nullspace_input.any():
+                person.reach("left", [y + 0.05, 0.72 + z, -1.1 + x])
+            rows["hand"] = by_hand(page, state, person, args.seconds)
+            with watched(page, args.watchers):
+                rows["hand_watched"] = by_hand(page, state, person, args.seconds)
+            if args.soak:
+                rows["soak"] = soaked(page, state, person, args.soak)
+    table = Table("", *dict.fromkeys(name for row in rows.values() for name in row))
+    columns = [str(column.header) for column in table.columns[1:]]
+    for name, row in rows.items():
+        table.add_row(name, *(f"{row[c]:.3g}" if c in row else "" for c in columns))
+    Console().print(table)
+    flat = {f"{name}_{key}": value for name, row in rows.items() for key, value in row.items()}
+    write_values(args.json, flat)
+
+
+def measure(args: Args) -> None:
+    """As `main`; without a browser or the client built it says so and measures nothing."""
+    try:
+        main(args)
+    except pytest.skip.Exception as missing:
+        print(f"not measured: {missing}")
+
+
+if __name__ == "__main__":
+    cli.run(measure, Args)
