@@ -49,12 +49,12 @@ navigator.xr.requestSession = async (...options) => {
 class Headset:
     """The client in a tab, and a person with two hands before it."""
 
-    def __init__(self, tab, page: Page):
+    def __init__(self, tab, url: str):
         self.tab = tab
         tab.set_default_timeout(120e3)
         tab.add_init_script(path=str(EMULATOR))
         tab.add_init_script(_WEAR)
-        tab.goto(page.headset_url)
+        tab.goto(url)
         self.button("Enter AR").wait_for()
 
     def enter(self) -> None:
@@ -120,6 +120,26 @@ class Headset:
         self.tab.evaluate(f"headset.hands['{hand}'].updatePinchValue({int(closed)})")
         self.frames(3)
 
+    def walk(self, hand: str, path: np.ndarray, rate: float) -> None:
+        """Move the fingertips along points of the room, so many a second; waits for the end.
+
+        In the browser's own time, so that a machine that draws slowly moves them no slower.
+        """
+        away = path - self.hand(hand)
+        self.tab.evaluate(
+            """([hand, steps, rate]) => new Promise((done) => {
+              const p = headset.hands[hand].position, from = [p.x, p.y, p.z];
+              const began = performance.now();
+              const timer = setInterval(() => {
+                const k = Math.floor((performance.now() - began) * rate / 1e3);
+                const step = steps[Math.min(k, steps.length - 1)];
+                p.set(from[0] + step[0], from[1] + step[1], from[2] + step[2]);
+                if (k >= steps.length) { clearInterval(timer); done(); }
+              }, 10);
+            })""",
+            [hand, away.tolist(), rate],
+        )
+
     @contextmanager
     def pinching(self, hand: str) -> Iterator[None]:
         self.pinch(hand)
@@ -143,7 +163,7 @@ def headset(folder: Path, page: Page, size: tuple[int, int] = (640, 400)) -> Ite
         pytest.skip(f"the client for headsets is not built: {BUILD}")
     # Chromium's own WebXR stands in the way of the emulated one.
     with chromium(folder, size, ("--disable-blink-features=WebXR",)) as tab:
-        yield Headset(tab, page)
+        yield Headset(tab, page.headset_url)
 
 
 def placed(touch_points: np.ndarray, yaw: float, position) -> np.ndarray:

@@ -141,7 +141,8 @@ class HapticDevice(Human):
             raise ValueError(
                 f"a haptic device needs the extra `haptic` and Force Dimension's SDK: {error}"
             ) from error
-        number = dhd.open()
+        connect = dhd.open  # a device, no file
+        number = connect()
         if number < 0:
             raise ValueError(f"no haptic device: {dhd.errorGetLastStr()}.")
         return cls(chain, dhd, config, number=number)

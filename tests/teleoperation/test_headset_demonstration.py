@@ -1,12 +1,28 @@
 """A demonstration by hands that a headset tracks, from the first pinch to the dataset."""
 
+import json
+import os
+import re
+import subprocess
+import sys
+import time
+from itertools import pairwise
+from pathlib import Path
+
 import numpy as np
 import pyarrow.parquet as parquet
 import pytest
-from headset_in_browser import headset
-from page_in_browser import Session, wait_until
+from headset_in_browser import EMULATOR, Headset, headset, placed
+from page_in_browser import Session, chromium, wait_until
+
+from hrc_learn.kinematics import panda
+from hrc_learn.sim.workplace import Workplace
 
 pytestmark = pytest.mark.browser
+
+ROOT = Path(__file__).parents[2]
+RATE = 60.0
+"""Points of a hand's path [1/s]."""
 
 
 def test_a_demonstration_by_two_hands_is_recorded_kept_and_replayed(tmp_path):
@@ -47,4 +63,119 @@ def test_a_demonstration_by_two_hands_is_recorded_kept_and_replayed(tmp_path):
 
 
 def _doubted(person) -> bool:
-    return "Save again" in person.tab.locator("#words").text_content()
+    return "Save again" in _words(person)
+
+
+def hand_path(corners: np.ndarray, rng: np.random.Generator, speed: float = 0.13) -> np.ndarray:
+    """A hand along a way: minimum-jerk from corner to corner, with tremor and drift.
+
+    Physiological tremor is of 8 to 12 Hz and some tenths of a millimetre (Elble and Koller,
+    1990); hands that are held up drift by millimetres.
+    """
+    pieces = []
+    for start, end in pairwise(corners):
+        duration = 1.875 * np.linalg.norm(end - start) / (speed * rng.uniform(0.8, 1.2))
+        s = np.linspace(0, 1, max(int(duration * RATE), 2))[:, None]
+        pieces.append(start + (10 * s**3 - 15 * s**4 + 6 * s**5) * (end - start))
+    path = np.concatenate([*pieces, np.repeat(corners[-1:], int(2.5 * RATE), axis=0)])
+    time = np.arange(len(path))[:, None] / RATE
+    for frequency, size in ((rng.uniform(8, 12, 3), 0.0004), (rng.uniform(0.2, 0.6, 3), 0.002)):
+        phase = rng.uniform(0, 2 * np.pi, 3)
+        path = path + size * (np.sin(2 * np.pi * frequency * time + phase) - np.sin(phase))
+    return path
+
+
+def program(name, *arguments, status=(0,)):
+    done = subprocess.run(
+        [sys.executable, name, *map(str, arguments)],
+        cwd=ROOT,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode in status, done.stdout + done.stderr
+
+
+@pytest.mark.slow
+def test_demonstrations_by_hands_are_learned_and_placed(tmp_path):
+    count = int(os.environ.get("HAND_DEMONSTRATIONS", "20"))
+    if not EMULATOR.is_file():
+        pytest.skip("the client for headsets is not built")
+    workplace = Workplace()
+    start = panda.forward(workplace.home_joints()).position.numpy()
+    end = workplace.shelf("middle").position.numpy()
+    beside = end[1] + 0.3 * np.sign(start[1] - end[1])
+    corners = np.array(
+        [
+            start,
+            [start[0], start[1], end[2]],
+            [start[0], beside, end[2]],
+            [end[0], beside, end[2]],
+            end,
+        ]
+    )
+    # Nobody has placed the arm: it stands ahead of who enters, and faces them.
+    room = lambda points: placed(points, -np.pi / 2, (0.0, 0.72, -1.1))  # noqa: E731
+    demos, log = tmp_path / "demos", tmp_path / "log"
+    options = ("--out", demos, "--page.timeout", "12", "--page.silence", "12")
+    with (
+        log.open("w") as output,
+        chromium(tmp_path / "headset", (320, 200), ("--disable-blink-features=WebXR",)) as tab,
+    ):
+        served = subprocess.Popen(
+            [sys.executable, "control/serve_page.py", *map(str, options), "--no-page.meshes"],
+            cwd=ROOT,
+            env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"},
+            stdout=output,
+            stderr=subprocess.STDOUT,
+        )
+        try:
+            said = lambda: re.search(r"phones: (\S+)", log.read_text("utf-8"))  # noqa: E731
+            wait_until(said, "the page's address", timeout=180)
+            person = Headset(tab, said()[1])
+            person.enter()
+            closing = _closing(person)
+            for k in range(count):
+                path = hand_path(corners, np.random.default_rng(k))
+                person.reach("right", room(start[None])[0] - closing)
+                person.press("Start")
+                person.pinch("right")
+                person.walk(
+                    "right", room(path) - room(start[None]) + person.hand("right"), RATE
+                )
+                person.pinch("right", closed=False)
+                person.press("Stop")
+                wait_until(lambda: "stopped" in _words(person), "it stopped")
+                person.press("Save")
+                wait_until(
+                    lambda: "ready" in _words(person) or _doubted(person), "it is judged"
+                )
+                if _doubted(person):
+                    person.press("Save")
+                wait_until(lambda k=k: f"{k + 1} saved" in _words(person), "it is saved")
+                person.press("Back to start")
+                time.sleep(0.5)
+            tab.evaluate("null")
+        finally:
+            served.terminate()
+            served.wait(timeout=120)
+    program("datasets/check_dataset.py", demos)
+    program("training/fit_dmp.py", "--dataset", demos, "--out", tmp_path / "model")
+    outcome = tmp_path / "measured"
+    run = ("--placing", tmp_path / "model", "--out", tmp_path / "run", "--no-pictures")
+    program("control/run_placing.py", *run, "--json", outcome, status=(0, 1))
+    measured = json.loads(outcome.read_text("utf-8"))
+    print({k: v for k, v in measured.items() if "middle_shelf" in k})
+    assert measured["middle_shelf_placed"] == 1
+    assert measured["middle_shelf_contacts"] == 0
+    assert measured["middle_shelf_place_error_mm"] < 10
+
+
+def _words(person) -> str:
+    return person.tab.locator("#words").text_content()
+
+
+def _closing(person) -> np.ndarray:
+    start = person.reach("right", [0.9, 1.6, 0.5])
+    with person.pinching("right"):
+        return person.hand("right") - start
