@@ -29,9 +29,10 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
+# The browser and the emulated headset are those of the tests.
 sys.path.append(str(Path(__file__).parents[1] / "tests"))
-from headset_in_browser import Headset, headset
-from page_in_browser import Browser, chromium
+from headset_in_browser import Headset, headset  # pyright: ignore[reportMissingImports]
+from page_in_browser import Browser, chromium  # pyright: ignore[reportMissingImports]
 
 from hrc_learn import cli
 from hrc_learn.cli._run import write_values
@@ -167,7 +168,7 @@ def figures(delays: np.ndarray) -> dict[str, float]:
 @contextmanager
 def watched(page: Page, count: int):
     """Others who are told the scene, in processes of their own."""
-    from hostile_clients import cookie
+    from hostile_clients import cookie  # pyright: ignore[reportMissingImports]
 
     urls = [
         f"ws://127.0.0.1:{page.address.port}/session/somebody-who-watches-{k}"

@@ -60,6 +60,8 @@ def scene_glb(bodies: Sequence[Body], boxes: Sequence[Box]) -> bytes:
         boxes: What stands, in the base frame.
     """
     import trimesh
+    import trimesh.exchange.gltf
+    import trimesh.visual.material
 
     scene = trimesh.Scene()
 
