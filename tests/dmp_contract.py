@@ -8,7 +8,7 @@ from copy import deepcopy
 import numpy as np
 import pytest
 import torch
-from torch.autograd import gradcheck
+from torch.autograd import gradcheck, gradgradcheck
 from unchecked import shapes_unchecked
 
 
@@ -19,6 +19,9 @@ class DMPContract:
     """Bound on the error of the default rollout, in the unit of `distance`."""
     fast_gradients = False
     """Whether gradients are checked along one random direction instead of all."""
+    maps_over_durations = True
+    """Whether `torch.vmap` may, and finite differences of gradients: not if how many steps are
+    taken depends on the duration."""
 
     def demonstrate(self, seed, n_samples=300):
         """Arguments of `fit` for one demonstration, samples along dim 0; time first."""
@@ -196,6 +199,47 @@ class DMPContract:
             assert gradcheck(
                 outputs, inputs, atol=1e-6, rtol=1e-6, fast_mode=self.fast_gradients
             )
+
+    def test_times_and_durations_of_their_own_are_a_loop(self):
+        dmp = self.fit(*self.batch(3), n_basis=8)
+        rng = torch.Generator().manual_seed(2)
+        time = (2 * torch.rand(3, 9, generator=rng, dtype=torch.float64)).sort(-1).values
+        duration = 1 + torch.rand(3, generator=rng, dtype=torch.float64)
+        arguments = self.arguments(*self.ends(7))
+        together = self.outputs(dmp.rollout(time, duration=duration, **arguments))
+        for i in range(3):
+            one = dmp[i].rollout(time[i], duration=duration[i], **arguments)
+            self.assert_same(together, self.outputs(one), atol=1e-8, index=i)
+            # Nor does it matter which other times are asked for.
+            few = dmp[i].rollout(time[i, ::3], duration=duration[i], **arguments)
+            self.assert_same(
+                self.outputs(one), self.outputs(few), atol=1e-8, index=slice(0, None, 3)
+            )
+
+    def test_maps_and_derives_in_any_way(self):
+        dmp = self.fit(*(column[::15] for column in self.demonstrate(0)), n_basis=3)
+        time = torch.tensor([0.1, 0.7, 1.2], dtype=torch.float64)
+        durations = torch.tensor([0.8, 1.3], dtype=torch.float64)
+        start, goal = self.ends(5)
+
+        def path(duration, goal):
+            arguments = self.arguments(start, goal)
+            outputs = self.outputs(dmp.rollout(time, duration=duration, **arguments))
+            return torch.cat([x.flatten() for x in outputs.values()])
+
+        with shapes_unchecked():
+            if self.maps_over_durations:
+                looped = torch.stack([path(duration, goal) for duration in durations])
+                mapped = torch.func.vmap(path, in_dims=(0, None))(durations, goal)
+                torch.testing.assert_close(mapped, looped)
+            ends = durations[0].clone().requires_grad_(), goal.detach().clone().requires_grad_()
+            directions = torch.ones_like(ends[0]), 0.1 * torch.ones_like(goal)
+            _, forward = torch.func.jvp(path, ends, directions)
+            by_duration, by_goal = torch.autograd.functional.jacobian(path, ends)
+            backward = by_duration + by_goal.flatten(1) @ directions[1].flatten()
+            torch.testing.assert_close(forward, backward, rtol=1e-8, atol=1e-8)
+            if self.maps_over_durations:
+                assert gradgradcheck(path, ends, atol=1e-4, rtol=1e-3, fast_mode=True)
 
     def test_a_saved_primitive_is_the_same(self, dmp, tmp_path):
         dmp.save(tmp_path / "saved")

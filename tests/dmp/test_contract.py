@@ -162,6 +162,15 @@ class TestOrientationOfUde(TestOrientation):
 
     reproduction = 1e-4
     fast_gradients = True
+    maps_over_durations = False
+
+    @pytest.mark.slow
+    def test_times_and_durations_of_their_own_are_a_loop(self):
+        super().test_times_and_durations_of_their_own_are_a_loop()
+
+    @pytest.mark.slow
+    def test_maps_and_derives_in_any_way(self):
+        super().test_maps_and_derives_in_any_way()
 
     def test_reversed_goes_the_same_way_back(self, dmp):
         with pytest.raises(ValueError, match="not linear"):

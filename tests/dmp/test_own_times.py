@@ -144,7 +144,9 @@ def test_maps_over_durations(batch, output):
 
 COMPILED = """
 import torch
-from hrc_learn.dmp import JointDMP, LimitedDMP, OrientationDMP
+from hrc_learn.dmp import (
+    JointDMP, LimitedDMP, OrientationDMP, PoseDMP, SplineBasis, fit_rhythmic
+)
 from hrc_learn.geometry import quaternion
 
 t = torch.linspace(0, 2, 60, dtype=torch.float64)
@@ -153,13 +155,19 @@ kinds = (
     (JointDMP.fit(t, y, 12), "acceleration"),
     (OrientationDMP.fit(t, quaternion.exp(y), 12), "orientation"),
     (LimitedDMP.fit(t, y, -20.0, 20.0, 12), "position"),
+    (JointDMP.fit(t, y, basis=SplineBasis(count=12)), "velocity"),
+    (JointDMP.fit(t, y, 12, approach=0.7, scaling="amplitude"), "position"),
+    (fit_rhythmic(t, torch.sin(2 * torch.pi * t)[:, None].repeat(1, 3), 9, 1.0), "position"),
+    (PoseDMP.fit(t, y, quaternion.exp(y), 12), "orientation"),
 )
 durations = torch.tensor([0.8, 1.0, 1.7], dtype=torch.float64)
 for dmp, output in kinds:
     for times in (t, None):
         def path(tau):
-            goal = dmp.goal.expand(*tau.shape, -1)
-            return getattr(dmp.rollout(times, goal=goal, duration=tau), output)
+            ends = {}
+            if isinstance(dmp.goal, torch.Tensor):
+                ends["goal"] = dmp.goal.expand(*tau.shape, -1)
+            return getattr(dmp.rollout(times, duration=tau, **ends), output)
         torch._dynamo.reset()
         compiled = torch.compile(path, fullgraph=True, backend="aot_eager")
         for tau in (durations[1], durations):
