@@ -2,7 +2,7 @@
 
 Written between the lines `<!-- arms:begin -->` and `<!-- arms:end -->` of the files given. The
 last column is of earlier runs of `hrc demo --robot NAME --json FOLDER/NAME.json`; an arm
-without one is shown as not tried. Arms whose package is not installed are left out.
+without one keeps what its row says. Arms whose package is not installed are left out.
 """
 
 import os
@@ -22,6 +22,7 @@ from rich.console import Console
 
 from hrc_learn import cli
 from hrc_learn.kinematics import Arm, MissingModelError, arm, registered_arms, solve_inverse
+from hrc_learn.kinematics._capsule_fit import shape_points
 from hrc_learn.kinematics.registry import maker_of
 
 # pyright: reportAttributeAccessIssue=false
@@ -30,16 +31,19 @@ from hrc_learn.kinematics.registry import maker_of
 _BEGIN, _END = "<!-- arms:begin -->", "<!-- arms:end -->"
 _HEADER = (
     "| arm | maker | joints | reach [m] | largest difference from MuJoCo | poses found "
-    "| ms a pose | `hrc demo` |\n|---|---|---|---|---|---|---|---|"
+    "| ms a pose | touches itself: capsules, MuJoCo, missed | `hrc demo` |"
+    "\n|---|---|---|---|---|---|---|---|---|"
 )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
     states: int = 500
-    """Random joint positions in which MuJoCo's pose and Jacobian are compared."""
+    """Random joint positions in which MuJoCo's pose, Jacobian and contacts are compared."""
     poses: int = 200
     """Random reachable poses to invert."""
+    arms: tuple[str, ...] = ()
+    """Measure these alone: rows of others stay as they are; none: all."""
     demos: Path | None = None
     """Folder with NAME.json of `hrc demo`."""
     files: tuple[Path, ...] = ()
@@ -53,6 +57,9 @@ def main(args: Args) -> None:
     torch.set_num_threads(1)
     rows, figures = [_HEADER], {}
     for name in registered_arms():
+        if args.arms and name not in args.arms:
+            rows += _row_before(name, args)
+            continue
         try:
             described = arm(name)
         except MissingModelError:
@@ -65,7 +72,8 @@ def main(args: Args) -> None:
             f"| {measured['reach_m']:.2f} "
             f"| {'its own model' if error is None else f'{error:.0e}'} "
             f"| {100 * measured['inverse_found']:.1f} % | {measured['inverse_ms']:.0f} "
-            f"| {_demo(name, args.demos)} |"
+            f"| {_percent(measured, 'capsules_touch', 'hulls_touch', 'missed')} "
+            f"| {_demo(name, args)} |"
         )
         Console().print(rows[-1], highlight=False)
     for file in args.files:
@@ -103,7 +111,7 @@ def _measured(described: Arm, args: Args) -> dict[str, float]:
     }
     if described.description is not None:
         figures["difference_from_mujoco"] = _difference(described, drawn(args.states))
-    return figures
+    return figures | _self_contacts(described, drawn(args.states))
 
 
 def _difference(described: Arm, q: torch.Tensor) -> float:
@@ -132,6 +140,50 @@ def _difference(described: Arm, q: torch.Tensor) -> float:
     return largest
 
 
+def _self_contacts(described: Arm, q: torch.Tensor) -> dict[str, float]:
+    """Shares of postures in which an arm touches itself, by capsules and by MuJoCo's hulls.
+
+    "missed" are those in which hulls of links meet that are no neighbours, but no capsules.
+    """
+    chain, n = described.chain, len(described.joint_names)
+    capsules = described.body.self_distance(q).numpy() < 0
+    spec = mujoco.MjSpec()
+    links = sorted({shape.link for shape in described.shapes})
+    for link in links:
+        body = spec.worldbody.add_body(name=f"{link}")
+        body.add_freejoint()
+        for k, shape in enumerate(s for s in described.shapes if s.link == link):
+            points = shape_points(shape.shape) @ shape.pose[:3, :3].T + shape.pose[:3, 3]
+            mesh = spec.add_mesh(name=f"{link}_{k}", uservert=points.ravel())
+            mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+            body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name, mass=1.0)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    poses = chain.link_poses(q)
+    still = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
+    touches = np.zeros(len(q), dtype=bool)
+    for row in range(len(q)):
+        for address, link in enumerate(links):
+            place = (
+                (poses.position[row, link - 1], poses.orientation[row, link - 1])
+                if link
+                else still
+            )
+            data.qpos[7 * address : 7 * address + 7] = np.concatenate(place)
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_collision(model, data)
+        for contact in data.contact:
+            a, b = sorted(links[model.geom_bodyid[g] - 1] for g in contact.geom)
+            # Flange and tool are one body with the last link.
+            apart = min(b, n) - min(a, n) > 1
+            touches[row] |= contact.dist < 0 and apart
+    return {
+        "capsules_touch": float(capsules.mean()),
+        "hulls_touch": float(touches.mean()),
+        "missed": float((touches & ~capsules).mean()),
+    }
+
+
 def _mujoco_model(described: Arm) -> mujoco.MjModel:
     """MuJoCo's own reading of the file; of URDF the kinematics alone."""
     assert described.description is not None
@@ -150,10 +202,22 @@ def _mujoco_model(described: Arm) -> mujoco.MjModel:
     return mujoco.MjModel.from_xml_string(ElementTree.tostring(robot, encoding="unicode"))
 
 
-def _demo(name: str, folder: Path | None) -> str:
-    path = None if folder is None else folder / f"{name}.json"
+def _percent(measured: dict[str, float], *names: str) -> str:
+    return ", ".join(f"{100 * measured[name]:.0f} %" for name in names)
+
+
+def _row_before(name: str, args: Args) -> list[str]:
+    """The row of an arm in the first of the files, if it has one."""
+    rows = [row for file in args.files for row in file.read_text(encoding="utf-8").splitlines()]
+    return [row for row in rows if row.startswith(f"| {name} |")][:1]
+
+
+def _demo(name: str, args: Args) -> str:
+    """What came of the demo; without a new one, what the table says already."""
+    path = None if args.demos is None else args.demos / f"{name}.json"
     if path is None or not path.is_file():
-        return "not tried"
+        before = _row_before(name, args)
+        return before[0].split("|")[-2].strip() if before else "not tried"
     values = json.loads(path.read_text(encoding="utf-8"))
     if values["success_rate"] < 1:
         return "not done"
