@@ -123,7 +123,7 @@ def test_demonstrations_by_hands_are_learned_and_placed(tmp_path):
         chromium(tmp_path / "headset", (320, 200), ("--disable-blink-features=WebXR",)) as tab,
     ):
         served = subprocess.Popen(
-            [sys.executable, "control/serve_page.py", *map(str, options), "--no-page.meshes"],
+            [sys.executable, "control/serve_page.py", *map(str, options), "--page.no-meshes"],
             cwd=ROOT,
             env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"},
             stdout=output,
