@@ -136,7 +136,7 @@ class HapticDevice(Human):
             ValueError: There is no device, or the maker's SDK is not installed.
         """
         try:
-            from forcedimension_core import dhd
+            from forcedimension_core import dhd  # pyright: ignore[reportMissingImports]
         except ImportError as error:
             raise ValueError(
                 f"a haptic device needs the extra `haptic` and Force Dimension's SDK: {error}"
