@@ -10,11 +10,11 @@ from hrc_learn.kinematics.collision import CapsuleArm as CapsuleArm
 from hrc_learn.kinematics.collision import LinkCapsule as LinkCapsule
 from hrc_learn.kinematics.franka import LINK_CAPSULES as LINK_CAPSULES
 from hrc_learn.kinematics.franka import TOOL_LINK as TOOL_LINK
-from hrc_learn.kinematics.franka import FrankaArm as FrankaArm
+from hrc_learn.kinematics.franka import FrankaChain as FrankaChain
 from hrc_learn.kinematics.franka import UnreachableError as UnreachableError
 from hrc_learn.kinematics.franka import fr3 as fr3
 from hrc_learn.kinematics.franka import fr3_capsules as fr3_capsules
-from hrc_learn.kinematics.franka import franka_arm as franka_arm
+from hrc_learn.kinematics.franka import franka_chain as franka_chain
 from hrc_learn.kinematics.franka import panda as panda
 from hrc_learn.kinematics.franka import panda_body as panda_body
 from hrc_learn.kinematics.franka import panda_capsules as panda_capsules

@@ -54,7 +54,7 @@ class UnreachableError(ValueError):
     """No joint configuration within limits reaches a pose with the wanted joint 7."""
 
 
-class FrankaArm(SerialChain):
+class FrankaChain(SerialChain):
     """A Franka arm with the Franka hand: a serial chain with a closed-form inverse."""
 
     def __init__(self, name: str, limits: JointLimits):
@@ -193,16 +193,16 @@ def _exact_cos_sin(angle: float) -> tuple[float, float]:
     return float(round(cos(angle))), float(round(sin(angle)))
 
 
-panda = FrankaArm("panda", PANDA_LIMITS)
+panda = FrankaChain("panda", PANDA_LIMITS)
 """The Panda with its hand; a Cartesian limit of 1.7 m/s and 2.5 rad/s is the controller's."""
 
-fr3 = FrankaArm("fr3", FR3_LIMITS)
+fr3 = FrankaChain("fr3", FR3_LIMITS)
 """The Research 3 with its hand; the Cartesian limits are 3 m/s and 2.5 rad/s."""
 
 _ARMS = {arm.name: arm for arm in (panda, fr3)}
 
 
-def franka_arm(name: str) -> FrankaArm:
+def franka_chain(name: str) -> FrankaChain:
     """One of Franka's arms by its name, `panda` or `fr3`.
 
     Raises:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics.chain import SerialChain
-from hrc_learn.kinematics.franka import FrankaArm, UnreachableError
+from hrc_learn.kinematics.franka import FrankaChain, UnreachableError
 
 # Smallest singular value of the 6 x n Jacobian (metres and radians mixed, as it stands) below
 # which inverting it exactly asks for joint speeds an arm does not have.
@@ -141,7 +141,7 @@ def arm_angle_and_motion(
 
 
 def comfortable_posture(
-    chain: FrankaArm, pose: Pose, *, candidates: int = 29
+    chain: FrankaChain, pose: Pose, *, candidates: int = 29
 ) -> Float[Tensor, "n"]:
     """Inverse-kinematics solution furthest from singularities and joint limits.
 
@@ -163,7 +163,7 @@ def comfortable_posture(
 
 
 def comfortable_postures(
-    chain: FrankaArm, pose: Pose, *, candidates: int = 29
+    chain: FrankaChain, pose: Pose, *, candidates: int = 29
 ) -> Float[Tensor, "postures n"]:
     """Inverse-kinematics solutions that differ, the most comfortable one first.
 

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from hrc_learn.kinematics.arm import Arm, LimitsGiven
 from hrc_learn.kinematics.collision import CapsuleArm
-from hrc_learn.kinematics.franka import FrankaArm, fr3, fr3_capsules, panda, panda_capsules
+from hrc_learn.kinematics.franka import FrankaChain, fr3, fr3_capsules, panda, panda_capsules
 
 
 class MissingModelError(ModuleNotFoundError):
@@ -173,7 +173,7 @@ _SOURCES = {
         ready=(0.0, 0.0, 0.0, 1.4, 0.0),
     ),
 }
-_OWN: dict[str, tuple[FrankaArm, CapsuleArm]] = {
+_OWN: dict[str, tuple[FrankaChain, CapsuleArm]] = {
     "panda": (panda, panda_capsules),
     "fr3": (fr3, fr3_capsules),
 }

@@ -26,7 +26,7 @@ from hrc_learn.kinematics.franka import (
     HAND_CAPSULES,
     LINK_CAPSULES,
     OVERLAPPING,
-    FrankaArm,
+    FrankaChain,
     UnreachableError,
     fr3,
     panda,
@@ -95,9 +95,9 @@ class WorkArm(ABC):
 class FrankaWorkArm(WorkArm):
     """A Franka arm with its own hand, and its inverse in closed form."""
 
-    chain: FrankaArm
+    chain: FrankaChain
 
-    def __init__(self, chain: FrankaArm):
+    def __init__(self, chain: FrankaChain):
         """Of an arm whose links have the published shape."""
         self.name, self.chain = chain.name, chain
         self.body = CapsuleArm(chain, LINK_CAPSULES, OVERLAPPING)

@@ -6,7 +6,7 @@ from sampling import generator, within
 from torch.testing import assert_close
 
 from hrc_learn.geometry import Pose
-from hrc_learn.kinematics import UnreachableError, fr3, franka_arm, panda
+from hrc_learn.kinematics import UnreachableError, fr3, franka_chain, panda
 
 
 def solvable_configurations(count, rng):
@@ -165,10 +165,10 @@ def test_its_wrist_bends_further_than_the_pandas():
 
 
 def test_arms_by_their_name():
-    assert franka_arm("panda") is panda
-    assert franka_arm("fr3") is fr3
+    assert franka_chain("panda") is panda
+    assert franka_chain("fr3") is fr3
     assert fr3.joint_names[6] == "fr3_joint7"
     assert '<robot name="fr3">' in fr3.urdf()
     assert '<robot name="panda">' in panda.urdf()
     with pytest.raises(ValueError, match=r"no arm 'ur5'; Franka's are panda, fr3"):
-        franka_arm("ur5")
+        franka_chain("ur5")

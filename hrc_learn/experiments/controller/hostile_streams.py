@@ -14,7 +14,7 @@ from torch import Tensor
 
 from hrc_learn.controller import SafetyConfig, SafetyFilter
 from hrc_learn.experiments.controller.disturbance_trials import uniform
-from hrc_learn.kinematics import JointLimits, franka_arm
+from hrc_learn.kinematics import JointLimits, franka_chain
 
 STREAMS = ("random", "bang-bang", "resonant", "outward", "chasing", "poisoned")
 """Kinds of commands: new random velocities in each tick or held for a while; signs at ten times
@@ -32,7 +32,7 @@ class StreamConfig:
     """How streams are drawn."""
 
     arm: str = "fr3"
-    """By its name, as for `franka_arm`."""
+    """By its name, as for `franka_chain`."""
     count: int = 120
     """Of streams, as many of each kind."""
     ticks: int = 1000
@@ -76,7 +76,7 @@ def hostile_streams(config: StreamConfig, safety: SafetyFilter | None = None) ->
         safety: The filter; None: one of the arm's limits and `config.safety`.
     """
     rng = torch.Generator().manual_seed(config.seed)
-    arm, count, dt = franka_arm(config.arm), config.count, config.dt
+    arm, count, dt = franka_chain(config.arm), config.count, config.dt
     safety = safety or SafetyFilter(arm.limits, config.safety)
     kind = torch.arange(count) % len(STREAMS)
     poisoned = (kind == STREAMS.index("poisoned")).unsqueeze(-1)
