@@ -260,9 +260,10 @@ class Samples:
     ) -> FitReport:
         """Residuals of a reproduction, on the samples that count; `trust` is passed on."""
         error = self._filled(reproduction - self.position, 0.0)
+        counted = error.shape[-1] if self.complete else self.mask.sum(-1, keepdim=True)
         residuals = {
-            "rmse": error.norm(dim=-1) / self.mask.sum(-1, keepdim=True).sqrt(),
-            "peak": torch.maximum(-error.amin(-1), error.amax(-1)),
+            "rmse": error.norm(dim=-1) / counted**0.5,
+            "peak": error.abs().amax(-1),
             "span": self.span,
         }
         residuals = {k: v.reshape(*self.batch, -1) for k, v in residuals.items()}
@@ -358,9 +359,9 @@ def check_samples(
     # Time last from here on: everything that reads the samples runs along it.
     position = position.reshape(-1, T, D).mT.contiguous()
 
-    enough = mask.sum(-1) >= MINIMUM_SAMPLES
-    if not enough.all():
-        i = int((~enough).nonzero()[0])
+    few = mask.sum(-1) < MINIMUM_SAMPLES if T < MINIMUM_SAMPLES or not complete else None
+    if few is not None and few.any():
+        i = int(few.nonzero()[0])
         raise ValueError(
             f"{demo_label(i, batch)}a motion needs at least {MINIMUM_SAMPLES} samples, "
             f"got {int(mask[i].sum())}"

@@ -308,12 +308,14 @@ class MotionFit:
         """
         samples = self.samples
         # One where a coordinate never moves: nothing to scale, and nothing to divide by.
-        amplitude = torch.where(samples.span > 0, samples.span, 1.0)
+        amplitude = samples.span.masked_fill(samples.span == 0, 1.0)
         shown = Demonstrated(*(x.double() for x in (samples.first, samples.last, amplitude)))
-        for ends in (samples, self.noisy):
+        scaling.check(shown, samples.batch, names)
+        if self.noisy is not samples:
             # Noise would make a way of none, and taking it off as well.
-            recorded = Demonstrated(ends.first.double(), ends.last.double(), shown.amplitude)
-            scaling.check(recorded, samples.batch, names)
+            first, last = self.noisy.first.double(), self.noisy.last.double()
+            noisy = Demonstrated(first, last, shown.amplitude)
+            scaling.check(noisy, samples.batch, names)
         s = samples.s[0] if samples.shared else samples.s.view(*samples.batch, -1)
         return {
             "weights": self._batched(scaling.unscale(self.weights.mT, shown).mT),

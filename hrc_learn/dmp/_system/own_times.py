@@ -76,11 +76,6 @@ class OwnTimesTable:
         """Pieces of a motion, that after the end among them."""
         return self.matrix.shape[1] // self.size
 
-    def flat(self, piece: Int[Tensor, "B T"]) -> Int[Tensor, "BT"]:
-        """Pieces of a batch of motions, those of one after those of another."""
-        first = torch.arange(len(piece), dtype=piece.dtype, device=piece.device)
-        return (piece + self.pieces * first[:, None]).view(-1)
-
     def place(
         self, s: Float[Tensor, "B T"], dtype: torch.dtype
     ) -> tuple[Int[Tensor, "B T"], Float[Tensor, "B T K"]]:
@@ -306,11 +301,24 @@ def _of_least_degree(
     return coefficients
 
 
-def _rows(table: OwnTimesTable, coordinates: Float[Tensor, "B D M"]) -> Tensor:
-    """Coefficients of each motion, (B, pieces, K, D)."""
+def _rows(
+    table: OwnTimesTable, coordinates: Float[Tensor, "B D M"], pieces: int | None = None
+) -> Tensor:
+    """Coefficients of each motion, (B, pieces, K, D), of the first pieces or of all."""
     B, D, M = coordinates.shape
-    rows = coordinates.reshape(-1, M) @ table.matrix
+    matrix = table.matrix if pieces is None else table.matrix[:, : pieces * table.size]
+    rows = coordinates.reshape(-1, M) @ matrix
     return rows.view(B, D, -1, table.size).permute(0, 2, 3, 1)
+
+
+def _in_turn(piece: Int[Tensor, "B T"]) -> tuple[Int[Tensor, "BT"], int]:
+    """Pieces of a batch of motions, those of one after those of another, and how many each.
+
+    Those past the latest that a time lies on are left out: often they are a quarter.
+    """
+    pieces = int(piece.max()) + 1
+    first = torch.arange(len(piece), dtype=piece.dtype, device=piece.device)
+    return (piece + pieces * first[:, None]).view(-1), pieces
 
 
 def _gathered(table: OwnTimesTable, s: Tensor, coordinates: Tensor) -> Float[Tensor, "B T D"]:
@@ -342,15 +350,17 @@ class _Motion(torch.autograd.Function):
         for part in _parts(s):
             x = coordinates[part]
             piece, powers = table.place(s[part], y.dtype)
-            rows = _rows(table, x).contiguous().view(-1, D)
+            flat, pieces = _in_turn(piece)
+            rows = _rows(table, x, pieces).contiguous().view(-1, D)
             if bags is None:
                 # Looked up: to add up the indices of each sample takes twice as long.
-                bags = torch.arange(len(rows), dtype=torch.int32, device=s.device)
+                count = len(x) * table.pieces * table.size
+                bags = torch.arange(count, dtype=torch.int32, device=s.device)
                 bags = bags.view(-1, table.size)
             # A weighted sum of rows for each sample: the one operation that does not write
             # the rows down first.
             y[part] = torch.nn.functional.embedding_bag(
-                bags.index_select(0, table.flat(piece)),
+                bags.index_select(0, flat),
                 rows,
                 mode="sum",
                 per_sample_weights=powers.view(-1, table.size),
@@ -402,11 +412,11 @@ class _Adjoint(torch.autograd.Function):
         for part in _parts(s):
             g = grad[part]
             piece, powers = table.place(s[part], g.dtype)
-            flat, powers = table.flat(piece), powers.view(-1, table.size)
+            (flat, pieces), powers = _in_turn(piece), powers.view(-1, table.size)
             # Sums over the samples of each piece are bags of them, one beside the other.
             rising = bool((flat[1:] >= flat[:-1]).all())
             sample = torch.arange(len(flat), device=s.device) if rising else flat.argsort()
-            counts = torch.bincount(flat, minlength=len(g) * table.pieces)
+            counts = torch.bincount(flat, minlength=len(g) * pieces)
             sums = [
                 torch.nn.functional.embedding_bag(
                     sample,
@@ -419,7 +429,8 @@ class _Adjoint(torch.autograd.Function):
             ]
             rows = torch.stack(sums, dim=-1).view(len(g), -1, D, table.size).movedim(2, 1)
             rows = rows.reshape(len(g) * D, -1)
-            by_x[part] = (rows @ table.matrix.mT).view(len(g), D, -1)
+            matrix = table.matrix[:, : rows.shape[-1]]
+            by_x[part] = (rows @ matrix.mT).view(len(g), D, -1)
             if table.others is not None:
                 by_x[part] += (g.mT @ table.extra(s[part], g.dtype)) @ table.others.mT
         return by_x
