@@ -29,6 +29,8 @@ from hrc_learn.dmp.dual_arm_dmp import DualArmDMP as DualArmDMP
 from hrc_learn.dmp.dual_arm_dmp import DualArmState as DualArmState
 from hrc_learn.dmp.exported_dmp import ExportedDMP as ExportedDMP
 from hrc_learn.dmp.exported_dmp import load_stepper as load_stepper
+from hrc_learn.dmp.framed_dmp import FramedDMP as FramedDMP
+from hrc_learn.dmp.framed_dmp import Frames as Frames
 from hrc_learn.dmp.interaction_primitive import InteractionEstimate as InteractionEstimate
 from hrc_learn.dmp.interaction_primitive import InteractionPrimitive as InteractionPrimitive
 from hrc_learn.dmp.joint_dmp import BasisSelection as BasisSelection

@@ -1,0 +1,141 @@
+"""How well a motion out of one object and into another is predicted for objects elsewhere.
+
+Made-up planar motions between two frames a metre apart, give or take 0.3 m, each turned by up
+to one radian: out of the first along its x axis, into the second along its own, for a stretch
+that differs by 10 %. Learnt from a few, and compared with the motion itself in fifty other
+places.
+"""
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from rich.console import Console
+from rich.table import Table
+from torch import Tensor
+
+from hrc_learn import cli
+from hrc_learn.dmp import ContextualDMP, FramedDMP, Frames, JointDMP, mean_primitive
+
+SAMPLES, PLACES = 100, 50
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args:
+    counts: tuple[int, ...] = (3, 4, 6, 8, 12)
+    """Of demonstrations."""
+    seeds: int = 10
+    """Sets of demonstrations of each count."""
+    n_basis: int = 30
+    """Basis functions of each primitive."""
+    json: Path | None = None
+    """Receives the figures as one flat object."""
+
+
+def main(args: Args) -> None:
+    """Predict, print a table, write the figures."""
+    torch.set_num_threads(1)
+    figures: dict[str, float] = {}
+    for count in args.counts:
+        errors: dict[str, list[float]] = defaultdict(list)
+        for seed in range(args.seeds):
+            rng = torch.Generator().manual_seed(seed)
+            with torch.no_grad():
+                for name, error in predict(count, args.n_basis, rng).items():
+                    errors[name].append(error)
+        for name, values in errors.items():
+            figures[f"{name}_{count}"] = sum(values) / len(values)
+    show(figures, args.counts)
+    if args.json:
+        cli.write_json(args.json, figures)
+
+
+def predict(count: int, n_basis: int, rng: torch.Generator) -> dict[str, float]:
+    """Median RMSE over the places [mm], by each method."""
+    shown, others = made_up_frames(count, rng), made_up_frames(PLACES, rng)
+    time, position = made_up_motions(shown, 0.1, rng)
+    _, wanted = made_up_motions(others, 0.0, rng)
+    start, goal = others.b.unbind(1)
+    mean = mean_primitive(JointDMP.fit(time, position, n_basis, approach=1.0))
+    function = ContextualDMP.fit(time, position, context(shown), n_basis=n_basis)
+    framed = FramedDMP.fit(time, position, shown, n_basis)
+    made = {
+        "mean": mean.rollout(time, start, goal).position,
+        "function": function.at(context(others)).rollout(time, start, goal).position,
+        "moments": product_of_moments(position, shown, others),
+        "framed": framed.at(others).rollout(time).position,
+    }
+    return {
+        name: 1e3 * (y - wanted).square().sum(-1).mean(-1).sqrt().median().item()
+        for name, y in made.items()
+    }
+
+
+def made_up_frames(n: int, rng: torch.Generator) -> Frames:
+    """Two in each of n places."""
+    angle = 2 * torch.rand(n, 2, generator=rng, dtype=torch.float64) - 1
+    c, s = angle.cos(), angle.sin()
+    A = torch.stack([torch.stack([c, -s], -1), torch.stack([s, c], -1)], -2)
+    off = 0.3 * torch.randn(n, 2, 2, generator=rng, dtype=torch.float64)
+    return Frames(A, off + torch.tensor([[0.0, 0.0], [1.0, 0.0]]))
+
+
+def made_up_motions(
+    frames: Frames, differ: float, rng: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Time (T,) and Bezier curves (n, T, 2), at the speed of minimum jerk."""
+    n = len(frames.b)
+    reach = 0.4 * (1 + differ * torch.randn(n, 2, 1, generator=rng, dtype=torch.float64))
+    (first, last), (out, into) = frames.b.unbind(1), (reach * frames.A[..., 0]).unbind(1)
+    s = torch.linspace(0, 1, SAMPLES, dtype=torch.float64)
+    m = s**3 * (10 - 15 * s + 6 * s**2)
+    handles = first, first + out, last - into, last
+    shares = (1 - m) ** 3, 3 * m * (1 - m) ** 2, 3 * m**2 * (1 - m), m**3
+    ways = [p[:, None] * w[:, None] for p, w in zip(handles, shares, strict=True)]
+    return 2 * s, torch.stack(ways).sum(0)
+
+
+def context(frames: Frames) -> Tensor:
+    """Where the frames are and where they point, as numbers."""
+    return torch.cat([frames.b, frames.A[..., 0]], dim=-1).flatten(1)
+
+
+def product_of_moments(position: Tensor, shown: Frames, others: Frames) -> Tensor:
+    """Gaussians of each moment by itself, seen from the frames and multiplied elsewhere."""
+    seen = torch.linalg.solve(shown.A, (position[:, None] - shown.b[:, :, None]).mT).mT
+    mean = seen.mean(0)
+    off = (seen - mean)[..., None]
+    least = 1e-3**2 * torch.eye(2, dtype=torch.float64)
+    covariance = (off @ off.mT).sum(0) / (len(position) - 1) + least
+    A, b = others.A[:, :, None], others.b[:, :, None]
+    precision = torch.linalg.inv(A @ covariance @ A.mT)
+    there = (A @ mean[..., None])[..., 0] + b
+    together = (precision @ there[..., None]).sum(1)
+    return torch.linalg.solve(precision.sum(1), together)[..., 0]
+
+
+LABELS = {
+    "mean": "mean, adapted (approach=1)",
+    "function": "ContextualDMP of the places",
+    "moments": "product at each moment",
+    "framed": "FramedDMP",
+}
+
+
+def show(figures: dict[str, float], counts: tuple[int, ...]) -> None:
+    """Print the errors by method and number of demonstrations."""
+    table = Table("RMSE [mm]", title="Motions between two frames")
+    for count in counts:
+        table.add_column(f"{count} shown", justify="right")
+    for name, label in LABELS.items():
+        table.add_row(label, *(f"{figures[f'{name}_{count}']:.0f}" for count in counts))
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    cli.run(main, Args)
