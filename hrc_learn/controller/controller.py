@@ -30,6 +30,7 @@ from hrc_learn.controller.monitors import potential_rate
 from hrc_learn.controller.resolved_rate import (
     PoseDrift,
     excess_speed,
+    led_descent,
     measure_drift,
     planned_motion,
     resolved_rate,
@@ -41,7 +42,8 @@ from hrc_learn.controller.way_making import WayMakingConfig, way_making_velocity
 from hrc_learn.geometry import Pose
 from hrc_learn.geometry.numerics import is_number
 from hrc_learn.jacobian import ImageJacobianEstimator, Measurement
-from hrc_learn.kinematics import SerialChain
+from hrc_learn.kinematics import SerialChain, TaskSpace, task_basis, task_rank
+from hrc_learn.kinematics.inverse import TASK_ROWS
 from hrc_learn.pytree import pytree
 from hrc_learn.regions import JointRegion
 
@@ -144,6 +146,8 @@ class _Motion(NamedTuple):
     """Velocities that limits of position and velocity allow."""
     pose_drift: PoseDrift | None
     """None: not compensated in this step."""
+    jacobian: Tensor
+    """Of that part of the tool's motion which the task leads."""
 
 
 @final
@@ -155,6 +159,10 @@ class AdaptiveController(nn.Module):
     with what it takes to run it on an arm: the twist is capped with its direction kept, J^+
     is damped where J is singular, vision feedback fades in and out, null-space motion yields
     to the task where a limit is near, and a safety filter has the last word.
+
+    Goals that lead less than a pose of the tool (`Goals.task`) leave more null space: with rows
+    J_t = B J of the Jacobian, u = -J_t^+ (J J_t^+)^T s + N_t c_d^-1 (d - xi_q), along which the
+    potential falls as it does with six.
 
     A step is a pure function `(state, observation) -> (command, state)`; nothing is stored
     in the module. Run real-time loops under `torch.inference_mode()`.
@@ -177,12 +185,18 @@ class AdaptiveController(nn.Module):
             goals: Regions to go to, unless an observation brings its own.
             config: Default: the recommended settings.
             joint_region: Default: that of the chain's limits.
+
+        Raises:
+            ValueError: The arm has too few joints for what the goals lead.
         """
         super().__init__()
         self.chain = chain
         self.estimator = estimator
         self.goals = goals
         self.config = config = config or ControllerConfig()
+        # Here once: which they are is no question of a step.
+        self._ranks = {task: task_rank(chain, task) for task in TASK_ROWS}
+        self._check_task(goals)
         limits = chain.limits
         self.joint_region = joint_region or JointRegion.from_limits(limits.lower, limits.upper)
         self.blending = VisionBlending(config.blending)
@@ -202,6 +216,29 @@ class AdaptiveController(nn.Module):
         self.goals = _pytree.tree_map(fn, self.goals)
         self.joint_region = _pytree.tree_map(fn, self.joint_region)
         return self
+
+    def null_space_dimension(self, task: TaskSpace | None = None) -> int:
+        """How many dimensions of joint motion a task leaves to people and limits.
+
+        Args:
+            task: What of the tool's pose is led; None: what the goals lead.
+        """
+        return len(self.chain.joint_names) - self._ranks[task or self.goals.task]
+
+    def _check_task(self, goals: Goals) -> None:
+        task, n = goals.task, len(self.chain.joint_names)
+        if task == "pose" and n < 6:
+            left = self.null_space_dimension("position+axis")
+            raise ValueError(
+                f"the goals lead the whole pose of the tool, which takes six joints, but the "
+                f"arm has {n}: lead its position and axis, Goals.at(..., "
+                f"task='position+axis'), which leaves {left} of null space, or its position"
+            )
+        if task != "pose" and self.config.jacobian == "analytic":
+            raise ValueError(
+                f"the analytic Jacobian counts whole rotations: goals of {task!r} take "
+                "ControllerConfig(jacobian='geometric')"
+            )
 
     def initial_state(
         self,
@@ -244,10 +281,12 @@ class AdaptiveController(nn.Module):
             What to send and why, and the next state.
 
         Raises:
-            ValueError: A number dt is not in (0, longest_step] of the safety settings.
+            ValueError: A number dt is not in (0, longest_step] of the safety settings, or the
+                observation's goals lead more than the arm has joints for.
         """
         state = self._restored(state)
         goals, known = effective_goals(observation, self.goals)
+        self._check_task(goals)
         dt, timed = known_step(observation.dt, self.config.safety.longest_step)
         q, stale = validated_position(observation, state.safety.position)
         pose, J = self.chain.forward_and_jacobian(q)
@@ -273,7 +312,7 @@ class AdaptiveController(nn.Module):
         descent = feedback.s
         if self.config.jacobian == "analytic":
             descent = analytic_descent(descent, pose.orientation)
-        motion = self._motion(state, observation, goals, q, J, task_level, descent)
+        motion = self._motion(state, observation, goals, q, pose, J, task_level, descent)
         asked = torch.cat([motion.joint_velocity, feedback.xi_x, feedback.xi_r], dim=-1)
         sound = timed & is_number(asked).all(-1)
         if observation.stop is not None:
@@ -299,9 +338,10 @@ class AdaptiveController(nn.Module):
         if motion.pose_drift is None:
             pose_drift = replace(state.pose_drift, active=torch.zeros_like(stale))
         else:
-            planned = planned_motion(motion.task_twist, motion.twist, J, v, dt)
+            led = motion.jacobian
+            planned = planned_motion(motion.task_twist, motion.twist, led, v, dt)
             # An arm that only brakes does not drift.
-            braking = safety.dt.unsqueeze(-1) * torch.linalg.vecdot(J, v.unsqueeze(-2))
+            braking = safety.dt.unsqueeze(-1) * torch.linalg.vecdot(led, v.unsqueeze(-2))
             planned = torch.where(sound.unsqueeze(-1), planned, braking)
             pose_drift = replace(motion.pose_drift, planned=planned)
         command = Command(
@@ -346,6 +386,7 @@ class AdaptiveController(nn.Module):
         observation: Observation,
         goals: Goals,
         q: Tensor,
+        pose: Pose,
         J: Tensor,
         task_level: Tensor,
         descent: Tensor,
@@ -355,19 +396,33 @@ class AdaptiveController(nn.Module):
         xi_q = self.joint_region.gradient(q)
         null = (-xi_q if d is None else d - xi_q) / self.config.null_damping
 
+        # B^T B J is the Jacobian of what the task leads of the tool's motion.
+        basis, led = self._basis(goals, pose, J), J
+        if basis is not None:
+            led = basis.mT @ (basis @ J)
+            descent = led_descent(J, basis, descent)
         twist = task_twist = -descent / excess_speed(descent, self.caps[0])
         pose_drift = None
         if d is not None and rate > 0:
             # A joint-space approach plans no path of the tool from which it could drift.
             active = (d != 0).any(-1) & ((task_level == 1) | (goals.posture is None))
-            pose_drift = measure_drift(state.pose_drift, q, J, active)
+            pose_drift = measure_drift(state.pose_drift, q, led, active)
             twist = torch.add(task_twist, pose_drift.drift, alpha=rate)
 
         ahead = self.config.command_delay
         if ahead > 0:
             # Where the arm will be when it follows: the null space is that of then.
-            J = self.chain.jacobian(q + ahead * state.safety.velocity)
-        task, null = resolved_rate(J, twist, null)
+            coming = q + ahead * state.safety.velocity
+            if basis is None:
+                J = self.chain.jacobian(coming)
+            else:
+                pose, J = self.chain.forward_and_jacobian(coming)
+                basis = self._basis(goals, pose, J)
+        if basis is None:
+            task, null = resolved_rate(J, twist, null)
+        else:
+            rows = (basis @ twist.unsqueeze(-1)).squeeze(-1)
+            task, null = resolved_rate(basis @ J, rows, null)
         if goals.posture is not None:
             approach = approach_velocity(goals.posture, q, J, self.caps[1])
             task = torch.lerp(approach, task, task_level.unsqueeze(-1))
@@ -375,7 +430,14 @@ class AdaptiveController(nn.Module):
         # Constraints let it yield better.
         if self.config.null_space_yields and self.config.safety.constraints is None:
             null = scale_null_space(task, null, *bounds)
-        return _Motion(task + null, null, twist, task_twist, xi_q, bounds, pose_drift)
+        return _Motion(task + null, null, twist, task_twist, xi_q, bounds, pose_drift, led)
+
+    def _basis(self, goals: Goals, pose: Pose, J: Tensor) -> Tensor | None:
+        """What the goals lead of the tool's motion; None: all of it."""
+        task = goals.task
+        return (
+            None if task == "pose" else task_basis(J, pose.orientation, task, self._ranks[task])
+        )
 
     def _nullspace_input(self, observation: Observation) -> Tensor | None:
         """The person's, and the effort that would make the arm make way by itself."""

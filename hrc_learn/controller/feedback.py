@@ -229,7 +229,10 @@ def regional_feedback(
         vision_rate: Fastest decay of the pixel error to ask for [1/s].
     """
     P_t, xi_position = goals.position.feedback(pose.position)
-    P_o, xi_orientation = goals.orientation.feedback(pose.orientation)
+    if goals.orientation is None:
+        P_o, xi_orientation = 0.0, torch.zeros_like(xi_position)
+    else:
+        P_o, xi_orientation = goals.orientation.feedback(pose.orientation)
     P_v, xi_x = goals.vision.feedback(blending.feature)
     xi_r = torch.cat([xi_position, xi_orientation], dim=-1)
     error = blending.feature - goals.vision.target

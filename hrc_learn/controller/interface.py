@@ -5,7 +5,7 @@ All are pytrees of tensors, so a step compiles, exports and maps over batches.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -15,15 +15,25 @@ from torch import Tensor
 from hrc_learn.controller.constraint_layer import Distances
 from hrc_learn.controller.safety_filter import SafetyReport
 from hrc_learn.geometry import quaternion
-from hrc_learn.kinematics import JointLimits
+from hrc_learn.kinematics import JointLimits, TaskSpace
 from hrc_learn.pytree import pytree
 from hrc_learn.regions import (
+    AxisRegion,
     JointRegion,
     OrientationRegion,
     PositionRegion,
     PostureRegion,
     VisionRegion,
 )
+
+type ToolRegion = OrientationRegion | AxisRegion | None
+"""What is led of the tool's orientation: all, its z axis, or nothing."""
+
+_OF_TASK: dict[TaskSpace, Callable[[Tensor], ToolRegion]] = {
+    "pose": lambda goal: OrientationRegion(goal=goal),
+    "position+axis": lambda goal: AxisRegion(goal=goal),
+    "position": lambda goal: None,
+}
 
 HALF_SIZE = (0.12, 0.12, 0.08)
 """Half edges of the box that proved large enough to find the marker in view [m]."""
@@ -41,13 +51,22 @@ class Goals:
     """
 
     position: PositionRegion
-    orientation: OrientationRegion
+    orientation: ToolRegion
+    """Of the tool; an `AxisRegion` leaves turns about its axis free, None all of them. An arm
+    of fewer joints than a pose has dimensions is led by less than one."""
     vision: VisionRegion
     vision_enabled: Bool[Tensor, "*#batch"]
     """False: steer by the Cartesian regions alone, whatever the camera sees."""
     posture: PostureRegion | None = None
     """Where to go in joint space before task-space feedback takes over; None: it leads from
     the start."""
+
+    @property
+    def task(self) -> TaskSpace:
+        """What of the tool's pose is led."""
+        if self.orientation is None:
+            return "position"
+        return "position+axis" if isinstance(self.orientation, AxisRegion) else "pose"
 
     @classmethod
     def at(
@@ -58,6 +77,7 @@ class Goals:
         *,
         half_size: Sequence[float] = HALF_SIZE,
         image_size: tuple[int, int] = IMAGE_SIZE,
+        task: TaskSpace = "pose",
     ) -> Goals:
         """Goals with the recommended gains.
 
@@ -68,6 +88,8 @@ class Goals:
                 switches the camera off.
             half_size: Of the box [m].
             image_size: Width and height of the image [px].
+            task: What of the tool's pose is led: all, its position and its z axis, or its
+                position. What is not led is null space.
 
         Raises:
             ValueError: The target lies outside the image.
@@ -77,7 +99,7 @@ class Goals:
             target = centre.new_tensor(image_size) / 2
         return cls(
             position=PositionRegion(centre=centre, half_size=centre.new_tensor(half_size)),
-            orientation=OrientationRegion(goal=orientation),
+            orientation=_OF_TASK[task](orientation),
             vision=VisionRegion.inside_image(target, image_size),
             vision_enabled=torch.tensor(enabled, device=centre.device),
         )
@@ -95,7 +117,9 @@ class Goals:
         )
 
     def turned_to(self, orientation: Float[Tensor, "*#batch 4"]) -> Goals:
-        """The same goals with another tool orientation."""
+        """The same goals with another tool orientation, where one is led."""
+        if self.orientation is None:
+            return self
         return replace(self, orientation=replace(self.orientation, goal=orientation))
 
     def aimed_at(self, target: Float[Tensor, "*#batch rows"]) -> Goals:

@@ -26,7 +26,7 @@ from hrc_learn.pytree import pytree
 # Lets the Cholesky factorisation go through at a singularity; used there only to see how
 # near it is, never in a solution.
 _FLOOR = 1e-9
-_EYE = Constant(torch.eye(6, dtype=torch.float64))
+_EYE = {rows: Constant(torch.eye(rows, dtype=torch.float64)) for rows in range(1, 7)}
 
 
 def excess_speed(
@@ -42,9 +42,33 @@ def excess_speed(
     return (speeds / caps).amax(-1, keepdim=True).clamp(min=1)
 
 
-def resolved_rate(
+def led_descent(
     J: Float[Tensor, "*batch 6 n"],
-    twist: Float[Tensor, "*batch 6"],
+    basis: Float[Tensor, "*batch rows 6"],
+    gradient: Float[Tensor, "*batch 6"],
+) -> Float[Tensor, "*batch 6"]:
+    """The part of a gradient that leading fewer than six dimensions of the tool descends along.
+
+    With J_t = B J the joints move by J_t^+ y for a motion y of the task, and the tool by all of
+    J J_t^+ y, turns that nobody leads included. So the gradient over y is (J J_t^+)^T s, and
+    the potential falls by its square. Where the task leads all that s asks for, it is B s.
+
+    Args:
+        J: Geometric Jacobian.
+        basis: B, orthonormal twists that the task leads (`task_basis`).
+        gradient: s, of the potentials over small motions of the tool.
+
+    Returns:
+        B^T y, a twist.
+    """
+    J_t = matmul(basis, J)
+    pushed = matmul(J_t, matmul(J.mT, gradient.unsqueeze(-1)))
+    return matmul(basis.mT, solve_positive(_damped_gram(J_t), pushed)).squeeze(-1)
+
+
+def resolved_rate(
+    J: Float[Tensor, "*batch rows n"],
+    twist: Float[Tensor, "*batch rows"],
     null_velocity: Float[Tensor, "*batch n"],
 ) -> tuple[Float[Tensor, "*batch n"], Float[Tensor, "*batch n"]]:
     """J^+ twist and N w, for a null-space velocity w.
@@ -59,21 +83,25 @@ def resolved_rate(
     one step to the next; the safety filter limits the acceleration that takes.
 
     Args:
-        J: Geometric Jacobian.
-        twist: Wanted motion of the tool (linear [m/s], angular [rad/s]).
+        J: Geometric Jacobian, or the rows of it that the task leads: 6 or fewer, at most n.
+        twist: Wanted motion of the tool (linear [m/s], angular [rad/s]), or of those.
         null_velocity: Wanted joint velocity w, of which N keeps what leaves the tool at rest
             [rad/s].
 
     Returns:
         Joint velocity of the task, and that of the null space [rad/s].
     """
+    task = matmul(J.mT, solve_positive(_damped_gram(J), twist.unsqueeze(-1))).squeeze(-1)
+    return task, null_projection(J, null_velocity)
+
+
+def _damped_gram(J: Float[Tensor, "*batch rows n"]) -> Float[Tensor, "*batch rows rows"]:
+    """J J^T + lambda^2 I."""
     gram = matmul(J, J.mT)
-    eye = _EYE.like(J)
+    eye = _EYE[J.shape[-2]].like(J)
     sigma_square = 1 / inverse_norm(torch.add(gram, eye, alpha=_FLOOR))
     damping_square = (SINGULAR_BELOW**2 - sigma_square).clamp(min=0)
-    damped = torch.addcmul(gram, eye, damping_square[..., None, None])
-    task = matmul(J.mT, solve_positive(damped, twist.unsqueeze(-1))).squeeze(-1)
-    return task, null_projection(J, null_velocity)
+    return torch.addcmul(gram, eye, damping_square[..., None, None])
 
 
 def scale_null_space(

@@ -17,17 +17,20 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from hrc_learn.geometry import Pose
+from hrc_learn.geometry import Pose, quaternion
+from hrc_learn.geometry.numerics import Constant
 from hrc_learn.kinematics.chain import SerialChain
 
 type TaskSpace = Literal["pose", "position+axis", "position"]
 """What of the tool's pose matters: all, all but the turn about its z axis, the position."""
 
-TASK_ROWS = {"pose": 6, "position+axis": 5, "position": 3}
+TASK_ROWS: dict[TaskSpace, int] = {"pose": 6, "position+axis": 5, "position": 3}
 # Weight of an angle against a distance [m/rad]: turning by 1 rad moves what is this far away.
 _LEVER = 0.3
-# Singular values below this part of the largest are none (`null_space_dimension`).
-_RANK = 1e-6
+# Singular values below this part of the largest are none (`null_space_dimension`), and below
+# this one nothing that an arm is led by: the SO-101's tool is 8 mm off the axis about which its
+# last joint rolls it, which moves it by so much and no further.
+_RANK, _LED = 1e-6, 0.02
 _BIAS = 1e-9  # smallest damping: the system stays regular where the task has more rows than n
 _STARTS, _ROUNDS, _ITERATIONS = 12, 6, 40
 _CORRECTIONS = 2  # of Newton's, from one pose of a path to the next
@@ -80,7 +83,11 @@ def task_error_and_jacobian(
 
 
 def null_space_dimension(
-    chain: SerialChain, q: Float[Tensor, "*batch joints"], task: TaskSpace = "pose"
+    chain: SerialChain,
+    q: Float[Tensor, "*batch joints"],
+    task: TaskSpace = "pose",
+    *,
+    below: float = _RANK,
 ) -> Float[Tensor, "*batch"]:
     """How many dimensions of joint motion leave a task alone: 1 of a 7-joint arm's pose.
 
@@ -88,12 +95,65 @@ def null_space_dimension(
         chain: The arm.
         q: Joint positions [rad, m]. At singularities there are more.
         task: What must not move.
+        below: Singular values below this part of the largest count as none.
     """
     flat = q.reshape(-1, q.shape[-1])
     _, J = task_error_and_jacobian(chain, flat, chain.forward(flat), task)
     values = torch.linalg.svdvals(J)
-    rank = (values > _RANK * values[..., :1]).sum(-1)
+    rank = (values > below * values[..., :1]).sum(-1)
     return (q.shape[-1] - rank).reshape(q.shape[:-1]).to(q)
+
+
+_SAMPLES = 64  # joint positions at which `task_rank` looks: nearly all are regular
+
+
+def task_rank(chain: SerialChain, task: TaskSpace = "pose") -> int:
+    """How many dimensions of a task an arm leads, away from its singularities.
+
+    6 of a pose by six joints or more. Of "position+axis" 5, but 4 of five joints the last of
+    which turns the tool about its axis: position and tilt. What is left of the joints is null
+    space. Directions that take 50 times as much motion as others are not led.
+
+    Args:
+        chain: The arm.
+        task: What of the tool's pose is led.
+    """
+    limits, rng = chain.limits, torch.Generator().manual_seed(0)
+    share = torch.rand(_SAMPLES, len(chain.joint_names), generator=rng, dtype=torch.float64)
+    q = limits.lower + share * (limits.upper - limits.lower)
+    return len(chain.joint_names) - int(null_space_dimension(chain, q, task, below=_LED).amin())
+
+
+_LINEAR = Constant(torch.eye(6, dtype=torch.float64)[:3])
+
+
+def task_basis(
+    J: Float[Tensor, "*batch 6 joints"],
+    orientation: Float[Tensor, "*batch 4"],
+    task: TaskSpace,
+    rank: int,
+) -> Float[Tensor, "*batch {rank} 6"]:
+    """Orthonormal twists of the tool that a task leads: its velocity there is B J q_dot.
+
+    Linear ones, then the turns across the tool's axis. Of an arm that has fewer of them than
+    the task, those that it moves: the range of J in them.
+
+    Args:
+        J: Geometric Jacobian of the tool.
+        orientation: Of the tool.
+        task: What of its pose is led.
+        rank: `task_rank` of the arm.
+    """
+    rows = _LINEAR.like(J).expand(*J.shape[:-2], 3, 6)
+    if task == "pose":
+        rows = torch.eye(6, dtype=J.dtype, device=J.device).expand(*J.shape[:-2], 6, 6)
+    elif task == "position+axis":
+        across = quaternion.to_matrix(orientation)[..., :2].mT
+        rows = torch.cat([rows, torch.nn.functional.pad(across, (3, 0))], dim=-2)
+    if rank == rows.shape[-2]:
+        return rows
+    U = torch.linalg.svd(rows @ J, full_matrices=False).U
+    return U[..., :rank].mT @ rows
 
 
 def solve_inverse(

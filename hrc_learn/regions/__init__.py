@@ -2,6 +2,7 @@
 
 from hrc_learn.regions.joint import JointRegion as JointRegion
 from hrc_learn.regions.joint import PostureRegion as PostureRegion
+from hrc_learn.regions.region import AxisRegion as AxisRegion
 from hrc_learn.regions.region import OrientationRegion as OrientationRegion
 from hrc_learn.regions.region import PositionRegion as PositionRegion
 from hrc_learn.regions.region import Region as Region

@@ -1,5 +1,5 @@
-"""The interface of regions, and the Cartesian ones: a box for the position, a cone round a goal
-orientation.
+"""The interface of regions, and the Cartesian ones: a box for the position, cones round a goal
+orientation and round a goal axis.
 """
 
 from __future__ import annotations
@@ -192,6 +192,62 @@ class OrientationRegion(Region):
     def _error(self, x: Tensor) -> Tensor:
         """Error p * p_g^-1 with the sign of the shortest rotation."""
         return quaternion.canonical(quaternion.multiply(x, quaternion.conjugate(self.goal)))
+
+
+@pytree
+@dataclass(frozen=True, kw_only=True)
+class AxisRegion(Region):
+    """All orientations whose z axis is within an angle of the goal's; turns about it are free.
+
+    f and P are those of `OrientationRegion`, of the angle phi between both axes. The gradient
+    is dP over a small rotation of the end effector about the base axes. It is across both axes:
+    no turn about the tool's own is asked for. Exactly opposite ones are led about an axis that
+    the goal chooses.
+    """
+
+    goal: Float[Tensor, "*#batch 4"]
+    """An orientation with the wanted z axis, a unit quaternion (w, x, y, z)."""
+    sharpness: float = static(15.0)
+    """alpha_o, two over the tolerated angle [1/rad]."""
+    stiffness: float = static(0.02)
+    """k_o."""
+
+    @property
+    def tolerance(self) -> float:
+        """Half opening angle of the cone [rad]."""
+        return 2 / self.sharpness
+
+    def value(self, x: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*both"]:
+        """Region function f at the orientation x (a unit quaternion)."""
+        _, sine, cosine = self._swing(x)
+        return self.sharpness * torch.atan2(sine, cosine).squeeze(-1) - 1
+
+    def feedback(
+        self, x: Float[Tensor, "*batch 4"]
+    ) -> tuple[Float[Tensor, "*both"], Float[Tensor, "*both 3"]]:
+        """Potential of shape (*both,) and its gradient (*both, 3) [1/rad]."""
+        swing, sine, cosine = self._swing(x)
+        f = (self.sharpness * torch.atan2(sine, cosine) - 1).clamp(min=0)
+        P = (0.5 * self.stiffness) * (f * f).squeeze(-1)
+        slope = (0.5 * self.stiffness * self.sharpness) * f / sine.clamp(min=_SHORTEST_AXIS)
+        return P, slope * quaternion.rotate(self.goal, swing)
+
+    def _swing(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """sin(phi/2) n in the goal's frame, sin(phi/2) and cos(phi/2).
+
+        The rotation from goal to x is a turn about z, then one by phi about n, across z
+        (swing-twist decomposition).
+        """
+        error = quaternion.multiply(quaternion.conjugate(self.goal), x)
+        w, i, j, k = error.split(1, dim=-1)
+        sine = torch.linalg.vector_norm(error[..., 1:3], dim=-1, keepdim=True)
+        cosine = torch.linalg.vector_norm(torch.cat([w, k], dim=-1), dim=-1, keepdim=True)
+        # Of half a turn of the axis any turn about z may be taken for none.
+        half_turn = cosine < _SHORTEST_AXIS
+        length = torch.where(half_turn, 1.0, cosine)
+        c, s = torch.where(half_turn, 1.0, w / length), torch.where(half_turn, 0.0, k / length)
+        swing = torch.cat([c * i - s * j, c * j + s * i, torch.zeros_like(i)], dim=-1)
+        return swing, sine, cosine
 
 
 def printed_derivative(

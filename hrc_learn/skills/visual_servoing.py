@@ -17,6 +17,7 @@ from hrc_learn.controller import AdaptiveController, ControllerState, Goals, Obs
 from hrc_learn.controller.interface import IMAGE_SIZE
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import Measurement
+from hrc_learn.regions import OrientationRegion
 from hrc_learn.skills.drawn_goals import DrawnGoals, DrawnGoalsConfig
 from hrc_learn.skills.failures import MissedGraspError
 from hrc_learn.skills.marker_angle import AngleServo, MarkerAngle
@@ -121,8 +122,10 @@ class VisualServoConfig:
             # Pulls from wherever the marker is seen; the paper's region may leave it outside.
             vision=replace(goals.vision, formulation="saturated"),
             position=replace(goals.position, stiffness=(4e-4, 4e-4, upright)),
-            orientation=replace(
-                goals.orientation, sharpness=sharpness, stiffness=4 * self.rate / sharpness**2
+            orientation=OrientationRegion(
+                goal=above.orientation,
+                sharpness=sharpness,
+                stiffness=4 * self.rate / sharpness**2,
             ),
         )
 

@@ -12,6 +12,7 @@ from torch.utils import _pytree
 
 from hrc_learn.geometry import quaternion
 from hrc_learn.regions import (
+    AxisRegion,
     JointRegion,
     OrientationRegion,
     PositionRegion,
@@ -103,6 +104,22 @@ def orientation(formulation: str, coordinates: str = "rotation") -> Case:
     )
 
 
+def axis() -> Case:
+    def make(*batch: int, rng: torch.Generator) -> AxisRegion:
+        return AxisRegion(goal=sampling.quaternions(*batch, rng=rng))
+
+    def delicate() -> Tensor:
+        region = make(rng=sampling.generator())
+        angles = [0.0, 1e-9, region.tolerance, torch.pi, torch.pi - 1e-9, 2 * torch.pi]
+        tilts = [[a, 0, 0] for a in angles] + [[0, 0, a] for a in angles]
+        vectors = torch.tensor(tilts, dtype=torch.float64)
+        return quaternion.multiply(region.goal, quaternion.exp(vectors))
+
+    return Case(
+        make, lambda *b, rng: sampling.quaternions(*b, rng=rng), delicate, 3, move=rotate
+    )
+
+
 def vision(formulation: str, points: int = 1) -> Case:
     rows = 2 * points
 
@@ -142,6 +159,7 @@ CASES = {
     "orientation-paper": orientation("paper"),
     "orientation-vector": orientation("exact", "rotation_vector"),
     "orientation-vector-paper": orientation("paper", "rotation_vector"),
+    "axis": axis(),
     "posture": posture(),
     "vision": vision("paper"),
     "vision-saturated": vision("saturated"),

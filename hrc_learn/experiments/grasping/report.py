@@ -57,6 +57,7 @@ class RegionActivity:
         seen = servoed & np.isfinite(log["feature"]).all(axis=1)
         tool = run.cell.chain.forward(torch.from_numpy(log["joint_position"]))
         goals = config.goals(above, np.zeros(2))
+        assert goals.orientation is not None
         turn = np.where(servoed, goals.orientation.potential(tool.orientation).numpy(), np.nan)
         vision = np.full_like(turn, np.nan)
         for k in np.flatnonzero(seen):
