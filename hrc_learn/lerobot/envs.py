@@ -125,6 +125,7 @@ class PandaEnv(gym.Env):
             max_episode_steps: Actions after which an episode has failed.
         """
         self._robot = MujocoPanda(config)
+        self._robot.judged = False
         self._robot.connect()
         self._actions = action_names(config.action_space)
         self._max_episode_steps = max_episode_steps

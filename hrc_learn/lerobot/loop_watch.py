@@ -1,10 +1,14 @@
-"""Whether LeRobot's loop keeps the rate at which its recordings will be read."""
+"""What LeRobot's recordings of an arm are worth: late actions, limits, contacts, no motion."""
 
 from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
+
+from hrc_learn.kinematics import SerialChain
+from hrc_learn.protocols import ArmState
+from hrc_learn.teleoperation.recording_quality import RecordingQuality
 
 logger = logging.getLogger(__name__)
 
@@ -14,58 +18,73 @@ PAUSE = 2.0
 """Longer without an action is no late one but a pause [s], as between two episodes."""
 TOLERATED = 0.02
 """Share of late actions of which nothing is said."""
+EPISODE = 1.0
+"""Shorter stretches are no episodes [s], and need not show anything."""
 
 
 class LoopWatch:
-    """Counts late actions, and warns at the end of each stretch of them.
+    """Judges what is recorded of an arm, and warns at the end of each stretch of actions.
 
     LeRobot stamps frames with their number over the rate, whenever they were recorded: in what
-    is late the arm seems to have moved faster than it did.
+    is late the arm seems to have moved faster than it did. It tells a robot neither that it
+    records nor when an episode ends, and keeps what is doubtful; so a stretch ends with a
+    pause, with the robot's own next episode, or when it is disconnected.
     """
 
-    def __init__(self, name: str, fps: float, clock: Callable[[], float] = time.perf_counter):
+    def __init__(
+        self,
+        name: str,
+        fps: float,
+        clock: Callable[[], float] = time.perf_counter,
+        chain: SerialChain | None = None,
+        *,
+        in_real_time: bool = True,
+    ):
         """Begin with nothing.
 
         Args:
             name: Of the robot, for the warning.
             fps: Actions a second that there should be.
             clock: Seconds.
+            chain: Of the arm, whose limits are watched; None: they are not known.
+            in_real_time: Whether the arm goes on moving while the loop is late.
         """
-        self._name, self._period, self._clock = name, 1 / fps, clock
-        self._last: float | None = None
-        self._clear()
+        self._name, self._clock, self._in_real_time = name, clock, in_real_time
+        self._fps, self._quality = fps, RecordingQuality(fps, chain, LATE)
 
-    def tick(self) -> None:
-        """Note an action."""
+    def tick(self, state: ArmState | None = None, touching: Collection[str] = ()) -> None:
+        """Note an action.
+
+        Args:
+            state: Last reading of the arm; None: it was not read.
+            touching: What the arm touches that it should not, in words.
+        """
         now = self._clock()
-        gap = 0.0 if self._last is None else now - self._last
-        self._last = now
-        if gap > PAUSE:
+        if self._in_real_time and self._quality.ticks.gap(now) > PAUSE:
             self.end()
-            self._last = now
-            gap = 0.0
-        self.actions += 1
-        if gap > LATE * self._period:
-            self.late += 1
-            self.lost += round(gap / self._period) - 1
-            self.latest = max(self.latest, gap - self._period)
+        if state is None:
+            self._quality.ticks.tick(now)
+        else:
+            q, width = state.joint_position, state.gripper_width
+            self._quality.add(now, state.time, q, width, touching)
 
     def end(self) -> None:
-        """Warn of what came late since the last end, if it was much."""
-        if self.late > TOLERATED * self.actions:
+        """Warn of what is doubtful since the last end."""
+        ticks = self._quality.ticks
+        if self._in_real_time and ticks.late_ticks > TOLERATED * ticks.ticks:
             logger.warning(
                 "%s: %d of %d actions came late, by %.0f ms at most: what was recorded lacks "
                 "about %d frames, and moves faster there than the arm did. Record again with "
                 "fewer or smaller images, a lower --dataset.fps, or nothing else to compute",
                 self._name,
-                self.late,
-                self.actions,
-                1e3 * self.latest,
-                self.lost,
+                ticks.late_ticks,
+                ticks.ticks,
+                1e3 * ticks.latest,
+                ticks.lost,
             )
-        self._last = None
-        self._clear()
-
-    def _clear(self) -> None:
-        self.actions = self.late = self.lost = 0
-        self.latest = 0.0
+        doubts = self._quality.met()
+        if len(self._quality.states) >= EPISODE * self._fps:
+            doubts.insert(0, self._quality.worthless())
+        for doubt in filter(None, doubts):
+            logger.warning("%s: in what was recorded, %s", self._name, doubt)
+        self._quality.clear()

@@ -24,6 +24,7 @@ from hrc_learn.kinematics import gripper_down, panda, panda_capsules
 from hrc_learn.lerobot.loop_watch import LoopWatch
 from hrc_learn.lerobot.person import Person, PersonConfig
 from hrc_learn.protocols import Arm, ArmState
+from hrc_learn.teleoperation.recording_quality import pressed
 
 if TYPE_CHECKING:
     from hrc_learn.sim import World
@@ -252,6 +253,7 @@ class PandaRobot(Device, Robot):
         initial_configurations: How often everything has been put in place, which only a
             simulation can.
         complement: Lets a person lead the body, while connected; None: there is none.
+        judged: Whether what it does may be recorded, so that doubts are told.
     """
 
     complement: ComplementaryMotion | None = None
@@ -270,7 +272,11 @@ class PandaRobot(Device, Robot):
         )
         self._rotation = DOWN
         self._person_config = config.person
-        self._loop = LoopWatch(str(self), config.fps)
+        self._loop = LoopWatch(
+            str(self), config.fps, chain=panda, in_real_time=self.in_real_time
+        )
+        self._state: ArmState | None = None
+        self.judged = True
 
     @property
     def observation_features(self) -> dict[str, Any]:
@@ -303,6 +309,7 @@ class PandaRobot(Device, Robot):
     def get_observation(self) -> dict[str, Any]:
         self._need_connection()
         state, names = self.arm.read(), self._names
+        self._state = state
         values = observed(state, names, self._rotation)
         if HAND[0] in values:
             self._rotation = np.array([values[name] for name in HAND[3:]])
@@ -317,14 +324,27 @@ class PandaRobot(Device, Robot):
 
     def send_action(self, action: dict[str, Any]) -> dict[str, float]:
         self._need_connection()
-        if self.in_real_time:
-            self._loop.tick()
+        self._judge()
         where, width = target_of(action)
         joints = self._joints_at(where) if isinstance(where, Pose) else where
         if self.complement is not None:
             joints, width = self._beside_person(self.complement, where, joints, width)
         sent = self._command(joints, width)
         return action_of(self.space, sent, width, self._rotation)
+
+    def _judge(self) -> None:
+        """Tell the watch what is recorded with this action."""
+        if not self.judged:
+            return
+        state, self._state = self._state, None
+        if state is None:
+            self._loop.tick()
+        else:
+            self._loop.tick(state, (*self._touching(), *pressed(panda, state)))
+
+    def _touching(self) -> tuple[str, ...]:
+        """What the arm has met since the last action that it should not, in words."""
+        return ()
 
     @property
     @abstractmethod

@@ -127,6 +127,8 @@ _FLAT = math.cos(math.radians(3.0))
 # Of an object in the tool's frame: its x lies along the fingers' line of closing, its top
 # towards the gripper.
 _IN_HAND = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
+# Touches that are looked through for those of a moment; more begin in no control step.
+_REMEMBERED = 64
 _ARM_BODIES = ("link1",)  # the tree from link 1 on, hand and fingers included
 
 
@@ -228,6 +230,24 @@ class World:
         self._watch.restart()
         for monitor in self._monitors:
             monitor.clear()
+
+    def touched_since(self, time: float) -> tuple[str, ...]:
+        """What the arm has met since a time [s] that it should not: cabinet, table, itself or
+        the worker, in words.
+        """
+        monitors = (
+            self.cabinet_contacts,
+            self.table_contacts,
+            self.self_contacts,
+            self.worker_contacts,
+        )
+        met = [
+            f"{touch.first} touched {touch.second}"
+            for monitor in monitors
+            for touch in monitor.touches[-_REMEMBERED:]
+            if touch.end >= time
+        ]
+        return tuple(dict.fromkeys(met))
 
     def advance(self, duration: float) -> None:
         """Run the physics for a while, the arm following its last command [s].

@@ -2,30 +2,22 @@
 
 import contextlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float
 
 from hrc_learn.demos import DatasetError, DatasetWriter
+from hrc_learn.kinematics import SerialChain
 from hrc_learn.protocols import Request
 from hrc_learn.teleoperation.hand_guiding import Frame
+from hrc_learn.teleoperation.recording_quality import RecordingQuality, moving_part
 
 RecorderState = Literal["ready", "recording", "stopped"]
 """Stopped: a demonstration waits to be saved or discarded."""
 
-_STILL = 0.005
-"""Motion of a joint [rad], or of the gripper [m], below which a person has not begun yet."""
-_REST = (0.3, 0.7)
-"""Rest that is kept before and after the motion [s]: primitives smooth, and have to arrive."""
-_SHORTEST = 0.5
-"""Shortest demonstration [s]: a mouse click on a link moves the arm for less."""
-_MOST_LOST, _LONGEST_GAP = 0.05, 0.2
-"""Share of lost frames, and time without one [s], from which a demonstration is doubted: at
-0.5 m/s the hand goes on for 10 cm meanwhile."""
 _LATE, _MOST_LATE = 2.0, 0.2
 """Periods after which a frame is late, and share of such frames from which a demonstration is
 doubted: one in five, so that a machine that is busy for a moment asks for nothing."""
@@ -66,6 +58,7 @@ class DemonstrationRecorder:
         writer: DatasetWriter,
         task: Callable[[], str],
         clock: Callable[[], float] = time.monotonic,
+        chain: SerialChain | None = None,
     ):
         """Prepare.
 
@@ -73,10 +66,11 @@ class DemonstrationRecorder:
             writer: Of the dataset, used by nobody else.
             task: What is demonstrated, in words; asked for when a demonstration is saved.
             clock: Tells the time that passes for the person [s].
+            chain: Of the arm, whose limits are watched; None: they are not known.
         """
         self._writer, self._task, self._clock = writer, task, clock
         self._frames: list[Frame] = []
-        self._came: list[float] = []  # when, by the clock [s]
+        self._quality = RecordingQuality(writer.fps, chain, _LATE)
         self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="recorder")
         self._writing: list[Future[int]] = []
         self._draft: Future[float] | None = None
@@ -114,6 +108,11 @@ class DemonstrationRecorder:
         seconds = _duration(self._frames)
         return RecorderStatus(state=self._state, seconds=seconds, saved=saved, note=note)
 
+    @property
+    def recording(self) -> bool:
+        """Whether frames are kept."""
+        return self._state == "recording"
+
     def handle(self, request: Request) -> None:
         """Do what a person asks; what makes no sense now is noted, not done."""
         match request, self._state:
@@ -132,25 +131,43 @@ class DemonstrationRecorder:
             case (("stop" | "save" | "discard"), _):
                 self._note = f"nothing to {request}: start a demonstration first"
 
-    def add(self, frame: Frame) -> None:
-        """Keep a frame while recording."""
-        if self._state != "recording":
+    def add(self, frame: Frame, touching: Collection[str] = ()) -> None:
+        """Keep a frame while recording.
+
+        Args:
+            frame: Its columns.
+            touching: What the arm touches that it should not, in words.
+        """
+        if not self.recording:
             return
         now = self._clock()
         self._frames.append(frame)
-        self._came.append(now)
+        self._quality.add(
+            now,
+            float(frame["time"]),
+            np.asarray(frame["joint_position"]),
+            float(frame.get("gripper", 0.0)),
+            touching,
+        )
         if self._draft is not None and self._draft.done():
             # A long demonstration takes longer to write: a tenth of the time at most.
             took = self._draft.result()
             self._draft, self._draft_due = None, now + max(_DRAFT_EVERY, 10 * took)
         if self._draft is None and now >= self._draft_due:
             frames, task = self._frames[:], self._task() or UNNAMED
-            self._draft = self._thread.submit(self._write_draft, frames, task)
+            if self._quality.worthless():
+                self._draft_due = now + _DRAFT_EVERY
+            else:
+                self._draft = self._thread.submit(self._write_draft, frames, task)
 
     def _forget(self) -> None:
         """Drop the demonstration in hand, and its draft."""
-        self._frames, self._came, self._state, self._insists = [], [], "ready", False
+        self._clear()
         self._thread.submit(self._writer.discard_draft)
+
+    def _clear(self) -> None:
+        self._frames, self._state, self._insists = [], "ready", False
+        self._quality.clear()
 
     def _save(self, task: str) -> None:
         frames = self._frames
@@ -158,7 +175,7 @@ class DemonstrationRecorder:
             self._state = "stopped"
             self._note = "not saved yet: say in Task what is demonstrated"
             return
-        if why := worthless(frames):
+        if why := self._quality.worthless():
             self._forget()
             self._note = f"nothing to save: {why}"
             return
@@ -166,33 +183,28 @@ class DemonstrationRecorder:
             self._state, self._insists = "stopped", True
             self._note = f"not saved yet: {doubt}. Save again to keep it all the same"
             return
-        self._frames, self._came, self._state, self._insists = [], [], "ready", False
+        self._clear()
         self._note = "saved"
         self._writing.append(self._thread.submit(self._write, without_rest(frames), task))
 
     def _doubt(self) -> str:
         """Why a demonstration should rather be shown again; empty if it is good."""
-        period = 1 / self._writer.fps
-        stamps = np.array([float(frame["time"]) for frame in self._frames])
-        gaps = np.diff(stamps)
-        lost = float((np.rint(gaps / period) - 1).clip(0).sum())
-        if lost > _MOST_LOST * (lost + len(stamps)) or gaps.max() - period > _LONGEST_GAP:
+        if lost := self._quality.lost():
+            return lost
+        late = self._quality.ticks
+        if late.late_ticks > _MOST_LATE * (late.ticks - 1):
             return (
-                f"{100 * lost / (lost + len(stamps)):.0f} % of its frames are lost, up to "
-                f"{gaps.max():.2f} s in a row"
+                f"the loop was late at {late.late_ticks} of {late.ticks} frames: this machine "
+                f"is busy"
             )
-        late = int((np.diff(self._came) > _LATE * period).sum())
-        if late > _MOST_LATE * len(gaps):
-            return f"the loop was late at {late} of {len(stamps)} frames: this machine is busy"
-        return ""
+        return ", ".join(self._quality.met())
 
     def _write_draft(self, frames: list[Frame], task: str) -> float:
         """Time that it took [s]."""
         began = time.perf_counter()
         # What cannot be written is told when it is saved.
         with contextlib.suppress(ValueError, OSError):
-            if not worthless(frames):
-                self._writer.write_draft(task, frames)
+            self._writer.write_draft(task, frames)
         return time.perf_counter() - began
 
     def _write(self, frames: list[Frame], task: str) -> int:
@@ -208,25 +220,8 @@ class DemonstrationRecorder:
             self._writer.discard_episode()
 
 
-def worthless(frames: list[Frame]) -> str:
-    """Why a demonstration shows nothing at all; empty if it shows something."""
-    if not frames:
-        return "the demonstration has no frames"
-    if not moves(frames):
-        return "the arm has not moved"
-    if (seconds := _duration(without_rest(frames))) < _SHORTEST:
-        return f"the arm has moved for {seconds:.1f} s only"
-    return ""
-
-
 def _duration(frames: list[Frame]) -> float:
     return float(frames[-1]["time"]) - float(frames[0]["time"]) if frames else 0.0
-
-
-def moves(frames: list[Frame]) -> bool:
-    """Whether the arm or its gripper moves."""
-    state = np.stack([_state(frame) for frame in frames])
-    return bool((np.abs(state - state[0]) > _STILL).any())
 
 
 def without_rest(frames: list[Frame]) -> list[Frame]:
@@ -234,19 +229,7 @@ def without_rest(frames: list[Frame]) -> list[Frame]:
 
     All of them where it never moves.
     """
-    state = np.stack([_state(frame) for frame in frames])
-    away = np.flatnonzero((np.abs(state - state[0]) > _STILL).any(axis=1))
-    not_there = np.flatnonzero((np.abs(state - state[-1]) > _STILL).any(axis=1))
-    if not len(away):
-        return frames
     time = np.array([float(frame["time"]) for frame in frames])
-    first = np.searchsorted(time, time[away[0]] - _REST[0])
-    end = len(frames)
-    if len(not_there):
-        end = np.searchsorted(time, time[not_there[-1]] + _REST[1], side="right")
-    return frames[int(first) : int(end)]
-
-
-def _state(frame: Frame) -> Float[np.ndarray, " n"]:
-    """What moves: joints [rad] and gripper [m]."""
-    return np.append(frame["joint_position"], frame.get("gripper", 0.0))
+    state = [np.append(f["joint_position"], f.get("gripper", 0.0)) for f in frames]
+    part = moving_part(time, np.stack(state))
+    return frames if part is None else frames[part]

@@ -29,6 +29,7 @@ from hrc_learn.teleoperation.hand_guiding import (
     HandGuidingConfig,
 )
 from hrc_learn.teleoperation.page import Page, PageConfig, PageHuman, PageStatus
+from hrc_learn.teleoperation.recording_quality import pressed
 from hrc_learn.viz.palette import GREEN, rgba
 
 # Of the fields drawn on the boards [m]: thin, but thick enough not to flicker with the board.
@@ -177,13 +178,15 @@ class PageSession:
         )
         self._ticks, self._width = 0, None
         self._watched, self._alone = False, 0
+        self._looked = world.time
 
     def step(self) -> GuidedStep:
         """One control step of the arm, and of the world."""
         with torch.inference_mode():
             step = self.arm.step()
         if self._ticks % self._config.record_every == 0:
-            self._recorder.add({**recorded(step), **hand_columns(self._page.hands)})
+            frame = {**recorded(step), **hand_columns(self._page.hands)}
+            self._recorder.add(frame, self._met(step))
         width = step.human_input.gripper
         if width is not None and width != self._width:
             self._width = width
@@ -213,6 +216,14 @@ class PageSession:
             self._go_home()
         else:
             self._recorder.handle(request)
+
+    def _met(self, step: GuidedStep) -> tuple[str, ...]:
+        """What the arm has met since the last frame that it should not, in words."""
+        last, self._looked = self._looked, self.world.time
+        if not self._recorder.recording:
+            return ()
+        felt = pressed(self.world.arm.robot.chain, step.state)
+        return (*self.world.touched_since(last), *felt)
 
     def _stop_when_left(self) -> None:
         """End a recording that everybody at the page has left, and keep what was shown."""

@@ -83,7 +83,7 @@ def test_late_actions_of_an_arm_that_moves_on_are_told(
 ):
     robot, clock = simulated(scenario="grasping", fps=FPS), [0.0]
     monkeypatch.setattr(MujocoPanda, "in_real_time", in_real_time)
-    robot._loop = LoopWatch("arm", FPS, lambda: clock[0])
+    robot._loop = LoopWatch("arm", FPS, lambda: clock[0], in_real_time=in_real_time)
     seen = robot.get_observation()
     for gap in (1.0, 1.0, 3.0):
         robot.send_action({name: seen[name] for name in (*JOINTS, GRIPPER)})
@@ -91,6 +91,23 @@ def test_late_actions_of_an_arm_that_moves_on_are_told(
     robot.send_action({name: seen[name] for name in (*JOINTS, GRIPPER)})
     robot.disconnect()
     assert ("arm: 1 of 4 actions came late" in caplog.text) == in_real_time
+
+
+def test_what_the_arm_meets_while_it_is_recorded_is_told(simulated, caplog):
+    robot = simulated(scenario="grasping", fps=FPS)
+    down = {name: robot.get_observation()[name] for name in (*JOINTS, GRIPPER)}
+    for _ in range(40):
+        robot.get_observation()
+        down[JOINTS[1]] += 0.02  # the shoulder lowers the hand onto the table
+        robot.send_action(dict(down))
+        if robot.world.table_contacts.touches:
+            break
+    robot.get_observation()
+    robot.send_action(dict(down))
+    robot.disconnect()
+    touch = robot.run.world.table_contacts.touches[0]
+    assert f"in what was recorded, {touch.first} touched {touch.second} for" in caplog.text
+    assert "at its limit" not in caplog.text
 
 
 @pytest.mark.parametrize(

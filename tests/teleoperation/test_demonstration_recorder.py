@@ -250,6 +250,31 @@ def test_a_loop_that_stutters_is_told(folder, late, good):
     assert recorder.status.saved == 1  # what is open is kept in any case
 
 
+def test_limits_and_contacts_are_told_before_it_is_saved(folder):
+    def reach(k):
+        return np.array([0.0, -0.3, 0.0, -2.0, 0.0, 1.8, 0.5]) + 0.01 * k
+
+    writer = DatasetWriter(folder, FPS, "panda", panda.joint_names)
+    with DemonstrationRecorder(writer, lambda: "show it", chain=panda) as recorder:
+        recorder.handle("start")
+        for k in range(20):
+            q = reach(k)
+            q[1] = float(panda.limits.lower[1]) + 0.01
+            touching = ["finger touched table"] * (k == 7)
+            recorder.add(frame(k) | {"joint_position": q}, touching)
+        recorder.handle("save")
+        assert recorder.status.note == (
+            "not saved yet: panda_joint2 was at its limit for 4.0 s, finger touched table for "
+            "0.20 s. Save again to keep it all the same"
+        )
+        recorder.handle("discard")
+        recorder.handle("start")  # what was said of the last one is forgotten
+        for k in range(20):
+            recorder.add(frame(k) | {"joint_position": reach(k)})
+        recorder.handle("save")
+        assert recorder.status.note == "saved"
+
+
 def test_a_draft_is_on_disk_until_it_is_saved_or_discarded(folder):
     now = [0.0]
 

@@ -59,7 +59,7 @@ def page(args: ServePage) -> None:
         frames={"base": f"{robot.name}_link0", "ee": f"{robot.name}_hand_tcp"},
         details={"taught by": "a person at the page", "recorded with": configuration(args)},
     )
-    recorder = DemonstrationRecorder(writer, lambda: page.task)
+    recorder = DemonstrationRecorder(writer, lambda: page.task, chain=robot.chain)
     stands = [*workplace.scene.boxes(), *place_targets(workplace)]
     try:
         # The recorder ends last: whatever ends the rest, what is open is kept.

@@ -95,7 +95,7 @@ class MujocoPanda(PandaRobot):
     def __init__(self, config: MujocoPandaConfig):
         super().__init__(config)
         self.config = config
-        self._began = 0.0
+        self._began = self._looked = 0.0
 
     @property
     def observation_features(self) -> dict[str, Any]:
@@ -122,6 +122,10 @@ class MujocoPanda(PandaRobot):
     @property
     def world(self) -> World:
         return self.run.world
+
+    def _touching(self) -> tuple[str, ...]:
+        last, self._looked = self._looked, self.world.time
+        return self.world.touched_since(last)
 
     def clearance(self, joint_position: Float[Tensor, "*batch 7"]) -> Float[Tensor, "*batch"]:
         return self.run.scenario.workplace.arm_clearance(joint_position)
@@ -192,7 +196,9 @@ class MujocoPanda(PandaRobot):
 
     def begin(self, seed: int) -> None:
         """Put everything in place as a seed has it."""
+        self._loop.end()
         self.run.begin(seed)
+        self._looked = 0.0
         if self.complement is not None:
             self.complement.restart()
             self._person.begin(seed)
