@@ -1,14 +1,21 @@
 """The contract of a dataset: what it says of its columns, and that readers obey it."""
 
+import errno
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from lerobot_folders import write_folder
+from clean_sets import SETS, write_set
+from commands import done
+from lerobot_folders import joint_path, write_folder
 
 from hrc_learn.demos import DatasetError, check_dataset, load_demos
+from hrc_learn.demos.format.metadata import SIDECAR_PATH
 from hrc_learn.demos.read.contract import contract_content, keep_contract
+from hrc_learn.demos.read.reader import keep_first_contract
+from hrc_learn.demos.repair import RepairOptions, repair_dataset
 
 STATE = "observation.state"
 NAMES = ["shoulder.pos", "elbow.pos", "gripper.pos"]
@@ -95,3 +102,101 @@ def test_a_contract_that_makes_no_sense_is_refused(root, change, message):
 def test_what_is_kept_is_plain_json(root):
     content = contract_content(kept(root))
     assert json.loads(json.dumps(content)) == content
+
+
+# Kept when a dataset is first learned from.
+
+
+CONVENTIONS = {
+    "no names": {STATE: None, "action": None},
+    "leader and follower": {
+        STATE: ["left.pos", "right.pos", "gripper.pos"],
+        "action": ["l.pos", "r.pos", "g.pos"],
+    },
+    "ALOHA": {
+        key: ["waist", "elbow", "gripper"]
+        for key in (STATE, "observation.velocity", "observation.effort", "action")
+    },
+    "a pose": {
+        STATE: ["x", "y", "z", "qx", "qy", "qz", "qw"],
+        "action": ["a.vel", "b.vel", "c.vel"],
+    },
+    "what no name explains": {STATE: NAMES, "observation.other": ["spam", "egg"]},
+}
+
+
+def of_convention(folder, names):
+    def values(key, seed):
+        width = len(names[key] or NAMES)
+        x = joint_path(60, width, seed)
+        if width == 7:
+            x[:, 3:] /= np.linalg.norm(x[:, 3:], axis=1, keepdims=True)
+        return x
+
+    episodes = [{key: values(key, seed) for key in names} for seed in range(3)]
+    return write_folder(folder, episodes, names)
+
+
+def same(first, second):
+    assert first.joint_names == second.joint_names
+    for one, other in zip(first, second, strict=True):
+        for name, values in vars(one).items():
+            np.testing.assert_equal(vars(other)[name], values, err_msg=name)
+
+
+@pytest.mark.parametrize("names", CONVENTIONS.values(), ids=CONVENTIONS)
+def test_a_first_contract_changes_nothing_that_is_read(tmp_path, names):
+    root = of_convention(tmp_path / "set", names)
+    before = load_demos(root)
+    assert "edit it there" in keep_first_contract(root)
+    same(before, load_demos(root))
+    assert keep_first_contract(root) == ""  # once
+
+
+@pytest.mark.parametrize("options", SETS.values(), ids=SETS)
+def test_a_first_contract_of_sound_sets_says_their_units(tmp_path, options):
+    root = write_set(tmp_path / "set", **options)
+    before = load_demos(root)
+    keep_first_contract(root)
+    same(before, load_demos(root))
+    assert not any("no unit declared" in i.message for i in check_dataset(root).warnings)
+
+
+def test_what_cannot_be_understood_or_written_is_said(root, tmp_path, monkeypatch):
+    episodes = [motion(i) for i in range(3)]
+    episodes[1] = {key: np.deg2rad(values) for key, values in episodes[1].items()}
+    names = {STATE: NAMES, "action": NAMES}
+    odd = write_folder(tmp_path / "odd", episodes, names, fps=FPS)
+    assert "episode 1" in keep_first_contract(odd)
+    assert not (odd / SIDECAR_PATH).exists()
+
+    def refuse(*_):
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr("hrc_learn.demos.read.reader.keep_contract", refuse)
+    assert "Permission denied" in keep_first_contract(root)
+
+
+def test_fit_keeps_a_contract_and_fit_evaluate_and_repair_say_when_the_data_changed(
+    root, tmp_path
+):
+    model = tmp_path / "model"
+    kept = done("fit", "--dataset", root, "--out", model, "--n-basis", 10).output
+    assert "edit it there" in kept
+    assert "changed since" not in done("evaluate", "--model", model, "--dataset", root).output
+    names = {STATE: NAMES, "action": NAMES}
+    other = write_folder(tmp_path / "other", [motion(i) for i in range(5)], names, fps=FPS)
+    shutil.copyfile(root / SIDECAR_PATH, other / SIDECAR_PATH)
+    for command in (
+        ("fit", "--dataset", other, "--out", tmp_path / "again", "--n-basis", 10),
+        ("evaluate", "--model", model, "--dataset", other),
+    ):
+        assert "changed since" in " ".join(done(*command).output.split())
+    report = repair_dataset(other, tmp_path / "new", RepairOptions(dry_run=True))
+    assert "changed since" in " ".join(report.notes)
+
+
+def test_without_keeping_the_dataset_is_not_touched(root, tmp_path):
+    fit = ("fit", "--dataset", root, "--out", tmp_path / "model", "--n-basis", 10)
+    done(*fit, "--no-keep-contract")
+    assert not (root / SIDECAR_PATH).exists()

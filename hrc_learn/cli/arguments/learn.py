@@ -63,6 +63,8 @@ class FitPrimitives(Fit):
     """Units on disk by quantity, such as: joint_position deg position mm."""
     mapping: More[dict[str, str]] = field(default_factory=dict)
     """Columns by quantity where they are not found, such as: joint_position action[0:7]."""
+    keep_contract: More[bool] = True
+    """Keep what the columns mean in DATASET/meta/hrc_learn.json, where nothing says it yet."""
     as_lerobot_policy: bool = False
     """Write the folder of a trained LeRobot policy instead, of type dmp: from observations to
     the dataset's own actions, joints or the end effector, in closed form."""

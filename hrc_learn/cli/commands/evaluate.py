@@ -77,6 +77,8 @@ def _evaluate(args: EvaluatePrimitives, model: Path) -> int:
     if not channels:
         raise FileNotFoundError(f"{model} holds no model of `hrc fit`")
     demos = _demonstrations(args, model, console)
+    for note in demos.notes:
+        console.print(f"note: {note}")
     motions = Motions.of(demos)
     figures: dict[str, float] = {"demonstrations": float(len(demos))}
     errors: dict[str, ReproductionError] = {}

@@ -16,6 +16,8 @@ from hrc_learn.cli._tables import image_jacobian_rows, primitive_rows, show_valu
 from hrc_learn.cli.arguments.learn import FitImageJacobian, FitPrimitives
 from hrc_learn.cli.commands.check import columns
 from hrc_learn.demos import DemonstrationSource, load_demos, open_demos
+from hrc_learn.demos.read.contract import contract_notes
+from hrc_learn.demos.read.reader import keep_first_contract
 from hrc_learn.jacobian import CellErrors, RBFCenters, grid
 from hrc_learn.learning.model_choice import best_models, keep_best
 from hrc_learn.learning.primitive_fitting import (
@@ -46,8 +48,9 @@ def fit_primitives(args: FitPrimitives) -> None:
         _fit_policy(args, console)
         return
     if args.several == "streamed":
-        _fit_streamed(args)
+        _fit_streamed(args, console)
         return
+    _keep_contract(args, console)
     demos = load_demos(args.dataset, **_wanted(args))
     for note in demos.notes:
         console.print(f"note: {note}")
@@ -78,6 +81,13 @@ def fit_primitives(args: FitPrimitives) -> None:
         print(f"Dashboard: {show_command(args.folder)}")
 
 
+def _keep_contract(args: FitPrimitives, console: Console) -> None:
+    """Keep what the columns mean, unless the caller says what they mean."""
+    wanted = args.keep_contract and not args.mapping
+    if wanted and (done := keep_first_contract(args.dataset, args.units)):
+        console.print(f"note: {done}", soft_wrap=True)
+
+
 def _wanted(args: FitPrimitives) -> dict[str, Any]:
     """What to read of the dataset, and how."""
     return {
@@ -88,9 +98,11 @@ def _wanted(args: FitPrimitives) -> dict[str, Any]:
     }
 
 
-def _fit_streamed(args: FitPrimitives) -> None:
+def _fit_streamed(args: FitPrimitives, console: Console) -> None:
     with distributed.processes() as rank:
         demos = open_demos(args.dataset, **_wanted(args))
+        for note in () if rank else demos.notes:
+            console.print(f"note: {note}")
         fits, metrics = fit_streamed(demos, args.n_basis or 60, channels=args.channels)
         if rank:
             return
@@ -117,6 +129,10 @@ def _fit_policy(args: FitPrimitives, console: Console) -> None:
         )
     if args.n_basis is None:
         raise ValueError("--as-lerobot-policy needs a number of basis functions: --n-basis 50")
+    if (args.dataset / "meta/info.json").is_file():
+        _keep_contract(args, console)
+        for note in contract_notes(args.dataset):
+            console.print(f"note: {note}", soft_wrap=True)
     with new_folder(args.folder, _made_by(args), args.overwrite) as folder:
         with console.status("Fitting a policy"):
             metrics = write_closed_form_policy(

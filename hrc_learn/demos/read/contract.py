@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from hrc_learn.demos.format.dataset_folder import DatasetFolder
+from hrc_learn.demos.format.dataset_folder import DatasetFolder, open_folder
 from hrc_learn.demos.format.metadata import (
     SIDECAR_FORMAT,
     SIDECAR_PATH,
@@ -230,6 +230,21 @@ def changed_since(folder: DatasetFolder, contract: Contract | None) -> str | Non
     )
 
 
+def contract_notes(root: Path) -> list[str]:
+    """What is to be said of the contract by whoever reads a dataset in another way.
+
+    Raises:
+        DatasetError: The contract or the metadata are damaged.
+    """
+    contract = contract_of(read_sidecar(root))
+    if contract is None:
+        return []
+    folder = open_folder(root)
+    contract.selections(folder.features)  # names what does not exist
+    changed = changed_since(folder, contract)
+    return [] if changed is None else [changed]
+
+
 # What the episodes say.
 
 # R squared from which a state is said to follow a command.
@@ -255,7 +270,9 @@ def infer_contract(
         for role, selection in mapping.selections.items()
         for number, column in enumerate(selection.columns)
     }
-    parts = []
+    parts: list[ComponentContract] = []
+    places: dict[str, dict[int, int]] = {}
+    """Role -> number of its component -> place among the parts."""
     for feature in folder.features.values():
         known = [p for p in profiles if feature.key in p.columns]
         if not feature.numeric or feature.key in INDEX_KEYS or not known:
@@ -270,7 +287,7 @@ def infer_contract(
             part = ComponentContract(
                 key=feature.key,
                 index=index,
-                name=f"{index}" if feature.names is None else feature.names[index],
+                name=feature.names[index] if feature.names else f"joint_{index + 1}",
                 role=role or "other",
                 unit="",
                 low=float(low[index]),
@@ -279,8 +296,14 @@ def infer_contract(
             if role is None:
                 parts.append(_unnamed(part, float(discrete[index]), feature.key))
             else:
+                places.setdefault(role, {})[number] = len(parts)
                 parts.append(_of_role(part, number, decisions[role], profiles, folder.fps))
-    return Contract(components=tuple(parts), fingerprint=fingerprint(folder))
+    # A quantity is read in the order of the contract: of x, y, z, w on disk the w comes first.
+    ordered = list(parts)
+    for of_role in places.values():
+        for there, number in zip(sorted(of_role.values()), sorted(of_role), strict=True):
+            ordered[there] = parts[of_role[number]]
+    return Contract(components=tuple(ordered), fingerprint=fingerprint(folder))
 
 
 def _unnamed(part: ComponentContract, discrete: float, key: str) -> ComponentContract:

@@ -398,9 +398,13 @@ class EpisodeReader:
 
     @property
     def _sample(self) -> Sequence[EpisodeEntry]:
-        """Episodes evenly over the dataset, which decide on its units."""
+        """Episodes that decide on its units."""
+        return self.sample(_SAMPLED_EPISODES)
+
+    def sample(self, most: int) -> Sequence[EpisodeEntry]:
+        """Episodes evenly over the dataset, `most` at most, whichever are wanted."""
         every = self.folder.episodes
-        places = np.linspace(0, len(every) - 1, min(len(every), _SAMPLED_EPISODES))
+        places = np.linspace(0, len(every) - 1, min(len(every), most))
         return [every[int(place)] for place in places]
 
     def survey(self, given: Mapping[str, str]) -> dict[str, UnitDecision]:

@@ -219,3 +219,30 @@ def track(
         fit=fit,
         likeness=likeness,
     )
+
+
+def track_quantities(
+    quantities: Mapping[str, Float64[np.ndarray, "_frames _components"]], fps: float
+) -> dict[str, Tracking]:
+    """How commands, joints and their rates go together, by what is compared.
+
+    Args:
+        quantities: By role, during one episode.
+        fps: Frame rate [1/s].
+    """
+    joints, found = quantities.get("joint_position"), {}
+    if joints is None or len(joints) < 3:
+        return {}
+    rates = np.gradient(joints, 1 / fps, axis=0)
+    pairs = {
+        "command_position": (quantities.get("command_position"), joints),
+        "rates": (quantities.get("command_position"), rates),
+        "command_velocity": (quantities.get("command_velocity"), rates),
+        "joint_velocity": (quantities.get("joint_velocity"), rates),
+    }
+    for name, (given, followed) in pairs.items():
+        if given is not None and given.shape == followed.shape:
+            tracking = track(given, followed, fps)
+            if tracking is not None:
+                found[name] = tracking
+    return found

@@ -19,9 +19,11 @@ from hrc_learn.demos.demonstration import (
     joint_columns,
 )
 from hrc_learn.demos.format.dataset_folder import DatasetFolder, EpisodeEntry
+from hrc_learn.demos.format.metadata import SIDECAR_PATH
 from hrc_learn.demos.image_features import with_feature
 from hrc_learn.demos.issue import DatasetError, UnitsWarning
-from hrc_learn.demos.read.column_mapping import ColumnMapping, MappingSpec
+from hrc_learn.demos.read.column_mapping import ColumnMapping, MappingSpec, map_columns
+from hrc_learn.demos.read.contract import infer_contract, keep_contract
 from hrc_learn.demos.read.episodes import (
     EpisodeFilter,
     EpisodeReader,
@@ -31,6 +33,7 @@ from hrc_learn.demos.read.episodes import (
     open_reader,
 )
 from hrc_learn.demos.read.frames import RawFrames, frame_timestamps
+from hrc_learn.demos.read.profiles import EpisodeProfile, profile_columns, track_quantities
 from hrc_learn.demos.read.roles import ORIENTATION_ROLES, UnitDecision
 from hrc_learn.geometry import quaternion
 
@@ -378,3 +381,65 @@ def _warn_of_conversions(root: Path, decisions: Mapping[str, UnitDecision]) -> N
     for decision in decisions.values():
         if decision.converts:
             warnings.warn(f"{root}: {decision.note}", UnitsWarning, stacklevel=3)
+
+
+# What the columns of a dataset mean, kept with it when it is first learned from.
+
+_CONTRACT_EPISODES = 200
+"""Episodes that a contract is inferred from: more say the same, and take longer."""
+
+
+def keep_first_contract(path: str | Path, units: Mapping[str, str] | None = None) -> str:
+    """Keep beside a dataset what its columns mean, where nobody has said it yet.
+
+    What reads the dataset later then takes them for the same, whatever is added, and says that
+    it changed. Datasets that declare their columns, as those of `DatasetWriter`, need none.
+
+    Args:
+        path: The dataset's folder.
+        units: Units on disk by role, as in `load_demos`.
+
+    Returns:
+        What was kept, or why nothing, in words; empty where there is nothing to keep.
+
+    Raises:
+        DatasetError: The metadata are missing or damaged.
+    """
+    reader = open_reader(path, None, None, None, None)
+    folder, sidecar = reader.folder, reader.sidecar
+    if sidecar.contract or sidecar.columns:
+        return ""
+    profiles = []
+    try:
+        decisions = reader.survey(units or {})
+        for entry in reader.sample(_CONTRACT_EPISODES):
+            (episode,) = reader.read([entry])
+            profiles.append(
+                EpisodeProfile(
+                    index=entry.index,
+                    length=entry.length,
+                    columns=profile_columns(episode.frames),
+                    tracking=track_quantities(episode.quantities, folder.fps),
+                )
+            )
+    except DatasetError as error:
+        return f"no contract of the columns is kept: {error}"
+    contract = infer_contract(folder, reader.column_mapping, decisions, profiles)
+    kept = map_columns(folder.features, sidecar, kept=contract.selections(folder.features))
+    if not _alike(kept, reader.column_mapping):
+        return ""  # such as components in an order that a contract cannot say
+    try:
+        keep_contract(folder.root, contract)
+    except OSError as error:
+        return f"no contract of the columns is kept: {error.strerror or error}"
+    return f"what the columns mean is kept in {folder.root / SIDECAR_PATH}: edit it there"
+
+
+def _alike(one: ColumnMapping, other: ColumnMapping) -> bool:
+    """Whether two mappings read the same numbers under the same names."""
+
+    def read(mapping: ColumnMapping) -> tuple:
+        columns = {role: s.columns for role, s in mapping.selections.items()}
+        return columns, mapping.joint_names, {*mapping.extra}
+
+    return read(one) == read(other)

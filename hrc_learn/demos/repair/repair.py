@@ -39,7 +39,12 @@ from hrc_learn.demos.format.videos import (
 )
 from hrc_learn.demos.issue import DatasetError
 from hrc_learn.demos.read.column_mapping import MappingSpec
-from hrc_learn.demos.read.contract import contract_content, contract_of, fingerprint
+from hrc_learn.demos.read.contract import (
+    changed_since,
+    contract_content,
+    contract_of,
+    fingerprint,
+)
 from hrc_learn.demos.read.episodes import (
     Quantities,
     read_mapping,
@@ -282,7 +287,8 @@ class ColumnRewriter:
         kept: Mapping[int, slice] | None = None,
     ):
         self.kept = kept
-        self.notes: list[str] = []
+        changed = changed_since(folder, contract_of(sidecar))
+        self.notes: list[str] = [] if changed is None else [changed]
         self.folder = folder
         self.semantics = semantics
         self._segments = segments

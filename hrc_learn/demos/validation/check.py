@@ -20,7 +20,7 @@ from hrc_learn.demos.read.episodes import (
     units_on_disk,
 )
 from hrc_learn.demos.read.frames import RawFrames, recorded_stamps
-from hrc_learn.demos.read.profiles import EpisodeProfile, Tracking, profile_columns, track
+from hrc_learn.demos.read.profiles import EpisodeProfile, profile_columns, track_quantities
 from hrc_learn.demos.read.reader import to_quaternion
 from hrc_learn.demos.read.roles import ORIENTATION_ROLES, UnitDecision, unit_factor
 from hrc_learn.demos.validation.consistency_checks import check_consistency
@@ -178,7 +178,7 @@ def _check_meaning(
             profiles[entry.index] = profile
             if _sound(frames, columns):
                 found = select_quantities(frames, columns.selections)
-                profile.tracking.update(_tracking(found, folder.fps))
+                profile.tracking.update(track_quantities(found, folder.fps))
                 yield entry, found
 
     declared = sidecar.units | ({} if contract is None else contract.units())
@@ -209,26 +209,6 @@ def _check_meaning(
     report.contract = infer_contract(folder, columns, decisions, [*profiles.values()])
     if contract is not None:
         report.contract = contract
-
-
-def _tracking(quantities: Quantities, fps: float) -> dict[str, Tracking]:
-    """How commands, joints and their rates go together."""
-    joints, found = quantities.get("joint_position"), {}
-    if joints is None or len(joints) < 3:
-        return {}
-    rates = np.gradient(joints, 1 / fps, axis=0)
-    pairs = {
-        "command_position": (quantities.get("command_position"), joints),
-        "rates": (quantities.get("command_position"), rates),
-        "command_velocity": (quantities.get("command_velocity"), rates),
-        "joint_velocity": (quantities.get("joint_velocity"), rates),
-    }
-    for name, (given, followed) in pairs.items():
-        if given is not None and given.shape == followed.shape:
-            tracking = track(given, followed, fps)
-            if tracking is not None:
-                found[name] = tracking
-    return found
 
 
 def _usual_motion(
