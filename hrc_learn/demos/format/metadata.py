@@ -288,13 +288,16 @@ def image_statistics(images: UInt8[np.ndarray, "_count _height _width 3"]) -> di
     return nested | {"count": [len(images)]}
 
 
-def combined_statistics(episodes: Sequence[Statistics]) -> Statistics:
+def combined_statistics(episodes: Mapping[str, Mapping[str, np.ndarray]]) -> Statistics:
     """Statistics over all episodes.
 
     Exact but for the quantiles, which are the means of the episodes' weighted by length:
     that is how LeRobot itself combines them.
+
+    Args:
+        episodes: By feature and name of the statistic, its values in each episode.
     """
-    return {key: _combine([episode[key] for episode in episodes]) for key in episodes[0]}
+    return {key: _combine(stacked) for key, stacked in episodes.items()}
 
 
 def _of_columns(values: np.ndarray) -> dict[str, list]:
@@ -310,8 +313,7 @@ def _of_columns(values: np.ndarray) -> dict[str, list]:
     }
 
 
-def _combine(episodes: Sequence[dict[str, list]]) -> dict[str, list]:
-    stacked = {name: np.array([episode[name] for episode in episodes]) for name in episodes[0]}
+def _combine(stacked: Mapping[str, np.ndarray]) -> dict[str, list]:
     weights = (stacked["count"] / stacked["count"].sum()).reshape(
         -1, *[1] * (stacked["mean"].ndim - 1)
     )

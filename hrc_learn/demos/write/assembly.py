@@ -14,10 +14,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from hrc_learn.demos.format.dataset_folder import how_to_recover, open_folder, read_rows
+from hrc_learn.demos.format.dataset_folder import (
+    how_to_recover,
+    open_folder,
+    open_parquet,
+    read_table,
+)
 from hrc_learn.demos.format.metadata import (
     CHUNK_SIZE,
     DATA_PATH,
@@ -59,26 +65,34 @@ from hrc_learn.store import (
     source_of,
 )
 
+_PACKED = 256
+"""Rows of the list of episodes that are held as Python objects, fifty times their size."""
+
 
 @dataclass
 class _Index:
     """The list of episodes as it grows, one row of `meta/episodes` each."""
 
-    rows: list[dict] = field(default_factory=list)
     tasks: dict[str, None] = field(default_factory=dict)
     """Task texts in the order of their indices."""
     data_files: int = 0
+    episodes: int = 0
+    frames: int = 0
+    _tables: list[pa.Table] = field(default_factory=list)
+    _rows: list[dict] = field(default_factory=list)
 
-    @property
-    def frames(self) -> int:
-        return self.rows[-1]["dataset_to_index"] if self.rows else 0
+    def carry(self, table: pa.Table) -> None:
+        """Begin with the list of an earlier dataset."""
+        self._tables.append(table)
+        self.episodes += len(table)
+        self.frames = table.column("dataset_to_index")[-1].as_py()
 
     def add(self, staged: StagedEpisode, file: int, videos: Mapping[str, object]) -> None:
         length = len(staged.table)
         self.tasks |= dict.fromkeys(staged.tasks)
-        self.rows.append(
+        self._rows.append(
             {
-                "episode_index": len(self.rows),
+                "episode_index": self.episodes,
                 "tasks": list(staged.tasks),
                 "length": length,
                 "data/chunk_index": file // CHUNK_SIZE,
@@ -95,19 +109,39 @@ class _Index:
                 "meta/episodes/file_index": 0,
             }
         )
+        self.episodes += 1
+        self.frames += length
+        if len(self._rows) == _PACKED:
+            self._pack()
 
-    def statistics(self) -> list[Statistics]:
-        """Of each episode, for those features that all have them for."""
-        keys = [name for name in self.rows[0] if name.startswith("stats/")]
-        shared = [name for name in keys if all(name in row for row in self.rows)]
-        episodes: list[Statistics] = []
-        for row in self.rows:
-            statistics: Statistics = {}
-            for name in shared:
+    def _pack(self) -> None:
+        names = dict.fromkeys(name for row in self._rows for name in row)
+        columns = {name: [row.get(name) for row in self._rows] for name in names}
+        self._tables.append(pa.table(columns))
+        self._rows = []
+
+    def table(self) -> pa.Table:
+        """All rows."""
+        if self._rows:
+            self._pack()
+        self._tables = [_joined(self._tables)]
+        return self._tables[0]
+
+    def count_videos(self, key: str) -> int:
+        """How many files of a video the episodes are in so far."""
+        if not self.episodes:
+            return 0
+        return 1 + _last_file(self.table(), f"videos/{key}")
+
+    def statistics(self) -> Statistics:
+        """Of the whole, for those features that all episodes have them for."""
+        table, stacked = self.table(), {}
+        for name in table.column_names:
+            column = table.column(name)
+            if name.startswith("stats/") and not column.null_count:
                 key, _, statistic = name.removeprefix("stats/").rpartition("/")
-                statistics.setdefault(key, {})[statistic] = row[name]
-            episodes.append(statistics)
-        return episodes
+                stacked.setdefault(key, {})[statistic] = np.array(column.to_pylist())
+        return combined_statistics(stacked)
 
 
 def assemble(
@@ -137,7 +171,7 @@ def assemble(
     cameras = [key for key, f in header.features.items() if f["dtype"] == "video"]
     index = _carry_over(earlier, target) if earlier is not None else _Index()
     index.tasks |= dict.fromkeys(tasks)
-    taken = {key: _count_videos(index, key) for key in cameras}
+    taken = {key: index.count_videos(key) for key in cameras}
     shelf = VideoPlacement(target, taken, share=share)
     if videos is None:
         videos = [_recorded_videos(path, cameras, header.fps) for path in paths]
@@ -178,19 +212,17 @@ def _by_size(paths: Sequence[Path]) -> Iterator[list[Path]]:
 def _write_metadata(target: Path, header: RecordingHeader, index: _Index) -> None:
     tasks = list(index.tasks)
     write_tasks(target / "meta/tasks.parquet", tasks)
-    names = dict.fromkeys(name for row in index.rows for name in row)
-    columns = {name: [row.get(name) for row in index.rows] for name in names}
-    pq.write_table(pa.table(columns), target / EPISODES_PATH)
+    pq.write_table(index.table(), target / EPISODES_PATH)
     content = info(
         header.features,
         header.fps,
         header.robot_type,
-        episodes=len(index.rows),
+        episodes=index.episodes,
         frames=index.frames,
         tasks=len(tasks),
     )
     write_json(target / "meta/info.json", content)
-    write_json(target / "meta/stats.json", combined_statistics(index.statistics()))
+    write_json(target / "meta/stats.json", index.statistics())
     if header.sidecar:
         write_json(target / SIDECAR_PATH, header.sidecar)
 
@@ -210,25 +242,40 @@ def _carry_over(earlier: Path, target: Path) -> _Index:
     files = [*(earlier / "data").glob("*/*.parquet"), *(earlier / "videos").glob("**/*.mp4")]
     for file in files:
         link(file, target / file.relative_to(earlier))
-    rows = [
-        row
-        for path in sorted((earlier / "meta/episodes").glob("*/*.parquet"))
-        for row in read_rows(earlier, str(path.relative_to(earlier)), ())
-    ]
-    rows.sort(key=lambda row: row["episode_index"])
-    for row in rows:  # they are put into one file
-        row |= {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
-    last = max(row["data/chunk_index"] * CHUNK_SIZE + row["data/file_index"] for row in rows)
-    tasks = dict.fromkeys(folder.tasks[i] for i in sorted(folder.tasks))
-    return _Index(rows=rows, tasks=tasks, data_files=last + 1)
+    listed = sorted((earlier / "meta/episodes").glob("*/*.parquet"))
+    names = [str(path.relative_to(earlier)) for path in listed]
+    tables = [read_table(open_parquet(earlier, name), name, None) for name in names]
+    table = _joined(tables).sort_by("episode_index")
+    for name in ("meta/episodes/chunk_index", "meta/episodes/file_index"):
+        zeros = pa.array(np.zeros(len(table), np.int64))  # they are put into one file
+        if name in table.column_names:
+            table = table.drop_columns([name])
+        table = table.append_column(name, zeros)
+    index = _Index(
+        tasks=dict.fromkeys(folder.tasks[i] for i in sorted(folder.tasks)),
+        data_files=1 + _last_file(table, "data"),
+    )
+    index.carry(table)
+    return index
 
 
-def _count_videos(index: _Index, key: str) -> int:
-    numbers = [
-        row[f"videos/{key}/chunk_index"] * CHUNK_SIZE + row[f"videos/{key}/file_index"]
-        for row in index.rows
-    ]
-    return 1 + max(numbers, default=-1)
+def _joined(tables: Sequence[pa.Table]) -> pa.Table:
+    """One table of all rows, whichever columns each has."""
+    try:
+        return pa.concat_tables(tables, promote_options="permissive")
+    except pa.ArrowException:  # the same values in lists of another type
+        rows = [row for table in tables for row in table.to_pylist()]
+        names = dict.fromkeys(name for row in rows for name in row)
+        return pa.table({name: [row.get(name) for row in rows] for name in names})
+
+
+def _last_file(table: pa.Table, kind: str) -> int:
+    """Number of the last file of data, or of a video, that a list of episodes names."""
+    chunks, files = (table.column(f"{kind}/{part}_index").to_pylist() for part in _PARTS)
+    return max(c * CHUNK_SIZE + f for c, f in zip(chunks, files, strict=True))
+
+
+_PARTS = ("chunk", "file")
 
 
 _RECORDING = "recording.json"
