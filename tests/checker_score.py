@@ -4,7 +4,7 @@ import re
 import resource
 import shutil
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
@@ -18,6 +18,9 @@ KINDS: dict[str, Kind] = VALUES | STAMPS | FILES | VIDEOS
 Line = tuple[str, str]
 """A finding: its level, and the whole of its text."""
 
+Examine = Callable[[str], list[Line]]
+"""Looks at the dataset in a folder; raises where it breaks down."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
@@ -26,8 +29,10 @@ class Outcome:
     dataset: str
     kind: str
     severe: bool
+    noticed: bool
+    """Something is said that is not said of the sound set."""
     found: bool
-    """Something is said that is not said of the sound set, with its place where it has one."""
+    """The same, with its place where it has one."""
     error: bool
     """That is said as an error."""
     crash: str
@@ -38,21 +43,33 @@ class Outcome:
     said: tuple[str, ...]
 
 
-def _check(root: str, pipe) -> None:
-    """In a process of its own: a report, or why there is none."""
-    start = time.monotonic()
-    try:
-        from hrc_learn.demos import check_dataset
+def examine(root: str) -> list[Line]:
+    """What `check_dataset` says.
 
-        report = check_dataset(root)
-        lines = [("error", str(i)) for i in report.errors]
-        lines += [("warning", str(i)) for i in report.warnings]
-        "\n".join(report.lines())
-        # What a step of the check did not foresee is a finding, and a fault of the check.
-        unforeseen = [text for _, text in lines if "cannot be examined further (" in text]
-        crash = unforeseen[0] if unforeseen else ""
+    Raises:
+        RuntimeError: A step of the check did not foresee what it met: a fault of the check.
+    """
+    from hrc_learn.demos import check_dataset
+
+    report = check_dataset(root)
+    lines = [("error", str(i)) for i in report.errors]
+    lines += [("warning", str(i)) for i in report.warnings]
+    "\n".join(report.lines())
+    for _, text in lines:
+        if "cannot be examined further (" in text:
+            raise RuntimeError(text)
+    return lines
+
+
+def _run(examine: Examine, root: str, pipe) -> None:
+    """In a process of its own: findings, or why there are none."""
+    start = time.monotonic()
+    lines: list[Line] = []
+    crash = ""
+    try:
+        lines = examine(root)
     except BaseException as error:
-        lines, crash = [], f"{type(error).__name__}: {error}"[:300]
+        crash = f"{type(error).__name__}: {error}"[:300]
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     pipe.send((lines, crash, time.monotonic() - start, memory))
 
@@ -60,15 +77,28 @@ def _check(root: str, pipe) -> None:
 class Checker:
     """Checks datasets in processes of their own, bounded in time."""
 
-    def __init__(self, limit: float = 60.0):
-        self.limit = limit
+    def __init__(
+        self,
+        limit: float = 60.0,
+        examine: Examine = examine,
+        modules: Sequence[str] = ("hrc_learn.demos.validation.check",),
+    ):
+        """Prepare.
+
+        Args:
+            limit: Time that a check may take [s].
+            examine: The check; ours unless told otherwise.
+            modules: What it imports, once for all processes.
+        """
+        self.limit, self._examine = limit, examine
         self._context = get_context("forkserver")
-        self._context.set_forkserver_preload(["hrc_learn.demos.validation.check"])
+        self._context.set_forkserver_preload([*modules])
 
     def __call__(self, root: Path) -> tuple[list[Line], str, float, float]:
         """Findings, reason of a failure, seconds and megabytes."""
         ours, theirs = self._context.Pipe(duplex=False)
-        process = self._context.Process(target=_check, args=(str(root), theirs))
+        arguments = (self._examine, str(root), theirs)
+        process = self._context.Process(target=_run, args=arguments)
         process.start()
         theirs.close()
         try:
@@ -116,12 +146,14 @@ def outcomes(
         new = [line for line in lines if _plain(line, copy.root) not in before]
         if "statistics" not in kind_name:  # those are off after almost any damage
             new = [line for line in new if "statistics are" not in line[1]]
+        noticed = bool(new)
         if kind.local:
             new = [line for line in new if _names(line[1], copy)]
         yield Outcome(
             dataset=name,
             kind=kind_name,
             severe=kind.severe,
+            noticed=noticed,
             found=bool(new),
             error=any(level == "error" for level, _ in new),
             crash=crash,
@@ -138,6 +170,7 @@ def _plain(line: Line, root: Path) -> Line:
 
 def _names(text: str, copy: Copy) -> bool:
     """Whether a finding names the second episode, or its file."""
-    if re.search(rf"episodes? {copy.episode}\b", text) or copy.data in text:
+    number = rf"(?i)episodes?(?:\(s\))?[ a-z:]*[\[(]*(?:\d+, )*{copy.episode}\b"
+    if re.search(number, text) or copy.data in text:
         return True
     return bool(re.search(r"(episode_000001|file-000)\.mp4", text))

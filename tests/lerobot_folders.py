@@ -100,9 +100,13 @@ def write_folder(
 
 
 def one_step_of_act(root: Path) -> float:
-    """Loss of one training step of LeRobot's ACT on a dataset, by its own factory."""
+    """Loss of one training step of LeRobot's ACT on a dataset, by its own factory.
+
+    ACT takes no state alone: where there are neither images nor a state of the environment, it
+    sees the robot's state as that of the environment.
+    """
     import torch
-    from lerobot.configs import FeatureType
+    from lerobot.configs import FeatureType, PolicyFeature
     from lerobot.datasets import LeRobotDataset
     from lerobot.policies.act.configuration_act import ACTConfig
     from lerobot.policies.factory import make_policy, make_pre_post_processors
@@ -125,10 +129,20 @@ def one_step_of_act(root: Path) -> float:
         video_backend="pyav",
         delta_timestamps={"action": [k / fps for k in range(8)]},
     )
+    batch = next(iter(torch.utils.data.DataLoader(dataset, batch_size=4)))
+    stats, state, around = (
+        dataset.meta.stats,
+        "observation.state",
+        "observation.environment_state",
+    )
+    blind = not any("image" in key or key == around for key in dataset.meta.features)
+    if blind:
+        shape = tuple(dataset.meta.features[state]["shape"])
+        config.input_features = {around: PolicyFeature(type=FeatureType.ENV, shape=shape)}
+        batch[around], stats = batch[state], stats | {around: stats[state]}
     policy = make_policy(config, ds_meta=dataset.meta)
     assert any(f.type is FeatureType.ACTION for f in policy.config.output_features.values())
-    preprocess, _ = make_pre_post_processors(config, dataset_stats=dataset.meta.stats)
-    batch = next(iter(torch.utils.data.DataLoader(dataset, batch_size=4)))
+    preprocess, _ = make_pre_post_processors(config, dataset_stats=stats)
     optimizer = torch.optim.Adam(policy.parameters(), 1e-4)
     loss, _ = policy.forward(preprocess(batch))
     loss.backward()
@@ -191,6 +205,14 @@ def _write_v3(root, tables, lengths, episode_tasks, texts) -> None:
     table = pa.table({key: list(values) for key, values in episodes.items()})
     pq.write_table(table, root / "meta/episodes/chunk-000/file-000.parquet")
     tasks = pa.table({"task_index": range(len(texts)), "task": texts})
+    # LeRobot writes the texts as the index of a pandas table.
+    kinds = {"task_index": ("int64", "int64"), "task": ("unicode", "object")}
+    columns = [
+        {"name": k, "field_name": k, "pandas_type": a, "numpy_type": b, "metadata": None}
+        for k, (a, b) in kinds.items()
+    ]
+    index = {"index_columns": ["task"], "column_indexes": [], "columns": columns}
+    tasks = tasks.replace_schema_metadata({"pandas": json.dumps(index)})
     pq.write_table(tasks, root / "meta/tasks.parquet")
 
 

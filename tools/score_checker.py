@@ -7,14 +7,20 @@ of the sound set, naming the episode or the file where the defect has one. Copie
 nothing a defect could concern (no video, no gripper) are left out.
 
     python tools/score_checker.py path/to/dataset --json score.json
+
+With `--peers FOLDER` other checkers look at the same copies; tests/peer_checkers.py says how
+they come into that folder. Those that cannot open the sound set are left out for it.
 """
 
 import argparse
 import json
+import os
 import sys
 import tempfile
-from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict
+from multiprocessing import get_context
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -22,6 +28,11 @@ sys.path.insert(0, str(ROOT / "tests"))
 
 from checker_score import KINDS, Checker, Outcome, outcomes  # noqa: E402
 from clean_sets import SETS, write_set  # noqa: E402
+from peer_checkers import PEERS, cannot_open  # noqa: E402
+
+OURS = "hrc check"
+Scored = tuple[str, str, Outcome]
+"""Set, checker and what it made of one broken copy."""
 
 
 def arguments() -> argparse.Namespace:
@@ -31,55 +42,102 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("dataset", nargs="*", type=Path, help="sound sets besides our own")
     parser.add_argument("--kinds", default="", help="only kinds whose names hold this")
     parser.add_argument("--limit", type=float, default=60.0, help="seconds a check may take")
+    parser.add_argument("--sets", default="", help="only own sets whose names hold this")
+    parser.add_argument("--peers", type=Path, help="folder with other checkers")
     parser.add_argument("--json", type=Path, help="receives every outcome")
     return parser.parse_args()
 
 
-def line(name: str, results: list[Outcome]) -> str:
+def score(
+    checker: str, sets: Mapping[str, Path], work: Path, args: argparse.Namespace
+) -> tuple[list[Scored], dict[str, Mapping[str, int]]]:
+    """What a checker makes of all copies, and what it says of the sound sets."""
+    if checker == OURS:
+        check = Checker(args.limit)
+    else:
+        sys.path.insert(0, str(args.peers.resolve()))
+        check = Checker(args.limit, *PEERS[checker])
+    kinds = [name for name in KINDS if args.kinds in name]
+    every: list[Scored] = []
+    sound: dict[str, Mapping[str, int]] = {}
+    for name, root in sets.items():
+        lines, crash, _, _ = check(root)
+        if crash or cannot_open(lines):
+            print(f"{checker} does not open {name}: {crash or lines[0][1]}"[:300])
+            continue
+        sound[name] = {
+            level: sum(known == level for known, _ in lines) for level in ("error", "warning")
+        }
+        for outcome in outcomes(root, name, kinds, work, check):
+            every.append((name, checker, outcome))
+            if checker == OURS and (outcome.crash or not outcome.found):
+                print(f"{name}: {outcome.kind}: {outcome.crash or 'not found'}", flush=True)
+    return every, sound
+
+
+def line(name: str, checker: str, results: Sequence[Outcome]) -> str:
     """A row of the table: what was found of how many."""
     severe = [r for r in results if r.severe]
     mild = [r for r in results if not r.severe]
     return (
-        f"| {name} | {sum(r.found for r in severe)} of {len(severe)} "
+        f"| {name} | {checker} | {sum(r.found for r in severe)} of {len(severe)} "
         f"| {sum(r.error for r in severe)} | {sum(r.found for r in mild)} of {len(mild)} "
-        f"| {sum(bool(r.crash) for r in results)} | {max(r.seconds for r in results):.1f} s "
+        f"| {sum(r.noticed for r in results)} of {len(results)} "
+        f"| {sum(bool(r.crash) for r in results)} "
+        f"| {sum(r.seconds for r in results) / len(results):.2f} s "
         f"| {max(r.megabytes for r in results):.0f} MB |"
     )
 
 
+def compare(every: Sequence[Scored]) -> None:
+    """Kinds that a checker noticed and ours did not find, and how many the other way round."""
+    found = {(name, outcome.kind): outcome.found for name, who, outcome in every if who == OURS}
+    for checker in dict.fromkeys(who for _, who, _ in every if who != OURS):
+        theirs = {(name, o.kind): o for name, who, o in every if who == checker}
+        alone = [place for place, o in theirs.items() if o.noticed and not found[place]]
+        ours = sum(not o.noticed and found[place] for place, o in theirs.items())
+        print(f"{checker} alone: {len(alone)}; {OURS} alone: {ours}")
+        for name, kind in alone:
+            print(f"    {name}: {kind}: {'; '.join(theirs[name, kind].said)[:200]}")
+
+
 def main() -> int:
     args = arguments()
-    kinds = [name for name in KINDS if args.kinds in name]
-    check, every, clean = Checker(args.limit), [], {}
-    by_set: dict[str, list[Outcome]] = defaultdict(list)
+    # LeRobot would ask the Hub for whatever it cannot open.
+    os.environ["HF_HUB_OFFLINE"] = "1"
+    every: list[Scored] = []
+    sound: dict[str, Mapping[str, Mapping[str, int]]] = {}
     with tempfile.TemporaryDirectory() as temporary:
         work = Path(temporary)
+        os.environ["HF_DATASETS_CACHE"] = str(work / "cache")
         sets = {
-            name: write_set(work / f"set{i}", **SETS[name]) for i, name in enumerate(SETS)
-        } | {path.name: path for path in args.dataset}
-        for name, root in sets.items():
-            found = check(root)[0]
-            clean[name] = {
-                level: sum(known == level for known, _ in found)
-                for level in ("error", "warning")
-            }
-            for outcome in outcomes(root, name, kinds, work, check):
-                by_set[name].append(outcome)
-                every.append(outcome)
-                if outcome.crash or not outcome.found:
-                    print(f"{name}: {outcome.kind}: {outcome.crash or 'not found'}", flush=True)
+            name: write_set(work / f"set{i}", **SETS[name])
+            for i, name in enumerate(SETS)
+            if args.sets in name
+        } | {path.name: path.resolve() for path in args.dataset}
+        for checker in (OURS, *(PEERS if args.peers is not None else ())):
+            # In a process of its own, so that none holds what another imported.
+            with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+                found, sound[checker] = pool.submit(score, checker, sets, work, args).result()
+            every += found
             if args.json is not None:
-                content = {"clean": clean, "outcomes": [asdict(o) for o in every]}
-                text = json.dumps(content, indent=1) + "\n"
-                args.json.write_text(text, encoding="utf-8")
-    print("| | severe | as errors | others | crashes | longest | most memory |")
-    print("|---|---|---|---|---|---|---|")
-    for name, results in by_set.items():
-        print(line(name, results))
-    print(line(f"all, {len({o.kind for o in every})} kinds", every))
-    for name, counts in clean.items():
-        print(f"sound: {name}: {counts['error']} errors, {counts['warning']} warnings")
-    return int(any(o.crash for o in every) or any(c["error"] for c in clean.values()))
+                content = [{"checker": who} | asdict(o) for _, who, o in every]
+                text = json.dumps({"clean": sound, "outcomes": content}, indent=1)
+                args.json.write_text(f"{text}\n", encoding="utf-8")
+    head = "| set | checker | severe | as errors | others | noticed | crashes | mean | most |"
+    print(head, "|---" * head.count(" |") + "|", sep="\n")
+    for place in dict.fromkeys((name, who) for name, who, _ in every):
+        print(line(*place, [o for name, who, o in every if (name, who) == place]))
+    for who in dict.fromkeys(who for _, who, _ in every):
+        results = [o for _, checker, o in every if checker == who]
+        print(line(f"all, {len({o.kind for o in results})} kinds", who, results))
+    for checker, of_sets in sound.items():
+        for name, counts in of_sets.items():
+            said = f"{counts['error']} errors, {counts['warning']} warnings"
+            print(f"sound: {name}, {checker}: {said}")
+    compare(every)
+    broken = any(o.crash for _, who, o in every if who == OURS)
+    return int(broken or any(counts["error"] for counts in sound[OURS].values()))
 
 
 if __name__ == "__main__":
