@@ -128,6 +128,27 @@ def twice(table: pa.Table) -> pa.Table:
     return table.append_column(STATE, table.column(STATE))
 
 
+def retitle(copy: Copy) -> None:
+    """All episodes show a task whose text was typed to get past the question."""
+    if copy.v3:
+        for file, key, value in (
+            (tasks_file(copy), "task", "test"),
+            (copy.root / copy.episodes_file, "tasks", ["test"]),
+        ):
+            table = pq.read_table(file)
+            field = table.schema.field(key)
+            renamed = pa.array([value] * len(table), field.type)
+            number = table.schema.get_field_index(key)
+            pq.write_table(table.set_column(number, field, renamed), file)
+        return
+    for file, change in (
+        (tasks_file(copy), {"task": "test"}),
+        (copy.root / copy.episodes_file, {"tasks": ["test"]}),
+    ):
+        lines = [json.loads(line) | change for line in file.read_text().splitlines()]
+        file.write_text("".join(json.dumps(line) + "\n" for line in lines))
+
+
 def version_2(damage: Callable[[Copy], object]) -> Callable[[Copy], None]:
     def only(copy: Copy) -> None:
         if copy.v3:
@@ -255,6 +276,7 @@ FILES = {
     "an episode's number twice": Kind(listed(episode_index=0)),
     "an offset into another episode": Kind(listed(dataset_from_index=lambda n: n - 9)),
     "a data file that is not there": Kind(listed(**{"data/file_index": 9})),
+    "a task that says nothing": Kind(retitle, severe=False),
     "a task of no list": Kind(listed(tasks=["juggle"]), severe=False),
     "a data file of no episode": Kind(
         lambda c: shutil.copy(

@@ -1,9 +1,11 @@
 """Episodes added to a dataset that is there already."""
 
+import json
 import shlex
 import shutil
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from commands import hrc
 from lerobot_folders import joint_path, read_info
@@ -59,6 +61,28 @@ def test_the_longer_dataset_is_as_if_recorded_at_once(tmp_path):
     assert sorted(tmp_path.iterdir()) == [once, twice]
     record(twice, [3], ["pour"], append=True)
     assert_holds(twice, [0, 1, 2, 3], ["reach", "place", "reach", "pour"])
+
+
+def test_a_list_of_episodes_that_is_put_together_of_pieces_is_the_same(tmp_path, monkeypatch):
+    tasks = ("reach", "place", "reach", "pour", "reach")
+    whole = record(tmp_path / "whole", range(5), tasks)
+    monkeypatch.setattr("hrc_learn.demos.write.assembly._PACKED", 2)
+    pieces = record(tmp_path / "pieces", range(3), tasks[:3])
+    record(pieces, (3, 4), tasks[3:], append=True)
+    lists = [
+        pq.read_table(root / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
+        for root in (whole, pieces)
+    ]
+    for row in (row for rows in lists for row in rows):
+        row.pop("data/file_index")  # what is appended has files of its own
+    assert lists[0] == lists[1]
+    statistics = [
+        json.loads((root / "meta/stats.json").read_text()) for root in (whole, pieces)
+    ]
+    assert statistics[0].keys() == statistics[1].keys()
+    for key, of_whole in statistics[0].items():
+        for name, values in of_whole.items():
+            np.testing.assert_allclose(statistics[1][key][name], values, rtol=1e-12)
 
 
 def test_nothing_is_appended_where_nothing_was_recorded(tmp_path):

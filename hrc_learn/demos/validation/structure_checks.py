@@ -318,11 +318,39 @@ def _check_leftovers(folder: DatasetFolder, report: ValidationReport) -> None:
 _MOST_LISTED = 100_000
 
 
+_SAYS_NOTHING = frozenset(
+    [
+        "test",
+        "testing",
+        "asdf",
+        "todo",
+        "tbd",
+        "n/a",
+        "na",
+        "none",
+        "null",
+        "xxx",
+        "foo",
+        "task",
+        "demo",
+        "placeholder",
+        "untitled",
+    ]
+)
+"""Texts that were typed to get past the question."""
+
+
 def _check_tasks(folder: DatasetFolder, report: ValidationReport) -> None:
     texts = list(folder.tasks.values())
     empty = [index for index, text in folder.tasks.items() if not text.strip()]
     if empty:
         report.warning(f"task {empty[0]} has no text", file="meta/tasks")
+    for index, text in folder.tasks.items():
+        if text.strip().lower() in _SAYS_NOTHING:
+            report.warning(
+                f"task {index}, {text!r}, does not say what is shown: policies are told by it",
+                file="meta/tasks",
+            )
     if len({*texts}) < len(texts):
         report.warning("a task is listed twice", file="meta/tasks")
     for name, counted in (("total_tasks", len(texts)),):
