@@ -191,8 +191,8 @@ def read_converted(root: Path) -> list[dict[str, np.ndarray]]:
     episodes = pq.read_table(root / "meta/episodes/chunk-000/file-000.parquet")
     starts = episodes.column("dataset_from_index").to_pylist()
     stops = episodes.column("dataset_to_index").to_pylist()
-    names = json.loads((root / "meta/info.json").read_text())["features"]
-    layout = json.loads((root / "meta/hrc_learn.json").read_text())["columns"]
+    names = json.loads((root / "meta/info.json").read_text(encoding="utf-8"))["features"]
+    layout = json.loads((root / "meta/hrc_learn.json").read_text(encoding="utf-8"))["columns"]
     places = {
         role: (entry["key"], [names[entry["key"]]["names"].index(n) for n in entry["names"]])
         for role, entry in layout.items()

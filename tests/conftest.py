@@ -21,6 +21,21 @@ def no_waiting_for_the_disk():
         yield
 
 
+@pytest.fixture(autouse=True)
+def scheduled_as_before():
+    """libfranka takes the highest realtime priority for the thread that controls an arm, in
+    simulation too. Kept, browsers and programs that later tests start would inherit it and
+    leave nothing of the machine to anybody else.
+    """
+    if not hasattr(os, "sched_setscheduler"):
+        yield
+        return
+    before = os.sched_getscheduler(0), os.sched_getparam(0)
+    yield
+    if os.sched_getscheduler(0) != before[0]:
+        os.sched_setscheduler(0, *before)
+
+
 NEEDED = {
     "browser": "a headless Chromium (Debian: apt install chromium)",
     "egl": "EGL for rendered images (Debian: apt install libegl1)",
