@@ -80,8 +80,10 @@ def test_an_arm_that_was_held_up_goes_on_from_where_it_is(world):
     stuck = world.arm.read()
     assert any(touch.second == "cabinet_door" for touch in world.cabinet_contacts.touches)
     assert abs(stuck.joint_velocity[0]) < 0.05
+    assert any("touched cabinet_door" in met for met in world.touched_since(world.time - 0.02))
     world.arm.command(-swing)
     world.advance(0.5)
+    assert world.touched_since(world.time - 0.02) == ()
     back = world.arm.read()
     # Two seconds of it were spent at the door: they are not made up for on the way back.
     assert back.joint_position[0] - stuck.joint_position[0] == pytest.approx(0.25, abs=0.05)
