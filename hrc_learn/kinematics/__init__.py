@@ -27,6 +27,7 @@ from hrc_learn.kinematics.inverse import TaskSpace as TaskSpace
 from hrc_learn.kinematics.inverse import null_space_dimension as null_space_dimension
 from hrc_learn.kinematics.inverse import solve_inverse as solve_inverse
 from hrc_learn.kinematics.inverse import task_basis as task_basis
+from hrc_learn.kinematics.inverse import task_error as task_error
 from hrc_learn.kinematics.inverse import task_error_and_jacobian as task_error_and_jacobian
 from hrc_learn.kinematics.inverse import task_rank as task_rank
 from hrc_learn.kinematics.limits import JointLimits as JointLimits

@@ -61,12 +61,36 @@ def task_error_and_jacobian(
         task: What of it matters.
     """
     T, J = chain.transform_and_jacobian(q)
+    if task == "pose":
+        return Pose.from_matrix(T).twist_to(pose), J
+    error = task_error(T, pose, task)
+    if task == "position":
+        return error[..., :3], J[..., :3, :]
+    sides = pose.matrix()[..., :3, :2].mT
+    turn = (sides @ error[..., 3:, None])[..., 0]
+    return (
+        torch.cat([error[..., :3], turn], dim=-1),
+        torch.cat([J[..., :3, :], sides @ J[..., 3:, :]], dim=-2),
+    )
+
+
+def task_error(
+    T: Float[Tensor, "*batch 3 4"], pose: Pose, task: TaskSpace
+) -> Float[Tensor, "*batch 6"]:
+    """Twist that takes the tool in unit time to what a task wants of a pose [m, rad].
+
+    Of "position+axis" the shortest turn of the tool's axis, of "position" none.
+
+    Args:
+        T: Where the tool is, base frame.
+        pose: Wanted.
+        task: What of it matters.
+    """
+    if task == "pose":
+        return Pose.from_matrix(T).twist_to(pose)
     linear = pose.position - T[..., 3]
     if task == "position":
-        return linear, J[..., :3, :]
-    if task == "pose":
-        error = Pose.from_matrix(T).twist_to(pose)
-        return error, J
+        return torch.cat([linear, torch.zeros_like(linear)], dim=-1)
     R = pose.matrix()[..., :3, :3]
     wanted, now = R[..., 2], T[..., 2]
     across = torch.linalg.cross(now, wanted)
@@ -77,9 +101,7 @@ def task_error_and_jacobian(
     small = sine < 1e-9
     axis = torch.where(small, R[..., 0], across / sine.clamp(min=1e-9))
     turn = axis * torch.where(small & (cosine > 0), 0.0, angle)
-    sides = R[..., :2].mT
-    error = torch.cat([linear, (sides @ turn[..., None])[..., 0]], dim=-1)
-    return error, torch.cat([J[..., :3, :], sides @ J[..., 3:, :]], dim=-2)
+    return torch.cat([linear, turn], dim=-1)
 
 
 def null_space_dimension(

@@ -23,8 +23,8 @@ SINGULAR_BELOW = 0.05
 
 
 def pseudo_inverse(
-    J: Float[Tensor, "*batch 6 joints"], damping: Float[Tensor, "*#batch"] | float = 0.0
-) -> Float[Tensor, "*batch joints 6"]:
+    J: Float[Tensor, "*batch rows joints"], damping: Float[Tensor, "*#batch"] | float = 0.0
+) -> Float[Tensor, "*batch joints rows"]:
     """Right pseudo-inverse J^T (J J^T + damping^2 I)^-1.
 
     Without damping it inverts exactly wherever J has full rank, and fails or overflows where
@@ -57,7 +57,7 @@ def null_space_projector(
 
 
 def singularity_damping(
-    J: Float[Tensor, "*batch 6 joints"], strength: float = SINGULAR_BELOW
+    J: Float[Tensor, "*batch rows joints"], strength: float = SINGULAR_BELOW
 ) -> Float[Tensor, "*batch"]:
     """Damping that is exactly zero away from singularities and grows smoothly towards them.
 

@@ -153,8 +153,9 @@ class EquippedArm(WorkArm):
         old, n = arm.chain, len(arm.chain.joint_names)
         if n < 6:
             raise ValueError(
-                f"{arm.name} has {n} joints, but placing needs the full pose of the tool, for "
-                "which it takes six or more."
+                f"{arm.name} has {n} joints, but grasping and placing need the full pose of "
+                "the tool, for which it takes six: with fewer it servoes by position and axis "
+                "(`hrc sweep --only near`, docs/controller.md)."
             )
         tcp = torch.eye(4, dtype=torch.float64)
         tcp[2, 3] = _TCP

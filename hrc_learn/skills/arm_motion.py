@@ -38,8 +38,8 @@ _ITERATIONS = 4
 
 
 def resolved_rate(
-    jacobian: Float[Tensor, "*batch 6 joints"],
-    twist: Float[Tensor, "*batch 6"],
+    jacobian: Float[Tensor, "*batch rows joints"],
+    twist: Float[Tensor, "*batch rows"],
     null_velocity: Float[Tensor, "*batch joints"],
 ) -> Float[Tensor, "*batch joints"]:
     """Joint velocities for a given twist, as close as possible to given joint velocities.
@@ -48,15 +48,15 @@ def resolved_rate(
     null-space motion move the end effector.
 
     Args:
-        jacobian: Geometric Jacobian of the end effector.
-        twist: Linear [m/s] and angular [rad/s] velocity of the end effector.
+        jacobian: Geometric Jacobian of the end effector, or the rows of it that are led.
+        twist: Linear [m/s] and angular [rad/s] velocity of the end effector, or of those.
         null_velocity: Desired joint velocities; only their null-space part acts [rad/s].
     """
     return task_rate(jacobian, twist) + null_projection(jacobian, null_velocity)
 
 
 def task_rate(
-    jacobian: Float[Tensor, "*batch 6 joints"], twist: Float[Tensor, "*batch 6"]
+    jacobian: Float[Tensor, "*batch rows joints"], twist: Float[Tensor, "*batch rows"]
 ) -> Float[Tensor, "*batch joints"]:
     """`resolved_rate` of the task alone: the least joint velocity for a twist [rad/s].
 

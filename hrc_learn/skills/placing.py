@@ -22,11 +22,15 @@ from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.kinematics import (
     PANDA,
     SerialChain,
+    TaskSpace,
     UnreachableError,
     WorkArm,
     arm_angle,
     arm_angle_and_motion,
     panda,
+    task_basis,
+    task_error,
+    task_rank,
 )
 from hrc_learn.regions import JointRegion
 from hrc_learn.skills.arm_motion import joint_line, resolved_rate
@@ -185,12 +189,15 @@ def follow_pose(
     twist: Float[Tensor, "steps 6"],
     angle: Float[Tensor, " steps"] | None,
     dt: float,
+    *,
+    task: TaskSpace = "pose",
 ) -> Float[Tensor, "steps joints"]:
     """Joint path that tracks poses of the end effector, and arm angles in the null space.
 
     u = J^+ (twist + k_e e) + N n (angle' + k_a (angle - angle(q))) - N xi_q, where
     n turns the arm angle at unit rate and xi_q is the gradient of the joint-limit region: the
-    poses are met, the arm angle as far as the null space and the joint limits allow.
+    poses are met, the arm angle as far as the null space and the joint limits allow. Of a task
+    of fewer dimensions than a pose, J and N are those of what it leads.
 
     Args:
         chain: The arm.
@@ -200,19 +207,27 @@ def follow_pose(
         angle: Desired arm angles, continuous [rad]; None: the joint limits alone move the null
             space, if there is one.
         dt: Time between samples [s].
+        task: What of the poses is followed: an arm of five joints has none for all of it.
     """
     limits = JointRegion.from_limits(chain.limits.lower, chain.limits.upper)
     rate = None if angle is None else torch.gradient(angle, spacing=dt)[0]
     q, path = start, [start]
+    rank = task_rank(chain, task)
     for k in range(len(twist) - 1):
         pose, J = chain.forward_and_jacobian(q)
-        desired = twist[k] + _POSE_GAIN * pose.twist_to(poses[k])
+        if task == "pose":
+            desired = twist[k] + _POSE_GAIN * pose.twist_to(poses[k])
+        else:
+            desired = twist[k] + _POSE_GAIN * task_error(pose.matrix()[:3], poses[k], task)
         null_velocity = -limits.gradient(q)
         if angle is not None and rate is not None:
             measured, motion = arm_angle_and_motion(chain, q, J)
             # The shorter way around the circle.
             error = torch.remainder(angle[k] - measured + torch.pi, 2 * torch.pi) - torch.pi
             null_velocity = motion * (rate[k] + _ANGLE_GAIN * error) + null_velocity
+        if task != "pose":
+            basis = task_basis(J, pose.orientation, task, rank)
+            J, desired = basis @ J, basis @ desired
         q = q + dt * resolved_rate(J, desired, null_velocity)
         path.append(q)
     return torch.stack(path)
