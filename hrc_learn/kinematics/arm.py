@@ -95,6 +95,15 @@ class Arm:
         return fit_body(self.chain, [(s.link, s.shape, s.pose) for s in self.shapes])
 
     @cached_property
+    def reach(self) -> float:
+        """How far the tool centre point gets from joint 2 [m], as far as random states tell."""
+        limits, rng = self.chain.limits, torch.Generator().manual_seed(0)
+        share = torch.rand(5000, len(self.joint_names), generator=rng, dtype=torch.float64)
+        q = limits.lower + (limits.upper - limits.lower) * share
+        apart = self.chain.forward(q).position - self.chain.joint_origins(q)[:, 1]
+        return float(torch.linalg.vector_norm(apart, dim=-1).max())
+
+    @cached_property
     def masses(self) -> tuple[float, ...]:
         """Of base, links, flange and tool [kg].
 

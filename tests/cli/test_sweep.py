@@ -65,6 +65,15 @@ def test_a_sweep_without_grasps_has_figures_but_no_picture(tmp_path: Path, coars
     assert "--recording shows grasps, but stress_late are none" in outcome.error
 
 
+def test_another_arm_servoes_and_what_is_about_a_panda_refuses_it(coarse):
+    three = ("sweep", "--only", "near", "--trials", "3", "--robot", "fr3")
+    outcome = hrc(*three)
+    assert outcome.status == 0, outcome.error
+    outcome = hrc("sweep", "--only", "near", "stress_late", "--robot", "fr3")
+    assert outcome.status == 2
+    assert "--robot fr3: stress_late are about a Panda" in outcome.error
+
+
 def test_an_unknown_experiment_ends_in_one_line():
     outcome = hrc("sweep", "--only", "far")
     assert outcome.status == 2

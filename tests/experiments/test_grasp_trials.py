@@ -12,14 +12,15 @@ from hrc_learn.experiments.controller.grasp_trials import (
     MARKER,
     TrialConfig,
     TrialResult,
-    clearance,
     draw_scene,
     run_trials,
+    trial_arm,
 )
 from hrc_learn.experiments.controller.mujoco_trials import build_plant
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import FixedEstimator, KalmanConfig, KalmanEstimator, PaperEstimator
 from hrc_learn.kinematics import (
+    ArmChoice,
     UnreachableError,
     clear_posture,
     comfortable_posture,
@@ -68,6 +69,28 @@ def test_a_filter_that_knows_the_noise_of_poses_keeps_the_better_image_jacobian(
     assert errors[2] > 1.3 * errors[1]
 
 
+@shapes_unchecked()  # for speed
+def test_an_arm_of_five_joints_servoes_as_far_as_it_reaches(tmp_path):
+    """Base, three hinges in a plane, and a roll about the tool's axis, 0.4 m long."""
+    origins = ("0 0 0.06", "0 0 0.04", "0 0 0.15", "0 0 0.15", "0 0 0.05")
+    axes = ("0 0 1", "0 1 0", "0 1 0", "0 1 0", "0 0 1")
+    joints = "".join(
+        f'<link name="l{k + 1}"/><joint name="j{k}" type="revolute"><parent link="l{k}"/>'
+        f'<child link="l{k + 1}"/><origin xyz="{xyz}"/><axis xyz="{axis}"/>'
+        '<limit lower="-2.9" upper="2.9" velocity="2" effort="9"/></joint>'
+        for k, (xyz, axis) in enumerate(zip(origins, axes, strict=True))
+    )
+    path = tmp_path / "five.urdf"
+    path.write_text(f'<robot name="five"><link name="l0"/>{joints}</robot>')
+    arm = trial_arm(ArmChoice(str(path)))
+    assert arm.task == "position+axis"
+    assert arm.scale == pytest.approx(0.35 / 0.95, rel=0.05)
+    result = run_trials(KalmanEstimator, replace(QUICK, count=10, robot=ArmChoice(str(path))))
+    assert result.success.sum() >= 9
+    assert not result.violations.any()
+    assert not result.touched.any()
+
+
 def test_the_same_seed_draws_the_same_trials():
     short = replace(QUICK, duration=0.2)
     one, same = run_trials(KalmanEstimator, short), run_trials(KalmanEstimator, short)
@@ -86,6 +109,7 @@ def test_a_run_that_left_the_target_again_is_no_success():
         vision_time=torch.tensor([0.5, 0.5, math.nan, 1.0, 1.0], dtype=torch.float64),
         violations=torch.tensor([0, 0, 2, 0, 0]),
         touched=torch.tensor([False, True, False, False, False]),
+        touched_itself=torch.tensor([False, True, False, False, False]),
         peak_speed=torch.full((5,), 0.7, dtype=torch.float64),
         hand_overs=torch.ones(5, dtype=torch.int64),
         jacobian_error=torch.tensor([0.1, 0.2, 0.9, 0.3, 0.4], dtype=torch.float64),
@@ -141,12 +165,17 @@ def test_a_path_that_would_touch_is_not_taken():
     rng = torch.Generator().manual_seed(0)
     config = TrialConfig(count=250, starts="global")
     starts = draw_scene(config, rng).start
+    clearance = trial_arm(ArmChoice()).clearance
     assert (clearance(starts) > 0).all()
     down = quaternion.normalize(torch.tensor(GRIPPER_DOWN, dtype=torch.float64))
     pose = Pose(torch.tensor(CENTRE, dtype=torch.float64), down)
     postures = comfortable_postures(panda, pose)
     share = torch.linspace(0, 1, 50, dtype=torch.float64)[:, None]
-    blind = clearance(torch.lerp(starts[:, None], postures[0], share)).amin(-1)
+    blind = (
+        trial_arm(ArmChoice())
+        .clearance(torch.lerp(starts[:, None], postures[0], share))
+        .amin(-1)
+    )
     q = starts[blind < 0]
     assert len(q) >= 3
     seeing = clear_posture(postures, q, clearance)

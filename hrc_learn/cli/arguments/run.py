@@ -240,7 +240,7 @@ class Report(Measured):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sweep(Written):
+class Sweep(OfRobot, Written):
     """Thousands of simulated grasps as batches: how often, how fast and how safely.
 
     Random starts, targets and uncalibrated cameras, turned by up to 180 degrees from what the

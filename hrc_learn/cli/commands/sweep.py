@@ -20,7 +20,9 @@ from hrc_learn.experiments.controller.sweep import (
     compared,
     join,
     run_chunk,
+    takes_another_arm,
 )
+from hrc_learn.kinematics import ArmChoice
 from hrc_learn.store import new_file, new_folder, write_json
 from hrc_learn.viz import SweepRecording, SweptTrials
 
@@ -41,9 +43,15 @@ def sweep(args: Sweep) -> int:
                 f"--{option} shows grasps, but {', '.join(names)} are none: choose one of them "
                 "too, or leave it out."
             )
+    robot = ArmChoice(args.robot, args.base, args.tip)
+    if robot != ArmChoice() and (fixed := [n for n in names if not takes_another_arm(n)]):
+        raise ValueError(
+            f"--robot {args.robot}: {', '.join(fixed)} are about a Panda; --only near, global, "
+            "fixed and others of grasping servo with any arm."
+        )
     torch.set_num_threads(1)
-    jobs = [
-        job
+    jobs: list[Job] = [
+        (*job, robot)
         for name in names
         for job in chunks(
             name, args.trials if EXPERIMENTS[name].main else args.variants, args.seed, CHUNK
@@ -111,7 +119,7 @@ def _chosen(args: Sweep) -> list[str]:
     ]
 
 
-Job = tuple[str, int, int]
+type Job = tuple[str, int, int, ArmChoice]
 
 
 def _run(jobs: list[Job], spread: Callable[[list[Job]], Iterator[Any]]) -> dict[str, Any]:
@@ -136,9 +144,9 @@ def _with_ray(jobs: list[Job]) -> Iterator[Any]:
         raise ValueError("--ray needs Ray: pip install ray") from error
 
     @ray.remote
-    def run(name: str, count: int, seed: int) -> Any:
+    def run(*job: Any) -> Any:
         torch.set_num_threads(1)
-        return run_chunk(name, count, seed)
+        return run_chunk(*job)
 
     ray.init(log_to_driver=False)
     waiting = [run.remote(*job) for job in jobs]

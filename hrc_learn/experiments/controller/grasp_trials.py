@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cache, cached_property
 from typing import Literal
 
 import torch
@@ -28,12 +29,19 @@ from hrc_learn.controller.monitors import LimitMonitor
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import ImageJacobianEstimator, RBFImageJacobian, paper_grid
 from hrc_learn.kinematics import (
-    JointLimits,
+    Arm,
+    ArmChoice,
+    CapsuleArm,
+    FrankaChain,
+    TaskSpace,
+    UnreachableError,
+    arm,
     clear_posture,
     comfortable_postures,
-    panda,
-    panda_capsules,
+    gripper_down,
 )
+from hrc_learn.kinematics.inverse import solutions_from
+from hrc_learn.kinematics.redundancy import best_postures
 from hrc_learn.regions import JointRegion
 from hrc_learn.sim.closed_loop import (
     Imperfections,
@@ -46,19 +54,6 @@ TABLE = ((0.26, 0.54, -0.02), (0.42, 0.34, 0.02))
 """Centre and half edges of the table [m], as simulated."""
 PEDESTAL = ((-0.03, 0.0, -0.36), (0.12, 0.12, 0.36))
 """The same of what the arm stands on [m]."""
-
-
-def clearance(q: Float[Tensor, "*batch 7"]) -> Float[Tensor, "*batch"]:
-    """Distance of the Panda from itself, the table and the pedestal [m]; negative in contact.
-
-    Args:
-        q: Joint position [rad].
-    """
-    distance = panda_capsules.self_distance(q)
-    for box in (TABLE, PEDESTAL):
-        centre, half_size = q.new_tensor(box)
-        distance = torch.minimum(distance, panda_capsules.box_distance(q, centre, half_size))
-    return distance
 
 
 ROLL_CLASSES = ((0, 30), (30, 60), (60, 90), (90, 135), (135, 180))
@@ -75,6 +70,102 @@ CORNERS = tuple(
 )
 """Of the marker, from its centre in the tool's frame [m]."""
 
+# From which postures of arms without an inverse in closed form are sought.
+_STARTS = 200
+# Heights at which an arm with its tool down is tried [m], as shares of those of a Franka arm.
+_HEIGHTS = (CENTRE[2], 0.2, 0.1)
+
+
+class TrialArm:
+    """An arm that servoes, and where, by its reach.
+
+    Attributes:
+        arm: The arm.
+        scale: Distances, as shares of those for a Franka arm; at most 1.
+        task: What of its tool's pose is led: of five joints position and axis.
+        centre: Of the Cartesian region [m].
+        down: Orientation of the tool there: the paper's, of others than Franka's straight down.
+        postures: Joint positions with that pose, the best first [rad].
+    """
+
+    def __init__(self, arm: Arm):
+        """Place table and region before an arm.
+
+        Raises:
+            UnreachableError: It does not get there with its tool pointing down.
+        """
+        self.arm, self.chain = arm, arm.chain
+        self.task: TaskSpace = "pose" if len(arm.joint_names) >= 6 else "position+axis"
+        self.scale, self.down = (
+            1.0,
+            quaternion.normalize(torch.tensor(GRIPPER_DOWN, dtype=torch.float64)),
+        )
+        if isinstance(arm.chain, FrankaChain):
+            self.centre = self.scaled(CENTRE)
+            self.postures = comfortable_postures(arm.chain, Pose(self.centre, self.down))
+            return
+        self.scale, self.down = min(1.0, arm.reach / _PANDA_REACH), gripper_down()
+        for height in _HEIGHTS:
+            self.centre = self.scaled((*CENTRE[:2], height))
+            found = self._solutions(self.task)
+            if len(found) and self.task != "pose":
+                # Its joints decide how the tool is turned about its axis.
+                self.down = self.chain.forward(best_postures(self.chain, found)[0]).orientation
+                found = self._solutions("pose")
+            if len(found):
+                self.postures = best_postures(self.chain, found)
+                return
+        raise UnreachableError(
+            f"the {arm.name} does not get its tool to {self.centre.tolist()} m, pointing down"
+        )
+
+    def _solutions(self, task: TaskSpace) -> Float[Tensor, "solutions joints"]:
+        limits, rng = self.chain.limits, torch.Generator().manual_seed(0)
+        half = ((limits.upper - limits.lower) / 2).clamp(max=math.pi)
+        share = torch.rand(_STARTS, len(half), generator=rng, dtype=torch.float64)
+        start = limits.middle + (2 * share - 1) * half
+        # Five joints meet a pose as exactly as their axes are parallel in the description.
+        tolerance = 1e-9 if self.task == "pose" else 1e-3
+        found = solutions_from(
+            self.chain, Pose(self.centre, self.down), start, task=task, tolerance=tolerance
+        )
+        return found[found.isfinite().all(-1)]
+
+    def scaled(self, lengths: tuple[float, ...]) -> Float[Tensor, " n"]:
+        """Lengths as they are for this arm [m]."""
+        return self.scale * torch.tensor(lengths, dtype=torch.float64)
+
+    def clearance(self, q: Float[Tensor, "*batch joints"]) -> Float[Tensor, "*batch"]:
+        """Distance from itself, the table and the pedestal [m]; negative in contact.
+
+        Args:
+            q: Joint position [rad].
+        """
+        distance = self.arm.body.self_distance(q)
+        if not self._above.capsules:  # of a description without shapes
+            return distance
+        below = self.centre - self.scaled(CENTRE)
+        for (centre, half_size), lower in ((TABLE, below), (PEDESTAL, 0 * below)):
+            box = self.scaled(centre) + lower, self.scaled(half_size)
+            distance = torch.minimum(distance, self._above.box_distance(q, *box))
+        return distance
+
+    @cached_property
+    def _above(self) -> CapsuleArm:
+        """Without link 1, which always is as near to what the arm stands on."""
+        body = self.arm.body
+        return CapsuleArm(self.chain, [c for c in body.capsules if c.link > 1])
+
+
+_PANDA_REACH = 0.95  # [m], as `Arm.reach` of it
+
+
+@cache
+def trial_arm(choice: ArmChoice) -> TrialArm:
+    """An arm, ready for trials."""
+    return TrialArm(arm(choice.name, base=choice.base or None, tip=choice.tip or None))
+
+
 # At the joints' speeds the arm moves less than 5 cm in between [s].
 _SECONDS_BETWEEN_CONTACT_CHECKS = 0.024
 # Starts are drawn again below this distance from contact [m].
@@ -87,6 +178,7 @@ class TrialConfig:
 
     count: int = 1000
     seed: int = 0
+    robot: ArmChoice = field(default_factory=ArmChoice)
     starts: Literal["near", "global"] = "near"
     """Ready posture with 0.4 rad of noise on each joint, or anywhere within the limits."""
     tilt: tuple[float, float] = (0.0, 0.35)
@@ -132,6 +224,8 @@ class TrialResult:
     """Steps that broke a limit of position, velocity, acceleration or jerk."""
     touched: Bool[Tensor, "trials"]
     """Contact of the arm with itself, the table or the pedestal; False if not checked."""
+    touched_itself: Bool[Tensor, "trials"]
+    """Contact of the arm with itself; False if not checked."""
     peak_speed: Float[Tensor, "trials"]
     """Largest joint velocity over its limit."""
     hand_overs: Int[Tensor, "trials"]
@@ -146,6 +240,7 @@ class TrialResult:
             "success": _rate(self.success),
             "free_success": _rate(self.success & ~self.touched),
             "touched": _rate(self.touched),
+            "touched_itself": _rate(self.touched_itself),
             "t50": self.time.quantile(0.5, interpolation="higher").item(),
             "t95": self.time.quantile(0.95, interpolation="higher").item(),
             "vision_phase": _median(self.vision_time),
@@ -219,9 +314,10 @@ def draw_scene(config: TrialConfig, rng: torch.Generator) -> TrialScene:
     roll_class = torch.arange(config.count) % len(ROLL_CLASSES)
     low, high = torch.deg2rad(torch.tensor(ROLL_CLASSES, dtype=torch.float64))[roll_class].mT
     side = torch.where(uniform(0.0, 1.0) < 0.5, -1.0, 1.0)
-    centre = torch.tensor(CENTRE, dtype=torch.float64)
+    servoing = trial_arm(config.robot)
+    centre = servoing.centre
     camera = PinholeCamera.above(
-        centre + uniform(-0.05, 0.05, 3),
+        centre + servoing.scale * uniform(-0.05, 0.05, 3),
         height=uniform(0.9, 1.2),
         roll=side * (low + (high - low) * uniform(0.0, 1.0)),
         tilt=uniform(*config.tilt),
@@ -229,29 +325,30 @@ def draw_scene(config: TrialConfig, rng: torch.Generator) -> TrialScene:
         marker=centre.new_tensor(MARKER),
         corners=centre.new_tensor(CORNERS) if config.feature == "corners" else None,
     )
-    spread = centre.new_tensor((0.08, 0.08, 0.05))
-    down = quaternion.normalize(centre.new_tensor(GRIPPER_DOWN))
-    tool = Pose(centre + spread * uniform(-1.0, 1.0, 3), down.expand(config.count, 4))
+    spread = servoing.scaled((0.08, 0.08, 0.05))
+    at = centre + spread * uniform(-1.0, 1.0, 3)
+    tool = Pose(at, servoing.down.expand(config.count, 4))
     return TrialScene(
         camera=camera,
         target=camera.project(tool)[0],
-        start=_starts(config, panda.limits, rng),
+        start=_starts(config, servoing, rng),
         roll_class=roll_class,
     )
 
 
-def _starts(config: TrialConfig, limits: JointLimits, rng: torch.Generator) -> Tensor:
+def _starts(config: TrialConfig, servoing: TrialArm, rng: torch.Generator) -> Tensor:
+    limits = servoing.chain.limits
     lower, upper = limits.lower + 0.03, limits.upper - 0.03
     shape = (config.count, len(lower))
     free: list[Tensor] = []
     while sum(map(len, free)) < config.count:
         if config.starts == "near":
             noise = torch.randn(shape, generator=rng, dtype=torch.float64)
-            q = (panda.ready + 0.4 * noise).clamp(lower, upper)
+            q = (servoing.chain.ready + 0.4 * noise).clamp(lower, upper)
         else:
             unit = torch.rand(shape, generator=rng, dtype=torch.float64)
             q = lower + unit * (upper - lower)
-        free.append(q[clearance(q) > _START_CLEARANCE])
+        free.append(q[servoing.clearance(q) > _START_CLEARANCE])
     return torch.cat(free)[: config.count]
 
 
@@ -263,22 +360,23 @@ def grasp_controller(
     """The controller of all trials, with the law and the goals of the configuration."""
     J = config.initial_jacobian(torch.tensor(INITIAL_IMAGE_JACOBIAN, dtype=torch.float64))
     J = J.repeat(scene.target.shape[-1] // 2, 1)
-    network = RBFImageJacobian.from_jacobian(J, paper_grid(), 0.1)
-    centre = torch.tensor(CENTRE, dtype=torch.float64)
+    servoing = trial_arm(config.robot)
+    scale, chain, centre = servoing.scale, servoing.chain, servoing.centre
+    network = RBFImageJacobian.from_jacobian(J, scale * paper_grid(), scale * 0.1)
+    box = servoing.scaled(config.half_size)
     if config.law == "printed":
-        box = centre.new_tensor(config.half_size)
         goals = paper_goals(centre, box, scene.target, config.stiffness)
-        settings, region = ControllerConfig.paper(), paper_joint_region(panda.limits)
+        settings, region = ControllerConfig.paper(), paper_joint_region(chain.limits)
     else:
-        down = quaternion.normalize(centre.new_tensor(GRIPPER_DOWN))
-        postures = comfortable_postures(panda, Pose(centre, down))
-        posture = clear_posture(postures, scene.start, clearance)
-        goals = Goals.at(centre, down, scene.target, half_size=config.half_size)
+        posture = clear_posture(servoing.postures, scene.start, servoing.clearance)
+        goals = Goals.at(
+            centre, servoing.down, scene.target, half_size=box.tolist(), task=servoing.task
+        )
         goals = goals.approached_by(posture)
         settings = ControllerConfig()
-        region = JointRegion.from_limits(panda.limits.lower, panda.limits.upper)
+        region = JointRegion.from_limits(chain.limits.lower, chain.limits.upper)
     return AdaptiveController(
-        panda, make_estimator(network), goals, config=settings, joint_region=region
+        chain, make_estimator(network), goals, config=settings, joint_region=region
     )
 
 
@@ -287,6 +385,7 @@ class Judge:
 
     def __init__(self, scene: TrialScene, controller: AdaptiveController, config: TrialConfig):
         self.scene, self.controller, self.dt = scene, controller, config.dt
+        self.servoing = trial_arm(config.robot)
         self.contact_steps = 0
         if config.contacts:
             self.contact_steps = max(1, round(_SECONDS_BETWEEN_CONTACT_CHECKS / config.dt))
@@ -297,8 +396,10 @@ class Judge:
         self.hand_overs = torch.zeros(count, dtype=torch.int64)
         self.peak_speed = torch.zeros(count, dtype=torch.float64)
         still = torch.zeros_like(scene.start)
-        self.watch = LimitMonitor(panda.limits, still, config.dt)
+        self.limits = self.servoing.chain.limits
+        self.watch = LimitMonitor(self.limits, still, config.dt)
         self.touched = torch.zeros(count, dtype=torch.bool)
+        self.touched_itself = torch.zeros(count, dtype=torch.bool)
         self.active = torch.zeros(count, dtype=torch.bool)
         self.in_box = torch.zeros(count, dtype=torch.bool)
         self.last: tuple[Tensor, ControllerState] | None = None
@@ -313,7 +414,7 @@ class Judge:
     ) -> None:
         now = torch.tensor(step * self.dt, dtype=torch.float64)
         self.last = q, state
-        tool = panda.forward(q)
+        tool = self.servoing.chain.forward(q)
         error = self.scene.camera.project(tool)[0] - self.scene.target
         centre = error.unflatten(-1, (-1, 2)).mean(-2)
         close = torch.linalg.vector_norm(centre, dim=-1) < 5
@@ -329,10 +430,11 @@ class Judge:
         self.in_box = ((tool.position - box.centre).abs() <= 1.05 * box.half_size).all(-1)
         v = command.joint_velocity
         self.violations += self.watch.violations(q, v).any(-1) | ~v.isfinite().all(-1)
-        speed = (v.abs() / panda.limits.velocity).amax(-1)
+        speed = (v.abs() / self.limits.velocity).amax(-1)
         self.peak_speed = torch.maximum(self.peak_speed, speed)
         if self.contact_steps and step % self.contact_steps == 0:
-            self.touched |= clearance(q) < 0
+            self.touched |= self.servoing.clearance(q) < 0
+            self.touched_itself |= self.servoing.arm.body.self_distance(q) < 0
 
     def result(self) -> TrialResult:
         return TrialResult(
@@ -343,6 +445,7 @@ class Judge:
             vision_time=self.entered - self.taken_over,
             violations=self.violations,
             touched=self.touched,
+            touched_itself=self.touched_itself,
             peak_speed=self.peak_speed,
             hand_overs=self.hand_overs,
             jacobian_error=self._jacobian_error(),
@@ -351,7 +454,7 @@ class Judge:
     def _jacobian_error(self) -> Float[Tensor, "trials"]:
         assert self.last is not None
         q, state = self.last
-        tool, estimator = panda.forward(q), self.controller.estimator
+        tool, estimator = self.servoing.chain.forward(q), self.controller.estimator
         true = self.scene.camera.image_jacobian(tool)[..., :3]
         wrong = estimator.jacobian(state.estimator, tool)[..., :3] - true
         return wrong.flatten(-2).norm(dim=-1) / true.flatten(-2).norm(dim=-1)

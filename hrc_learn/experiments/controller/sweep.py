@@ -35,6 +35,9 @@ from hrc_learn.jacobian import (
     RBFImageJacobian,
     RecursiveLeastSquaresEstimator,
 )
+from hrc_learn.kinematics import ArmChoice
+
+_PANDA = ArmChoice()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -247,11 +250,28 @@ EXPERIMENTS: Mapping[str, BatchedTrials] = {
 """What can be run."""
 
 
-def run_chunk(name: str, count: int, seed: int) -> Any:
-    """Run some trials of an experiment; a whole one has its own number of them."""
+def run_chunk(name: str, count: int, seed: int, robot: ArmChoice = _PANDA) -> Any:
+    """Run some trials of an experiment; a whole one has its own number of them.
+
+    Args:
+        name: Of the experiment.
+        count: Of trials.
+        seed: Of all that is random.
+        robot: The arm, of experiments that take another (`takes_another_arm`).
+    """
     experiment = EXPERIMENTS[name]
-    changes = {"seed": seed} if experiment.whole else {"seed": seed, "count": count}
+    changes: dict[str, Any] = {"seed": seed}
+    if not experiment.whole:
+        changes["count"] = count
+    if robot != _PANDA:
+        changes["robot"] = robot
     return experiment.run(replace(experiment.config, **changes))
+
+
+def takes_another_arm(name: str) -> bool:
+    """Whether an experiment is about kinematics alone, and so about any arm's."""
+    experiment = EXPERIMENTS[name]
+    return isinstance(experiment.config, TrialConfig) and experiment.suite != "mujoco"
 
 
 def chunks(name: str, count: int, seed: int, size: int) -> list[tuple[str, int, int]]:
