@@ -1,8 +1,10 @@
-"""A table of the registered arms: joints, reach, agreement with MuJoCo, inverse, and demo.
+"""A table of the registered arms: joints, reach, agreement with MuJoCo, servoing, demo, more.
 
-Written between the lines `<!-- arms:begin -->` and `<!-- arms:end -->` of the files given. The
-last column is of earlier runs of `hrc demo --robot NAME --json FOLDER/NAME.json`; an arm
-without one keeps what its row says. Arms whose package is not installed are left out.
+Written between the lines `<!-- arms:begin -->` and `<!-- arms:end -->` of the files given.
+Servoing is that of `hrc sweep --only near --robot NAME`: random starts, targets and cameras
+that nobody calibrated, against the kinematics. The last column is of earlier runs of
+`hrc demo --robot NAME --json FOLDER/NAME.json`; an arm without one keeps what its row says.
+Arms whose package is not installed are left out.
 """
 
 import os
@@ -21,7 +23,17 @@ import torch
 from rich.console import Console
 
 from hrc_learn import cli
-from hrc_learn.kinematics import Arm, MissingModelError, arm, registered_arms, solve_inverse
+from hrc_learn.experiments.controller.grasp_trials import TrialConfig, run_trials
+from hrc_learn.jacobian import KalmanEstimator
+from hrc_learn.kinematics import (
+    Arm,
+    ArmChoice,
+    MissingModelError,
+    UnreachableError,
+    arm,
+    registered_arms,
+    solve_inverse,
+)
 from hrc_learn.kinematics._capsule_fit import shape_points
 from hrc_learn.kinematics.registry import maker_of
 
@@ -31,9 +43,11 @@ from hrc_learn.kinematics.registry import maker_of
 _BEGIN, _END = "<!-- arms:begin -->", "<!-- arms:end -->"
 _HEADER = (
     "| arm | maker | joints | reach [m] | largest difference from MuJoCo | poses found "
-    "| ms a pose | touches itself: capsules, MuJoCo, missed | `hrc demo` |"
-    "\n|---|---|---|---|---|---|---|---|---|"
+    "| ms a pose | touches itself: capsules, MuJoCo, missed "
+    "| servoing: done; beyond limits, self-contacts "
+    "| `hrc demo` |\n|---|---|---|---|---|---|---|---|---|---|"
 )
+_COLUMNS = _HEADER.splitlines()[0].count("|") - 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,6 +58,8 @@ class Args:
     """Random reachable poses to invert."""
     arms: tuple[str, ...] = ()
     """Measure these alone: rows of others stay as they are; none: all."""
+    trials: int = 0
+    """Of servoing; 0: what its row says is kept."""
     demos: Path | None = None
     """Folder with NAME.json of `hrc demo`."""
     files: tuple[Path, ...] = ()
@@ -73,7 +89,7 @@ def main(args: Args) -> None:
             f"| {'its own model' if error is None else f'{error:.0e}'} "
             f"| {100 * measured['inverse_found']:.1f} % | {measured['inverse_ms']:.0f} "
             f"| {_percent(measured, 'capsules_touch', 'hulls_touch', 'missed')} "
-            f"| {_demo(name, args)} |"
+            f"| {_servoing(name, measured, args)} | {_demo(name, args)} |"
         )
         Console().print(rows[-1], highlight=False)
     for file in args.files:
@@ -95,23 +111,36 @@ def _measured(described: Arm, args: Args) -> dict[str, float]:
         share = torch.rand(count, n, generator=rng, dtype=torch.float64)
         return lower + (upper - lower) * share
 
-    # Of the tool centre point from joint 2, as far as 5,000 random states tell.
-    q = drawn(5000)
-    shoulder = chain.joint_origins(q)[:, 1]
-    reach = float((chain.forward(q).position - shoulder).norm(dim=-1).max())
     pose = chain.forward(drawn(args.poses))
     begun = time.thread_time()
     found = solve_inverse(chain, pose, task="pose" if n >= 6 else "position+axis").found
     spent = time.thread_time() - begun
     figures = {
         "joints": float(n),
-        "reach_m": reach,
+        "reach_m": described.reach,
         "inverse_found": float(found.double().mean()),
         "inverse_ms": 1e3 * spent / args.poses,
     }
+    if args.trials:
+        figures |= _servoed(described.name, args.trials)
     if described.description is not None:
         figures["difference_from_mujoco"] = _difference(described, drawn(args.states))
     return figures | _self_contacts(described, drawn(args.states))
+
+
+def _servoed(name: str, trials: int) -> dict[str, float]:
+    """As shares of trials: done, with a contact; and steps beyond limits; NaN: not reached."""
+    config = TrialConfig(count=trials, robot=ArmChoice(name), duration=8.0, contacts=True)
+    try:
+        result = run_trials(KalmanEstimator, config)
+    except UnreachableError:
+        return {}
+    return {
+        "servo_done": float((result.success & ~result.touched_itself).double().mean()),
+        "servo_violations": float(result.violations.sum()),
+        "servo_self_contacts": float(result.touched_itself.sum()),
+        "servo_touched": float(result.touched.sum()),
+    }
 
 
 def _difference(described: Arm, q: torch.Tensor) -> float:
@@ -210,6 +239,25 @@ def _row_before(name: str, args: Args) -> list[str]:
     """The row of an arm in the first of the files, if it has one."""
     rows = [row for file in args.files for row in file.read_text(encoding="utf-8").splitlines()]
     return [row for row in rows if row.startswith(f"| {name} |")][:1]
+
+
+def _cells_before(name: str, args: Args) -> list[str]:
+    """Those of that row, the last ones counted from its end."""
+    before = _row_before(name, args)
+    cells = [cell.strip() for cell in before[0].split("|")[1:-1]] if before else []
+    return cells if len(cells) == _COLUMNS else []
+
+
+def _servoing(name: str, measured: dict[str, float], args: Args) -> str:
+    if not args.trials:
+        before = _cells_before(name, args)
+        return before[-2] if before else "not tried"
+    if "servo_done" not in measured:
+        return "out of reach"
+    return (
+        f"{100 * measured['servo_done']:.1f} %; {measured['servo_violations']:.0f}, "
+        f"{measured['servo_self_contacts']:.0f}"
+    )
 
 
 def _demo(name: str, args: Args) -> str:
