@@ -215,6 +215,7 @@ class DrawnGoals:
                 self._tell("The plan leads again.")
             return
         where = drawn_position(self._seen, planned.position, self._config).centre
+        assert planned.orientation is not None  # servoing to an object leads all of a pose
         why = self._refusal(Pose(where, planned.orientation.goal))
         if why:
             self.leads = _NOTHING
