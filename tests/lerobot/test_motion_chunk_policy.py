@@ -90,6 +90,21 @@ def test_a_chunk_begins_in_the_state_it_is_given_and_soon_is_as_planned(index):
     torch.testing.assert_close(same, planned.double(), rtol=0, atol=1e-8)
 
 
+@pytest.mark.parametrize(("fps", "chunk_size"), [(80.0, 24), (30.0, 50), (15.0, 8)])
+def test_uneven_plans_do_not_lead_a_motion_astray(fps, chunk_size):
+    """Each chunk goes on with the acceleration of the one before, and so with its noise."""
+    settings = dict(n_action_steps=5, n_basis=10, **UNNAMED)
+    decoder = chunk_policy(decaying(), fps=fps, chunk_size=chunk_size, **settings).decoder
+    rng, noise = torch.Generator().manual_seed(0), 0.03
+    state, farthest = torch.zeros(200, 3, 1), 0.0
+    for _ in range(12):
+        plan = decoder.project(noise * torch.randn(200, chunk_size + 1, 1, generator=rng))
+        states = decoder.states(decoder.begin_in(plan, state))
+        farthest = max(farthest, states[:, :6, 0].square().mean().sqrt().item())
+        state = states[:, 5]
+    assert farthest < 2 * noise
+
+
 def test_states_are_derivatives_of_positions():
     decoder = ChunkDecoder(400, 0.005, 8, blend_time=0.05)
     planned = torch.randn(1, decoder.size, generator=torch.Generator().manual_seed(0))

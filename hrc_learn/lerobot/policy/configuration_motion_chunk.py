@@ -30,8 +30,10 @@ class MotionChunkConfig(MotionPolicyConfig):
     two_level_actions: list[int] | None = None
     """Components of the action that know two levels only, such as a gripper that is open or
     shut, and jump between them; None: those that the dataset's statistics show to be such."""
-    blend_time: float = 0.05
-    """About how long a chunk takes from what is carried out to what is planned [s]."""
+    blend_time: float | None = None
+    """About how long a chunk takes from what is carried out to what is planned [s]; None: 0.05
+    s, or less where the basis functions of a chunk are so close to each other that its
+    acceleration is uneven within that time, with which the motion would go on."""
     optimizer_lr: float = 1e-3
     optimizer_weight_decay: float = 1e-2
     scheduler_decay_steps: int = 20_000
@@ -42,7 +44,7 @@ class MotionChunkConfig(MotionPolicyConfig):
         for name in ("n_basis", "hidden_dim", "n_plans"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if self.blend_time <= 0:
+        if self.blend_time is not None and self.blend_time <= 0:
             raise ValueError(f"blend_time must be positive seconds, got {self.blend_time}")
         if self.chunk_size < 4:
             raise ValueError(f"chunk_size must be at least 4, got {self.chunk_size}")

@@ -52,6 +52,11 @@ VELOCITY_WEIGHT = 0.005
 """Of the error in velocity, spreads a second, beside that in position."""
 SCORE_WEIGHT = 0.1
 """Of the scores of plans beside the plans: a classification learns faster."""
+BLEND_TIME = 0.05
+"""At most, unless it is given [s]."""
+BLEND_SHARE = 0.3
+"""Of the time between two basis functions. A plan that is off by e at that spacing h is off by
+some 20 e / h^2 in acceleration, which leads a motion astray by 20 e (blend_time / h)^2."""
 SAME_WAY = 0.5
 """Root mean square distance, in spreads, from which on plans are different ways to go: of
 nearer ones the mean is closer to what is shown than any, of others it is neither way."""
@@ -139,8 +144,10 @@ class MotionChunkPolicy(PreTrainedPolicy):
                 f"not all of them; got {self._stepped}"
             )
         self._smooth = [k for k in range(width) if k not in self._stepped]
+        between = config.chunk_size / config.fps / config.n_basis
+        blend_time = config.blend_time or min(BLEND_TIME, BLEND_SHARE * between)
         self.decoder = ChunkDecoder(
-            config.chunk_size, 1 / config.fps, config.n_basis, config.blend_time
+            config.chunk_size, 1 / config.fps, config.n_basis, blend_time
         )
         self.network = ChunkNetwork(
             numbers=sum(widths.values()),
