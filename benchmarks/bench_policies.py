@@ -19,10 +19,10 @@ os.environ.setdefault("HF_HUB_OFFLINE", "1")
 import json
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from jaxtyping import Float
@@ -39,8 +39,6 @@ WARM_UP = 50
 CONSTANT = 1e-6
 """Columns of the action that vary by less play no part."""
 type Episode = dict[str, Tensor]
-type Player = Callable[[Float[Tensor, "T F"], int], Float[Tensor, "T A"]]
-"""From an episode's states, and how many actions of a chunk are carried out, to actions."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,11 +90,21 @@ def main(args: Args) -> None:
         table = Table("policy", "steps", "CPU s", *_titles(args.executed))
         table.title = f"{root.name}: {len(held_out)} of {len(episodes)} episodes held out"
         for name in args.policies:
-            torch.manual_seed(args.seed)
-            play, steps, seconds = _learn(name, shown, stats, fps, args)
+            actor, steps, seconds = learn(
+                name,
+                shown,
+                fps,
+                minutes=args.minutes,
+                chunk=args.chunk,
+                executed=args.executed[0],
+                batch_size=args.batch_size,
+                seed=args.seed,
+            )
             row = []
             for executed in args.executed:
-                made = [(play(e[STATE], executed) / spread)[:, varies] for e in held_out]
+                made = [
+                    (_play(actor, e[STATE], executed) / spread)[:, varies] for e in held_out
+                ]
                 error = _rms([x - y for x, y in zip(made, wanted, strict=True)])
                 seam = _rms([_at_seams(_jerk(x, fps), executed) for x in made])
                 row += [error, seam]
@@ -139,25 +147,60 @@ def _at_seams(jerk: Float[Tensor, "T3 A"], executed: int) -> Float[Tensor, "n A"
     return jerk[(k + 3 >= executed) & ((k + 3) % executed < 3)]
 
 
-def _learn(
+class Actor(Protocol):
+    """Acts on one state after the other."""
+
+    def begin(self, executed: int) -> None:
+        """Begin an episode, with so many actions carried out of each chunk."""
+        ...
+
+    def act(self, state: Float[Tensor, "F"]) -> Float[Tensor, "A"]:
+        """What to do in a state, which is that after the last action."""
+        ...
+
+
+@torch.no_grad()
+def _play(actor: Actor, states: Float[Tensor, "T F"], executed: int) -> Float[Tensor, "T A"]:
+    actor.begin(executed)
+    return torch.stack([actor.act(state) for state in states])
+
+
+def learn(
     name: str,
     shown: Sequence[Episode],
-    stats: dict[str, dict[str, Tensor]],
     fps: float,
-    args: Args,
-) -> tuple[Player, int, float]:
-    """A policy, the steps it was trained for, and the CPU time that took [s]."""
+    *,
+    minutes: float,
+    chunk: int,
+    executed: int,
+    batch_size: int = 64,
+    seed: int = 0,
+) -> tuple[Actor, int, float]:
+    """A policy, the steps it was trained for, and the CPU time that took [s].
+
+    Args:
+        name: nearest, or a policy that `config_of` knows.
+        shown: Demonstrations to learn from.
+        fps: Their frames a second.
+        minutes: CPU time of building and training.
+        chunk: Actions predicted at once.
+        executed: Of these, how many are to be carried out.
+        batch_size: Samples in each step of training.
+        seed: Of weights and batches.
+    """
+    torch.manual_seed(seed)
+    stats = statistics(shown)
     begun = time.process_time()
     if name == "nearest":
-        return _nearest(shown, stats, args.chunk), 0, time.process_time() - begun
+        return _Nearest(shown, stats, chunk), 0, time.process_time() - begun
     from lerobot.policies import get_policy_class, make_pre_post_processors
 
     import hrc_learn.lerobot  # noqa: F401  registers ours
 
-    config = config_of(name, shown[0], fps, args.chunk, args.executed[0])
-    with_environment = name == "act"
+    config = config_of(name, shown[0], fps, chunk, executed)
+    with_environment = ENVIRONMENT in config.input_features
     if with_environment:
-        # ACT demands images or the environment's state: it gets the state there.
+        # ACT and Diffusion demand images or the environment's state: they get the state there.
         stats = stats | {ENVIRONMENT: stats[STATE]}
         shown = [e | {ENVIRONMENT: e[STATE]} for e in shown]
     begun = time.process_time()
@@ -167,42 +210,55 @@ def _learn(
     elif name == "motion_chunk":
         policy.fit(shown)
     before, after = make_pre_post_processors(config, dataset_stats=stats)
-    until = begun + 60 * args.minutes
-    steps = train(policy, before, shown, fps, until, args.batch_size, args.seed)
+    until = begun + 60 * minutes
+    steps = train(policy, before, shown, fps, until, batch_size, seed)
     seconds = time.process_time() - begun
+    return _Policy(policy, before, after, with_environment), steps, seconds
+
+
+@dataclass(frozen=True, eq=False)
+class _Policy:
+    """One of LeRobot, with its processors."""
+
+    policy: Any
+    before: Any
+    after: Any
+    with_environment: bool
+
+    def begin(self, executed: int) -> None:
+        self.policy.config.n_action_steps = executed
+        self.policy.reset()
 
     @torch.no_grad()
-    def play(states: Tensor, executed: int) -> Tensor:
-        policy.config.n_action_steps = executed
-        policy.reset()
-        made = []
-        for state in states:
-            seen = {STATE: state} | ({ENVIRONMENT: state} if with_environment else {})
-            made.append(after(policy.select_action(before(seen))))
-        return torch.cat(made)
-
-    return play, steps, seconds
+    def act(self, state: Float[Tensor, "F"]) -> Float[Tensor, "A"]:
+        seen = {STATE: state} | ({ENVIRONMENT: state} if self.with_environment else {})
+        return self.after(self.policy.select_action(self.before(seen)))[0]
 
 
-def _nearest(
-    shown: Sequence[Episode], stats: dict[str, dict[str, Tensor]], chunk: int
-) -> Player:
-    from hrc_learn.lerobot.policy.closed_form import SampleWindows
+class _Nearest:
+    """The chunk that was shown after the state most like the one seen."""
 
-    windows = SampleWindows(shown, {STATE: None, ACTION: range(chunk)}, 1)
-    all_of_it = windows.batch(torch.arange(len(windows)))
-    scale = torch.where(stats[STATE]["std"] > CONSTANT, stats[STATE]["std"], torch.inf)
-    known = all_of_it[STATE] / scale
+    def __init__(
+        self, shown: Sequence[Episode], stats: dict[str, dict[str, Tensor]], chunk: int
+    ):
+        from hrc_learn.lerobot.policy.closed_form import SampleWindows
 
-    def play(states: Tensor, executed: int) -> Tensor:
-        nearest = [
-            int((known - state / scale).square().sum(-1).argmin())
-            for state in states[::executed]
-        ]
-        made = torch.cat([all_of_it[ACTION][k, :executed] for k in nearest])
-        return made[: len(states)]
+        windows = SampleWindows(shown, {STATE: None, ACTION: range(chunk)}, 1)
+        everything = windows.batch(torch.arange(len(windows)))
+        spread = stats[STATE]["std"]
+        self._scale = torch.where(spread > CONSTANT, spread, torch.inf)
+        self._known, self._chunks = everything[STATE] / self._scale, everything[ACTION]
+        self.begin(chunk)
 
-    return play
+    def begin(self, executed: int) -> None:
+        self._executed, self._left = executed, self._chunks[0, :0]
+
+    def act(self, state: Float[Tensor, "F"]) -> Float[Tensor, "A"]:
+        if not len(self._left):
+            k = int((self._known - state / self._scale).square().sum(-1).argmin())
+            self._left = self._chunks[k, : self._executed]
+        action, self._left = self._left[0], self._left[1:]
+        return action
 
 
 def config_of(name: str, episode: Episode, fps: float, chunk: int, executed: int) -> Any:
