@@ -55,8 +55,8 @@ PER_METRE = 100.0
 class Args:
     tasks: tuple[str, ...] = ("pick-place-v3", "push-v3")
     """Of MetaWorld, with one object that can be moved and named as there."""
-    policies: tuple[str, ...] = ("nearest", "act", "diffusion", "dmp", "motion_chunk")
-    """As of bench_policies.py; diffusion needs LeRobot's extra of that name."""
+    policies: tuple[str, ...] = ("nearest", "act", "dmp", "motion_chunk")
+    """As of bench_policies.py, and diffusion, which needs LeRobot's extra of that name."""
     demonstrations: int = 50
     """To learn from."""
     few: int = 3

@@ -1,5 +1,7 @@
 """The image Jacobian: learned offline from demonstrations, adapted online."""
 
+from hrc_learn.jacobian.camera_correction import CameraCorrection as CameraCorrection
+from hrc_learn.jacobian.camera_correction import ObjectPlane as ObjectPlane
 from hrc_learn.jacobian.camera_motion import CameraMotion as CameraMotion
 from hrc_learn.jacobian.camera_motion import CameraPlacement as CameraPlacement
 from hrc_learn.jacobian.camera_motion import CameraReference as CameraReference

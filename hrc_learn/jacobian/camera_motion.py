@@ -259,7 +259,7 @@ class CameraWatch:
         if self.displacement <= self.reference.threshold:
             return None
         points, pixels = (np.array([f[i] for f in frames]) for i in (1, 2))
-        return _motion(_refined(camera, points, pixels, twist), points, camera)
+        return motion_of(refined_twist(camera, points, pixels, twist), points, camera)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -306,7 +306,7 @@ def camera_placements(
     camera = _camera_of(chosen, image_size)
     for _ in range(_REFINEMENTS):
         views = [(camera.points(pose), pixel) for pose, pixel in map(_seen, chosen)]
-        twists = np.array([_refined(camera, *view, np.zeros(6)) for view in views])
+        twists = np.array([refined_twist(camera, *view, np.zeros(6)) for view in views])
         # The camera of all stays where the typical episode sees it from.
         twists -= np.median(twists, axis=0)
         unmoved = [
@@ -334,7 +334,7 @@ def camera_placements(
     return [
         CameraPlacement(
             episodes=tuple(index[i] for i in group),
-            motion=_motion(
+            motion=motion_of(
                 np.median(twists[group], axis=0) - first,
                 np.concatenate([camera.points(_seen(chosen[i])[0]) for i in group]),
                 camera,
@@ -385,15 +385,16 @@ def _explained(
     return _PLAUSIBLE * unit, _root_mean_square(scaled @ unit)
 
 
-def _refined(
+def refined_twist(
     camera: MarkerCamera,
     points: Float[np.ndarray, "frames 3"],
     pixels: Float[np.ndarray, "frames 2"],
     twist: Float[np.ndarray, "6"],
+    steps: int = _REFINEMENTS,
 ) -> Float[np.ndarray, "6"]:
     """The motion [rad, m] by Gauss-Newton, also where it is large."""
-    for _ in range(_REFINEMENTS):
-        seen = _from_moved(points, twist)
+    for _ in range(steps):
+        seen = from_moved(points, twist)
         errors = pixels - camera.project(seen)
         step, _ = _explained(errors, camera.motion_jacobian(seen))
         # In the frame of the camera as moved so far.
@@ -404,9 +405,9 @@ def _refined(
     return twist
 
 
-def _from_moved(
-    points: Float[np.ndarray, "frames 3"], twist: Float[np.ndarray, "6"]
-) -> Float[np.ndarray, "frames 3"]:
+def from_moved(
+    points: Float[np.ndarray, "*batch 3"], twist: Float[np.ndarray, "6"]
+) -> Float[np.ndarray, "*batch 3"]:
     """Points [m] in the frame of a camera that turned and moved (see `MarkerCamera.moved`)."""
     turn = quaternion.exp(torch.from_numpy(twist[:3]))
     return (points - twist[3:]) @ quaternion.to_matrix(turn).numpy()
@@ -417,11 +418,11 @@ def _as_unmoved(
 ) -> ImageDemonstration:
     """What the camera would have seen had it not moved."""
     points = camera.points(_double(demo.pose))
-    change = camera.project(_from_moved(points, twist)) - camera.project(points)
+    change = camera.project(from_moved(points, twist)) - camera.project(points)
     return replace(demo, feature=demo.feature.double() - torch.from_numpy(change))
 
 
-def _motion(
+def motion_of(
     twist: Float[np.ndarray, "6"], points: Float[np.ndarray, "frames 3"], camera: MarkerCamera
 ) -> CameraMotion:
     turn, shift = twist[:3].tolist(), twist[3:].tolist()

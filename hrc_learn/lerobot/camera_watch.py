@@ -1,15 +1,18 @@
 """Notices in a rollout of any policy that the camera was moved since the demonstrations.
 
 A step of the policy's preprocessor: it compares where the marker of the tool is seen with where
-the demonstrations say it must be (`CameraWatch`), and warns. Actions are left as they are.
+the demonstrations say it must be (`CameraWatch`), and warns. Where that is wanted, it corrects
+the pixels that the policy sees to what they were if the camera still stood there
+(`CameraCorrection`). Actions are left as they are.
 """
 
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from jaxtyping import Float
@@ -23,16 +26,26 @@ from hrc_learn.controller.interface import IMAGE_SIZE
 from hrc_learn.demos import load_demos
 from hrc_learn.demos.format.dataset_folder import read_info
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.jacobian import CameraMotion, CameraReference, CameraWatch
+from hrc_learn.jacobian import (
+    CameraCorrection,
+    CameraMotion,
+    CameraReference,
+    CameraWatch,
+    ImageDemonstration,
+    ObjectPlane,
+)
 from hrc_learn.learning.visual_servo_fitting import feature_trajectories
+from hrc_learn.lerobot.panda_robot import MARKER, PIXELS
+from hrc_learn.lerobot.policy.closed_form import read_episodes
 from hrc_learn.lerobot.smoothing import PREPROCESSOR, read_pipeline
 from hrc_learn.lerobot.smoothing.limits import write_json
 
 CAMERA_WATCH = "hrc_learn_camera_watch"
 POSE_NAMES = ("ee.x", "ee.y", "ee.z", "ee.wx", "ee.wy", "ee.wz")
-"""Of the values of a state that hold the tool's pose: position [m], rotation vector [rad]."""
+"""Of the values of a state that hold the tool's pose: position [m], rotation vector [rad]; a
+robot's end in `.pos`."""
 FEATURE = "observation.image_feature"
-"""Pixel u, v of the tool's marker, and whether it is seen."""
+"""Pixel u, v of the tool's marker, and whether it is seen, where the state has no `MARKER`."""
 
 
 @ProcessorStepRegistry.register(CAMERA_WATCH)
@@ -51,51 +64,88 @@ class CameraWatchStep(ProcessorStep):
     """Of the state, the values called `POSE_NAMES`, in that order."""
     feature: str = FEATURE
     """Observation with the pixel and whether it is seen."""
+    marker_columns: list[int] | None = None
+    """Of the state, the values called `MARKER`, in that order; None: `feature` has them."""
+    correct: bool = False
+    """Whether the policy sees what it would if the camera had not been moved."""
+    object_columns: list[int] | None = None
+    """Of the state, the values called `PIXELS`, to be corrected too; None: there are none."""
+    object_height: float = 0.0
+    """Of the plane on which the object lies, as of `ObjectPlane` [m]."""
     motion: CameraMotion | None = field(default=None, init=False, repr=False)
-    """As seen last in this episode; None while the camera stands still."""
+    """As seen last, in this episode unless it is corrected; None: the camera stands still."""
 
     def __post_init__(self) -> None:
         if not self.fps > 0:
             raise ValueError(f"fps must be positive, got {self.fps}.")
-        if len(self.pose_columns) != len(POSE_NAMES):
-            raise ValueError(
-                f"pose_columns must be those of {', '.join(POSE_NAMES)}, got "
-                f"{len(self.pose_columns)} of them."
-            )
-        self._watch = CameraWatch(CameraReference.from_content(self.reference))
+        for name, wanted in (
+            ("pose_columns", POSE_NAMES),
+            ("marker_columns", MARKER),
+            ("object_columns", PIXELS),
+        ):
+            columns = getattr(self, name)
+            if columns is not None and len(columns) != len(wanted):
+                raise ValueError(
+                    f"{name} must be those of {', '.join(wanted)}, got {len(columns)} of them."
+                )
+        reference = CameraReference.from_content(self.reference)
+        self._watch = CameraCorrection(reference) if self.correct else CameraWatch(reference)
+        self._plane = ObjectPlane(height=self.object_height)
         self._calls = 0
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
         observation = transition.get(TransitionKey.OBSERVATION) or {}
         state, feature = observation.get(OBS_STATE), observation.get(self.feature)
         self._calls += 1
-        if state is None or feature is None:
+        if state is None or (self.marker_columns is None and feature is None):
             return transition
         if state.ndim > 1 and len(state) > 1:
             raise ValueError(
                 f"a camera is watched in one environment at a time, but this batch has "
                 f"{len(state)}: set eval.batch_size to 1."
             )
-        self._look(state.reshape(-1).double().cpu(), feature.reshape(-1).double().cpu())
-        return transition
+        values = state.reshape(-1).double().cpu()
+        marker = values[self.marker_columns] if feature is None else feature.reshape(-1)
+        marker = marker.double().cpu()
+        pose = self._look(values, marker)
+        if not (isinstance(self._watch, CameraCorrection) and self._watch.motion):
+            return transition
+        values = values.clone()
+        if self.object_columns is not None:
+            pixel = self._watch.object(self._plane, values[self.object_columns].numpy())
+            values[self.object_columns] = torch.from_numpy(pixel)
+        if pose is not None:
+            marker[:2] = torch.from_numpy(self._watch.marker(pose, marker[:2].numpy()))
+        corrected = dict(observation)
+        if feature is None:
+            values[self.marker_columns] = marker
+        else:
+            corrected[self.feature] = marker.to(feature).reshape(feature.shape)
+        corrected[OBS_STATE] = values.to(state).reshape(state.shape)
+        return cast(EnvTransition, {**transition, TransitionKey.OBSERVATION: corrected})
 
-    def _look(self, state: Float[Tensor, " values"], feature: Float[Tensor, "3"]) -> None:
-        u, v, visible = feature.tolist()
+    def _look(self, state: Float[Tensor, " values"], marker: Float[Tensor, "3"]) -> Pose | None:
+        """Where the tool is, if its marker is seen."""
+        u, v, visible = marker.tolist()
         vector = state[self.pose_columns]
-        if visible < 0.5 or not (feature.isfinite().all() and vector.isfinite().all()):
-            return
+        if visible < 0.5 or not (marker.isfinite().all() and vector.isfinite().all()):
+            return None
         pose = Pose(vector[:3], quaternion.exp(vector[3:]))
         seen = self._watch.update(self._calls / self.fps, pose, torch.tensor([u, v]).numpy())
         if seen is not None:
-            if self.motion is None:
+            if self.correct:
+                logging.warning("%s since the demonstrations: what it sees is corrected.", seen)
+            elif self.motion is None:
                 logging.warning(
                     "%s since the demonstrations: move it back, or record and fit again.", seen
                 )
             self.motion = seen
+        return pose
 
     def reset(self) -> None:
         self._watch.clear()
-        self.motion = None
+        if not self.correct:
+            self.motion = None
 
     def get_config(self) -> dict[str, Any]:
         return {
@@ -103,6 +153,10 @@ class CameraWatchStep(ProcessorStep):
             "fps": self.fps,
             "pose_columns": self.pose_columns,
             "feature": self.feature,
+            "marker_columns": self.marker_columns,
+            "correct": self.correct,
+            "object_columns": self.object_columns,
+            "object_height": self.object_height,
         }
 
     def transform_features(
@@ -112,7 +166,11 @@ class CameraWatchStep(ProcessorStep):
 
 
 def add_camera_watch(
-    checkpoint: Path, dataset: Path, image_size: tuple[int, int] = IMAGE_SIZE
+    checkpoint: Path,
+    dataset: Path,
+    image_size: tuple[int, int] = IMAGE_SIZE,
+    *,
+    correct: bool = False,
 ) -> CameraReference:
     """Let a trained policy's camera be watched wherever its checkpoint is used.
 
@@ -122,31 +180,67 @@ def add_camera_watch(
         checkpoint: Folder `pretrained_model` of a checkpoint of any policy.
         dataset: It was trained on, with the tool's pose and its marker's pixel in every frame.
         image_size: Width and height of the camera's images [px].
+        correct: Whether pixels of the marker, and of an object that was seen before the tool
+            came and is taken where the tool is lowest, are corrected as well.
 
     Returns:
         Where the camera stood.
 
     Raises:
         FileNotFoundError: The folder holds no preprocessor.
-        ValueError: The dataset lacks a column; names it.
+        ValueError: The dataset lacks a column; names it. Or the object was not taken from
+            where it was seen.
     """
     path = checkpoint / PREPROCESSOR
     content = read_pipeline(path, without=(CAMERA_WATCH,))
-    names = list(read_info(dataset)["features"][OBS_STATE]["names"])
+    info = read_info(dataset)
+    names = [name.removesuffix(".pos") for name in info["features"][OBS_STATE]["names"]]
     if missing := [name for name in POSE_NAMES if name not in names]:
         raise ValueError(
             f"{dataset}: {OBS_STATE} has no {', '.join(missing)}: the tool's pose is needed to "
             "know where its marker must be seen."
         )
-    demos = load_demos(dataset)
-    watched = list(feature_trajectories(demos))
-    fps = float(read_info(dataset)["fps"])
+    pose_columns, marker_columns, object_columns = (
+        _columns(names, wanted) for wanted in (POSE_NAMES, MARKER, PIXELS)
+    )
+    assert pose_columns is not None
+    states = [episode[OBS_STATE].double() for episode in read_episodes(dataset, [OBS_STATE])]
+    if marker_columns is None:
+        watched = list(feature_trajectories(load_demos(dataset)))
+    else:
+        watched = [_watched(x[:, pose_columns], x[:, marker_columns]) for x in states]
+    fps = float(info["fps"])
     reference = CameraReference.fit(watched, fps, image_size)
+    height = 0.0
+    if correct and object_columns is not None:
+        lowest = [x[x[:, pose_columns[2]].argmin(), pose_columns[:3]] for x in states]
+        seen = torch.stack([x[0, object_columns] for x in states])
+        height = ObjectPlane.fit(reference, torch.stack(lowest).numpy(), seen.numpy()).height
     step = CameraWatchStep(
         reference=reference.content(),
         fps=fps,
-        pose_columns=[names.index(name) for name in POSE_NAMES],
+        pose_columns=pose_columns,
+        marker_columns=marker_columns,
+        correct=correct,
+        object_columns=object_columns if correct else None,
+        object_height=height,
     )
     content["steps"].insert(0, {"registry_name": CAMERA_WATCH, "config": step.get_config()})
     write_json(path, content)
     return reference
+
+
+def _columns(names: Sequence[str], wanted: Sequence[str]) -> list[int] | None:
+    """Where they are; None if one is not there."""
+    wanted = [name.removesuffix(".pos") for name in wanted]
+    return [names.index(name) for name in wanted] if {*wanted} <= {*names} else None
+
+
+def _watched(
+    pose: Float[Tensor, "frames 6"], marker: Float[Tensor, "frames 3"]
+) -> ImageDemonstration:
+    return ImageDemonstration(
+        pose=Pose(pose[:, :3], quaternion.exp(pose[:, 3:])),
+        feature=marker[:, :2],
+        visible=marker[:, 2] > 0.5,
+    )

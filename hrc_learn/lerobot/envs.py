@@ -16,7 +16,7 @@ from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
 from hrc_learn.lerobot.panda_robot import ActionSpace, action_names
 from hrc_learn.lerobot.robots import MujocoPanda, MujocoPandaConfig
-from hrc_learn.lerobot.robots.mujoco_panda import CAMERA, ImagesConfig
+from hrc_learn.lerobot.robots.mujoco_panda import CAMERA, ImagesConfig, MovedCameraConfig
 from hrc_learn.teleoperation.scenarios import ScenarioView, make_scenario
 
 _MORE_TIME = 1.25
@@ -45,6 +45,10 @@ class PandaEnvConfig(EnvConfig):
     hand: bool = False
     """As of the robot."""
     pixels: bool = False
+    """As of the robot."""
+    marker: bool = False
+    """As of the robot."""
+    moved_camera: MovedCameraConfig = field(default_factory=MovedCameraConfig)
     """As of the robot."""
     images: ImagesConfig = field(default_factory=ImagesConfig)
     """As of the robot."""
@@ -76,6 +80,8 @@ class PandaEnvConfig(EnvConfig):
             velocity=self.velocity,
             hand=self.hand,
             pixels=self.pixels,
+            marker=self.marker,
+            moved_camera=self.moved_camera,
             images=self.images,
         )
 

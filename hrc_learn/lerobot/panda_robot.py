@@ -36,6 +36,7 @@ VELOCITIES = tuple(f"{name}.vel" for name in panda.joint_names)
 HAND = tuple(f"ee.{axis}.pos" for axis in ("x", "y", "z", "wx", "wy", "wz"))
 GRIPPER = "gripper.pos"
 PIXELS = ("object.u.pos", "object.v.pos")
+MARKER = ("marker.u.pos", "marker.v.pos", "marker.seen.pos")
 
 ActionSpace = Literal["joint", "ee"]
 """Positions of the joints, or of the end effector; the gripper's opening in either case."""
@@ -112,7 +113,7 @@ def observed(
 
     Args:
         state: Of the arm.
-        names: Wanted, of those of this module but `PIXELS`.
+        names: Wanted, of those of this module but `PIXELS` and `MARKER`.
         near: Rotation vector of the end effector before [rad].
     """
     values = dict(zip(JOINTS, state.joint_position.tolist(), strict=True))

@@ -16,7 +16,8 @@ from jaxtyping import Float, UInt8
 from hrc_learn.controller import SafetyConfig
 from hrc_learn.kinematics import gripper_down
 from hrc_learn.protocols import ArmState, Feedback, Human, HumanInput
-from hrc_learn.sim import CameraKind, Imperfections, World, open_camera
+from hrc_learn.sim import CameraChange, CameraKind, Imperfections, World, open_camera
+from hrc_learn.sim.cameras import hidden_markers
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.arm_motion import (
     PositionServo,
@@ -190,6 +191,7 @@ class ScenarioRun:
         dt: Time that passes with each command [s].
         expert: Who can show it from where it began.
         servo: Leads the arm by positions.
+        camera: The fixed camera where it is now.
         seed: Of the present initial configuration.
         commands: Given since then.
     """
@@ -216,7 +218,8 @@ class ScenarioRun:
         self.scenario, self.dt = scenario, 1.0 / fps
         self._sizes = imperfections or Imperfections.ideal()
         self._build(np.random.default_rng(0))
-        self._noise = np.random.default_rng(0)
+        self.camera = scenario.workplace.scene.camera
+        self._noise, self._tool_noise = np.random.default_rng(0), np.random.default_rng(0)
         self.begin(seed)
 
     def begin(self, seed: int) -> None:
@@ -227,6 +230,7 @@ class ScenarioRun:
         self.expert = self.scenario.begin(self.world, np.random.default_rng(seed))
         self.servo.restart()
         self._pixel: np.ndarray | None = None
+        _reseed(self._tool_noise, [seed, 3])
 
     def _build(self, rng: np.random.Generator) -> None:
         """The world with imperfections as they are drawn, and who leads the arm in it."""
@@ -268,8 +272,7 @@ class ScenarioRun:
         marker = self.scenario.workplace.scene.objects[0].marker.id
         if self._pixel is None:
             sensor = self._sensor  # whose background takes random numbers when it is first made
-            noise = np.random.default_rng([self.seed, 1])
-            self._noise.bit_generator.state = noise.bit_generator.state
+            _reseed(self._noise, [self.seed, 1])
             self._pixel = sensor.detect().get(marker)
         if self._pixel is None:
             raise ValueError(
@@ -287,12 +290,61 @@ class ScenarioRun:
         def poses() -> dict[int, np.ndarray]:
             return {marker.id: self.world.marker_poses()[marker.id]}
 
-        camera = SyntheticCamera(scene.camera, [marker], poses, rng=self._noise)
+        camera = SyntheticCamera(self.camera, [marker], poses, rng=self._noise)
         return MarkerSensor(camera, scene.marker_ids)
+
+    def tool_pixel(self) -> Float[np.ndarray, "2"] | None:
+        """Where the fixed camera sees the marker on the tool now (u, v) [px]; None: nowhere."""
+        return self._tool_sensor.detect().get(self.scenario.workplace.tool_marker)
+
+    @cached_property
+    def _tool_sensor(self) -> MarkerSensor:
+        plate = self.scenario.workplace.scene.arm.marker
+        if plate is None:
+            raise ValueError("the arm of this scene carries no marker: leave out its pixel.")
+        marker = plate.marker
+        camera = SyntheticCamera(
+            self.camera,
+            [marker],
+            lambda: {marker.id: self.world.marker_poses()[marker.id]},
+            rng=self._tool_noise,
+            hidden=lambda: hidden_markers(self.world, self.camera, [marker]),
+        )
+        return MarkerSensor(camera, [marker.id])
+
+    def move_camera(self, change: CameraChange, rng: np.random.Generator) -> None:
+        """Let the fixed camera stand elsewhere from now on, where it still sees the table.
+
+        Args:
+            change: By how much, from where the scene has it.
+            rng: Source of the direction.
+
+        Raises:
+            ValueError: From nowhere so far away it sees the table.
+        """
+        self.camera = change.applied(self.scenario.workplace.scene.camera, self._watched(), rng)
+        for name in ("_sensor", "_tool_sensor"):
+            self.__dict__.pop(name, None)
+        self._pixel = None
+
+    def _watched(self) -> Float[np.ndarray, "points 3"]:
+        """Where objects lie on the table, and the tool's marker at and above them [m]."""
+        place = self.scenario.workplace
+        middle, half = (x.numpy() for x in place.object_region())
+        corners = np.array([[a, b, 0.0] for a in (-1, 1) for b in (-1, 1)]) * half
+        tool = self.world.hand_marker_offset() * (1.0, -1.0, -1.0)  # it points down
+        heights = (place.hover_height, 2 * middle[2])
+        above = [np.array([*middle[:2], h]) + tool for h in heights]
+        return np.concatenate([centre + corners for centre in (middle, *above)])
 
     def succeeded(self) -> bool:
         """Whether the job is done, by MuJoCo's contacts."""
         return self.scenario.succeeded(self.world)
+
+
+def _reseed(rng: np.random.Generator, seed: list[int]) -> None:
+    """In place: cameras hold on to their source of noise."""
+    rng.bit_generator.state = np.random.default_rng(seed).bit_generator.state
 
 
 class ScenarioView:

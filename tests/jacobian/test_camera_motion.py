@@ -9,13 +9,16 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from unchecked import shapes_unchecked
 
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import (
+    CameraCorrection,
     CameraReference,
     CameraWatch,
     ImageDemonstration,
     MarkerCamera,
+    ObjectPlane,
     RBFCenters,
     RBFImageJacobian,
     camera_placements,
@@ -231,3 +234,94 @@ def test_placements_tell_episodes_of_a_moved_camera_apart():
 def test_a_camera_that_stood_still_has_one_placement(demonstrations):
     (only,) = camera_placements(demonstrations, IMAGE)
     assert only.episodes == tuple(range(len(demonstrations)))
+
+
+def shown_at(points, place=(ROTATION, SHIFT)):
+    """Where OpenCV sees points of the base frame."""
+    return cv2.projectPoints(np.asarray(points), *place, INTRINSICS, LENS)[0][:, 0]
+
+
+def objects(rng, count=12):
+    """On a table, and the places that the tool takes them from: 3 cm above, 1 cm beside."""
+    there = np.array([0.45, 0.0, 0.02]) + rng.uniform(-0.1, 0.1, (count, 3)) * [1, 1, 0]
+    return there, there + np.array([0.01, 0.0, 0.03]) + rng.normal(0, 5e-4, (count, 3))
+
+
+@pytest.fixture(scope="module")
+def plane(reference):
+    rng = np.random.default_rng(11)
+    there, taken = objects(rng)
+    return ObjectPlane.fit(reference, taken, shown_at(there) + rng.normal(0, 0.1, (12, 2)))
+
+
+def corrected(correction, demo):
+    """What becomes of the marker's pixels, and how often a motion is noticed."""
+    pixels, noticed = [], 0
+    with shapes_unchecked():
+        for frame in demo.visible.nonzero()[:, 0].tolist():
+            pose, pixel = demo.pose[frame], demo.feature[frame].numpy()
+            noticed += correction.update(frame / FPS, pose, pixel) is not None
+            pixels.append(correction.marker(pose, pixel))
+    return np.array(pixels), noticed
+
+
+KNOCKS = [
+    moved(np.deg2rad(angle) * np.array(axis), shift)
+    for angle, axis, shift in (
+        (10.0, (1.0, 0.0, 0.0), np.array([0.0, 0.1, 0.0])),
+        (10.0, (0.0, 0.6, 0.8), np.array([0.06, 0.0, -0.08])),
+        (2.0, (0.0, 1.0, 0.0), np.array([0.0, 0.0, 0.0])),
+    )
+]
+
+
+@pytest.mark.parametrize("place", KNOCKS[:2])
+def test_a_moved_camera_shows_things_where_it_would_have_seen_them(reference, plane, place):
+    rng = np.random.default_rng(12)
+    correction = CameraCorrection(reference)
+    correction.clear()
+    pixels, noticed = corrected(correction, demonstration(rng, place))
+    assert noticed == 1
+    correction.clear()  # another episode, with the camera where it is now
+    demo = demonstration(rng, place)
+    pixels, noticed = corrected(correction, demo)
+    assert noticed == 0
+    seen = demo.visible.numpy()
+    points = demo.pose.apply(torch.from_numpy(MARKER)).numpy()[seen]
+    assert np.abs(pixels - shown_at(points)).max() < 2.0
+    there, _ = objects(rng)
+    found = [correction.object(plane, pixel) for pixel in shown_at(there, place)]
+    np.testing.assert_allclose(found, shown_at(there), rtol=0, atol=3.0)
+    assert np.abs(shown_at(there, place) - shown_at(there)).max() > 50.0
+
+
+def test_a_camera_that_stands_still_is_not_corrected(reference, plane):
+    correction = CameraCorrection(reference)
+    demo = demonstration(np.random.default_rng(13))
+    pixels, noticed = corrected(correction, demo)
+    assert noticed == 0
+    assert correction.motion is None
+    np.testing.assert_array_equal(pixels, demo.feature.numpy()[demo.visible.numpy()])
+    pixel = np.array([700.0, 500.0])
+    np.testing.assert_array_equal(correction.object(plane, pixel), pixel)
+
+
+def test_a_camera_may_be_moved_again_and_put_back(reference, plane):
+    rng = np.random.default_rng(14)
+    correction = CameraCorrection(reference)
+    there, _ = objects(rng)
+    for place in (KNOCKS[0], KNOCKS[2], (ROTATION, SHIFT)):
+        correction.clear()
+        _, noticed = corrected(correction, demonstration(rng, place))
+        assert noticed >= 1
+        found = [correction.object(plane, pixel) for pixel in shown_at(there, place)]
+        assert np.abs(np.array(found) - shown_at(there)).max() < 3.0
+
+
+def test_an_objects_plane_says_what_it_takes(reference):
+    there, taken = objects(np.random.default_rng(15))
+    pixels = shown_at(there)
+    with pytest.raises(ValueError, match="four"):
+        ObjectPlane.fit(reference, taken[:3], pixels[:3])
+    with pytest.raises(ValueError, match="apart"):
+        ObjectPlane.fit(reference, taken, pixels[::-1])

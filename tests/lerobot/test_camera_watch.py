@@ -64,20 +64,24 @@ def dataset(tmp_path_factory):
     return root
 
 
-@pytest.fixture
-def step(dataset, tmp_path):
-    """As LeRobot makes it of the checkpoint's file."""
-    content = {
-        "name": "policy",
-        "steps": [{"registry_name": "to_batch_processor", "config": {}}],
-    }
-    (tmp_path / PREPROCESSOR).write_text(json.dumps(content))
-    add_camera_watch(tmp_path, dataset)
-    add_camera_watch(tmp_path, dataset)  # replaces its own
-    first, *others = json.loads((tmp_path / PREPROCESSOR).read_text())["steps"]
+@pytest.fixture(scope="module")
+def config(dataset, tmp_path_factory):
+    """As the checkpoint's file has it."""
+    folder = tmp_path_factory.mktemp("checkpoint")
+    watch = {"registry_name": CAMERA_WATCH, "config": {}}  # of an earlier call, to be replaced
+    steps = [watch, {"registry_name": "to_batch_processor", "config": {}}]
+    (folder / PREPROCESSOR).write_text(json.dumps({"name": "policy", "steps": steps}))
+    add_camera_watch(folder, dataset)
+    first, *others = json.loads((folder / PREPROCESSOR).read_text())["steps"]
     assert [other["registry_name"] for other in others] == ["to_batch_processor"]
     assert first["registry_name"] == CAMERA_WATCH
-    return ProcessorStepRegistry.get(CAMERA_WATCH)(**first["config"])
+    return first["config"]
+
+
+@pytest.fixture
+def step(config):
+    """As LeRobot makes it of the checkpoint's file."""
+    return ProcessorStepRegistry.get(CAMERA_WATCH)(**config)
 
 
 def rollout(step, dataset, pose, pixels):
@@ -116,6 +120,54 @@ def test_a_moved_camera_is_warned_about_once_an_episode(step, dataset, caplog):
     assert len(caplog.records) == 2
 
 
+OBJECT = np.array([0.5, 0.03, 0.02])
+
+
+def looking(step, pose, pixels, camera):
+    """What a policy sees of the marker and of an object, both in its state, at the end."""
+    seen = camera.project(camera.from_base(OBJECT))
+    for k, pixel in enumerate(pixels):
+        state = torch.tensor([*pose[k].vector(), *pixel, 1.0, *seen]).float()[None]
+        before = state.clone()
+        transition = step({TransitionKey.OBSERVATION: {"observation.state": state}})
+        assert torch.equal(state, before)
+    return transition[TransitionKey.OBSERVATION]["observation.state"][0].numpy()
+
+
+@pytest.fixture
+def correcting(step):
+    columns = {"pose_columns": [*range(6)], "marker_columns": [6, 7, 8]}
+    more = {"correct": True, "object_columns": [9, 10], "object_height": OBJECT[2]}
+    return CameraWatchStep(**step.get_config() | columns | more)
+
+
+def test_a_policy_sees_what_it_would_if_the_camera_had_not_been_moved(correcting, caplog):
+    rng = np.random.default_rng(4)
+    moved = CAMERA.moved(np.array([0.1, 0.02, 0.05, 0.05, -0.03, 0.02]))
+    unmoved = CAMERA.project(CAMERA.from_base(OBJECT))
+    for _ in range(2):
+        pose, pixels = episode(rng, moved)
+        state = looking(correcting, pose, pixels, moved)
+        np.testing.assert_allclose(state[9:], unmoved, atol=4.0)
+        there = CAMERA.project(CAMERA.points(pose[-1:]))[0]
+        np.testing.assert_allclose(state[6:8], there, atol=2.0)
+        assert np.abs(pixels[-1] - there).max() > 50.0
+        correcting.reset()
+        # Known from the first frame on, before the arm has moved.
+        state = looking(correcting, pose[:1], pixels[:1], moved)
+        np.testing.assert_allclose(state[9:], unmoved, atol=4.0)
+    assert len([r for r in caplog.records if "corrected" in r.getMessage()]) == 1
+    again = CameraWatchStep(**correcting.get_config())
+    assert again.get_config() == correcting.get_config()
+
+
+def test_a_policy_sees_what_there_is_while_the_camera_stands_still(correcting):
+    pose, pixels = episode(np.random.default_rng(5))
+    state = looking(correcting, pose, pixels, CAMERA)
+    np.testing.assert_allclose(state[6:8], pixels[-1], rtol=1e-6)
+    np.testing.assert_allclose(state[9:], CAMERA.project(CAMERA.from_base(OBJECT)), rtol=1e-6)
+
+
 def test_an_unseen_marker_and_missing_observations_are_passed_over(step, dataset):
     pose, pixels = episode(np.random.default_rng(3))
     rollout(step, dataset, pose, np.full_like(pixels, np.nan))
@@ -131,7 +183,12 @@ def test_several_environments_at_once_are_refused(step):
 
 
 def test_settings_that_make_no_sense_are_refused(step):
-    for change, word in (({"fps": 0.0}, "fps"), ({"pose_columns": [1]}, "ee.x")):
+    for change, word in (
+        ({"fps": 0.0}, "fps"),
+        ({"pose_columns": [1]}, "ee.x"),
+        ({"marker_columns": [1]}, "marker.u"),
+        ({"object_columns": [1]}, "object.u"),
+    ):
         with pytest.raises(ValueError, match=word):
             CameraWatchStep(**step.get_config() | change)
 

@@ -2,14 +2,16 @@
 
 import time
 
+import numpy as np
 import pytest
 from lerobot.robots import make_robot_from_config
 from lerobot.teleoperators import make_teleoperator_from_config
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 
 from hrc_learn.lerobot.loop_watch import LoopWatch
-from hrc_learn.lerobot.panda_robot import GRIPPER, HAND, JOINTS, PIXELS
+from hrc_learn.lerobot.panda_robot import GRIPPER, HAND, JOINTS, MARKER, PIXELS
 from hrc_learn.lerobot.robots import MujocoPanda, MujocoPandaConfig
+from hrc_learn.lerobot.robots.mujoco_panda import MovedCameraConfig
 from hrc_learn.lerobot.teleoperators import PandaExpertConfig
 
 FPS = 20.0
@@ -153,3 +155,25 @@ def test_what_is_not_connected_says_so(tmp_path):
 def test_settings_that_make_no_sense_are_refused(settings, message):
     with pytest.raises(ValueError, match=message):
         MujocoPandaConfig(**settings)
+
+
+@pytest.mark.parametrize(("distance", "angle"), [(0.0, 0.0), (0.1, 10.0)])
+def test_markers_are_seen_by_the_camera_where_it_stands(simulated, distance, angle):
+    moved = MovedCameraConfig(distance, angle, seed=3)
+    robot = simulated(
+        scenario="grasping", fps=20.0, pixels=True, marker=True, moved_camera=moved
+    )
+    values, run = robot.get_observation(), robot.run
+    assert values.keys() == robot.observation_features.keys()
+    place, poses = run.scenario.workplace, run.world.marker_poses()
+    at_first = place.scene.camera.pose
+    for names, marker in (
+        (MARKER, place.tool_marker),
+        (PIXELS, place.scene.objects[0].marker.id),
+    ):
+        pixel = run.camera.project(poses[marker][:3, 3])
+        np.testing.assert_allclose([values[name] for name in names[:2]], pixel, atol=1.0)
+    assert values[MARKER[2]] == 1.0
+    assert np.linalg.norm(run.camera.pose[:3, 3] - at_first[:3, 3]) == pytest.approx(distance)
+    turn = run.camera.pose[:3, :3] @ at_first[:3, :3].T
+    assert np.degrees(np.arccos((np.trace(turn) - 1) / 2)) == pytest.approx(angle, abs=1e-4)

@@ -85,5 +85,8 @@ class RecordExpert(Measured):
     """What actions give: positions of the joints, or of the end effector."""
     pixels: More[bool] = True
     """Whether the pixel of the object to grasp is observed."""
+    marker: More[bool] = False
+    """Whether pose and marker of the tool are observed too, by which a moved camera is
+    noticed."""
     seed: int = 0
     """Of the first initial configuration; each one after has the next."""

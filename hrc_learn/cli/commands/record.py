@@ -143,6 +143,8 @@ def record_expert(args: RecordExpert) -> int:
         fps=float(args.fps),
         action_space=args.action_space,
         pixels=args.pixels and args.scenario == "grasping",
+        marker=args.marker,
+        hand=args.marker,
         seed=args.seed,
     )
     failed = 0

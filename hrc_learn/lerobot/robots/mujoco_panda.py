@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
@@ -13,7 +14,7 @@ from lerobot.robots import RobotConfig
 from torch import Tensor
 
 from hrc_learn.geometry import Pose
-from hrc_learn.lerobot.panda_robot import DOWN, PIXELS, PandaRobot, PandaRobotConfig
+from hrc_learn.lerobot.panda_robot import DOWN, MARKER, PIXELS, PandaRobot, PandaRobotConfig
 from hrc_learn.lerobot.person import PersonConfig
 from hrc_learn.protocols import Arm
 from hrc_learn.teleoperation.scenarios import check_scenario, make_scenario
@@ -39,6 +40,18 @@ class ImagesConfig:
     """[px]"""
 
 
+@dataclass
+class MovedCameraConfig:
+    """The fixed camera stands elsewhere than in demonstrations, and still sees the table."""
+
+    distance: float = 0.0
+    """By how much it is moved [m]."""
+    angle: float = 0.0
+    """By how much it is turned [degrees]."""
+    seed: int = 0
+    """Of the directions of both."""
+
+
 @RobotConfig.register_subclass("mujoco_panda")
 @dataclass(kw_only=True)
 class MujocoPandaConfig(PandaRobotConfig):
@@ -56,6 +69,11 @@ class MujocoPandaConfig(PandaRobotConfig):
     pixels: bool = False
     """Whether the pixel of the object is observed, as the fixed camera saw it at the beginning:
     what a policy needs to grasp without images."""
+    marker: bool = False
+    """Whether the pixel of the marker on the tool is observed, as the fixed camera sees it now,
+    and whether it does: by this a camera that was moved is noticed."""
+    moved_camera: MovedCameraConfig = field(default_factory=MovedCameraConfig)
+    """Where the fixed camera stands, from where demonstrations had it."""
     images: ImagesConfig = field(default_factory=ImagesConfig)
     """Images to be observed."""
     imperfections: float = 0.0
@@ -96,6 +114,7 @@ class MujocoPanda(PandaRobot):
         super().__init__(config)
         self.config = config
         self._began = self._looked = 0.0
+        self._marker = (0.0, 0.0, 0.0)
 
     @property
     def observation_features(self) -> dict[str, Any]:
@@ -103,6 +122,8 @@ class MujocoPanda(PandaRobot):
         features = super().observation_features
         if self.config.pixels:
             features |= dict.fromkeys(PIXELS, float)
+        if self.config.marker:
+            features |= dict.fromkeys(MARKER, float)
         if images.kind != "none":
             features[CAMERA] = (images.height, images.width, 3)
         return features
@@ -135,13 +156,17 @@ class MujocoPanda(PandaRobot):
         self._person.begin(self.run.seed)
 
     def _open(self) -> None:
-        from hrc_learn.sim import Imperfections
+        from hrc_learn.sim import CameraChange, Imperfections
         from hrc_learn.teleoperation.scenarios import ScenarioRun, ScenarioView
 
         config, images = self.config, self.config.images
         scenario = make_scenario(config.scenario, config.shelf)
         sizes = Imperfections.nominal().scaled(config.imperfections)
         self.run = ScenarioRun(scenario, config.fps, seed=config.seed, imperfections=sizes)
+        moved = config.moved_camera
+        if moved.distance or moved.angle:
+            change = CameraChange(distance=moved.distance, angle=math.radians(moved.angle))
+            self.run.move_camera(change, np.random.default_rng(moved.seed))
         if images.kind != "none":
             self.cameras = {
                 CAMERA: ScenarioView(self.run, images.width, images.height, images.kind)
@@ -156,9 +181,18 @@ class MujocoPanda(PandaRobot):
         values = super().get_observation()
         if self.config.pixels:
             values |= zip(PIXELS, map(float, self.run.object_pixel()), strict=True)
+        if self.config.marker:
+            values |= zip(MARKER, self._look_at_marker(), strict=True)
         for name, camera in self.cameras.items():
             values[name] = camera.read()
         return values
+
+    def _look_at_marker(self) -> tuple[float, float, float]:
+        """Its pixel, or the last one, and whether it is seen."""
+        pixel = self.run.tool_pixel()
+        u, v = self._marker[:2] if pixel is None else pixel.tolist()
+        self._marker = (u, v, float(pixel is not None))
+        return self._marker
 
     def _begin_anew_in_time(self) -> None:
         """With the recorder's next episode.
