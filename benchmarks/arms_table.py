@@ -36,6 +36,7 @@ from hrc_learn.kinematics import (
 )
 from hrc_learn.kinematics._capsule_fit import shape_points
 from hrc_learn.kinematics.registry import maker_of
+from hrc_learn.sim.workplace import Workplace
 
 # pyright: reportAttributeAccessIssue=false
 # MuJoCo ships no type stubs; its names come from a compiled module.
@@ -61,7 +62,9 @@ class Args:
     trials: int = 0
     """Of servoing; 0: what its row says is kept."""
     demos: Path | None = None
-    """Folder with NAME.json of `hrc demo`."""
+    """Folder with NAME.json of `hrc demo`; whether arms without one are refused is tried."""
+    measure: bool = True
+    """Else rows keep all that is not of demos."""
     files: tuple[Path, ...] = ()
     """Into which the table is written."""
     json: Path | None = None
@@ -79,6 +82,10 @@ def main(args: Args) -> None:
         try:
             described = arm(name)
         except MissingModelError:
+            continue
+        if not args.measure:
+            cells = [*_cells_before(name, args)[:-1], _demo(name, args)]
+            rows.append(f"| {' | '.join(cells)} |")
             continue
         measured = _measured(described, args)
         figures |= {f"{name}_{key}": value for key, value in measured.items()}
@@ -265,7 +272,8 @@ def _demo(name: str, args: Args) -> str:
     path = None if args.demos is None else args.demos / f"{name}.json"
     if path is None or not path.is_file():
         before = _row_before(name, args)
-        return before[0].split("|")[-2].strip() if before else "not tried"
+        said = before[0].split("|")[-2].strip() if before else "not tried"
+        return _refusal(name) or said if path is not None else said
     values = json.loads(path.read_text(encoding="utf-8"))
     if values["success_rate"] < 1:
         return "not done"
@@ -273,6 +281,18 @@ def _demo(name: str, args: Args) -> str:
         f"grasped, {values['grasp_offset_mm']:.1f} mm off; "
         f"placed, {values['place_error_mm']:.1f} mm off; {values['contacts']:.0f} contacts"
     )
+
+
+def _refusal(name: str) -> str:
+    """Why the demo does not begin with an arm; empty where it does."""
+    choice = ArmChoice(name)
+    if len(arm(name).joint_names) < 6:
+        return "refused: it takes six joints"
+    try:
+        Workplace.of(choice.work_arm())
+    except UnreachableError:
+        return "refused: too small for the cell"
+    return ""
 
 
 if __name__ == "__main__":
