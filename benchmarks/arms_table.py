@@ -118,6 +118,7 @@ def _measured(described: Arm, args: Args) -> dict[str, float]:
         share = torch.rand(count, n, generator=rng, dtype=torch.float64)
         return lower + (upper - lower) * share
 
+    drawn(5000)  # those of `reach`: what follows are others
     pose = chain.forward(drawn(args.poses))
     begun = time.thread_time()
     found = solve_inverse(chain, pose, task="pose" if n >= 6 else "position+axis").found
