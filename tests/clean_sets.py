@@ -70,7 +70,8 @@ def write_set(root: Path, version: str, *, degrees: bool = False, camera: bool =
 
 def _add_videos(root: Path, lengths: list[int]) -> None:
     info = json.loads((root / "meta/info.json").read_text())
-    info["features"][CAMERA]["shape"] = [*SIZE, 3]
+    names = ["height", "width", "channels"]  # LeRobot's policies need them
+    info["features"][CAMERA] |= {"shape": [*SIZE, 3], "names": names}
     if info["codebase_version"].startswith("v3"):
         info["video_path"] = (
             "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"

@@ -14,6 +14,7 @@ import sys
 import tempfile
 import warnings
 from collections.abc import Callable, Iterator
+from fractions import Fraction
 from pathlib import Path
 
 os.environ["HF_HUB_OFFLINE"] = "1"
@@ -77,7 +78,8 @@ def with_images(root: Path) -> Path:
     write_set(root, "v2.1")
     info = read_info(root)
     key, shape = "observation.images.front", [*SIZE, 3]
-    info["features"][key] = {"dtype": "image", "shape": shape, "names": None}
+    names = ["height", "width", "channels"]
+    info["features"][key] = {"dtype": "image", "shape": shape, "names": names}
     write_info(root, info)
     for file in sorted((root / "data").glob("*/*.parquet")):
 
@@ -93,7 +95,7 @@ def picture(shade: int) -> bytes:
     """A PNG image of one shade."""
     stream = av.CodecContext.create("png", "w")
     stream.height, stream.width, stream.pix_fmt = *SIZE, "rgb24"
-    stream.time_base = "1/30"
+    stream.time_base = Fraction(1, 30)
     frame = av.VideoFrame.from_ndarray(np.full((*SIZE, 3), shade, np.uint8), format="rgb24")
     return b"".join(bytes(packet) for packet in [*stream.encode(frame), *stream.encode()])
 
