@@ -22,18 +22,12 @@ def no_waiting_for_the_disk():
 
 
 @pytest.fixture(autouse=True)
-def scheduled_as_before():
-    """libfranka takes the highest realtime priority for the thread that controls an arm, in
-    simulation too. Kept, browsers and programs that later tests start would inherit it and
-    leave nothing of the machine to anybody else.
-    """
-    if not hasattr(os, "sched_setscheduler"):
-        yield
-        return
-    before = os.sched_getscheduler(0), os.sched_getparam(0)
+def ordinary_priority():
+    """A realtime thread starts realtime threads and processes, which starve other tests."""
     yield
-    if os.sched_getscheduler(0) != before[0]:
-        os.sched_setscheduler(0, *before)
+    left = os.sched_getscheduler(0)
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    assert left == os.SCHED_OTHER, "the test leaves its thread with another scheduling"
 
 
 NEEDED = {

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import atexit
 import importlib
+import os
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
@@ -113,6 +114,7 @@ class FrankyArm:
         self._fault, self._lost = "", False
         self._robot: Any = None
         self._closed = False
+        self._scheduling = _scheduling()
         self._connect()
         self.gripper = GripperThread(
             partial(_FrankyGripper, self._franky, ip, self.config),
@@ -151,7 +153,7 @@ class FrankyArm:
         try:
             if not self._is_moving():
                 self._require_ready(self._read())
-            self._robot.move(motion, asynchronous=True)
+            self._move(motion)
         except ArmFaultError:
             raise
         except Exception as error:
@@ -166,7 +168,7 @@ class FrankyArm:
         if not self._fault:
             try:
                 if self._is_moving():
-                    self._robot.move(self._franky.JointVelocityStopMotion(), asynchronous=True)
+                    self._move(self._franky.JointVelocityStopMotion())
             except Exception as error:
                 # What ended the motion: the arm is at rest already. The next command tells.
                 self._failed(error)
@@ -231,8 +233,12 @@ class FrankyArm:
             "enforce": franky.RealtimeConfig.Enforce,
             "ignore": franky.RealtimeConfig.Ignore,
         }[config.realtime]
+        before = _scheduling()
         try:
+            # Makes the thread that connects a realtime one, and all that it starts later: only
+            # the driver's own thread is to be one (`_move`).
             self._robot = franky.Robot(self._ip, realtime_config=mode)
+            self._scheduling = _scheduling()
         except franky.RealtimeException as error:
             raise _no_realtime(str(error)) from error
         except (franky.NetworkException, franky.IncompatibleVersionException) as error:
@@ -241,6 +247,8 @@ class FrankyArm:
                 "address, switch on the arm, release its joints and activate FCI on its desk, "
                 "and take the build of franky-control for its server version."
             ) from error
+        finally:
+            os.sched_setscheduler(0, *before)
         self._newest: Any = None
         self._recover()
         robot, collision, load = self._robot, config.collision, config.load
@@ -261,6 +269,19 @@ class FrankyArm:
         if not self._robot.recover_from_errors():
             raise self._stopped(self._robot.state, "its error recovery failed")
         self._require_ready(self._robot.state)
+
+    def _move(self, motion: Any) -> None:
+        """Begin a motion.
+
+        The driver's thread that speaks to the control box begins with it, and has the priority
+        of the thread that it is begun from.
+        """
+        before = _scheduling()
+        os.sched_setscheduler(0, *self._scheduling)
+        try:
+            self._robot.move(motion, asynchronous=True)
+        finally:
+            os.sched_setscheduler(0, *before)
 
     def _is_moving(self) -> bool:
         """Whether a motion is under way; raises what has ended the last one, once."""
@@ -371,6 +392,11 @@ def require_realtime() -> None:
         has = False
     if not has:
         raise _no_realtime("this kernel does not schedule in real time")
+
+
+def _scheduling() -> tuple[int, os.sched_param]:
+    """Policy and priority of this thread."""
+    return os.sched_getscheduler(0), os.sched_getparam(0)
 
 
 def _no_realtime(why: str) -> RealtimeError:

@@ -1,5 +1,6 @@
 """The driver franky against a simulator of the arm's network protocol."""
 
+import os
 import subprocess
 import sys
 import threading
@@ -72,6 +73,38 @@ def test_seven_joints_reach_their_goal_while_the_gripper_moves(arm, simulator):
     assert len({round(width, 3) for width in widths}) > 10
     assert widths[-1] == pytest.approx(0.08, abs=2e-3)
     arm.gripper.check()
+
+
+def scheduling(thread=0):
+    return os.sched_getscheduler(thread), os.sched_getparam(thread).sched_priority
+
+
+def test_only_the_drivers_own_thread_has_realtime_priority(simulator):
+    before = scheduling()
+    assert before[0] == os.SCHED_OTHER
+    known = set(os.listdir("/proc/self/task"))
+    with FrankyArm(simulator.ip, CONFIG) as arm:
+        assert scheduling() == before
+        assert {scheduling(int(thread)) for thread in os.listdir("/proc/self/task")} == {before}
+        arm.command(0.1 * np.eye(7)[0])
+        assert scheduling() == before
+        pause(0.05)
+        started = map(int, set(os.listdir("/proc/self/task")) - known)
+        priorities = [scheduling(thread)[0] for thread in started]
+        if _may_take_priority():
+            assert priorities.count(os.SCHED_FIFO) == 1
+        arm.stop()
+        assert scheduling() == before
+
+
+def _may_take_priority() -> bool:
+    try:
+        highest = os.sched_get_priority_max(os.SCHED_FIFO)
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(highest))
+    except PermissionError:
+        return False
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    return True
 
 
 def test_a_velocity_that_nobody_renews_brings_the_arm_to_rest(simulator):

@@ -142,4 +142,5 @@ def test_with_its_driver_in_another_process_a_silent_loop_is_stopped_and_goes_on
         assert (np.abs(resumed) <= 2 * panda.limits.acceleration.numpy() / FPS).all()
         process = robot.watchdog._process
         robot.disconnect()
+        process.join(60)
         assert process.exitcode == 0
