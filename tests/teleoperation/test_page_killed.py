@@ -50,6 +50,15 @@ async def record(page, until):
     return status
 
 
+@pytest.fixture
+def hearing_interrupts():
+    """As at a terminal: what a shell starts in the background is deaf to them."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("hearing_interrupts")
 @pytest.mark.parametrize("ended_by", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
 def test_what_is_recorded_survives_the_end_of_the_program(tmp_path, ended_by):
     demos, log = tmp_path / "demos", tmp_path / "log"

@@ -262,7 +262,9 @@ def _rate(flags: Tensor) -> float:
 
 
 def _median(times: Tensor) -> float:
-    """Median where infinity, for never, is a value like any other."""
+    """Median where infinity, for never, is a value like any other; of no trials it is NaN."""
+    if not len(times):
+        return math.nan
     times = torch.where(times.isnan(), math.inf, times)  # never taken over: inf - inf
     return times.quantile(0.5, interpolation="higher").item()
 
