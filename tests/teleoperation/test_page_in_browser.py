@@ -77,7 +77,7 @@ def test_the_hands_arrow_leads_along_its_axis(session, browser):
 
 @pytest.mark.slow
 def test_a_region_in_force_draws_the_hand_in(session, browser):
-    browser.tab.get_by_label("Active").check()
+    browser.tab.get_by_role("checkbox", name="Active").check()
     wait_until(lambda: session.asked.region is not None, "a region")
     region = session.asked.region
 
@@ -86,7 +86,7 @@ def test_a_region_in_force_draws_the_hand_in(session, browser):
         return (offset < np.array(region.half_size) + 0.01).all()
 
     wait_until(inside, "the hand inside", timeout=300)
-    browser.tab.get_by_label("Active").uncheck()
+    browser.tab.get_by_role("checkbox", name="Active").uncheck()
     wait_until(lambda: session.asked.region is None, "no region")
 
 
