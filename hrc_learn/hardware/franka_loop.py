@@ -338,26 +338,28 @@ class Punctuality:
 
     A process that has been held up finds a state whose time is over. Its answer would be
     dropped, or worse be taken for another cycle: it is better not given. A robot that is slower
-    than its clock, as a simulator on a busy machine, is not late for that.
+    than its clock, as a simulator on a busy machine, is not late for that. Of two states in a
+    row one is answered, however late: a machine on which each answer takes longer than a cycle
+    moves the arm all the same.
     """
 
     def __init__(self):
         self._last = math.nan
         self._pace = 1.0
-        self._skipped = False
+        self._skipped = self._skipped_before = False
 
     def late(self, now: float, period: float) -> bool:
-        """Whether to leave a state unanswered; never two in a row.
+        """Whether to leave a state unanswered; asked once for each, before `overdue`.
 
         Args:
             now: When it was read [s].
             period: Time of the robot since the one before [s].
         """
         passed, self._last = now - self._last, now
+        self._skipped_before, self._skipped = self._skipped, False
         if math.isnan(passed) or period <= 0:
             return False
-        late = passed > self._pace * period + CYCLE and not self._skipped
-        self._skipped = late
+        late = self._skip(passed > self._pace * period + CYCLE)
         pace = min(passed / period, _SLOWEST)
         self._pace = max(1.0, self._pace + _FOLLOWS * (pace - self._pace))
         return late
@@ -368,9 +370,11 @@ class Punctuality:
         Args:
             cost: Time since the state was read [s].
         """
-        overdue = cost > self._pace * CYCLE and not self._skipped
-        self._skipped = self._skipped or overdue
-        return overdue
+        return self._skip(cost > self._pace * CYCLE)
+
+    def _skip(self, too_late: bool) -> bool:
+        self._skipped = self._skipped or (too_late and not self._skipped_before)
+        return self._skipped
 
 
 @final

@@ -147,6 +147,14 @@ class TestPunctuality:
         assert not punctuality.late(7e-3, 1e-3)
         assert not punctuality.overdue(0.2e-3)
 
+    def test_a_machine_too_slow_for_each_cycle_answers_every_second_one(self):
+        punctuality = Punctuality()
+        answered = []
+        for k in range(100):
+            late = punctuality.late(2e-3 * k, 2e-3)
+            answered.append(not late and not punctuality.overdue(1.3e-3))
+        assert not any(first == second for first, second in pairwise(answered))
+
     def test_a_robot_that_is_slower_than_its_clock_is_answered(self):
         punctuality = Punctuality()
         late = [punctuality.late(2.5e-3 * k, 1e-3) for k in range(300)]
