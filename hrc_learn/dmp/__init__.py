@@ -54,6 +54,7 @@ from hrc_learn.dmp.numpy_stepper import OrientationStepper as OrientationStepper
 from hrc_learn.dmp.numpy_stepper import PoseStepper as PoseStepper
 from hrc_learn.dmp.numpy_stepper import Stepper as Stepper
 from hrc_learn.dmp.numpy_stepper import StepperState as StepperState
+from hrc_learn.dmp.online_fit import OnlineFit as OnlineFit
 from hrc_learn.dmp.orientation_dmp import OrientationDMP as OrientationDMP
 from hrc_learn.dmp.orientation_dmp import OrientationState as OrientationState
 from hrc_learn.dmp.orientation_dmp import OrientationTrajectory as OrientationTrajectory
