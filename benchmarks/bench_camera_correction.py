@@ -92,8 +92,8 @@ def _roll_out(checkpoint: Path, size: float, correct: bool, args: Args) -> list[
 
     from hrc_learn.demos.format.dataset_folder import read_info
     from hrc_learn.lerobot.camera_watch import add_camera_watch
-    from hrc_learn.lerobot.envs import PandaEnv, PandaEnvConfig
-    from hrc_learn.lerobot.robots.mujoco_panda import MovedCameraConfig
+    from hrc_learn.lerobot.envs import ArmEnv, ArmEnvConfig
+    from hrc_learn.lerobot.robots.mujoco_arm import MovedCameraConfig
 
     if correct:
         add_camera_watch(checkpoint, args.data, correct=True)
@@ -104,10 +104,10 @@ def _roll_out(checkpoint: Path, size: float, correct: bool, args: Args) -> list[
         # Loaded anew, it knows of no move before.
         before, after = make_pre_post_processors(config, pretrained_path=str(checkpoint))
         camera = MovedCameraConfig(size * args.distance, size * args.angle, move)
-        scene = PandaEnvConfig(
+        scene = ArmEnvConfig(
             task="grasping", fps=fps, pixels=True, marker=True, hand=True, moved_camera=camera
         )
-        env, grasped_now = PandaEnv(**scene.gym_kwargs), []
+        env, grasped_now = ArmEnv(**scene.gym_kwargs), []
         for k in range(args.episodes):
             for part in (before, policy, after):
                 part.reset()

@@ -32,7 +32,7 @@ from hrc_learn.kinematics import panda
 
 # LeRobot takes ten seconds to import: only once there is something to do.
 if TYPE_CHECKING:
-    from hrc_learn.lerobot.robots import MujocoPanda, MujocoPandaConfig
+    from hrc_learn.lerobot.robots import MujocoArmRobot, MujocoArmRobotConfig
     from hrc_learn.lerobot.rollouts import CheckpointPolicy
     from hrc_learn.teleoperation import ScriptedForce
 
@@ -101,11 +101,11 @@ class Pulled:
 
 def main(args: Args) -> None:
     from hrc_learn.lerobot.person import PersonConfig, scripted_pulls
-    from hrc_learn.lerobot.robots import MujocoPanda, MujocoPandaConfig
+    from hrc_learn.lerobot.robots import MujocoArmRobot, MujocoArmRobotConfig
     from hrc_learn.lerobot.rollouts import CheckpointPolicy
 
     torch.set_num_threads(1)
-    config = MujocoPandaConfig(
+    config = MujocoArmRobotConfig(
         scenario=args.task,
         fps=float(args.fps),
         pixels=args.task == "grasping",
@@ -116,7 +116,7 @@ def main(args: Args) -> None:
     robots, done = [], []
     for kind in kinds:
         person = PersonConfig(kind=kind, observed=args.observed, after_push=args.after_push)
-        robot = MujocoPanda(
+        robot = MujocoArmRobot(
             replace(config, imperfections=args.imperfections, person=person, id=kind)
         )
         robot.connect()
@@ -142,7 +142,7 @@ def main(args: Args) -> None:
         robot.disconnect()
 
 
-def _fitted(args: Args, config: MujocoPandaConfig) -> Path:
+def _fitted(args: Args, config: MujocoArmRobotConfig) -> Path:
     """The policy `dmp` in closed form, of ten demonstrations without imperfections."""
     from hrc_learn.lerobot.expert_recording import record_expert
     from hrc_learn.lerobot.policy.modeling_dmp import write_closed_form_policy
@@ -159,14 +159,16 @@ def _fitted(args: Args, config: MujocoPandaConfig) -> Path:
     return policy
 
 
-def _do(robot: MujocoPanda, leader: CheckpointPolicy, seed: int) -> Done:
-    from hrc_learn.lerobot.panda_robot import JOINTS
+def _do(robot: MujocoArmRobot, leader: CheckpointPolicy, seed: int) -> Done:
     from hrc_learn.lerobot.rollouts import roll_out
 
     rows: list[tuple[Any, ...]] = []
     waited, complement = 0.0, robot.complement
     for _, action in roll_out(robot, leader, seed):
-        state, asked = robot.arm.read(), np.array([action[name] for name in JOINTS])
+        state, asked = (
+            robot.arm.read(),
+            np.array([action[name] for name in robot.values.joints]),
+        )
         if complement is not None and complement.posture is not None:
             asked, waited = complement.posture.numpy(), waited + robot.dt * complement.waits
         hand = robot.world.arm.tcp_pose()[:3, 3]
@@ -183,13 +185,13 @@ def _do(robot: MujocoPanda, leader: CheckpointPolicy, seed: int) -> Done:
     )
 
 
-def _contacts(robot: MujocoPanda) -> int:
+def _contacts(robot: MujocoArmRobot) -> int:
     world = robot.world
     monitors = (world.cabinet_contacts, world.self_contacts, world.table_contacts)
     return sum(len(monitor.touches) for monitor in monitors)
 
 
-def _effects(run: Done, pulls: Sequence[ScriptedForce], robot: MujocoPanda) -> list[Pulled]:
+def _effects(run: Done, pulls: Sequence[ScriptedForce], robot: MujocoArmRobot) -> list[Pulled]:
     """Of every pull that was over before the rollout was."""
     joints, posture = torch.from_numpy(run.joints), torch.from_numpy(run.posture)
     elbow = _elbow(joints) - _elbow(posture)

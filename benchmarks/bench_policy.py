@@ -35,7 +35,7 @@ from hrc_learn.kinematics import panda
 
 # LeRobot takes ten seconds to import: only once there is something to do.
 if TYPE_CHECKING:
-    from hrc_learn.lerobot.envs import PandaEnvConfig
+    from hrc_learn.lerobot.envs import ArmEnvConfig
 
 STATE, ACTION = "observation.state", "action"
 ENVIRONMENT = "observation.environment_state"
@@ -97,11 +97,11 @@ class Done:
 
 
 def main(args: Args) -> None:
-    from hrc_learn.lerobot.envs import PandaEnvConfig
+    from hrc_learn.lerobot.envs import ArmEnvConfig
     from hrc_learn.lerobot.policy.closed_form import read_episodes
 
     torch.set_num_threads(1)
-    env = PandaEnvConfig(task=args.task, fps=args.fps, pixels=args.task == "grasping")
+    env = ArmEnvConfig(task=args.task, fps=args.fps, pixels=args.task == "grasping")
     held_out = _recorded(args, env, HELD_OUT, args.beginnings)
     expert = [episode[STATE][:, :7] for episode in read_episodes(held_out, (STATE,))]
     table = Table("policy", "demonstrations", *Figures.__dataclass_fields__)
@@ -119,7 +119,7 @@ def main(args: Args) -> None:
     Console().print(table)
 
 
-def _recorded(args: Args, env: PandaEnvConfig, first: int, count: int) -> Path:
+def _recorded(args: Args, env: ArmEnvConfig, first: int, count: int) -> Path:
     folder = args.data / f"{args.task}_{args.fps}hz_from_{first}_{count}"
     if not folder.exists():
         from hrc_learn.lerobot.expert_recording import record_expert
@@ -134,7 +134,7 @@ def _recorded(args: Args, env: PandaEnvConfig, first: int, count: int) -> Path:
 
 
 def _measure(
-    name: str, dataset: Path, env: PandaEnvConfig, expert: Sequence[Tensor], args: Args
+    name: str, dataset: Path, env: ArmEnvConfig, expert: Sequence[Tensor], args: Args
 ) -> tuple[Figures, dict[str, float]]:
     torch.manual_seed(args.seed)
     began = time.process_time()
@@ -252,11 +252,11 @@ def _train(policy: Any, before: Any, dataset: Path, args: Args, title: str) -> d
 
 
 def _do(
-    act: Callable[[Tensor | None], Any], config: PandaEnvConfig, count: int, title: str
+    act: Callable[[Tensor | None], Any], config: ArmEnvConfig, count: int, title: str
 ) -> list[Done]:
-    from hrc_learn.lerobot.envs import PandaEnv
+    from hrc_learn.lerobot.envs import ArmEnv
 
-    env, done = PandaEnv(**config.gym_kwargs), []
+    env, done = ArmEnv(**config.gym_kwargs), []
     for seed in track(range(HELD_OUT, HELD_OUT + count), title):
         act(None)
         seen, _ = env.reset(seed=seed)

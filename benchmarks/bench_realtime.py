@@ -72,17 +72,17 @@ type Stepper = Callable[[dict[str, Any]], tuple[np.ndarray, bool]]
 
 
 def main(args: Args) -> None:
-    from hrc_learn.lerobot.envs import PandaEnv, PandaEnvConfig
+    from hrc_learn.lerobot.envs import ArmEnv, ArmEnvConfig
     from hrc_learn.lerobot.policy.closed_form import read_episodes
 
     torch.set_num_threads(1)
     columns = read_episodes(args.data, (STATE, ACTION))
     shown = [{STATE: e[STATE].float(), ACTION: e[ACTION].float()} for e in columns]
     largest = np.max([e[ACTION].diff(dim=0).abs().amax(0).numpy() for e in shown], axis=0)
-    config = PandaEnvConfig(task=args.scenario, fps=round(_fps(args.data)))
+    config = ArmEnvConfig(task=args.scenario, fps=round(_fps(args.data)))
     policy, steps, seconds = _learn(shown, config.fps, args)
     Console().print(f"motion_chunk: {steps} steps of training, {seconds:.0f} s of CPU")
-    env = PandaEnv(**config.gym_kwargs)
+    env = ArmEnv(**config.gym_kwargs)
     late = round(args.delay * config.fps)
     ways: dict[str, Callable[[], Stepper]] = {
         **{f"every {n}": lambda n=n: _selecting(policy, n) for n in args.periods},

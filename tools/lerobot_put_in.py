@@ -14,7 +14,7 @@ import pytest
 POLICIES = ("dmp", "motion_chunk")
 FPS = 30.0
 """Of LeRobot's tests, whose policies are made without a dataset that would tell."""
-PAIRS = ("mock", "mujoco_panda", "smooth")
+PAIRS = ("mock", "mujoco_arm", "smooth")
 
 
 def pytest_configure(config):
@@ -32,13 +32,13 @@ def pytest_pycollect_makeitem(collector, name, obj):
         policies.extend(POLICIES)
         module.make_policy_config = _knowing_the_rate(module.make_policy_config)
     environments = getattr(module, "AVAILABLE_ENVS", None)
-    if environments is not None and "panda" not in environments:
-        environments.append("panda")
+    if environments is not None and "mujoco_arm" not in environments:
+        environments.append("mujoco_arm")
         from tests import utils
 
         # LeRobot looks for a package gym_NAME, and skips the test where there is none.
         available = utils.is_package_available
-        utils.is_package_available = lambda name: name == "gym_panda" or available(name)
+        utils.is_package_available = lambda name: name == "gym_mujoco_arm" or available(name)
 
 
 def _knowing_the_rate(make):
@@ -59,17 +59,17 @@ def put_in_pair(request, monkeypatch, tmp_path):
     """A robot and a teleoperator in the place of LeRobot's mocks."""
     if request.param == "mock":
         return
-    from hrc_learn.lerobot.robots import MujocoPandaConfig
+    from hrc_learn.lerobot.robots import MujocoArmRobotConfig
     from hrc_learn.lerobot.smoothing import ActionLimits, SmoothRobotConfig
-    from hrc_learn.lerobot.teleoperators import PandaExpertConfig
+    from hrc_learn.lerobot.teleoperators import ArmExpertConfig
 
     def panda():
-        return MujocoPandaConfig(scenario="grasping", fps=FPS, calibration_dir=tmp_path)
+        return MujocoArmRobotConfig(scenario="grasping", fps=FPS, calibration_dir=tmp_path)
 
     def smooth():
-        from hrc_learn.lerobot.robots import MujocoPanda
+        from hrc_learn.lerobot.robots import MujocoArmRobot
 
-        names = list(MujocoPanda(panda()).action_features)
+        names = list(MujocoArmRobot(panda()).action_features)
         ones, unlimited = [1.0] * len(names), [None] * len(names)
         limits = ActionLimits(
             names=names,
@@ -83,7 +83,7 @@ def put_in_pair(request, monkeypatch, tmp_path):
         )
         limits.save(tmp_path / "limits.json")
         return SmoothRobotConfig(
-            of="mujoco_panda",
+            of="mujoco_arm",
             options={"scenario": "grasping", "fps": 2 * FPS},
             limits=tmp_path / "limits.json",
             rate=2 * FPS,
@@ -91,8 +91,8 @@ def put_in_pair(request, monkeypatch, tmp_path):
             calibration_dir=tmp_path,
         )
 
-    robot = panda if request.param == "mujoco_panda" else smooth
+    robot = panda if request.param == "mujoco_arm" else smooth
     monkeypatch.setattr(request.module, "MockRobotConfig", robot)
     monkeypatch.setattr(
-        request.module, "MockTeleopConfig", lambda: PandaExpertConfig(calibration_dir=tmp_path)
+        request.module, "MockTeleopConfig", lambda: ArmExpertConfig(calibration_dir=tmp_path)
     )

@@ -66,7 +66,7 @@ def main() -> None:
     sys.exit(any(theirs.get(name, ("",))[0] != "failed" for name in broken))
 
 
-_OURS = ("dmp", "motion_chunk", "panda", "smooth")
+_OURS = ("dmp", "motion_chunk", "mujoco_arm", "panda", "smooth")
 
 
 def _check_out(source: Path, out: Path) -> None:

@@ -14,9 +14,9 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
-from hrc_learn.lerobot.panda_robot import ActionSpace, action_names
-from hrc_learn.lerobot.robots import MujocoPanda, MujocoPandaConfig
-from hrc_learn.lerobot.robots.mujoco_panda import CAMERA, ImagesConfig, MovedCameraConfig
+from hrc_learn.lerobot.arm_robot import ActionSpace
+from hrc_learn.lerobot.robots import MujocoArmRobot, MujocoArmRobotConfig
+from hrc_learn.lerobot.robots.mujoco_arm import CAMERA, ImagesConfig, MovedCameraConfig
 from hrc_learn.teleoperation.scenarios import ScenarioView, make_scenario
 
 _MORE_TIME = 1.25
@@ -24,9 +24,11 @@ _MORE_TIME = 1.25
 
 
 @EnvConfig.register_subclass("panda")
+@EnvConfig.register_subclass("mujoco_arm")
 @dataclass
-class PandaEnvConfig(EnvConfig):
-    """Scenarios of a `mujoco_panda`, judged by MuJoCo's contacts; `--env.type=panda`.
+class ArmEnvConfig(EnvConfig):
+    """Scenarios of a `mujoco_arm`, judged by MuJoCo's contacts; `--env.type=mujoco_arm`, as
+    before `panda`.
 
     Observations and actions are those of the robot with the same settings, in the same order,
     so that what was recorded on it can be evaluated here.
@@ -34,6 +36,12 @@ class PandaEnvConfig(EnvConfig):
 
     task: str | None = "placing"
     """What is to be done: "placing" or "grasping"."""
+    arm: str = "panda"
+    """As of the robot."""
+    base: str = ""
+    """As of the robot."""
+    tip: str = ""
+    """As of the robot."""
     fps: int = 50
     """Of the dataset that the policy was trained on."""
     shelf: str = "middle"
@@ -56,11 +64,11 @@ class PandaEnvConfig(EnvConfig):
     """Actions after which an episode has failed; None: a quarter more than a demonstration."""
 
     def __post_init__(self) -> None:
-        robot = MujocoPanda(self.robot_config())
+        robot = MujocoArmRobot(self.robot_config())
         values = robot.observation_features
         state = sum(shape is float for shape in values.values())
         self.features = {
-            ACTION: PolicyFeature(FeatureType.ACTION, (len(action_names(self.action_space)),)),
+            ACTION: PolicyFeature(FeatureType.ACTION, (len(robot.action_features),)),
             "agent_pos": PolicyFeature(FeatureType.STATE, (state,)),
         }
         self.features_map = {ACTION: ACTION, "agent_pos": OBS_STATE}
@@ -70,9 +78,12 @@ class PandaEnvConfig(EnvConfig):
             )
             self.features_map[f"pixels/{CAMERA}"] = f"{OBS_IMAGES}.{CAMERA}"
 
-    def robot_config(self) -> MujocoPandaConfig:
+    def robot_config(self) -> MujocoArmRobotConfig:
         """Settings of the robot in it."""
-        return MujocoPandaConfig(
+        return MujocoArmRobotConfig(
+            arm=self.arm,
+            base=self.base,
+            tip=self.tip,
             scenario=self.task or "placing",
             shelf=self.shelf,
             fps=float(self.fps),
@@ -93,14 +104,14 @@ class PandaEnvConfig(EnvConfig):
         if self.episode_length is not None:
             return self.episode_length
         robot = self.robot_config()
-        duration = make_scenario(robot.scenario, robot.shelf).duration
+        duration = make_scenario(robot.scenario, robot.shelf, robot.work_arm()).duration
         return round(_MORE_TIME * duration * self.fps)
 
     def create_envs(
         self, n_envs: int, use_async_envs: bool = False
     ) -> dict[str, dict[int, gym.vector.VectorEnv]]:
         """One vector of environments that differ by their seeds."""
-        makers = [partial(PandaEnv, **self.gym_kwargs)] * n_envs
+        makers = [partial(ArmEnv, **self.gym_kwargs)] * n_envs
         mode = AutoresetMode.SAME_STEP
         if use_async_envs and n_envs > 1:
             vector = gym.vector.AsyncVectorEnv(
@@ -117,23 +128,23 @@ _STEADY = 0.3
 """How long the job must stay done to count [s]: a thing that topples rests for a moment."""
 
 
-class PandaEnv(gym.Env):
+class ArmEnv(gym.Env):
     """The job is done, and the episode over, once MuJoCo's contacts say so for a while.
 
     The same seed and actions lead to the same end.
     """
 
-    def __init__(self, config: MujocoPandaConfig, max_episode_steps: int):
+    def __init__(self, config: MujocoArmRobotConfig, max_episode_steps: int):
         """Set up.
 
         Args:
             config: Of the robot, with the scenario.
             max_episode_steps: Actions after which an episode has failed.
         """
-        self._robot = MujocoPanda(config)
+        self._robot = MujocoArmRobot(config)
         self._robot.judged = False
         self._robot.connect()
-        self._actions = action_names(config.action_space)
+        self._actions = tuple(self._robot.action_features)
         self._max_episode_steps = max_episode_steps
         self._steps = self._done = 0
         self._view: ScenarioView | None = None

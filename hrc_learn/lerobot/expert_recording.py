@@ -11,18 +11,19 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.utils.constants import ACTION, OBS_STR
 from lerobot.utils.feature_utils import build_dataset_frame, hw_to_dataset_features
 
-from hrc_learn.lerobot.panda_robot import PandaRobot
+from hrc_learn.lerobot.arm_robot import ArmRobot
 from hrc_learn.lerobot.person import COLUMNS
-from hrc_learn.lerobot.robots import MujocoPanda, MujocoPandaConfig
-from hrc_learn.lerobot.teleoperators import PandaExpert, PandaExpertConfig
+from hrc_learn.lerobot.robots import MujocoArmRobot, MujocoArmRobotConfig
+from hrc_learn.lerobot.teleoperators import ArmExpert, ArmExpertConfig
 from hrc_learn.store import DATASET, replacing
 
 
-def observation_features(robot: PandaRobot) -> dict[str, dict]:
+def observation_features(robot: ArmRobot) -> dict[str, dict]:
     """Features of what a robot observes in a dataset: what concerns the person in columns of
     its own, the rest as LeRobot has it.
     """
-    own = {key: names for key, names in COLUMNS.items() if names[0] in robot.person_names}
+    columns = {key: names(robot.values.chain) for key, names in COLUMNS.items()}
+    own = {key: names for key, names in columns.items() if names[0] in robot.person_names}
     rest = {
         name: shape
         for name, shape in robot.observation_features.items()
@@ -35,7 +36,7 @@ def observation_features(robot: PandaRobot) -> dict[str, dict]:
 
 
 @contextmanager
-def new_dataset(folder: Path, robot: PandaRobot) -> Iterator[LeRobotDataset]:
+def new_dataset(folder: Path, robot: ArmRobot) -> Iterator[LeRobotDataset]:
     """A dataset of what a robot observes and is sent, whole at the end or not there.
 
     Args:
@@ -75,7 +76,7 @@ def add_frame(
 
 
 def record_expert(
-    folder: Path, config: MujocoPandaConfig, episodes: int
+    folder: Path, config: MujocoArmRobotConfig, episodes: int
 ) -> Iterator[tuple[int, bool]]:
     """Let the expert show a scenario, and write what lerobot-record would have written.
 
@@ -95,7 +96,7 @@ def record_expert(
         FileExistsError: There is something at `folder`.
         RuntimeError: More demonstrations fail than succeed.
     """
-    robot, expert = MujocoPanda(config), PandaExpert(PandaExpertConfig())
+    robot, expert = MujocoArmRobot(config), ArmExpert(ArmExpertConfig())
     with new_dataset(folder, robot) as dataset:
         robot.connect()
         expert.connect()
@@ -119,7 +120,7 @@ def record_expert(
             robot.disconnect()
 
 
-def _show(robot: MujocoPanda, expert: PandaExpert, dataset: LeRobotDataset) -> bool:
+def _show(robot: MujocoArmRobot, expert: ArmExpert, dataset: LeRobotDataset) -> bool:
     """One demonstration, kept in the dataset's buffer; whether it succeeded."""
     scenario = robot.run.scenario
     for _ in range(round(scenario.duration / robot.dt)):

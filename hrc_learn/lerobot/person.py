@@ -7,27 +7,31 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from hrc_learn.kinematics import panda
+from hrc_learn.kinematics import SerialChain, WorkArm
 from hrc_learn.protocols import ArmState, Feedback, Human, HumanInput
 
 if TYPE_CHECKING:
-    from hrc_learn.lerobot.panda_robot import PandaRobot
+    from hrc_learn.lerobot.arm_robot import ArmRobot
     from hrc_learn.lerobot.robot_page import RobotPage
     from hrc_learn.teleoperation import ScriptedForce
 
 PersonKind = Literal["none", "scripted", "page", "gamepad", "keyboard"]
 """No person, a script that pulls the elbow at random moments of a simulation, or the device of
 a real one. Gamepad and keyboard, which lead an end effector elsewhere, lead the elbow here."""
-NULLSPACE_INPUTS = tuple(f"{name}.human_torque" for name in panda.joint_names)
-"""Names of what the person asks of the joints [N m]."""
-OFFSETS = tuple(f"{name}.pushed_aside" for name in panda.joint_names)
-"""Names of how far the joints are from where the actions have them [rad]."""
 
-COLUMNS = {
-    "observation.human_effort": NULLSPACE_INPUTS,
-    "observation.pushed_aside": OFFSETS,
-}
-"""Columns of their own, where those are to be had."""
+
+def nullspace_inputs(chain: SerialChain) -> tuple[str, ...]:
+    """Names of what the person asks of the joints [N m]."""
+    return tuple(f"{name}.human_torque" for name in chain.joint_names)
+
+
+def offsets(chain: SerialChain) -> tuple[str, ...]:
+    """Names of how far the joints are from where the actions have them [rad]."""
+    return tuple(f"{name}.pushed_aside" for name in chain.joint_names)
+
+
+COLUMNS = {"observation.human_effort": nullspace_inputs, "observation.pushed_aside": offsets}
+"""Columns of their own, with the names of their values, where those are to be had."""
 
 
 @dataclass
@@ -49,10 +53,11 @@ class PersonConfig:
     port: int | None = None
     """Port to serve it at; the first free one from 8080 on if None."""
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Of what is observed of the person."""
-        return (*NULLSPACE_INPUTS, *OFFSETS) if self.record and self.kind != "none" else ()
+    def names(self, chain: SerialChain) -> tuple[str, ...]:
+        """Of what is observed of the person beside an arm."""
+        if not self.record or self.kind == "none":
+            return ()
+        return (*nullspace_inputs(chain), *offsets(chain))
 
 
 def scripted_pulls(seed: int) -> tuple[ScriptedForce, ...]:
@@ -66,13 +71,18 @@ def scripted_pulls(seed: int) -> tuple[ScriptedForce, ...]:
 class Person(Human):
     """Reads the device of a person, shows them the arm, and gives the device back."""
 
-    def __init__(self, config: PersonConfig):
+    def __init__(self, config: PersonConfig, work_arm: WorkArm):
         """Open the device.
+
+        Args:
+            config: Which.
+            work_arm: The arm whose body is led.
 
         Raises:
             ValueError: There is none.
         """
         self._page: RobotPage | None = None
+        self._work_arm, self._chain = work_arm, work_arm.chain
         self._human = self._opened(config)
 
     def _opened(self, config: PersonConfig) -> Human:
@@ -84,21 +94,23 @@ class Person(Human):
                 from hrc_learn.lerobot.robot_page import RobotPage
 
                 note = "A policy leads the end effector. Pull at a link or a knob."
-                self._page = RobotPage(config.host, config.port, note, guides=False)
+                self._page = RobotPage(
+                    self._work_arm, config.host, config.port, note, guides=False
+                )
                 return self._page.page.human
             case "gamepad":
-                return LinkGuide(Gamepad.open(panda), panda)
+                return LinkGuide(Gamepad.open(self._chain), self._chain)
             case "keyboard":
-                return LinkGuide(TerminalKeyboard.open(panda), panda)
+                return LinkGuide(TerminalKeyboard.open(self._chain), self._chain)
             case _:
-                return ScriptedPerturbation(panda, ())
+                return ScriptedPerturbation(self._chain, ())
 
     def begin(self, seed: int) -> None:
         """The simulation begins anew: a scripted person pulls as the seed has it."""
         from hrc_learn.teleoperation.scripted_expert import ScriptedPerturbation
 
         if isinstance(self._human, ScriptedPerturbation):
-            self._human = ScriptedPerturbation(panda, scripted_pulls(seed))
+            self._human = ScriptedPerturbation(self._chain, scripted_pulls(seed))
 
     def read(self, state: ArmState) -> HumanInput:
         """What the person asks for."""
@@ -108,7 +120,7 @@ class Person(Human):
         """Tell the person at their device."""
         self._human.tell(feedback)
 
-    def show(self, robot: PandaRobot) -> None:
+    def show(self, robot: ArmRobot) -> None:
         """Show the person where the arm is."""
         if self._page is not None:
             self._page.show(robot)

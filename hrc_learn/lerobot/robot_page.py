@@ -5,10 +5,10 @@ from __future__ import annotations
 from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
-from hrc_learn.kinematics import panda
+from hrc_learn.kinematics import WorkArm
 
 if TYPE_CHECKING:
-    from hrc_learn.lerobot.panda_robot import PandaRobot
+    from hrc_learn.lerobot.arm_robot import ArmRobot
 
 
 class RobotPage:
@@ -18,28 +18,32 @@ class RobotPage:
         page: Served until it is closed.
     """
 
-    def __init__(self, host: str, port: int | None, note: str, *, guides: bool = True):
+    def __init__(
+        self, arm: WorkArm, host: str, port: int | None, note: str, *, guides: bool = True
+    ):
         """Serve it.
 
         Args:
+            arm: That is shown.
             host: Address to serve at.
             port: To serve at; None: the first free one from 8080 on.
             note: What the page says.
             guides: Whether the person leads the end effector too, and not the body alone.
         """
         from hrc_learn.sim import MovingBodies, World
+        from hrc_learn.sim.workplace import Workplace
         from hrc_learn.teleoperation.page import Page, PageConfig, PageStatus
 
         self._served = ExitStack()
-        self._ghost = self._shown = World()
+        self._ghost = self._shown = World(Workplace.of(arm).scene)
         self._bodies = MovingBodies(self._ghost)
         drawn = self._bodies.drawn(*(poses[None] for poses in self._bodies.poses()))
         config = PageConfig(host=host, port=port)
-        page = Page(panda, drawn, self._ghost.config.boxes(), config, guides=guides)
+        page = Page(arm.chain, drawn, self._ghost.config.boxes(), config, guides=guides)
         self.page = self._served.enter_context(page)
         self.page.show(PageStatus(title="LeRobot", note=note))
 
-    def show(self, robot: PandaRobot) -> None:
+    def show(self, robot: ArmRobot) -> None:
         """Show where the arm is, and in simulation everything else as well."""
         from hrc_learn.sim import MovingBodies
 

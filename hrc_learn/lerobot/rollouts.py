@@ -17,10 +17,10 @@ from lerobot.policies.utils import prepare_observation_for_inference
 from lerobot.utils.constants import OBS_STR
 from lerobot.utils.feature_utils import build_dataset_frame
 
+from hrc_learn.lerobot.arm_robot import ArmRobot
 from hrc_learn.lerobot.expert_recording import add_frame, new_dataset, observation_features
-from hrc_learn.lerobot.panda_robot import PandaRobot
 from hrc_learn.lerobot.person import COLUMNS
-from hrc_learn.lerobot.robots import MujocoPanda, MujocoPandaConfig
+from hrc_learn.lerobot.robots import MujocoArmRobot, MujocoArmRobotConfig
 
 # What a rollout gets, in durations of a demonstration: as of the environment, and time to wait
 # for a person.
@@ -43,7 +43,7 @@ class Leader(Protocol):
 class CheckpointPolicy:
     """Any policy of LeRobot's, from its checkpoint."""
 
-    def __init__(self, folder: Path, robot: PandaRobot):
+    def __init__(self, folder: Path, robot: ArmRobot):
         """Load it.
 
         Args:
@@ -84,7 +84,7 @@ class CheckpointPolicy:
 
 
 def roll_out(
-    robot: MujocoPanda, leader: Leader, seed: int
+    robot: MujocoArmRobot, leader: Leader, seed: int
 ) -> Iterator[tuple[dict[str, Any], dict[str, float]]]:
     """Let a policy do the scenario of a simulated robot once.
 
@@ -106,7 +106,7 @@ def roll_out(
 
 
 def record_rollouts(
-    folder: Path, policy: Path, config: MujocoPandaConfig, episodes: int
+    folder: Path, policy: Path, config: MujocoArmRobotConfig, episodes: int
 ) -> Iterator[bool]:
     """Roll a policy out and record it, successful or not.
 
@@ -119,7 +119,7 @@ def record_rollouts(
     Yields:
         After each episode: whether the job was done.
     """
-    robot = MujocoPanda(config)
+    robot = MujocoArmRobot(config)
     leader = CheckpointPolicy(policy, robot)
     with new_dataset(folder, robot) as dataset:
         robot.connect()

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, UInt8
 
 from hrc_learn.controller import SafetyConfig
-from hrc_learn.kinematics import gripper_down
+from hrc_learn.kinematics import PANDA, WorkArm, gripper_down
 from hrc_learn.protocols import ArmState, Feedback, Human, HumanInput
 from hrc_learn.sim import CameraChange, CameraKind, Imperfections, World, open_camera
 from hrc_learn.sim.cameras import hidden_markers
@@ -423,6 +423,13 @@ def check_scenario(name: str, shelf: str, pixels: bool) -> None:
         raise ValueError("placing begins with the object in the gripper, so it has no pixels.")
 
 
-def make_scenario(name: str, shelf: str) -> Scenario:
-    """A scenario in the default workplace."""
-    return Placing(shelf=shelf) if name == "placing" else Grasping()
+def make_scenario(name: str, shelf: str, robot: WorkArm = PANDA) -> Scenario:
+    """A scenario in the workplace of an arm.
+
+    Raises:
+        UnreachableError: The arm cannot do the work in any layout.
+    """
+    workplace = Workplace.of(robot)
+    if name == "placing":
+        return Placing(workplace=workplace, shelf=shelf)
+    return Grasping(workplace=workplace)

@@ -18,7 +18,7 @@ BATCHES = [(), (1,), (3, 1, 2)]
 
 
 @pytest.fixture(scope="module")
-def mujoco_panda():
+def mujoco_arm():
     """A model of bare frames: each body placed and turned as the table says."""
 
     def placed(T):
@@ -36,17 +36,17 @@ def mujoco_panda():
     return model, mujoco.MjData(model)
 
 
-def solve_mujoco(mujoco_panda, q):
-    model, data = mujoco_panda
+def solve_mujoco(mujoco_arm, q):
+    model, data = mujoco_arm
     data.qpos[:] = q.numpy()
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
     return model, data
 
 
-def test_agrees_with_mujoco(mujoco_panda):
+def test_agrees_with_mujoco(mujoco_arm):
     for q in joint_positions(50, rng=generator(1)):
-        model, data = solve_mujoco(mujoco_panda, q)
+        model, data = solve_mujoco(mujoco_arm, q)
         links, J = panda.link_poses(q), panda.jacobian(q)
         positions = torch.cat([torch.tensor(data.xpos[1:]), torch.tensor(data.site_xpos)])
         rotations = torch.cat([torch.tensor(data.xmat[1:]), torch.tensor(data.site_xmat)])
@@ -61,9 +61,9 @@ def test_agrees_with_mujoco(mujoco_panda):
 
 
 @pytest.mark.parametrize("joint", range(1, 8))
-def test_joint_jacobian_agrees_with_mujoco(mujoco_panda, joint):
+def test_joint_jacobian_agrees_with_mujoco(mujoco_arm, joint):
     for q in joint_positions(10, rng=generator(2)):
-        model, data = solve_mujoco(mujoco_panda, q)
+        model, data = solve_mujoco(mujoco_arm, q)
         linear, angular = torch.zeros(2, 3, 7, dtype=torch.float64).numpy()
         mujoco.mj_jacBody(model, data, linear, angular, joint)
         J = panda.joint_jacobian(q, joint)

@@ -2,8 +2,8 @@
 
 import pytest
 
-from hrc_learn.lerobot.panda_robot import robot_registry
-from hrc_learn.lerobot.robots import MujocoPanda, MujocoPandaConfig
+from hrc_learn.lerobot.arm_robot import robot_registry
+from hrc_learn.lerobot.robots import MujocoArmRobot, MujocoArmRobotConfig
 
 
 @pytest.fixture(autouse=True)
@@ -17,8 +17,8 @@ def nothing_left_connected():
 def simulated(tmp_path):
     """Makes connected robots of their settings."""
 
-    def connected(**settings) -> MujocoPanda:
-        robot = MujocoPanda(MujocoPandaConfig(calibration_dir=tmp_path, **settings))
+    def connected(**settings) -> MujocoArmRobot:
+        robot = MujocoArmRobot(MujocoArmRobotConfig(calibration_dir=tmp_path, **settings))
         robot.connect()
         return robot
 

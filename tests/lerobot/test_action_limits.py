@@ -13,7 +13,7 @@ import pytest
 from hrc_learn.demos import DatasetWriter
 from hrc_learn.kinematics import panda
 from hrc_learn.lerobot import smoothing
-from hrc_learn.lerobot.panda_robot import JOINTS
+from hrc_learn.lerobot.arm_robot import ArmValues
 from hrc_learn.lerobot.smoothing import (
     ActionLimits,
     calibrated_ranges,
@@ -275,7 +275,7 @@ def test_hrc_smooth_writes_limits_with_the_positions_that_are_known(tmp_path):
     file = tmp_path / "limits.json"
     smooth(Smooth(dataset=dataset, limits=file))
     limits = ActionLimits.load(file)
-    assert limits.names == list(JOINTS)
+    assert limits.names == list(ArmValues(panda).joints)
     assert limits.lower == panda.limits.lower.tolist()
     assert limits.upper == panda.limits.upper.tolist()
     urdf = URDF.replace('name="a"', f'name="{panda.joint_names[0]}"')

@@ -6,9 +6,9 @@ from gymnasium.vector import SyncVectorEnv
 from lerobot.teleoperators import make_teleoperator_from_config
 from unchecked import shapes_unchecked
 
-from hrc_learn.lerobot.envs import PandaEnv, PandaEnvConfig
-from hrc_learn.lerobot.robots.mujoco_panda import ImagesConfig
-from hrc_learn.lerobot.teleoperators import PandaExpertConfig
+from hrc_learn.lerobot.envs import ArmEnv, ArmEnvConfig
+from hrc_learn.lerobot.robots.mujoco_arm import ImagesConfig
+from hrc_learn.lerobot.teleoperators import ArmExpertConfig
 from hrc_learn.teleoperation.scenarios import make_scenario
 
 FPS = 20
@@ -19,7 +19,7 @@ def test_the_expert_succeeds_and_the_environment_says_so(simulated, tmp_path):
     """What was shown on the robot is done again in the environment, by poses of the hand."""
     settings = {"action_space": "ee", "pixels": True}
     robot = simulated(scenario="grasping", fps=float(FPS), seed=4, **settings)
-    expert = make_teleoperator_from_config(PandaExpertConfig(calibration_dir=tmp_path))
+    expert = make_teleoperator_from_config(ArmExpertConfig(calibration_dir=tmp_path))
     expert.connect()
     shown, first = [], robot.get_observation()
     with shapes_unchecked():
@@ -34,8 +34,8 @@ def test_the_expert_succeeds_and_the_environment_says_so(simulated, tmp_path):
     assert steps.max() < 0.05  # no rotation vector changes sides
     robot.disconnect()
 
-    config = PandaEnvConfig(task="grasping", fps=FPS, **settings)
-    env = config.create_envs(1)["panda"][0]
+    config = ArmEnvConfig(task="grasping", fps=FPS, **settings)
+    env = config.create_envs(1)["mujoco_arm"][0]
     state, _ = env.reset(seed=4)
     assert state["agent_pos"].shape == (1, *config.features["agent_pos"].shape)
     np.testing.assert_allclose(state["agent_pos"][0], list(first.values()), rtol=1e-6)
@@ -51,8 +51,8 @@ def test_the_expert_succeeds_and_the_environment_says_so(simulated, tmp_path):
 
 
 def test_an_episode_ends_when_its_time_is_up():
-    env = PandaEnvConfig(task="grasping", fps=FPS, episode_length=2).create_envs(1)
-    vector = env["panda"][0]
+    env = ArmEnvConfig(task="grasping", fps=FPS, episode_length=2).create_envs(1)
+    vector = env["mujoco_arm"][0]
     state, _ = vector.reset(seed=0)
     still = state["agent_pos"].astype(np.float32)
     assert not vector.step(still)[3].any()
@@ -64,8 +64,8 @@ def test_an_episode_ends_when_its_time_is_up():
 
 
 def environment(**settings):
-    config = PandaEnvConfig(task="grasping", fps=FPS, **settings)
-    return config, PandaEnv(**config.gym_kwargs)
+    config = ArmEnvConfig(task="grasping", fps=FPS, **settings)
+    return config, ArmEnv(**config.gym_kwargs)
 
 
 def held(env):
@@ -118,6 +118,15 @@ def test_a_seed_is_a_beginning_and_others_are_drawn():
     env.close()  # twice is once
 
 
+def test_another_arm_is_that_of_the_robot():
+    config, env = environment(arm="fr3", hand=True)
+    assert env._robot.name == "mujoco_fr3"
+    assert config.features["agent_pos"].shape == (7 + 6 + 1,)
+    state, _ = env.reset(seed=0)
+    assert env.observation_space.contains(state)
+    env.close()
+
+
 def test_images_are_observed_as_declared():
     config, env = environment(images=ImagesConfig(kind="synthetic", width=64, height=48))
     assert config.features["pixels/front"].shape == (48, 64, 3)
@@ -131,13 +140,13 @@ def test_images_are_observed_as_declared():
 
 
 def test_a_vector_has_environments_of_its_own():
-    vector = PandaEnvConfig(task="grasping", fps=FPS).create_envs(2)["panda"][0]
+    vector = ArmEnvConfig(task="grasping", fps=FPS).create_envs(2)["mujoco_arm"][0]
     assert isinstance(vector, SyncVectorEnv)
     state, _ = vector.reset(seed=[1, 2])
     assert state["agent_pos"].shape[0] == 2
     assert [env._robot.run.seed for env in vector.envs] == [1, 2]
     vector.close()
-    (one,) = PandaEnvConfig(task=None).create_envs(1, use_async_envs=True)["panda"].values()
+    (one,) = ArmEnvConfig(task=None).create_envs(1, use_async_envs=True)["mujoco_arm"].values()
     assert isinstance(one, SyncVectorEnv)
     assert one.envs[0].task == "placing"
     one.close()

@@ -7,7 +7,7 @@ from unchecked import shapes_unchecked
 
 from hrc_learn.lerobot import expert_recording
 from hrc_learn.lerobot.policy.closed_form import read_episodes
-from hrc_learn.lerobot.robots import MujocoPandaConfig
+from hrc_learn.lerobot.robots import MujocoArmRobotConfig
 
 FPS = 10.0
 
@@ -46,7 +46,7 @@ def outcomes(monkeypatch):
 
 
 def config(folder):
-    return MujocoPandaConfig(calibration_dir=folder, scenario="grasping", fps=FPS, seed=5)
+    return MujocoArmRobotConfig(calibration_dir=folder, scenario="grasping", fps=FPS, seed=5)
 
 
 def test_what_fails_is_shown_again_from_the_next_seed(tmp_path, outcomes):

@@ -12,7 +12,7 @@ from served_franka import served_franka
 
 from hrc_learn.hardware import CollisionConfig, DriverError, Load
 from hrc_learn.kinematics import panda
-from hrc_learn.lerobot.panda_robot import GRIPPER, JOINTS
+from hrc_learn.lerobot.arm_robot import GRIPPER
 from hrc_learn.lerobot.robots import FrankaPandaConfig
 from hrc_learn.sim import SceneConfig, World
 from hrc_learn.sim.protocol_server import serve_world

@@ -9,14 +9,16 @@ from unchecked import shapes_unchecked
 from hrc_learn.demos import load_demos
 from hrc_learn.kinematics import panda
 from hrc_learn.lerobot import person
+from hrc_learn.lerobot.arm_robot import GRIPPER, HAND, ArmValues
 from hrc_learn.lerobot.expert_recording import add_frame, new_dataset
-from hrc_learn.lerobot.panda_robot import GRIPPER, HAND, JOINTS, VELOCITIES
-from hrc_learn.lerobot.person import NULLSPACE_INPUTS, OFFSETS, PersonConfig
+from hrc_learn.lerobot.person import PersonConfig, nullspace_inputs, offsets
 from hrc_learn.lerobot.policy.closed_form import read_episodes
 from hrc_learn.lerobot.robots import FrankaPandaConfig
-from hrc_learn.lerobot.teleoperators.panda_teleoperators import GuidedRobot
+from hrc_learn.lerobot.teleoperators.arm_teleoperators import GuidedRobot
 from hrc_learn.teleoperation import ScriptedForce
 
+JOINTS, VELOCITIES = ArmValues(panda).joints, ArmValues(panda).velocities
+NULLSPACE_INPUTS, OFFSETS = nullspace_inputs(panda), offsets(panda)
 FPS = 20.0
 PULL = ScriptedForce(start=0.5, duration=2.5, towards=(-0.4, 0.6, 0.2), max_force=60.0)
 
@@ -124,12 +126,12 @@ def test_what_the_person_does_is_recorded_in_columns_of_its_own(pulled, tmp_path
     assert list(robot.observation_features) == [*JOINTS, GRIPPER, *names]
     # Those lerobot-rollout hands on to a policy, which knows nothing of the person.
     assert not any(name.endswith((".pos", ".vel")) for name in names)
-    folder, inputs, offsets = tmp_path / "set", [], []
+    folder, inputs, aside = tmp_path / "set", [], []
     with shapes_unchecked(), new_dataset(folder, robot) as dataset:
         for _, action in wishes(robot, 2.0):
             seen = robot.get_observation()
             inputs.append([seen[name] for name in NULLSPACE_INPUTS])
-            offsets.append([seen[name] for name in OFFSETS])
+            aside.append([seen[name] for name in OFFSETS])
             robot.send_action(action)
             add_frame(dataset, seen, action, "go there and back")
         dataset.save_episode()
@@ -137,7 +139,7 @@ def test_what_the_person_does_is_recorded_in_columns_of_its_own(pulled, tmp_path
     (episode,) = read_episodes(folder, keys)
     assert episode["observation.state"].shape == (40, 8)
     np.testing.assert_allclose(episode[keys[0]], inputs, atol=1e-5)
-    np.testing.assert_allclose(episode[keys[1]], offsets, atol=1e-6)
+    np.testing.assert_allclose(episode[keys[1]], aside, atol=1e-6)
     (demo,) = load_demos(folder)
     assert np.abs(demo.human_effort).max() > 1.0
 
@@ -153,7 +155,7 @@ def test_the_real_panda_yields_to_a_device_too(tmp_path, monkeypatch):
         FrankaPandaConfig(person=PersonConfig(kind="scripted"), **settings)
 
     class Device(person.Human):
-        def __init__(self, config):
+        def __init__(self, config, work_arm):
             self.closed = False
 
         def read(self, state):
@@ -165,7 +167,7 @@ def test_the_real_panda_yields_to_a_device_too(tmp_path, monkeypatch):
         def close(self):
             self.closed = True
 
-    monkeypatch.setattr("hrc_learn.lerobot.panda_robot.Person", Device)
+    monkeypatch.setattr("hrc_learn.lerobot.arm_robot.Person", Device)
     with served_franka(
         tmp_path, person=PersonConfig(kind="gamepad"), fps=FPS, dynamics=1.0
     ) as served:

@@ -7,17 +7,23 @@ from lerobot.robots import RobotConfig
 from lerobot.teleoperators import TeleoperatorConfig
 
 from hrc_learn.lerobot import DMPConfig, MotionChunkConfig
-from hrc_learn.lerobot.envs import PandaEnvConfig
-from hrc_learn.lerobot.robots import FrankaPandaConfig, MujocoPandaConfig
-from hrc_learn.lerobot.teleoperators import PandaExpertConfig, PandaPageConfig
+from hrc_learn.lerobot.envs import ArmEnvConfig
+from hrc_learn.lerobot.robots import FrankaPandaConfig, MujocoArmRobotConfig
+from hrc_learn.lerobot.teleoperators import ArmExpertConfig, ArmPageConfig
 
 
 def test_lerobot_knows_them_by_name():
-    assert RobotConfig.get_choice_class("mujoco_panda") is MujocoPandaConfig
+    assert RobotConfig.get_choice_class("mujoco_arm") is MujocoArmRobotConfig
     assert RobotConfig.get_choice_class("franka_panda") is FrankaPandaConfig
-    assert TeleoperatorConfig.get_choice_class("panda_expert") is PandaExpertConfig
-    assert TeleoperatorConfig.get_choice_class("panda_page") is PandaPageConfig
-    assert EnvConfig.get_choice_class("panda") is PandaEnvConfig
+    assert TeleoperatorConfig.get_choice_class("arm_expert") is ArmExpertConfig
+    assert TeleoperatorConfig.get_choice_class("arm_page") is ArmPageConfig
+    assert EnvConfig.get_choice_class("mujoco_arm") is ArmEnvConfig
+    # As they were called when there was no other arm.
+    assert RobotConfig.get_choice_class("mujoco_panda") is MujocoArmRobotConfig
+    assert TeleoperatorConfig.get_choice_class("panda_expert") is ArmExpertConfig
+    assert TeleoperatorConfig.get_choice_class("panda_page") is ArmPageConfig
+    assert EnvConfig.get_choice_class("panda") is ArmEnvConfig
+    assert MujocoArmRobotConfig().type == "mujoco_arm"
     for step in ("hrc_learn_watch_state", "hrc_learn_smooth_actions"):
         assert ProcessorStepRegistry.get(step)
     assert PreTrainedConfig.get_choice_class("dmp") is DMPConfig

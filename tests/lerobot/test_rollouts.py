@@ -5,17 +5,19 @@ import pytest
 import torch
 from unchecked import shapes_unchecked
 
+from hrc_learn.kinematics import panda
 from hrc_learn.lerobot import person
+from hrc_learn.lerobot.arm_robot import GRIPPER, ArmValues
 from hrc_learn.lerobot.expert_recording import add_frame, new_dataset
-from hrc_learn.lerobot.panda_robot import GRIPPER, JOINTS
 from hrc_learn.lerobot.person import PersonConfig
 from hrc_learn.lerobot.policy.closed_form import read_episodes
 from hrc_learn.lerobot.policy.modeling_dmp import write_closed_form_policy
-from hrc_learn.lerobot.robots import MujocoPandaConfig
+from hrc_learn.lerobot.robots import MujocoArmRobotConfig
 from hrc_learn.lerobot.rollouts import CheckpointPolicy, record_rollouts
 from hrc_learn.teleoperation import ScriptedForce
 from hrc_learn.teleoperation.scenarios import Grasping
 
+JOINTS = ArmValues(panda).joints
 FPS = 20.0
 PULL = ScriptedForce(start=0.2, duration=0.6, towards=(-0.4, 0.6, 0.2), max_force=60.0)
 FAR = np.array([0.3, 0.1, 0.0, 0.1, 0.0, 0.1, 0.0])
@@ -24,10 +26,12 @@ FAR = np.array([0.3, 0.1, 0.0, 0.1, 0.0, 0.1, 0.0])
 @pytest.fixture(scope="module")
 def policy(tmp_path_factory):
     """Fitted to two motions along a line."""
-    from hrc_learn.lerobot.robots import MujocoPanda
+    from hrc_learn.lerobot.robots import MujocoArmRobot
 
     home = tmp_path_factory.mktemp("home")
-    robot = MujocoPanda(MujocoPandaConfig(calibration_dir=home, scenario="grasping", fps=FPS))
+    robot = MujocoArmRobot(
+        MujocoArmRobotConfig(calibration_dir=home, scenario="grasping", fps=FPS)
+    )
     robot.connect()
     with shapes_unchecked(), new_dataset(home / "set", robot) as dataset:
         for seed in (0, 1):
@@ -52,7 +56,7 @@ def test_a_checkpoint_is_rolled_out_and_recorded_with_what_the_person_does(
     monkeypatch.setattr(person, "scripted_pulls", lambda seed: (PULL,) if seed == 8 else ())
     monkeypatch.setattr(Grasping, "duration", 1.0)
     who = PersonConfig(kind="scripted", record=True)
-    config = MujocoPandaConfig(
+    config = MujocoArmRobotConfig(
         calibration_dir=tmp_path, scenario="grasping", fps=FPS, seed=7, person=who
     )
     with shapes_unchecked():

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 from hrc_learn.cli._options import Detail, More
-from hrc_learn.cli.arguments import Channel, Configuration, Measured, Scaling, Written
+from hrc_learn.cli.arguments import Channel, Configuration, Measured, OfRobot, Scaling, Written
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,7 +155,7 @@ class EvaluateImageJacobian(Measured):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Tune(Written):
+class Tune(OfRobot, Written):
     """Tune gains of the controller: the marker sooner at its target, in simulation.
 
     Searches the gains over a batch of closed loops against the workplace's camera, turned by

@@ -63,11 +63,11 @@ class RecordServoing(OfRobot, Led, Written):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RecordExpert(Measured):
-    """Record the scripted expert on LeRobot's simulated Panda, in simulated time.
+class RecordExpert(OfRobot, Measured):
+    """Record the scripted expert on LeRobot's simulated arm, in simulated time.
 
-    Writes what lerobot-record would write with --robot.type=mujoco_panda and
-    --teleop.type=panda_expert, but waits for no clock: every episode is shown to its end, as
+    Writes what lerobot-record would write with --robot.type=mujoco_arm and
+    --teleop.type=arm_expert, but waits for no clock: every episode is shown to its end, as
     fast as the machine can. Demonstrations that fail are shown again.
     """
 

@@ -275,7 +275,7 @@ class Sweep(OfRobot, Written):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SweepWorker(Imperfect, Written):
+class SweepWorker(OfRobot, Imperfect, Written):
     """Many arms at their job, each beside a worker who does not look at it.
 
     Another worker comes in each run, puts something on the table, reaches for markers under the

@@ -129,15 +129,18 @@ def _opening(args: RecordPlacing | RecordServoing, robot: WorkArm) -> OpenArm:
 
 
 def record_expert(args: RecordExpert) -> int:
-    """The same expert on LeRobot's simulated Panda."""
+    """The same expert on LeRobot's simulated arm."""
     from hrc_learn.lerobot.expert_recording import record_expert as recorded
-    from hrc_learn.lerobot.robots import MujocoPandaConfig
+    from hrc_learn.lerobot.robots import MujocoArmRobotConfig
 
     if args.episodes < 1:
         raise ValueError(f"--episodes must be at least 1, but is {args.episodes}.")
     if args.out.exists():
         raise FileExistsError(f"there is something at {args.out}: give another folder.")
-    config = MujocoPandaConfig(
+    config = MujocoArmRobotConfig(
+        arm=args.robot,
+        base=args.base,
+        tip=args.tip,
         scenario=args.scenario,
         shelf=args.shelf,
         fps=float(args.fps),

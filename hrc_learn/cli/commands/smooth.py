@@ -17,7 +17,7 @@ def smooth(args: Smooth) -> None:
     if args.checkpoint is None and (args.remove or args.limits is None):
         raise ValueError("--checkpoint is needed, or --limits to write them to a file alone.")
     # LeRobot takes seconds to import.
-    from hrc_learn.lerobot.panda_robot import JOINTS
+    from hrc_learn.lerobot.arm_robot import ArmValues
     from hrc_learn.lerobot.smoothing import add_smoothing, gathered_limits, remove_smoothing
 
     if args.remove and args.checkpoint is not None:
@@ -37,7 +37,7 @@ def smooth(args: Smooth) -> None:
     )
     if args.urdf is None and args.calibration is None:
         ends = zip(panda.limits.lower.tolist(), panda.limits.upper.tolist(), strict=True)
-        limits = limits.within(dict(zip(JOINTS, ends, strict=True)))
+        limits = limits.within(dict(zip(ArmValues(panda).joints, ends, strict=True)))
     if args.limits is not None:
         limits.save(args.limits)
     if args.checkpoint is not None:

@@ -50,6 +50,10 @@ def sweep_worker(args: SweepWorker) -> int:
     """Run the study, print its table, write the figures."""
     if args.out is not None:
         refuse_existing(args.out, args.overwrite)
+    if args.robot != "panda":
+        raise ValueError(
+            f"--robot {args.robot}: hrc sweep worker is about a Panda, as are its workers."
+        )
     if args.cycles < 1:
         raise ValueError(f"--cycles must be at least 1, but is {args.cycles}.")
     if any(not distance > 0 for distance in args.stop_distances):

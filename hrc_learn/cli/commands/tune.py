@@ -21,6 +21,7 @@ from hrc_learn.experiments.controller.initialization_study import (
     summary,
 )
 from hrc_learn.jacobian import KalmanEstimator
+from hrc_learn.kinematics import ArmChoice
 from hrc_learn.learning.tuning import TUNED, TuningState
 from hrc_learn.sim import World
 from hrc_learn.sim.workplace import Workplace
@@ -39,7 +40,7 @@ def tune(args: Tune) -> None:
     place = args.out.with_name(f"{args.out.name}.search.json")
     search, history = _begin(args, place, default)
     with new_folder(args.out, asdict(args), args.overwrite) as folder:
-        cost = _cost(_loops(args.starts), default)
+        cost = _cost(_loops(args, args.starts), default)
         with Progress(console=console) as progress:
             task = progress.add_task("Searching", total=args.generations)
             progress.advance(task, search.generation)
@@ -75,9 +76,9 @@ def _begin(
     return TuningState.around(start, seed=args.starts.seed), []
 
 
-def _loops(config: StartsConfig) -> ClosedLoops:
-    """Above the table of the workplace."""
-    workplace = Workplace()
+def _loops(args: Tune, config: StartsConfig) -> ClosedLoops:
+    """Above the table of the arm's workplace."""
+    workplace = Workplace.of(ArmChoice(args.robot, args.base, args.tip).work_arm())
     world = World(workplace.scene)
     world.reset(workplace.home_joints().numpy(), {})
     middle = workplace.hover().position
@@ -88,6 +89,7 @@ def _loops(config: StartsConfig) -> ClosedLoops:
         torch.stack([middle - reach, middle + reach]),
         workplace.hover_joints(),
         config,
+        workplace.robot,
     )
 
 
@@ -106,7 +108,7 @@ def _figures(
     args: Tune, default: ControllerConfig, gains: dict[str, float]
 ) -> dict[str, float]:
     """The gains, and times with and without them on closed loops that were not searched."""
-    loops = _loops(replace(args.starts, seed=args.held_out_seed))
+    loops = _loops(args, replace(args.starts, seed=args.held_out_seed))
     estimator = KalmanEstimator(guessed_network())
     figures = dict(gains)
     for name, config in (("default", default), ("tuned", replace(default, **gains))):

@@ -22,9 +22,8 @@ from hrc_learn.jacobian import (
     KalmanEstimator,
     RBFImageJacobian,
 )
-from hrc_learn.kinematics import gripper_down, panda
+from hrc_learn.kinematics import PANDA, WorkArm, gripper_down
 from hrc_learn.sim.closed_loop import Imperfections, VirtualCamera, simulate_closed_loop
-from hrc_learn.skills.arm_motion import nearest_configuration
 from hrc_learn.skills.visual_skill import guessed_network
 from hrc_learn.vision import CameraModel
 
@@ -96,6 +95,7 @@ class ClosedLoops:
     """[rad]"""
     goals: Goals
     config: StartsConfig
+    robot: WorkArm = PANDA
 
     @classmethod
     def draw(
@@ -105,6 +105,7 @@ class ClosedLoops:
         workspace: Float[Tensor, "2 3"],
         near: Float[Tensor, "joints"],
         config: StartsConfig,
+        robot: WorkArm = PANDA,
     ) -> "ClosedLoops":
         """Draw them at random.
 
@@ -114,6 +115,7 @@ class ClosedLoops:
             workspace: Lower and upper corner of the box of starts and targets [m].
             near: Joints with the end effector in it, near which starts are chosen [rad].
             config: How.
+            robot: The arm.
         """
         rng, n = torch.Generator().manual_seed(config.seed), config.count
 
@@ -132,9 +134,10 @@ class ClosedLoops:
         tilted = quaternion.multiply(quaternion.exp(config.tilt * uniform(3)), down)
         return cls(
             camera=turned,
-            start=_postures(Pose(middle + half * uniform(3), tilted), near),
+            start=robot.nearest(Pose(middle + half * uniform(3), tilted), near, samples=9),
             goals=Goals.at(middle, down[0], target),
             config=config,
+            robot=robot,
         )
 
     def times(
@@ -142,11 +145,12 @@ class ClosedLoops:
     ) -> Float[Tensor, " starts"]:
         """Time until the marker stays at its target [s]; infinite where it does not."""
         config, target = self.config, self.goals.vision.target
-        controller = AdaptiveController(panda, estimator, self.goals, config=control)
+        chain = self.robot.chain
+        controller = AdaptiveController(chain, estimator, self.goals, config=control)
         reached = torch.full((len(self.start),), math.inf, dtype=torch.float64)
 
         def watch(step: int, q: Tensor, *_: object) -> None:
-            error = self.camera.project(panda.forward(q))[0] - target
+            error = self.camera.project(chain.forward(q))[0] - target
             near = torch.linalg.vector_norm(error, dim=-1) < config.reached
             # The first step of the last interval inside.
             reached.copy_(torch.where(near, reached.clamp(max=step * config.dt), math.inf))
@@ -165,11 +169,6 @@ class ClosedLoops:
                 on_step=watch,
             )
         return reached
-
-
-def _postures(tool: Pose, near: Float[Tensor, "joints"]) -> Float[Tensor, "starts joints"]:
-    """Joint positions with the end effector at each of the poses [rad]."""
-    return nearest_configuration(tool, near, samples=9)
 
 
 class _Turned(KalmanEstimator):

@@ -1,6 +1,6 @@
-"""The Panda as a LeRobot robot: simulated, and real."""
+"""Arms as LeRobot robots: any in simulation, and a real Panda."""
 
 from hrc_learn.lerobot.robots.franka_panda import FrankaPanda as FrankaPanda
 from hrc_learn.lerobot.robots.franka_panda import FrankaPandaConfig as FrankaPandaConfig
-from hrc_learn.lerobot.robots.mujoco_panda import MujocoPanda as MujocoPanda
-from hrc_learn.lerobot.robots.mujoco_panda import MujocoPandaConfig as MujocoPandaConfig
+from hrc_learn.lerobot.robots.mujoco_arm import MujocoArmRobot as MujocoArmRobot
+from hrc_learn.lerobot.robots.mujoco_arm import MujocoArmRobotConfig as MujocoArmRobotConfig

@@ -25,8 +25,8 @@ from hrc_learn.hardware import (
     Load,
     Realtime,
 )
-from hrc_learn.kinematics import panda
-from hrc_learn.lerobot.panda_robot import PandaRobot, PandaRobotConfig
+from hrc_learn.kinematics import PANDA
+from hrc_learn.lerobot.arm_robot import ArmRobot, ArmRobotConfig
 from hrc_learn.protocols import Arm
 from hrc_learn.watchdog import bring_to_rest
 
@@ -44,7 +44,7 @@ _DELAY = 0.030
 
 @RobotConfig.register_subclass("franka_panda")
 @dataclass(kw_only=True)
-class FrankaPandaConfig(PandaRobotConfig):
+class FrankaPandaConfig(ArmRobotConfig):
     """A Franka Panda at its control box; `--robot.type=franka_panda`."""
 
     ip: str
@@ -99,7 +99,7 @@ class FrankaPandaConfig(PandaRobotConfig):
         )
 
 
-class FrankaPanda(PandaRobot):
+class FrankaPanda(ArmRobot):
     """A Franka Panda led by positions, through its velocity interface.
 
     NOT RUN ON HARDWARE. Between an action and the arm stand, in this order: the limits of the
@@ -116,7 +116,7 @@ class FrankaPanda(PandaRobot):
     watchdog: Watchdog | ArmProcess
 
     def __init__(self, config: FrankaPandaConfig):
-        super().__init__(config)
+        super().__init__(config, PANDA)
         self.config = config
         self.cameras = make_cameras_from_configs(config.cameras)
         self._arm: FrankyArm | ArmProcess
@@ -151,7 +151,7 @@ class FrankaPanda(PandaRobot):
             self.watchdog = Watchdog(config.timeout, self._arm.stop)
         safety = SafetyConfig(tcp_speed=config.tcp_speed, braking=config.dynamics, delay=_DELAY)
         self._servo = PositionServo(
-            panda, self._arm, self.dt, PositionServoConfig(safety=safety)
+            PANDA.chain, self._arm, self.dt, PositionServoConfig(safety=safety)
         )
         for camera in self.cameras.values():
             camera.connect()
@@ -175,10 +175,12 @@ class FrankaPanda(PandaRobot):
             values[name] = camera.read_latest()
         return values
 
-    def _joints_at(self, pose: Pose) -> Float[np.ndarray, "7"]:
+    def _joints_at(self, pose: Pose) -> Float[np.ndarray, " joints"]:
         return self._servo.joints_at(pose)
 
-    def _command(self, joints: Float[np.ndarray, "7"], width: float) -> Float[np.ndarray, "7"]:
+    def _command(
+        self, joints: Float[np.ndarray, " joints"], width: float
+    ) -> Float[np.ndarray, " joints"]:
         if self.watchdog.trips != self._trips:
             self._trips = self.watchdog.trips
             self._servo.restart()  # the arm is at rest, which the servo does not know

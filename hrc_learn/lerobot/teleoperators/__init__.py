@@ -1,10 +1,10 @@
-"""Who leads a Panda: a script that shows a job, or a person in a browser."""
+"""Who leads an arm: a script that shows a job, or a person in a browser."""
 
-from hrc_learn.lerobot.teleoperators.panda_teleoperators import PandaExpert as PandaExpert
-from hrc_learn.lerobot.teleoperators.panda_teleoperators import (
-    PandaExpertConfig as PandaExpertConfig,
+from hrc_learn.lerobot.teleoperators.arm_teleoperators import ArmExpert as ArmExpert
+from hrc_learn.lerobot.teleoperators.arm_teleoperators import (
+    ArmExpertConfig as ArmExpertConfig,
 )
-from hrc_learn.lerobot.teleoperators.panda_teleoperators import PandaPage as PandaPage
-from hrc_learn.lerobot.teleoperators.panda_teleoperators import (
-    PandaPageConfig as PandaPageConfig,
+from hrc_learn.lerobot.teleoperators.arm_teleoperators import ArmPage as ArmPage
+from hrc_learn.lerobot.teleoperators.arm_teleoperators import (
+    ArmPageConfig as ArmPageConfig,
 )

@@ -9,14 +9,15 @@ from lerobot.teleoperators import make_teleoperator_from_config
 from served_franka import served_franka
 from unchecked import shapes_unchecked
 
-from hrc_learn.kinematics import panda
-from hrc_learn.lerobot.panda_robot import GRIPPER, HAND, JOINTS
-from hrc_learn.lerobot.teleoperators import PandaExpertConfig, PandaPageConfig
-from hrc_learn.lerobot.teleoperators.panda_teleoperators import GuidedRobot
+from hrc_learn.kinematics import fr3, panda
+from hrc_learn.lerobot.arm_robot import GRIPPER, HAND, ArmValues
+from hrc_learn.lerobot.teleoperators import ArmExpertConfig, ArmPageConfig
+from hrc_learn.lerobot.teleoperators.arm_teleoperators import GuidedRobot
 from hrc_learn.protocols import ArmState, Human, HumanInput
 from hrc_learn.teleoperation import hand_guiding, page
 
 READY = panda.ready.numpy()
+JOINTS = ArmValues(panda).joints
 
 
 class Arm:
@@ -24,6 +25,7 @@ class Arm:
 
     def __init__(self, space):
         self.space, self.dt, self.initial_configurations = space, 0.1, 0
+        self.values = ArmValues(panda)
         self.joints = READY.copy()
 
     def read_state(self):
@@ -105,7 +107,7 @@ def test_poses_of_the_hand_go_on_past_half_a_turn(pull):
 @pytest.mark.parametrize("space", ["joint", "ee"])
 def test_the_expert_leads_from_wherever_it_begins(simulated, tmp_path, space):
     robot = simulated(scenario="grasping", fps=20.0, seed=3, action_space=space)
-    expert = make_teleoperator_from_config(PandaExpertConfig(calibration_dir=tmp_path))
+    expert = make_teleoperator_from_config(ArmExpertConfig(calibration_dir=tmp_path))
     expert.connect()
 
     def led(steps):
@@ -135,7 +137,8 @@ class Page(Human):
     requests = ()
 
     def __init__(self, chain, bodies, boxes, config, *, guides):
-        self.config, self.open, self.human = config, False, self
+        self.chain, self.config = chain, config
+        self.open, self.human = False, self
         self.places = []
 
     def __enter__(self):
@@ -158,7 +161,7 @@ class Page(Human):
 @pytest.fixture
 def served(monkeypatch, tmp_path):
     monkeypatch.setattr(page, "Page", Page)
-    config = PandaPageConfig(calibration_dir=tmp_path, host="0.0.0.0", port=8123)
+    config = ArmPageConfig(calibration_dir=tmp_path, host="0.0.0.0", port=8123)
     leader = make_teleoperator_from_config(config)
     leader.connect()
     assert leader.page.open
@@ -182,6 +185,20 @@ def test_a_page_leads_the_simulated_panda_and_shows_its_world(simulated, served)
     served.get_action()
     assert any(np.allclose(served.page.places[-1][0][-1], x) for x in data.xpos)
     assert robot.run.seed == 3
+
+
+def test_a_page_that_was_there_first_shows_the_arm_that_is_connected(simulated, served):
+    first = served.page
+    assert first.chain is panda
+    robot = simulated(scenario="grasping", fps=20.0, arm="fr3")
+    action = served.get_action()
+    assert action.keys() == robot.action_features.keys() == served.action_features.keys()
+    assert served.page.chain is fr3
+    assert served.page.open
+    assert not first.open
+    shown = served.page
+    served.get_action()
+    assert served.page is shown
 
 
 def test_home_begins_the_scenario_anew(simulated, served):
@@ -212,7 +229,7 @@ def test_a_page_shows_the_real_panda_where_it_is(franka, served):
 
 
 def test_the_expert_knows_no_real_panda(franka, tmp_path):
-    expert = make_teleoperator_from_config(PandaExpertConfig(calibration_dir=tmp_path))
+    expert = make_teleoperator_from_config(ArmExpertConfig(calibration_dir=tmp_path))
     expert.connect()
-    with pytest.raises(ValueError, match="of a mujoco_panda only, not of franka_panda"):
+    with pytest.raises(ValueError, match="of a mujoco_arm only, not of franka_panda"):
         expert.get_action()

@@ -1,32 +1,27 @@
-"""What LeRobot's names for the values of a Panda stand for."""
+"""What LeRobot's names for the values of an arm stand for."""
 
 import numpy as np
 import pytest
 import torch
+from bare_arm import bare
 from lerobot.utils.errors import DeviceNotConnectedError
 
 from hrc_learn.geometry import Pose
-from hrc_learn.kinematics import panda
-from hrc_learn.lerobot.panda_robot import (
-    GRIPPER,
-    HAND,
-    JOINTS,
-    VELOCITIES,
-    action_of,
-    hand_vector,
-    observed,
-    robot_registry,
-    target_of,
-)
-from hrc_learn.lerobot.robots import FrankaPandaConfig, MujocoPandaConfig
+from hrc_learn.kinematics import EquippedArm, panda
+from hrc_learn.lerobot.arm_robot import GRIPPER, HAND, ArmValues, robot_registry
+from hrc_learn.lerobot.expert_recording import observation_features
+from hrc_learn.lerobot.person import PersonConfig
+from hrc_learn.lerobot.robots import FrankaPandaConfig, MujocoArmRobotConfig
 
 READY = panda.ready.numpy()
+VALUES = ArmValues(panda)
+JOINTS, VELOCITIES = VALUES.joints, VALUES.velocities
 
 
 @pytest.mark.parametrize("space", ["joint", "ee"])
 def test_an_action_says_where_it_came_from(space):
     joints = READY + 0.1
-    where, width = target_of(action_of(space, joints, 0.05))
+    where, width = VALUES.target_of(VALUES.action_of(space, joints, 0.05))
     assert width == 0.05
     if isinstance(where, Pose):
         assert space == "ee"
@@ -39,15 +34,67 @@ def test_an_action_says_where_it_came_from(space):
 
 def test_rotation_vectors_go_on_past_half_a_turn():
     turned = [READY + np.array([0, 0, 0, 0, 0, d, 0]) for d in np.linspace(-0.2, 0.2, 9)]
-    vectors = [hand_vector(turned[0])[3:]]
+    vectors = [VALUES.hand_vector(turned[0])[3:]]
     for joints in turned[1:]:
-        vectors.append(hand_vector(joints, vectors[-1])[3:])
+        vectors.append(VALUES.hand_vector(joints, vectors[-1])[3:])
     assert np.abs(np.diff(vectors, axis=0)).max() < 0.1
 
 
 def test_an_action_without_joints_is_refused():
     with pytest.raises(ValueError, match=r"lacks panda_joint2\.pos"):
-        target_of({JOINTS[0]: 0.0})
+        VALUES.target_of({JOINTS[0]: 0.0})
+
+
+@pytest.fixture
+def six(monkeypatch):
+    """Lets every simulated arm be one of six joints, a Panda's without the third."""
+    arm = EquippedArm(bare())
+    monkeypatch.setattr(MujocoArmRobotConfig, "work_arm", lambda config: arm)
+    return arm
+
+
+@pytest.mark.parametrize("space", ["joint", "ee"])
+def test_names_are_those_of_the_arms_joints(six, simulated, space):
+    robot = simulated(scenario="grasping", action_space=space, velocity=True, hand=True)
+    assert robot.name == "mujoco_cut"
+    joints = [f"cut_{i}.pos" for i in (0, 1, 3, 4, 5, 6)]
+    velocities = [name.replace(".pos", ".vel") for name in joints]
+    values = robot.get_observation()
+    assert list(values) == [*joints, *velocities, *HAND, GRIPPER]
+    actions = [*(joints if space == "joint" else HAND), GRIPPER]
+    assert list(robot.action_features) == actions
+    q = torch.tensor([values[name] for name in joints], dtype=torch.float64)
+    tool = six.chain.forward(q)
+    assert [values[name] for name in HAND[:3]] == pytest.approx(tool.position.tolist())
+    # It goes where it is sent, by either kind of actions.
+    sent = q + 0.005
+    goal = six.chain.forward(sent)
+    action = ArmValues(six.chain).action_of(space, sent.numpy(), 0.06)
+    for _ in range(20):
+        robot.send_action(action)
+    there = six.chain.forward(torch.from_numpy(robot.read_state().joint_position))
+    assert float(there.twist_to(goal).abs().max()) < 1e-3
+
+
+def test_nobody_can_lead_the_body_of_six_joints(six, simulated):
+    with pytest.raises(ValueError, match=r"body of a cut beside .* its 6 joints no motion"):
+        simulated(scenario="grasping", person=PersonConfig(kind="scripted"))
+
+
+def test_what_the_person_does_is_named_after_the_joints_too(simulated):
+    settings = {"arm": "fr3", "scenario": "grasping"}
+    who = PersonConfig(kind="scripted", record=True)
+    robot = simulated(person=who, **settings)
+    names = [f"fr3_joint{i}" for i in range(1, 8)]
+    asked = [f"{name}.human_torque" for name in names]
+    aside = [f"{name}.pushed_aside" for name in names]
+    values = robot.get_observation()
+    joints = [f"{name}.pos" for name in names]
+    assert list(values) == [*joints, GRIPPER, *asked, *aside]
+    features = observation_features(robot)
+    assert features["observation.human_effort"]["names"] == asked
+    assert features["observation.pushed_aside"]["names"] == aside
+    assert robot.world.config.arm.robot.name == "fr3"
 
 
 @pytest.mark.parametrize("space", ["joint", "ee"])
@@ -91,7 +138,7 @@ def test_a_robot_is_found_by_its_name_or_where_it_is_the_only_one(simulated):
 
 def test_an_action_of_the_hand_in_part_is_none_of_it():
     action = dict.fromkeys(HAND[:5], 0.1) | dict.fromkeys(JOINTS, 0.2)
-    where, width = target_of(action)
+    where, width = VALUES.target_of(action)
     np.testing.assert_array_equal(where, np.full(7, 0.2))
     assert np.isnan(width)
 
@@ -104,9 +151,9 @@ def test_an_action_of_the_hand_in_part_is_none_of_it():
         (FrankaPandaConfig, {"dynamics": 1.0}, {"dynamics": 1.01}),
         (FrankaPandaConfig, {"dynamics": 0.01}, {"dynamics": 0.0}),
         (FrankaPandaConfig, {"fps": 20.0, "timeout": 0.076}, {"fps": 20.0, "timeout": 0.075}),
-        (MujocoPandaConfig, {"fps": 5.0}, {"fps": 4.9}),
-        (MujocoPandaConfig, {"fps": 500.0}, {"fps": 500.5}),
-        (MujocoPandaConfig, {"episode_time": 0.5}, {"episode_time": -0.5}),
+        (MujocoArmRobotConfig, {"fps": 5.0}, {"fps": 4.9}),
+        (MujocoArmRobotConfig, {"fps": 500.0}, {"fps": 500.5}),
+        (MujocoArmRobotConfig, {"episode_time": 0.5}, {"episode_time": -0.5}),
     ],
 )
 def test_settings_have_bounds(config, good, bad):
@@ -120,7 +167,7 @@ def test_settings_have_bounds(config, good, bad):
 def test_one_value_alone_is_observed_as_among_others(simulated):
     state = simulated(scenario="grasping").read_state()
     names = (*JOINTS, *VELOCITIES, *HAND, GRIPPER)
-    everything = observed(state, names)
+    everything = VALUES.observed(state, names)
     assert list(everything) == list(names)
     for name in names:
-        assert observed(state, [name]) == {name: everything[name]}
+        assert VALUES.observed(state, [name]) == {name: everything[name]}

@@ -1,4 +1,4 @@
-"""The Panda as LeRobot sees it: names and units of its values, and what all its robots share.
+"""An arm as LeRobot sees it: names and units of its values, and what all its robots share.
 
 Radians, metres and pixels; poses in the base frame as position and rotation vector. Names end
 in `.pos` or `.vel` because lerobot-rollout hands on no others.
@@ -20,7 +20,7 @@ from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnected
 from torch import Tensor
 
 from hrc_learn.geometry import Pose, quaternion
-from hrc_learn.kinematics import gripper_down, panda, panda_capsules
+from hrc_learn.kinematics import SerialChain, WorkArm, gripper_down
 from hrc_learn.lerobot.loop_watch import LoopWatch
 from hrc_learn.lerobot.person import Person, PersonConfig
 from hrc_learn.protocols import Arm, ArmState
@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from hrc_learn.skills.arm_motion import PositionServo
     from hrc_learn.skills.complementary_motion import ComplementaryMotion
 
-JOINTS = tuple(f"{name}.pos" for name in panda.joint_names)
-VELOCITIES = tuple(f"{name}.vel" for name in panda.joint_names)
 HAND = tuple(f"ee.{axis}.pos" for axis in ("x", "y", "z", "wx", "wy", "wz"))
 GRIPPER = "gripper.pos"
 PIXELS = ("object.u.pos", "object.v.pos")
@@ -41,87 +39,102 @@ MARKER = ("marker.u.pos", "marker.v.pos", "marker.seen.pos")
 ActionSpace = Literal["joint", "ee"]
 """Positions of the joints, or of the end effector; the gripper's opening in either case."""
 
-
-def action_names(space: ActionSpace) -> tuple[str, ...]:
-    """Names of an action's values, in order."""
-    return (*(JOINTS if space == "joint" else HAND), GRIPPER)
-
-
 DOWN = quaternion.log(gripper_down()).numpy()
 """Rotation vector of a gripper that points down, by which those of others are told [rad]."""
 
 
-def action_of(
-    space: ActionSpace,
-    joints: Float[np.ndarray, "7"],
-    width: float,
-    near: Float[np.ndarray, "3"] = DOWN,
-) -> dict[str, float]:
-    """The action that sends the joints somewhere, and the gripper to an opening.
+class ArmValues:
+    """The values of an arm by their names: those of its joints are called as the joints are.
 
-    Args:
-        space: Of the action.
-        joints: Positions [rad].
-        width: Opening [m].
-        near: Rotation vector before, which this one goes on from [rad].
+    Attributes:
+        chain: Of the arm.
+        joints: Names of the joints' positions [rad].
+        velocities: Names of their velocities [rad/s].
     """
-    values = joints if space == "joint" else hand_vector(joints, near)
-    return dict(zip(action_names(space), (*map(float, values), float(width)), strict=True))
 
+    def __init__(self, chain: SerialChain):
+        """Name them."""
+        self.chain = chain
+        self.joints = tuple(f"{name}.pos" for name in chain.joint_names)
+        self.velocities = tuple(f"{name}.vel" for name in chain.joint_names)
 
-def hand_vector(
-    joints: Float[np.ndarray, "7"], near: Float[np.ndarray, "3"] = DOWN
-) -> Float[np.ndarray, "6"]:
-    """Position [m] and rotation vector [rad] of the end effector.
+    def action_names(self, space: ActionSpace) -> tuple[str, ...]:
+        """Names of an action's values, in order."""
+        return (*(self.joints if space == "joint" else HAND), GRIPPER)
 
-    A gripper that points down is half a turn from the base, where the shortest rotation vector
-    jumps from one side to the other; `near` picks the side.
-    """
-    pose = panda.forward(torch.from_numpy(np.asarray(joints, dtype=float)))
-    vector = pose.vector()
-    pair = torch.stack([torch.from_numpy(np.array(near, dtype=float)), vector[3:]])
-    return torch.cat([vector[:3], quaternion.unwrap_log(pair)[1]]).numpy()
+    def action_of(
+        self,
+        space: ActionSpace,
+        joints: Float[np.ndarray, " joints"],
+        width: float,
+        near: Float[np.ndarray, "3"] = DOWN,
+    ) -> dict[str, float]:
+        """The action that sends the joints somewhere, and the gripper to an opening.
 
+        Args:
+            space: Of the action.
+            joints: Positions [rad].
+            width: Opening [m].
+            near: Rotation vector before, which this one goes on from [rad].
+        """
+        values = joints if space == "joint" else self.hand_vector(joints, near)
+        names = self.action_names(space)
+        return dict(zip(names, (*map(float, values), float(width)), strict=True))
 
-def target_of(action: Mapping[str, Any]) -> tuple[Float[np.ndarray, "7"] | Pose, float]:
-    """Read an action of either space; names it does not know are passed over.
+    def hand_vector(
+        self, joints: Float[np.ndarray, " joints"], near: Float[np.ndarray, "3"] = DOWN
+    ) -> Float[np.ndarray, "6"]:
+        """Position [m] and rotation vector [rad] of the end effector.
 
-    Returns:
-        Positions of the joints [rad] or pose of the end effector, and opening of the gripper
-        [m], NaN where none is given.
+        A gripper that points down is half a turn from the base, where the shortest rotation
+        vector jumps from one side to the other; `near` picks the side.
+        """
+        pose = self.chain.forward(torch.from_numpy(np.asarray(joints, dtype=float)))
+        vector = pose.vector()
+        pair = torch.stack([torch.from_numpy(np.array(near, dtype=float)), vector[3:]])
+        return torch.cat([vector[:3], quaternion.unwrap_log(pair)[1]]).numpy()
 
-    Raises:
-        ValueError: Names are missing.
-    """
-    width = float(action.get(GRIPPER, np.nan))
-    if all(name in action for name in HAND):
-        vector = torch.tensor([float(action[name]) for name in HAND], dtype=torch.float64)
-        return Pose.from_vector(vector), width
-    missing = [name for name in JOINTS if name not in action]
-    if missing:
-        raise ValueError(
-            f"an action for a Panda needs {', '.join(JOINTS)} or {', '.join(HAND)}, but lacks "
-            f"{', '.join(missing)}."
-        )
-    return np.array([float(action[name]) for name in JOINTS]), width
+    def target_of(
+        self, action: Mapping[str, Any]
+    ) -> tuple[Float[np.ndarray, " joints"] | Pose, float]:
+        """Read an action of either space; names it does not know are passed over.
 
+        Returns:
+            Positions of the joints [rad] or pose of the end effector, and opening of the
+            gripper [m], NaN where none is given.
 
-def observed(
-    state: ArmState, names: Sequence[str], near: Float[np.ndarray, "3"] = DOWN
-) -> dict[str, float]:
-    """Values of an arm's state by name.
+        Raises:
+            ValueError: Names are missing.
+        """
+        width = float(action.get(GRIPPER, np.nan))
+        if all(name in action for name in HAND):
+            vector = torch.tensor([float(action[name]) for name in HAND], dtype=torch.float64)
+            return Pose.from_vector(vector), width
+        missing = [name for name in self.joints if name not in action]
+        if missing:
+            raise ValueError(
+                f"an action for this arm needs {', '.join(self.joints)} or {', '.join(HAND)}, "
+                f"but lacks {', '.join(missing)}."
+            )
+        return np.array([float(action[name]) for name in self.joints]), width
 
-    Args:
-        state: Of the arm.
-        names: Wanted, of those of this module but `PIXELS` and `MARKER`.
-        near: Rotation vector of the end effector before [rad].
-    """
-    values = dict(zip(JOINTS, state.joint_position.tolist(), strict=True))
-    values |= zip(VELOCITIES, state.joint_velocity.tolist(), strict=True)
-    values[GRIPPER] = state.gripper_width
-    if not {*HAND}.isdisjoint(names):
-        values |= zip(HAND, hand_vector(state.joint_position, near).tolist(), strict=True)
-    return {name: float(values[name]) for name in names}
+    def observed(
+        self, state: ArmState, names: Sequence[str], near: Float[np.ndarray, "3"] = DOWN
+    ) -> dict[str, float]:
+        """Values of the arm's state by name.
+
+        Args:
+            state: Of the arm.
+            names: Wanted, of those of this class, `HAND` and `GRIPPER`.
+            near: Rotation vector of the end effector before [rad].
+        """
+        q = state.joint_position
+        values = dict(zip(self.joints, q.tolist(), strict=True))
+        values |= zip(self.velocities, state.joint_velocity.tolist(), strict=True)
+        values[GRIPPER] = state.gripper_width
+        if not {*HAND}.isdisjoint(names):
+            values |= zip(HAND, self.hand_vector(q, near).tolist(), strict=True)
+        return {name: float(values[name]) for name in names}
 
 
 class Device:
@@ -185,21 +198,21 @@ class RobotRegistry:
     """
 
     def __init__(self) -> None:
-        self._robots: list[PandaRobot] = []
+        self._robots: list[ArmRobot] = []
 
-    def __iter__(self) -> Iterator[PandaRobot]:
+    def __iter__(self) -> Iterator[ArmRobot]:
         """In the order in which they were connected."""
         return iter(tuple(self._robots))
 
-    def add(self, robot: PandaRobot) -> None:
+    def add(self, robot: ArmRobot) -> None:
         """Note a robot that has been connected."""
         self._robots.append(robot)
 
-    def remove(self, robot: PandaRobot) -> None:
+    def remove(self, robot: ArmRobot) -> None:
         """Forget a robot that has been disconnected."""
         self._robots.remove(robot)
 
-    def find(self, id: str | None) -> PandaRobot:
+    def find(self, id: str | None) -> ArmRobot:
         """The robot with a name, or the only one.
 
         Raises:
@@ -211,7 +224,7 @@ class RobotRegistry:
         names = ", ".join(repr(robot.id) for robot in self._robots) or "none"
         wanted = "a robot of hrc_learn" if id is None else f"one robot with id {id!r}"
         raise DeviceNotConnectedError(
-            f"this teleoperator guides {wanted} (mujoco_panda or franka_panda); connected: "
+            f"this teleoperator guides {wanted} (mujoco_arm or franka_panda); connected: "
             f"{names}. Give --teleop.robot_id where there are several."
         )
 
@@ -223,8 +236,8 @@ def robot_registry() -> RobotRegistry:
 
 
 @dataclass(kw_only=True)
-class PandaRobotConfig(RobotConfig):
-    """Settings that the simulated and the real Panda share."""
+class ArmRobotConfig(RobotConfig):
+    """Settings that simulated and real arms share."""
 
     fps: float = 50.0
     """Actions a second: the rate of the dataset, or of the rollout."""
@@ -238,17 +251,19 @@ class PandaRobotConfig(RobotConfig):
     """Who leads the body while actions lead the end effector."""
 
 
-class PandaRobot(Device, Robot):
-    """A Panda led by positions of its joints, or of its end effector.
+class ArmRobot(Device, Robot):
+    """An arm led by positions of its joints, or of its end effector.
 
     Actions of either space are obeyed, and values they do not name are left alone, so that
     lerobot-rollout's way back to the first position works as well. What an action asks for is
     done within the limits of the joints only; `send_action` returns what was done.
 
-    With a person beside it (`PandaRobotConfig.person`) actions lead the end effector only, and
+    With a person beside it (`ArmRobotConfig.person`) actions lead the end effector only, and
     the person the body, at the same time (`ComplementaryMotion`).
 
     Attributes:
+        work_arm: The arm, with its hand.
+        values: What it observes and is sent, by name.
         space: Of the actions that it declares.
         dt: Time between actions [s].
         initial_configurations: How often everything has been put in place, which only a
@@ -259,22 +274,28 @@ class PandaRobot(Device, Robot):
 
     complement: ComplementaryMotion | None = None
 
-    def __init__(self, config: PandaRobotConfig):
+    def __init__(self, config: ArmRobotConfig, work_arm: WorkArm):
         super().__init__(config)
+        if config.person.kind != "none" and work_arm.null_space == "none":
+            raise ValueError(
+                f"person.kind: nobody can lead the body of a {work_arm.name} beside its hand: "
+                f"a full pose of the hand leaves its {work_arm.joints} joints no motion."
+            )
+        self.work_arm, self.values = work_arm, ArmValues(work_arm.chain)
         self.space: ActionSpace = config.action_space
         self.dt = 1.0 / config.fps
         self.cameras: dict[str, Any] = {}
         self.initial_configurations = 0
         self._names = (
-            *JOINTS,
-            *(VELOCITIES if config.velocity else ()),
+            *self.values.joints,
+            *(self.values.velocities if config.velocity else ()),
             *(HAND if config.hand or self.space == "ee" else ()),
             GRIPPER,
         )
         self._rotation = DOWN
         self._person_config = config.person
         self._loop = LoopWatch(
-            str(self), config.fps, chain=panda, in_real_time=self.in_real_time
+            str(self), config.fps, chain=work_arm.chain, in_real_time=self.in_real_time
         )
         self._state: ArmState | None = None
         self.judged = True
@@ -285,12 +306,12 @@ class PandaRobot(Device, Robot):
 
     @property
     def action_features(self) -> dict[str, Any]:
-        return dict.fromkeys(action_names(self.space), float)
+        return dict.fromkeys(self.values.action_names(self.space), float)
 
     @property
     def person_names(self) -> tuple[str, ...]:
         """Names of what is observed of the person."""
-        return self._person_config.names
+        return self._person_config.names(self.work_arm.chain)
 
     def connect(self, calibrate: bool = True) -> None:
         super().connect(calibrate)
@@ -311,13 +332,13 @@ class PandaRobot(Device, Robot):
         self._need_connection()
         state, names = self.arm.read(), self._names
         self._state = state
-        values = observed(state, names, self._rotation)
+        values = self.values.observed(state, names, self._rotation)
         if HAND[0] in values:
             self._rotation = np.array([values[name] for name in HAND[3:]])
         if self.complement is not None:
             seen = self._seen(state)
             joints = [name for name in names if name not in HAND]
-            values |= observed(seen, joints)
+            values |= self.values.observed(seen, joints)
             told = (*self.complement.nullspace_input, *self.complement.offset)
             if self.person_names:
                 values |= zip(self.person_names, map(float, told), strict=True)
@@ -326,12 +347,12 @@ class PandaRobot(Device, Robot):
     def send_action(self, action: dict[str, Any]) -> dict[str, float]:
         self._need_connection()
         self._judge()
-        where, width = target_of(action)
+        where, width = self.values.target_of(action)
         joints = self._joints_at(where) if isinstance(where, Pose) else where
         if self.complement is not None:
             joints, width = self._beside_person(self.complement, where, joints, width)
         sent = self._command(joints, width)
-        return action_of(self.space, sent, width, self._rotation)
+        return self.values.action_of(self.space, sent, width, self._rotation)
 
     def _judge(self) -> None:
         """Tell the watch what is recorded with this action."""
@@ -341,7 +362,7 @@ class PandaRobot(Device, Robot):
         if state is None:
             self._loop.tick()
         else:
-            self._loop.tick(state, (*self._touching(), *pressed(panda, state)))
+            self._loop.tick(state, (*self._touching(), *pressed(self.work_arm.chain, state)))
 
     def _touching(self) -> tuple[str, ...]:
         """What the arm has met since the last action that it should not, in words."""
@@ -353,11 +374,13 @@ class PandaRobot(Device, Robot):
         """The arm, to be read."""
 
     @abstractmethod
-    def _joints_at(self, pose: Pose) -> Float[np.ndarray, "7"]:
+    def _joints_at(self, pose: Pose) -> Float[np.ndarray, " joints"]:
         """Joint positions that bring the end effector to a pose [rad]."""
 
     @abstractmethod
-    def _command(self, joints: Float[np.ndarray, "7"], width: float) -> Float[np.ndarray, "7"]:
+    def _command(
+        self, joints: Float[np.ndarray, " joints"], width: float
+    ) -> Float[np.ndarray, " joints"]:
         """Send joints [rad] and gripper [m]; where the joints are really sent [rad]."""
 
     @property
@@ -380,21 +403,23 @@ class PandaRobot(Device, Robot):
         self._need_connection()
         return self._seen(self.arm.read())
 
-    def clearance(self, joint_position: Float[Tensor, "*batch 7"]) -> Float[Tensor, "*batch"]:
+    def clearance(
+        self, joint_position: Float[Tensor, "*batch joints"]
+    ) -> Float[Tensor, "*batch"]:
         """Distance of the arm from what it must not meet, as far as that is known [m].
 
         A real arm knows of itself only.
         """
-        return panda_capsules.self_distance(joint_position)
+        return self.work_arm.whole.self_distance(joint_position)
 
     def _invite(self, config: PersonConfig) -> None:
         """Let a person lead the body."""
         from hrc_learn.skills.complementary_motion import ComplementaryMotion
         from hrc_learn.skills.null_space_yielding import YieldingConfig
 
-        self._person = Person(config)
+        self._person = Person(config, self.work_arm)
         self.complement = ComplementaryMotion(
-            panda,
+            self.work_arm.chain,
             self._person,
             self.dt,
             self.servo.limits,
@@ -405,16 +430,16 @@ class PandaRobot(Device, Robot):
     def _beside_person(
         self,
         complement: ComplementaryMotion,
-        where: Float[np.ndarray, "7"] | Pose,
-        joints: Float[np.ndarray, "7"],
+        where: Float[np.ndarray, " joints"] | Pose,
+        joints: Float[np.ndarray, " joints"],
         width: float,
-    ) -> tuple[Float[np.ndarray, "7"], float]:
+    ) -> tuple[Float[np.ndarray, " joints"], float]:
         """Joints and gripper, with the body where the person wants it."""
         from hrc_learn.skills.arm_motion import joints_near
 
         with torch.inference_mode():
             if isinstance(where, Pose) and complement.posture is not None:
-                joints = joints_near(panda, where, complement.posture).numpy()
+                joints = joints_near(self.work_arm.chain, where, complement.posture).numpy()
             joints, width = complement.next(self.arm.read(), joints, width)
         self._person.show(self)
         return joints, width

@@ -1,4 +1,4 @@
-"""The simulated Panda as a LeRobot robot."""
+"""Simulated arms as LeRobot robots."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from lerobot.robots import RobotConfig
 from torch import Tensor
 
 from hrc_learn.geometry import Pose
-from hrc_learn.lerobot.panda_robot import DOWN, MARKER, PIXELS, PandaRobot, PandaRobotConfig
+from hrc_learn.kinematics import ArmChoice, WorkArm
+from hrc_learn.lerobot.arm_robot import DOWN, MARKER, PIXELS, ArmRobot, ArmRobotConfig
 from hrc_learn.lerobot.person import PersonConfig
 from hrc_learn.protocols import Arm
 from hrc_learn.teleoperation.scenarios import check_scenario, make_scenario
@@ -53,13 +54,20 @@ class MovedCameraConfig:
 
 
 @RobotConfig.register_subclass("mujoco_panda")
+@RobotConfig.register_subclass("mujoco_arm")
 @dataclass(kw_only=True)
-class MujocoPandaConfig(PandaRobotConfig):
-    """The Panda in our MuJoCo workplace; `--robot.type=mujoco_panda`.
+class MujocoArmRobotConfig(ArmRobotConfig):
+    """An arm in our MuJoCo workplace; `--robot.type=mujoco_arm`, as before `mujoco_panda`.
 
     `fps` counts commands a second of simulated time.
     """
 
+    arm: str = "panda"
+    """Registered name of the arm, or its URDF or MJCF file."""
+    base: str = ""
+    """Link of such a file that is the arm's base; empty: its root."""
+    tip: str = ""
+    """Link of such a file that is the arm's flange; empty: its only end."""
     scenario: str = "placing"
     """What is to be done: "placing" or "grasping"."""
     shelf: str = "middle"
@@ -92,26 +100,37 @@ class MujocoPandaConfig(PandaRobotConfig):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} must not be negative.")
 
+    def work_arm(self) -> WorkArm:
+        """The arm with our hand on it.
+
+        Raises:
+            ValueError: There is no such arm, or it cannot do the work.
+        """
+        return ArmChoice(self.arm, self.base, self.tip).work_arm()
+
 
 CAMERA = "front"
 
 
-class MujocoPanda(PandaRobot):
-    """The Panda in our MuJoCo workplace, for lerobot-record, -replay, -teleoperate, -rollout.
+class MujocoArmRobot(ArmRobot):
+    """An arm in our MuJoCo workplace, for lerobot-record, -replay, -teleoperate, -rollout.
 
-    Simulated time passes by 1/fps with every action, whatever the clock says: a loop that is
-    late records the same frames, only later.
+    A dataset's robot type says which: `mujoco_panda`, `mujoco_ur5e`, ... The workplace is laid
+    out for the arm's reach. Simulated time passes by 1/fps with every action, whatever the
+    clock says: a loop that is late records the same frames, only later.
 
     Attributes:
         run: The scenario under way, while connected.
     """
 
-    config_class = MujocoPandaConfig
-    name = "mujoco_panda"
+    config_class = MujocoArmRobotConfig
+    name = "mujoco_arm"
     run: ScenarioRun
 
-    def __init__(self, config: MujocoPandaConfig):
-        super().__init__(config)
+    def __init__(self, config: MujocoArmRobotConfig):
+        work_arm = config.work_arm()
+        self.name = f"mujoco_{work_arm.name}"  # before LeRobot derives folders from it
+        super().__init__(config, work_arm)
         self.config = config
         self._began = self._looked = 0.0
         self._marker = (0.0, 0.0, 0.0)
@@ -148,7 +167,9 @@ class MujocoPanda(PandaRobot):
         last, self._looked = self._looked, self.world.time
         return self.world.touched_since(last)
 
-    def clearance(self, joint_position: Float[Tensor, "*batch 7"]) -> Float[Tensor, "*batch"]:
+    def clearance(
+        self, joint_position: Float[Tensor, "*batch joints"]
+    ) -> Float[Tensor, "*batch"]:
         return self.run.scenario.workplace.arm_clearance(joint_position)
 
     def _invite(self, config: PersonConfig) -> None:
@@ -160,7 +181,7 @@ class MujocoPanda(PandaRobot):
         from hrc_learn.teleoperation.scenarios import ScenarioRun, ScenarioView
 
         config, images = self.config, self.config.images
-        scenario = make_scenario(config.scenario, config.shelf)
+        scenario = make_scenario(config.scenario, config.shelf, self.work_arm)
         sizes = Imperfections.nominal().scaled(config.imperfections)
         self.run = ScenarioRun(scenario, config.fps, seed=config.seed, imperfections=sizes)
         moved = config.moved_camera
@@ -239,8 +260,10 @@ class MujocoPanda(PandaRobot):
         self.initial_configurations += 1
         self._rotation = DOWN
 
-    def _joints_at(self, pose: Pose) -> Float[np.ndarray, "7"]:
+    def _joints_at(self, pose: Pose) -> Float[np.ndarray, " joints"]:
         return self.run.servo.joints_at(pose)
 
-    def _command(self, joints: Float[np.ndarray, "7"], width: float) -> Float[np.ndarray, "7"]:
+    def _command(
+        self, joints: Float[np.ndarray, " joints"], width: float
+    ) -> Float[np.ndarray, " joints"]:
         return self.run.command(joints, width)

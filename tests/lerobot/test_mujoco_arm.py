@@ -8,12 +8,14 @@ from lerobot.robots import make_robot_from_config
 from lerobot.teleoperators import make_teleoperator_from_config
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 
+from hrc_learn.kinematics import panda
+from hrc_learn.lerobot.arm_robot import GRIPPER, HAND, MARKER, PIXELS, ArmValues
 from hrc_learn.lerobot.loop_watch import LoopWatch
-from hrc_learn.lerobot.panda_robot import GRIPPER, HAND, JOINTS, MARKER, PIXELS
-from hrc_learn.lerobot.robots import MujocoPanda, MujocoPandaConfig
-from hrc_learn.lerobot.robots.mujoco_panda import MovedCameraConfig
-from hrc_learn.lerobot.teleoperators import PandaExpertConfig
+from hrc_learn.lerobot.robots import MujocoArmRobot, MujocoArmRobotConfig
+from hrc_learn.lerobot.robots.mujoco_arm import MovedCameraConfig
+from hrc_learn.lerobot.teleoperators import ArmExpertConfig
 
+JOINTS = ArmValues(panda).joints
 FPS = 20.0
 
 
@@ -84,7 +86,7 @@ def test_late_actions_of_an_arm_that_moves_on_are_told(
     simulated, monkeypatch, caplog, in_real_time
 ):
     robot, clock = simulated(scenario="grasping", fps=FPS), [0.0]
-    monkeypatch.setattr(MujocoPanda, "in_real_time", in_real_time)
+    monkeypatch.setattr(MujocoArmRobot, "in_real_time", in_real_time)
     robot._loop = LoopWatch("arm", FPS, lambda: clock[0], in_real_time=in_real_time)
     seen = robot.get_observation()
     for gap in (1.0, 1.0, 3.0):
@@ -115,8 +117,8 @@ def test_what_the_arm_meets_while_it_is_recorded_is_told(simulated, caplog, monk
 @pytest.mark.parametrize(
     "device",
     [
-        lambda folder: make_robot_from_config(MujocoPandaConfig(calibration_dir=folder)),
-        lambda folder: make_teleoperator_from_config(PandaExpertConfig(calibration_dir=folder)),
+        lambda folder: make_robot_from_config(MujocoArmRobotConfig(calibration_dir=folder)),
+        lambda folder: make_teleoperator_from_config(ArmExpertConfig(calibration_dir=folder)),
     ],
     ids=["robot", "teleoperator"],
 )
@@ -134,12 +136,12 @@ def test_devices_are_connected_and_disconnected_once(device, tmp_path):
 
 
 def test_what_is_not_connected_says_so(tmp_path):
-    robot = make_robot_from_config(MujocoPandaConfig(calibration_dir=tmp_path))
+    robot = make_robot_from_config(MujocoArmRobotConfig(calibration_dir=tmp_path))
     with pytest.raises(DeviceNotConnectedError, match="connect"):
         robot.get_observation()
-    teleoperator = make_teleoperator_from_config(PandaExpertConfig(calibration_dir=tmp_path))
+    teleoperator = make_teleoperator_from_config(ArmExpertConfig(calibration_dir=tmp_path))
     teleoperator.connect()
-    with pytest.raises(DeviceNotConnectedError, match="mujoco_panda or franka_panda"):
+    with pytest.raises(DeviceNotConnectedError, match="mujoco_arm or franka_panda"):
         teleoperator.get_action()
 
 
@@ -154,7 +156,7 @@ def test_what_is_not_connected_says_so(tmp_path):
 )
 def test_settings_that_make_no_sense_are_refused(settings, message):
     with pytest.raises(ValueError, match=message):
-        MujocoPandaConfig(**settings)
+        MujocoArmRobotConfig(**settings)
 
 
 @pytest.mark.parametrize(("distance", "angle"), [(0.0, 0.0), (0.1, 10.0)])

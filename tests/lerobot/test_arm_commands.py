@@ -15,7 +15,7 @@ pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[2]
 COMMANDS = Path(sys.executable).parent
 DISCOVER = "--robot.discover_packages_path=hrc_learn.lerobot"
-ROBOT = ("--robot.type=mujoco_panda", "--robot.scenario=grasping", "--robot.fps=10")
+ROBOT = ("--robot.type=mujoco_arm", "--robot.scenario=grasping", "--robot.fps=10")
 SEEN = "--robot.pixels=true"
 
 
@@ -47,7 +47,7 @@ def recorded(tmp_path_factory):
         *ROBOT,
         SEEN,
         "--robot.episode_time=9",
-        "--teleop.type=panda_expert",
+        "--teleop.type=arm_expert",
         "--dataset.repo_id=local/grasping",
         f"--dataset.root={home / 'set'}",
         "--dataset.single_task=grasp the box",
@@ -133,7 +133,7 @@ def test_what_was_recorded_can_be_replayed_and_led(recorded):
         "teleoperate",
         DISCOVER,
         *ROBOT,
-        "--teleop.type=panda_expert",
+        "--teleop.type=arm_expert",
         "--fps=10",
         "--teleop_time_s=1",
     )
@@ -157,7 +157,7 @@ def test_a_policy_is_rolled_out_and_evaluated_with_smooth_actions(recorded, poli
         recorded,
         "eval",
         "--env.discover_packages_path=hrc_learn.lerobot",
-        "--env.type=panda",
+        "--env.type=mujoco_arm",
         "--env.task=grasping",
         "--env.pixels=true",
         "--env.fps=10",

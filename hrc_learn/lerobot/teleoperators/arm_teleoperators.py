@@ -1,4 +1,4 @@
-"""Who leads a Panda as a LeRobot teleoperator: a script, or a person in a browser."""
+"""Who leads an arm as a LeRobot teleoperator: a script, or a person in a browser."""
 
 from __future__ import annotations
 
@@ -13,19 +13,16 @@ from jaxtyping import Float
 from lerobot.teleoperators import Teleoperator, TeleoperatorConfig
 from lerobot.utils.errors import DeviceNotConnectedError
 
-from hrc_learn.kinematics import panda
-from hrc_learn.lerobot.panda_robot import (
+from hrc_learn.kinematics import PANDA, WorkArm
+from hrc_learn.lerobot.arm_robot import (
     DOWN,
-    JOINTS,
-    ActionSpace,
+    ArmRobot,
+    ArmValues,
     Device,
-    PandaRobot,
-    action_names,
-    action_of,
     robot_registry,
 )
 from hrc_learn.lerobot.robot_page import RobotPage
-from hrc_learn.lerobot.robots import MujocoPanda
+from hrc_learn.lerobot.robots import MujocoArmRobot
 from hrc_learn.protocols import ArmState, Human, HumanInput
 
 if TYPE_CHECKING:
@@ -44,7 +41,7 @@ class GuidedRobot:
         initial_configuration: Number of the robot's that it started from.
     """
 
-    def __init__(self, robot: PandaRobot, human: Human):
+    def __init__(self, robot: ArmRobot, human: Human):
         """Begin where the arm is.
 
         Args:
@@ -54,9 +51,9 @@ class GuidedRobot:
         from hrc_learn.teleoperation.hand_guiding import HandGuidedArm, HandGuidingConfig
 
         self.robot, self.initial_configuration = robot, robot.initial_configurations
-        self._velocity = np.zeros(len(JOINTS))
-        self._guided = HandGuidedArm(panda, self, human, HandGuidingConfig(dt=robot.dt))
-        state = robot.read_state()
+        state, chain = robot.read_state(), robot.values.chain
+        self._velocity = np.zeros_like(state.joint_position)
+        self._guided = HandGuidedArm(chain, self, human, HandGuidingConfig(dt=robot.dt))
         self._joints, self._width = state.joint_position.copy(), state.gripper_width
         self._rotation = DOWN
 
@@ -77,34 +74,36 @@ class GuidedRobot:
         self._joints = self._joints + self._velocity * self.robot.dt
         if step.human_input.gripper is not None:
             self._width = step.human_input.gripper
-        action = action_of(self.robot.space, self._joints, self._width, self._rotation)
+        action = self.robot.values.action_of(
+            self.robot.space, self._joints, self._width, self._rotation
+        )
         if self.robot.space == "ee":
             self._rotation = np.array(list(action.values())[3:6])
         return action, step.human_input
 
 
 @dataclass(kw_only=True)
-class PandaTeleoperatorConfig(TeleoperatorConfig):
-    """Settings of all who lead one of our Pandas."""
+class ArmTeleoperatorConfig(TeleoperatorConfig):
+    """Settings of all who lead one of our arms."""
 
     robot_id: str | None = None
     """Which robot to lead, where several are connected."""
 
 
-class PandaTeleoperator(Device, Teleoperator):
-    """What those who lead one of our Pandas have in common."""
+class ArmTeleoperator(Device, Teleoperator):
+    """What those who lead one of our arms have in common."""
 
-    def __init__(self, config: PandaTeleoperatorConfig):
+    def __init__(self, config: ArmTeleoperatorConfig):
         super().__init__(config)
         self._robot_id = config.robot_id
         self._guided: GuidedRobot | None = None
 
     @property
     def action_features(self) -> dict[str, type]:
-        space: ActionSpace = "joint"
+        names = ArmValues(PANDA.chain).action_names("joint")
         with suppress(DeviceNotConnectedError):  # LeRobot asks before it connects the robot
-            space = self._find().space
-        return dict.fromkeys(action_names(space), float)
+            names = tuple(self._find().action_features)
+        return dict.fromkeys(names, float)
 
     @property
     def feedback_features(self) -> dict[str, type]:
@@ -119,7 +118,7 @@ class PandaTeleoperator(Device, Teleoperator):
     def _close(self) -> None:
         self._guided = None
 
-    def _guided_robot(self, robot: PandaRobot, human: Callable[[], Human]) -> GuidedRobot:
+    def _guided_robot(self, robot: ArmRobot, human: Callable[[], Human]) -> GuidedRobot:
         """The guided robot, anew whenever everything has been put in place."""
         guided = self._guided
         if (
@@ -130,41 +129,47 @@ class PandaTeleoperator(Device, Teleoperator):
             guided = self._guided = GuidedRobot(robot, human())
         return guided
 
-    def _find(self) -> PandaRobot:
+    def _find(self) -> ArmRobot:
         """The robot that is guided, which is connected after its teleoperator."""
         return robot_registry().find(self._robot_id)
 
 
 @TeleoperatorConfig.register_subclass("panda_expert")
+@TeleoperatorConfig.register_subclass("arm_expert")
 @dataclass(kw_only=True)
-class PandaExpertConfig(PandaTeleoperatorConfig):
-    """The script that shows a `mujoco_panda` its scenario; `--teleop.type=panda_expert`."""
+class ArmExpertConfig(ArmTeleoperatorConfig):
+    """The script that shows a `mujoco_arm` its scenario; `--teleop.type=arm_expert`, as
+    before `panda_expert`.
+    """
 
 
-class PandaExpert(PandaTeleoperator):
-    """Shows a `mujoco_panda` its scenario from each initial configuration, then keeps still.
+class ArmExpert(ArmTeleoperator):
+    """Shows a `mujoco_arm` its scenario from each initial configuration, then keeps still.
 
     The same demonstrations as `hrc record placing` records, with the release of the
     object, and grasping.
     """
 
-    config_class = PandaExpertConfig
-    name = "panda_expert"
+    config_class = ArmExpertConfig
+    name = "arm_expert"
 
     def get_action(self) -> dict[str, float]:
         self._need_connection()
         robot = self._find()
-        if not isinstance(robot, MujocoPanda):
+        if not isinstance(robot, MujocoArmRobot):
             raise ValueError(
-                f"panda_expert knows the scenarios of a mujoco_panda only, not of {robot.name}."
+                f"arm_expert knows the scenarios of a mujoco_arm only, not of {robot.name}."
             )
         return self._guided_robot(robot, lambda: robot.run.expert).next()[0]
 
 
 @TeleoperatorConfig.register_subclass("panda_page")
+@TeleoperatorConfig.register_subclass("arm_page")
 @dataclass(kw_only=True)
-class PandaPageConfig(PandaTeleoperatorConfig):
-    """A person who leads a Panda in a browser; `--teleop.type=panda_page`."""
+class ArmPageConfig(ArmTeleoperatorConfig):
+    """A person who leads an arm in a browser; `--teleop.type=arm_page`, as before
+    `panda_page`.
+    """
 
     host: str = "127.0.0.1"
     """Address to serve the page at. Whoever reaches it can move the arm."""
@@ -172,29 +177,36 @@ class PandaPageConfig(PandaTeleoperatorConfig):
     """Port to serve at; the first free one from 8080 on if None."""
 
 
-class PandaPage(PandaTeleoperator):
+class ArmPage(ArmTeleoperator):
     """A person leads the end effector, the elbow and the gripper in a browser.
 
     Shows the arm where the robot reports it, simulated or real. "Home" begins the scenario of a
-    `mujoco_panda` anew; what concerns recording is left to LeRobot.
+    `mujoco_arm` anew; what concerns recording is left to LeRobot.
 
     Attributes:
         page: While connected.
     """
 
-    config_class = PandaPageConfig
-    name = "panda_page"
+    config_class = ArmPageConfig
+    name = "arm_page"
     page: Page
     _shown: RobotPage
+    _arm: WorkArm
 
-    def __init__(self, config: PandaPageConfig):
+    def __init__(self, config: ArmPageConfig):
         super().__init__(config)
         self.config = config
 
     def _open(self) -> None:
+        arm = PANDA
+        with suppress(DeviceNotConnectedError):  # which LeRobot may connect later
+            arm = self._find().work_arm
+        self._serve(arm)
+
+    def _serve(self, arm: WorkArm) -> None:
         note = "LeRobot records: its own keys begin and end episodes"
-        self._shown = RobotPage(self.config.host, self.config.port, note)
-        self.page = self._shown.page
+        self._shown = RobotPage(arm, self.config.host, self.config.port, note)
+        self._arm, self.page = arm, self._shown.page
 
     def _close(self) -> None:
         super()._close()
@@ -203,8 +215,11 @@ class PandaPage(PandaTeleoperator):
     def get_action(self) -> dict[str, float]:
         self._need_connection()
         robot = self._find()
+        if robot.work_arm is not self._arm:
+            self._shown.close()
+            self._serve(robot.work_arm)
         action, asked = self._guided_robot(robot, lambda: self.page.human).next()
         self._shown.show(robot)
-        if "home" in asked.requests and isinstance(robot, MujocoPanda):
+        if "home" in asked.requests and isinstance(robot, MujocoArmRobot):
             robot.begin(robot.run.seed + 1)
         return action
