@@ -35,14 +35,17 @@ class Issue:
     """Column (feature) concerned, with the name of its component where one is to blame."""
     severity: float = 0.0
     """How bad it is among findings of its kind, in the kind's own measure."""
+    names: tuple[str, ...] = ()
+    """Components that the message names."""
 
     @property
     def kind(self) -> tuple[str, str]:
-        """What findings that differ in their place and figures alone have in common."""
+        """What findings that differ in place, components and figures alone have in common."""
         column = (self.key or "").split(" (")[0]
-        words = re.sub(r"[-+]?\d[\d.e+-]*|'[^']*'", "#", self.message)
-        # What is said before the figures: names of joints come and go.
-        return column, " ".join(w for w in words.split() if "." not in w.strip(".,:;"))[:120]
+        # Of some components or of another number of them: the same kind.
+        words = (w for w in self.message.split() if w.strip(".,:;") not in self.names)
+        text = re.sub(r"[-+]?\d[\d.e+-]*|'[^']*'", "#", " ".join(words))
+        return column, " ".join(w for w in text.split() if "." not in w.strip(".,:;"))[:120]
 
     def __str__(self) -> str:
         episode = None if self.episode is None else f"episode {self.episode}"

@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -11,6 +12,7 @@ import pytest
 from lerobot_folders import FPS, joint_path, read_info, rewrite, write_folder, write_info
 
 from hrc_learn.demos import DatasetError, check_dataset, load_demos
+from hrc_learn.demos.issue import ValidationReport
 
 STATE = "observation.state"
 NAMES = ["a.pos", "b.pos", "c.pos"]
@@ -464,6 +466,61 @@ def test_a_rotation_near_half_a_turn_may_be_turned_over(tmp_path, turn, errors):
     found = [e for e in report.errors if "other sign" in e.message]
     assert len(found) == errors
     assert all(e.episode == 2 and "ee.wy" in e.message for e in found)
+
+
+JOINTS = ["shoulder", "elbow", "wrist", "rotation"]
+
+
+def four_joints(seed, levels=(0.0, 1.0, 2.0, 3.0)):
+    """Joints that each move a little about a level of their own [rad]."""
+    rng = np.random.default_rng(seed)
+    phase = np.linspace(0, 3, 60)[:, None] + rng.uniform(0, 0.2, 4)
+    return {STATE: np.array(levels) + 0.1 * np.sin(phase)}
+
+
+@pytest.mark.parametrize(
+    ("levels", "errors"),
+    [
+        ((1.0, 0.0, 2.0, 3.0), 1),
+        ((1.0, 0.0, 3.0, 2.0), 1),
+        # Two are where others usually are, and these are nearly there as well.
+        ((1.0, 1.01, 3.0, 3.01), 0),
+    ],
+)
+def test_joints_are_exchanged_where_each_took_the_others_place(tmp_path, levels, errors):
+    episodes = [four_joints(i) for i in range(4)] + [four_joints(4, levels)]
+    root = write_folder(tmp_path / "set", episodes, {STATE: JOINTS})
+    found = [i for i in check_dataset(root).errors if "look exchanged" in i.message]
+    assert len(found) == errors
+    assert all(i.episode == 4 for i in found)
+
+
+@pytest.mark.parametrize(("joint", "told"), [("elbow", True), ("kRightHandIndex", False)])
+def test_a_joint_that_stays_froze_a_finger_may_hold_something(tmp_path, joint, told):
+    def episode(seed):
+        q = joint_path(60, seed=seed)
+        state = q.copy()
+        state[20:45, 1] = state[20, 1]
+        return {STATE: state, "action": q}
+
+    names = ["shoulder.pos", f"{joint}.pos", "wrist.pos"]
+    root = write_folder(
+        tmp_path / "set", [episode(i) for i in range(3)], {STATE: names, "action": names}
+    )
+    found = [i for i in check_dataset(root).warnings if "stays exactly the same" in i.message]
+    assert bool(found) == told
+    assert all(i.names == (joint,) for i in found)
+
+
+def test_findings_that_differ_in_joints_and_figures_alone_share_a_line():
+    report = ValidationReport(path=Path("set"))
+    for episode, names in enumerate([("elbow",), ("kWrist", "base"), ("base",)]):
+        text = f"is noisier by {episode + 0.5} than usual: {', '.join(names)}"
+        report.warning(text, episode=episode, names=names, severity=0.1 * episode)
+    report.warning("is noisier by 3 than usual: spam", episode=3)  # not said to be a name
+    first, second, _ = report.lines()
+    assert first.endswith("usual: base (and 2 times more; episodes 0, 1)")
+    assert second.endswith("usual: spam")
 
 
 def test_names_unknown(root):

@@ -7,6 +7,7 @@ import pytest
 from hrc_learn.demos.read.roles import (
     ComponentMeaning,
     decide_units,
+    is_hand,
     meaning_of_component,
     role_of_key,
 )
@@ -114,3 +115,20 @@ def test_velocities_follow_the_unit_of_positions(role, unit):
 def test_the_unit_of_stamps_is_the_nearest_to_the_frame_rate(step, unit, factor):
     decision = decide_units({"time": 1.0}, {}, {}, step)["time"]
     assert (decision.unit, decision.factor) == (unit, factor)
+
+
+@pytest.mark.parametrize(
+    ("name", "hand"),
+    [
+        ("kRightHandIndex", True),
+        ("leftHand1", True),
+        ("left_hand.joint_3", True),
+        ("right_ring_2", True),
+        ("gripper", True),
+        ("kRightShoulderPitch", False),
+        ("handle_joint", False),
+        ("Shorthand", False),
+    ],
+)
+def test_joints_of_hands_by_their_names(name, hand):
+    assert is_hand(name) == hand

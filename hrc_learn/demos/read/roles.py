@@ -95,6 +95,8 @@ _HAND = re.compile(
     r"finger|thumb|pinky|knuckle|"
     r"(?:^|[._/ ])(?:hand|palm|index|middle|ring|little|claw|jaw|gripper)(?:$|[._/ \d])"
 )
+_CAMEL = re.compile(r"(?<=[a-z\d])(?=[A-Z])")
+"""Between the words of a name like `kRightHandIndex`."""
 
 _XYZ = {"x": 0, "y": 1, "z": 2}
 _POSE_COMPONENTS = {
@@ -189,7 +191,8 @@ def joint_of(name: str) -> str:
 
 def is_hand(name: str) -> bool:
     """Whether a joint is one of a hand or gripper by its name, not of the arm."""
-    return bool(_HAND.search(name.strip().lower()))
+    words = _CAMEL.sub("_", name.strip())
+    return bool(_HAND.search(words.lower()))
 
 
 def role_of_key(key: str) -> str | None:

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Int64
 
 from hrc_learn.demos.format.dataset_folder import DatasetFolder, EpisodeEntry
 from hrc_learn.demos.issue import ValidationReport
@@ -115,6 +115,7 @@ def check_sizes(feature: _Feature, report: ValidationReport) -> None:
             f"the episode out",
             **feature.entries[number].location,
             key=feature.key,
+            names=(feature.names[component],),
             severity=float(np.log(largest[number, component])),
         )
 
@@ -138,6 +139,7 @@ def check_holds(feature: _Feature, fps: float, report: ValidationReport) -> None
             f"encoder froze?",
             **feature.entries[number].location,
             key=feature.key,
+            names=(feature.names[component],),
             severity=float(share[number, component]),
         )
 
@@ -158,6 +160,7 @@ def check_noise(feature: _Feature, report: ValidationReport) -> None:
                 f"is {what} than in the other episodes: {', '.join(names[:6])}",
                 **feature.entries[number].location,
                 key=feature.key,
+                names=tuple(names),
                 severity=float(odd[number].sum()),
             )
 
@@ -175,8 +178,8 @@ def check_switches(feature: _Feature, report: ValidationReport) -> None:
         if alike.sum() < max(_FEW, len(alike) - 1):
             continue  # no habit to go against
         for number in np.flatnonzero(~alike):
-            place = {**feature.entries[number].location, "key": feature.key}
             name = feature.names[component]
+            place = {**feature.entries[number].location, "key": feature.key, "names": (name,)}
             if span[number, component] == 0:
                 report.warning(f"{name} stays, it switches in the other episodes", **place)
             elif opposite[number, :, component].all():
@@ -215,9 +218,10 @@ def check_exchanges(feature: _Feature, report: ValidationReport) -> None:
             **feature.entries[number].location,
             "key": feature.key,
             "severity": float(off.max()),
+            "names": tuple(_name(feature, moving, i) for i in np.flatnonzero(off > _FAR_OFF)),
         }
         _, best = linear_sum_assignment(np.minimum(cost, 50))
-        exchanged = np.flatnonzero((best != np.arange(len(best))) & (off > _FAR_OFF))
+        exchanged = _exchanged(best, off > _FAR_OFF)
         after = cost[exchanged, best[exchanged]]
         if (
             len(exchanged) > 1
@@ -258,6 +262,23 @@ def check_exchanges(feature: _Feature, report: ValidationReport) -> None:
         elif len(moved):
             names = ", ".join(_name(feature, moving, i) for i in moved[:6])
             report.warning(f"is far from the other episodes: {names}", **place)
+
+
+def _exchanged(
+    best: Int64[np.ndarray, " components"], off: Bool[np.ndarray, " components"]
+) -> Int64[np.ndarray, " _"]:
+    """Components that took each other's place, every one of them away from its own.
+
+    Where only some are away, these look like others by chance.
+    """
+    found = []
+    for first in range(len(best)):
+        ring = [first]
+        while best[ring[-1]] != first:
+            ring.append(int(best[ring[-1]]))
+        if len(ring) > 1 and off[ring].all():
+            found.append(first)
+    return np.array(found, dtype=int)
 
 
 def _without_sign(feature: _Feature) -> Bool[np.ndarray, " components"]:
@@ -312,7 +333,7 @@ def check_tracking(
         )
     for number, profile in enumerate(known):
         tracking = profile.tracking["command_position"]
-        place = {**entries[profile.index].location, "key": key}
+        place = {**entries[profile.index].location, "key": key, "names": (*names,)}
         off = delays[number] - usual_delay
         agreeing = (np.abs(delays - usual_delay) <= 2).mean()
         better = gain_over(tracking, round(usual_delay)) > 0.8

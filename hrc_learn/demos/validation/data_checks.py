@@ -9,7 +9,7 @@ from hrc_learn.demos.format.dataset_folder import DatasetFolder, EpisodeEntry
 from hrc_learn.demos.format.metadata import Feature
 from hrc_learn.demos.issue import ValidationReport
 from hrc_learn.demos.read.frames import RawFrames
-from hrc_learn.demos.read.roles import INDEX_KEYS
+from hrc_learn.demos.read.roles import INDEX_KEYS, is_hand
 
 # Faults of single values and columns.
 
@@ -183,7 +183,9 @@ def check_jumps(
     """Steps no joint can make: lost frames, glitches, encoders that wrapped."""
     change = np.diff(joint_position, axis=0)
     speed = np.abs(change) / np.diff(time)[:, None]
-    limits = np.array([speed_limits.get(name, _FASTEST_ARM) for name in joint_names])
+    # Fingers are faster, and often counted in units of their own.
+    usual = {name: np.inf if is_hand(name) else _FASTEST_ARM for name in joint_names}
+    limits = np.array([speed_limits.get(name, usual[name]) for name in joint_names])
     too_fast = speed > limits
     if not too_fast.any():
         return
@@ -204,6 +206,7 @@ def check_jumps(
         **entry.location,
         frame=frame + 1,
         key=f"joint_position ({joint_names[joint]})",
+        names=(joint_names[joint],),
     )
 
 
@@ -309,6 +312,7 @@ def check_spikes(
             **entry.location,
             frame=int(frame) + offset,
             key=f"{role} ({names[joint]})",
+            names=(names[joint],),
             severity=float(size.max()),
         )
 
@@ -321,10 +325,14 @@ def check_frozen(
     span: Float64[np.ndarray, " joints"],
     report: ValidationReport,
 ) -> None:
-    """Joints that stay exactly where they are while their command goes elsewhere."""
+    """Joints that stay exactly where they are while their command goes elsewhere.
+
+    Not those of hands: a finger at an object does so too.
+    """
     if joints.shape != command.shape or len(joints) < 20:
         return
-    for joint in np.flatnonzero(span > 0):
+    arm = np.array([not is_hand(name) for name in names])
+    for joint in np.flatnonzero((span > 0) & arm):
         moves = np.flatnonzero(np.diff(joints[:, joint]) != 0)
         edges = np.concatenate([[-1], moves, [len(joints) - 1]])
         longest = int(np.diff(edges).argmax())
@@ -339,6 +347,7 @@ def check_frozen(
                 **entry.location,
                 frame=first,
                 key=f"joint_position ({names[joint]})",
+                names=(names[joint],),
                 severity=asked,
             )
 
