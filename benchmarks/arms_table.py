@@ -12,8 +12,11 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import json
+import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -43,8 +46,8 @@ from hrc_learn.sim.workplace import Workplace
 
 _BEGIN, _END = "<!-- arms:begin -->", "<!-- arms:end -->"
 _HEADER = (
-    "| arm | maker | joints | reach [m] | largest difference from MuJoCo | poses found "
-    "| ms a pose | touches itself: capsules, MuJoCo, missed "
+    "| arm | maker | joints | reach [m] | largest difference from MuJoCo, Pinocchio "
+    "| poses found | ms a pose | touches itself: capsules, MuJoCo, missed "
     "| servoing: done; beyond limits, self-contacts "
     "| `hrc demo` |\n|---|---|---|---|---|---|---|---|---|---|"
 )
@@ -53,14 +56,18 @@ _COLUMNS = _HEADER.splitlines()[0].count("|") - 1
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
-    states: int = 500
-    """Random joint positions in which MuJoCo's pose, Jacobian and contacts are compared."""
-    poses: int = 200
+    states: int = 10_000
+    """Random joint positions in which pose and Jacobian are compared."""
+    postures: int = 500
+    """Of them, those in which contacts are compared."""
+    poses: int = 1000
     """Random reachable poses to invert."""
     arms: tuple[str, ...] = ()
     """Measure these alone: rows of others stay as they are; none: all."""
     trials: int = 0
     """Of servoing; 0: what its row says is kept."""
+    kinematics: bool = True
+    """Else what a row says of them is kept."""
     demos: Path | None = None
     """Folder with NAME.json of `hrc demo`; whether arms without one are refused is tried."""
     measure: bool = True
@@ -87,13 +94,19 @@ def main(args: Args) -> None:
             cells = [*_cells_before(name, args)[:-1], _demo(name, args)]
             rows.append(f"| {' | '.join(cells)} |")
             continue
+        if not args.kinematics:
+            measured = _servoed(name, args.trials) if args.trials else {}
+            cells = _cells_before(name, args)[:-2]
+            cells += [_servoing(name, measured, args), _demo(name, args)]
+            rows.append(f"| {' | '.join(cells)} |")
+            Console().print(rows[-1], highlight=False)
+            continue
         measured = _measured(described, args)
         figures |= {f"{name}_{key}": value for key, value in measured.items()}
-        error = measured.get("difference_from_mujoco")
         rows.append(
             f"| {name} | {maker_of(name)} | {measured['joints']:.0f} "
             f"| {measured['reach_m']:.2f} "
-            f"| {'its own model' if error is None else f'{error:.0e}'} "
+            f"| {_differences(measured)} "
             f"| {100 * measured['inverse_found']:.1f} % | {measured['inverse_ms']:.0f} "
             f"| {_percent(measured, 'capsules_touch', 'hulls_touch', 'missed')} "
             f"| {_servoing(name, measured, args)} | {_demo(name, args)} |"
@@ -131,14 +144,17 @@ def _measured(described: Arm, args: Args) -> dict[str, float]:
     }
     if args.trials:
         figures |= _servoed(described.name, args.trials)
+    q = drawn(args.states)
     if described.description is not None:
-        figures["difference_from_mujoco"] = _difference(described, drawn(args.states))
-    return figures | _self_contacts(described, drawn(args.states))
+        figures |= _compared(described, q)
+    return figures | _self_contacts(described, q[: args.postures])
 
 
 def _servoed(name: str, trials: int) -> dict[str, float]:
     """As shares of trials: done, with a contact; and steps beyond limits; NaN: not reached."""
-    config = TrialConfig(count=trials, robot=ArmChoice(name), duration=8.0, contacts=True)
+    config = TrialConfig(
+        count=trials, robot=ArmChoice(name), duration=8.0, contacts=True, pull="saturated"
+    )
     try:
         result = run_trials(KalmanEstimator, config)
     except UnreachableError:
@@ -151,30 +167,84 @@ def _servoed(name: str, trials: int) -> dict[str, float]:
     }
 
 
-def _difference(described: Arm, q: torch.Tensor) -> float:
-    """Largest one of flange positions [m], rotations and Jacobians."""
+# Poses of base and flange, and the Jacobian of the flange, all in the world.
+type _Seen = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+def _compared(described: Arm, q: torch.Tensor) -> dict[str, float]:
+    """Largest differences of flange positions [m], rotations and Jacobians from others'."""
+    flange = described.with_tool(torch.eye(4, dtype=torch.float64)).chain
+    poses, jacobians = flange.forward_and_jacobian(q)
+    ours = list(zip(q.numpy(), poses.matrix().numpy(), jacobians.numpy(), strict=True))
+
+    def largest(see: Callable[[np.ndarray], _Seen]) -> float:
+        worst = 0.0
+        for row, T, J in ours:
+            base, tip, theirs = see(row)
+            R = base[:3, :3]
+            turned = np.concatenate([R.T @ theirs[:3], R.T @ theirs[3:]])
+            off = T - np.linalg.inv(base) @ tip
+            worst = max(worst, float(np.abs(off).max()), float(np.abs(J - turned).max()))
+        return worst
+
+    figures = {"difference_from_mujoco": largest(_mujoco_kinematics(described))}
+    if find_spec("pinocchio") is not None:
+        try:
+            see = _pinocchio_kinematics(described)
+        except IndexError:  # what 4.1 says of some files that MuJoCo reads
+            return figures
+        figures["difference_from_pinocchio"] = largest(see)
+    return figures
+
+
+def _mujoco_kinematics(described: Arm) -> Callable[[np.ndarray], _Seen]:
     model = _mujoco_model(described)
     data, names = mujoco.MjData(model), described.joint_names
     addresses = [int(model.joint(name).qposadr[0]) for name in names]
     columns = [int(model.joint(name).dofadr[0]) for name in names]
-    flange = described.with_tool(torch.eye(4, dtype=torch.float64)).chain
-    poses, jacobians = flange.forward_and_jacobian(q)
-    J, largest = np.zeros((6, model.nv)), 0.0
-    for row, T, ours in zip(q, poses.matrix().numpy(), jacobians.numpy(), strict=True):
+    base = model.body(described.base).id if described.base else 0
+    tip, J = model.body(described.tip).id, np.zeros((6, model.nv))
+
+    def pose(body: int) -> np.ndarray:
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = data.xmat[body].reshape(3, 3), data.xpos[body]
+        return T
+
+    def see(row: np.ndarray) -> _Seen:
         data.qpos[addresses] = row
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
-        mujoco.mj_jacBody(model, data, J[:3], J[3:], model.body(described.tip).id)
-        root = data.body(described.base) if described.base else data.body(0)
-        R, tip = root.xmat.reshape(3, 3), data.body(described.tip)
-        theirs = np.concatenate([R.T @ J[:3, columns], R.T @ J[3:, columns]])
-        largest = max(
-            largest,
-            float(np.abs(T[:3, 3] - R.T @ (tip.xpos - root.xpos)).max()),
-            float(np.abs(T[:3, :3] - R.T @ tip.xmat.reshape(3, 3)).max()),
-            float(np.abs(ours - theirs).max()),
-        )
-    return largest
+        mujoco.mj_jacBody(model, data, J[:3], J[3:], tip)
+        return pose(base), pose(tip), J[:, columns]
+
+    return see
+
+
+def _pinocchio_kinematics(described: Arm) -> Callable[[np.ndarray], _Seen]:
+    import pinocchio  # pyright: ignore[reportMissingImports]
+
+    urdf, mjcf = pinocchio.buildModelFromUrdf, pinocchio.buildModelFromMJCF
+    read = mjcf if described.format == "mjcf" else urdf
+    model = read(str(described.description))
+    data, q = model.createData(), pinocchio.neutral(model)
+    joints = [model.joints[model.getJointId(name)] for name in described.joint_names]
+    columns = [joint.idx_v for joint in joints]
+    body = pinocchio.FrameType.BODY
+    base = model.getFrameId(described.base, body) if described.base else 0
+    tip = model.getFrameId(described.tip, body)
+
+    def see(row: np.ndarray) -> _Seen:
+        for joint, angle in zip(joints, row, strict=True):
+            # One that turns without end is its cosine and sine there.
+            value = [angle] if joint.nq == 1 else [math.cos(angle), math.sin(angle)]
+            q[joint.idx_q : joint.idx_q + joint.nq] = value
+        pinocchio.computeJointJacobians(model, data, q)
+        pinocchio.updateFramePlacements(model, data)
+        aligned = pinocchio.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        J = pinocchio.getFrameJacobian(model, data, tip, aligned)
+        return data.oMf[base].homogeneous, data.oMf[tip].homogeneous, J[:, columns]
+
+    return see
 
 
 def _self_contacts(described: Arm, q: torch.Tensor) -> dict[str, float]:
@@ -237,6 +307,13 @@ def _mujoco_model(described: Arm) -> mujoco.MjModel:
     kept_apart = '<mujoco><compiler fusestatic="false"/></mujoco>'
     robot.append(ElementTree.fromstring(kept_apart))
     return mujoco.MjModel.from_xml_string(ElementTree.tostring(robot, encoding="unicode"))
+
+
+def _differences(measured: dict[str, float]) -> str:
+    """From MuJoCo and Pinocchio; of Franka's arms tests compare what others have of them."""
+    found = [measured.get(f"difference_from_{name}") for name in ("mujoco", "pinocchio")]
+    shown = [f"{error:.0e}" for error in found if error is not None]
+    return ", ".join(shown) or "its own model"
 
 
 def _percent(measured: dict[str, float], *names: str) -> str:

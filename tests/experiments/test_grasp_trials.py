@@ -6,6 +6,7 @@ import torch
 from unchecked import shapes_unchecked
 
 from hrc_learn.controller import GRIPPER_DOWN
+from hrc_learn.experiments.controller import sweep
 from hrc_learn.experiments.controller.disturbance_trials import EffortConfig, run_effort_trials
 from hrc_learn.experiments.controller.grasp_trials import (
     CENTRE,
@@ -13,6 +14,7 @@ from hrc_learn.experiments.controller.grasp_trials import (
     TrialConfig,
     TrialResult,
     draw_scene,
+    grasp_controller,
     run_trials,
     trial_arm,
 )
@@ -69,19 +71,68 @@ def test_a_filter_that_knows_the_noise_of_poses_keeps_the_better_image_jacobian(
     assert errors[2] > 1.3 * errors[1]
 
 
+def described(path, lengths, axes):
+    """A file with joints one above the other, when all are at zero."""
+    joints = "".join(
+        f'<link name="l{k + 1}"/><joint name="j{k}" type="revolute"><parent link="l{k}"/>'
+        f'<child link="l{k + 1}"/><origin xyz="0 0 {length}"/><axis xyz="{axis}"/>'
+        '<limit lower="-2.9" upper="2.9" velocity="2" effort="9"/></joint>'
+        for k, (length, axis) in enumerate(zip(lengths, axes, strict=True))
+    )
+    path.write_text(f'<robot name="{path.stem}"><link name="l0"/>{joints}</robot>')
+    return path
+
+
+@shapes_unchecked()  # for speed
+def test_targets_are_where_a_long_tool_gets_to_all_of_them(tmp_path):
+    """Shoulder, elbow and wrist of 0.3 m each, and a tool of 0.2 m beyond the wrist."""
+    axes = ("0 0 1", "0 1 0", "0 1 0", "0 0 1", "0 1 0", "0 0 1")
+    path = described(tmp_path / "six.urdf", (0.06, 0.06, 0.3, 0.15, 0.15, 0.2), axes)
+    arm = trial_arm(ArmChoice(str(path)))
+    spread = arm.scale * torch.tensor([0.08, 0.08, 0.05], dtype=torch.float64)
+    corners = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0]).double()] * 3) * spread
+
+    def stretch(centre):
+        """From the shoulder to the wrist above the farthest corner, of 0.6 m that there are."""
+        wrist = centre + corners + torch.tensor([0.0, 0.0, 0.2 - 0.12], dtype=torch.float64)
+        return float(wrist.norm(dim=-1).max())
+
+    assert stretch(arm.scaled(CENTRE)) > 0.6
+    assert stretch(arm.centre) < 0.595
+    x, y = (arm.centre / arm.scaled(CENTRE))[:2].tolist()
+    assert x == pytest.approx(y)
+    for posture in arm.postures:
+        reached = arm.chain.forward(posture)
+        assert float((reached.position - arm.centre).abs().max()) < 1e-8
+    far = (arm.postures - arm.chain.ready).norm(dim=-1)
+    assert (far.diff() >= 0).all()
+
+
+def test_the_pull_to_the_target_ends_at_the_ellipse_or_not():
+    for pull, holds in (("paper", False), ("saturated", True)):
+        config = TrialConfig(count=3, pull=pull)
+        scene = draw_scene(config, torch.Generator().manual_seed(0))
+        vision = grasp_controller(KalmanEstimator, config, scene).goals.vision
+        outside = vision.target + 1.1 * vision.half_size
+        pulled = vision.gradient(outside).abs().amin(-1)
+        assert ((pulled > 0) == holds).all()
+
+
+def test_sweeps_of_other_arms_have_the_pull_that_holds(monkeypatch):
+    kept = replace(sweep.EXPERIMENTS["near"], run=lambda config: config)
+    monkeypatch.setitem(sweep.EXPERIMENTS, "near", kept)
+    own = sweep.run_chunk("near", 5, 3)
+    assert (own.robot, own.pull) == (ArmChoice(), "paper")
+    other = sweep.run_chunk("near", 5, 3, ArmChoice("fr3"))
+    assert (other.robot, other.pull) == (ArmChoice("fr3"), "saturated")
+    assert (other.count, other.seed) == (5, 3)
+
+
 @shapes_unchecked()  # for speed
 def test_an_arm_of_five_joints_servoes_as_far_as_it_reaches(tmp_path):
     """Base, three hinges in a plane, and a roll about the tool's axis, 0.4 m long."""
-    origins = ("0 0 0.06", "0 0 0.04", "0 0 0.15", "0 0 0.15", "0 0 0.05")
     axes = ("0 0 1", "0 1 0", "0 1 0", "0 1 0", "0 0 1")
-    joints = "".join(
-        f'<link name="l{k + 1}"/><joint name="j{k}" type="revolute"><parent link="l{k}"/>'
-        f'<child link="l{k + 1}"/><origin xyz="{xyz}"/><axis xyz="{axis}"/>'
-        '<limit lower="-2.9" upper="2.9" velocity="2" effort="9"/></joint>'
-        for k, (xyz, axis) in enumerate(zip(origins, axes, strict=True))
-    )
-    path = tmp_path / "five.urdf"
-    path.write_text(f'<robot name="five"><link name="l0"/>{joints}</robot>')
+    path = described(tmp_path / "five.urdf", (0.06, 0.04, 0.15, 0.15, 0.05), axes)
     arm = trial_arm(ArmChoice(str(path)))
     assert arm.task == "position+axis"
     assert arm.scale == pytest.approx(0.35 / 0.95, rel=0.05)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from typing import Literal
 
@@ -29,6 +30,7 @@ from hrc_learn.controller.monitors import LimitMonitor
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import ImageJacobianEstimator, RBFImageJacobian, paper_grid
 from hrc_learn.kinematics import (
+    SINGULAR_BELOW,
     Arm,
     ArmChoice,
     CapsuleArm,
@@ -72,8 +74,11 @@ CORNERS = tuple(
 
 # From which postures of arms without an inverse in closed form are sought.
 _STARTS = 200
-# Heights at which an arm with its tool down is tried [m], as shares of those of a Franka arm.
-_HEIGHTS = (CENTRE[2], 0.2, 0.1)
+# Where an arm with its tool down is tried: heights, as those of a Franka arm [m], and shares
+# of the distance from the base. A long tool, or a wrist that bends little, reaches less far.
+_HEIGHTS, _NEARER = (CENTRE[2], 0.2, 0.1), (1.0, 0.85, 0.7)
+_SPREAD = (0.08, 0.08, 0.05)
+"""Of targets, either way from the centre along each axis [m]."""
 
 
 class TrialArm:
@@ -85,7 +90,9 @@ class TrialArm:
         task: What of its tool's pose is led: of five joints position and axis.
         centre: Of the Cartesian region [m].
         down: Orientation of the tool there: the paper's, of others than Franka's straight down.
-        postures: Joint positions with that pose, the best first [rad].
+        postures: Joint positions with that pose, the best first [rad]. Of arms without an
+            inverse in closed form the nearest to its ready posture are first, if any is among
+            those from which it gets to all targets.
     """
 
     def __init__(self, arm: Arm):
@@ -105,19 +112,56 @@ class TrialArm:
             self.postures = comfortable_postures(arm.chain, Pose(self.centre, self.down))
             return
         self.scale, self.down = min(1.0, arm.reach / _PANDA_REACH), gripper_down()
-        for height in _HEIGHTS:
-            self.centre = self.scaled((*CENTRE[:2], height))
-            found = self._solutions(self.task)
-            if len(found) and self.task != "pose":
-                # Its joints decide how the tool is turned about its axis.
-                self.down = self.chain.forward(best_postures(self.chain, found)[0]).orientation
-                found = self._solutions("pose")
-            if len(found):
-                self.postures = best_postures(self.chain, found)
-                return
-        raise UnreachableError(
-            f"the {arm.name} does not get its tool to {self.centre.tolist()} m, pointing down"
+        possible = []
+        for nearer, height in itertools.product(_NEARER, _HEIGHTS):
+            place = self._place((nearer * CENTRE[0], nearer * CENTRE[1], height))
+            possible += [] if place is None else [place]
+            if place is not None and place[-1]:
+                break
+        if not possible:
+            raise UnreachableError(
+                f"the {arm.name} does not get its tool to {self.centre.tolist()} m, pointing "
+                "down"
+            )
+        # The first place from which it gets to all targets, else the first there is.
+        self.centre, self.down, self.postures, _ = max(possible, key=lambda place: place[-1])
+
+    def _place(
+        self, centre: tuple[float, float, float]
+    ) -> tuple[Tensor, Tensor, Float[Tensor, "postures joints"], bool] | None:
+        """Centre, orientation and postures there; and whether it gets to all targets."""
+        self.centre = self.scaled(centre)
+        found = self._solutions(self.task)
+        if len(found) and self.task != "pose":
+            # Its joints decide how the tool is turned about its axis.
+            self.down = self.chain.forward(best_postures(self.chain, found)[0]).orientation
+            found = self._solutions("pose")
+        if len(found) == 0:
+            return None
+        postures = best_postures(self.chain, found)
+        if self.task != "pose":
+            return self.centre, self.down, postures, True
+        reaching = postures[self._reaches_targets(postures)]
+        if len(reaching) == 0:
+            return self.centre, self.down, postures, False
+        # A start near the ready posture then has the shortest way to servo from.
+        far = (reaching - self.chain.ready).norm(dim=-1)
+        return self.centre, self.down, reaching[far.argsort()], True
+
+    def _reaches_targets(
+        self, postures: Float[Tensor, "postures joints"]
+    ) -> Bool[Tensor, " postures"]:
+        """Whether targets in all corners are reached from postures, and not at the last reach.
+
+        An arm that is stretched out to a target is singular there, so that it gets no closer.
+        """
+        signs = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0], dtype=torch.float64)] * 3)
+        corners = Pose(
+            self.centre + self.scaled(_SPREAD) * signs, self.down.expand(len(signs), 4)
         )
+        q = solutions_from(self.chain, corners, postures.expand(len(signs), *postures.shape))
+        least = torch.linalg.svdvals(self.chain.jacobian(q.nan_to_num()))[..., -1]
+        return (q.isfinite().all(-1) & (least > SINGULAR_BELOW)).all(0)
 
     def _solutions(self, task: TaskSpace) -> Float[Tensor, "solutions joints"]:
         limits, rng = self.chain.limits, torch.Generator().manual_seed(0)
@@ -192,6 +236,10 @@ class TrialConfig:
     """Control step [s]."""
     feature: Literal["centre", "corners"] = "centre"
     """Of the marker: the paper's single point, or the four corners."""
+    pull: Literal["paper", "saturated"] = "paper"
+    """Of the marker to its target: the paper's ends at the ellipse, where an arm that comes in
+    from afar may stop at a wall of its box; the other, which the work cell's servoing has,
+    holds wherever the marker is seen (`VisionRegion`)."""
     law: Literal["recommended", "printed"] = "recommended"
     """The paper's law as printed has Table I's gains and no joint-space approach."""
     half_size: tuple[float, float, float] = HALF_SIZE
@@ -327,7 +375,7 @@ def draw_scene(config: TrialConfig, rng: torch.Generator) -> TrialScene:
         marker=centre.new_tensor(MARKER),
         corners=centre.new_tensor(CORNERS) if config.feature == "corners" else None,
     )
-    spread = servoing.scaled((0.08, 0.08, 0.05))
+    spread = servoing.scaled(_SPREAD)
     at = centre + spread * uniform(-1.0, 1.0, 3)
     tool = Pose(at, servoing.down.expand(config.count, 4))
     return TrialScene(
@@ -375,6 +423,7 @@ def grasp_controller(
             centre, servoing.down, scene.target, half_size=box.tolist(), task=servoing.task
         )
         goals = goals.approached_by(posture)
+        goals = replace(goals, vision=replace(goals.vision, formulation=config.pull))
         settings = ControllerConfig()
         region = JointRegion.from_limits(chain.limits.lower, chain.limits.upper)
     return AdaptiveController(

@@ -264,7 +264,8 @@ def run_chunk(name: str, count: int, seed: int, robot: ArmChoice = _PANDA) -> An
     if not experiment.whole:
         changes["count"] = count
     if robot != _PANDA:
-        changes["robot"] = robot
+        # The Panda's figures are of the paper's pull, in which some arms stop on their way.
+        changes |= {"robot": robot, "pull": "saturated"}
     return experiment.run(replace(experiment.config, **changes))
 
 
