@@ -268,6 +268,15 @@ class LinearPrimitive(nn.Module):
         Arguments are those of `AdaptedPrimitive.step`, in columns: `external_acceleration` is
         added to the motion, per s^2, (*batch, D).
         """
+        if (
+            isinstance(dt, float)
+            and goal is goal_filter is external_acceleration is None
+            and phase_stopping is forcing_gain is None
+            and isinstance(self.forcing_scale, NoScaling)
+        ):
+            alone = closed_loop_step.advance_alone(state, dt, self.response, self.weights)
+            if alone is not None:
+                return alone
         target = state.target
         if goal is not None:
             target = checked_vector("goal", goal, state.goal).expand_as(state.goal)

@@ -9,7 +9,14 @@ from demo_motions import arm_motion
 from dmp_oracle import solve
 from unchecked import shapes_unchecked
 
-from hrc_learn.dmp import GaussianBasis, JointDMP, SpringDamper, continue_motion, response_of
+from hrc_learn.dmp import (
+    GaussianBasis,
+    JointDMP,
+    SplineBasis,
+    SpringDamper,
+    continue_motion,
+    response_of,
+)
 from hrc_learn.dmp._closed_loop_step import host_values
 
 
@@ -353,3 +360,41 @@ def test_an_approach_cannot_be_continued():
             elapsed=dmp.duration,
             time=dmp.timestamps,
         )
+
+
+@pytest.mark.parametrize("basis", [GaussianBasis(count=20), SplineBasis(count=20)], ids=str)
+def test_steps_without_gradients_are_those_with_them(basis):
+    """NumPy and PyTorch do the same sums; past the end of the forcing as before it."""
+    time = torch.linspace(0, 2, 200, dtype=torch.float64)
+    motion = torch.stack([torch.sin(2 * time), time * torch.cos(time)], dim=-1)
+    dmp = JointDMP.fit(time, motion, basis=basis)
+    derived = plain = dmp.initial_state()
+    for _ in range(30):
+        derived = dmp.step(derived, 0.11)
+        with torch.no_grad():
+            plain = dmp.step(plain, 0.11)
+        for name, value in vars(derived).items():
+            mine = getattr(plain, name)
+            assert mine.shape == value.shape
+            assert not mine.requires_grad
+            torch.testing.assert_close(mine, value.detach(), rtol=1e-12, atol=1e-12)
+    assert plain.s > 1.5
+    with torch.inference_mode():
+        once = dmp.step(dmp.initial_state(), 0.3)
+    again = dmp.step(dmp.initial_state(), 0.3)
+    torch.testing.assert_close(once.position, again.position.detach())
+
+
+def test_a_step_that_the_fast_way_is_not_for_goes_the_other():
+    time = torch.linspace(0, 2, 200, dtype=torch.float64)
+    wave = torch.sin(2 * time)[:, None]
+    for dmp in (
+        JointDMP.fit(time, wave, 20, approach=1.0),
+        JointDMP.fit(time, wave, 20, scaling="amplitude"),
+        JointDMP.fit(time, wave, 20).float(),
+        JointDMP.fit(time, torch.stack([wave, 2 * wave]), 20),
+    ):
+        derived = dmp.step(dmp.step(dmp.initial_state(), 0.4), 0.3)
+        with torch.no_grad():
+            plain = dmp.step(dmp.step(dmp.initial_state(), 0.4), 0.3)
+        torch.testing.assert_close(plain.position, derived.position.detach())

@@ -145,6 +145,22 @@ class PiecewisePolynomial:
         c = self.coefficients.view(pieces, -1).index_select(0, piece.reshape(-1))
         return (powers @ c.view(*s.shape, P, -1)).view(*s.shape, *shape)
 
+    def at(self, s: float) -> np.ndarray:
+        """Value at `s`, (rows, columns), in NumPy."""
+        pieces, _, *shape = self.coefficients.shape
+        x = s / self.interval
+        x = x % pieces if self.periodic else min(max(x, 0.0), float(pieces))
+        piece = min(int(x), pieces - 1)
+        powers = (2 * (x - piece) - 1) ** self._arrays[1]
+        return powers.dot(self._arrays[0][piece]).reshape(shape)
+
+    @cached_property
+    def _arrays(self) -> tuple[np.ndarray, np.ndarray]:
+        """Coefficients by piece and power, and the powers, sharing memory where they can."""
+        coefficients = self.coefficients.numpy()
+        rows = coefficients.reshape(*coefficients.shape[:2], -1)
+        return rows, np.arange(rows.shape[1], dtype=float)
+
     def to(self, device: torch.device) -> "PiecewisePolynomial":
         """The same function on another device; made once."""
         if device == self.coefficients.device:
