@@ -381,15 +381,20 @@ def _episodes_v3(root: Path, info: dict) -> Iterable[EpisodeEntry]:
         )
         start = _integer(row["dataset_from_index"], "dataset_from_index", "meta/episodes")
         first_row[place] = min(first_row.get(place, start), start)
+    # Looked up once a file: links are followed, which takes longer than all else of an episode.
+    paths = {
+        (chunk, number): path_in(
+            root, info.get("data_path"), "data_path", chunk_index=chunk, file_index=number
+        )
+        for chunk, number in first_row
+    }
     for row in rows:
         chunk, file = row["data/chunk_index"], row["data/file_index"]
         yield EpisodeEntry(
             index=_integer(row["episode_index"], "episode_index", "meta/episodes"),
             length=_integer(row["length"], "length", "meta/episodes"),
             tasks=_task_texts(row),
-            file=path_in(
-                root, info.get("data_path"), "data_path", chunk_index=chunk, file_index=file
-            ),
+            file=paths[chunk, file],
             start=int(row["dataset_from_index"]) - first_row[chunk, file],
         )
 

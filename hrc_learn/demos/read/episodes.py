@@ -182,16 +182,17 @@ def _unit_faults(
     telling = (size > 1e-2) & (np.array([decision.unit_of(i) for i in range(len(size))]) != "1")
     if not telling.any():
         return
-    for entry, of_episode in peaks:
-        own = of_episode.get(role)
-        if own is None or len(own) != len(size):
-            continue
-        ratio = np.log(np.maximum(own[telling], 1e-9) / size[telling])
-        if abs(abs(float(np.median(ratio))) - _DEGREES) < _NEAR:
-            seems = "deg" if np.median(ratio) > 0 else "rad"
+    known = [(entry, p[role]) for entry, p in peaks if role in p and len(p[role]) == len(size)]
+    if not known:
+        return
+    reached = np.stack([own[telling] for _, own in known])
+    ratios = np.median(np.log(np.maximum(reached, 1e-9) / size[telling]), axis=1)
+    for (entry, _), ratio in zip(known, ratios.tolist(), strict=True):
+        if abs(abs(ratio) - _DEGREES) < _NEAR:
+            seems = "deg" if ratio > 0 else "rad"
             key, index = selection.columns[int(np.flatnonzero(telling)[0])]
             yield DatasetError(
-                f"{role} is about {math.exp(abs(float(np.median(ratio)))):.0f} times as "
+                f"{role} is about {math.exp(abs(ratio)):.0f} times as "
                 f"{'large' if seems == 'deg' else 'small'} as in the other episodes: {seems} "
                 f"among {decision.unit}? Leave the episode out, or record it again",
                 **entry.location,

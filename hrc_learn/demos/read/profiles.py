@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float64, Int64, Shaped
+from jaxtyping import Float32, Float64, Int64, Shaped
 
 from hrc_learn.demos.read.roles import INDEX_KEYS
 
@@ -22,28 +22,59 @@ _LONGEST_DELAY = 1.5
 """No controller answers later than this [s]."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class ColumnProfile:
-    """One feature during one episode, a number for each component."""
+    """One feature during one episode, a number for each component.
 
-    levels: Float64[np.ndarray, "5 components"]
-    """Quantiles 0.5, 5, 50, 95 and 99.5 %."""
-    start: Float64[np.ndarray, " components"]
-    """Median of the first frames."""
-    goal: Float64[np.ndarray, " components"]
-    """Median of the last frames."""
-    step: Float64[np.ndarray, " components"]
-    """Change from frame to frame that one in a hundred is above."""
-    noise: Float64[np.ndarray, " components"]
-    """Median size of the second difference."""
-    held: Int64[np.ndarray, " components"]
-    """Most frames in a row without any change."""
-    distinct: Int64[np.ndarray, " components"]
-    """Values that differ."""
-    largest: Float64[np.ndarray, " components"]
-    """Largest absolute value."""
-    flat: Float64[np.ndarray, " components"]
-    """Share of steps without any change."""
+    All are kept in one array: of 10,000 episodes small ones take more than their numbers.
+    """
+
+    figures: Float64[np.ndarray, "13 components"]
+
+    @property
+    def levels(self) -> Float64[np.ndarray, "5 components"]:
+        """Quantiles 0.5, 5, 50, 95 and 99.5 %."""
+        return self.figures[:5]
+
+    @property
+    def start(self) -> Float64[np.ndarray, " components"]:
+        """Median of the first frames."""
+        return self.figures[5]
+
+    @property
+    def goal(self) -> Float64[np.ndarray, " components"]:
+        """Median of the last frames."""
+        return self.figures[6]
+
+    @property
+    def step(self) -> Float64[np.ndarray, " components"]:
+        """Change from frame to frame that one in a hundred is above."""
+        return self.figures[7]
+
+    @property
+    def noise(self) -> Float64[np.ndarray, " components"]:
+        """Median size of the second difference."""
+        return self.figures[8]
+
+    @property
+    def held(self) -> Float64[np.ndarray, " components"]:
+        """Most frames in a row without any change."""
+        return self.figures[9]
+
+    @property
+    def distinct(self) -> Float64[np.ndarray, " components"]:
+        """Values that differ."""
+        return self.figures[10]
+
+    @property
+    def largest(self) -> Float64[np.ndarray, " components"]:
+        """Largest absolute value."""
+        return self.figures[11]
+
+    @property
+    def flat(self) -> Float64[np.ndarray, " components"]:
+        """Share of steps without any change."""
+        return self.figures[12]
 
     @property
     def peak(self) -> Float64[np.ndarray, " components"]:
@@ -56,26 +87,26 @@ class ColumnProfile:
         return self.levels[-1] - self.levels[0]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, slots=True)
 class Tracking:
     """How a command and the component that follows it go together during one episode."""
 
     delay: int
     """Frames by which the state comes later, the same for all components."""
-    residual: Float64[np.ndarray, " delays"]
+    residual: Float32[np.ndarray, " delays"]
     """What is left of the variance of the components that follow their command, at each delay,
     from the longest lead on."""
     slope: Float64[np.ndarray, " components"]
     """Change of the state for a change of the command, at that delay."""
-    offset: Float64[np.ndarray, " components"]
-    """Median of state minus command, at that delay."""
     fit: Float64[np.ndarray, " components"]
     """Share of the state's variance that the command explains (R squared)."""
-    likeness: Float64[np.ndarray, "components components"]
-    """Correlation of every command with every state; NaN where one of them rests."""
+    partner: Int64[np.ndarray, " components"]
+    """State that each command is most like."""
+    likeness: Float64[np.ndarray, " components"]
+    """Size of their correlation; 0 where one of them rests."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, slots=True)
 class EpisodeProfile:
     """One episode, feature by feature."""
 
@@ -108,17 +139,18 @@ def _profile(values: Float64[np.ndarray, "frames components"]) -> ColumnProfile:
     steps = np.abs(np.diff(values, axis=0)) if len(values) > 1 else np.zeros_like(values)
     bends = np.abs(np.diff(values, 2, axis=0)) if len(values) > 2 else np.zeros_like(values)
     at = min(len(steps) - 1, int(0.99 * len(steps)))
-    return ColumnProfile(
-        levels=ordered[places],
-        start=np.median(values[:few], axis=0),
-        goal=np.median(values[-few:], axis=0),
-        step=np.partition(steps, at, axis=0)[at],
-        noise=np.median(bends, axis=0),
-        held=longest_hold(values),
-        distinct=1 + (np.diff(ordered, axis=0) > 0).sum(0),
-        largest=np.maximum(np.abs(ordered[0]), np.abs(ordered[-1])),
-        flat=(steps == 0).mean(0),
+    figures = (
+        *ordered[places],
+        np.median(values[:few], axis=0),
+        np.median(values[-few:], axis=0),
+        np.partition(steps, at, axis=0)[at],
+        np.median(bends, axis=0),
+        longest_hold(values),
+        1 + (np.diff(ordered, axis=0) > 0).sum(0),
+        np.maximum(np.abs(ordered[0]), np.abs(ordered[-1])),
+        (steps == 0).mean(0),
     )
+    return ColumnProfile(np.stack(figures).astype(float))
 
 
 def longest_hold(
@@ -166,6 +198,31 @@ def _standardized(values: np.ndarray) -> np.ndarray:
     return centered / np.maximum(centered.std(0), 1e-12)
 
 
+# Of the variance: a window in which a component rests, but for what rounding leaves.
+_RESTS = 1e-10
+
+
+def _correlations(
+    command: Float64[np.ndarray, "frames components"],
+    state: Float64[np.ndarray, "frames components"],
+    reach: int,
+) -> Float64[np.ndarray, "delays components"]:
+    """Correlation of state(t) with command(t - delay), delays from -reach to reach.
+
+    The same frames of the state are compared at each; 0 where the command rests in its own.
+    """
+    inner = len(state) - 2 * reach
+    late, early = _standardized(state[reach : reach + inner]), _standardized(command)
+    windows = np.lib.stride_tricks.sliding_window_view(early, inner, axis=0)
+    together = np.einsum("dcn,nc->dc", windows, late) / inner
+    # Mean and variance of all windows from running sums.
+    sums, squares = (np.cumsum(np.pad(x, ((1, 0), (0, 0))), axis=0) for x in (early, early**2))
+    mean = (sums[inner:] - sums[:-inner]) / inner
+    variance = (squares[inner:] - squares[:-inner]) / inner - mean**2
+    found = together / np.sqrt(np.maximum(variance, _RESTS))
+    return np.where(variance > _RESTS, found, 0.0)[::-1]  # the last window is the earliest
+
+
 def track(
     command: Float64[np.ndarray, "frames components"],
     state: Float64[np.ndarray, "frames components"],
@@ -184,14 +241,8 @@ def track(
     moving = size > 1e-9 * (1 + np.abs(state).max(0))
     if not moving.any():
         return None
-    inner = slice(reach, frames - reach)
-    late = _standardized(state[inner][:, moving])
     delays = np.arange(-reach, reach + 1)
-    left = np.empty((len(delays), late.shape[1]))
-    for number, delay in enumerate(delays):
-        # state(t) against command(t - delay), whatever their zeros and scales
-        early = _standardized(command[reach - delay : frames - reach - delay][:, moving])
-        left[number] = 1 - np.maximum((late * early).mean(0), 0) ** 2
+    left = 1 - np.maximum(_correlations(command[:, moving], state[:, moving], reach), 0) ** 2
     # Hands and grippers that stand still at an object tell nothing of the delay.
     followed = left.min(0) < _FOLLOWED
     residual = left[:, followed if followed.any() else slice(None)].mean(1)
@@ -206,18 +257,19 @@ def track(
     with np.errstate(divide="ignore", invalid="ignore"):
         slope = together / power
         fit = together**2 / (power * answer)
-        likeness = (a0.T @ s0) / np.sqrt(np.outer(power, answer))
+        likeness = np.nan_to_num(np.abs(a0.T @ s0) / np.sqrt(np.outer(power, answer)))
     for value in (slope, fit):
         value[~moving] = np.nan
-    likeness[~moving] = np.nan
-    likeness[:, ~moving] = np.nan
+    likeness[~moving] = 0.0
+    likeness[:, ~moving] = 0.0
+    partner = likeness.argmax(1)
     return Tracking(
         delay=delay,
-        residual=residual,
+        residual=residual.astype(np.float32),
         slope=slope,
-        offset=np.median(s - a, axis=0),
         fit=fit,
-        likeness=likeness,
+        partner=partner,
+        likeness=likeness.max(1),
     )
 
 

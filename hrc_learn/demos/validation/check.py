@@ -59,7 +59,7 @@ class _SoundEpisode:
     quantities: Quantities
 
 
-_KEPT_BYTES = 2**27
+_KEPT_BYTES = 2**24
 """Frames that are kept for the second look; of larger datasets they are read twice."""
 
 

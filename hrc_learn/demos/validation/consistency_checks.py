@@ -353,9 +353,8 @@ def check_tracking(
             & (fits[number] > _FOLLOWS)
             & (np.abs(slopes[number] + slope) < 0.5 * np.abs(slope))
         )
-        likeness = np.nan_to_num(np.abs(tracking.likeness))
-        partner = likeness.argmax(1)
-        swapped = [i for i in lost if likeness[i, partner[i]] > 0.9 and partner[i] != i]
+        partner = tracking.partner
+        swapped = [i for i in lost if tracking.likeness[i] > 0.9 and partner[i] != i]
         if len(against):
             report.error(
                 f"the state goes the other way than its command, in this episode alone: "
