@@ -24,7 +24,13 @@ import pyarrow.parquet as pq
 import torch
 
 from hrc_learn import cli
-from hrc_learn.demos import DatasetWriter, check_dataset, load_demos, open_demos
+from hrc_learn.demos import (
+    DatasetWriter,
+    ImageReader,
+    check_dataset,
+    load_demos,
+    open_demos,
+)
 from hrc_learn.geometry import quaternion
 
 JOINTS = tuple(f"panda_joint{i}" for i in range(1, 8))
@@ -39,7 +45,7 @@ class Args:
     repeats: int = 9
     """Times each reading is repeated; the median counts."""
     peer: bool = False
-    """Also record and read one episode with LeRobot's own classes."""
+    """Also record and read one episode, and images of two cameras, with LeRobot."""
     json: Path | None = None
     """Receives the figures as one flat object."""
 
@@ -53,6 +59,7 @@ def main(args: Args) -> None:
         figures |= measure_reading(root, args)
         if args.peer:
             figures |= measure_lerobot(Path(folder) / "peer", args)
+            figures |= measure_images(Path(folder) / "images")
     for name, value in figures.items():
         print(f"{name:36s} {value:12,.4g}")
     if args.json:
@@ -144,6 +151,30 @@ def measure_lerobot(root: Path, args: Args) -> dict[str, float]:
         "lerobot_add_frame_us": 1e6 * adding / args.frames,
         "lerobot_save_episode_ms_per_frame": 1e3 * saving / args.frames,
         "lerobot_samples_per_s": args.frames / reading,
+    }
+
+
+def measure_images(root: Path, frames: int = 150, size: tuple[int, int] = (480, 640)) -> dict:
+    """Images of two cameras, frame after frame: `ImageReader` and LeRobot's `dataset[i]`."""
+    from lerobot.datasets import LeRobotDataset
+
+    cameras = {"front": size, "wrist": size}
+    rng = np.random.default_rng(0)
+    scene = rng.integers(0, 255, (60, 80, 3), dtype=np.uint8).repeat(8, 0).repeat(8, 1)
+    with DatasetWriter(root, 30, "panda", JOINTS, cameras=cameras) as writer:
+        writer.start_episode("place the bottle")
+        for k in range(frames):
+            image = np.roll(scene, 3 * k, axis=1)  # the camera pans
+            images = {"front": image, "wrist": image[::-1]}
+            writer.add_frame(time=k / 30, joint_position=np.full(7, 0.01 * k), images=images)
+        writer.save_episode()
+    reader = ImageReader(root)
+    opened = LeRobotDataset("local/images", root=root)
+    ours = median_seconds(lambda: reader.read(0), 3)
+    theirs = median_seconds(lambda: [opened[k] for k in range(frames)], 3)
+    return {
+        "images_of_two_cameras_frames_per_s": frames / ours,
+        "lerobot_images_of_two_cameras_frames_per_s": frames / theirs,
     }
 
 
