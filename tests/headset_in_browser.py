@@ -19,6 +19,16 @@ const device = new IWER.XRDevice(IWER.metaQuest3);
 device.installRuntime();
 device.primaryInputMode = "hand";
 window.headset = device;
+// The arm as the client is told of it.
+window.bodies = [];
+window.Worker = class extends Worker {
+  constructor(...options) {
+    super(...options);
+    this.addEventListener("message", ({ data }) => {
+      if (data.scene) window.bodies = data.scene.bodies;
+    });
+  }
+};
 // What the client is told in each frame, seen beside it.
 const request = navigator.xr.requestSession.bind(navigator.xr);
 navigator.xr.requestSession = async (...options) => {
@@ -139,6 +149,19 @@ class Headset:
             })""",
             [hand, away.tolist(), rate],
         )
+
+    def watch_it_rest(self, patience: float = 120.0) -> None:
+        """Look at the arm until it moves no more, as who leads it does before they go on."""
+        positions = lambda: np.array(self.tab.evaluate("window.bodies"))[:, :3]  # noqa: E731
+        before, end = positions(), time.monotonic() + patience
+        while True:
+            time.sleep(1.0)
+            now = positions()
+            if np.abs(now - before).max() < 1e-3:
+                return
+            if time.monotonic() > end:
+                pytest.fail(f"the arm does not come to rest within {patience} s")
+            before = now
 
     @contextmanager
     def pinching(self, hand: str) -> Iterator[None]:

@@ -21,6 +21,8 @@ from hrc_learn.sim.workplace import Workplace
 pytestmark = pytest.mark.browser
 
 ROOT = Path(__file__).parents[2]
+PLACINGS = 20
+"""From random starts."""
 RATE = 60.0
 """Points of a hand's path [1/s]."""
 
@@ -66,8 +68,10 @@ def _doubted(person) -> bool:
     return "Save again" in _words(person)
 
 
-def hand_path(corners: np.ndarray, rng: np.random.Generator, speed: float = 0.13) -> np.ndarray:
-    """A hand along a way: minimum-jerk from corner to corner, with tremor and drift.
+def hand_paths(
+    corners: np.ndarray, rng: np.random.Generator, speed: float = 0.13
+) -> list[np.ndarray]:
+    """A hand from corner to corner: minimum-jerk, with tremor and drift.
 
     Physiological tremor is of 8 to 12 Hz and some tenths of a millimetre (Elble and Koller,
     1990); hands that are held up drift by millimetres.
@@ -77,12 +81,12 @@ def hand_path(corners: np.ndarray, rng: np.random.Generator, speed: float = 0.13
         duration = 1.875 * np.linalg.norm(end - start) / (speed * rng.uniform(0.8, 1.2))
         s = np.linspace(0, 1, max(int(duration * RATE), 2))[:, None]
         pieces.append(start + (10 * s**3 - 15 * s**4 + 6 * s**5) * (end - start))
-    path = np.concatenate([*pieces, np.repeat(corners[-1:], int(2.5 * RATE), axis=0)])
+    path = np.concatenate(pieces)
     time = np.arange(len(path))[:, None] / RATE
     for frequency, size in ((rng.uniform(8, 12, 3), 0.0004), (rng.uniform(0.2, 0.6, 3), 0.002)):
         phase = rng.uniform(0, 2 * np.pi, 3)
         path = path + size * (np.sin(2 * np.pi * frequency * time + phase) - np.sin(phase))
-    return path
+    return np.split(path, np.cumsum([len(piece) for piece in pieces])[:-1])
 
 
 def program(name, *arguments, status=(0,)):
@@ -136,13 +140,14 @@ def test_demonstrations_by_hands_are_learned_and_placed(tmp_path):
             person.enter()
             closing = _closing(person)
             for k in range(count):
-                path = hand_path(corners, np.random.default_rng(k))
                 person.reach("right", room(start[None])[0] - closing)
                 person.press("Start")
                 person.pinch("right")
-                person.walk(
-                    "right", room(path) - room(start[None]) + person.hand("right"), RATE
-                )
+                offset = person.hand("right") - room(start[None])
+                # Who sees that the arm lags, on a slow machine, waits for it.
+                for path in hand_paths(corners, np.random.default_rng(k)):
+                    person.walk("right", room(path) + offset, RATE)
+                    person.watch_it_rest()
                 person.pinch("right", closed=False)
                 person.press("Stop")
                 wait_until(lambda: "stopped" in _words(person), "it stopped")
@@ -163,12 +168,16 @@ def test_demonstrations_by_hands_are_learned_and_placed(tmp_path):
     program("training/fit_dmp.py", "--dataset", demos, "--out", tmp_path / "model")
     outcome = tmp_path / "measured"
     run = ("--placing", tmp_path / "model", "--out", tmp_path / "run", "--no-pictures")
+    run += ("--trials", PLACINGS)
     program("control/run_placing.py", *run, "--json", outcome, status=(0, 1))
     measured = json.loads(outcome.read_text("utf-8"))
-    print({k: v for k, v in measured.items() if "middle_shelf" in k})
-    assert measured["middle_shelf_placed"] == 1
-    assert measured["middle_shelf_contacts"] == 0
-    assert measured["middle_shelf_place_error_mm"] < 10
+    # On the shelf that was demonstrated and on the two others. A start may bring the object
+    # against the cabinet, as none of the demonstrations was from there.
+    assert measured["random_starts_placings"] == 3 * PLACINGS
+    assert measured["random_starts_fraction_that_stands_on_its_shelf"] == 1
+    assert measured["random_starts_fraction_within_3_mm_and_3_deg_of_its_place"] == 1
+    assert measured["random_starts_joint_limit_violations"] == 0
+    assert measured["random_starts_fraction_without_contact"] > 0.7
 
 
 def _words(person) -> str:
