@@ -3,6 +3,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from bare_arm import bare
 from unchecked import shapes_unchecked
 
 from hrc_learn.controller import GRIPPER_DOWN
@@ -11,6 +12,8 @@ from hrc_learn.experiments.controller.disturbance_trials import EffortConfig, ru
 from hrc_learn.experiments.controller.grasp_trials import (
     CENTRE,
     MARKER,
+    PEDESTAL,
+    TrialArm,
     TrialConfig,
     TrialResult,
     draw_scene,
@@ -22,7 +25,9 @@ from hrc_learn.experiments.controller.mujoco_trials import build_plant
 from hrc_learn.geometry import Pose, quaternion
 from hrc_learn.jacobian import FixedEstimator, KalmanConfig, KalmanEstimator, PaperEstimator
 from hrc_learn.kinematics import (
+    Arm,
     ArmChoice,
+    CapsuleArm,
     UnreachableError,
     clear_posture,
     comfortable_posture,
@@ -84,28 +89,52 @@ def described(path, lengths, axes):
 
 
 @shapes_unchecked()  # for speed
-def test_targets_are_where_a_long_tool_gets_to_all_of_them(tmp_path):
-    """Shoulder, elbow and wrist of 0.3 m each, and a tool of 0.2 m beyond the wrist."""
+@pytest.mark.parametrize("link", [0.33, 0.25])
+def test_targets_are_where_a_long_tool_gets_to_all_of_them(tmp_path, link):
+    """Shoulder, elbow and wrist one link apart each, and a tool of 0.2 m beyond the wrist."""
     axes = ("0 0 1", "0 1 0", "0 1 0", "0 0 1", "0 1 0", "0 0 1")
-    path = described(tmp_path / "six.urdf", (0.06, 0.06, 0.3, 0.15, 0.15, 0.2), axes)
-    arm = trial_arm(ArmChoice(str(path)))
+    lengths = (0.06, 0.06, link, link / 2, link / 2, 0.2)
+    arm = trial_arm(ArmChoice(str(described(tmp_path / "six.urdf", lengths, axes))))
     spread = arm.scale * torch.tensor([0.08, 0.08, 0.05], dtype=torch.float64)
     corners = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0]).double()] * 3) * spread
 
     def stretch(centre):
-        """From the shoulder to the wrist above the farthest corner, of 0.6 m that there are."""
+        """From shoulder to wrist above the farthest corner, as a share of both links."""
         wrist = centre + corners + torch.tensor([0.0, 0.0, 0.2 - 0.12], dtype=torch.float64)
-        return float(wrist.norm(dim=-1).max())
+        return float(wrist.norm(dim=-1).max()) / (2 * link)
 
-    assert stretch(arm.scaled(CENTRE)) > 0.6
-    assert stretch(arm.centre) < 0.595
-    x, y = (arm.centre / arm.scaled(CENTRE))[:2].tolist()
-    assert x == pytest.approx(y)
+    places = [
+        arm.scaled((nearer * CENTRE[0], nearer * CENTRE[1], height))
+        for nearer in (1.0, 0.85, 0.7)
+        for height in (CENTRE[2], 0.2, 0.1)
+    ]
+    # Where it is stretched out it is singular: 0.983 and 0.997 of the links are too much.
+    assert any(0.97 < stretch(place) < 1 for place in places[: 7 if link < 0.3 else 2])
+    torch.testing.assert_close(arm.centre, next(p for p in places if stretch(p) < 0.97))
     for posture in arm.postures:
         reached = arm.chain.forward(posture)
         assert float((reached.position - arm.centre).abs().max()) < 1e-8
     far = (arm.postures - arm.chain.ready).norm(dim=-1)
     assert (far.diff() >= 0).all()
+
+
+def test_a_link_that_always_meets_the_pedestal_is_not_looked_at():
+    """The upper arm, too thick for its shoulder; the forearm is looked at all the same."""
+    thick = bare()
+    (lower,) = (c for c in thick.own_body.capsules if c.link == 2)
+    rest = [c for c in thick.own_body.capsules if c.link != 2]
+    body = CapsuleArm(thick.chain, [*rest, replace(lower, radius=0.34)], [(0, 2), (2, 4)])
+    arm = TrialArm(Arm(name="thick", chain=thick.chain, own_body=body))
+    q = thick.chain.ready
+    assert float(body.box_distance(q, *map(arm.scaled, PEDESTAL))) < 0
+    links = {c.link for c in arm._above_pedestal.capsules}
+    assert links == {c.link for c in body.capsules} - {0, 1, 2}
+
+
+def test_an_arm_without_a_free_start_is_refused(monkeypatch):
+    monkeypatch.setattr(TrialArm, "clearance", lambda arm, q: torch.zeros(len(q)))
+    with pytest.raises(ValueError, match=r"no start of the panda .* free of contacts"):
+        draw_scene(TrialConfig(count=3), torch.Generator().manual_seed(0))
 
 
 def test_the_pull_to_the_target_ends_at_the_ellipse_or_not():

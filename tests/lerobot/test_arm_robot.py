@@ -8,7 +8,7 @@ from lerobot.utils.errors import DeviceNotConnectedError
 
 from hrc_learn.geometry import Pose
 from hrc_learn.kinematics import EquippedArm, panda
-from hrc_learn.lerobot.arm_robot import GRIPPER, HAND, ArmValues, robot_registry
+from hrc_learn.lerobot.arm_robot import GRIPPER, HAND, ArmRobot, ArmValues, robot_registry
 from hrc_learn.lerobot.expert_recording import observation_features
 from hrc_learn.lerobot.person import PersonConfig
 from hrc_learn.lerobot.robots import FrankaPandaConfig, MujocoArmRobotConfig
@@ -66,6 +66,11 @@ def test_names_are_those_of_the_arms_joints(six, simulated, space):
     q = torch.tensor([values[name] for name in joints], dtype=torch.float64)
     tool = six.chain.forward(q)
     assert [values[name] for name in HAND[:3]] == pytest.approx(tool.position.tolist())
+    state = robot.read_state()
+    assert values[GRIPPER] == state.gripper_width > 0.05
+    # What a real arm knows of itself, too.
+    itself = ArmRobot.clearance(robot, q)
+    assert float(itself) == float(six.whole.self_distance(q))
     # It goes where it is sent, by either kind of actions.
     sent = q + 0.005
     goal = six.chain.forward(sent)

@@ -35,6 +35,7 @@ from hrc_learn.kinematics import (
     ArmChoice,
     CapsuleArm,
     FrankaChain,
+    LinkCapsule,
     TaskSpace,
     UnreachableError,
     arm,
@@ -189,9 +190,12 @@ class TrialArm:
         if not self._above.capsules:  # of a description without shapes
             return distance
         below = self.centre - self.scaled(CENTRE)
-        for (centre, half_size), lower in ((TABLE, below), (PEDESTAL, 0 * below)):
+        for body, (centre, half_size), lower in (
+            (self._above, TABLE, below),
+            (self._above_pedestal, PEDESTAL, 0 * below),
+        ):
             box = self.scaled(centre) + lower, self.scaled(half_size)
-            distance = torch.minimum(distance, self._above.box_distance(q, *box))
+            distance = torch.minimum(distance, body.box_distance(q, *box))
         return distance
 
     @cached_property
@@ -199,6 +203,23 @@ class TrialArm:
         """Without link 1, which always is as near to what the arm stands on."""
         body = self.arm.body
         return CapsuleArm(self.chain, [c for c in body.capsules if c.link > 1])
+
+    @cached_property
+    def _above_pedestal(self) -> CapsuleArm:
+        """Without links either whose capsule meets the pedestal in most postures.
+
+        That of a thick upper arm, which turns about a low shoulder, tells nothing.
+        """
+        limits, rng = self.chain.limits, torch.Generator().manual_seed(0)
+        share = torch.rand(_STARTS, len(limits.lower), generator=rng, dtype=torch.float64)
+        q = limits.lower + (limits.upper - limits.lower) * share
+        box = self.scaled(PEDESTAL[0]), self.scaled(PEDESTAL[1])
+
+        def tells(capsule: LinkCapsule) -> bool:
+            distance = CapsuleArm(self.chain, [capsule]).box_distance(q, *box)
+            return float((distance > _START_CLEARANCE).double().mean()) > 0.5
+
+        return CapsuleArm(self.chain, [c for c in self._above.capsules if tells(c)])
 
 
 _PANDA_REACH = 0.95  # [m], as `Arm.reach` of it
@@ -214,6 +235,8 @@ def trial_arm(choice: ArmChoice) -> TrialArm:
 _SECONDS_BETWEEN_CONTACT_CHECKS = 0.024
 # Starts are drawn again below this distance from contact [m].
 _START_CLEARANCE = 0.01
+# Times that all starts are drawn, none of them free, before the arm is refused.
+_MOST_DRAWS = 20
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -399,6 +422,12 @@ def _starts(config: TrialConfig, servoing: TrialArm, rng: torch.Generator) -> Te
             unit = torch.rand(shape, generator=rng, dtype=torch.float64)
             q = lower + unit * (upper - lower)
         free.append(q[servoing.clearance(q) > _START_CLEARANCE])
+        if len(free) > _MOST_DRAWS and not any(map(len, free)):
+            raise ValueError(
+                f"no start of the {servoing.arm.name} near its ready posture is free of "
+                "contacts with itself, table and pedestal: give it another ready posture, or "
+                "shapes that are less coarse."
+            )
     return torch.cat(free)[: config.count]
 
 
