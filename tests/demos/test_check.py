@@ -495,6 +495,30 @@ def test_joints_are_exchanged_where_each_took_the_others_place(tmp_path, levels,
     assert all(i.episode == 4 for i in found)
 
 
+def test_a_joint_that_rests_is_no_standing_still(tmp_path):
+    def episode(seed):
+        q = joint_path(120, seed=seed)
+        q[60:, 0] = q[60, 0]
+        q[:60, 1] = q[60, 1]
+        return {STATE: q}
+
+    root = write_folder(tmp_path / "set", [episode(i) for i in range(3)], {STATE: NAMES})
+    assert "standing still" not in str(check_dataset(root))
+
+
+@pytest.mark.parametrize(("delay", "shifted"), [(6, False), (-6, True)])
+def test_an_episode_whose_state_leads_where_it_follows_in_the_others(tmp_path, delay, shifted):
+    def episode(seed, frames):
+        t = np.linspace(0, 6, 160)[:, None] + np.random.default_rng(seed).uniform(0, 0.3, 3)
+        q = 0.5 * np.sin(t * [1.0, 1.7, 2.3])
+        return {STATE: q[20 - frames : 140 - frames], "action": q[20:140]}
+
+    episodes = [episode(i, 6) for i in range(4)] + [episode(4, delay)]
+    root = write_folder(tmp_path / "set", episodes, {STATE: NAMES, "action": NAMES})
+    found = [i.episode for i in check_dataset(root).errors if "shifted" in i.message]
+    assert found == ([4] if shifted else [])
+
+
 @pytest.mark.parametrize(("joint", "told"), [("elbow", True), ("kRightHandIndex", False)])
 def test_a_joint_that_stays_froze_a_finger_may_hold_something(tmp_path, joint, told):
     def episode(seed):
