@@ -20,7 +20,7 @@ from hrc_learn.sim.worker import WORKER_ITEM_HALF_SIZE, Posture, Worker
 # Half of the step by which velocities are taken [s]: they err by 0.1 mm/s at most.
 _HALF_STEP = 1e-4
 # Step of a person who walks, fraction of the stature: two in a stride of 0.8 of it.
-_STEP = 0.40
+STEP = 0.40
 HAND_OVER_BENCH = 2 * WORKER_ITEM_HALF_SIZE[2]
 """Height of a hand that puts down or takes what stands on the bench [m]."""
 # How far markers are to the sides of what the arm is at work above [m].
@@ -52,7 +52,7 @@ class HumanSpeeds:
                 )
 
 
-class _Pose(NamedTuple):
+class WorkerPose(NamedTuple):
     """What is given of a posture at the ends of a movement."""
 
     place: np.ndarray
@@ -205,10 +205,10 @@ def turned_about_base(
     return turned
 
 
-class _Writer:
+class PoseWriter:
     """Adds pose after pose, each as soon as his speeds allow."""
 
-    def __init__(self, start: _Pose, begin: float, speeds: HumanSpeeds, stature: float):
+    def __init__(self, start: WorkerPose, begin: float, speeds: HumanSpeeds, stature: float):
         self.now, self._speeds, self._stature = start, speeds, stature
         self.times, self.rows = [begin], [start.row()]
 
@@ -226,7 +226,7 @@ class _Writer:
         fastest = max(walked, leaned / limits.walking, turned, moved / limits.reaching)
         self._add(following, max(_PEAK * float(fastest), 0.3))
 
-    def _add(self, following: _Pose, duration: float) -> None:
+    def _add(self, following: WorkerPose, duration: float) -> None:
         self.times.append(self.times[-1] + duration)
         self.rows.append(following.row())
         self.now = following
@@ -296,9 +296,9 @@ def random_visit(
     carrying = hanging.copy()
     carrying[side] = [0.20 * h, (0.05, -0.05)[side] * h, 0.63 * h]
 
-    inwards, outwards = (_direction(b - a) for a, b in ((entrance, stand), (stand, leaving)))
-    start = _Pose(entrance, _near(inwards, facing), 0.0, carrying)
-    script = _Writer(start, rng.uniform(*begin), pace, h)
+    inwards, outwards = (direction(b - a) for a, b in ((entrance, stand), (stand, leaving)))
+    start = WorkerPose(entrance, nearest_turn(inwards, facing), 0.0, carrying)
+    script = PoseWriter(start, rng.uniform(*begin), pace, h)
     script.go(place=stand)
     script.go(heading=facing)
     # Down on the bench, near its edge, and away from what is under the arm.
@@ -310,8 +310,8 @@ def random_visit(
         ]
     )
     above = own(spot + np.array([0.0, 0.0, 0.12]))
-    script.go(hands=hand(above, side), lean=_lean(worker, above, side))
-    script.go(hands=hand(own(spot), side), lean=_lean(worker, own(spot), side))
+    script.go(hands=hand(above, side), lean=lean_for(worker, above, side))
+    script.go(hands=hand(own(spot), side), lean=lean_for(worker, own(spot), side))
     script.wait(rng.uniform(0.2, 0.5))
     released = script.times[-1]
     script.go(hands=ready, lean=0.05)
@@ -335,18 +335,18 @@ def random_visit(
         markers.append(_marker(worker, rng, own, np.array([*under, top]), is_reached))
         target = own(markers[-1])
         which = _hand_for(target)
-        script.go(hands=hand(target, which), lean=_lean(worker, target, which))
+        script.go(hands=hand(target, which), lean=lean_for(worker, target, which))
         script.wait(rng.uniform(0.3, 1.2))
         spans.append(script.times[-2:])
         script.go(hands=ready, lean=rng.uniform(0.0, 0.15))
     script.go(hands=hanging, lean=0.0)
-    script.go(heading=_near(outwards, facing))
+    script.go(heading=nearest_turn(outwards, facing))
     script.go(place=leaving)
     return WorkerVisit(
         worker=worker,
         time=np.array(script.times),
         poses=np.array(script.rows),
-        step=_STEP * h,
+        step=STEP * h,
         side=side,
         released=released,
         markers=np.array(markers),
@@ -382,16 +382,16 @@ def _marker(
     )
 
 
-def _lean(worker: Worker, target: np.ndarray, side: int) -> float:
+def lean_for(worker: Worker, target: np.ndarray, side: int) -> float:
     lean = worker.lean_to(target, side)
     assert lean is not None  # places are drawn within reach
     return lean
 
 
-def _direction(vector: np.ndarray) -> float:
+def direction(vector: np.ndarray) -> float:
     return float(np.arctan2(vector[1], vector[0]))
 
 
-def _near(angle: float, other: float) -> float:
+def nearest_turn(angle: float, other: float) -> float:
     """The same direction, half a turn from another one at most."""
     return other + (angle - other + np.pi) % (2 * np.pi) - np.pi

@@ -316,6 +316,16 @@ class World:
         self._object(name)
         self._put(name, self.arm.tcp_pose() @ _IN_HAND)
 
+    def carry(self, name: str, pose: Float[np.ndarray, "4 4"]) -> None:
+        """Put an object somewhere at rest, as somebody's hand does who carries it.
+
+        Raises:
+            KeyError: If there is no object of that name.
+        """
+        self._object(name)
+        self.data.joint(name).qvel[:] = 0.0
+        self._put(name, pose)
+
     def _put(self, name: str, pose: Float[np.ndarray, "4 4"]) -> None:
         _put(self.data, name, pose)
         mujoco.mj_kinematics(self.model, self.data)

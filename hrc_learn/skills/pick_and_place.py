@@ -17,7 +17,7 @@ counted:
   put back where it was.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Literal
@@ -36,6 +36,7 @@ from hrc_learn.skills.grasping import (
 from hrc_learn.skills.marker_sensor import longest_occlusion
 from hrc_learn.skills.path_following import follow_path
 from hrc_learn.skills.placing import PlacingSkill, Plan, PlanningSpace, plan_candidates
+from hrc_learn.skills.receiving import Receipt, Receiving
 from hrc_learn.skills.visual_servoing import ServoTarget
 from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.skills.work_cell import WorkCell
@@ -85,6 +86,8 @@ class PickPlaceJob:
     attempts: int = 1
     """Times it was started."""
     recoveries: list[Recovery] = field(default_factory=list)
+    receipt: Receipt | None = None
+    """How a person handed the object over; None: it lay on the table."""
     span: tuple[float, float] = (0.0, 0.0)
     """Start and end [s]."""
 
@@ -98,6 +101,7 @@ class Phase(StrEnum):
     """What the robot is doing; the start of a phase is an event of the log."""
 
     DETECT = "detect"
+    RECEIVE = "receive"
     SERVO = "servo"
     INTERACT = "interact"
     GRASP = "grasp"
@@ -110,6 +114,7 @@ class Phase(StrEnum):
 
 
 INTERACT, HOME, TRANSFER, RELEASE = Phase.INTERACT, Phase.HOME, Phase.TRANSFER, Phase.RELEASE
+RECEIVE = Phase.RECEIVE
 """Phases that others look up in the log."""
 
 # Delays and occlusions up to this are no recovery [s]: a few lost images, or a blink.
@@ -194,6 +199,7 @@ class PickAndPlace:
         placing: PlacingSkill,
         check: Callable[[Plan], None] = lambda plan: None,
         config: PickAndPlaceConfig | None = None,
+        receiving: Mapping[str, Receiving] | None = None,
     ):
         """Prepare.
 
@@ -204,7 +210,10 @@ class PickAndPlace:
             placing: Learned placing motion.
             check: Raises if a plan must not be executed.
             config: How the jobs are done.
+            receiving: How objects are taken from a person's hand, by their names; the others
+                lie on the table.
         """
+        self._receiving = dict(receiving or {})
         self.jobs: list[PickPlaceJob] = []
         self._cell = cell
         self._workplace = workplace
@@ -214,6 +223,7 @@ class PickAndPlace:
         self._grasping = Grasping(cell, workplace, servoing, config.grasping, check=check)
         self._work: dict[Phase, Callable[[PickPlaceJob], Phase]] = {
             Phase.DETECT: self._detect,
+            Phase.RECEIVE: self._receive,
             Phase.SERVO: self._servo,
             Phase.INTERACT: self._interact,
             Phase.GRASP: self._grasp,
@@ -263,12 +273,31 @@ class PickAndPlace:
     def _deliver(self, job: PickPlaceJob) -> None:
         start = self._cell.time
         self._cell.gripper.move(OPEN)
-        phase = Phase.DETECT
+        phase = Phase.RECEIVE if job.item.name in self._receiving else Phase.DETECT
         try:
             while phase is not Phase.OVER:
                 phase = self._work[phase](job)
         finally:
             job.span = start, self._cell.time
+
+    def _receive(self, job: PickPlaceJob) -> Phase:
+        """Take the object from a person's hand, wherever they hand it over."""
+        receiving, robot = self._receiving[job.item.name], self._workplace.robot
+        job.receipt = receiving.receipt
+        posture = robot.nearest(receiving.wait, near=self._workplace.hover_joints())
+        plan = joint_plan(self._cell, self._cell.joints, posture)
+        self._check(plan)
+        follow_path(self._cell, plan.path)
+        self._cell.begin_phase(Phase.RECEIVE)
+        try:
+            receiving.receive(job.item)
+        except MissedGraspError as error:
+            job.failure = str(error)
+            self._grasping.start_over()
+            return Phase.OVER
+        receiving.wait_until_away()
+        job.picked_up = self._cell.pose
+        return Phase.HOME
 
     def _detect(self, job: PickPlaceJob) -> Phase:
         start = self._cell.time
@@ -392,6 +421,8 @@ class PickAndPlace:
     def _put_back(self, job: PickPlaceJob) -> Phase:
         """Lay the object where it was, and go home."""
         assert job.picked_up is not None
+        if job.receipt is not None:
+            return Phase.OVER  # it was in a hand: the arm keeps it
         self._cell.begin_phase(Phase.PUT_BACK)
         plan = joint_plan(self._cell, self._cell.joints, self._workplace.hover_joints())
         self._check(plan)
@@ -405,6 +436,9 @@ class PickAndPlace:
         """From home, unless it has been tried often enough."""
         self._note(job, mishap, what)
         self._grasping.start_over()
+        if job.receipt is not None:
+            job.failure = what  # what a person has given lies nobody knows where
+            return Phase.OVER
         if job.attempts == self._config.grasping.attempts:
             job.failure = what
             return Phase.OVER

@@ -137,6 +137,7 @@ def test_the_command_asks_for_the_job_and_reports_it(models, job, monkeypatch, t
     ]
     assert options["config"].interaction > options["forces"][-1].end
     assert options["worker"] is True
+    assert options["handover"] is False
     assert options["disturbances"] == Disturbances(occlusions=OCCLUDED)
     assert options["cell_config"].latency == LATE
     assert options["imperfections"] == Imperfections.nominal().scaled(0.5)
@@ -547,3 +548,33 @@ def test_every_object_needs_a_shelf_of_its_own(skills):
     for shelves in (("lower",), ("lower", "lower")):
         with pytest.raises(ValueError, match="a shelf of its own"):
             simulate_collaboration(*skills, shelves, workplace=workplace)
+
+
+def test_one_person_comes_at_a_time(skills):
+    with pytest.raises(ValueError, match="one person comes"):
+        simulate_collaboration(*skills, ("upper",), worker=True, handover=True)
+
+
+@pytest.mark.slow
+@shapes_unchecked()
+def test_an_object_is_handed_over_and_placed(skills):
+    job = simulate_collaboration(
+        *skills,
+        ("middle",),
+        camera="synthetic",
+        forces=(),
+        config=PickAndPlaceConfig(interactions=0, speed=2.0),
+        imperfections=Imperfections.nominal(),
+        handover=True,
+    )
+    assert verdict(job) == ""
+    values = evaluated(job).values
+    assert values["hand_over_recognised_before_it_began"] == 0
+    assert values["other_movements_passed_over"] >= 4
+    assert values["separation_violations"] == 0
+    assert values["hand_over_recognised_true_share_of_the_movement_then_%"] < 100
+    (pick,) = job.picks
+    assert job.hand_over is not None
+    assert pick.receipt is not None
+    assert pick.receipt.recognised > job.hand_over.reaches[-1].begin
+    assert pick.receipt.taken < job.hand_over.carried[-1][1]

@@ -218,6 +218,9 @@ class RunCollaboration(RunServoing):
     worker: bool = False
     """Whether a worker comes and reaches under the arm. He puts something on the table first,
     leaves again, and makes no way for the robot; how near he comes is measured."""
+    handover: bool = False
+    """Whether somebody hands the last object over: the robot goes to meet their hand when its
+    motion says so, and waits through their other movements."""
     config: Configuration = Detail("hrc_learn.skills.pick_and_place", "PickAndPlaceConfig")
     """How the job is done."""
 

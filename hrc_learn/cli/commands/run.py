@@ -76,6 +76,7 @@ _SIMULATED_ONLY = (
     "occlusion",
     "camera_moved",
     "worker",
+    "handover",
 )
 """Options that only the simulated work cell has."""
 
@@ -156,6 +157,7 @@ def run_collaboration(args: RunCollaboration) -> int:
         pulls=_possible_pulls(args),
         mapping=args.mapping,
         worker=args.worker,
+        handover=args.handover,
         imperfections=_imperfections(args),
         curve=args.curve,
         disturbances=Disturbances(

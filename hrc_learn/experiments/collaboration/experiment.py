@@ -69,6 +69,8 @@ class CollaborationExperiment:
     """How these pulls act."""
     worker: bool = False
     """Whether a worker comes to the table, another one each time, and reaches under the arm."""
+    handover: bool = False
+    """Whether the last object is in a person's hand, who hands it over."""
     disturbances: Disturbances = field(default_factory=Disturbances)
     imperfections: Imperfections = field(default_factory=Imperfections.nominal)
     """Of arm, calibration, camera and objects."""
@@ -105,6 +107,7 @@ class CollaborationExperiment:
             config=self._job(),
             imperfections=self.imperfections,
             worker=self.worker,
+            handover=self.handover,
             cell_config=replace(self.cell, keep_image_every=keep_every),
             mapping=self.mapping,
             drawings=self.drawings,
@@ -154,7 +157,7 @@ class CollaborationExperiment:
     ) -> Sequence[Section]:
         """Timeline, grasping, person, worker, placing."""
         snapshots = []
-        if run.visit is not None and len(run.cell.log):
+        if run.visit is not None and len(run.visit.markers) and len(run.cell.log):
             try:
                 snapshots = take_snapshots(run)
             except RenderingUnavailableError as error:

@@ -22,7 +22,9 @@ from hrc_learn.experiments.run_recording import (
     worker_distance,
 )
 from hrc_learn.sim import Touch
+from hrc_learn.sim.hand_over import HandOver, Reach
 from hrc_learn.skills.pick_and_place import HOME, RELEASE, Mishap, PickPlaceJob
+from hrc_learn.skills.receiving import Receipt
 
 _CONTACTS = {
     "cabinet": "contacts with the cabinet",
@@ -30,6 +32,75 @@ _CONTACTS = {
     "arm itself": "contacts of the arm with itself",
 }
 """Names of metrics, by what was met."""
+
+
+def _handed(
+    of: Callable[[Receipt, Reach, HandOver], float],
+) -> Callable[[CollaborationRun], float | None]:
+    """Of the hand-over of a run; None where there was none, or it was not recognised."""
+
+    def measure(run: CollaborationRun) -> float | None:
+        receipt = next((p.receipt for p in run.picks if p.receipt is not None), None)
+        if run.hand_over is None or receipt is None or receipt.predicted is None:
+            return None
+        value = float(of(receipt, run.hand_over.reaches[-1], run.hand_over))
+        return None if np.isnan(value) else value
+
+    return measure
+
+
+def _apart(place: np.ndarray | None, other: np.ndarray) -> float:
+    """[mm]; NaN for no place."""
+    return float("nan") if place is None else 1e3 * float(np.linalg.norm(place - other))
+
+
+HAND_OVER_METRICS: Sequence[Metric[CollaborationRun]] = (
+    Metric(
+        "hand-over recognised before it began",
+        _handed(lambda told, reach, _: float(told.seen < reach.begin)),
+        at_most=0,
+    ),
+    Metric("other movements passed over", _handed(lambda told, _, __: told.passed_over)),
+    Metric(
+        "hand-over recognised, true share of the movement then",
+        _handed(
+            lambda told, reach, _: (
+                100 * (told.recognised - reach.begin) / (reach.end - reach.begin)
+            )
+        ),
+        "%",
+    ),
+    Metric(
+        "phase error when recognised",
+        _handed(
+            lambda told, reach, _: (
+                100 * abs(told.phase - (told.seen - reach.begin) / (reach.end - reach.begin))
+            )
+        ),
+        "%",
+    ),
+    Metric(
+        "hand-over place, error when recognised",
+        _handed(lambda told, _, plan: _apart(told.predicted, plan.place)),
+        "mm",
+    ),
+    Metric(
+        "hand-over place, error after the movement",
+        _handed(lambda told, _, plan: _apart(told.refined, plan.place)),
+        "mm",
+    ),
+    Metric(
+        "from where it was held out to where it was taken",
+        _handed(lambda told, _, plan: _apart(told.place, plan.place)),
+        "mm",
+    ),
+    Metric(
+        "from the hand setting off until the object was held",
+        _handed(lambda told, reach, _: told.taken - reach.begin),
+        "s",
+    ),
+)
+"""Of the object that a person hands over."""
 
 _FAR = 0.15
 """Elbow moved by a pull that got its way [m]."""
@@ -110,6 +181,7 @@ def collaboration_metrics(
             essential=True,
         ),
         Metric("waited for the worker", _waited, "s"),
+        *HAND_OVER_METRICS,
         Metric("free for his hands while he reaches", _free_volume, "l", resolution=0.1),
         Metric("bench he reaches comfortably", _comfortable, "%"),
         Metric(
@@ -251,7 +323,8 @@ CURVES = {
 
 def _worst(run: CollaborationRun, measured: Callable[[PickPlaceJob], float]) -> float | None:
     """Over the objects that were released on a shelf; None if it never came to that."""
-    return max((float(measured(e)) for e in run.picks if e.release is not None), default=None)
+    grasped = [e for e in run.picks if e.release is not None and e.receipt is None]
+    return max((float(measured(e)) for e in grasped), default=None)
 
 
 def _pushed(run: CollaborationRun, of: Callable[[Deviation], np.ndarray]) -> float | None:

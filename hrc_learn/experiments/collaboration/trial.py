@@ -11,6 +11,12 @@ import torch
 from jaxtyping import Float
 
 from hrc_learn.experiments.arm_access import SIMULATED, ArmAccess
+from hrc_learn.experiments.collaboration.hand_over import (
+    GivingPerson,
+    giver,
+    shown_hand_overs,
+    waiting,
+)
 from hrc_learn.experiments.collaboration.pulls import PullEffect, pull_effects
 from hrc_learn.experiments.collaboration.worker import (
     move_worker,
@@ -39,7 +45,9 @@ from hrc_learn.sim import (
     open_camera,
     whole_arm,
 )
+from hrc_learn.sim.hand_over import HandOver
 from hrc_learn.sim.imperfections import Imperfections
+from hrc_learn.sim.worker import PARTS
 from hrc_learn.sim.workplace import Workplace
 from hrc_learn.skills.grasping import as_load
 from hrc_learn.skills.marker_sensor import LatencyConfig, MarkerSensor
@@ -47,12 +55,14 @@ from hrc_learn.skills.person_watch import PersonWatch
 from hrc_learn.skills.pick_and_place import (
     HOME,
     INTERACT,
+    RECEIVE,
     RELEASE,
     PickAndPlace,
     PickAndPlaceConfig,
     PickPlaceJob,
 )
 from hrc_learn.skills.placing import PlacingSkill, Plan, check_plan
+from hrc_learn.skills.receiving import Receiving
 from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.skills.work_cell import WorkCell, WorkCellConfig
 from hrc_learn.teleoperation import (
@@ -143,6 +153,8 @@ class CollaborationRun:
     """Of the person on the elbow, in the time of the run, where they do not wait to be let."""
     visit: WorkerVisit | None = None
     """Where the worker truly was; None: nobody was there."""
+    hand_over: HandOver | None = None
+    """What he did who handed an object over; None: nobody did."""
     held_flat: frozenset[str] = frozenset()
     """Objects that both pads held on opposite faces, when lifted and still at the release."""
 
@@ -181,7 +193,7 @@ class CollaborationRun:
     @cached_property
     def reach_rooms(self) -> list[ReachRoom]:
         """What room the arm left the worker at each marker; empty if nobody was there."""
-        if self.visit is None:
+        if self.visit is None or not len(self.visit.markers):
             return []
         x, y, _ = self.visit.markers.mean(axis=0).tolist()
         return reach_rooms(
@@ -214,6 +226,7 @@ def simulate_collaboration(
     cell_config: WorkCellConfig | None = None,
     imperfections: Imperfections | None = None,
     worker: bool = False,
+    handover: bool = False,
     access: ArmAccess = SIMULATED,
     mapping: ForceMapping = DEFAULT_MAPPING,
     drawings: Sequence[DrawnInterval] = (),
@@ -239,6 +252,7 @@ def simulate_collaboration(
         cell_config: How the loop runs; images may be late or lost.
         imperfections: Of arm, calibration, camera and objects; None: none.
         worker: Whether a worker comes to the table, whom nobody expects.
+        handover: Whether the last object is in a person's hand, who hands it over.
         access: How the arm is led.
         mapping: How these forces act.
         drawings: What a scripted person draws, in the time of the run.
@@ -271,10 +285,14 @@ def simulate_collaboration(
     config = _on_plant(config or PickAndPlaceConfig(), plant)
     items, chain = workplace.scene.objects, workplace.robot.chain
     _check_shelves(workplace, shelves)
+    if worker and handover:
+        raise ValueError("one person comes: give --worker or --handover")
     # Drawn apart, so that runs with and without the worker are alike but for him.
     chance = np.random.default_rng([seed, 2])
     visit = somebody_comes(workplace, chance, beside_elbow=True) if worker else None
     scene = replace(workplace.scene, worker=None if visit is None else visit.worker.config)
+    if handover:
+        scene = replace(scene, worker=giver(seed).config)
     world = World(scene, sizes.draw(rng, workplace.robot.joints))
     world.reset(
         workplace.home_joints().numpy(), _object_poses(workplace, world, sizes.object_yaw, rng)
@@ -289,9 +307,15 @@ def simulate_collaboration(
     else:
         person = ScriptedPerturbation(chain, forces, None, interaction)
     watch = None
-    if visit is not None:
-        tracker = WorkerSensor(visit, lambda: world.time, sizes, chance)
+    giving = None
+    if handover:
+        giving = GivingPerson(world, items[-1], np.random.default_rng([seed, 3]))
+    tracker = None
+    somebody = giving or visit
+    if somebody is not None:
+        tracker = WorkerSensor(somebody, lambda: world.time, sizes, chance)
         watch = PersonWatch(tracker, whole_arm(scene.arm), safety.separation)
+    if visit is not None:
         move_worker(world, visit)
     occluder = ScriptedOcclusion(world, disturbances.occlusions)
     eyes = ChangingCamera(
@@ -305,6 +329,8 @@ def simulate_collaboration(
         on_phase(phase, time)
         if phase in flat:
             flat[phase] |= {item.name for item in items if world.holds_flat(item.name)}
+        if phase == RECEIVE and giving is not None:
+            giving.begin(time)
         if phase == INTERACT and not pulls:
             person.begin(time)
 
@@ -327,6 +353,8 @@ def simulate_collaboration(
             occluder.update()
             if visit is not None:
                 move_worker(world, visit)
+            if giving is not None:
+                giving.update()
 
         human, passing, beside = person, advance, None
         if drawings:
@@ -352,7 +380,13 @@ def simulate_collaboration(
             beside.follow(cell)
         stack.enter_context(view(cell, world, motion))
         on_start(world, cell)
-        task = PickAndPlace(cell, workplace, aiming, placing, check, config)
+        receiving = {}
+        if giving is not None and tracker is not None:
+            model = shown_hand_overs(workplace, sizes, items[-1])
+            receiving[items[-1].name] = Receiving(
+                cell, tracker, model, PARTS, waiting(workplace)
+            )
+        task = PickAndPlace(cell, workplace, aiming, placing, check, config, receiving)
         picks = task.run(list(zip(items, shelves, strict=True)), before)
     return CollaborationRun(
         workplace=workplace,
@@ -363,7 +397,8 @@ def simulate_collaboration(
         cameras=tuple(eyes.history),
         disturbances=disturbances,
         pulls=pulls,
-        visit=visit,
+        visit=visit if giving is None else giving.hand_over.visit,
+        hand_over=None if giving is None else giving.hand_over,
         held_flat=frozenset(flat[HOME] & flat[RELEASE]),
     )
 

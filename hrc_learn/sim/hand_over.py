@@ -1,0 +1,262 @@
+"""A worker who lays a thing on the bench, takes it up again, and holds it out to the robot.
+
+Whoever watches his hand has to tell these movements apart: two of the three are none of the
+robot's business. From where he holds the thing out he brings it on to the robot's hand, once
+that has come.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from hrc_learn.geometry import Box
+from hrc_learn.sim.worker import Worker
+from hrc_learn.sim.worker_visit import (
+    STEP,
+    HumanSpeeds,
+    PoseWriter,
+    WorkerPose,
+    WorkerVisit,
+    direction,
+    lean_for,
+    nearest_turn,
+)
+
+RIGHT = 1
+"""The hand that he uses, as numbered in the worker's capsules."""
+HELD_OUT = np.array([0.0, -0.09, -0.03])
+"""From where his hand grips to the middle of what it holds out by its near end, in the base
+frame [m]; he faces its -y. The capsule of a hand leaves out how thin fingers are."""
+BENCH, BACK, HAND_OVER = "to the bench", "back", "hand over"
+"""Kinds of his movements."""
+
+UNHURRIED = HumanSpeeds(reaching=0.9)
+"""Of people who hand something over: half of what they can, so that it takes about a second."""
+
+# How far over the bench the thing is held out, from its edge, and how high [m]: a forearm over
+# it, at the height of the elbow.
+_OVER_BENCH, _HEIGHT = (0.26, 0.42), (0.24, 0.36)
+# To his right of where he stands [m], and x between which an arm reaches it well.
+_ASIDE, _WITHIN = (-0.22, 0.04), (0.08, 0.42)
+# Leans beyond which nobody holds things out [rad]; places tried until one is within reach.
+_LEANS, _TRIED = 0.45, 200
+# Of the way on to the robot's hand, share of the speed of other movements.
+_CAREFUL = 0.3
+
+
+class Reach(NamedTuple):
+    """A movement of the hand from rest to rest."""
+
+    kind: str
+    begin: float
+    """[s]"""
+    end: float
+    """[s]"""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class HandOver:
+    """What he does, so far as it is settled: the rest depends on the robot."""
+
+    visit: WorkerVisit
+    """His postures; at the end of them he holds the thing out."""
+    reaches: tuple[Reach, ...]
+    carried: tuple[tuple[float, float], ...]
+    """From when to when the thing is in his hand [s]; between them it lies on the bench."""
+    place: Float[np.ndarray, "3"]
+    """Where he holds it out, its middle [m]."""
+    leaving: Float[np.ndarray, "2"]
+    """Where he goes at last [m]."""
+    speeds: HumanSpeeds
+    """His."""
+
+    def starting(self, time: float) -> HandOver:
+        """The same, later by a time [s]."""
+        visit = replace(self.visit, time=self.visit.time + time)
+        return replace(
+            self,
+            visit=visit,
+            reaches=tuple(Reach(r.kind, r.begin + time, r.end + time) for r in self.reaches),
+            carried=tuple((begin + time, end + time) for begin, end in self.carried),
+        )
+
+    def thing_at(self, time: float) -> Float[np.ndarray, "3"]:
+        """Middle of the thing as long as he has it, or has laid it down [m]."""
+        latest = [span for span in self.carried if span[0] <= time]
+        first, last = latest[-1] if latest else self.carried[0]
+        ends = self.visit.ends_at(min(max(time, first), last))
+        return self.visit.worker.grip(ends, RIGHT) + HELD_OUT
+
+    def brought_to(self, place: Float[np.ndarray, "3"], now: float) -> HandOver:
+        """He brings the thing to a place from now on, as far as he reaches [m, s]."""
+        visit, last = self.visit, self._last()
+        target = _own(visit.worker, last.place, last.heading, place - HELD_OUT)
+        lean = visit.worker.lean_to(target, RIGHT)
+        slow = replace(self.speeds, reaching=_CAREFUL * self.speeds.reaching)
+        script = PoseWriter(last, now, slow, visit.worker.config.stature)
+        script.go(hands=_hands(last, target), lean=_LEANS if lean is None else lean)
+        return self._continued(script)
+
+    def left(self, now: float) -> HandOver:
+        """He lets go of the thing and walks away from now on [s]."""
+        visit, last = self.visit, self._last()
+        worker = visit.worker
+        script = PoseWriter(last, now, self.speeds, worker.config.stature)
+        script.go(hands=worker.hanging_hands(), lean=0.0)
+        outwards = direction(self.leaving - last.place)
+        script.go(heading=nearest_turn(outwards, last.heading))
+        script.go(place=self.leaving)
+        carried = (*self.carried[:-1], (self.carried[-1][0], now))
+        return replace(self._continued(script), carried=carried)
+
+    def _last(self) -> WorkerPose:
+        row = self.visit.poses[-1]
+        return WorkerPose(row[:2], float(row[2]), float(row[3]), row[4:].reshape(2, 3))
+
+    def _continued(self, script: PoseWriter) -> HandOver:
+        """The same, with what is written from a moment after the last pose on."""
+        visit = self.visit
+        longer = replace(
+            visit,
+            time=np.concatenate([visit.time, script.times]),
+            poses=np.concatenate([visit.poses, script.rows]),
+        )
+        return replace(self, visit=longer)
+
+
+def random_hand_over(
+    worker: Worker,
+    rng: np.random.Generator,
+    *,
+    bench: Box,
+    thickness: float,
+    begin: tuple[float, float] = (1.0, 3.0),
+    speeds: HumanSpeeds | None = None,
+) -> HandOver:
+    """Draw a worker's way to the far side of the bench, with a thing for the robot.
+
+    Args:
+        worker: Who comes.
+        rng: Source of chance.
+        bench: The table, whose far side (+y) is free.
+        thickness: Half the height of the thing [m].
+        begin: When he comes in, earliest and latest [s].
+        speeds: How fast he is at most; each visit takes 50 to 95 % of it.
+
+    Raises:
+        ValueError: He is too small to hold anything out over the bench.
+    """
+    most, h = speeds or UNHURRIED, worker.config.stature
+    pace = HumanSpeeds(
+        walking=rng.uniform(0.6, 0.9) * most.walking,
+        reaching=rng.uniform(0.5, 0.85) * most.reaching,
+        turning=rng.uniform(0.6, 0.95) * most.turning,
+    )
+    top = bench.centre[2] + bench.half_size[2]
+    edge = bench.centre[1] + bench.half_size[1]
+    stand = np.array([rng.uniform(0.15, 0.45), edge + 0.1 * h + rng.uniform(0, 0.05)])
+    facing = -np.pi / 2 + rng.uniform(-0.1, 0.1)
+    entrance, leaving = (
+        np.array([rng.uniform(-1.0, 1.4), edge + rng.uniform(1.2, 1.5)]) for _ in range(2)
+    )
+    place, target, lean = _held_out(worker, rng, stand, facing, edge, top)
+    ready = np.array(
+        [[0.16 * h, s * 0.13 * h, top + 0.12 - worker.config.floor] for s in (1, -1)]
+    )
+    carrying = worker.hanging_hands()
+    carrying[RIGHT] = [0.20 * h, -0.05 * h, 0.63 * h]
+    start = WorkerPose(
+        entrance, nearest_turn(direction(stand - entrance), facing), 0.0, carrying
+    )
+    script = PoseWriter(start, rng.uniform(*begin), pace, h)
+    script.go(place=stand)
+    # Down on the bench, near its edge, to his right.
+    x, y = stand[0] + rng.uniform(-0.25, 0.0), edge - rng.uniform(0.10, 0.16)
+    spot = np.array([x, y, top + thickness]) - HELD_OUT
+    bench_hand = _own(worker, stand, facing, spot)
+    reaches: list[Reach] = []
+
+    def reach(kind: str, **changes) -> None:
+        begun = script.times[-1]
+        script.go(**changes)
+        reaches.append(Reach(kind, begun, script.times[-1]))
+
+    def lay_hand_on(kind: str) -> None:
+        reach(
+            kind, hands=_hands(script.now, bench_hand), lean=lean_for(worker, bench_hand, RIGHT)
+        )
+
+    reach(BACK, heading=facing, hands=ready)
+    script.wait(rng.uniform(0.6, 1.5))
+    lay_hand_on(BENCH)
+    script.wait(rng.uniform(0.2, 0.5))
+    laid = script.times[-1]
+    reach(BACK, hands=ready, lean=0.05)
+    script.wait(rng.uniform(0.6, 1.5))
+    lay_hand_on(BENCH)
+    script.wait(rng.uniform(0.2, 0.5))
+    taken = script.times[-1]
+    reach(BACK, hands=ready, lean=0.05)
+    script.wait(rng.uniform(0.6, 1.5))
+    reach(HAND_OVER, hands=_hands(script.now, target), lean=lean)
+    return HandOver(
+        visit=WorkerVisit(
+            worker=worker,
+            time=np.array(script.times),
+            poses=np.array(script.rows),
+            step=STEP * h,
+            side=RIGHT,
+            released=np.inf,
+            markers=np.empty((0, 3)),
+            reaches=np.empty((0, 2)),
+        ),
+        reaches=tuple(reaches),
+        carried=((-np.inf, laid), (taken, np.inf)),
+        place=place,
+        leaving=leaving,
+        speeds=pace,
+    )
+
+
+def _held_out(
+    worker: Worker,
+    rng: np.random.Generator,
+    stand: np.ndarray,
+    facing: float,
+    edge: float,
+    top: float,
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Where he holds a thing out, where his hand is then in his own frame, and his lean."""
+    for _ in range(_TRIED):
+        place = np.array(
+            [
+                np.clip(stand[0] + rng.uniform(*_ASIDE), *_WITHIN),
+                edge - rng.uniform(*_OVER_BENCH),
+                top + rng.uniform(*_HEIGHT),
+            ]
+        )
+        target = _own(worker, stand, facing, place - HELD_OUT)
+        lean = worker.lean_to(target, RIGHT)
+        if lean is not None and lean <= _LEANS:
+            return place, target, lean
+    raise ValueError(
+        f"a worker of {worker.config.stature:.2f} m cannot hold anything out over the bench"
+    )
+
+
+def _own(worker: Worker, stand: np.ndarray, facing: float, point: Sequence[float] | np.ndarray):
+    """A point of the base frame in the frame of the worker who stands there [m]."""
+    c, s = np.cos(facing), np.sin(facing)
+    x, y = np.asarray(point)[:2] - stand
+    return np.array([c * x + s * y, c * y - s * x, point[2] - worker.config.floor])
+
+
+def _hands(pose: WorkerPose, target: np.ndarray) -> np.ndarray:
+    hands = pose.hands.copy()
+    hands[RIGHT] = target
+    return hands

@@ -1,0 +1,184 @@
+"""Taking a thing from a person's hand, whose motion says when and where."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from unchecked import shapes_unchecked
+
+from hrc_learn.dmp import InteractionPrimitive
+from hrc_learn.geometry import Pose
+from hrc_learn.kinematics import gripper_down
+from hrc_learn.protocols import PersonObservation
+from hrc_learn.sim import ObjectConfig
+from hrc_learn.skills.failures import MissedGraspError
+from hrc_learn.skills.receiving import MovementWatch, Receiving, ReceivingConfig
+
+PARTS = ("pelvis", "hand_right")
+RATE, REST = 30.0, np.array([0.2, 0.8, 0.1])
+BESIDE = np.array([0.0, 0.15, 0.1])
+"""Of the person's hand from the robot's, at a hand-over."""
+START = torch.tensor([0.3, 0.3, 0.4], dtype=torch.float64)
+ITEM = ObjectConfig(half_size=(0.02, 0.03, 0.03))
+ELSEWHERE = np.array([0.1, 0.75, -0.25])
+
+
+def quintic(u):
+    u = np.clip(u, 0, 1)
+    return u**3 * (10 - 15 * u + 6 * u**2)
+
+
+def hand_at(time, moves):
+    """Rests, then goes from one place to the next: moves are (begin, duration, place)."""
+    place = REST
+    for begin, duration, to in moves:
+        place = place + quintic((time - begin) / duration) * (to - place)
+    return place
+
+
+def seen(time, hand, body=(0.0, 1.1, 0.0)):
+    ends = np.stack([np.stack([np.asarray(body)] * 2), np.stack([hand - 0.05, hand + 0.05])])
+    return PersonObservation(
+        time=time, ends=ends, radius=np.full(2, 0.05), velocity=np.zeros_like(ends)
+    )
+
+
+def place(rng):
+    return np.array([0.25, 0.45, 0.3]) + rng.uniform(-0.1, 0.1, 3)
+
+
+@pytest.fixture(scope="module")
+@shapes_unchecked()
+def model():
+    rng, shown = np.random.default_rng(0), []
+    for k in range(24):
+        met, s = place(rng), np.linspace(0, 1, 30)
+        duration, handed = rng.uniform(0.8, 1.4), k % 2 == 0
+        goal = met + BESIDE if handed else ELSEWHERE + rng.normal(0, 0.03, 3)
+        hand = REST + quintic(s)[:, None] * (goal - REST)
+        robot = START.numpy() + quintic(s)[:, None] * (met - START.numpy()) * handed
+        shown.append((duration * s, hand, robot, "hand over" if handed else "elsewhere"))
+    time, hand, robot, kinds = zip(*shown, strict=True)
+    columns = ([torch.from_numpy(x) for x in one] for one in (time, hand, robot))
+    return InteractionPrimitive.fit(
+        next(columns), next(columns), next(columns), kinds, n_basis=5
+    )
+
+
+class Cell:
+    """An arm that is at once where it is told, and a gripper that closes on what is there."""
+
+    def __init__(self, moves, brings=True):
+        self.config = SimpleNamespace(dt=0.02)
+        self.time, self.load, self.closed = 0.0, None, []
+        self.pose = Pose(START.clone(), gripper_down())
+        self.gripper = SimpleNamespace(move=self._grip)
+        self._moves, self._brings = list(moves), brings
+        self._width = 0.08
+
+    @property
+    def state(self):
+        return SimpleNamespace(gripper_width=self._width)
+
+    def _grip(self, width):
+        if width == 0:
+            self.closed.append(self.time)
+        there = np.linalg.norm(self.hand() - BESIDE - self.pose.position.numpy()) < 0.02
+        self._width = 0.04 if width == 0 and there else width
+
+    def hand(self):
+        return hand_at(self.time, self._moves)
+
+    def read(self):
+        return seen(np.floor(self.time * RATE) / RATE, self.hand())
+
+    def track_pose(self, goal, twist):
+        before, self.pose = self.pose, goal
+        self.time += self.config.dt
+        still = torch.equal(before.position, goal.position)
+        over = self.time > self._moves[-1][0] + self._moves[-1][1] + 1.5
+        if self._brings and still and over:
+            # The thing comes on to the robot's hand.
+            to = self.pose.position.numpy() + BESIDE
+            self._moves.append((self.time, 0.8, to))
+            self._brings = False
+
+    def hold_pose(self, duration):
+        for _ in range(round(duration / self.config.dt)):
+            self.track_pose(self.pose, None)
+
+
+def receiving(cell, model, **config):
+    with shapes_unchecked():
+        return Receiving(cell, cell, model, PARTS, cell.pose, ReceivingConfig(**config))
+
+
+@shapes_unchecked()
+def test_passes_over_another_movement_and_meets_the_hand(model):
+    met = np.array([0.3, 0.4, 0.33])
+    moves = [(1.0, 1.0, ELSEWHERE), (3.0, 1.0, REST), (5.0, 1.1, met + BESIDE)]
+    cell = Cell(moves)
+    receipt = receiving(cell, model).receive(ITEM)
+    assert receipt.passed_over >= 1
+    # Before half of the movement had passed, and not before it had begun.
+    assert 5.0 < receipt.recognised < 5.0 + 0.8
+    assert 0.1 < receipt.phase < 0.75
+    true_phase = (receipt.seen - 5.0) / 1.1
+    assert receipt.phase == pytest.approx(true_phase, abs=0.2)
+    assert np.linalg.norm(receipt.refined - met) < 0.03
+    assert np.linalg.norm(receipt.place - met) < 0.03
+    assert receipt.attempts == 1
+    assert cell.closed == [pytest.approx(receipt.taken - 0.7)]
+    assert cell.load is not None
+
+
+@shapes_unchecked()
+def test_closes_on_nothing_as_often_as_told(model):
+    met = np.array([0.2, 0.5, 0.25])
+    cell = Cell([(1.0, 1.0, met + BESIDE)])
+    cell._grip = lambda width: cell.closed.append(cell.time) if width == 0 else None
+    cell.gripper.move, cell._width = cell._grip, 0.0
+    taker = receiving(cell, model, attempts=2)
+    with pytest.raises(MissedGraspError, match="closed on nothing"):
+        taker.receive(ITEM)
+    assert len(cell.closed) == taker.receipt.attempts == 2
+
+
+@shapes_unchecked()
+def test_nobody_hands_anything_over(model):
+    cell = Cell([(1.0, 1.0, ELSEWHERE)], brings=False)
+    with pytest.raises(MissedGraspError, match="nobody handed"):
+        receiving(cell, model, patience=4.0).receive(ITEM)
+    assert cell.time == pytest.approx(4.0, abs=0.05)
+    assert torch.equal(cell.pose.position, START)
+    assert cell.closed == []
+
+
+@shapes_unchecked()
+def test_waits_no_longer_than_it_is_told_for_the_hand(model):
+    met = np.array([0.2, 0.5, 0.25])
+    cell = Cell([(1.0, 1.0, met + BESIDE), (2.5, 1.0, REST)], brings=False)
+    with pytest.raises(MissedGraspError, match="did not come"):
+        receiving(cell, model, patience=8.0).receive(ITEM)
+    assert np.linalg.norm(cell.pose.position.numpy() - met) < 0.05
+
+
+def test_movements_are_cut_from_rest_to_rest_of_a_body_that_stands():
+    watch = MovementWatch(ReceivingConfig(), 0, 1)
+    rng = np.random.default_rng(1)
+    moving = []
+    for time in np.arange(0, 8, 1 / RATE):
+        hand = hand_at(time, [(2.0, 1.0, REST + np.array([0.4, 0, 0]))])
+        # From 5 s on all of them walks.
+        way = np.array([max(time - 5.0, 0.0), 0.0, 0.0])
+        noise = rng.normal(0, 0.007, 3)
+        if watch.see(seen(time, hand + way + noise, np.array([0, 1.1, 0]) + way)):
+            moving.append(time)
+            assert watch.times[-1] == time
+            assert len(watch.times) == len(watch.hand)
+    # Seen once it has gone some way, and until its last images are a window old.
+    assert 2.0 < moving[0] < 2.45
+    assert 2.8 < moving[-1] < 3.4
+    assert np.ptp(np.diff(moving)) < 1e-9
+    assert watch.times == []
