@@ -177,15 +177,14 @@ def advance_alone(
     tensors = state.position, state.rate, state.target, state.forced, weights
     if torch.is_grad_enabled() or response.approach or not readable(*tensors):
         return None
-    known = host_values(state.s, state.duration)
-    if not isinstance(known[0], float):
+    s, duration = host_values(state.s, state.duration)
+    if not (isinstance(s, float) and isinstance(duration, float)):
         return None
     for x in tensors:  # in a comprehension this takes twice as long
         if type(x) not in _ARRAYS or not x.is_cpu or x.dtype is not torch.float64:
             return None
     if weights.ndim != 2:
         return None
-    s, duration = known
     ds = dt / duration
     now = s + ds
     E = response.spring.propagator(ds).numpy()
