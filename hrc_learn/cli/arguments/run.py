@@ -201,7 +201,7 @@ class RunCollaboration(RunServoing):
     """How far behind the board's front edge [m]; likewise."""
     occlusion: More[tuple[tuple[float, float], ...]] = ()
     """Intervals in which a board occludes the marker: start and duration [s]."""
-    camera_moved: bool = False
+    camera_moved: More[bool] = False
     """Move and turn the camera between two objects."""
     camera_change: Configuration = Detail("hrc_learn.sim", "CameraChange")
     """How far, with --camera-moved."""
@@ -219,7 +219,7 @@ class RunCollaboration(RunServoing):
     """Whether a worker comes and reaches under the arm. He puts something on the table first,
     leaves again, and makes no way for the robot; how near he comes is measured."""
     handover: bool = False
-    """Whether somebody hands the last object over: the robot goes to meet their hand when its
+    """Whether somebody hands the last object over. The robot goes to meet their hand when its
     motion says so, and waits through their other movements."""
     config: Configuration = Detail("hrc_learn.skills.pick_and_place", "PickAndPlaceConfig")
     """How the job is done."""
