@@ -580,3 +580,18 @@ def test_the_report_reads_as_text(root):
 def test_the_fixture_is_at_the_rate_the_findings_assume(root):
     assert read_info(root)["fps"] == FPS
     assert pq.read_metadata(root / DATA).num_row_groups == 3
+
+
+@pytest.mark.parametrize(("size", "noise", "found"), [(2.0, 0.004, True), (0.2, 0.004, False)])
+def test_standing_still_is_meant_relative_to_the_motion(tmp_path, size, noise, found):
+    """Half a per cent of the way is the noise of an arm at rest."""
+    rng = np.random.default_rng(0)
+    episodes = []
+    for seed in range(3):
+        moves = joint_path(60, seed=seed)
+        moves = moves / np.ptp(moves, axis=0).max() * size
+        rests = moves[:1] + noise * rng.uniform(-1, 1, (2 * int(FPS), moves.shape[1]))
+        episodes.append({STATE: np.concatenate([moves[:1], rests, moves])})
+    root = write_folder(tmp_path / "set", episodes, {STATE: NAMES})
+    said = [finding.message for finding in check_dataset(root).warnings]
+    assert any("of standing still" in message for message in said) == found
