@@ -12,12 +12,13 @@ from served_franka import served_franka
 
 from hrc_learn.hardware import CollisionConfig, DriverError, Load
 from hrc_learn.kinematics import panda
-from hrc_learn.lerobot.arm_robot import GRIPPER
+from hrc_learn.lerobot.arm_robot import GRIPPER, ArmValues
 from hrc_learn.lerobot.robots import FrankaPandaConfig
 from hrc_learn.sim import SceneConfig, World
 from hrc_learn.sim.protocol_server import serve_world
 
 FPS = 20.0
+JOINTS = ArmValues(panda).joints
 
 
 pytestmark = pytest.mark.realtime
