@@ -22,6 +22,7 @@ from typing import Annotated
 
 import tyro
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from hrc_learn import cli
@@ -29,6 +30,7 @@ from hrc_learn.cli._run import write_values
 
 ROOT = Path(__file__).parents[1]
 BLOCK = re.compile(r"^```sh\n(.*?)^```", re.MULTILINE | re.DOTALL)
+CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 WIDTH, HEIGHT = "100", "40"
 """Of the terminal [characters]."""
 SERVES = ("hrc page", "hrc serve", "hrc curate")
@@ -56,6 +58,8 @@ class Waited:
     cpu: float
     silence: float
     """Longest time without anything new."""
+    before: str
+    """Last line before it."""
     output: str
     status: int
 
@@ -89,14 +93,16 @@ def wait_for(command: str, folder: Path) -> Waited:
         stderr=theirs,
     )
     os.close(theirs)
-    silence, output = 0.0, b""
+    silence, before, output = 0.0, 0, b""
     while True:
         try:
             new = os.read(ours, 65536)
         except OSError:  # Linux says so when nobody has the terminal any more
             new = b""
         now = time.monotonic()
-        silence, last = max(silence, now - last), now
+        if now - last > silence:
+            silence, before = now - last, len(output)
+        last = now
         if not new:
             break
         output += new
@@ -108,9 +114,16 @@ def wait_for(command: str, folder: Path) -> Waited:
         wall=time.monotonic() - begin,
         cpu=used.ru_utime + used.ru_stime,
         silence=silence,
+        before=_last_line(output[:before].decode("utf-8", "replace")),
         output=output.decode("utf-8", "replace"),
         status=process.returncode,
     )
+
+
+def _last_line(output: str) -> str:
+    """Of a terminal's output, without what moves its cursor and colours it."""
+    lines = [line.strip() for line in re.split(r"[\r\n]+", CONTROL.sub("", output))]
+    return next((line for line in reversed(lines) if line), "")
 
 
 def main(args: Args) -> None:
@@ -127,6 +140,7 @@ def main(args: Args) -> None:
             one = wait_for(command, folder)
             waited.append(one)
             table.add_row(command, f"{one.wall:.0f}", f"{one.cpu:.0f}", f"{one.silence:.1f}")
+            console.print(f"[dim]silent for {one.silence:.1f} s after: {escape(one.before)}")
             if one.status:
                 console.print(one.output)
                 break
