@@ -319,7 +319,8 @@ def _conduct[Run](
         if counts.get(name)
     }
     with new_folder(options.out, configuration, options.overwrite) as folder:
-        run = experiment.run(options.seed, Observer(view=view, tell=console.print))
+        with console.status(f"{experiment.title}: running"):
+            run = experiment.run(options.seed, Observer(view=view, tell=console.print))
         trials = {
             name: _repeat(studies[name], counts[name], file, options)
             for name, file in files.items()
