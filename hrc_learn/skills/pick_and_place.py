@@ -113,8 +113,8 @@ class Phase(StrEnum):
     OVER = "over"
 
 
-INTERACT, HOME, TRANSFER, RELEASE = Phase.INTERACT, Phase.HOME, Phase.TRANSFER, Phase.RELEASE
-RECEIVE = Phase.RECEIVE
+RECEIVE, INTERACT, HOME = Phase.RECEIVE, Phase.INTERACT, Phase.HOME
+TRANSFER, RELEASE = Phase.TRANSFER, Phase.RELEASE
 """Phases that others look up in the log."""
 
 # Delays and occlusions up to this are no recovery [s]: a few lost images, or a blink.
