@@ -53,6 +53,13 @@ window.jumping = setInterval(() => {
   window.jumped.push(performance.timeOrigin + performance.now());
 }, 250);
 """
+_STOP_JUMPING = """
+clearInterval(window.jumping);
+if (window.jumped.length % 2) {
+  const p = headset.hands.left.position;
+  p.set(p.x - 0.03, p.y - 0.03, p.z);
+}
+"""
 _WATCH = """
 import asyncio, sys
 from websockets.asyncio.client import connect
@@ -134,7 +141,7 @@ def by_hand(page: Page, state: ArmState, person: Headset, seconds: float) -> dic
     with Reader(page, state) as reader:
         person.tab.evaluate(_JUMPS)
         time.sleep(seconds)
-        person.tab.evaluate("clearInterval(window.jumping)")
+        person.tab.evaluate(_STOP_JUMPING)
         time.sleep(_LOST)
     moved = [t / 1e3 for t in person.tab.evaluate("window.jumped")]
     drawn = person.tab.evaluate("window.seen.frames") - frames
@@ -197,15 +204,26 @@ def memory(person: Headset) -> tuple[float, float]:
 
 
 def soaked(page: Page, state: ArmState, person: Headset, minutes: float) -> dict[str, float]:
-    """Memory before and after, and what got lost meanwhile."""
+    """Memory before and after, and what got lost meanwhile.
+
+    A hand that was let go, as after a client's silence, takes hold again at the next minute's
+    start: `let_go` counts how often, and `lost` the motions without effect until then.
+    """
     by_hand(page, state, person, 20)  # what is filled once is full
     server, client = memory(person)
-    lost = 0.0
-    for _ in range(max(round(minutes), 1)):
-        lost += by_hand(page, state, person, 58)["lost"]
+    motions = lost = let_go = 0.0
+    for minute in range(max(round(minutes), 1)):
+        if not page.human.read(state).nullspace_input.any():
+            let_go += 1
+            person.pinch("left", closed=False)
+            person.pinch("left")
+        seen = by_hand(page, state, person, 58)
+        motions, lost = motions + seen["motions"], lost + seen["lost"]
+        print(f"minute {minute + 1}: {seen['lost']:.0f} of {seen['motions']:.0f} lost", flush=True)
     after = memory(person)
     grown = {"server_grown_mb": after[0] - server, "client_grown_mb": after[1] - client}
-    return {"minutes": minutes, "lost": lost, **grown, "server_mb": after[0]}
+    counts = {"motions": motions, "lost": lost, "let_go": let_go}
+    return {"minutes": minutes, **counts, **grown, "server_mb": after[0]}
 
 
 def main(args: Args) -> None:
