@@ -219,7 +219,9 @@ def soaked(page: Page, state: ArmState, person: Headset, minutes: float) -> dict
             person.pinch("left")
         seen = by_hand(page, state, person, 58)
         motions, lost = motions + seen["motions"], lost + seen["lost"]
-        print(f"minute {minute + 1}: {seen['lost']:.0f} of {seen['motions']:.0f} lost", flush=True)
+        print(
+            f"minute {minute + 1}: {seen['lost']:.0f} of {seen['motions']:.0f} lost", flush=True
+        )
     after = memory(person)
     grown = {"server_grown_mb": after[0] - server, "client_grown_mb": after[1] - client}
     counts = {"motions": motions, "lost": lost, "let_go": let_go}

@@ -233,6 +233,14 @@ def test_claims_of_the_paper_have_a_column_where_there_are_any():
     assert "The paper says" not in page(table=[FREE]).texts
 
 
+def test_claims_widen_only_the_table_that_has_some():
+    claimed = Measurement(name="last", value=1, claim="2 (Fig. 8)")
+    table = [*(replace(GOOD, name=f"v{i}") for i in range(6)), claimed]
+    seen, folded = reports_page("x", [report(table=table)]).split("<details>", 1)
+    assert "The paper says" not in seen
+    assert "The paper says" in folded.split("</details>")[0]
+
+
 @pytest.mark.parametrize(
     ("name", "unit", "key"),
     [
@@ -340,6 +348,19 @@ def test_a_folder_holds_page_pictures_and_what_they_were_made_from(tmp_path):
     assert Image.open(tmp_path / "figures/path.png").size == (450, 300)
     html = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert html == reports_page("Grasp", [read_report(tmp_path)])
+
+
+def test_the_page_links_to_what_the_run_left_beside_it(tmp_path):
+    for name in ("run.rrd", "log.npz", "a & b.rrd", "measured.json"):
+        (tmp_path / name).touch()
+    write_report(tmp_path, report(film=Film(b"an mp4", "The run")))
+    html = (tmp_path / "report.html").read_text(encoding="utf-8")
+    links = re.findall(r'<a href="([^"]+)"', html)
+    assert links == ["a%20%26%20b.rrd", "film.mp4", "log.npz", "run.rrd"]
+    assert "a &amp; b.rrd" in html
+    assert "hrc show" in html
+    alone = reports_page("x", [report()])
+    assert "<a " not in alone
 
 
 def test_a_report_is_read_as_it_was_written(tmp_path):

@@ -16,6 +16,7 @@ from html import escape
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from hrc_learn.store import new_file
 from hrc_learn.viz.report.content import (
@@ -29,12 +30,13 @@ from hrc_learn.viz.report.content import (
 )
 
 
-def reports_page(title: str, reports: Sequence[Report]) -> str:
+def reports_page(title: str, reports: Sequence[Report], beside: Sequence[str] = ()) -> str:
     """One page about one or several runs, as HTML.
 
     Args:
         title: Of the page.
         reports: In order. Several are listed with their verdicts first.
+        beside: Files in the page's folder that a page of one run links to.
 
     Raises:
         ValueError: If there is no report.
@@ -42,7 +44,7 @@ def reports_page(title: str, reports: Sequence[Report]) -> str:
     if not reports:
         raise ValueError("a page needs at least one report.")
     if len(reports) == 1:
-        body = _report(reports[0], "run1")
+        body = _report(reports[0], "run1", beside)
     else:
         articles = [
             f"<article>{_report(report, f'run{i}')}</article>"
@@ -94,7 +96,7 @@ def _cell(m: Measurement | None) -> str:
     return f"<td{missed}>{escape(m.shown)}</td>"
 
 
-def _report(report: Report, anchor: str) -> str:
+def _report(report: Report, anchor: str, beside: Sequence[str] = ()) -> str:
     return "\n".join(
         [
             f'<h1 id="{anchor}">{escape(report.title)}</h1>',
@@ -102,6 +104,7 @@ def _report(report: Report, anchor: str) -> str:
             _paragraphs(report.summary),
             "" if report.film is None else _film(report.film),
             _measurements(report.table),
+            _links(beside),
             *(_section(section) for section in report.sections),
             *(
                 [f"<h2>Reproduce</h2>\n<pre>{escape(report.command)}</pre>"]
@@ -131,16 +134,31 @@ def _measurements(table: Sequence[Measurement]) -> str:
     """The first values as a table, the others folded."""
     if not table:
         return ""
+    first, others = leading(table, _FIRST)
+    page = _values(first)
+    if others:
+        summary = f"{len(others)} more values"
+        page += f"<details><summary>{summary}</summary>{_values(others)}</details>"
+    return page
+
+
+def _values(table: Sequence[Measurement]) -> str:
+    """Values beside their targets, and beside the paper's claims if there are any."""
     claims = any(m.claim for m in table)
     heads = '<th>Measured</th><th class="n">Value</th><th class="n">Target</th><th></th>'
     if claims:
         heads += "<th>The paper says</th>"
-    first, others = leading(table, _FIRST)
-    page = _table(heads, [_row(m, claims) for m in first])
-    if others:
-        folded = _table(heads, [_row(m, claims) for m in others])
-        page += f"<details><summary>{len(others)} more values</summary>{folded}</details>"
-    return page
+    return _table(heads, [_row(m, claims) for m in table])
+
+
+def _links(beside: Sequence[str]) -> str:
+    """What else the run has left in the folder of the page."""
+    if not beside:
+        return ""
+    links = ", ".join(f'<a href="{quote(name)}">{escape(name)}</a>' for name in beside)
+    opens = " <code>hrc show</code> with this folder opens the recording."
+    shown = opens if any(name.endswith(".rrd") for name in beside) else ""
+    return f"<p>In this folder: {links}.{shown}</p>"
 
 
 def _row(m: Measurement, claims: bool) -> str:
@@ -222,6 +240,8 @@ REPORT = "report.json"
 PAGE = "report.html"
 FIGURES = "figures"
 FILM = "film.mp4"
+LINKED = (".rrd", ".mp4", ".npz")
+"""Recordings, films and logs, which the page links to where they lie beside it."""
 FORMAT = "hrc_learn report"
 VERSION = 1
 
@@ -251,7 +271,8 @@ def write_report(folder: str | os.PathLike[str], report: Report) -> None:
         with new_file(folder / FILM) as part:
             part.write_bytes(report.film.mp4)
     with new_file(folder / PAGE) as part:
-        part.write_text(reports_page(report.title, [report]), encoding="utf-8")
+        beside = sorted(file.name for file in folder.iterdir() if file.suffix in LINKED)
+        part.write_text(reports_page(report.title, [report], beside), encoding="utf-8")
     with new_file(folder / REPORT) as part:
         text = json.dumps(_to_json(report), indent=2, ensure_ascii=False, allow_nan=False)
         part.write_text(text + "\n", encoding="utf-8")
