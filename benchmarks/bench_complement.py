@@ -27,7 +27,8 @@ from rich.progress import track
 from rich.table import Table
 
 from hrc_learn import cli
-from hrc_learn.experiments.collaboration.pulls import elbow_room, path_distance
+from hrc_learn.experiments.collaboration.pulls import elbow_room
+from hrc_learn.experiments.path_distance import path_distance
 from hrc_learn.kinematics import panda
 
 # LeRobot takes ten seconds to import: only once there is something to do.

@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float
 
 from hrc_learn.demos import Demonstration
+from hrc_learn.experiments.path_distance import path_distance
 from hrc_learn.geometry import Box, Pose, quaternion
 from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import SerialChain, panda
@@ -87,7 +88,7 @@ def link_poses(log: LoggedSteps, chain: SerialChain = panda) -> Pose:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Deviation:
-    """How far end effector and elbow really moved while a person pushed; NaN otherwise."""
+    """How far end effector and elbow moved while a person pushed; NaN otherwise."""
 
     position: Float[np.ndarray, " time"]
     """Of the end effector [m]."""
@@ -124,6 +125,28 @@ class Deviation:
             position=distance(tool),
             rotation=np.where(rows, angle, np.nan),
             elbow=distance(elbow),
+        )
+
+    @classmethod
+    def beside_path(cls, log: LoggedSteps, chain: SerialChain) -> "Deviation":
+        """From the path, as the encoders have it, while the arm follows one and is pushed.
+
+        Args:
+            log: The run's.
+            chain: The arm.
+        """
+        joints, path = (
+            torch.from_numpy(log[name]) for name in ("joint_position", "path_joints")
+        )
+        pushed = (log["nullspace_input"] != 0).any(axis=1)
+        hand = chain.forward(joints).position.numpy()
+        off = path_distance(hand, log["goal_position"], log["time"])
+        elbow, planned = (chain.joint_origins(q)[:, ELBOW] for q in (joints, path))
+        aside = (elbow - planned).norm(dim=-1).numpy()
+        return cls(
+            position=np.where(pushed, off, np.nan),
+            rotation=np.full_like(off, np.nan),
+            elbow=np.where(pushed, aside, np.nan),
         )
 
 
@@ -242,7 +265,10 @@ def record(
     log = cell.log.snapshot(len(motion))
     time, safety = log["time"], log["safety"]
     images = tuple(cell.images)
-    deviation = Deviation.of(log, motion, world)
+    if spans(log, INTERACT):
+        deviation = Deviation.of(log, motion, world)
+    else:
+        deviation = Deviation.beside_path(log, cell.chain)
     # The end effector backs out of a shelf the way it went in.
     paths = [plan.tool_pose.position.numpy() for plan in plans]
     plan_paths = [np.vstack([path, path[::-1]]) for path in paths]

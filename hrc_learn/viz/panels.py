@@ -50,6 +50,16 @@ class Tab:
     columns: int = 1
 
 
+def without_empty_plots(tab: Tab) -> Tab:
+    """The plots of a tab in which there is something to see."""
+    seen = [
+        plot
+        for plot in tab.plots
+        if any(np.isfinite(curves.values).any() for curves in plot.curves)
+    ]
+    return replace(tab, plots=tuple(seen))
+
+
 def run_tabs(run: RunRecording) -> list[Tab]:
     """Every tab that the run has data for."""
     tabs = [
@@ -146,7 +156,8 @@ def _jacobian_plot(run: RunRecording, row: int, pixel: str, half: str) -> Plot:
 
 def _person_and_worker(run: RunRecording) -> Tab:
     plots = (*_person(run), *_worker(run))
-    return Tab(title="Person and worker", plots=plots)
+    # In two columns: eight plots above one another are too low to be read.
+    return Tab(title="Person and worker", plots=plots, columns=2)
 
 
 def _person(run: RunRecording) -> list[Plot]:
@@ -154,7 +165,7 @@ def _person(run: RunRecording) -> list[Plot]:
     if run.nullspace_input is not None:
         effort = several("person/effort", run.joint_names, run.nullspace_input)
         title = "Null-space effort d of the person, by joint [N m]"
-        plots.append(Plot(title=title, curves=(effort,), legend=True, share=2.0))
+        plots.append(Plot(title=title, curves=(effort,), legend=True))
     if run.followed is not None:
         share = single("person/followed", "share", run.followed, palette.TARGET)
         title = "Share of the push that the arm follows [-]"

@@ -21,7 +21,7 @@ import rerun.blueprint as rrb
 from jaxtyping import Float, Int, Shaped
 
 from hrc_learn.viz import palette
-from hrc_learn.viz.panels import Plot, run_tabs, several
+from hrc_learn.viz.panels import Plot, run_tabs, several, without_empty_plots
 from hrc_learn.viz.recordings import RunRecording
 from hrc_learn.viz.rerun_stream import (
     CameraStream,
@@ -74,8 +74,11 @@ def run_layout(run: RunRecording, finished: bool = True) -> rrb.Blueprint:
                 contents=["$origin/**"],
             )
         )
-    tabs = [tab_view(tab, span) for tab in run_tabs(run)]
-    right: list[rrb.Container | rrb.View] = [rrb.Tabs(contents=tabs, active_tab=0)]
+    tabs = run_tabs(run)
+    if finished:
+        tabs = [tab for tab in map(without_empty_plots, tabs) if tab.plots]
+    views = [tab_view(tab, span) for tab in tabs]
+    right: list[rrb.Container | rrb.View] = [rrb.Tabs(contents=views, active_tab=0)]
     if run.phases:
         # The text tells the time as well: all other columns would only narrow it.
         text = rrb.TextLogColumns(timeline_columns=[], text_log_columns=["Body"])

@@ -4,11 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from hrc_learn.experiments.collaboration.pulls import (
-    elbow_room,
-    path_distance,
-    pull_effects,
-)
+from hrc_learn.experiments.collaboration.pulls import elbow_room, pull_effects
+from hrc_learn.experiments.path_distance import path_distance
+from hrc_learn.experiments.run_recording import Deviation
 from hrc_learn.geometry.numerics import null_projection
 from hrc_learn.kinematics import UnreachableError, panda
 from hrc_learn.sim.workplace import Workplace
@@ -109,6 +107,22 @@ def test_the_elbow_moved_as_far_as_it_is_from_where_it_was(planned):
     assert [effect.phase for effect in pull_effects(log, [refused])] == ["transfer"]
     after = ScriptedForce(start=3.5, duration=0.2, towards=(0.0, 0.0, 0.0))
     assert not pull_effects(log, [after])
+
+
+@pytest.mark.parametrize("planned", [True, False])
+def test_a_recording_shows_what_a_push_moves_beside_the_path(planned):
+    log = pushed_aside(planned)
+    shown, pushed = Deviation.beside_path(log, panda), (TIME >= 0.5) & (TIME < 2.0)
+    q = torch.from_numpy(log["joint_position"])
+    away = np.linalg.norm(panda.forward(q).position.numpy() - log["goal_position"], axis=1)
+    np.testing.assert_allclose(shown.position[pushed], away[pushed], rtol=1e-6)
+    elbows = panda.link_poses(q).position[:, 3].numpy()
+    aside = np.linalg.norm(elbows - elbows[0], axis=1)
+    expected = aside if planned else np.full(len(TIME), np.nan)
+    np.testing.assert_allclose(shown.elbow[pushed], expected[pushed], atol=1e-9)
+    for values in (shown.position, shown.elbow):
+        assert np.isnan(values[~pushed]).all()
+    assert np.isnan(shown.rotation).all()
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])

@@ -27,6 +27,7 @@ from hrc_learn.viz.run_dashboard import (
     LogStream,
     live_dashboard,
     record_run,
+    run_layout,
     serve_stream,
 )
 
@@ -58,6 +59,23 @@ def test_every_curve_is_recorded_at_every_step(run, rrd):
 def test_the_layout_comes_with_the_data(rrd):
     assert rrd.blueprints == 1
     assert rrd.column("__properties", "RecordingInfo:name", static=True) == [["Grasp"]]
+
+
+def names_of(part) -> set[str]:
+    """Names of the views and tabs of a layout."""
+    inner = set().union(*map(names_of, getattr(part, "contents", None) or ()))
+    return inner | {part.name} if isinstance(getattr(part, "name", None), str) else inner
+
+
+def test_plots_of_nothing_are_left_out_of_what_is_over():
+    nothing = np.full(len(sample_run().time), np.nan)
+    run = sample_run(elbow_motion=nothing, potentials={"x": nothing}, potential_rate=None)
+    elbow, lyapunov = "Elbow moved by the person [mm]", "Lyapunov"
+    over, going_on = (names_of(run_layout(run, f).root_container) for f in (True, False))
+    assert {elbow, lyapunov} <= going_on  # it may come
+    assert not {elbow, lyapunov} & over
+    assert "Person and worker" in over
+    assert elbow in names_of(run_layout(sample_run()).root_container)
 
 
 def test_bodies_move_as_they_did(run, rrd):

@@ -1,0 +1,144 @@
+"""Refresh the pictures of docs/dashboards.md: what a browser shows of each recording.
+
+Every recording is served as `hrc show --web` does, opened in a headless Chromium and
+photographed; of a run, each of its tabs.
+
+hrc run collaboration --pulls random --worker --out outputs/beside
+hrc show outputs/placing_demos --out outputs/demonstrations.rrd
+python docs/dashboards.py --run outputs/beside/run.rrd \
+    --demonstrations outputs/demonstrations.rrd
+"""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from urllib.parse import quote
+
+from PIL import Image
+
+# The browser is that of the tests.
+sys.path.append(str(Path(__file__).parents[1] / "tests"))
+from page_in_browser import chromium  # pyright: ignore[reportMissingImports]
+
+from hrc_learn import cli
+
+SIZE = (1600, 1000)
+"""Of the window [px]."""
+WIDTH = 1200
+"""Of the pictures, at which the viewer's text can still be read [px]."""
+TABS = ("Story", "Servoing", "Person and worker", "Primitive", "Safety", "Lyapunov")
+"""Of a run, as `run_tabs` names them."""
+LEFT, DOWN, LETTER, MARGIN = 800, 40, 6.5, 33
+"""Where the viewer draws the row of a run's tabs, and how wide they are: a letter, and what is
+around a title [px]. Read off its picture: the viewer draws them itself, without elements."""
+REDRAWN = 30.0
+"""Until another tab is shown where nothing draws but the CPU [s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args:
+    """Which recordings to show; the pictures of others stay as they are."""
+
+    run: Path | None = None
+    """Of `hrc run collaboration`."""
+    demonstrations: Path | None = None
+    """Of `hrc show DATASET --out FILE`."""
+    fit: Path | None = None
+    """Of `hrc fit`."""
+    sweep: Path | None = None
+    """Of `hrc sweep --recording`."""
+    load: float = 90.0
+    """Until the viewer has drawn all of a recording [s]."""
+    out: Path = Path(__file__).parent / "images"
+    """Folder of the pictures."""
+
+
+def main(args: Args) -> None:
+    recordings = {
+        "dashboard": args.run,
+        "demonstrations": args.demonstrations,
+        "fit_dashboard": args.fit,
+        "sweep_dashboard": args.sweep,
+    }
+    for name, recording in recordings.items():
+        if recording is None:
+            continue
+        for suffix, content in _pictures(
+            recording, args.load, TABS[: 6 * (name == "dashboard")]
+        ):
+            file = args.out / f"{name}{suffix}.jpg"
+            file.write_bytes(content)
+            print(f"{file}: {len(content) / 1e3:.0f} kB", flush=True)
+
+
+def _pictures(
+    recording: Path, load: float, tabs: tuple[str, ...]
+) -> Iterator[tuple[str, bytes]]:
+    with (
+        tempfile.TemporaryDirectory() as profile,
+        _served(recording) as address,
+        chromium(Path(profile), SIZE) as tab,
+    ):
+        tab.goto(address, timeout=120e3)
+        time.sleep(load)
+        if not tabs:
+            yield "", _picture(tab)
+        left = float(LEFT)
+        for title in tabs:
+            width = MARGIN + LETTER * len(title)
+            tab.mouse.click(left + width / 2, DOWN)
+            tab.mouse.move(LEFT / 2, SIZE[1] - 5)
+            time.sleep(REDRAWN)
+            yield f"_{title.split()[0].lower()}", _picture(tab)
+            left += width
+
+
+@contextmanager
+def _served(recording: Path) -> Iterator[str]:
+    """The address at which the viewer shows a recording to this machine."""
+    page, data = _free_port(), _free_port()
+    ports = ["--web-viewer-port", str(page), "--port", str(data)]
+    served = ["--serve-web", "--bind", "127.0.0.1", *ports, str(recording)]
+    # A group of its own: what this starts is a program that starts the viewer.
+    command = [sys.executable, "-m", "rerun", *served]
+    viewer = subprocess.Popen(command, start_new_session=True)
+    try:
+        while viewer.poll() is None and not _listens(page):
+            time.sleep(0.1)
+        source = quote(f"rerun+http://127.0.0.1:{data}/proxy")
+        yield f"http://127.0.0.1:{page}/?url={source}&renderer=webgl"
+    finally:
+        os.killpg(viewer.pid, signal.SIGTERM)
+        viewer.wait()
+
+
+def _free_port() -> int:
+    with closing(socket.socket()) as found:
+        found.bind(("127.0.0.1", 0))
+        return found.getsockname()[1]
+
+
+def _listens(port: int) -> bool:
+    with closing(socket.socket()) as asking:
+        return asking.connect_ex(("127.0.0.1", port)) == 0
+
+
+def _picture(tab) -> bytes:
+    shown = Image.open(BytesIO(tab.screenshot(type="png"))).convert("RGB")
+    buffer = BytesIO()
+    smaller = shown.resize((WIDTH, WIDTH * SIZE[1] // SIZE[0]), Image.Resampling.LANCZOS)
+    smaller.save(buffer, "JPEG", quality=80)
+    return buffer.getvalue()
+
+
+if __name__ == "__main__":
+    cli.run(main, Args)
