@@ -5,8 +5,11 @@ import torch
 from hrc_learn.kinematics import Arm, CapsuleArm, JointLimits, LinkCapsule, SerialChain, panda
 
 
-def bare(left_out=(2,), name="cut"):
-    """What a description would give: its joints but for those left out, and thin capsules."""
+def bare(left_out=(2,), name="cut", slides=()):
+    """What a description would give: its joints but for those left out, and thin capsules.
+
+    Joints of the numbers `slides`, from 0, slide along their axes instead of turning.
+    """
     keep = [i for i in range(7) if i not in left_out]
     mounts, carried = [], torch.eye(4, dtype=torch.float64)
     for i in range(7):
@@ -25,6 +28,7 @@ def bare(left_out=(2,), name="cut"):
         tcp=torch.eye(4, dtype=torch.float64),
         limits=JointLimits(**limits, vintage="test"),
         ready=panda.ready[keep],
+        kinds=["prismatic" if i in slides else "revolute" for i in range(len(keep))],
     )
     n = len(keep)
     capsules = [

@@ -222,7 +222,7 @@ def solve_inverse(
             start[:, 0] = best[missing]
         row = missing.repeat_interleave(_STARTS)
         q, reached = _descend(chain, goal[row], start.flatten(0, 1), task, tolerance)
-        q = _unwound(chain, q, wish[row])
+        q = unwound(chain, q, wish[row])
         apart = torch.linalg.vector_norm(q - wish[row], dim=-1)
         apart = torch.where(reached, apart, torch.inf).unflatten(0, (-1, _STARTS))
         least = apart.min(-1)
@@ -339,7 +339,7 @@ def _descend(
     return result, done
 
 
-def _unwound(chain: SerialChain, q: Tensor, wish: Tensor) -> Tensor:
+def unwound(chain: SerialChain, q: Tensor, wish: Tensor) -> Tensor:
     """The same postures with joints turned by whole turns towards a wish, within limits."""
     turns = torch.tensor([kind != "prismatic" for kind in chain.kinds])
     whole = 2 * math.pi * ((wish - q) / (2 * math.pi)).round()

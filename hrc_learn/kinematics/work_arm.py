@@ -31,7 +31,7 @@ from hrc_learn.kinematics.franka import (
     fr3,
     panda,
 )
-from hrc_learn.kinematics.inverse import solutions_from
+from hrc_learn.kinematics.inverse import solutions_from, unwound
 from hrc_learn.kinematics.redundancy import best_postures, comfortable_postures
 
 type NullSpace = Literal["arm angle", "free", "none"]
@@ -167,6 +167,7 @@ class EquippedArm(WorkArm):
             tcp=tcp,
             limits=old.limits,
             ready=old.ready,
+            kinds=old.kinds,
         )
         links = tuple(c for c in arm.body.capsules if c.link <= n)
         hand = tuple(
@@ -211,7 +212,7 @@ class EquippedArm(WorkArm):
         wish = near.double().unsqueeze(-2)
         all_over = (low + (high - low) * some).expand(*near.shape[:-1], -1, -1)
         found = solutions_from(self.chain, pose, torch.cat([wish, all_over], dim=-2))
-        return _turned_towards(found, wish, limits.lower, limits.upper)
+        return unwound(self.chain, found, wish)
 
 
 _STARTS = 200
@@ -237,17 +238,6 @@ def _nearest_of(
         orientation = pose.orientation.expand(*missing.shape, 4)[first]
         raise UnreachableError(_unreachable(Pose(position, orientation)))
     return torch.take_along_dim(found, least.indices[..., None, None], dim=-2).squeeze(-2)
-
-
-def _turned_towards(
-    q: Float[Tensor, "*batch solutions joints"],
-    near: Float[Tensor, "*#batch #solutions joints"],
-    lower: Float[Tensor, " joints"],
-    upper: Float[Tensor, " joints"],
-) -> Float[Tensor, "*batch solutions joints"]:
-    """The same poses with each joint turned by whole turns to be near given positions."""
-    turned = q - 2 * math.pi * torch.round((q - near) / (2 * math.pi))
-    return torch.where((turned >= lower) & (turned <= upper), turned, q)
 
 
 def _meshes(arm: Arm, flange: Float[np.ndarray, "4 4"]) -> dict[str, tuple[MeshFile, ...]]:

@@ -262,11 +262,12 @@ def _add_capsules(body, robot: WorkArm, link: int, mass: float | None) -> None:
 
 
 def _add_joint(spec: mujoco.MjSpec, body, name: str, i: int, config: ArmModelConfig) -> None:
-    limits = config.robot.chain.limits
+    chain, limits = config.robot.chain, config.robot.chain.limits
+    slides = chain.kinds[i] == "prismatic"
     stiffness, damping = config.servo(i)
     body.add_joint(
         name=name,
-        type=mujoco.mjtJoint.mjJNT_HINGE,
+        type=mujoco.mjtJoint.mjJNT_SLIDE if slides else mujoco.mjtJoint.mjJNT_HINGE,
         axis=(0, 0, 1),
         range=(float(limits.lower[i]), float(limits.upper[i])),
         armature=config.armature(i),

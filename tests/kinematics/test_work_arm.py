@@ -63,6 +63,24 @@ def test_joints_that_turn_twice_around_stay_near():
         torch.testing.assert_close(found, away, atol=1e-7, rtol=0)
 
 
+def test_joints_that_slide_go_on_sliding_and_are_not_turned():
+    described = bare((), slides=(0,))
+    limits = described.chain.limits
+    # So far that it could go by the length of a whole turn, were it one [m].
+    far = limits.upper.clone()
+    far[0] = 9.0
+    described.chain.limits = JointLimits(**{**vars(limits), "upper": far})
+    arm = EquippedArm(described)
+    q, _ = poses_of(bare(()).chain, 3, seed=2)
+    pose = described.with_tool(arm.chain.tcp).chain.forward(q)
+    assert arm.chain.forward(q).twist_to(pose).abs().max() < 1e-12
+    away = torch.zeros(7, dtype=torch.float64)
+    away[0] = 2 * math.pi
+    for i in range(3):
+        found = arm.nearest(pose[i], near=q[i] + away)
+        assert arm.chain.forward(found).twist_to(pose[i]).abs().max() < 1e-6
+
+
 def test_postures_differ_and_the_first_is_the_most_comfortable():
     arm = EquippedArm(bare())
     _, poses = poses_of(arm.chain, 10, seed=3)

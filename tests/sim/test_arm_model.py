@@ -40,6 +40,22 @@ def test_mujoco_has_the_tool_where_the_chain_has_it(robot):
         np.testing.assert_allclose(world.arm.read().joint_position, q)
 
 
+def test_a_joint_that_slides_slides_in_mujoco_too():
+    robot = EquippedArm(bare((), slides=(0, 2)))
+    spec = mujoco.MjSpec()
+    add_arm(spec, ArmModelConfig(robot=robot))
+    model = spec.compile()
+    data, rng, limits = mujoco.MjData(model), np.random.default_rng(0), robot.chain.limits
+    for _ in range(5):
+        q = rng.uniform(limits.lower.numpy(), limits.upper.numpy())
+        data.qpos[:7] = q
+        mujoco.mj_kinematics(model, data)
+        T = robot.chain.forward(torch.from_numpy(q)).matrix().numpy()
+        tool = data.site("tcp")
+        np.testing.assert_allclose(tool.xpos, T[:3, 3], atol=1e-9)
+        np.testing.assert_allclose(tool.xmat.reshape(3, 3), T[:3, :3], atol=1e-9)
+
+
 def test_it_holds_its_posture_and_follows_a_velocity(robot):
     workplace = Workplace.of(robot)
     world = World(workplace.scene)
