@@ -78,10 +78,14 @@ def status_of(work: Callable[[], int]) -> int:
         return 2
     except ModuleNotFoundError as error:
         library = (error.name or "").split(".")[0]
-        if library not in EXTRAS:
+        if library in EXTRAS:
+            extra = f"pip install 'hrc-learn[{EXTRAS[library]}]'"
+            missing = f"{library} is not installed, which this needs: {extra}"
+        elif not str(error).startswith("No module named"):
+            missing = one_line(error)  # of a package without an extra: says itself what to do
+        else:
             raise
-        extra = f"pip install 'hrc-learn[{EXTRAS[library]}]'"
-        print(f"error: {library} is not installed, which this needs: {extra}", file=sys.stderr)
+        print(f"error: {missing}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)

@@ -147,7 +147,7 @@ class Description:
             if joint is None:
                 raise ValueError(
                     f"{self.path}: link {tip!r} does not hang on {base!r}, but on {link!r}: "
-                    "name another base or tip"
+                    "name another base or tip (base=, tip=; --base, --tip)"
                 )
             joints.append(joint)
             link = joint.parent
@@ -156,13 +156,14 @@ class Description:
             if joint.kind not in (*MOVING, "fixed"):
                 raise ValueError(
                     f"{self.path}: joint {joint.name} is {joint.kind}, which no serial "
-                    f"chain has: choose a base or a tip so that it is outside (its parent is "
-                    f"{joint.parent}, its child {joint.child})"
+                    f"chain has: name a base or a tip (base=, tip=; --base, --tip) so that it "
+                    f"is outside (its parent is {joint.parent}, its child {joint.child})"
                 )
             if joint.follows is not None:
                 raise ValueError(
                     f"{self.path}: joint {joint.name} only follows {joint.follows[0]}, as the "
-                    f"fingers of grippers do: end the chain before it, tip={joint.parent!r}"
+                    f"fingers of grippers do: end the chain before it (tip=, --tip), at "
+                    f"{joint.parent!r}"
                 )
         if not any(joint.kind in MOVING for joint in joints):
             raise ValueError(f"{self.path}: no joint moves between {base!r} and {tip!r}")
@@ -180,7 +181,7 @@ class Description:
         moved = {name: self._joints_above(name, base) for name in (link, *leaves)}
         ends = sorted((n for n in moved if moved[n]), key=moved.__getitem__, reverse=True)
         raise ValueError(
-            f"{self.path} has {len(leaves)} ends; say which is the tool with tip=: "
+            f"{self.path} has {len(leaves)} ends; say which is the tool (tip=, --tip): "
             f"{', '.join(ends or leaves)}"
         )
 

@@ -160,8 +160,8 @@ def complete_limits(
             upper = _TURN if upper is None else upper
         if lower is None or upper is None or not lower < upper:
             raise ValueError(
-                f"{source}: joint {name} has the range {lower} to {upper}; give limits= with "
-                f"lower and upper for it"
+                f"{source}: joint {name} has the range {lower} to {upper}; give it lower and "
+                f"upper by limits=, or in the file {Path(source).stem}.limits.toml beside it"
             )
         velocity = told.get("velocity") or (
             DEFAULT_SLIDING_VELOCITY if slides else DEFAULT_VELOCITY

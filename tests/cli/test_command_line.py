@@ -22,6 +22,7 @@ from hrc_learn.demos.repair import RepairOptions
 from hrc_learn.dmp.forcing_scale import SCALINGS
 from hrc_learn.experiments.controller.sweep import EXPERIMENTS
 from hrc_learn.experiments.grasping.experiment import VARIANTS
+from hrc_learn.kinematics import MissingModelError
 from hrc_learn.learning.channels import CHANNELS
 from hrc_learn.sim import CameraKind
 from hrc_learn.sim.workplace import Workplace
@@ -233,6 +234,7 @@ def run(monkeypatch, main) -> object:
         (FileNotFoundError(2, "No such file or directory", "/x"), 2, "error: /x: No such file"),
         (KeyboardInterrupt(), 1, "interrupted\n"),
         (ModuleNotFoundError("no tyro", name="tyro"), 1, "error: tyro is not installed"),
+        (MissingModelError("get it", name="robosuite"), 1, "error: get it\n"),
     ],
 )
 def test_the_users_mistakes_end_in_one_line(monkeypatch, capsys, error, status, line):
@@ -242,6 +244,14 @@ def test_the_users_mistakes_end_in_one_line(monkeypatch, capsys, error, status, 
     monkeypatch.setattr("warnings.formatwarning", None)
     assert run(monkeypatch, main) == status
     assert capsys.readouterr().err.startswith(line)
+
+
+def test_a_module_that_nobody_told_of_shows_where_it_was_missed(monkeypatch):
+    def main(_):
+        raise ModuleNotFoundError("No module named 'ours'", name="ours")
+
+    with pytest.raises(ModuleNotFoundError):
+        run(monkeypatch, main)
 
 
 def test_our_own_mistakes_are_not_taken_for_the_users(monkeypatch):

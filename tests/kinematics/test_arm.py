@@ -196,7 +196,9 @@ def test_bad_files_are_told_in_a_line(tmp_path, old, new, message):
 
 def test_several_ends_are_listed(tmp_path):
     odd(tmp_path)
-    with pytest.raises(ValueError, match=r"2 ends; say which is the tool .*: finger, c, tip"):
+    with pytest.raises(
+        ValueError, match=r"2 ends; say which is the tool \(tip=, --tip\): finger, c, tip"
+    ):
         arm(tmp_path / "odd.urdf")
 
 
@@ -206,7 +208,7 @@ def test_ends_that_nothing_moves_are_no_tools(tmp_path):
         '<child link="mark"/></joint></robot>'
     )
     odd(tmp_path, ODD.replace("</robot>", mark))
-    with pytest.raises(ValueError, match=r"3 ends; .*with tip=: finger, tip$"):
+    with pytest.raises(ValueError, match=r"3 ends; .*--tip\): finger, tip$"):
         arm(tmp_path / "odd.urdf")
 
 
