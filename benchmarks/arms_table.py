@@ -168,59 +168,79 @@ def _servoed(name: str, trials: int) -> dict[str, float]:
 
 
 # Poses of base and flange, and the Jacobian of the flange, all in the world.
-type _Seen = tuple[np.ndarray, np.ndarray, np.ndarray]
+type Seen = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def _compared(described: Arm, q: torch.Tensor) -> dict[str, float]:
     """Largest differences of flange positions [m], rotations and Jacobians from others'."""
-    flange = described.with_tool(torch.eye(4, dtype=torch.float64)).chain
-    poses, jacobians = flange.forward_and_jacobian(q)
-    ours = list(zip(q.numpy(), poses.matrix().numpy(), jacobians.numpy(), strict=True))
-
-    def largest(see: Callable[[np.ndarray], _Seen]) -> float:
-        worst = 0.0
-        for row, T, J in ours:
-            base, tip, theirs = see(row)
-            R = base[:3, :3]
-            turned = np.concatenate([R.T @ theirs[:3], R.T @ theirs[3:]])
-            off = T - np.linalg.inv(base) @ tip
-            worst = max(worst, float(np.abs(off).max()), float(np.abs(J - turned).max()))
-        return worst
-
-    figures = {"difference_from_mujoco": largest(_mujoco_kinematics(described))}
+    seen = mujoco_kinematics(described)
+    figures = {"difference_from_mujoco": largest_difference(described, q, seen)}
     if find_spec("pinocchio") is not None:
         try:
             see = _pinocchio_kinematics(described)
         except IndexError:  # what 4.1 says of some files that MuJoCo reads
             return figures
-        figures["difference_from_pinocchio"] = largest(see)
+        figures["difference_from_pinocchio"] = largest_difference(described, q, see)
     return figures
 
 
-def _mujoco_kinematics(described: Arm) -> Callable[[np.ndarray], _Seen]:
+def largest_difference(
+    described: Arm, q: torch.Tensor, see: Callable[[np.ndarray], Seen]
+) -> float:
+    """Of flange positions [m], rotations and Jacobians from what another library computes.
+
+    Args:
+        described: The arm.
+        q: Joint positions (states, joints) [rad, m].
+        see: Of one of them, by that library.
+    """
+    flange = described.with_tool(torch.eye(4, dtype=torch.float64)).chain
+    poses, jacobians = flange.forward_and_jacobian(q)
+    worst = 0.0
+    for row, T, J in zip(q.numpy(), poses.matrix().numpy(), jacobians.numpy(), strict=True):
+        base, tip, theirs = see(row)
+        R = base[:3, :3]
+        turned = np.concatenate([R.T @ theirs[:3], R.T @ theirs[3:]])
+        off = T - np.linalg.inv(base) @ tip
+        worst = max(worst, float(np.abs(off).max()), float(np.abs(J - turned).max()))
+    return worst
+
+
+def mujoco_kinematics(described: Arm) -> Callable[[np.ndarray], Seen]:
+    """By MuJoCo's own reading of an arm's file.
+
+    Raises:
+        ValueError: MuJoCo does not read it.
+    """
     model = _mujoco_model(described)
     data, names = mujoco.MjData(model), described.joint_names
     addresses = [int(model.joint(name).qposadr[0]) for name in names]
     columns = [int(model.joint(name).dofadr[0]) for name in names]
     base = model.body(described.base).id if described.base else 0
-    tip, J = model.body(described.tip).id, np.zeros((6, model.nv))
+    bodies = [model.body(i).name for i in range(model.nbody)]
+    at_site = described.tip not in bodies
+    tip = (model.site if at_site else model.body)(described.tip).id
+    place, turn = (data.site_xpos, data.site_xmat) if at_site else (data.xpos, data.xmat)
+    jacobian = mujoco.mj_jacSite if at_site else mujoco.mj_jacBody
+    J = np.zeros((6, model.nv))
 
-    def pose(body: int) -> np.ndarray:
+    def pose(position: np.ndarray, rotation: np.ndarray) -> np.ndarray:
         T = np.eye(4)
-        T[:3, :3], T[:3, 3] = data.xmat[body].reshape(3, 3), data.xpos[body]
+        T[:3, :3], T[:3, 3] = rotation.reshape(3, 3), position
         return T
 
-    def see(row: np.ndarray) -> _Seen:
+    def see(row: np.ndarray) -> Seen:
         data.qpos[addresses] = row
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
-        mujoco.mj_jacBody(model, data, J[:3], J[3:], tip)
-        return pose(base), pose(tip), J[:, columns]
+        jacobian(model, data, J[:3], J[3:], tip)
+        standing = pose(data.xpos[base], data.xmat[base])
+        return standing, pose(place[tip], turn[tip]), J[:, columns]
 
     return see
 
 
-def _pinocchio_kinematics(described: Arm) -> Callable[[np.ndarray], _Seen]:
+def _pinocchio_kinematics(described: Arm) -> Callable[[np.ndarray], Seen]:
     import pinocchio  # pyright: ignore[reportMissingImports]
 
     urdf, mjcf = pinocchio.buildModelFromUrdf, pinocchio.buildModelFromMJCF
@@ -233,7 +253,7 @@ def _pinocchio_kinematics(described: Arm) -> Callable[[np.ndarray], _Seen]:
     base = model.getFrameId(described.base, body) if described.base else 0
     tip = model.getFrameId(described.tip, body)
 
-    def see(row: np.ndarray) -> _Seen:
+    def see(row: np.ndarray) -> Seen:
         for joint, angle in zip(joints, row, strict=True):
             # One that turns without end is its cosine and sine there.
             value = [angle] if joint.nq == 1 else [math.cos(angle), math.sin(angle)]
