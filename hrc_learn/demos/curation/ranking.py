@@ -16,6 +16,7 @@ from hrc_learn.demos.format.dataset_folder import EpisodeEntry, open_folder
 from hrc_learn.demos.issue import DatasetError, Issue, plain_text
 from hrc_learn.demos.preprocessing import resting
 from hrc_learn.demos.read.column_mapping import MappingSpec
+from hrc_learn.demos.read.frames import each_or_fault
 from hrc_learn.demos.read.reader import DemonstrationSource, open_demos
 from hrc_learn.demos.validation.check import check_dataset
 
@@ -216,14 +217,15 @@ def _demonstrations(
             return
         source = open_demos(root, sound, mapping=mapping, units=units)
         entries = tuple(e for e in entries if e.index in set(sound))
-    for number, entry in enumerate(progress(entries) if progress else entries):
+    shown = progress(entries) if progress else entries
+    demos = each_or_fault(len(source), lambda first: source[first:], source.__getitem__)
+    for entry, demo in zip(shown, demos, strict=True):
         quality = qualities[entry.index]
-        try:
-            yield quality, source[number]
-        except DatasetError as error:
-            if not quality.broken:
-                quality.broken = True
-                quality.doubt(_ERROR, str(error))
+        if isinstance(demo, Demonstration):
+            yield quality, demo
+        elif not quality.broken:
+            quality.broken = True
+            quality.doubt(_ERROR, str(demo))
 
 
 def _motion(demo: Demonstration) -> Float64[np.ndarray, "frames components"] | None:

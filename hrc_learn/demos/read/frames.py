@@ -1,7 +1,7 @@
 """Frames of episodes as raw arrays, just as they are on disk, and when each was taken."""
 
-from collections.abc import Iterator, Sequence
-from itertools import groupby
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import groupby, pairwise
 
 import numpy as np
 import pyarrow as pa
@@ -45,6 +45,66 @@ def read_frames(
     """
     for file, group in groupby(entries, key=lambda entry: entry.file):
         yield from _read_file(folder, file, list(group), keys)
+
+
+_ALONE = 64
+"""Episodes read one by one where one of those to come cannot be read."""
+
+
+def each_or_fault[T](
+    count: int, following: Callable[[int], Iterable[T]], alone: Callable[[int], T]
+) -> Iterator[T | DatasetError]:
+    """What is read of every episode, many of them together, or why one cannot be read.
+
+    Args:
+        count: Episodes.
+        following: Reads all from one on; ends with an error, maybe that of a later one, as
+            many are read together.
+        alone: Reads one by itself.
+    """
+    done = 0
+    while done < count:
+        try:
+            for found in following(done):
+                yield found
+                done += 1
+        except DatasetError:
+            for place in range(done, min(done + _ALONE, count)):
+                try:
+                    read: T | DatasetError = alone(place)
+                except DatasetError as error:
+                    read = error
+                yield read
+                done += 1
+
+
+def read_each(
+    folder: DatasetFolder, entries: Sequence[EpisodeEntry], keys: Sequence[str]
+) -> Iterator[RawFrames | DatasetError]:
+    """Columns of every episode, in any order, or why it cannot be read; else as `read_frames`.
+
+    One that cannot be read does not keep the others from being read.
+    """
+
+    def following(first: int) -> Iterator[RawFrames]:
+        for run in disk_runs(entries[first:]):
+            yield from (frames for _, frames in read_frames(folder, run, keys))
+
+    def alone(place: int) -> RawFrames:
+        ((_, frames),) = read_frames(folder, [entries[place]], keys)
+        return frames
+
+    return each_or_fault(len(entries), following, alone)
+
+
+def disk_runs(entries: Sequence[EpisodeEntry]) -> Iterator[list[EpisodeEntry]]:
+    """Cut a sequence into runs of episodes that lie on disk in this order."""
+    place = [(entry.file, entry.start) for entry in entries]
+    cuts = [0]
+    for before, here in pairwise(place):
+        cuts.append(cuts[-1] + (here <= before))
+    for _, run in groupby(zip(cuts, entries, strict=True), key=lambda pair: pair[0]):
+        yield [entry for _, entry in run]
 
 
 def slice_frames(columns: RawFrames, start: int, length: int) -> RawFrames:

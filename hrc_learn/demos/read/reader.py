@@ -1,9 +1,8 @@
 """Reading any LeRobot dataset into demonstrations, on pyarrow alone."""
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import groupby, pairwise
 from pathlib import Path
 from typing import overload
 
@@ -32,7 +31,7 @@ from hrc_learn.demos.read.episodes import (
     RawEpisode,
     open_reader,
 )
-from hrc_learn.demos.read.frames import RawFrames, frame_timestamps
+from hrc_learn.demos.read.frames import RawFrames, disk_runs, frame_timestamps
 from hrc_learn.demos.read.profiles import EpisodeProfile, profile_columns, track_quantities
 from hrc_learn.demos.read.roles import ORIENTATION_ROLES, UnitDecision
 from hrc_learn.geometry import quaternion
@@ -248,16 +247,25 @@ class DemonstrationSource(Sequence[Demonstration]):
     def __getitem__(self, index: slice) -> "DemonstrationSource": ...
     def __getitem__(self, index):
         if isinstance(index, slice):
-            chosen = replace(self._reader, entries=self._reader.entries[index])
-            return DemonstrationSource(chosen, self._decisions, self.joint_names)
+            return self._of(self._reader.entries[index])
         (episode,) = self._reader.read([self._reader.entries[index]])
         return self.convert(episode)
+
+    def spread(self, most: int) -> "DemonstrationSource":
+        """Some of them, `most` at most, evenly over the sequence and still unread."""
+        entries = self._reader.entries
+        places = np.linspace(0, len(entries) - 1, min(len(entries), most)).astype(int)
+        return self._of(entries[place] for place in places.tolist())
+
+    def _of(self, entries: Iterable[EpisodeEntry]) -> "DemonstrationSource":
+        reader = replace(self._reader, entries=tuple(entries))
+        return DemonstrationSource(reader, self._decisions, self.joint_names)
 
     def __len__(self) -> int:
         return len(self._reader.entries)
 
     def __iter__(self) -> Iterator[Demonstration]:
-        for run in _runs(self._reader.entries):
+        for run in disk_runs(self._reader.entries):
             yield from map(self.convert, self._reader.read(run))
 
     def __repr__(self) -> str:
@@ -296,16 +304,6 @@ class DemonstrationSource(Sequence[Demonstration]):
         if reader.extracted is not None:
             demo = with_feature(demo, reader.extracted)
         return demo.select_joints(self.joint_names)
-
-
-def _runs(entries: Sequence[EpisodeEntry]) -> Iterator[list[EpisodeEntry]]:
-    """Cut a sequence into runs of episodes that lie on disk in this order."""
-    place = [(entry.file, entry.start) for entry in entries]
-    cuts = [0]
-    for before, here in pairwise(place):
-        cuts.append(cuts[-1] + (here <= before))
-    for _, run in groupby(zip(cuts, entries, strict=True), key=lambda pair: pair[0]):
-        yield [entry for _, entry in run]
 
 
 # Reading any LeRobot dataset into demonstrations, on pyarrow alone.

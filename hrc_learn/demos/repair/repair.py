@@ -1,6 +1,5 @@
 """A dataset repaired into a copy."""
 
-import contextlib
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -51,7 +50,7 @@ from hrc_learn.demos.read.episodes import (
     select_quantities,
     units_on_disk,
 )
-from hrc_learn.demos.read.frames import RawFrames, read_frames, recorded_stamps
+from hrc_learn.demos.read.frames import RawFrames, read_each, recorded_stamps
 from hrc_learn.demos.read.roles import INDEX_KEYS, is_hand
 from hrc_learn.demos.repair.episode_edit import (
     ColumnSemantics,
@@ -120,10 +119,11 @@ def repair_dataset(
     segments = read_segments(folder) if options.videos else {}
     recast = ColumnRewriter(folder, sidecar, semantics, options, units, segments, kept)
     report = RepairReport(path=Path(out), notes=recast.notes, dry_run=options.dry_run)
+    entries = progress(folder.episodes) if progress else folder.episodes
     if options.dry_run:
-        for entry in progress(folder.episodes) if progress else folder.episodes:
+        for entry, frames in zip(entries, _read(folder), strict=True):
             report.frames_before += entry.length
-            if (edit := _edited(recast, entry, options, report)) is not None:
+            if (edit := _edited(recast, entry, frames, options, report)) is not None:
                 report.changes[entry.index] = edit.changes
                 report.frames += len(edit)
         return report
@@ -131,9 +131,9 @@ def repair_dataset(
         staging = target / "episodes"
         staging.mkdir(parents=True)
         videos: list[Segments] = []
-        for entry in progress(folder.episodes) if progress else folder.episodes:
+        for entry, frames in zip(entries, _read(folder), strict=True):
             report.frames_before += entry.length
-            edit = _edited(recast, entry, options, report)
+            edit = _edited(recast, entry, frames, options, report)
             if edit is None:
                 continue
             recast.stage(episode_path(staging, len(report.changes)), edit, report.frames)
@@ -155,14 +155,18 @@ def repair_dataset(
 
 
 def _edited(
-    recast: "ColumnRewriter", entry: EpisodeEntry, options: RepairOptions, report: RepairReport
+    recast: "ColumnRewriter",
+    entry: EpisodeEntry,
+    frames: RawFrames | DatasetError,
+    options: RepairOptions,
+    report: RepairReport,
 ) -> EpisodeEdit | None:
     """The episode repaired; None, and the reason in the report, where it is left out."""
     if recast.kept is not None and entry.index not in recast.kept:
         report.left_out[entry.index] = "not kept"
         return None
     try:
-        edit = _repair(recast, entry, options)
+        edit = _repair(recast, entry, frames, options)
         recast.videos_of(edit)
         recast.require_images(edit)
     except DatasetError as error:
@@ -195,10 +199,10 @@ def _resolve(
     column_mapping = read_mapping(folder, sidecar, mapping)
 
     def readable() -> Iterator[tuple[EpisodeEntry, Quantities]]:
-        for entry in folder.episodes:
+        for entry, frames in zip(folder.episodes, _read(folder), strict=True):
             # What cannot be read is reported, or left out, when its turn comes.
-            with contextlib.suppress(DatasetError):
-                yield entry, select_quantities(_read(folder, entry), column_mapping.selections)
+            if not isinstance(frames, DatasetError):
+                yield entry, select_quantities(frames, column_mapping.selections)
 
     contract = contract_of(sidecar)
     declared = sidecar.units | ({} if contract is None else contract.units())
@@ -210,19 +214,23 @@ def _resolve(
     return ColumnSemantics(column_mapping=column_mapping, units=decisions, hands=hands, bad=bad)
 
 
-def _read(folder: DatasetFolder, entry: EpisodeEntry) -> RawFrames:
+def _read(folder: DatasetFolder) -> Iterator[RawFrames | DatasetError]:
+    """Numbers of every episode."""
     keys = [key for key, f in folder.features.items() if f.numeric and key not in INDEX_KEYS]
-    ((_, frames),) = read_frames(folder, [entry], keys)
-    return frames
+    return read_each(folder, folder.episodes, keys)
 
 
 def _repair(
-    recast: "ColumnRewriter", entry: EpisodeEntry, options: RepairOptions
+    recast: "ColumnRewriter",
+    entry: EpisodeEntry,
+    frames: RawFrames | DatasetError,
+    options: RepairOptions,
 ) -> EpisodeEdit:
-    folder, semantics = recast.folder, recast.semantics
+    folder, semantics, time = recast.folder, recast.semantics, None
     if (fault := semantics.bad.get(entry.index)) is not None:
         raise fault
-    frames, time = _read(folder, entry), None
+    if isinstance(frames, DatasetError):
+        raise frames
     if "time" in semantics.column_mapping.selections:
         ((key, index),) = semantics.column_mapping.selections["time"].columns
         time = frames[key][:, index].astype(float) * semantics.units["time"].factor
