@@ -1,6 +1,6 @@
 """Batches of primitives: some of them taken out, several of them put together."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import torch
@@ -65,6 +65,53 @@ def stack[M: nn.Module](primitives: Sequence[M]) -> M:
         return _timestamps(present) if name == "timestamps" else torch.stack(present)
 
     return _changed(primitives[0], stacked)
+
+
+def concatenate[M: nn.Module](batches: Iterable[M], samples: int) -> M:
+    """Batches of primitives of one kind, one after another along their first axis.
+
+    They are taken one by one, and none of them is held longer than it takes to copy. Their
+    demonstrations need not be sampled alike: the timestamps of the result, those of a rollout
+    without arguments, are even.
+
+    Args:
+        batches: Each with one batch axis or more, alike in the axes behind the first.
+        samples: Timestamps of the result.
+
+    Raises:
+        ValueError: There are none, or they differ; says in what.
+    """
+    first, described, count = None, {}, 0
+    parts: dict[str, list[Tensor]] = {}
+    for batch in batches:
+        weights: Any = batch.motion.weights  # pyright: ignore[reportAttributeAccessIssue]
+        own = _described(batch) | {"shape of the weights": weights.shape[1:]}
+        if first is None:
+            # A copy: what a batch was made from goes with it.
+            first, described = select(batch, slice(0, 1)), own
+        for name, value in described.items():
+            if own[name] != value:
+                raise ValueError(
+                    f"primitives of one batch must be alike, but {name} of batch {count} is "
+                    f"{own[name]}, of the first {value}"
+                )
+        count += 1
+        for path, x in _tensors(batch):
+            if path.rpartition(".")[2] not in (*SHARED, "timestamps"):
+                parts.setdefault(path, []).append(x.detach().clone())
+    if first is None:
+        raise ValueError("there are no primitives to concatenate")
+
+    def joined(path: str, x: Tensor) -> Tensor | None:
+        name = path.rpartition(".")[2]
+        if name == "timestamps":
+            return torch.linspace(0, 1, samples, dtype=x.dtype, device=x.device)
+        if name in SHARED:
+            return x.clone()
+        found = parts[path]
+        return torch.cat(found) if len(found) == count else None
+
+    return _changed(first, joined)
 
 
 def _timestamps(every: list[Tensor]) -> Tensor:

@@ -2,8 +2,8 @@
 context, or streamed from disk.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -30,12 +30,14 @@ from hrc_learn.dmp import (
     mean_primitive,
     select_basis_count,
 )
+from hrc_learn.dmp.batching import concatenate
 from hrc_learn.kinematics import panda
 from hrc_learn.learning.channels import (
     CHANNELS,
     LazyMap,
     Motions,
     Primitive,
+    ReproductionError,
     reproduction_error,
     require_motion,
     select_channels,
@@ -60,6 +62,11 @@ class FittedPrimitives:
     """How the number of basis functions was chosen, if it was."""
     options: Mapping[str, Any] = field(default_factory=dict)
     """Of the fit."""
+    every: Mapping[str, Primitive] = field(default_factory=dict)
+    """By channel: one for each demonstration of a dataset of which `motions` and `each` are a
+    sample (see `fit_all`); empty where they are all."""
+    every_error: Mapping[str, ReproductionError] = field(default_factory=dict)
+    """By channel: how close those come to their demonstrations."""
 
     @property
     def demonstrations(self) -> PaddedDemonstrations:
@@ -86,7 +93,7 @@ class FittedPrimitives:
         """
         for channel, primitive in self.common.items():
             primitive.save(folder / channel)
-        for channel, primitives in self.each.items() if each else ():
+        for channel, primitives in {**self.each, **self.every}.items() if each else ():
             primitives.save(folder / EACH / channel)
 
     def distribution(self, channel: str) -> DMPDistribution:
@@ -95,19 +102,27 @@ class FittedPrimitives:
         Raises:
             ValueError: Of fewer than two demonstrations, or scaled primitives.
         """
-        return DMPDistribution.fit(self.each[channel])
+        return DMPDistribution.fit({**self.each, **self.every}[channel])
 
     def metrics(self) -> dict[str, float]:
         """How close the primitives come to their demonstrations.
 
-        `mean_` is the common primitive, given start, goal and duration of each.
+        `mean_` is the common primitive, given start, goal and duration of each; of a sample
+        where there is one.
         """
-        values = {"demonstrations": float(len(self.demonstrations.length))}
-        values["basis_functions"] = float(self.n_basis)
+        count = len(self.demonstrations.length)
+        values = {"demonstrations": float(count), "basis_functions": float(self.n_basis)}
+        if self.every:
+            values["demonstrations_sampled"] = float(count)
         for channel in self.each:
-            own = self.motions.own(self.each[channel])
             adapted = self.motions.adapted(channel, self.common[channel])
-            values |= reproduction_error(channel, self.motions, own).summary(channel)
+            own = self.every_error.get(channel)
+            if own is None:
+                made = self.motions.own(self.each[channel])
+                own = reproduction_error(channel, self.motions, made)
+            else:
+                values["demonstrations"] = float(len(next(iter(own.columns().values()))))
+            values |= own.summary(channel)
             values |= reproduction_error(channel, self.motions, adapted).summary(
                 f"mean_{channel}"
             )
@@ -157,6 +172,116 @@ def fit_primitives(
         n_basis=n_basis,
         selection=selection,
         options=options,
+    )
+
+
+# More demonstrations than memory holds: all are fitted, some at a time, and a sample of them
+# tells what needs many at once.
+
+HELD_AT_ONCE = 700_000
+"""Numbers of a channel (frames, padding included, times joints or 7 of a pose) that are held at
+once: their fit and the comparison of models take up to 300 MB."""
+FITTED_AT_ONCE = 140_000
+"""Numbers fitted at a time where all are: enough for the speed of one matrix product."""
+LONGEST = 5_000
+"""Frames of one demonstration that are fitted where there are many, or more for more than 100
+basis functions: `_SAMPLES` for each function tell all that these can follow."""
+_SAMPLES = 50
+
+
+def sampled(source: DemonstrationSource) -> DemonstrationSet:
+    """All demonstrations, or some spread over them where all are too many to hold.
+
+    A note says which. Of the longest, as many frames are kept as twice the usual ones have.
+
+    Args:
+        source: On disk.
+    """
+    lengths = source.lengths
+    if len(lengths) * max(lengths) * _width(source) <= HELD_AT_ONCE:
+        return source.load()
+    longest = min(LONGEST, 2 * int(np.median(lengths)), max(lengths))
+    count = min(len(lengths), max(1, HELD_AT_ONCE // (longest * _width(source))))
+    demos = [_thinned(demo, longest) for demo in source.spread(count)]
+    note = "all demonstrations are too long to hold"
+    if count < len(lengths):
+        note = f"{count} of {len(lengths)} demonstrations, spread over them, are a sample"
+    if max(lengths) > longest:
+        note += f"; of those longer than that, {longest} frames are taken"
+    return DemonstrationSet(demos, notes=(*source.notes, note), source=source.source)
+
+
+def fit_all(fitted: FittedPrimitives, source: DemonstrationSource) -> FittedPrimitives:
+    """Fit every demonstration as a sample of them was fitted, some in memory at a time.
+
+    What they have in common, their own primitives and their errors are then of all; what is
+    else worked out from `motions` and `each` is of the sample.
+
+    Args:
+        fitted: To a sample, as `sampled` gives it.
+        source: All demonstrations, on disk.
+
+    Raises:
+        ValueError: One of them cannot be read, or holds no motion; says which.
+    """
+    found = {channel: _fit_channel(fitted, source, channel) for channel in fitted.each}
+    every = {channel: primitives for channel, (primitives, _) in found.items()}
+    return replace(
+        fitted,
+        every=every,
+        every_error={channel: error for channel, (_, error) in found.items()},
+        common={k: mean_primitive(cast(Any, primitives)) for k, primitives in every.items()},
+    )
+
+
+def _fit_channel(
+    fitted: FittedPrimitives, source: DemonstrationSource, channel: str
+) -> tuple[Primitive, ReproductionError]:
+    """Primitives of all demonstrations, and their errors."""
+    errors: list[dict[str, Tensor]] = []
+
+    def batches() -> Iterator[Primitive]:
+        for demos in _batches(source, max(LONGEST, _SAMPLES * fitted.n_basis)):
+            motions = Motions.of(demos)
+            primitives = motions.fit(channel, fitted.n_basis, **fitted.options)
+            error = reproduction_error(channel, motions, motions.own(primitives))
+            errors.append(error.columns())
+            yield primitives
+
+    primitives = concatenate(batches(), fitted.motions.demos.mask.shape[1])
+    columns = {name: torch.cat([e[name] for e in errors]) for name in errors[0]}
+    return primitives, ReproductionError(**columns)
+
+
+def _batches(source: DemonstrationSource, longest: int) -> Iterator[DemonstrationSet]:
+    """Demonstrations one after another, as many at a time as may be fitted at once."""
+    batch: list[Demonstration] = []
+    for demo in source:
+        demo = _thinned(demo, longest)
+        padded = max(len(one) for one in (*batch, demo)) * (len(batch) + 1)
+        if batch and padded * _width(source) > FITTED_AT_ONCE:
+            yield DemonstrationSet(batch, source=source.source)
+            batch = []
+        batch.append(demo)
+    if batch:
+        yield DemonstrationSet(batch, source=source.source)
+
+
+def _width(source: DemonstrationSource) -> int:
+    """Columns of the widest channel there may be."""
+    return max(7, len(source.joint_names))
+
+
+def _thinned(demo: Demonstration, longest: int) -> Demonstration:
+    """A demonstration by that many of its frames at most, the first and the last among them."""
+    if len(demo) <= longest:
+        return demo
+    kept = np.linspace(0, len(demo) - 1, longest).round().astype(int)
+    return replace(
+        demo,
+        **{name: getattr(demo, name)[kept] for name in demo.recorded},
+        fps=demo.fps * (longest - 1) / (len(demo) - 1),
+        extra={key: values[kept] for key, values in demo.extra.items()},
     )
 
 

@@ -60,6 +60,8 @@ def test_slices_are_shares_that_nobody_reads_twice(tmp_path):
     assert [[demo.episode for demo in share] for share in shares] == [[0, 2, 4], [1, 3]]
     assert [demo.episode for demo in source[::-1]] == [4, 3, 2, 1, 0]
     assert len(source[5:]) == 0
+    assert [demo.episode for demo in source.spread(3)] == [0, 2, 4]
+    assert len(source.spread(9)) == 5
     with pytest.raises(IndexError):
         source[5]
 

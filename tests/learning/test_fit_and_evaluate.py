@@ -9,9 +9,10 @@ import pytest
 import torch
 
 from hrc_learn.controller import ControllerConfig
-from hrc_learn.demos import Demonstration, DemonstrationSet
+from hrc_learn.demos import DatasetWriter, Demonstration, DemonstrationSet, open_demos
 from hrc_learn.dmp import ContextualDMP, JointDMP, OrientationDMP, PoseDMP
 from hrc_learn.geometry import quaternion
+from hrc_learn.learning import primitive_fitting
 from hrc_learn.learning.channels import (
     Motions,
     Reproduction,
@@ -19,7 +20,14 @@ from hrc_learn.learning.channels import (
     load_primitive,
     reproduction_error,
 )
-from hrc_learn.learning.primitive_fitting import EACH, contexts, fit_contextual, fit_primitives
+from hrc_learn.learning.primitive_fitting import (
+    EACH,
+    contexts,
+    fit_all,
+    fit_contextual,
+    fit_primitives,
+    sampled,
+)
 from hrc_learn.learning.tuning import TuningState, with_gains
 
 
@@ -180,3 +188,70 @@ def test_gains_of_a_file_take_the_place_of_defaults(tmp_path):
         path.write_text(content)
         with pytest.raises(ValueError, match=r"gains\.json"):
             with_gains(config, path)
+
+
+def big_set(root, monkeypatch, episodes=11):
+    """Poses on disk, of several lengths, of which three and no more fit into memory."""
+    for name, numbers in (("HELD_AT_ONCE", 3 * 110 * 7), ("FITTED_AT_ONCE", 4 * 120 * 7)):
+        monkeypatch.setattr(primitive_fitting, name, numbers)
+    with DatasetWriter(root, fps=60, robot_type="hand", joint_names=[]) as writer:
+        for episode in range(episodes):
+            demo = demonstration(episode, 90 + 10 * (episode % 3))
+            assert demo.position is not None
+            assert demo.orientation is not None
+            writer.start_episode("reach")
+            for time, position, turn in zip(
+                demo.time, demo.position, demo.orientation, strict=True
+            ):
+                writer.add_frame(time=time, position=position, orientation=turn)
+            writer.save_episode()
+    return open_demos(root)
+
+
+def test_more_than_fit_into_memory_give_what_all_of_them_give(tmp_path, monkeypatch):
+    source = big_set(tmp_path / "set", monkeypatch)
+    every = source.load()
+    sample = sampled(source)
+    assert len(sample) == 3
+    assert [demo.episode for demo in sample] == [0, 5, 10]
+    assert "3 of 11 demonstrations" in sample.notes[-1]
+    channels = ("position", "orientation", "pose")
+    fitted = fit_all(fit_primitives(sample, 15, channels=channels), source)
+    truth = fit_primitives(every, 15, channels=channels)
+    for channel in channels:
+        found, expected = (
+            truth.motions.adapted(channel, each.common[channel]) for each in (fitted, truth)
+        )
+        for made, other in zip(vars(found).values(), vars(expected).values(), strict=True):
+            torch.testing.assert_close(made, other, rtol=0, atol=1e-9)
+    # The worst demonstration is none of the sample.
+    found, expected = fitted.metrics(), truth.metrics()
+    assert (found["demonstrations"], found["demonstrations_sampled"]) == (11, 3)
+    for name, value in expected.items():
+        if name.startswith(channels):
+            assert found[name] == pytest.approx(value, rel=1e-6, abs=1e-9)
+    fitted.save(tmp_path / "model", each=True)
+    assert load_primitive(tmp_path / "model" / EACH / "pose", "pose").duration.shape == (11,)
+
+
+def test_of_demonstrations_too_long_to_hold_some_frames_are_fitted(tmp_path, monkeypatch):
+    monkeypatch.setattr(primitive_fitting, "LONGEST", 60)
+    source = big_set(tmp_path / "set", monkeypatch, episodes=2)
+    monkeypatch.setattr(primitive_fitting, "HELD_AT_ONCE", 60 * 7)
+    (demo,) = sampled(source)
+    whole = source[0]
+    assert len(demo) == 60
+    assert demo.duration == whole.duration
+    for name in ("position", "orientation"):
+        np.testing.assert_array_equal(
+            getattr(demo, name)[[0, -1]], getattr(whole, name)[[0, -1]]
+        )
+    np.testing.assert_array_equal(np.isin(demo.time, whole.time), True)
+    assert demo.fps == pytest.approx(60 * 59 / (len(whole) - 1))
+
+
+def test_few_are_loaded_as_they_are(tmp_path, monkeypatch):
+    source = big_set(tmp_path / "set", monkeypatch)
+    monkeypatch.setattr(primitive_fitting, "HELD_AT_ONCE", 11 * 110 * 7)
+    assert len(sampled(source)) == 11
+    assert sampled(source).notes == source.notes

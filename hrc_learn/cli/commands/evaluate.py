@@ -27,6 +27,7 @@ from hrc_learn.learning.channels import (
     reproduction_error,
 )
 from hrc_learn.learning.model_choice import best_models, predict
+from hrc_learn.learning.primitive_fitting import sampled
 from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.store import new_folder, read_made_by, write_json
 from hrc_learn.viz.figures import measures_figure
@@ -111,7 +112,7 @@ def _demonstrations(
 ) -> DemonstrationSet:
     """Those asked for, with the joints that were learned."""
     made_by = read_made_by(model)
-    learned = [int(i) for i in made_by.get("episodes") or ()]
+    learned = {int(i) for i in made_by.get("episodes") or ()}
     episodes = list(args.episodes)
     same = Path(made_by["dataset"]).resolve() == args.dataset.resolve()
     if not episodes and learned and same:
@@ -119,14 +120,16 @@ def _demonstrations(
         episodes = [i for i in every if i not in learned]
         console.print(f"note: {len(episodes)} episodes that were not learned from")
     names = tuple(made_by.get("joint_names") or ())
-    if same and (not learned or set(episodes) & set(learned)):
+    if same and (not learned or set(episodes) & learned):
         console.print("note: some of these demonstrations were learned from")
-    return load_demos(
-        args.dataset,
-        episodes=episodes or None,
-        joint_names=names or None,
-        mapping=columns(args.mapping or made_by.get("mapping") or {}),
-        units=args.units or made_by.get("units") or {},
+    return sampled(
+        open_demos(
+            args.dataset,
+            episodes=episodes or None,
+            joint_names=names or None,
+            mapping=columns(args.mapping or made_by.get("mapping") or {}),
+            units=args.units or made_by.get("units") or {},
+        )
     )
 
 

@@ -15,16 +15,18 @@ from hrc_learn.cli._run import write_values
 from hrc_learn.cli._tables import image_jacobian_rows, primitive_rows, show_values
 from hrc_learn.cli.arguments.learn import FitImageJacobian, FitPrimitives
 from hrc_learn.cli.commands.check import columns
-from hrc_learn.demos import DemonstrationSource, load_demos, open_demos
+from hrc_learn.demos import DemonstrationSource, open_demos
 from hrc_learn.demos.read.contract import contract_notes
 from hrc_learn.demos.read.reader import keep_first_contract
 from hrc_learn.jacobian import CellErrors, RBFCenters, grid
 from hrc_learn.learning.model_choice import best_models, keep_best
 from hrc_learn.learning.primitive_fitting import (
     FittedPrimitives,
+    fit_all,
     fit_contextual,
     fit_recording,
     fit_streamed,
+    sampled,
 )
 from hrc_learn.learning.primitive_fitting import fit_primitives as fit_demonstrations
 from hrc_learn.learning.visual_servo_fitting import fit_visual_servo, learning_recording
@@ -51,11 +53,15 @@ def fit_primitives(args: FitPrimitives) -> None:
         _fit_streamed(args, console)
         return
     _keep_contract(args, console)
-    demos = load_demos(args.dataset, **_wanted(args))
+    source = open_demos(args.dataset, **_wanted(args))
+    demos = sampled(source)
+    is_sample = len(demos) < len(source) or demos.frames < source.frames
     for note in demos.notes:
         console.print(f"note: {note}")
+    if is_sample:
+        console.print(f"note: {_OF_A_SAMPLE}", soft_wrap=True)
     with new_folder(args.folder, _made_by(args), args.overwrite) as folder:
-        with console.status(f"Fitting {len(demos)} demonstrations"):
+        with console.status(f"Fitting {len(source)} demonstrations"):
             # Not every channel takes a scaling.
             scaled: dict[str, Any] = {} if args.scaling == "none" else {"scaling": args.scaling}
             fitted = fit_demonstrations(
@@ -66,6 +72,8 @@ def fit_primitives(args: FitPrimitives) -> None:
                 robust=args.robust,
                 **scaled,
             )
+            if is_sample:
+                fitted = fit_all(fitted, source)
             metrics = fitted.metrics()
             if args.several == "contextual":
                 metrics |= fit_contextual(fitted, demos, args.context, folder)
@@ -79,6 +87,12 @@ def fit_primitives(args: FitPrimitives) -> None:
         _finish(args, metrics, folder)
     if drawn:
         print(f"Dashboard: {show_command(args.folder)}")
+
+
+_OF_A_SAMPLE = (
+    "every demonstration is fitted, and the mean is that of all; the sample tells how far the "
+    "mean is off and which model predicts best, and models other than the mean are made of it"
+)
 
 
 def _keep_contract(args: FitPrimitives, console: Console) -> None:
