@@ -206,7 +206,7 @@ class Show(Measured):
     web: bool = False
     """Open it in the browser, as where there is no screen; ends with Ctrl-C."""
     episodes: tuple[int, ...] = ()
-    """Episodes of a dataset to show; all when empty."""
+    """Episodes of a dataset to show; all when empty, or 200 spread over it of more."""
     units: dict[str, str] = field(default_factory=dict)
     """Units on disk by quantity, such as: joint_position deg position mm."""
 

@@ -69,15 +69,27 @@ def _open(recordings: Sequence[Path], web: bool) -> int:
         return 0
 
 
+_SHOWN, _SHOWN_FRAMES = 200, 1_000_000
+"""Demonstrations shown of a dataset, unless they are named, and their frames: more are neither
+told apart by eye nor held by a viewer."""
+
+
 def _record_demonstrations(args: Show, out: Path) -> None:
     # Rerun and PyTorch, which a report does without.
-    from hrc_learn.demos import load_demos
+    from hrc_learn.demos import open_demos
     from hrc_learn.learning.channels import demonstrations_recording
     from hrc_learn.viz.learning_dashboards import record_demonstrations
 
-    demos = load_demos(args.path, episodes=args.episodes or None, units=args.units or None)
+    source = open_demos(args.path, episodes=args.episodes or None, units=args.units or None)
+    shown = source
+    if not args.episodes:
+        usual = sorted(source.lengths)[len(source) // 2]
+        shown = source.spread(min(_SHOWN, max(1, _SHOWN_FRAMES // usual)))
+    demos = shown.load()
     title = f"Demonstrations in {args.path.resolve().name}"
     record_demonstrations(out, demonstrations_recording(demos, title))
+    if len(demos) < len(source):
+        print(f"of {len(source)}, spread over them (--episodes names others): ", end="")
     print(f"{len(demos)} demonstrations")
     seconds = sum(demo.duration for demo in demos)
     write_values(args.json, {"episodes": len(demos), "seconds": seconds})
