@@ -1,0 +1,144 @@
+"""The limits from which an episode is told from the others, by cases on both sides of each."""
+
+import numpy as np
+import pytest
+from lerobot_folders import FPS, write_folder
+
+from hrc_learn.demos import check_dataset
+from hrc_learn.demos.format.dataset_folder import open_folder
+from hrc_learn.demos.issue import ValidationReport
+from hrc_learn.demos.validation import structure_checks
+
+STATE = "observation.state"
+JOINTS = ["shoulder.pos", "elbow.pos", "wrist.pos"]
+ODD = 4
+"""The episode that differs; the ones before it are alike."""
+
+
+def found(root, episodes, text, names=JOINTS):
+    """Findings of a dataset that hold a text."""
+    columns = dict.fromkeys(episodes[0], names)
+    write_folder(root, episodes, columns)
+    report = check_dataset(root)
+    return [issue for issue in (*report.errors, *report.warnings) if text in issue.message]
+
+
+def ramp(frames=100):
+    return np.linspace(0, 1, frames)
+
+
+def loop(frames=100):
+    """From the middle up, down, and back: both ends are the same."""
+    return np.sin(2 * np.pi * ramp(frames)) / 2
+
+
+@pytest.mark.parametrize(
+    ("held", "usual", "frames", "told"),
+    [
+        (20, 0, 100, True),
+        (14, 0, 100, False),  # less than 0.3 s
+        (20, 0, 300, False),  # less than a tenth of the episode
+        (20, 5, 100, False),  # not five times the usual
+        (35, 5, 100, True),
+    ],
+)
+def test_an_encoder_froze_that_stays_long_and_longer_than_usual(
+    tmp_path, held, usual, frames, told
+):
+    assert FPS == 50
+
+    def episode(count):
+        q = np.stack([ramp(frames) + 0.1 * k * loop(frames) for k in range(3)], axis=1)
+        q[40 : 41 + count, 1] = q[40, 1]
+        return {STATE: q}
+
+    episodes = [*(episode(usual) for _ in range(ODD)), episode(held)]
+    issues = found(tmp_path / "set", episodes, "the encoder froze?")
+    assert [(i.episode, i.names) for i in issues] == ([(ODD, ("elbow.pos",))] if told else [])
+
+
+def three(second, noise=0):
+    """Three joints, of which the second does as told."""
+    frames = len(second)
+    jitter = 1e-3 * np.random.default_rng(noise).normal(size=3)
+    others = (0.3 + ramp(frames), -0.4 - 0.7 * ramp(frames))
+    return {STATE: np.stack([others[0], second, others[1]], axis=1) + jitter}
+
+
+@pytest.mark.parametrize(
+    ("usual", "odd", "told"),
+    [
+        (0.2 + ramp(), -0.2 - ramp(), True),
+        # Negated it would be 1.2 spreads away, of the 4 that it is.
+        (-0.07 + loop(), 0.13 + loop(), False),
+        # Negated it would be 2 spreads away, of 10.
+        (-0.2 + loop(), 0.3 + loop(), False),
+    ],
+)
+def test_a_joint_has_the_other_sign_where_negated_it_is_like_the_others(
+    tmp_path, usual, odd, told
+):
+    episodes = [*(three(usual, i) for i in range(ODD)), three(odd, ODD)]
+    issues = found(tmp_path / "set", episodes, "has the other sign")
+    assert [(i.episode, i.names) for i in issues] == ([(ODD, ("elbow.pos",))] if told else [])
+    assert all(issue.message.endswith(": elbow.pos") for issue in issues)
+
+
+@pytest.mark.parametrize(
+    ("forwards", "backwards", "told"),
+    [
+        ((ramp(), 2 * ramp(), 3 - ramp()), (1 - ramp(), 2 - 2 * ramp(), 2 + ramp()), True),
+        # One of three goes back.
+        ((ramp(), 2 * ramp(), 3 - ramp()), (1 - ramp(), 2 * ramp(), 3 - ramp()), False),
+        # One of six goes back, and the others would look alike both ways.
+        ((ramp(), *5 * [loop()]), (1 - ramp(), *5 * [loop()]), False),
+    ],
+)
+def test_an_episode_runs_backwards_if_all_of_it_does(tmp_path, forwards, backwards, told):
+    def episode(columns, seed):
+        jitter = 1e-3 * np.random.default_rng(seed).normal(size=len(columns))
+        return {STATE: np.stack(columns, axis=1) + jitter}
+
+    names = [f"joint{i}.pos" for i in range(len(forwards))]
+    episodes = [*(episode(forwards, i) for i in range(ODD)), episode(backwards, ODD)]
+    issues = found(tmp_path / "set", episodes, "runs the other way", names)
+    assert [issue.episode for issue in issues] == ([ODD] if told else [])
+
+
+@pytest.mark.parametrize(
+    ("gain", "usual", "told"),
+    [
+        (2.0, 1.0, True),
+        (0.5, 1.0, True),
+        (1.4, 1.0, False),
+        (0.7, 1.0, False),
+        (2.0, 2.0, False),
+    ],
+)
+def test_a_state_that_goes_further_or_less_far_than_its_command(tmp_path, gain, usual, told):
+    def episode(seed, factor):
+        t = np.linspace(0, 6, 140)[:, None] + np.random.default_rng(seed).uniform(0, 0.3, 3)
+        q = 0.5 * np.sin(t * [1.0, 1.7, 2.3])
+        state = q[:120] * [1.0, factor, 1.0]
+        return {STATE: state, "action": q[6:126]}
+
+    episodes = [*(episode(i, usual) for i in range(ODD)), episode(ODD, gain)]
+    issues = found(tmp_path / "set", episodes, "times as far as its command")
+    assert [issue.episode for issue in issues] == ([ODD] if told else [])
+    assert all(issue.message.endswith(": elbow") for issue in issues)
+
+
+def test_rows_between_episodes_are_passed_over(tmp_path, monkeypatch):
+    """Of three episodes in a file the one in the middle is of none that is listed."""
+    monkeypatch.setattr(structure_checks, "_BATCH_ROWS", 8)
+    values = [k + np.tile(ramp(frames), (3, 1)).T for k, frames in ((1, 13), (2, 40), (3, 11))]
+    root = write_folder(tmp_path / "set", [{STATE: q} for q in values], {STATE: JOINTS})
+    folder = open_folder(root)
+    (file,) = folder.files()
+    listed = [entry for entry in folder.episodes if entry.index != 1]
+    report = ValidationReport(path=root)
+    pieces = structure_checks._read_pieces(folder, file, listed, report)
+    read = {entry.index: frames[STATE] for entry, frames in pieces}
+    assert [*read] == [0, 2]
+    for index, frames in read.items():
+        np.testing.assert_allclose(frames, values[index], rtol=1e-6)
