@@ -7,6 +7,7 @@ import struct
 import numpy as np
 import pytest
 from clean_sets import CAMERA, write_set
+from lerobot_folders import write_folder
 from page_in_browser import chromium, wait_until
 
 from hrc_learn.demos import load_demos
@@ -118,6 +119,22 @@ def test_images_and_curves_are_those_of_the_dataset(page, client):
     assert np.abs(image.astype(int) - truth).mean() < 4  # what JPEG loses
 
 
+def test_curves_of_columns_without_a_meaning_go_by_their_own_names(tmp_path):
+    """Actions that belong to other joints than the state, and a column without names."""
+    way = np.linspace(0, 1, 40)[:, None] * np.ones(3)
+    episodes = [{"observation.state": way + i, "action": 2 * way, "extra": way} for i in (1, 2)]
+    names = {
+        "observation.state": ["a.pos", "b.pos", "c.pos"],
+        "action": ["lift", "grip", "turn"],
+    }
+    root = write_folder(tmp_path / "set", episodes, names)
+    with CurationPage(rank_episodes(root), tmp_path / "out", AddressConfig(port=0)) as page:
+        curves = json.loads(Client(page).ask("/data/curves/1")[1])
+    lines = {c["name"]: [line["name"] for line in c["lines"]] for c in curves["charts"]}
+    assert lines["action"] == others
+    assert lines["extra"] == ["component 0", "component 1", "component 2"]
+
+
 def test_curves_of_long_episodes_lose_no_spike():
     from hrc_learn.teleoperation.curation_page.server import _points
 
@@ -154,6 +171,10 @@ def test_an_episode_is_looked_at_cut_and_written_in_the_browser(page, tmp_path):
         tab.on("pageerror", lambda error: errors.append(error))
         tab.goto(page.url)
         tab.locator("#charts canvas").first.wait_for()
+        # The same order as in the terminal.
+        listed = tab.locator("#episodes b").all_inner_texts()
+        rows = [line.split()[0] for line in page.ranking.lines()][1 : 1 + len(listed)]
+        assert listed == [f"Episode {row}" for row in rows]
         wait_until(lambda: tab.locator("#videos canvas[data-frame='0']").count(), "an image")
         tab.get_by_role("button", name="Play").click()
         moved = tab.locator("#videos canvas").first
@@ -174,8 +195,11 @@ def test_an_episode_is_looked_at_cut_and_written_in_the_browser(page, tmp_path):
         assert not errors
     assert page.decisions[first].verdict == "reject"
     kept = load_demos(page.out)
-    assert sorted(map(len, kept))[0] == 70
     assert len(kept) == 4
+    (cut,) = (demo for demo in kept if len(demo) == 70)
+    source = load_demos(page.ranking.path)[second]
+    np.testing.assert_array_equal(cut.joint_position, source.joint_position[30:100])
+    np.testing.assert_array_equal(cut.command_position, source.command_position[30:100])
 
 
 @pytest.mark.browser

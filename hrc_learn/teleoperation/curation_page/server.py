@@ -27,9 +27,12 @@ from hrc_learn.demos.curation import (
     write_curated,
 )
 from hrc_learn.demos.curation.decisions import decision
+from hrc_learn.demos.format.dataset_folder import open_folder
+from hrc_learn.demos.format.metadata import Feature
 from hrc_learn.demos.issue import plain_text
 from hrc_learn.demos.read.column_mapping import MappingSpec
 from hrc_learn.demos.read.images import ImageReader, jpeg
+from hrc_learn.demos.validation.data_checks import component_name
 from hrc_learn.teleoperation.gate.address import AddressConfig, listening_socket, tls_context
 from hrc_learn.teleoperation.gate.admission import HEADERS, Admission
 from hrc_learn.teleoperation.gate.gate import Content, static_contents
@@ -95,6 +98,7 @@ class CurationPage:
         self._lengths = {q.episode: q.length for q in ranking.episodes}
         self._broken = {q.episode for q in ranking.episodes if q.broken}
         self._images = ImageReader(ranking.path)
+        self._features = open_folder(ranking.path).features
         self._lock, self._writing = Lock(), ThreadPoolExecutor(1)
         self._written: Future[str] | None = None
         self.contents = {
@@ -207,11 +211,11 @@ class CurationPage:
                     "name": plain_text(name),
                     "unit": unit,
                     "lines": [
-                        {"name": label, "points": _points(values, frames)}
+                        {"name": plain_text(label), "points": _points(values, frames)}
                         for label, values in lines.items()
                     ],
                 }
-                for name, unit, lines in _charts(demo)
+                for name, unit, lines in _charts(demo, self._features)
             ],
         }
 
@@ -305,8 +309,10 @@ _JOINT_LINES = {
 _OTHER_CHARTS = {"position": ("xyz", "m"), "feature": ("uv", "px")}
 
 
-def _charts(demo: Demonstration) -> list[tuple[str, str, dict[str, np.ndarray]]]:
-    """Name, unit and lines of each chart."""
+def _charts(
+    demo: Demonstration, features: Mapping[str, Feature]
+) -> list[tuple[str, str, dict[str, np.ndarray]]]:
+    """Name, unit and lines of each chart; columns without a meaning go by their own names."""
     charts = []
     for number, joint in enumerate(demo.joint_names):
         lines = {
@@ -325,8 +331,8 @@ def _charts(demo: Demonstration) -> list[tuple[str, str, dict[str, np.ndarray]]]
         charts.append(("gripper", "", {"state": demo.gripper}))
     for key, values in demo.extra.items():
         if 0 < values.shape[1] <= 12:
-            lines = {f"{i}": values[:, i] for i in range(values.shape[1])}
-            charts.append((key, "", lines))
+            names = [component_name(features.get(key), i) for i in range(values.shape[1])]
+            charts.append((key, "", dict(zip(names, values.T, strict=True))))
     return charts
 
 
