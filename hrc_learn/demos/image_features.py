@@ -4,7 +4,7 @@ demonstrations.
 
 import json
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -152,6 +152,8 @@ class Extraction:
     """Those of them in which the feature was seen."""
     without_image: int = 0
     """Frames for which the video holds no image."""
+    left_out: dict[int, str] = field(default_factory=dict)
+    """Episodes whose video is missing or damaged, and what is wrong with it."""
 
 
 def extract_features(
@@ -165,7 +167,8 @@ def extract_features(
     """Find a feature in every image of a camera and keep it beside the dataset.
 
     Episodes that were looked at before, in the same videos, are skipped: run it again after
-    it was broken off, or after more was recorded.
+    it was broken off, or after more was recorded. Those whose video is missing or damaged are
+    left out, and listed in the result.
 
     Args:
         path: The dataset.
@@ -177,20 +180,26 @@ def extract_features(
             progress bar.
 
     Raises:
-        DatasetError: There is no such camera, or a video is missing or damaged.
+        DatasetError: There is no such camera, or the metadata are damaged.
     """
     folder = open_folder(path)
     key = _camera_key(video_keys(folder), camera)
     cache = FeatureCache(folder.root, f"{key.rpartition('.')[2]}.{name}")
-    segments = {
-        entry.index: _require(found.get(key), entry, key)
-        for entry, found in zip(folder.episodes, read_segments(folder).values(), strict=True)
-    }
-    waiting = [e for e in folder.episodes if not cache.is_current(e.index, segments[e.index])]
+    segments = {index: found.get(key) for index, found in read_segments(folder).items()}
+    waiting = [
+        entry
+        for entry in folder.episodes
+        if (segment := segments[entry.index]) is None
+        or not cache.is_current(entry.index, segment)
+    ]
     done = Extraction(name=cache.name, known=len(folder.episodes) - len(waiting))
     for entry in progress(waiting) if progress else waiting:
-        segment = segments[entry.index]
-        track, images = _look(segment, entry.length, folder.fps, detector())
+        try:
+            segment = _require(segments[entry.index], entry, key)
+            track, images = _look(segment, entry.length, folder.fps, detector())
+        except DatasetError as error:
+            done.left_out[entry.index] = str(error)
+            continue
         cache.write(entry.index, segment, track)
         done.episodes += 1
         done.frames += entry.length

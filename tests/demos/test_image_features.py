@@ -130,17 +130,36 @@ def test_several_features_are_chosen_among(tmp_path):
         attach_features(demos, "left")
 
 
+@pytest.mark.parametrize(
+    ("bad", "said"),
+    [
+        (lambda video: video.write_bytes(video.read_bytes()[:200]), "cannot be decoded"),
+        (lambda video: video.write_bytes(b""), "cannot be decoded"),
+        (lambda video: video.unlink(), "its video is not here"),
+    ],
+)
+def test_a_bad_video_is_listed_and_keeps_none_of_the_others_out(tmp_path, bad, said):
+    root = record(tmp_path / "set")
+    first, _ = sorted((root / "videos").glob("**/*.mp4"))
+    whole = first.read_bytes()
+    bad(first)
+    done = extract_features(root, "spot", lambda: brightest)
+    assert (done.episodes, done.frames, [*done.left_out]) == (1, 50, [0])
+    assert said in done.left_out[0]
+    assert_tracks(load_demos(root, episodes=[1]))
+    with pytest.raises(DatasetError, match=r"episode 0: front\.spot was not extracted"):
+        load_demos(root)
+    # Copied again, it is all that is left to look at.
+    first.write_bytes(whole)
+    done = extract_features(root, "spot", lambda: brightest)
+    assert (done.episodes, done.known, done.left_out) == (1, 1, {})
+    assert_tracks(load_demos(root))
+
+
 def test_what_cannot_be_looked_at_is_told(tmp_path):
     root = record(tmp_path / "set")
     with pytest.raises(DatasetError, match=r"no camera 'side'; .*observation\.images\.front"):
         extract_features(root, "spot", lambda: brightest, camera="side")
-    videos = sorted((root / "videos").glob("**/*.mp4"))
-    videos[1].write_bytes(videos[1].read_bytes()[:200])
-    with pytest.raises(DatasetError, match="cannot be decoded"):
-        extract_features(root, "spot", lambda: brightest)
-    videos[1].unlink()
-    with pytest.raises(DatasetError, match=r"episode 1, .*its video is not here"):
-        extract_features(root, "spot", lambda: brightest)
     bare = write_folder(tmp_path / "bare", [{"state": joint_path()}], {})
     with pytest.raises(DatasetError, match="the videos are of none"):
         extract_features(bare, "spot", lambda: brightest)

@@ -108,8 +108,8 @@ def _read(args: ImportArrays, path: Path) -> list[Demonstration]:
     )
 
 
-def extract(args: Extract) -> None:
-    """Look at every image that was not looked at before."""
+def extract(args: Extract) -> int:
+    """Look at every image that was not looked at before; status 1 where some could not be."""
     if not 0 <= args.marker < 50:
         raise ValueError(f"--marker must be from 0 to 49, got {args.marker}")
     start = time.perf_counter()
@@ -133,8 +133,12 @@ def extract(args: Extract) -> None:
         "seen_share": share,
         "frames_without_image": done.without_image,
         "frames_per_s": rate,
+        "episodes_left_out": len(done.left_out),
     }
+    for said in done.left_out.values():
+        print(f"left out: {said}")
     write_values(args.json, values)
+    return int(bool(done.left_out))
 
 
 def _follow(marker: int) -> Detector:
