@@ -82,6 +82,8 @@ class Args:
     """Who watch in the second measurement."""
     soak: float = 0.0
     """Minutes that the hand goes on at the end."""
+    pixels: float = 1.0
+    """Of a screen's, across, that viser's page draws (its `fixedDpr`)."""
     meshes: bool = False
     """Whether the client draws real meshes, three arms of them, rather than capsules."""
     json: Path | None = None
@@ -148,13 +150,15 @@ def by_hand(page: Page, state: ArmState, person: Headset, seconds: float) -> dic
     return {**figures(reader.delays(moved)), "frames_per_s": drawn / (time.time() - began)}
 
 
-def by_mouse(page: Page, state: ArmState, folder: Path, seconds: float) -> dict[str, float]:
+def by_mouse(
+    page: Page, state: ArmState, folder: Path, seconds: float, pixels: float
+) -> dict[str, float]:
     """Of a mouse that drags link 4 on viser's page."""
     q = torch.from_numpy(state.joint_position)
     elbow = panda.link_poses(q)[3].position.numpy()
     moved = []
     with chromium(folder) as tab, Reader(page, state) as reader:
-        browser = Browser(tab, page)
+        browser = Browser(tab, page, pixels=pixels)
         x, y = browser.pixel(elbow)
         held = lambda: page.human.read(state).nullspace_input.any()  # noqa: E731
         with browser.dragging(elbow, by=(40, -10), until=held):
@@ -198,7 +202,9 @@ def watched(page: Page, count: int):
 def memory(person: Headset) -> tuple[float, float]:
     """Of this process and of the client's heap [MB]."""
     pages = int(Path("/proc/self/statm").read_text("ascii").split()[1])
-    person.tab.evaluate("window.gc && gc()")
+    browser = person.tab.context.new_cdp_session(person.tab)
+    browser.send("HeapProfiler.collectGarbage")  # or garbage would count
+    browser.detach()
     heap = person.tab.evaluate("performance.memory.usedJSHeapSize")
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6, heap / 1e6
 
@@ -237,7 +243,7 @@ def main(args: Args) -> None:
         still_page(args.meshes) as (page, state),
     ):
         folder = Path(name)
-        rows["mouse"] = by_mouse(page, state, folder / "mouse", args.seconds)
+        rows["mouse"] = by_mouse(page, state, folder / "mouse", args.seconds, args.pixels)
         with headset(folder / "headset", page, (320, 200)) as person:
             person.enter()
             arm = person.tab.evaluate("JSON.parse(localStorage['hrc-placing'] ?? '{}').arm")

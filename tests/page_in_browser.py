@@ -91,10 +91,20 @@ class Session:
 class Browser:
     """A page shown in Chromium, and its mouse."""
 
-    def __init__(self, tab, page: Page, timeout: float = 180.0, *, guides: bool = True):
+    def __init__(
+        self,
+        tab,
+        page: Page,
+        timeout: float = 180.0,
+        *,
+        guides: bool = True,
+        pixels: float = 1.0,
+    ):
         self.tab = tab
         tab.set_default_timeout(1e3 * timeout)
         tab.goto(page.url)
+        if pixels != 1.0:  # as the page advises a person with a slow browser
+            tab.goto(f"{page.address.origin}/?fixedDpr={pixels:g}")
         # viser warns of drawing without a GPU, right over the arm that the mouse is to meet.
         tab.add_style_tag(content="[class*=Notifications] { display: none !important; }")
         (self.button("Start") if guides else tab.get_by_text("Safety filter")).wait_for()
