@@ -84,12 +84,19 @@ class OwnTimesTable:
         pieces, periodic = len(forced.coefficients), forced.periodic
         x = s / forced.interval
         x = x % pieces if periodic else x.clamp(0, pieces)
-        piece = x.detach().to(torch.int32).clamp(max=pieces - periodic)
-        u = (2 * (x - piece) - 1).to(dtype)
+        piece = x.detach().to(torch.int32)
+        if periodic:  # a remainder may round up to what it is taken of
+            piece = piece.clamp(max=pieces - 1)
+        u = 2 * (x - piece if periodic else x.frac()).to(dtype) - 1
         powers = u.new_ones(*s.shape, self.size)
-        # Column by column: along rows of six a product takes more than twice as long.
+        # Column by column: along rows of six a product takes more than twice as long. Written
+        # where they belong, unless something derives or traces.
+        in_place = not (torch.compiler.is_compiling() or u.requires_grad)
         for k in range(1, self.size):
-            powers[..., k] = powers[..., k - 1] * u
+            if in_place:
+                torch.mul(powers[..., k - 1], u, out=powers[..., k])
+            else:
+                powers[..., k] = powers[..., k - 1] * u
         if periodic or not (torch.compiler.is_compiling() or piece.max() == pieces):
             return piece, powers
         back = spring_rows(self.response, (s - forced.end).clamp(min=0), self.order)
