@@ -238,6 +238,11 @@ LINK_CAPSULES = tuple(
 )
 """Of the links of either arm; the simulated one is built from the same."""
 
+LINK_MASSES = (4.97, 0.65, 3.23, 3.59, 1.23, 1.67, 0.74)
+"""Of links 1 to 7 [kg], from franka_description."""
+HAND_MASS = 0.73
+"""Of the hand without its fingers [kg], from the same."""
+
 # The hand is a box of 60 x 200 x 66 mm, which this contains, and so are the open fingers.
 HAND_CAPSULES = (
     LinkCapsule(

@@ -16,7 +16,15 @@ from torch import Tensor
 
 from hrc_learn.kinematics.arm import Arm, LimitsGiven
 from hrc_learn.kinematics.collision import CapsuleArm
-from hrc_learn.kinematics.franka import FrankaChain, fr3, fr3_capsules, panda, panda_capsules
+from hrc_learn.kinematics.franka import (
+    HAND_MASS,
+    LINK_MASSES,
+    FrankaChain,
+    fr3,
+    fr3_capsules,
+    panda,
+    panda_capsules,
+)
 
 
 class MissingModelError(ModuleNotFoundError):
@@ -179,10 +187,6 @@ _OWN: dict[str, tuple[FrankaChain, CapsuleArm]] = {
 }
 
 
-# Of links 1 to 7 [kg], as the simulator of this package has them, and of the hand, 0.73 kg.
-_LINK_MASSES = (4.97, 0.65, 3.23, 3.59, 1.23, 1.67, 0.74)
-
-
 def registered_arms() -> tuple[str, ...]:
     """Names that `arm` takes."""
     return (*_OWN, *sorted(_SOURCES))
@@ -313,5 +317,5 @@ def _franka(name: str) -> Arm:
         visuals=drawn.visuals,
         gripper=drawn.gripper,
         shapes=drawn.shapes,
-        told_masses=(None, *_LINK_MASSES, 0.0, 0.73),
+        told_masses=(None, *LINK_MASSES, 0.0, HAND_MASS),
     )

@@ -25,6 +25,7 @@ from hrc_learn.kinematics.collision import CapsuleArm, LinkCapsule
 from hrc_learn.kinematics.franka import (
     HAND_CAPSULES,
     LINK_CAPSULES,
+    LINK_MASSES,
     OVERLAPPING,
     FrankaChain,
     UnreachableError,
@@ -102,8 +103,7 @@ class FrankaWorkArm(WorkArm):
         self.name, self.chain = chain.name, chain
         self.body = CapsuleArm(chain, LINK_CAPSULES, OVERLAPPING)
         self.whole = CapsuleArm(chain, LINK_CAPSULES + HAND_CAPSULES, OVERLAPPING)
-        # From franka_description.
-        self.masses = (4.97, 0.65, 3.23, 3.59, 1.23, 1.67, 0.74)
+        self.masses = LINK_MASSES
         self.meshes = {}
 
     @property

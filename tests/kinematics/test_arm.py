@@ -11,6 +11,7 @@ from torch.testing import assert_close
 
 from hrc_learn.kinematics import (
     Arm,
+    ArmChoice,
     MissingModelError,
     arm,
     null_space_dimension,
@@ -137,6 +138,17 @@ def test_registered_arms_are_ready_within_limits(name):
     assert a.chain.limits.contain(a.chain.ready)
     assert a.visuals or a.description is None
     assert all(visual.mesh.path.is_file() for visual in a.visuals)
+
+
+@pytest.mark.parametrize("name", ["panda", "fr3"])
+def test_the_links_of_frankas_arms_weigh_what_their_description_says(name):
+    ur5 = installed("ur5").description
+    assert ur5 is not None
+    robots = next(folder for folder in ur5.parents if folder.name == "robots")
+    described = arm(robots / "panda_description/urdf/panda.urdf", tip="panda_link8")
+    assert_close(ArmChoice(name).work_arm().masses, described.masses[1:8], rtol=0, atol=0.005)
+    # The description has the fingers apart.
+    assert installed(name).masses[-1] == pytest.approx(described.masses[-1], abs=0.05)
 
 
 def odd(tmp_path, text: str = ODD) -> Arm:
