@@ -173,6 +173,34 @@ def test_written_out_kinematics_slide_too(tmp_path):
         assert_close(ours, expected, rtol=0, atol=1e-14)
 
 
+def test_fingers_are_where_mujoco_has_them_from_closed_to_open(tmp_path):
+    box = '<collision><origin xyz="0 0 0.01"/><geometry><box size="1 1 1"/></geometry>'
+    text = ODD.replace('<link name="finger"/>', f'<link name="finger">{box}</collision></link>')
+    for axis, lower, upper in (("0 1 0", 0, 0.04), ("0.6 0 -0.8", -0.03, 0.01)):
+        limits = f'<axis xyz="{axis}"/><limit lower="{lower}" upper="{upper}"'
+        gripping = text.replace('<axis xyz="0 1 0"/><limit lower="0" upper="0.04"', limits)
+        for kind in ("prismatic", "revolute"):
+            joint = f'<joint name="grip" type="{kind}">'
+            a = odd(tmp_path, gripping.replace('<joint name="grip" type="prismatic">', joint))
+            model = mujoco_model(a)
+            data = mujoco.MjData(model)
+            assert a.gripper is not None
+            (finger,) = a.gripper.joints
+            assert {finger.closed, finger.opened} == {lower, upper}
+            assert abs(finger.opened) > abs(finger.closed)
+            values = np.linspace(finger.closed, finger.opened, 5)
+            for value, shape in zip(values, a.shapes, strict=True):
+                assert shape.link == a.tool_link
+                data.joint("grip").qpos[0] = value
+                mujoco.mj_kinematics(model, data)
+                tip, moved = data.body("tip"), data.body("finger")
+                R = tip.xmat.reshape(3, 3)
+                centre = moved.xpos + moved.xmat.reshape(3, 3) @ [0, 0, 0.01] - tip.xpos
+                assert_close(shape.pose[:3, 3], R.T @ centre, rtol=0, atol=1e-12)
+                turned = R.T @ moved.xmat.reshape(3, 3)
+                assert_close(shape.pose[:3, :3], turned, rtol=0, atol=1e-12)
+
+
 def test_limits_that_the_file_lacks_follow_the_rule(tmp_path):
     limits = odd(tmp_path).chain.limits
     assert limits.upper.tolist() == [2 * torch.pi, 0.5, 3.0]
