@@ -23,12 +23,10 @@ _MORE_TIME = 1.25
 """What a policy gets, in durations of a demonstration."""
 
 
-@EnvConfig.register_subclass("panda")
 @EnvConfig.register_subclass("mujoco_arm")
 @dataclass
 class ArmEnvConfig(EnvConfig):
-    """Scenarios of a `mujoco_arm`, judged by MuJoCo's contacts; `--env.type=mujoco_arm`, as
-    before `panda`.
+    """Scenarios of a `mujoco_arm`, judged by MuJoCo's contacts; `--env.type=mujoco_arm`.
 
     Observations and actions are those of the robot with the same settings, in the same order,
     so that what was recorded on it can be evaluated here.
@@ -120,6 +118,13 @@ class ArmEnvConfig(EnvConfig):
         else:
             vector = gym.vector.SyncVectorEnv(makers, autoreset_mode=mode)
         return {self.type: {0: vector}}
+
+
+# A class of its own: LeRobot takes an environment's type for the name that it was asked for by.
+@EnvConfig.register_subclass("panda")
+@dataclass
+class PandaEnvConfig(ArmEnvConfig):
+    """The same by its former name, `--env.type=panda`."""
 
 
 _PICTURE = (240, 180)

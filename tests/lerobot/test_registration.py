@@ -1,6 +1,7 @@
 """The names by which LeRobot's command lines know what is ours."""
 
 from lerobot.configs import PreTrainedConfig
+from lerobot.envs import make_env_config
 from lerobot.envs.configs import EnvConfig
 from lerobot.processor import ProcessorStepRegistry
 from lerobot.robots import RobotConfig
@@ -22,7 +23,12 @@ def test_lerobot_knows_them_by_name():
     assert RobotConfig.get_choice_class("mujoco_panda") is MujocoArmRobotConfig
     assert TeleoperatorConfig.get_choice_class("panda_expert") is ArmExpertConfig
     assert TeleoperatorConfig.get_choice_class("panda_page") is ArmPageConfig
-    assert EnvConfig.get_choice_class("panda") is ArmEnvConfig
+    assert issubclass(EnvConfig.get_choice_class("panda"), ArmEnvConfig)
+    # LeRobot takes the type of an environment for the name that it was asked for by.
+    assert [make_env_config(name).type for name in ("panda", "mujoco_arm")] == [
+        "panda",
+        "mujoco_arm",
+    ]
     assert MujocoArmRobotConfig().type == "mujoco_arm"
     for step in ("hrc_learn_watch_state", "hrc_learn_smooth_actions"):
         assert ProcessorStepRegistry.get(step)
