@@ -154,6 +154,9 @@ def test_density_clusters_are_those_of_the_definition():
         assert not core[i] or of_cores == {label}
     assert (labels[:30] == 0).sum() > 25
     assert labels[-1] == -1
+    # A group that is many steps long.
+    chain = 0.2 * np.arange(200.0)[:, None]
+    assert not density_clusters(np.concatenate([chain, chain + 50]), 0.3, 1)[:200].any()
 
 
 # What is decided.

@@ -358,6 +358,10 @@ def _principal(
     return vectors[:, ::-1][:, :_DIMENSIONS] * main / np.sqrt(_PHASES)
 
 
+_FRONT = 32
+"""Points whose neighbours are looked up at once."""
+
+
 def density_clusters(
     points: Float64[np.ndarray, "points dimensions"], radius: float, neighbours: int
 ) -> Int64[np.ndarray, " points"]:
@@ -375,22 +379,24 @@ def density_clusters(
     Returns:
         Number of each point's group, the largest group 0; -1 for points of none.
     """
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
     from scipy.spatial import KDTree
 
-    count = len(points)
-    pairs = KDTree(points).query_pairs(radius, output_type="ndarray")
-    degree = np.bincount(pairs.ravel(), minlength=count)
-    core = degree >= neighbours
-    both = pairs[core[pairs].all(1)]
-    graph = coo_matrix((np.ones(len(both)), (both[:, 0], both[:, 1])), shape=(count, count))
-    _, labels = connected_components(graph, directed=False)
-    labels = np.where(core, labels, -1)
-    for a, b in pairs[core[pairs].sum(1) == 1]:
-        member, outer = (a, b) if core[a] else (b, a)
-        if labels[outer] < 0:
-            labels[outer] = labels[member]
+    tree = KDTree(points)
+    # A point is within reach of itself.
+    core = tree.query_ball_point(points, radius, return_length=True) > neighbours
+    labels = np.full(len(points), -1)
+    for group, seed in enumerate(np.flatnonzero(core)):
+        if labels[seed] >= 0:
+            continue
+        labels[seed] = group
+        front = np.array([seed])
+        while len(front):
+            # Some at a time: all pairs of points of a dense group are too many to hold.
+            near = tree.query_ball_point(points[front[:_FRONT]], radius)
+            reached = np.unique(np.concatenate([*near]).astype(int))
+            new = reached[labels[reached] < 0]
+            labels[new] = group
+            front = np.concatenate([front[_FRONT:], new[core[new]]])
     known, sizes = np.unique(labels[labels >= 0], return_counts=True)
     order = {int(label): rank for rank, label in enumerate(known[np.argsort(-sizes)])}
     return np.array([order.get(int(label), -1) for label in labels])
