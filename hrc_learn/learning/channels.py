@@ -2,7 +2,7 @@
 are from them in the measures of the field, and demonstrations as a recording to look at.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, overload
@@ -345,20 +345,28 @@ def dimensionless_jerk(
     return square * duration**5 / length**2
 
 
-def demonstrations_recording(demos: DemonstrationSet, title: str) -> DemonstrationsRecording:
+def demonstrations_recording(
+    demos: DemonstrationSet,
+    title: str,
+    images: Mapping[int, Mapping[str, tuple[np.ndarray, tuple[bytes, ...]]]] | None = None,
+) -> DemonstrationsRecording:
     """Everything worth looking at; a Panda is drawn, and its hand's path found if unrecorded.
 
     Args:
         demos: All by one robot.
         title: What they are.
+        images: By episode and camera: times [s], and a JPEG file for each.
     """
+    images = images or {}
     names = demos[0].joint_names
     known = names == panda.joint_names
     limits = panda.limits
     return DemonstrationsRecording(
         title=title,
         joint_names=names,
-        demonstrations=tuple(_shown(demo, known) for demo in demos),
+        demonstrations=tuple(
+            _shown(demo, known, images.get(demo.episode, {})) for demo in demos
+        ),
         joint_limits=JointLimits(lower=limits.lower.numpy(), upper=limits.upper.numpy())
         if known
         else None,
@@ -366,7 +374,7 @@ def demonstrations_recording(demos: DemonstrationSet, title: str) -> Demonstrati
     )
 
 
-def _shown(demo: Demonstration, is_panda: bool) -> DemonstrationTrace:
+def _shown(demo: Demonstration, is_panda: bool, images: Mapping) -> DemonstrationTrace:
     q, position = demo.joint_position, demo.position
     bodies = ()
     if is_panda and q is not None:
@@ -386,4 +394,5 @@ def _shown(demo: Demonstration, is_panda: bool) -> DemonstrationTrace:
         human_effort=demo.human_effort,
         gripper=demo.gripper,
         bodies=bodies,
+        images=images,
     )

@@ -81,7 +81,11 @@ def record_demonstrations(
             frame_view(np.concatenate(paths)),
         )
         left.insert(0, rrb.Spatial3DView(origin="/world", name=name, eye_controls=eye))
-    tabs = rrb.Tabs(contents=[tab_view(tab) for tab, _ in views], active_tab=0)
+    pages: list[rrb.Container] = [tab_view(tab) for tab, _ in views]
+    for k, demo in enumerate(shown.demonstrations[:most], start=1):
+        if demo.images:
+            pages[k] = _beside_images(pages[k], demo)
+    tabs = rrb.Tabs(contents=pages, active_tab=0)
     layout = dashboard(left, [tabs], row_shares=(2, 1), column_shares=(2, 3))
     with rrd_file(path, shown.title, layout) as stream:
         for k, demo in enumerate(shown.demonstrations):
@@ -94,10 +98,29 @@ def record_demonstrations(
         for body in first.bodies:
             send_shapes(still, body)
             send_poses(stream, first.time, body, samples(first.time, _POSE_RATE))
+        for demo in shown.demonstrations[:most]:
+            for name, (time, images) in demo.images.items():
+                columns = rr.EncodedImage.columns(
+                    blob=images, media_type=["image/jpeg"] * len(images)
+                )
+                stream.send_columns(_camera(demo, name), seconds(time), columns)
         send_summary(stream, _recorded(shown))
         for _, curves in views:
             for time, curve in curves:
                 send_curves(stream, time, curve)
+
+
+def _camera(demo: DemonstrationTrace, name: str) -> str:
+    return f"episode_{demo.episode}/cameras/{slug(name)}"
+
+
+def _beside_images(page: rrb.Container, demo: DemonstrationTrace) -> rrb.Container:
+    """A tab below what the cameras saw."""
+    cameras = [
+        rrb.Spatial2DView(origin=f"/{_camera(demo, name)}", name=name) for name in demo.images
+    ]
+    title = f"Episode {demo.episode}"
+    return rrb.Vertical(rrb.Horizontal(*cameras), page, row_shares=(1, 3), name=title)
 
 
 def _together(shown: DemonstrationsRecording) -> DemonstrationView:

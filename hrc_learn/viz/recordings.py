@@ -254,6 +254,10 @@ class DemonstrationTrace:
     """Opening [m]."""
     bodies: tuple[Body, ...] = ()
     """The arm along the demonstration."""
+    images: Mapping[str, tuple[Float[np.ndarray, " images"], tuple[bytes, ...]]] = field(
+        default_factory=dict
+    )
+    """What cameras saw, by their names: times [s], and a JPEG file for each."""
 
     def __post_init__(self) -> None:
         names = ("joint_position", "position", "feature", "human_effort", "gripper")

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from commands import hrc
 from lerobot_folders import joint_path, write_folder
+from rrd_reading import Rrd
 
 from hrc_learn.cli.commands import show
 from hrc_learn.demos import DatasetWriter, load_demos
+from hrc_learn.demos.format.videos import decode_image
 
 ROOT = Path(__file__).parents[2]
 
@@ -219,6 +221,50 @@ def test_demonstrations_are_shown_in_a_recording(recording, tmp_path):
     assert hrc("show", tmp_path / "set", "--out", out, "--json", figures).status == 0
     assert out.stat().st_size > 1000
     assert json.loads(figures.read_text()) == {"episodes": 1, "seconds": pytest.approx(0.597)}
+
+
+def test_images_are_shown_and_a_bad_video_is_listed(tmp_path):
+    root, out = tmp_path / "set", tmp_path / "demos.rrd"
+    shades = 20 * np.arange(10) + 30
+    with DatasetWriter(root, 10, "any", ["a"], cameras={"front": (480, 640)}) as writer:
+        for _ in range(2):
+            writer.start_episode("look")
+            for k, shade in enumerate(shades):
+                image = np.full((480, 640, 3), shade, np.uint8)
+                writer.add_frame(joint_position=[0.01 * k], images={"front": image})
+            writer.save_episode()
+    _, second = sorted((root / "videos").glob("**/*.mp4"))
+    second.write_bytes(second.read_bytes()[:200])
+    shown = hrc("show", root, "--out", out)
+    assert shown.status == 0
+    assert "left out: " in shown.output
+    assert second.name in shown.output
+    recording = Rrd(out)
+    assert not [path for path in recording.entities if path.startswith("episode_1/cameras")]
+    place = "episode_0/cameras/front"
+    # Every other of ten a second, and the last.
+    frames = np.linspace(0, 9, 5).astype(int)
+    np.testing.assert_allclose(recording.time(place), 0.1 * frames, atol=1e-6)
+    blobs = recording.column(place, "EncodedImage:blob")
+    images = [decode_image(np.asarray(blob[0], np.uint8).tobytes()) for blob in blobs]
+    assert [image.shape for image in images] == [(240, 320, 3)] * 5
+    np.testing.assert_allclose([i.mean() for i in images], shades[frames], atol=4)
+
+
+def test_of_many_demonstrations_some_are_shown(tmp_path, monkeypatch):
+    monkeypatch.setattr(show, "_SHOWN", 2)
+    array = np.linspace(0, 1, 180).reshape(3, 20, 3)
+    np.save(tmp_path / "three.npy", array)
+    columns = ("--columns", "px,py,pz", "--duration", 2)
+    made = hrc("import", tmp_path / "three.npy", "--out", tmp_path / "set", *columns)
+    assert made.status == 0
+    figures = tmp_path / "figures.json"
+    arguments = ("show", tmp_path / "set", "--out", tmp_path / "d.rrd", "--json", figures)
+    said = hrc(*arguments)
+    assert (said.status, "of 3, spread over them" in said.output) == (0, True)
+    assert json.loads(figures.read_text())["episodes"] == 2
+    hrc(*arguments, "--episodes", 0, 1, 2)
+    assert json.loads(figures.read_text())["episodes"] == 3
 
 
 @pytest.fixture

@@ -194,7 +194,7 @@ class Show(Measured):
     Opens the dashboards that a command left in a folder. Of a dataset it makes one: paths of
     the end effector in 3D with the arm (a Panda; of other robots the paths alone), every joint
     of all demonstrations over one another, and for each what else was recorded: image feature,
-    the person's effort, gripper.
+    the person's effort, gripper, and of the first eight what the cameras saw.
     """
 
     path: Path
