@@ -13,7 +13,6 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.autograd import forward_ad
 
 from hrc_learn.dmp._arguments import readable
 from hrc_learn.dmp._system.closed_forms import SpringDamper, approach_state
@@ -174,44 +173,52 @@ def advance_alone(
         None where it does not apply: something derives, maps or traces the motion, or it is a
         batch, on another device or not in float64.
     """
-    tensors = state.position, state.rate, state.target, state.forced, weights
+    tensors = (
+        *(state.position, state.rate, state.target, state.forced, weights),
+        *(state.s, state.duration, state.pace),
+    )
     if torch.is_grad_enabled() or response.approach or not readable(*tensors):
         return None
-    s, duration = host_values(state.s, state.duration)
-    if not (isinstance(s, float) and isinstance(duration, float)):
+    if not (_plain(state.s) and _plain(state.duration) and _plain(state.pace)):
         return None
     for x in tensors:  # in a comprehension this takes twice as long
         if type(x) not in _ARRAYS or not x.is_cpu or x.dtype is not torch.float64:
             return None
+        if x.requires_grad and x is not weights:
+            return None
     if weights.ndim != 2:
         return None
-    ds = dt / duration
-    now = s + ds
+    ds = dt / state.duration.item()
+    now = state.s.item() + ds
     E = response.spring.propagator(ds).numpy()
-    position, rate, rest, before, w = (x.detach().numpy() for x in tensors)
+    rest, before = state.target.numpy(), state.forced.numpy()
+    w = weights.detach().numpy()
     after = response.forced.at(now).dot(w.T)
     if coast := response.coasting(now):
         after = response.spring.propagator(coast).numpy().dot(after)
     y = np.empty_like(before)
-    np.subtract(position, rest, out=y[0])
-    y[1] = rate
+    np.subtract(state.position.numpy(), rest, out=y[0])
+    y[1] = state.rate.numpy()
     y = E.dot(y - before)
     y += after
     y[0] += rest
-    both = torch.from_numpy(y)
+    position, rate = torch.from_numpy(y).unbind()
     return DMPState(
-        position=both[0],
-        rate=both[1],
+        position=position,
+        rate=rate,
         start=state.start,
         goal=state.target,
         way=state.way,
         target=state.target,
         duration=state.duration,
-        pace=torch.ones_like(state.pace),
-        s=torch.from_numpy(np.array(now)),
+        pace=_UNDISTURBED,
+        s=torch.scalar_tensor(now, dtype=torch.float64),
         forced=torch.from_numpy(after),
     )
 
+
+_UNDISTURBED = torch.ones((), dtype=torch.float64)
+"""The pace of every motion that nothing slows: to make another one takes longer than to add."""
 
 _ARRAYS = (Tensor, torch.nn.Parameter)
 """Types of tensors that hold numbers and nothing else."""
@@ -285,7 +292,6 @@ def _plain(time: Tensor) -> bool:
         and time.is_cpu  # of another device, reading would wait for all that was asked of it
         and type(time) is Tensor
         and not time.requires_grad
-        and forward_ad.unpack_dual(time).tangent is None
     )
 
 

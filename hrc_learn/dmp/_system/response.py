@@ -147,19 +147,19 @@ class PiecewisePolynomial:
 
     def at(self, s: float) -> np.ndarray:
         """Value at `s`, (rows, columns), in NumPy."""
-        pieces, _, *shape = self.coefficients.shape
+        rows, exponents, shape = self._arrays
+        pieces = len(rows)
         x = s / self.interval
         x = x % pieces if self.periodic else min(max(x, 0.0), float(pieces))
         piece = min(int(x), pieces - 1)
-        powers = (2 * (x - piece) - 1) ** self._arrays[1]
-        return powers.dot(self._arrays[0][piece]).reshape(shape)
+        return ((2 * (x - piece) - 1) ** exponents).dot(rows[piece]).reshape(shape)
 
     @cached_property
-    def _arrays(self) -> tuple[np.ndarray, np.ndarray]:
-        """Coefficients by piece and power, and the powers, sharing memory where they can."""
+    def _arrays(self) -> tuple[np.ndarray, np.ndarray, tuple[int, ...]]:
+        """Coefficients by piece and power, the powers, and the shape of a value."""
         coefficients = self.coefficients.numpy()
         rows = coefficients.reshape(*coefficients.shape[:2], -1)
-        return rows, np.arange(rows.shape[1], dtype=float)
+        return rows, np.arange(rows.shape[1], dtype=float), coefficients.shape[2:]
 
     def to(self, device: torch.device) -> "PiecewisePolynomial":
         """The same function on another device; made once."""
