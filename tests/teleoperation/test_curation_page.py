@@ -131,7 +131,7 @@ def test_curves_of_columns_without_a_meaning_go_by_their_own_names(tmp_path):
     with CurationPage(rank_episodes(root), tmp_path / "out", AddressConfig(port=0)) as page:
         curves = json.loads(Client(page).ask("/data/curves/1")[1])
     lines = {c["name"]: [line["name"] for line in c["lines"]] for c in curves["charts"]}
-    assert lines["action"] == others
+    assert lines["action"] == names["action"]
     assert lines["extra"] == ["component 0", "component 1", "component 2"]
 
 
