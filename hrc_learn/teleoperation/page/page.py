@@ -427,7 +427,8 @@ def slow_words(link: Link, config: PageConfig) -> str:
     if link.lag > config.timeout / 2:
         return (
             f"This browser was busy for {link.lag:.1f} s: beyond {config.timeout:.1f} s the "
-            "arm lets go. Make its window smaller, or hide the virtual twin."
+            "arm lets go. Make its window smaller, hide the virtual twin, or put ?fixedDpr=0.5 "
+            "behind the page's address, which draws a quarter of the pixels."
         )
     if link.silence > config.silence:
         return (
