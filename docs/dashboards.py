@@ -96,8 +96,11 @@ def _pictures(
         for title in tabs:
             width = MARGIN + LETTER * len(title)
             tab.mouse.click(left + width / 2, DOWN)
-            tab.mouse.move(LEFT / 2, SIZE[1] - 5)
-            time.sleep(REDRAWN)
+            # The viewer draws while something moves over it, and else leaves a scale half drawn.
+            for place in ((LEFT + 200, 300), (LEFT + 400, 500), (LEFT / 2, SIZE[1] - 5)):
+                time.sleep(REDRAWN / 3)
+                tab.mouse.move(*place)
+            time.sleep(REDRAWN / 3)
             yield f"_{title.split()[0].lower()}", _picture(tab)
             left += width
 

@@ -204,10 +204,11 @@ def capsules(shapes: tuple[Capsule, ...]) -> rr.Capsules3D:
 
 def tab_view(tab: Tab, span: tuple[float, float] | None = None) -> rrb.Grid:
     """Layout of one tab, with the time that its plots show; what is new when None [s]."""
+    columns = max(1, min(tab.columns, len(tab.plots)))
     return rrb.Grid(
         contents=[plot_view(plot, span) for plot in tab.plots],
-        grid_columns=tab.columns,
-        row_shares=[plot.share for plot in tab.plots[:: tab.columns]],
+        grid_columns=columns,
+        row_shares=[plot.share for plot in tab.plots[::columns]],
         name=tab.title,
     )
 
