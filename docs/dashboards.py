@@ -96,7 +96,7 @@ def _pictures(
         for title in tabs:
             width = MARGIN + LETTER * len(title)
             tab.mouse.click(left + width / 2, DOWN)
-            # The viewer draws while something moves over it, and else leaves a scale half drawn.
+            # The viewer draws while something moves over it; else a scale stays half drawn.
             for place in ((LEFT + 200, 300), (LEFT + 400, 500), (LEFT / 2, SIZE[1] - 5)):
                 time.sleep(REDRAWN / 3)
                 tab.mouse.move(*place)
