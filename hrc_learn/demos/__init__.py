@@ -17,6 +17,7 @@ from hrc_learn.demos.read.reader import DemonstrationSource as DemonstrationSour
 from hrc_learn.demos.read.reader import load_demos as load_demos
 from hrc_learn.demos.read.reader import open_demos as open_demos
 from hrc_learn.demos.read.roles import ROLES as ROLES
+from hrc_learn.demos.read.thumbnails import thumbnails as thumbnails
 from hrc_learn.demos.validation.check import check_dataset as check_dataset
 from hrc_learn.demos.write.assembly import recover_all as recover_all
 from hrc_learn.demos.write.assembly import recover_dataset as recover_dataset

@@ -43,6 +43,7 @@ from hrc_learn.learning.channels import (
     select_channels,
 )
 from hrc_learn.viz import FitRecording, JointLimits
+from hrc_learn.viz.recordings import Seen
 
 EACH = "each"
 """Folder of the primitives of single demonstrations, where they are kept."""
@@ -310,10 +311,21 @@ def _select(
     )
 
 
-def fit_recording(fitted: FittedPrimitives, title: str) -> FitRecording:
+def fit_recording(
+    fitted: FittedPrimitives,
+    title: str,
+    episodes: Sequence[int] = (),
+    images: Mapping[int, Seen] | None = None,
+) -> FitRecording:
     """Demonstrations beside their reproductions, to be looked at.
 
     Of the joints, or else of the position.
+
+    Args:
+        fitted: Them.
+        title: What they are.
+        episodes: Of a dataset that the demonstrations are, in their order.
+        images: What cameras saw, by episode.
 
     Raises:
         ValueError: If neither was learned.
@@ -352,6 +364,8 @@ def fit_recording(fitted: FittedPrimitives, title: str) -> FitRecording:
         reproduction_paths=reproduced,
         residual=residual,
         unit="rad" if channel == "joint" else "m",
+        episodes=tuple(episodes),
+        images=images or {},
     )
 
 

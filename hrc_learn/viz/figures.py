@@ -5,6 +5,7 @@ take the recording that the dashboards take, and raise ValueError where it lacks
 """
 
 from collections.abc import Mapping, Sequence
+from io import BytesIO
 
 import matplotlib
 import numpy as np
@@ -24,7 +25,13 @@ from hrc_learn.viz.figure_parts import (
     scaled,
     shade,
 )
-from hrc_learn.viz.recordings import FitRecording, JointLimits, RunRecording, SweepRecording
+from hrc_learn.viz.recordings import (
+    FitRecording,
+    JointLimits,
+    RunRecording,
+    Seen,
+    SweepRecording,
+)
 
 
 def joints_figure(run: RunRecording) -> Figure:
@@ -131,6 +138,44 @@ def residual_figure(fit: FitRecording) -> Figure:
         axes.set_title("How well the primitive follows the demonstrations")
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     return figure
+
+
+def seen_figure(seen: Mapping[int, Seen], most: int = 6, columns: int = 5) -> Figure:
+    """What the first camera saw of the first demonstrations, from their starts to their ends.
+
+    Args:
+        seen: By episode.
+        most: Episodes shown, a row each.
+        columns: Images of each, evenly over its time.
+
+    Raises:
+        ValueError: If no camera saw any.
+    """
+    rows = [(episode, *next(iter(saw.items()))) for episode, saw in seen.items() if saw]
+    rows = rows[:most]
+    if not rows:
+        raise ValueError("seen is empty: no camera saw a demonstration.")
+    with matplotlib.rc_context(STYLE):
+        height, width = _decoded(rows[0][2][1][0]).shape[:2]
+        tall = WIDTH / columns * height / width + 0.22  # with its heading [inch]
+        figure = Figure(figsize=(WIDTH, tall * len(rows)))
+        grid = figure.subplots(len(rows), columns, squeeze=False)
+        for line, (episode, camera, (time, files)) in zip(grid, rows, strict=True):
+            at = np.linspace(0, len(files) - 1, columns).round().astype(int)
+            for axes, k in zip(line, at, strict=True):
+                axes.imshow(_decoded(files[k]))
+                axes.set_axis_off()
+                axes.set_title(f"{time[k]:.1f} s", fontsize=8)
+            line[0].set_title(f"Episode {episode}, {camera}, {time[at[0]]:.1f} s", fontsize=8)
+    return figure
+
+
+def _decoded(file: bytes) -> np.ndarray:
+    """A JPEG file as an image."""
+    from PIL import Image
+
+    with Image.open(BytesIO(file)) as image:
+        return np.asarray(image)
 
 
 def _joints(

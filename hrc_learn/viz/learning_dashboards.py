@@ -5,6 +5,7 @@ demonstrations, and image Jacobians learned in rounds by their convergence, neur
 """
 
 import os
+from dataclasses import dataclass
 
 import matplotlib
 import numpy as np
@@ -30,6 +31,7 @@ from hrc_learn.viz.recordings import (
     ErrorMap,
     FitRecording,
     LearningRecording,
+    Seen,
 )
 from hrc_learn.viz.rerun_stream import (
     StaticShapes,
@@ -84,7 +86,7 @@ def record_demonstrations(
     pages: list[rrb.Container] = [tab_view(tab) for tab, _ in views]
     for k, demo in enumerate(shown.demonstrations[:most], start=1):
         if demo.images:
-            pages[k] = _beside_images(pages[k], demo)
+            pages[k] = _below_images(pages[k], f"Episode {demo.episode}", _cameras(demo))
     tabs = rrb.Tabs(contents=pages, active_tab=0)
     layout = dashboard(left, [tabs], row_shares=(2, 1), column_shares=(2, 3))
     with rrd_file(path, shown.title, layout) as stream:
@@ -99,28 +101,47 @@ def record_demonstrations(
             send_shapes(still, body)
             send_poses(stream, first.time, body, samples(first.time, _POSE_RATE))
         for demo in shown.demonstrations[:most]:
-            for name, (time, images) in demo.images.items():
-                columns = rr.EncodedImage.columns(
-                    blob=images, media_type=["image/jpeg"] * len(images)
-                )
-                stream.send_columns(_camera(demo, name), seconds(time), columns)
+            _send_images(stream, _cameras(demo))
         send_summary(stream, _recorded(shown))
         for _, curves in views:
             for time, curve in curves:
                 send_curves(stream, time, curve)
 
 
-def _camera(demo: DemonstrationTrace, name: str) -> str:
-    return f"episode_{demo.episode}/cameras/{slug(name)}"
+@dataclass(frozen=True)
+class _Camera:
+    """What a camera saw, and where it is logged."""
+
+    path: str
+    name: str
+    time: Float[np.ndarray, "_"]
+    images: tuple[bytes, ...]
 
 
-def _beside_images(page: rrb.Container, demo: DemonstrationTrace) -> rrb.Container:
-    """A tab below what the cameras saw."""
-    cameras = [
-        rrb.Spatial2DView(origin=f"/{_camera(demo, name)}", name=name) for name in demo.images
+def _cameras(demo: DemonstrationTrace) -> list[_Camera]:
+    return _at(f"episode_{demo.episode}", demo.images)
+
+
+def _at(root: str, seen: Seen) -> list[_Camera]:
+    """Cameras of a demonstration whose curves are at a root."""
+    return [
+        _Camera(f"{root}/cameras/{slug(name)}", name, time, images)
+        for name, (time, images) in seen.items()
     ]
-    title = f"Episode {demo.episode}"
-    return rrb.Vertical(rrb.Horizontal(*cameras), page, row_shares=(1, 3), name=title)
+
+
+def _below_images(page: rrb.Container, title: str, cameras: list[_Camera]) -> rrb.Container:
+    """A tab below what cameras saw."""
+    views = [rrb.Spatial2DView(origin=f"/{seen.path}", name=seen.name) for seen in cameras]
+    return rrb.Vertical(rrb.Horizontal(*views), page, row_shares=(1, 3), name=title)
+
+
+def _send_images(stream: rr.RecordingStream, cameras: list[_Camera]) -> None:
+    for camera in cameras:
+        columns = rr.EncodedImage.columns(
+            blob=camera.images, media_type=["image/jpeg"] * len(camera.images)
+        )
+        stream.send_columns(camera.path, seconds(camera.time), columns)
 
 
 def _together(shown: DemonstrationsRecording) -> DemonstrationView:
@@ -233,7 +254,14 @@ def record_fit(path: str | os.PathLike[str], fit: FitRecording, *, most: int = 6
         name = "Paths: demonstrations (grey), reproductions (blue, dots: now)"
         eye = frame_view(np.concatenate(every), base=bool(fit.boxes))
         left.insert(0, rrb.Spatial3DView(origin="/world", name=name, eye_controls=eye))
-    right = rrb.Tabs(contents=[tab_view(tab) for tab in tabs], active_tab=0)
+    pages: list[rrb.Container] = [tab_view(tab) for tab in tabs]
+    cameras: list[_Camera] = []
+    for i, episode in enumerate(fit.episodes[:most]):
+        if seen := fit.images.get(episode):
+            here = _at(f"demonstration_{i + 1}", seen)
+            pages[i] = _below_images(pages[i], tabs[i].title, here)
+            cameras += here
+    right = rrb.Tabs(contents=pages, active_tab=0)
     layout = dashboard(left, [right], row_shares=(1, 1), column_shares=(2, 3))
     with rrd_file(path, fit.title, layout) as stream:
         if fit.boxes:
@@ -246,6 +274,7 @@ def record_fit(path: str | os.PathLike[str], fit: FitRecording, *, most: int = 6
                 _send_strips(stream, name, paths, colour, radius)
         for i, (time, line) in enumerate(zip(fit.time, fit.reproduction_paths, strict=False)):
             _send_dot(stream, str(i + 1), time, line, palette.RUN_ON_DARK)
+        _send_images(stream, cameras)
         send_summary(stream, _fitted(fit))
         for tab, time in zip(tabs, fit.time, strict=False):
             send_tab(stream, time, tab)

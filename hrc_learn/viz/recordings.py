@@ -14,6 +14,9 @@ from hrc_learn.geometry import Body, Box
 from hrc_learn.vision import CameraModel
 from hrc_learn.viz.step_log import Event
 
+Seen = Mapping[str, tuple[Float[np.ndarray, "_"], tuple[bytes, ...]]]
+"""What cameras saw, by their names: times [s], and a JPEG file for each."""
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class JointLimits:
@@ -214,8 +217,16 @@ class FitRecording:
     """The number of basis functions used."""
     unit: str = "rad"
     """Of the joints, or "m" where they are positions."""
+    episodes: tuple[int, ...] = ()
+    """Of which dataset's episodes the demonstrations are, where that is known."""
+    images: Mapping[int, Seen] = field(default_factory=dict)
+    """What cameras saw, by episode."""
 
     def __post_init__(self) -> None:
+        if self.episodes and len(self.episodes) != len(self.demos):
+            raise ValueError(
+                f"{len(self.demos)} demonstrations cannot be of {len(self.episodes)} episodes."
+            )
         if not len(self.time) == len(self.demos) == len(self.reproductions) > 0:
             raise ValueError(
                 "time, demos and reproductions must hold one array a demonstration, but hold "
@@ -254,10 +265,8 @@ class DemonstrationTrace:
     """Opening [m]."""
     bodies: tuple[Body, ...] = ()
     """The arm along the demonstration."""
-    images: Mapping[str, tuple[Float[np.ndarray, " images"], tuple[bytes, ...]]] = field(
-        default_factory=dict
-    )
-    """What cameras saw, by their names: times [s], and a JPEG file for each."""
+    images: Seen = field(default_factory=dict)
+    """What cameras saw."""
 
     def __post_init__(self) -> None:
         names = ("joint_position", "position", "feature", "human_effort", "gripper")

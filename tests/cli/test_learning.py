@@ -1,10 +1,17 @@
 """The commands that learn, once, small."""
 
 import json
+from io import BytesIO
 
 import numpy as np
 import pytest
 from commands import done
+from PIL import Image
+from rrd_reading import Rrd
+
+from hrc_learn.cli.commands import evaluate
+from hrc_learn.demos import DatasetWriter
+from hrc_learn.viz.report import read_report
 
 
 @pytest.fixture(scope="module")
@@ -28,20 +35,70 @@ def test_fit_and_evaluate_on_demonstrations_held_out(poses, tmp_path):
         *("fit", "--dataset", poses, "--out", model, "--n-basis", 20),
         *("--episodes", 0, 1, 2, "--channels", "position", "pose", "--several", "contextual"),
     )
-    assert {"position", "pose", "contextual", "position.png"} <= {
+    assert {"position", "pose", "contextual", "report.html"} <= {
         p.name for p in model.iterdir()
     }
+    assert [p.name for p in read_report(model).pictures] == ["position"]
     outcome = done(
         *("evaluate", "--model", model, "--dataset", poses, "--out", tmp_path / "evaluation"),
         *("--most-nrmse", 0.2, "--json", tmp_path / "figures.json"),
     )
     assert "1 episodes that were not learned from" in outcome.output
+    assert "[rad" in outcome.output  # of a heading that may be broken into lines
     figures = json.loads((tmp_path / "figures.json").read_text())
     assert figures["demonstrations"] == 1
     assert figures["position_goal_error_max"] < 0.01
     assert (tmp_path / "evaluation" / "pose.png").stat().st_size > 1000
     # The same demonstrations fail a demand that none can meet.
     done("evaluate", "--model", model, "--dataset", poses, "--most-nrmse", 1e-9, status=1)
+
+
+def test_an_evaluation_lists_the_worst_demonstrations_first(poses, tmp_path, monkeypatch):
+    monkeypatch.setattr(evaluate, "_ROWS", 2)
+    model = tmp_path / "model"
+    fit = ("fit", "--dataset", poses, "--out", model, "--n-basis", 20, "--several", "mean")
+    done(*fit, "--channels", "position")
+    command = ("evaluate", "--model", model, "--dataset", poses)
+
+    def rows(output: str) -> list[tuple[str, float]]:
+        cells = [line.strip("│ ").split("│") for line in output.splitlines() if "│" in line]
+        return [(row[0].strip(), float(row[1])) for row in cells]
+
+    *every, median = rows(done(*command, "--verbose").output)
+    assert sorted(name for name, _ in every) == ["0", "1", "2", "3"]
+    assert [error for _, error in every] == sorted((e for _, e in every), reverse=True)
+    short = done(*command).output
+    assert rows(short) == [*every[:2], median]
+    assert "2 more, none worse" in short
+
+
+def test_a_fit_shows_what_the_cameras_saw_and_lists_what_it_cannot_show(tmp_path):
+    root, model = tmp_path / "set", tmp_path / "model"
+    with DatasetWriter(root, 20, "any", ["a"], cameras={"front": (64, 96)}) as writer:
+        for _ in range(2):
+            writer.start_episode("look")
+            for k in range(40):
+                image = np.full((64, 96, 3), 6 * k, np.uint8)
+                writer.add_frame(joint_position=[np.sin(0.05 * k)], images={"front": image})
+            writer.save_episode()
+    _, second = sorted((root / "videos").glob("**/*.mp4"))
+    second.write_bytes(second.read_bytes()[:200])
+    outcome = done("fit", "--dataset", root, "--out", model, "--n-basis", 10)
+    assert "left out: " in outcome.output
+    assert second.name in outcome.output
+    assert str(model / "report.html") in outcome.output.replace("\n", "")
+    recording = Rrd(model / "fit.rrd")
+    assert {e for e in recording.entities if "cameras" in e} == {
+        "demonstration_1/cameras/front"
+    }
+    pictures = {p.name: p for p in read_report(model).pictures}
+    assert list(pictures) == ["demonstrations", "joints"]
+    seen = np.asarray(Image.open(BytesIO(pictures["demonstrations"].png())).convert("L"))
+    middle = seen[len(seen) * 2 // 3]  # five images in a row, from dark to bright
+    shades = [np.median(part) for part in np.array_split(middle, 5)]
+    # Ten images of 40 frames, and five of these.
+    frames = np.linspace(0, 39, 10).astype(int)[[0, 2, 4, 7, 9]]
+    np.testing.assert_allclose(shades, 6 * frames, atol=4)
 
 
 def test_an_evaluation_reads_the_dataset_as_its_fit_did(poses, tmp_path):

@@ -140,6 +140,21 @@ def test_the_summary_lists_every_residual(tmp_path):
         assert line in text.splitlines()
 
 
+def test_images_are_above_the_curves_of_their_demonstration(tmp_path):
+    time = np.array([0.0, 0.5])
+    images = {7: {"front": (time, (b"a", b"b"))}, 9: {"front": (time, (b"c", b"d"))}}
+    fit = sample_fit(episodes=(5, 7, 9), images=images)
+    record_fit(tmp_path / "fit.rrd", fit, most=2)
+    rrd = Rrd(tmp_path / "fit.rrd")
+    cameras = [entity for entity in rrd.entities if "/cameras/" in entity]
+    assert cameras == ["demonstration_2/cameras/front"]
+    blobs = rrd.column(cameras[0], "EncodedImage:blob")
+    assert [bytes(blob[0]) for blob in blobs] == [b"a", b"b"]
+    np.testing.assert_allclose(rrd.time(cameras[0]), time)
+    with pytest.raises(ValueError, match="3 demonstrations cannot be of 2 episodes"):
+        sample_fit(episodes=(5, 7))
+
+
 @pytest.mark.parametrize("most", [1, 2, 10])
 def test_only_the_first_demonstrations_get_a_tab(tmp_path, most):
     record_fit(tmp_path / "fit.rrd", sample_fit(), most=most)

@@ -107,8 +107,8 @@ class EvaluatePrimitives(Written):
     """Evaluate fitted movement primitives on demonstrations, such as those held out.
 
     Each demonstration is predicted by the common primitive of `hrc fit`, told its start, goal
-    and duration. Prints error, goal error, smoothness and orientation error of every
-    demonstration, and writes figures of them. Without a model, primitives are fitted to four of
+    and duration. Prints error, goal error, smoothness and orientation error of the eight worst
+    demonstrations, and writes figures of all. Without a model, primitives are fitted to four of
     every five demonstrations first, and evaluated on the others. Exit status 1 if --most-nrmse
     was missed.
     """
@@ -127,6 +127,8 @@ class EvaluatePrimitives(Written):
     """Columns by quantity; those the model was fitted with when empty."""
     most_nrmse: float | None = None
     """Largest median error that passes."""
+    verbose: More[bool] = False
+    """Print every demonstration, not just the worst."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,6 +7,7 @@ from tempfile import TemporaryDirectory
 import torch
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from hrc_learn.cli._options import resolved
 from hrc_learn.cli._run import write_values
@@ -94,7 +95,7 @@ def _evaluate(args: EvaluatePrimitives, model: Path) -> int:
         figures[f"{channel}_duration_ratio_median"] = _duration_ratio(
             motions, primitive.duration
         )
-        console.print(_table(channel, demos, errors[channel]))
+        console.print(_table(channel, demos, errors[channel], args.verbose))
     if args.out is not None:
         with new_folder(args.out, asdict(args), args.overwrite) as folder:
             write_json(folder / "metrics.json", figures)
@@ -139,16 +140,28 @@ def _duration_ratio(motions: Motions, duration: torch.Tensor) -> float:
     return float((duration / motions.demos.time.take_along_dim(last, dim=1)[:, 0]).median())
 
 
-def _table(channel: str, demos: DemonstrationSet, error: ReproductionError) -> Table:
+_ROWS = 8
+"""Demonstrations in a table, unless all are asked for."""
+
+
+def _table(
+    channel: str, demos: DemonstrationSet, error: ReproductionError, everything: bool
+) -> Table:
+    """The worst demonstrations first, by the first of the measures."""
     columns = error.columns()
+    order = next(iter(columns.values())).argsort(descending=True).tolist()
+    shown = order if everything else order[:_ROWS]
     table = Table(title=f"{channel}: predicted from start, goal and duration")
     table.add_column("episode", justify="right")
     for name in columns:
         unit = f" [{UNITS[name]}]" if UNITS[name] else ""
-        table.add_column(name.replace("_", " ") + unit, justify="right")
-    for i, demo in enumerate(demos):
-        table.add_row(str(demo.episode), *(f"{x[i]:.3g}" for x in columns.values()))
+        # As text: brackets around a unit are no markup.
+        table.add_column(Text(name.replace("_", " ") + unit), justify="right")
+    for i in shown:
+        table.add_row(str(demos[i].episode), *(f"{x[i]:.3g}" for x in columns.values()))
     table.add_section()
+    if others := len(order) - len(shown):
+        table.caption = f"{others} more, none worse: --verbose"
     table.add_row("median", *(f"{x.quantile(0.5):.3g}" for x in columns.values()))
     return table
 

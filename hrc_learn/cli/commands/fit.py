@@ -11,14 +11,15 @@ from rich.console import Console
 
 from hrc_learn import distributed
 from hrc_learn.cli._options import resolved
-from hrc_learn.cli._run import write_values
+from hrc_learn.cli._run import command_line, configuration, write_values
 from hrc_learn.cli._tables import image_jacobian_rows, primitive_rows, show_values
 from hrc_learn.cli.arguments.learn import FitImageJacobian, FitPrimitives
 from hrc_learn.cli.commands.check import columns
-from hrc_learn.demos import DemonstrationSource, open_demos
+from hrc_learn.demos import DemonstrationSet, DemonstrationSource, open_demos, thumbnails
 from hrc_learn.demos.read.contract import contract_notes
 from hrc_learn.demos.read.reader import keep_first_contract
 from hrc_learn.jacobian import CellErrors, RBFCenters, grid
+from hrc_learn.learning.fit_report import fit_report
 from hrc_learn.learning.model_choice import best_models, keep_best
 from hrc_learn.learning.primitive_fitting import (
     FittedPrimitives,
@@ -32,14 +33,9 @@ from hrc_learn.learning.primitive_fitting import fit_primitives as fit_demonstra
 from hrc_learn.learning.visual_servo_fitting import fit_visual_servo, learning_recording
 from hrc_learn.skills.visual_skill import VisualServoSkill
 from hrc_learn.store import new_folder, write_json
-from hrc_learn.viz.figures import (
-    fit_joints_figure,
-    learning_figure,
-    residual_figure,
-    workspace_figure,
-)
+from hrc_learn.viz.figures import learning_figure, workspace_figure
 from hrc_learn.viz.learning_dashboards import record_fit, record_learning
-from hrc_learn.viz.report import show_command
+from hrc_learn.viz.report import PAGE, show_command, write_report
 
 
 def fit_primitives(args: FitPrimitives) -> None:
@@ -83,9 +79,12 @@ def fit_primitives(args: FitPrimitives) -> None:
         fitted.save(folder, each=args.several == "distribution")
         if args.several == "distribution":
             metrics |= {f"{k}_spread": _spread(fitted, k) for k in fitted.each}
-        drawn = _draw(fitted, args, folder)
+        missing = _draw(fitted, args, demos, metrics, folder)
         _finish(args, metrics, folder)
-    if drawn:
+    for said in missing:
+        print(f"left out: {said}")
+    if (args.folder / PAGE).is_file():
+        print(f"Report: {shlex.quote(str(args.folder / PAGE))}")
         print(f"Dashboard: {show_command(args.folder)}")
 
 
@@ -167,17 +166,31 @@ def _spread(fitted: FittedPrimitives, channel: str) -> float:
     return float(np.sqrt(np.square(distribution.position(time)[1].numpy()).mean()))
 
 
-def _draw(fitted: FittedPrimitives, args: FitPrimitives, folder: Path) -> bool:
-    """Figures and a recording of the fit, where there is more than an orientation to show."""
+_SEEN = 6
+"""Demonstrations with a tab of their own in the recording, and with images."""
+
+
+def _draw(
+    fitted: FittedPrimitives,
+    args: FitPrimitives,
+    demos: DemonstrationSet,
+    metrics: dict[str, float],
+    folder: Path,
+) -> list[str]:
+    """A report and a recording of the fit, where there is more than an orientation to show.
+
+    Returns:
+        Images that could not be read, a line each.
+    """
     if set(fitted.each) == {"orientation"}:
-        return False
-    shown = fit_recording(fitted, f"Fit of {args.dataset.name}")
-    record_fit(folder / "fit.rrd", shown)
-    name = "joints" if "joint" in fitted.each else "position"
-    fit_joints_figure(shown).savefig(folder / f"{name}.png", dpi=120)
-    if shown.residual:
-        residual_figure(shown).savefig(folder / "n_basis.png", dpi=120)
-    return True
+        return []
+    images, missing = thumbnails(args.dataset, demos[:_SEEN])
+    episodes = [demo.episode for demo in demos]
+    shown = fit_recording(fitted, f"Fit of {args.dataset.name}", episodes, images)
+    record_fit(folder / "fit.rrd", shown, most=_SEEN)
+    rows = primitive_rows(metrics)
+    write_report(folder, fit_report(shown, rows, configuration(args), command_line()))
+    return missing
 
 
 def _finish(args: FitPrimitives, metrics: dict[str, float], folder: Path) -> None:

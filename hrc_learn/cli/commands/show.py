@@ -6,9 +6,6 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from hrc_learn.cli._run import write_values
 from hrc_learn.cli.arguments.dataset import Show
@@ -79,38 +76,11 @@ told apart by eye nor held by a viewer."""
 
 _ALONE = 8
 """Demonstrations with a tab of their own, and with images in it."""
-_IMAGES_A_SECOND, _MOST_IMAGES, _TALLEST = 5.0, 200, 240
-"""Of a camera in one demonstration, and their height [px]: enough to see what was done."""
-
-
-def _images(
-    dataset: Path, demos: Sequence[Any]
-) -> tuple[dict[int, dict[str, tuple[np.ndarray, tuple[bytes, ...]]]], list[str]]:
-    """Small images of the first demonstrations, by episode and camera, and what is missing."""
-    from hrc_learn.demos import DatasetError, ImageReader
-    from hrc_learn.demos.read.images import jpeg
-
-    reader, found, missing = ImageReader(dataset), {}, []
-    for demo in demos[:_ALONE]:
-        count = min(len(demo), _MOST_IMAGES, 1 + int(demo.duration * _IMAGES_A_SECOND))
-        frames = sorted({*np.linspace(0, len(demo) - 1, count).astype(int).tolist()})
-        for camera in reader.available(demo.episode):
-            try:
-                height, width = reader.size(camera)
-                scale = min(1.0, _TALLEST / height) / 2
-                size = 2 * max(1, round(scale * height)), 2 * max(1, round(scale * width))
-                seen = [jpeg(i) for _, i in reader.stream(demo.episode, camera, frames, size)]
-            except DatasetError as error:
-                missing.append(str(error))
-            else:
-                name = camera.rpartition(".")[2]
-                found.setdefault(demo.episode, {})[name] = demo.time[frames], tuple(seen)
-    return found, missing
 
 
 def _record_demonstrations(args: Show, out: Path) -> None:
     # Rerun and PyTorch, which a report does without.
-    from hrc_learn.demos import open_demos
+    from hrc_learn.demos import open_demos, thumbnails
     from hrc_learn.learning.channels import demonstrations_recording
     from hrc_learn.viz.learning_dashboards import record_demonstrations
 
@@ -121,7 +91,7 @@ def _record_demonstrations(args: Show, out: Path) -> None:
         shown = source.spread(min(_SHOWN, max(1, _SHOWN_FRAMES // usual)))
     demos = shown.load()
     title = f"Demonstrations in {args.path.resolve().name}"
-    images, missing = _images(args.path, demos)
+    images, missing = thumbnails(args.path, demos[:_ALONE])
     record_demonstrations(out, demonstrations_recording(demos, title, images), most=_ALONE)
     for said in missing:
         print(f"left out: {said}")

@@ -58,6 +58,14 @@ class ImageReader:
         """Cameras of which an episode has images here."""
         return tuple(key for key in self.cameras if self._is_here(episode, key))
 
+    def length(self, episode: int) -> int:
+        """Frames of an episode.
+
+        Raises:
+            DatasetError: There is no such episode.
+        """
+        return self._entry(episode).length
+
     def size(self, camera: str) -> tuple[int, int]:
         """Height and width of a camera's images as declared [px].
 

@@ -137,7 +137,7 @@ def _measurements(table: Sequence[Measurement]) -> str:
     first, others = leading(table, _FIRST)
     page = _values(first)
     if others:
-        summary = f"{len(others)} more values"
+        summary = f"{len(others)} more value" + "s" * (len(others) > 1)
         page += f"<details><summary>{summary}</summary>{_values(others)}</details>"
     return page
 
