@@ -264,7 +264,7 @@ def main(args: Args) -> None:
     columns = [str(column.header) for column in table.columns[1:]]
     for name, row in rows.items():
         table.add_row(name, *(f"{row[c]:.3g}" if c in row else "" for c in columns))
-    Console().print(table)
+    Console(width=120).print(table)  # no column is cut, wherever it is kept
     flat = {f"{name}_{key}": value for name, row in rows.items() for key, value in row.items()}
     write_values(args.json, flat)
 

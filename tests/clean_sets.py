@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+import torch
 from lerobot_folders import write_folder
 
 CAMERA = "observation.images.front"
@@ -50,6 +51,12 @@ def write_video(
                 container.mux(packet)
         for packet in stream.encode():  # type: ignore[attr-defined]
             container.mux(packet)
+
+
+def bar(image: torch.Tensor) -> int:
+    """Column where the red bar of `write_video` begins."""
+    red = image[0].int() - image[1].int()
+    return int((red > 120).float().mean(0).gt(0.5).nonzero()[0])
 
 
 def write_set(root: Path, version: str, *, degrees: bool = False, camera: bool = False) -> Path:

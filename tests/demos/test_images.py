@@ -1,15 +1,13 @@
 """Images of a dataset as tensors: each beside its frame, or an error that names it."""
 
-from dataclasses import replace
-
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import torch
-from clean_sets import CAMERA, SIZE, write_set, write_video
+from clean_sets import CAMERA, SIZE, bar, write_set, write_video
 
-from hrc_learn.demos import DatasetError, ImageReader, load_demos, load_images, thumbnails
+from hrc_learn.demos import DatasetError, ImageReader, load_demos, load_images
 from hrc_learn.demos.format.videos import decode_image
 from hrc_learn.demos.read.images import jpeg
 
@@ -17,12 +15,6 @@ from hrc_learn.demos.read.images import jpeg
 @pytest.fixture(params=["v3.0", "v2.1"])
 def root(request, tmp_path):
     return write_set(tmp_path / "set", request.param, camera=True)
-
-
-def bar(image: torch.Tensor) -> int:
-    """Column where the red bar of `write_video` begins."""
-    red = image[0].int() - image[1].int()
-    return int((red > 120).float().mean(0).gt(0.5).nonzero()[0])
 
 
 def test_every_frame_has_its_own_image(root):
@@ -108,28 +100,3 @@ def test_jpeg_keeps_the_image():
     ramp = np.linspace(0, 255, 64)[None, :, None] * np.ones((48, 1, 3))
     image = ramp.astype(np.uint8)
     assert np.abs(decode_image(jpeg(image)).astype(int) - image).max() < 12
-
-
-def test_thumbnails_are_few_and_small_and_at_the_times_of_their_frames(root):
-    demo = load_demos(root)[1]
-    # One whose frames were thinned, as the fit of a long one does.
-    few = np.linspace(0, len(demo) - 1, 12).round().astype(int)
-    thinned = replace(
-        demo,
-        **{name: getattr(demo, name)[few] for name in demo.recorded},
-        fps=demo.fps * 11 / (len(demo) - 1),
-        extra={},
-    )
-    every = load_images(root, 1)[CAMERA]
-    for read in (demo, thinned):
-        found, missing = thumbnails(root, [read])
-        assert not missing
-        ((name, (time, files)),) = found[1].items()
-        assert CAMERA.endswith(name)
-        assert len(files) == len(time) == 1 + int(5 * demo.duration)
-        assert (time[0], time[-1]) == (0, pytest.approx(demo.duration))
-        for at, file in zip(time, files, strict=True):
-            frame = round(at * demo.fps)
-            seen = torch.from_numpy(decode_image(file)).permute(2, 0, 1)
-            assert seen.shape[1:] == SIZE  # lower than 240 rows already
-            assert abs(bar(seen) - bar(every[frame])) <= 1
