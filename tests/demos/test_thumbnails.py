@@ -39,11 +39,10 @@ def test_thumbnails_are_few_and_small_and_at_the_times_of_their_frames(version, 
             assert abs(bar(seen) - bar(every[frame])) <= 1
 
 
-def test_of_long_episodes_only_so_many_are_taken(tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "_MOST", 4)
+def test_of_long_episodes_only_so_many_are_taken(tmp_path):
     root = write_set(tmp_path / "set", "v2.1", camera=True)
     demo = load_demos(root)[0]
-    ((time, files),) = thumbnails(root, [demo])[0][0].values()
+    ((time, files),) = thumbnails(root, [demo], 4)[0][0].values()
     assert len(files) == 4
     np.testing.assert_allclose(np.diff(time), demo.duration / 3, atol=1 / demo.fps)
 

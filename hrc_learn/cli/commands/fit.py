@@ -166,8 +166,9 @@ def _spread(fitted: FittedPrimitives, channel: str) -> float:
     return float(np.sqrt(np.square(distribution.position(time)[1].numpy()).mean()))
 
 
-_SEEN = 6
-"""Demonstrations with a tab of their own in the recording, and with images."""
+_SEEN, _IMAGES = 3, 30
+"""Demonstrations with images, and images of each camera: few, as finding them means to decode
+all that is between."""
 
 
 def _draw(
@@ -184,10 +185,10 @@ def _draw(
     """
     if set(fitted.each) == {"orientation"}:
         return []
-    images, missing = thumbnails(args.dataset, demos[:_SEEN])
+    images, missing = thumbnails(args.dataset, demos[:_SEEN], _IMAGES)
     episodes = [demo.episode for demo in demos]
     shown = fit_recording(fitted, f"Fit of {args.dataset.name}", episodes, images)
-    record_fit(folder / "fit.rrd", shown, most=_SEEN)
+    record_fit(folder / "fit.rrd", shown)
     rows = primitive_rows(metrics)
     write_report(folder, fit_report(shown, rows, configuration(args), command_line()))
     return missing
