@@ -21,6 +21,9 @@ RecorderState = Literal["ready", "recording", "stopped"]
 _LATE, _MOST_LATE = 2.0, 0.2
 """Periods after which a frame is late, and share of such frames from which a demonstration is
 doubted: one in five, so that a machine that is busy for a moment asks for nothing."""
+_SLOWEST = 0.8
+"""Pace of a simulated arm from which a demonstration is doubted: it is a quarter faster in the
+dataset than it was shown, and reproductions that are faster still meet limits."""
 _DRAFT_EVERY = 2.0
 """Time from one draft of the open demonstration to the next [s]."""
 
@@ -196,6 +199,11 @@ class DemonstrationRecorder:
             return (
                 f"the loop was late at {late.late_ticks} of {late.ticks} frames: this machine "
                 f"is busy"
+            )
+        if (pace := self._quality.pace) < _SLOWEST:
+            return (
+                f"the arm moved at {100 * pace:.0f} % of real time, so what was shown is "
+                f"{1 / pace:.1f} times as fast: this machine is busy"
             )
         return ", ".join(self._quality.met())
 

@@ -50,6 +50,8 @@ class LateTicks:
     """Frames that there should have been meanwhile."""
     latest: float = 0.0
     """By how much at most [s]."""
+    first: float | None = None
+    """When the first frame came [s]."""
     last: float | None = None
     """When the last frame came [s]."""
 
@@ -60,7 +62,7 @@ class LateTicks:
     def tick(self, now: float) -> None:
         """Note a frame that comes now [s]."""
         gap = self.gap(now)
-        self.last = now
+        self.first, self.last = now if self.first is None else self.first, now
         self.ticks += 1
         if gap > self.late * self.period:
             self.late_ticks += 1
@@ -125,6 +127,17 @@ class RecordingQuality:
             self._at_limit.update(
                 chain.joint_names[k] for k in np.flatnonzero(room < _AT_LIMIT)
             )
+
+    @property
+    def pace(self) -> float:
+        """Time that passed for the arm, by that which passed for the person.
+
+        A simulated arm that its machine cannot keep up with is led faster than it looks.
+        """
+        first, last = self.ticks.first, self.ticks.last
+        if first is None or last is None or last == first:
+            return 1.0
+        return (self._stamps[-1] - self._stamps[0]) / (last - first)
 
     def worthless(self) -> str:
         """Why the frames show nothing at all; empty if they show something."""

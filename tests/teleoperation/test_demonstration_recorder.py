@@ -243,11 +243,29 @@ def test_a_loop_that_stutters_is_told(folder, late, good):
         recorder.handle("start")
         for k in range(101):
             recorder.add(frame(k))
-            now[0] += (2.1 if k < late else 1.9) / FPS
+            now[0] += (2.1 if k < late else 0.9) / FPS
         recorder.handle("save")
         assert recorder.status.state == ("ready" if good else "stopped")
         assert good or f"late at {late} of 101 frames" in recorder.status.note
     assert recorder.status.saved == 1  # what is open is kept in any case
+
+
+@pytest.mark.parametrize(("gap", "good"), [(1.24, True), (1.27, False)])
+def test_an_arm_that_is_slower_than_the_person_is_told(folder, gap, good):
+    now = [5.0]
+    writer = DatasetWriter(folder, FPS, "panda", panda.joint_names)
+    with DemonstrationRecorder(writer, lambda: "show it", lambda: now[0]) as recorder:
+        for end in ("discard", "save"):  # the time of the last one is forgotten
+            recorder.handle("start")
+            for k in range(101):
+                recorder.add(frame(k))
+                now[0] += gap / FPS
+            recorder.handle(end)
+            now[0] += 60.0
+        assert recorder.status.state == ("ready" if good else "stopped")
+        said = "at 79 % of real time, so what was shown is 1.3 times as fast"
+        assert good or said in recorder.status.note
+    assert recorder.status.saved == 1
 
 
 def test_limits_and_contacts_are_told_before_it_is_saved(folder):

@@ -23,6 +23,11 @@ pytestmark = pytest.mark.browser
 ROOT = Path(__file__).parents[2]
 PLACINGS = 20
 """From random starts."""
+LIFTED = 0.02
+"""How far above its place a hand that drifts by millimetres brings an object, and sets it down
+[m]: the place itself is 7 mm above the board."""
+ATTEMPTS = 3
+"""At a demonstration that the quality gate doubts, as where the machine is busy."""
 RATE = 60.0
 """Points of a hand's path [1/s]."""
 
@@ -109,12 +114,14 @@ def test_demonstrations_by_hands_are_learned_and_placed(tmp_path):
     start = panda.forward(workplace.home_joints()).position.numpy()
     end = workplace.shelf("middle").position.numpy()
     beside = end[1] + 0.3 * np.sign(start[1] - end[1])
+    above = end[2] + LIFTED
     corners = np.array(
         [
             start,
-            [start[0], start[1], end[2]],
-            [start[0], beside, end[2]],
-            [end[0], beside, end[2]],
+            [start[0], start[1], above],
+            [start[0], beside, above],
+            [end[0], beside, above],
+            [end[0], end[1], above],
             end,
         ]
     )
@@ -140,23 +147,29 @@ def test_demonstrations_by_hands_are_learned_and_placed(tmp_path):
             person.enter()
             closing = _closing(person)
             for k in range(count):
-                person.reach("right", room(start[None])[0] - closing)
-                person.press("Start")
-                person.pinch("right")
-                offset = person.hand("right") - room(start[None])
-                # Who sees that the arm lags, on a slow machine, waits for it.
-                for path in hand_paths(corners, np.random.default_rng(k)):
-                    person.walk("right", room(path) + offset, RATE)
-                    person.watch_it_rest()
-                person.pinch("right", closed=False)
-                person.press("Stop")
-                wait_until(lambda: "stopped" in _words(person), "it stopped")
-                person.press("Save")
-                wait_until(
-                    lambda: "ready" in _words(person) or _doubted(person), "it is judged"
-                )
-                if _doubted(person):
+                for again in reversed(range(ATTEMPTS)):
+                    person.reach("right", room(start[None])[0] - closing)
+                    person.press("Start")
+                    person.pinch("right")
+                    offset = person.hand("right") - room(start[None])
+                    # Who sees that the arm lags, on a slow machine, waits for it.
+                    for path in hand_paths(corners, np.random.default_rng(k)):
+                        person.walk("right", room(path) + offset, RATE)
+                        person.watch_it_rest()
+                    person.pinch("right", closed=False)
+                    person.press("Stop")
+                    wait_until(lambda: "stopped" in _words(person), "it stopped")
                     person.press("Save")
+                    wait_until(
+                        lambda k=k: f"{k + 1} saved" in _words(person) or _doubted(person),
+                        "it is judged",
+                    )
+                    if not _doubted(person):
+                        break
+                    person.press("Discard" if again else "Save")
+                    if again:
+                        person.press("Back to start")
+                        time.sleep(0.5)
                 wait_until(lambda k=k: f"{k + 1} saved" in _words(person), "it is saved")
                 person.press("Back to start")
                 time.sleep(0.5)

@@ -90,7 +90,11 @@ def test_ones_own_demonstration_is_recorded_learned_and_run(tmp_path):
             show(tab)
             tab.get_by_role("button", name="Stop", exact=True).click()
             tab.get_by_role("button", name="save", exact=True).click()
-            tab.get_by_text("1 saved").wait_for()
+            saved, doubted = tab.get_by_text("1 saved"), tab.get_by_text("Save again")
+            saved.or_(doubted).first.wait_for()
+            if doubted.is_visible():  # this machine is busy, and the quality gate says so
+                tab.get_by_role("button", name="save", exact=True).click()
+            saved.wait_for()
             tab.get_by_role("button", name="finish", exact=True).click()
             assert program.wait(timeout=120) == 0, log.read_text()
         finally:
