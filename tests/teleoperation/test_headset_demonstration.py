@@ -185,12 +185,12 @@ def test_demonstrations_by_hands_are_learned_and_placed(tmp_path):
     program("control/run_placing.py", *run, "--json", outcome, status=(0, 1))
     measured = json.loads(outcome.read_text("utf-8"))
     # On the shelf that was demonstrated and on the two others. A start may bring the object
-    # against the cabinet, as none of the demonstrations was from there.
+    # against the cabinet, as none of the demonstrations was from there: none of 60 did.
     assert measured["random_starts_placings"] == 3 * PLACINGS
     assert measured["random_starts_fraction_that_stands_on_its_shelf"] == 1
     assert measured["random_starts_fraction_within_3_mm_and_3_deg_of_its_place"] == 1
     assert measured["random_starts_joint_limit_violations"] == 0
-    assert measured["random_starts_fraction_without_contact"] > 0.7
+    assert measured["random_starts_fraction_without_contact"] > 0.9
 
 
 def _words(person) -> str:
