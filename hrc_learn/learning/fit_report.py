@@ -40,8 +40,7 @@ def fit_report(
     basis = "" if fit.n_basis is None else f" of {fit.n_basis} basis functions"
     return Report(
         title=fit.title,
-        summary=f"A movement primitive{basis} for each of {len(fit.demos)} demonstrations, and "
-        "one for all of them.",
+        summary=f"A movement primitive{basis} for each demonstration, and one for all of them.",
         table=table,
         sections=sections,
         configuration=configuration,

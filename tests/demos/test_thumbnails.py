@@ -47,6 +47,11 @@ def test_of_long_episodes_only_so_many_are_taken(tmp_path):
     np.testing.assert_allclose(np.diff(time), demo.duration / 3, atol=1 / demo.fps)
 
 
+def test_two_cameras_of_the_same_last_word_are_told_apart():
+    names = {module._name(f"observation.images.{side}.rgb") for side in ("left", "right")}
+    assert names == {"left.rgb", "right.rgb"}
+
+
 def test_tall_images_are_scaled_to_even_sides():
     assert module._small((480, 641)) == (240, 320)
     assert module._small((241, 97)) == (240, 96)

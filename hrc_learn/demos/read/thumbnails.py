@@ -12,10 +12,10 @@ from hrc_learn.demos.demonstration import Demonstration
 from hrc_learn.demos.issue import DatasetError
 from hrc_learn.demos.read.images import ImageReader, jpeg
 
-Seen = tuple[Float[np.ndarray, " images"], tuple[bytes, ...]]
+Stamped = tuple[Float[np.ndarray, " images"], tuple[bytes, ...]]
 """Times [s], and a JPEG file for each."""
-Thumbnails = dict[str, Seen]
-"""By camera."""
+Thumbnails = dict[str, Stamped]
+"""By camera, without what LeRobot puts before the name of each."""
 
 _RATE = 5.0
 """Images a second: a hand-guided arm moves by a few centimetres between two."""
@@ -47,13 +47,13 @@ def thumbnails(
             if isinstance(images, DatasetError):
                 missing.append(str(images))
             else:
-                found.setdefault(demo.episode, {})[camera.rpartition(".")[2]] = images
+                found.setdefault(demo.episode, {})[_name(camera)] = images
     return found, missing
 
 
 def _seen(
     reader: ImageReader, demo: Demonstration, camera: str, most: int
-) -> Seen | DatasetError:
+) -> Stamped | DatasetError:
     """What one camera saw, or why that is not known."""
     last = reader.length(demo.episode) - 1
     count = min(last + 1, most, 1 + int(demo.duration * _RATE))
@@ -64,6 +64,11 @@ def _seen(
     except DatasetError as error:
         return error
     return np.interp(frames, np.linspace(0, last, len(demo)), demo.time), files
+
+
+def _name(camera: str) -> str:
+    # Not the last word alone: left.rgb and right.rgb are two.
+    return camera.removeprefix("observation.images.")
 
 
 def _small(size: tuple[int, int]) -> tuple[int, int]:
