@@ -72,14 +72,18 @@ def test_views_of_the_chain_are_not_left_behind():
 
 def test_joints_move_as_they_are_told_and_rest_once_nobody_tells(arm):
     velocity = 0.2 * np.array([1, -1, 1, -1, 1, 1, -1])
-    start = arm.read()
+    start, fastest = arm.read(), np.zeros(7)
     while (now := arm.read()).time < start.time + 0.8:
         arm.command(velocity)
+        fastest = np.maximum(fastest, now.joint_velocity / velocity)
         time.sleep(0.01)
-    way = now.joint_position - start.joint_position
-    # The motion begins with a ramp, the servo follows late, and this simulator loses some way
-    # on a busy machine, as it goes on without an answer.
-    np.testing.assert_allclose(way, 0.8 * velocity, atol=0.04)
+    # Joint 7 swings by 30 % about its velocity in this simulator.
+    np.testing.assert_allclose(fastest[:6], 1, rtol=0.06)
+    # The motion begins with a ramp, the servo follows late, and this simulator loses way on a
+    # busy machine, as it goes on without an answer: some 0.9 on a quiet one, 0.7 has been seen.
+    share = (now.joint_position - start.joint_position) / (0.8 * velocity)
+    assert share.min() > 0.5
+    assert share.max() < 1.02
     # From 0.2 rad/s at 3 rad/s^2 rest takes 0.07 s, and ramps of the jerk.
     wait_until(lambda: arm.read().time > now.time + CONFIG.hold + 0.15)
     at_rest = arm.read()

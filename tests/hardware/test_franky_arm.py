@@ -289,16 +289,21 @@ def test_a_reflex_ends_all_commands_until_it_is_recovered(reflexing):
         arm.command(0.1 * np.eye(7)[0])
         pause()
     server.reflex("kReflex")
+    # A busy machine may see the mode before the end of the motion.
     with pytest.raises(
-        ArmFaultError, match=r"aborted by reflex.*joint_velocity_violation.*call recover\(\)"
+        ArmFaultError,
+        match=r"(aborted by reflex|in mode Reflex).*joint_velocity_violation.*call recover\(\)",
     ):
         keep_going(arm)
     for _ in range(3):
         with pytest.raises(ArmFaultError):
             arm.command(np.zeros(7))
-    arm.stop()  # it is at rest
-    rest = arm.read()  # which can still be looked at
-    assert abs(rest.joint_velocity[0]) < 0.05
+    arm.stop()
+    aborted = rest = arm.read()  # it can still be looked at
+    while abs(rest.joint_velocity[0]) > 0.01:
+        pause()
+        rest = arm.read()
+        assert rest.time < aborted.time + 0.3
     with pytest.raises(
         ArmFaultError, match=r"mode Reflex \(.*joint_velocity_violation.*make room"
     ):
