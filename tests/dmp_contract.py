@@ -241,6 +241,31 @@ class DMPContract:
             if self.maps_over_durations:
                 assert gradgradcheck(path, ends, atol=1e-4, rtol=1e-3, fast_mode=True)
 
+    @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
+    def test_a_gpu_does_what_the_cpu_does(self):
+        results = []
+        for device in ("cpu", "cuda"):
+            dmp = self.fit(*(column.to(device) for column in self.batch(2)))
+            arguments = self.arguments(*(end.to(device) for end in self.ends(7)))
+            durations = torch.tensor([0.8, 1.3], dtype=torch.float64, device=device)
+            state = dmp.initial_state(**arguments)
+            for _ in range(5):
+                state = dmp.step(state, 0.1)
+            motions = (
+                dmp.rollout(**arguments),
+                dmp.rollout([0.3, 0.9], **arguments, duration=2.0),
+                dmp.rollout(**arguments, duration=durations),
+            )
+            results.append([*map(self.outputs, motions), self.state_outputs(state)])
+        for cpu, gpu in zip(*results, strict=True):
+            for name, value in gpu.items():
+                assert value.is_cuda, name
+                same = value.cpu()
+                if name.endswith("orientation") and not name.startswith("rate of"):
+                    # Of either sign.
+                    same = same * (same * cpu[name]).sum(-1, keepdim=True).sign()
+                torch.testing.assert_close(same, cpu[name], rtol=1e-7, atol=1e-7)
+
     def test_a_saved_primitive_is_the_same(self, dmp, tmp_path):
         dmp.save(tmp_path / "saved")
         loaded = type(dmp).load(tmp_path / "saved")

@@ -160,7 +160,10 @@ class MixtureDMP[P: AdaptedPrimitive]:
 
     def sample(self, n: int, generator: torch.Generator | None = None) -> P:
         """A batch of n primitives drawn at random, each of a mode drawn first."""
-        drawn = torch.multinomial(self.probability, n, replacement=True, generator=generator)
+        # On the CPU, as all of it: a seed means the same on every device.
+        likely = self.probability.cpu()
+        drawn = torch.multinomial(likely, n, replacement=True, generator=generator)
+        drawn = drawn.to(self.probability.device)
         spread = torch.stack([mode.spread for mode in self.modes])[drawn]
         z = torch.randn(n, spread.shape[-1], 1, generator=generator, dtype=torch.float64)
         means = torch.stack([mode.mean for mode in self.modes])[drawn]

@@ -65,7 +65,7 @@ class RBFImageJacobian(nn.Module):
         reference: Float[Tensor, "4"] | None = None,
         normalized: bool = True,
     ):
-        """Build a network; its dtype is that of `centers`.
+        """Build a network; its dtype and device are those of `centers`.
 
         Args:
             centers: One row a neuron, one column an input.
@@ -185,7 +185,7 @@ class RBFImageJacobian(nn.Module):
 
         Args:
             demonstrations: In memory, or a sequence that reads them when asked.
-            neurons: Of the network; its dtype is that of their centres.
+            neurons: Of the network; its dtype and device are those of their centres.
             config: Noise, prior and the choice of key frames.
 
         Returns:

@@ -252,7 +252,9 @@ def statistics_by_fold(
     folds = [RegressionStatistics.empty(6 * neurons) for _ in range(FOLDS)]
     with torch.no_grad():
         for fold, motion in samples_by_fold(demonstrations, config):
-            folds[fold] += RegressionStatistics.of(motion.regressors(basis), motion.dx)
+            part = RegressionStatistics.of(motion.regressors(basis), motion.dx)
+            # The first of a fold takes it to the device of the data.
+            folds[fold] = folds[fold] + part if folds[fold].count else part
     return [fold.over_processes() for fold in folds]
 
 

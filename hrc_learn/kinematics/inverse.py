@@ -205,17 +205,19 @@ def solve_inverse(
         pose.position.detach().double().expand(*batch, 3).reshape(-1, 3),
         pose.orientation.detach().double().expand(*batch, 4).reshape(-1, 4),
     )
-    wish = near.detach().double().expand(*batch, joints).reshape(-1, joints)
-    lower, upper = chain.limits.lower, chain.limits.upper
+    wish = near.detach().to(goal.position).expand(*batch, joints).reshape(-1, joints)
+    lower, upper = _limits(chain, wish)
     rng = torch.Generator().manual_seed(seed)
     best = wish.clone().clamp(lower, upper)
-    distance = torch.full((len(wish),), torch.inf, dtype=torch.float64)
+    distance = wish.new_full((len(wish),), torch.inf)
     for round_ in range(_ROUNDS):
         # First from the wish itself and around it, then wherever the arm can be.
         missing = distance.isinf().nonzero().flatten()
         if len(missing) == 0:
             break
+        # Drawn on the CPU: a seed means the same on every device.
         random = torch.rand(len(missing), _STARTS, joints, generator=rng, dtype=torch.float64)
+        random = random.to(wish.device)
         half = ((upper - lower) / 2).clamp(max=math.pi)
         start = (lower + upper) / 2 + (2 * random - 1) * half
         if round_ == 0:
@@ -226,7 +228,8 @@ def solve_inverse(
         apart = torch.linalg.vector_norm(q - wish[row], dim=-1)
         apart = torch.where(reached, apart, torch.inf).unflatten(0, (-1, _STARTS))
         least = apart.min(-1)
-        chosen = q.unflatten(0, (-1, _STARTS))[torch.arange(len(missing)), least.indices]
+        each = torch.arange(len(missing), device=q.device)
+        chosen = q.unflatten(0, (-1, _STARTS))[each, least.indices]
         good = least.values.isfinite()
         best[missing[good]], distance[missing[good]] = chosen[good], least.values[good]
     found = distance.isfinite()
@@ -263,9 +266,9 @@ def solutions_from(
         pose.position.detach().double().expand(*batch, 3).reshape(-1, 3),
         pose.orientation.detach().double().expand(*batch, 4).reshape(-1, 4),
     )
-    row = torch.arange(len(goal.position)).repeat_interleave(count)
+    row = torch.arange(len(goal.position), device=starts.device).repeat_interleave(count)
     start = starts.detach().double().expand(*batch, count, joints).reshape(-1, joints)
-    start = start.clamp(chain.limits.lower, chain.limits.upper)
+    start = start.clamp(*_limits(chain, start))
     q, reached = _descend(chain, goal[row], start, task, tolerance)
     return torch.where(reached[:, None], q, torch.nan).reshape(*batch, count, joints)
 
@@ -315,20 +318,25 @@ def _step(
     weight[:, 3:] = _LEVER
     e, A = error * weight, J * weight[..., None]
     damping = e.square().sum(-1)[:, None, None] + _BIAS
-    eye = torch.eye(A.shape[-2], dtype=q.dtype)
+    eye = torch.eye(A.shape[-2], dtype=q.dtype, device=q.device)
     gram = A @ A.mT + damping * eye
     dq = (A.mT @ torch.linalg.solve(gram, e[..., None]))[..., 0]
     if wish is not None:
         away = wish - q
         dq = dq + away - (A.mT @ torch.linalg.solve(gram, A @ away[..., None]))[..., 0]
-    return (q + dq).clamp(chain.limits.lower, chain.limits.upper), error
+    return (q + dq).clamp(*_limits(chain, q)), error
+
+
+def _limits(chain: SerialChain, like: Tensor) -> tuple[Tensor, Tensor]:
+    """Lower and upper ones, on the device of `like`."""
+    return chain.limits.lower.to(like.device), chain.limits.upper.to(like.device)
 
 
 def _descend(
     chain: SerialChain, goal: Pose, q: Tensor, task: TaskSpace, tolerance: float
 ) -> tuple[Tensor, Tensor]:
-    result, done = q.clone(), torch.zeros(len(q), dtype=torch.bool)
-    rows = torch.arange(len(q))
+    result, done = q.clone(), torch.zeros(len(q), dtype=torch.bool, device=q.device)
+    rows = torch.arange(len(q), device=q.device)
     for _ in range(_ITERATIONS):
         after, error = _step(chain, goal[rows], q, task)
         arrived = error.abs().amax(-1) < tolerance
@@ -341,10 +349,11 @@ def _descend(
 
 def unwound(chain: SerialChain, q: Tensor, wish: Tensor) -> Tensor:
     """The same postures with joints turned by whole turns towards a wish, within limits."""
-    turns = torch.tensor([kind != "prismatic" for kind in chain.kinds])
+    turns = torch.tensor([kind != "prismatic" for kind in chain.kinds], device=q.device)
     whole = 2 * math.pi * ((wish - q) / (2 * math.pi)).round()
     moved = q + torch.where(turns, whole, 0.0)
-    inside = (moved >= chain.limits.lower) & (moved <= chain.limits.upper)
+    lower, upper = _limits(chain, q)
+    inside = (moved >= lower) & (moved <= upper)
     return torch.where(inside, moved, q)
 
 

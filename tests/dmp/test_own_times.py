@@ -20,7 +20,7 @@ from hrc_learn.dmp import (
     response_of,
 )
 from hrc_learn.dmp._system import own_times
-from hrc_learn.dmp._system.own_times import ColumnPieces, motion
+from hrc_learn.dmp._system.own_times import ColumnPieces, motion, power_by_power
 
 BASES = {
     "gaussian": (GaussianBasis(count=12), 0.0),
@@ -44,6 +44,17 @@ def random_motions(basis, batch=3, dtype=torch.float64, seed=0):
     s = 2.5 * torch.rand(batch, 30, generator=rng, dtype=torch.float64)
     s[:, :3] = torch.tensor([0.0, 1.0, 1e3])
     return s, x.to(dtype)
+
+
+def test_sums_power_by_power_are_weighted_sums_of_rows():
+    """As a GPU makes them."""
+    rng = torch.Generator().manual_seed(0)
+    rows, powers = torch.randn(3, 4, 5, 2, generator=rng), torch.randn(3, 6, 5, generator=rng)
+    piece = torch.randint(4, (3, 6), generator=rng)
+    flat = (piece + 4 * torch.arange(3)[:, None]).view(-1)
+    chosen = rows[torch.arange(3)[:, None], piece]
+    expected = torch.einsum("btkd,btk->btd", chosen, powers)
+    torch.testing.assert_close(power_by_power(rows, flat, powers), expected)
 
 
 @pytest.mark.parametrize("order", [0, 1, 2])
@@ -172,6 +183,17 @@ for dmp, output in kinds:
         compiled = torch.compile(path, fullgraph=True, backend="aot_eager")
         for tau in (durations[1], durations):
             torch.testing.assert_close(compiled(tau), path(tau))
+
+# A table that was made before is looked up, not made again in each call.
+dmp, sizes = JointDMP.fit(t, y, 13), []
+def counted(graph, inputs):
+    sizes.append(len(graph.graph.nodes))
+    return graph
+for _ in range(2):
+    torch._dynamo.reset()
+    compiled = torch.compile(lambda tau: dmp.rollout(t, duration=tau).position, backend=counted)
+    torch.testing.assert_close(compiled(durations), dmp.rollout(t, duration=durations).position)
+assert sizes[1] < 0.7 * sizes[0], sizes
 """
 
 

@@ -29,8 +29,9 @@ UNSEEN = 1e-9
 well below what the response itself is exact to."""
 MOST_TERMS = 20
 """Of a Chebyshev series on a piece: a few dozen samples on each, fitted the fastest."""
-AT_ONCE = 2**16
-"""Samples whose indices and powers a core keeps in its cache; a million takes twice as long."""
+AT_ONCE = {"cpu": 2**16, "cuda": 2**22}
+"""Samples by device: whose indices and powers a core keeps in its cache, where a million takes
+twice as long; that keep a GPU busy within a gigabyte."""
 
 
 def motion(
@@ -137,11 +138,11 @@ def _approach(s: Tensor, share: float, order: int) -> Tensor:
 
 def _table(response: "Response", order: int, like: Tensor) -> OwnTimesTable:
     """The table of one order, in dtype and on the device of `like`; made once."""
-    if torch.compiler.is_compiling():
-        # What is made while a program is traced cannot be kept, and costs it nothing.
-        return _tabulate(response, order, like.dtype, like.device)
     key = order, like.dtype, like.device
     if key not in response.own_times:
+        if torch.compiler.is_compiling():
+            # What is made while a program is traced cannot be kept: it makes it every time.
+            return _tabulate(response, *key)
         with torch.inference_mode(False), torch.no_grad():
             response.own_times[key] = _tabulate(response, *key)
     return response.own_times[key]
@@ -328,6 +329,24 @@ def _in_turn(piece: Int[Tensor, "B T"]) -> tuple[Int[Tensor, "BT"], int]:
     return (piece + pieces * first[:, None]).view(-1), pieces
 
 
+def power_by_power(
+    rows: Float[Tensor, "B pieces K D"], flat: Int[Tensor, "BT"], powers: Float[Tensor, "B T K"]
+) -> Float[Tensor, "B T D"]:
+    """Sums of rows weighted by powers: 2.6 times as fast as bags of them on a GPU (H200).
+
+    Args:
+        rows: Coefficients of each motion.
+        flat: Pieces, those of one motion after those of another.
+        powers: What the coefficients are multiplied by.
+    """
+    (B, T, K), D = powers.shape, rows.shape[-1]
+    terms = rows.movedim(2, 0).reshape(K, -1, D)
+    y = terms[0].index_select(0, flat) * powers[..., 0].view(-1, 1)
+    for k in range(1, K):
+        y.addcmul_(terms[k].index_select(0, flat), powers[..., k].view(-1, 1))
+    return y.view(B, T, D)
+
+
 def _gathered(table: OwnTimesTable, s: Tensor, coordinates: Tensor) -> Float[Tensor, "B T D"]:
     """`motion` of plain operations, as a compiler joins them."""
     piece, powers = table.place(s, coordinates.dtype)
@@ -341,7 +360,8 @@ def _gathered(table: OwnTimesTable, s: Tensor, coordinates: Tensor) -> Float[Ten
 
 def _parts(s: Float[Tensor, "B T"]) -> Iterator[slice]:
     """The batch in parts of `AT_ONCE` samples."""
-    size = max(1, AT_ONCE // max(s.shape[1], 1))
+    most = AT_ONCE.get(s.device.type, AT_ONCE["cpu"])
+    size = max(1, most // max(s.shape[1], 1))
     return (slice(i, i + size) for i in range(0, s.shape[0], size))
 
 
@@ -358,20 +378,22 @@ class _Motion(torch.autograd.Function):
             x = coordinates[part]
             piece, powers = table.place(s[part], y.dtype)
             flat, pieces = _in_turn(piece)
-            rows = _rows(table, x, pieces).contiguous().view(-1, D)
-            if bags is None:
+            rows = _rows(table, x, pieces)
+            if y.is_cpu and bags is None:
                 # Looked up: to add up the indices of each sample takes twice as long.
                 count = len(x) * table.pieces * table.size
-                bags = torch.arange(count, dtype=torch.int32, device=s.device)
-                bags = bags.view(-1, table.size)
-            # A weighted sum of rows for each sample: the one operation that does not write
-            # the rows down first.
-            y[part] = torch.nn.functional.embedding_bag(
-                bags.index_select(0, flat),
-                rows,
-                mode="sum",
-                per_sample_weights=powers.view(-1, table.size),
-            ).view(len(x), -1, D)
+                bags = torch.arange(count, dtype=torch.int32).view(-1, table.size)
+            if bags is None:
+                y[part] = power_by_power(rows, flat, powers)
+            else:
+                # A weighted sum of rows for each sample: the one operation that does not write
+                # the rows down first.
+                y[part] = torch.nn.functional.embedding_bag(
+                    bags.index_select(0, flat),
+                    rows.contiguous().view(-1, D),
+                    mode="sum",
+                    per_sample_weights=powers.view(-1, table.size),
+                ).view(len(x), -1, D)
             if table.others is not None:
                 y[part] += table.extra(s[part], y.dtype) @ (x @ table.others).mT
         return y
