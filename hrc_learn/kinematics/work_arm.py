@@ -118,7 +118,9 @@ class FrankaWorkArm(WorkArm):
         lower, upper = float(self.chain.limits.lower[6]), float(self.chain.limits.upper[6])
         batch = torch.broadcast_shapes(pose.position.shape[:-1], near.shape[:-1])
         # A little inside the limits, where the arm can still be corrected.
-        candidates = torch.linspace(lower + 0.02, upper - 0.02, samples, dtype=torch.float64)
+        candidates = torch.linspace(
+            lower + 0.02, upper - 0.02, samples, dtype=torch.float64, device=near.device
+        )
         candidates = torch.cat(
             [near[..., 6:7].expand(*batch, 1), candidates.expand(*batch, samples)], dim=-1
         )
