@@ -3,7 +3,7 @@ recording of what was learned.
 """
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import islice
 from typing import NamedTuple
@@ -207,7 +207,10 @@ _BELOW = 0.03
 
 
 def learning_recording(
-    skill: VisualServoSkill, demos: Demonstrations, title: str
+    skill: VisualServoSkill,
+    demos: Demonstrations,
+    title: str,
+    images: Mapping[str, bytes] | None = None,
 ) -> LearningRecording:
     """What is to be shown of a skill just fitted.
 
@@ -215,6 +218,7 @@ def learning_recording(
         skill: With its held-out errors, and the rounds of learning if there were any.
         demos: That it was fitted to; the first of them are drawn.
         title: Of the recording.
+        images: JPEG files by what they show.
 
     Raises:
         ValueError: If the skill was loaded: only one just fitted knows how it was learned.
@@ -241,6 +245,7 @@ def learning_recording(
             z=min(float(path[:, 2].min()) for path in paths) - _BELOW,
             share=cells.relative.numpy(),
         ),
+        images=images or {},
     )
 
 

@@ -350,10 +350,19 @@ def record_learning(path: str | os.PathLike[str], learning: LearningRecording) -
         name = "End effector (grey), neurons (orange), held-out error (blue)"
         eye = _look_down(np.concatenate(every))
         left.insert(0, rrb.Spatial3DView(origin="/world", name=name, eye_controls=eye))
-    right = [tab_view(tab)] if tab.plots else []
+    pages: list[rrb.Container] = [tab_view(tab)] if tab.plots else []
+    if learning.images:
+        seen = [
+            rrb.Spatial2DView(origin=f"/{_image(name)}", name=name) for name in learning.images
+        ]
+        pages.append(rrb.Grid(*seen, grid_columns=2, name="Images"))
+    right = [rrb.Tabs(contents=pages, active_tab=0)] if len(pages) > 1 else pages
     layout = dashboard(left, right, row_shares=(3, 2), timeline=ROUND)
     with rrd_file(path, learning.title, layout) as stream:
         send_summary(stream, _learned(learning))
+        for name, image in learning.images.items():
+            still = rr.EncodedImage(contents=image, media_type="image/jpeg")
+            stream.log(_image(name), still, static=True)
         if learning.paths:
             _send_strips(stream, "demonstrations", learning.paths, palette.DEMO, 0.0008)
         if learning.errors is not None:
@@ -366,6 +375,10 @@ def record_learning(path: str | os.PathLike[str], learning: LearningRecording) -
             dot = rr.SeriesPoints(names=kept.names, colors=kept.colours, marker_sizes=[6.0])
             stream.log(kept.path, dot, static=True)
             send_rows(stream, _rounds(np.array([learning.best])), kept)
+
+
+def _image(name: str) -> str:
+    return f"images/{slug(name)}"
 
 
 def learning_tab(learning: LearningRecording) -> Tab:

@@ -344,6 +344,8 @@ class LearningRecording:
     """Of the end effector in demonstrations [m]."""
     errors: ErrorMap | None = None
     """On demonstrations held out."""
+    images: Mapping[str, bytes] = field(default_factory=dict)
+    """JPEG files by what they show."""
 
     def __post_init__(self) -> None:
         rounds = len(self.centers)

@@ -240,6 +240,13 @@ def test_a_fit_without_rounds_shows_where_it_errs(tmp_path):
     assert "Round" not in text
 
 
+def test_images_stand_still_whatever_the_round(tmp_path):
+    rrd = recorded(tmp_path, images={"End of episode 3": b"jpeg", "Start": b"other"})
+    blob = rrd.column("images/End_of_episode_3", "EncodedImage:blob", static=True)
+    assert bytes(blob[0][0]) == b"jpeg"
+    assert not {e for e in recorded(tmp_path).entities if e.startswith("images")}
+
+
 @pytest.mark.parametrize(
     ("changes", "complaint"),
     [

@@ -2,6 +2,7 @@
 
 import shlex
 from dataclasses import asdict
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -262,7 +263,15 @@ def _write(
             figure = learning_figure(held_out, skill.learned.best, "px")
             figure.savefig(folder / "learning.png", dpi=120)
         title = f"Image Jacobian from {args.dataset.name}"
-        record_learning(folder / "fit.rrd", learning_recording(skill, demos, title))
+        seen, missing = thumbnails(args.dataset, islice(demos, _SEEN), 2)
+        ends = {
+            f"End of episode {episode}, {camera}": files[-1]
+            for episode, cameras in seen.items()
+            for camera, (_, files) in cameras.items()
+        }
+        record_learning(folder / "fit.rrd", learning_recording(skill, demos, title, ends))
+    for line in missing:
+        console.print(f"note: {line}")
     rows = image_jacobian_rows(metrics)
     show_values(f"Image Jacobian from {args.dataset}", metrics, rows, args.verbose)
     print(f"Model in {shlex.quote(str(args.folder))}")
