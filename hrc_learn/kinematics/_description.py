@@ -181,8 +181,8 @@ class Description:
         moved = {name: self._joints_above(name, base) for name in (link, *leaves)}
         ends = sorted((n for n in moved if moved[n]), key=moved.__getitem__, reverse=True)
         raise ValueError(
-            f"{self.path} has {len(leaves)} ends; say which is the tool (tip=, --tip): "
-            f"{', '.join(ends or leaves)}"
+            f"{self.path} has several ends; say which is the tool (tip=, --tip), the likeliest "
+            f"first: {', '.join(ends or leaves)}"
         )
 
     def _joints_above(self, link: str, base: str) -> int:
