@@ -248,7 +248,7 @@ def test_ends_that_nothing_moves_are_no_tools(tmp_path):
         '<child link="mark"/></joint></robot>'
     )
     odd(tmp_path, ODD.replace("</robot>", mark))
-    with pytest.raises(ValueError, match=r"3 ends; .*--tip\): finger, tip$"):
+    with pytest.raises(ValueError, match=r"ends; .*first: finger, tip$"):
         arm(tmp_path / "odd.urdf")
 
 
