@@ -75,20 +75,32 @@ def shade(
 
 
 def draw_limits(axes: Axes, lower: float, upper: float) -> None:
-    """Lines at both limits of a joint, with what lies beyond them tinted."""
-    margin = 0.06 * (upper - lower)
-    for limit, beyond in ((lower, lower - margin), (upper, upper + margin)):
-        axes.axhspan(
-            min(limit, beyond), max(limit, beyond), color=palette.LIMIT, alpha=0.15, lw=0
-        )
-        axes.axhline(limit, color=palette.LIMIT, lw=0.9, label="limit")
-    axes.set_ylim(lower - margin, upper + margin)
+    """Lines at the limits of a joint, with what lies beyond them tinted.
+
+    The motion drawn before fills the picture: where a limit is far from it, both are written
+    instead.
+    """
+    low, high = axes.dataLim.intervaly
+    around = max(0.25, 0.15 * (high - low))  # of a joint that hardly moves [rad]
+    beyond = 0.06 * (upper - lower)
+    bottom, top = max(lower - beyond, low - around), min(upper + beyond, high + around)
+    for limit, end in ((lower, bottom), (upper, top)):
+        if bottom <= limit <= top:
+            inner, outer = sorted((limit, end))
+            axes.axhspan(inner, outer, color=palette.LIMIT, alpha=0.15, lw=0)
+            axes.axhline(limit, color=palette.LIMIT, lw=0.9, label="limit")
+    axes.set_ylim(bottom, top)
+    if not (bottom <= lower and upper <= top):
+        said = f"limits {lower:.2f}, {upper:.2f}"
+        axes.set_title(said, loc="right", fontsize=7, color=palette.LIMIT)
 
 
 def legend_in_free_cell(figure: Figure, grid: np.ndarray, used: int) -> None:
     """One legend for all cells, in the first unused one, or above where all are used."""
-    handles, labels = grid[0].get_legend_handles_labels()
-    unique = dict(zip(labels, handles, strict=True))
+    unique = {}
+    for axes in grid[:used]:
+        handles, labels = axes.get_legend_handles_labels()
+        unique |= dict(zip(labels, handles, strict=True))
     for axes in grid[used:]:
         axes.set_axis_off()
     if used < len(grid):

@@ -4,12 +4,13 @@ from io import BytesIO
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from PIL import Image
 from sample_runs import NAMES, STEPS, sample_fit, sample_run
 
 from hrc_learn.geometry import Box
 from hrc_learn.viz import figure_parts, figures
-from hrc_learn.viz.figure_parts import active_intervals, near
+from hrc_learn.viz.figure_parts import active_intervals, draw_limits, near
 
 RUN_FIGURES = [
     figures.joints_figure,
@@ -54,8 +55,31 @@ def test_joints_figure_shows_every_joint_with_its_limits():
         np.testing.assert_array_equal(shown["run"], run.joint_position[:, i])
         np.testing.assert_array_equal(shown["demonstration"], run.demo_joint_position[:, i])
         low, high = a.get_ylim()
-        assert low < -2.9
-        assert high > 2.9
+        assert low < min(values.min() for values in shown.values())
+        assert high > max(values.max() for values in shown.values())
+        # Far from them, so that the motion fills the picture.
+        assert a.get_title(loc="right") == "limits -2.90, 2.90"
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper", "drawn", "said"),
+    [
+        (-1.1, 1.2, [-1.1, 1.2], ""),
+        (-1.1, 6.0, [-1.1], "limits -1.10, 6.00"),
+        (-6.0, 6.0, [], "limits -6.00, 6.00"),
+    ],
+)
+def test_limits_are_drawn_where_the_motion_is_near_them(lower, upper, drawn, said):
+    axes = Figure().subplots()
+    axes.plot([0, 1, 2], [-1.0, 0.0, 1.0])
+    draw_limits(axes, lower, upper)
+    low, high = axes.get_ylim()
+    assert low < -1
+    assert high > 1
+    assert high - low < 2.7
+    assert [line.get_ydata()[0] for line in axes.get_lines()[1:]] == drawn
+    assert len(axes.patches) == len(drawn)
+    assert axes.get_title(loc="right") == said
 
 
 def test_person_figure_shades_the_push_and_shows_millimetres():

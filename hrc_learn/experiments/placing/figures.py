@@ -11,7 +11,6 @@ import matplotlib
 import numpy as np
 import torch
 from jaxtyping import Float
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullFormatter, StrMethodFormatter
 
@@ -112,31 +111,22 @@ def shelf_joints_figure(
         figure = Figure(figsize=(WIDTH, 1.45 * rows + 0.5))
         grid = figure.subplots(rows, 2, sharex=True, squeeze=False).ravel()
         for i, (axes, name) in enumerate(zip(grid, names, strict=False)):
-            demonstrated = demonstration.joint_position[:, i]
             axes.plot(
-                demonstration.time, demonstrated, color=palette.DEMO, lw=3.5, label="demo"
+                demonstration.time,
+                demonstration.joint_position[:, i],
+                color=palette.DEMO,
+                lw=3.5,
+                label="demo",
             )
-            values = [demonstrated]
             for shelf, colour in shelf_colours(list(motions)).items():
                 motion = motions[shelf]
-                values.append(motion.joint_position[:, i])
-                axes.plot(motion.time, values[-1], color=colour, label=f"{shelf} shelf")
+                position = motion.joint_position[:, i]
+                axes.plot(motion.time, position, color=colour, label=f"{shelf} shelf")
             axes.set(title=name, ylabel="rad")
             axes.margins(x=0)
-            _keep_limits_in_sight(axes, np.concatenate(values), limits, i)
+            draw_limits(axes, float(limits.lower[i]), float(limits.upper[i]))
         legend_in_free_cell(figure, grid, len(names))
     return figure
-
-
-def _keep_limits_in_sight(
-    axes: Axes, values: Float[np.ndarray, " samples"], limits: JointLimits, i: int
-) -> None:
-    """Draw a joint's limits, but let its motion fill the picture where they are far away."""
-    draw_limits(axes, float(limits.lower[i]), float(limits.upper[i]))
-    low, high = float(values.min()), float(values.max())
-    margin = max(0.25, 0.15 * (high - low))
-    bottom, top = axes.get_ylim()
-    axes.set_ylim(max(bottom, low - margin), min(top, high + margin))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
