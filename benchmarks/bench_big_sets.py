@@ -126,7 +126,8 @@ def write(root: Path, episodes: int, frames: int, die: bool = False) -> None:
     reach = s**3 * (10 - 15 * s + 6 * s**2) if frames < _HOUR else np.sin(360 * np.pi * s) ** 2
     with DatasetWriter(root, _FPS, "any", JOINTS, {"action": JOINTS}) as writer:
         for _ in range(episodes):
-            goal = rng.uniform(-1, 1, len(JOINTS))
+            # Of one sign, or a joint of four motions looks mirrored in one of them.
+            goal = rng.uniform(0.2, 1, len(JOINTS))
             joints = reach[:, None] * goal + rng.normal(0, 1e-4, (frames, len(JOINTS)))
             writer.start_episode("reach")
             for row, after in zip(joints, [*joints[1:], joints[-1]], strict=True):
