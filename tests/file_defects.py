@@ -136,6 +136,8 @@ def retitle(copy: Copy) -> None:
             (copy.root / copy.episodes_file, "tasks", ["test"]),
         ):
             table = pq.read_table(file)
+            if key not in table.schema.names:  # LeRobot has it as the index of pandas
+                key = "__index_level_0__"
             field = table.schema.field(key)
             renamed = pa.array([value] * len(table), field.type)
             number = table.schema.get_field_index(key)
