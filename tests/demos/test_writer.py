@@ -371,6 +371,34 @@ def test_a_users_file_in_the_recording_is_kept(tmp_path):
     assert len(load_demos(root)) == 1
 
 
+def test_a_folder_of_somebody_else_is_no_recording(tmp_path):
+    """Though it is called like one."""
+    other = tmp_path / "set.recording"
+    (other / "episode_1").mkdir(parents=True)
+    files = {"episode_0.mp4", "episode_000000.parquet", "episode_1/raw.bin", "notes.txt"}
+    for name in files:
+        (other / name).write_text("mine")
+    assert recover_all(tmp_path) == []
+    with pytest.raises(FileNotFoundError, match="no interrupted recording"):
+        recover_dataset(tmp_path / "set")
+    with pytest.raises(FileExistsError, match="is left alone: move it away"):
+        writing(tmp_path / "set")
+    left = {str(path.relative_to(other)) for path in other.rglob("*") if path.is_file()}
+    assert left == files
+    assert [path.name for path in tmp_path.iterdir()] == ["set.recording"]
+
+
+def test_files_of_others_in_a_recording_survive_it(tmp_path):
+    root = tmp_path / "set"
+    with writing(root) as writer:
+        writer.start_episode("")
+        writer.add_frame(gripper=0.1)
+        writer.save_episode()
+        (tmp_path / "set.recording" / "episode_1").mkdir()
+        (tmp_path / "set.recording" / "episode_1" / "raw.bin").write_text("mine")
+    assert (tmp_path / "set.recording.kept/episode_1/raw.bin").read_text() == "mine"
+
+
 def record_one(root, frames, then=None):
     with writing(root) as writer:
         writer.start_episode("reach")

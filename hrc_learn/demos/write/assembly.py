@@ -279,7 +279,8 @@ _PARTS = ("chunk", "file")
 
 
 _RECORDING = "recording.json"
-_FILES = ("episode_*", "*.unfinished.mp4", ".*.writing/*")
+_EPISODE = "episode_[0-9][0-9][0-9][0-9][0-9][0-9]."
+_FILES = (f"{_EPISODE}parquet", f"{_EPISODE}*.mp4", "*.unfinished.mp4", ".*.writing/*")
 """What a recording holds besides."""
 
 
@@ -292,9 +293,14 @@ def begin(root: Path, earlier_episodes: int | None) -> None:
 
     Raises:
         FileExistsError: `root` is already there, or may not be replaced by a longer one, or an
-            interrupted recording of it holds episodes.
+            interrupted recording of it holds episodes, or somebody else's folder has its name.
     """
     root, staging = resolved(root), staging_folder(root)
+    if staging.is_dir() and not _is_recording(staging):
+        raise FileExistsError(
+            f"{staging} is no interrupted recording, and is left alone: move it away, or "
+            f"choose another name than {root.name}"
+        )
     if staging.is_dir() and (_is_done(root, staging) or not _episodes(staging)):
         discard(staging)  # nothing in it that the dataset lacks
     if earlier_episodes is None and os.path.lexists(root):
@@ -327,12 +333,12 @@ def recover_dataset(root: str | Path) -> Path:
 
     Raises:
         BusyError: The recording is still going on.
-        FileNotFoundError: There is no recording of that name.
+        FileNotFoundError: There is no recording of that name; somebody else's folder is none.
         FileExistsError: There is a dataset of that name, and the recording was none of it.
         DatasetError: The recording held no saved episode; it is removed.
     """
     root = Path(root)
-    if not staging_folder(root).is_dir():
+    if not _is_recording(staging_folder(root)):
         raise FileNotFoundError(f"no interrupted recording at {staging_folder(root)}")
     with Claim(root) as claim:
         finish(root, claim)
@@ -395,7 +401,7 @@ def recover_all(path: str | Path) -> list[str]:
     done = recover(path)
     suffix = staging_folder(path).name.removeprefix(path.name)
     for staging in [staging_folder(path), *path.glob(f"**/*{suffix}")]:
-        if not staging.is_dir():
+        if not _is_recording(staging):
             continue
         root = staging.with_name(staging.name.removesuffix(suffix))
         try:
@@ -419,6 +425,16 @@ def _write(staging: Path, earlier_episodes: int | None) -> None:
     with new_file(staging / _RECORDING) as part:
         content = {"id": uuid.uuid4().hex, "episodes": earlier_episodes}
         part.write_text(json.dumps(content), encoding="utf-8")
+
+
+def _is_recording(staging: Path) -> bool:
+    """Whether a folder is of a recording: it has its name first, and loses it last."""
+    if not staging.is_dir():
+        return False
+    if (staging / _RECORDING).is_file():
+        return True
+    unnamed = (".writing", ".unfinished.mp4")
+    return all(path.name.endswith(unnamed) for path in staging.iterdir())
 
 
 def _episodes(staging: Path) -> bool:
