@@ -1,5 +1,7 @@
 """Plain arrays become demonstrations, or say why they cannot."""
 
+import io
+
 import numpy as np
 import pytest
 from lerobot_folders import joint_path
@@ -67,12 +69,42 @@ def test_csv_with_and_without_a_header(tmp_path, delimiter):
         np.testing.assert_allclose(demo.time, TIME - TIME[0])
 
 
+@pytest.mark.parametrize("header", ["", "time,q\n"])
+def test_a_byte_order_mark_is_no_part_of_the_first_name(tmp_path, header):
+    path = tmp_path / "run.csv"
+    path.write_text(header + "0,1\n0.1,2\n0.2,3\n", encoding="utf-8-sig")
+    (demo,) = read(path, [] if header else ["time", "q"])
+    np.testing.assert_allclose(demo.time, [0, 0.1, 0.2])
+    np.testing.assert_allclose(demo.joint_position, [[1], [2], [3]])
+
+
+def test_names_of_several_words_are_not_taken_apart(tmp_path):
+    path = tmp_path / "run.csv"
+    path.write_text("\ntime,joint position 1,joint position 2\n\n0,1,2\n0.1,3,4\n")
+    assert [*read_table(path)] == ["time", "joint position 1", "joint position 2"]
+
+
+@pytest.mark.parametrize("name", ["duration", "fps"])
+@pytest.mark.parametrize("value", [0, -1, float("inf")])
+def test_durations_and_rates_are_positive(tmp_path, name, value):
+    np.save(tmp_path / "joints.npy", Q)
+    with pytest.raises(ValueError, match=f"{name} must be positive, got {value}"):
+        read(tmp_path / "joints.npy", **{name: value})
+
+
 @pytest.mark.parametrize(
     ("arrays", "sources", "message"),
     [
         ({"q": Q}, {}, "say which arrays are joints or poses.*it holds q"),
         ({"q": Q}, {"joints": "p"}, "no array 'p' for joints; it holds q"),
         ({"q": Q, "t": TIME[:-1]}, {"joints": "q", "time": "t"}, "differ in their numbers"),
+        (
+            {"a": Q[:, 0], "b": Q[:-1, 1], "t": TIME},
+            {"joints": "a,b"},
+            "joints: 'a' has 40 frames, 'b' has 39",
+        ),
+        ({"q": Q[:1], "t": TIME[:1]}, {"joints": "q"}, "at least two frames, got 1"),
+        ({"q": Q, "t": 0 * TIME}, {"joints": "q"}, "time must increase.*frame 0"),
         ({"q": Q}, {"joints": "q"}, "there are no stamps.*duration or fps"),
         ({"q": Q * np.nan, "t": TIME}, {"joints": "q"}, "episode 0: joints is nan at frame 0"),
         ({"q": Q, "t": TIME[::-1]}, {"joints": "q"}, "time must increase.*frame 0"),
@@ -93,9 +125,24 @@ def test_arrays_that_are_no_demonstrations(tmp_path, arrays, sources, message):
     assert raised.value.file == str(path)
 
 
+def saved(save, *arrays, **named):
+    """The bytes of a file of numpy's."""
+    stream = io.BytesIO()
+    save(stream, *arrays, **named)
+    return stream.getvalue()
+
+
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
+        ("a.npz", saved(np.savez, q=Q)[:-30], "cannot be read as numpy arrays"),
+        ("a.npy", saved(np.save, Q)[:-30], "cannot be read as numpy arrays"),
+        ("a.npy", saved(np.savez, q=Q), "its name should end in .npz"),
+        ("a.npz", saved(np.save, Q), "its name should end in .npy"),
+        ("a.npz", saved(np.savez, q=Q, o=np.array([{}])), "a.npz, o: cannot be read"),
+        ("a.csv", "0,1\n0.1,2 °\n".encode("latin-1"), "a.csv: is not encoded in UTF-8"),
+        ("a.csv", b"\n \n,,\n", "a.csv: is empty"),
+        ("a.csv", b"t,q\n\n0,1\n0.1\n", "line 4 does not hold 2 numbers"),
         ("a.npy", b"junk", "cannot be read as numpy arrays"),
         ("a.npz", b"junk", "cannot be read as numpy arrays"),
         ("a.mat", b"junk", "neither .npz, .npy nor .csv"),

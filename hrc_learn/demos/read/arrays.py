@@ -1,6 +1,9 @@
 """Demonstrations made of plain arrays: in memory, or in .npz, .npy and .csv files."""
 
 import csv
+import math
+import zipfile
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,34 +42,59 @@ def read_table(path: Path, columns: Sequence[str] = ()) -> Table:
         raise DatasetError("not found", file=path)
     match path.suffix.lower():
         case ".npz":
-            with _load(path) as file:
-                return {name: _three_axes(file[name], path, name) for name in _numeric(file)}
+            return _read_npz(path)
         case ".npy":
-            return _split(_three_axes(_load(path), path, UNNAMED), columns, path)
+            array = _load(path)
+            if not isinstance(array, np.ndarray):
+                raise DatasetError(
+                    "holds several arrays: its name should end in .npz", file=path
+                )
+            return _split(_three_axes(array, path, UNNAMED), columns, path)
         case ".csv" | ".txt":
             names, values = _read_csv(path)
             return _split(values[None], columns or names, path)
     raise DatasetError("is neither .npz, .npy nor .csv", file=path)
 
 
+_UNREADABLE = (ValueError, OSError, EOFError, zipfile.BadZipFile, zlib.error)
+"""What numpy raises of files that are truncated, damaged or of another kind."""
+
+
 def _load(path: Path):
     try:
         return np.load(path, allow_pickle=False)
-    except (ValueError, OSError, EOFError) as error:
+    except _UNREADABLE as error:
         raise DatasetError(f"cannot be read as numpy arrays: {error}", file=path) from error
 
 
-def _numeric(file) -> list[str]:
-    """Names of the arrays that can be tables of numbers."""
-    return [
-        name
-        for name in file.files
-        if file[name].dtype.kind in "fiu" and 1 <= file[name].ndim <= 3
-    ]
+def _read_npz(path: Path) -> Table:
+    """The arrays of a file that can be tables of numbers."""
+    file = _load(path)
+    if isinstance(file, np.ndarray):
+        raise DatasetError("holds a single array: its name should end in .npy", file=path)
+    table: Table = {}
+    with file:
+        for name in file.files:
+            try:
+                array = file[name]
+            except _UNREADABLE as error:
+                raise DatasetError(
+                    f"cannot be read as an array of numbers ({error}): save it anew, or without",
+                    file=path,
+                    key=name,
+                ) from error
+            # Of a member that is no array, numpy gives the bytes.
+            if isinstance(array, np.ndarray) and _is_numeric(array):
+                table[name] = _three_axes(array, path, name)
+    return table
+
+
+def _is_numeric(array: np.ndarray) -> bool:
+    return array.dtype.kind in "fiu" and 1 <= array.ndim <= 3
 
 
 def _three_axes(array: np.ndarray, path: Path, name: str) -> np.ndarray:
-    if array.dtype.kind not in "fiu" or not 1 <= array.ndim <= 3 or 0 in array.shape:
+    if not _is_numeric(array) or 0 in array.shape:
         raise DatasetError(
             f"an array of shape {array.shape} and type {array.dtype} holds no frames of "
             f"numbers",
@@ -91,26 +119,45 @@ def _split(array: np.ndarray, columns: Sequence[str], path: Path) -> Table:
 
 def _read_csv(path: Path) -> tuple[list[str], np.ndarray]:
     """Header, [] where there is none, and numbers of a file with commas or semicolons."""
-    lines = path.read_text(encoding="utf-8").splitlines()
-    if not lines:
+    lines = _read_lines(path)
+    first = next((line for line in lines if line.strip()), "")
+    delimiter = max(",;\t", key=first.count)
+    if delimiter not in first:
+        delimiter = " "
+    reader = csv.reader(lines, delimiter=delimiter, skipinitialspace=True)
+    try:
+        rows = [
+            (reader.line_num, fields)
+            for row in reader
+            if (fields := [field.strip() for field in row if field.strip()])
+        ]
+    except csv.Error as error:
+        raise DatasetError(f"line {reader.line_num}: {error}", file=path) from error
+    if not rows:
         raise DatasetError("is empty", file=path)
-    delimiter = max(",;\t ", key=lines[0].count)
-    rows = [
-        [field.strip() for field in row if field.strip()]
-        for row in csv.reader(lines, delimiter=delimiter, skipinitialspace=True)
-        if row
-    ]
-    header = [] if _are_numbers(rows[0]) else rows[0]
-    numbers = rows[1:] if header else rows
-    for line, row in enumerate(numbers, start=2 if header else 1):
-        if len(row) != len(rows[0]) or not _are_numbers(row):
+    first_fields = rows[0][1]
+    header = [] if _are_numbers(first_fields) else first_fields
+    numbers, width = rows[1:] if header else rows, len(first_fields)
+    for line, row in numbers:
+        if len(row) != width or not _are_numbers(row):
             raise DatasetError(
-                f"line {line} does not hold {len(rows[0])} numbers separated by {delimiter!r}",
+                f"line {line} does not hold {width} numbers separated by {delimiter!r}",
                 file=path,
             )
     if not numbers:
         raise DatasetError("holds a header and no numbers", file=path)
-    return header, np.array(numbers, dtype=np.float64)
+    return header, np.array([[float(field) for field in row] for _, row in numbers])
+
+
+def _read_lines(path: Path) -> list[str]:
+    try:
+        # Spreadsheets mark UTF-8 by a byte order mark.
+        return path.read_text(encoding="utf-8-sig").splitlines()
+    except UnicodeDecodeError as error:
+        raise DatasetError(
+            f"is not encoded in UTF-8 ({error.reason} at byte {error.start}): save it as UTF-8",
+            file=path,
+        ) from error
 
 
 def _are_numbers(fields: Sequence[str]) -> bool:
@@ -168,7 +215,11 @@ def demonstrations_from_table(
     Raises:
         DatasetError: An array is missing, has a wrong shape, or holds values no
             demonstration can have; says which, and at which frame.
+        ValueError: The duration or the frame rate is not positive.
     """
+    for name, value in (("duration", duration), ("fps", fps)):
+        if value is not None and not 0 < value < math.inf:
+            raise ValueError(f"{name} must be positive, got {value}")
     found = _find(table, sources, path)
     if not {"joints", "position"} & found.keys():
         raise DatasetError(
@@ -207,7 +258,7 @@ def _find(table: Table, sources: ArraySources, path: Path) -> Table:
                 file=path,
                 key=name,
             )
-        found[name] = np.concatenate([table[array] for array in arrays], axis=-1)
+        found[name] = _side_by_side(name, arrays, table, path)
     shapes = {name: values.shape[:2] for name, values in found.items()}
     frames = {shape[1] for shape in shapes.values()}
     counts = {shape[0] for shape in shapes.values()} - {1}
@@ -216,6 +267,23 @@ def _find(table: Table, sources: ArraySources, path: Path) -> Table:
             f"arrays differ in their numbers of demonstrations and frames: {shapes}", file=path
         )
     return found
+
+
+def _side_by_side(
+    name: str, arrays: Sequence[str], table: Table, path: Path
+) -> Float64[np.ndarray, "demos frames components"]:
+    first, *others = arrays
+    for other in others:
+        for axis, counted in enumerate(("demonstrations", "frames")):
+            one, two = table[first].shape[axis], table[other].shape[axis]
+            if one != two:
+                raise DatasetError(
+                    f"{first!r} has {one} {counted}, {other!r} has {two}: make them alike, or "
+                    f"name arrays that are",
+                    file=path,
+                    key=name,
+                )
+    return np.concatenate([table[array] for array in arrays], axis=-1)
 
 
 def _by_name(table: Table) -> dict[str, list[str]]:
@@ -282,10 +350,10 @@ def _orientation(values: np.ndarray | None, quaternion_order: str) -> np.ndarray
 def _stamps(
     given: np.ndarray | None, frames: int, duration: float | int | None, fps: float | int | None
 ) -> np.ndarray:
+    if frames < 2:
+        raise ValueError(f"a demonstration needs at least two frames, got {frames}")
     if given is not None:
         return given[:, 0]
-    if frames < 2:
-        raise ValueError("a demonstration needs at least two frames")
     if duration is not None:
         return np.linspace(0.0, duration, frames)
     if fps is not None:
@@ -297,4 +365,6 @@ def _stamps(
 
 def _nominal_rate(time: np.ndarray) -> float:
     """LeRobot counts frames at a whole rate; the stamps themselves are kept beside it."""
-    return float(max(1, round(1 / float(np.median(np.diff(time))))))
+    step = float(np.median(np.diff(time)))
+    # Stamps that do not increase are refused by `Demonstration`.
+    return float(max(1, round(1 / step))) if step > 0 else 1.0
