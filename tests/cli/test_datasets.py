@@ -115,6 +115,19 @@ def test_recordings_of_different_robots_do_not_mix(recording, tmp_path):
     assert "do not fit into one dataset" in error
 
 
+@pytest.mark.parametrize("order", [("pose", "position"), ("position", "pose")])
+def test_recordings_of_different_arrays_do_not_mix(tmp_path, order):
+    position = dict(zip(("px", "py", "pz"), joint_path(50).T, strict=True))
+    turn = {"wx": np.zeros(50), "wy": np.zeros(50), "wz": np.linspace(0, 1, 50)}
+    np.savez(tmp_path / "position.npz", t=0.01 * np.arange(50), **position)
+    np.savez(tmp_path / "pose.npz", t=0.01 * np.arange(50), **position, **turn)
+    first, second = (tmp_path / f"{name}.npz" for name in order)
+    status, _, error = hrc("import", first, second, "--out", tmp_path / "set")
+    assert status == 2
+    assert f"{second} and {first} do not fit into one dataset: arrays" in error
+    assert not list(tmp_path.glob("set*"))
+
+
 def test_check_names_the_place_of_an_error(tmp_path):
     q = joint_path()
     q[7, 1] = np.nan

@@ -20,19 +20,14 @@ def import_arrays(args: ImportArrays) -> None:
     """Import the recordings."""
     if not args.files:
         raise ValueError("name at least one recording to import")
-    demos = [demo for path in args.files for demo in _read(args, path)]
-    rates = sorted({demo.fps for demo in demos})
-    if len({demo.joint_names for demo in demos}) > 1 or len(rates) > 1:
-        raise ValueError(
-            f"the files do not fit into one dataset: joints "
-            f"{sorted({len(demo.joint_names) for demo in demos})}, frame rates {rates} Hz "
-            f"(give --fps to count all alike; stamps are kept)"
-        )
-    features = {}
+    read = [(path, demo) for path in args.files for demo in _read(args, path)]
+    _refuse_unlike(read)
+    demos = [demo for _, demo in read]
+    fps, features = demos[0].fps, {}
     if args.actions:
         demos, features = with_actions(demos)
     with DatasetWriter(
-        args.out, rates[0], args.robot_type, demos[0].joint_names, features, dtype=args.dtype
+        args.out, fps, args.robot_type, demos[0].joint_names, features, dtype=args.dtype
     ) as writer:
         for demo in demos:
             writer.add_episode(demo)
@@ -40,13 +35,34 @@ def import_arrays(args: ImportArrays) -> None:
         "episodes": len(demos),
         "frames": sum(map(len, demos)),
         "seconds": sum(demo.duration for demo in demos),
-        "fps": rates[0],
+        "fps": fps,
     }
     print(
         f"{args.out}: {summary['episodes']} demonstrations, {summary['frames']} frames, "
         f"{summary['seconds']:.1f} s"
     )
     write_values(args.json, summary)
+
+
+def _refuse_unlike(demos: Sequence[tuple[Path, Demonstration]]) -> None:
+    """Refuse demonstrations, each with its file, that cannot share a dataset."""
+    first_path, first = demos[0]
+    for path, demo in demos[1:]:
+        for what, one, two, advice in (
+            ("joints", len(first.joint_names), len(demo.joint_names), "import them apart"),
+            ("joints", first.joint_names, demo.joint_names, "give --joint-names"),
+            ("arrays", first.recorded, demo.recorded, "import them apart"),
+            ("frame rate", first.fps, demo.fps, "give --fps; stamps are kept"),
+        ):
+            if one != two:
+                raise ValueError(
+                    f"{path} and {first_path} do not fit into one dataset: {what} "
+                    f"{_in_words(two)} and {_in_words(one)} ({advice})"
+                )
+
+
+def _in_words(value: float | int | tuple[str, ...]) -> str:
+    return ", ".join(value) if isinstance(value, tuple) else f"{value:g}"
 
 
 _POSE_ACTION = {
