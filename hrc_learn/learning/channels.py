@@ -94,12 +94,19 @@ class Motions:
 
     @classmethod
     def of(cls, demos: DemonstrationSet) -> "Motions":
-        """Pad them; of a Panda, the pose of the end effector follows from the joints."""
+        """Pad them; of a Panda, the pose of the end effector follows from the joints.
+
+        Not where a position or an orientation was recorded: it may be of another frame, and
+        nothing is learned from a pose of two.
+
+        Raises:
+            ValueError: A demonstration shows nothing, or holds values that are no numbers.
+        """
         for demo in demos:
             require_motion(demo, demos.source)
         padded = demos.padded()
         joints = padded.joint_position if demos.joint_names == panda.joint_names else None
-        if joints is not None and (padded.position is None or padded.orientation is None):
+        if joints is not None and padded.position is None and padded.orientation is None:
             hand = panda.forward(joints)
             pose = {"position": hand.position, "orientation": hand.orientation}
             padded = PaddedDemonstrations(**(vars(padded) | pose))
@@ -159,8 +166,7 @@ class Motions:
         if missing:
             raise ValueError(
                 f"{self.source}: the demonstrations hold no {' and no '.join(missing)}, which "
-                f"a primitive of channel {channel!r} is learned from. Look with "
-                f"datasets/check_dataset.py."
+                f"a primitive of channel {channel!r} is learned from. Look with hrc check."
             )
 
     def adapted(self, channel: str, primitive: Primitive) -> "Reproduction":
@@ -244,8 +250,7 @@ def select_channels(motions: Motions, wanted: Sequence[str]) -> tuple[str, ...]:
     if not available:
         raise ValueError(
             f"{motions.source}: the demonstrations hold neither joint positions nor "
-            "end-effector poses, so there is no motion to learn. Look with "
-            "hrc check."
+            "end-effector poses, so there is no motion to learn. Look with hrc check."
         )
     whole = [channel for channel in ("joint", "pose") if channel in available]
     parts = [channel for channel in ("position", "orientation") if channel in available]

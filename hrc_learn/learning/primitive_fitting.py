@@ -142,7 +142,8 @@ def fit_primitives(
     """Fit one primitive to each demonstration, and their mean.
 
     Joints are learned from any robot. The pose of the end effector is learned where it was
-    recorded, or where the joints are those of a Panda, with its arm angle.
+    recorded, or where nothing of it was and the joints are those of a Panda; of a Panda with
+    its arm angle.
 
     Args:
         demos: Demonstrations of one motion.

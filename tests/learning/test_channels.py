@@ -4,7 +4,7 @@ import torch
 
 from hrc_learn.demos import Demonstration, DemonstrationSet
 from hrc_learn.kinematics import panda, panda_capsules
-from hrc_learn.learning.channels import demonstrations_recording
+from hrc_learn.learning.channels import Motions, demonstrations_recording
 from hrc_learn.viz.arm_bodies import panda_bodies
 
 
@@ -56,3 +56,15 @@ def test_what_was_not_seen_and_other_robots_are_left_out(joints):
     assert shown.joint_limits is None
     assert shown.demonstrations[0].bodies == ()
     assert shown.demonstrations[0].position is None
+
+
+def test_a_recorded_position_is_learned_as_it_is_and_no_pose_of_two_frames(joints):
+    hand = panda.forward(torch.from_numpy(joints))
+    recorded = hand.position.numpy() + np.array([0.0, 0.0, 0.5])  # the arm stands on a table
+    motions = Motions.of(DemonstrationSet([demonstration(joints, position=recorded)]))
+    np.testing.assert_array_equal(motions.position("position")[0], recorded)
+    assert motions.available() == ("joint", "position")
+    with pytest.raises(ValueError, match=r"no orientation, .* Look with hrc check"):
+        motions.require("pose")
+    found = Motions.of(DemonstrationSet([demonstration(joints)]))
+    np.testing.assert_allclose(found.position("pose")[0], hand.position, atol=1e-12)
