@@ -367,11 +367,13 @@ def fit_motion(
     Raises:
         ValueError: An option that there is not.
     """
+    is_named = n_basis is not None or basis is not None
     if smooth is None:
-        smooth = n_basis is None and basis is None
-    if n_basis is not None or basis is not None:
-        warn_of_few_samples(samples, basis.count if basis else n_basis or 0)
-    basis = basis or GaussianBasis(count=n_basis or DEFAULT_COUNT)
+        smooth = not is_named
+    if basis is None:
+        basis = GaussianBasis(count=DEFAULT_COUNT if n_basis is None else n_basis)
+    if is_named:
+        warn_of_few_samples(samples, basis.count)
     response = response_of(spring or SpringDamper(), basis, float(approach))
     trust = noise = None
     if robust is not None:

@@ -75,6 +75,13 @@ def test_a_kind_that_was_not_recorded_is_refused(demos):
         fit_primitives(demos, 10, channels=("joint",))
 
 
+@pytest.mark.parametrize("count", [0, -3])
+def test_a_number_of_basis_functions_that_is_none_is_refused(demos, count):
+    for channel in ("position", "orientation", "pose"):
+        with pytest.raises(ValueError, match=f"at least 2 functions, got {count}"):
+            fit_primitives(demos, count, channels=(channel,))
+
+
 @pytest.mark.parametrize(
     ("position", "message"),
     [(np.full((40, 3), 0.3), "nothing moves in it"), (np.full((40, 3), np.nan), "no numbers")],
