@@ -131,7 +131,8 @@ def push_dataset(
         folder_path=folder.root,
         allow_patterns=[*UPLOADED],
         ignore_patterns=[_CARD, *([] if videos else ["videos/**"])],
-        delete_patterns=[*_OWNED],
+        # What is not sent is not known to be gone.
+        delete_patterns=[name for name in _OWNED if videos or name != "videos/*"],
         commit_message="Upload the dataset",
         **where,
     )

@@ -18,6 +18,7 @@ from hrc_learn.demos import (
     load_demos,
     recover_all,
 )
+from hrc_learn.demos.format.metadata import read_sidecar
 
 JOINTS = ("a", "b", "c")
 
@@ -170,6 +171,18 @@ def test_a_file_of_the_users_own_stays_in_the_dataset(tmp_path):
         record(root, [seed], ["place"], append=True)
     assert_holds(root, [0, 1, 2], ["reach", "place", "place"])
     assert (root / "README.md").read_text() == (root / "meta/notes.txt").read_text() == "mine"
+
+
+def test_what_was_kept_of_a_dataset_stays_with_the_longer_one(tmp_path):
+    root = record(tmp_path / "set", [1, 2], ["a", "b"], details={"who": "me", "room": 1})
+    assert hrc("check", root, "--keep-contract").status == 0
+    before = read_sidecar(root)
+    assert before.contract
+    record(root, [3], ["a"], append=True, details={"room": 2})
+    after = read_sidecar(root)
+    assert after.contract == before.contract
+    assert after.details == {"who": "me", "room": 2}
+    assert len(load_demos(root)) == 3
 
 
 def test_a_dataset_behind_a_link_grows_there(tmp_path):

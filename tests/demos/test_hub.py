@@ -132,8 +132,18 @@ def test_another_branch_leaves_main_and_its_tag_alone(hub, dataset):
     main, tags = repo.branches["main"], dict(repo.tags)
     push_dataset(dataset, "alice/reach", revision="try", videos=False, api=client(hub))
     assert (repo.branches["main"], repo.tags) == (main, tags)
-    assert not any(path.startswith("videos/") for path in repo.files("try"))
     assert any(path.startswith("videos/") for path in repo.files("main"))
+
+
+def test_videos_that_are_not_sent_stay_where_an_earlier_push_put_them(hub, dataset):
+    push_dataset(dataset, "alice/reach", videos=False, api=client(hub))
+    repo = hub.repositories["alice/reach"]
+    assert not any(path.startswith("videos/") for path in repo.files())
+    push_dataset(dataset, "alice/reach", api=client(hub))
+    videos = {path for path in repo.files() if path.startswith("videos/")}
+    assert videos
+    push_dataset(dataset, "alice/reach", videos=False, api=client(hub))
+    assert videos <= set(repo.files())
 
 
 def test_a_card_of_its_own_is_kept(hub, dataset):

@@ -20,6 +20,7 @@ from lerobot_folders import (
 from scipy.spatial.transform import Rotation
 
 from hrc_learn.demos import DatasetError, DatasetWriter, check_dataset, load_demos
+from hrc_learn.demos.read.reader import keep_first_contract
 from hrc_learn.demos.repair import RepairOptions, repair_dataset
 
 STATE = "observation.state"
@@ -348,6 +349,37 @@ def test_joints_are_not_torn_from_their_commands(tmp_path):
     (demo,) = load_demos(tmp_path / "both")
     np.testing.assert_allclose(demo.joint_position, q, atol=1e-9)
     np.testing.assert_allclose(demo.command_position, q + 0.05, atol=1e-9)
+
+
+@pytest.mark.parametrize(("turn", "unit"), [(2 * np.pi, "rad"), (360.0, "deg")])
+def test_resampling_goes_on_where_joints_and_commands_wrap(tmp_path, turn, unit):
+    q = np.linspace(2.5, 4.5, 90)[:, None] * np.array([1.0, -1.0, 0.2])
+    wrapped = (q + np.pi) % (2 * np.pi) - np.pi
+    factor = turn / (2 * np.pi)
+    episode = {STATE: factor * wrapped, "action": factor * wrapped}
+    names = {STATE: NAMES, "action": NAMES}
+    root = write_folder(tmp_path / "old", [episode], names, dtype="float64")
+    units = {"joint_position": unit, "command_position": unit}
+    options = RepairOptions(trim=False, fps=120)
+    repair_dataset(root, tmp_path / "new", options, units=units)
+    (demo,) = load_demos(tmp_path / "new")
+    expected = np.stack(
+        [np.interp(demo.time, np.arange(90) / FPS, column) for column in q.T], axis=1
+    )
+    for values in (demo.joint_position, demo.command_position):
+        assert np.abs(values).max() <= np.pi + 1e-6
+        off = np.angle(np.exp(1j * (values - expected)))
+        np.testing.assert_allclose(off, 0, atol=1e-3)
+
+
+def test_units_given_to_a_repair_overrule_an_older_contract(tmp_path):
+    root = write(tmp_path / "old", [joint_path(60, seed=k) for k in range(2)])
+    keep_first_contract(root, {"joint_position": "rad"})
+    repair_dataset(
+        root, tmp_path / "new", RepairOptions(trim=False), units={"joint_position": "deg"}
+    )
+    degrees = np.deg2rad(joint_path(60, seed=0))
+    np.testing.assert_allclose(load_demos(tmp_path / "new")[0].joint_position, degrees)
 
 
 def test_trimming_waits_for_the_gripper_and_for_the_command(tmp_path):

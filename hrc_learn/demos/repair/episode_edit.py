@@ -110,7 +110,7 @@ def unwrap(edit: EpisodeEdit, semantics: ColumnSemantics, commands: bool) -> Epi
     roles += ["command_position"] * (commands and "command_position" in quantities)
     for role in roles:
         values = quantities[role]
-        turn = 2 * np.pi / np.broadcast_to(semantics.units[role].factor, values.shape[1])
+        turn = _turn_of(values, semantics, role)
         if role == "rotation_vector":
             scaled = torch.from_numpy(values * 2 * np.pi / turn)
             smooth = quaternion.unwrap_log(scaled).numpy() * turn / (2 * np.pi)
@@ -121,11 +121,7 @@ def unwrap(edit: EpisodeEdit, semantics: ColumnSemantics, commands: bool) -> Epi
             ]
         if role == "joint_position" and not commands and "command_position" in quantities:
             other = quantities["command_position"]
-            bound = (
-                2
-                * np.pi
-                / np.broadcast_to(semantics.units["command_position"].factor, other.shape[1])
-            )
+            bound = _turn_of(other, semantics, "command_position")
             together = _turns(other / bound).any(0)
             smooth[:, together] = values[:, together]
         # Beyond rounding: a rotation vector is changed in its last digit by scaling.
@@ -194,13 +190,14 @@ def _with_quantity(
     semantics: ColumnSemantics,
     role: str,
     values: Float64[np.ndarray, "frames columns"],
-    change: str,
+    change: str | None,
 ) -> EpisodeEdit:
     columns: RawFrames = {}
     for number, (key, index) in enumerate(semantics.column_mapping.selections[role].columns):
         column = columns.setdefault(key, edit.frames[key].copy())
         column[:, index] = values[:, number]
-    return replace(edit, frames=edit.frames | columns, changes=(*edit.changes, change))
+    said = edit.changes if change is None else (*edit.changes, change)
+    return replace(edit, frames=edit.frames | columns, changes=said)
 
 
 # An episode at the frames of a regular grid.
@@ -213,12 +210,15 @@ def resample_to_grid(
 ) -> EpisodeEdit:
     """Resample every column, as `preprocessing.resample` does.
 
-    Rotation vectors and Euler angles are interpolated as they are: unwrap them first.
+    Angles that jump by whole turns are interpolated without these, and jump again afterwards.
+    Rotation vectors are interpolated as they are: unwrap them first.
 
     Raises:
         DatasetError: The stamps do not increase, or the episode is shorter than a period, or
             holds transforms, which cannot be interpolated by their entries.
     """
+    source = edit
+    edit, jumping = _without_turns(edit, semantics)
     quantities = edit.quantities(semantics)
     if "pose_matrix" in quantities:
         raise edit.bad(
@@ -251,6 +251,9 @@ def resample_to_grid(
         ].columns
         for number, (key, index) in enumerate(taken):
             columns[key][:, index] = values[:, number]
+    for (key, index), (turn, middle) in jumping.items():
+        column = columns[key][:, index]
+        columns[key][:, index] = column - turn * np.rint((column - middle) / turn)
     nearest = nearest_frames(demo.time, np.minimum(moved.time, demo.time[-1]))
     hands = {
         column
@@ -263,8 +266,8 @@ def resample_to_grid(
         )
         if role == "gripper" or label in semantics.hands
     }
-    profiles = profile_columns(edit.frames)
-    for key, values in edit.frames.items():
+    profiles = profile_columns(source.frames)
+    for key, values in source.frames.items():
         if values.dtype.kind not in "f":
             columns[key] = values[nearest]
             continue
@@ -285,6 +288,39 @@ def resample_to_grid(
             f"resampled {len(edit)} frames to {len(moved)} at {fps:g} Hz",
         ),
     )
+
+
+def _without_turns(
+    edit: EpisodeEdit, semantics: ColumnSemantics
+) -> tuple[EpisodeEdit, dict[tuple[str, int], tuple[float, float]]]:
+    """Angles and commands without jumps by whole turns.
+
+    Returns:
+        The episode, and of each component that jumps a turn, and the middle of its range, in
+        its unit.
+    """
+    quantities, jumping = edit.quantities(semantics), {}
+    for role in (*_MEASURED_ANGLES, "command_position"):
+        if role not in quantities:
+            continue
+        values = quantities[role]
+        turn = _turn_of(values, semantics, role)
+        turns = _turns(values / turn) * _may_turn(edit, semantics, role)
+        if not turns.any():
+            continue
+        selection = semantics.column_mapping.selections[role]
+        for k in np.flatnonzero(turns.any(0)):
+            middle = float(values[:, k].min() + values[:, k].max()) / 2
+            jumping[selection.columns[k]] = float(turn[k]), middle
+        edit = _with_quantity(edit, semantics, role, values - turn * turns, None)
+    return edit, jumping
+
+
+def _turn_of(
+    values: Float64[np.ndarray, "frames columns"], semantics: ColumnSemantics, role: str
+) -> Float64[np.ndarray, " columns"]:
+    """A whole turn in the unit of each component."""
+    return 2 * np.pi / np.broadcast_to(semantics.units[role].factor, values.shape[1])
 
 
 # Frames that a dataset is better without.

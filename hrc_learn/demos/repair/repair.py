@@ -39,6 +39,7 @@ from hrc_learn.demos.format.videos import (
 from hrc_learn.demos.issue import DatasetError
 from hrc_learn.demos.read.column_mapping import MappingSpec
 from hrc_learn.demos.read.contract import (
+    Contract,
     changed_since,
     contract_content,
     contract_of,
@@ -146,7 +147,19 @@ def repair_dataset(
         assemble(paths, target, videos=videos, tasks=recast.tasks, share=False)
         _copy_notes(folder.root, target)
         if (contract := contract_of(sidecar)) is not None:
-            carried = replace(contract, fingerprint=fingerprint(open_folder(target)))
+            given = {
+                column: units[role]
+                for role in units
+                if role in semantics.column_mapping.selections
+                for column in semantics.column_mapping.selections[role].columns
+            }
+            carried = Contract(
+                components=tuple(
+                    replace(part, unit=given.get((part.key, part.index), part.unit))
+                    for part in contract.components
+                ),
+                fingerprint=fingerprint(open_folder(target)),
+            )
             content = read_sidecar(target)
             content = replace(content, contract=contract_content(carried))
             write_json(target / SIDECAR_PATH, sidecar_copy(content, content.units))

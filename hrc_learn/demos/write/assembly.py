@@ -35,6 +35,7 @@ from hrc_learn.demos.format.metadata import (
     data_schema,
     info,
     place,
+    read_sidecar,
     write_json,
     write_tasks,
 )
@@ -182,7 +183,14 @@ def assemble(
             for key, segment in next(segments).items():
                 columns |= shelf.columns(key, segment)
             index.add(staged, file, columns)
-    _write_metadata(target, header, index)
+    sidecar = header.sidecar
+    if earlier is not None and sidecar:
+        # What was kept, or edited by hand, holds for the longer dataset too.
+        before = read_sidecar(earlier)
+        sidecar = sidecar | {"details": before.details | sidecar["details"]}
+        if before.contract:
+            sidecar["contract"] = before.contract
+    _write_metadata(target, header, index, sidecar)
 
 
 def _write_frames(
@@ -209,7 +217,9 @@ def _by_size(paths: Sequence[Path]) -> Iterator[list[Path]]:
     yield group
 
 
-def _write_metadata(target: Path, header: RecordingHeader, index: _Index) -> None:
+def _write_metadata(
+    target: Path, header: RecordingHeader, index: _Index, sidecar: dict[str, Any]
+) -> None:
     tasks = list(index.tasks)
     write_tasks(target / "meta/tasks.parquet", tasks)
     pq.write_table(index.table(), target / EPISODES_PATH)
@@ -223,8 +233,8 @@ def _write_metadata(target: Path, header: RecordingHeader, index: _Index) -> Non
     )
     write_json(target / "meta/info.json", content)
     write_json(target / "meta/stats.json", index.statistics())
-    if header.sidecar:
-        write_json(target / SIDECAR_PATH, header.sidecar)
+    if sidecar:
+        write_json(target / SIDECAR_PATH, sidecar)
 
 
 def _recorded_videos(path: Path, cameras: Sequence[str], fps: float) -> Segments:
