@@ -52,6 +52,8 @@ class FeatureTrack:
 
 def features_folder(root: Path) -> Path:
     """Where the features found in the videos of the dataset `root` are kept."""
+    if root.name in ("", ".."):
+        root = root.resolve()
     return root.with_name(root.name + ".features")
 
 
@@ -104,8 +106,8 @@ class FeatureCache:
         file = str(self.path(episode))
         if not self.path(episode).is_file():
             raise DatasetError(
-                f"{self.name} was not extracted from this episode: run extract_features.py, "
-                f"which goes on where it was broken off",
+                f"{self.name} was not extracted from this episode: hrc extract goes on where "
+                f"it was broken off",
                 file=file,
                 episode=episode,
             )
@@ -114,8 +116,7 @@ class FeatureCache:
         u, v, visible = (to_numpy(table.column(c))[:, 0] for c in ("u", "v", "visible"))
         if len(u) != frames:
             raise DatasetError(
-                f"{self.name} has {len(u)} frames, the episode {frames}: run "
-                f"extract_features.py again",
+                f"{self.name} has {len(u)} frames, the episode {frames}: run hrc extract again",
                 file=file,
                 episode=episode,
             )
@@ -277,11 +278,33 @@ def only_feature(root: Path) -> FeatureCache | None:
     return FeatureCache(root, names[0]) if len(names) == 1 else None
 
 
-def with_feature(demo: Demonstration, cache: FeatureCache) -> Demonstration:
+def missing_note(cache: FeatureCache, episodes: Sequence[int]) -> list[str]:
+    """Says in which episodes a feature was not looked for; empty if in none."""
+    without = [episode for episode in episodes if not cache.path(episode).is_file()]
+    if not without:
+        return []
+    first = ", ".join(map(str, without[:5])) + ", ..." * (len(without) > 5)
+    return [
+        f"{cache.name} was not extracted from {len(without)} episodes ({first}) and counts as "
+        f"not seen there; hrc extract goes on where it was broken off"
+    ]
+
+
+def with_feature(
+    demo: Demonstration, cache: FeatureCache, *, if_known: bool = False
+) -> Demonstration:
     """The demonstration with the feature of its episode.
+
+    Args:
+        demo: Of the dataset.
+        cache: Of the feature.
+        if_known: Seen nowhere, where it was not extracted from the episode.
 
     Raises:
         DatasetError: It was not extracted from this episode.
     """
+    if if_known and not cache.path(demo.episode).is_file():
+        unseen = np.zeros((len(demo), 2)), np.zeros(len(demo), dtype=bool)
+        return replace(demo, feature=unseen[0], feature_visible=unseen[1])
     track = cache.read(demo.episode, len(demo))
     return replace(demo, feature=track.pixels, feature_visible=track.visible)

@@ -7,10 +7,12 @@ import json
 import subprocess
 import sys
 import typing
+from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import hrc
+from clean_sets import SETS, write_set
+from commands import done, hrc
 
 from hrc_learn import cli
 from hrc_learn.cli import _options
@@ -232,8 +234,11 @@ def run(monkeypatch, main) -> object:
     [
         (ValueError("two\nlines"), 2, "error: two lines\n"),
         (FileNotFoundError(2, "No such file or directory", "/x"), 2, "error: /x: No such file"),
+        (PermissionError(13, "Permission denied", "/x"), 2, "error: /x: Permission denied\n"),
+        (IsADirectoryError(21, "Is a directory", "/x"), 2, "error: /x: Is a directory\n"),
         (KeyboardInterrupt(), 1, "interrupted\n"),
         (ModuleNotFoundError("no tyro", name="tyro"), 1, "error: tyro is not installed"),
+        (ModuleNotFoundError("none", name="httpx"), 1, "error: httpx is not installed, which"),
         (MissingModelError("get it", name="robosuite"), 1, "error: get it\n"),
     ],
 )
@@ -254,12 +259,13 @@ def test_a_module_that_nobody_told_of_shows_where_it_was_missed(monkeypatch):
         run(monkeypatch, main)
 
 
-def test_our_own_mistakes_are_not_taken_for_the_users(monkeypatch):
+@pytest.mark.parametrize("error", [KeyError("ours"), OSError("of no file"), BrokenPipeError()])
+def test_our_own_mistakes_are_not_taken_for_the_users(monkeypatch, error):
     def main(_):
-        raise KeyError("ours")
+        raise error
 
     monkeypatch.setattr("warnings.formatwarning", None)
-    with pytest.raises(KeyError):
+    with pytest.raises(type(error)):
         run(monkeypatch, main)
 
 
@@ -288,3 +294,14 @@ def test_configurations_are_resolved_to_their_defaults_or_to_what_was_given():
     assert given.seed == 3
     # What is kept with a run has nothing left open.
     assert "Detail" not in str(dataclasses.asdict(given)) + str(dataclasses.asdict(plain))
+
+
+def test_a_dataset_may_be_where_one_is(monkeypatch, tmp_path):
+    write_set(tmp_path / "set", **SETS["v2.0"])
+    monkeypatch.chdir(tmp_path / "set")
+    done("show", ".", "--out", tmp_path / "shown.rrd")
+    done("fit", "--dataset", ".", "--n-basis", 10)
+    assert (tmp_path / "set_model" / "metrics.json").is_file()
+    done("repair", ".", "--dry-run")
+    assert Repair(dataset=Path(".")).folder == tmp_path / "set_repaired"
+    assert Repair(dataset=Path("set")).folder == Path("set_repaired")

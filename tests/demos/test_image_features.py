@@ -86,8 +86,12 @@ def test_what_was_broken_off_goes_on_where_it_was(tmp_path):
 
     with pytest.raises(KeyboardInterrupt):
         extract_features(root, "spot", lambda: brightest, progress=unlucky)
+    demos = load_demos(root)
+    assert_tracks(demos[:1])
+    assert not demos[1].feature_visible.any()
+    assert any("not extracted from 1 episodes (1)" in note for note in demos.notes)
     with pytest.raises(DatasetError, match=r"episode 1: front\.spot was not extracted"):
-        load_demos(root)
+        attach_features(demos)
 
     def counting(image):
         looked.append(1)
@@ -146,9 +150,13 @@ def test_a_bad_video_is_listed_and_keeps_none_of_the_others_out(tmp_path, bad, s
     done = extract_features(root, "spot", lambda: brightest)
     assert (done.episodes, done.frames, [*done.left_out]) == (1, 50, [0])
     assert said in done.left_out[0]
-    assert_tracks(load_demos(root, episodes=[1]))
-    with pytest.raises(DatasetError, match=r"episode 0: front\.spot was not extracted"):
-        load_demos(root)
+    alone = load_demos(root, episodes=[1])
+    assert_tracks(alone)
+    assert not any("not extracted" in note for note in alone.notes)
+    demos = load_demos(root)
+    assert not demos[0].feature_visible.any()
+    assert_tracks(demos[1:])
+    assert any("not extracted from 1 episodes (0)" in note for note in demos.notes)
     # Copied again, it is all that is left to look at.
     first.write_bytes(whole)
     done = extract_features(root, "spot", lambda: brightest)

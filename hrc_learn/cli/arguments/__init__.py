@@ -82,6 +82,12 @@ Experiment = Literal[
 """Keys of `hrc_learn.experiments.controller.sweep.EXPERIMENTS`."""
 
 
+def beside(dataset: Path, what: str) -> Path:
+    """The folder DATASET_what; "." and ".." go by their true name."""
+    named = dataset if dataset.name not in ("", "..") else dataset.resolve()
+    return named.with_name(f"{named.name}_{what}")
+
+
 @dataclass(frozen=True, kw_only=True)
 class OfRobot:
     """A command that some arm carries out."""

@@ -7,7 +7,7 @@ from typing import Any, Literal
 from tyro.conf import Positional
 
 from hrc_learn.cli._options import Detail, More
-from hrc_learn.cli.arguments import Measured, Written
+from hrc_learn.cli.arguments import Measured, Written, beside
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,7 +89,7 @@ class Repair(Measured):
     @property
     def folder(self) -> Path:
         """Where the copy is written."""
-        return self.out or self.dataset.with_name(f"{self.dataset.name}_repaired")
+        return self.out or beside(self.dataset, "repaired")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,7 +131,7 @@ class Curate(Measured):
     @property
     def folder(self) -> Path:
         """Where the cleaned dataset is written."""
-        return self.out or self.dataset.with_name(f"{self.dataset.resolve().name}_curated")
+        return self.out or beside(self.dataset, "curated")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,7 +5,15 @@ from pathlib import Path
 from typing import Literal
 
 from hrc_learn.cli._options import Detail, More
-from hrc_learn.cli.arguments import Channel, Configuration, Measured, OfRobot, Scaling, Written
+from hrc_learn.cli.arguments import (
+    Channel,
+    Configuration,
+    Measured,
+    OfRobot,
+    Scaling,
+    Written,
+    beside,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,7 +32,7 @@ class Fit(Written):
     @property
     def folder(self) -> Path:
         """Where the model is written."""
-        return self.out or self.dataset.with_name(f"{self.dataset.name}_model")
+        return self.out or beside(self.dataset, "model")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,7 +19,7 @@ from hrc_learn.demos.demonstration import (
 )
 from hrc_learn.demos.format.dataset_folder import DatasetFolder, EpisodeEntry
 from hrc_learn.demos.format.metadata import SIDECAR_PATH
-from hrc_learn.demos.image_features import with_feature
+from hrc_learn.demos.image_features import missing_note, with_feature
 from hrc_learn.demos.issue import DatasetError, UnitsWarning
 from hrc_learn.demos.read.column_mapping import ColumnMapping, MappingSpec, map_columns
 from hrc_learn.demos.read.contract import infer_contract, keep_contract
@@ -239,6 +239,9 @@ class DemonstrationSource(Sequence[Demonstration]):
         self.joint_names = tuple(names)
         guesses = (decision.note for decision in decisions.values() if decision.note)
         self.notes = (*reader.notes, *guesses)
+        if reader.extracted is not None:
+            wanted = [entry.index for entry in reader.entries]
+            self.notes += tuple(missing_note(reader.extracted, wanted))
         self.source = str(reader.folder.root)
 
     @overload
@@ -302,7 +305,7 @@ class DemonstrationSource(Sequence[Demonstration]):
         reader = self._reader
         demo = to_demonstration(reader.folder, episode, reader.column_mapping, self._decisions)
         if reader.extracted is not None:
-            demo = with_feature(demo, reader.extracted)
+            demo = with_feature(demo, reader.extracted, if_known=True)
         return demo.select_joints(self.joint_names)
 
 
