@@ -6,9 +6,13 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 from clean_sets import CAMERA, SIZE, bar, write_set, write_video
+from lerobot_folders import read_info, rewrite, write_info
+from unchecked import shapes_unchecked
 
 from hrc_learn.demos import DatasetError, ImageReader, load_demos, load_images
-from hrc_learn.demos.format.videos import decode_image
+from hrc_learn.demos.format import videos
+from hrc_learn.demos.format.dataset_folder import open_folder
+from hrc_learn.demos.format.videos import decode_image, read_segments
 from hrc_learn.demos.read.images import jpeg
 
 
@@ -38,6 +42,45 @@ def test_frames_come_in_the_order_asked_for_and_scaled(root):
     assert small.shape == (1, 3, 24, 32)
     assert abs(bar(small[0]) - bar(every[9]) / 2) <= 1
     assert load_images(root, 1, frames=[]) == {}
+
+
+EPISODES = "meta/episodes/chunk-000/file-000.parquet"
+
+
+@pytest.mark.parametrize("version", ["3.0", 3.0])
+def test_the_version_may_be_written_otherwise(tmp_path, version):
+    root = write_set(tmp_path / "set", "v3.0", camera=True)
+    write_info(root, read_info(root) | {"codebase_version": version})
+    with shapes_unchecked():  # a number is no text
+        images = load_images(root, 0, frames=[9])[CAMERA]
+    assert bar(images[0]) == pytest.approx(9, abs=1)
+
+
+@pytest.mark.parametrize("name", ["file_index", "from_timestamp", "to_timestamp"])
+def test_a_video_without_a_place_is_named(tmp_path, name):
+    root = write_set(tmp_path / "set", "v3.0", camera=True)
+    column = f"videos/{CAMERA}/{name}"
+    rewrite(root / EPISODES, lambda table: table.drop_columns([column]))
+    with pytest.raises(DatasetError, match=f"{EPISODES}, episode 0, {column}: must be"):
+        ImageReader(root)
+
+
+def test_of_the_list_of_episodes_only_the_places_of_videos_are_read(tmp_path, monkeypatch):
+    root = write_set(tmp_path / "set", "v3.0", camera=True)
+    rewrite(
+        root / EPISODES,
+        lambda table: table.append_column("stats/action/mean", pa.array([[0.0]] * len(table))),
+    )
+    read, rows = set(), videos.read_rows
+
+    def watched(*args, **options):
+        found = rows(*args, **options)
+        read.update(*found)
+        return found
+
+    monkeypatch.setattr(videos, "read_rows", watched)
+    assert len(read_segments(open_folder(root))) == 5
+    assert {name.split("/")[0] for name in read} == {"episode_index", "videos"}
 
 
 def test_a_video_without_the_last_images_names_the_first_that_is_missing(tmp_path):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from unchecked import shapes_unchecked
 
 from hrc_learn.demos import DatasetWriter, check_dataset, load_demos, recover_dataset
 from hrc_learn.demos.format.videos import video_path
@@ -78,6 +79,17 @@ def test_images_that_do_not_fit_are_refused(tmp_path, images, message):
         writer.start_episode("look")
         with pytest.raises(ValueError, match=message):
             writer.add_frame(joint_position=[0.0], images=images)
+        writer.add_frame(joint_position=[0.0], images={"front": image(0)})
+        writer.save_episode()
+    assert len(load_demos(tmp_path / "set")[0]) == 1
+
+
+def test_images_of_another_type_leave_no_row_without_an_image(tmp_path):
+    with DatasetWriter(tmp_path / "set", 50, "any", ["a"], cameras={"front": SIZE}) as writer:
+        writer.start_episode("look")
+        refused = pytest.raises(ValueError, match=r"front must be uint8.*got float64")
+        with shapes_unchecked(), refused:
+            writer.add_frame(joint_position=[0.0], images={"front": image(0) / 255})
         writer.add_frame(joint_position=[0.0], images={"front": image(0)})
         writer.save_episode()
     assert len(load_demos(tmp_path / "set")[0]) == 1

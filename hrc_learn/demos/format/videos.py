@@ -20,6 +20,7 @@ from jaxtyping import Shaped, UInt8
 from hrc_learn.demos.format.dataset_folder import (
     DatasetFolder,
     EpisodeEntry,
+    _generation,
     path_in,
     read_rows,
 )
@@ -64,12 +65,13 @@ def read_segments(folder: DatasetFolder, missing: bool = False) -> dict[int, Seg
         missing: Also those whose file is not there.
 
     Raises:
-        DatasetError: The metadata lead to no file, or out of the dataset.
+        DatasetError: The metadata lead to no file, or out of the dataset, or do not say where
+            in a file the images lie.
     """
     keys = video_keys(folder)
     if not keys:
         return {}
-    places = _places_v3(folder, keys) if folder.version.startswith("v3") else {}
+    places = _places_v3(folder, keys) if _generation(folder.version) == 3 else {}
     segments = {}
     for entry in folder.episodes:
         found = places.get(entry.index) or _of_own_file(folder, entry, keys)
@@ -77,33 +79,53 @@ def read_segments(folder: DatasetFolder, missing: bool = False) -> dict[int, Seg
     return segments
 
 
+_PLACE = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
+"""What the list of episodes says of an episode's images in each video feature."""
+
+
 def _places_v3(folder: DatasetFolder, keys: list[str]) -> dict[int, Segments]:
-    template = folder.info.get("video_path")
-    places = {}
+    columns = [f"videos/{key}/{name}" for key in keys for name in _PLACE]
+    places: dict[int, Segments] = {}
     for path in sorted((folder.root / "meta/episodes").glob("*/*.parquet")):
-        for row in read_rows(folder.root, str(path.relative_to(folder.root)), ()):
+        file = str(path.relative_to(folder.root))
+        for row in read_rows(folder.root, file, ("episode_index",), columns):
             places[row["episode_index"]] = {
-                key: VideoSegment(
-                    file=folder.root
-                    / path_in(
-                        folder.root,
-                        template,
-                        "video_path",
-                        video_key=key,
-                        chunk_index=row[f"videos/{key}/chunk_index"],
-                        file_index=row[f"videos/{key}/file_index"],
-                    ),
-                    start=float(row[f"videos/{key}/from_timestamp"]),
-                    stop=float(row[f"videos/{key}/to_timestamp"]),
-                )
+                key: _segment(folder, file, key, row)
                 for key in keys
                 if row.get(f"videos/{key}/chunk_index") is not None
             }
     return places
 
 
+def _segment(
+    folder: DatasetFolder, file: str, key: str, row: Mapping[str, Any]
+) -> VideoSegment:
+    values: dict[str, Any] = {name: row.get(f"videos/{key}/{name}") for name in _PLACE}
+    for name, value in values.items():
+        if not isinstance(value, int | float):
+            raise DatasetError(
+                f"must be a number, got {value!r}: copy the list of episodes again",
+                file=file,
+                episode=row["episode_index"],
+                key=f"videos/{key}/{name}",
+            )
+    video = path_in(
+        folder.root,
+        folder.info.get("video_path"),
+        "video_path",
+        video_key=key,
+        chunk_index=values["chunk_index"],
+        file_index=values["file_index"],
+    )
+    return VideoSegment(
+        file=folder.root / video,
+        start=float(values["from_timestamp"]),
+        stop=float(values["to_timestamp"]),
+    )
+
+
 def _of_own_file(folder: DatasetFolder, entry: EpisodeEntry, keys: list[str]) -> Segments:
-    if folder.version.startswith("v3"):
+    if _generation(folder.version) == 3:
         return {}
     template = folder.info.get("video_path")
     chunk = entry.index // int(folder.info.get("chunks_size", 1000))
@@ -278,7 +300,8 @@ class CameraRecorder:
         """Refuse what cannot be encoded.
 
         Raises:
-            ValueError: A camera is missing or unknown, or its image is of the wrong size.
+            ValueError: A camera is missing or unknown, or its image is of the wrong size or
+                type.
         """
         if images.keys() != self._cameras.keys():
             raise ValueError(
@@ -291,6 +314,8 @@ class CameraRecorder:
                     f"images of {camera} are {(*self._cameras[camera], 3)}, got "
                     f"{np.shape(image)}"
                 )
+            if (dtype := np.asarray(image).dtype) != np.uint8:
+                raise ValueError(f"images of {camera} must be uint8 (0 to 255), got {dtype}")
 
     def append(self, images: Mapping[str, Image]) -> None:
         """Encode one frame's images, which `examine` has passed."""
