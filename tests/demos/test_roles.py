@@ -102,6 +102,14 @@ def test_velocities_follow_the_unit_of_positions(role, unit):
     assert decisions[role].factor == pytest.approx(math.pi / 180)
 
 
+@pytest.mark.parametrize("unit", ["%", "1"])
+@pytest.mark.parametrize("role", ["joint_velocity", "command_velocity"])
+def test_velocities_of_joints_given_as_a_share_keep_their_own_unit(role, unit):
+    decisions = decide_units({role: 1.0, "joint_position": 90.0}, {}, {"joint_position": unit})
+    assert decisions[role].unit == "rad/s"
+    assert decisions[role].evidence == ""
+
+
 @pytest.mark.parametrize(
     ("step", "unit", "factor"),
     [

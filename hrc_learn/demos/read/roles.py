@@ -285,16 +285,27 @@ def unit_factor(role: str, unit: str) -> float:
         raise DatasetError(
             f"units are given for the unknown quantity {role!r}; known are {', '.join(ROLES)}"
         )
-    own = ROLES[role].unit
-    options = next(units for units in _DIMENSIONS.values() if own in units)
-    if role in ("gripper", "joint_position", "command_position"):
-        # Grippers and hands come as a share of their opening, hobby arms of their range.
-        options = options | _DIMENSIONS["ratio"]
+    options = _options(role)
     if unit not in options:
         raise DatasetError(
             f"{role} does not come in {unit!r}; known units are {', '.join(options)}"
         )
     return options[unit]
+
+
+def comes_in(role: str, unit: str) -> bool:
+    """Whether a known quantity comes in a unit."""
+    return unit in _options(role)
+
+
+def _options(role: str) -> dict[str, float]:
+    """The units of a quantity and their sizes."""
+    own = ROLES[role].unit
+    options = next(units for units in _DIMENSIONS.values() if own in units)
+    if role in ("gripper", "joint_position", "command_position"):
+        # Grippers and hands come as a share of their opening, hobby arms of their range.
+        options = options | _DIMENSIONS["ratio"]
+    return options
 
 
 def decide_units(
@@ -333,15 +344,7 @@ def decide_units(
         if role in stated:
             decisions[role] = _stated(role, stated[role])
         elif (leader := decisions.get(_FOLLOWERS.get(role, ""))) is not None:
-            per_second = "/s" if role.endswith("velocity") else ""
-            units = () if per_second else leader.units
-            decisions[role] = UnitDecision(
-                role=role,
-                unit=leader.unit + per_second if leader.unit != "1" else ROLES[role].unit,
-                units=units,
-                confidence=leader.confidence,
-                evidence=f"that of {leader.role}",
-            )
+            decisions[role] = _following(role, leader)
         elif role == "time":
             decisions[role] = _guess_time(frame_step)
         elif role in _GUESSABLE:
@@ -350,6 +353,21 @@ def decide_units(
         else:
             decisions[role] = UnitDecision(role=role, unit=ROLES[role].unit)
     return decisions
+
+
+def _following(role: str, leader: UnitDecision) -> UnitDecision:
+    """In the unit of the leader, where it has one that the quantity comes in."""
+    velocity = role.endswith("velocity")
+    unit = leader.unit + "/s" if velocity else leader.unit
+    # Of a share of the range, nothing is known of the speed.
+    followed = leader.unit != "1" and comes_in(role, unit)
+    return UnitDecision(
+        role=role,
+        unit=unit if followed else ROLES[role].unit,
+        units=() if velocity else leader.units,
+        confidence=leader.confidence,
+        evidence=f"that of {leader.role}" if followed else "",
+    )
 
 
 def _stated(role: str, unit: str | Sequence[str]) -> UnitDecision:
