@@ -329,6 +329,15 @@ def test_mapping_overrules_what_names_say(tmp_path):
         ({"joint_position": "observation.qpos"}, "observation.qpos: .*does not exist"),
         ({"joint_position": ["elbow"]}, "elbow: .*does not exist.*panda_joint1"),
         ({"position": f"{STATE}[0:2]"}, "position 2 columns, it takes 3"),
+        ({"joint_position": []}, "joint_position no columns"),
+        *(
+            (
+                {"joint_position": f"{STATE}[{bounds}]"},
+                rf"{STATE}: mapping takes joint_position from .*\[{bounds}\]', which is no "
+                rf"range of its 3 components",
+            )
+            for bounds in ("0:6", "3:6", "3:", "4", "2:1", "2:2", "", "0:3:2", "x")
+        ),
     ],
 )
 def test_a_wrong_mapping_says_what_exists(tmp_path, mapping, message):

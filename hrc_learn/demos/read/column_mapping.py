@@ -26,7 +26,8 @@ MappingSpec = Mapping[str, str | Sequence[str] | None]
 """Role -> columns: a feature ("observation.qpos"), a range of one ("observation.state[0:7]"),
 or component names (["j1.pos", "observation.state/j2.pos"]); None leaves the role out."""
 
-_RANGE = re.compile(r"(.+)\[(\d*):?(\d*)\]")
+_RANGE = re.compile(r"(.+)\[([^\[\]]*)\]")
+_BOUNDS = re.compile(r"(\d{1,9})|(\d{0,9}):(\d{0,9})")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,6 +79,8 @@ def _selection(
         places = _feature_range(role, columns, features)
     else:
         places = [_component(role, name, features) for name in columns]
+    if not places:
+        raise DatasetError(f"mapping gives {role} no columns; None leaves it out")
     width = ROLES[role].width
     if width is not None and len(places) != width:
         raise DatasetError(f"mapping gives {role} {len(places)} columns, it takes {width}")
@@ -98,7 +101,7 @@ def _label(name: str, role: str) -> str:
 def _feature_range(
     role: str, text: str, features: Mapping[str, Feature]
 ) -> list[tuple[str, int]]:
-    match = _RANGE.fullmatch(text)
+    match = None if text in features else _RANGE.fullmatch(text)
     key = match[1] if match else text
     if key not in features:
         raise DatasetError(
@@ -107,12 +110,26 @@ def _feature_range(
             file=INFO_PATH,
             key=key,
         )
-    indices = range(features[key].width)
-    if match and ":" in text:
-        indices = indices[int(match[2] or 0) : int(match[3]) if match[3] else None]
-    elif match:
-        indices = indices[int(match[2]) : int(match[2]) + 1]
-    return [(key, index) for index in indices]
+    width = features[key].width
+    first, stop = _bounds(match[2], width) if match else (0, width)
+    if not first < stop <= width:
+        raise DatasetError(
+            f"mapping takes {role} from {text!r}, which is no range of its {width} components: "
+            f"write [first:stop] or [index], counted from 0",
+            file=INFO_PATH,
+            key=key,
+        )
+    return [(key, index) for index in range(first, stop)]
+
+
+def _bounds(text: str, width: int) -> tuple[int, int]:
+    """First component of a range and the one behind its last; an empty one of other texts."""
+    match = _BOUNDS.fullmatch(text)
+    if match is None:
+        return 0, 0
+    if match[1]:
+        return int(match[1]), int(match[1]) + 1
+    return int(match[2] or 0), int(match[3] or width)
 
 
 def _component(role: str, name: str, features: Mapping[str, Feature]) -> tuple[str, int]:
