@@ -79,7 +79,7 @@ def _read_npz(path: Path) -> Table:
                 array = file[name]
             except _UNREADABLE as error:
                 raise DatasetError(
-                    f"cannot be read as an array of numbers ({error}): save it anew, or without",
+                    f"cannot be read as an array of numbers ({error}): save it anew",
                     file=path,
                     key=name,
                 ) from error
