@@ -6,12 +6,14 @@ line on stderr.
 
 import io
 import json
+import os
 import re
 import shlex
 import signal
 import sys
 import threading
 import warnings
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr
 from dataclasses import asdict, fields
@@ -44,6 +46,7 @@ EXTRAS = {
     "example_robot_data": "meshes",
     "ray": "sweep",
     "huggingface_hub": "hub",
+    "httpx": "hub",
 }
 """Extra of the package that brings a library."""
 
@@ -51,10 +54,10 @@ EXTRAS = {
 def run[Args](main: Callable[[Args], int | None], args: type[Args]) -> NoReturn:
     """Parse the command line into the dataclass `args`, call `main` with it, and exit.
 
-    `main` returns the exit status, None for 0. A ValueError or a missing or existing file is
-    the user's doing and ends with status 2 and one line; a library that is not installed ends
-    with status 1 and the extra that brings it; anything else is ours and shows its traceback
-    with status 1.
+    `main` returns the exit status, None for 0. A ValueError or a file that is missing, exists
+    or may not be used is the user's doing and ends with status 2 and one line; a library that
+    is not installed ends with status 1 and the extra that brings it; anything else is ours and
+    shows its traceback with status 1.
     """
     words, program = sys.argv[1:], Path(sys.argv[0]).name
     # The program's own docstring says what it does.
@@ -66,13 +69,16 @@ def status_of(work: Callable[[], int]) -> int:
     """Do the work; its exit status, what went wrong told in one line on stderr.
 
     SIGTERM ends it as an exception, so that arms are stopped and files are closed on the way
-    out, with status 143.
+    out, with status 143. Whoever reads the output may leave, as `head` does: nothing is said
+    then, and the status is 1.
     """
     # As a user reads it: without the place in our code that warned.
     warnings.formatwarning = lambda message, *_place, **_line: f"warning: {message}\n"
     try:
         with _ended_by_sigterm():
-            return work()
+            status = work()
+        sys.stdout.flush()
+        return status
     except (ValueError, FileNotFoundError, FileExistsError, NotADirectoryError) as error:
         print(f"error: {one_line(error)}", file=sys.stderr)
         return 2
@@ -87,9 +93,30 @@ def status_of(work: Callable[[], int]) -> int:
             raise
         print(f"error: {missing}", file=sys.stderr)
         return 1
+    except BrokenPipeError:
+        if not _reader_left():
+            raise
+        return 1
+    except OSError as error:
+        if error.filename is None:
+            raise
+        print(f"error: {one_line(error)}", file=sys.stderr)
+        return 2
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 1
+
+
+def _reader_left() -> bool:
+    """Whether nobody reads the output any more; what is left of it then goes nowhere."""
+    try:
+        print(flush=True)
+    except BrokenPipeError:
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, sys.stdout.fileno())
+        os.close(nowhere)
+        return True
+    return False
 
 
 @contextmanager
@@ -199,6 +226,17 @@ def refuse_existing(path: Path, overwrite: bool) -> None:
     """
     if path.exists() and not overwrite:
         raise FileExistsError(f"{path} exists: give another --out, or --overwrite it")
+
+
+def refuse_repeats(episodes: Sequence[int]) -> None:
+    """Say that an episode is named twice, which would count it twice.
+
+    Raises:
+        ValueError: It is; says which.
+    """
+    repeated = [episode for episode, count in Counter(episodes).items() if count > 1]
+    if repeated:
+        raise ValueError(f"--episodes names {repeated[0]} more than once: name each once")
 
 
 def leads_real_arm(args: Led, simulated_only: Sequence[str] = ()) -> bool:

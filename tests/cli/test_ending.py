@@ -43,3 +43,16 @@ def test_a_second_sigterm_does_not_wait():
         assert program.stdout.readline() == "x\n"
         program.send_signal(signal.SIGTERM)
         assert program.wait(60) == -signal.SIGTERM
+
+
+@pytest.mark.parametrize("lines", [2, 100_000])
+def test_a_reader_that_leaves_ends_a_command_quietly(lines):
+    loud = PROGRAM.replace("time.sleep(60)", f'time.sleep(0.5), print("x\\n" * {lines})')
+    loud = loud.replace('print("tidied up", flush=True)', "pass")
+    command = [sys.executable, "-c", loud]
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command, **streams) as program:
+        assert program.stdout.readline() == "at work\n"
+        program.stdout.close()
+        assert program.stderr.read() == ""
+        assert program.wait(60) == 1
