@@ -1,16 +1,19 @@
 """The commands that learn, once, small."""
 
 import json
+import math
 from io import BytesIO
 
 import numpy as np
 import pytest
 from commands import done
+from lerobot_folders import joint_path, write_folder
 from PIL import Image
 from rrd_reading import Rrd
 
 from hrc_learn.cli.commands import evaluate
 from hrc_learn.demos import DatasetWriter
+from hrc_learn.learning.channels import ReproductionError
 from hrc_learn.viz.report import read_report
 
 
@@ -113,6 +116,81 @@ def test_an_evaluation_reads_the_dataset_as_its_fit_did(poses, tmp_path):
     done(*evaluate, "--units", "position", "m")
     of_metres = json.loads((tmp_path / "f.json").read_text())
     assert of_metres["position_largest_max"] > 100 * of_fit["position_largest_max"]
+
+
+def test_an_evaluation_on_what_was_learned_from_says_so(poses, tmp_path):
+    model = tmp_path / "model"
+    fit = ("fit", "--dataset", poses, "--out", model, "--n-basis", 20, "--several", "mean")
+    done(*fit, "--episodes", 0, 1, 2, 3)
+    output = done("evaluate", "--model", model, "--dataset", poses).output
+    assert "all of these demonstrations were learned from" in output
+    assert "not learned from" not in output
+    every = ("evaluate", "--dataset", poses, "--episodes", 0, 1, 2, 3)
+    assert "leaves none to fit" in done(*every, status=2).error
+
+
+def test_an_evaluation_without_a_model_keeps_nothing_and_reads_as_told(tmp_path):
+    # Told by their size, the second is in radians and the others are in degrees.
+    moves = [joint_path(100, 2, seed) * scale for seed, scale in enumerate((60, 1, 60))]
+    names = ["shoulder.pos", "elbow.pos"]
+    root = write_folder(
+        tmp_path / "set",
+        [{"observation.state": values} for values in moves],
+        {"observation.state": names},
+    )
+    done("evaluate", "--dataset", root, status=2)
+    outcome = done("evaluate", "--dataset", root, "--units", "joint_position", "rad")
+    for told in ("Model in", "Report:", "Dashboard:", "kept in", "Fit of"):
+        assert told not in outcome.output
+    assert not (root / "meta" / "hrc_learn.json").exists()
+
+
+@pytest.mark.parametrize("content", ["{}", '{"dataset": 3}', "{"])
+def test_a_model_that_names_no_dataset_is_refused(poses, tmp_path, content):
+    model = tmp_path / "model"
+    (model / "position").mkdir(parents=True)
+    (model / "made_by.json").write_text(content)
+    error = done("evaluate", "--model", model, "--dataset", poses, status=2).error
+    assert str(model / "made_by.json") in error
+
+
+def test_an_error_that_is_no_number_meets_no_limit(poses, tmp_path, monkeypatch):
+    model = tmp_path / "model"
+    fit = ("fit", "--dataset", poses, "--out", model, "--n-basis", 20, "--several", "mean")
+    done(*fit, "--channels", "position")
+    monkeypatch.setattr(
+        ReproductionError, "summary", lambda *_: {"position_nrmse_median": math.nan}
+    )
+    command = ("evaluate", "--model", model, "--dataset", poses)
+    done(*command)
+    done(*command, "--most-nrmse", 0.5, status=1)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--several", "streamed", "--method", "ridge"), "neither --method nor"),
+        (("--several", "streamed", "--robust", "huber"), "neither --method nor"),
+        (("--several", "streamed", "--scaling", "amplitude"), "neither --method nor"),
+        (("--several", "streamed", "--context", "size"), "neither --method nor"),
+        (("--several", "streamed", "--n-basis", "None"), "--n-basis 60"),
+        (("--several", "streamed", "--n-basis", 0), "at least 2 functions, got 0"),
+        (("--several", "mean", "--context", "size"), "no use for --context"),
+        (("--scaling", "amplitude", "--context", "size"), "no use for --context"),
+        (("--episodes", 0, 1, 0), "--episodes names 0 more than once"),
+    ],
+)
+def test_options_that_would_be_ignored_are_refused(poses, tmp_path, options, message):
+    out = tmp_path / "model"
+    fit = ("fit", "--dataset", poses, "--out", out, "--channels", "position")
+    assert message in done(*fit, *options, status=2).error
+    assert not out.exists()
+
+
+def test_an_episode_counts_once_wherever_episodes_are_named(poses, tmp_path):
+    for command in (("fit", "image-jacobian"), ("evaluate",)):
+        error = done(*command, "--dataset", poses, "--episodes", 1, 1, status=2).error
+        assert "--episodes names 1 more than once" in error
 
 
 def test_a_streamed_fit(poses, tmp_path):

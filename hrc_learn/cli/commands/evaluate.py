@@ -1,8 +1,10 @@
 """`hrc evaluate`: what was learned, on demonstrations held out and against the truth."""
 
+import json
 from dataclasses import asdict, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import torch
 from rich.console import Console
@@ -10,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from hrc_learn.cli._options import resolved
-from hrc_learn.cli._run import write_values
+from hrc_learn.cli._run import refuse_repeats, write_values
 from hrc_learn.cli._tables import named
 from hrc_learn.cli.arguments.learn import (
     EvaluateImageJacobian,
@@ -18,7 +20,7 @@ from hrc_learn.cli.arguments.learn import (
     FitPrimitives,
 )
 from hrc_learn.cli.commands.check import columns
-from hrc_learn.cli.commands.fit import fit_primitives
+from hrc_learn.cli.commands.fit import fit_silently
 from hrc_learn.demos import DemonstrationSet, load_demos, open_demos
 from hrc_learn.learning.channels import (
     CHANNELS,
@@ -30,7 +32,7 @@ from hrc_learn.learning.channels import (
 from hrc_learn.learning.model_choice import best_models, predict
 from hrc_learn.learning.primitive_fitting import sampled
 from hrc_learn.skills.visual_skill import VisualServoSkill
-from hrc_learn.store import new_folder, read_made_by, write_json
+from hrc_learn.store import MADE_BY, new_folder, read_made_by, write_json
 from hrc_learn.viz.figures import measures_figure
 from hrc_learn.viz.report import show_measurements
 
@@ -45,7 +47,13 @@ UNITS = {
 
 
 def evaluate_primitives(args: EvaluatePrimitives) -> int:
-    """Primitives on demonstrations held out."""
+    """Primitives on demonstrations held out.
+
+    Raises:
+        FileNotFoundError: There is no dataset, or no model.
+        ValueError: The model does not say what it learned from, or the episodes make no sense.
+    """
+    refuse_repeats(args.episodes)
     if args.model is not None:
         return _evaluate(args, args.model)
     if not args.dataset.is_dir():
@@ -57,20 +65,30 @@ def evaluate_primitives(args: EvaluatePrimitives) -> int:
 
 
 def _fit_most(args: EvaluatePrimitives, model: Path) -> None:
-    """Fit the demonstrations that are not to be evaluated on, into a folder."""
-    count = len(open_demos(args.dataset))
+    """Fit the demonstrations that are not to be evaluated on, into a folder.
+
+    Raises:
+        ValueError: All are to be evaluated on.
+    """
+    source = open_demos(args.dataset, mapping=columns(args.mapping), units=args.units)
+    count = len(source)
     # Every fifth is held out, the last one of few; a single one cannot be.
     held_out = set(args.episodes or range(count)[4::5] or range(count)[1:][-1:])
     episodes = tuple(i for i in range(count) if i not in held_out)
-    fit_primitives(
-        FitPrimitives(
-            dataset=args.dataset,
-            out=model,
-            episodes=episodes,
-            units=args.units,
-            mapping=args.mapping,
+    if not episodes and count > 1:
+        raise ValueError(
+            f"--episodes names all {count} episodes of {args.dataset} and leaves none to fit: "
+            f"name fewer, or give --model"
         )
+    wanted = FitPrimitives(
+        dataset=args.dataset,
+        out=model,
+        episodes=episodes,
+        units=args.units,
+        mapping=args.mapping,
     )
+    with Console().status(f"Fitting {len(episodes) or count} demonstrations"):
+        fit_silently(wanted)
 
 
 def _evaluate(args: EvaluatePrimitives, model: Path) -> int:
@@ -104,34 +122,55 @@ def _evaluate(args: EvaluatePrimitives, model: Path) -> int:
                 figure = measures_figure(columns, [demo.episode for demo in demos], UNITS)
                 figure.savefig(folder / f"{channel}.png", dpi=120)
     write_values(args.json, figures)
-    limit = torch.inf if args.most_nrmse is None else args.most_nrmse
-    return int(any(figures.get(f"{channel}_nrmse_median", 0.0) > limit for channel in channels))
+    if args.most_nrmse is None:
+        return 0
+    medians = [figures.get(f"{channel}_nrmse_median", 0.0) for channel in channels]
+    # An error that is no number has not met the limit either.
+    return int(not all(median <= args.most_nrmse for median in medians))
 
 
 def _demonstrations(
     args: EvaluatePrimitives, model: Path, console: Console
 ) -> DemonstrationSet:
     """Those asked for, with the joints that were learned."""
-    made_by = read_made_by(model)
+    made_by = _made_by(model)
     learned = {int(i) for i in made_by.get("episodes") or ()}
-    episodes = list(args.episodes)
-    same = Path(made_by["dataset"]).resolve() == args.dataset.resolve()
-    if not episodes and learned and same:
-        every = range(len(open_demos(args.dataset)))
-        episodes = [i for i in every if i not in learned]
-        console.print(f"note: {len(episodes)} episodes that were not learned from")
     names = tuple(made_by.get("joint_names") or ())
-    if same and (not learned or set(episodes) & learned):
-        console.print("note: some of these demonstrations were learned from")
-    return sampled(
-        open_demos(
-            args.dataset,
-            episodes=episodes or None,
-            joint_names=names or None,
-            mapping=columns(args.mapping or made_by.get("mapping") or {}),
-            units=args.units or made_by.get("units") or {},
+    wanted: dict[str, Any] = {
+        "joint_names": names or None,
+        "mapping": columns(args.mapping or made_by.get("mapping") or {}),
+        "units": args.units or made_by.get("units") or {},
+    }
+    episodes = list(args.episodes)
+    if Path(made_by["dataset"]).resolve() == args.dataset.resolve():
+        if not episodes and learned:
+            every = range(len(open_demos(args.dataset, **wanted)))
+            episodes = [i for i in every if i not in learned]
+            if episodes:
+                console.print(f"note: {len(episodes)} episodes that were not learned from")
+            else:
+                console.print("note: all of these demonstrations were learned from")
+        elif not learned or set(episodes) & learned:
+            console.print("note: some of these demonstrations were learned from")
+    return sampled(open_demos(args.dataset, episodes=episodes or None, **wanted))
+
+
+def _made_by(model: Path) -> dict[str, Any]:
+    """What a model was made from.
+
+    Raises:
+        ValueError: It does not say of which dataset, and where that should stand.
+    """
+    try:
+        made_by = read_made_by(model)
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{model / MADE_BY}: not valid JSON ({error})") from None
+    if not isinstance(made_by, dict) or not isinstance(made_by.get("dataset"), str):
+        raise ValueError(
+            f"{model / MADE_BY} names no dataset that was learned from: give a folder of "
+            f"hrc fit"
         )
-    )
+    return made_by
 
 
 def _duration_ratio(motions: Motions, duration: torch.Tensor) -> float:

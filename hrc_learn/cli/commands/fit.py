@@ -12,7 +12,7 @@ from rich.console import Console
 
 from hrc_learn import distributed
 from hrc_learn.cli._options import resolved
-from hrc_learn.cli._run import command_line, configuration, write_values
+from hrc_learn.cli._run import command_line, configuration, refuse_repeats, write_values
 from hrc_learn.cli._tables import image_jacobian_rows, primitive_rows, show_values
 from hrc_learn.cli.arguments.learn import FitImageJacobian, FitPrimitives
 from hrc_learn.cli.commands.check import columns
@@ -40,46 +40,31 @@ from hrc_learn.viz.report import PAGE, show_command, write_report
 
 
 def fit_primitives(args: FitPrimitives) -> None:
-    """Movement primitives of joints and end effector."""
+    """Movement primitives of joints and end effector.
+
+    Raises:
+        ValueError: Options that contradict each other, or an episode named twice.
+    """
     torch.manual_seed(args.seed)
     console = Console()
+    refuse_repeats(args.episodes)
     if args.as_lerobot_policy:
         _fit_policy(args, console)
         return
     if args.several == "streamed":
         _fit_streamed(args, console)
         return
+    _refuse_unused_context(args)
     _keep_contract(args, console)
     source = open_demos(args.dataset, **_wanted(args))
     demos = sampled(source)
-    is_sample = len(demos) < len(source) or demos.frames < source.frames
     for note in demos.notes:
         console.print(f"note: {note}")
-    if is_sample:
+    if _is_sample(demos, source):
         console.print(f"note: {_OF_A_SAMPLE}", soft_wrap=True)
     with new_folder(args.folder, _made_by(args), args.overwrite) as folder:
         with console.status(f"Fitting {len(source)} demonstrations"):
-            # Not every channel takes a scaling.
-            scaled: dict[str, Any] = {} if args.scaling == "none" else {"scaling": args.scaling}
-            fitted = fit_demonstrations(
-                demos,
-                args.n_basis,
-                args.method,
-                channels=args.channels,
-                robust=args.robust,
-                **scaled,
-            )
-            if is_sample:
-                fitted = fit_all(fitted, source)
-            metrics = fitted.metrics()
-            if args.several == "contextual":
-                metrics |= fit_contextual(fitted, demos, args.context, folder)
-            # Scaled motions are linear neither in their mean nor in a context.
-            if args.several == "best" and args.scaling == "none":
-                metrics |= keep_best(fitted, demos, args.context, folder)
-        fitted.save(folder, each=args.several == "distribution")
-        if args.several == "distribution":
-            metrics |= {f"{k}_spread": _spread(fitted, k) for k in fitted.each}
+            fitted, metrics = _learn(args, source, demos, folder)
         missing = _draw(fitted, args, demos, metrics, folder)
         _finish(args, metrics, folder)
     for said in missing:
@@ -87,6 +72,66 @@ def fit_primitives(args: FitPrimitives) -> None:
     if (args.folder / PAGE).is_file():
         print(f"Report: {shlex.quote(str(args.folder / PAGE))}")
         print(f"Dashboard: {show_command(args.folder)}")
+
+
+def fit_silently(args: FitPrimitives) -> None:
+    """The models of `fit_primitives` alone: no contract, no report, and nothing is said.
+
+    Raises:
+        ValueError: The demonstrations hold no motion, or not what a channel needs.
+    """
+    torch.manual_seed(args.seed)
+    source = open_demos(args.dataset, **_wanted(args))
+    with new_folder(args.folder, _made_by(args), args.overwrite) as folder:
+        _learn(args, source, sampled(source), folder)
+
+
+def _learn(
+    args: FitPrimitives, source: DemonstrationSource, demos: DemonstrationSet, folder: Path
+) -> tuple[FittedPrimitives, dict[str, float]]:
+    """Fit, and save the models into the folder; the fit and what was measured of it."""
+    # Not every channel takes a scaling.
+    scaled: dict[str, Any] = {} if args.scaling == "none" else {"scaling": args.scaling}
+    fitted = fit_demonstrations(
+        demos,
+        args.n_basis,
+        args.method,
+        channels=args.channels,
+        robust=args.robust,
+        **scaled,
+    )
+    if _is_sample(demos, source):
+        fitted = fit_all(fitted, source)
+    metrics = fitted.metrics()
+    if args.several == "contextual":
+        metrics |= fit_contextual(fitted, demos, args.context, folder)
+    # Scaled motions are linear neither in their mean nor in a context.
+    if args.several == "best" and args.scaling == "none":
+        metrics |= keep_best(fitted, demos, args.context, folder)
+    fitted.save(folder, each=args.several == "distribution")
+    if args.several == "distribution":
+        metrics |= {f"{k}_spread": _spread(fitted, k) for k in fitted.each}
+    return fitted, metrics
+
+
+def _is_sample(demos: DemonstrationSet, source: DemonstrationSource) -> bool:
+    return len(demos) < len(source) or demos.frames < source.frames
+
+
+def _refuse_unused_context(args: FitPrimitives) -> None:
+    """Raise ValueError where a context is given that no model would be a function of."""
+    if not args.context:
+        return
+    if args.several not in ("best", "contextual"):
+        raise ValueError(
+            f"--several {args.several} has no use for --context: leave it out, or learn a "
+            f"function of it by --several contextual"
+        )
+    if args.several == "best" and args.scaling != "none":
+        raise ValueError(
+            f"--scaling {args.scaling} has no use for --context: leave one of them out, or "
+            f"give --several contextual"
+        )
 
 
 _OF_A_SAMPLE = (
@@ -113,11 +158,19 @@ def _wanted(args: FitPrimitives) -> dict[str, Any]:
 
 
 def _fit_streamed(args: FitPrimitives, console: Console) -> None:
+    given = (args.context, args.robust, args.method != "trajectory", args.scaling != "none")
+    if any(given):
+        raise ValueError(
+            "--several streamed fits unscaled least squares to all demonstrations: it takes "
+            "neither --method nor --robust nor --scaling nor --context"
+        )
+    if args.n_basis is None:
+        raise ValueError("--several streamed needs a number of basis functions: --n-basis 60")
     with distributed.processes() as rank:
         demos = open_demos(args.dataset, **_wanted(args))
         for note in () if rank else demos.notes:
             console.print(f"note: {note}")
-        fits, metrics = fit_streamed(demos, args.n_basis or 60, channels=args.channels)
+        fits, metrics = fit_streamed(demos, args.n_basis, channels=args.channels)
         if rank:
             return
         with new_folder(args.folder, _made_by(args), args.overwrite) as folder:
@@ -216,8 +269,13 @@ _MODELS = {
 
 
 def fit_image_jacobian(args: FitImageJacobian) -> None:
-    """Image Jacobian, and the visual target."""
+    """Image Jacobian, and the visual target.
+
+    Raises:
+        ValueError: An episode is named twice.
+    """
     args = resolved(args)
+    refuse_repeats(args.episodes)
     with distributed.processes() as rank:
         console = Console(quiet=rank != 0)
         demos = open_demos(args.dataset, episodes=args.episodes or None)
