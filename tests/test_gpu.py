@@ -16,7 +16,7 @@ from hrc_learn.controller import constrained_velocity
 from hrc_learn.dmp import ContextualDMP, JointDMP, MixtureDMP, MotionHead, ProbabilisticDMP
 from hrc_learn.dmp.training import DescentConfig, Tracking, train
 from hrc_learn.jacobian import RBFImageJacobian, paper_grid
-from hrc_learn.kinematics import panda, panda_capsules, separation, solve_inverse
+from hrc_learn.kinematics import ArmChoice, panda, panda_capsules, separation, solve_inverse
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
 DOUBLE = torch.float64
@@ -42,6 +42,11 @@ def inverse(device: str):
     q = postures(20).to(device)
     found = solve_inverse(panda, panda.forward(q), near=q + 0.05)
     return panda.forward(found.position), found.found
+
+
+def analytic_inverse(device: str):
+    q = postures(20).to(device)
+    return ArmChoice("panda").work_arm().nearest(panda.forward(q), near=q)
 
 
 def self_distance(device: str):
@@ -139,6 +144,7 @@ def training(device: str):
     [
         kinematics,
         inverse,
+        analytic_inverse,
         self_distance,
         distance_to_a_person,
         image_jacobian,
