@@ -10,6 +10,7 @@ import pytest
 from clean_sets import SETS, write_set
 from commands import done
 from lerobot_folders import joint_path, write_folder
+from unchecked import shapes_unchecked
 
 from hrc_learn.demos import DatasetError, check_dataset, load_demos
 from hrc_learn.demos.format.metadata import SIDECAR_PATH
@@ -97,6 +98,96 @@ def test_a_contract_that_makes_no_sense_is_refused(root, change, message):
     keep_contract(root, broken)
     with pytest.raises(DatasetError, match=message):
         load_demos(root)
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "message"),
+    [
+        ("index", "0", r"contract.components\[0\]: index must be a whole number"),
+        ("index", -1, r"contract.components\[0\]: index must be .* at least 0, got -1"),
+        ("index", 1, r"contract.components\[1\]: is of component 1 of action"),
+        ("name", None, r"contract.components\[0\]: name must be text, got None"),
+        ("unit", 5, r"contract.components\[0\]: unit must be text, got 5"),
+        ("sign", 2, r"contract.components\[0\]: sign must be -1, 0 or 1, got 2"),
+        ("colour", "red", r"contract.components\[0\]: has the unknown field 'colour'"),
+    ],
+)
+def test_an_entry_that_was_edited_wrongly_is_named(root, place, value, message):
+    content = contract_content(kept(root))
+    content["components"].sort(key=lambda entry: (entry["key"], entry["index"]))
+    content["components"][0][place] = value
+    edit_sidecar(root, contract=content)
+    with pytest.raises(DatasetError, match=f"{SIDECAR_PATH}, {message}"):
+        load_demos(root)
+
+
+@pytest.mark.parametrize(
+    ("said", "message"),
+    [
+        ({"units": []}, "units: must be an object"),
+        ({"units": {"position": 5}}, "units.position: must be text, got 5"),
+        ({"columns": ["joint_position"]}, "columns: must be an object"),
+        ({"columns": {"joint_position": {"key": STATE}}}, "columns.joint_position: must hold"),
+        ({"columns": {"joint_position": STATE}}, "columns.joint_position: must hold"),
+        ({"contract": [1]}, "contract: must be an object"),
+        ({"contract": {"components": {}}}, "contract.components: must be a list"),
+        ({"contract": {"components": [1]}}, "contract.fingerprint: must be text"),
+        (
+            {"contract": {"components": [{"key": STATE}], "fingerprint": ""}},
+            r"contract.components\[0\]: lacks index",
+        ),
+    ],
+)
+def test_a_sidecar_that_was_edited_wrongly_is_refused(root, said, message):
+    edit_sidecar(root, **said)
+    with shapes_unchecked(), pytest.raises(DatasetError, match=f"{SIDECAR_PATH}, {message}"):
+        load_demos(root)
+
+
+def edit_sidecar(root, **said):
+    keep_contract(root, kept(root))
+    file = root / SIDECAR_PATH
+    file.write_text(json.dumps(json.loads(file.read_text()) | said))
+
+
+@pytest.fixture
+def hand(tmp_path):
+    """Three joints within some degrees and two fingers [1], with a contract that says so."""
+    values = np.concatenate([5 * joint_path(60, 3), 0.5 + 0.4 * joint_path(60, 2)], axis=1)
+    names = ["j1", "j2", "j3", "finger_1", "finger_2"]
+    root = write_folder(tmp_path / "hand", [{STATE: values, "action": values}], {STATE: names})
+    units = dict(zip(names, ["deg"] * 3 + ["1"] * 2, strict=True))
+    contract = kept(root)
+    parts = [
+        replace(part, role="finger" if unit == "1" else "arm", unit=unit)
+        for part in contract.components
+        if part.key == STATE
+        for unit in (units[part.name],)
+    ]
+    keep_contract(root, replace(contract, components=tuple(parts)))
+    return root
+
+
+@pytest.mark.parametrize(
+    "mapping",
+    [
+        ["finger_1", "j1", "j2", "j3", "finger_2"],
+        ["j3", "finger_2"],
+        f"{STATE}[0:3]",
+        f"{STATE}[3:5]",
+    ],
+)
+def test_units_stay_with_the_columns_that_a_mapping_puts_in_order(hand, mapping):
+    every = load_demos(hand)
+    mapped = load_demos(hand, mapping={"joint_position": mapping})
+    expected = every[0].select_joints(mapped.joint_names)
+    np.testing.assert_array_equal(mapped[0].joint_position, expected.joint_position)
+
+
+def test_columns_keep_their_unit_as_another_quantity(hand):
+    joints = load_demos(hand)[0].select_joints(["j1", "j2", "j3"]).joint_position
+    mapping = {"command_position": f"{STATE}[0:3]", "joint_position": None}
+    np.testing.assert_array_equal(load_demos(hand, mapping=mapping)[0].command_position, joints)
 
 
 def test_what_is_kept_is_plain_json(root):

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from hrc_learn.demos.demonstration import JOINT_FIELDS
-from hrc_learn.demos.format.metadata import INFO_PATH, Feature, Sidecar
+from hrc_learn.demos.format.metadata import INFO_PATH, SIDECAR_PATH, Feature, Sidecar
 from hrc_learn.demos.issue import DatasetError
 from hrc_learn.demos.read.roles import (
     INDEX_KEYS,
@@ -194,8 +194,10 @@ def map_columns(
         kept: Columns by a contract that is kept with the dataset; spares all guessing.
 
     Raises:
-        DatasetError: The mapping names a role or column that does not exist.
+        DatasetError: The mapping names a role or column that does not exist, or what the
+            sidecar says of units and columns is malformed.
     """
+    _refuse_malformed(sidecar)
     usable = {
         key: feature
         for key, feature in features.items()
@@ -236,6 +238,32 @@ def map_columns(
         notes=tuple(notes),
         unmatched=unmatched,
     )
+
+
+def _refuse_malformed(sidecar: Sidecar) -> None:
+    """Refuse units and columns that are not of the form that our writer gives them."""
+    for name in ("units", "columns"):
+        if not isinstance(content := getattr(sidecar, name), dict):
+            raise DatasetError(
+                f"must be an object, got {content!r}; edit it", file=SIDECAR_PATH, key=name
+            )
+    for role, unit in sidecar.units.items():
+        if not isinstance(unit, str):
+            raise DatasetError(
+                f"must be text, got {unit!r}; edit it", file=SIDECAR_PATH, key=f"units.{role}"
+            )
+    for role, column in sidecar.columns.items():
+        told = column if isinstance(column, dict) else {}
+        if not isinstance(told.get("key"), str) or not _are_texts(told.get("names")):
+            raise DatasetError(
+                'must hold a "key", a feature, and "names", a list of its components; edit it',
+                file=SIDECAR_PATH,
+                key=f"columns.{role}",
+            )
+
+
+def _are_texts(names: object) -> bool:
+    return isinstance(names, list) and all(isinstance(name, str) for name in names)
 
 
 def _by_convention(

@@ -7,8 +7,8 @@ role, unit, range, sign and delay, with the evidence for each and how sure it is
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import MISSING, asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,14 @@ from hrc_learn.demos.format.metadata import (
 from hrc_learn.demos.issue import DatasetError, plain_text
 from hrc_learn.demos.read.column_mapping import ColumnMapping, ColumnSelection
 from hrc_learn.demos.read.profiles import EpisodeProfile, Tracking, is_discrete
-from hrc_learn.demos.read.roles import INDEX_KEYS, ROLES, UnitDecision, is_hand, joint_of
+from hrc_learn.demos.read.roles import (
+    INDEX_KEYS,
+    ROLES,
+    UnitDecision,
+    comes_in,
+    is_hand,
+    joint_of,
+)
 from hrc_learn.store import new_file
 
 _READ_AS = {
@@ -124,14 +131,28 @@ class Contract:
             cells = (f"{cell:{w}}" for cell, w in zip(row, widths, strict=False))
             yield f"{'  '.join(cells)}  {row[-1]}".rstrip()
 
-    def units(self) -> dict[str, tuple[str, ...]]:
-        """Quantity -> unit of each of its components, in the order of the contract."""
-        units: dict[str, tuple[str, ...]] = {}
-        for part in self.components:
-            role = _READ_AS.get(part.role, part.role)
-            if role is not None:
-                units[role] = (*units.get(role, ()), part.unit or ROLES[role].unit)
-        return units
+    def units(
+        self, selections: Mapping[str, ColumnSelection] | None = None
+    ) -> dict[str, tuple[str, ...]]:
+        """Quantity -> unit of each of its components.
+
+        Args:
+            selections: The columns of each quantity; one with a column of unknown unit is left
+                out. None: those of the contract, in its order.
+        """
+        known = {(part.key, part.index): part for part in self.components}
+        columns: dict[str, tuple[tuple[str, int], ...]] = {}
+        if selections is not None:
+            columns = {role: selection.columns for role, selection in selections.items()}
+        else:
+            for place, part in known.items():
+                if (role := _quantity(part)) is not None:
+                    columns[role] = (*columns.get(role, ()), place)
+        units = {
+            role: tuple(_unit_as(role, known.get(place)) for place in places)
+            for role, places in columns.items()
+        }
+        return {role: of_role for role, of_role in units.items() if all(of_role)}
 
     def selections(self, features: Mapping[str, Feature]) -> dict[str, ColumnSelection]:
         """The columns of each quantity.
@@ -141,7 +162,7 @@ class Contract:
         """
         found: dict[str, list[ComponentContract]] = {}
         for part in self.components:
-            role = _READ_AS.get(part.role, part.role)
+            role = _quantity(part)
             feature = features.get(part.key)
             if feature is None or part.index >= feature.width:
                 raise _faulty(f"{part.key}/{part.name} is no component of the dataset")
@@ -162,8 +183,22 @@ class Contract:
         }
 
 
-def _faulty(message: str) -> DatasetError:
-    return DatasetError(f"contract: {message}; edit it", file=SIDECAR_PATH, key="contract")
+def _quantity(part: ComponentContract) -> str | None:
+    """The quantity of a demonstration that a component is read as."""
+    return _READ_AS.get(part.role, part.role)
+
+
+def _unit_as(role: str, part: ComponentContract | None) -> str:
+    """Unit of a component that is read as this quantity; "" where none is known."""
+    if part is None:
+        return ""
+    if _quantity(part) == role:
+        return part.unit or ROLES[role].unit
+    return part.unit if comes_in(role, part.unit) else ""
+
+
+def _faulty(message: str, place: str = "contract") -> DatasetError:
+    return DatasetError(f"{message}; edit it", file=SIDECAR_PATH, key=place)
 
 
 def contract_of(sidecar: Sidecar) -> Contract | None:
@@ -174,16 +209,67 @@ def contract_of(sidecar: Sidecar) -> Contract | None:
     """
     if not sidecar.contract:
         return None
-    try:
-        parts = tuple(ComponentContract(**part) for part in sidecar.contract["components"])
-        contract = Contract(components=parts, fingerprint=sidecar.contract["fingerprint"])
-    except (KeyError, TypeError) as error:
-        raise _faulty(f"damaged ({error!r})") from error
-    for part in contract.components:
-        if part.role not in CONTRACT_ROLES:
-            known = ", ".join(CONTRACT_ROLES)
-            raise _faulty(f"{part.name} has the unknown role {part.role!r}; known are {known}")
-    return contract
+    content: object = sidecar.contract
+    if not isinstance(content, dict):
+        raise _faulty(f"must be an object, got {content!r}")
+    components, of_data = content.get("components"), content.get("fingerprint")
+    if not isinstance(components, list):
+        raise _faulty(f"must be a list, got {components!r}", "contract.components")
+    if not isinstance(of_data, str):
+        raise _faulty(f"must be text, got {of_data!r}", "contract.fingerprint")
+    parts: dict[tuple[str, int], ComponentContract] = {}
+    for number, entry in enumerate(components):
+        place = f"contract.components[{number}]"
+        part = _component(entry, place)
+        if (part.key, part.index) in parts:
+            raise _faulty(f"is of component {part.index} of {part.key}, as one before", place)
+        parts[part.key, part.index] = part
+    return Contract(components=tuple(parts.values()), fingerprint=of_data)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+_TEXT = ("text", lambda value: isinstance(value, str))
+_NUMBER = ("a number", _is_number)
+_FIELDS: dict[str, tuple[str, Callable[[Any], bool]]] = {
+    "key": _TEXT,
+    "index": ("a whole number of at least 0", lambda value: type(value) is int and value >= 0),
+    "name": _TEXT,
+    "role": _TEXT,
+    "unit": _TEXT,
+    "low": _NUMBER,
+    "high": _NUMBER,
+    "sign": ("-1, 0 or 1", lambda value: _is_number(value) and value in (-1, 0, 1)),
+    "delay": ("a number or null", lambda value: value is None or _is_number(value)),
+    "confidence": _NUMBER,
+    "evidence": _TEXT,
+}
+"""Field of a `ComponentContract` -> what it must be, in words and as a test."""
+
+
+def _component(entry: object, place: str) -> ComponentContract:
+    """One component from its JSON object, which somebody may have edited."""
+    if not isinstance(entry, dict):
+        raise _faulty(f"must be an object, got {entry!r}", place)
+    required = [f.name for f in fields(ComponentContract) if f.default is MISSING]
+    missing = [name for name in required if name not in entry]
+    unknown = [name for name in entry if name not in _FIELDS]
+    if missing or unknown:
+        fault = f"lacks {missing[0]}" if missing else f"has the unknown field {unknown[0]!r}"
+        raise _faulty(fault, place)
+    for name, value in entry.items():
+        wanted, fits = _FIELDS[name]
+        if not fits(value):
+            raise _faulty(f"{name} must be {wanted}, got {value!r}", place)
+    part = ComponentContract(**entry)
+    if part.role not in CONTRACT_ROLES:
+        known = ", ".join(CONTRACT_ROLES)
+        raise _faulty(
+            f"{part.name} has the unknown role {part.role!r}; known are {known}", place
+        )
+    return part
 
 
 def keep_contract(root: Path, contract: Contract) -> None:

@@ -394,8 +394,7 @@ class EpisodeReader:
     @property
     def declared_units(self) -> Mapping[str, str | Sequence[str]]:
         """Units by role from the sidecar, of each component where a contract is kept."""
-        contract = contract_of(self.sidecar)
-        return self.sidecar.units | ({} if contract is None else contract.units())
+        return declared_units(self.sidecar, self.column_mapping.selections)
 
     @property
     def _sample(self) -> Sequence[EpisodeEntry]:
@@ -425,13 +424,26 @@ class EpisodeReader:
         return self.decide_units(episodes, given)
 
 
+def declared_units(
+    sidecar: Sidecar, selections: Mapping[str, ColumnSelection]
+) -> dict[str, str | Sequence[str]]:
+    """Units of these quantities by the sidecar, of each component where a contract is kept.
+
+    Raises:
+        DatasetError: The contract is damaged.
+    """
+    contract = contract_of(sidecar)
+    return {**sidecar.units, **({} if contract is None else contract.units(selections))}
+
+
 def read_mapping(
     folder: DatasetFolder, sidecar: Sidecar, mapping: MappingSpec | None
 ) -> ColumnMapping:
     """The quantities among the columns: the caller's, the contract's, or those found by name.
 
     Raises:
-        DatasetError: The mapping or the contract name what does not exist.
+        DatasetError: The mapping or the contract name what does not exist, or the sidecar is
+            damaged.
     """
     contract = contract_of(sidecar)
     kept = None if contract is None else contract.selections(folder.features)

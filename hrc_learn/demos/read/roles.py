@@ -366,7 +366,7 @@ def _following(role: str, leader: UnitDecision) -> UnitDecision:
         unit=unit if followed else ROLES[role].unit,
         units=() if velocity else leader.units,
         confidence=leader.confidence,
-        evidence=f"that of {leader.role}" if followed else "",
+        evidence=f"that of {leader.role}" if followed or not velocity else "",
     )
 
 
