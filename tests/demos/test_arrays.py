@@ -80,7 +80,7 @@ def test_a_byte_order_mark_is_no_part_of_the_first_name(tmp_path, header):
 
 def test_names_of_several_words_are_not_taken_apart(tmp_path):
     path = tmp_path / "run.csv"
-    path.write_text("\ntime,joint position 1,joint position 2\n\n0,1,2\n0.1,3,4\n")
+    path.write_text("time,joint position 1,joint position 2\n\n0,1,2\n0.1,3,4\n")
     assert [*read_table(path)] == ["time", "joint position 1", "joint position 2"]
 
 
