@@ -274,7 +274,8 @@ def compensate_delay(demo: Demonstration, delays: Mapping[str, float]) -> Demons
     moved = {
         field: getattr(shifted, field)
         for name, delay in delays.items()
-        for shifted in [at_times(demo, kept + delay)]
+        # By rounding a sum may lie past the last frame.
+        for shifted in [at_times(demo, np.minimum(kept + delay, demo.time[-1]))]
         for field in _together(name, shifted)
     }
     return replace(at_times(demo, kept), **moved)

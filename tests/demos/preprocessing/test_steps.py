@@ -333,6 +333,13 @@ def test_a_late_stream_is_moved_to_when_it_was_measured():
         compensate_delay(demo, {"gripper": 0.1})
 
 
+def test_a_delay_of_whole_frames_is_compensated_to_the_last_one():
+    time = np.arange(61) / 100  # 0.54 s and 0.06 s of delay are more than 0.6 s, by rounding
+    moved = compensate_delay(swing(time, gripper=time - 0.06), {"gripper": 0.06})
+    assert len(moved) == 55
+    np.testing.assert_allclose(moved.gripper, moved.time, atol=1e-9)
+
+
 def warped(time, strength):
     """The swing gone through at a changing pace."""
     s = time / time[-1]
