@@ -84,6 +84,27 @@ def test_data_that_changed_since_are_told(root, tmp_path):
     assert any("changed since" in issue.message for issue in check_dataset(other).warnings)
 
 
+def test_a_contract_is_renewed_and_says_what_was_edited_or_is_told_now(root, tmp_path):
+    contract = kept(root)
+    edited = [
+        replace(part, name="first.pos", unit="rad") if part.name == "shoulder.pos" else part
+        for part in contract.components
+    ]
+    names = {STATE: NAMES, "action": NAMES}
+    other = write_folder(tmp_path / "other", [motion(i) for i in range(9, 13)], names, fps=FPS)
+    keep_contract(other, replace(contract, components=tuple(edited)))
+    done("check", other, "--keep-contract")
+    assert not any("changed since" in issue.message for issue in check_dataset(other).warnings)
+    first = named(kept(other), STATE, "first.pos")
+    assert (first.role, first.unit) == ("arm", "rad")
+    assert load_demos(other)[0].joint_names[0] == "first"
+    units = ("--units", "joint_position", "deg", "command_position", "deg")
+    shown = done("check", other, *units, "--keep-contract").output
+    assert "first.pos .. elbow.pos" in shown
+    parts = [named(kept(other), key, "first.pos") for key in (STATE, "action")]
+    assert [(part.role, part.unit) for part in parts] == [("arm", "deg"), ("command", "deg")]
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -1,7 +1,7 @@
 """Examining a dataset before anything is learned from it."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,12 @@ from hrc_learn.demos.format.dataset_folder import DatasetFolder, EpisodeEntry
 from hrc_learn.demos.format.metadata import SIDECAR_PATH, read_sidecar
 from hrc_learn.demos.issue import DatasetError, ValidationReport
 from hrc_learn.demos.read.column_mapping import ColumnMapping, MappingSpec, parse_mapping
-from hrc_learn.demos.read.contract import changed_since, contract_of, infer_contract
+from hrc_learn.demos.read.contract import (
+    Contract,
+    changed_since,
+    contract_of,
+    infer_contract,
+)
 from hrc_learn.demos.read.episodes import (
     Quantities,
     read_mapping,
@@ -81,6 +86,7 @@ def check_dataset(
 
     Raises:
         DatasetError: `mapping` or `units` name what does not exist.
+        ValueError: `speed_limits` name no joint, or one is no positive number.
     """
     for role, unit in (units or {}).items():
         unit_factor(role, unit)
@@ -89,6 +95,8 @@ def check_dataset(
     if folder is None:
         return report
     parse_mapping(mapping or {}, folder.features)
+    if speed_limits:
+        _refuse_limits(folder, mapping or {}, speed_limits)
     survey = _Survey(folder, report)
     episodes = survey.first_look()
     check_columns(folder, survey.columns, report)
@@ -101,6 +109,24 @@ def check_dataset(
         ),
     )
     return report
+
+
+def _refuse_limits(
+    folder: DatasetFolder, mapping: MappingSpec, speed_limits: Mapping[str, float | int]
+) -> None:
+    """Raise ValueError where a limit is of no joint, or none that a speed can keep to."""
+    try:
+        names = read_mapping(folder, read_sidecar(folder.root), mapping).joint_names
+    except DatasetError:
+        return  # told where the columns are looked at
+    for name, limit in speed_limits.items():
+        if name not in names:
+            raise ValueError(
+                f"speed_limits: {folder.root} has no joint {name!r}; there are "
+                f"{', '.join(names) or 'none'}"
+            )
+        if not limit > 0:
+            raise ValueError(f"speed_limits: that of {name} must be positive, but is {limit}")
 
 
 class _Survey:
@@ -208,7 +234,46 @@ def _check_meaning(
     check_consistency(folder, columns, profiles, report)
     report.contract = infer_contract(folder, columns, decisions, [*profiles.values()])
     if contract is not None:
-        report.contract = contract
+        overruled = {*mapping, *units}
+        if {*mapping} & {*ORIENTATION_ROLES}:  # one encoding takes the place of all
+            overruled |= {*ORIENTATION_ROLES}
+        report.contract = _renewed(contract, report.contract, folder, columns, overruled)
+
+
+def _renewed(
+    kept: Contract,
+    inferred: Contract,
+    folder: DatasetFolder,
+    columns: ColumnMapping,
+    overruled: Collection[str],
+) -> Contract:
+    """What was inferred anew, with the names, roles and units that the kept contract says.
+
+    Args:
+        kept: Beside the data, perhaps edited there.
+        inferred: From the data as they are.
+        folder: The dataset.
+        columns: As they are read now.
+        overruled: Quantities of which the caller says columns or units.
+    """
+    told = {(part.key, part.index): part for part in kept.components}
+    quantities: dict[tuple[str, int], set[str]] = {}
+    for selections in (kept.selections(folder.features), columns.selections):
+        for role, selection in selections.items():
+            for column in selection.columns:
+                quantities.setdefault(column, set()).add(role)
+    parts = []
+    for part in inferred.components:
+        column = (part.key, part.index)
+        old = told.get(column)
+        if old is not None:
+            anew = (part.role, part.unit) == (old.role, old.unit)
+            if anew or quantities.get(column, set()) & {*overruled}:
+                part = replace(part, name=old.name)
+            else:
+                part = replace(old, low=part.low, high=part.high)
+        parts.append(part)
+    return replace(inferred, components=tuple(parts))
 
 
 def _usual_motion(
