@@ -11,7 +11,7 @@ from commands import hrc
 from lerobot_folders import joint_path, write_folder
 from rrd_reading import Rrd
 
-from hrc_learn.cli.commands import show
+from hrc_learn.cli.commands import check, show
 from hrc_learn.demos import DatasetWriter, load_demos
 from hrc_learn.demos.format.videos import decode_image
 
@@ -155,6 +155,24 @@ def test_findings_are_written_for_other_programs(recording, tmp_path):
     assert "no statistics" in finding["message"]
     assert finding["file"] == "meta/stats.json"
     assert finding["episode"] is None
+
+
+def test_what_was_found_is_written_even_where_the_camera_cannot_be_told(tmp_path, monkeypatch):
+    def refuse(demos):
+        raise ValueError(f"no marker was seen in {len(demos)} episodes")
+
+    monkeypatch.setattr(check, "feature_trajectories", refuse)
+    # Told by their size, the first is in degrees and the second in radians.
+    episodes = [{"observation.state": scale * joint_path(60, 2)} for scale in (60, 1)]
+    root = write_folder(tmp_path / "set", episodes, {"observation.state": ["a.pos", "b.pos"]})
+    written = {name: tmp_path / name for name in ("findings", "json", "out")}
+    places = [word for name, path in written.items() for word in (f"--{name}", path)]
+    status, _, error = hrc(
+        "check", root, "--camera", "--units", "joint_position", "rad", *places
+    )
+    assert (status, error.count("\n")) == (2, 1)
+    assert "no marker was seen in 2 episodes" in error  # so they were read as told
+    assert all(path.exists() for path in written.values())
 
 
 def test_a_broken_dataset_is_repaired_checked_and_read(tmp_path):

@@ -11,8 +11,10 @@ from hrc_learn.cli._run import configuration, write_values
 from hrc_learn.cli.arguments.dataset import Check, Recover, Repair
 from hrc_learn.controller.interface import IMAGE_SIZE
 from hrc_learn.demos import check_dataset, load_demos, recover_all
+from hrc_learn.demos.format.dataset_folder import open_folder
 from hrc_learn.demos.format.metadata import SIDECAR_PATH
-from hrc_learn.demos.read.contract import contract_content, keep_contract
+from hrc_learn.demos.issue import ValidationReport
+from hrc_learn.demos.read.contract import Contract, contract_content, keep_contract
 from hrc_learn.demos.repair import RepairOptions, repair_dataset
 from hrc_learn.jacobian import camera_placements
 from hrc_learn.learning.visual_servo_fitting import feature_trajectories
@@ -25,7 +27,13 @@ def columns(mapping: Mapping[str, str]) -> dict[str, str | list[str]]:
 
 
 def check(args: Check) -> int:
-    """Check the dataset and print the findings."""
+    """Check the dataset and print the findings.
+
+    Raises:
+        FileNotFoundError: There is no dataset.
+        ValueError: Options name what does not exist, or there is nothing to keep a contract of
+            or to tell the camera's place by; the findings are written before.
+    """
     if not args.dataset.is_dir():
         raise FileNotFoundError(f"there is no dataset at {args.dataset}")
     report = check_dataset(
@@ -38,37 +46,49 @@ def check(args: Check) -> int:
     if contract is not None:
         print(*contract.lines(), "", sep="\n")
     print(*report.lines(full=args.full), sep="\n")
-    moved = args.camera and _camera_moved(args.dataset)
-    if args.keep_contract:
-        if contract is None:
-            raise ValueError(f"{args.dataset}: nothing could be read to keep a contract of")
-        keep_contract(args.dataset, contract)
-        print(f"contract kept in {args.dataset / SIDECAR_PATH}: edit it there")
-    findings = json.dumps(report.records(), indent=2) + "\n"
     counts = {
         "errors": len(report.errors),
         "warnings": len(report.warnings),
         "episodes": report.episodes,
         "frames": report.frames,
     }
-    if args.camera:
-        counts["camera_moved"] = int(moved)
+    moved = False
+    try:
+        if args.keep_contract:
+            _keep(args.dataset, contract)
+        if args.camera:
+            moved = _camera_moved(args)
+            counts["camera_moved"] = int(moved)
+    finally:
+        _write(args, report, counts)
+    return int(bool(report.errors or (args.strict and (report.warnings or moved))))
+
+
+def _keep(dataset: Path, contract: Contract | None) -> None:
+    if contract is None:
+        raise ValueError(f"{dataset}: nothing could be read to keep a contract of")
+    contract.selections(open_folder(dataset).features)  # refuses what nobody could read
+    keep_contract(dataset, contract)
+    print(f"contract kept in {dataset / SIDECAR_PATH}: edit it there")
+
+
+def _write(args: Check, report: ValidationReport, counts: Mapping[str, int]) -> None:
+    findings = json.dumps(report.records(), indent=2) + "\n"
     if args.out is not None:
         with new_folder(args.out, configuration(args), args.overwrite) as folder:
             write_text(folder / "findings.json", findings)
             write_json(folder / "metrics.json", counts)
-            if contract is not None:
-                text = json.dumps(contract_content(contract), indent=2) + "\n"
+            if report.contract is not None:
+                text = json.dumps(contract_content(report.contract), indent=2) + "\n"
                 write_text(folder / "contract.json", text)
     if args.findings is not None:
         write_text(args.findings, findings)
     write_values(args.json, counts)
-    return int(bool(report.errors or (args.strict and (report.warnings or moved))))
 
 
-def _camera_moved(dataset: Path) -> bool:
+def _camera_moved(args: Check) -> bool:
     """Whether the camera was moved between episodes; prints where it stood in which."""
-    demos = load_demos(dataset)
+    demos = load_demos(args.dataset, mapping=columns(args.mapping), units=args.units)
     placements = camera_placements(list(feature_trajectories(demos)), IMAGE_SIZE)
     if not placements:
         print("camera: the marker is seen in fewer than two episodes, nothing to compare")
