@@ -351,13 +351,16 @@ def test_joints_are_not_torn_from_their_commands(tmp_path):
     np.testing.assert_allclose(demo.command_position, q + 0.05, atol=1e-9)
 
 
+@pytest.mark.parametrize("low", [-np.pi, 0.0])
 @pytest.mark.parametrize(("turn", "unit"), [(2 * np.pi, "rad"), (360.0, "deg")])
-def test_resampling_goes_on_where_joints_and_commands_wrap(tmp_path, turn, unit):
-    q = np.linspace(2.5, 4.5, 90)[:, None] * np.array([1.0, -1.0, 0.2])
-    wrapped = (q + np.pi) % (2 * np.pi) - np.pi
+def test_resampling_goes_on_where_joints_and_commands_wrap(tmp_path, turn, unit, low):
+    q = (low + 2 * np.pi + np.linspace(-0.6, 1.4, 90))[:, None] * np.array([1.0, -1.0, 0.2])
+    wrapped = (q - low) % (2 * np.pi) + low
     factor = turn / (2 * np.pi)
-    episode = {STATE: factor * wrapped, "action": factor * wrapped}
-    names = {STATE: NAMES, "action": NAMES}
+    # A hand whose levels happen to lie a turn apart.
+    hand = np.where(np.arange(90) // 9 % 2, np.pi, -np.pi)[:, None]
+    columns = factor * np.hstack([wrapped, hand])
+    episode, names = {STATE: columns, "action": columns}, {STATE: HAND, "action": HAND}
     root = write_folder(tmp_path / "old", [episode], names, dtype="float64")
     units = {"joint_position": unit, "command_position": unit}
     options = RepairOptions(trim=False, fps=120)
@@ -366,8 +369,11 @@ def test_resampling_goes_on_where_joints_and_commands_wrap(tmp_path, turn, unit)
     expected = np.stack(
         [np.interp(demo.time, np.arange(90) / FPS, column) for column in q.T], axis=1
     )
-    for values in (demo.joint_position, demo.command_position):
-        assert np.abs(values).max() <= np.pi + 1e-6
+    for moved in (demo.joint_position, demo.command_position):
+        values, fingers = moved[:, :3], moved[:, 3]
+        assert np.abs(values - low - np.pi).max() <= np.pi + 0.05
+        np.testing.assert_allclose(np.abs(fingers), np.pi)
+        assert 8 <= np.count_nonzero(np.diff(fingers)) <= 9
         off = np.angle(np.exp(1j * (values - expected)))
         np.testing.assert_allclose(off, 0, atol=1e-3)
 

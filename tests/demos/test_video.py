@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from clean_sets import SETS, write_set
+from lerobot_folders import read_info, write_info
 from unchecked import shapes_unchecked
 
 from hrc_learn.demos import DatasetWriter, check_dataset, load_demos, recover_dataset
@@ -99,3 +101,12 @@ def test_odd_sizes_are_refused_before_anything_is_written(tmp_path):
     with pytest.raises(ValueError, match="even sizes"):
         DatasetWriter(tmp_path / "set", 50, "any", cameras={"front": (95, 128)})
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_version_without_its_letter_is_the_same_version(tmp_path):
+    root = write_set(tmp_path / "set", **SETS["v3.0 with a camera"])
+    before = check_dataset(root)
+    write_info(root, read_info(root) | {"codebase_version": 3.0})
+    after = check_dataset(root)
+    assert after.ok
+    assert list(map(str, after.warnings)) == list(map(str, before.warnings))

@@ -99,7 +99,7 @@ def open_folder(path: str | Path) -> DatasetFolder:
     info = read_info(root)
     return DatasetFolder(
         root=root,
-        version=info["codebase_version"],
+        version=str(info["codebase_version"]),
         fps=float(info["fps"]),
         robot_type=info.get("robot_type"),
         features=read_features(info),
@@ -128,7 +128,7 @@ def read_info(root: Path) -> dict:
     if missing:
         raise DatasetError(f"lacks {', '.join(missing)}", file=INFO_PATH)
     version = info["codebase_version"]
-    if _generation(version) is None:
+    if generation(version) is None:
         raise DatasetError(
             f"dataset version {version!r} is unknown; versions 2.0, 2.1 and 3.0 can be read",
             file=INFO_PATH,
@@ -153,8 +153,8 @@ def read_episodes(root: Path, info: dict) -> list[EpisodeEntry]:
     Raises:
         DatasetError: The list of episodes is missing or damaged.
     """
-    generation = _generation(info["codebase_version"])
-    entries = _episodes_v3(root, info) if generation == 3 else _episodes_v2(root, info)
+    read = _episodes_v3 if generation(info["codebase_version"]) == 3 else _episodes_v2
+    entries = read(root, info)
     return sorted(entries, key=lambda entry: entry.index)
 
 
@@ -164,7 +164,7 @@ def read_tasks(root: Path, info: dict) -> dict[int, str]:
     Raises:
         DatasetError: The list of tasks is missing or damaged.
     """
-    if _generation(info["codebase_version"]) == 3:
+    if generation(info["codebase_version"]) == 3:
         file = "meta/tasks.parquet"
         rows = read_rows(root, file, ("task_index",))
         # The column of texts has no name when pandas wrote an index without one.
@@ -187,7 +187,7 @@ def recorded_statistics(folder: DatasetFolder) -> dict[int, Statistics]:
     """
     found: dict[int, Statistics] = {}
     lines = "meta/episodes_stats.jsonl"
-    if _generation(folder.version) == 3:
+    if generation(folder.version) == 3:
         for path in sorted((folder.root / "meta/episodes").glob("*/*.parquet")):
             for row in read_rows(folder.root, str(path.relative_to(folder.root)), ()):
                 statistics = found.setdefault(row["episode_index"], {})
@@ -346,7 +346,8 @@ def _why_no_info(root: Path) -> str:
     return "not found: this folder is no LeRobot dataset, or its recording was not finalized"
 
 
-def _generation(version: object) -> int | None:
+def generation(version: object) -> int | None:
+    """2 or 3 of a version such as "v2.1"; None of one that is not known here."""
     numbers = str(version).removeprefix("v").split(".")
     if numbers[0] == "3" or numbers[:2] in (["2", "0"], ["2", "1"]):
         return int(numbers[0])

@@ -20,7 +20,7 @@ from jaxtyping import Shaped, UInt8
 from hrc_learn.demos.format.dataset_folder import (
     DatasetFolder,
     EpisodeEntry,
-    _generation,
+    generation,
     path_in,
     read_rows,
 )
@@ -71,7 +71,7 @@ def read_segments(folder: DatasetFolder, missing: bool = False) -> dict[int, Seg
     keys = video_keys(folder)
     if not keys:
         return {}
-    places = _places_v3(folder, keys) if _generation(folder.version) == 3 else {}
+    places = _places_v3(folder, keys) if generation(folder.version) == 3 else {}
     segments = {}
     for entry in folder.episodes:
         found = places.get(entry.index) or _of_own_file(folder, entry, keys)
@@ -125,7 +125,7 @@ def _segment(
 
 
 def _of_own_file(folder: DatasetFolder, entry: EpisodeEntry, keys: list[str]) -> Segments:
-    if _generation(folder.version) == 3:
+    if generation(folder.version) == 3:
         return {}
     template = folder.info.get("video_path")
     chunk = entry.index // int(folder.info.get("chunks_size", 1000))

@@ -305,7 +305,7 @@ def _without_turns(
             continue
         values = quantities[role]
         turn = _turn_of(values, semantics, role)
-        turns = _turns(values / turn) * _may_turn(edit, semantics, role)
+        turns = _turns(values / turn)
         if not turns.any():
             continue
         selection = semantics.column_mapping.selections[role]

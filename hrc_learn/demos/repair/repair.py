@@ -47,6 +47,7 @@ from hrc_learn.demos.read.contract import (
 )
 from hrc_learn.demos.read.episodes import (
     Quantities,
+    declared_units,
     read_mapping,
     select_quantities,
     units_on_disk,
@@ -217,8 +218,7 @@ def _resolve(
             if not isinstance(frames, DatasetError):
                 yield entry, select_quantities(frames, column_mapping.selections)
 
-    contract = contract_of(sidecar)
-    declared = sidecar.units | ({} if contract is None else contract.units())
+    declared = declared_units(sidecar, column_mapping.selections)
     decisions, faults = units_on_disk(
         column_mapping.selections, readable(), folder.fps, declared, units
     )

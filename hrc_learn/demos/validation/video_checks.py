@@ -8,7 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from hrc_learn.demos.format.dataset_folder import DatasetFolder, is_inside, require_file
+from hrc_learn.demos.format.dataset_folder import (
+    DatasetFolder,
+    generation,
+    is_inside,
+    require_file,
+)
 from hrc_learn.demos.format.videos import (
     Segments,
     VideoSegment,
@@ -170,7 +175,7 @@ def _check_file(
         report.error(
             f"runs at {video.rate:.4g} images a second, the dataset at {folder.fps:g}", **place
         )
-    own = not folder.version.startswith("v3")
+    own = generation(folder.version) != 3
     for index, segment in sorted(shown, key=lambda item: item[1].start):
         length = lengths[index]
         frames = video.images if own else round((segment.stop - segment.start) * folder.fps)
