@@ -39,7 +39,7 @@ def check_metadata(root: Path, report: ValidationReport) -> DatasetFolder | None
         return None
     folder = DatasetFolder(
         root=root,
-        version=info["codebase_version"],
+        version=str(info["codebase_version"]),
         fps=float(info["fps"]),
         robot_type=info.get("robot_type"),
         features=features,
