@@ -3,13 +3,14 @@
 import json
 import math
 import ssl
+import sys
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from hrc_learn.teleoperation.gate import Control, qr_code
+from hrc_learn.teleoperation.gate import Control, Gate, GateCallbacks, address, qr_code
 from hrc_learn.teleoperation.gate.address import (
     Address,
     AddressConfig,
@@ -17,7 +18,7 @@ from hrc_learn.teleoperation.gate.address import (
     network_name,
     tls_context,
 )
-from hrc_learn.teleoperation.gate.admission import Bucket
+from hrc_learn.teleoperation.gate.admission import Admission, Bucket
 from hrc_learn.teleoperation.gate.control import Link
 from hrc_learn.teleoperation.gate.messages import (
     Hands,
@@ -262,6 +263,46 @@ def test_a_page_on_the_network_has_a_certificate_of_its_own(tmp_path, monkeypatc
     (folder / "arm.local.pem").write_text("no certificate")
     with pytest.raises(ValueError, match=r"arm\.local\.pem"):
         tls_context(config)
+
+
+def test_a_certificate_that_ends_is_made_anew(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(address, "_VALID_DAYS", 2)
+    config = AddressConfig(host="0.0.0.0", name="arm.local")
+    tls_context(config)
+    certificate = tmp_path / "hrc_learn" / "tls" / "arm.local.pem"
+    before = certificate.read_bytes()
+    tls_context(config)
+    assert certificate.read_bytes() != before
+
+
+NO_TEXT = b"\xff".decode("ascii", "surrogateescape")
+"""As headers come that hold other bytes."""
+
+
+def test_what_is_no_address_name_or_text_is_refused():
+    admission = Admission(AddressConfig(), 8080, tls=False)
+    cookie = f"hrc_page_8080={admission.address.token}"
+
+    def code(target, host="127.0.0.1:8080", cookies=()):
+        verdict = admission.refuse(target, host, cookies, lambda _: True)
+        return None if verdict is None else verdict.code
+
+    assert code("/", cookies=[cookie]) is None
+    assert code("//[x", cookies=[cookie]) == 403
+    assert code("/", "[abc", [cookie]) == 403
+    assert code("/", cookies=[f"hrc_page_8080={NO_TEXT}"]) == 401
+    assert code(f"/?token={NO_TEXT}") == 403
+    assert not admission.from_ours("http://[abc")
+
+
+def test_a_gate_whose_thread_fails_says_so_instead_of_waiting(control, monkeypatch):
+    callbacks = GateCallbacks(heard=id, fits=bool, status=dict, scene=dict)
+    gate = Gate(AddressConfig(port=0), control, {}, callbacks, "ws://127.0.0.1:9", "secret")
+    monkeypatch.setitem(sys.modules, "websockets.asyncio.server", None)
+    with pytest.raises(ImportError, match="websockets"):
+        gate.start()
+    gate.close("")
 
 
 def test_a_phone_reads_the_code():

@@ -15,6 +15,7 @@ from pathlib import Path
 
 _FIRST_PORTS = range(8080, 8180)  # tried in turn where none was asked for
 _VALID_DAYS = 800  # browsers refuse certificates of more than 825 days
+_LEAST_DAYS = 7  # that one of our own lasts still when it is used again
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,8 +119,8 @@ def listening_socket(config: AddressConfig) -> socket.socket:
 def tls_context(config: AddressConfig) -> ssl.SSLContext | None:
     """TLS for a page on the network; None for one that this machine alone can reach.
 
-    Without a certificate one is made by `openssl`, kept in the cache folder and used again, so
-    that browsers ask about it once.
+    Without a certificate one is made by `openssl`, kept in the cache folder and used again as
+    long as it lasts, so that browsers ask about it once.
 
     Raises:
         ValueError: There is neither a certificate nor a program to make one, or it is no good.
@@ -141,9 +142,9 @@ def _own_certificate(name: str) -> tuple[Path, Path]:
     cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
     folder = cache / "hrc_learn" / "tls"
     certificate, key = folder / f"{name}.pem", folder / f"{name}.key"
-    if certificate.is_file() and key.is_file():
-        return certificate, key
     openssl = shutil.which("openssl")
+    if certificate.is_file() and key.is_file() and (openssl is None or _lasts(certificate)):
+        return certificate, key
     if openssl is None:
         raise ValueError(
             "a page on the network needs TLS: install openssl, which makes a certificate, or "
@@ -168,6 +169,13 @@ def _own_certificate(name: str) -> tuple[Path, Path]:
     made.with_suffix(".key").replace(key)
     made.replace(certificate)
     return certificate, key
+
+
+def _lasts(certificate: Path) -> bool:
+    """Whether browsers will take it for some days still."""
+    seconds = str(_LEAST_DAYS * 24 * 3600)
+    command = ["openssl", "x509", "-noout", "-checkend", seconds, "-in", str(certificate)]
+    return subprocess.run(command, capture_output=True, check=False).returncode == 0
 
 
 def qr_code(text: str) -> str:

@@ -97,9 +97,12 @@ class Admission:
             cookies: The headers.
             known: Whether there is something at a path.
         """
-        parts = urlsplit(target)
         if not self.is_ours(host):
             return Verdict(code=403, words="This page is not served under that name.")
+        try:
+            parts = urlsplit(target)
+        except ValueError:
+            return Verdict(code=403, words="That is no address of this page.")
         if "token" in (query := parse_qs(parts.query)):
             return self._enter(query["token"][0], parts.path if known(parts.path) else "/")
         if not self._knows(cookies):
@@ -111,18 +114,20 @@ class Admission:
 
     def is_ours(self, host: str) -> bool:
         """Whether a Host header names us: another name may have been bound to our address."""
-        parts = urlsplit(f"//{host}")
         with suppress(ValueError):
+            parts = urlsplit(f"//{host}")
             return parts.hostname in self._hosts and parts.port in (self.address.port, None)
         return False
 
     def from_ours(self, origin: str) -> bool:
         """Whether an Origin header is that of our own page."""
-        parts = urlsplit(origin)
-        return parts.scheme == self.address.scheme and self.is_ours(parts.netloc)
+        with suppress(ValueError):
+            parts = urlsplit(origin)
+            return parts.scheme == self.address.scheme and self.is_ours(parts.netloc)
+        return False
 
     def _enter(self, token: str, path: str) -> Verdict:
-        if not hmac.compare_digest(token.encode(), self.address.token.encode()):
+        if not same_secret(token, self.address.token):
             if self._wrong.take():
                 return Verdict(code=403, words="That secret is not the one of this start.")
             return Verdict(code=429, words="Too many wrong secrets.")
@@ -134,5 +139,15 @@ class Admission:
         for cookie in "; ".join(cookies).split(";"):
             name, _, value = cookie.strip().partition("=")
             if name == self._cookie:
-                return hmac.compare_digest(value.encode(), self.address.token.encode())
+                return same_secret(value, self.address.token)
         return False
+
+
+def same_secret(given: str, secret: str) -> bool:
+    """Whether they are alike, told in a time that says nothing of where they differ.
+
+    Args:
+        given: By a client; may hold bytes that are no text, as headers may.
+        secret: Of ASCII characters but `?`.
+    """
+    return hmac.compare_digest(given.encode(errors="replace"), secret.encode())

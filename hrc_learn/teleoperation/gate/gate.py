@@ -6,7 +6,6 @@ In front of viser, which lets anybody in who reaches its port, and of the XR cli
 from __future__ import annotations
 
 import asyncio
-import hmac
 import http
 import json
 import logging
@@ -25,7 +24,7 @@ from hrc_learn.teleoperation.gate.address import (
     listening_socket,
     tls_context,
 )
-from hrc_learn.teleoperation.gate.admission import HEADERS, Admission, Bucket
+from hrc_learn.teleoperation.gate.admission import HEADERS, Admission, Bucket, same_secret
 from hrc_learn.teleoperation.gate.control import Control
 from hrc_learn.teleoperation.gate.messages import (
     Beat,
@@ -152,12 +151,20 @@ class Gate:
         self._views: dict[str, ServerConnection] = {}
         self._open = 0
         self._ready, self._farewell = Event(), ""
+        self._failure: BaseException | None = None
         self._thread = Thread(target=self._run, name="page gate", daemon=True)
 
     def start(self) -> None:
-        """Let people in."""
+        """Let people in.
+
+        Raises:
+            Exception: Whatever kept the gate's thread from serving.
+        """
         self._thread.start()
         self._ready.wait()
+        if self._failure is not None:
+            self._thread.join()
+            raise self._failure
 
     def close(self, words: str) -> None:
         """Tell everybody that it is over, and why, and stop."""
@@ -169,7 +176,14 @@ class Gate:
         self._socket.close()
 
     def _run(self) -> None:
-        asyncio.run(self._serve())
+        try:
+            asyncio.run(self._serve())
+        except BaseException as error:
+            if self._ready.is_set():
+                raise
+            self._failure = error
+        finally:
+            self._ready.set()
 
     async def _serve(self) -> None:
         from websockets.asyncio.server import serve
@@ -398,7 +412,7 @@ def guarded_servers(secret: str):
     def serve(*args: Any, **options: Any) -> Any:
         def check(connection: ServerConnection, request: Request) -> Response | None:
             given = request.headers.get(SECRET_HEADER, "")
-            if hmac.compare_digest(given.encode(), secret.encode()):
+            if same_secret(given, secret):
                 return None
             return _refused(403, "This port is not for browsers.")
 
