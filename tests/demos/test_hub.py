@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import sys
 
 import huggingface_hub
 import pytest
@@ -170,6 +171,13 @@ def test_what_has_errors_stays_here(hub, dataset):
 def test_a_name_that_is_none(dataset, name):
     with pytest.raises(ValueError, match=r"OWNER/NAME|Repo id"):
         push_dataset(dataset, name)
+
+
+def test_without_the_hubs_libraries_the_command_names_the_extra(dataset, monkeypatch):
+    monkeypatch.setitem(sys.modules, "httpx", None)
+    status, _, error = hrc("push", dataset, "alice/reach", "--dry-run")
+    assert status == 1
+    assert "pip install 'hrc-learn[hub]'" in error
 
 
 def test_the_command(hub, dataset, tmp_path, monkeypatch):
