@@ -8,8 +8,10 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from clean_sets import CAMERA, FPS, demonstration, write_set
+from commands import done
 from lerobot_folders import write_folder
 
+from hrc_learn.cli.commands import curate
 from hrc_learn.demos import DatasetError, check_dataset, load_demos
 from hrc_learn.demos.curation import (
     Decision,
@@ -21,6 +23,7 @@ from hrc_learn.demos.curation import (
 from hrc_learn.demos.curation.decisions import decision, decisions_path
 from hrc_learn.demos.curation.ranking import density_clusters, log_dimensionless_jerk
 from hrc_learn.demos.read.images import load_images
+from hrc_learn.teleoperation.curation_page import CurationPage
 
 NAMES = [*(f"joint{i}.pos" for i in range(1, 7)), "gripper.pos"]
 
@@ -201,6 +204,30 @@ def test_the_cleaned_set_is_what_was_decided_and_the_source_as_it_was(tmp_path, 
     assert (shown == load_images(root, 2, frames=range(20, 90))[CAMERA]).all()
     assert not check_dataset(tmp_path / "out").errors
     assert {path: path.read_bytes() for path in before} == before
+
+
+def test_what_is_typed_is_decided_before_the_page_opens(tmp_path, monkeypatch):
+    root = write_set(tmp_path / "set", "v3.0")
+    opened = []
+    monkeypatch.setattr(CurationPage, "wait", lambda page: opened.append(dict(page.decisions)))
+    monkeypatch.setattr(curate, "_has_screen", lambda: False)
+    command = ("curate", root, "--page.port", 0)
+    done(*command, "--reject", 3, "--accept", 1, "--cut", 2, "5:20")
+    (decisions,) = opened
+    assert {k: d.verdict for k, d in decisions.items()} == {1: "accept", 2: "cut", 3: "reject"}
+    assert read_decisions(root) == decisions
+
+
+@pytest.mark.parametrize(
+    ("one", "other"), [("accept", "reject"), ("accept", "cut"), ("cut", "reject")]
+)
+def test_an_episode_is_not_decided_on_twice(odd, one, other):
+    words = {
+        name: (f"--{name}", 3, *(("5:20",) if name == "cut" else ())) for name in (one, other)
+    }
+    error = done("curate", odd, *words[one], *words[other], status=2).error
+    assert f"--{one} and --{other} both name episode 3" in error
+    assert not decisions_path(odd).exists()
 
 
 def test_all_rejected_and_unknown_episodes_are_refused(odd, tmp_path):

@@ -3,6 +3,7 @@
 import os
 import sys
 import webbrowser
+from itertools import combinations
 
 from rich.console import Console
 from rich.progress import track
@@ -26,8 +27,14 @@ _SHOWN = 20
 
 
 def curate(args: Curate) -> None:
-    """Rank the episodes, and have it decided which of them stay."""
+    """Rank the episodes, and have it decided which of them stay.
+
+    Raises:
+        FileNotFoundError: There is no dataset.
+        ValueError: An episode is decided on twice, or does not exist, or a cut leaves nothing.
+    """
     args = resolved(args)
+    _refuse_contradictions(args)
     if not args.dataset.is_dir():
         raise FileNotFoundError(f"there is no dataset at {args.dataset}")
     ranking = rank_episodes(
@@ -36,11 +43,11 @@ def curate(args: Curate) -> None:
         args.units,
         progress=lambda episodes: track(episodes, description="Ranking", transient=True),
     )
+    decisions = _as_typed(args, ranking)
     if args.browser and not args.write:
         decisions = _in_browser(args, ranking)
     else:
         print(*ranking.lines(None if args.full else _SHOWN), sep="\n")
-        decisions = _as_typed(args, ranking)
     values = {
         "episodes": len(ranking.episodes),
         "episodes_in_doubt": sum(q.score > 0 for q in ranking.episodes),
@@ -69,6 +76,15 @@ def curate(args: Curate) -> None:
             f"--write makes the cleaned set"
         )
     write_values(args.json, values)
+
+
+def _refuse_contradictions(args: Curate) -> None:
+    options = {"accept": {*args.accept}, "cut": {*args.cut}, "reject": {*args.reject}}
+    for (one, first), (other, second) in combinations(options.items(), 2):
+        if first & second:
+            raise ValueError(
+                f"--{one} and --{other} both name episode {min(first & second)}: decide on one"
+            )
 
 
 def _as_typed(args: Curate, ranking: Ranking) -> Decisions:
