@@ -14,6 +14,7 @@ from rrd_reading import Rrd
 from hrc_learn.cli.commands import evaluate
 from hrc_learn.demos import DatasetWriter
 from hrc_learn.learning.channels import ReproductionError
+from hrc_learn.learning.tuning import TuningState
 from hrc_learn.viz.report import read_report
 
 
@@ -225,6 +226,25 @@ def test_a_missing_dataset_and_unknown_joints_are_bad_input(tmp_path):
     assert "elbow" in outcome.error
     assert "joint1" in outcome.error
     assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (None, "holds no search to go on with (KeyError: 'search')"),
+        ({"names": ("a", "b", "c")}, "searches a, b, c, not vision_rate"),
+        ({"middle": (1.0,)}, "holds no search to go on with"),
+        ({"spread": ("wide",) * 3}, "holds no search to go on with"),
+    ],
+)
+def test_a_search_is_not_taken_up_from_another_file(tmp_path, change, message):
+    search = TuningState.around({"vision_rate": 1.0, "linear_speed": 0.1, "angular_speed": 1.0})
+    state = {"search": search.to_json() | (change or {}), "costs": []}
+    place = tmp_path / "gains.search.json"
+    place.write_text("{}" if change is None else json.dumps(state))
+    error = done("tune", "--out", tmp_path / "gains", "--resume", status=2).error
+    assert f"error: {place}" in error
+    assert message in error
 
 
 @pytest.mark.slow

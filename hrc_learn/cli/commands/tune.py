@@ -68,10 +68,34 @@ def tune(args: Tune) -> None:
 def _begin(
     args: Tune, place: Path, default: ControllerConfig
 ) -> tuple[TuningState, list[float]]:
-    """A new search, or the one that was interrupted."""
+    """A new search, or the one that was interrupted.
+
+    Raises:
+        FileNotFoundError: None was interrupted.
+        ValueError: Its file holds something else, or searches other gains.
+    """
     if args.resume:
-        state = json.loads(place.read_text(encoding="utf-8"))
-        return TuningState.from_json(state["search"]), [float(cost) for cost in state["costs"]]
+        text = place.read_text(encoding="utf-8")
+        try:
+            state = json.loads(text)
+            search = TuningState.from_json(state["search"])
+            history = [float(cost) for cost in state["costs"]]
+            widths = {len(search.names), len(search.middle), len(search.spread)}
+            if len(widths) > 1 or len(search.best) not in (0, *widths):
+                raise ValueError("its lists differ in length")
+            # Asking and telling looks at all that a search holds.
+            search.tell(tried := search.ask(2), [0.0] * len(tried))
+        except Exception as error:
+            raise ValueError(
+                f"{place} holds no search to go on with ({type(error).__name__}: {error}): "
+                f"delete it and start without --resume"
+            ) from None
+        if search.names != TUNED:
+            raise ValueError(
+                f"{place} searches {', '.join(search.names)}, not {', '.join(TUNED)}: delete "
+                f"it and start without --resume"
+            )
+        return search, history
     start = {name: getattr(default, name) for name in TUNED}
     return TuningState.around(start, seed=args.starts.seed), []
 
