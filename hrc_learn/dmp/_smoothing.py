@@ -66,7 +66,7 @@ def warn_of_few_samples(samples: Samples, n_basis: int) -> None:
         warnings.warn(
             f"{demo_label(i, samples.batch)}{n_basis} basis functions are fitted to "
             f"{int(counts[i])} samples, which cannot tell them apart: the motion between "
-            "samples is arbitrary. Leave n_basis out to have it chosen.",
+            "samples is arbitrary. Take fewer, or have noise taken off (smooth=True).",
             stacklevel=4,
         )
 

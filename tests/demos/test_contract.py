@@ -203,6 +203,12 @@ def test_units_stay_with_the_columns_that_a_mapping_puts_in_order(hand, mapping)
     mapped = load_demos(hand, mapping={"joint_position": mapping})
     expected = every[0].select_joints(mapped.joint_names)
     np.testing.assert_array_equal(mapped[0].joint_position, expected.joint_position)
+    # Who checks and who repairs reads them alike.
+    mapping = {"joint_position": mapping}
+    said = [str(issue) for issue in check_dataset(hand, mapping=mapping).errors]
+    assert said == [str(issue) for issue in check_dataset(hand).errors]
+    options = RepairOptions(trim=False, dry_run=True)
+    assert repair_dataset(hand, hand / "new", options, mapping=mapping).changed == 0
 
 
 def test_columns_keep_their_unit_as_another_quantity(hand):

@@ -112,11 +112,11 @@ class Curate(Measured):
     browser: bool = True
     """Open the page in the browser."""
     reject: tuple[int, ...] = ()
-    """Episodes that go. In the terminal."""
+    """Episodes that go."""
     accept: tuple[int, ...] = ()
-    """Episodes that stay as they are. In the terminal."""
+    """Episodes that stay as they are."""
     cut: dict[int, str] = field(default_factory=dict)
-    """Frames that stay of an episode, such as: 12 30:410. In the terminal."""
+    """Frames that stay of an episode, such as: 12 30:410."""
     write: bool = False
     """Write the cleaned dataset by what was decided, and serve no page."""
     full: bool = False

@@ -131,26 +131,17 @@ class Contract:
             cells = (f"{cell:{w}}" for cell, w in zip(row, widths, strict=False))
             yield f"{'  '.join(cells)}  {row[-1]}".rstrip()
 
-    def units(
-        self, selections: Mapping[str, ColumnSelection] | None = None
-    ) -> dict[str, tuple[str, ...]]:
+    def units(self, selections: Mapping[str, ColumnSelection]) -> dict[str, tuple[str, ...]]:
         """Quantity -> unit of each of its components.
 
         Args:
             selections: The columns of each quantity; one with a column of unknown unit is left
-                out. None: those of the contract, in its order.
+                out.
         """
         known = {(part.key, part.index): part for part in self.components}
-        columns: dict[str, tuple[tuple[str, int], ...]] = {}
-        if selections is not None:
-            columns = {role: selection.columns for role, selection in selections.items()}
-        else:
-            for place, part in known.items():
-                if (role := _quantity(part)) is not None:
-                    columns[role] = (*columns.get(role, ()), place)
         units = {
-            role: tuple(_unit_as(role, known.get(place)) for place in places)
-            for role, places in columns.items()
+            role: tuple(_unit_as(role, known.get(place)) for place in selection.columns)
+            for role, selection in selections.items()
         }
         return {role: of_role for role, of_role in units.items() if all(of_role)}
 

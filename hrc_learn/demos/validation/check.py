@@ -20,6 +20,7 @@ from hrc_learn.demos.read.contract import (
 )
 from hrc_learn.demos.read.episodes import (
     Quantities,
+    declared_units,
     read_mapping,
     select_quantities,
     units_on_disk,
@@ -207,7 +208,7 @@ def _check_meaning(
                 profile.tracking.update(track_quantities(found, folder.fps))
                 yield entry, found
 
-    declared = sidecar.units | ({} if contract is None else contract.units())
+    declared = declared_units(sidecar, columns.selections)
     decisions, faults = units_on_disk(
         columns.selections, quantities(), folder.fps, declared, units
     )
