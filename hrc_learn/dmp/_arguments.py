@@ -266,7 +266,8 @@ class Samples:
             "peak": error.abs().amax(-1),
             "span": self.span,
         }
-        residuals = {k: v.reshape(*self.batch, -1) for k, v in residuals.items()}
+        batch = self.batch
+        residuals = {k: v.reshape(*batch, -1) if batch else v[0] for k, v in residuals.items()}
         return FitReport(**residuals, trust=trust)
 
     def _at(self, index: Tensor) -> Tensor:

@@ -25,7 +25,7 @@ from hrc_learn.dmp._system.bases import Basis, GaussianBasis, balanced_units
 from hrc_learn.dmp._system.closed_forms import SpringDamper
 from hrc_learn.dmp._system.own_times import ColumnPieces
 from hrc_learn.dmp._system.response import Response, Trajectory, response_of
-from hrc_learn.dmp.forcing_scale import Demonstrated, Scaling
+from hrc_learn.dmp.forcing_scale import Demonstrated, NoScaling, Scaling
 
 
 class FitOptions(TypedDict, total=False):
@@ -309,16 +309,10 @@ class MotionFit:
         samples = self.samples
         # One where a coordinate never moves: nothing to scale, and nothing to divide by.
         amplitude = samples.span.masked_fill(samples.span == 0, 1.0)
-        shown = Demonstrated(*(x.double() for x in (samples.first, samples.last, amplitude)))
-        scaling.check(shown, samples.batch, names)
-        if self.noisy is not samples:
-            # Noise would make a way of none, and taking it off as well.
-            first, last = self.noisy.first.double(), self.noisy.last.double()
-            noisy = Demonstrated(first, last, shown.amplitude)
-            scaling.check(noisy, samples.batch, names)
+        weights = self._unscaled(scaling, amplitude, names)
         s = samples.s[0] if samples.shared else samples.s.view(*samples.batch, -1)
         return {
-            "weights": self._batched(scaling.unscale(self.weights.mT, shown).mT),
+            "weights": self._batched(weights),
             "start": self._batched(samples.first),
             "goal": self._batched(samples.last),
             "start_velocity": self._batched(self.rate / samples.duration[:, None]),
@@ -330,6 +324,21 @@ class MotionFit:
             "scaling": scaling,
             "approach": self.response.approach,
         }
+
+    def _unscaled(
+        self, scaling: Scaling, amplitude: Float[Tensor, "B D"], names: Sequence[str] | None
+    ) -> Float[Tensor, "B D N"]:
+        if isinstance(scaling, NoScaling):
+            return self.weights
+        samples, noisy = self.samples, self.noisy
+        ends = (samples.first, samples.last, amplitude)
+        shown = Demonstrated(*(x.double() for x in ends))
+        scaling.check(shown, samples.batch, names)
+        if noisy is not samples:
+            # Noise would make a way of none, and taking it off as well.
+            first, last = noisy.first.double(), noisy.last.double()
+            scaling.check(Demonstrated(first, last, shown.amplitude), samples.batch, names)
+        return scaling.unscale(self.weights.mT, shown).mT
 
     def report(self, motion: Trajectory) -> FitReport:
         """Residuals of a motion at all samples, noise included, and how rough it is."""
@@ -347,7 +356,8 @@ class MotionFit:
 
     def _batched(self, values: Tensor) -> Tensor:
         samples = self.samples
-        return values.to(samples.position.dtype).reshape(samples.batch + values.shape[1:])
+        values = values.to(samples.position.dtype)
+        return values.reshape(samples.batch + values.shape[1:]) if samples.batch else values[0]
 
 
 def fit_motion(
