@@ -39,7 +39,6 @@ from hrc_learn.demos.format.videos import (
 from hrc_learn.demos.issue import DatasetError
 from hrc_learn.demos.read.column_mapping import MappingSpec
 from hrc_learn.demos.read.contract import (
-    Contract,
     changed_since,
     contract_content,
     contract_of,
@@ -154,13 +153,12 @@ def repair_dataset(
                 if role in semantics.column_mapping.selections
                 for column in semantics.column_mapping.selections[role].columns
             }
-            carried = Contract(
-                components=tuple(
-                    replace(part, unit=given.get((part.key, part.index), part.unit))
-                    for part in contract.components
-                ),
-                fingerprint=fingerprint(open_folder(target)),
+            parts = (
+                replace(part, unit=given.get((part.key, part.index), part.unit))
+                for part in contract.components
             )
+            copied = fingerprint(open_folder(target))
+            carried = replace(contract, components=tuple(parts), fingerprint=copied)
             content = read_sidecar(target)
             content = replace(content, contract=contract_content(carried))
             write_json(target / SIDECAR_PATH, sidecar_copy(content, content.units))
