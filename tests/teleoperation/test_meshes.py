@@ -4,7 +4,12 @@ import numpy as np
 import pytest
 
 from hrc_learn.geometry import Body, Box, Capsule, MeshFile
-from hrc_learn.teleoperation.page.meshes import body_meshes, box_mesh, capsule_mesh
+from hrc_learn.teleoperation.page.meshes import (
+    body_meshes,
+    box_mesh,
+    capsule_mesh,
+    simplified,
+)
 
 TETRAHEDRON = """v 0 0 0
 v 1 0 0
@@ -101,3 +106,33 @@ def test_a_body_with_meshes_is_drawn_in_their_colours(tmp_path):
     # The mirrored one has its outside outside as well: their volumes add up.
     assert volume(drawn[red]) == pytest.approx((1 + 2) / 6)
     assert volume(drawn[plate_colour]) == pytest.approx(8 * 0.1**3)
+
+
+def test_many_triangles_become_few_and_the_surface_stays():
+    end, r = np.array([0.0, 0.0, 0.3]), 0.06
+    fine = capsule_mesh(
+        Capsule(start=(0.0, 0.0, 0.0), end=(0.0, 0.0, 0.3), radius=r), segments=200
+    )
+    few = simplified(fine)
+    assert len(fine.faces) > 10_000
+    assert 500 < len(few.faces) <= 1500
+    assert edges_meet_in_pairs(few)
+    share = np.clip(few.vertices @ end / (end @ end), 0, 1)
+    distance = np.linalg.norm(few.vertices - share[:, None] * end, axis=1)
+    np.testing.assert_allclose(distance, r, atol=1e-3)
+    assert volume(few) == pytest.approx(volume(fine), rel=0.02)
+    assert simplified(few) is few
+
+
+def test_edges_with_two_normals_do_not_tear():
+    """Files give such an edge its corners twice, once for each side's normals."""
+    capsule = capsule_mesh(
+        Capsule(start=(0.0, 0.0, 0.0), end=(0.0, 0.0, 0.3), radius=0.06), segments=200
+    )
+    torn = type(capsule)(
+        capsule.vertices[capsule.faces.ravel()], np.arange(capsule.faces.size).reshape(-1, 3)
+    )
+    few = simplified(torn)
+    assert len(few.faces) <= 1500
+    assert edges_meet_in_pairs(few)
+    assert volume(few) == pytest.approx(volume(capsule), rel=0.02)

@@ -40,6 +40,35 @@ def test_a_dragged_elbow_yields_and_the_hand_stays(session, browser):
     assert np.linalg.norm(session.frame(-1) - hand) < 5e-3
 
 
+def test_drawing_by_the_processor_leaves_time_for_the_mouse(session, browser):
+    counted = """() => new Promise((done) => {
+      const canvas = document.querySelector("canvas"), told = [];
+      addEventListener("pointermove", (event) => told.push(event.isTrusted));
+      let frames = 0;
+      const count = () => { frames += 1; requestAnimationFrame(count); };
+      count();
+      const gone = [];
+      cancelAnimationFrame(requestAnimationFrame(() => gone.push(1)));
+      setTimeout(() => done({
+        smooth: canvas.getContext("webgl2").getContextAttributes().antialias,
+        frames, told, gone: gone.length,
+      }), 2000);
+    })"""
+    pulled = lambda: session.asked.nullspace_input.any()  # noqa: E731
+    with browser.dragging(session.frame(4), by=(40, -10), until=pulled):
+        browser.tab.evaluate(f"window.counted = ({counted})()")
+        browser.tab.mouse.move(*browser.pixel(session.frame(4)))
+        seen = browser.tab.evaluate("window.counted")
+    assert not seen["smooth"]
+    assert 0 < seen["frames"] <= 1 + 2000 / 45
+    assert False in seen["told"]  # before a frame is drawn, as the browser would have it
+    assert not seen["gone"]
+    browser.tab.evaluate(f"window.counted = ({counted})()")
+    browser.tab.mouse.move(30, 300)  # nothing is held
+    assert False not in browser.tab.evaluate("window.counted")["told"]
+    wait_until(lambda: still(session), "rest")
+
+
 def test_a_corner_that_is_dragged_sizes_the_region(session, browser):
     editor = session.page._panel._region
     before = editor._region

@@ -81,8 +81,11 @@ def page_contents(viser: Path) -> dict[str, Content]:
         viser: Folder of the package.
     """
     page = (viser / "client" / "build" / "index.html").read_bytes()
-    # Ours comes first: it says which socket viser's client opens.
-    page = page.replace(b"<head>", b'<head><script src="/static/session.js"></script>', 1)
+    # Ours come first: one says which socket viser's client opens, one how it draws.
+    ours = b"".join(
+        b'<script src="/static/%s"></script>' % name for name in (b"session.js", b"prompt.js")
+    )
+    page = page.replace(b"<head>", b"<head>" + ours, 1)
     page = page.replace(b"<title>Viser</title>", b"<title>hrc page</title>", 1)
     return {"/": Content.of("index.html", page), **static_contents(_STATIC)}
 

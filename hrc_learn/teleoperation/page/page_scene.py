@@ -16,7 +16,7 @@ from jaxtyping import Float
 from hrc_learn.geometry import Body, Box, Pose
 from hrc_learn.geometry.shapes import Colour
 from hrc_learn.protocols import DrawnRegion
-from hrc_learn.teleoperation.page.meshes import body_meshes, joined
+from hrc_learn.teleoperation.page.meshes import body_meshes, joined, simplified
 from hrc_learn.teleoperation.page.page_operator import AddedTurn, HeldGizmo, HeldGizmos
 from hrc_learn.viz.palette import PERSON, SKY, TARGET, rgba
 
@@ -200,10 +200,13 @@ class PageScene:
                 self._knob_colours[joint] = now
                 for knobs in (self._knobs, self._twin_knobs):
                     knobs[joint].color = rgba(now)[:3]
-        if self._arrows is not None:
+        if self._arrows is not None and not len(arrows):
             self._arrows.remove()
             self._arrows = None
-        if len(arrows):
+        elif self._arrows is not None:  # to draw them anew would cost the browser more
+            self._arrows.points = arrows.astype(np.float32)
+            self._arrows.colors = np.array(rgba(colour)[:3], np.uint8)
+        elif len(arrows):
             self._arrows = self._scene.add_arrows(
                 "/pull",
                 arrows,
@@ -220,7 +223,7 @@ class PageScene:
         )
         shapes = body_meshes(body)
         if parent:
-            shapes = {_TWIN: joined([*shapes.values()])}
+            shapes = {_TWIN: simplified(joined([*shapes.values()]))}
         meshes = [
             self._scene.add_mesh_simple(
                 f"{path}/{k}",
@@ -239,6 +242,7 @@ class PageScene:
         return self._scene.add_icosphere(
             f"{parent}/knobs/joint{joint}",
             radius=0.078,
+            subdivisions=2,
             color=_PERSON,
             opacity=0.9,
             cast_shadow=False,
