@@ -2,6 +2,7 @@
 
 import time
 from contextlib import contextmanager
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -206,6 +207,10 @@ def test_the_page_shows_how_far_a_held_elbow_follows_and_why_not_further(world, 
     assert wrist.color == rgba(PERSON)[:3]
     until(lambda: "joint 4 is at its limit" in page._panel._told.content)
     until(lambda: arrow_colour() == rgba(VERMILION)[:3])
+    # A pointer that goes on takes the arrow along; it is not drawn anew.
+    drawn, held = page._scene._arrows, replace(held, pointer=far + 0.01)
+    until(lambda: np.allclose(drawn.points[0, 1], held.pointer, atol=1e-6))
+    assert page._scene._arrows is drawn
     # What the loop itself tells takes its place, until nobody holds on.
     until(lambda: cell.hold_pose(0.01) or beside.human.feedback.pushed)
     assert beside.human.feedback is not told
