@@ -9,13 +9,12 @@ from jaxtyping import Float, Int
 from hrc_learn.geometry import Body, Box, Capsule, read_mesh
 from hrc_learn.geometry.shapes import Colour
 
-
 _TRIANGLES = 1500
-"""Of one colour of a body: the Panda then has 29,000 rather than 135,000, which a browser without
-a graphics processor draws in half the time."""
+"""Of one colour of a body: the Panda then has 29,000 rather than 135,000, which a browser
+without a graphics processor draws in half the time."""
 _AGGRESSION = 5
-"""From 0 to 10, of fast-simplification: at the triangles above, this lost the least of the Panda
-(surfaces within 1 mm but for cable sockets; 7, its default, up to 5 mm)."""
+"""From 0 to 10, of fast-simplification: at the triangles above, 99 % of the Panda's surfaces
+stay within 1 mm, sockets of cables within 8 mm; at 7, its default, within 3 mm."""
 
 
 class Mesh(NamedTuple):
