@@ -84,8 +84,8 @@ class Args:
     """Minutes that the hand goes on at the end."""
     pixels: float = 1.0
     """Of a screen's, across, that viser's page draws (its `fixedDpr`)."""
-    meshes: bool = False
-    """Whether the client draws real meshes, three arms of them, rather than capsules."""
+    meshes: bool = True
+    """Whether the clients draw the arm as it is, rather than as capsules."""
     json: Path | None = None
     """Receives the figures as one flat object."""
 

@@ -40,7 +40,7 @@ ELBOW = 4
 """Link that is pulled."""
 VIEW = (720, 450)
 """Of the headset's pictures [px]."""
-STANDS, LOOKS_AT = (0.35, 1.55, -0.15), (0.12, 1.05, -0.95)
+STANDS, LOOKS_AT = (0.35, 1.55, 0.0), (-0.08, 1.05, -0.95)
 """Where the person stands who wears it, and looks, in the room (y up) [m]."""
 SCENES = 14
 """Pictures of each part of the film."""
