@@ -6,6 +6,7 @@ import pytest
 from hrc_learn.geometry import Body, Box, Capsule, MeshFile
 from hrc_learn.teleoperation.page.meshes import (
     body_meshes,
+    body_shape,
     box_mesh,
     capsule_mesh,
     simplified,
@@ -136,3 +137,25 @@ def test_edges_with_two_normals_do_not_tear():
     assert len(few.faces) <= 1500
     assert edges_meet_in_pairs(few)
     assert volume(few) == pytest.approx(volume(capsule), rel=0.02)
+
+
+def test_a_body_of_fine_meshes_is_drawn_by_few_triangles(tmp_path):
+    fine = capsule_mesh(Capsule(start=(0.0, 0.0, 0.0), end=(0.0, 0.0, 0.3), radius=0.06), 100)
+    lines = [*(f"v {x} {y} {z}" for x, y, z in fine.vertices.tolist())]
+    lines += [f"f {a} {b} {c}" for a, b, c in (fine.faces + 1).tolist()]
+    (tmp_path / "fine.obj").write_text("\n".join(lines))
+    colours = (0.8, 0.1, 0.1, 1.0), (0.2, 0.2, 0.2, 1.0)
+    body = Body(
+        name="link1",
+        position=np.zeros((1, 3)),
+        orientation=np.array([[1.0, 0.0, 0.0, 0.0]]),
+        capsules=(),
+        meshes=tuple(MeshFile(path=tmp_path / "fine.obj", colour=c) for c in colours),
+    )
+    assert len(fine.faces) > 5000
+    for mesh in body_meshes(body).values():
+        assert len(mesh.faces) <= 1500
+        assert volume(mesh) == pytest.approx(volume(fine), rel=0.02)
+    whole = body_shape(body)
+    assert len(whole.faces) <= 1500
+    np.testing.assert_allclose(np.ptp(whole.vertices, axis=0), [0.12, 0.12, 0.42], atol=2e-3)

@@ -218,4 +218,5 @@ def test_the_page_shows_how_far_a_held_elbow_follows_and_why_not_further(world, 
     until(lambda: "follows by 100 %" in page._panel._told.content)
     until(lambda: cell.hold_pose(0.01) or not beside.human.feedback.pushed, holds=False)
     until(lambda: elbow.color == rgba(PERSON)[:3], holds=False)
+    until(lambda: arrow_colour() is None, holds=False)
     until(lambda: page._panel._told.content == "", holds=False)

@@ -89,6 +89,11 @@ def body_meshes(body: Body) -> dict[Colour, Mesh]:
     return {colour: simplified(joined(meshes)) for colour, meshes in parts.items()}
 
 
+def body_shape(body: Body) -> Mesh:
+    """All that a body looks like as one mesh, for who draws it in one colour."""
+    return simplified(joined([*body_meshes(body).values()]))
+
+
 def simplified(mesh: Mesh) -> Mesh:
     """The same surface, nearly, of as many triangles as a browser draws quickly."""
     if len(mesh.faces) <= _TRIANGLES:

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from hrc_learn.geometry import Body, Box, Pose
 from hrc_learn.geometry.shapes import Colour
 from hrc_learn.protocols import DrawnRegion
-from hrc_learn.teleoperation.page.meshes import body_meshes, joined, simplified
+from hrc_learn.teleoperation.page.meshes import body_meshes, body_shape
 from hrc_learn.teleoperation.page.page_operator import AddedTurn, HeldGizmo, HeldGizmos
 from hrc_learn.viz.palette import PERSON, SKY, TARGET, rgba
 
@@ -221,9 +221,7 @@ class PageScene:
         frame = self._scene.add_frame(
             path, position=body.position[0], wxyz=body.orientation[0], show_axes=False
         )
-        shapes = body_meshes(body)
-        if parent:
-            shapes = {_TWIN: simplified(joined([*shapes.values()]))}
+        shapes = {_TWIN: body_shape(body)} if parent else body_meshes(body)
         meshes = [
             self._scene.add_mesh_simple(
                 f"{path}/{k}",
