@@ -1,5 +1,6 @@
 """The page as people meet it: in a browser, with a mouse."""
 
+import time
 from contextlib import closing
 
 import numpy as np
@@ -123,10 +124,15 @@ def test_a_region_in_force_draws_the_hand_in(session, browser):
 
 @pytest.mark.slow
 def test_a_click_marks_the_target_on_the_table(session, browser):
-    browser.button("Mark the target").click()
     point = np.array([0.45, 0.75, 0.0])
-    browser.tab.mouse.click(*browser.pixel(point))
-    wait_until(lambda: session.asked.target is not None, "a target")
+
+    def marked():  # once the browser has heard that a click is waited for
+        browser.tab.mouse.click(*browser.pixel(point))
+        time.sleep(0.5)
+        return session.asked.target is not None
+
+    browser.button("Mark the target").click()
+    wait_until(marked, "a target")
     np.testing.assert_allclose(session.asked.target[:2], point[:2], atol=0.01)
     browser.button("Clear the target").click()
     wait_until(lambda: session.asked.target is None, "no target")
@@ -158,6 +164,9 @@ def test_a_browser_that_hangs_lets_go(session, browser):
 def test_a_browser_that_is_closed_lets_go(session, browser):
     with closing(browser.tab.context.new_page()) as tab:
         other = Browser(tab, session.page)
+        other.button("Ask to lead").click()
+        browser.button("Hand over").click()
+        wait_until(lambda: other.button("Ask to lead").count() == 0, "the lead")
         tab.mouse.move(*other.pixel(session.frame(4)))
         tab.mouse.down()
         tab.mouse.move(*other.pixel(session.frame(4) + np.array([0.0, 0.2, 0.0])))
