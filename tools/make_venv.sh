@@ -62,7 +62,8 @@ else
   announce "$python and pip"
   "$python" -m venv .venv
   # Since 25.1 pip shows how far it is while it installs what it has fetched, some 100 s.
-  .venv/bin/python -m pip install --quiet --disable-pip-version-check "pip>=25.1"
+  .venv/bin/python -m pip install --quiet --disable-pip-version-check "pip>=25.1" ||
+    say "An older pip is used: it says nothing while it installs."
   install=(.venv/bin/python -m pip install --disable-pip-version-check --constraint constraints.txt --editable "$extras")
   if [ -t 1 ]; then
     "${install[@]}"  # pip's own bars
