@@ -159,3 +159,20 @@ def test_a_body_of_fine_meshes_is_drawn_by_few_triangles(tmp_path):
     whole = body_shape(body)
     assert len(whole.faces) <= 1500
     np.testing.assert_allclose(np.ptp(whole.vertices, axis=0), [0.12, 0.12, 0.42], atol=2e-3)
+
+
+def test_a_mesh_of_which_parts_would_be_lost_stays_as_it_is():
+    """Triangles that share no edge with others may go without costing any volume."""
+    capsule = capsule_mesh(
+        Capsule(start=(0.0, 0.0, 0.0), end=(0.0, 0.0, 0.3), radius=0.06), segments=200
+    )
+    rng = np.random.default_rng(0)
+    at = rng.uniform(-0.5, 0.5, (400, 1, 3))
+    loose = (at + rng.normal(0, 1e-3, (400, 3, 3))).reshape(-1, 3)
+    faces = len(capsule.vertices) + np.arange(1200).reshape(-1, 3)
+    whole = type(capsule)(
+        np.concatenate([capsule.vertices, loose]), np.concatenate([capsule.faces, faces])
+    )
+    drawn = simplified(whole)
+    for end in (np.min, np.max):
+        np.testing.assert_allclose(end(drawn.vertices, 0), end(whole.vertices, 0), atol=2e-3)
