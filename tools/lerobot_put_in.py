@@ -11,7 +11,7 @@
 
 import pytest
 
-POLICIES = ("dmp", "motion_chunk")
+POLICIES = ("dmp", "motion_chunk", "act_dmp", "diffusion_dmp")
 FPS = 30.0
 """Of LeRobot's tests, whose policies are made without a dataset that would tell."""
 PAIRS = ("mock", "mujoco_arm", "smooth")

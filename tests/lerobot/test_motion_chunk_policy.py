@@ -132,13 +132,13 @@ def test_a_seam_keeps_position_velocity_and_acceleration_whatever_is_predicted(s
     for _ in range(4):
         seen = {STATE: torch.randn(1, 3, generator=rng), GOAL: torch.randn(1, 2, generator=rng)}
         left = None if chunk is None else chunk[0, steps:]
-        before = policy._chunk
+        before = policy.motion.chunk
         chunk = policy.predict_action_chunk(seen, prev_chunk_left_over=left)
         if before is None or steps == 10:
             continue
         # From one action to the next, of an arm that is sent from chunk to chunk.
         torch.testing.assert_close(chunk[0, 0], left[0], rtol=0, atol=1e-5)
-        seam, end = policy._chunk.states[0, 0], before.states[0, steps]
+        seam, end = policy.motion.chunk.states[0, 0], before.states[0, steps]
         torch.testing.assert_close(seam, end, rtol=0, atol=1e-5)
 
 
@@ -202,13 +202,13 @@ def test_real_time_chunks_begin_with_what_will_be_carried_out_meanwhile():
     assert supports_rtc_inference(policy)
     seen = {STATE: torch.zeros(1, 3), GOAL: torch.ones(1, 2)}
     first = policy.predict_action_chunk(seen)[0]
-    before = policy._chunk
+    before = policy.motion.chunk
     other = {STATE: torch.ones(1, 3), GOAL: -torch.ones(1, 2)}
     chunk = policy.predict_action_chunk(
         other, inference_delay=4, prev_chunk_left_over=first[3:]
     )[0]
     torch.testing.assert_close(chunk[:4], first[3:7], rtol=0, atol=0)
-    now, then = policy._chunk.states[0, 4], before.states[0, 7]
+    now, then = policy.motion.chunk.states[0, 4], before.states[0, 7]
     torch.testing.assert_close(now, then, rtol=0, atol=1e-5)
     assert (chunk[8] - first[7]).abs().max() > 0.1
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -14,6 +14,11 @@ from hrc_learn.dmp.motion_head import MotionHead
 
 NOISE = 1e-2
 """Of demonstrated actions over their spread: what it hides is not learned."""
+BLEND_TIME = 0.05
+"""At most, unless it is given [s]."""
+BLEND_SHARE = 0.3
+"""Of the time between two basis functions. A plan that is off by e at that spacing h is off by
+some 20 e / h^2 in acceleration, which leads a motion astray by 20 e (blend_time / h)^2."""
 TINY = 1e-9
 """Added to what is inverted, so that it can be."""
 
@@ -32,7 +37,9 @@ class ChunkDecoder(nn.Module):
     the state that a chunk ends in, at the one after the last."""
     projection: Float[Tensor, "M samples"]
 
-    def __init__(self, chunk_size: int, step: float, n_basis: int, blend_time: float):
+    def __init__(
+        self, chunk_size: int, step: float, n_basis: int, blend_time: float | None = None
+    ):
         """Compute the maps.
 
         Args:
@@ -40,10 +47,13 @@ class ChunkDecoder(nn.Module):
             step: From one action to the next [s].
             n_basis: N, weights a column.
             blend_time: About how long a motion takes to get from where it is to what is
-                planned [s].
+                planned [s]; None: 0.05 s, or less where basis functions are so close to each
+                other that acceleration is uneven within that time.
         """
         super().__init__()
-        self.blend_time = blend_time
+        between = chunk_size * step / n_basis
+        self.step = step
+        self.blend_time = blend_time or min(BLEND_TIME, BLEND_SHARE * between)
         head = MotionHead(1, n_basis, duration=chunk_size * step).double()
         unit = torch.eye(n_basis + 3, dtype=torch.float64)
         time = step * torch.arange(chunk_size + 1, dtype=torch.float64)
@@ -62,6 +72,11 @@ class ChunkDecoder(nn.Module):
     def size(self) -> int:
         """M, coefficients of a column."""
         return self.maps.shape[-1]
+
+    @property
+    def samples(self) -> int:
+        """Actions of a chunk, and the one after its last."""
+        return self.maps.shape[1]
 
     def project(self, chunks: Float[Tensor, "*batch samples D"]) -> Float[Tensor, "*batch D M"]:
         """The coefficients whose motion is nearest to demonstrated chunks."""
@@ -105,30 +120,6 @@ class ChunkDecoder(nn.Module):
         x = coefficients.double()
         off = state.double().mT - x @ through.T
         return x + off @ change.T
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class MotionChunk:
-    """Actions to come as a motion, of a batch."""
-
-    states: Float[Tensor, "B samples 3 D"]
-    """Position, velocity and acceleration of the smooth columns, whitened."""
-    upper: Float[Tensor, "B samples G"]
-    """1 where a two-level column is at its upper level, else 0."""
-    actions: Float[Tensor, "B samples A"]
-
-    def after(self, steps: Int[Tensor, "B"]) -> "MotionChunk":
-        """What is left after so many actions; it stands still where there is no more."""
-        samples = self.states.shape[1]
-        index = steps[:, None] + torch.arange(samples, device=steps.device)
-        over = index > samples - 1
-        index = index.clamp(max=samples - 1)
-        row = torch.arange(len(steps), device=steps.device)[:, None]
-        states = self.states[row, index].clone()
-        states[:, :, 1:] = torch.where(over[..., None, None], 0.0, states[:, :, 1:])
-        return MotionChunk(
-            states=states, upper=self.upper[row, index], actions=self.actions[row, index]
-        )
 
 
 # Several plans for one observation, and how likely each is.
@@ -194,7 +185,7 @@ class ChunkNetwork(nn.Module):
         """
         super().__init__()
         self.numbers, self.columns, self.n_plans = numbers, columns, n_plans
-        self.samples, self.two_level = decoder.maps.shape[1], two_level
+        self.samples, self.two_level = decoder.samples, two_level
         self.register_buffer("mean", torch.zeros(columns, decoder.size))
         self.register_buffer("spread", torch.ones(columns, decoder.size))
         self.linear = nn.Linear(numbers, columns * decoder.size)

@@ -19,6 +19,9 @@ logger = logging.getLogger(__name__)
 OUTLIER = 25.0
 """Spreads from the mean from which on a value is no motion: one glitch among n frames is
 sqrt(n) spreads away, a gripper that opens for every 600th frame as many."""
+TWO_LEVEL = 0.9
+"""Share of the largest variance between minimum and maximum (Bhatia and Davis 2000, "A better
+bound on the variance") from which on a column knows two levels: 1 if it is never between."""
 
 
 @dataclass
@@ -119,7 +122,7 @@ def _names(features: dict[str, dict[str, Any]], key: str) -> list[str] | None:
     return None if names is None else list(names)
 
 
-def frame_rate(config: MotionPolicyConfig, dataset_meta: Any) -> float:
+def frame_rate(config: Any, dataset_meta: Any) -> float:
     """Actions a second, of the settings or the dataset.
 
     Raises:
@@ -204,6 +207,19 @@ def require_statistics(
             OUTLIER,
             values,
         )
+
+
+def two_level_columns(mean: Tensor, std: Tensor, low: Tensor, high: Tensor) -> list[int]:
+    """Columns that are at their least or their largest value, such as a gripper's.
+
+    Args:
+        mean: Of each column, (A).
+        std: Its spread.
+        low: Its least value.
+        high: Its largest value.
+    """
+    largest = (high - mean) * (mean - low)
+    return ((std > 0) & (std.square() > TWO_LEVEL * largest)).nonzero().flatten().tolist()
 
 
 def require_any_statistics(stats: Mapping[str, Any] | None, dataset_meta: Any) -> None:

@@ -17,7 +17,6 @@ from hrc_learn.lerobot.policy.chunk_network import (
     LEFT_OVER,
     ChunkDecoder,
     ChunkNetwork,
-    MotionChunk,
     Plans,
 )
 from hrc_learn.lerobot.policy.closed_form import SampleWindows, read_episodes
@@ -27,8 +26,10 @@ from hrc_learn.lerobot.policy.common import (
     require_any_statistics,
     require_numbers,
     require_statistics,
+    two_level_columns,
 )
 from hrc_learn.lerobot.policy.configuration_motion_chunk import HISTORY, MotionChunkConfig
+from hrc_learn.lerobot.policy.continued_motion import ContinuedMotion, MotionChunk
 from hrc_learn.lerobot.policy.motion_planner import (
     ActionEncoding,
     matched_columns,
@@ -38,9 +39,6 @@ from hrc_learn.lerobot.policy.networks import Observation, ObservationEncoder
 
 logger = logging.getLogger(__name__)
 
-TWO_LEVEL = 0.9
-"""Share of the largest variance between minimum and maximum (Bhatia and Davis 2000, "A better
-bound on the variance") from which on a column knows two levels: 1 if it is never between."""
 MEASURED = 0.5
 """Spreads by which actions may differ from the state of their name to be what it measures."""
 UNSURE = 0.3
@@ -52,11 +50,6 @@ VELOCITY_WEIGHT = 0.005
 """Of the error in velocity, spreads a second, beside that in position."""
 SCORE_WEIGHT = 0.1
 """Of the scores of plans beside the plans: a classification learns faster."""
-BLEND_TIME = 0.05
-"""At most, unless it is given [s]."""
-BLEND_SHARE = 0.3
-"""Of the time between two basis functions. A plan that is off by e at that spacing h is off by
-some 20 e / h^2 in acceleration, which leads a motion astray by 20 e (blend_time / h)^2."""
 SAME_WAY = 0.5
 """Root mean square distance, in spreads, from which on plans are different ways to go: of
 nearer ones the mean is closer to what is shown than any, of others it is neither way."""
@@ -144,10 +137,8 @@ class MotionChunkPolicy(PreTrainedPolicy):
                 f"not all of them; got {self._stepped}"
             )
         self._smooth = [k for k in range(width) if k not in self._stepped]
-        between = config.chunk_size / config.fps / config.n_basis
-        blend_time = config.blend_time or min(BLEND_TIME, BLEND_SHARE * between)
         self.decoder = ChunkDecoder(
-            config.chunk_size, 1 / config.fps, config.n_basis, blend_time
+            config.chunk_size, 1 / config.fps, config.n_basis, config.blend_time
         )
         self.network = ChunkNetwork(
             numbers=sum(widths.values()),
@@ -159,6 +150,7 @@ class MotionChunkPolicy(PreTrainedPolicy):
             hidden=config.hidden_dim,
             dropout=config.dropout,
         )
+        self.motion = ContinuedMotion(self.decoder, self._compose, self._decompose)
         if config.pretrained_path is None:
             self._fit(dataset_meta)
         self.reset()
@@ -173,7 +165,7 @@ class MotionChunkPolicy(PreTrainedPolicy):
 
     def reset(self) -> None:
         """Forget the motion that is under way: the next begins where the arm is measured."""
-        self._chunk: MotionChunk | None = None
+        self.motion.reset()
         self._action_queue: deque[Tensor] = deque()
 
     def forward(
@@ -252,9 +244,9 @@ class MotionChunkPolicy(PreTrainedPolicy):
         require_numbers(self.config, self.encoder.widths, batch)
         features = self.encoder(self._turned(batch))
         if prev_chunk_left_over is not None:
-            before = self._left_over(prev_chunk_left_over)
-        elif self._chunk is not None:
-            before = self._chunk.after(self._steps_done(features, self._chunk))
+            before = self.motion.left_over(prev_chunk_left_over)
+        elif self.motion.chunk is not None:
+            before = self.motion.nearest(self._planned_now(features))
         else:
             before = None
         return self._go_on(batch, features, before, inference_delay)
@@ -266,11 +258,7 @@ class MotionChunkPolicy(PreTrainedPolicy):
             self.eval()
             require_numbers(self.config, self.encoder.widths, batch)
             steps, features = self.config.n_action_steps, self.encoder(self._turned(batch))
-            before = None
-            if self._chunk is not None:
-                done = torch.full((len(features),), steps, device=features.device)
-                before = self._chunk.after(done)
-            chunk = self._go_on(batch, features, before, 0)
+            chunk = self._go_on(batch, features, self.motion.after(steps), 0)
             self._action_queue.extend(chunk[:, :steps].unbind(1))
         return self._action_queue.popleft()
 
@@ -292,21 +280,12 @@ class MotionChunkPolicy(PreTrainedPolicy):
         """Plan, and keep the motion that leads from what is carried out to the plan."""
         plans = self._plans(features, before)
         planned = self._chosen(plans, before)
+        beginning = None
         if before is None:
-            delay = 0
-            state = self._beginning(batch, self.decoder.states(planned)[:, 0])
-        else:
-            delay = min(delay, self.config.chunk_size)
-            state = before.states[:, delay]
-        motion = self.decoder.begin_in(planned, state, delay)
-        states, upper = self.decoder.states(motion), (plans.levels > 0).to(features)
-        if before is not None:
-            states[:, :delay] = before.states[:, :delay]
-            upper[:, :delay] = before.upper[:, :delay]
-        self._chunk = MotionChunk(
-            states=states, upper=upper, actions=self._actions(states[:, :, 0], upper)
-        )
-        return self._chunk.actions[:, :-1]
+            beginning = self._beginning(batch, self.decoder.states(planned)[:, 0])
+        upper = (plans.levels > 0).to(features)
+        actions = self.motion.go_on(planned, upper, before, beginning=beginning, delay=delay)
+        return actions[:, :-1]
 
     def _plans(self, features: Tensor, before: MotionChunk | None) -> Plans:
         known = features.new_full((len(features),), float(before is not None))
@@ -349,47 +328,23 @@ class MotionChunkPolicy(PreTrainedPolicy):
         position = torch.where(there, seen, planned[:, 0])
         return torch.cat([position[:, None], planned[:, 1:]], dim=1)
 
-    def _actions(self, position: Tensor, upper: Tensor) -> Float[Tensor, "B samples A"]:
+    def _planned_now(self, features: Tensor) -> Float[Tensor, "B D"]:
+        """Where the motion should be for what is seen, if it could begin anywhere."""
+        return self.decoder.states(self._chosen(self._plans(features, None), None))[:, 0, 0]
+
+    def _compose(self, position: Tensor, upper: Tensor) -> Float[Tensor, "B samples A"]:
+        """Actions of whitened positions, and of levels: 1 for the upper one, else 0."""
         low, high = self.levels[:, self._stepped]
         coordinates = self.encoding.mean.new_zeros(*position.shape[:2], self.levels.shape[1])
         coordinates[..., self._smooth] = position.to(coordinates)
         coordinates[..., self._stepped] = low + upper * (high - low)
         return self.encoding.to_actions(coordinates)
 
-    def _steps_done(self, features: Tensor, chunk: MotionChunk) -> Int[Tensor, "B"]:
-        """At which action the last chunk is nearest to the one planned for what is seen now."""
-        planned = self._chosen(self._plans(features, None), None)
-        now = self.decoder.states(planned)[:, :1, 0]
-        return (chunk.states[:, 1:, 0] - now).square().sum(-1).argmin(1) + 1
-
-    def _left_over(self, actions: Tensor) -> MotionChunk | None:
-        """What goes on in actions of the last chunk, or of whatever made them."""
-        actions = actions.reshape(-1, self.levels.shape[1]).to(self.encoding.mean)
-        # LeRobot fills short ones up with zeros.
-        there = actions.any(-1).nonzero().flatten()
-        actions = actions[: int(there[-1]) + 1] if len(there) else actions[:0]
-        chunk, samples = self._chunk, self.config.chunk_size + 1
-        if chunk is not None:
-            if not len(actions):
-                return chunk.after(torch.tensor([samples], device=actions.device))
-            for k in range(samples):
-                same = chunk.actions[0, k : k + len(actions)]
-                if len(same) and torch.equal(same, actions[: len(same)]):
-                    return chunk.after(torch.tensor([k], device=actions.device))
-        if not len(actions):
-            return None
-        # Somebody else's: as fast as they change, and standing still after the last.
-        index = torch.arange(samples, device=actions.device).clamp(max=len(actions) - 1)
-        coordinates = self.encoding.to_coordinates(actions[index][None])
-        position = coordinates[..., self._smooth].double()
-        (velocity,) = torch.gradient(position, spacing=self._step, dim=1)
-        (acceleration,) = torch.gradient(velocity, spacing=self._step, dim=1)
+    def _decompose(self, actions: Float[Tensor, "B samples A"]) -> tuple[Tensor, Tensor]:
+        coordinates = self.encoding.to_coordinates(actions.to(self.encoding.mean))
         low, high = self.levels[:, self._stepped]
-        return MotionChunk(
-            states=torch.stack([position, velocity, acceleration], dim=2),
-            upper=(coordinates[..., self._stepped] > (low + high) / 2).to(coordinates),
-            actions=actions[index][None],
-        )
+        upper = (coordinates[..., self._stepped] > (low + high) / 2).to(coordinates)
+        return coordinates[..., self._smooth], upper
 
     @classmethod
     def _load_as_safetensor(
@@ -414,10 +369,8 @@ class MotionChunkPolicy(PreTrainedPolicy):
         self.encoding.whiten(std, mean)
         self.levels.copy_((torch.stack([low, high]) - mean) / self.encoding.std)
         if self.config.two_level_actions is None:
-            largest = (high - mean) * (mean - low)
-            two = (std > 0) & (std.square() > TWO_LEVEL * largest)
             turning = {i for triple in self.encoding.triples for i in triple}
-            found = [i for i in two.nonzero().flatten().tolist() if i not in turning]
+            found = [i for i in two_level_columns(mean, std, low, high) if i not in turning]
             self.config.two_level_actions = found if len(found) < width else []
 
     def _fit(self, dataset_meta: Any) -> None:
