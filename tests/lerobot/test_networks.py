@@ -5,7 +5,9 @@ import math
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import save_file
 from torch import nn
+from torchvision.models import ResNet18_Weights, resnet18, resnet34
 
 from hrc_learn.dmp import GaussianBasis, SpringDamper, response_of
 from hrc_learn.lerobot.policy.networks import (
@@ -13,6 +15,7 @@ from hrc_learn.lerobot.policy.networks import (
     ContextualMotion,
     KeypointEncoder,
     ObservationEncoder,
+    load_backbone,
     make_backbone,
 )
 
@@ -42,6 +45,67 @@ def test_a_resnet_takes_images_of_any_channels(channels):
     assert first.weight.shape == (64, channels, 7, 7)
     assert first.stride == (2, 2)
     assert first.bias is None
+
+
+@pytest.mark.parametrize("ending", ["pth", "safetensors"])
+def test_torchvisions_weights_make_torchvisions_features(tmp_path, ending):
+    """Those of a ResNet in evaluation, whose images torchvision has prepared."""
+    torch.manual_seed(0)
+    theirs = resnet18(weights=None).eval()
+    for layer in theirs.modules():
+        if isinstance(layer, nn.BatchNorm2d):  # as after a training
+            layer.running_mean.normal_()
+            layer.running_var.uniform_(0.5, 2)
+            nn.init.normal_(layer.bias)
+    file = tmp_path / f"weights.{ending}"
+    if ending == "pth":
+        torch.save(theirs.state_dict(), file)
+    else:
+        save_file(theirs.state_dict(), file)
+    encoder = ObservationEncoder(
+        {}, {"front": 3}, backbone="resnet18", n_keypoints=4, pretrained=True
+    )
+    encoder.load_vision(file)
+    (camera,) = encoder.cameras.values()
+    image = torch.rand(2, 3, 64, 96)
+    prepare = ResNet18_Weights.IMAGENET1K_V1.transforms()
+    x = (image - torch.tensor(prepare.mean)[:, None, None]) / torch.tensor(prepare.std)[
+        :, None, None
+    ]
+    for name, part in theirs.named_children():
+        if name == "avgpool":
+            break
+        x = part(x)
+    camera.maps, seen = nn.Identity(), []
+    camera.maps.register_forward_hook(lambda _, __, maps: seen.append(maps))
+    camera(image)
+    torch.testing.assert_close(seen[0], x, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("write", "message"),
+    [
+        (None, "there is no file"),
+        (lambda file: file.write_bytes(b"no weights"), "cannot be read"),
+        (lambda file: torch.save({"conv1.weight": torch.ones(64, 3, 7, 7)}, file), "first bn1"),
+        (lambda file: torch.save(resnet34().state_dict(), file), "holds no weights"),
+    ],
+)
+def test_files_that_hold_no_weights_of_a_resnet_are_named(tmp_path, write, message):
+    file = tmp_path / "weights.pth"
+    if write is not None:
+        write(file)
+    backbone, _ = make_backbone("resnet50", 3, pretrained=True)
+    with pytest.raises(ValueError, match=f"vision_weights: .*{message}") as error:
+        load_backbone(backbone, file)
+    assert str(file) in str(error.value)
+
+
+def test_weights_that_fit_no_network_are_refused():
+    with pytest.raises(ValueError, match="give vision_backbone as well"):
+        make_backbone("small", 3, pretrained=True)
+    with pytest.raises(ValueError, match="3 channels, these have 1"):
+        make_backbone("resnet18", 1, pretrained=True)
 
 
 def test_places_are_the_centres_of_a_softmax_over_the_maps():

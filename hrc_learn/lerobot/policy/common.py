@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -13,6 +14,7 @@ from safetensors import SafetensorError
 from torch import Tensor
 
 from hrc_learn.demos.format.metadata import flatten_names
+from hrc_learn.lerobot.policy.networks import ObservationEncoder
 
 logger = logging.getLogger(__name__)
 
@@ -35,6 +37,11 @@ class MotionPolicyConfig(PreTrainedConfig):
     vision_backbone: str = "small"
     """Of images: "small", four convolutions, or a ResNet of torchvision such as "resnet18";
     no weights are downloaded."""
+    vision_weights: str | None = None
+    """File of torchvision's weights for such a ResNet to begin with, .pth, .safetensors; None:
+    begin with random ones. Once they are loaded the policy has them, and this is None."""
+    vision_pretrained: bool = False
+    """Whether the ResNet was begun with weights of torchvision's; set by `vision_weights`."""
     n_keypoints: int = 32
     """Places in each image that the network looks for."""
     fit_episodes: list[int] | None = None
@@ -120,6 +127,26 @@ class MotionPolicyConfig(PreTrainedConfig):
 def _names(features: dict[str, dict[str, Any]], key: str) -> list[str] | None:
     names = flatten_names(features.get(key, {}).get("names"))
     return None if names is None else list(names)
+
+
+def make_encoder(config: MotionPolicyConfig, widths: Mapping[str, int]) -> ObservationEncoder:
+    """What sees for a policy; of one that is not loaded, with the weights that it begins with.
+
+    Raises:
+        ValueError: There is no such backbone, or no weights for it.
+    """
+    config.vision_pretrained |= config.vision_weights is not None
+    encoder = ObservationEncoder(
+        widths,
+        {key: feature.shape[0] for key, feature in config.image_features.items()},
+        backbone=config.vision_backbone,
+        n_keypoints=config.n_keypoints,
+        pretrained=config.vision_pretrained,
+    )
+    if config.vision_weights is not None:
+        encoder.load_vision(Path(config.vision_weights))
+        config.vision_weights = None
+    return encoder
 
 
 def frame_rate(config: Any, dataset_meta: Any) -> float:

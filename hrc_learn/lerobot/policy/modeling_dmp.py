@@ -21,6 +21,7 @@ from hrc_learn.lerobot.policy.closed_form import read_episodes
 from hrc_learn.lerobot.policy.common import (
     frame_rate,
     load_weights,
+    make_encoder,
     require_any_statistics,
     require_numbers,
     require_statistics,
@@ -34,7 +35,7 @@ from hrc_learn.lerobot.policy.motion_planner import (
     matched_columns,
     rotation_triples,
 )
-from hrc_learn.lerobot.policy.networks import ContextualMotion, ObservationEncoder
+from hrc_learn.lerobot.policy.networks import ContextualMotion
 
 logger = logging.getLogger(__name__)
 
@@ -199,12 +200,7 @@ class DMPPolicy(PreTrainedPolicy):
 def _planner(config: DMPConfig, step: float) -> MotionPlanner:
     inputs = config.input_features or {}
     widths = {k: inputs[k].shape[0] for k in (OBS_STATE, OBS_ENV_STATE) if k in inputs}
-    encoder = ObservationEncoder(
-        widths,
-        {key: feature.shape[0] for key, feature in config.image_features.items()},
-        backbone=config.vision_backbone,
-        n_keypoints=config.n_keypoints,
-    )
+    encoder = make_encoder(config, widths)
     (width,) = (config.output_features or {})[ACTION].shape
     names = config.action_feature_names
     states = config.state_names if OBS_STATE in widths else None

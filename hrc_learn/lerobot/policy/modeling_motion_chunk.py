@@ -23,6 +23,7 @@ from hrc_learn.lerobot.policy.closed_form import SampleWindows, read_episodes
 from hrc_learn.lerobot.policy.common import (
     frame_rate,
     load_weights,
+    make_encoder,
     require_any_statistics,
     require_numbers,
     require_statistics,
@@ -35,7 +36,7 @@ from hrc_learn.lerobot.policy.motion_planner import (
     matched_columns,
     rotation_triples,
 )
-from hrc_learn.lerobot.policy.networks import Observation, ObservationEncoder
+from hrc_learn.lerobot.policy.networks import Observation
 
 logger = logging.getLogger(__name__)
 
@@ -107,12 +108,7 @@ class MotionChunkPolicy(PreTrainedPolicy):
         self.config = config
         inputs = config.input_features or {}
         widths = {k: inputs[k].shape[0] for k in (OBS_STATE, OBS_ENV_STATE) if k in inputs}
-        self.encoder = ObservationEncoder(
-            widths,
-            {key: feature.shape[0] for key, feature in config.image_features.items()},
-            backbone=config.vision_backbone,
-            n_keypoints=config.n_keypoints,
-        )
+        self.encoder = make_encoder(config, widths)
         (width,) = (config.output_features or {})[ACTION].shape
         names, states = config.action_feature_names, config.state_names
         self.encoding = ActionEncoding(width, rotation_triples(names))

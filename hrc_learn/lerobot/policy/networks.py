@@ -1,41 +1,52 @@
 """What the policy learns: from observations to features, and from those to primitives."""
 
 import math
+from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import torch
 from jaxtyping import Float
+from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from hrc_learn.dmp import Response, continue_motion
 
-# Convolutions that policies see with, by name; none brings or downloads weights.
+# Convolutions that policies see with, by name; none downloads weights.
 
 GROUPS = 8
 """Of channels normalised together; batches of few demonstrations say too little."""
+IMAGENET = ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
+"""Mean and spread of red, green and blue that torchvision's weights were trained with."""
 
 
-def make_backbone(name: str, channels: int) -> tuple[nn.Module, int]:
+def make_backbone(
+    name: str, channels: int, *, pretrained: bool = False
+) -> tuple[nn.Module, int]:
     """From images to feature maps.
 
     Args:
         name: "small", or a ResNet of torchvision.
         channels: Of the images.
+        pretrained: Whether weights of torchvision's own will be loaded: the normalisation is
+            theirs then, over batches that are long gone.
 
     Returns:
         The backbone, and the channels of its maps.
 
     Raises:
-        ValueError: There is no such backbone.
+        ValueError: There is no such backbone, or none that weights could be loaded into.
     """
     if name == "small":
+        if pretrained:
+            raise ValueError("vision_weights are of a ResNet: give vision_backbone as well")
         return _small(channels)
     if name.startswith("resnet"):
-        return _resnet(name, channels)
+        return _resnet(name, channels, pretrained)
     raise ValueError(f"vision_backbone must be 'small' or a 'resnet...', got {name!r}")
 
 
@@ -49,18 +60,56 @@ def _small(channels: int) -> tuple[nn.Module, int]:
     return nn.Sequential(*layers), widths[-1]
 
 
-def _resnet(name: str, channels: int) -> tuple[nn.Module, int]:
+def _resnet(name: str, channels: int, pretrained: bool) -> tuple[nn.Module, int]:
     from torchvision.models import ResNet, get_model, list_models
+    from torchvision.ops import FrozenBatchNorm2d
 
     known = [model for model in list_models() if model.startswith("resnet")]
     if name not in known:
         raise ValueError(f"vision_backbone {name!r} is unknown; there are {', '.join(known)}")
-    resnet = get_model(name, weights=None, norm_layer=partial(nn.GroupNorm, GROUPS))
+    norm = FrozenBatchNorm2d if pretrained else partial(nn.GroupNorm, GROUPS)
+    resnet = get_model(name, weights=None, norm_layer=norm)
     assert isinstance(resnet, ResNet)
+    if pretrained and channels != 3:
+        raise ValueError(f"vision_weights are for images of 3 channels, these have {channels}")
     if channels != 3:
         resnet.conv1 = nn.Conv2d(channels, 64, kernel_size=7, stride=2, padding=3, bias=False)
-    # All but pooling and classes; the last stage halves the resolution once more.
-    return nn.Sequential(*list(resnet.children())[:-2]), resnet.fc.in_features
+    # All but pooling and classes, by torchvision's names; the last stage halves the resolution
+    # once more.
+    parts = OrderedDict(list(resnet.named_children())[:-2])
+    return nn.Sequential(parts), resnet.fc.in_features
+
+
+def load_backbone(backbone: nn.Module, path: Path) -> None:
+    """Load weights of a ResNet as torchvision saves them, from a file.
+
+    Args:
+        backbone: As of `make_backbone`, pretrained.
+        path: A state dict, .safetensors or what `torch.save` writes.
+
+    Raises:
+        ValueError: There is no such file, or it holds no weights of this ResNet.
+    """
+    if not path.is_file():
+        raise ValueError(f"vision_weights: there is no file {path}")
+    try:
+        weights = (
+            load_file(path)
+            if path.suffix == ".safetensors"
+            else torch.load(path, map_location="cpu", weights_only=True)
+        )
+    except Exception as error:
+        raise ValueError(f"vision_weights: {path} cannot be read ({error})") from error
+    own = backbone.state_dict()
+    wrong = [
+        name for name, x in own.items() if name not in weights or weights[name].shape != x.shape
+    ]
+    if wrong:
+        raise ValueError(
+            f"vision_weights: {path} holds no weights of this ResNet; {len(wrong)} of "
+            f"{len(own)} are missing or of another shape, the first {wrong[0]}"
+        )
+    backbone.load_state_dict({name: weights[name] for name in own})
 
 
 # What a policy makes of an observation: whitened numbers, and places in images.
@@ -83,6 +132,7 @@ class ObservationEncoder(nn.Module):
         *,
         backbone: str,
         n_keypoints: int,
+        pretrained: bool = False,
     ):
         """Put it together, with a spread of one for all numbers.
 
@@ -91,6 +141,7 @@ class ObservationEncoder(nn.Module):
             images: Features of images: key, and number of channels.
             backbone: See `make_backbone`.
             n_keypoints: Places looked for in each image.
+            pretrained: See `make_backbone`.
 
         Raises:
             ValueError: There is no such backbone.
@@ -102,7 +153,7 @@ class ObservationEncoder(nn.Module):
         # Names of modules may hold no dots, keys of features do.
         self.cameras = nn.ModuleDict(
             {
-                _module_name(key): KeypointEncoder(backbone, channels, n_keypoints)
+                _module_name(key): KeypointEncoder(backbone, channels, n_keypoints, pretrained)
                 for key, channels in images.items()
             }
         )
@@ -120,6 +171,16 @@ class ObservationEncoder(nn.Module):
         )
         self.mean.copy_(mean)
         self.std.copy_(torch.where(std > SMALLEST_SPREAD, std, 1.0))
+
+    def load_vision(self, path: Path) -> None:
+        """Begin with the weights of a file in the backbones of all cameras.
+
+        Raises:
+            ValueError: As `load_backbone`.
+        """
+        for camera in self.cameras.values():
+            assert isinstance(camera, KeypointEncoder)
+            load_backbone(camera.backbone, path)
 
     def numbers(self, observation: Observation) -> Float[Tensor, "*batch C"]:
         """The numbers alone, whitened."""
@@ -141,14 +202,22 @@ class KeypointEncoder(nn.Module):
     (Levine et al. 2016, "End-to-end training of deep visuomotor policies", section 5)
     """
 
-    def __init__(self, backbone: str, channels: int, n_keypoints: int):
+    def __init__(
+        self, backbone: str, channels: int, n_keypoints: int, pretrained: bool = False
+    ):
         super().__init__()
-        self.backbone, width = make_backbone(backbone, channels)
+        self.pretrained = pretrained
+        self.backbone, width = make_backbone(backbone, channels, pretrained=pretrained)
         self.maps = nn.Conv2d(width, n_keypoints, kernel_size=1)
 
     def forward(self, image: Float[Tensor, "B C H W"]) -> Float[Tensor, "B two_K"]:
         """Coordinates (u right, v down) of each place, -1 to 1."""
-        maps = self.maps(self.backbone(2 * image - 1))
+        if self.pretrained:
+            mean, std = (image.new_tensor(x)[:, None, None] for x in IMAGENET)
+            image = (image - mean) / std
+        else:
+            image = 2 * image - 1
+        maps = self.maps(self.backbone(image))
         height, width = maps.shape[-2:]
         share = maps.flatten(-2).softmax(-1).unflatten(-1, (height, width))
         u = torch.linspace(-1, 1, width).to(maps)
