@@ -38,6 +38,7 @@ WARM_UP = 50
 """Steps of training in which the learning rate rises."""
 CONSTANT = 1e-6
 """Columns of the action that vary by less play no part."""
+POLICIES = ("act", "diffusion", "dmp", "motion_chunk", "act_dmp", "diffusion_dmp")
 type Episode = dict[str, Tensor]
 
 
@@ -46,8 +47,8 @@ class Args:
     data: tuple[Path, ...]
     """Folders of LeRobot datasets."""
     policies: tuple[str, ...] = ("nearest", "act", "dmp", "motion_chunk")
-    """nearest: neighbour; act: a small one; dmp and motion_chunk: ours, trained from their
-    closed form."""
+    """nearest: neighbour; act, diffusion: small ones; dmp, motion_chunk: from a closed form;
+    act_dmp, diffusion_dmp: the first two decoded by movement primitives."""
     minutes: float = 1.0
     """CPU time of building and training each."""
     chunk: int = 50
@@ -90,16 +91,7 @@ def main(args: Args) -> None:
         table = Table("policy", "steps", "CPU s", *_titles(args.executed))
         table.title = f"{root.name}: {len(held_out)} of {len(episodes)} episodes held out"
         for name in args.policies:
-            actor, steps, seconds = learn(
-                name,
-                shown,
-                fps,
-                minutes=args.minutes,
-                chunk=args.chunk,
-                executed=args.executed[0],
-                batch_size=args.batch_size,
-                seed=args.seed,
-            )
+            actor, steps, seconds = _actor(name, shown, fps, stats, args)
             row = []
             for executed in args.executed:
                 made = [
@@ -120,13 +112,33 @@ def main(args: Args) -> None:
             cli.write_json(args.json, figures)
 
 
+def _actor(
+    name: str, shown: list[Episode], fps: float, stats: dict[str, dict[str, Tensor]], args: Args
+) -> tuple[Actor, int, float]:
+    """Who acts, the steps it was trained for, and the CPU time that took [s]."""
+    if name == "nearest":
+        begun = time.process_time()
+        return Nearest(shown, stats, args.chunk), 0, time.process_time() - begun
+    learned = learn(
+        name,
+        shown,
+        fps,
+        minutes=args.minutes,
+        chunk=args.chunk,
+        executed=args.executed[0],
+        batch_size=args.batch_size,
+        seed=args.seed,
+    )
+    return learned, learned.steps, learned.seconds
+
+
 def _titles(executed: Sequence[int]) -> list[str]:
     return [t for n in executed for t in (f"RMSE, {n} executed", "jerk at seams [1/s^3]")]
 
 
 def statistics(episodes: Sequence[Episode]) -> dict[str, dict[str, Tensor]]:
     stats = {}
-    for key in (STATE, ACTION):
+    for key in episodes[0]:
         x = torch.cat([e[key] for e in episodes])
         low, high = x.aminmax(dim=0)
         stats[key] = {"mean": x.mean(0), "std": x.std(0), "min": low, "max": high}
@@ -175,12 +187,12 @@ def learn(
     executed: int,
     batch_size: int = 64,
     seed: int = 0,
-) -> tuple[Actor, int, float]:
-    """A policy, the steps it was trained for, and the CPU time that took [s].
+) -> Learned:
+    """A policy of LeRobot or ours, trained from memory as lerobot-train does it.
 
     Args:
-        name: nearest, or a policy that `config_of` knows.
-        shown: Demonstrations to learn from.
+        name: Of a policy that `config_of` knows.
+        shown: Demonstrations to learn from, with the environment's state where it is known.
         fps: Their frames a second.
         minutes: CPU time of building and training.
         chunk: Actions predicted at once.
@@ -190,16 +202,13 @@ def learn(
     """
     torch.manual_seed(seed)
     stats = statistics(shown)
-    begun = time.process_time()
-    if name == "nearest":
-        return _Nearest(shown, stats, chunk), 0, time.process_time() - begun
     from lerobot.policies import get_policy_class, make_pre_post_processors
 
     import hrc_learn.lerobot  # noqa: F401  registers ours
 
     config = config_of(name, shown[0], fps, chunk, executed)
-    with_environment = ENVIRONMENT in config.input_features
-    if with_environment:
+    stands_in = ENVIRONMENT in config.input_features and ENVIRONMENT not in shown[0]
+    if stands_in:
         # ACT and Diffusion demand images or the environment's state: they get the state there.
         stats = stats | {ENVIRONMENT: stats[STATE]}
         shown = [e | {ENVIRONMENT: e[STATE]} for e in shown]
@@ -213,17 +222,27 @@ def learn(
     until = begun + 60 * minutes
     steps = train(policy, before, shown, fps, until, batch_size, seed)
     seconds = time.process_time() - begun
-    return _Policy(policy, before, after, with_environment), steps, seconds
+    return Learned(policy, before, after, stands_in, steps, seconds)
 
 
 @dataclass(frozen=True, eq=False)
-class _Policy:
-    """One of LeRobot, with its processors."""
+class Learned:
+    """A policy of LeRobot, with its processors."""
 
     policy: Any
     before: Any
     after: Any
-    with_environment: bool
+    stands_in: bool
+    """Whether the state stands in for that of the environment."""
+    steps: int = 0
+    """It was trained for."""
+    seconds: float = 0.0
+    """CPU time that took."""
+
+    def save(self, folder: Path) -> None:
+        """As a checkpoint of LeRobot."""
+        for part in (self.policy, self.before, self.after):
+            part.save_pretrained(folder)
 
     def begin(self, executed: int) -> None:
         self.policy.config.n_action_steps = executed
@@ -231,11 +250,11 @@ class _Policy:
 
     @torch.no_grad()
     def act(self, state: Float[Tensor, "F"]) -> Float[Tensor, "A"]:
-        seen = {STATE: state} | ({ENVIRONMENT: state} if self.with_environment else {})
+        seen = {STATE: state} | ({ENVIRONMENT: state} if self.stands_in else {})
         return self.after(self.policy.select_action(self.before(seen)))[0]
 
 
-class _Nearest:
+class Nearest:
     """The chunk that was shown after the state most like the one seen."""
 
     def __init__(
@@ -266,50 +285,59 @@ def config_of(name: str, episode: Episode, fps: float, chunk: int, executed: int
     from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature
     from lerobot.policies import ACTConfig, DiffusionConfig
 
-    from hrc_learn.lerobot import DMPConfig, MotionChunkConfig
+    from hrc_learn.lerobot import (
+        ActDmpConfig,
+        DiffusionDmpConfig,
+        DMPConfig,
+        MotionChunkConfig,
+    )
 
-    state = (episode[STATE].shape[1],)
+    inputs = {STATE: PolicyFeature(FeatureType.STATE, (episode[STATE].shape[1],))}
+    if ENVIRONMENT in episode or name not in ("dmp", "motion_chunk"):
+        width = episode.get(ENVIRONMENT, episode[STATE]).shape[1]
+        inputs[ENVIRONMENT] = PolicyFeature(FeatureType.ENV, (width,))
+    width = episode[ACTION].shape[1]
     common: dict[str, Any] = {
-        "chunk_size": chunk,
         "n_action_steps": executed,
         "device": "cpu",
         "push_to_hub": False,
-        "input_features": {STATE: PolicyFeature(FeatureType.STATE, state)},
-        "output_features": {
-            ACTION: PolicyFeature(FeatureType.ACTION, (episode[ACTION].shape[1],))
-        },
+        "input_features": inputs,
+        "output_features": {ACTION: PolicyFeature(FeatureType.ACTION, (width,))},
+    }
+    act: dict[str, Any] = {
+        "chunk_size": chunk,
+        "normalization_mapping": dict.fromkeys(
+            ("STATE", "ENV", "ACTION"), NormalizationMode.MEAN_STD
+        ),
+        "dim_model": 64,
+        "n_heads": 4,
+        "dim_feedforward": 256,
+        "n_encoder_layers": 2,
+        "use_vae": False,
+        "optimizer_lr": 1e-3,
+    }
+    diffusion: dict[str, Any] = {
+        "horizon": chunk,
+        "down_dims": (64, 128),
+        "noise_scheduler_type": "DDIM",
+        "num_inference_steps": 10,
+        "diffusion_step_embed_dim": 64,
+        "optimizer_lr": 1e-3,
     }
     match name:
         case "dmp":
-            return DMPConfig(**common, fps=fps)
+            return DMPConfig(**common, chunk_size=chunk, fps=fps)
         case "motion_chunk":
-            return MotionChunkConfig(**common, fps=fps)
+            return MotionChunkConfig(**common, chunk_size=chunk, fps=fps)
         case "act":
-            common["input_features"][ENVIRONMENT] = PolicyFeature(FeatureType.ENV, state)
-            return ACTConfig(
-                **common,
-                normalization_mapping=dict.fromkeys(
-                    ("STATE", "ENV", "ACTION"), NormalizationMode.MEAN_STD
-                ),
-                dim_model=64,
-                n_heads=4,
-                dim_feedforward=256,
-                n_encoder_layers=2,
-                use_vae=False,
-                optimizer_lr=1e-3,
-            )
+            return ACTConfig(**common, **act)
+        case "act_dmp":
+            return ActDmpConfig(**common, **act, fps=fps)
         case "diffusion":
-            common["input_features"][ENVIRONMENT] = PolicyFeature(FeatureType.ENV, state)
-            common["horizon"] = common.pop("chunk_size")
-            return DiffusionConfig(
-                **common,
-                down_dims=(64, 128),
-                noise_scheduler_type="DDIM",
-                num_inference_steps=10,
-                diffusion_step_embed_dim=64,
-                optimizer_lr=1e-3,
-            )
-    raise ValueError(f"--policies takes nearest, act, dmp and motion_chunk, not {name!r}")
+            return DiffusionConfig(**common, **diffusion)
+        case "diffusion_dmp":
+            return DiffusionDmpConfig(**common, **diffusion, fps=fps)
+    raise ValueError(f"--policies takes nearest, {', '.join(POLICIES)}, not {name!r}")
 
 
 def train(

@@ -11,7 +11,8 @@
 
 import pytest
 
-POLICIES = ("dmp", "motion_chunk", "act_dmp", "diffusion_dmp")
+BACKBONES = ("act_dmp", "diffusion_dmp")
+POLICIES = ("dmp", "motion_chunk", *BACKBONES)
 FPS = 30.0
 """Of LeRobot's tests, whose policies are made without a dataset that would tell."""
 PAIRS = ("mock", "mujoco_arm", "smooth")
@@ -47,7 +48,11 @@ def pytest_pycollect_makeitem(collector, name, obj):
 
 def _knowing_the_rate(make):
     def made(name, **settings):
-        return make(name, **(settings | ({"fps": FPS} if name in POLICIES else {})))
+        if name in POLICIES:
+            settings["fps"] = FPS
+        if name in BACKBONES:  # no network for torchvision's weights
+            settings["pretrained_backbone_weights"] = None
+        return make(name, **settings)
 
     return made
 

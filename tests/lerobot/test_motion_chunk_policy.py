@@ -387,6 +387,29 @@ def test_losses_chunks_and_gradients_whatever_it_sees(name, episodes):
     assert policy.select_action(now).shape == (2, width)
 
 
+def test_training_blurs_numbers_alone():
+    """So that plans lead back to what was shown from beside it; images are seen as they are."""
+    rng = torch.Generator().manual_seed(0)
+    episodes = [
+        {STATE: e[STATE], IMAGE: torch.rand(len(e[STATE]), 3, 32, 48, generator=rng)}
+        | {"action": e["action"]}
+        for e in SHOWN[:3]
+    ]
+    policy, seen = chunk_policy(episodes, dropout=0.0), []
+    policy.network.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    batch = windows(policy, episodes).draw(256, rng)
+    for training in (True, False):
+        policy.train(training)
+        with torch.random.fork_rng():
+            torch.manual_seed(0)
+            policy.forward(batch)
+    blurred, plain = seen
+    off, numbers = blurred - plain, policy.network.numbers
+    assert numbers == 3
+    assert (off[:, numbers:] == 0).all()
+    torch.testing.assert_close(off[:, :3].std(), torch.tensor(0.15), rtol=0.1, atol=0)
+
+
 def test_padding_is_not_learned():
     policy = chunk_policy(SHOWN).eval()
     samples = windows(policy, SHOWN)

@@ -108,6 +108,22 @@ def test_weights_that_fit_no_network_are_refused():
         make_backbone("resnet18", 1, pretrained=True)
 
 
+def test_numbers_that_hardly_vary_are_not_blown_up():
+    """A joint that is held trembles; one that never moved is left as it is."""
+    widths = {"joints": 4, "goal": 2}
+    encoder = ObservationEncoder(widths, {}, backbone="small", n_keypoints=1)
+    std = {"joints": [0.5, 1e-4, 0.3, 0.0], "goal": [0.0, 0.0]}
+    encoder.whiten(
+        {
+            key: {"mean": torch.ones(n), "std": torch.tensor(std[key])}
+            for key, n in widths.items()
+        }
+    )
+    off = {"joints": 1 + torch.tensor([1.0, 3e-3, 0.3, 0.2]), "goal": 1 + torch.ones(2)}
+    numbers = encoder.numbers(off)
+    torch.testing.assert_close(numbers, torch.tensor([2.0, 1.0, 1.0, 0.2, 1.0, 1.0]))
+
+
 def test_places_are_the_centres_of_a_softmax_over_the_maps():
     encoder = KeypointEncoder("small", 3, n_keypoints=2)
     encoder.backbone = nn.Identity()

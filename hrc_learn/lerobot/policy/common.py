@@ -14,7 +14,7 @@ from safetensors import SafetensorError
 from torch import Tensor
 
 from hrc_learn.demos.format.metadata import flatten_names
-from hrc_learn.lerobot.policy.networks import ObservationEncoder
+from hrc_learn.lerobot.policy.networks import Observation, ObservationEncoder
 
 logger = logging.getLogger(__name__)
 
@@ -172,7 +172,7 @@ def frame_rate(config: Any, dataset_meta: Any) -> float:
 
 
 def require_numbers(
-    config: MotionPolicyConfig, widths: Mapping[str, int], batch: Mapping[str, Tensor]
+    config: MotionPolicyConfig, widths: Mapping[str, int], batch: Observation
 ) -> None:
     """See whether an observation holds the numbers that a policy was trained with.
 

@@ -96,7 +96,7 @@ class DecodedPolicy:
             self.motion.reset()
 
     @torch.no_grad()
-    def select_action(self, batch: dict[str, Tensor], **settings: Any) -> Float[Tensor, "B A"]:
+    def select_action(self, batch: dict[str, Any], **settings: Any) -> Float[Tensor, "B A"]:
         """The next action; a new chunk is predicted when the last one is used up."""
         self._carried_out = self.config.n_action_steps
         try:
@@ -157,7 +157,7 @@ class _MotionACT(ACT):
         super().__init__(config)
         self._decode = motion.decode
 
-    def forward(self, batch: dict[str, Tensor]) -> Any:
+    def forward(self, batch: dict[str, Any]) -> Any:
         """As ACT."""
         actions, latent = super().forward(batch)
         return self._decode(actions), latent
@@ -197,7 +197,7 @@ class ActDmpPolicy(DecodedPolicy, ACTPolicy):
     @torch.no_grad()
     def predict_action_chunk(
         self,
-        batch: dict[str, Tensor],
+        batch: dict[str, Any],
         inference_delay: int = 0,
         prev_chunk_left_over: Tensor | None = None,
         **_: Any,
@@ -232,7 +232,7 @@ class DiffusionDmpPolicy(DecodedPolicy, DiffusionPolicy):
     @torch.no_grad()
     def predict_action_chunk(
         self,
-        batch: dict[str, Tensor],
+        batch: dict[str, Any],
         noise: Tensor | None = None,
         inference_delay: int = 0,
         prev_chunk_left_over: Tensor | None = None,

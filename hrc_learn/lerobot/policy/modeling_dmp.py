@@ -97,7 +97,7 @@ class DMPPolicy(PreTrainedPolicy):
         self._action_queue: deque[Tensor] = deque()
 
     def forward(
-        self, batch: dict[str, Tensor], reduction: str = "mean"
+        self, batch: dict[str, Any], reduction: str = "mean"
     ) -> tuple[Tensor, dict[str, float]]:
         """Mean square error of chunks, in the spread of each component of the action.
 
@@ -127,7 +127,7 @@ class DMPPolicy(PreTrainedPolicy):
 
     @torch.no_grad()
     def predict_action_chunk(
-        self, batch: dict[str, Tensor], **_: Any
+        self, batch: dict[str, Any], **_: Any
     ) -> Float[Tensor, "B chunk A"]:
         """The next chunk, of which `n_action_steps` are taken for carried out.
 
@@ -152,7 +152,7 @@ class DMPPolicy(PreTrainedPolicy):
         return self.planner.encoding.to_actions(chunk.position)
 
     @torch.no_grad()
-    def select_action(self, batch: dict[str, Tensor], **_: Any) -> Float[Tensor, "B A"]:
+    def select_action(self, batch: dict[str, Any], **_: Any) -> Float[Tensor, "B A"]:
         """The next action; a new chunk is predicted when the last one is used up."""
         if not self._action_queue:
             chunk = self.predict_action_chunk(batch)

@@ -116,7 +116,12 @@ def load_backbone(backbone: nn.Module, path: Path) -> None:
 
 SMALLEST_SPREAD = 1e-6
 """Components that vary by less have never changed."""
-type Observation = Mapping[str, Tensor]
+SMALLEST_SHARE = 0.01
+"""Of the median spread of the numbers of a feature: those that vary by less are not blown up. A
+joint that is held still trembles by a thousandth of what others move, in another way wherever
+the arm has not been shown; blown up, that led an arm of ALOHA away from its cube."""
+type Observation = Mapping[str, Any]
+"""Tensors by key; LeRobot's evaluation adds other things."""
 
 
 class ObservationEncoder(nn.Module):
@@ -165,12 +170,10 @@ class ObservationEncoder(nn.Module):
         """Take mean and spread of the numbers from a dataset's statistics."""
         if not self.widths:
             return
-        mean, std = (
-            torch.cat([torch.as_tensor(stats[key][name]) for key in self.widths])
-            for name in ("mean", "std")
-        )
+        mean = torch.cat([torch.as_tensor(stats[key]["mean"]) for key in self.widths])
         self.mean.copy_(mean)
-        self.std.copy_(torch.where(std > SMALLEST_SPREAD, std, 1.0))
+        spreads = [_spread(torch.as_tensor(stats[key]["std"])) for key in self.widths]
+        self.std.copy_(torch.cat(spreads))
 
     def load_vision(self, path: Path) -> None:
         """Begin with the weights of a file in the backbones of all cameras.
@@ -194,6 +197,15 @@ class ObservationEncoder(nn.Module):
         """All features of a batch of observations."""
         seen = [self.cameras[_module_name(key)](observation[key]) for key in self.images]
         return torch.cat([self.numbers(observation), *seen], dim=-1)
+
+
+def _spread(std: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
+    """What the numbers of a feature are divided by."""
+    varies = std > SMALLEST_SPREAD
+    if not varies.any():
+        return torch.ones_like(std)
+    least = SMALLEST_SHARE * std[varies].median()
+    return torch.where(varies, std.clamp_min(least), 1.0)
 
 
 class KeypointEncoder(nn.Module):

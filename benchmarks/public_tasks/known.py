@@ -1,0 +1,74 @@
+"""The tasks by name, and how long their chunks are."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from public_tasks import PublicTask
+
+
+@dataclass(frozen=True, kw_only=True)
+class Setting:
+    """How a task is learned: alike for all policies."""
+
+    make: Callable[[], PublicTask]
+    chunk: int
+    """Actions predicted at once: one to two seconds, a third of one in MetaWorld."""
+    executed: int
+    """Of these, how many are carried out before the next prediction."""
+
+
+def _pusht() -> PublicTask:
+    from public_tasks.pusht import PushT
+
+    return PushT()
+
+
+def _aloha() -> PublicTask:
+    from public_tasks.aloha import AlohaTransfer
+
+    return AlohaTransfer()
+
+
+def _pick_place() -> PublicTask:
+    from public_tasks.metaworld import MetaWorld
+
+    return MetaWorld("pick-place-v3")
+
+
+def _push() -> PublicTask:
+    from public_tasks.metaworld import MetaWorld
+
+    return MetaWorld("push-v3")
+
+
+def _so101() -> PublicTask:
+    from public_tasks.so101 import SO101PickPlace
+
+    return SO101PickPlace()
+
+
+def _grasping() -> PublicTask:
+    from public_tasks.grasping import Grasping
+
+    return Grasping()
+
+
+TASKS = {
+    "pusht": Setting(make=_pusht, chunk=16, executed=8),
+    "aloha-transfer": Setting(make=_aloha, chunk=48, executed=12),
+    "metaworld-pick-place": Setting(make=_pick_place, chunk=24, executed=3),
+    "metaworld-push": Setting(make=_push, chunk=24, executed=3),
+    "so101-pick-place": Setting(make=_so101, chunk=16, executed=4),
+    "grasping": Setting(make=_grasping, chunk=24, executed=12),
+}
+
+
+def make_task(name: str) -> PublicTask:
+    """A task by its name.
+
+    Raises:
+        ValueError: There is no such task.
+    """
+    if name not in TASKS:
+        raise ValueError(f"there is no task {name!r}; there are {', '.join(TASKS)}")
+    return TASKS[name].make()
