@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Real
-from torch import Tensor
+from torch import Tensor, nn
 from torch.autograd import forward_ad
 from torch.autograd.forward_ad import unpack_dual
 
@@ -67,6 +67,37 @@ def readable(*tensors: Tensor) -> bool:
     return True
 
 
+_transform_level = getattr(
+    torch._C._functorch,  # pyright: ignore[reportAttributeAccessIssue]
+    "maybe_current_level",
+    lambda: 0,
+)
+"""None where `torch.func` neither maps nor derives; a PyTorch that does not tell may always."""
+
+
+def fits_numpy(detached: Tensor, *others: Any) -> bool:
+    """Whether tensors may be worked on in NumPy: nothing traces, maps or derives them.
+
+    Of a few numbers that takes a third of the time: PyTorch takes far longer to find out what
+    to do than to do it. To ask each tensor for transforms would as well.
+
+    Args:
+        detached: May require gradients, which are not asked for: `detach` it.
+        others: Of the same dtype; what is no tensor does not fit.
+    """
+    if torch.is_grad_enabled() or torch.compiler.is_compiling():
+        return False
+    if _transform_level() is not None or forward_ad._current_level >= 0:
+        return False
+    dtype = detached.dtype
+    if type(detached) not in (Tensor, nn.Parameter) or not detached.is_cpu:
+        return False
+    for x in others:  # in a comprehension this takes twice as long
+        if type(x) is not Tensor or x.dtype is not dtype or x.requires_grad or not x.is_cpu:
+            return False
+    return True
+
+
 def vector(
     name: str, value: Vectors, like: Float[Tensor, "*batch D"]
 ) -> Float[Tensor, "*other D"]:
@@ -92,7 +123,7 @@ def finite(name: str, values: Tensor) -> Tensor:
     if not values.is_cpu or not readable(values):
         return values
     # Of a few numbers Python's sum takes half as long.
-    few = values.ndim == 1 and len(values) <= 32
+    few = values.ndim == 1 and values.numel() <= 32
     if not math.isfinite(sum(values.tolist()) if few else values.detach().sum().item()):
         wrong = values[~values.isfinite()]
         if len(wrong):  # a sum overflows too

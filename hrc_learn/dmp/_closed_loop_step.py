@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from hrc_learn.dmp._arguments import readable
+from hrc_learn.dmp._arguments import fits_numpy, readable
 from hrc_learn.dmp._system.closed_forms import SpringDamper, approach_state
 from hrc_learn.dmp._system.response import Response, broadcast_shapes
 
@@ -174,19 +174,12 @@ def advance_alone(
         batch, on another device or not in float64.
     """
     tensors = (
-        *(state.position, state.rate, state.target, state.forced, weights),
+        *(weights, state.position, state.rate, state.target, state.forced),
         *(state.s, state.duration, state.pace),
     )
-    if torch.is_grad_enabled() or response.approach or not readable(*tensors):
+    if response.approach or weights.ndim != 2 or weights.dtype is not torch.float64:
         return None
-    if not (_plain(state.s) and _plain(state.duration) and _plain(state.pace)):
-        return None
-    for x in tensors:  # in a comprehension this takes twice as long
-        if type(x) not in _ARRAYS or not x.is_cpu or x.dtype is not torch.float64:
-            return None
-        if x.requires_grad and x is not weights:
-            return None
-    if weights.ndim != 2:
+    if state.s.ndim or state.duration.ndim or state.pace.ndim or not fits_numpy(*tensors):
         return None
     ds = dt / state.duration.item()
     now = state.s.item() + ds
@@ -202,26 +195,22 @@ def advance_alone(
     y = E.dot(y - before)
     y += after
     y[0] += rest
-    position, rate = torch.from_numpy(y).unbind()
     return DMPState(
-        position=position,
-        rate=rate,
+        position=torch.from_numpy(y[0]),
+        rate=torch.from_numpy(y[1]),
         start=state.start,
         goal=state.target,
         way=state.way,
         target=state.target,
         duration=state.duration,
         pace=_UNDISTURBED,
-        s=torch.scalar_tensor(now, dtype=torch.float64),
+        s=torch.from_numpy(np.array(now)),
         forced=torch.from_numpy(after),
     )
 
 
 _UNDISTURBED = torch.ones((), dtype=torch.float64)
 """The pace of every motion that nothing slows: to make another one takes longer than to add."""
-
-_ARRAYS = (Tensor, torch.nn.Parameter)
-"""Types of tensors that hold numbers and nothing else."""
 
 
 def second_derivative(

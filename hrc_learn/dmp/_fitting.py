@@ -85,7 +85,9 @@ def fit_samples(
     start_rate = position.new_empty(position.shape[:2])
     alone = torch.ones(len(position), dtype=torch.bool)
     if method == "trajectory" and not (response.approach or response.basis.periodic):
-        weights, start_rate, alone = _fit_at_own_times(response, samples, rate, regularization)
+        weights, start_rate, alone = _fit_at_own_times(
+            response, samples, position, rate, regularization
+        )
     for i in alone.nonzero()[:, 0].tolist():
         valid = samples.mask[i]
         one_rate = None if rate is None else rate[i, :, valid]
@@ -109,6 +111,7 @@ one is a third of it, so that an error falls to a percent in two."""
 def _fit_at_own_times(
     response: Response,
     samples: Samples,
+    position: Float[Tensor, "B D T"],
     rate: Float[Tensor, "B D T"] | None,
     regularization: float,
 ) -> tuple[Float[Tensor, "B D N"], Float[Tensor, "B D"], Bool[Tensor, "B"]]:
@@ -126,7 +129,8 @@ def _fit_at_own_times(
     mixing, sigma, directions, pieces = _orthonormal_columns(response, n, samples.s.device)
     apart = mixing[:n, :n]
     mask = samples.mask.to(mixing)
-    position = torch.where(samples.mask[:, None], samples.position.double(), 0.0)
+    if not samples.complete:
+        position = torch.where(samples.mask[:, None], position, 0.0)
     gram, right = pieces.products(samples.s, position, mask)
     known = [samples.first.double(), samples.last.double()]
     if rate is not None:

@@ -4,10 +4,12 @@ Joints, the error of an orientation, positions, coordinates without bounds: a co
 makes columns of them (`coordinate_adapter.py`), and from here on they are all alike.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -19,6 +21,7 @@ from hrc_learn.dmp._arguments import (
     Times,
     Vectors,
     check_precision,
+    fits_numpy,
     normalised_time,
     positive,
     to_tensor,
@@ -230,21 +233,67 @@ class LinearPrimitive(nn.Module):
             time: Since the start [s], (T,) or (*batch, T).
             forcing_gain: Factor on the forcing term, (*batch).
         """
+        x = None
+        if forcing_gain is None and not torch.is_grad_enabled():
+            x = self._coordinates_alone(ends, duration)
+        if x is None:
+            x = self._coordinates_between(ends, duration, forcing_gain)
+        s = self.timestamps if time is None else normalised_time(time, duration)
+        return Trajectory(coordinates=x, s=s, duration=duration, response=self.response)
+
+    def _coordinates_between(
+        self, ends: ColumnEnds, duration: Tensor, forcing_gain: Scalars | None
+    ) -> Float[Tensor, "*batch D M"]:
+        """What the response maps to the motion between `ends`."""
         start, goal, rate = self.boundary(ends, duration)
-        weights, columns = self._scaled_weights(start, goal), (rate, start, goal)
+        weights = self._scaled_weights(start, goal)
         if forcing_gain is not None:
             weights = weights * self._as_tensor(forcing_gain)[..., None, None]
         shape = weights.shape[:-1]
-        if not rate.shape == start.shape == goal.shape == shape or duration.ndim:
+        if not rate.shape == start.shape == goal.shape == shape or duration.shape != shape[:-1]:
             self._motion_shape(rate=rate, start=start, goal=goal, duration=duration)
-            shape = broadcast_shapes(shape, *(x.shape for x in columns))
-            weights, columns = weights.expand(*shape, -1), [x.expand(shape) for x in columns]
-        return Trajectory(
-            coordinates=torch.cat([weights, torch.stack(columns, dim=-1)], dim=-1),
-            s=self.normalised_time(time, duration),
-            duration=duration,
-            response=self.response,
-        )
+            shape = broadcast_shapes(shape, rate.shape, start.shape, goal.shape)
+            weights = weights.expand(*shape, -1)
+            rate, start, goal = (x.expand(shape) for x in (rate, start, goal))
+        return torch.cat([weights, torch.stack([rate, start, goal], dim=-1)], dim=-1)
+
+    def _coordinates_alone(
+        self, ends: ColumnEnds, duration: Tensor
+    ) -> Float[np.ndarray, "D M"] | None:
+        """`_coordinates_between` for one motion, in NumPy: a third of the time.
+
+        Returns:
+            None where it does not apply, or where an end is wrong, which is said elsewhere.
+        """
+        weights = self.weights
+        if weights.ndim != 2 or duration.ndim or not isinstance(self.forcing_scale, NoScaling):
+            return None
+        # A module takes three times as long for attributes. None: it is a parameter by now.
+        own: Any = self._buffers.get
+        start, goal, velocity = ends
+        dtype, device = weights.dtype, weights.device
+        start = own("start") if start is None else to_tensor(start, dtype, device)
+        goal = own("goal") if goal is None else to_tensor(goal, dtype, device)
+        if velocity is None:
+            velocity, lasting = own("start_velocity"), own("duration")
+        else:
+            velocity, lasting = to_tensor(velocity, dtype, device), duration
+        if not fits_numpy(weights, start, goal, velocity, lasting):
+            return None
+        start, goal, velocity = start.numpy(), goal.numpy(), velocity.numpy()
+        D, N = weights.shape
+        if not start.shape == goal.shape == velocity.shape == (D,):
+            return None
+        x = np.empty((D, N + 3), start.dtype)
+        x[:, :N] = weights.detach().numpy()
+        np.multiply(velocity, lasting.item(), out=x[:, N])
+        x[:, N + 1] = start
+        x[:, N + 2] = goal
+        for given, value in zip(ends, (start, goal, velocity), strict=True):
+            # Of so few numbers Python's sum takes the least time.
+            if given is not None and not math.isfinite(sum(value.tolist())):
+                return None
+        return x
 
     def begin(self, ends: ColumnEnds, duration: Float[Tensor, "*#batch"]) -> DMPState:
         """State at the start of a motion [s], for `advance`."""

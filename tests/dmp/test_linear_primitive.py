@@ -1,12 +1,16 @@
 """Files of a primitive, its coordinates, and what it keeps between calls."""
 
+import copy
 import json
+from concurrent.futures import ThreadPoolExecutor
 
+import numpy as np
 import pytest
 import torch
 from demo_motions import arm_motion
 from power_cuts import cut_off
 from safetensors.torch import load_file, save_file
+from torch.autograd import forward_ad
 
 from hrc_learn.dmp import GaussianBasis, JointDMP, SpringDamper
 
@@ -233,20 +237,40 @@ def rebuilt(dmp):
 
 
 @pytest.mark.parametrize("name", ["weights", "start", "goal", "start_velocity", "timestamps"])
-@pytest.mark.parametrize("how", ["in place", "data", "load"])
-def test_a_change_shows_in_the_next_rollout(name, how):
+@pytest.mark.parametrize("how", ["in place", "data", "load", "new", "array"])
+@pytest.mark.parametrize("derived", [True, False])
+def test_a_change_shows_in_the_next_rollout(name, how, derived):
+    with torch.set_grad_enabled(derived):
+        check_that_a_change_shows(name, how)
+
+
+def check_that_a_change_shows(name, how):
     dmp = fitted()
     before = dmp.rollout().position
     if how == "load":
         dmp.load_state_dict(dmp.state_dict() | {name: 0.9 * dmp.state_dict()[name]})
     elif how == "data":
         getattr(dmp, name).data.mul_(0.9)
+    elif how == "new":  # a buffer becomes a parameter
+        setattr(dmp, name, torch.nn.Parameter(0.9 * getattr(dmp, name).detach()))
+    elif how == "array":
+        getattr(dmp, name).detach().numpy()[...] *= 0.9
     else:
         with torch.no_grad():
             getattr(dmp, name).mul_(0.9)
     after = dmp.rollout().position
     assert (after - before).abs().max() > 1e-3
     torch.testing.assert_close(after, rebuilt(dmp))
+
+
+def test_a_copy_goes_ways_of_its_own():
+    dmp = fitted()
+    with torch.no_grad():
+        before = dmp.rollout().position
+        other = copy.deepcopy(dmp)
+        other.weights.mul_(0.9)
+        torch.testing.assert_close(dmp.rollout().position, before, rtol=0, atol=0)
+        torch.testing.assert_close(other.rollout().position, rebuilt(other))
 
 
 def test_another_precision_shows_in_the_next_rollout():
@@ -296,3 +320,141 @@ def test_what_inference_leaves_behind_serves_a_backward_pass():
     (dmp.rollout().position.sum() + step.position.sum()).backward()
     assert dmp.weights.grad is not None
     assert dmp.weights.grad.isfinite().all()
+
+
+# Where nothing derives, NumPy does it: the same motions, and no others
+
+
+ENDS = {
+    "as demonstrated": {},
+    "goal": {"goal": torch.tensor([0.3, -0.2], dtype=torch.float64)},
+    "lists": {"start": [0.1, 0.2], "goal": [0.3, -0.2], "start_velocity": [0.5, -0.1]},
+    "duration": {"duration": 1.3, "start_velocity": [0.5, -0.1]},
+    "parameter": {"goal": torch.nn.Parameter(torch.tensor([0.3, -0.2], dtype=torch.float64))},
+    "one for two": {"goal": torch.zeros(1, 2, dtype=torch.float64)},
+    "gain": {"forcing_gain": 0.5},
+}
+
+
+@pytest.mark.parametrize("ends", ENDS.values(), ids=ENDS.keys())
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_rollout_is_the_same_with_and_without_gradients(ends, dtype):
+    dmp = fitted().to(dtype)
+    for time in (None, torch.linspace(0, 2, 17)):
+        derived = dmp.rollout(time, **ends)
+        for inference in (False, True):
+            with torch.inference_mode(inference), torch.no_grad():
+                plain = dmp.rollout(time, **ends)
+                for name in ("time", "position", "velocity", "acceleration", "jerk"):
+                    # The digits that sums of fifteen products leave, of the largest.
+                    expected = getattr(derived, name).detach()
+                    atol = 100 * torch.finfo(dtype).eps * expected.abs().max().item()
+                    actual = getattr(plain, name)
+                    torch.testing.assert_close(actual, expected, rtol=0, atol=atol)
+
+
+def test_a_rollout_without_gradients_leaves_those_of_the_next_alone():
+    dmp = fitted()
+    with torch.no_grad():
+        assert not dmp.rollout().position.requires_grad
+    dmp.rollout().position.sum().backward()
+    assert dmp.weights.grad.abs().max() > 0
+
+
+def test_what_is_read_later_is_of_when_it_was_asked_for():
+    dmp = fitted()
+    with torch.no_grad():
+        expected, motion = dmp.rollout().position, dmp.rollout()
+        dmp.weights.mul_(0.5)
+    torch.testing.assert_close(motion.position, expected, rtol=0, atol=1e-12)
+
+
+def test_ends_that_are_wrong_are_named_without_gradients_too():
+    dmp = fitted()
+    with torch.no_grad():
+        with pytest.raises(ValueError, match="goal must be finite"):
+            dmp.rollout(goal=[0.0, float("nan")])
+        with pytest.raises(ValueError, match=r"start must have shape \(\.\.\., 2\)"):
+            dmp.rollout(start=[0.0, 1.0, 2.0])
+        with pytest.raises(ValueError, match="start_velocity must be finite"):
+            dmp.rollout(start_velocity=[float("inf"), 0.0])
+
+
+def test_transforms_see_through_rollouts_without_gradients():
+    """`no_grad` stops neither `vmap` nor derivatives forwards."""
+    dmp = fitted()
+    goals = torch.tensor([[0.3, -0.2], [0.1, 0.4], [0.0, 0.0]], dtype=torch.float64)
+
+    def position(goal):
+        return dmp.rollout(goal=goal).position
+
+    with torch.no_grad():
+        expected = torch.stack([position(goal) for goal in goals])
+        torch.testing.assert_close(torch.vmap(position)(goals), expected)
+        _, change = torch.func.jvp(position, (goals[0],), (torch.ones_like(goals[0]),))
+        with forward_ad.dual_level():
+            dual = forward_ad.make_dual(goals[0], torch.ones_like(goals[0]))
+            tangent = forward_ad.unpack_dual(position(dual)).tangent
+    moved = (position(goals[0] + 1) - position(goals[0])).detach()  # linear in the goal
+    torch.testing.assert_close(change, moved)
+    torch.testing.assert_close(tangent, moved)
+
+
+def test_swapped_parameters_are_those_that_move():
+    dmp = fitted()
+    other = {"weights": 0.5 * dmp.weights.detach(), "goal": dmp.goal + 0.1}
+    with torch.no_grad():
+        before = dmp.rollout().position
+        swapped = torch.func.functional_call(
+            Rolling(dmp), {f"dmp.{k}": other[k] for k in other}
+        )
+        torch.testing.assert_close(dmp.rollout().position, before, rtol=0, atol=0)
+        for name, value in other.items():
+            getattr(dmp, name).copy_(value)
+    torch.testing.assert_close(swapped, rebuilt(dmp))
+
+
+class Rolling(torch.nn.Module):
+    """A primitive's rollout as a module's `forward`."""
+
+    def __init__(self, dmp):
+        super().__init__()
+        self.dmp = dmp
+
+    def forward(self):
+        return self.dmp.rollout().position
+
+
+def test_threads_share_a_primitive():
+    dmp = fitted()
+    grids = [torch.linspace(0, 1 + k, 20 + k, dtype=torch.float64) for k in range(4)]
+    goals = [torch.full((2,), 0.1 * k, dtype=torch.float64) for k in range(4)]
+
+    @torch.no_grad()
+    def position(k):
+        return dmp.rollout(grids[k % 4], goal=goals[k % 4]).position
+
+    expected = [position(k) for k in range(4)]
+    with ThreadPoolExecutor(4) as threads:
+        for k, made in enumerate(threads.map(position, range(400))):
+            torch.testing.assert_close(made, expected[k % 4], rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("n_threads", [1, 2])
+@pytest.mark.parametrize("shape", [(1,), (5,), (2, 3)])
+def test_a_batch_without_gradients_is_a_loop(shape, n_threads):
+    """On one thread NumPy multiplies motion by motion."""
+    time, position = arm_motion(n_samples=80)
+    positions = position + torch.randn(*shape, 1, 7, dtype=torch.float64)
+    dmp = JointDMP.fit(time, positions, 12)
+    before = torch.get_num_threads()
+    torch.set_num_threads(n_threads)
+    try:
+        with torch.no_grad():
+            motion = dmp.rollout()
+            for i in np.ndindex(shape):
+                one = dmp[i].rollout()
+                torch.testing.assert_close(motion.position[i], one.position)
+                torch.testing.assert_close(motion.velocity[i], one.velocity)
+    finally:
+        torch.set_num_threads(before)

@@ -253,7 +253,9 @@ def test_samples_that_do_not_count_change_no_fit():
         torch.testing.assert_close(together[i].start_velocity, alone.start_velocity)
 
 
-def test_products_are_those_of_the_design():
+@pytest.mark.parametrize("most", [own_times.MOST_IN_TABLE, 0])
+def test_products_are_those_of_the_design(monkeypatch, most):
+    monkeypatch.setattr(own_times, "MOST_IN_TABLE", most)
     rng = torch.Generator().manual_seed(0)
     s = torch.rand(3, 60, generator=rng, dtype=torch.float64).sort(-1).values
     s[:, 0], s[:, -1] = 0.0, 1.0

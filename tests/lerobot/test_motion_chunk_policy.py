@@ -19,6 +19,7 @@ from lerobot_samples import (
     stats_of,
     windows,
 )
+from safetensors.torch import save_file
 from torchvision.models import resnet18
 
 from hrc_learn.lerobot import MotionChunkConfig
@@ -466,17 +467,21 @@ def test_a_policy_begins_with_given_weights_and_a_checkpoint_brings_them(tmp_pat
     """The file is not asked for again."""
     torch.manual_seed(0)
     weights = resnet18(weights=None).state_dict()
-    torch.save(weights, tmp_path / "weights.pth")
+    file = tmp_path / "weights.safetensors"
+    save_file(weights, file)
     episodes = [
         {STATE: e[STATE], IMAGE: torch.rand(len(e[STATE]), 3, 64, 64), "action": e["action"]}
         for e in SHOWN[:2]
     ]
-    settings = {"vision_backbone": "resnet18", "vision_weights": str(tmp_path / "weights.pth")}
+    settings = {
+        "vision_backbone": "resnet18",
+        "vision_weights": str(tmp_path / "weights.safetensors"),
+    }
     policy = chunk_policy(episodes, **settings)
     (camera,) = policy.encoder.cameras.values()
     torch.testing.assert_close(camera.backbone.conv1.weight, weights["conv1.weight"])
     policy.save_pretrained(tmp_path / "policy")
-    (tmp_path / "weights.pth").unlink()
+    file.unlink()
     loaded = MotionChunkPolicy.from_pretrained(tmp_path / "policy")
     (again,) = loaded.encoder.cameras.values()
     torch.testing.assert_close(again.backbone.state_dict(), camera.backbone.state_dict())

@@ -47,8 +47,7 @@ def test_a_resnet_takes_images_of_any_channels(channels):
     assert first.bias is None
 
 
-@pytest.mark.parametrize("ending", ["pth", "safetensors"])
-def test_torchvisions_weights_make_torchvisions_features(tmp_path, ending):
+def test_torchvisions_weights_make_torchvisions_features(tmp_path):
     """Those of a ResNet in evaluation, whose images torchvision has prepared."""
     torch.manual_seed(0)
     theirs = resnet18(weights=None).eval()
@@ -57,11 +56,8 @@ def test_torchvisions_weights_make_torchvisions_features(tmp_path, ending):
             layer.running_mean.normal_()
             layer.running_var.uniform_(0.5, 2)
             nn.init.normal_(layer.bias)
-    file = tmp_path / f"weights.{ending}"
-    if ending == "pth":
-        torch.save(theirs.state_dict(), file)
-    else:
-        save_file(theirs.state_dict(), file)
+    file = tmp_path / "weights.safetensors"
+    save_file(theirs.state_dict(), file)
     encoder = ObservationEncoder(
         {}, {"front": 3}, backbone="resnet18", n_keypoints=4, pretrained=True
     )
@@ -86,13 +82,13 @@ def test_torchvisions_weights_make_torchvisions_features(tmp_path, ending):
     ("write", "message"),
     [
         (None, "there is no file"),
-        (lambda file: file.write_bytes(b"no weights"), "cannot be read"),
-        (lambda file: torch.save({"conv1.weight": torch.ones(64, 3, 7, 7)}, file), "first bn1"),
-        (lambda file: torch.save(resnet34().state_dict(), file), "holds no weights"),
+        (lambda file: file.write_bytes(b"no weights"), "is no safetensors file"),
+        (lambda file: save_file({"conv1.weight": torch.ones(64, 3, 7, 7)}, file), "first bn1"),
+        (lambda file: save_file(resnet34().state_dict(), file), "holds no weights"),
     ],
 )
 def test_files_that_hold_no_weights_of_a_resnet_are_named(tmp_path, write, message):
-    file = tmp_path / "weights.pth"
+    file = tmp_path / "weights.safetensors"
     if write is not None:
         write(file)
     backbone, _ = make_backbone("resnet50", 3, pretrained=True)

@@ -10,8 +10,7 @@ from rich.console import Console
 
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
 import bench_environments as bench  # pyright: ignore[reportMissingImports]
-import public_tasks  # pyright: ignore[reportMissingImports]
-from public_tasks import known, lerobot_env  # pyright: ignore[reportMissingImports]
+from public_tasks import known, lerobot_env, protocol  # pyright: ignore[reportMissingImports]
 
 
 class Walk:
@@ -64,16 +63,16 @@ def walks(monkeypatch):
 
 
 def test_a_demonstration_is_what_was_seen_before_each_action():
-    shown = public_tasks.demonstrate(Walk(), 0)
+    shown = protocol.demonstrate(Walk(), 0)
     assert shown["observation.state"].tolist() == [[0.0], [1.0], [2.0]]
     assert shown["observation.environment_state"].tolist() == [[3.0]] * 3
     assert shown["action"].tolist() == [[1.0]] * 3
-    assert public_tasks.demonstrate(Lost(), 0) is None
+    assert protocol.demonstrate(Lost(), 0) is None
 
 
 def test_an_expert_is_tried_with_the_thing_moved():
-    assert public_tasks.succeeds(Walk(), 3, moved=True)  # 6 + 4 of 12 actions
-    assert not public_tasks.succeeds(Lost(), 0, moved=False)
+    assert protocol.succeeds(Walk(), 3, moved=True)  # 6 + 4 of 12 actions
+    assert not protocol.succeeds(Lost(), 0, moved=False)
 
 
 @pytest.mark.parametrize(("moved", "expected"), [(False, 3), (True, 7)])
@@ -135,7 +134,7 @@ def test_an_expert_who_mostly_fails_shows_nothing(tmp_path):
 def test_successes_are_counted_by_lerobots_evaluation():
     """A policy that steps on, whatever it sees, gets there, and later where the thing moved."""
     args = bench.Args(demonstrations=8, minutes=0.02)
-    shown = [public_tasks.demonstrate(Walk(), seed) for seed in range(8)]
+    shown = [protocol.demonstrate(Walk(), seed) for seed in range(8)]
     learned = bench._learn("walk", "motion_chunk", shown, args)
     for moved in (False, True):
         with bench._environments("walk", 4, moved=moved) as vector:

@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -201,6 +202,9 @@ class ColumnPieces:
 
     interval: float
     coefficients: Float[Tensor, "P K n"]
+    table: Float[Tensor, "P_moments pairs"] | None
+    """What the sums of T_0 ... T_2K-2 over the samples of each piece add to H'H, one half of
+    it; None if that took more memory than `MOST_IN_TABLE`."""
 
     @classmethod
     def of(cls, response: "Response", mixing: Float[Tensor, "M n"]) -> "ColumnPieces":
@@ -226,7 +230,8 @@ class ColumnPieces:
         # What terms leave out is at most the sum of their coefficients.
         left = coefficients.abs().flip(1).cumsum(1).flip(1).amax(0)
         terms = int((left > UNSEEN * size).any(-1).sum())
-        return cls(interval, coefficients[:, :terms].contiguous())
+        coefficients = coefficients[:, :terms].contiguous()
+        return cls(interval, coefficients, _moments_to_gram(coefficients))
 
     def products(
         self,
@@ -236,8 +241,8 @@ class ColumnPieces:
     ) -> tuple[Float[Tensor, "B n n"], Float[Tensor, "B n D"]]:
         """H'H and H'y of the columns, over the samples that count (float64).
 
-        No H is made: sums over the samples of a piece, of products of Chebyshev polynomials,
-        say all about them.
+        No H is made: sums over the samples of a piece, of Chebyshev polynomials T_k up to
+        twice the degree, say all about them, for T_i T_j = (T_i+j + T_|i-j|) / 2.
 
         Args:
             s: Normalised times from 0 to 1, never falling.
@@ -248,7 +253,7 @@ class ColumnPieces:
         edges = torch.arange(P + 1, dtype=s.dtype, device=s.device)
         # Samples at the very end belong to the last piece.
         edges[-1] = math.inf
-        gram, right = s.new_empty(len(s), n, n), s.new_empty(len(s), n, D)
+        moments, right = s.new_empty(len(s), P, 2 * K - 1), s.new_empty(len(s), n, D)
         flat = self.coefficients.reshape(P * K, n).mT
         for part in _parts(s):
             x, B = s[part] / self.interval, len(s[part])
@@ -258,20 +263,61 @@ class ColumnPieces:
             there = index < first[:, 1:, None]
             index = index.clamp(max=s.shape[1] - 1).flatten(1)
             u = 2 * (x.gather(1, index).view(B, P, most) - edges[:P, None]) - 1
-            rows = s.new_empty(B, P, K + D, most)
-            samples = y[part].gather(2, index[:, None].expand(-1, D, -1))
-            rows[:, :, K:] = samples.view(B, D, P, most).transpose(1, 2)
+            rows = s.new_empty(B, P, K, most)
             rows[:, :, 0] = mask[part].gather(1, index).view(B, P, most) * there
-            rows[:, :, 1] = rows[:, :, 0] * u
+            torch.mul(rows[:, :, 0], u, out=rows[:, :, 1])
+            u = 2 * u
             for k in range(2, K):
-                rows[:, :, k] = 2 * u * rows[:, :, k - 1] - rows[:, :, k - 2]
-            sums = rows[:, :, :K] @ rows.mT
-            # Of series times series, in an order that leaves one flat product.
-            inner = sums[..., :K].permute(1, 2, 0, 3).reshape(P, K * B, K) @ self.coefficients
-            gram[part] = (flat @ inner.view(P * K, B * n)).view(n, B, n).movedim(1, 0)
-            outer = sums[..., K:].permute(1, 2, 0, 3).reshape(P * K, B * D)
+                torch.mul(u, rows[:, :, k - 1], out=rows[:, :, k])
+                rows[:, :, k] -= rows[:, :, k - 2]
+            # Beside the samples, 1 and the highest polynomial: that one gives the other half.
+            others = s.new_empty(B, P, D + 2, most)
+            samples = y[part].gather(2, index[:, None].expand(-1, D, -1))
+            others[:, :, :D] = samples.view(B, D, P, most).transpose(1, 2)
+            others[:, :, D] = rows[:, :, 0]
+            others[:, :, D + 1] = rows[:, :, -1]
+            sums = rows @ others.mT
+            moments[part, :, :K] = sums[..., D]
+            moments[part, :, K - 1 :] = 2 * sums[..., D + 1] - sums[..., D].flip(-1)
+            outer = sums[..., :D].permute(1, 2, 0, 3).reshape(P * K, B * D)
             right[part] = (flat @ outer).view(n, B, D).movedim(1, 0)
-        return gram, right
+        return self._gram(moments), right
+
+    def _gram(self, moments: Float[Tensor, "B P moments"]) -> Float[Tensor, "B n n"]:
+        """H'H from the sums of Chebyshev polynomials."""
+        (P, K, n), B = self.coefficients.shape, len(moments)
+        if self.table is not None:
+            i, j = torch.triu_indices(n, n, device=moments.device)
+            half = torch.empty(n, n, dtype=torch.long, device=moments.device)
+            half[i, j] = half[j, i] = torch.arange(len(i), device=moments.device)
+            return (moments.flatten(1) @ self.table)[:, half]
+        k = torch.arange(K, device=moments.device)
+        sums = (moments[..., k + k[:, None]] + moments[..., (k - k[:, None]).abs()]) / 2
+        # Of series times series, in an order that leaves one flat product.
+        inner = sums.permute(1, 2, 0, 3).reshape(P, K * B, K) @ self.coefficients
+        flat = self.coefficients.reshape(P * K, n).mT
+        return (flat @ inner.view(P * K, B * n)).view(n, B, n).movedim(1, 0)
+
+
+MOST_IN_TABLE = 2**22
+"""Entries of a `ColumnPieces.table`, 32 MB: 50 functions take 1.3 million, 100 take ten."""
+
+
+def _moments_to_gram(
+    coefficients: Float[Tensor, "P K n"],
+) -> Float[Tensor, "P_moments pairs"] | None:
+    """`ColumnPieces.table` of series."""
+    P, K, n = coefficients.shape
+    i, j = torch.triu_indices(n, n, device=coefficients.device)
+    if P * (2 * K - 1) * len(i) > MOST_IN_TABLE:
+        return None
+    table = coefficients.new_zeros(P, 2 * K - 1, len(i))
+    right, k = coefficients[..., j], torch.arange(K, device=coefficients.device)
+    for degree in range(K):
+        halves = coefficients[:, degree, None, i] * right / 2
+        table[:, degree : degree + K] += halves
+        table.index_add_(1, (k - degree).abs(), halves)
+    return table.flatten(0, 1)
 
 
 def without_subnormals(values: Tensor) -> Tensor:
@@ -365,6 +411,15 @@ def _parts(s: Float[Tensor, "B T"]) -> Iterator[slice]:
     return (slice(i, i + size) for i in range(0, s.shape[0], size))
 
 
+def _empty(like: Tensor, *shape: int) -> Tensor:
+    """Memory for a result, of NumPy on a CPU: it asks for large pages, and for hundreds of
+    megabytes the system takes as long to find small ones as a motion to fill them.
+    """
+    if not like.is_cpu:
+        return like.new_empty(shape)
+    return torch.from_numpy(np.empty(shape, str(like.dtype).removeprefix("torch.")))
+
+
 class _Motion(torch.autograd.Function):
     """`motion` in one pass over the samples."""
 
@@ -372,7 +427,7 @@ class _Motion(torch.autograd.Function):
     def forward(s, coordinates, response, order):
         table = _table(response, order, coordinates)
         B, D, _ = coordinates.shape
-        y = coordinates.new_empty(B, s.shape[1], D)
+        y = _empty(coordinates, B, s.shape[1], D)
         bags = None
         for part in _parts(s):
             x = coordinates[part]

@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 from jaxtyping import Float
+from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
@@ -81,11 +82,11 @@ def _resnet(name: str, channels: int, pretrained: bool) -> tuple[nn.Module, int]
 
 
 def load_backbone(backbone: nn.Module, path: Path) -> None:
-    """Load weights of a ResNet as torchvision saves them, from a file.
+    """Load weights of a ResNet, by torchvision's names, from a file.
 
     Args:
         backbone: As of `make_backbone`, pretrained.
-        path: A state dict, .safetensors or what `torch.save` writes.
+        path: A state dict as safetensors.
 
     Raises:
         ValueError: There is no such file, or it holds no weights of this ResNet.
@@ -93,13 +94,12 @@ def load_backbone(backbone: nn.Module, path: Path) -> None:
     if not path.is_file():
         raise ValueError(f"vision_weights: there is no file {path}")
     try:
-        weights = (
-            load_file(path)
-            if path.suffix == ".safetensors"
-            else torch.load(path, map_location="cpu", weights_only=True)
-        )
-    except Exception as error:
-        raise ValueError(f"vision_weights: {path} cannot be read ({error})") from error
+        weights = load_file(path)
+    except SafetensorError as error:
+        raise ValueError(
+            f"vision_weights: {path} is no safetensors file ({error}); of what torchvision "
+            "downloads make one by safetensors.torch.save_file(torch.load(PTH), FILE)"
+        ) from error
     own = backbone.state_dict()
     wrong = [
         name for name, x in own.items() if name not in weights or weights[name].shape != x.shape
