@@ -36,8 +36,8 @@ from typing import Any
 import gymnasium as gym
 import torch
 from bench_policies import Learned, learn
-from public_tasks import Episode, demonstrate, succeeds
 from public_tasks.known import TASKS, make_task
+from public_tasks.protocol import Episode, demonstrate, succeeds
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table

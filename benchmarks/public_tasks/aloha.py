@@ -17,8 +17,7 @@ from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float, UInt8
-
-from public_tasks import AGENT_POS, ENVIRONMENT_STATE, Expert, Observation
+from public_tasks.protocol import AGENT_POS, ENVIRONMENT_STATE, Expert, Observation
 
 FPS = 50.0
 """Of gym-aloha."""

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from public_tasks import PublicTask
+from public_tasks.protocol import PublicTask
 
 
 @dataclass(frozen=True, kw_only=True)

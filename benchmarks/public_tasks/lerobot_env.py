@@ -11,9 +11,8 @@ from jaxtyping import Float
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
-
-from public_tasks import AGENT_POS, ENVIRONMENT_STATE, Observation, PublicTask
 from public_tasks.known import make_task
+from public_tasks.protocol import AGENT_POS, ENVIRONMENT_STATE, Observation, PublicTask
 
 
 @EnvConfig.register_subclass("public_task")

@@ -14,8 +14,7 @@ from typing import Any
 import mujoco
 import numpy as np
 from jaxtyping import Float, UInt8
-
-from public_tasks import AGENT_POS, ENVIRONMENT_STATE, Expert, Observation
+from public_tasks.protocol import AGENT_POS, ENVIRONMENT_STATE, Expert, Observation
 
 # pyright: reportAttributeAccessIssue=false
 # MuJoCo ships no type stubs, and MetaWorld is taken for this file.

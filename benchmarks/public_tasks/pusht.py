@@ -14,8 +14,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-
-from public_tasks import AGENT_POS, ENVIRONMENT_STATE, Expert, Observation
+from public_tasks.protocol import AGENT_POS, ENVIRONMENT_STATE, Expert, Observation
 
 type Point = Float[np.ndarray, "2"]
 type Points = Float[np.ndarray, "*N 2"]
