@@ -1,5 +1,6 @@
 """Public tasks as an environment of LeRobot: `--env.type=public_task --env.task=pusht`."""
 
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -107,7 +108,8 @@ class PublicTaskEnv(gym.Env):
         seen, success = self._task.step(np.asarray(action, float))
         self._steps += 1
         if self._move_object and self._steps == self._task.moved_at and not success:
-            seen = self._task.move_object(self._rng)
+            with suppress(RuntimeError):  # a policy may have knocked it away by then
+                seen = self._task.move_object(self._rng)
         late = self._steps >= self._max_episode_steps and not success
         return _single(seen), float(success), success, late, {"is_success": success}
 

@@ -98,6 +98,17 @@ def test_lerobots_environment_moves_the_thing_under_way(moved, expected):
     assert things == ([3.0] * 3 if not moved else [3.0] * 2 + [7.0] * 5)
 
 
+def test_a_thing_that_is_out_of_reach_by_then_is_left_there(monkeypatch):
+    def nowhere(self, rng):
+        raise RuntimeError("no such place")
+
+    monkeypatch.setattr(Walk, "move_object", nowhere)
+    env = lerobot_env.PublicTaskEnv("walk", move_object=True)
+    env.reset(seed=0)
+    things = [env.step(np.zeros(1))[0]["environment_state"].item() for _ in range(4)]
+    assert things == [3.0] * 4
+
+
 def test_an_episode_that_takes_too_long_ends_without_success():
     env = lerobot_env.PublicTaskEnv("walk")
     env.reset(seed=0)

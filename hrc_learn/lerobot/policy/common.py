@@ -38,8 +38,8 @@ class MotionPolicyConfig(PreTrainedConfig):
     """Of images: "small", four convolutions, or a ResNet of torchvision such as "resnet18";
     no weights are downloaded."""
     vision_weights: str | None = None
-    """File of weights for such a ResNet to begin with, safetensors by torchvision's names; None:
-    it begins with random ones, or has been given its weights."""
+    """File of weights for such a ResNet to begin with, safetensors by torchvision's names;
+    None: it begins with random ones, or has been given its weights."""
     vision_pretrained: bool = False
     """Whether the ResNet was begun with weights of torchvision's; set by `vision_weights`."""
     n_keypoints: int = 32
