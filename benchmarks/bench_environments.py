@@ -78,6 +78,8 @@ class Args:
     """Of each kind, from the same beginnings."""
     seed: int = 0
     """Of weights and batches."""
+    state_noise: float = 0.0
+    """In training, of `motion_chunk`."""
     out: Path = Path("outputs/environments")
     """Demonstrations are kept here, and taken from here the next time."""
     keep: bool = False
@@ -186,6 +188,7 @@ def _learn(name: str, policy: str, shown: Sequence[Episode], args: Args) -> Lear
         chunk=setting.chunk,
         executed=args.executed or setting.executed,
         seed=args.seed,
+        state_noise=args.state_noise,
     )
 
 

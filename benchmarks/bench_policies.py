@@ -187,6 +187,7 @@ def learn(
     executed: int,
     batch_size: int = 64,
     seed: int = 0,
+    state_noise: float = 0.0,
 ) -> Learned:
     """A policy of LeRobot or ours, trained from memory as lerobot-train does it.
 
@@ -199,6 +200,7 @@ def learn(
         executed: Of these, how many are to be carried out.
         batch_size: Samples in each step of training.
         seed: Of weights and batches.
+        state_noise: Of `motion_chunk`.
     """
     torch.manual_seed(seed)
     stats = statistics(shown)
@@ -206,7 +208,7 @@ def learn(
 
     import hrc_learn.lerobot  # noqa: F401  registers ours
 
-    config = config_of(name, shown[0], fps, chunk, executed)
+    config = config_of(name, shown[0], fps, chunk, executed, state_noise)
     stands_in = ENVIRONMENT in config.input_features and ENVIRONMENT not in shown[0]
     if stands_in:
         # ACT and Diffusion demand images or the environment's state: they get the state there.
@@ -280,7 +282,14 @@ class Nearest:
         return action
 
 
-def config_of(name: str, episode: Episode, fps: float, chunk: int, executed: int) -> Any:
+def config_of(
+    name: str,
+    episode: Episode,
+    fps: float,
+    chunk: int,
+    executed: int,
+    state_noise: float = 0.0,
+) -> Any:
     """Settings of a policy that predicts so many actions and carries out so many of them."""
     from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature
     from lerobot.policies import ACTConfig, DiffusionConfig
@@ -328,7 +337,9 @@ def config_of(name: str, episode: Episode, fps: float, chunk: int, executed: int
         case "dmp":
             return DMPConfig(**common, chunk_size=chunk, fps=fps)
         case "motion_chunk":
-            return MotionChunkConfig(**common, chunk_size=chunk, fps=fps)
+            return MotionChunkConfig(
+                **common, chunk_size=chunk, fps=fps, state_noise=state_noise
+            )
         case "act":
             return ACTConfig(**common, **act)
         case "act_dmp":

@@ -388,15 +388,14 @@ def test_losses_chunks_and_gradients_whatever_it_sees(name, episodes):
     assert policy.select_action(now).shape == (2, width)
 
 
-def test_training_blurs_numbers_alone():
-    """So that plans lead back to what was shown from beside it; images are seen as they are."""
+@pytest.mark.parametrize("noise", [0.15, 0.0])
+def test_training_blurs_the_arms_own_state_alone(noise):
+    """So that plans lead back from beside the path; goals and images are seen as they are."""
     rng = torch.Generator().manual_seed(0)
     episodes = [
-        {STATE: e[STATE], IMAGE: torch.rand(len(e[STATE]), 3, 32, 48, generator=rng)}
-        | {"action": e["action"]}
-        for e in SHOWN[:3]
+        e | {IMAGE: torch.rand(len(e[STATE]), 3, 32, 48, generator=rng)} for e in SHOWN[:3]
     ]
-    policy, seen = chunk_policy(episodes, dropout=0.0), []
+    policy, seen = chunk_policy(episodes, dropout=0.0, state_noise=noise), []
     policy.network.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
     batch = windows(policy, episodes).draw(256, rng)
     for training in (True, False):
@@ -404,11 +403,9 @@ def test_training_blurs_numbers_alone():
         with torch.random.fork_rng():
             torch.manual_seed(0)
             policy.forward(batch)
-    blurred, plain = seen
-    off, numbers = blurred - plain, policy.network.numbers
-    assert numbers == 3
-    assert (off[:, numbers:] == 0).all()
-    torch.testing.assert_close(off[:, :3].std(), torch.tensor(0.15), rtol=0.1, atol=0)
+    off = seen[0] - seen[1]
+    assert (off[:, 3:] == 0).all()
+    torch.testing.assert_close(off[:, :3].std(), torch.tensor(noise), rtol=0.1, atol=0)
 
 
 def test_padding_is_not_learned():
@@ -497,6 +494,7 @@ def test_a_policy_begins_with_given_weights_and_a_checkpoint_brings_them(tmp_pat
         ({"n_obs_steps": 2}, "sees one step"),
         ({"n_plans": 0}, "n_plans must be at least 1"),
         ({"blend_time": 0.0}, "blend_time must be positive"),
+        ({"state_noise": -0.1}, "state_noise must not be negative"),
         ({"chunk_size": 3, "n_action_steps": 1}, "chunk_size must be at least 4"),
         ({"two_level_actions": [2]}, "two_level_actions"),
     ],

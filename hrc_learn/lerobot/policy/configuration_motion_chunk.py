@@ -22,6 +22,10 @@ class MotionChunkConfig(MotionPolicyConfig):
     """Width of the network."""
     dropout: float = 0.1
     """Share of the network's hidden features left out in training."""
+    state_noise: float = 0.0
+    """Noise on observation.state in training, in its spreads. With 0.15, plans lead back from
+    beside what was demonstrated, which matters where demonstrations hardly differ, as those of
+    scripts do; people's own variation does the same, and noise blurs what they mean."""
     n_plans: int = 3
     """Plans for each observation, of which one is carried out: as many ways to go as the
     demonstrations may show from one place."""
@@ -46,6 +50,8 @@ class MotionChunkConfig(MotionPolicyConfig):
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
         if self.blend_time is not None and self.blend_time <= 0:
             raise ValueError(f"blend_time must be positive seconds, got {self.blend_time}")
+        if self.state_noise < 0:
+            raise ValueError(f"state_noise must not be negative, got {self.state_noise}")
         if self.chunk_size < 4:
             raise ValueError(f"chunk_size must be at least 4, got {self.chunk_size}")
 

@@ -45,10 +45,6 @@ MEASURED = 0.5
 UNSURE = 0.3
 """Noise on position and velocity of the motion in training, in their spreads: policies that are
 sure of their own past go on with it whatever they see."""
-BLUR = 0.15
-"""Noise on the numbers seen in training, in their spreads: beside the demonstrated path, plans
-lead back to it then. Of 24 episodes of ALOHA's transfer it takes 5 to 17; those of the SO-101
-and of MetaWorld's pick-place are done as often as without, and half as often with 0.3."""
 UNKNOWN = 0.15
 """Share of samples trained without either, as after a reset."""
 VELOCITY_WEIGHT = 0.005
@@ -193,10 +189,10 @@ class MotionChunkPolicy(PreTrainedPolicy):
             moving = moving + UNSURE * torch.randn_like(moving)
             known = (torch.rand_like(known) > UNKNOWN).to(moving)
         features = self.encoder(self._turned(batch))
-        if self.training:
-            numbers = self.network.numbers
-            blur = BLUR * torch.randn_like(features[:, :numbers])
-            features = torch.cat([features[:, :numbers] + blur, features[:, numbers:]], dim=-1)
+        if self.training and self.config.state_noise:
+            own = self.encoder.widths.get(OBS_STATE, 0)  # come first among the features
+            noise = self.config.state_noise * torch.randn_like(features[:, :own])
+            features = torch.cat([features[:, :own] + noise, features[:, own:]], dim=-1)
         plans = self.network(features, moving[..., self._smooth], known)
         present = (~batch[f"{ACTION}_is_pad"][:, HISTORY:]).to(shown)
         error = self.decoder.positions(plans.coefficients) - shown[:, None, :, self._smooth]
