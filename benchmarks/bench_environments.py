@@ -14,7 +14,7 @@ Public environments demand older packages than ours:
 and ours (--tasks grasping) the MuJoCo of .venv, whose Python runs it there. A policy that is
 kept (--keep) can be evaluated by the command itself:
 
-    PYTHONPATH=benchmarks lerobot-eval --env.discover_packages_path=public_tasks.lerobot_env
+    PYTHONPATH=benchmarks lerobot-eval --env.discover_packages_path=public_tasks
       --env.type=public_task --env.task=pusht --policy.path=FOLDER ...
 """
 
