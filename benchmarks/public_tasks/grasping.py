@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from public_tasks.protocol import AGENT_POS, ENVIRONMENT_STATE, Expert, Observation
+from public_tasks.protocol import ACTION, AGENT_POS, ENVIRONMENT_STATE, Expert, Observation
 
 from hrc_learn.lerobot.envs import ArmEnv, ArmEnvConfig
 from hrc_learn.lerobot.teleoperators import ArmExpert, ArmExpertConfig
@@ -33,7 +33,7 @@ class Grasping:
         self._env = ArmEnv(**settings)
         self.expert: Expert = _Expert(settings["config"].id)
         self.longest = self._env._max_episode_steps
-        self.n_actions = self._env.action_space.shape[0]
+        self.n_actions = config.features[ACTION].shape[0]
 
     def begin(self, seed: int) -> Observation:
         """The box where the seed has it."""
