@@ -1,6 +1,6 @@
 """What a policy does after its camera was moved, with and without correcting what it sees.
 
-A policy learns from a dataset of
+The policy `dmp` learns in closed form from a dataset of
 
     hrc record expert --scenario grasping --marker --episodes 30 --out DATA
 
@@ -8,8 +8,7 @@ to grasp by the pixel of the object, and does so in MuJoCo from beginnings that 
 with the camera where it was; moved by 10 cm and 10 degrees in random directions in which it
 still sees the table; and the same with `add_camera_watch(..., correct=True)`. Each time it was
 moved it is watched anew, so that in the first episode after that nothing is known of it before
-the arm moves: `dmp`, which plans from the first thing it sees, cannot grasp then, and
-`motion_chunk`, which looks again, may.
+the arm moves: this policy, which plans from the first thing it sees, cannot grasp then.
 """
 
 from __future__ import annotations
@@ -23,25 +22,18 @@ import shutil
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
-from bench_policies import ACTION, STATE, Learned, learn
 from lerobot.utils.constants import OBS_STATE
 from rich.console import Console
 from rich.table import Table
 
 from hrc_learn import cli
-from hrc_learn.demos.format.dataset_folder import read_info
-from hrc_learn.lerobot.policy.closed_form import read_episodes
 from hrc_learn.lerobot.policy.modeling_dmp import write_closed_form_policy
 
 N_BASIS = 60
 """Of a coordinate: as of `hrc fit --as-lerobot-policy`."""
-CHUNK = 1.2
-"""Of `motion_chunk` [s]."""
-LOOKS = 6
-"""How often it looks again in that time."""
 FIRST_SEED = 50_000
 """Beginnings that were not shown: demonstrations count from 0."""
 
@@ -50,11 +42,8 @@ FIRST_SEED = 50_000
 class Args:
     data: Path
     """Dataset of `hrc record expert --scenario grasping --marker`."""
-    policy: Literal["dmp", "motion_chunk"] | Path = "dmp"
-    """`dmp` fitted in closed form, `motion_chunk` trained for `minutes`, or the checkpoint of a
-    policy that was trained on the dataset."""
-    minutes: float = 1.0
-    """CPU time of training."""
+    policy: Path | None = None
+    """Checkpoint of a policy that was trained on it; `dmp` is fitted to it without."""
     moves: int = 10
     """Of the camera, in different directions."""
     episodes: int = 5
@@ -73,11 +62,9 @@ def main(args: Args) -> None:
     figures: dict[str, float] = {}
     with tempfile.TemporaryDirectory() as folder:
         checkpoint = Path(folder) / "policy"
-        if args.policy == "dmp":
+        if args.policy is None:
             checkpoint.mkdir()
             write_closed_form_policy(args.data, checkpoint, n_basis=N_BASIS)
-        elif args.policy == "motion_chunk":
-            _train_chunks(args).save(checkpoint)
         else:
             shutil.copytree(args.policy, checkpoint)  # a watch is put into it
         rows: tuple[tuple[str, float, bool], ...] = (
@@ -98,25 +85,12 @@ def main(args: Args) -> None:
         cli.write_json(args.json, figures)
 
 
-def _train_chunks(args: Args) -> Learned:
-    episodes = read_episodes(args.data, (STATE, ACTION))
-    fps = float(read_info(args.data)["fps"])
-    chunk = round(CHUNK * fps)
-    return learn(
-        "motion_chunk",
-        episodes,
-        fps,
-        minutes=args.minutes,
-        chunk=chunk,
-        executed=chunk // LOOKS,
-    )
-
-
 def _roll_out(checkpoint: Path, size: float, correct: bool, args: Args) -> list[list[bool]]:
     """Whether the object was grasped: a row for each move of the camera."""
     from lerobot.configs.policies import PreTrainedConfig
     from lerobot.policies import get_policy_class, make_pre_post_processors
 
+    from hrc_learn.demos.format.dataset_folder import read_info
     from hrc_learn.lerobot.camera_watch import add_camera_watch
     from hrc_learn.lerobot.envs import ArmEnv, ArmEnvConfig
     from hrc_learn.lerobot.robots.mujoco_arm import MovedCameraConfig

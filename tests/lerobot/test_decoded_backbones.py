@@ -107,6 +107,7 @@ def test_the_first_chunk_is_the_motion_nearest_to_what_is_predicted(name):
     predicted = torch.randn(3, policy.motion.decoder.samples, 2, generator=rng)
     begun = policy.motion.begin(predicted, None, 0)
     nearest = policy.motion.decode(predicted)[:, :-1]
+    assert policy.motion.decoder.step == 1 / FPS
     torch.testing.assert_close(begun, nearest, rtol=0, atol=1e-4)
 
 
@@ -190,6 +191,25 @@ def test_a_gripper_of_two_levels_is_left_as_it_is_predicted(name):
     policy.motion.begin(torch.zeros_like(chunk), None, 0)
     after = policy.motion.begin(chunk, policy.motion.after(5), 0)
     torch.testing.assert_close(after[..., 1], chunk[:, :-1, 1], rtol=0, atol=0)
+
+
+@both
+def test_what_will_be_carried_out_meanwhile_keeps_its_gripper(name):
+    motion = small(name, two_level_actions=[1]).motion
+    samples = motion.decoder.samples
+    motion.begin(torch.zeros(1, samples, 2), None, 0)
+    plan = torch.ones(1, samples, 2)
+    actions = motion.begin(plan, motion.after(2), 3)
+    assert actions[0, :, 1].tolist() == [0.0] * 3 + [1.0] * (samples - 4)
+    assert (plan == 1).all()  # what was predicted is not written to
+
+
+@both
+def test_a_delay_longer_than_a_chunk_carries_out_the_last_one(name):
+    policy = small(name)
+    first = chunk_of(policy, 0)
+    later = chunk_of(policy, 1, inference_delay=500, prev_chunk_left_over=first[0])
+    torch.testing.assert_close(later, first, rtol=0, atol=1e-6)
 
 
 @both
