@@ -158,6 +158,22 @@ def test_who_does_not_say_what_was_carried_out_is_found_on_the_chunk(name):
 
 
 @both
+def test_asking_for_chunks_after_single_actions_goes_by_where_the_plan_is(name):
+    policy = small(name)
+    executed(policy, 6)
+    last = policy.motion.chunk
+    plan = last.actions + (last.actions[:, 3] - last.actions[:, 0])[:, None]
+    begun = policy.go_on(plan.float(), 0, None)
+    torch.testing.assert_close(begun[0, 0], last.actions[0, 3].float(), rtol=0, atol=1e-4)
+
+
+def test_actions_that_all_know_two_levels_are_motions_all_the_same():
+    shown = [e | {"action": (e["action"] > 0.5).float()} for e in SHOWN]
+    shown[0]["action"][0] = 1.0  # both are up somewhere
+    assert small("act_dmp", shown).config.two_level_actions == []
+
+
+@both
 def test_reset_forgets_the_motion(name):
     policy = small(name)
     first = chunk_of(policy, 0)
