@@ -174,6 +174,12 @@ def test_actions_that_all_know_two_levels_are_motions_all_the_same():
 
 
 @both
+def test_what_decodes_goes_where_the_policy_goes(name):
+    policy = small(name).to("meta")
+    assert policy.motion.decoder.maps.device.type == "meta"
+
+
+@both
 def test_reset_forgets_the_motion(name):
     policy = small(name)
     first = chunk_of(policy, 0)

@@ -84,6 +84,11 @@ class DecodedPolicy:
     config: Any
     motion: ChunkMotion
 
+    def decode_by(self, predicted: int) -> None:
+        """Take chunks of so many samples for motions from now on."""
+        self.motion = ChunkMotion(self.config, predicted, self.config.action_feature.shape[0])
+        self.decoder = self.motion.decoder  # a module: goes where the policy goes
+
     def supports_rtc(self) -> bool:
         """Chunks go on from what is left of the one before: without guidance, exactly."""
         return True
@@ -146,10 +151,6 @@ def _know_dataset(
             config.two_level_actions = found
 
 
-def _motion_of(config: Any, predicted: int) -> ChunkMotion:
-    return ChunkMotion(config, predicted, config.action_feature.shape[0])
-
-
 class _MotionACT(ACT):
     """ACT whose chunks are motions while it learns, too."""
 
@@ -191,7 +192,7 @@ class ActDmpPolicy(DecodedPolicy, ACTPolicy):
         super().__init__(config)
         # One action more, which is where the chunk ends.
         whole = replace(config, chunk_size=config.chunk_size + 1)
-        self.motion = _motion_of(config, whole.chunk_size)
+        self.decode_by(whole.chunk_size)
         self.model = _MotionACT(whole, self.motion)
 
     @torch.no_grad()
@@ -224,7 +225,7 @@ class DiffusionDmpPolicy(DecodedPolicy, DiffusionPolicy):
         _know_dataset(config, dataset_stats, dataset_meta)
         super().__init__(config)
         predicted = config.horizon - config.n_obs_steps + 1
-        self.motion = _motion_of(config, predicted)
+        self.decode_by(predicted)
         # All that it generates from the present action on, not what is carried out alone.
         self.diffusion.config = copy(config)
         self.diffusion.config.n_action_steps = predicted
