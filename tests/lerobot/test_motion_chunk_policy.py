@@ -23,7 +23,7 @@ from safetensors.torch import save_file
 from torchvision.models import resnet18
 
 from hrc_learn.lerobot import MotionChunkConfig
-from hrc_learn.lerobot.policy.chunk_network import ChunkDecoder
+from hrc_learn.lerobot.policy.chunk_network import ChunkDecoder, Plans
 from hrc_learn.lerobot.policy.modeling_motion_chunk import MotionChunkPolicy
 
 SHOWN = reaching(10)
@@ -272,6 +272,161 @@ def test_who_does_not_say_what_was_carried_out_is_found_on_the_chunk():
         first = second
 
 
+# How fast the state changes.
+
+
+def heard(policy):
+    """What the network is told of velocities: their values, and whether they are known."""
+    told = []
+    policy.network.register_forward_pre_hook(lambda _, inputs: told.append(inputs[1:]))
+    return told
+
+
+def turning_about(frames=30):
+    """A hand that points down and turns past half a turn, where vectors jump, and a slide."""
+    turn = torch.pi + torch.linspace(-0.4, 0.6, frames) ** 2
+    turn = torch.where(turn > torch.pi, turn - 2 * torch.pi, turn)
+    slide = torch.linspace(0, 1, frames) ** 3
+    state = torch.stack([turn, 0 * turn, 0 * turn, slide], dim=-1)
+    return {STATE: state, "action": state}
+
+
+HAND = ["ee.wx", "ee.wy", "ee.wz", "slide.pos"]
+
+
+@pytest.mark.parametrize("history", [1, 2, 5])
+@pytest.mark.parametrize(
+    ("episode", "names"),
+    [
+        (SHOWN[0], {}),
+        (turning_about(), {"state_names": HAND, "action_feature_names": HAND}),
+    ],
+    ids=["joints", "hand"],
+)
+def test_velocities_are_the_same_in_training_and_in_use(history, episode, names):
+    """Of frames as they are loaded, and of those that went by; at first neither knows it."""
+    policy = chunk_policy([episode], history=history, n_action_steps=1, **names).eval()
+    told = heard(policy)
+    batch = windows(policy, [episode]).batch(torch.arange(20))
+    assert batch[STATE].shape[1] == 2
+    policy.forward(batch)
+    played(policy, {key: x[:20] for key, x in episode.items()})
+    velocity, known = (torch.cat(x) for x in zip(*told[1:], strict=True))
+    assert known.tolist() == [0.0] * history + [1.0] * (20 - history)
+    torch.testing.assert_close(told[0][1], known, rtol=0, atol=0)
+    sure = known > 0
+    torch.testing.assert_close(told[0][0][sure], velocity[sure], rtol=0, atol=1e-5)
+
+
+def test_velocities_are_differences_in_their_own_spread():
+    policy = chunk_policy(SHOWN, history=3, n_action_steps=1)
+    told = heard(policy)
+    played(policy, SHOWN[0])
+    rates = torch.cat([e[STATE].diff(dim=0) * FPS for e in SHOWN])
+    spread = rates.square().mean(0).sqrt()
+    moves = spread > 0
+    off = (SHOWN[0][STATE][13] - SHOWN[0][STATE][10]) * FPS / 3
+    expected = off[moves] / spread[moves]
+    torch.testing.assert_close(told[13][0][0, moves], expected, rtol=1e-4, atol=0)
+
+
+def test_after_a_reset_and_for_chunks_alone_no_velocity_is_known():
+    policy = chunk_policy(SHOWN, n_action_steps=1)
+    told = heard(policy)
+    played(policy, {key: x[:5] for key, x in SHOWN[0].items()})
+    policy.predict_action_chunk({key: SHOWN[0][key][5:6] for key in (STATE, GOAL)})
+    policy.select_action({key: SHOWN[0][key][6:7] for key in (STATE, GOAL)})
+    policy.reset()
+    played(policy, {key: x[:3] for key, x in SHOWN[1].items()})
+    assert [float(known) for _, known in told] == [0, 0, 1, 1, 1, 0, 0, 0, 0, 1]
+
+
+def test_a_frame_that_was_not_measured_leaves_the_velocity_unknown():
+    """Between two chunks; what a chunk is planned from must be measured."""
+    policy = chunk_policy(SHOWN, n_action_steps=3)
+    told = heard(policy)
+    seen = [{key: SHOWN[0][key][k : k + 1] for key in (STATE, GOAL)} for k in range(7)]
+    seen[1][STATE] = torch.full((1, 3), torch.nan)
+    made = [policy.select_action(x) for x in seen]
+    assert torch.cat(made).isfinite().all()
+    assert [float(known) for _, known in told] == [0, 0, 1]
+    assert not told[1][0].any()
+
+
+def test_without_a_history_one_frame_is_loaded_and_seen():
+    policy = chunk_policy(SHOWN, history=0)
+    assert policy.config.observation_delta_indices is None
+    batch = windows(policy, SHOWN).batch(torch.arange(6))
+    assert batch[STATE].ndim == 2
+    told = heard(policy)
+    assert policy.forward(batch)[0].isfinite()
+    played(policy, SHOWN[0])
+    assert told[-1][0].shape == (1, 0)
+
+
+def there_and_back(count=12, frames=60):
+    """Along a line and back through the same places: where to depends on the way one comes."""
+    rng = torch.Generator().manual_seed(0)
+    time = torch.linspace(0, math.pi, frames)[:, None]
+    paths = [(1 + 0.05 * torch.randn(1, generator=rng)) * torch.sin(time) for _ in range(count)]
+    return [{STATE: x, "action": x} for x in (p.expand(-1, 2).clone() for p in paths)]
+
+
+def test_velocities_tell_the_way_there_from_the_way_back():
+    shown = there_and_back()
+    errors = []
+    for history in (2, 0):
+        settings = dict(n_action_steps=5, n_plans=1, history=history, **UNNAMED)
+        policy = train(chunk_policy(shown, **settings), shown, 300)
+        made = played(policy, shown[0])
+        errors.append((made - shown[0]["action"])[10:].square().mean().sqrt())
+    assert errors[0] < 0.4 * errors[1]
+
+
+# Several plans.
+
+
+@pytest.mark.parametrize(("apart", "expected"), [(2.9, "mean"), (3.1, "likeliest")])
+def test_plans_are_averaged_where_their_error_explains_how_far_apart_they_are(apart, expected):
+    policy = chunk_policy(SHOWN, n_plans=2)
+    policy.error.fill_(0.2)
+    middle = torch.zeros(1, 2, 2, policy.decoder.size)
+    unit = policy.decoder.project(torch.ones(11, 2))  # one everywhere, as near as may be
+    size = policy.decoder.positions(unit).square().mean().sqrt()
+    middle[0, 1] = apart * 0.2 * unit / size
+    plans = Plans(
+        coefficients=middle, scores=torch.tensor([[0.0, 0.1]]), levels=torch.zeros(1, 11, 0)
+    )
+    share = torch.tensor(0.1).sigmoid() if expected == "mean" else 1.0
+    chosen = policy._chosen(plans, None)
+    torch.testing.assert_close(chosen, share * middle[:, 1], rtol=1e-5, atol=1e-6)
+
+
+def test_the_error_of_the_nearest_plan_is_learned_and_kept(tmp_path):
+    shown = passing()
+    policy = chunk_policy(shown, chunk_size=20, n_basis=8, **UNNAMED)
+    at_first = float(policy.error)  # of the linear function, which goes between
+    assert at_first > 0.3
+    train(policy, shown, 400)
+    assert policy.error < 0.5 * at_first
+    policy.save_pretrained(tmp_path)
+    assert MotionChunkPolicy.from_pretrained(tmp_path).error == policy.error
+
+
+@pytest.mark.parametrize(("chunk", "count"), [(50, 10), (31, 10), (16, 5), (4, 2)])
+def test_short_chunks_have_no_more_basis_functions_than_they_can_tell(chunk, count):
+    assert ChunkDecoder(chunk, 0.1).size == count + 3
+
+
+@pytest.mark.parametrize(("step", "expected"), [(0.1, 0.096), (0.05, 0.048), (0.01, 0.0096)])
+def test_motions_blend_within_an_action_or_what_basis_functions_resolve(step, expected):
+    assert ChunkDecoder(16, step).blend_time == pytest.approx(expected)
+    assert ChunkDecoder(200, step).blend_time == pytest.approx(max(0.05, step))
+
+
+# Columns that jump.
+
+
 def gripping(count=10):
     """A gripper that shuts where the arm passes half its way, up to 1, in one step."""
     episodes = []
@@ -415,8 +570,6 @@ def test_padding_is_not_learned():
     batch = samples.batch(torch.tensor([len(SHOWN[0]["action"]) - 2, 5, len(samples) - 1]))
     loss, _ = policy.forward(batch)
     absent = batch["action_is_pad"].clone()
-    # Before the beginning an arm stands where it begins: that much is known of it.
-    absent[:, :5] = False
     batch["action"] = torch.where(absent[..., None], 100.0, batch["action"])
     torch.testing.assert_close(policy.forward(batch)[0], loss, rtol=0, atol=1e-5)
 
@@ -495,6 +648,7 @@ def test_a_policy_begins_with_given_weights_and_a_checkpoint_brings_them(tmp_pat
         ({"n_plans": 0}, "n_plans must be at least 1"),
         ({"blend_time": 0.0}, "blend_time must be positive"),
         ({"state_noise": -0.1}, "state_noise must not be negative"),
+        ({"history": -1}, "history must be 0 frames or more"),
         ({"chunk_size": 3, "n_action_steps": 1}, "chunk_size must be at least 4"),
         ({"two_level_actions": [2]}, "two_level_actions"),
     ],

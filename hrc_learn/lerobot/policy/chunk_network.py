@@ -14,8 +14,10 @@ from hrc_learn.dmp.motion_head import MotionHead
 
 NOISE = 1e-2
 """Of demonstrated actions over their spread: what it hides is not learned."""
+BASIS, ACTIONS_EACH = 10, 3
+"""Basis functions of a chunk, and the fewest actions for each: plans are no finer than that."""
 BLEND_TIME = 0.05
-"""At most, unless it is given [s]."""
+"""At most [s], or one action where that takes longer, unless it is given."""
 BLEND_SHARE = 0.3
 """Of the time between two basis functions. A plan that is off by e at that spacing h is off by
 some 20 e / h^2 in acceleration, which leads a motion astray by 20 e (blend_time / h)^2."""
@@ -38,22 +40,27 @@ class ChunkDecoder(nn.Module):
     projection: Float[Tensor, "M samples"]
 
     def __init__(
-        self, chunk_size: int, step: float, n_basis: int, blend_time: float | None = None
+        self,
+        chunk_size: int,
+        step: float,
+        n_basis: int | None = None,
+        blend_time: float | None = None,
     ):
         """Compute the maps.
 
         Args:
             chunk_size: Actions of a chunk.
             step: From one action to the next [s].
-            n_basis: N, weights a column.
+            n_basis: N, weights a column; None: 10, or one for three actions of short chunks.
             blend_time: About how long a motion takes to get from where it is to what is
-                planned [s]; None: 0.05 s, or less where basis functions are so close to each
-                other that acceleration is uneven within that time.
+                planned [s]; None: 0.05 s or one action, or less where basis functions are so
+                close to each other that acceleration is uneven within that time.
         """
         super().__init__()
+        n_basis = n_basis or min(BASIS, max(2, chunk_size // ACTIONS_EACH))
         between = chunk_size * step / n_basis
         self.step = step
-        self.blend_time = blend_time or min(BLEND_TIME, BLEND_SHARE * between)
+        self.blend_time = blend_time or min(max(BLEND_TIME, step), BLEND_SHARE * between)
         head = MotionHead(1, n_basis, duration=chunk_size * step).double()
         unit = torch.eye(n_basis + 3, dtype=torch.float64)
         time = step * torch.arange(chunk_size + 1, dtype=torch.float64)
@@ -148,11 +155,11 @@ class Plans:
 
 
 class ChunkNetwork(nn.Module):
-    """Plans as a function of what is seen and, where it is known, of how the arm moves.
+    """Plans as a function of what is seen and, where it is known, of how fast that changes.
 
     The plans are a linear function of the numbers seen, which a fit in closed form sets, and a
-    network, which starts with next to nothing. How the arm moves, position and velocity of the
-    actions that are carried out, tells apart what looks alike on the way there and back.
+    network, which starts with next to nothing. Velocities tell apart what looks alike on the
+    way there and back.
     """
 
     mean: Float[Tensor, "D M"]
@@ -164,6 +171,7 @@ class ChunkNetwork(nn.Module):
         *,
         numbers: int,
         features: int,
+        moving: int,
         columns: int,
         two_level: int,
         decoder: ChunkDecoder,
@@ -176,6 +184,7 @@ class ChunkNetwork(nn.Module):
         Args:
             numbers: Of the features, those that a linear function suits, in front.
             features: Of an observation.
+            moving: Velocities.
             columns: D, that move smoothly.
             two_level: G, that know two levels only.
             decoder: For coefficients and the length of a chunk.
@@ -190,7 +199,7 @@ class ChunkNetwork(nn.Module):
         self.register_buffer("spread", torch.ones(columns, decoder.size))
         self.linear = nn.Linear(numbers, columns * decoder.size)
         self.levels = nn.Linear(hidden, self.samples * two_level)
-        self.into = nn.Linear(features + 2 * columns + 1, hidden)
+        self.into = nn.Linear(features + moving + 1, hidden)
         self.blocks = nn.ModuleList(_block(hidden, dropout) for _ in range(2))
         self.plans = nn.Linear(hidden, n_plans * columns * decoder.size)
         self.scores = nn.Linear(hidden, n_plans)
@@ -203,19 +212,19 @@ class ChunkNetwork(nn.Module):
     def forward(
         self,
         features: Float[Tensor, "B F"],
-        moving: Float[Tensor, "B 2 D"],
+        velocity: Float[Tensor, "B V"],
         known: Float[Tensor, "B"],
     ) -> Plans:
         """Plans for what is seen.
 
         Args:
             features: Of the observation.
-            moving: Position and velocity of the motion now, each in its spread.
+            velocity: Of numbers of it, each in its spread.
             known: 1 where that is known, else 0.
         """
         features = features.clamp(-FARTHEST, FARTHEST)
-        motion = moving.flatten(1).clamp(-FARTHEST, FARTHEST) * known[:, None]
-        x = F.gelu(self.into(torch.cat([features, motion, known[:, None]], dim=-1)))
+        velocity = velocity.clamp(-FARTHEST, FARTHEST) * known[:, None]
+        x = F.gelu(self.into(torch.cat([features, velocity, known[:, None]], dim=-1)))
         for block in self.blocks:
             x = x + block(x)
         plain = self.linear(features[:, : self.numbers])[:, None]

@@ -11,11 +11,11 @@ from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
 class DecodingConfig:
     """How a chunk becomes a motion."""
 
-    n_basis: int = 10
-    """Basis functions a coordinate and chunk."""
+    n_basis: int | None = None
+    """Basis functions a coordinate and chunk; None: 10, or one for three actions."""
     blend_time: float | None = None
     """About how long a chunk takes from what is carried out to what is planned [s]; None: 0.05
-    s, or less where basis functions are close to each other."""
+    s or one action, or less where basis functions are close to each other."""
     two_level_actions: list[int] | None = None
     """Components of the action that know two levels only, such as a gripper that is open or
     shut, and are left as they are predicted; None: those that the dataset's statistics show to
@@ -29,7 +29,7 @@ class DecodingConfig:
         Raises:
             ValueError: It is not, or it has no basis functions.
         """
-        if self.n_basis < 1:
+        if self.n_basis is not None and self.n_basis < 1:
             raise ValueError(f"n_basis must be at least 1, got {self.n_basis}")
         if not executed < predicted:
             raise ValueError(

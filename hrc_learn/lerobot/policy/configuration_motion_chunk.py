@@ -7,21 +7,21 @@ from lerobot.optim import CosineDecayWithWarmupSchedulerConfig
 
 from hrc_learn.lerobot.policy.common import MotionPolicyConfig
 
-HISTORY = 4
-"""Actions before a chunk from which training takes the velocity of the motion."""
-
 
 @PreTrainedConfig.register_subclass("motion_chunk")
 @dataclass
 class MotionChunkConfig(MotionPolicyConfig):
     """Chunks of actions, each a motion that goes on from what is being carried out."""
 
-    n_basis: int = 10
-    """Basis functions a coordinate and chunk."""
+    n_basis: int | None = None
+    """Basis functions a coordinate and chunk; None: 10, or one for three actions."""
     hidden_dim: int = 256
     """Width of the network."""
     dropout: float = 0.1
     """Share of the network's hidden features left out in training."""
+    history: int = 2
+    """Frames over which the velocity of observation.state is seen, where every frame is shown
+    (`select_action`); 0: it is not. Training loads a second frame of everything for it."""
     state_noise: float = 0.0
     """Noise on observation.state in training, in its spreads. With 0.15, plans lead back from
     beside what was demonstrated, which matters where demonstrations hardly differ, as those of
@@ -36,8 +36,8 @@ class MotionChunkConfig(MotionPolicyConfig):
     shut, and jump between them; None: those that the dataset's statistics show to be such."""
     blend_time: float | None = None
     """About how long a chunk takes from what is carried out to what is planned [s]; None: 0.05
-    s, or less where the basis functions of a chunk are so close to each other that its
-    acceleration is uneven within that time, with which the motion would go on."""
+    s or one action, or less where the basis functions of a chunk are so close to each other
+    that its acceleration is uneven within that time, with which the motion would go on."""
     optimizer_lr: float = 1e-3
     optimizer_weight_decay: float = 1e-2
     scheduler_decay_steps: int = 20_000
@@ -46,24 +46,27 @@ class MotionChunkConfig(MotionPolicyConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in ("n_basis", "hidden_dim", "n_plans"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ValueError(f"{name} must be at least 1, got {value}")
         if self.blend_time is not None and self.blend_time <= 0:
             raise ValueError(f"blend_time must be positive seconds, got {self.blend_time}")
+        if self.history < 0:
+            raise ValueError(f"history must be 0 frames or more, got {self.history}")
         if self.state_noise < 0:
             raise ValueError(f"state_noise must not be negative, got {self.state_noise}")
         if self.chunk_size < 4:
             raise ValueError(f"chunk_size must be at least 4, got {self.chunk_size}")
 
     @property
-    def observation_delta_indices(self) -> None:
-        """The current observation alone."""
-        return
+    def observation_delta_indices(self) -> list[int] | None:
+        """The current observation, and one before."""
+        return [-self.history, 0] if self.history else None
 
     @property
     def action_delta_indices(self) -> list[int]:
-        """The chunk, the action after it, and those before it."""
-        return list(range(-HISTORY, self.chunk_size + 1))
+        """The chunk, and the action after it."""
+        return list(range(self.chunk_size + 1))
 
     def get_scheduler_preset(self) -> CosineDecayWithWarmupSchedulerConfig:
         """From full rate to nothing along a cosine."""

@@ -29,7 +29,7 @@ from hrc_learn.lerobot.policy.common import (
     require_statistics,
     two_level_columns,
 )
-from hrc_learn.lerobot.policy.configuration_motion_chunk import HISTORY, MotionChunkConfig
+from hrc_learn.lerobot.policy.configuration_motion_chunk import MotionChunkConfig
 from hrc_learn.lerobot.policy.continued_motion import ContinuedMotion, MotionChunk
 from hrc_learn.lerobot.policy.motion_planner import (
     ActionEncoding,
@@ -42,21 +42,22 @@ logger = logging.getLogger(__name__)
 
 MEASURED = 0.5
 """Spreads by which actions may differ from the state of their name to be what it measures."""
-UNSURE = 0.3
-"""Noise on position and velocity of the motion in training, in their spreads: policies that are
-sure of their own past go on with it whatever they see."""
-UNKNOWN = 0.15
-"""Share of samples trained without either, as after a reset."""
+UNKNOWN = 0.3
+"""Share of samples trained without the velocity of the state, as after a reset, and so that
+policies are not sure of their own past, with which they would go on whatever they see."""
 VELOCITY_WEIGHT = 0.005
 """Of the error in velocity, spreads a second, beside that in position."""
 SCORE_WEIGHT = 0.1
 """Of the scores of plans beside the plans: a classification learns faster."""
-SAME_WAY = 0.5
-"""Root mean square distance, in spreads, from which on plans are different ways to go: of
-nearer ones the mean is closer to what is shown than any, of others it is neither way."""
+SAME_WAY = 3.0
+"""Distance from which on plans are different ways to go, in the error of the nearest: of nearer
+ones the mean is closer to what is shown than any, of others it is neither way. Three that share
+one normal distribution are 2.8 apart (Max 1960, "Quantizing for minimum distortion")."""
+FORGETTING = 0.01
+"""Of that error, each step of training."""
 
 SLOWEST = 1e-3
-"""Of the spreads of velocities: what never moved is not divided by nothing."""
+"""Of spreads of velocities, and of turned states: nothing is divided by less."""
 MOST_CHUNKS = 50_000
 """That say enough of a linear function; more are spread evenly."""
 
@@ -64,10 +65,10 @@ MOST_CHUNKS = 50_000
 class MotionChunkPolicy(PreTrainedPolicy):
     """Chunks that begin as what is being carried out goes on: C2, whatever is predicted.
 
-    From each observation, and how the arm moves, a network plans the next second or two. What
-    is carried out is the motion nearest to that plan of those that begin with the position,
-    the velocity and the acceleration that the actions before will have led to. No clock runs:
-    chunks may be asked for at any time, and after `reset` from anywhere.
+    From each observation, and how fast the state in it changes, a network plans the next second
+    or two. What is carried out is the motion nearest to that plan of those that begin with the
+    position, the velocity and the acceleration that the actions before will have led to. No
+    clock runs: chunks may be asked for at any time, and after `reset` from anywhere.
     """
 
     config_class = MotionChunkConfig  # pyright: ignore[reportAssignmentType]
@@ -76,10 +77,13 @@ class MotionChunkPolicy(PreTrainedPolicy):
 
     measured: Int[Tensor, "A"]
     """Columns of the state that hold the action's components; -1: none does."""
+    error: Float[Tensor, ""]
+    """Root mean square distance of the nearest plan from what is shown, in spreads."""
     levels: Float[Tensor, "2 A"]
     """Least and largest action, whitened."""
-    velocity_spread: Float[Tensor, "A"]
-    """Root mean square of the velocity of demonstrated actions, whitened, per second."""
+    velocity_spread: Float[Tensor, "F"]
+    """Root mean square of the velocity of demonstrated states, whitened, per second; of none
+    where it is not seen."""
 
     def __init__(
         self,
@@ -119,9 +123,11 @@ class MotionChunkPolicy(PreTrainedPolicy):
         columns = matched_columns(
             names, states if OBS_STATE in widths else None, (width, widths.get(OBS_STATE, 0))
         )
+        self.register_buffer("error", torch.ones(()))
         self.register_buffer("measured", torch.tensor(columns))
         self.register_buffer("levels", torch.tensor([[-1.0], [1.0]]).repeat(1, width))
-        self.register_buffer("velocity_spread", torch.ones(width))
+        moving = widths.get(OBS_STATE, 0) if config.history else 0
+        self.register_buffer("velocity_spread", torch.ones(moving))
         if config.pretrained_path is None:
             require_any_statistics(dataset_stats, dataset_meta)
             self._whiten(dataset_stats)
@@ -139,6 +145,7 @@ class MotionChunkPolicy(PreTrainedPolicy):
         self.network = ChunkNetwork(
             numbers=sum(widths.values()),
             features=self.encoder.size,
+            moving=moving,
             columns=len(self._smooth),
             two_level=len(self._stepped),
             decoder=self.decoder,
@@ -162,6 +169,7 @@ class MotionChunkPolicy(PreTrainedPolicy):
     def reset(self) -> None:
         """Forget the motion that is under way: the next begins where the arm is measured."""
         self.motion.reset()
+        self._states: deque[Tensor] = deque(maxlen=self.config.history + 1)
         self._action_queue: deque[Tensor] = deque()
 
     def forward(
@@ -172,29 +180,26 @@ class MotionChunkPolicy(PreTrainedPolicy):
         Actions before the beginning of an episode and after its end count as none.
 
         Args:
-            batch: As LeRobot loads it by the config's delta indices: observations (B, ...),
-                `action` (B, HISTORY + chunk + 1, A) and `action_is_pad`.
+            batch: As LeRobot loads it by the config's delta indices: observations (B, 2, ...)
+                of `history` frames ago and of now, or (B, ...) of now alone; `action`
+                (B, chunk + 1, A) and `action_is_pad`.
             reduction: "none" for one loss each, (B), else their mean.
 
         Returns:
             The loss, and the root mean square error of the nearest plans in the spread of
             each component of the action.
         """
-        coordinates = self.encoding.to_coordinates(batch[ACTION])
-        shown = coordinates[:, HISTORY:]
-        velocity = (shown[:, 0] - coordinates[:, 0]) / (HISTORY * self._step)
-        moving = torch.stack([shown[:, 0], velocity / self.velocity_spread], dim=1)
-        known = torch.ones(len(shown), device=shown.device)
+        shown = self.encoding.to_coordinates(batch[ACTION])
+        batch, velocity, known = self._now(batch)
         if self.training:
-            moving = moving + UNSURE * torch.randn_like(moving)
-            known = (torch.rand_like(known) > UNKNOWN).to(moving)
-        features = self.encoder(self._turned(batch))
+            known = known * (torch.rand_like(known) > UNKNOWN)
+        features = self.encoder(batch)
         if self.training and self.config.state_noise:
             own = self.encoder.widths.get(OBS_STATE, 0)  # come first among the features
             noise = self.config.state_noise * torch.randn_like(features[:, :own])
             features = torch.cat([features[:, :own] + noise, features[:, own:]], dim=-1)
-        plans = self.network(features, moving[..., self._smooth], known)
-        present = (~batch[f"{ACTION}_is_pad"][:, HISTORY:]).to(shown)
+        plans = self.network(features, velocity, known)
+        present = (~batch[f"{ACTION}_is_pad"]).to(shown)
         error = self.decoder.positions(plans.coefficients) - shown[:, None, :, self._smooth]
         rate = error.diff(dim=2) / self._step
         each = (error.abs().mean(-1) * present[:, None]).mean(-1)
@@ -209,8 +214,10 @@ class MotionChunkPolicy(PreTrainedPolicy):
             wrong = F.binary_cross_entropy_with_logits(plans.levels, up, reduction="none")
             loss = loss + (wrong.mean(-1) * present).mean(-1)
         square = error.detach()[row, best].square().mean(-1) * present
-        rmse = {"rmse": float((square.sum() / present.sum()).sqrt())}
-        return (loss if reduction == "none" else loss.mean()), rmse
+        rmse = (square.sum() / present.sum()).sqrt()
+        if self.training:
+            self.error.lerp_(rmse, FORGETTING)
+        return (loss if reduction == "none" else loss.mean()), {"rmse": float(rmse)}
 
     @torch.no_grad()
     def predict_action_chunk(
@@ -241,23 +248,28 @@ class MotionChunkPolicy(PreTrainedPolicy):
         if inference_delay < 0:
             raise ValueError(f"inference_delay must not be negative, got {inference_delay}")
         require_numbers(self.config, self.encoder.widths, batch)
-        features = self.encoder(self._turned(batch))
+        self._states.clear()  # Who asks for chunks does not show every frame.
+        plans = self._plans(batch)
         if prev_chunk_left_over is not None:
             before = self.motion.left_over(prev_chunk_left_over)
         elif self.motion.chunk is not None:
-            before = self.motion.nearest(self._planned_now(features))
+            # Where the motion should be for what is seen, if it could begin anywhere.
+            now = self.decoder.states(self._chosen(plans, None))[:, 0, 0]
+            before = self.motion.nearest(now)
         else:
             before = None
-        return self._go_on(batch, features, before, inference_delay)
+        return self._go_on(batch, plans, before, inference_delay)
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Any], **_: Any) -> Float[Tensor, "B A"]:
         """The next action; a new chunk is predicted when the last one is used up."""
+        if OBS_STATE in batch:
+            self._states.append(batch[OBS_STATE])
         if not self._action_queue:
             self.eval()
             require_numbers(self.config, self.encoder.widths, batch)
-            steps, features = self.config.n_action_steps, self.encoder(self._turned(batch))
-            chunk = self._go_on(batch, features, self.motion.after(steps), 0)
+            steps = self.config.n_action_steps
+            chunk = self._go_on(batch, self._plans(batch), self.motion.after(steps), 0)
             self._action_queue.extend(chunk[:, :steps].unbind(1))
         return self._action_queue.popleft()
 
@@ -270,49 +282,65 @@ class MotionChunkPolicy(PreTrainedPolicy):
         """The observation with what turns in its state as an orientation."""
         if not self.turning.triples:
             return batch
-        state = self.turning.to_coordinates(batch[OBS_STATE][:, None])[:, 0]
-        return {**batch, OBS_STATE: state}
+        state = batch[OBS_STATE]
+        turned = self.turning.to_coordinates(state.reshape(-1, 1, state.shape[-1]))
+        return {**batch, OBS_STATE: turned.reshape(state.shape)}
+
+    def _velocity(self, states: Float[Tensor, "B frames F"]) -> Float[Tensor, "B F"]:
+        """From the first to the last of turned states `history` frames apart, whitened."""
+        moved = (states[:, -1] - states[:, 0]) / self.encoder.std[: states.shape[-1]]
+        return moved / (self.config.history * self._step * self.velocity_spread)
+
+    def _now(self, batch: Mapping[str, Any]) -> tuple[dict[str, Any], Tensor, Tensor]:
+        """Loaded samples' observations of now, turned, the velocity, and where it is known."""
+        now = dict(self._turned(batch))
+        velocity = batch[ACTION].new_zeros(len(batch[ACTION]), len(self.velocity_spread))
+        known = velocity.new_zeros(len(velocity))
+        dims = dict.fromkeys(self.encoder.widths, 2) | dict.fromkeys(self.encoder.images, 4)
+        for key in (key for key, n in dims.items() if now[key].ndim > n):
+            if key == OBS_STATE and len(self.velocity_spread):
+                velocity = self._velocity(now[key])
+                known = (~batch[f"{key}_is_pad"][:, 0]).to(velocity)
+            now[key] = now[key][:, -1]
+        return now, velocity, known
 
     def _go_on(
-        self, batch: Observation, features: Tensor, before: MotionChunk | None, delay: int
+        self, batch: Observation, plans: Plans, before: MotionChunk | None, delay: int
     ) -> Float[Tensor, "B chunk A"]:
-        """Plan, and keep the motion that leads from what is carried out to the plan."""
-        plans = self._plans(features, before)
+        """Keep the motion that leads from what is carried out to a plan."""
         planned = self._chosen(plans, before)
         beginning = None
         if before is None:
             beginning = self._beginning(batch, self.decoder.states(planned)[:, 0])
-        upper = (plans.levels > 0).to(features)
+        upper = (plans.levels > 0).to(plans.coefficients)
         actions = self.motion.go_on(planned, upper, before, beginning=beginning, delay=delay)
         return actions[:, :-1]
 
-    def _plans(self, features: Tensor, before: MotionChunk | None) -> Plans:
-        known = features.new_full((len(features),), float(before is not None))
-        moving = features.new_zeros(len(features), 2, len(self._smooth))
-        if before is not None:
-            moving = before.states[:, 0, :2].to(features)
-            moving = (
-                moving
-                / torch.stack([torch.ones_like(self.velocity_spread), self.velocity_spread])[
-                    :, self._smooth
-                ]
-            )
-        return self.network(features, moving, known)
+    def _plans(self, batch: Observation) -> Plans:
+        """For what is seen now, and how fast it has changed."""
+        features = self.encoder(self._turned(batch))
+        velocity = features.new_zeros(len(features), len(self.velocity_spread))
+        known = features.new_zeros(len(features))
+        if self._states.maxlen == len(self._states) > 1:
+            states = torch.stack([self._states[0], self._states[-1]], dim=1)
+            velocity = self._velocity(self._turned({OBS_STATE: states})[OBS_STATE])
+            known = velocity.isfinite().all(-1).to(features)
+        return self.network(features, velocity.nan_to_num(), known)
 
     def _chosen(self, plans: Plans, before: MotionChunk | None) -> Float[Tensor, "B D M"]:
         """One plan: likely, and the way that is being gone; the mean of those of one way."""
-        scores = plans.scores.log_softmax(-1)
+        scores, same = plans.scores.log_softmax(-1), SAME_WAY * self.error
         positions = self.decoder.positions(plans.coefficients)
         if before is not None:
             off = positions - before.states[:, None, :, 0].to(positions)
-            scores = scores - off.square().mean((-2, -1)) / (2 * SAME_WAY**2)
+            scores = scores - off.square().mean((-2, -1)) / (2 * same**2)
         if before is None and self.config.sample_plans:
             chosen = torch.multinomial(scores.exp(), 1)[:, 0]
         else:
             chosen = scores.argmax(-1)
         row = torch.arange(len(chosen), device=chosen.device)
         apart = (positions - positions[row, chosen][:, None]).square().mean((-2, -1))
-        share = scores.masked_fill(apart >= SAME_WAY**2, -torch.inf).softmax(-1)
+        share = scores.masked_fill(apart >= same**2, -torch.inf).softmax(-1)
         return (share[..., None, None] * plans.coefficients).sum(1)
 
     def _beginning(
@@ -326,10 +354,6 @@ class MotionChunkPolicy(PreTrainedPolicy):
         seen, there = seen[:, self._smooth].to(planned), self.measured[self._smooth] >= 0
         position = torch.where(there, seen, planned[:, 0])
         return torch.cat([position[:, None], planned[:, 1:]], dim=1)
-
-    def _planned_now(self, features: Tensor) -> Float[Tensor, "B D"]:
-        """Where the motion should be for what is seen, if it could begin anywhere."""
-        return self.decoder.states(self._chosen(self._plans(features, None), None))[:, 0, 0]
 
     def _compose(self, position: Tensor, upper: Tensor) -> Float[Tensor, "B samples A"]:
         """Actions of whitened positions, and of levels: 1 for the upper one, else 0."""
@@ -410,18 +434,24 @@ class MotionChunkPolicy(PreTrainedPolicy):
             self._keep_measured(torch.cat(states), torch.cat([e[ACTION] for e in episodes]))
             if self.turning.triples:
                 self._learn_turning(states)
-        rates = torch.cat([e[ACTION].diff(dim=0) / self._step for e in episodes])
-        self.velocity_spread.copy_(rates.square().mean(0).sqrt().clamp_min(SLOWEST))
+        if len(self.velocity_spread):
+            turned = [self._turned({OBS_STATE: x})[OBS_STATE] for x in states]
+            moved = torch.cat([x.diff(dim=0) for x in turned]) / self._step
+            rates = (moved / self.encoder.std[: moved.shape[1]]).square().mean(0).sqrt()
+            self.velocity_spread.copy_(rates.clamp_min(SLOWEST))
         deltas: dict[str, Any] = dict.fromkeys(self.encoder.widths)
         samples = self.config.chunk_size + 1
         windows = SampleWindows(episodes, {**deltas, ACTION: range(samples)}, 1 / self._step)
         every = -(-len(windows) // MOST_CHUNKS)
         batch = windows.batch(torch.arange(0, len(windows), every))
-        chunks = batch.pop(ACTION)[..., self._smooth]
+        chunks = batch[ACTION][..., self._smooth]
         numbers = chunks.new_zeros(len(chunks), 0)
         if self.encoder.widths:
             numbers = self.encoder.numbers(self._turned(batch))
         self.network.fit(numbers, self.decoder.project(chunks))
+        linear = self.network.linear(numbers).unflatten(-1, self.network.mean.shape)
+        planned = self.decoder.positions(linear * self.network.spread + self.network.mean)
+        self.error.copy_((planned - chunks).square().mean().sqrt())
 
     def _learn_turning(self, states: list[Tensor]) -> None:
         """Take references of orientations and, for what they make of states, the spread."""
