@@ -383,6 +383,49 @@ def test_velocities_tell_the_way_there_from_the_way_back():
     assert errors[0] < 0.4 * errors[1]
 
 
+# Numbers that hardly vary.
+
+
+def trembling(names=None, size=1e-5):
+    """Demonstrations in which a column, or a hand that points down, follows by a tremble."""
+    episodes = []
+    for e in SHOWN:
+        way = e["action"][:, :1]
+        small = size * torch.cat([way, way.sin(), way.square()], dim=-1)
+        if names:
+            small = small + torch.tensor([math.pi, 0.0, 0.0])
+        state = torch.cat([e[STATE], small if names else small[:, :1]], dim=-1)
+        episodes.append({STATE: state, GOAL: e[GOAL], "action": e["action"]})
+    return episodes
+
+
+@pytest.mark.parametrize(
+    ("names", "off"), [(None, 1e-3), (["ee.wx", "ee.wy", "ee.wz"], 0.01)], ids=["joint", "hand"]
+)
+def test_what_only_trembles_leads_no_motion_astray(names, off):
+    """Off by a hundred times what was shown, or more, it changes next to nothing."""
+    shown = trembling(names)
+    named = ["b.pos", "gripper.pos", "a.pos", *(names or ["held.pos"])]
+    policy = chunk_policy(shown, state_names=named)
+    seen = {key: shown[0][key][10:11].clone() for key in (STATE, GOAL)}
+    usual = policy.predict_action_chunk(seen)
+    policy.reset()
+    seen[STATE][:, 3:] += off
+    moved = policy.predict_action_chunk(seen) - usual
+    assert moved.abs().max() < 0.05 * stats_of(shown)["action"]["std"].max()
+
+
+def test_slow_columns_are_not_blown_up_as_velocities():
+    """A held joint that is shaken: slow beside what moves, fast beside what it did."""
+    policy = chunk_policy(trembling(), n_action_steps=1, state_names=[*"bga", "held"])
+    told = heard(policy)
+    seen = {key: trembling()[0][key][:3].clone() for key in (STATE, GOAL)}
+    seen[STATE][2, 3] += 1e-3
+    played(policy, seen, 3)
+    assert told[2][1] == 1
+    assert told[2][0][0, 3].abs() < 1
+
+
 # Several plans.
 
 

@@ -7,7 +7,6 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from hrc_learn.dmp import fit_ridge
 from hrc_learn.dmp.motion_head import MotionHead
 
 # Chunks as a motion: a linear map of few numbers, with its derivatives.
@@ -243,10 +242,13 @@ class ChunkNetwork(nn.Module):
         self.spread.copy_(coefficients.std(0).clamp_min(SPREAD))
         whitened = ((coefficients - self.mean) / self.spread).flatten(1)
         if self.numbers:
-            fit = fit_ridge(numbers.double(), whitened.double(), RIDGE)
-            slopes = fit.coefficients[1:] / fit.scale[:, None]
+            # Not whitened again: what hardly varies would be blown up after all.
+            x, mean = numbers.double(), numbers.double().mean(0)
+            penalty = len(x) * RIDGE * torch.eye(self.numbers).to(x)
+            off = x - mean
+            slopes = torch.linalg.solve(off.T @ off + penalty, off.T @ whitened.double())
             self.linear.weight.copy_(slopes.T)
-            self.linear.bias.copy_(-numbers.double().mean(0) @ slopes)
+            self.linear.bias.copy_(-mean @ slopes)
 
 
 def _block(hidden: int, dropout: float) -> nn.Module:

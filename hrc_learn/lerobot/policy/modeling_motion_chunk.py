@@ -36,7 +36,7 @@ from hrc_learn.lerobot.policy.motion_planner import (
     matched_columns,
     rotation_triples,
 )
-from hrc_learn.lerobot.policy.networks import Observation
+from hrc_learn.lerobot.policy.networks import Observation, divisors
 
 logger = logging.getLogger(__name__)
 
@@ -56,8 +56,11 @@ one normal distribution are 2.8 apart (Max 1960, "Quantizing for minimum distort
 FORGETTING = 0.01
 """Of that error, each step of training."""
 
-SLOWEST = 1e-3
-"""Of spreads of velocities, and of turned states: nothing is divided by less."""
+SMALLEST_TURN = 0.05
+"""Spread of orientations, at least [rad]: a hand that points down in all demonstrations
+trembles by 1e-5, and tilts by more as soon as anything differs from what was shown."""
+SLOWEST = 0.3
+"""Of the median velocity in spreads: columns that are slower are not blown up either."""
 MOST_CHUNKS = 50_000
 """That say enough of a linear function; more are spread evenly."""
 
@@ -438,7 +441,7 @@ class MotionChunkPolicy(PreTrainedPolicy):
             turned = [self._turned({OBS_STATE: x})[OBS_STATE] for x in states]
             moved = torch.cat([x.diff(dim=0) for x in turned]) / self._step
             rates = (moved / self.encoder.std[: moved.shape[1]]).square().mean(0).sqrt()
-            self.velocity_spread.copy_(rates.clamp_min(SLOWEST))
+            self.velocity_spread.copy_(divisors(rates, SLOWEST))
         deltas: dict[str, Any] = dict.fromkeys(self.encoder.widths)
         samples = self.config.chunk_size + 1
         windows = SampleWindows(episodes, {**deltas, ACTION: range(samples)}, 1 / self._step)
@@ -462,7 +465,9 @@ class MotionChunkPolicy(PreTrainedPolicy):
         mean, std = self.encoder.mean, self.encoder.std
         first = slice(0, len(turning.mean))  # states come first among the numbers
         mean[first] = turned.mean(0)
-        std[first] = turned.std(0).clamp_min(SLOWEST)
+        std[first] = divisors(turned.std(0))
+        for triple in turning.triples:
+            std[triple] = std[triple].clamp_min(SMALLEST_TURN)
 
     def _keep_measured(self, states: Tensor, coordinates: Tensor) -> None:
         """Drop columns of the state whose values are not those that actions set."""

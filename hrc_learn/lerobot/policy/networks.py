@@ -172,7 +172,7 @@ class ObservationEncoder(nn.Module):
             return
         mean = torch.cat([torch.as_tensor(stats[key]["mean"]) for key in self.widths])
         self.mean.copy_(mean)
-        spreads = [_spread(torch.as_tensor(stats[key]["std"])) for key in self.widths]
+        spreads = [divisors(torch.as_tensor(stats[key]["std"])) for key in self.widths]
         self.std.copy_(torch.cat(spreads))
 
     def load_vision(self, path: Path) -> None:
@@ -199,12 +199,12 @@ class ObservationEncoder(nn.Module):
         return torch.cat([self.numbers(observation), *seen], dim=-1)
 
 
-def _spread(std: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
-    """What the numbers of a feature are divided by."""
+def divisors(std: Float[Tensor, "n"], share: float = SMALLEST_SHARE) -> Float[Tensor, "n"]:
+    """What the numbers of a feature are divided by: spreads, at least a share of the median."""
     varies = std > SMALLEST_SPREAD
     if not varies.any():
         return torch.ones_like(std)
-    least = SMALLEST_SHARE * std[varies].median()
+    least = share * std[varies].median()
     return torch.where(varies, std.clamp_min(least), 1.0)
 
 
