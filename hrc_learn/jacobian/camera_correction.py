@@ -26,6 +26,9 @@ from hrc_learn.jacobian.camera_motion import (
 
 _FRAMES = 600
 """Of the marker from which a motion is found: half a minute at 20 a second."""
+_FEWEST = 1
+"""Frames that tell a motion to begin with: until then what is seen leads the arm astray, soon
+to where no demonstration went and nothing can be told."""
 _AGREEMENT = 10.0
 """Root mean square [px] up to which pixels of objects and the places they were taken from are
 of the same camera: people grasp an object some millimetres from where its marker is."""
@@ -96,7 +99,7 @@ class CameraCorrection:
     def __init__(self, reference: CameraReference):
         self.motion: CameraMotion | None = None
         self._reference = reference
-        self._watch = CameraWatch(reference)
+        self._watch = CameraWatch(reference, _FEWEST)
         self._frames: deque[tuple[float, np.ndarray, np.ndarray]] = deque(maxlen=_FRAMES)
         self._twist = np.zeros(6)
 

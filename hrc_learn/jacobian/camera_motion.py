@@ -197,9 +197,17 @@ class CameraWatch:
         displacement: Of the last seconds [px]; 0 while too little is seen.
     """
 
-    def __init__(self, reference: CameraReference):
+    def __init__(self, reference: CameraReference, fewest: int = _FEWEST):
+        """Compare with a camera that stands still.
+
+        Args:
+            reference: Of the demonstrations.
+            fewest: Frames from which on a motion is told; of less than 10, the fewer the larger
+                it must be.
+        """
         self.reference = reference
         self.displacement = 0.0
+        self._fewest = fewest
         self._frames: deque[_Frame] = deque()
 
     def clear(self) -> None:
@@ -250,13 +258,13 @@ class CameraWatch:
             )
         while frames and frames[0].time < time - self.reference.window:
             frames.popleft()
-        if len(frames) < _FEWEST:
+        if len(frames) < self._fewest:
             self.displacement = 0.0
             return None
         errors = np.array([frame.error for frame in frames])
         jacobians = np.array([frame.jacobian for frame in frames])
         twist, self.displacement = _explained(errors, jacobians)
-        if self.displacement <= self.reference.threshold:
+        if self.displacement <= self.reference.threshold * max(1, _FEWEST / len(frames)):
             return None
         points, pixels = (np.array([f[i] for f in frames]) for i in (1, 2))
         return motion_of(refined_twist(camera, points, pixels, twist), points, camera)

@@ -456,12 +456,12 @@ def test_the_error_of_the_nearest_plan_is_learned_and_kept(tmp_path):
     assert MotionChunkPolicy.from_pretrained(tmp_path).error == policy.error
 
 
-@pytest.mark.parametrize(("chunk", "count"), [(50, 10), (31, 10), (16, 5), (4, 2)])
+@pytest.mark.parametrize(("chunk", "count"), [(50, 10), (24, 9), (16, 6), (4, 2)])
 def test_short_chunks_have_no_more_basis_functions_than_they_can_tell(chunk, count):
     assert ChunkDecoder(chunk, 0.1).size == count + 3
 
 
-@pytest.mark.parametrize(("step", "expected"), [(0.1, 0.096), (0.05, 0.048), (0.01, 0.0096)])
+@pytest.mark.parametrize(("step", "expected"), [(0.1, 0.08), (0.05, 0.04), (0.01, 0.008)])
 def test_motions_blend_within_an_action_or_what_basis_functions_resolve(step, expected):
     assert ChunkDecoder(16, step).blend_time == pytest.approx(expected)
     assert ChunkDecoder(200, step).blend_time == pytest.approx(max(0.05, step))

@@ -13,7 +13,7 @@ from hrc_learn.dmp.motion_head import MotionHead
 
 NOISE = 1e-2
 """Of demonstrated actions over their spread: what it hides is not learned."""
-BASIS, ACTIONS_EACH = 10, 3
+BASIS, ACTIONS_EACH = 10, 2.5
 """Basis functions of a chunk, and the fewest actions for each: plans are no finer than that."""
 BLEND_TIME = 0.05
 """At most [s], or one action where that takes longer, unless it is given."""
@@ -50,13 +50,13 @@ class ChunkDecoder(nn.Module):
         Args:
             chunk_size: Actions of a chunk.
             step: From one action to the next [s].
-            n_basis: N, weights a column; None: 10, or one for three actions of short chunks.
+            n_basis: N, weights a column; None: 10, or two for five actions.
             blend_time: About how long a motion takes to get from where it is to what is
                 planned [s]; None: 0.05 s or one action, or less where basis functions are so
                 close to each other that acceleration is uneven within that time.
         """
         super().__init__()
-        n_basis = n_basis or min(BASIS, max(2, chunk_size // ACTIONS_EACH))
+        n_basis = n_basis or min(BASIS, max(2, int(chunk_size / ACTIONS_EACH)))
         between = chunk_size * step / n_basis
         self.step = step
         self.blend_time = blend_time or min(max(BLEND_TIME, step), BLEND_SHARE * between)

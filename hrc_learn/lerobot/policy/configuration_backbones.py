@@ -12,7 +12,7 @@ class DecodingConfig:
     """How a chunk becomes a motion."""
 
     n_basis: int | None = None
-    """Basis functions a coordinate and chunk; None: 10, or one for three actions."""
+    """Basis functions a coordinate and chunk; None: 10, or two for five actions."""
     blend_time: float | None = None
     """About how long a chunk takes from what is carried out to what is planned [s]; None: 0.05
     s or one action, or less where basis functions are close to each other."""

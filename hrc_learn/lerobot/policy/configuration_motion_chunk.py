@@ -14,7 +14,7 @@ class MotionChunkConfig(MotionPolicyConfig):
     """Chunks of actions, each a motion that goes on from what is being carried out."""
 
     n_basis: int | None = None
-    """Basis functions a coordinate and chunk; None: 10, or one for three actions."""
+    """Basis functions a coordinate and chunk; None: 10, or two for five actions."""
     hidden_dim: int = 256
     """Width of the network."""
     dropout: float = 0.1
