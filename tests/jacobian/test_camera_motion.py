@@ -306,6 +306,39 @@ def test_a_camera_that_stands_still_is_not_corrected(reference, plane):
     np.testing.assert_array_equal(correction.object(plane, pixel), pixel)
 
 
+@pytest.mark.parametrize("place", KNOCKS[:2])
+def test_a_single_frame_tells_most_of_a_large_motion(reference, plane, place):
+    """So that nobody acts on what a moved camera shows until a second has passed."""
+    rng = np.random.default_rng(16)
+    correction = CameraCorrection(reference)
+    demo = demonstration(rng, place)
+    first = int(demo.visible.nonzero()[0])
+    pose, pixel = demo.pose[first], demo.feature[first].double().numpy()
+    assert correction.update(0.0, pose, pixel) is not None
+    marker = shown_at(pose.apply(torch.from_numpy(MARKER)).numpy()[None])[0]
+    np.testing.assert_allclose(correction.marker(pose, pixel), marker, rtol=0, atol=2.0)
+    there, _ = objects(rng)
+    found = [correction.object(plane, pixel) for pixel in shown_at(there, place)]
+    left = np.linalg.norm(found - shown_at(there), axis=-1)
+    assert np.median(left) < 0.5 * np.median(
+        np.linalg.norm(shown_at(there, place) - shown_at(there), axis=-1)
+    )
+
+
+@pytest.mark.parametrize(("frames", "thresholds"), [(1, 10), (4, 2.5), (10, 1), (20, 1)])
+def test_the_fewer_frames_the_more_they_must_show(reference, frames, thresholds):
+    demo = demonstration(np.random.default_rng(17), noise=0.0)
+    seen = demo.visible.nonzero()[:frames, 0]
+    for share, expected in ((0.8, False), (1.3, True)):
+        correction = CameraCorrection(reference)
+        for k in map(int, seen):
+            # All pixels are off alike, as when the camera is turned a little.
+            off = np.array([share * thresholds * reference.threshold, 0.0])
+            pixel = demo.feature[k].double().numpy() + off
+            correction.update(k / FPS, demo.pose[k], pixel)
+        assert (correction.motion is not None) == expected
+
+
 def test_a_camera_may_be_moved_again_and_put_back(reference, plane):
     rng = np.random.default_rng(14)
     correction = CameraCorrection(reference)

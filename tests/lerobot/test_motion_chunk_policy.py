@@ -420,7 +420,7 @@ def test_slow_columns_are_not_blown_up_as_velocities():
     policy = chunk_policy(trembling(), n_action_steps=1, state_names=[*"bga", "held"])
     told = heard(policy)
     seen = {key: x[:3].clone() for key, x in trembling()[0].items()}
-    seen[STATE][2, 3] += 1e-3
+    seen[STATE][2, 3] += 2e-4
     played(policy, seen, 3)
     assert told[2][1] == 1
     assert told[2][0][0, 3].abs() < 1
