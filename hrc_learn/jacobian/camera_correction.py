@@ -29,6 +29,8 @@ _FRAMES = 600
 _FEWEST = 1
 """Frames that tell a motion to begin with: until then what is seen leads the arm astray, soon
 to where no demonstration went and nothing can be told."""
+_SURE = 10
+"""Frames that are not forgotten again where the next is as if the camera had not been moved."""
 _AGREEMENT = 10.0
 """Root mean square [px] up to which pixels of objects and the places they were taken from are
 of the same camera: people grasp an object some millimetres from where its marker is."""
@@ -121,7 +123,8 @@ class CameraCorrection:
         """
         camera = self._reference.camera
         point = camera.points(Pose(pose.position.double(), pose.orientation.double()))
-        noticed = self._watch.update(time, pose, self.marker(pose, pixel))
+        corrected = self.marker(pose, pixel)
+        noticed = self._watch.update(time, pose, corrected)
         if not self._reference.covers(point):
             return None
         self._frames.append((time, point, pixel))
@@ -132,6 +135,15 @@ class CameraCorrection:
             self._find(steps=1)  # from where the frame before has led
             return None
         self._watch.clear()
+        if self.motion is not None and len(self._frames) < _SURE:
+            there = camera.project(point)
+            if np.linalg.norm(pixel - there) < np.linalg.norm(corrected - there):
+                # A marker was wrong in the first frames: the camera stands where it stood.
+                self.motion, self._twist = None, np.zeros(6)
+                self._frames.clear()
+            else:
+                self._find()
+            return None
         if self.motion is not None and self._find() <= self._reference.threshold:
             return None  # it is known better now, that is all
         self._forget(time)

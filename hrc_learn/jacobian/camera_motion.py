@@ -30,6 +30,8 @@ from hrc_learn.jacobian.samples import FOLDS, ImageDemonstration
 _PLAUSIBLE = np.array([0.1] * 3 + [0.1] * 3)
 """Prior standard deviation of a motion [rad, m]: settles which of a turn and a shift that look
 alike is meant, by taking both as likely for a tripod that was knocked."""
+_FARTHEST = 5.0
+"""Of these a camera is not taken to have moved by more: it would not see the table any longer."""
 _FEWEST = 10
 """Frames with the marker in view below which nothing is said."""
 _OUTLIER = 3.0
@@ -380,16 +382,24 @@ def _double(pose: Pose) -> Pose:
 
 
 def _explained(
-    errors: Float[np.ndarray, "frames 2"], jacobians: Float[np.ndarray, "frames 2 6"]
+    errors: Float[np.ndarray, "frames 2"],
+    jacobians: Float[np.ndarray, "frames 2 6"],
+    already: Float[np.ndarray, "6"] | None = None,
 ) -> tuple[Float[np.ndarray, "6"], float]:
-    """The motion that explains the errors best, and how much of them, rms [px]."""
+    """The motion that explains the errors best, and how much of them, rms [px].
+
+    Of a camera that has moved by `already`, all of which is to be plausible.
+    """
     size = np.linalg.norm(errors, axis=-1)
     # At least a tenth of a pixel, so that exact images are not all outliers.
     most = max(_OUTLIER * float(np.median(size)), 0.1)
     errors = errors * np.minimum(1.0, most / np.maximum(size, most))[:, None]
     scaled = jacobians * _PLAUSIBLE
     gram = np.einsum("fij,fik->jk", scaled, scaled) + np.eye(6)
-    unit = np.linalg.solve(gram, np.einsum("fij,fi->j", scaled, errors))
+    towards = np.einsum("fij,fi->j", scaled, errors)
+    if already is not None:
+        towards -= already / _PLAUSIBLE
+    unit = np.linalg.solve(gram, towards)
     return _PLAUSIBLE * unit, _root_mean_square(scaled @ unit)
 
 
@@ -404,12 +414,14 @@ def refined_twist(
     for _ in range(steps):
         seen = from_moved(points, twist)
         errors = pixels - camera.project(seen)
-        step, _ = _explained(errors, camera.motion_jacobian(seen))
+        step, _ = _explained(errors, camera.motion_jacobian(seen), twist)
         # In the frame of the camera as moved so far.
         turn = quaternion.exp(torch.from_numpy(np.stack([twist[:3], step[:3]])))
         both = quaternion.log(quaternion.multiply(turn[0], turn[1])).numpy()
         shift = quaternion.rotate(turn[0], torch.from_numpy(step[3:])).numpy()
         twist = np.concatenate([both, twist[3:] + shift])
+        # Two frames that contradict each other would lead to where both are behind the camera.
+        twist = twist * min(1.0, _FARTHEST / float(np.linalg.norm(twist / _PLAUSIBLE)))
     return twist
 
 

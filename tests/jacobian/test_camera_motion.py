@@ -325,6 +325,21 @@ def test_a_single_frame_tells_most_of_a_large_motion(reference, plane, place):
     )
 
 
+def test_a_wrong_marker_in_one_frame_is_undone_by_those_after_it(reference):
+    correction, demo = CameraCorrection(reference), demonstration(np.random.default_rng(18))
+    seen = demo.visible.nonzero()[:, 0].tolist()
+    wrong = demo.feature[seen[0]].double().numpy() + np.array([150.0, -80.0])
+    assert correction.update(seen[0] / FPS, demo.pose[seen[0]], wrong) is not None
+    for k in seen[1:]:
+        correction.update(k / FPS, demo.pose[k], demo.feature[k].double().numpy())
+    pixels = demo.feature[seen[1:]].double().numpy()
+    found = [
+        correction.marker(demo.pose[k], pixel)
+        for k, pixel in zip(seen[1:], pixels, strict=True)
+    ]
+    assert np.abs(np.array(found) - pixels).max() < 2.0
+
+
 @pytest.mark.parametrize(("frames", "thresholds"), [(1, 10), (4, 2.5), (10, 1), (20, 1)])
 def test_the_fewer_frames_the_more_they_must_show(reference, frames, thresholds):
     demo = demonstration(np.random.default_rng(17), noise=0.0)
