@@ -31,7 +31,7 @@ _PLAUSIBLE = np.array([0.1] * 3 + [0.1] * 3)
 """Prior standard deviation of a motion [rad, m]: settles which of a turn and a shift that look
 alike is meant, by taking both as likely for a tripod that was knocked."""
 _FARTHEST = 5.0
-"""Of these a camera is not taken to have moved by more: it would not see the table any longer."""
+"""Of these a camera has not moved by more: it would not see the table any longer."""
 _FEWEST = 10
 """Frames with the marker in view below which nothing is said."""
 _OUTLIER = 3.0

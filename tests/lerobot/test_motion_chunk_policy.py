@@ -24,6 +24,7 @@ from torchvision.models import resnet18
 
 from hrc_learn.lerobot import MotionChunkConfig
 from hrc_learn.lerobot.policy.chunk_network import ChunkDecoder, Plans
+from hrc_learn.lerobot.policy.continued_motion import MotionChunk
 from hrc_learn.lerobot.policy.modeling_motion_chunk import MotionChunkPolicy
 
 SHOWN = reaching(10)
@@ -353,6 +354,21 @@ def test_a_frame_that_was_not_measured_leaves_the_velocity_unknown():
     assert not told[1][0].any()
 
 
+def test_three_samples_in_ten_are_trained_without_their_velocity():
+    policy = chunk_policy(SHOWN)
+    told = heard(policy)
+    batch = windows(policy, SHOWN).draw(4000, torch.Generator().manual_seed(0))
+    moving = ~batch[f"{STATE}_is_pad"][:, 0]
+    for training in (True, False):
+        with torch.random.fork_rng():
+            torch.manual_seed(0)
+            policy.train(training).forward(batch)
+    (_, known), (_, all_known) = told
+    torch.testing.assert_close(all_known, moving.float(), rtol=0, atol=0)
+    assert not known[~moving].any()
+    assert 0.67 < known[moving].mean() < 0.73
+
+
 def test_without_a_history_one_frame_is_loaded_and_seen():
     policy = chunk_policy(SHOWN, history=0)
     assert policy.config.observation_delta_indices is None
@@ -429,20 +445,40 @@ def test_slow_columns_are_not_blown_up_as_velocities():
 # Several plans.
 
 
+def two_plans(policy, apart, score):
+    """The first stands still, the second is so far off everywhere and has another score."""
+    coefficients = torch.zeros(1, 2, 2, policy.decoder.size)
+    unit = policy.decoder.project(torch.ones(11, 2))  # one everywhere, as near as may be
+    size = policy.decoder.positions(unit).square().mean().sqrt()
+    coefficients[0, 1] = apart * unit / size
+    return Plans(
+        coefficients=coefficients,
+        scores=torch.tensor([[0.0, score]]),
+        levels=torch.zeros(1, 11, 0),
+    )
+
+
 @pytest.mark.parametrize(("apart", "expected"), [(2.9, "mean"), (3.1, "likeliest")])
 def test_plans_are_averaged_where_their_error_explains_how_far_apart_they_are(apart, expected):
     policy = chunk_policy(SHOWN, n_plans=2)
     policy.error.fill_(0.2)
-    middle = torch.zeros(1, 2, 2, policy.decoder.size)
-    unit = policy.decoder.project(torch.ones(11, 2))  # one everywhere, as near as may be
-    size = policy.decoder.positions(unit).square().mean().sqrt()
-    middle[0, 1] = apart * 0.2 * unit / size
-    plans = Plans(
-        coefficients=middle, scores=torch.tensor([[0.0, 0.1]]), levels=torch.zeros(1, 11, 0)
-    )
+    plans = two_plans(policy, 0.2 * apart, 0.1)
     share = torch.tensor(0.1).sigmoid() if expected == "mean" else 1.0
+    second = plans.coefficients[:, 1]
     chosen = policy._chosen(plans, None)
-    torch.testing.assert_close(chosen, share * middle[:, 1], rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(chosen, share * second, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize(("score", "stays"), [(1.2, True), (1.6, False)])
+def test_a_motion_stays_with_its_way_unless_another_is_far_likelier(score, stays):
+    """Five errors off: by 5^2 / (2 3^2) = 1.39 in the logarithm."""
+    policy = chunk_policy(SHOWN, n_plans=2)
+    policy.error.fill_(0.2)
+    plans = two_plans(policy, 1.0, score)
+    still = torch.zeros(1, 11, 3, 2)
+    before = MotionChunk(states=still, stepped=still[:, :, 0, :0], actions=still[:, :, 0])
+    assert (policy._chosen(plans, None) != 0).any()
+    assert (policy._chosen(plans, before) == 0).all() == stays
 
 
 def test_the_error_of_the_nearest_plan_is_learned_and_kept(tmp_path):
