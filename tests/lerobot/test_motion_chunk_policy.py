@@ -319,6 +319,18 @@ def test_velocities_are_the_same_in_training_and_in_use(history, episode, names)
     torch.testing.assert_close(told[0][0][sure], velocity[sure], rtol=0, atol=1e-5)
 
 
+def test_of_two_frames_the_later_one_is_what_is_seen():
+    episodes, rng = SHOWN[:2], torch.Generator().manual_seed(0)
+    episodes = [
+        e | {IMAGE: torch.rand(len(e[STATE]), 3, 16, 24, generator=rng)} for e in episodes
+    ]
+    policy, seen = chunk_policy(episodes).eval(), []
+    policy.network.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    policy.forward(windows(policy, episodes).batch(torch.arange(12)))
+    now = {key: episodes[0][key][:12] for key in (STATE, GOAL, IMAGE)}
+    torch.testing.assert_close(seen[0], policy.encoder(now))
+
+
 def test_velocities_are_differences_in_their_own_spread():
     policy = chunk_policy(SHOWN, history=3, n_action_steps=1)
     told = heard(policy)
@@ -486,6 +498,7 @@ def test_the_error_of_the_nearest_plan_is_learned_and_kept(tmp_path):
     policy = chunk_policy(shown, chunk_size=20, n_basis=8, **UNNAMED)
     at_first = float(policy.error)  # of the linear function, which goes between
     assert at_first > 0.3
+    assert chunk_policy(decaying(), **UNNAMED).error < 0.05  # whose future is linear
     train(policy, shown, 400)
     assert policy.error < 0.5 * at_first
     policy.save_pretrained(tmp_path)
