@@ -379,6 +379,15 @@ def test_three_samples_in_ten_are_trained_without_their_velocity():
     torch.testing.assert_close(all_known, moving.float(), rtol=0, atol=0)
     assert not known[~moving].any()
     assert 0.67 < known[moving].mean() < 0.73
+    # What is unknown has no effect, whatever it would be.
+    policy = wild(policy.eval())
+    features, velocity = policy.encoder({k: SHOWN[0][k][:5] for k in (STATE, GOAL)}), told[0][0]
+    for share, same in ((0.0, True), (1.0, False)):
+        plans = [
+            policy.network(features, v, torch.full((5,), share)).coefficients
+            for v in (velocity[:5], velocity[5:10] + 1)
+        ]
+        assert torch.equal(*plans) == same
 
 
 def test_without_a_history_one_frame_is_loaded_and_seen():
