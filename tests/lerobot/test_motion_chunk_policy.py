@@ -502,6 +502,16 @@ def test_a_motion_stays_with_its_way_unless_another_is_far_likelier(score, stays
     assert (policy._chosen(plans, before) == 0).all() == stays
 
 
+@pytest.mark.parametrize("error", [0.0, 1e-12])
+def test_plans_without_an_error_are_plans_all_the_same(error):
+    """Of demonstrations that stand still."""
+    still = [{STATE: torch.ones(40, 2), "action": torch.ones(40, 2)} for _ in range(3)]
+    policy = chunk_policy(still, **UNNAMED)
+    policy.error.fill_(error)
+    made = played(policy, still[0])
+    torch.testing.assert_close(made, still[0]["action"], rtol=0, atol=1e-3)
+
+
 def test_the_error_of_the_nearest_plan_is_learned_and_kept(tmp_path):
     shown = passing()
     policy = chunk_policy(shown, chunk_size=20, n_basis=8, **UNNAMED)

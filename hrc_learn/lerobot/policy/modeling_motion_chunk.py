@@ -53,6 +53,8 @@ SAME_WAY = 3.0
 """Distance from which on plans are different ways to go, in the error of the nearest: of nearer
 ones the mean is closer to what is shown than any, of others it is neither way. Three that share
 one normal distribution are 2.8 apart (Max 1960, "Quantizing for minimum distortion")."""
+LEAST_ERROR = 1e-3
+"""In spreads: where nothing moves there is none, and plans are the same way all the same."""
 FORGETTING = 0.01
 """Of that error, each step of training."""
 
@@ -332,7 +334,10 @@ class MotionChunkPolicy(PreTrainedPolicy):
 
     def _chosen(self, plans: Plans, before: MotionChunk | None) -> Float[Tensor, "B D M"]:
         """One plan: likely, and the way that is being gone; the mean of those of one way."""
-        scores, same = plans.scores.log_softmax(-1), SAME_WAY * self.error
+        scores, same = (
+            plans.scores.log_softmax(-1),
+            SAME_WAY * self.error.clamp_min(LEAST_ERROR),
+        )
         positions = self.decoder.positions(plans.coefficients)
         if before is not None:
             off = positions - before.states[:, None, :, 0].to(positions)
