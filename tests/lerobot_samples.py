@@ -121,7 +121,9 @@ def chunk_policy(episodes: list[Episode], **changes) -> MotionChunkPolicy:
         "push_to_hub": False,
     }
     config = MotionChunkConfig(**features_of(episodes[0]), **settings | changes)
-    policy = MotionChunkPolicy(config, dataset_stats=stats_of(episodes))
+    with torch.random.fork_rng():
+        torch.manual_seed(0)  # of the weights, whatever was drawn before
+        policy = MotionChunkPolicy(config, dataset_stats=stats_of(episodes))
     policy.fit(episodes)
     return policy
 
