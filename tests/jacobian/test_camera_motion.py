@@ -23,6 +23,7 @@ from hrc_learn.jacobian import (
     RBFImageJacobian,
     camera_placements,
 )
+from hrc_learn.jacobian.camera_motion import from_moved, refined_twist
 
 IMAGE, FPS, MARKER = (1440, 1080), 25.0, np.array([0.0, 0.06, 0.03])
 ROTATION, SHIFT = np.array([np.pi - 0.2, 0.1, 0.05]), np.array([-0.4, 0.05, 1.1])
@@ -323,6 +324,22 @@ def test_a_single_frame_tells_most_of_a_large_motion(reference, plane, place):
     assert np.median(left) < 0.5 * np.median(
         np.linalg.norm(shown_at(there, place) - shown_at(there), axis=-1)
     )
+
+
+def test_few_frames_lead_to_the_likeliest_motion_and_never_far(camera):
+    """Of errors [px] and a prior spread of 0.1 rad and 0.1 m, the most probable motion."""
+    prior, points = 0.1, np.array([[0.05, -0.1, 0.9], [0.06, -0.1, 0.9]])
+    pixels = camera.project(points) + np.array([100.0, 60.0])
+    twist = refined_twist(camera, points, pixels, np.zeros(6), steps=60)
+    seen = from_moved(points, twist)
+    errors, jacobian = pixels - camera.project(seen), camera.motion_jacobian(seen)
+    slope = prior * np.einsum("fij,fi->j", jacobian, errors) - twist / prior
+    # The turn composes, so that the prior is exact to first order only.
+    assert np.linalg.norm(slope) < 0.2 * np.linalg.norm(twist / prior)
+    # Two frames of the same place that contradict each other.
+    pixels = camera.project(points) + np.array([[400.0, 300.0], [-400.0, 100.0]])
+    twist = refined_twist(camera, points, pixels, np.zeros(6), steps=60)
+    assert np.linalg.norm(twist / prior) <= 5.0 + 1e-9
 
 
 def test_a_wrong_marker_in_one_frame_is_undone_by_those_after_it(reference):
