@@ -331,6 +331,19 @@ def test_of_two_frames_the_later_one_is_what_is_seen():
     torch.testing.assert_close(seen[0], policy.encoder(now))
 
 
+def test_observations_may_be_written_over_one_another():
+    """As of a loop that fills one array again and again."""
+    policy = chunk_policy(SHOWN, n_action_steps=1)
+    told = heard(policy)
+    seen = {key: SHOWN[0][key][:1].clone() for key in (STATE, GOAL)}
+    for k in range(10):
+        seen[STATE].copy_(SHOWN[0][STATE][k])
+        policy.select_action(seen)
+    played(policy, SHOWN[0], 10)
+    torch.testing.assert_close(told[9][0], told[19][0])
+    assert told[9][0].any()
+
+
 def test_velocities_are_differences_in_their_own_spread():
     policy = chunk_policy(SHOWN, history=3, n_action_steps=1)
     told = heard(policy)

@@ -269,7 +269,7 @@ class MotionChunkPolicy(PreTrainedPolicy):
     def select_action(self, batch: dict[str, Any], **_: Any) -> Float[Tensor, "B A"]:
         """The next action; a new chunk is predicted when the last one is used up."""
         if OBS_STATE in batch:
-            self._states.append(batch[OBS_STATE])
+            self._states.append(batch[OBS_STATE].clone())  # its memory may be used again
         if not self._action_queue:
             self.eval()
             require_numbers(self.config, self.encoder.widths, batch)
