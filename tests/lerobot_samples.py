@@ -165,3 +165,50 @@ def played(
             for k in range(frames)
         ]
     )
+
+
+DECAY = 1.5
+"""Of the decay to the origin in `decaying` [1/s]."""
+
+
+def decaying(count=12, frames=80):
+    """Motions whose future is a linear function of where they are: a' = -DECAY a."""
+    rng = torch.Generator().manual_seed(0)
+    time = torch.arange(frames)[:, None] / FPS
+    paths = [torch.randn(2, generator=rng) * torch.exp(-DECAY * time) for _ in range(count)]
+    return [{STATE: path, "action": path} for path in paths]
+
+
+def wild(policy, seed=0):
+    """The same after a training that went astray: what is seen changes the motion wildly."""
+    rng = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for layer in (policy.network.plans, policy.network.scores, policy.network.levels):
+            layer.weight.copy_(0.3 * torch.randn(layer.weight.shape, generator=rng))
+    return policy
+
+
+def executed(policy, start, steps):
+    """Actions by a policy whose arm is where the last action sent it, (steps, A)."""
+    policy.reset()
+    where, made = start, []
+    for _ in range(steps):
+        where = policy.select_action({STATE: where[None]})[0]
+        made.append(where)
+    return torch.stack(made)
+
+
+def train(policy, episodes, steps, rate=3e-3, size=64):
+    """By gradient descent, in a few seconds."""
+    samples, rng = windows(policy, episodes), torch.Generator().manual_seed(0)
+    optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=rate)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
+    policy.train()
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        for _ in range(steps):
+            optimizer.zero_grad()
+            policy.forward(samples.draw(size, rng))[0].backward()
+            optimizer.step()
+            schedule.step()
+    return policy.eval()

@@ -60,7 +60,7 @@ class RidgeFit:
 
     mean: Float[Tensor, "F"]
     scale: Float[Tensor, "F"]
-    """Standard deviation of each feature; one where it never changes."""
+    """Standard deviation of each feature; one where it never changes, or by request."""
     coefficients: Float[Tensor, "F_and_1 K"]
     """First row a, the others B transposed."""
     held_out: Float[Tensor, "n K"]
@@ -68,7 +68,11 @@ class RidgeFit:
 
 
 def fit_ridge(
-    features: Float[Tensor, "n F"], targets: Float[Tensor, "n K"], regularization: float
+    features: Float[Tensor, "n F"],
+    targets: Float[Tensor, "n K"],
+    regularization: float,
+    *,
+    standardize: bool = True,
 ) -> RidgeFit:
     """Minimise |Y - A X|^2 + n regularization |B|^2, A = [1, (features - mean) / scale].
 
@@ -81,6 +85,8 @@ def fit_ridge(
         features: n >= 2.
         targets: Fitted alike, column by column.
         regularization: Positive; 1 weighs the penalty as much as the data.
+        standardize: Divide features by their standard deviation; False: scale is one, for
+            features in one scale, of which those that hardly vary are to stay small.
 
     Raises:
         ValueError: Fewer than 2 samples, or a regularization that is not positive.
@@ -92,7 +98,7 @@ def fit_ridge(
         raise ValueError(f"regularization must be positive, got {regularization}")
     mean, deviation = features.mean(0), features.std(0, correction=0)
     # What is left of a constant in rounding is no deviation.
-    varies = deviation > CONSTANT * features.abs().amax(0)
+    varies = standardize & (deviation > CONSTANT * features.abs().amax(0))
     scale = torch.where(varies, deviation, 1.0)
     A = torch.cat([torch.ones_like(features[:, :1]), (features - mean) / scale], dim=1)
     penalty = torch.zeros(F, F + 1).to(A)

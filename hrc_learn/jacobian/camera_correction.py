@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from hrc_learn.geometry import Pose
 from hrc_learn.jacobian.camera_motion import (
+    FEWEST_FRAMES,
     CameraMotion,
     CameraReference,
     CameraWatch,
@@ -29,8 +30,6 @@ _FRAMES = 600
 _FEWEST = 1
 """Frames that tell a motion to begin with: until then what is seen leads the arm astray, soon
 to where no demonstration went and nothing can be told."""
-_SURE = 10
-"""Frames that are not forgotten again where the next is as if the camera had not been moved."""
 _AGREEMENT = 10.0
 """Root mean square [px] up to which pixels of objects and the places they were taken from are
 of the same camera: people grasp an object some millimetres from where its marker is."""
@@ -135,7 +134,7 @@ class CameraCorrection:
             self._find(steps=1)  # from where the frame before has led
             return None
         self._watch.clear()
-        if self.motion is not None and len(self._frames) < _SURE:
+        if self.motion is not None and len(self._frames) < FEWEST_FRAMES:
             there = camera.project(point)
             if np.linalg.norm(pixel - there) < np.linalg.norm(corrected - there):
                 # A marker was wrong in the first frames: the camera stands where it stood.

@@ -32,7 +32,7 @@ _PLAUSIBLE = np.array([0.1] * 3 + [0.1] * 3)
 alike is meant, by taking both as likely for a tripod that was knocked."""
 _FARTHEST = 5.0
 """Of these a camera has not moved by more: it would not see the table any longer."""
-_FEWEST = 10
+FEWEST_FRAMES = 10
 """Frames with the marker in view below which nothing is said."""
 _OUTLIER = 3.0
 """Errors count no more than so many medians of all in view: a marker half covered is off by
@@ -135,7 +135,7 @@ class CameraReference:
                 largest = max(largest, _largest_displacement(watch, demo, fps))
         if not largest:
             raise ValueError(
-                f"the marker is never seen in {_FEWEST} frames within {window} s of a "
+                f"the marker is never seen in {FEWEST_FRAMES} frames within {window} s of a "
                 "demonstration: there is nothing to compare with."
             )
         camera = _camera_of(demonstrations, image_size)
@@ -199,7 +199,7 @@ class CameraWatch:
         displacement: Of the last seconds [px]; 0 while too little is seen.
     """
 
-    def __init__(self, reference: CameraReference, fewest: int = _FEWEST):
+    def __init__(self, reference: CameraReference, fewest: int = FEWEST_FRAMES):
         """Compare with a camera that stands still.
 
         Args:
@@ -266,7 +266,7 @@ class CameraWatch:
         errors = np.array([frame.error for frame in frames])
         jacobians = np.array([frame.jacobian for frame in frames])
         twist, self.displacement = _explained(errors, jacobians)
-        if self.displacement <= self.reference.threshold * max(1, _FEWEST / len(frames)):
+        if self.displacement <= self.reference.threshold * max(1, FEWEST_FRAMES / len(frames)):
             return None
         points, pixels = (np.array([f[i] for f in frames]) for i in (1, 2))
         return motion_of(refined_twist(camera, points, pixels, twist), points, camera)
@@ -307,7 +307,7 @@ def camera_placements(
     seen = {
         index: frames
         for index, demo in enumerate(demonstrations)
-        if len(frames := _seen(demo)[1]) >= _FEWEST
+        if len(frames := _seen(demo)[1]) >= FEWEST_FRAMES
     }
     if len(seen) < 2:
         return []

@@ -51,13 +51,14 @@ def test_what_is_affine_in_the_context_is_met_where_nothing_was_shown():
     torch.testing.assert_close(dmp.held_out_duration, torch.ones(5).double(), rtol=1e-8, atol=0)
 
 
-def test_the_ridge_solves_the_penalised_equations():
+@pytest.mark.parametrize("standardize", [True, False])
+def test_the_ridge_solves_the_penalised_equations(standardize):
     """Against normal equations on features as they are, each slope with its own penalty."""
     rng = np.random.default_rng(0)
     x, y = rng.normal(2.0, [1.0, 5.0, 0.1], (9, 3)), rng.normal(size=(9, 4))
-    fit = fit_ridge(torch.tensor(x), torch.tensor(y), 0.3)
+    fit = fit_ridge(torch.tensor(x), torch.tensor(y), 0.3, standardize=standardize)
     A = np.column_stack([np.ones(9), x])
-    P = np.diag([0.0, *(9 * 0.3 * x.var(0))])
+    P = np.diag([0.0, *(9 * 0.3 * (x.var(0) if standardize else np.ones(3)))])
     expected = np.linalg.solve(A.T @ A + P, A.T @ y)
     slopes = fit.coefficients[1:] / fit.scale[:, None]
     np.testing.assert_allclose(slopes, expected[1:], rtol=1e-9, atol=1e-12)

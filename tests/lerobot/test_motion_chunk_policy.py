@@ -1,7 +1,6 @@
 """What LeRobot, and whoever trusts a policy with an arm, may expect of `motion_chunk`."""
 
 import json
-import math
 
 import pytest
 import torch
@@ -9,71 +8,31 @@ from lerobot.policies import get_policy_class
 from lerobot.policies.rtc import ActionQueue, RTCConfig
 from lerobot.rollout.inference.rtc import supports_rtc_inference
 from lerobot_samples import (
+    DECAY,
     FPS,
     GOAL,
     STATE,
     chunk_policy,
+    decaying,
+    executed,
     features_of,
     played,
     reaching,
     stats_of,
+    train,
+    wild,
     windows,
 )
 from safetensors.torch import save_file
 from torchvision.models import resnet18
 
 from hrc_learn.lerobot import MotionChunkConfig
-from hrc_learn.lerobot.policy.chunk_network import ChunkDecoder, Plans
-from hrc_learn.lerobot.policy.continued_motion import MotionChunk
+from hrc_learn.lerobot.policy.chunk_network import ChunkDecoder
 from hrc_learn.lerobot.policy.modeling_motion_chunk import MotionChunkPolicy
 
 SHOWN = reaching(10)
 IMAGE = "observation.images.front"
 UNNAMED = {"state_names": None, "action_feature_names": None}
-RATE = 1.5
-"""Of the decay to the origin in `decaying` [1/s]."""
-
-
-def decaying(count=12, frames=80):
-    """Motions whose future is a linear function of where they are: a' = -RATE a."""
-    rng = torch.Generator().manual_seed(0)
-    time = torch.arange(frames)[:, None] / FPS
-    paths = [torch.randn(2, generator=rng) * torch.exp(-RATE * time) for _ in range(count)]
-    return [{STATE: path, "action": path} for path in paths]
-
-
-def wild(policy, seed=0):
-    """The same after a training that went astray: what is seen changes the motion wildly."""
-    rng = torch.Generator().manual_seed(seed)
-    with torch.no_grad():
-        for layer in (policy.network.plans, policy.network.scores, policy.network.levels):
-            layer.weight.copy_(0.3 * torch.randn(layer.weight.shape, generator=rng))
-    return policy
-
-
-def executed(policy, start, steps):
-    """Actions by a policy whose arm is where the last action sent it, (steps, A)."""
-    policy.reset()
-    where, made = start, []
-    for _ in range(steps):
-        where = policy.select_action({STATE: where[None]})[0]
-        made.append(where)
-    return torch.stack(made)
-
-
-def train(policy, episodes, steps, rate=3e-3, size=64):
-    samples, rng = windows(policy, episodes), torch.Generator().manual_seed(0)
-    optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=rate)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
-    policy.train()
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        for _ in range(steps):
-            optimizer.zero_grad()
-            policy.forward(samples.draw(size, rng))[0].backward()
-            optimizer.step()
-            schedule.step()
-    return policy.eval()
 
 
 @pytest.mark.parametrize("index", [0, 3, 9])
@@ -169,7 +128,7 @@ def test_the_motion_is_the_same_however_often_it_is_planned(steps):
     policy = chunk_policy(shown, chunk_size=50, n_action_steps=steps, n_basis=10, **UNNAMED)
     start = torch.tensor([0.8, -0.5])
     made = executed(policy, start, 60)
-    truth = start * torch.exp(-RATE * torch.arange(60)[:, None] / FPS)
+    truth = start * torch.exp(-DECAY * torch.arange(60)[:, None] / FPS)
     # Every plan sees the arm one step late, where the last action sent it.
     torch.testing.assert_close(made, truth, rtol=0, atol=0.05)
 
@@ -273,270 +232,6 @@ def test_who_does_not_say_what_was_carried_out_is_found_on_the_chunk():
         first = second
 
 
-# How fast the state changes.
-
-
-def heard(policy):
-    """What the network is told of velocities: their values, and whether they are known."""
-    told = []
-    policy.network.register_forward_pre_hook(lambda _, inputs: told.append(inputs[1:]))
-    return told
-
-
-def turning_about(frames=30):
-    """A hand that points down and turns past half a turn, where vectors jump, and a slide."""
-    turn = torch.pi + torch.linspace(-0.4, 0.6, frames) ** 2
-    turn = torch.where(turn > torch.pi, turn - 2 * torch.pi, turn)
-    slide = torch.linspace(0, 1, frames) ** 3
-    state = torch.stack([turn, 0 * turn, 0 * turn, slide], dim=-1)
-    return {STATE: state, "action": state}
-
-
-HAND = ["ee.wx", "ee.wy", "ee.wz", "slide.pos"]
-
-
-@pytest.mark.parametrize("history", [1, 2, 5])
-@pytest.mark.parametrize(
-    ("episode", "names"),
-    [
-        (SHOWN[0], {}),
-        (turning_about(), {"state_names": HAND, "action_feature_names": HAND}),
-    ],
-    ids=["joints", "hand"],
-)
-def test_velocities_are_the_same_in_training_and_in_use(history, episode, names):
-    """Of frames as they are loaded, and of those that went by; at first neither knows it."""
-    policy = chunk_policy([episode], history=history, n_action_steps=1, **names).eval()
-    told = heard(policy)
-    batch = windows(policy, [episode]).batch(torch.arange(20))
-    assert batch[STATE].shape[1] == 2
-    policy.forward(batch)
-    played(policy, {key: x[:20] for key, x in episode.items()})
-    velocity, known = (torch.cat(x) for x in zip(*told[1:], strict=True))
-    assert known.tolist() == [0.0] * history + [1.0] * (20 - history)
-    torch.testing.assert_close(told[0][1], known, rtol=0, atol=0)
-    sure = known > 0
-    torch.testing.assert_close(told[0][0][sure], velocity[sure], rtol=0, atol=1e-5)
-
-
-def test_of_two_frames_the_later_one_is_what_is_seen():
-    episodes, rng = SHOWN[:2], torch.Generator().manual_seed(0)
-    episodes = [
-        e | {IMAGE: torch.rand(len(e[STATE]), 3, 16, 24, generator=rng)} for e in episodes
-    ]
-    policy, seen = chunk_policy(episodes).eval(), []
-    policy.network.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
-    policy.forward(windows(policy, episodes).batch(torch.arange(12)))
-    now = {key: episodes[0][key][:12] for key in (STATE, GOAL, IMAGE)}
-    torch.testing.assert_close(seen[0], policy.encoder(now))
-
-
-def test_observations_may_be_written_over_one_another():
-    """As of a loop that fills one array again and again."""
-    policy = chunk_policy(SHOWN, n_action_steps=1)
-    told = heard(policy)
-    seen = {key: SHOWN[0][key][:1].clone() for key in (STATE, GOAL)}
-    for k in range(10):
-        seen[STATE].copy_(SHOWN[0][STATE][k])
-        policy.select_action(seen)
-    played(policy, SHOWN[0], 10)
-    torch.testing.assert_close(told[9][0], told[19][0])
-    assert told[9][0].any()
-
-
-def test_velocities_are_differences_in_their_own_spread():
-    policy = chunk_policy(SHOWN, history=3, n_action_steps=1)
-    told = heard(policy)
-    played(policy, SHOWN[0])
-    rates = torch.cat([e[STATE].diff(dim=0) * FPS for e in SHOWN])
-    spread = rates.square().mean(0).sqrt()
-    moves = spread > 0
-    off = (SHOWN[0][STATE][13] - SHOWN[0][STATE][10]) * FPS / 3
-    expected = off[moves] / spread[moves]
-    torch.testing.assert_close(told[13][0][0, moves], expected, rtol=1e-4, atol=0)
-
-
-def test_after_a_reset_and_for_chunks_alone_no_velocity_is_known():
-    policy = chunk_policy(SHOWN, n_action_steps=1)
-    told = heard(policy)
-    played(policy, {key: x[:5] for key, x in SHOWN[0].items()})
-    policy.predict_action_chunk({key: SHOWN[0][key][5:6] for key in (STATE, GOAL)})
-    policy.select_action({key: SHOWN[0][key][6:7] for key in (STATE, GOAL)})
-    policy.reset()
-    played(policy, {key: x[:3] for key, x in SHOWN[1].items()})
-    assert [float(known) for _, known in told] == [0, 0, 1, 1, 1, 0, 0, 0, 0, 1]
-
-
-def test_a_frame_that_was_not_measured_leaves_the_velocity_unknown():
-    """Between two chunks; what a chunk is planned from must be measured."""
-    policy = chunk_policy(SHOWN, n_action_steps=3)
-    told = heard(policy)
-    seen = [{key: SHOWN[0][key][k : k + 1] for key in (STATE, GOAL)} for k in range(7)]
-    seen[1][STATE] = torch.full((1, 3), torch.nan)
-    made = [policy.select_action(x) for x in seen]
-    assert torch.cat(made).isfinite().all()
-    assert [float(known) for _, known in told] == [0, 0, 1]
-    assert not told[1][0].any()
-
-
-def test_three_samples_in_ten_are_trained_without_their_velocity():
-    policy = chunk_policy(SHOWN)
-    told = heard(policy)
-    batch = windows(policy, SHOWN).draw(4000, torch.Generator().manual_seed(0))
-    moving = ~batch[f"{STATE}_is_pad"][:, 0]
-    for training in (True, False):
-        with torch.random.fork_rng():
-            torch.manual_seed(0)
-            policy.train(training).forward(batch)
-    (_, known), (_, all_known) = told
-    torch.testing.assert_close(all_known, moving.float(), rtol=0, atol=0)
-    assert not known[~moving].any()
-    assert 0.67 < known[moving].mean() < 0.73
-    # What is unknown has no effect, whatever it would be.
-    policy = wild(policy.eval())
-    features, velocity = policy.encoder({k: SHOWN[0][k][:5] for k in (STATE, GOAL)}), told[0][0]
-    for share, same in ((0.0, True), (1.0, False)):
-        plans = [
-            policy.network(features, v, torch.full((5,), share)).coefficients
-            for v in (velocity[:5], velocity[5:10] + 1)
-        ]
-        assert torch.equal(*plans) == same
-
-
-def test_without_a_history_one_frame_is_loaded_and_seen():
-    policy = chunk_policy(SHOWN, history=0)
-    assert policy.config.observation_delta_indices is None
-    batch = windows(policy, SHOWN).batch(torch.arange(6))
-    assert batch[STATE].ndim == 2
-    told = heard(policy)
-    assert policy.forward(batch)[0].isfinite()
-    played(policy, SHOWN[0])
-    assert told[-1][0].shape == (1, 0)
-
-
-def there_and_back(count=12, frames=60):
-    """Along a line and back through the same places: where to depends on the way one comes."""
-    rng = torch.Generator().manual_seed(0)
-    time = torch.linspace(0, math.pi, frames)[:, None]
-    paths = [(1 + 0.05 * torch.randn(1, generator=rng)) * torch.sin(time) for _ in range(count)]
-    return [{STATE: x, "action": x} for x in (p.expand(-1, 2).clone() for p in paths)]
-
-
-def test_velocities_tell_the_way_there_from_the_way_back():
-    shown = there_and_back()
-    errors = []
-    for history in (2, 0):
-        settings = dict(n_action_steps=5, n_plans=1, history=history, **UNNAMED)
-        policy = train(chunk_policy(shown, **settings), shown, 300)
-        made = played(policy, shown[0])
-        errors.append((made - shown[0]["action"])[10:].square().mean().sqrt())
-    assert errors[0] < 0.4 * errors[1]
-
-
-# Numbers that hardly vary.
-
-
-def trembling(names=None, size=1e-5):
-    """Demonstrations in which a column, or a hand that points down, follows by a tremble."""
-    episodes = []
-    for e in SHOWN:
-        way = e["action"][:, :1]
-        small = size * torch.cat([way, way.sin(), way.square()], dim=-1)
-        if names:
-            small = small + torch.tensor([math.pi, 0.0, 0.0])
-        state = torch.cat([e[STATE], small if names else small[:, :1]], dim=-1)
-        episodes.append({STATE: state, GOAL: e[GOAL], "action": e["action"]})
-    return episodes
-
-
-@pytest.mark.parametrize(
-    ("names", "off"), [(None, 1e-3), (["ee.wx", "ee.wy", "ee.wz"], 0.01)], ids=["joint", "hand"]
-)
-def test_what_only_trembles_leads_no_motion_astray(names, off):
-    """Off by a hundred times what was shown, or more, it changes next to nothing."""
-    shown = trembling(names)
-    named = ["b.pos", "gripper.pos", "a.pos", *(names or ["held.pos"])]
-    policy = chunk_policy(shown, state_names=named)
-    seen = {key: shown[0][key][10:11].clone() for key in (STATE, GOAL)}
-    usual = policy.predict_action_chunk(seen)
-    policy.reset()
-    seen[STATE][:, 3:] += off
-    moved = policy.predict_action_chunk(seen) - usual
-    assert moved.abs().max() < 0.05 * stats_of(shown)["action"]["std"].max()
-
-
-def test_slow_columns_are_not_blown_up_as_velocities():
-    """A held joint that is shaken: slow beside what moves, fast beside what it did."""
-    policy = chunk_policy(trembling(), n_action_steps=1, state_names=[*"bga", "held"])
-    told = heard(policy)
-    seen = {key: x[:3].clone() for key, x in trembling()[0].items()}
-    seen[STATE][2, 3] += 2e-4
-    played(policy, seen, 3)
-    assert told[2][1] == 1
-    assert told[2][0][0, 3].abs() < 1
-
-
-# Several plans.
-
-
-def two_plans(policy, apart, score):
-    """The first stands still, the second is so far off everywhere and has another score."""
-    coefficients = torch.zeros(1, 2, 2, policy.decoder.size)
-    unit = policy.decoder.project(torch.ones(11, 2))  # one everywhere, as near as may be
-    size = policy.decoder.positions(unit).square().mean().sqrt()
-    coefficients[0, 1] = apart * unit / size
-    return Plans(
-        coefficients=coefficients,
-        scores=torch.tensor([[0.0, score]]),
-        levels=torch.zeros(1, 11, 0),
-    )
-
-
-@pytest.mark.parametrize(("apart", "expected"), [(2.9, "mean"), (3.1, "likeliest")])
-def test_plans_are_averaged_where_their_error_explains_how_far_apart_they_are(apart, expected):
-    policy = chunk_policy(SHOWN, n_plans=2)
-    policy.error.fill_(0.2)
-    plans = two_plans(policy, 0.2 * apart, 0.1)
-    share = torch.tensor(0.1).sigmoid() if expected == "mean" else 1.0
-    second = plans.coefficients[:, 1]
-    chosen = policy._chosen(plans, None)
-    torch.testing.assert_close(chosen, share * second, rtol=1e-5, atol=1e-6)
-
-
-@pytest.mark.parametrize(("score", "stays"), [(1.2, True), (1.6, False)])
-def test_a_motion_stays_with_its_way_unless_another_is_far_likelier(score, stays):
-    """Five errors off: by 5^2 / (2 3^2) = 1.39 in the logarithm."""
-    policy = chunk_policy(SHOWN, n_plans=2)
-    policy.error.fill_(0.2)
-    plans = two_plans(policy, 1.0, score)
-    still = torch.zeros(1, 11, 3, 2)
-    before = MotionChunk(states=still, stepped=still[:, :, 0, :0], actions=still[:, :, 0])
-    assert (policy._chosen(plans, None) != 0).any()
-    assert (policy._chosen(plans, before) == 0).all() == stays
-
-
-@pytest.mark.parametrize("error", [0.0, 1e-12])
-def test_plans_without_an_error_are_plans_all_the_same(error):
-    """Of demonstrations that stand still."""
-    still = [{STATE: torch.ones(40, 2), "action": torch.ones(40, 2)} for _ in range(3)]
-    policy = chunk_policy(still, **UNNAMED)
-    policy.error.fill_(error)
-    made = played(policy, still[0])
-    torch.testing.assert_close(made, still[0]["action"], rtol=0, atol=1e-3)
-
-
-def test_the_error_of_the_nearest_plan_is_learned_and_kept(tmp_path):
-    shown = passing()
-    policy = chunk_policy(shown, chunk_size=20, n_basis=8, **UNNAMED)
-    at_first = float(policy.error)  # of the linear function, which goes between
-    assert at_first > 0.3
-    assert chunk_policy(decaying(), **UNNAMED).error < 0.05  # whose future is linear
-    train(policy, shown, 400)
-    assert policy.error < 0.5 * at_first
-    policy.save_pretrained(tmp_path)
-    assert MotionChunkPolicy.from_pretrained(tmp_path).error == policy.error
-
-
 @pytest.mark.parametrize(("chunk", "count"), [(50, 10), (24, 9), (16, 6), (4, 2)])
 def test_short_chunks_have_no_more_basis_functions_than_they_can_tell(chunk, count):
     assert ChunkDecoder(chunk, 0.1).size == count + 3
@@ -582,44 +277,6 @@ def test_a_gripper_that_opens_slowly_is_a_motion():
         for u in [torch.linspace(0, 1, len(e["action"]))]
     ]
     assert chunk_policy(shown, **UNNAMED).config.two_level_actions == []
-
-
-def passing(count=24, frames=40):
-    """Past an obstacle at (1, 0), half of the times on either side, from the same place."""
-    rng = torch.Generator().manual_seed(0)
-    x = torch.linspace(0, 2, frames)
-    episodes = []
-    for k in range(count):
-        side = 1 if k % 2 else -1
-        y = side * 0.6 * torch.sin(math.pi * x / 2) ** 2
-        path = torch.stack([x, y + 0.02 * torch.randn((), generator=rng)], dim=-1)
-        episodes.append({STATE: path, "action": path})
-    return episodes
-
-
-def sides(policy, count):
-    """Where each of so many motions passes the obstacle."""
-    passes = []
-    for _ in range(count):
-        path = executed(policy, torch.zeros(2), 32)
-        passes.append(path[(path[:, 0] - 1).abs().argmin(), 1])
-    return torch.stack(passes)
-
-
-@pytest.mark.slow
-def test_both_ways_round_an_obstacle_are_kept_and_none_between():
-    shown = passing()
-    settings = dict(chunk_size=20, n_action_steps=5, n_basis=8, hidden_dim=64, **UNNAMED)
-    policy = train(chunk_policy(shown, sample_plans=True, **settings), shown, 1000)
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        y = sides(policy, 60)
-    in_a_mode = (y.abs() - 0.6).abs() < 0.2
-    assert in_a_mode.float().mean() >= 0.95
-    assert 0.25 < (y > 0).float().mean() < 0.75
-    # The likeliest is one of them, always the same.
-    policy.config.sample_plans = False
-    assert sides(policy, 2).diff().abs() == 0
 
 
 def with_images(episodes, keep):

@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from hrc_learn.dmp import fit_ridge
 from hrc_learn.dmp.motion_head import MotionHead
 
 # Chunks as a motion: a linear map of few numbers, with its derivatives.
@@ -242,13 +243,11 @@ class ChunkNetwork(nn.Module):
         self.spread.copy_(coefficients.std(0).clamp_min(SPREAD))
         whitened = ((coefficients - self.mean) / self.spread).flatten(1)
         if self.numbers:
-            # Not whitened again: what hardly varies would be blown up after all.
-            x, mean = numbers.double(), numbers.double().mean(0)
-            penalty = len(x) * RIDGE * torch.eye(self.numbers).to(x)
-            off = x - mean
-            slopes = torch.linalg.solve(off.T @ off + penalty, off.T @ whitened.double())
+            # Not standardized again: what hardly varies would be blown up after all.
+            fit = fit_ridge(numbers.double(), whitened.double(), RIDGE, standardize=False)
+            constant, slopes = fit.coefficients[0], fit.coefficients[1:]
             self.linear.weight.copy_(slopes.T)
-            self.linear.bias.copy_(-mean @ slopes)
+            self.linear.bias.copy_(constant - fit.mean @ slopes)
 
 
 def _block(hidden: int, dropout: float) -> nn.Module:

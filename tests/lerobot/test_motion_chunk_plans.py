@@ -1,0 +1,118 @@
+"""`motion_chunk` knows several ways: averaged where their error explains them, else chosen."""
+
+import math
+
+import pytest
+import torch
+from lerobot_samples import (
+    STATE,
+    chunk_policy,
+    decaying,
+    executed,
+    played,
+    reaching,
+    train,
+)
+
+from hrc_learn.lerobot.policy.chunk_network import Plans
+from hrc_learn.lerobot.policy.continued_motion import MotionChunk
+from hrc_learn.lerobot.policy.modeling_motion_chunk import MotionChunkPolicy
+
+SHOWN = reaching(10)
+UNNAMED = {"state_names": None, "action_feature_names": None}
+
+
+def two_plans(policy, apart, score):
+    """The first stands still, the second is so far off everywhere and has another score."""
+    coefficients = torch.zeros(1, 2, 2, policy.decoder.size)
+    unit = policy.decoder.project(torch.ones(11, 2))  # one everywhere, as near as may be
+    size = policy.decoder.positions(unit).square().mean().sqrt()
+    coefficients[0, 1] = apart * unit / size
+    return Plans(
+        coefficients=coefficients,
+        scores=torch.tensor([[0.0, score]]),
+        levels=torch.zeros(1, 11, 0),
+    )
+
+
+@pytest.mark.parametrize(("apart", "expected"), [(2.9, "mean"), (3.1, "likeliest")])
+def test_plans_are_averaged_where_their_error_explains_how_far_apart_they_are(apart, expected):
+    policy = chunk_policy(SHOWN, n_plans=2)
+    policy.error.fill_(0.2)
+    plans = two_plans(policy, 0.2 * apart, 0.1)
+    share = torch.tensor(0.1).sigmoid() if expected == "mean" else 1.0
+    second = plans.coefficients[:, 1]
+    chosen = policy._chosen(plans, None)
+    torch.testing.assert_close(chosen, share * second, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize(("score", "stays"), [(1.2, True), (1.6, False)])
+def test_a_motion_stays_with_its_way_unless_another_is_far_likelier(score, stays):
+    """Five errors off: by 5^2 / (2 3^2) = 1.39 in the logarithm."""
+    policy = chunk_policy(SHOWN, n_plans=2)
+    policy.error.fill_(0.2)
+    plans = two_plans(policy, 1.0, score)
+    still = torch.zeros(1, 11, 3, 2)
+    before = MotionChunk(states=still, stepped=still[:, :, 0, :0], actions=still[:, :, 0])
+    assert (policy._chosen(plans, None) != 0).any()
+    assert (policy._chosen(plans, before) == 0).all() == stays
+
+
+@pytest.mark.parametrize("error", [0.0, 1e-12])
+def test_plans_without_an_error_are_plans_all_the_same(error):
+    """Of demonstrations that stand still."""
+    still = [{STATE: torch.ones(40, 2), "action": torch.ones(40, 2)} for _ in range(3)]
+    policy = chunk_policy(still, **UNNAMED)
+    policy.error.fill_(error)
+    made = played(policy, still[0])
+    torch.testing.assert_close(made, still[0]["action"], rtol=0, atol=1e-3)
+
+
+def test_the_error_of_the_nearest_plan_is_learned_and_kept(tmp_path):
+    shown = passing()
+    policy = chunk_policy(shown, chunk_size=20, n_basis=8, **UNNAMED)
+    at_first = float(policy.error)  # of the linear function, which goes between
+    assert at_first > 0.3
+    assert chunk_policy(decaying(), **UNNAMED).error < 0.05  # whose future is linear
+    train(policy, shown, 400)
+    assert policy.error < 0.5 * at_first
+    policy.save_pretrained(tmp_path)
+    assert MotionChunkPolicy.from_pretrained(tmp_path).error == policy.error
+
+
+def passing(count=24, frames=40):
+    """Past an obstacle at (1, 0), half of the times on either side, from the same place."""
+    rng = torch.Generator().manual_seed(0)
+    x = torch.linspace(0, 2, frames)
+    episodes = []
+    for k in range(count):
+        side = 1 if k % 2 else -1
+        y = side * 0.6 * torch.sin(math.pi * x / 2) ** 2
+        path = torch.stack([x, y + 0.02 * torch.randn((), generator=rng)], dim=-1)
+        episodes.append({STATE: path, "action": path})
+    return episodes
+
+
+def sides(policy, count):
+    """Where each of so many motions passes the obstacle."""
+    passes = []
+    for _ in range(count):
+        path = executed(policy, torch.zeros(2), 32)
+        passes.append(path[(path[:, 0] - 1).abs().argmin(), 1])
+    return torch.stack(passes)
+
+
+@pytest.mark.slow
+def test_both_ways_round_an_obstacle_are_kept_and_none_between():
+    shown = passing()
+    settings = dict(chunk_size=20, n_action_steps=5, n_basis=8, hidden_dim=64, **UNNAMED)
+    policy = train(chunk_policy(shown, sample_plans=True, **settings), shown, 1000)
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        y = sides(policy, 60)
+    in_a_mode = (y.abs() - 0.6).abs() < 0.2
+    assert in_a_mode.float().mean() >= 0.95
+    assert 0.25 < (y > 0).float().mean() < 0.75
+    # The likeliest is one of them, always the same.
+    policy.config.sample_plans = False
+    assert sides(policy, 2).diff().abs() == 0
