@@ -5,8 +5,9 @@ at given times and ends at a third. A network reads the three points and says, o
 the mean of a Gaussian over the parameters of a motion; a clipped policy gradient (PPO, as for
 black boxes in Otto et al. 2022) improves it. The network, its optimiser, the contexts, the
 number of parameters and the root mean square by which the first samples deviate are the same
-for both heads, each at its defaults otherwise. CMA-ES searches both parameter spaces as well,
-for one context at a time and without a network. Figures are returns by environment steps.
+for both heads, each at its defaults otherwise. The rate of the optimiser falls to nothing along
+a run. CMA-ES searches both parameter spaces as well, for one context at a time and without a
+network. Figures are returns by environment steps.
 
 Needs mp_pytorch and cma: pip install mp_pytorch cma
 """
@@ -60,12 +61,14 @@ class Args:
     """Between two updates."""
     search_episodes: int = 3000
     """Of CMA-ES for one context."""
+    search_contexts: int = 8
+    """Searched for by CMA-ES in each run, one after the other; their mean is its figure."""
     n_basis: int = 5
     """Of each joint; as many parameters and one, the goal."""
     deviation: float = 0.3
     """Standard deviation of whitened parameters at first."""
     rate: float = 1e-3
-    """Of Adam."""
+    """Of Adam at first; it falls linearly to zero."""
     first_seed: int = 0
     """Others than those reported are for choosing `deviation` and `rate`."""
     picture: Path | None = None
@@ -219,6 +222,8 @@ def learn(motions: Motions, args: Args, seed: int) -> Float[np.ndarray, "points"
             curve.append(reacher.returns(motions(z), held_out).mean().item())
         if iteration == args.iterations:
             break
+        for group in optimiser.param_groups:
+            group["lr"] = args.rate * (1 - iteration / args.iterations)
         x = contexts(args.episodes, rng)
         with torch.no_grad():
             policy = torch.distributions.Normal(mean(x), log_deviation.exp())
@@ -242,12 +247,23 @@ def learn(motions: Motions, args: Args, seed: int) -> Float[np.ndarray, "points"
 
 
 def search(motions: Motions, args: Args, seed: int) -> Float[np.ndarray, "points"]:
-    """Best return that CMA-ES has seen for one context, by generation."""
+    """Best return that CMA-ES has seen for a context, by generation; mean over contexts."""
+    rng = torch.Generator().manual_seed(20_000 + seed)
+    runs = [
+        search_one(motions, args, context[None], args.search_contexts * seed + k + 1)
+        for k, context in enumerate(contexts(args.search_contexts, rng))
+    ]
+    return np.mean(runs, axis=0)
+
+
+def search_one(
+    motions: Motions, args: Args, context: Float[Tensor, "1 6"], seed: int
+) -> Float[np.ndarray, "points"]:
+    """The same of one context; `seed` is positive."""
     import cma  # pyright: ignore[reportMissingImports]
 
-    context = contexts(1, torch.Generator().manual_seed(20_000 + seed))
     reacher, P = Reacher(), JOINTS * (args.n_basis + 1)
-    options = {"seed": seed + 1, "verbose": -9, "maxfevals": args.search_episodes}
+    options = {"seed": seed, "verbose": -9, "maxfevals": args.search_episodes}
     strategy = cma.CMAEvolutionStrategy(P * [0.0], args.deviation, options)
     curve, best = [], -math.inf
     for _ in range(args.search_episodes // strategy.popsize):
@@ -317,7 +333,7 @@ def draw(
         axis.set_ylabel("return [m]")
         axis.grid(alpha=0.3)
     axes[0].set_title("policy over all contexts, held-out contexts")
-    axes[1].set_title("CMA-ES, one context a seed, best so far")
+    axes[1].set_title("CMA-ES, one context at a time, best so far")
     low = min(runs.mean(0)[len(runs.T) // 20] for key, runs in curves.items() if "CMA" in key)
     axes[1].set_ylim(1.1 * low, 0)
     axes[0].legend(loc="lower right")

@@ -42,17 +42,18 @@ def simulated_arm() -> Iterator[SimpleNamespace]:
 
 @contextmanager
 def served_world(
-    world: World | None = None, config: FrankyConfig | None = None
+    world: World | None = None, config: FrankyConfig | None = None, **serving
 ) -> Iterator[SimpleNamespace]:
     """A world of ours, at rest, with franky connected to its arm.
 
-    Time passes by `server.advance` only, so that a slow machine makes no difference.
+    Time passes by `server.advance` only, so that a slow machine makes no difference. `serving`
+    goes to `serve_world`.
     """
     if world is None:
         world = World(SceneConfig(objects=()))
         world.reset(READY)
     config = config or FrankyConfig(realtime="ignore", dynamics=1.0)
-    with serve_world(world) as server:
+    with serve_world(world, **serving) as server:
         with server.running():
             driver = FrankyArm(server.address, config)
         with closing(ServedArm(driver, server)) as arm:

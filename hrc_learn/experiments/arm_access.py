@@ -17,7 +17,10 @@ from hrc_learn.hardware import FrankaArm, FrankaConfig, FrankyArm, FrankyConfig
 from hrc_learn.kinematics import PANDA, FrankaWorkArm, SerialChain, WorkArm, panda
 from hrc_learn.protocols import OpenedArm
 from hrc_learn.sim import Imperfections, World
-from hrc_learn.sim.protocol_server import ServedArm, serve_world
+from hrc_learn.sim.protocol_server import ArmServer, ServedArm, serve_world
+
+type Serve = Callable[[World], AbstractContextManager[ArmServer]]
+"""Puts the arm of a world behind its protocol, as `serve_world` does."""
 
 FRANKY_DELAY = 0.003
 """From a command to franky until the arm's servos have it [s]: two cycles of the protocol, and
@@ -48,31 +51,39 @@ SIMULATED = ArmAccess(open=lambda world: nullcontext(world.opened_arm))
 """The simulated arm itself."""
 
 
-def through_franky(config: FrankyConfig | None = None) -> ArmAccess:
+def through_franky(config: FrankyConfig | None = None, serve: Serve = serve_world) -> ArmAccess:
     """Over the network protocol, by the driver package franky.
 
     Args:
         config: How the driver leads the arm; None: as a real one, but for real time, which a
             server that waits for each answer does not need, and the grip of the simulated hand.
+        serve: Puts the arm behind its protocol.
     """
     config = config or FrankyConfig(realtime="ignore", grip_force=40.0)
     return through_protocol(
-        partial(FrankyArm, config=config), delay=FRANKY_DELAY, dynamics=config.dynamics
+        partial(FrankyArm, config=config),
+        delay=FRANKY_DELAY,
+        dynamics=config.dynamics,
+        serve=serve,
     )
 
 
-def through_franka(config: FrankaConfig | None = None, chain: SerialChain = panda) -> ArmAccess:
+def through_franka(
+    config: FrankaConfig | None = None, chain: SerialChain = panda, serve: Serve = serve_world
+) -> ArmAccess:
     """Over the network protocol, by our loop at 1 kHz.
 
     Args:
         config: How the arm is driven; None: as for `through_franky`.
         chain: The arm.
+        serve: Puts the arm behind its protocol.
     """
     config = config or FrankaConfig(realtime=False)
     return through_protocol(
         partial(FrankaArm, chain=chain, config=config),
         delay=FRANKY_DELAY,
         dynamics=config.acceleration,
+        serve=serve,
     )
 
 
@@ -101,7 +112,11 @@ def access_by(driver: ArmDriver, robot: WorkArm = PANDA) -> ArmAccess:
 
 
 def through_protocol(
-    open_driver: Callable[[str], Any], *, delay: float, dynamics: float
+    open_driver: Callable[[str], Any],
+    *,
+    delay: float,
+    dynamics: float,
+    serve: Serve = serve_world,
 ) -> ArmAccess:
     """Over the network protocol, by any driver.
 
@@ -109,11 +124,12 @@ def through_protocol(
         open_driver: Connects to the arm at an address: an `Arm` and a `Gripper` with `close`.
         delay: From a command until the arm's servos have it [s].
         dynamics: Fraction of the arm's acceleration that the driver uses.
+        serve: Puts the arm behind its protocol.
     """
 
     @contextmanager
     def open_arm(world: World) -> Iterator[OpenedArm]:
-        with serve_world(world) as server:
+        with serve(world) as server:
             with server.running():
                 driver = open_driver(server.address)
             with closing(ServedArm(driver, server)) as arm:

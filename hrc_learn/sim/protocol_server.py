@@ -13,9 +13,9 @@ from __future__ import annotations
 import random
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, final
+from typing import TYPE_CHECKING, Any, NamedTuple, final
 
 import numpy as np
 from jaxtyping import Float
@@ -38,6 +38,21 @@ whoever advances the time is busy, a cycle goes by after each of these [s]."""
 _CATCH_UP = 20.0
 """Rate at which joints commanded by position approach it [1/s]: those of franky's motions move
 on by themselves, so this only takes away what rounding leaves."""
+_BRIDGED = 20
+"""Cycles without an answer, in a row, after which a control box stops the arm (libfranka,
+network requirements)."""
+
+
+class DrivenCycle(NamedTuple):
+    """A cycle of a motion, as the arm was led in it."""
+
+    motion: int
+    """Number that the driver has given to the motion."""
+    velocity: Float[np.ndarray, " joints"]
+    """Commanded, or gone on with where no answer has come [rad/s]."""
+    position: Float[np.ndarray, " joints"]
+    """Of the joints, as the driver was told before [rad]."""
+    answered: bool
 
 
 class ArmServer:
@@ -54,26 +69,45 @@ class ArmServer:
     still, but for signs of life, so that it may be looked at; calls of the driver, which may
     wait for the next cycle, belong within `running`.
 
+    In a cycle whose answer does not come the arm goes on with its acceleration, as a control
+    box lets it.
+
     Attributes:
         world: The world.
         address: Of the arm, for its driver.
         cycles: How many have gone by.
         missed: How many of them the driver had a motion in, and did not answer in time.
+        lost: How many packets of motions were lost on purpose, states and answers.
+        longest_gap: Most cycles of a motion in a row without an answer. A control box stops the
+            arm after 20; this server does not, and holds the velocity from then on.
     """
 
-    def __init__(self, world: World, addresses: Iterable[str]):
+    def __init__(
+        self,
+        world: World,
+        addresses: Iterable[str],
+        *,
+        loss: float = 0.0,
+        on_cycle: Callable[[DrivenCycle], None] | None = None,
+    ):
         """Listen; `serve_world` does this and ends it.
 
         Args:
             world: The world. Its physics goes by steps of a cycle from now on.
             addresses: Of this machine; the first one is taken that is free.
+            loss: Share of the packets that are lost, of states and of answers each.
+            on_cycle: Told of each cycle of a motion, on the server's thread.
 
         Raises:
             ImportError: The package franky-sim is not installed.
             OSError: None of the addresses is free.
+            ValueError: A share that is not in [0, 1).
         """
+        if not 0 <= loss < 1:
+            raise ValueError(f"loss must be in [0, 1), got {loss}")
         self.world = world
-        self.cycles = self.missed = 0
+        self.cycles = self.missed = self.lost = self.longest_gap = self._gap = 0
+        self._loss, self._chance, self._on_cycle = loss, random.Random(0), on_cycle
         simulator, self._robot, server = _protocol(world)
         self._server = server(self._robot, list(addresses))
         self._server.init()
@@ -178,17 +212,34 @@ class ArmServer:
 
     def _cycle(self) -> None:
         """One step of the physics, told to the driver; its answer counts in the next."""
-        server = self._server
+        server, robot = self._server, self._robot
         self._simulator.step()
+        robot.begin_cycle()
         connected = server.udp_connected
+        server.lose_state, server.lose_answer = (
+            bool(server.current_motion_id) and self._chance.random() < self._loss
+            for _ in range(2)
+        )
         server.send_state()
         self.cycles += 1
         self._sent = self._sent + 1 if connected else 0
-        give_up = time.monotonic() + _LATE
-        self._robot.answered = False
+        self._await_answer()
+        if motion := server.current_motion_id:
+            self._gap = 0 if robot.answered else self._gap + 1
+            self.longest_gap = max(self.longest_gap, self._gap)
+            if not robot.answered and self._gap <= _BRIDGED:
+                robot.go_on()
+            if self._on_cycle is not None:
+                self._on_cycle(robot.driven(motion))
+
+    def _await_answer(self) -> None:
+        server, give_up = self._server, time.monotonic() + _LATE
         while True:
             server.process_commands()
             if self._robot.answered or not server.current_motion_id:
+                return
+            if server.lose_state or server.has_lost_answer:
+                self.lost += 1
                 return
             if time.monotonic() > give_up:
                 self.missed += 1
@@ -246,22 +297,32 @@ def loopback_addresses(number: int = 50) -> list[str]:
 
 
 @contextmanager
-def serve_world(world: World, addresses: Iterable[str] | None = None) -> Iterator[ArmServer]:
+def serve_world(
+    world: World,
+    addresses: Iterable[str] | None = None,
+    *,
+    loss: float = 0.0,
+    on_cycle: Callable[[DrivenCycle], None] | None = None,
+) -> Iterator[ArmServer]:
     """A server of a world's arm, until the block ends.
 
     Args:
         world: The world, at rest, and not to be reset meanwhile. Its physics goes by steps of
             1 ms meanwhile.
         addresses: Of this machine; the first one is taken that is free. None: any.
+        loss: Share of the packets that are lost, of states and of answers each.
+        on_cycle: Told of each cycle of a motion, on the server's thread.
 
     Raises:
         ImportError: The package franky-sim is not installed.
         OSError: None of the addresses is free.
+        ValueError: A share that is not in [0, 1).
     """
     step = world.model.opt.timestep
     world.model.opt.timestep = CYCLE
     try:
-        server = ArmServer(world, loopback_addresses() if addresses is None else addresses)
+        addresses = loopback_addresses() if addresses is None else addresses
+        server = ArmServer(world, addresses, loss=loss, on_cycle=on_cycle)
         try:
             yield server
         finally:
@@ -291,6 +352,8 @@ def _protocol(world: World) -> tuple[BaseSimulator, Any, type]:
             super().__init__()
             self.answered = False
             self._target: np.ndarray | None = None
+            # Of this cycle and of the two before it.
+            self._velocity = self._last = self._before = np.zeros(7)
             self._width_goal: float | None = None
             self._finger_speed = 0.0
             self._look()
@@ -308,12 +371,35 @@ def _protocol(world: World) -> tuple[BaseSimulator, Any, type]:
                 tau_j=tuple(read.external_torque.tolist()),
             )
 
+        def begin_cycle(self) -> None:
+            """Nothing has come yet."""
+            self.answered = False
+            self._before, self._last = self._last, self._velocity
+
+        def go_on(self) -> None:
+            """Without an answer: with the acceleration of the last two cycles."""
+            self._velocity = 2 * self._last - self._before
+            if self._target is None:
+                self.joint_velocity_control(self._velocity, has_new_command=False)
+            else:
+                self._target = self._target + self._velocity * CYCLE
+                self._drive(self._velocity)
+
+        def driven(self, motion: int) -> DrivenCycle:
+            """What this cycle was."""
+            position = self._read.joint_position
+            return DrivenCycle(motion, self._velocity, position, self.answered)
+
         def joint_velocity_control(self, target_dq: Any, has_new_command: bool = True) -> None:
             self.answered |= has_new_command
+            if not has_new_command:
+                target_dq = self._velocity
             super().joint_velocity_control(target_dq, has_new_command)
 
         def joint_position_control(self, target_q: Any, has_new_command: bool = True) -> None:
             self.answered |= has_new_command
+            if not has_new_command and self._target is not None:
+                target_q = self._target
             super().joint_position_control(target_q, has_new_command)
 
         def _joint_velocity_control(self, target_dq: np.ndarray) -> None:
@@ -332,6 +418,7 @@ def _protocol(world: World) -> tuple[BaseSimulator, Any, type]:
             self._drive(ahead / CYCLE + _CATCH_UP * behind)
 
         def _drive(self, velocity: np.ndarray) -> None:
+            self._velocity = velocity
             world.arm.command(velocity)
             self.torque_control([0.0] * 7)  # what is told of commanded torques
 
@@ -372,5 +459,23 @@ def _protocol(world: World) -> tuple[BaseSimulator, Any, type]:
         def _step(self) -> None:
             world.advance(CYCLE)
 
+    class LossyServer(FrankaRobotServer):
+        """Loses the state of a cycle, or the answer to it, when told to."""
+
+        lose_state = lose_answer = has_lost_answer = False
+
+        def send_state(self) -> None:
+            self.has_lost_answer = False
+            if self.lose_state:
+                # The package cannot leave one out, and has to count it.
+                self._FrankaServer__message_id += 1
+            else:
+                super().send_state()
+
+        def _handle_udp_command(self, command_data: bytes) -> None:
+            self.has_lost_answer = self.lose_answer
+            if not self.lose_answer:
+                super()._handle_udp_command(command_data)
+
     robot = ServedRobot()
-    return ServedSimulator(), robot, FrankaRobotServer
+    return ServedSimulator(), robot, LossyServer

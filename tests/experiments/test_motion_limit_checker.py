@@ -2,10 +2,12 @@
 
 import json
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from unchecked import shapes_unchecked
 
 from hrc_learn.controller import SafetyFilter
@@ -31,9 +33,9 @@ JUDGES = {
 }
 
 
-def judged(sent: HostileStreams, limits: JointLimits | None, folder: Path) -> dict:
+def judged(sent: HostileStreams, limits: JointLimits | None, folder: Path, **more) -> dict:
     """What the checker says."""
-    arrays = {"position": sent.position.numpy(), "velocity": sent.velocity.numpy()}
+    arrays = {"position": sent.position.numpy(), "velocity": sent.velocity.numpy()} | more
     if limits is not None:
         names = ("lower", "upper", "acceleration", "jerk", "velocity_offset", "deceleration")
         rows = {name: getattr(limits, name) for name in names} | {
@@ -71,3 +73,22 @@ def test_it_finds_what_a_filter_with_other_limits_lets_pass(tmp_path):
     with shapes_unchecked():
         sent = hostile_streams(config)
     assert judged(sent, panda.limits, tmp_path)["findings"] > 100
+
+
+def test_motions_one_after_another_begin_from_rest_each(tmp_path):
+    """Cut out of the middle of one, the second does not begin at rest unless it is said so."""
+    with shapes_unchecked():
+        config = StreamConfig(arm="panda", count=1, ticks=400, seed=3)
+        sent = hostile_streams(config)
+        twice = replace(
+            sent,
+            position=torch.cat([sent.position, sent.position]),
+            velocity=torch.cat([sent.velocity, sent.velocity]),
+        )
+    assert sent.velocity[-1].abs().max() > 0.05
+    number = np.repeat([4, 9], 400)
+    apart = judged(twice, panda.limits, tmp_path, motion=number)
+    assert apart == {"ticks": 800, "findings": 0, "shown": []}
+    as_one = judged(twice, panda.limits, tmp_path, motion=np.full(800, 4))
+    assert as_one["findings"] > 0
+    assert "tick 400" in as_one["shown"][0]

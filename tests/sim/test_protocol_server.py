@@ -142,6 +142,50 @@ def test_physics_that_fails_is_told_to_whoever_lets_time_pass():
         stack.close()
 
 
+def test_without_answers_the_arm_goes_on_with_its_acceleration():
+    """Lost packets of both ways; the motion hardly differs from the one without."""
+    cycles = []
+    with served_world(loss=0.1, on_cycle=cycles.append) as served:
+        *_, actual, commands = follow(
+            served, lambda k: 0.3 * np.sin(2 * np.pi * 0.8 * k * DT), 125
+        )
+        server = served.server
+        assert server.lost == sum(not cycle.answered for cycle in cycles) - server.missed
+        # Of a state or of the answer to it.
+        assert server.lost / len(cycles) == pytest.approx(1 - 0.9**2, rel=0.25)
+        assert 2 <= server.longest_gap < 20
+    velocities = np.array([cycle.velocity for cycle in cycles])
+    (silent,) = np.nonzero([not cycle.answered for cycle in cycles])
+    silent = silent[silent > 1]
+    went_on = 2 * velocities[silent - 1] - velocities[silent - 2]
+    np.testing.assert_allclose(velocities[silent], went_on, atol=1e-9)
+    assert np.abs(velocities[silent, 0]).max() > 0.1
+    late = round(FRANKY_DELAY / DT) + 1
+    np.testing.assert_allclose(actual[late:], commands[:-late], atol=0.05)
+
+
+def test_a_box_without_any_answer_holds_the_velocity_in_the_end():
+    cycles = []
+    with served_world(on_cycle=cycles.append) as served:
+        follow(served, lambda k: 0.02 * k, 8)
+        served.server._loss = 1.0
+        served.server.advance(0.04)
+        assert served.server.longest_gap >= 30
+        last_answer = max(k for k, cycle in enumerate(cycles) if cycle.answered)
+        velocity = np.array([cycle.velocity[0] for cycle in cycles[last_answer:]])
+        assert len(velocity) > 30
+        slopes = np.diff(velocity)
+        assert slopes[0] > 1e-5
+        np.testing.assert_allclose(slopes[:20], slopes[0], atol=1e-9)
+        np.testing.assert_allclose(slopes[20:], 0.0, atol=1e-12)
+        served.server._loss = 0.0
+
+
+def test_a_share_of_all_packets_cannot_be_lost():
+    with pytest.raises(ValueError, match="loss"), serve_world(World(), loss=1.0):
+        pass
+
+
 def test_servers_beside_each_other_take_addresses_of_their_own():
     addresses = loopback_addresses(3)
     first, second = World(), World()

@@ -1,0 +1,188 @@
+"""The whole job beside a person through the driver of the real arm, its sockets and its cycles.
+
+One object is grasped, carried and placed while a person pushes the elbow, with the nominal
+imperfections of a laboratory, in MuJoCo behind the network protocol of the arm (franky-sim),
+which waits for each answer. What led the arm in each cycle, answers and what a control box goes
+on with where none comes, is judged afterwards by the limit checker of franka-sim, in its own
+environment (tools/make_franka_sim.sh), by the Panda's limits. Packets are lost on purpose, if
+wanted.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import json
+import subprocess
+import tempfile
+import time
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from hrc_learn import cli
+from hrc_learn.experiments.arm_access import through_franka, through_franky
+from hrc_learn.experiments.collaboration.metrics import collaboration_metrics
+from hrc_learn.experiments.collaboration.trial import simulate_collaboration
+from hrc_learn.hardware import DriverError
+from hrc_learn.kinematics import panda
+from hrc_learn.sim import Imperfections
+from hrc_learn.sim.protocol_server import ArmServer, DrivenCycle, serve_world
+from hrc_learn.skills.pick_and_place import PickAndPlaceConfig
+from hrc_learn.skills.placing import PlacingSkill
+from hrc_learn.skills.visual_skill import VisualServoSkill
+
+ROOT = Path(__file__).parents[1]
+PYTHON = ROOT / ".venv-franka-sim" / "bin" / "python"
+SHELF = "middle"
+REPORTED = {
+    "place error": "off its place [mm]",
+    "end effector deviation": "hand off its path, at most [mm]",
+    "elbow moved": "elbow moved [mm]",
+    "joint limit violations": "steps outside limits",
+}
+"""Metrics of the job, by the heads of their columns."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args:
+    models: Path
+    """Folder of `hrc demo`, with `aiming` and `placing`."""
+    driver: Literal["franky", "franka"] = "franka"
+    """franky's own motion generator, or our loop at 1 kHz."""
+    first_seed: int = 0
+    """Of the objects' places, of images and imperfections."""
+    jobs: int = 50
+    """Seeds from there on."""
+    loss: float = 0.0
+    """Share of the packets that are lost, of states and of answers each."""
+    config: PickAndPlaceConfig = field(default_factory=PickAndPlaceConfig)
+    """How the job is done."""
+    json: Path | None = None
+    """Receives the rows as they come, one job a line; seeds that it has are not done again."""
+
+
+def main(args: Args) -> None:
+    """Do the jobs, one after another."""
+    if not PYTHON.exists():
+        raise ValueError("tools/make_franka_sim.sh makes the environment of the checker first")
+    aiming = VisualServoSkill.load(args.models / "aiming")
+    placing = PlacingSkill.load(args.models / "placing")
+    rows = _done_before(args.json)
+    for seed in range(args.first_seed, args.first_seed + args.jobs):
+        if any(row["seed"] == seed for row in rows):
+            continue
+        row = {"seed": seed} | job(aiming, placing, seed, args)
+        rows.append(row)
+        Console().print(row)
+        if args.json is not None:
+            with args.json.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(row) + "\n")
+    show(rows)
+
+
+def _done_before(path: Path | None) -> list[dict[str, Any]]:
+    if path is None or not path.exists():
+        return []
+    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+
+
+def job(
+    aiming: VisualServoSkill, placing: PlacingSkill, seed: int, args: Args
+) -> dict[str, Any]:
+    """One of them, as a row."""
+    cycles: list[DrivenCycle] = []
+    servers: list[ArmServer] = []
+
+    @contextmanager
+    def serve(world: Any) -> Any:
+        with serve_world(world, loss=args.loss, on_cycle=cycles.append) as server:
+            servers.append(server)
+            yield server
+
+    begun = time.monotonic()
+    through = partial(through_franky if args.driver == "franky" else through_franka)
+    try:
+        run = simulate_collaboration(
+            aiming,
+            placing,
+            (SHELF,),
+            camera="synthetic",
+            config=args.config,
+            imperfections=Imperfections.nominal(),
+            access=through(serve=serve),
+            seed=seed,
+        )
+    except DriverError as error:
+        row: dict[str, Any] = {"failure": f"driver: {error}"}
+    else:
+        row = {"failure": run.failure, "time": float(run.cell.log["time"][-1])}
+        measured = {m.name: m.of(run) for m in collaboration_metrics(1, 0.0)}
+        row |= {name: measured[name] for name in REPORTED if name in measured}
+        row["placed"] = run.world.rests_on(
+            run.workplace.scene.objects[0].name, f"board_{SHELF}"
+        )
+        row["contacts"] = sum(
+            len(monitor.touches)
+            for monitor in (
+                run.world.cabinet_contacts,
+                run.world.table_contacts,
+                run.world.self_contacts,
+            )
+        )
+    server = servers[-1]
+    counts = {name: getattr(server, name) for name in ("missed", "lost", "longest_gap")}
+    return row | counts | judged(cycles) | {"wall": time.monotonic() - begun}
+
+
+def judged(cycles: list[DrivenCycle]) -> dict[str, Any]:
+    """What the checker says of all cycles."""
+    if not cycles:
+        return {"ticks": 0, "findings": 0, "shown": []}
+    limits = panda.limits
+    arrays = {
+        "motion": np.array([cycle.motion for cycle in cycles]),
+        "velocity": np.array([cycle.velocity for cycle in cycles])[:, None],
+        "position": np.array([cycle.position for cycle in cycles])[:, None],
+        "max_velocity": limits.velocity.numpy(),
+    }
+    for name in ("lower", "upper", "acceleration", "jerk"):
+        arrays[name] = getattr(limits, name).numpy()
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "sent.npz"
+        np.savez(path, **arrays)
+        command = [PYTHON, ROOT / "tools" / "motion_limit_checker.py", "--sent", path]
+        done = subprocess.run(command, check=True, capture_output=True, text=True)
+    return json.loads(done.stdout)
+
+
+def show(rows: list[dict[str, Any]]) -> None:
+    """Print what came of all."""
+    table = Table("", "", title=f"{len(rows)} jobs")
+    done = [row for row in rows if not row["failure"]]
+    table.add_row("done", f"{len(done)}")
+    table.add_row("placed", f"{sum(row['placed'] for row in done)}")
+    for name in ("contacts", "missed", "lost", "ticks", "findings"):
+        table.add_row(name, f"{sum(row.get(name, 0) for row in rows):,}")
+    table.add_row("longest gap", f"{max(row['longest_gap'] for row in rows)}")
+    for name, head in REPORTED.items():
+        values = [row[name] for row in done if row.get(name) is not None]
+        if values:
+            median, p95 = np.percentile(values, [50, 95])
+            table.add_row(f"{head}, median and p95", f"{median:.1f}, {p95:.1f}")
+    table.add_row(
+        "wall time of a job, median [s]", f"{np.median([r['wall'] for r in rows]):.0f}"
+    )
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    cli.run(main, Args)
