@@ -70,7 +70,7 @@ class ArmServer:
     wait for the next cycle, belong within `running`.
 
     In a cycle whose answer does not come the arm goes on with its acceleration, as a control
-    box lets it.
+    box lets it, where velocities are commanded.
 
     Attributes:
         world: The world.
@@ -377,13 +377,13 @@ def _protocol(world: World) -> tuple[BaseSimulator, Any, type]:
             self._before, self._last = self._last, self._velocity
 
         def go_on(self) -> None:
-            """Without an answer: with the acceleration of the last two cycles."""
-            self._velocity = 2 * self._last - self._before
+            """Without an answer: with the acceleration of the last two cycles.
+
+            Where positions are commanded, the arm waits for the next one instead.
+            """
             if self._target is None:
+                self._velocity = 2 * self._last - self._before
                 self.joint_velocity_control(self._velocity, has_new_command=False)
-            else:
-                self._target = self._target + self._velocity * CYCLE
-                self._drive(self._velocity)
 
         def driven(self, motion: int) -> DrivenCycle:
             """What this cycle was."""
@@ -398,8 +398,6 @@ def _protocol(world: World) -> tuple[BaseSimulator, Any, type]:
 
         def joint_position_control(self, target_q: Any, has_new_command: bool = True) -> None:
             self.answered |= has_new_command
-            if not has_new_command and self._target is not None:
-                target_q = self._target
             super().joint_position_control(target_q, has_new_command)
 
         def _joint_velocity_control(self, target_dq: np.ndarray) -> None:
