@@ -146,10 +146,12 @@ def test_without_answers_the_arm_goes_on_with_its_acceleration():
     """Lost packets of both ways; the motion hardly differs from the one without."""
     cycles = []
     with served_world(loss=0.1, on_cycle=cycles.append) as served:
-        *_, actual, commands = follow(
+        times, _, actual, commands = follow(
             served, lambda k: 0.3 * np.sin(2 * np.pi * 0.8 * k * DT), 125
         )
         server = served.server
+        # States that are lost count: the driver's clock does not fall behind.
+        assert np.ptp(times) == pytest.approx(124 * DT, abs=5 * CYCLE)
         assert server.lost == sum(not cycle.answered for cycle in cycles) - server.missed
         # Of a state or of the answer to it.
         assert server.lost / len(cycles) == pytest.approx(1 - 0.9**2, rel=0.25)
