@@ -18,9 +18,9 @@ import json
 import subprocess
 import tempfile
 import time
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -34,7 +34,7 @@ from hrc_learn.experiments.collaboration.metrics import collaboration_metrics
 from hrc_learn.experiments.collaboration.trial import simulate_collaboration
 from hrc_learn.hardware import DriverError
 from hrc_learn.kinematics import panda
-from hrc_learn.sim import Imperfections
+from hrc_learn.sim import Imperfections, World
 from hrc_learn.sim.protocol_server import ArmServer, DrivenCycle, serve_world
 from hrc_learn.skills.pick_and_place import PickAndPlaceConfig
 from hrc_learn.skills.placing import PlacingSkill
@@ -103,13 +103,13 @@ def job(
     servers: list[ArmServer] = []
 
     @contextmanager
-    def serve(world: Any) -> Any:
+    def serve(world: World) -> Iterator[ArmServer]:
         with serve_world(world, loss=args.loss, on_cycle=cycles.append) as server:
             servers.append(server)
             yield server
 
     begun = time.monotonic()
-    through = partial(through_franky if args.driver == "franky" else through_franka)
+    through = through_franky if args.driver == "franky" else through_franka
     try:
         run = simulate_collaboration(
             aiming,
