@@ -166,6 +166,22 @@ def test_without_answers_the_arm_goes_on_with_its_acceleration():
     np.testing.assert_allclose(actual[late:], commands[:-late], atol=0.05)
 
 
+def test_the_acceleration_told_is_that_of_the_commands():
+    cycles, told, servers = [], [], []
+
+    def note(cycle):
+        cycles.append(cycle)
+        told.append(servers[0]._robot.state.ddq_d[0])
+
+    with served_world(loss=0.05, on_cycle=note) as served:
+        servers.append(served.server)
+        follow(served, lambda k: 0.3 * np.sin(2 * np.pi * 0.8 * k * DT), 60)
+    velocity = np.array([cycle.velocity[0] for cycle in cycles])
+    # A state tells of the commands before it.
+    np.testing.assert_allclose(told[2:], np.diff(velocity)[:-1] / CYCLE, atol=1e-6)
+    assert np.abs(told).max() > 1.0
+
+
 def test_a_box_without_any_answer_holds_the_velocity_in_the_end():
     cycles = []
     with served_world(on_cycle=cycles.append) as served:
