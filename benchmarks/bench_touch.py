@@ -1,0 +1,113 @@
+"""Touches that nobody made: how often an arm that does its job takes itself for being touched.
+
+The whole job with one object, with the nominal imperfections of a laboratory, led directly in
+MuJoCo. `Touch` listens all along, as on a real arm, and what it asks for is not done; while a
+scripted person leads the elbow without touching the arm, and without anybody.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from hrc_learn import cli
+from hrc_learn.experiments.collaboration.trial import NULL_SPACE_FORCES, simulate_collaboration
+from hrc_learn.kinematics import panda
+from hrc_learn.protocols import ArmState, Feedback, Human, HumanInput
+from hrc_learn.sim import Imperfections, World
+from hrc_learn.skills.placing import PlacingSkill
+from hrc_learn.skills.visual_skill import VisualServoSkill
+from hrc_learn.skills.work_cell import WorkCell
+from hrc_learn.teleoperation.touch import Touch, TouchConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args:
+    models: Path
+    """Folder of `hrc demo`, with `aiming` and `placing`."""
+    first_seed: int = 0
+    """Of the object's place, of images and imperfections."""
+    jobs: int = 50
+    """Seeds from there on, each with and without the person."""
+    config: TouchConfig = field(default_factory=TouchConfig)
+    """What counts as a touch."""
+    json: Path | None = None
+    """Receives all figures as one flat object."""
+
+
+class Listener(Human):
+    """The person of the job, beside an arm that listens for touches."""
+
+    def __init__(self, person: Human, touch: Touch):
+        self._person, self._touch = person, touch
+        self._before: tuple[str, bool, bool] = ("nothing", False, False)
+        self.felt: Counter[str] = Counter()
+        """Beginnings: of pushes at the elbow, of pauses, of stops."""
+
+    def read(self, state: ArmState) -> HumanInput:
+        """What the person asks for."""
+        asked = self._touch.read(state)
+        now = (self._touch.place, asked.pause, bool(asked.stop))
+        self.felt["elbow pushed"] += now[0] == "elbow" != self._before[0]
+        self.felt["task paused"] += now[1] and not self._before[1]
+        self.felt["arm stopped"] += now[2] and not self._before[2]
+        self._before = now
+        return self._person.read(state)
+
+    def tell(self, feedback: Feedback) -> None:
+        """Tell both."""
+        self._touch.tell(feedback)
+        self._person.tell(feedback)
+
+
+def main(args: Args) -> None:
+    """Do the jobs and count."""
+    aiming = VisualServoSkill.load(args.models / "aiming")
+    placing = PlacingSkill.load(args.models / "placing")
+    table = Table("", "jobs done", "hours", "elbow pushed", "task paused", "arm stopped")
+    figures: dict[str, float] = {}
+    for name, forces in (("nobody", ()), ("a person leads the elbow", NULL_SPACE_FORCES)):
+        felt: Counter[str] = Counter()
+        done, hours = 0, 0.0
+        for seed in range(args.first_seed, args.first_seed + args.jobs):
+            listeners: list[Listener] = []
+
+            def listen(world: World, cell: WorkCell, listeners: list = listeners) -> None:
+                listener = Listener(cell._human, Touch(panda, args.config))
+                cell._human = listener
+                listeners.append(listener)
+
+            run = simulate_collaboration(
+                aiming,
+                placing,
+                ("middle",),
+                camera="synthetic",
+                forces=forces,
+                imperfections=Imperfections.nominal(),
+                seed=seed,
+                on_start=listen,
+            )
+            done += not run.failure
+            hours += float(run.cell.log["time"][-1]) / 3600
+            felt.update(listeners[0].felt)
+            Console().print(name, seed, run.failure, dict(listeners[0].felt))
+        kinds = ("elbow pushed", "task paused", "arm stopped")
+        table.add_row(name, str(done), f"{hours:.2f}", *(str(felt[kind]) for kind in kinds))
+        key = name.replace(" ", "_")
+        figures |= {f"{key}_done": float(done), f"{key}_hours": hours}
+        figures |= {f"{key}_{kind.replace(' ', '_')}": float(felt[kind]) for kind in kinds}
+    Console().print(table)
+    if args.json is not None:
+        cli.write_json(args.json, figures)
+
+
+if __name__ == "__main__":
+    cli.run(main, Args)
