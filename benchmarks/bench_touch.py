@@ -11,6 +11,7 @@ import os
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import gc
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -99,6 +100,8 @@ def main(args: Args) -> None:
             hours += float(run.cell.log["time"][-1]) / 3600
             felt.update(listeners[0].felt)
             Console().print(name, seed, run.failure, dict(listeners[0].felt))
+            del run
+            gc.collect()  # of half a gigabyte of images, which refer to each other's world
         kinds = ("elbow pushed", "task paused", "arm stopped")
         table.add_row(name, str(done), f"{hours:.2f}", *(str(felt[kind]) for kind in kinds))
         key = name.replace(" ", "_")
