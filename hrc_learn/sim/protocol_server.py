@@ -397,7 +397,7 @@ def _protocol(world: World) -> tuple[BaseSimulator, Any, type]:
             super().joint_velocity_control(target_dq, has_new_command)
             # The package tells a smoothed acceleration; a control box knows what it commands.
             self._tracked_state_components["ddq_d"].set(
-                self._BaseRobot__t, (self._velocity - self._last) / CYCLE
+                vars(self)["_BaseRobot__t"], (self._velocity - self._last) / CYCLE
             )
 
         def joint_position_control(self, target_q: Any, has_new_command: bool = True) -> None:
