@@ -19,6 +19,9 @@ FPS = 20.0
 NAMES = ["a.pos", "b.pos"]
 STATE = "observation.state"
 GOAL = "observation.environment_state"
+IMAGE = "observation.images.front"
+UNNAMED = {"state_names": None, "action_feature_names": None}
+"""Settings of a policy whose columns have no names."""
 type Episode = dict[str, Tensor]
 
 

@@ -6,6 +6,7 @@ import pytest
 import torch
 from lerobot_samples import (
     STATE,
+    UNNAMED,
     chunk_policy,
     decaying,
     executed,
@@ -19,7 +20,6 @@ from hrc_learn.lerobot.policy.continued_motion import MotionChunk
 from hrc_learn.lerobot.policy.modeling_motion_chunk import MotionChunkPolicy
 
 SHOWN = reaching(10)
-UNNAMED = {"state_names": None, "action_feature_names": None}
 
 
 def two_plans(policy, apart, score):

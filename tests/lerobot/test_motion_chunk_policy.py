@@ -11,7 +11,9 @@ from lerobot_samples import (
     DECAY,
     FPS,
     GOAL,
+    IMAGE,
     STATE,
+    UNNAMED,
     chunk_policy,
     decaying,
     executed,
@@ -31,8 +33,6 @@ from hrc_learn.lerobot.policy.chunk_network import ChunkDecoder
 from hrc_learn.lerobot.policy.modeling_motion_chunk import MotionChunkPolicy
 
 SHOWN = reaching(10)
-IMAGE = "observation.images.front"
-UNNAMED = {"state_names": None, "action_feature_names": None}
 
 
 @pytest.mark.parametrize("index", [0, 3, 9])

@@ -7,7 +7,9 @@ import torch
 from lerobot_samples import (
     FPS,
     GOAL,
+    IMAGE,
     STATE,
+    UNNAMED,
     chunk_policy,
     played,
     reaching,
@@ -18,8 +20,6 @@ from lerobot_samples import (
 )
 
 SHOWN = reaching(10)
-IMAGE = "observation.images.front"
-UNNAMED = {"state_names": None, "action_feature_names": None}
 
 
 def heard(policy):
