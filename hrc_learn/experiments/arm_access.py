@@ -74,11 +74,12 @@ def through_franka(
     """Over the network protocol, by our loop at 1 kHz.
 
     Args:
-        config: How the arm is driven; None: as for `through_franky`.
+        config: How the arm is driven; None: as for `through_franky`, and in lockstep with the
+            server.
         chain: The arm.
         serve: Puts the arm behind its protocol.
     """
-    config = config or FrankaConfig(realtime=False)
+    config = config or FrankaConfig(realtime=False, lockstep=True)
     return through_protocol(
         partial(FrankaArm, chain=chain, config=config),
         delay=FRANKY_DELAY,

@@ -89,6 +89,9 @@ class FrankaConfig:
     """Whether to insist on a realtime kernel and priority. Without the kernel cycles are late
     now and then, which the control box tolerates up to 20 in a row; priority is taken where the
     user may have it."""
+    lockstep: bool = False
+    """Whether the arm is a simulator that stands still until it is answered, and while nobody
+    calls it: then no answer is late, and each state gets one."""
     compiled: bool = True
     """Whether to compile the step, once for a machine, which takes a minute or two the first
     time. Uncompiled it takes a whole cycle on a busy machine: for simulators only."""
@@ -185,7 +188,7 @@ class FrankaArm:
         self._shared, self._orders = Shared(), Orders()
         # Of the threads here that command: the loop is never held up by it.
         self._writing = threading.Lock()
-        robot = Robot(ip, config.realtime, config.collision, config.load)
+        robot = Robot(ip, config.realtime, config.collision, config.load, config.lockstep)
         context = multiprocessing.get_context("spawn")
         self._process = context.Process(
             target=serve,

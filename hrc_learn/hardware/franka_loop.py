@@ -238,6 +238,8 @@ class Robot:
     """Whether to refuse a kernel or a priority without realtime."""
     collision: CollisionConfig
     load: Load | None
+    lockstep: bool = False
+    """Whether it is a simulator that waits for each answer, so that none is late."""
 
     def connect(self) -> Any:
         """Connect, clear what stopped the arm before, and tell what has to be told.
@@ -343,7 +345,14 @@ class Punctuality:
     moves the arm all the same.
     """
 
-    def __init__(self):
+    def __init__(self, *, lockstep: bool = False):
+        """None has been read yet.
+
+        Args:
+            lockstep: Whether the robot is a simulator that waits for each answer, so that none
+                is late, and may stand still in between.
+        """
+        self._lockstep = lockstep
         self._last = math.nan
         self._pace = 1.0
         self._skipped = self._skipped_before = False
@@ -373,7 +382,8 @@ class Punctuality:
         return self._skip(cost > self._pace * CYCLE)
 
     def _skip(self, too_late: bool) -> bool:
-        self._skipped = self._skipped or (too_late and not self._skipped_before)
+        may_skip = not (self._lockstep or self._skipped_before)
+        self._skipped = self._skipped or (too_late and may_skip)
         return self._skipped
 
 
@@ -467,7 +477,8 @@ class ControlLoop:
         control = self._link.start_joint_velocity_control(mode)
         self._sent = self._reported = np.full(JOINTS, np.nan)  # nothing yet
         report = self._report
-        number, finished, punctuality = 0, False, Punctuality()
+        number, finished = 0, False
+        punctuality = Punctuality(lockstep=self._robot.lockstep)
         while not finished:
             state, period = control.readOnce()
             begin = time.perf_counter()

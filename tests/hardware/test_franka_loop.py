@@ -163,6 +163,12 @@ class TestPunctuality:
         # Held up for 5 ms more, it is late all the same.
         assert punctuality.late(2.5e-3 * 300 + 5e-3, 1e-3)
 
+    def test_a_simulator_that_waits_is_answered_however_late(self):
+        punctuality = Punctuality(lockstep=True)
+        for moment in (0.0, 1e-3, 19e-3, 2.0):
+            assert not punctuality.late(moment, 1e-3)
+            assert not punctuality.overdue(1.1e-3)
+
 
 @pytest.mark.parametrize(
     ("make", "named"),
