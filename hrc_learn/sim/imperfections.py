@@ -254,6 +254,8 @@ class DrawnImperfections:
             if joint.type != mujoco.mjtJoint.mjJNT_HINGE:  # fingers slide, objects are free
                 continue
             joint.frictionloss = self.sizes.joint_friction
+            # MuJoCo's usual 0.02 s make friction push a joint on that its servo brakes harder.
+            joint.solref_friction = (2 * spec.option.timestep, 1.0)
             joint.parent.gravcomp = 1.0 + self.gravity_error
 
     def encoders(

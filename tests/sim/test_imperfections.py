@@ -167,6 +167,26 @@ def test_the_arm_is_not_moved_by_less_than_its_friction():
         made.data.qfrc_applied[0] = 0.0
 
 
+def test_friction_brakes_however_hard_the_servos_do():
+    made = world(joint_friction=1.0)
+    made.reset(HOVER)
+    made.arm.command(np.array([0.8, -0.8, 0.8, 0.8, 0.8, -0.8, 0.8]))
+    made.advance(0.2)
+    made.arm.command(np.zeros(7))
+    data, dt = made.data, made.model.opt.timestep
+    taken = given = 0.0
+    for _ in range(100):
+        velocity = data.qvel[:7].copy()
+        made.advance(dt)
+        rubs = data.efc_type[: data.nefc] == mujoco.mjtConstraint.mjCNSTR_FRICTION_DOF
+        work = data.efc_force[: data.nefc][rubs][:7] * velocity * dt
+        taken -= work.clip(max=0.0).sum()
+        given += work.clip(min=0.0).sum()
+    # All of it 1 N m over the way of seven joints; a joint that turns within a step gets some.
+    assert taken > 0.04
+    assert given < 0.1 * taken
+
+
 def test_table_and_objects_are_as_high_as_they_are():
     made = world(table_height=0.05, object_height=0.01)
     assert made.table_top == pytest.approx(made.imperfections.table_height)
