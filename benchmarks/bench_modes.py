@@ -1,19 +1,23 @@
 """How well a demonstration is predicted from others that go several ways.
 
-Made-up planar sets like those of the LASA handwriting data: strokes to one end from starts
-that scatter by 7 % of the way, of one way or of two or three, seven to nine demonstrations
-each. Each is left out in turn and predicted from the others, given its start and goal alone.
+Planar sets of demonstrations: those of the LASA handwriting dataset (seven each, four of the
+thirty sets of several ways), or made-up ones like them: strokes to one end from starts that
+scatter by 7 % of the way, of one way or of two or three, seven to nine demonstrations each.
+Each is left out in turn and predicted from the others, given its start and goal alone.
 """
 
 import os
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
+from recordings import read_recordings
 from rich.console import Console
 from rich.table import Table
 from torch import Tensor
@@ -26,8 +30,10 @@ SAMPLES = 150
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
+    lasa: Path | None = None
+    """Folder of the LASA set's .mat files; None: sets are made up."""
     sets: int = 32
-    """Of demonstrations, half of them of one way."""
+    """How many to make up, half of them of one way."""
     n_basis: int = 30
     """Basis functions of each primitive."""
     seed: int = 0
@@ -36,25 +42,51 @@ class Args:
     """Receives the figures as one flat object."""
 
 
+class Set(NamedTuple):
+    """Demonstrations of one task."""
+
+    time: Tensor
+    """(n, T) [s]."""
+    position: Tensor
+    """(n, T, 2)."""
+    ways: int | None
+    """How many there are; None: several, as many as there may be."""
+
+
 def main(args: Args) -> None:
     """Predict, print a table, write the figures."""
     torch.set_num_threads(1)
-    rng = torch.Generator().manual_seed(args.seed)
     errors: dict[str, list[float]] = {"nearest": [], "mean": [], "mixture": []}
     several, right = [], []
     with torch.no_grad():
-        for k in range(args.sets):
-            ways = 1 if k % 2 == 0 else 2 + int(torch.randint(2, (), generator=rng))
-            time, position = made_up(ways, rng)
-            primitives = JointDMP.fit(time, position, args.n_basis)
-            for i in range(len(position)):
-                found = predict(primitives, i, position, errors)
-                several.append(ways > 1)
-                right.append(found == ways)
+        for shown in made_up_sets(args) if args.lasa is None else drawn_sets(args.lasa):
+            primitives = JointDMP.fit(shown.time, shown.position, args.n_basis)
+            for i in range(len(shown.position)):
+                found = predict(primitives, i, shown.position, errors)
+                several.append(shown.ways != 1)
+                right.append(found > 1 if shown.ways is None else found == shown.ways)
     figures = summarise(errors, np.array(several)) | {"modes_right": float(np.mean(right))}
     show(figures)
     if args.json:
         cli.write_json(args.json, figures)
+
+
+def made_up_sets(args: Args) -> Iterator[Set]:
+    """As many as are asked for."""
+    rng = torch.Generator().manual_seed(args.seed)
+    for k in range(args.sets):
+        ways = 1 if k % 2 == 0 else 2 + int(torch.randint(2, (), generator=rng))
+        yield Set(*made_up(ways, rng), ways)
+
+
+def drawn_sets(folder: Path) -> Iterator[Set]:
+    """Those of the LASA set; of which four go several ways, as their names say."""
+    for name, shown in read_recordings(folder).items():
+        time, position = (
+            torch.from_numpy(np.stack(x))
+            for x in ([r.time for r in shown], [r.position for r in shown])
+        )
+        yield Set(time, position, None if name.startswith("Multi_Models") else 1)
 
 
 def made_up(ways: int, rng: torch.Generator) -> tuple[Tensor, Tensor]:
@@ -100,7 +132,8 @@ def predict(
         "mixture": mixture.at(context).mean_primitive(),
     }
     low, high = position.flatten(0, 1).aminmax(dim=0)
-    s = torch.linspace(0, 1, SAMPLES, dtype=torch.float64)
+    # Samples of all sets are evenly spaced.
+    s = torch.linspace(0, 1, position.shape[1], dtype=torch.float64)
     for name, dmp in predictions.items():
         path = dmp.with_ends(start, goal).rollout(s * dmp.duration).position
         off = (path - position[i]).square().mean().sqrt()

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from recordings import read_recordings
 from torch import Tensor
 
 from hrc_learn.dmp import JointDMP, OrientationDMP
@@ -21,26 +22,63 @@ def measure_reproduction(folder: Path) -> dict[str, float]:
     """Median error over recordings, relative to the largest range of each.
 
     Args:
-        folder: Holds .npz files with stamps `t` (T,) [s] and joint positions `q` (T, D).
-
-    Raises:
-        ValueError: It holds none, or one without these.
+        folder: Of `read_recordings`.
     """
-    files = sorted(folder.glob("*.npz"))
-    if not files:
-        raise ValueError(f"{folder} holds no .npz recordings")
+    shown = [one for several in read_recordings(folder).values() for one in several]
     figures = {}
     for n_basis in (50, 100):
         errors = []
-        for file in files:
-            with np.load(file) as recording:
-                if not {"t", "q"} <= set(recording.files):
-                    raise ValueError(f"{file} needs arrays 't' and 'q', has {recording.files}")
-                dmp = JointDMP.fit(recording["t"], recording["q"], n_basis)
+        for recording in shown:
+            dmp = JointDMP.fit(recording.time, recording.position, n_basis)
             assert dmp.fit_report is not None
             errors.append(dmp.fit_report.nrmse.item())
         figures[f"reproduction_{n_basis}_nrmse"] = float(np.median(errors))
     return figures
+
+
+NOISE, FRAME_RATE = 2e-3, 30.0
+"""Of a cheap arm's encoders, as a share of the range (of one radian 2 mrad); and of the samples
+that a camera's rate leaves [1/s]."""
+FIXED_COUNTS = (10, 20, 50, 100)
+
+
+@torch.no_grad()
+def measure_noise(folder: Path) -> dict[str, float]:
+    """What a fit without options makes of noisy recordings, the first of each file.
+
+    Positions are scaled to a range of one, resampled, and noise is added. Errors are those to
+    the recording as it was; its peak acceleration is that of a fit with as many functions as it
+    bears, 200 at most.
+
+    Args:
+        folder: Of `read_recordings`.
+    """
+    rng = np.random.default_rng(0)
+    peaks, errors = [], []
+    for recording, *_ in read_recordings(folder).values():
+        time = recording.time - recording.time[0]
+        position = recording.position / np.ptp(recording.position, axis=0).max()
+        frames = np.arange(0.0, time[-1], 1 / FRAME_RATE)
+        seen = np.stack([np.interp(frames, time, y) for y in position.T], axis=1)
+        seen += NOISE * rng.standard_normal(seen.shape)
+        within = time <= frames[-1]
+        stamps, truth = torch.from_numpy(time[within]), torch.from_numpy(position[within])
+        exact = JointDMP.fit(stamps, truth, min(200, len(stamps) // 6))
+        motions = {
+            count: JointDMP.fit(frames, seen, count).rollout(stamps)
+            for count in (None, *(n for n in FIXED_COUNTS if n < len(frames)))
+        }
+        off = {n: (m.position - truth).square().mean().sqrt() for n, m in motions.items()}
+        peak = exact.rollout(stamps).acceleration.abs().max()
+        peaks.append((motions[None].acceleration.abs().max() / peak).item())
+        errors.append((off.pop(None) / min(off.values())).item())
+    return {
+        "noisy_peak_acceleration_median": float(np.median(peaks)),
+        "noisy_peak_acceleration_most": max(peaks),
+        "noisy_error_of_best_fixed_median": float(np.median(errors)),
+        "noisy_error_of_best_fixed_most": max(errors),
+        "noisy_better_than_any_fixed": float(np.mean(np.array(errors) <= 1)),
+    }
 
 
 def measure_turns() -> dict[str, float]:

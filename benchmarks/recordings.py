@@ -1,0 +1,51 @@
+"""Recorded motions that benchmarks are run on, and that the project does not hold."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from scipy.io import loadmat
+
+
+class Recording(NamedTuple):
+    """A motion as it was recorded."""
+
+    name: str
+    time: np.ndarray
+    """(T,) [s]."""
+    position: np.ndarray
+    """(T, D) [rad], or in what it was drawn in."""
+
+
+def read_recordings(folder: Path) -> dict[str, list[Recording]]:
+    """Recordings by file, in alphabetical order.
+
+    Args:
+        folder: Holds `.npz` files of one recording each, stamps `t` (T,) [s] and positions `q`
+            (T, D), or the `.mat` files of the LASA handwriting dataset (Khansari-Zadeh and
+            Billard 2011), of seven demonstrations each.
+
+    Raises:
+        ValueError: It holds neither, or a file without these.
+    """
+    files = sorted([*folder.glob("*.npz"), *folder.glob("*.mat")])
+    if not files:
+        raise ValueError(f"{folder} holds no .npz or .mat recordings")
+    return {file.stem: _npz(file) if file.suffix == ".npz" else _lasa(file) for file in files}
+
+
+def _npz(file: Path) -> list[Recording]:
+    with np.load(file) as arrays:
+        if not {"t", "q"} <= set(arrays.files):
+            raise ValueError(f"{file} needs arrays 't' and 'q', has {arrays.files}")
+        return [Recording(file.stem, arrays["t"], arrays["q"])]
+
+
+def _lasa(file: Path) -> list[Recording]:
+    arrays = loadmat(file, simplify_cells=True)
+    if "demos" not in arrays:
+        raise ValueError(f"{file} has no 'demos' as files of the LASA set have")
+    return [
+        Recording(f"{file.stem} {i + 1}", demo["t"].ravel(), demo["pos"].T)
+        for i, demo in enumerate(arrays["demos"])
+    ]
