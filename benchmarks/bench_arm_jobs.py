@@ -1,11 +1,11 @@
 """The whole job beside a person through the driver of the real arm, its sockets and its cycles.
 
-One object is grasped, carried and placed while a person pushes the elbow, with the nominal
-imperfections of a laboratory, in MuJoCo behind the network protocol of the arm (franky-sim),
-which waits for each answer. What led the arm in each cycle, answers and what a control box goes
-on with where none comes, is judged afterwards by the limit checker of franka-sim, in its own
-environment (tools/make_franka_sim.sh), by the Panda's limits. Packets are lost on purpose, if
-wanted.
+One object is grasped, carried and placed while a person pushes the elbow, and a worker comes to
+the table if wanted, with the nominal imperfections of a laboratory, in MuJoCo behind the network
+protocol of the arm (franky-sim), which waits for each answer. What led the arm in each cycle,
+answers and what a control box goes on with where none comes, is judged afterwards by the limit
+checker of franka-sim, in its own environment (tools/make_franka_sim.sh), by the Panda's limits.
+Packets are lost on purpose, if wanted.
 """
 
 from __future__ import annotations
@@ -26,12 +26,13 @@ from typing import Any, Literal
 
 import numpy as np
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from hrc_learn import cli
 from hrc_learn.experiments.arm_access import through_franka, through_franky
 from hrc_learn.experiments.collaboration.metrics import collaboration_metrics
-from hrc_learn.experiments.collaboration.trial import simulate_collaboration
+from hrc_learn.experiments.collaboration.trial import NULL_SPACE_FORCES, simulate_collaboration
 from hrc_learn.hardware import DriverError
 from hrc_learn.kinematics import panda
 from hrc_learn.sim import Imperfections, World
@@ -48,6 +49,9 @@ REPORTED = {
     "end effector deviation": "hand off its path, at most [mm]",
     "elbow moved": "elbow moved [mm]",
     "joint limit violations": "steps outside limits",
+    "separation violations": "steps too near the worker",
+    "min distance": "smallest distance of the worker [mm]",
+    "contacts with the worker": "contacts with the worker",
 }
 """Metrics of the job, by the heads of their columns."""
 
@@ -64,6 +68,10 @@ class Args:
     """Seeds from there on."""
     loss: float = 0.0
     """Share of the packets that are lost, of states and of answers each."""
+    pulls: Literal["scripted", "random"] = "scripted"
+    """When the elbow is pushed: while the arm waits for it, or at any time."""
+    worker: bool = False
+    """Whether a worker comes to the table, whom nobody expects."""
     config: PickAndPlaceConfig = field(default_factory=PickAndPlaceConfig)
     """How the job is done."""
     json: Path | None = None
@@ -116,8 +124,10 @@ def job(
             placing,
             (SHELF,),
             camera="synthetic",
+            forces=NULL_SPACE_FORCES if args.pulls == "scripted" else "random",
             config=args.config,
             imperfections=Imperfections.nominal(),
+            worker=args.worker,
             access=through(serve=serve),
             seed=seed,
         )
@@ -177,9 +187,9 @@ def show(rows: list[dict[str, Any]]) -> None:
         values = [row[name] for row in done if row.get(name) is not None]
         if values:
             median, p95 = np.percentile(values, [50, 95])
-            table.add_row(f"{head}, median and p95", f"{median:.1f}, {p95:.1f}")
+            table.add_row(escape(f"{head}, median and p95"), f"{median:.1f}, {p95:.1f}")
     table.add_row(
-        "wall time of a job, median [s]", f"{np.median([r['wall'] for r in rows]):.0f}"
+        escape("wall time of a job, median [s]"), f"{np.median([r['wall'] for r in rows]):.0f}"
     )
     Console().print(table)
 
