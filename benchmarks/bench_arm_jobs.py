@@ -1,11 +1,11 @@
 """The whole job beside a person through the driver of the real arm, its sockets and its cycles.
 
 One object is grasped, carried and placed while a person pushes the elbow, and a worker comes to
-the table if wanted, with the nominal imperfections of a laboratory, in MuJoCo behind the network
-protocol of the arm (franky-sim), which waits for each answer. What led the arm in each cycle,
-answers and what a control box goes on with where none comes, is judged afterwards by the limit
-checker of franka-sim, in its own environment (tools/make_franka_sim.sh), by the Panda's limits.
-Packets are lost on purpose, if wanted.
+the table if wanted, with the nominal imperfections of a laboratory, in MuJoCo behind the
+network protocol of the arm (franky-sim), which waits for each answer. What led the arm in each
+cycle, answers and what a control box goes on with where none comes, is judged afterwards by the
+limit checker of franka-sim, in its own environment (tools/make_franka_sim.sh), by the Panda's
+limits. Packets are lost on purpose, if wanted.
 """
 
 from __future__ import annotations
