@@ -1,0 +1,213 @@
+"""A person who pushes the arm itself: where the elbow goes, and whether a held hand pauses.
+
+The arm, with the nominal imperfections of a laboratory in MuJoCo, holds an object and goes to
+and fro along a path of the joints drawn at random. For some seconds a force acts on its elbow,
+along the way the null space lets it go, or on its hand, in any direction. Nothing but the torques
+of the joints tells of it.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import track
+from rich.table import Table
+
+from hrc_learn import cli
+from hrc_learn.experiments.collaboration.pulls import elbow_room
+from hrc_learn.kinematics import panda
+from hrc_learn.protocols import ArmState, Feedback, Human, HumanInput
+from hrc_learn.sim import Imperfections, World
+from hrc_learn.sim.workplace import Workplace
+from hrc_learn.skills import StoppedByPersonError, WorkCell, WorkCellConfig, joint_line
+from hrc_learn.skills.path_following import follow_path
+from hrc_learn.teleoperation import Touch, TouchConfig
+from hrc_learn.teleoperation.scripted_expert import ScriptedForce
+
+ELBOW = 4
+"""Joint whose origin it is, counted from 1."""
+BEGIN, RISE = 1.0, 0.3
+"""When a push begins, and how long its force takes to come and to go [s]."""
+LASTS = {"elbow": 4.0, "hand": 1.6}
+"""How long it acts [s]."""
+WAY, TIME = 0.3, 4.0
+"""Most that a joint goes [rad], and the time it has for it, there and back each [s]."""
+ENOUGH = 0.15
+"""Way of an elbow that has got out of somebody's way [m]."""
+NOMINAL = Imperfections.nominal()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args:
+    pushes: int = 50
+    """Of elbow and hand each."""
+    first_seed: int = 0
+    """Of path, push and imperfections."""
+    force: float = 20.0
+    """[N]"""
+    config: TouchConfig = field(default_factory=TouchConfig)
+    """What counts as a touch."""
+    json: Path | None = None
+    """Receives all figures as one flat object."""
+
+
+class Listener(Human):
+    """Touch, and when the task was paused."""
+
+    def __init__(self, touch: Touch):
+        self._touch = touch
+        self.paused: list[float] = []
+        self.elbow_felt: list[float] = []
+
+    def read(self, state: ArmState) -> HumanInput:
+        """What the touch asks for."""
+        asked = self._touch.read(state)
+        if asked.pause:
+            self.paused.append(state.time)
+        if self._touch.place == "elbow":
+            self.elbow_felt.append(state.time)
+        return asked
+
+    def tell(self, feedback: Feedback) -> None:
+        """Tell it."""
+        self._touch.tell(feedback)
+
+
+def main(args: Args) -> None:
+    """Push, print a table, write the figures."""
+    figures: dict[str, float] = {}
+    seeds = range(args.first_seed, args.first_seed + args.pushes)
+    for where in ("elbow", "hand"):
+        rows = [push(where, seed, args) for seed in track(seeds, where)]
+        figures |= (summary_of_elbow if where == "elbow" else summary_of_hand)(rows)
+    table = Table("", "")
+    for name, value in figures.items():
+        table.add_row(escape(name.replace("_", " ")), f"{value:.4g}")
+    Console().print(table)
+    if args.json is not None:
+        cli.write_json(args.json, figures)
+
+
+def push(where: Literal["elbow", "hand"], seed: int, args: Args) -> dict[str, Any]:
+    """One push, in SI units."""
+    rng = np.random.default_rng([seed, 0])
+    workplace = Workplace()
+    world = World(workplace.scene, NOMINAL.draw(np.random.default_rng(seed)))
+    home = workplace.home_joints()
+    world.hold(workplace.scene.objects[0].name, home.numpy())
+    human = Listener(Touch(panda, args.config))
+    far = home + torch.from_numpy(rng.uniform(-WAY, WAY, len(home)))
+    force = rng.standard_normal(3)
+    if where == "elbow":
+        J, J_elbow = panda.jacobian(home), panda.joint_jacobian(home, ELBOW)[:3]
+        null = torch.linalg.svd(J)[2][-1]
+        force = (J_elbow @ null).numpy() * np.sign(rng.standard_normal())
+    force *= args.force / np.linalg.norm(force)
+
+    def advance(duration: float) -> None:
+        apply(world, where, force)
+        world.advance(duration)
+
+    config = WorkCellConfig(
+        safety=NOMINAL.plant(WorkCellConfig().safety), command_delay=NOMINAL.following_delay
+    )
+    cell = WorkCell(
+        chain=panda,
+        arm=world.arm,
+        gripper=world.arm,
+        human=human,
+        advance=advance,
+        config=config,
+        clearance=workplace.arm_clearance,
+    )
+    stopped = ""
+    try:
+        for end in (far, home):
+            speed = 1.875 * float((far - home).abs().max()) / TIME
+            follow_path(cell, joint_line(cell.joints, end, speed, config.dt).numpy())
+    except StoppedByPersonError as error:
+        stopped = str(error)
+    elbow, hand = aside(cell)
+    start = panda.joint_origins(home)[ELBOW - 1]
+    pull = ScriptedForce(
+        start=0.0,
+        duration=LASTS[where],
+        towards=tuple((start.numpy() + force).tolist()),
+        joint=ELBOW,
+    )
+    return {
+        "stopped": stopped,
+        "room": elbow_room(home, pull, panda, workplace.arm_clearance),
+        "elbow": float(elbow.max()),
+        "hand": float(np.percentile(hand, 95)),
+        "hand_most": float(hand.max()),
+        "paused": human.paused[0] - BEGIN if human.paused else None,
+        "resumed": human.paused[-1] - BEGIN - LASTS[where] if human.paused else None,
+        "felt": human.elbow_felt[0] - BEGIN if human.elbow_felt else None,
+    }
+
+
+def apply(world: World, where: str, force: np.ndarray) -> None:
+    """Put the force on its body, as strong as it is by now."""
+    data, body = world.data, world.model.body({"elbow": "link4", "hand": "hand"}[where]).id
+    edge = min(data.time - BEGIN, BEGIN + LASTS[where] - data.time) / RISE
+    at = data.xpos[body] if where == "elbow" else data.site("tcp").xpos
+    data.xfrc_applied[body, :3] = np.clip(edge, 0.0, 1.0) * force
+    moment = np.cross(at - data.xipos[body], data.xfrc_applied[body, :3])
+    data.xfrc_applied[body, 3:] = moment
+
+
+def aside(cell: WorkCell) -> tuple[np.ndarray, np.ndarray]:
+    """Of elbow and hand from the path at each step on it [m]."""
+    on = np.isfinite(cell.log["path_joints"][:, 0])
+    q, path = (
+        torch.from_numpy(cell.log[name][on]) for name in ("joint_position", "path_joints")
+    )
+    elbow = (panda.joint_origins(q) - panda.joint_origins(path))[:, ELBOW - 1]
+    hand = panda.forward(q).position - panda.forward(path).position
+    return elbow.norm(dim=-1).numpy(), hand.norm(dim=-1).numpy()
+
+
+def summary_of_elbow(rows: list[dict[str, Any]]) -> dict[str, float]:
+    """How far elbows went, and hands."""
+    roomy = [row for row in rows if row["room"] >= ENOUGH]
+    return {
+        "elbow_pushes": float(len(rows)),
+        "elbow_felt": float(sum(row["felt"] is not None for row in rows)),
+        "elbow_stopped": float(sum(bool(row["stopped"]) for row in rows)),
+        "with_room_for_150_mm": float(len(roomy)),
+        "of_these_moved_150_mm": float(sum(row["elbow"] >= ENOUGH for row in roomy)),
+        "of_these_moved_median_mm": 1e3 * float(np.median([row["elbow"] for row in roomy])),
+        "others_moved_least_mm": 1e3
+        * min((row["elbow"] for row in rows if row["room"] < ENOUGH), default=np.nan),
+        "hand_off_path_p95_most_mm": 1e3 * max(row["hand"] for row in rows),
+        "hand_off_path_most_mm": 1e3 * max(row["hand_most"] for row in rows),
+        "task_paused_by_elbow": float(sum(row["paused"] is not None for row in rows)),
+    }
+
+
+def summary_of_hand(rows: list[dict[str, Any]]) -> dict[str, float]:
+    """How many paused the task, and when."""
+    paused = [row for row in rows if row["paused"] is not None and not row["stopped"]]
+    return {
+        "hand_pushes": float(len(rows)),
+        "task_paused": float(len(paused)),
+        "hand_stopped": float(sum(bool(row["stopped"]) for row in rows)),
+        "paused_after_median_s": float(np.median([row["paused"] for row in paused])),
+        "paused_after_most_s": max(row["paused"] for row in paused),
+        "resumed_after_median_s": float(np.median([row["resumed"] for row in paused])),
+    }
+
+
+if __name__ == "__main__":
+    cli.run(main, Args)
