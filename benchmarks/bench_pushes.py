@@ -2,8 +2,8 @@
 
 The arm, with the nominal imperfections of a laboratory in MuJoCo, holds an object and goes to
 and fro along a path of the joints drawn at random. For some seconds a force acts on its elbow,
-along the way the null space lets it go, or on its hand, in any direction. Nothing but the torques
-of the joints tells of it.
+along the way the null space lets it go, or on its hand, in any direction. Nothing but the
+torques of the joints tells of it.
 """
 
 from __future__ import annotations
