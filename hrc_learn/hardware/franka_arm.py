@@ -36,16 +36,8 @@ from hrc_learn.deploy import (
 )
 from hrc_learn.hardware.arm_process import DriverError
 from hrc_learn.hardware.franka_gripper import FrankaHand, GripperProcess
-from hrc_learn.hardware.franka_loop import (
-    CYCLE,
-    JOINTS,
-    Orders,
-    Phase,
-    Report,
-    Robot,
-    Shared,
-    serve,
-)
+from hrc_learn.hardware.franka_loop import CYCLE, Robot, serve
+from hrc_learn.hardware.franka_memory import JOINTS, Orders, Phase, Report, Shared
 from hrc_learn.hardware.franka_settings import CollisionConfig, Load
 from hrc_learn.kinematics import SerialChain
 from hrc_learn.protocols import ArmState

@@ -17,7 +17,8 @@ from typing import Protocol, final
 
 import numpy as np
 
-from hrc_learn.hardware.franka_loop import TEXT, Mailbox, import_pylibfranka
+from hrc_learn.hardware.franka_loop import import_pylibfranka
+from hrc_learn.hardware.franka_memory import TEXT, Mailbox
 
 NARROW = 0.005
 """Openings below this are a wish to squeeze; smaller changes of a wish are none [m]."""

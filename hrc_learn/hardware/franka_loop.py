@@ -21,9 +21,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from enum import IntEnum
-from multiprocessing.sharedctypes import RawArray
+from dataclasses import dataclass
 from types import FrameType
 from typing import Any, final
 
@@ -32,15 +30,11 @@ import torch
 from jaxtyping import Float
 
 from hrc_learn.deploy import StepRunner
+from hrc_learn.hardware.franka_memory import COST_BINS, JOINTS, Orders, Phase, Report, Shared
 from hrc_learn.hardware.franka_settings import CollisionConfig, Load
 
 CYCLE = 1e-3
 """Of Franka's control interface [s]."""
-JOINTS = 7
-TEXT = 2000
-"""Longest message about a fault [bytes]."""
-COST_BINS = 2000
-"""Of the histogram of what cycles cost, each 1 us wide; the last one has all that is longer."""
 
 _AGREES = 1e-5
 """By how much the box's commanded velocity may differ from what was sent [rad/s]: it comes
@@ -54,178 +48,6 @@ _SLOWEST, _FOLLOWS = 4.0, 0.02
 fast that is learned, in 50 cycles."""
 _PARENT_EVERY = 50
 """Cycles between two looks at whether the process that commands still lives."""
-_TRIES = 100
-"""Readings of a mailbox before its writer is taken for dead in the middle of a line: a line is
-written within a microsecond or two."""
-
-
-class Phase(IntEnum):
-    """What the loop is doing."""
-
-    STARTING = 0
-    IDLE = 1
-    MOVING = 2
-    FAULTED = 3
-    RECOVERING = 4
-    ENDED = 5
-
-
-@final
-class Mailbox:
-    """The newest line of numbers that one process writes and others read, without a lock.
-
-    The first number counts: odd while a line is being written. A reader takes a line only if
-    the count was even and has not changed meanwhile, and never waits for a writer.
-    """
-
-    def __init__(self, size: int):
-        """Take shared memory for lines of a length."""
-        self._memory = RawArray("d", size + 1)
-        self._attach()
-
-    def _attach(self) -> None:
-        self._line = np.frombuffer(self._memory, dtype=float)
-
-    def __getstate__(self) -> object:
-        return self._memory
-
-    def __setstate__(self, memory: Any) -> None:
-        self._memory = memory
-        self._attach()
-
-    def write(self, line: Float[np.ndarray, " size"]) -> None:
-        """Replace the line. There is one writer at a time."""
-        self._line[0] += 1
-        self._line[1:] = line
-        self._line[0] += 1
-
-    def read(self) -> Float[np.ndarray, " size"] | None:
-        """Return the newest line; None: its writer stays in the middle of one."""
-        for _ in range(_TRIES):
-            before = self._line[0]
-            line = self._line[1:].copy()
-            if before % 2 == 0 and self._line[0] == before:
-                return line
-        return None
-
-
-def _zeros() -> Float[np.ndarray, "7"]:
-    return np.zeros(JOINTS)
-
-
-@dataclass
-class Orders:
-    """What the commanding process wants, as a line of a mailbox."""
-
-    stamp: float = -np.inf
-    """When the velocity was set, by time.monotonic() [s]."""
-    stop: bool = False
-    """Whether to brake to rest whatever is wanted."""
-    recoveries: int = 0
-    """How often recovery has been asked for."""
-    end: bool = False
-    """Whether to bring the arm to rest and end."""
-    joint_velocity: Float[np.ndarray, "7"] = field(default_factory=_zeros)
-    """Wanted [rad/s]."""
-
-    SIZE = 4 + JOINTS
-
-    def line(self) -> Float[np.ndarray, " size"]:
-        """The numbers."""
-        numbers = [self.stamp, self.stop, self.recoveries, self.end, *self.joint_velocity]
-        return np.array(numbers, dtype=float)
-
-    @classmethod
-    def of(cls, line: Float[np.ndarray, " size"]) -> Orders:
-        """From a line."""
-        return cls(float(line[0]), bool(line[1]), int(line[2]), bool(line[3]), line[4:])
-
-
-@dataclass
-class Report:
-    """What the loop tells, as a line of a mailbox."""
-
-    phase: Phase = Phase.STARTING
-    stamp: float = -np.inf
-    """When the state was read, by time.monotonic() [s]."""
-    time: float = 0.0
-    """Of the robot's clock [s]."""
-    recoveries: int = 0
-    """Requests for recovery that have been dealt with."""
-    faults: int = 0
-    """So far."""
-    cycles: int = 0
-    """Answered in motion."""
-    lost: int = 0
-    """Of which no state was read in time to be answered."""
-    success_rate: float = 0.0
-    """Share of the last 100 answers that the control box got in time, by its own count."""
-    resting: bool = True
-    """Whether the velocity that was sent last is zero."""
-    joint_position: Float[np.ndarray, "7"] = field(default_factory=_zeros)
-    """[rad]"""
-    joint_velocity: Float[np.ndarray, "7"] = field(default_factory=_zeros)
-    """[rad/s]"""
-    external_torque: Float[np.ndarray, "7"] = field(default_factory=_zeros)
-    """[N m]"""
-
-    SIZE = 9 + 3 * JOINTS
-
-    def line(self) -> Float[np.ndarray, " size"]:
-        """The numbers."""
-        head = [
-            self.phase, self.stamp, self.time, self.recoveries, self.faults, self.cycles,
-            self.lost, self.success_rate, self.resting,
-        ]  # fmt: skip
-        return np.array(
-            [*head, *self.joint_position, *self.joint_velocity, *self.external_torque],
-            dtype=float,
-        )
-
-    @classmethod
-    def of(cls, line: Float[np.ndarray, " size"]) -> Report:
-        """From a line."""
-        q, dq, torque = line[9:].reshape(3, JOINTS)
-        return cls(
-            phase=Phase(int(line[0])),
-            stamp=float(line[1]),
-            time=float(line[2]),
-            recoveries=int(line[3]),
-            faults=int(line[4]),
-            cycles=int(line[5]),
-            lost=int(line[6]),
-            success_rate=float(line[7]),
-            resting=bool(line[8]),
-            joint_position=q,
-            joint_velocity=dq,
-            external_torque=torque,
-        )
-
-
-@final
-class Shared:
-    """The memory that both processes have."""
-
-    def __init__(self):
-        self.orders, self.report = Mailbox(Orders.SIZE), Mailbox(Report.SIZE)
-        self.orders.write(Orders().line())
-        self.report.write(Report().line())
-        self._text = RawArray("c", TEXT)
-        self._costs = RawArray("d", COST_BINS)
-
-    @property
-    def message(self) -> str:
-        """About the last fault."""
-        return self._text.value.decode("utf-8", "replace")
-
-    @message.setter
-    def message(self, text: str) -> None:
-        self._text.value = text.encode()[: TEXT - 1]
-
-    @property
-    def costs(self) -> Float[np.ndarray, " bins"]:
-        """How many cycles cost how many microseconds, from a state read to it answered."""
-        return np.frombuffer(self._costs, dtype=float)
 
 
 @dataclass(frozen=True)

@@ -8,15 +8,8 @@ import numpy as np
 import pytest
 
 from hrc_learn.hardware import FrankaConfig, LoopTiming
-from hrc_learn.hardware.franka_loop import (
-    Mailbox,
-    Orders,
-    Phase,
-    Punctuality,
-    Report,
-    Shared,
-    answer_was_lost,
-)
+from hrc_learn.hardware.franka_loop import Punctuality, answer_was_lost
+from hrc_learn.hardware.franka_memory import Mailbox, Orders, Phase, Report, Shared
 
 LONG = 50_000
 """Numbers that take so long to copy that writer and reader meet."""
