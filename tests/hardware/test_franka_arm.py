@@ -7,6 +7,7 @@ import math
 import os
 import signal
 import time
+from contextlib import closing
 from dataclasses import replace
 from importlib.util import find_spec
 from multiprocessing.reduction import ForkingPickler
@@ -22,6 +23,8 @@ from hrc_learn.hardware.franka_arm import step_of
 from hrc_learn.kinematics import SerialChain, panda
 from hrc_learn.kinematics import fr3 as FR3
 from hrc_learn.protocols import Arm, Gripper
+from hrc_learn.sim import SceneConfig, World
+from hrc_learn.sim.protocol_server import ServedArm, serve_world
 
 # Not imported: one process cannot have both drivers, and this one may get the other.
 pytestmark = [
@@ -242,3 +245,25 @@ def test_only_arms_of_seven_joints_are_driven():
     )
     with pytest.raises(ValueError, match="7 joints"):
         FrankaArm("127.0.0.1", short, CONFIG)
+
+
+def pauses_missed(**settings) -> int:
+    """Cycles that nobody answers of a world that stands still thirty times in a motion."""
+    world = World(SceneConfig(objects=()))
+    world.reset(panda.ready.numpy())
+    config = replace(CONFIG, gripper=False, **settings)
+    with serve_world(world) as server:
+        with server.running():
+            driver = FrankaArm(server.address, panda, config)
+        with closing(ServedArm(driver, server)) as arm:
+            for _ in range(30):
+                arm.command(np.full(7, 0.1))
+                server.advance(0.01)
+                time.sleep(0.02)
+            assert driver.faults == 0
+            return server.missed
+
+
+def test_in_lockstep_a_state_after_a_pause_is_not_taken_for_a_late_one():
+    assert pauses_missed() > 20
+    assert pauses_missed(lockstep=True) < 10
